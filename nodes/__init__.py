@@ -1,0 +1,8 @@
+"""The physics: one plain, differentiable function for each step of the camera.
+
+Nothing here knows of recipes, caches, devices or graphs.
+"""
+
+from neusee.nodes._node import Check, Facts, Node, ParameterError, node
+
+__all__ = ["Check", "Facts", "Node", "ParameterError", "node"]

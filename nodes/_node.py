@@ -1,0 +1,152 @@
+"""What a node is: a plain function, plus the little that an engine must know of it.
+
+The signature is the whole contract. What stands before ``*`` is data and comes from
+other steps; what stands after ``*`` is a parameter and comes from the recipe; a
+parameter named ``rng`` is filled in by the engine.
+
+    @node(rtol=0.0)
+    def digitize(electrons: Tensor, *, gain: Gain, bits: Bits = 16) -> Tensor: ...
+
+    @digitize.reference        # float64, slow, plainly right; a test compares to rtol
+    @digitize.negligible       # true upper bound of what skipping the step changes
+    @digitize.preflight        # looks at the parameters before anything runs
+    @digitize.check            # looks at the result: what a physicist would look at first
+"""
+
+from __future__ import annotations
+
+import functools
+import inspect
+import math
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from typing import Any, Literal, TypeVar, get_type_hints
+
+import torch
+from pydantic import BaseModel, ConfigDict, create_model
+from torch import Tensor
+
+Device = Literal["any", "cpu", "gpu"]
+Fn = TypeVar("Fn", bound=Callable[..., Any])
+
+
+class ParameterError(ValueError):
+    """A parameter cannot be used; raised by a node's ``preflight``, before anything runs.
+
+    Args: the name of the parameter, and one sentence with the value and the fix.
+    """
+
+    def __init__(self, parameter: str, message: str) -> None:
+        super().__init__(message)
+        self.parameter = parameter
+
+
+@dataclass(frozen=True, slots=True)
+class Check:
+    """One line that a physicist would look at: ``Check("phase step 0.31 turn < 0.5", True)``."""
+
+    text: str
+    ok: bool = True
+
+
+@dataclass(frozen=True, slots=True)
+class Facts:
+    """What is cheap to know of a tensor, kept beside it so that a verdict never loads it."""
+
+    shape: tuple[int, ...]
+    dtype: str
+    min: float
+    max: float
+    sum: float
+    support: int  #: elements that are not zero
+    finite: bool
+
+    @classmethod
+    def of(cls, value: Any) -> Facts | None:
+        """Facts of a tensor, or of the first tensor of a named tuple; None of anything else."""
+        if isinstance(value, tuple | list) and value:
+            return cls.of(value[0])
+        if not isinstance(value, Tensor):
+            return None
+        x = value.detach()
+        shape, dtype = tuple(x.shape), str(x.dtype).removeprefix("torch.")
+        if x.numel() == 0:
+            return cls(shape, dtype, math.nan, math.nan, 0.0, 0, True)
+        x = x.abs() if x.is_complex() else x
+        low, high = (float(v) for v in torch.aminmax(x.to(torch.uint8) if x.dtype == torch.bool else x))
+        total = float(x.sum(dtype=torch.float64))
+        finite = all(map(math.isfinite, (low, high, total)))
+        return cls(shape, dtype, low, high, total, int(torch.count_nonzero(x)), finite)
+
+
+class Node:
+    """A function with its typed parameters, its reference, its bound and its checks."""
+
+    def __init__(self, fn: Callable[..., Any], device: Device = "any", rtol: float = 1e-5) -> None:
+        functools.update_wrapper(self, fn)
+        self.fn, self.device, self.rtol = fn, device, rtol
+        self.ref: Callable[..., Any] | None = None
+        self.bound: Callable[..., float] | None = None
+        self.before: Callable[..., Sequence[str]] | None = None
+        self.after: Callable[..., Sequence[Check]] | None = None
+        pars = inspect.signature(fn).parameters.values()
+        data = [p for p in pars if p.kind is p.POSITIONAL_OR_KEYWORD]
+        self.inputs = tuple(p.name for p in data)
+        self.optional = frozenset(p.name for p in data if p.default is not p.empty)
+        self.random = any(p.name == "rng" for p in pars)
+        self._keyword_only = [p for p in pars if p.kind is p.KEYWORD_ONLY and p.name != "rng"]
+
+    def __call__(self, *inputs: Any, **params: Any) -> Any:
+        """Call the function itself: no validation, no cache; gradients flow."""
+        return self.fn(*inputs, **params)
+
+    def __repr__(self) -> str:
+        return f"<node {self.path}>"
+
+    @property
+    def path(self) -> str:
+        """The name a recipe writes: ``sensor.digitize``."""
+        parts = [p for p in self.fn.__module__.removeprefix("neusee.nodes.").split(".") if not p.startswith("_")]
+        return ".".join([*parts, self.fn.__name__])
+
+    @functools.cached_property
+    def hints(self) -> dict[str, Any]:
+        """Annotations by argument name, and ``return``, with their ``Annotated`` extras."""
+        return get_type_hints(self.fn, include_extras=True)
+
+    @functools.cached_property
+    def params(self) -> type[BaseModel]:
+        """Model that reads this node's parameters from a recipe and rejects the rest."""
+        fields = {p.name: (self.hints[p.name], ... if p.default is p.empty else p.default) for p in self._keyword_only}
+        config = ConfigDict(extra="forbid", frozen=True, arbitrary_types_allowed=True)
+        model: type[BaseModel] = create_model(self.fn.__name__, __config__=config, **fields)  # type: ignore[call-overload]
+        return model
+
+    def reference(self, fn: Fn) -> Fn:
+        """Attach the slow float64 form: same arguments, same result within ``rtol``."""
+        self.ref = fn
+        return fn
+
+    def negligible(self, fn: Fn) -> Fn:
+        """Attach the bound: ``(facts of each input, *, parameters) -> float``.
+
+        It bounds ``max |with - without| / max |with|``; of a random node, the same with
+        root mean square over the noise. Skipping hands on the first input.
+        """
+        self.bound = fn
+        return fn
+
+    def preflight(self, fn: Fn) -> Fn:
+        """Attach ``(*, parameters) -> notes``; it may raise `ParameterError`."""
+        self.before = fn
+        return fn
+
+    def check(self, fn: Fn) -> Fn:
+        """Attach ``(result, *inputs, **parameters) -> checks``, run once after computing."""
+        self.after = fn
+        return fn
+
+
+def node(device: Device = "any", rtol: float = 1e-5) -> Callable[[Callable[..., Any]], Node]:
+    """Make a node of a function. ``rtol`` is the agreed error against its reference."""
+    return lambda fn: Node(fn, device, rtol)

@@ -1,0 +1,82 @@
+"""Units: a recipe writes ``550 nm``, a node receives metres.
+
+A parameter with a dimension must carry its unit in the recipe, so that no one can
+mistake micrometres for nanometres. Inside the program everything is SI (or e-, DN).
+"""
+
+from __future__ import annotations
+
+import math
+import re
+from pathlib import Path
+from typing import Annotated, Any
+
+from pydantic import AfterValidator, BeforeValidator, Field
+
+_SCALE: dict[str, dict[str, float]] = {
+    "m": {"m": 1.0, "cm": 1e-2, "mm": 1e-3, "um": 1e-6, "µm": 1e-6, "μm": 1e-6, "nm": 1e-9},
+    "s": {"s": 1.0, "ms": 1e-3, "us": 1e-6, "µs": 1e-6},
+    "rad": {"rad": 1.0, "mrad": 1e-3, "urad": 1e-6, "deg": math.pi / 180.0},
+    "K": {"K": 1.0},
+    "e-": {"e-": 1.0, "ke-": 1e3},
+    "waves": {"waves": 1.0, "wave": 1.0},
+}
+_NUMBER = re.compile(r"([-+]?(?:\d+\.?\d*|\.\d+)(?:[eE][-+]?\d+)?)\s*(.*)")
+
+
+def _usual(si: str) -> str:
+    return {"m": "um", "s": "ms", "rad": "mrad"}.get(si, si)
+
+
+def read_quantity(value: Any, si: str) -> float:
+    """Read ``"550 nm"`` as a finite number of ``si``; a bare number is refused with the fix."""
+    text = str(value).strip()
+    match = _NUMBER.fullmatch(text)
+    units = ", ".join(_SCALE[si])
+    if isinstance(value, bool) or match is None:
+        raise ValueError(f"is no quantity: write a number and a unit, such as '1 {_usual(si)}'")
+    number, unit = float(match[1]), match[2].strip()
+    if not unit:
+        raise ValueError(f"needs a unit: write {match[1]} {_usual(si)} (one of {units})")
+    if unit not in _SCALE[si]:
+        raise ValueError(f"has the wrong unit {unit!r}: write one of {units}")
+    if not math.isfinite(number):
+        raise ValueError("must be finite")
+    return number * _SCALE[si][unit]
+
+
+def _reader(si: str) -> BeforeValidator:
+    return BeforeValidator(lambda value: read_quantity(value, si), json_schema_input_type=str)
+
+
+def _finite(value: float) -> float:
+    if not math.isfinite(value):
+        raise ValueError("must be finite")
+    return value
+
+
+Length = Annotated[float, _reader("m")]  #: metre, any sign
+PositiveLength = Annotated[float, Field(gt=0), _reader("m")]  #: metre
+Wavelength = Annotated[float, Field(ge=100e-9, le=20e-6), _reader("m")]  #: metre, 100 nm to 20 µm
+Time = Annotated[float, Field(gt=0), _reader("s")]  #: second
+Angle = Annotated[float, _reader("rad")]  #: radian
+Temperature = Annotated[float, Field(gt=0), _reader("K")]  #: kelvin
+Electrons = Annotated[float, Field(ge=0), _reader("e-")]  #: electron
+Waves = Annotated[float, _reader("waves")]  #: wavelengths of path
+Fraction = Annotated[float, Field(ge=0, le=1)]  #: number in [0, 1]
+Count = Annotated[int, Field(ge=1)]  #: whole number from 1
+Real = Annotated[float, AfterValidator(_finite)]  #: finite number
+Shape = tuple[Count, Count]  #: (y, x) in pixels
+
+
+class IsFile:
+    """Marks a parameter whose *content* decides the result; the engine digests it."""
+
+
+def _existing(path: Path) -> Path:
+    if not path.is_file():
+        raise ValueError(f"no such file: {path}")
+    return path
+
+
+DataFile = Annotated[Path, AfterValidator(_existing), IsFile()]  #: path of a file that exists

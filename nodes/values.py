@@ -1,0 +1,49 @@
+"""What travels between steps when one tensor is not enough.
+
+Every field is a tensor, so that any of these can be stored, moved and differentiated.
+Spectral sampling is data: whoever needs wavelengths receives `Bands`.
+"""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+from torch import Tensor
+
+
+class Bands(NamedTuple):
+    """Spectral samples, of a scene (31 bands) or of one laser line (its own few)."""
+
+    centres: Tensor  #: (band,) float64, m
+    widths: Tensor  #: (band,) float64, m
+    weights: Tensor  #: (band,) float64; a scene: all 1; a laser line: its share of the energy, sum 1
+
+
+class Dirt(NamedTuple):
+    """What lies on the window, in the plane of the pupil."""
+
+    amplitude: Tensor  #: (v, u) transmission of the field in [0, 1]
+    path: Tensor  #: (v, u) added optical path, m
+
+
+class Pupil(NamedTuple):
+    """The pupil function of all bands, in factors.
+
+    The field of band b is ``amplitude * exp(2 pi i (index[b] * height + path) / wavelengths[b])``.
+    Kept in factors because 31 complex fields of 2160 x 2160 are 1.2 GB and the factors 75 MB.
+    """
+
+    aperture: Tensor  #: (v, u) clear aperture: 1 inside, 0 outside
+    amplitude: Tensor  #: (v, u) aperture times dirt
+    height: Tensor  #: (v, u) of the diffractive element, m
+    path: Tensor  #: (v, u) aberrations and dirt, m of optical path
+    index: Tensor  #: (band,) float64, refractive index of the element minus that of air
+    wavelengths: Tensor  #: (band,) float64, m
+    pitch: Tensor  #: () float64, m between samples, both axes
+
+
+class Psf(NamedTuple):
+    """Point-spread functions, as the share of the light through the clear pupil per pixel."""
+
+    intensity: Tensor  #: (band, y, x); the sum over an infinite plane is the transmitted share
+    clear_peak: Tensor  #: (band,) float64: the pixel on the axis, same lens, no element, no dirt, no aberration
