@@ -1,0 +1,1 @@
+"""Diffractive optical elements: height maps and materials."""

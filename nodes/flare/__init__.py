@@ -1,0 +1,1 @@
+"""Flare: dirt in the pupil and ghosts on the sensor."""

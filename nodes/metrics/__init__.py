@@ -1,0 +1,1 @@
+"""Metrics: what a reader of results asks for."""

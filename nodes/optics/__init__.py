@@ -1,0 +1,1 @@
+"""Optics: pupil, point-spread function, image and laser spot."""

@@ -1,0 +1,1 @@
+"""Restoration: from raw digital numbers back to colour."""

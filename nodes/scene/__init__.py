@@ -1,0 +1,1 @@
+"""Scenes: where light enters a recipe."""

@@ -1,0 +1,1 @@
+"""Sensor: photons to electrons to digital numbers."""

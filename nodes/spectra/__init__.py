@@ -1,0 +1,1 @@
+"""Spectra: bands, lines, lifts from RGB, illuminants and responses."""

@@ -1,0 +1,1 @@
+"""Recipes: cameras, scenes and studies, as YAML. No code."""
