@@ -1,0 +1,99 @@
+"""The graph of a checked recipe: steps, their wires and the order in which they run."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Mapping
+from dataclasses import dataclass, field
+from typing import Any
+
+from neusee.nodes import Node
+from neusee.workflows._marks import Mark
+
+Wire = str | tuple[str, ...] | None  #: one step, the steps of all items, or an optional input that is absent
+
+
+@dataclass(frozen=True, slots=True)
+class Step:
+    """One bound step: a node, its validated parameters and the steps that feed it."""
+
+    name: str  #: ``psf[mask]``, ``spot[mask,green]``
+    node: Node
+    params: Mapping[str, Any]  #: validated, SI, with the node's defaults
+    wires: Mapping[str, Wire]  #: by input, in the node's order
+    mark: Mark
+    param_marks: Mapping[str, Mark]  #: where each value that was given stands
+
+    @property
+    def sources(self) -> tuple[str, ...]:
+        """Every step that feeds this one, in the order of the inputs."""
+        return tuple(name for wire in self.wires.values() for name in _names(wire))
+
+
+def _names(wire: Wire) -> tuple[str, ...]:
+    return () if wire is None else (wire,) if isinstance(wire, str) else wire
+
+
+@dataclass(frozen=True, slots=True)
+class Expectation:
+    """A number that the recipe promises: ``step`` at ``at`` is ``value`` within ``rtol``."""
+
+    name: str
+    step: str
+    at: tuple[int | str, ...]  #: indices, or the name of a field of a named tuple
+    value: float
+    rtol: float
+    mark: Mark
+
+
+@dataclass(frozen=True, slots=True)
+class Setting:
+    """A final value and where it comes from: ``file:line:column``, ``argument n`` or a node's default."""
+
+    value: Any
+    source: str
+
+
+@dataclass(frozen=True, slots=True)
+class Config:
+    """Every final value by its dotted path, in the order of the recipe."""
+
+    settings: Mapping[str, Setting] = field(default_factory=dict)
+
+    def __getitem__(self, path: str) -> Setting:
+        return self.settings[path]
+
+
+@dataclass(frozen=True, slots=True)
+class Recipe:
+    """A recipe whose every value, wire and file was looked at; nothing of it has run."""
+
+    name: str
+    title: str
+    seed: int
+    tolerance: float
+    outputs: tuple[str, ...]
+    steps: Mapping[str, Step]
+    expect: tuple[Expectation, ...] = ()
+    config: Config = field(default_factory=Config)
+    notes: tuple[str, ...] = ()
+    absent: Mapping[str, str] = field(default_factory=dict)  #: step that is null -> where that is written
+
+
+def needed(recipe: Recipe, outputs: Iterable[str]) -> list[str]:
+    """Steps that ``outputs`` need, each after its sources."""
+    return in_order({name: step.sources for name, step in recipe.steps.items()}, outputs)
+
+
+def in_order(sources: Mapping[str, Iterable[str]], wanted: Iterable[str]) -> list[str]:
+    """Names after their sources, without recursion; a cycle must have been ruled out before."""
+    order: dict[str, None] = {}
+    stack = [(name, iter(sources[name])) for name in reversed(list(wanted))]
+    while stack:
+        name, rest = stack[-1]
+        below = next((s for s in rest if s not in order), None)
+        if below is not None:
+            stack.append((below, iter(sources[below])))
+            continue
+        order.setdefault(name)
+        stack.pop()
+    return list(order)

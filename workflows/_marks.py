@@ -1,0 +1,52 @@
+"""Where a value was written, and what is wrong with it: one located line for each mistake."""
+
+from __future__ import annotations
+
+import difflib
+from collections.abc import Iterable
+from dataclasses import dataclass, field
+
+
+@dataclass(frozen=True, slots=True, order=True)
+class Mark:
+    """A place in a file (lines and columns count from 1), or an argument such as ``argument 2`` (line 0)."""
+
+    file: str  #: as the user knows it: ``first_light.yaml``, ``sensor/neusee.yaml``
+    line: int = 0
+    column: int = 0
+    folder: str = field(default=".", compare=False)  #: what a relative path written here is relative to
+
+    def __str__(self) -> str:
+        return f"{self.file}:{self.line}:{self.column}" if self.line else self.file
+
+
+@dataclass(frozen=True, slots=True, order=True)
+class Problem:
+    """One mistake: where, of what, and what to write instead."""
+
+    mark: Mark
+    path: str
+    message: str
+
+
+class RecipeError(ValueError):
+    """A recipe cannot be run; ``str`` gives one line a problem, in the order of the files."""
+
+    def __init__(self, problems: Iterable[Problem]) -> None:
+        self.problems = tuple(sorted(set(problems)))
+        super().__init__(_table(self.problems))
+
+
+def _table(problems: tuple[Problem, ...]) -> str:
+    where = max((len(str(p.mark)) for p in problems), default=0)
+    what = min(max((len(p.path) for p in problems), default=0), 40)
+    return "\n".join(f"{p.mark!s:<{where}}   {p.path:<{what}}   {p.message}" for p in problems)
+
+
+def nearest(name: str, among: Iterable[str]) -> str:
+    """``did you mean gain?``, or what there is, or nothing where there is nothing."""
+    names = sorted(set(map(str, among)))
+    close = difflib.get_close_matches(str(name), names, 1, 0.6)
+    if close:
+        return f"did you mean {close[0]}?"
+    return f"there are: {', '.join(names[:12])}{', …' if len(names) > 12 else ''}" if names else "there are none"
