@@ -1,0 +1,140 @@
+"""A relief drawn by a network from the pupil coordinates alone: a smooth prior with a million numbers."""
+
+from itertools import pairwise
+from pathlib import Path
+from typing import Any
+
+import torch
+from torch import Tensor, nn
+from torch.nn import functional as F
+
+from neusee.nodes import ParameterError, node
+from neusee.nodes.doe._relief import relief_checks
+from neusee.nodes.optics._aperture import Aperture, grid_notes
+from neusee.nodes.units import Count, DataFile, PositiveLength
+
+
+class HeightNet(nn.Module):
+    """Eight convolutions, four down and four up, from (u, v) to one logit a sample."""
+
+    def __init__(self, width: int = 32) -> None:
+        super().__init__()
+        sizes = [2, width, 2 * width, 4 * width, 8 * width]
+        pairs = zip(pairwise(sizes), [1, 2, 2, 2], strict=True)
+        self.down = nn.ModuleList(nn.Conv2d(a, b, 3, stride=s, padding=1) for (a, b), s in pairs)
+        self.up = nn.ModuleList(nn.Conv2d(3 * b, b, 3, padding=1) for b in sizes[3:0:-1])
+        self.last = nn.Conv2d(width, 1, 3, padding=1)
+
+    def forward(self, coordinates: Tensor) -> Tensor:
+        """(2, y, x) -> (y, x)."""
+        x, passed = coordinates[None], []
+        for layer in self.down:
+            x = F.silu(layer(x))
+            passed.append(x)
+        for layer, skip in zip(self.up, passed[-2::-1], strict=True):
+            x = F.silu(layer(torch.cat([enlarge(x, skip.shape[-2], skip.shape[-1]), skip], dim=1)))
+        logits: Tensor = self.last(x)[0, 0]
+        return logits
+
+
+def _cubic(size: int, new: int, like: Tensor) -> Tensor:
+    """Matrix (new, size) of bicubic interpolation between grids of the same extent."""
+    one = torch.eye(size, dtype=like.dtype, device=like.device)[None, None]
+    return F.interpolate(one, size=(new, size), mode="bicubic", align_corners=False)[0, 0]
+
+
+def enlarge(image: Tensor, height: int, width: int) -> Tensor:
+    """Resample (…, y, x) bicubically by two small matrix products: deterministic and differentiable at will."""
+    rows, columns = _cubic(image.shape[-2], height, image), _cubic(image.shape[-1], width, image)
+    return rows @ image @ columns.T
+
+
+def coordinates(grid: int, device: torch.device | None = None) -> Tensor:
+    """What the network sees: u and v from -1 to 1 across the pupil grid, (2, grid, grid)."""
+    line = (torch.arange(grid, dtype=torch.float64, device=device) - (grid - 1) / 2) * (2 / grid)
+    v, u = torch.meshgrid(line, line, indexing="ij")
+    return torch.stack([u, v]).to(torch.float32)
+
+
+def height_of(net: nn.Module, samples: int, grid: int, max_height: float) -> Tensor:
+    """Relief (samples, samples) between 0 and ``max_height``, through which the network learns."""
+    device = next(net.parameters()).device
+    logits = net(coordinates(min(grid, samples), device))
+    return max_height * torch.sigmoid(enlarge(logits, samples, samples))
+
+
+def fresh(width: int, grid: int, rng: torch.Generator) -> HeightNet:
+    """Draw a network: orthogonal weights, zero biases, last layer scaled so that the start is far from flat."""
+    net = HeightNet(width).to(rng.device)
+    with torch.no_grad():
+        for name, parameter in net.named_parameters():
+            if name.endswith("bias"):
+                parameter.zero_()
+            else:
+                nn.init.orthogonal_(parameter, gain=2**0.5, generator=rng)
+        logits = net(coordinates(grid, rng.device))
+        spread = logits.std(correction=0).clamp(min=1e-12)
+        net.last.weight.div_(spread)
+        net.last.bias = nn.Parameter((-logits.mean() / spread)[None])
+    return net
+
+
+def _load(weights: Path, width: int) -> HeightNet:
+    from safetensors.torch import load_file
+
+    net = HeightNet(width)
+    net.load_state_dict(load_file(weights))
+    return net
+
+
+@node()
+def unet(
+    *,
+    samples: Count,
+    pitch: PositiveLength,
+    diameter: PositiveLength,
+    aperture: Aperture = "clip",
+    max_height: PositiveLength = 1.2e-6,
+    grid: Count = 270,
+    width: Count = 32,
+    weights: DataFile | None = None,
+    rng: torch.Generator,
+) -> Tensor:
+    """Draw the relief with a UNet of the pupil coordinates: max_height * sigmoid(UNet(u, v)).
+
+    Evaluated on ``grid`` samples and resampled bicubically before the sigmoid, so that it stays inside its range.
+
+    Shapes: -> (v, u).
+    Units:  m.
+    Error:  1e-6 of max_height (float32).
+    Source: the camera of "Learning to See Through Flare", section 4; layer widths are ours.
+    """
+    net = fresh(width, min(grid, samples), rng) if weights is None else _load(weights, width)
+    return height_of(net, samples, grid, max_height).detach()
+
+
+@unet.preflight
+def _(*, width: int, weights: Path | None, **rest: Any) -> list[str]:
+    if weights is not None:
+        _same_layout(weights, width)
+    return grid_notes(**rest)
+
+
+def _same_layout(weights: Path, width: int) -> None:
+    from safetensors import SafetensorError, safe_open
+
+    with torch.device("meta"):
+        wanted = {name: tuple(tensor.shape) for name, tensor in HeightNet(width).state_dict().items()}
+    try:
+        with safe_open(weights, framework="pt") as tensors:
+            found = {name: tuple(tensors.get_slice(name).get_shape()) for name in tensors.keys()}  # noqa: SIM118
+    except SafetensorError as error:
+        raise ParameterError("weights", f"{weights.name} is no safetensors file: {error}") from error
+    odd = sorted(name for name in wanted | found if wanted.get(name) != found.get(name))
+    if odd:
+        name = odd[0]
+        text = f"{weights.name}: {name} is {found.get(name)}, this network (width {width}) has {wanted.get(name)}"
+        raise ParameterError("weights", text)
+
+
+unet.check(relief_checks)

@@ -1,0 +1,66 @@
+"""The stop and its grid: the one place that decides pitch and diameter of the pupil."""
+
+import math
+from typing import Any, Literal, NamedTuple
+
+import torch
+from torch import Tensor
+
+from neusee.nodes import ParameterError
+
+Aperture = Literal["clip", "stretch"]
+
+
+class Stop(NamedTuple):
+    """A round stop on a square grid whose sample j lies at (j - (samples - 1) / 2) * pitch."""
+
+    samples: int  #: along each axis
+    pitch: float  #: m
+    diameter: float  #: m, of the clear aperture
+
+
+def stop(samples: int, pitch: float, diameter: float, aperture: Aperture = "clip") -> Stop:
+    """Decide pitch and diameter: the grid clips the aperture, or is stretched to span it.
+
+    Raises: ParameterError where no sample lies inside the aperture.
+    """
+    if aperture == "stretch":
+        return Stop(samples, diameter / samples, diameter)
+    nearest = 0.0 if samples % 2 else pitch * math.sqrt(0.5)
+    if diameter < 2 * nearest:
+        needed = f"{2 * nearest * 1e6:.3g} um"
+        raise ParameterError(
+            "diameter", f"{diameter * 1e6:.3g} um holds no pupil sample: needs {needed} or a finer pitch"
+        )
+    return Stop(samples, pitch, min(diameter, samples * pitch))
+
+
+def axes(grid: Stop, device: torch.device | None = None) -> tuple[Tensor, Tensor]:
+    """Coordinates in units of the stop's radius, float64: v (samples, 1) and u (1, samples)."""
+    steps = torch.arange(grid.samples, dtype=torch.float64, device=device) - (grid.samples - 1) / 2
+    line = steps * (2 * grid.pitch / grid.diameter)
+    return line[:, None], line[None, :]
+
+
+def polar(grid: Stop, device: torch.device | None = None) -> tuple[Tensor, Tensor]:
+    """Radius in units of the stop's radius and azimuth from +u towards +v, float64 (v, u)."""
+    v, u = axes(grid, device)
+    return torch.hypot(v, u), torch.atan2(v.expand(grid.samples, -1), u.expand(grid.samples, -1))
+
+
+def inside(grid: Stop, device: torch.device | None = None) -> Tensor:
+    """Samples whose centre the stop lets through, bool (v, u)."""
+    v, u = axes(grid, device)
+    return v.square() + u.square() <= 1
+
+
+def grid_notes(*, samples: int, pitch: float, diameter: float, aperture: Aperture, **_: Any) -> list[str]:
+    """What the grid does to the aperture, for a preflight: nothing, clipped or stretched."""
+    grid = stop(samples, pitch, diameter, aperture)
+    wanted, span = f"{diameter * 1e3:#.3g} mm", f"{samples * pitch * 1e3:#.3g} mm"
+    if grid.diameter < diameter:
+        return [f"aperture {wanted} > pupil grid {span}: clipped, see reading.aperture"]
+    if not math.isclose(grid.pitch, pitch):
+        change = f"{pitch * 1e6:#.3g} -> {grid.pitch * 1e6:#.3g} um"
+        return [f"aperture {wanted} over pupil grid {span}: pitch stretched {change}, see reading.aperture"]
+    return []

@@ -1,0 +1,71 @@
+"""Zernike polynomials over the stop: unit root mean square, numbered after Noll."""
+
+import math
+from collections.abc import Mapping
+
+import torch
+from torch import Tensor
+
+from neusee.nodes.optics._aperture import Stop, axes, inside
+
+
+def noll(index: int) -> tuple[int, int]:
+    """Radial order n and signed azimuthal order m: m > 0 with the cosine, m < 0 with the sine."""
+    if index < 1:
+        raise ValueError(f"Zernike index {index}: Noll counts from 1 (piston)")
+    n = (math.isqrt(8 * index - 7) - 1) // 2
+    place = index - n * (n + 1) // 2 - 1
+    m = 2 * ((place + (n + 1) % 2) // 2) + n % 2
+    return n, (m if index % 2 == 0 else -m)
+
+
+def _radial(n: int, m: int) -> list[float]:
+    """Coefficients of the orthonormal R(n, m)(r) / r**m in rising powers of r squared."""
+    low, high, factorial = (n - m) // 2, (n + m) // 2, math.factorial
+    norm = math.sqrt((n + 1) * (1 if m == 0 else 2))
+    terms = reversed(range(low + 1))
+    return [
+        norm * (-1) ** k * factorial(n - k) / (factorial(k) * factorial(high - k) * factorial(low - k)) for k in terms
+    ]
+
+
+def _by_azimuth(coefficients: Mapping[int, float]) -> dict[int, list[float]]:
+    """Radial polynomials summed over the terms that share a signed azimuthal order."""
+    sums: dict[int, list[float]] = {}
+    for index, rms in coefficients.items():
+        n, m = noll(index)
+        new, old = _radial(n, abs(m)), sums.get(m, [])
+        width = max(len(new), len(old))
+        padded = [row + [0.0] * (width - len(row)) for row in (new, old)]
+        sums[m] = [rms * a + b for a, b in zip(*padded, strict=True)]
+    return sums
+
+
+def _horner(coefficients: list[float], x: Tensor) -> Tensor:
+    value = torch.full_like(x, coefficients[-1])
+    for coefficient in coefficients[-2::-1]:
+        value.mul_(x).add_(coefficient)
+    return value
+
+
+def combine(coefficients: Mapping[int, float], v: Tensor, u: Tensor) -> Tensor:
+    """Sum of polynomials at (v, u) in units of the radius, each with its root mean square.
+
+    Written in powers of u + iv, so that neither the centre nor the cut of an azimuth is special.
+    Source: Noll, J. Opt. Soc. Am. 66, 207 (1976), Eqs. 1 and 2.
+    """
+    sums = _by_azimuth(coefficients)
+    square = v.square() + u.square()
+    total, real, imag = torch.zeros_like(square), torch.ones_like(square), torch.zeros_like(square)
+    for order in range(max(map(abs, sums), default=-1) + 1):
+        for m, wave in ((order, real), (-order, imag)):
+            if m in sums and (order or wave is real):
+                total.addcmul_(_horner(sums[m], square), wave)
+        real, imag = real * u - imag * v, real * v + imag * u
+    return total
+
+
+def surface(coefficients: Mapping[int, float], grid: Stop, device: torch.device | None = None) -> Tensor:
+    """The same over the stop, float64 (v, u), 0 outside."""
+    v, u = axes(grid, device)
+    return torch.where(inside(grid, device), combine(coefficients, v, u), 0.0)
