@@ -1,0 +1,114 @@
+"""Ghosts: reflections between the surfaces of the lens, paraxially, without its prescription."""
+
+import math
+from typing import Annotated, Any, NamedTuple
+
+import torch
+from pydantic import Field
+from torch import Tensor
+
+from neusee.nodes import Check, node
+from neusee.nodes.units import Angle, Fraction, PositiveLength
+from neusee.nodes.values import Bands
+
+
+class _Ghost(NamedTuple):
+    magnification: float  #: of the source's place on the sensor
+    radius: float  #: m
+    share: float  #: of the energy of all ghosts, before colour
+    tuned: tuple[float, float]  #: wavelengths, m, of the two reflecting coatings
+
+
+@node()
+def ghosts(
+    spot: Tensor,
+    bands: Bands,
+    *,
+    angle: tuple[Angle, Angle],
+    focal_length: PositiveLength,
+    pixel_pitch: PositiveLength,
+    count: Annotated[int, Field(ge=0, le=1000)] = 8,
+    energy: Fraction = 1e-4,
+    spread: Annotated[float, Field(gt=0, le=10)] = 2.0,
+    radius: PositiveLength = 300e-6,
+    rng: torch.Generator,
+) -> Tensor:
+    """Reflect the spot into discs on the line through the source and the axis.
+
+    Ghost j is an image of the round stop, out of focus: a disc of radius r_j (U(0.1, 1) * ``radius``) centred at s_j
+    times the place of the source, s_j from U(-``spread``, ``spread``), coloured by two quarter-wave coatings.
+    Together they carry ``energy`` times the energy of the spot inside the window, over all bands; what falls
+    outside the window is lost. The spot itself is not dimmed.
+
+    Shapes: (band, y, x), bands -> (band, y, x).
+    Units:  as the spot (W/m2); angle rad.
+    Error:  energy of a ghost inside the window 1e-6; its edge one pixel wide.
+    Raises: ValueError where spot and bands do not belong together.
+    Source: Hullin et al., ACM Trans. Graph. 30, 108 (2011), reduced to first order; coatings: Hecht, Optics,
+        single quarter-wave layer.
+    """
+    if spot.ndim != 3 or spot.shape[0] != bands.centres.numel():
+        raise ValueError(f"spot is {tuple(spot.shape)}, bands {bands.centres.numel()}: take both of one laser")
+    drawn = _draw(count, spread, radius, rng)
+    flux = spot.sum((-2, -1), dtype=torch.float64)
+    place = tuple(focal_length * n / pixel_pitch for n in angle)
+    total = torch.zeros_like(spot)
+    for ghost, colour in zip(drawn, _colours(drawn, bands.centres, flux), strict=True):
+        centre = (ghost.magnification * place[0], ghost.magnification * place[1])
+        _add(total, (energy * colour * flux).to(spot.dtype), centre, ghost.radius / pixel_pitch)
+    return total
+
+
+def _draw(count: int, spread: float, radius: float, rng: torch.Generator) -> list[_Ghost]:
+    draw = torch.rand(count, 5, generator=rng, device=rng.device, dtype=torch.float64).tolist()
+    sizes = [math.exp(2 * row[2]) for row in draw]
+    found = []
+    for (place, r, _, *coats), size in zip(draw, sizes, strict=True):
+        first, second = (400e-9 + 300e-9 * coat for coat in coats)
+        found.append(_Ghost(spread * (2 * place - 1), radius * (0.1 + 0.9 * r), size / sum(sizes), (first, second)))
+    return found
+
+
+def _reflected(wavelengths: Tensor, tuned: float) -> Tensor:
+    """Reflectance of a quarter-wave layer: least where it is tuned, never quite 0; at most 1."""
+    return 0.05 + 0.95 * torch.cos(torch.pi / 2 * tuned / wavelengths).square()
+
+
+def _colours(drawn: list[_Ghost], wavelengths: Tensor, flux: Tensor) -> list[Tensor]:
+    """Gain of each ghost in each band, scaled so that all of them together move exactly the whole flux."""
+    raw = [g.share * _reflected(wavelengths, g.tuned[0]) * _reflected(wavelengths, g.tuned[1]) for g in drawn]
+    moved = torch.stack(raw).sum(0).mul(flux).sum() if raw else flux.sum()
+    whole = torch.where(moved > 0, flux.sum() / moved, 0.0)
+    return [gain * whole for gain in raw]
+
+
+def _add(total: Tensor, energy: Tensor, centre: tuple[float, float], radius: float) -> None:
+    """Add one disc, of unit sum over the infinite plane, where it meets the window."""
+    height, width = total.shape[-2:]
+    y, x = centre[0] + height // 2, centre[1] + width // 2
+    rows, columns = _reach(y, radius), _reach(x, radius)
+    disc = (radius + 0.5 - torch.hypot((rows - y)[:, None], (columns - x)[None, :])).clamp(0, 1)
+    seen = (disc / disc.sum())[_part(rows, height), _part(columns, width)].to(total)
+    if seen.numel():
+        top, left = max(int(rows[0]), 0), max(int(columns[0]), 0)
+        total[:, top : top + seen.shape[0], left : left + seen.shape[1]] += energy[:, None, None] * seen
+
+
+def _reach(middle: float, radius: float) -> Tensor:
+    """Sample numbers, float64, that a disc can touch along one axis, inside the window or not."""
+    first, last = math.floor(middle - radius) - 1, math.ceil(middle + radius) + 1
+    return torch.arange(first, last + 1, dtype=torch.float64)
+
+
+def _part(numbers: Tensor, samples: int) -> slice:
+    """The part of these sample numbers that lies in the window; empty where none does."""
+    first = int(numbers[0])
+    return slice(min(max(-first, 0), len(numbers)), max(samples - first, 0))
+
+
+@ghosts.check
+def _(result: Tensor, spot: Tensor, bands: Bands, *, energy: float, **_: Any) -> list[Check]:
+    whole = float(spot.sum(dtype=torch.float64))
+    seen = float(result.sum(dtype=torch.float64)) / whole if whole > 0 else 0.0
+    bounded = seen <= energy * (1 + 1e-3)
+    return [Check(f"ghosts bring {seen:.3g} of the spot's energy into the window, of {energy:.3g} reflected", bounded)]
