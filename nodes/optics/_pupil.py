@@ -1,0 +1,98 @@
+"""The pupil function: stop, element, aberrations and dirt, kept in factors."""
+
+from collections.abc import Mapping
+from typing import Any
+
+import torch
+from torch import Tensor
+
+from neusee.nodes import Check, node
+from neusee.nodes.optics._aperture import Aperture, Stop, axes, inside, stop
+from neusee.nodes.optics._zernike import surface
+from neusee.nodes.units import Count, Length, PositiveLength, Waves
+from neusee.nodes.values import Bands, Dirt, Pupil
+
+DEFOCUS_WAVELENGTH = 550e-9  #: m; what a wave of defocus is counted in
+
+
+@node()
+def pupil(
+    height: Tensor,
+    index: Tensor,
+    bands: Bands,
+    dirt: Dirt | None = None,
+    *,
+    pitch: PositiveLength,
+    diameter: PositiveLength,
+    aperture: Aperture = "clip",
+    defocus: Waves = 0.0,
+    aberrations: dict[Count, Length] = {},  # noqa: B006 (read only)
+) -> Pupil:
+    """Let light through the stop: element, defocus, aberrations and dirt, in one plane.
+
+    Field of band b: amplitude * exp(2 pi i (index[b] * height + path) / wavelength[b]). Defocus adds the path
+    W * 550 nm * r**2, r = 1 at the rim, so W is peak to valley in waves at 550 nm. The stop passes a sample if
+    its centre is inside.
+
+    Shapes: height (v, u), index (band,), bands, dirt (v, u) -> Pupil.
+    Units:  height m; defocus waves at 550 nm; aberrations m of path, root mean square, by Noll's number.
+    Error:  path 1e-7 relative (float32); area of the staircase rim 2 / samples.
+    Raises: ValueError where the shapes do not belong together.
+    Source: Goodman, Introduction to Fourier Optics, 3rd ed., section 6.4; Noll, J. Opt. Soc. Am. 66, 207 (1976).
+    """
+    _shapes(height, index, bands, dirt)
+    grid = stop(height.shape[-1], pitch, diameter, aperture)
+    clear = inside(grid, height.device).to(height.dtype)
+    path = _lens_path(grid, defocus, aberrations, height.device).to(height.dtype)
+    if dirt is not None:
+        path = path + dirt.path
+    amplitude = clear if dirt is None else clear * dirt.amplitude
+    spacing = torch.tensor(grid.pitch, dtype=torch.float64, device=height.device)
+    return Pupil(clear, amplitude, height, path, index, bands.centres, spacing)
+
+
+def _lens_path(grid: Stop, defocus: float, aberrations: Mapping[int, float], device: torch.device) -> Tensor:
+    v, u = axes(grid, device)
+    bowl = torch.where(inside(grid, device), v.square() + u.square(), 0.0)
+    return defocus * DEFOCUS_WAVELENGTH * bowl + surface(aberrations, grid, device)
+
+
+def _shapes(height: Tensor, index: Tensor, bands: Bands, dirt: Dirt | None) -> None:
+    if height.ndim != 2 or height.shape[0] != height.shape[1]:
+        raise ValueError(f"height is {tuple(height.shape)}: the pupil grid is square, (samples, samples)")
+    if index.shape != bands.centres.shape:
+        raise ValueError(f"index is {tuple(index.shape)}, bands {tuple(bands.centres.shape)}: take both of one step")
+    if dirt is not None and dirt.amplitude.shape != height.shape:
+        found, wanted = tuple(dirt.amplitude.shape), tuple(height.shape)
+        raise ValueError(f"dirt is {found}, height {wanted}: give both the same samples")
+
+
+@pupil.check
+def _(result: Pupil, *_: Any, pitch: float, diameter: float, aperture: Aperture, **__: Any) -> list[Check]:
+    used = float(result.pitch) * result.height.shape[-1]
+    passed = float(result.amplitude.double().square().sum() / result.aperture.double().sum())
+    median, share = phase_steps(result)
+    text = f"phase step {median:.3f} turn between samples (median), {share:.1%} above half a turn"
+    clipped = f", clipped by the grid from {diameter * 1e3:#.3g} mm" if used < diameter * (1 - 1e-9) else ""
+    return [
+        Check(f"throughput {passed:.4f} of the clear pupil {min(used, diameter) * 1e3:#.3g} mm{clipped}", passed > 0),
+        Check(text if share <= 0.1 else f"{text}: aliased, use finer samples", share <= 0.1),
+    ]
+
+
+def phase_steps(pupil: Pupil) -> tuple[float, float]:
+    """Steps between neighbours inside the stop, in the band that has most: median in turns, share above one half.
+
+    A wrapped or split element has steps at its edges by design, so a few large ones mean nothing; many mean
+    that the samples cannot follow the phase.
+    """
+    worst = int((pupil.index / pupil.wavelengths).argmax())
+    turns = (pupil.index[worst] * pupil.height + pupil.path) / pupil.wavelengths[worst]
+    steps = [turns.diff(dim=axis).abs()[_pairs_inside(pupil.aperture, axis)] for axis in (0, 1)]
+    every = torch.cat(steps)
+    return (float(every.median()), float((every > 0.5).double().mean())) if every.numel() else (0.0, 0.0)
+
+
+def _pairs_inside(aperture: Tensor, axis: int) -> Tensor:
+    count = aperture.shape[axis] - 1
+    return (aperture.narrow(axis, 0, count) > 0) & (aperture.narrow(axis, 1, count) > 0)
