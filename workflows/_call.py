@@ -1,0 +1,83 @@
+"""Call the node of one step: on its device, with its random stream, and with an error that says where."""
+
+from __future__ import annotations
+
+import functools
+import platform
+from collections.abc import Mapping, Sequence
+from importlib.metadata import PackageNotFoundError, version
+from typing import Any
+
+import torch
+from torch import Tensor
+
+from neusee.nodes import Check
+from neusee.workflows._codec import each_tensor, settle, tensors_in
+from neusee.workflows._graph import Step
+from neusee.workflows._keys import stream_seed
+
+
+class RunError(RuntimeError):
+    """A step failed. Names it, its node, where it is written, what it was given, and the cause."""
+
+    def __init__(self, step: Step, inputs: Sequence[Any], cause: BaseException) -> None:
+        self.step, self.cause = step.name, cause
+        given = ", ".join(f"{name} {_shape(value)}" for name, value in zip(step.node.inputs, inputs, strict=False))
+        super().__init__(
+            f"{step.mark}   {step.name} ({step.node.path}): {type(cause).__name__}: {cause}"
+            + (f"\n  given {given}" if given else "")
+        )
+
+
+def call(step: Step, inputs: Sequence[Any], params: Mapping[str, Any], seed: int, device: str) -> Any:
+    """The result of a step, laid out as the store would give it back; gradients flow."""
+    moved = [to_device(value, device) for value in inputs]
+    rng = {"rng": torch.Generator(device).manual_seed(stream_seed(seed, step.name))} if step.node.random else {}
+    tensors = tensors_in(moved)
+    before = [x._version for x in tensors]
+    try:
+        value = settle(step.node(*moved, **params, **rng))
+    except Exception as error:
+        raise RunError(step, inputs, error) from error
+    if before != [x._version for x in tensors]:
+        raise RunError(step, inputs, ValueError("the node changed its input in place: let it work on a copy"))
+    return value
+
+
+def examine(step: Step, value: Any, inputs: Sequence[Any]) -> tuple[Check, ...]:
+    """What the node's own check says of a result; a check that fails to run is a check that failed."""
+    if step.node.after is None:
+        return ()
+    try:
+        return tuple(step.node.after(value, *inputs, **step.params))
+    except Exception as error:
+        return (Check(f"the check itself failed: {type(error).__name__}: {error}", False),)
+
+
+def place(step: Step, device: str) -> str:
+    """Where a step runs: on ``device``, unless its node is for the CPU alone."""
+    return "cpu" if step.node.device == "cpu" else device
+
+
+def to_device(value: Any, device: str) -> Any:
+    return each_tensor(lambda x: x.to(device), value)
+
+
+@functools.cache
+def versions() -> dict[str, str]:
+    """Of Python and of what computes; kept beside each result, but not in its key."""
+    found = {"python": platform.python_version()}
+    for name in ("neusee", "torch", "kornia", "colour-science", "OpenEXR"):
+        try:
+            found[name] = version(name)
+        except PackageNotFoundError:
+            found[name] = "none"
+    return found
+
+
+def _shape(value: Any) -> str:
+    if isinstance(value, Tensor):
+        return f"{tuple(value.shape)} {str(value.dtype).removeprefix('torch.')}"
+    if isinstance(value, list | tuple):
+        return f"{type(value).__name__}[{', '.join(_shape(v) for v in value)}]"
+    return "absent" if value is None else type(value).__name__

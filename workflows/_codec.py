@@ -1,0 +1,211 @@
+"""How a result lies on disk: a layout in JSON and its tensors in one safetensors file.
+
+The file is written from the tensors' own memory and read through a memory map, so that
+neither way makes a copy. Each tensor begins at a multiple of 64 bytes, as a fresh one
+does: a kernel then takes the same path on a stored value as on a computed one.
+"""
+
+from __future__ import annotations
+
+import base64
+import importlib
+import json
+import mmap
+from collections.abc import Callable
+from typing import IO, Any
+
+import torch
+import xxhash
+from torch import Tensor
+
+_ALIGN = 64
+_FILLER = "_"  #: begins the names of entries that only fill up to the next multiple
+_DTYPES = {
+    torch.float64: "F64",
+    torch.float32: "F32",
+    torch.float16: "F16",
+    torch.bfloat16: "BF16",
+    torch.float8_e4m3fn: "F8_E4M3",
+    torch.float8_e5m2: "F8_E5M2",
+    torch.int64: "I64",
+    torch.int32: "I32",
+    torch.int16: "I16",
+    torch.int8: "I8",
+    torch.uint64: "U64",
+    torch.uint32: "U32",
+    torch.uint16: "U16",
+    torch.uint8: "U8",
+    torch.bool: "BOOL",
+}
+_NAMES = {name: dtype for dtype, name in _DTYPES.items()}
+
+
+def each_tensor(change: Callable[[Tensor], Tensor], value: Any) -> Any:
+    """``value`` with every tensor in it changed; one that occurs twice is changed once."""
+    done: dict[int, Tensor] = {}
+
+    def walk(item: Any) -> Any:
+        if isinstance(item, Tensor):
+            if id(item) not in done:
+                done[id(item)] = change(item)
+            return done[id(item)]
+        if isinstance(item, tuple):
+            return item._make(map(walk, item)) if hasattr(item, "_make") else tuple(map(walk, item))
+        if isinstance(item, list):
+            return [walk(i) for i in item]
+        return {k: walk(v) for k, v in item.items()} if isinstance(item, dict) else item
+
+    return walk(value)
+
+
+def tensors_in(value: Any) -> list[Tensor]:
+    """Every tensor in ``value``, once."""
+    found: list[Tensor] = []
+    each_tensor(lambda t: found.append(t) or t, value)  # type: ignore[func-returns-value]
+    return found
+
+
+def settle(value: Any) -> Any:
+    """``value`` as the store would give it back: contiguous, and holding no larger memory than its own."""
+    return each_tensor(_settled, value)
+
+
+def _settled(x: Tensor) -> Tensor:
+    x = x.resolve_conj().resolve_neg().contiguous()
+    return x.clone() if x.untyped_storage().nbytes() > x.nbytes else x
+
+
+def pack(value: Any) -> tuple[Any, list[Tensor]]:
+    """The layout of ``value`` as JSON, and its tensors; memory that is shared is listed once."""
+    tensors: list[Tensor] = []
+    known: dict[tuple[Any, ...], int] = {}
+
+    def add(x: Tensor) -> int:
+        same = (x.data_ptr() or id(x), x.dtype, x.shape, x.stride(), x.is_conj(), x.is_neg())
+        if same not in known:
+            known[same] = len(tensors)
+            tensors.append(x.detach())
+        return known[same]
+
+    def walk(item: Any) -> Any:
+        if isinstance(item, Tensor):
+            return {"tensor": add(item)}
+        if isinstance(item, bytes):
+            return {"bytes": add(torch.frombuffer(bytearray(item), dtype=torch.uint8) if item else torch.empty(0))}
+        if isinstance(item, tuple):
+            return {"class": _class_path(item), "items": [walk(i) for i in item]}
+        if isinstance(item, list):
+            return {"list": [walk(i) for i in item]}
+        if isinstance(item, dict) and all(isinstance(k, str) for k in item):
+            return {"dict": {k: walk(v) for k, v in item.items()}}
+        if item is None or isinstance(item, bool | int | float | str):
+            return {"value": item}
+        raise TypeError(f"a step must give tensors, numbers, texts, bytes or collections of these, not {type(item)}")
+
+    return walk(value), tensors
+
+
+def unpack(layout: Any, tensors: list[Tensor]) -> Any:
+    """The value that `pack` took apart."""
+    ((kind, body),) = ((k, v) for k, v in layout.items() if k != "items")
+    if kind == "tensor":
+        return tensors[body]
+    if kind == "bytes":
+        return tensors[body].numpy().tobytes()
+    if kind == "class":
+        items = (unpack(i, tensors) for i in layout["items"])
+        return _class(body)(*items) if body else tuple(items)
+    if kind == "list":
+        return [unpack(i, tensors) for i in body]
+    return {k: unpack(v, tensors) for k, v in body.items()} if kind == "dict" else body
+
+
+def _class_path(item: tuple[Any, ...]) -> str:
+    """Where a named tuple's class stands; empty for a plain tuple."""
+    kind = type(item)
+    if kind is tuple:
+        return ""
+    if not kind.__module__.startswith("neusee.nodes.") or not hasattr(item, "_fields"):
+        raise TypeError(f"{kind.__module__}.{kind.__qualname__} cannot be stored: make it a NamedTuple in neusee.nodes")
+    return f"{kind.__module__}:{kind.__qualname__}"
+
+
+def _class(path: str) -> Callable[..., Any]:
+    module, _, name = path.partition(":")
+    if not module.startswith("neusee.nodes."):
+        raise ValueError(f"{path} is no class of neusee.nodes")
+    found: Callable[..., Any] = getattr(importlib.import_module(module), name)
+    return found
+
+
+def to_text(x: Tensor) -> list[Any]:
+    """A small tensor as JSON: type, shape, bytes."""
+    return [*_kind(x), base64.b64encode(_bytes(x)).decode()]
+
+
+def from_text(kind: str, shape: list[int], is_complex: bool, text: str) -> Tensor:
+    """The tensor that `to_text` wrote."""
+    return _tensor(bytearray(base64.b64decode(text)), 0, kind, shape, is_complex)
+
+
+def write(file: IO[bytes], tensors: list[Tensor]) -> str:
+    """Write a safetensors file; return the xxh3 of all its bytes."""
+    header: dict[str, Any] = {"__metadata__": {}}
+    end = 0
+    for i, x in enumerate(tensors):
+        kind, shape, is_complex = _kind(x)
+        header["__metadata__"][str(i)] = "complex" if is_complex else "real"
+        header[str(i)] = {"dtype": kind, "shape": shape, "data_offsets": [end, end + x.nbytes]}
+        end += x.nbytes
+        if pad := -end % _ALIGN:
+            header[f"{_FILLER}{i}"] = {"dtype": "U8", "shape": [pad], "data_offsets": [end, end + pad]}
+            end += pad
+    text = json.dumps(header, separators=(",", ":")).encode()
+    text += b" " * (-(8 + len(text)) % _ALIGN)
+    found = xxhash.xxh3_128()
+    for block in (len(text).to_bytes(8, "little"), text):
+        file.write(block)
+        found.update(block)
+    for x in tensors:
+        for part in (_bytes(x), bytes(-x.nbytes % _ALIGN)):
+            file.write(part)
+            found.update(part)
+    return found.hexdigest()
+
+
+def read(path: str, expected: str) -> list[Tensor]:
+    """Tensors of a file that `write` made, mapped into memory, once all its bytes have the ``expected`` xxh3."""
+    with open(path, "rb") as file:
+        data = mmap.mmap(file.fileno(), 0, access=mmap.ACCESS_COPY)
+    if xxhash.xxh3_128_hexdigest(data) != expected:
+        raise ValueError("its bytes are not those that were written")
+    size = int.from_bytes(data[:8], "little")
+    header = json.loads(data[8 : 8 + size])
+    tensors = []
+    for i, name in sorted((int(n), n) for n in header if n.isdigit()):
+        entry, is_complex = header[name], header["__metadata__"][str(i)] == "complex"
+        tensors.append(_tensor(data, 8 + size + entry["data_offsets"][0], entry["dtype"], entry["shape"], is_complex))
+    return tensors
+
+
+def _kind(x: Tensor) -> tuple[str, list[int], bool]:
+    real = torch.empty(0, dtype=x.dtype).real.dtype if x.is_complex() else x.dtype
+    if real not in _DTYPES:
+        raise TypeError(f"a tensor of {x.dtype} cannot be stored")
+    return _DTYPES[real], [*x.shape, 2] if x.is_complex() else list(x.shape), x.is_complex()
+
+
+def _bytes(x: Tensor) -> memoryview:
+    """The bytes of a tensor, without a copy where it is contiguous and on the CPU."""
+    x = x.detach().cpu().resolve_conj().resolve_neg().contiguous()
+    return x.reshape(-1).view(torch.uint8).numpy().data
+
+
+def _tensor(data: Any, offset: int, kind: str, shape: list[int], is_complex: bool) -> Tensor:
+    count = 1
+    for n in shape:
+        count *= n
+    dtype = _NAMES[kind]
+    flat = torch.frombuffer(data, dtype=dtype, count=count, offset=offset) if count else torch.empty(0, dtype=dtype)
+    x = flat.reshape(shape)
+    return torch.view_as_complex(x) if is_complex else x

@@ -1,0 +1,119 @@
+"""A recipe as a differentiable function of some of its parameters or steps."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterable, Mapping
+from typing import Any
+
+import torch
+
+from neusee.nodes import Facts
+from neusee.workflows._call import call, place
+from neusee.workflows._codec import settle
+from neusee.workflows._graph import Recipe, Step, in_order
+from neusee.workflows._marks import nearest
+from neusee.workflows._run import run
+from neusee.workflows._store import Store
+from neusee.workflows._verdict import judge
+
+Theta = Mapping[str, Any]
+
+
+def as_function(
+    recipe: Recipe,
+    *free: str,
+    outputs: Iterable[str] | None = None,
+    store: Store | None = None,
+    device: str = "cpu",
+) -> Callable[[Theta], dict[str, Any]]:
+    """The recipe as ``theta -> {output: value}``, bit for bit what `run` gives, with gradients.
+
+    Args: free: parameters such as ``"spot.strength"``, or steps whose whole value is given,
+    such as ``"height"``. What they cannot reach is computed once, here, or read from the
+    store. Noise is the same at every call: its stream depends on the seed and the step.
+    """
+    wanted = recipe.outputs if outputs is None else tuple(outputs)
+    given, tuned = _read(recipe, free)
+    sources = {name: () if name in given else step.sources for name, step in recipe.steps.items()}
+    order = in_order(sources, wanted)
+    if idle := sorted((given | tuned.keys()) - set(order)):
+        raise ValueError(f"no output depends on {', '.join(idle)}")
+    live: dict[str, None] = {}
+    for name in order:
+        if name in given or name in tuned or any(source in live for source in sources[name]):
+            live.setdefault(name)
+    border = {name for step in live for name in sources[step]} | set(wanted)
+    fixed = run(recipe, store, sorted(border - live.keys()), device=device).values
+    return _Function(recipe, free, wanted, given, tuned, list(live), fixed, device)
+
+
+def _read(recipe: Recipe, free: tuple[str, ...]) -> tuple[set[str], dict[str, dict[str, str]]]:
+    """Steps that are given whole, and by step the free parameters with their full names."""
+    given: set[str] = set()
+    tuned: dict[str, dict[str, str]] = {}
+    for name in free:
+        step, _, param = name.rpartition(".")
+        if name in recipe.steps:
+            given.add(name)
+        elif step not in recipe.steps:
+            raise ValueError(f"no step {step or name!r}; {nearest(step or name, recipe.steps)}")
+        elif param not in recipe.steps[step].params:
+            raise ValueError(f"{step} has no parameter {param!r}; {nearest(param, recipe.steps[step].params)}")
+        else:
+            tuned.setdefault(step, {})[param] = name
+    return given, tuned
+
+
+class _Function:
+    """The live part of a recipe, with the values of everything that feeds it."""
+
+    def __init__(
+        self,
+        recipe: Recipe,
+        free: tuple[str, ...],
+        wanted: tuple[str, ...],
+        given: set[str],
+        tuned: dict[str, dict[str, str]],
+        live: list[str],
+        fixed: dict[str, Any],
+        device: str,
+    ) -> None:
+        self.recipe, self.free, self.wanted, self.device = recipe, free, wanted, device
+        self.given, self.tuned, self.live, self.fixed = given, tuned, live, fixed
+        self._facts: dict[str, Facts | None] = {}
+        self._last = {source: name for name in live if name not in given for source in recipe.steps[name].sources}
+
+    def __call__(self, theta: Theta) -> dict[str, Any]:
+        if set(theta) != set(self.free):
+            raise ValueError(f"give exactly {', '.join(self.free)}, not {', '.join(theta) or 'nothing'}")
+        values = dict(self.fixed)
+        for name in self.live:
+            step = self.recipe.steps[name]
+            values[name] = settle(theta[name]) if name in self.given else self._evaluate(step, values, theta)
+            for source in () if name in self.given else set(step.sources):
+                if self._last[source] == name and source not in self.wanted:
+                    del values[source]
+        return {name: values[name] for name in self.wanted}
+
+    def _evaluate(self, step: Step, values: dict[str, Any], theta: Theta) -> Any:
+        params = {**step.params, **{p: theta[full] for p, full in self.tuned.get(step.name, {}).items()}}
+        if step.node.bound is not None:
+            with torch.no_grad():
+                verdict = judge(step, params, lambda name: self._facts_of(name, values), self.recipe.tolerance)
+            if verdict.left_out:
+                return values[verdict.instead]
+        inputs = [_gather(step.wires.get(name), values) for name in step.node.inputs]
+        return call(step, inputs, params, self.recipe.seed, place(step, self.device))
+
+    def _facts_of(self, name: str, values: dict[str, Any]) -> Facts | None:
+        if name not in self.fixed:
+            return Facts.of(values[name])
+        if name not in self._facts:
+            self._facts[name] = Facts.of(self.fixed[name])
+        return self._facts[name]
+
+
+def _gather(wire: str | tuple[str, ...] | None, values: Mapping[str, Any]) -> Any:
+    if wire is None or isinstance(wire, str):
+        return None if wire is None else values[wire]
+    return [values[name] for name in wire]
