@@ -18,6 +18,17 @@ Scale = Annotated[float, Field(gt=0, le=1)]  #: part of the pupil's diameter
 
 def _header(file: Path) -> tuple[int, ...]:
     """Shape of the relief in a file, without reading it."""
+    from safetensors import SafetensorError
+
+    try:
+        return _stated(file)
+    except ParameterError:
+        raise
+    except (SafetensorError, ValueError, EOFError) as error:
+        raise ParameterError("file", f"{file.name} cannot be read as a relief: {error}") from error
+
+
+def _stated(file: Path) -> tuple[int, ...]:
     if file.suffix == ".npy":
         import numpy as np
 
