@@ -1,0 +1,115 @@
+"""The pictures of a run, each kept by the key of what it shows: drawn once, taken as it is from then on."""
+
+from __future__ import annotations
+
+import importlib
+from collections.abc import Callable, Iterable, Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import xxhash
+
+from neusee.workflows._code import Code
+from neusee.workflows._keys import digest
+from neusee.workflows._needs import Found, Missing, find
+from neusee.workflows._roles import FIGURES
+from neusee.workflows._run import Result, run
+from neusee.workflows._shelf import Shelf
+
+GRAPH = (
+    "graph",
+    "The graph",
+    "Each box is a step; items of one step share a box. What reads stands below what it reads.",
+)
+
+
+@dataclass(frozen=True, slots=True)
+class Job:
+    """A file that can be made of a run: its name, its key, what it reads and who writes it."""
+
+    name: str
+    suffix: str
+    key: str
+    found: Mapping[str, Found]
+    make: Callable[..., bytes]
+
+
+def pictures(result: Result, shelf: Shelf) -> tuple[dict[str, Path], dict[str, str]]:
+    """Every picture that can be drawn of a run, and why the others cannot."""
+    code, drawing = Code(result.store.code_memo), _drawing()
+    jobs, missing = [], {}
+    for figure in FIGURES:
+        try:
+            found = needs(figure.needs, result, code)
+        except Missing as why:
+            missing[figure.name] = str(why)
+            continue
+        key = digest("figure", figure.draw, drawing, [[name, f.identity] for name, f in found.items()])
+        jobs.append(Job(figure.name, ".png", key, found, _function(figure.draw)))
+    code.save()
+    made = finished(jobs, result, shelf, missing)
+    return {**made, "graph": _graph(result, shelf, drawing)}, missing
+
+
+def needs(wanted: Mapping[str, str], result: Result, code: Code) -> dict[str, Found]:
+    """What each argument reads; an argument whose need begins with ``?`` is left out where there is none."""
+    found = {}
+    for argument, need in wanted.items():
+        try:
+            found[argument] = find(need.removeprefix("?"), result.recipe, result.keys, code)
+        except Missing:
+            if not need.startswith("?"):
+                raise
+    return found
+
+
+def finished(jobs: Iterable[Job], result: Result, shelf: Shelf, missing: dict[str, str]) -> dict[str, Path]:
+    """The file of each job: kept, or made now of values that are read together."""
+    jobs = list(jobs)
+    done = {job.name: path for job in jobs if (path := shelf.find(job.key, job.suffix))}
+    todo = [job for job in jobs if job.name not in done]
+    steps = {step for job in todo for f in job.found.values() for step in f.steps}
+    values = run(result.recipe, result.store, sorted(steps), device=result.device).values if todo else {}
+    for job in todo:
+        arguments = {name: f.make(values) for name, f in job.found.items()}
+        try:
+            content = job.make(**arguments)
+        except (ValueError, Missing, RuntimeError) as error:
+            missing[job.name] = str(error).partition("\n")[0]
+            continue
+        done[job.name] = shelf.keep(job.key, job.suffix, job.name, content)
+    return {job.name: done[job.name] for job in jobs if job.name in done}
+
+
+def _function(path: str) -> Callable[..., bytes]:
+    """A drawing function by ``module:function``, imported when it is called."""
+    module, _, name = path.partition(":")
+
+    def draw(**arguments: Any) -> bytes:
+        found: bytes = getattr(importlib.import_module(f"neusee.workflows.{module}"), name)(**arguments)
+        return found
+
+    return draw
+
+
+def _drawing() -> str:
+    """Digest of everything that draws, so that a better picture is drawn again."""
+    folder = Path(__file__).parent
+    return xxhash.xxh3_128_hexdigest(b"".join(p.read_bytes() for p in sorted(folder.glob("_figures_*.py"))))
+
+
+def _graph(result: Result, shelf: Shelf, drawing: str) -> Path:
+    """The graph with what became of each step; the one of a wholly cached run is drawn along, for the next time."""
+    states = {name: "cached" if done.state == "asleep" else str(done.state) for name, done in result.done.items()}
+    again = {name: "left out" if state == "left out" else "cached" for name, state in states.items()}
+    sources = {name: list(result.recipe.steps[name].sources) for name in result.done}
+    paths = []
+    for now in (states, again):
+        key = digest("graph", drawing, sources, now)
+        path = shelf.find(key, ".png")
+        if path is None:
+            content = _function("_figures_graph:graph")(sources=sources, states=now)
+            path = shelf.keep(key, ".png", "graph", content)
+        paths.append(path)
+    return paths[0]
