@@ -8,12 +8,12 @@ digests are kept in a file by the digest of the source, so that a cached run par
 from __future__ import annotations
 
 import ast
-import importlib.util
 import json
 import os
 import sys
 import warnings
 from collections.abc import Iterator
+from contextlib import suppress
 from pathlib import Path
 from typing import Any
 
@@ -28,6 +28,7 @@ _PYTHON = "{}.{}".format(*sys.version_info)  #: a syntax tree's text changes wit
 _THIS_PROCESS = os.urandom(8).hex()
 
 Summary = tuple[str, list[tuple[int, str, str]], list[str]]  #: tree's digest, imports, names bound by imports
+_edited_since: set[str] = set()  #: loaded modules whose source is no longer what runs
 _frozen: dict[str, tuple[Any, str]] = {}  #: module -> its spec and the digest of its source when first seen
 
 
@@ -57,20 +58,19 @@ class Code:
         """Keep the summaries that this run had to make; failing to is no failure."""
         if not self._new:
             return
-        part = self._memo.with_name(f"{self._memo.name}.{os.getpid()}.tmp")
-        try:
-            self._memo.parent.mkdir(parents=True, exist_ok=True)
+        self._new = False
+        part = self._memo.parent / "tmp" / f"{self._memo.name}.{os.getpid()}"
+        with suppress(OSError):
+            part.parent.mkdir(parents=True, exist_ok=True)
             part.write_text(json.dumps(dict(list(self._summaries.items())[-_KEPT:])))
             os.replace(part, self._memo)
-        except OSError:
-            part.unlink(missing_ok=True)
-        self._new = False
 
     def _look(self, module: str) -> tuple[str, list[str]]:
         path = _path(module)
         if path is None:
             raise LookupError(f"{module} has no source file, so its results cannot be told from others: put it in one")
         tree, imports, _ = self._summary(module, path)
+        tree += _THIS_PROCESS if module in _edited_since else ""
         package = module if path.name == "__init__.py" else module.rpartition(".")[0]
         names = [n for item in imports for n in self._imported(*item, package)]
         return tree, [n for n in names if n.startswith(f"{_ROOT}.") and n not in _LEFT_OUT]
@@ -129,8 +129,8 @@ def _path(module: str) -> Path | None:
     if module in sys.modules:
         file = getattr(sys.modules[module], "__file__", None)
         return Path(file) if file and os.path.isfile(file) else None
-    root = importlib.util.find_spec(_ROOT)
-    for folder in (root and root.submodule_search_locations) or ():
+    inside = module.startswith(f"{_ROOT}.")
+    for folder in getattr(sys.modules.get(_ROOT), "__path__", ()) if inside else ():
         stem = os.path.join(folder, *module.split(".")[2:])
         for file in (f"{stem}.py", os.path.join(stem, "__init__.py")):
             if os.path.isfile(file):
@@ -144,11 +144,12 @@ def _source_digest(module: str, path: Path) -> str:
     if spec is not None and module in _frozen and _frozen[module][0] is spec:
         return _frozen[module][1]
     found = xxhash.xxh3_128_hexdigest(path.read_bytes())
+    _edited_since.discard(module)
     if spec is not None:
-        if _edited(spec, path):
-            warnings.warn(f"{path} was edited after it was imported: start again to keep its results", stacklevel=2)
-            found = f"{found}:{_THIS_PROCESS}"
         _frozen[module] = (spec, found)
+        if _edited(spec, path):
+            _edited_since.add(module)
+            warnings.warn(f"{path} was edited after it was imported: start again to keep its results", stacklevel=2)
     return found
 
 

@@ -1,0 +1,364 @@
+"""What the store gives back, and what it does when the disk does not."""
+
+import errno
+import json
+import os
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+import pytest
+import torch
+import xxhash
+from hypothesis import given
+from hypothesis import strategies as st
+from safetensors.torch import load_file
+
+from neusee.nodes.values import Bands, Pupil
+from neusee.workflows import _codec
+from neusee.workflows._store import INLINE, Store, default_root
+
+KEY = "ab" + "0" * 30
+BIG = torch.arange(5000, dtype=torch.float32)
+DTYPES = [*_codec._DTYPES, torch.complex64, torch.complex128]
+
+
+def bits(x):
+    return bytes(x.resolve_conj().contiguous().reshape(-1).view(torch.uint8).numpy())
+
+
+def same(a, b):
+    """Equal to the last bit, in type, in shape and in kind of container."""
+    assert type(a) is type(b)
+    if isinstance(a, torch.Tensor):
+        assert a.shape == b.shape
+        assert a.dtype == b.dtype
+        assert bits(a) == bits(b)
+    elif isinstance(a, list | tuple):
+        assert len(a) == len(b)
+        for x, y in zip(a, b, strict=True):
+            same(x, y)
+    elif isinstance(a, dict):
+        assert list(a) == list(b)
+        for name in a:
+            same(a[name], b[name])
+    else:
+        assert repr(a) == repr(b)
+
+
+def keep(root, value, key=KEY):
+    assert Store(root).put(key, value, {"step": "s"})
+    return Store(root).get(key)
+
+
+@pytest.mark.parametrize("dtype", DTYPES, ids=str)
+@pytest.mark.parametrize("shape", [(), (0,), (3, 0, 2), (1,), (3, 5), (INLINE + 3,)])
+def test_every_type_and_shape_comes_back(tmp_path, dtype, shape):
+    count = torch.Size(shape).numel() * torch.empty(0, dtype=dtype).element_size()
+    raw = torch.randint(0, 2 if dtype == torch.bool else 255, (count,), dtype=torch.uint8)
+    x = raw.view(dtype).reshape(shape) if count else torch.empty(shape, dtype=dtype)
+    same(keep(tmp_path, x), x)
+
+
+@pytest.mark.parametrize("n", [4, 100])
+def test_views_come_back_as_what_they_show(tmp_path, n):
+    x = torch.randn(n, n, dtype=torch.complex64)
+    views = [x.T, x[::2, 1:], x.conj(), x.imag, x[0].expand(n, n), torch.view_as_real(x), x[1, 1], -x.conj().imag]
+    same(keep(tmp_path, views), [v.resolve_conj().resolve_neg() for v in views])
+
+
+@pytest.mark.parametrize("n", [2, 2000])
+def test_collections_come_back(tmp_path, n):
+    x = torch.rand(n, dtype=torch.float64)
+    weights = {"layer.0.weight": x, "layer.0.bias": x[:1], "empty": torch.empty(0)}
+    plain = [None, True, 3, -0.0, float("nan"), float("inf"), 5e-324, "µ", b"\x00\xff", b"", b"z" * n, [], {}, ()]
+    value = [Bands(x, x, x), weights, plain, (x, [x]), {"a": {"b": [Bands(x, x + 1, x)]}}]
+    same(keep(tmp_path, value), value)
+
+
+def test_a_learnable_value_is_stored_without_its_history(tmp_path):
+    x = torch.ones(3, requires_grad=True)
+    assert not keep(tmp_path, 2 * x).requires_grad
+
+
+@given(st.lists(st.integers(0, 300), max_size=6))
+def test_each_stored_tensor_begins_where_a_fresh_one_would(tmp_path_factory, sizes):
+    root = tmp_path_factory.mktemp("store")
+    value = [torch.rand(2000), *(torch.rand(n) for n in sizes)]
+    loaded = keep(root, value)
+    same(loaded, value)
+    assert all(x.data_ptr() % 64 == 0 for x in loaded if x.numel())
+
+
+def test_shared_memory_is_stored_once(tmp_path):
+    x = torch.rand(100, 100)
+    loaded = keep(tmp_path, Pupil(x, x, x, x.clone(), x[0], x[0], x[0, 0]))
+    assert loaded.aperture is loaded.amplitude
+    assert sum(f.stat().st_size for f in tmp_path.rglob("*.safetensors")) < 2 * x.nbytes + 2000
+
+
+def test_other_tools_can_read_a_payload(tmp_path):
+    x = torch.rand(100, 100, dtype=torch.float64)
+    keep(tmp_path, [x, x.bool(), x.bfloat16()])
+    (path,) = tmp_path.rglob("*.safetensors")
+    loaded = load_file(path)
+    same([loaded["0"], loaded["1"], loaded["2"]], [x, x.bool(), x.bfloat16()])
+    assert Store(tmp_path).about(KEY)["payload"]["xxh3"] == xxhash.xxh3_128_hexdigest(path.read_bytes())
+
+
+def test_a_loaded_value_may_be_written_to_without_touching_the_store(tmp_path):
+    keep(tmp_path, BIG).zero_()
+    same(Store(tmp_path).get(KEY), BIG)
+
+
+class Own(tuple):
+    _fields = ()
+
+
+@pytest.mark.parametrize("value", [object(), {1: 2}, Own(), {3}, torch.empty(2, dtype=torch.float8_e4m3fnuz)])
+def test_what_cannot_be_stored_is_refused(tmp_path, value):
+    with pytest.raises(TypeError, match=r"must give tensors|cannot be stored"):
+        Store(tmp_path).put(KEY, [value], {})
+    assert not Store(tmp_path).has(KEY)
+
+
+def test_a_missing_result_is_missing(tmp_path):
+    assert not Store(tmp_path / "none").has(KEY)
+    with pytest.raises(KeyError):
+        Store(tmp_path).get(KEY)
+
+
+def test_entries_are_listed_without_reading_them(tmp_path, monkeypatch):
+    store = Store(tmp_path)
+    keys = [f"{i:02x}" + "1" * 30 for i in (200, 3, 77)]
+    for key in keys:
+        store.put(key, BIG, {"step": key[:2], "seconds": 1.5})
+    monkeypatch.setattr(_codec, "read", lambda *a: pytest.fail("a payload was read"))
+    found = dict(Store(tmp_path).entries())
+    assert list(found) == sorted(keys)
+    assert all(about["bytes"] == BIG.nbytes and about["seconds"] == 1.5 for about in found.values())
+
+
+def payload(root: Path) -> Path:
+    return root / "ab" / f"{KEY}.safetensors"
+
+
+def sidecar(root: Path) -> Path:
+    return root / "ab" / f"{KEY}.json"
+
+
+def flip(path: Path, at: float) -> None:
+    data = bytearray(path.read_bytes())
+    data[int(at * (len(data) - 1))] ^= 1
+    path.write_bytes(data)
+
+
+def cut(path: Path) -> None:
+    path.write_bytes(path.read_bytes()[: path.stat().st_size // 2])
+
+
+DAMAGES = {
+    "payload cut": lambda r: cut(payload(r)),
+    "payload of no bytes": lambda r: payload(r).write_bytes(b""),
+    "payload gone": lambda r: payload(r).unlink(),
+    "payload longer": lambda r: payload(r).write_bytes(payload(r).read_bytes() + b"x"),
+    "description cut": lambda r: cut(sidecar(r)),
+    "description of no bytes": lambda r: sidecar(r).write_bytes(b""),
+    "description is no text": lambda r: sidecar(r).write_bytes(b"\xff" * 100),
+    "description is other JSON": lambda r: sidecar(r).write_text("{}"),
+    "description was edited": lambda r: sidecar(r).write_text(sidecar(r).read_text().replace('"s"', '"t"')),
+    **{f"payload flipped at {at}": lambda r, at=at: flip(payload(r), at) for at in (0.0, 0.003, 0.5, 1.0)},
+    **{f"description flipped at {at}": lambda r, at=at: flip(sidecar(r), at) for at in (0.0, 0.3, 0.9, 1.0)},
+}
+
+
+@pytest.mark.parametrize("damage", DAMAGES)
+def test_a_damaged_entry_is_put_aside_with_one_warning(tmp_path, damage):
+    keep(tmp_path, BIG)
+    DAMAGES[damage](tmp_path)
+    store = Store(tmp_path)
+    with pytest.warns(UserWarning, match="is damaged") as seen, pytest.raises(KeyError):
+        store.get(KEY)
+    assert len(seen) == 1
+    assert not store.has(KEY)
+    assert not Store(tmp_path).has(KEY)
+    assert list((tmp_path / "bad").iterdir())
+    same(keep(tmp_path, BIG), BIG)
+
+
+def test_an_entry_under_a_wrong_name_is_not_served(tmp_path):
+    keep(tmp_path, BIG)
+    other = "ab" + "1" * 30
+    for suffix in ("json", "safetensors"):
+        os.link(tmp_path / "ab" / f"{KEY}.{suffix}", tmp_path / "ab" / f"{other}.{suffix}")
+    with pytest.warns(UserWarning, match=f"it is the result of {KEY}"):
+        assert not Store(tmp_path).has(other)
+
+
+@given(st.integers(0, 10**6), st.integers(0, 7))
+def test_no_flipped_bit_of_a_small_result_goes_unseen(tmp_path_factory, place, bit):
+    root = tmp_path_factory.mktemp("store")
+    keep(root, [torch.rand(3), 1.5])
+    data = bytearray(sidecar(root).read_bytes())
+    data[place % len(data)] ^= 1 << bit
+    sidecar(root).write_bytes(data)
+    with pytest.warns(UserWarning, match="is damaged"):
+        assert not Store(root).has(KEY)
+
+
+def test_what_cannot_be_put_aside_is_still_not_served(tmp_path, monkeypatch):
+    keep(tmp_path, BIG)
+    flip(payload(tmp_path), 0.5)
+    store = Store(tmp_path)
+    monkeypatch.setattr(os, "replace", raiser(errno.EROFS))
+    with pytest.warns(UserWarning, match="is damaged"), pytest.raises(KeyError):
+        store.get(KEY)
+    assert not store.has(KEY)
+    monkeypatch.undo()
+    assert store.put(KEY, BIG, {})
+    same(store.get(KEY), BIG)
+
+
+def raiser(number):
+    def fail(*args, **options):
+        raise OSError(number, os.strerror(number))
+
+    return fail
+
+
+@pytest.mark.parametrize("where", ["os.fsync", "os.replace", "neusee.workflows._codec.write"])
+@pytest.mark.parametrize("number", [errno.ENOSPC, errno.EROFS, errno.EIO])
+def test_a_disk_that_fails_costs_one_warning_and_leaves_nothing(tmp_path, monkeypatch, where, number):
+    store = Store(tmp_path)
+    with monkeypatch.context() as broken:
+        broken.setattr(where, raiser(number))
+        with pytest.warns(UserWarning, match="cannot be written") as seen:
+            kept = [store.put(key, BIG, {}) for key in (KEY, "cd" + "0" * 30)]
+    assert kept == [False, False]
+    assert len(seen) == 1
+    assert not store.has(KEY)
+    assert not [f for f in tmp_path.rglob("*") if f.is_file() and f.name != ".lock"]
+    assert store.put(KEY, BIG, {})
+    same(store.get(KEY), BIG)
+
+
+def test_a_root_that_is_a_file_costs_one_warning(tmp_path):
+    root = tmp_path / "file"
+    root.write_text("in the way")
+    store = Store(root)
+    assert not store.has(KEY)
+    with pytest.warns(UserWarning, match="cannot be written") as seen:
+        kept = [store.put(KEY, value, {}) for value in (BIG, torch.zeros(1))]
+    assert kept == [False, False]
+    assert len(seen) == 1
+    assert not list(store.entries())
+
+
+def test_a_partial_write_has_no_name(tmp_path, monkeypatch):
+    monkeypatch.setattr(os, "fsync", lambda fd: (_ for _ in ()).throw(KeyboardInterrupt))
+    with pytest.raises(KeyboardInterrupt):
+        Store(tmp_path).put(KEY, BIG, {})
+    assert not list(tmp_path.rglob("*.safetensors"))
+    assert not Store(tmp_path).has(KEY)
+    assert [f.name for f in (tmp_path / "tmp").iterdir()] == []
+
+
+def test_a_payload_without_a_description_is_no_result(tmp_path):
+    keep(tmp_path, BIG)
+    sidecar(tmp_path).unlink()
+    assert not Store(tmp_path).has(KEY)
+    same(keep(tmp_path, BIG + 1), BIG + 1)
+
+
+def test_the_first_of_two_writers_stays(tmp_path):
+    one, two = Store(tmp_path), Store(tmp_path)
+    assert one.put(KEY, BIG, {"step": "one"})
+    assert two.put(KEY, BIG + 1, {"step": "two"})
+    for store in (one, two, Store(tmp_path)):
+        same(store.get(KEY), BIG)
+        assert store.about(KEY)["step"] == "one"
+
+
+def test_what_killed_processes_left_is_swept_after_an_hour(tmp_path):
+    folder = tmp_path / "tmp"
+    folder.mkdir()
+    for name, age in (("old", 3700), ("young", 3500)):
+        (folder / name).write_text("half")
+        os.utime(folder / name, (time.time() - age,) * 2)
+    keep(tmp_path, BIG)
+    assert {f.name for f in folder.iterdir()} == {"young", ".lock"}
+
+
+WRITER = """
+import sys
+from pathlib import Path
+import torch
+from neusee.workflows._store import Store
+torch.set_num_threads(1)
+print("ready", flush=True)
+for i in range(10_000):
+    key = f"{i % 40:02x}" + "5" * 30
+    store = Store(Path(sys.argv[1]))
+    if not store.has(key):
+        store.put(key, torch.full((200_000,), float(i % 40)), {"step": "s"})
+    elif i % 3 == 0:
+        (Path(sys.argv[1]) / key[:2] / f"{key}.json").unlink(missing_ok=True)
+"""
+
+
+def killed_writers(root: Path, count: int, delays: list[float]) -> None:
+    """Processes that write the same keys over and over, each killed in the midst of it."""
+    command = [sys.executable, "-c", WRITER, str(root)]
+    writers = [subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.DEVNULL) for _ in range(count)]
+    for writer, delay in zip(writers, delays, strict=True):
+        assert writer.stdout.readline() == b"ready\n"
+        time.sleep(delay)
+        writer.kill()
+        writer.wait()
+        writer.stdout.close()
+
+
+def check_kept(root: Path) -> int:
+    """Every entry that counts as there is whole and right."""
+    store = Store(root)
+    found = list(store.entries())
+    for key, _ in found:
+        same(store.get(key), torch.full((200_000,), float(int(key[:2], 16))))
+    return len(found)
+
+
+def test_killed_writers_leave_no_wrong_entry(tmp_path):
+    killed_writers(tmp_path, 3, [0.03, 0.05, 0.08])
+    assert check_kept(tmp_path) > 0
+
+
+@pytest.mark.slow
+def test_many_killed_writers_leave_no_wrong_entry(tmp_path):
+    for i in range(17):
+        killed_writers(tmp_path, 3, [0.01 + 0.003 * i, 0.01 * (i % 3), 0.007 * (i % 5)])
+        assert check_kept(tmp_path) > 0
+
+
+def test_the_store_stands_where_one_expects_it(tmp_path, monkeypatch):
+    monkeypatch.delenv("NEUSEE_CACHE", raising=False)
+    monkeypatch.setattr(Path, "home", lambda: tmp_path / "home")
+    (tmp_path / "work" / "deep").mkdir(parents=True)
+    (tmp_path / "work" / "cache").mkdir()
+    monkeypatch.chdir(tmp_path / "work" / "deep")
+    assert default_root() == tmp_path / "home" / ".cache" / "neusee"
+    (tmp_path / "work" / "pyproject.toml").write_text('[project]\nname = "other"\n')
+    assert default_root() == tmp_path / "home" / ".cache" / "neusee"
+    (tmp_path / "work" / "pyproject.toml").write_text('[project]\nname = "neusee"\n')
+    assert default_root() == tmp_path / "work" / "cache"
+    monkeypatch.setenv("NEUSEE_CACHE", str(tmp_path / "named"))
+    assert default_root() == tmp_path / "named"
+
+
+def test_a_description_is_json_that_says_what_it_is(tmp_path):
+    keep(tmp_path, BIG)
+    about = json.loads(sidecar(tmp_path).read_text())
+    assert about["key"] == KEY
+    assert about["step"] == "s"
+    assert about["layout"] == {"tensor": 0}
+    assert about["payload"]["size"] == payload(tmp_path).stat().st_size
