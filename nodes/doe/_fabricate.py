@@ -22,6 +22,15 @@ def _quantize(height: Tensor, step: float, levels: int, cyclic: bool) -> Tensor:
     return height + change
 
 
+def _refuse(material: Material, wrap_at: float | None, levels: int | None, max_height: float | None) -> None:
+    if wrap_at is not None and max_height is not None and wave_height(material, wrap_at) > max_height:
+        wave = f"{wave_height(material, wrap_at) * 1e6:.3f} um"
+        text = f"{max_height * 1e6:.3g} um is less than one wave of wrap_at in {material}: needs at least {wave}"
+        raise ParameterError("max_height", text)
+    if levels is not None and wrap_at is None and max_height is None:
+        raise ParameterError("levels", f"{levels} steps of what depth? Set wrap_at or max_height")
+
+
 @node(rtol=1e-5)
 def fabricate(
     height: Tensor,
@@ -39,8 +48,10 @@ def fabricate(
     Shapes: (v, u) -> (v, u).
     Units:  m.
     Error:  1e-7 of the unwrapped height (float32).
+    Raises: ParameterError where one wave is deeper than ``max_height``, or levels have no depth to divide.
     Source: Swanson, MIT Lincoln Laboratory Technical Report 854 (1989), for multi-level elements.
     """
+    _refuse(material, wrap_at, levels, max_height)
     if wrap_at is not None:
         period = wave_height(material, wrap_at)
         wrapped = height.remainder(period)
@@ -81,12 +92,7 @@ def _(
 
 @fabricate.preflight
 def _(*, material: Material, wrap_at: float | None, levels: int | None, max_height: float | None) -> list[str]:
-    if wrap_at is not None and max_height is not None and wave_height(material, wrap_at) > max_height:
-        wave = f"{wave_height(material, wrap_at) * 1e6:.3f} um"
-        text = f"{max_height * 1e6:.3g} um is less than one wave of wrap_at in {material}: needs at least {wave}"
-        raise ParameterError("max_height", text)
-    if levels is not None and wrap_at is None and max_height is None:
-        raise ParameterError("levels", f"{levels} steps of what depth? Set wrap_at or max_height")
+    _refuse(material, wrap_at, levels, max_height)
     if max_height is not None and wrap_at is None:
         return [f"relief above max_height {max_height * 1e6:.3g} um is cut flat: set wrap_at to wrap it instead"]
     return []

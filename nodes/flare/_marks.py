@@ -1,5 +1,6 @@
 """Opaque marks on glass, drawn with the right area at any sampling: round grains and scratched lines."""
 
+import math
 from collections.abc import Sequence
 from typing import NamedTuple
 
@@ -72,6 +73,9 @@ def _distance(y: Tensor, x: Tensor, start: tuple[float, float], end: tuple[float
 
 
 def _cover(distance: Tensor, size: float, round_: bool) -> Tensor:
-    """Covered part of a sample by a mark ``size`` samples wide, also where it is thinner than one."""
-    thin = min(size**2 * torch.pi / 4, 1.0) if round_ else min(size, 1.0)
-    return ((size + 1) / 2 - distance).clamp(0, thin)
+    """Covered part of a sample by a mark ``size`` samples wide; its volume is the area of the mark, thin or not."""
+    if round_:
+        square = size**2 / 4
+        edge = math.sqrt(max(square - 1 / 12, 1 / 4))
+        return min(3 * square, 1.0) * (edge + 0.5 - distance).clamp(0, 1)
+    return ((size + 1) / 2 - distance).clamp(0, min(size, 1.0))

@@ -35,6 +35,13 @@ def test_a_seed_is_a_window():
     assert first.amplitude.dtype == first.path.dtype == torch.float32
 
 
+def test_more_dust_leaves_the_rest_as_it_was():
+    with_dust, without = (flare.dirt(**GRID, **FILTHY | {"dust": n}, rng=seeded()) for n in (30.0, 0.0))
+    assert torch.equal(with_dust.path, without.path)
+    assert bool((with_dust.amplitude <= without.amplitude).all())
+    assert bool((with_dust.amplitude == without.amplitude).double().mean() > 0.5)
+
+
 @settings(max_examples=25, deadline=None)
 @given(
     samples=st.integers(1, 48),
@@ -64,6 +71,14 @@ def test_dirt_does_not_depend_on_the_sampling():
     boxed = torch.nn.functional.avg_pool2d(fine.amplitude[None, None], 3)[0, 0]
     assert float((boxed - coarse.amplitude).abs().mean()) < 0.01
     assert float(boxed.mean()) == pytest.approx(float(coarse.amplitude.mean()), rel=2e-3)
+
+
+@pytest.mark.parametrize("across", [0.2, 0.6, 1.0, 1.2, 2.0])
+def test_grains_about_a_sample_across_cover_their_area_on_average(across):
+    grid, places = stop(16, 1.0, 16.0), torch.rand(300, 2, generator=seeded(), dtype=torch.float64)
+    marks = [Grain(v / 16, u / 16, across / 32, 1.0) for v, u in places.tolist()]
+    shade = sum(float((1 - stamp(torch.ones(16, 16), [mark], grid)).sum()) for mark in marks)
+    assert shade / 300 == pytest.approx(math.pi * across**2 / 4, rel=0.05)
 
 
 @pytest.mark.parametrize("radius", [0.02, 0.05, 0.2])
