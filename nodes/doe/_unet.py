@@ -107,7 +107,7 @@ def unet(
     Shapes: -> (v, u).
     Units:  m.
     Error:  1e-6 of max_height (float32).
-    Source: the camera of "Learning to See Through Flare", section 4; layer widths are ours.
+    Source: "Learning to See Through Flare", "Neural Representation of the DOE"; the layer widths are ours.
     """
     net = fresh(width, min(grid, samples), rng) if weights is None else _load(weights, width)
     return height_of(net, samples, grid, max_height).detach()

@@ -119,3 +119,8 @@ def test_negligible_only_where_nothing_changes():
     assert doe.fabricate.bound(facts, **PLAIN | {"max_height": 2e-6}) == 0
     assert doe.fabricate.bound(facts, **PLAIN | {"wrap_at": 400e-9}) == math.inf
     assert doe.fabricate.bound(facts, **PLAIN | {"wrap_at": 550e-9, "levels": 256}) == math.inf
+
+
+@pytest.mark.parametrize("params", [{"wrap_at": 550e-9, "levels": 4}, {"max_height": 2e-6, "levels": 4}])
+def test_made_where_the_relief_is(params):
+    assert doe.fabricate(torch.zeros(4, 4, device="meta"), **params).device.type == "meta"

@@ -121,3 +121,9 @@ def test_check_reports_the_share():
     assert line.ok
     assert "bring 0.001 of" in line.text
     assert not flare.ghosts.after(light, light, bands(), energy=1e-3)[0].ok
+
+
+def test_ghosts_fall_where_the_spot_is():
+    line = Bands(*(x.to("meta") for x in bands()))
+    found = flare.ghosts(spot().to("meta"), line, angle=(1e-4, 0.0), **LENS, rng=seeded())
+    assert found.device.type == "meta"

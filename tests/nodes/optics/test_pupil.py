@@ -237,3 +237,12 @@ def test_screen_is_standard_noise_with_the_asked_correlation():
     for step in (3, 9, 15):
         along = float((draws[:, step:] * draws[:, :-step]).mean())
         assert along == pytest.approx(math.exp(-((step / 61 / 0.15) ** 2)), abs=0.03)
+
+
+def test_everything_is_made_where_the_relief_is():
+    """A device without memory shows where tensors are made; mixing two devices would raise."""
+    line = Bands(*(x.to("meta") for x in bands(500, 600)))
+    p = optics.pupil(
+        torch.zeros(8, 8, device="meta"), doe.material(line), line, **LENS, defocus=1.0, aberrations={5: 1e-8, 8: 1e-8}
+    )
+    assert {x.device.type for x in p} == {"meta"}
