@@ -7,7 +7,10 @@ from dataclasses import dataclass, field
 from typing import Any
 
 from neusee.nodes import Node
+from neusee.workflows._config import Config, Setting
 from neusee.workflows._marks import Mark
+
+__all__ = ["Config", "Expectation", "Recipe", "Setting", "Step", "Wire", "in_order", "needed"]
 
 Wire = str | tuple[str, ...] | None  #: one step, the steps of all items, or an optional input that is absent
 
@@ -43,24 +46,6 @@ class Expectation:
     value: float
     rtol: float
     mark: Mark
-
-
-@dataclass(frozen=True, slots=True)
-class Setting:
-    """A final value and where it comes from: ``file:line:column``, ``argument n`` or a node's default."""
-
-    value: Any
-    source: str
-
-
-@dataclass(frozen=True, slots=True)
-class Config:
-    """Every final value by its dotted path, in the order of the recipe."""
-
-    settings: Mapping[str, Setting] = field(default_factory=dict)
-
-    def __getitem__(self, path: str) -> Setting:
-        return self.settings[path]
 
 
 @dataclass(frozen=True, slots=True)

@@ -1,0 +1,74 @@
+"""The final values of a recipe, each with where it comes from, and the same as YAML that can be run again."""
+
+from __future__ import annotations
+
+import json
+import math
+import re
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass, field
+from typing import Any
+
+_BARE = re.compile(r"[A-Za-z_µ/][\w µ./+-]*(?<! )|[-+]?\d[\d.eE+-]* [A-Za-zµ][\w-]*")
+_WORDS = {"true", "false", "null", "yes", "no", "on", "off"}
+
+
+@dataclass(frozen=True, slots=True)
+class Setting:
+    """A final value and where it comes from: ``file:line:column``, ``argument n`` or a node's default."""
+
+    value: Any
+    source: str
+    path: tuple[str | int, ...] = ()  #: keys from the top
+    default: bool = False  #: whether no one wrote it
+
+
+@dataclass(frozen=True, slots=True)
+class Config:
+    """Every final value by its dotted path, in the order of the recipe."""
+
+    settings: Mapping[str, Setting] = field(default_factory=dict)
+
+    def __getitem__(self, path: str) -> Setting:
+        return self.settings[path]
+
+    def to_yaml(self) -> str:
+        """A recipe of these values without groups; sources stand as comments, and defaults, in SI, as comments only."""
+        tree: dict[str | int, Any] = {}
+        for name, setting in self.settings.items():
+            *parents, last = setting.path or tuple(name.split("."))
+            here = tree
+            for key in parents:
+                here = here.setdefault(key, {})
+            here[last] = setting
+        return "".join(f"{line}\n" for line in _lines(tree, 0))
+
+
+def _lines(tree: Mapping[str | int, Any], depth: int) -> Iterator[str]:
+    indent = "  " * depth
+    for key, value in tree.items():
+        if isinstance(value, Setting):
+            text = f"{_scalar(key)}: {flow(value.value)}"
+            yield f"{indent}{'# ' if value.default else ''}{text:<{44 - len(indent)}} # {value.source}"
+        else:
+            yield f"{indent}{_scalar(key)}:"
+            yield from _lines(value, depth + 1)
+
+
+def flow(value: Any) -> str:
+    """A value as YAML on one line."""
+    if isinstance(value, Mapping):
+        return f"{{{', '.join(f'{_scalar(key)}: {flow(child)}' for key, child in value.items())}}}"
+    if isinstance(value, list | tuple):
+        return f"[{', '.join(map(flow, value))}]"
+    return _scalar(value)
+
+
+def _scalar(value: Any) -> str:
+    if isinstance(value, float) and not math.isfinite(value):
+        return ".nan" if math.isnan(value) else ".inf" if value > 0 else "-.inf"
+    if value is None or isinstance(value, bool | int | float):
+        return json.dumps(value)
+    text = str(value)
+    bare = _BARE.fullmatch(text) and text.lower() not in _WORDS
+    return text if bare else json.dumps(text, ensure_ascii=False)

@@ -1,0 +1,142 @@
+"""From a recipe's name, or its file, and arguments to steps that are checked and ready to run.
+
+Everything is looked at before anything runs, and every mistake is reported at once.
+"""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from neusee.workflows._compose import Composed, compose, groups_of, packaged
+from neusee.workflows._config import Config, Setting
+from neusee.workflows._cycles import cycles
+from neusee.workflows._graph import Expectation, Recipe, Step, Wire
+from neusee.workflows._head import expectations, outputs_of, seed_and_tolerance
+from neusee.workflows._marks import Problem, RecipeError
+from neusee.workflows._overrides import arguments_in
+from neusee.workflows._params import Checker
+from neusee.workflows._refs import References
+from neusee.workflows._steps import Declared, declare
+from neusee.workflows._wires import Wiring
+from neusee.workflows._yaml import Value
+
+
+@dataclass(frozen=True, slots=True)
+class Titled:
+    """A packaged recipe or an option of a group, and the first line that says what it shows."""
+
+    name: str
+    title: str
+
+
+def load(
+    name_or_path: str | os.PathLike[str],
+    overrides: Sequence[str] = (),
+    folder: str | os.PathLike[str] | None = None,
+    first: int = 1,
+) -> Recipe:
+    """Read and check a packaged recipe, or a file whose name ends in ``.yaml``.
+
+    Paths in ``overrides`` are relative to ``folder`` (the working folder), and messages
+    count them from ``first``. Raises `RecipeError` with every problem.
+    """
+    composed = compose(os.fspath(name_or_path), overrides, Path(folder or ".").absolute(), first)
+    return check(composed)
+
+
+def check(composed: Composed) -> Recipe:
+    """A composed recipe with its steps bound, or a `RecipeError` with every problem."""
+    problems = list(composed.problems)
+    root, references = composed.root, References(composed.root, problems)
+    steps, absent = declare(root, references, problems)
+    wiring, checker = Wiring(root, steps, absent, references, problems), Checker(problems)
+    bound = {step.name: step for step in _bind(root, steps, wiring, checker)}
+    problems += cycles(bound, {name: step.value.key for name, step in steps.items()})
+    seed, tolerance = seed_and_tolerance(root, references, problems)
+    outputs = outputs_of(root, wiring)
+    expect = expectations(root, wiring)
+    references.finish()
+    if problems:
+        raise RecipeError(problems)
+    config = _config(root, bound, steps, checker)
+    nulls = {name: f"null ({value.mark})" for name, value in absent.items()}
+    title, notes = composed.title, tuple(checker.notes)
+    return Recipe(composed.name, title, seed, tolerance, outputs, bound, expect, config, notes, nulls)
+
+
+def _bind(root: Value, steps: dict[str, Declared], wiring: Wiring, checker: Checker) -> Iterator[Step]:
+    """Every copy of every step that can be bound."""
+    for step in steps.values():
+        if not step.items:
+            for part in ("from", "with"):
+                wiring.references.touch(step.part(part), step.dims)
+        for items in step.items:
+            given = wiring.references.resolve(step.part("with"), step.scope(root, items))
+            wires: dict[str, Wire] = wiring.wires(step, items)
+            if step.node is None:
+                continue
+            params = checker.read(step.node, given, step.value.key)
+            if params is not None:
+                checker.preflight(step.node, params, given.items, step.value)
+            marks = {str(name): value.mark for name, value in given.items.items()}
+            yield Step(step.instance(items), step.node, params or {}, wires, step.value.key, marks)
+
+
+def _config(root: Value, bound: dict[str, Step], steps: dict[str, Declared], checker: Checker) -> Config:
+    """Final values by path: what was written, and after each step's what its node has by default."""
+    settings: dict[str, Setting] = {}
+    for key, block in root.items.items():
+        if key != "steps":
+            settings |= _settings(block, checker)
+            continue
+        for name, step in block.items.items():
+            settings |= _settings(step, checker)
+            if str(name) in steps:
+                settings |= _defaults(steps[str(name)], bound)
+    return Config(settings)
+
+
+def _settings(block: Value, checker: Checker) -> Iterator[tuple[str, Setting]]:
+    for leaf in block.leaves():
+        value: Any = checker.files.get(leaf.path, leaf.plain)
+        sources = dict.fromkeys(map(str, (leaf.mark, *arguments_in(leaf))))
+        yield leaf.name, Setting(value, ", ".join(sources), leaf.path)
+
+
+def _defaults(step: Declared, bound: dict[str, Step]) -> Iterator[tuple[str, Setting]]:
+    """Parameters of a step that no one wrote, in SI."""
+    first = bound.get(step.instances[0]) if step.instances else None
+    for name, value in (first.params if first else {}).items():
+        if first and name not in first.param_marks:
+            path = (*step.value.path, "with", name)
+            yield ".".join(map(str, path)), Setting(value, f"default of {first.node.path}", path, True)
+
+
+# --- what there is --------------------------------------------------------------------------------------------------
+
+
+def recipes() -> list[Titled]:
+    """The packaged recipes."""
+    return [_titled(path) for path in sorted(packaged().glob("*.yaml"))]
+
+
+def groups(beside: Path | None = None) -> dict[str, list[Titled]]:
+    """The options of every group: packaged, and beside a recipe of one's own."""
+    folders = [folder for folder in (beside, packaged()) if folder]
+    return {
+        group: [_titled(next(p for f in folders if (p := f / group / f"{name}.yaml").is_file())) for name in names]
+        for group, names in groups_of(*folders).items()
+    }
+
+
+def _titled(path: Path) -> Titled:
+    with path.open(encoding="utf-8") as file:
+        first = file.readline().strip()
+    return Titled(path.stem, first.lstrip("# ") if first.startswith("#") else "")
+
+
+__all__ = ["Expectation", "Problem", "Recipe", "RecipeError", "Titled", "check", "groups", "load", "recipes"]
