@@ -13,28 +13,39 @@ from neusee.nodes.doe._relief import relief_checks
 from neusee.nodes.optics._aperture import Aperture, grid_notes
 from neusee.nodes.units import Count, DataFile, PositiveLength
 
+PITCH = 15.0  #: of the first layer's sines: about four periods across the pupil at the start
+
 
 class HeightNet(nn.Module):
-    """Eight convolutions, four down and four up, from (u, v) to one logit a sample."""
+    """Eight convolutions, four down and four up, from (u, v) to one logit a sample.
+
+    The first is followed by sines, so that the relief is not bound to be as smooth as its coordinates.
+    """
 
     def __init__(self, width: int = 32) -> None:
         super().__init__()
         sizes = [2, width, 2 * width, 4 * width, 8 * width]
         pairs = zip(pairwise(sizes), [1, 2, 2, 2], strict=True)
-        self.down = nn.ModuleList(nn.Conv2d(a, b, 3, stride=s, padding=1) for (a, b), s in pairs)
-        self.up = nn.ModuleList(nn.Conv2d(3 * b, b, 3, padding=1) for b in sizes[3:0:-1])
-        self.last = nn.Conv2d(width, 1, 3, padding=1)
+        self.down = nn.ModuleList(nn.Conv2d(a, b, 3, stride=s) for (a, b), s in pairs)
+        self.up = nn.ModuleList(nn.Conv2d(3 * b, b, 3) for b in sizes[3:0:-1])
+        self.last = nn.Conv2d(width, 1, 3)
 
     def forward(self, coordinates: Tensor) -> Tensor:
         """(2, y, x) -> (y, x)."""
-        x, passed = coordinates[None], []
-        for layer in self.down:
-            x = F.silu(layer(x))
-            passed.append(x)
+        passed = [torch.sin(PITCH * self.down[0](_edged(coordinates[None])))]
+        for layer in self.down[1:]:
+            passed.append(F.silu(layer(_edged(passed[-1]))))
+        x = passed[-1]
         for layer, skip in zip(self.up, passed[-2::-1], strict=True):
-            x = F.silu(layer(torch.cat([enlarge(x, skip.shape[-2], skip.shape[-1]), skip], dim=1)))
-        logits: Tensor = self.last(x)[0, 0]
+            x = F.silu(layer(_edged(torch.cat([enlarge(x, skip.shape[-2], skip.shape[-1]), skip], dim=1))))
+        logits: Tensor = self.last(_edged(x))[0, 0]
         return logits
+
+
+def _edged(x: Tensor) -> Tensor:
+    """Repeat the outermost rows and columns: zeros there would draw a frame around the relief."""
+    x = torch.cat([x[..., :1, :], x, x[..., -1:, :]], dim=-2)
+    return torch.cat([x[..., :1], x, x[..., -1:]], dim=-1)
 
 
 def _cubic(size: int, new: int, like: Tensor) -> Tensor:
