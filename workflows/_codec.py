@@ -42,20 +42,21 @@ _NAMES = {name: dtype for dtype, name in _DTYPES.items()}
 
 def each_tensor(change: Callable[[Tensor], Tensor], value: Any) -> Any:
     """``value`` with every tensor in it changed; one that occurs twice is changed once."""
-    done: dict[int, Tensor] = {}
+    return _change(value, change, {})
 
-    def walk(item: Any) -> Any:
-        if isinstance(item, Tensor):
-            if id(item) not in done:
-                done[id(item)] = change(item)
-            return done[id(item)]
-        if isinstance(item, tuple):
-            return item._make(map(walk, item)) if hasattr(item, "_make") else tuple(map(walk, item))
-        if isinstance(item, list):
-            return [walk(i) for i in item]
-        return {k: walk(v) for k, v in item.items()} if isinstance(item, dict) else item
 
-    return walk(value)
+def _change(item: Any, change: Callable[[Tensor], Tensor], done: dict[int, Tensor]) -> Any:
+    """A function of the module: a nested one that calls itself would hold its tensors until a garbage collection."""
+    if isinstance(item, Tensor):
+        if id(item) not in done:
+            done[id(item)] = change(item)
+        return done[id(item)]
+    if isinstance(item, tuple):
+        items = [_change(i, change, done) for i in item]
+        return item._make(items) if hasattr(item, "_make") else tuple(items)
+    if isinstance(item, list):
+        return [_change(i, change, done) for i in item]
+    return {k: _change(v, change, done) for k, v in item.items()} if isinstance(item, dict) else item
 
 
 def tensors_in(value: Any) -> list[Tensor]:
@@ -75,34 +76,41 @@ def _settled(x: Tensor) -> Tensor:
     return x.clone() if x.untyped_storage().nbytes() > x.nbytes else x
 
 
-def pack(value: Any) -> tuple[Any, list[Tensor]]:
-    """The layout of ``value`` as JSON, and its tensors; memory that is shared is listed once."""
-    tensors: list[Tensor] = []
-    known: dict[tuple[Any, ...], int] = {}
+class _Listed:
+    """Tensors in the order of a file; memory that is shared is listed once."""
 
-    def add(x: Tensor) -> int:
+    def __init__(self) -> None:
+        self.tensors: list[Tensor] = []
+        self._known: dict[tuple[Any, ...], int] = {}
+
+    def add(self, x: Tensor) -> int:
         same = (x.data_ptr() or id(x), x.dtype, x.shape, x.stride(), x.is_conj(), x.is_neg())
-        if same not in known:
-            known[same] = len(tensors)
-            tensors.append(x.detach())
-        return known[same]
+        if same not in self._known:
+            self._known[same] = len(self.tensors)
+            self.tensors.append(x.detach())
+        return self._known[same]
 
-    def walk(item: Any) -> Any:
-        if isinstance(item, Tensor):
-            return {"tensor": add(item)}
-        if isinstance(item, bytes):
-            return {"bytes": add(torch.frombuffer(bytearray(item), dtype=torch.uint8) if item else torch.empty(0))}
-        if isinstance(item, tuple):
-            return {"class": _class_path(item), "items": [walk(i) for i in item]}
-        if isinstance(item, list):
-            return {"list": [walk(i) for i in item]}
-        if isinstance(item, dict) and all(isinstance(k, str) for k in item):
-            return {"dict": {k: walk(v) for k, v in item.items()}}
-        if item is None or isinstance(item, bool | int | float | str):
-            return {"value": item}
-        raise TypeError(f"a step must give tensors, numbers, texts, bytes or collections of these, not {type(item)}")
 
-    return walk(value), tensors
+def pack(value: Any) -> tuple[Any, list[Tensor]]:
+    """The layout of ``value`` as JSON, and its tensors."""
+    listed = _Listed()
+    return _layout(value, listed), listed.tensors
+
+
+def _layout(item: Any, listed: _Listed) -> dict[str, Any]:
+    if isinstance(item, Tensor):
+        return {"tensor": listed.add(item)}
+    if isinstance(item, bytes):
+        return {"bytes": listed.add(torch.frombuffer(bytearray(item), dtype=torch.uint8) if item else torch.empty(0))}
+    if isinstance(item, tuple):
+        return {"class": _class_path(item), "items": [_layout(i, listed) for i in item]}
+    if isinstance(item, list):
+        return {"list": [_layout(i, listed) for i in item]}
+    if isinstance(item, dict) and all(isinstance(k, str) for k in item):
+        return {"dict": {k: _layout(v, listed) for k, v in item.items()}}
+    if item is None or isinstance(item, bool | int | float | str):
+        return {"value": item}
+    raise TypeError(f"a step must give tensors, numbers, texts, bytes or collections of these, not {type(item)}")
 
 
 def unpack(layout: Any, tensors: list[Tensor]) -> Any:
