@@ -28,13 +28,16 @@ class Verdict:
 class _Later:
     """Facts that are looked up, and if need be computed, only when a bound asks for one of them."""
 
-    __slots__ = ("_find",)
+    __slots__ = ("_find", "_seen")
 
-    def __init__(self, find: Callable[[], Facts | None]) -> None:
-        self._find = find
+    def __init__(self, find: Callable[[], Facts | None], seen: list[Facts]) -> None:
+        self._find, self._seen = find, seen
 
     def __getattr__(self, name: str) -> Any:
-        return getattr(self._find(), name)
+        facts = self._find()
+        if facts is not None:
+            self._seen.append(facts)
+        return getattr(facts, name)
 
 
 def judge(step: Step, params: Mapping[str, Any], facts_of: FactsOf, tolerance: float) -> Verdict:
@@ -42,13 +45,16 @@ def judge(step: Step, params: Mapping[str, Any], facts_of: FactsOf, tolerance: f
     node, first = step.node, step.wires.get(step.node.inputs[0])
     if node.bound is None or not isinstance(first, str):
         return Verdict(float("inf"), False, "nothing could stand in for it", "")
-    facts = [_facts(step.wires.get(name), facts_of) for name in node.inputs]
+    seen: list[Facts] = []
+    facts = [_facts(step.wires.get(name), facts_of, seen) for name in node.inputs]
     try:
         bound = float(node.bound(*facts, **{name: _number(value) for name, value in params.items()}))
     except RunError:
         raise
     except Exception as error:
         raise RunError(step, [], error) from error
+    if not all(f.finite for f in seen):
+        return Verdict(float("inf"), False, "its input is not finite, so nothing bounds its effect", first)
     left_out = bound <= tolerance
     why = (
         f"changes at most {bound:.2g}, tolerance {tolerance:.2g}" if bound < float("inf") else "no bound on its effect"
@@ -56,12 +62,12 @@ def judge(step: Step, params: Mapping[str, Any], facts_of: FactsOf, tolerance: f
     return Verdict(bound, left_out, why, first)
 
 
-def _facts(wire: str | tuple[str, ...] | None, facts_of: FactsOf) -> Any:
+def _facts(wire: str | tuple[str, ...] | None, facts_of: FactsOf, seen: list[Facts]) -> Any:
     if wire is None:
         return None
     if isinstance(wire, str):
-        return _Later(lambda: facts_of(wire))
-    return [_facts(name, facts_of) for name in wire]
+        return _Later(lambda: facts_of(wire), seen)
+    return [_facts(name, facts_of, seen) for name in wire]
 
 
 def _number(value: Any) -> Any:

@@ -316,6 +316,12 @@ def test_an_input_runs_for_a_verdict_only_if_the_bound_asks_for_its_facts(store)
     assert [e.step for e in events] == ["s", "s", "n"]
 
 
+@pytest.mark.parametrize("value", [float("inf"), float("nan")])
+def test_nothing_is_left_out_after_a_value_that_is_not_finite(store, value):
+    steps = recipe("n", 1.0, s=(source, {}, {"value": value}), n=(noise, {"x": "s"}))
+    assert states(run(steps, store)) == {"s": "run", "n": "run"}
+
+
 def test_a_bound_that_fails_names_its_step(store):
     with pytest.raises(RunError, match=r"test.yaml:3:5   n .*ZeroDivision"):
         run(recipe("n", 1.0, s=(source, {}, {"value": -3.0}), n=(noise, {"x": "s"})), store)
