@@ -15,6 +15,7 @@ import neusee.recipes
 from neusee.nodes import Node, units
 from neusee.workflows._marks import nearest
 from neusee.workflows._readings import READINGS
+from neusee.workflows._recipe import groups, recipes
 
 _FOLDER = Path(neusee.recipes.__file__).parent
 _KINDS = ("PositiveLength", "Length", "Wavelength", "Time", "Angle", "Temperature", "Electrons", "Waves", "DataFile")
@@ -37,25 +38,18 @@ def all_nodes() -> dict[str, Node]:
     for family in pkgutil.iter_modules(neusee.nodes.__path__):
         if family.ispkg:
             module = importlib.import_module(f"neusee.nodes.{family.name}")
-            nodes = (getattr(module, name) for name in sorted(module.__all__))
+            nodes = (getattr(module, name) for name in sorted(getattr(module, "__all__", ())))
             found |= {node.path: node for node in nodes if isinstance(node, Node)}
     return found
 
 
 def recipe_lines() -> list[str]:
     """Each recipe with its first line, then the groups that it may choose from."""
-    titles = {p.stem: _title(p) for p in sorted(_FOLDER.glob("*.yaml"))}
-    wide = max(map(len, titles), default=0)
-    groups: dict[str, list[str]] = {}
-    for path in sorted(_FOLDER.glob("*/*.yaml")):
-        groups.setdefault(path.parent.name, []).append(path.stem)
-    lines = [f"{name:<{wide}}  {title}" for name, title in titles.items()]
-    return [*lines, "", "groups, as in `neusee run laser=six`", *(f"  {g}: {', '.join(o)}" for g, o in groups.items())]
-
-
-def _title(path: Path) -> str:
-    first = path.read_text(encoding="utf-8").partition("\n")[0]
-    return first.removeprefix("#").strip() if first.startswith("#") else ""
+    found = recipes()
+    wide = max((len(r.name) for r in found), default=0)
+    lines = [f"{r.name:<{wide}}  {r.title}" for r in found]
+    lines += ["", "groups, as in `neusee run laser=six`"]
+    return [*lines, *(f"  {name}: {', '.join(o.name for o in options)}" for name, options in groups().items())]
 
 
 def nodes_lines() -> list[str]:
@@ -162,7 +156,7 @@ def _reading(name: str) -> list[str]:
     if row is None:
         return [f"reading.{name}"]
     return [
-        f"reading.{row.name} ({row.number}): the paper says {row.matter}",
+        f"reading.{row.name} ({row.number}): {row.matter}",
         f"  coherent (in force by default): {row.coherent}, because {row.reason}",
         f"  as printed (reading=as_printed): {row.as_printed}",
     ]

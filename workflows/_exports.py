@@ -9,6 +9,7 @@ from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import Any
 
+import torch
 from torch import Tensor
 
 from neusee.nodes.values import Bands, Psf
@@ -34,6 +35,9 @@ def exports(result: Result, shelf: Shelf) -> tuple[dict[str, Path], dict[str, st
             continue
         key = digest("file", form, _FORM, [[n, f.identity] for n, f in found.items()])
         jobs.append(Job(name, Path(name).suffix, key, found, _FORMS[form]))
+    found = needs({step: step for step in result.recipe.outputs}, result, code)
+    key = digest("file", "safetensors", _FORM, [[n, f.identity] for n, f in found.items()])
+    jobs.append(Job("outputs.safetensors", ".safetensors", key, found, safetensors))
     return finished(jobs, result, shelf, missing), missing
 
 
@@ -43,6 +47,18 @@ def spectral(cube: Tensor | Psf, bands: Bands) -> bytes:
 
     values = cube.intensity if isinstance(cube, Psf) else cube
     return _written(".exr", lambda path: write_spectral(path, values.detach().cpu().float(), bands.centres))
+
+
+def safetensors(**values: Any) -> bytes:
+    """Tensors by the name of their step, and of their field where a step gives several."""
+    from safetensors.torch import save
+
+    tensors: dict[str, Tensor] = {}
+    for name, value in values.items():
+        fields = value._asdict() if hasattr(value, "_asdict") else {"": value}
+        found = {f"{name}.{k}".rstrip("."): v for k, v in fields.items() if isinstance(v, Tensor)}
+        tensors |= {k: v.detach().cpu().clone(memory_format=torch.contiguous_format) for k, v in found.items()}
+    return save(tensors)
 
 
 def exr(image: Tensor) -> bytes:
@@ -56,8 +72,6 @@ def exr(image: Tensor) -> bytes:
 
 def png16(image: Tensor) -> bytes:
     """Whole numbers in [0, 65535], (3, y, x), as a 16-bit RGB PNG, bit for bit."""
-    import torch
-
     words = image.detach().cpu().double().round()
     if image.ndim != 3 or image.shape[0] != 3 or float(words.min()) < 0 or float(words.max()) > 65535:
         raise ValueError(f"16-bit PNG holds (3, y, x) in [0, 65535], not {tuple(image.shape)}")

@@ -167,7 +167,8 @@ def cache_ls() -> None:
 def load(words: list[str] | None) -> tuple[Recipe, list[str]]:
     """The recipe that the words name (`first_light` if none does) with its changes, and the words to run it again."""
     words = list(words or [])
-    name = DEFAULT if not words or _is_change(words[0]) else words.pop(0)
+    named = bool(words) and not _is_change(words[0])
+    name = words.pop(0) if named else DEFAULT
     for word in words:
         if not _is_change(word):
             fail(f"{word}: not a change of a value: write key=value, +key=value or ~key")
@@ -175,7 +176,7 @@ def load(words: list[str] | None) -> tuple[Recipe, list[str]]:
     from neusee.workflows._recipe import load as read
 
     try:
-        return read(name, words), ["neusee", "run", name, *words]
+        return read(name, words, first=1 + named), ["neusee", "run", name, *words]
     except RecipeError as error:
         count = len(error.problems)
         fail(f"{error}\n{count} problem{'s' * (count > 1)}, nothing was run")

@@ -10,14 +10,17 @@ import base64
 import json
 import os
 import platform
+import re
 import shlex
 from collections import Counter
 from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import replace
 from datetime import datetime
 from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
 from typing import Any
 
+from neusee.nodes import Check, Facts
 from neusee.workflows._graph import Recipe
 from neusee.workflows._numbers import expected, metrics, table
 from neusee.workflows._readings import in_force
@@ -25,6 +28,7 @@ from neusee.workflows._roles import FIGURES
 from neusee.workflows._run import Done, Result
 
 _LIBRARIES = ("torch", "numpy", "kornia", "colour-science", "OpenEXR", "pydantic", "safetensors")
+_UNITS = frozenset(("m", "nm", "rad", "e-", "DN", "photons", "W/m2", "dB"))
 _SAMPLING = "PSF point-sampled: a sample on the axis, at the pixel centre."
 
 
@@ -41,7 +45,7 @@ def document(
         "title": recipe.title,
         "version": _version("neusee"),
         "command": shlex.join(command),
-        "started": datetime.now().astimezone().isoformat(sep=" ", timespec="seconds"),
+        "started": datetime.now().astimezone().strftime("%Y-%m-%d %H:%M:%S %Z"),
         "device": result.device,
         "seconds": result.seconds,
         "tolerance": recipe.tolerance,
@@ -57,7 +61,7 @@ def document(
         "readings": _readings(recipe),
         "left_out": [{"step": d.step, "bound": d.bound, "why": d.why} for d in done if d.state == "left out"],
         "absent": [{"step": step, "where": where} for step, where in recipe.absent.items()],
-        "steps": [_step(d, recipe) for d in done],
+        "steps": [_step(d, result) for d in done],
         "figures": _figures(missing),
         "missing": [{"name": n, "title": _title(n), "why": why} for n, why in missing.items()],
         "facts": _facts(result),
@@ -118,8 +122,9 @@ def size_of(count: float) -> str:
     raise AssertionError
 
 
-def _step(done: Done, recipe: Recipe) -> dict[str, Any]:
-    node = recipe.steps[done.step].node
+def _step(done: Done, result: Result) -> dict[str, Any]:
+    node = result.recipe.steps[done.step].node
+    done = _remembered(done, result.store.about(done.key)) if done.state == "asleep" else done
     return {
         "step": done.step,
         "node": node.path,
@@ -137,14 +142,24 @@ def _step(done: Done, recipe: Recipe) -> dict[str, Any]:
     }
 
 
+def _remembered(done: Done, about: Mapping[str, Any] | None) -> Done:
+    """A step that was not looked at, with what the store says of its result."""
+    if about is None:
+        return done
+    found = about.get("facts")
+    facts = Facts(**{**found, "shape": tuple(found["shape"])}) if found else None
+    checks = tuple(Check(text, ok) for text, ok in about.get("checks", ()))
+    why = f"not read; made {about['date']} in {about['seconds']:.3g} s"
+    return replace(done, why=why, facts=facts, checks=checks, bytes=about["bytes"])
+
+
 def unit_of(docstring: str) -> str:
-    """The unit of the result, as a node's ``Units:`` line says it after the word ``result``."""
-    lines = [line.strip() for line in docstring.splitlines()]
-    units = next((line for line in lines if line.startswith("Units:")), "")
-    _, _, after = units.partition("result ")
-    for end in (" in [", ",", ";", ".", " ("):
-        after = after.partition(end)[0]
-    return after.strip()
+    """The unit of the result, as a node's ``Units:`` line says it: after the word ``result``, or alone."""
+    lines = (line.strip() for line in docstring.splitlines())
+    units = next((line for line in lines if line.startswith("Units:")), "Units:").removeprefix("Units:").strip()
+    before, found, after = units.partition("result ")
+    word = re.split(r"[\s,;:]|\.(?:\s|$)", after if found else before, maxsplit=1)[0]
+    return word if word in _UNITS else ""
 
 
 def _sampling(recipe: Recipe) -> list[str]:

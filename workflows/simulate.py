@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import json
 import warnings
-from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
@@ -14,7 +14,7 @@ from neusee.workflows import report
 from neusee.workflows._exports import exports
 from neusee.workflows._figures import pictures
 from neusee.workflows._files import RunFolder, new_run
-from neusee.workflows._graph import Config, Recipe, needed
+from neusee.workflows._graph import Recipe, needed
 from neusee.workflows._keys import digest
 from neusee.workflows._roles import SHOWN, TABLE
 from neusee.workflows._run import Event, Result, run
@@ -51,12 +51,10 @@ def simulate(
     command: Sequence[str],
     device: str = "cpu",
     watch: Callable[[Event], None] | None = None,
-    before_pictures: Callable[[], None] = lambda: None,
 ) -> Simulation:
     """Run ``recipe`` and write ``runs/<date>_<recipe>_<key>/``, complete or not at all."""
     with _noted() as notes:
         result = run(recipe, store, wanted(recipe), watch, device)
-        before_pictures()
         with new_run(runs, recipe.name, _run_key(result)) as folder:
             doc = _write(result, folder, command, notes)
     return Simulation(folder.path, doc)
@@ -82,27 +80,12 @@ def _write(result: Result, folder: RunFolder, command: Sequence[str], notes: Ite
         folder.take(f"figures/{name}.png", path)
     for name, path in files.items():
         folder.take(f"data/{name}", path)
-    _tensors(result, folder)
     folder.write("recipe.yaml", recipe_text(result.recipe))
     folder.write_rows("metrics.csv", ("step", "field", "index", "value"), doc["metrics"])
     folder.write_rows("timing.csv", _TIMING, [[s[column] for column in _TIMING] for s in doc["steps"]])
     folder.write("provenance.json", json.dumps(doc, indent=1, ensure_ascii=False, allow_nan=True))
     folder.write("report.html", report.page(doc, {name: path.read_bytes() for name, path in drawn.items()}))
     return doc
-
-
-def _tensors(result: Result, folder: RunFolder) -> None:
-    """The recipe's outputs as safetensors, one tensor a name; a named tuple gives one each field."""
-    from safetensors.torch import save_file
-    from torch import Tensor
-
-    tensors: dict[str, Any] = {}
-    for name in result.recipe.outputs:
-        value = result.values[name]
-        fields = value._asdict() if hasattr(value, "_asdict") else {"": value}
-        tensors |= {f"{name}.{k}".rstrip("."): v.cpu().contiguous() for k, v in fields.items() if isinstance(v, Tensor)}
-    (folder.path / "data").mkdir(exist_ok=True)
-    save_file(tensors, folder.path / "data" / "outputs.safetensors")
 
 
 @contextmanager
@@ -121,36 +104,6 @@ def _noted() -> Iterator[list[str]]:
 
 
 def recipe_text(recipe: Recipe) -> str:
-    """Every final value as YAML, with the place it comes from as a comment."""
-    head = [
-        f"# {recipe.title}" if recipe.title else f"# {recipe.name}",
-        "# Final values; after each, where it was written.",
-    ]
-    return "\n".join([*head, *config_lines(recipe.config)]) + "\n"
-
-
-def config_lines(config: Config) -> list[str]:
-    """Final values by their dotted path, nested as in a recipe, each with its source."""
-    lines: list[str] = []
-    open_path: list[str] = []
-    for path, setting in config.settings.items():
-        *parents, name = path.split(".")
-        shared = next((i for i, (a, b) in enumerate(zip(parents, open_path, strict=False)) if a != b), None)
-        shared = min(len(parents), len(open_path)) if shared is None else shared
-        lines += [f"{'  ' * depth}{parents[depth]}:" for depth in range(shared, len(parents))]
-        open_path = parents
-        lines.append(f"{'  ' * len(parents)}{name}: {_scalar(setting.value)}  # {setting.source}")
-    return lines
-
-
-def _scalar(value: Any) -> str:
-    """A value in YAML's flow style, which for these values is JSON with bare words."""
-    if isinstance(value, Mapping):
-        return "{" + ", ".join(f"{k}: {_scalar(v)}" for k, v in value.items()) + "}"
-    if isinstance(value, list | tuple):
-        return "[" + ", ".join(map(_scalar, value)) + "]"
-    if isinstance(value, Path):
-        return json.dumps(str(value))
-    if value is None or isinstance(value, bool | int | float):
-        return json.dumps(value)
-    return json.dumps(str(value), ensure_ascii=False)
+    """Every final value as YAML that can be run again, with the place it comes from as a comment."""
+    head = f"# {recipe.title or recipe.name}\n# Final values; after each, where it was written.\n"
+    return head + recipe.config.to_yaml()
