@@ -20,12 +20,9 @@ def cycles(steps: Mapping[str, Step], marks: Mapping[str, Mark]) -> Iterator[Pro
         seen.add(frozenset(names))
         start = min(range(len(names)), key=lambda n: marks[names[n]])
         names = names[start:] + names[:start]
-        shown = (
-            [*names, names[0]] if len(names) <= 12 else [*names[:10], f"({len(names) - 11} more)", names[-1], names[0]]
-        )
-        yield Problem(
-            marks[names[0]], "steps", f"cycle: {' -> '.join(shown)} ({_places([marks[n] for n in names[:12]])})"
-        )
+        few = names if len(names) <= _MOST else [*names[: _MOST - 1], f"({len(names) - _MOST} more)", names[-1]]
+        where = _places([marks[name] for name in names[:_MOST]])
+        yield Problem(marks[names[0]], "steps", f"cycle: {' -> '.join([*few, names[0]])} ({where})")
 
 
 def _places(marks: list[Mark]) -> str:

@@ -13,7 +13,7 @@ from dataclasses import dataclass
 import neusee.nodes
 from neusee.nodes import Node
 from neusee.workflows._marks import Problem, nearest
-from neusee.workflows._refs import References, Scope
+from neusee.workflows._refs import References, Scope, broken
 from neusee.workflows._yaml import Value, kind
 
 _KEYS = ("node", "each", "from", "with")
@@ -59,9 +59,12 @@ def declare(
         return {}, {}
     absent = {str(name): value for name, value in given.data.items() if value.data is None}
     steps = {}
+    nodes: dict[str, Node] = {}
     for name, value in given.data.items():
         if value.data is not None and _well_formed(str(name), value, problems):
-            steps[str(name)] = _declare(str(name), value, root, references, problems)
+            node, dims = _node(value, nodes, references, problems), _dims(value, root, problems)
+            items = tuple(itertools.product(*(map(str, root.items[dim].items) for dim in dims)))
+            steps[str(name)] = Declared(str(name), value, node, dims, items)
     return steps, absent
 
 
@@ -78,19 +81,22 @@ def _well_formed(name: str, value: Value, problems: list[Problem]) -> bool:
     return True
 
 
-def _declare(name: str, value: Value, root: Value, references: References, problems: list[Problem]) -> Declared:
-    node, dims = None, _dims(value, root, problems)
-    given = value.items.get("node")
+def _node(step: Value, nodes: dict[str, Node], references: References, problems: list[Problem]) -> Node | None:
+    """The node that a step names; ``nodes`` are those found before."""
+    given = step.items.get("node")
     if given is None:
-        problems.append(Problem(value.key, value.name, "has no node: write `node: family.name`"))
-    else:
-        given = references.resolve(given, Scope({}, name))
-        try:
-            node = find_node(str(given.data))
-        except LookupError as error:
-            problems.append(Problem(given.mark, f"{value.name}.node", str(error.args[0])))
-    items = tuple(itertools.product(*(map(str, root.items[dim].items) for dim in dims)))
-    return Declared(name, value, node, dims, items)
+        problems.append(Problem(step.key, step.name, "has no node: write `node: family.name`"))
+        return None
+    given = references.resolve(given, Scope({}, str(step.path[-1])))
+    if broken(given):
+        return None
+    try:
+        if str(given.data) not in nodes:
+            nodes[str(given.data)] = find_node(str(given.data))
+        return nodes[str(given.data)]
+    except LookupError as error:
+        problems.append(Problem(given.mark, f"{step.name}.node", str(error.args[0])))
+        return None
 
 
 def _dims(step: Value, root: Value, problems: list[Problem]) -> tuple[str, ...]:

@@ -229,6 +229,8 @@ def _fix(problem: str, here: str, column: int) -> str:
         return "a tab: YAML is indented with spaces"
     if re.search(r"[^\"']\$\{", here) and "expected" in problem:
         return 'inside { } or [ ], quote a reference: "${…}"'
+    if re.search(r"\[[^\]]*\w\[", here) and "'['" in problem:
+        return 'inside [ ], quote a name with brackets: "psf[mask]"'
     if "mapping values are not allowed" in problem:
         return "a second ':' on this line, or a wrong indent: quote the text, or begin a new line"
     if "but found another document" in problem:

@@ -1,0 +1,50 @@
+import importlib.util
+import sys
+from pathlib import Path
+
+import pytest
+
+
+@pytest.fixture
+def toy(monkeypatch):
+    """The family ``toy`` of nodes, as if it were one of the package."""
+    name = "neusee.nodes.toy"
+    spec = importlib.util.spec_from_file_location(name, Path(__file__).with_name("toy_nodes.py"))
+    module = importlib.util.module_from_spec(spec)
+    monkeypatch.setitem(sys.modules, name, module)
+    spec.loader.exec_module(module)
+    return module
+
+
+@pytest.fixture
+def write(tmp_path):
+    """Write a file of YAML below a folder of its own and give its path."""
+
+    def write(text, name="mine.yaml"):
+        path = tmp_path / name
+        path.parent.mkdir(parents=True, exist_ok=True)
+        path.write_text(text, encoding="utf-8")
+        return path
+
+    return write
+
+
+@pytest.fixture
+def read(toy, write, tmp_path):
+    """Load a recipe of toy nodes from its text and arguments."""
+    from neusee.workflows._recipe import load
+
+    return lambda text, *arguments: load(write(text), arguments, tmp_path)
+
+
+@pytest.fixture
+def mistakes(read):
+    """What a recipe of toy nodes is refused with: one line each, with single spaces between the columns."""
+    from neusee.workflows._marks import RecipeError
+
+    def mistakes(text, *arguments):
+        with pytest.raises(RecipeError) as caught:
+            read(text, *arguments)
+        return [" | ".join(filter(None, (str(p.mark), p.path, p.message))) for p in caught.value.problems]
+
+    return mistakes
