@@ -45,7 +45,7 @@ class Family:
         ran = sum(d.seconds for d in done if d.state == "run")
         told = next((d for d in done if any(not c.ok for c in d.checks)), done[0])
         shape = shape_of(told)
-        check = "; ".join(("" if c.ok else "FAILED: ") + c.text for c in told.checks)
+        check = "; ".join(("" if c.ok else "LOOK: ") + c.text for c in told.checks)
         check = check or (told.why if told.state == "left out" else "")
         return (name, told.device, self.state(), f"{ran:.3f}" if ran else "", f"{shape} {self.unit}".strip(), check)
 
@@ -99,7 +99,7 @@ class Live:
         for family in rows:
             cells = family.cells()
             style = {"run": "bold", "cached": "cyan", "left out": "dim"}.get(cells[2], "")
-            table.add_row(*cells, style="red" if "FAILED" in cells[5] else style)
+            table.add_row(*cells, style="red" if "LOOK" in cells[5] else style)
         asleep = sum(d.state == "asleep" for f in self.families.values() for d in f.done)
         if asleep:
             table.caption = f"{asleep} steps were not looked at: what needs them is in the cache"

@@ -97,7 +97,7 @@ def verdict(found: Sequence[Mapping[str, Any]], failed: Sequence[str]) -> str:
     numbers = (
         f"{met} of {len(found)} expected numbers within tolerance" if found else "No expected numbers in this recipe"
     )
-    checks = "every check held" if not failed else f"{len(failed)} check{'s' * (len(failed) > 1)} failed"
+    checks = "every check held" if not failed else f"{len(failed)} check{'s' * (len(failed) > 1)} to look at"
     return f"{numbers}; {checks}."
 
 

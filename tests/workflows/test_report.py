@@ -157,7 +157,14 @@ def _luminance(colour: str) -> float:
 def test_text_stands_out_from_its_ground(done):
     text = done.page.read_text()
     colours = dict(re.findall(r"--([\w-]+): (#\w{6})", text))
-    pairs = [("ink", "paper"), ("soft", "paper"), ("good-ink", "good"), ("bad-ink", "bad"), ("bad-ink", "paper")]
+    pairs = [
+        ("ink", "paper"),
+        ("soft", "paper"),
+        ("good-ink", "good"),
+        ("bad-ink", "bad"),
+        ("bad-ink", "paper"),
+        ("watch-ink", "watch"),
+    ]
     for ink, ground in pairs:
         light, dark = sorted((_luminance(colours[ink]), _luminance(colours[ground])), reverse=True)
         assert (light + 0.05) / (dark + 0.05) >= 7, (ink, ground)
