@@ -1,1 +1,23 @@
 """Sensor: photons to electrons to digital numbers."""
+
+from neusee.nodes.sensor._digital import crop, digitize, full_well
+from neusee.nodes.sensor._exposure import expose, gather, level
+from neusee.nodes.sensor._noise import dark_current, photon_noise, read_noise
+from neusee.nodes.sensor._saturation import Limits, limits, saturation
+from neusee.nodes.sensor._transfer import photon_transfer
+
+__all__ = [
+    "Limits",
+    "crop",
+    "dark_current",
+    "digitize",
+    "expose",
+    "full_well",
+    "gather",
+    "level",
+    "limits",
+    "photon_noise",
+    "photon_transfer",
+    "read_noise",
+    "saturation",
+]

@@ -1,0 +1,153 @@
+"""Light to photons: the level of the scene, the channels of the sensor, and all light together."""
+
+from typing import Annotated, Literal
+
+import torch
+from pydantic import Field
+from torch import Tensor
+
+from neusee.nodes import Check, node
+from neusee.nodes.sensor._saturation import Efficiency, Well, photons_per_joule, saturation
+from neusee.nodes.units import PositiveLength, Time
+from neusee.nodes.values import Bands
+
+Strength = Annotated[float, Field(ge=0, allow_inf_nan=False)]  #: multiple of what saturates
+
+
+@node()
+def expose(
+    irradiance: Tensor,
+    bands: Bands,
+    responses: Tensor,
+    level: Tensor | None = None,
+    *,
+    pixel_pitch: PositiveLength,
+    exposure: Time,
+) -> Tensor:
+    """Count the photons that each channel of a pixel takes in: sum over bands of r I level lambda t dx^2 / (h c).
+
+    Shapes: irradiance (..., band, y, x), responses (channel, band), level (band,) -> (..., channel, y, x).
+    Units:  irradiance W/m2 of the whole band (without level: of the band, with it: any); result photons.
+    Error:  one wavelength stands for its band: below (width / wavelength)^2 / 12, 5e-5 at 10 nm.
+    Raises: ValueError where the bands of the inputs differ.
+    Source: NeuSee, Eq. (photon_count); the channel sum as EMVA Standard 1288, release 4.0, for each wavelength.
+    """
+    weights = channel_weights(bands, responses, level, pixel_pitch=pixel_pitch, exposure=exposure)
+    if irradiance.ndim < 3 or irradiance.shape[-3] != weights.shape[1]:
+        raise ValueError(
+            f"irradiance {tuple(irradiance.shape)} is not (band, y, x) of {weights.shape[1]} bands: "
+            "give irradiance, bands and responses the same `bands` step"
+        )
+    flat = weights.to(irradiance) @ irradiance.flatten(-2)
+    return flat.reshape(*flat.shape[:-1], *irradiance.shape[-2:])
+
+
+@expose.reference
+def _(
+    irradiance: Tensor,
+    bands: Bands,
+    responses: Tensor,
+    level: Tensor | None = None,
+    *,
+    pixel_pitch: float,
+    exposure: float,
+) -> Tensor:
+    weights = channel_weights(bands, responses, level, pixel_pitch=pixel_pitch, exposure=exposure)
+    channels = [(row[:, None, None] * irradiance.double()).sum(-3) for row in weights.to(irradiance.device)]
+    return torch.stack(channels, -3)
+
+
+@expose.check
+def _(result: Tensor, *inputs: object, **params: object) -> list[Check]:
+    low, high = float(result.min()), float(result.max())
+    return [Check(f"brightest {high:.4g} photons", low >= -1e-3 * high)]
+
+
+def channel_weights(
+    bands: Bands, responses: Tensor, level: Tensor | None, *, pixel_pitch: float, exposure: float
+) -> Tensor:
+    """Photons in each channel for one unit of each band: (channel, band) float64."""
+    lengths = {len(bands.centres), responses.shape[-1]} | (set() if level is None else {len(level)})
+    if len(lengths) > 1:
+        raise ValueError(
+            f"bands {len(bands.centres)}, responses {tuple(responses.shape)}, level "
+            f"{None if level is None else tuple(level.shape)} must have the same bands: give them the same `bands` step"
+        )
+    photons = photons_per_joule(bands.centres) * (exposure * pixel_pitch**2)
+    weights = responses.double() * photons.to(responses.device)
+    return weights if level is None else weights * level.to(weights)
+
+
+@node()
+def level(
+    plain_image: Tensor,
+    bands: Bands,
+    responses: Tensor,
+    *,
+    strength: Strength,
+    full_well: Well,
+    quantum_efficiency: Efficiency,
+    pixel_pitch: PositiveLength,
+    exposure: Time,
+    rule: Literal["channel_sum", "per_band"] = "channel_sum",
+) -> Tensor:
+    """Find the factor that makes W/m2 of the unscaled image, so that the plain lens fills its brightest pixel.
+
+    `channel_sum`: the brightest pixel of the brightest channel holds strength x full well, summed over bands.
+    `per_band`: each band alone peaks at strength x I_sat, as the paper prints; 31 bands then overexpose.
+
+    Shapes: plain_image (..., band, y, x), responses (channel, band) -> (band,) float64.
+    Units:  result W/m2 per unit of the image.
+    Error:  exact; a scene without light has level 0.
+    Source: NeuSee, Eq. (peak_irrad_coded).
+    """
+    if rule == "per_band":
+        peaks = plain_image.amax((-2, -1)).reshape(-1, len(bands.centres)).amax(0).double()
+        top = saturation(
+            bands,
+            full_well=full_well,
+            quantum_efficiency=quantum_efficiency,
+            pixel_pitch=pixel_pitch,
+            exposure=exposure,
+        )
+    else:
+        photons: Tensor = expose(plain_image, bands, responses, pixel_pitch=pixel_pitch, exposure=exposure)
+        peaks = photons.amax().double().expand(len(bands.centres))
+        top = torch.tensor(full_well / quantum_efficiency, dtype=torch.float64)
+    lit = peaks > 0
+    return torch.where(lit, strength * top.to(peaks) / peaks.where(lit, 1.0), 0.0)
+
+
+@level.preflight
+def _(*, strength: float, rule: str = "channel_sum", **params: object) -> list[str]:
+    notes = (
+        [f"background of {strength:g} full wells saturates the plain lens without any laser"] if strength > 1 else []
+    )
+    return notes + (["level per band: each band alone fills the well"] if rule == "per_band" else [])
+
+
+@node(rtol=1e-6)
+def gather(photons: Tensor, lasers: list[Tensor] | None = None, ghosts: list[Tensor] | None = None) -> Tensor:
+    """Add the photons of the scene, of every laser and of every ghost: incoherent light adds.
+
+    Shapes: photons (..., channel, y, x), each laser and ghost the same -> (..., channel, y, x).
+    Units:  photons.
+    Error:  float32: 6e-8 of the sum.
+    Raises: ValueError where a shape differs.
+    Source: NeuSee, Eq. (photon_count).
+    """
+    total = photons
+    for added in [*(lasers or ()), *(ghosts or ())]:
+        if added.shape[-3:] != photons.shape[-3:]:
+            raise ValueError(
+                f"light of shape {tuple(added.shape)} cannot fall on {tuple(photons.shape)}: "
+                "give laser and scene the same `shape`"
+            )
+        total = total + added
+    return total
+
+
+@gather.check
+def _(result: Tensor, photons: Tensor, *others: object, **params: object) -> list[Check]:
+    scene, high = float(photons.max()), float(result.max())
+    return [Check(f"brightest pixel {high:.4g} photons, scene alone {scene:.4g}", high >= 0)]

@@ -1,0 +1,71 @@
+"""Where the sensor ends: the irradiance that fills a pixel, and the figures that follow from it."""
+
+import math
+from typing import Annotated, NamedTuple
+
+import torch
+from pydantic import Field
+from torch import Tensor
+
+from neusee.nodes import Check, node
+from neusee.nodes.constants import LIGHT, PLANCK
+from neusee.nodes.units import Electrons, PositiveLength, Time
+from neusee.nodes.values import Bands
+
+Efficiency = Annotated[float, Field(gt=0, le=1)]  #: electrons per photon
+Well = Annotated[Electrons, Field(gt=0)]  #: electrons that fill a pixel
+
+
+class Limits(NamedTuple):
+    """What a sensor can tell apart at best."""
+
+    photons: Tensor  #: () float64, photons that fill a pixel
+    snr: Tensor  #: () float64, signal to noise at saturation
+    dynamic_range: Tensor  #: () float64, dB
+
+
+def photons_per_joule(centres: Tensor) -> Tensor:
+    """Photons of each wavelength in a joule: wavelength / (h c)."""
+    return centres.double() / (PLANCK * LIGHT)
+
+
+@node(rtol=1e-12)
+def saturation(
+    bands: Bands, *, full_well: Well, quantum_efficiency: Efficiency, pixel_pitch: PositiveLength, exposure: Time
+) -> Tensor:
+    """Find the irradiance that fills a pixel within one exposure, of each wavelength alone.
+
+    Shapes: bands (band,) -> (band,) float64.
+    Units:  result W/m2.
+    Error:  exact for a fill factor of 1 and an efficiency that does not depend on wavelength. The paper's rounded
+            constants give 0.13 % more.
+    Source: NeuSee, Eq. (ThresSat).
+    """
+    joules = full_well / quantum_efficiency / photons_per_joule(bands.centres)
+    return joules / (exposure * pixel_pitch**2)
+
+
+@saturation.check
+def _(result: Tensor, bands: Bands, **params: object) -> list[Check]:
+    low, high = float(result.min()), float(result.max())
+    return [Check(f"I_sat {low:.3e} to {high:.3e} W/m2", math.isfinite(low + high) and low > 0)]
+
+
+@node(rtol=1e-12)
+def limits(*, full_well: Well, quantum_efficiency: Efficiency, read_noise: Electrons) -> Limits:
+    """Tell what the sensor can resolve at best: photons that fill a pixel, their signal to noise, the dynamic range.
+
+    Shapes: -> three scalars, float64.
+    Units:  photons; signal to noise as a ratio; dynamic range in dB, 20 log10(well / read noise).
+    Error:  shot noise alone at the top and read noise alone at the bottom; a read noise under 1 e- counts as 1 e-.
+    Source: EMVA Standard 1288, release 4.0 (SNR_max = sqrt(saturation capacity)).
+    """
+    decibels = 20.0 * math.log10(full_well / max(read_noise, 1.0))
+    values = (full_well / quantum_efficiency, math.sqrt(full_well), decibels)
+    return Limits(*(torch.tensor(v, dtype=torch.float64) for v in values))
+
+
+@limits.check
+def _(result: Limits, **params: object) -> list[Check]:
+    text = f"{float(result.photons):.0f} photons, SNR {float(result.snr):.1f}, {float(result.dynamic_range):.1f} dB"
+    return [Check(text, float(result.dynamic_range) > 0)]

@@ -1,0 +1,103 @@
+"""Full well, converter and window: exact numbers, both readings of the paper, true bounds."""
+
+import math
+
+import pytest
+import torch
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from neusee.nodes import Facts
+from neusee.nodes.sensor import crop, digitize, full_well
+
+
+def seeded():
+    return torch.Generator().manual_seed(0)
+
+
+@settings(max_examples=60, deadline=None)
+@given(
+    st.lists(st.floats(-1e6, 999999995904.0, width=32), min_size=1, max_size=6),
+    st.floats(1e-3, 1e3),
+    st.sampled_from(["e-/DN", "DN/e-"]),
+    st.sampled_from(["nearest", "dithered_floor"]),
+    st.integers(1, 16),
+)
+def test_digitize_agrees_with_its_reference(values, gain, unit, rounding, bits):
+    electrons = torch.tensor(values)
+    how = {"gain": gain, "gain_unit": unit, "rounding": rounding, "bits": bits}
+    found = digitize(electrons, **how, rng=seeded())
+    assert torch.equal(found, digitize.ref(electrons, **how, rng=seeded())) or rounding == "dithered_floor"
+    assert torch.equal(found, found.round())
+    assert float(found.min()) >= 0
+    assert float(found.max()) <= 2**bits - 1
+
+
+def test_dithered_floor_agrees_with_its_reference():
+    electrons = torch.rand(500, dtype=torch.float64) * 100
+    how = {"gain": 0.37, "rounding": "dithered_floor", "bits": 8}
+    assert torch.equal(digitize(electrons, **how, rng=seeded()), digitize.ref(electrons, **how, rng=seeded()))
+
+
+def test_gain_in_both_units():
+    well = torch.tensor([25500.0])
+    assert float(digitize(well, gain=0.37, gain_unit="DN/e-")) == 9435
+    assert float(digitize(well, gain=0.37, gain_unit="e-/DN")) == 65535
+    assert "24248 e-" in digitize.before(gain=0.37, gain_unit="e-/DN", bits=16)[0]
+
+
+def test_dithered_floor_lies_half_a_number_low_and_is_noisier():
+    line = torch.rand(400_000, dtype=torch.float64, generator=torch.Generator().manual_seed(1)) * 50 + 10
+    near = digitize(line, gain=1.0) - line
+    floor = digitize(line, gain=1.0, rounding="dithered_floor", rng=seeded()) - line
+    assert float(near.mean()) == pytest.approx(0.0, abs=3e-3)
+    assert float(near.var()) == pytest.approx(1 / 12, rel=0.01)
+    assert float(floor.mean()) == pytest.approx(-0.5, abs=3e-3)
+    assert float(floor.var()) == pytest.approx(1 / 6, rel=0.01)
+
+
+def test_dither_needs_a_generator():
+    with pytest.raises(ValueError, match="rng"):
+        digitize(torch.ones(1), gain=1.0, rounding="dithered_floor")
+
+
+@pytest.mark.parametrize("rounding", ["nearest", "dithered_floor"])
+def test_gradient_is_the_line_and_nothing_where_it_clips(rounding):
+    electrons = torch.tensor([-5.0, 10.2, 1e9]).requires_grad_()
+    digitize(electrons, gain=0.5, rounding=rounding, bits=8, rng=seeded()).sum().backward()
+    assert electrons.grad.tolist() == [0.0, 2.0, 0.0]
+
+
+@settings(max_examples=60, deadline=None)
+@given(st.lists(st.floats(0, 999999995904.0, width=32), min_size=1, max_size=8), st.floats(1.0, 1e6))
+def test_the_bound_of_the_full_well_is_true(values, capacity):
+    electrons = torch.tensor(values, dtype=torch.float64)
+    result = full_well(electrons, capacity=capacity)
+    bound = full_well.bound(Facts.of(electrons), capacity=capacity)
+    assert float((result - electrons).abs().max()) <= bound * float(result.abs().max()) * (1 + 1e-9)
+    assert (bound == 0) == (max(values) <= capacity)
+
+
+def test_full_well_counts():
+    (line,) = full_well.after(torch.tensor([5.0, 9.0, 9.0]), torch.zeros(3), capacity=9.0)
+    assert line.text == "2 of 3 full"
+
+
+@settings(max_examples=60, deadline=None)
+@given(st.integers(1, 12), st.integers(1, 12), st.integers(1, 12), st.integers(1, 12))
+def test_crop_keeps_the_axis(y, x, h, w):
+    image = torch.zeros(2, y, x)
+    image[:, y // 2, x // 2] = 1.0
+    if h > y or w > x:
+        with pytest.raises(ValueError, match="enlarge"):
+            crop(image, shape=(h, w))
+        return
+    window = crop(image, shape=(h, w))
+    assert window.shape == (2, h, w)
+    assert float(window[1, h // 2, w // 2]) == 1.0
+    assert crop.bound(Facts.of(image), shape=(h, w)) == (0.0 if (h, w) == (y, x) else math.inf)
+
+
+def test_check_of_the_converter():
+    assert not digitize.after(torch.full((4,), 255.0), torch.zeros(4), bits=8)[0].ok
+    assert digitize.after(torch.tensor([0.0, 1.0, 2.0, 255.0]), bits=8)[0].text == "25.00% at the top, 25.00% at 0 DN"

@@ -1,0 +1,101 @@
+"""Light to photons: units, conservation, the level of the scene, light that adds."""
+
+import pytest
+import torch
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from neusee.nodes.sensor import expose, gather, level, saturation
+from neusee.nodes.values import Bands
+
+SHUTTER = {"pixel_pitch": 2.9e-6, "exposure": 0.1}
+SENSOR = {"full_well": 25500.0, "quantum_efficiency": 0.56, **SHUTTER}
+CENTRES = torch.linspace(400e-9, 700e-9, 5, dtype=torch.float64)
+BANDS = Bands(CENTRES, torch.full_like(CENTRES, 1e-8), torch.ones_like(CENTRES))
+RESPONSES = torch.rand(3, 5, dtype=torch.float64, generator=torch.Generator().manual_seed(0))
+
+
+def scene(*shape, dtype=torch.float32):
+    return torch.rand(5, *shape, dtype=dtype, generator=torch.Generator().manual_seed(1))
+
+
+def test_saturating_light_of_one_wavelength_frees_a_full_well():
+    one = torch.zeros(5, 2, 2, dtype=torch.float64)
+    one[3] = saturation(BANDS, **SENSOR)[3]
+    photons = expose(one, BANDS, torch.ones(1, 5), **SHUTTER)
+    torch.testing.assert_close(photons * 0.56, torch.full_like(photons, 25500.0), rtol=1e-6, atol=0.0)
+
+
+def test_agrees_with_its_reference():
+    found = expose(scene(4, 3), BANDS, RESPONSES, torch.rand(5), **SHUTTER)
+    assert found.dtype == torch.float32
+    exact = expose.ref(scene(4, 3), BANDS, RESPONSES, torch.rand(5), **SHUTTER)
+    assert found.shape == exact.shape == (3, 4, 3)
+    again = expose(scene(4, 3), BANDS, RESPONSES, **SHUTTER)
+    torch.testing.assert_close(again.double(), expose.ref(scene(4, 3), BANDS, RESPONSES, **SHUTTER), rtol=1e-6, atol=0)
+
+
+@settings(max_examples=30, deadline=None)
+@given(st.floats(1e-6, 1e3), st.sampled_from([0.0, 1e-30, 1.0, 1e15]))
+def test_doubling_the_exposure_doubles_the_photons(exposure, scale):
+    light = scene(1, 1) * scale
+    one = expose(light, BANDS, RESPONSES, pixel_pitch=2.9e-6, exposure=exposure)
+    two = expose(light, BANDS, RESPONSES, pixel_pitch=2.9e-6, exposure=2 * exposure)
+    assert torch.isfinite(two).all()
+    torch.testing.assert_close(two, 2 * one, rtol=1e-5, atol=0.0)
+
+
+def test_a_batch_passes():
+    assert expose(scene(2, 2).expand(7, 5, 2, 2), BANDS, RESPONSES, **SHUTTER).shape == (7, 3, 2, 2)
+
+
+def test_gradient():
+    light = scene(2, 2, dtype=torch.float64).requires_grad_()
+    assert torch.autograd.gradcheck(lambda x: expose(x * 1e-3, BANDS, RESPONSES, **SHUTTER), (light,))
+
+
+@pytest.mark.parametrize("strength", [0.0, 0.7, 3.0])
+def test_level_fills_the_brightest_channel_to_the_strength(strength):
+    factor = level(scene(6, 6), BANDS, RESPONSES, strength=strength, **SENSOR)
+    electrons = 0.56 * expose(scene(6, 6), BANDS, RESPONSES, factor, **SHUTTER)
+    assert float(electrons.max()) == pytest.approx(strength * 25500, rel=1e-5)
+    assert len(set(factor.tolist())) == 1
+
+
+def test_level_per_band_lets_each_band_reach_the_strength():
+    factor = level(scene(6, 6), BANDS, RESPONSES, strength=0.7, rule="per_band", **SENSOR)
+    peaks = (scene(6, 6) * factor[:, None, None]).amax((-2, -1))
+    torch.testing.assert_close(peaks.double(), 0.7 * saturation(BANDS, **SENSOR), rtol=1e-6, atol=0.0)
+    assert "each band alone" in level.before(strength=0.7, rule="per_band")[0]
+    assert "saturates" in level.before(strength=2.0, rule="channel_sum")[0]
+
+
+@pytest.mark.parametrize("rule", ["channel_sum", "per_band"])
+@pytest.mark.parametrize("value", [0.0, 1e-40])
+def test_a_dark_scene_has_a_finite_level(rule, value):
+    factor = level(torch.full((5, 2, 2), value), BANDS, RESPONSES, strength=0.7, rule=rule, **SENSOR)
+    assert torch.isfinite(factor).all()
+    assert (value > 0) == bool(factor.any())
+
+
+def test_light_adds():
+    one, two, three = (torch.full((3, 2, 2), float(n)) for n in (1, 2, 3))
+    assert gather(one) is one
+    torch.testing.assert_close(gather(one, [two, two], [three]), torch.full((3, 2, 2), 8.0))
+    with pytest.raises(ValueError, match="cannot fall"):
+        gather(one, [torch.ones(3, 1, 1)])
+
+
+def test_bands_must_agree():
+    with pytest.raises(ValueError, match="same `bands` step"):
+        expose(scene(2, 2)[:4], BANDS, RESPONSES, **SHUTTER)
+    with pytest.raises(ValueError, match="must have the same bands"):
+        expose(scene(2, 2), BANDS, RESPONSES[:, :4], **SHUTTER)
+    with pytest.raises(ValueError, match="level"):
+        expose(scene(2, 2), BANDS, RESPONSES, torch.ones(3), **SHUTTER)
+
+
+def test_checks():
+    assert expose.after(torch.ones(3, 2, 2))[0].ok
+    assert not expose.after(torch.tensor([-1.0, 1.0]))[0].ok
+    assert "scene alone 1" in gather.after(torch.full((3, 1, 1), 4.0), torch.ones(3, 1, 1), [])[0].text
