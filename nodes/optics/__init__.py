@@ -1,5 +1,7 @@
 """Optics: pupil, point-spread function, image and laser spot."""
 
+from neusee.nodes.optics._image import image
 from neusee.nodes.optics._pupil import pupil
+from neusee.nodes.optics._spot import spot
 
-__all__ = ["pupil"]
+__all__ = ["image", "pupil", "spot"]
