@@ -46,7 +46,8 @@ class Family:
         told = next((d for d in done if any(not c.ok for c in d.checks)), done[0])
         shape = shape_of(told)
         check = "; ".join(("" if c.ok else "LOOK: ") + c.text for c in told.checks)
-        check = check or (told.why if told.state == "left out" else "")
+        why = next((d.why for d in done if d.state in ("run", "left out") and d.why), "")
+        check = f"{check}  ({why})" if check and why else check or why
         return (name, told.device, self.state(), f"{ran:.3f}" if ran else "", f"{shape} {self.unit}".strip(), check)
 
     def state(self) -> str:

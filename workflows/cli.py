@@ -55,6 +55,7 @@ def run(
     recipe, command = load(words)
     from neusee.workflows import _console as console
 
+    check_device(device)
     if not (as_json or quiet):
         say(console.opening(recipe, " ".join(command[1:])))
     done = _simulate(recipe, command, device, out, as_json or quiet)
@@ -180,6 +181,16 @@ def load(words: list[str] | None) -> tuple[Recipe, list[str]]:
     except RecipeError as error:
         count = len(error.problems)
         fail(f"{error}\n{count} problem{'s' * (count > 1)}, nothing was run")
+
+
+def check_device(device: str) -> None:
+    """Refuse a device that is no device, or is not here."""
+    import torch
+
+    try:
+        torch.empty(0, device=device)
+    except (RuntimeError, AssertionError) as error:
+        fail(f"--device {device}: {str(error).partition(chr(10))[0]}")
 
 
 def _is_change(word: str) -> bool:

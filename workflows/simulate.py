@@ -6,7 +6,7 @@ import json
 import warnings
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from contextlib import contextmanager
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -17,9 +17,10 @@ from neusee.workflows._files import RunFolder, new_run
 from neusee.workflows._graph import Recipe, needed
 from neusee.workflows._keys import digest
 from neusee.workflows._roles import SHOWN, TABLE
-from neusee.workflows._run import Event, Result, run
+from neusee.workflows._run import Done, Event, Result, run
 from neusee.workflows._shelf import Shelf
 from neusee.workflows._store import Store
+from neusee.workflows._why import explained
 
 _TIMING = ("step", "node", "device", "state", "seconds", "bytes", "key")
 
@@ -54,10 +55,24 @@ def simulate(
 ) -> Simulation:
     """Run ``recipe`` and write ``runs/<date>_<recipe>_<key>/``, complete or not at all."""
     with _noted() as notes:
-        result = run(recipe, store, wanted(recipe), watch, device)
+        told: dict[str, Done] = {}
+        result = run(recipe, store, wanted(recipe), explained(recipe, store, _both(told, watch)), device)
+        result = replace(result, done={name: told.get(name, done) for name, done in result.done.items()})
         with new_run(runs, recipe.name, _run_key(result)) as folder:
             doc = _write(result, folder, command, notes)
     return Simulation(folder.path, doc)
+
+
+def _both(told: dict[str, Done], watch: Callable[[Event], None] | None) -> Callable[[Event], None]:
+    """A watch that also remembers what it was told."""
+
+    def note(event: Event) -> None:
+        if event.done is not None:
+            told[event.step] = event.done
+        if watch is not None:
+            watch(event)
+
+    return note
 
 
 def steps_of(recipe: Recipe) -> list[str]:

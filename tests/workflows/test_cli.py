@@ -105,6 +105,17 @@ def test_a_changed_value_runs_only_what_follows(neusee):
     assert states == {"cone": "cached", "made": "run"}
 
 
+def test_a_row_says_why_it_ran(neusee):
+    _, out, _ = neusee("run", "mine.yaml")
+    assert "→" not in out
+    _, out, _ = neusee("run", "mine.yaml", "mask.max_height=1.3 um")
+    assert "max_height 1.2e-06 → 1.3e-06" in next(line for line in out.splitlines() if line.startswith("  made"))
+    _, out, _ = neusee("run", "mine.yaml", "mask.waves=3")
+    rows = {line.split()[0]: line for line in out.splitlines() if line.startswith("  ")}
+    assert "waves 2 → 3" in rows["cone"]
+    assert "after cone" in rows["made"]
+
+
 def test_json_is_one_document_and_quiet_is_the_path(neusee, here):
     code, out, _ = neusee("run", "mine.yaml", "--json")
     document = json.loads(out)
@@ -148,6 +159,7 @@ def test_mistakes_come_all_at_once_located_and_nothing_runs(neusee, here):
         (["nodes", "doe.flatt"], "doe.flat"),
         (["report", "nowhere"], "no run at nowhere"),
         (["explode"], "explode"),
+        (["run", "mine.yaml", "--device", "toaster"], "--device toaster"),
         (["run", "no_such_recipe"], "no_such_recipe"),
     ],
 )
