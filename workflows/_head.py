@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from difflib import get_close_matches
 from typing import Any
 
 from neusee.workflows._graph import Expectation
@@ -36,6 +37,8 @@ def outputs_of(root: Value, wiring: Wiring) -> tuple[str, ...]:
     given = root.items.get("outputs")
     if given is None or given.data in (None, "", [], {}):
         mark = root.mark if given is None else given.mark
+        if given is None and get_close_matches("outputs", map(str, root.items)):
+            return ()  # misspelt, and reported as unknown
         wiring.problems.append(Problem(mark, "outputs", "nothing is asked for: write outputs: [STEP, …]"))
         return ()
     if isinstance(given.data, dict):
@@ -66,8 +69,9 @@ def _expectation(name: str, given: Value, wiring: Wiring) -> Expectation | None:
     for key, value in said.items():
         if key not in _EXPECTED:
             wiring.problems.append(Problem(value.key, value.name, f"unknown; {nearest(str(key), _EXPECTED)}"))
+    meant = {nearest(str(key), _EXPECTED) for key in said if key not in _EXPECTED}
     for key in ("step", "value", "rtol"):
-        if key not in said:
+        if key not in said and f"did you mean {key}?" not in meant:
             wiring.problems.append(Problem(given.key, given.name, f"needs {key}: {{step, value, rtol}} and perhaps at"))
     for key in ("value", "rtol"):
         if key in said and not (_is_number(said[key].data) and (key == "value" or said[key].data >= 0)):

@@ -88,7 +88,7 @@ def _problems(
         name = str(e["loc"][0])
         if e["type"] == "extra_forbidden":
             hint = nearest(name, node.params.model_fields)
-            yield Problem(values[name].key, values[name].name, f"unknown to {node.path}; {hint}")
+            yield Problem(values[name].key, f"{given.name}.{name}", f"unknown to {node.path}; {hint}")
         elif e["type"] == "missing" and len(e["loc"]) == 1:
             if f"did you mean {name}?" not in meant:
                 yield Problem(step, f"{given.name}.{name}", f"is missing: {node.path} needs it")
@@ -117,11 +117,14 @@ def _said(value: Value) -> str:
 
 def _message(error: ErrorDetails) -> str:
     """What pydantic says, as one line that says what to write."""
+    if error["type"] == "missing":
+        return f"must have at least {int(error['loc'][-1]) + 1} values"
     text = error["msg"].removeprefix("Value error, ")
     text = re.sub(
         r"^Input should be (a valid |valid )?", lambda m: "must be a " if m[1] == "a valid " else "must be ", text
     )
     text = re.sub(r"^must be a (?=[aeiou])", "must be an ", text)
+    text = text.replace("must be a tuple", "must be a list, such as [1, 2]").replace("a dictionary", "a mapping")
     text = text.replace("must be an integer, got a number with a fractional part", "must be a whole number")
     text = re.sub(r"must be an? (integer|number), unable to parse .*", _number_wanted, text)
     if error["type"] == "literal_error":

@@ -8,7 +8,7 @@ from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import Any
 
-from neusee.workflows._marks import Problem, nearest
+from neusee.workflows._marks import Problem
 from neusee.workflows._overrides import RESERVED
 from neusee.workflows._yaml import Value, Where, dotted
 
@@ -49,7 +49,8 @@ class References:
     def resolve(self, value: Value, scope: Scope) -> Value:
         """``value`` with every reference followed; what cannot be followed is a problem, and None."""
         if isinstance(value.data, dict):
-            return replace(value, data={key: self.resolve(child, scope) for key, child in value.data.items()})
+            children = ((key, child, self.resolve(child, scope)) for key, child in value.data.items())
+            return replace(value, data={key: replace(found, key=child.key) for key, child, found in children})
         if isinstance(value.data, list):
             return replace(value, data=[self.resolve(child, scope) for child in value.data])
         if not isinstance(value.data, str) or "${" not in value.data:
@@ -113,9 +114,9 @@ class References:
         if any(_follow(other, parts) for other in siblings):
             problem = Problem(start.key, start.name, f"has no {name}; steps.{scope.step} needs it")
         else:
-            hint = nearest(dotted(wanted), [leaf.name for leaf in self.root.leaves() if leaf.path[0] not in RESERVED])
-            near = f"; {hint}" if hint.startswith("did you mean") else ""
-            problem = Problem(origin.mark, origin.name, f"${{{dotted(wanted)}}} is unknown{near}")
+            near = _nearest(wanted, {leaf.path for leaf in self.root.leaves() if leaf.path[0] not in RESERVED})
+            hint = f"; did you mean {dotted(near)}?" if near else ""
+            problem = Problem(origin.mark, origin.name, f"${{{dotted(wanted)}}} is unknown{hint}")
         self.lacking.append((wanted, problem))
 
     def _fail(self, origin: Value, message: str) -> Value:
@@ -127,11 +128,11 @@ class References:
         for text in _texts(value):
             for match in _REFERENCE.finditer(text.data):
                 parts = match[1].strip().split(".")
-                if parts[0] == "each" or (parts[0] == "item" and len(dims) == 1):
-                    dim, rest = (parts[1], parts[2:]) if parts[0] == "each" and len(parts) > 1 else (dims[0], parts[1:])
-                    self.used |= {(dim, *item, *rest) for item in self._names(dim)}
-                elif parts[0] != "item":
+                if parts[0] not in ("item", "each"):
                     self._target(match[1], text, Scope({}, ""))
+                    continue
+                rest = parts[1 if parts[0] == "item" else 2 :]
+                self.used |= {(dim, *item, *rest) for dim in dims or self.root.items for item in self._names(str(dim))}
 
     def _names(self, dim: str) -> Iterator[tuple[str | int]]:
         block = self.root.items.get(dim)
@@ -161,13 +162,17 @@ class References:
         """The nearest path that steps do refer to, first among those beside it."""
         known = {*self.used, *(wanted for wanted, _ in self.lacking)}
         known |= {(name,) for name in (*RESERVED, "defaults")} if len(leaf.path) == 1 else set()
-        beside = {str(path[-1]): path for path in known if path[:-1] == leaf.path[:-1]}
-        anywhere = {dotted(path): path for path in known}
-        for name, paths in ((str(leaf.path[-1]), beside), (leaf.name, anywhere)):
-            close = difflib.get_close_matches(name, paths, 1)
-            if close:
-                return paths[close[0]]
-        return None
+        return _nearest(leaf.path, known)
+
+
+def _nearest(path: Where, known: set[Where]) -> Where | None:
+    """The path whose last name is nearest, first among those beside it."""
+    beside = {str(other[-1]): other for other in known if other[:-1] == path[:-1]}
+    for paths in (beside, {str(other[-1]): other for other in known}):
+        close = difflib.get_close_matches(str(path[-1]), paths, 1, 0.75)
+        if close:
+            return paths[close[0]]
+    return None
 
 
 BROKEN = type("Broken", (), {"__repr__": lambda self: "?", "__doc__": "What a reference that fails leaves."})()

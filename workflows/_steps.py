@@ -29,7 +29,7 @@ class Declared:
     value: Value
     node: Node | None  #: None where no such node is found: its wires are still looked at
     dims: tuple[str, ...]
-    items: tuple[tuple[str, ...], ...]  #: one empty tuple where there is no ``each``
+    items: tuple[tuple[str, ...], ...]  #: one empty tuple where there is no ``each``; nothing where that is wrong
 
     def instance(self, items: tuple[str, ...]) -> str:
         return f"{self.name}[{','.join(items)}]" if items else self.name
@@ -63,8 +63,10 @@ def declare(
     for name, value in given.data.items():
         if value.data is not None and _well_formed(str(name), value, problems):
             node, dims = _node(value, nodes, references, problems), _dims(value, root, problems)
-            items = tuple(itertools.product(*(map(str, root.items[dim].items) for dim in dims)))
-            steps[str(name)] = Declared(str(name), value, node, dims, items)
+            items = tuple(itertools.product(*(map(str, root.items[dim].items) for dim in dims or ())))
+            steps[str(name)] = Declared(str(name), value, node, dims or (), () if dims is None else items)
+        elif value.data is not None:
+            steps[str(name)] = Declared(str(name), value, None, (), ())
     return steps, absent
 
 
@@ -99,14 +101,15 @@ def _node(step: Value, nodes: dict[str, Node], references: References, problems:
         return None
 
 
-def _dims(step: Value, root: Value, problems: list[Problem]) -> tuple[str, ...]:
-    """The item lists of ``each``: none, one or two."""
+def _dims(step: Value, root: Value, problems: list[Problem]) -> tuple[str, ...] | None:
+    """The item lists of ``each``: none, one or two; None if there is something wrong with them."""
     given = step.items.get("each")
     if given is None or given.data is None:
         return ()
     named = list(given.items.values()) if isinstance(given.data, list) else [given]
     lists = [key for key, block in root.items.items() if key != "steps" and _is_item_list(block)]
     dims: list[str] = []
+    before = len(problems)
     for value in named:
         block = root.items.get(value.data) if isinstance(value.data, str) else None
         if block is None or value.data not in lists:
@@ -121,7 +124,7 @@ def _dims(step: Value, root: Value, problems: list[Problem]) -> tuple[str, ...]:
                 for key, item in block.items.items()
                 if not _ITEM.fullmatch(str(key))
             ]
-    return tuple(dims)
+    return tuple(dims) if len(problems) == before else None
 
 
 def _is_item_list(block: Value) -> bool:

@@ -34,7 +34,9 @@ class Wiring:
         given = self.references.resolve(step.part("from"), step.scope(self.root, items))
         if step.node is None:
             return {}
-        named = self._by_input(step, step.node, given)
+        named = self._by_input(step.node, given)
+        if named is None:
+            return {}
         found: dict[str, Wire] = {}
         for name in step.node.inputs:
             if name not in named:
@@ -47,18 +49,20 @@ class Wiring:
         """Steps named by an output or an expectation."""
         return self._producers(value, path, {}) or ()
 
-    def _by_input(self, step: Declared, node: Node, given: Value) -> dict[str, Value]:
-        """What ``from`` says, by input; a single name feeds the first."""
-        if given.data is None or given.data is BROKEN:
+    def _by_input(self, node: Node, given: Value) -> dict[str, Value] | None:
+        """What ``from`` says, by input; a single name feeds the first. None if it cannot be read."""
+        if given.data is BROKEN:
+            return None
+        if given.data is None:
             return {}
         if isinstance(given.data, list):
             self._refuse(given, given.name, "must be a step's name, or a mapping of inputs to names, not a list")
-            return {}
+            return None
         if not isinstance(given.data, dict):
             if node.inputs:
                 return {node.inputs[0]: given}
             self._refuse(given, given.name, f"{node.path} takes no inputs: leave `from` out")
-            return {}
+            return None
         for name, value in given.data.items():
             if name not in node.inputs:
                 hint = nearest(str(name), node.inputs)
