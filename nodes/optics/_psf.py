@@ -1,0 +1,209 @@
+"""The point-spread function: the lens, the element and the sensor's sampling in one scaled transform."""
+
+import math
+from dataclasses import replace
+from typing import Literal, NamedTuple
+
+import torch
+from torch import Tensor
+
+from neusee.nodes import Check, node
+from neusee.nodes.optics._axis import Axis, centred
+from neusee.nodes.optics._intensity import PupilIntensity, Sampling, View
+from neusee.nodes.optics._transform import Method
+from neusee.nodes.units import Angle, PositiveLength, Shape
+from neusee.nodes.values import Psf, Pupil
+
+
+class _Camera(NamedTuple):
+    """What stands behind the pupil, in metres, radians and pixels."""
+
+    focal_length: float
+    pixel_pitch: float
+    shape: tuple[int, int]
+    angle: tuple[float, float]
+    zoh: bool
+    integrated: bool
+
+
+@node(rtol=2e-6)
+def psf(
+    pupil: Pupil,
+    *,
+    focal_length: PositiveLength,
+    pixel_pitch: PositiveLength,
+    shape: Shape,
+    angle: tuple[Angle, Angle] = (0.0, 0.0),
+    pixel: Literal["point", "zoh"] = "point",
+    sensor: Literal["point", "integrated"] = "point",
+    precision: Literal["single", "double"] = "single",
+) -> Psf:
+    """Focus the pupil on the sensor by the scaled Fraunhofer integral, at the sensor's own pitch.
+
+    A source at ``angle`` (n_y, n_x) has its spot at (f n_y, f n_x), to a fraction of a pixel.
+    ``pixel="zoh"`` holds the element constant over each square pupil pixel (a sinc envelope).
+    ``sensor="integrated"`` averages over the square of the sensor's pixel, ``"point"`` samples its middle.
+    The gradient reaches amplitude, height and path, once (a second derivative raises).
+
+    Shapes: pupil (v, u) -> intensity (band, y, x), clear_peak (band,).
+    Units: metres -> share of the clear pupil's light per pixel, not normalised to sum one.
+    Error: single, 2e-6 of the brightest pixel and 1e-4 of a tail at 1e-8 of it; double, 1e-12;
+        integrated, further 1e-5 of the clear peak.
+    Raises: ValueError where the window reaches beyond half the alias-free field, lambda f / (2 pitch), from the spot.
+    Source: Goodman, Introduction to Fourier Optics, 3rd edition, eq. 5-14 (field in the focal plane of a lens).
+    """
+    camera = _Camera(focal_length, pixel_pitch, shape, angle, pixel == "zoh", sensor == "integrated")
+    return _focus(pupil, camera, torch.float64 if precision == "double" else torch.float32, "auto")
+
+
+@psf.reference
+def _(
+    pupil: Pupil,
+    *,
+    focal_length: PositiveLength,
+    pixel_pitch: PositiveLength,
+    shape: Shape,
+    angle: tuple[Angle, Angle] = (0.0, 0.0),
+    pixel: Literal["point", "zoh"] = "point",
+    sensor: Literal["point", "integrated"] = "point",
+    precision: Literal["single", "double"] = "single",
+) -> Psf:
+    camera = _Camera(focal_length, pixel_pitch, shape, angle, pixel == "zoh", sensor == "integrated")
+    return _focus(pupil, camera, torch.float64, "direct")
+
+
+@psf.check
+def _(result: Psf, pupil: Pupil, **params: object) -> list[Check]:
+    shares = 100 * result.intensity.detach().sum(dim=(1, 2), dtype=torch.float64)
+    low, high = float(shares.min()), float(shares.max())
+    energy = f"energy in window {low:.1f} %" + (f" to {high:.1f} %" if high - low >= 0.05 else "")
+    step = phase_step(pupil)
+    verdict = "< 0.5" if step < 0.5 else ">= 0.5: jumps, or a slope that this pupil pitch aliases"
+    return [Check(energy, low >= 0.0 and high < 100.1), Check(f"phase step max {step:.2f} turn {verdict}", step < 0.5)]
+
+
+def phase_step(pupil: Pupil) -> float:
+    """Largest step of the phase between neighbours inside the aperture, in turns, over all bands."""
+    inside, largest = pupil.aperture > 0, 0.0
+    shortest = int(pupil.wavelengths.argmin())
+    turns = (pupil.index[shortest] * pupil.height.detach() + pupil.path.detach()) / pupil.wavelengths[shortest]
+    for axis in (0, 1):
+        step = turns.diff(dim=axis).abs_()
+        n = step.shape[axis]
+        step.mul_(inside.narrow(axis, 0, n) & inside.narrow(axis, 1, n))
+        largest = max(largest, float(step.max()) if step.numel() else 0.0)
+    return largest
+
+
+def _focus(pupil: Pupil, camera: _Camera, dtype: torch.dtype, method: Method) -> Psf:
+    _agree(pupil)
+    _refuse_aliases(pupil, camera)
+    views, area, total = [], *_area(pupil)
+    peaks: list[float] = []
+    for band in range(pupil.wavelengths.numel()):
+        views += _views(pupil, camera, band, 1 / area, dtype)
+        peaks.append(_clear_peak(pupil, camera, band, area, total))
+    sampling = Sampling(tuple(views), dtype, method)
+    intensity: Tensor = PupilIntensity.apply(pupil.amplitude, pupil.height, pupil.path, sampling)  # type: ignore[no-untyped-call]
+    return Psf(intensity, torch.tensor(peaks, dtype=torch.float64, device=intensity.device))
+
+
+def _area(pupil: Pupil) -> tuple[float, float]:
+    """Light through the clear pupil and its field on the axis, in samples."""
+    return float(pupil.aperture.square().sum(dtype=torch.float64)), float(pupil.aperture.sum(dtype=torch.float64))
+
+
+def _alpha(pupil: Pupil, camera: _Camera, band: int) -> float:
+    return float(pupil.pitch) * camera.pixel_pitch / (float(pupil.wavelengths[band]) * camera.focal_length)
+
+
+def _views(pupil: Pupil, camera: _Camera, band: int, scale: float, dtype: torch.dtype) -> list[View]:
+    """The windows of point samples that make the pixels of one band: one, or one per quadrature node."""
+    alpha, wavelength = _alpha(pupil, camera, band), float(pupil.wavelengths[band])
+    nodes, weights = _nodes(max(pupil.height.shape) * alpha) if camera.integrated else ([0.0], [1.0])
+    axes = [Axis(n, k, alpha) for n, k in zip(pupil.height.shape, camera.shape, strict=True)]
+    views = []
+    for y, wy in zip(nodes, weights, strict=True):
+        for x, wx in zip(nodes, weights, strict=True):
+            middle = [(n - 1) / 2 - c + s for n, c, s in zip(camera.shape, _spot(camera), (y, x), strict=True)]
+            tilt = (-alpha * middle[0], -alpha * middle[1])
+            envelope = _envelopes(camera, alpha, middle, dtype, pupil.height.device) if camera.zoh else None
+            turns_height, turns_path = float(pupil.index[band]) / wavelength, 1 / wavelength
+            weight = wy * wx * scale * alpha**2
+            views.append(View(band, axes[0], axes[1], turns_height, turns_path, tilt, weight, envelope))
+    return views
+
+
+def _spot(camera: _Camera) -> list[float]:
+    """Where the spot lies on the sensor's grid, in samples."""
+    return [
+        n // 2 + camera.focal_length * a / camera.pixel_pitch for n, a in zip(camera.shape, camera.angle, strict=True)
+    ]
+
+
+def _envelopes(
+    camera: _Camera, alpha: float, middle: list[float], dtype: torch.dtype, device: torch.device
+) -> tuple[Tensor, Tensor]:
+    pair = [
+        torch.sinc((centred(n, device) + m) * alpha).square().to(dtype)
+        for n, m in zip(camera.shape, middle, strict=True)
+    ]
+    return pair[0], pair[1]
+
+
+def _nodes(bandwidth: float) -> tuple[list[float], list[float]]:
+    """Gauss-Legendre nodes over one pixel, as few as integrate its fastest fringe to 5e-6.
+
+    ``bandwidth``: fringes per pixel from opposite rims of the pupil. As the clear pupil's
+    transfer function bounds any other, the error is below 1e-5 of the clear peak.
+    """
+    import numpy as np
+
+    fringes = np.linspace(0, bandwidth, 65)
+    for count in range(2, 65):
+        x, w = np.polynomial.legendre.leggauss(count)
+        if np.abs(np.cos(math.pi * np.outer(fringes, x)) @ w / 2 - np.sinc(fringes)).max() < 5e-6:
+            break
+    return (x / 2).tolist(), (w / 2).tolist()
+
+
+def _clear_peak(pupil: Pupil, camera: _Camera, band: int, area: float, total: float) -> float:
+    """The pixel on the axis with nothing but the clear aperture, sampled as the rest is."""
+    alpha = _alpha(pupil, camera, band)
+    if not camera.integrated:
+        return total**2 * alpha**2 / area
+    centre = camera._replace(shape=(1, 1), angle=(0.0, 0.0))
+    nothing = torch.zeros_like(pupil.height)
+    views = _views(pupil, centre, band, 1 / area, torch.float64)
+    sampling = Sampling(tuple(replace(view, band=0) for view in views), torch.float64)
+    return float(PupilIntensity.apply(pupil.aperture, nothing, nothing, sampling))  # type: ignore[no-untyped-call]
+
+
+def _agree(pupil: Pupil) -> None:
+    shapes = {name: tuple(getattr(pupil, name).shape) for name in ("aperture", "amplitude", "height", "path")}
+    if len(set(shapes.values())) != 1 or pupil.height.dim() != 2:
+        raise ValueError(f"the pupil's parts differ in shape: {shapes}; give each the same (v, u)")
+    if pupil.index.shape != pupil.wavelengths.shape or pupil.index.dim() != 1:
+        raise ValueError(
+            f"index {tuple(pupil.index.shape)} and wavelengths {tuple(pupil.wavelengths.shape)} differ: "
+            "give one index for each band"
+        )
+    if not bool((pupil.aperture > 0).any()):
+        raise ValueError("the aperture is closed everywhere: no light to normalise by")
+
+
+def _refuse_aliases(pupil: Pupil, camera: _Camera) -> None:
+    """A sampled pupil repeats its PSF every lambda f / pitch; only with square pillars is the repeated light real."""
+    if camera.zoh:
+        return
+    shortest = float(pupil.wavelengths.min())
+    limit = shortest * camera.focal_length / (2 * float(pupil.pitch))
+    for axis, n, spot in zip("yx", camera.shape, _spot(camera), strict=True):
+        reach = max(abs(0 - spot), abs(n - 1 - spot)) * camera.pixel_pitch
+        if reach > limit * (1 + 1e-9):
+            raise ValueError(
+                f"the window reaches {reach * 1e3:.3g} mm from the spot along {axis}, but at {shortest * 1e9:.4g} nm "
+                f"a pupil pitch of {float(pupil.pitch) * 1e6:.4g} um carries only {limit * 1e3:.3g} mm "
+                "(lambda f / (2 pitch)) before the PSF repeats: take a smaller angle, a smaller shape, "
+                "a finer pupil pitch, or pixel='zoh'"
+            )

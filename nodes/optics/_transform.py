@@ -1,0 +1,75 @@
+"""The scaled Fourier transform between two grids of any pitch: which method, and the plain call."""
+
+from typing import Literal
+
+import torch
+from torch import Tensor
+
+from neusee.nodes.optics._axis import Axis, Sink, Source, centred, unit_phasor
+from neusee.nodes.optics._direct import direct, folded
+from neusee.nodes.optics._workspace import Workspace, borrowed
+
+Method = Literal["auto", "direct", "folded", "bluestein", "kaiser_bessel"]
+_METHODS = {"direct": direct, "folded": folded}
+
+
+def propagate(rows: Axis, columns: Axis, source: Source, sink: Sink, work: Workspace, method: Method = "auto") -> None:
+    """Transform what ``source`` gives, in pieces that fit the cache, and hand the pieces of the result to ``sink``."""
+    name = cheapest(rows, columns, work) if method == "auto" else method
+    _METHODS[name](rows, columns, source, sink, work)
+
+
+def cheapest(rows: Axis, columns: Axis, work: Workspace) -> str:
+    """The method with the least expected time."""
+    return "folded"
+
+
+def transform(
+    field: Tensor,
+    shape: tuple[int, int],
+    alpha: tuple[float, float],
+    centre_in: tuple[float, float],
+    centre_out: tuple[float, float],
+    *,
+    sign: int = -1,
+    method: Method = "auto",
+) -> Tensor:
+    """``U = K_y P K_x^T`` with kernels ``exp(sign 2 pi i alpha (j - centre_in) (k - centre_out))``, each per axis.
+
+    The field is complex64 or complex128, of any shape (v, u); both centres may lie between
+    samples or outside. Phases are float64, reduced to half a turn before they are cast.
+    """
+    axes = [Axis(n, k, a, sign) for n, k, a in zip(field.shape, shape, alpha, strict=True)]
+    real = field.real.dtype
+    before, after = _tilts(axes, centre_in, centre_out, real, field.device)
+    planes = torch.view_as_real(field * before).movedim(2, 0)
+    out = torch.empty(shape, dtype=field.dtype, device=field.device)
+    parts = torch.view_as_real(out).movedim(2, 0)
+
+    def source(start: int, stop: int, into: Tensor) -> None:
+        into.copy_(planes[:, start:stop])
+
+    def sink(rows: slice, columns: slice, patch: Tensor) -> None:
+        parts[:, rows, columns] = patch
+
+    with borrowed(real, field.device) as work:
+        propagate(axes[0], axes[1], source, sink, work, method)
+    return out.mul_(after)
+
+
+def _tilts(
+    axes: list[Axis],
+    centre_in: tuple[float, float],
+    centre_out: tuple[float, float],
+    real: torch.dtype,
+    device: torch.device,
+) -> tuple[Tensor, Tensor]:
+    """Phasors that turn the transform about the middles into the one about the given centres."""
+    before, after = [], []
+    for axis, c_in, c_out in zip(axes, centre_in, centre_out, strict=True):
+        d_in, d_out = (axis.n_in - 1) / 2 - c_in, (axis.n_out - 1) / 2 - c_out
+        a = axis.sign * axis.alpha
+        before.append(centred(axis.n_in, device) * (a * d_out))
+        after.append((centred(axis.n_out, device) + d_out) * (a * d_in))
+    pair = [unit_phasor(v[:, None] + u, real) for v, u in (before, after)]
+    return pair[0], pair[1]

@@ -1,0 +1,46 @@
+"""Buffers that are kept: a fresh 100 MB temporary costs more in page faults than the transform it serves."""
+
+import contextlib
+import threading
+from collections.abc import Iterator
+from math import prod
+
+import torch
+from torch import Tensor
+
+_IDLE_AT_MOST = 2
+_idle: list["Workspace"] = []
+_lock = threading.Lock()
+
+
+class Workspace:
+    """Named buffers of one caller at a time; a name always returns the same memory, grown when needed."""
+
+    def __init__(self, dtype: torch.dtype, device: torch.device) -> None:
+        self.dtype, self.device = dtype, device
+        self._flat: dict[tuple[str, torch.dtype], Tensor] = {}
+
+    def take(self, name: str, *shape: int, dtype: torch.dtype | None = None) -> Tensor:
+        """Uninitialised buffer; what another buffer of this name held is gone."""
+        key = (name, dtype or self.dtype)
+        flat, size = self._flat.get(key), prod(shape)
+        if flat is None or flat.numel() < size:
+            self._flat.pop(key, None)
+            flat = self._flat[key] = torch.empty(size, dtype=key[1], device=self.device)
+        return flat[:size].view(shape)
+
+
+@contextlib.contextmanager
+def borrowed(dtype: torch.dtype, device: torch.device) -> Iterator[Workspace]:
+    """Lend a workspace that no other thread has; at most two idle ones are kept."""
+    with _lock:
+        fits = [w for w in _idle if (w.dtype, w.device) == (dtype, device)]
+        work = fits[-1] if fits else Workspace(dtype, device)
+        if fits:
+            _idle.remove(work)
+    try:
+        yield work
+    finally:
+        with _lock:
+            _idle.append(work)
+            del _idle[:-_IDLE_AT_MOST]
