@@ -4,18 +4,17 @@ from __future__ import annotations
 
 import importlib
 import inspect
-import pkgutil
 import re
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any, get_args
 
-import neusee.nodes
 import neusee.recipes
 from neusee.nodes import Node, units
 from neusee.workflows._marks import nearest
 from neusee.workflows._readings import READINGS
 from neusee.workflows._recipe import groups, recipes
+from neusee.workflows._steps import all_nodes
 
 _FOLDER = Path(neusee.recipes.__file__).parent
 _KINDS = ("PositiveLength", "Length", "Wavelength", "Time", "Angle", "Temperature", "Electrons", "Waves", "DataFile")
@@ -32,17 +31,6 @@ _SAID = {
 }
 
 
-def all_nodes() -> dict[str, Node]:
-    """Every public node by the name a recipe writes."""
-    found: dict[str, Node] = {}
-    for family in pkgutil.iter_modules(neusee.nodes.__path__):
-        if family.ispkg:
-            module = importlib.import_module(f"neusee.nodes.{family.name}")
-            nodes = (getattr(module, name) for name in sorted(getattr(module, "__all__", ())))
-            found |= {node.path: node for node in nodes if isinstance(node, Node)}
-    return found
-
-
 def recipe_lines() -> list[str]:
     """Each recipe with its first line, then the groups that it may choose from."""
     found = recipes()
@@ -54,7 +42,7 @@ def recipe_lines() -> list[str]:
 
 def nodes_lines() -> list[str]:
     """Every node by family, with the first sentence of what it does."""
-    nodes = all_nodes()
+    nodes = dict(all_nodes())
     wide = max(map(len, nodes), default=0)
     lines: list[str] = []
     for path, node in nodes.items():
@@ -69,7 +57,7 @@ def node_lines(name: str) -> list[str]:
     """One node: its physics, its inputs and parameters, and where it is used; or all readings."""
     if name == "reading":
         return [line for row in READINGS for line in (*_reading(row.name), "")]
-    nodes = all_nodes()
+    nodes = dict(all_nodes())
     if name not in nodes:
         raise LookupError(f"no node {name}: {nearest(name, nodes)}")
     node, uses = nodes[name], list(_uses(name))
@@ -165,51 +153,3 @@ def _reading(name: str) -> list[str]:
 def _first(text: str | None) -> str:
     """The first sentence."""
     return inspect.cleandoc(text or "").partition("\n\n")[0].replace("\n", " ").partition(". ")[0].rstrip(".")
-
-
-def schema() -> dict[str, Any]:
-    """JSON schema of a recipe: each node with its own parameters; ``${…}`` may stand for any value."""
-    steps = [_step_schema(path, node) for path, node in all_nodes().items()]
-    number, anything = {"type": "number"}, {"type": "object"}
-    expectation = {"type": "object", "required": ["step", "value", "rtol"], "additionalProperties": False}
-    expectation["properties"] = {"step": {"type": "string"}, "at": {"type": "array"}, "value": number, "rtol": number}
-    return {
-        "$schema": "https://json-schema.org/draft/2020-12/schema",
-        "title": "neusee recipe",
-        "type": "object",
-        "properties": {
-            "defaults": {"type": "array", "items": anything},
-            "steps": {"type": "object", "additionalProperties": {"anyOf": [{"type": "null"}, *steps, _changed_step()]}},
-            "seed": {"type": "integer"},
-            "tolerance": {"type": "number", "minimum": 0},
-            "outputs": {"type": "array", "items": {"type": "string"}},
-            "expect": {"type": "object", "additionalProperties": expectation},
-        },
-        "additionalProperties": anything,
-        "$defs": {k: v for s in steps for k, v in s.pop("$defs", {}).items()},
-    }
-
-
-def _step_schema(path: str, node: Node) -> dict[str, Any]:
-    own = node.params.model_json_schema()
-    reference = {"type": "string", "pattern": r"\$\{"}
-    fields = {name: {"anyOf": [field, reference]} for name, field in own.get("properties", {}).items()}
-    wires = {"type": ["string", "object"]} if node.inputs else False
-    return {
-        "title": _first(node.__doc__),
-        "type": "object",
-        "required": ["node"],
-        "additionalProperties": False,
-        "properties": {
-            "node": {"const": path},
-            "each": {"type": ["string", "array"]},
-            "from": wires,
-            "with": {"type": "object", "properties": fields, "additionalProperties": False},
-        },
-        "$defs": own.get("$defs", {}),
-    }
-
-
-def _changed_step() -> dict[str, Any]:
-    """A step of another file with something changed: it names no node."""
-    return {"type": "object", "not": {"required": ["node"]}}

