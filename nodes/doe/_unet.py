@@ -75,7 +75,7 @@ def height_of(net: nn.Module, samples: int, grid: int, max_height: float) -> Ten
 
 
 def fresh(width: int, grid: int, rng: torch.Generator) -> HeightNet:
-    """Draw a network: orthogonal weights, zero biases, last layer scaled so that the start is far from flat."""
+    """Draw a network: orthogonal weights, zero biases; the last layer centred and scaled: a start far from flat."""
     net = HeightNet(width).to(rng.device)
     with torch.no_grad():
         for name, parameter in net.named_parameters():
