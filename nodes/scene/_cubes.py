@@ -1,0 +1,94 @@
+"""Files of spectral cubes: .mat, .npy and spectral OpenEXR."""
+
+from pathlib import Path
+from typing import Any, Literal
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from torch import Tensor
+
+from neusee.nodes import ParameterError
+from neusee.nodes.scene._spectral_exr import read_spectral, spectral_channels
+
+Layout = Literal["y x band", "band y x"]
+_TYPES = {"double": "float64", "single": "float32", "logical": "bool", "char": "str", "cell": "O", "struct": "O"}
+
+
+def cube_and_wavelengths(
+    file: Path, variable: str | None, start: float | None, stop: float | None, layout: Layout
+) -> tuple[Tensor, Tensor]:
+    """Cube (band, y, x) float32 and its wavelengths in m."""
+    if file.suffix == ".exr":
+        cube, known, _ = read_spectral(file)
+        return cube, known
+    if start is None or stop is None:
+        raise ValueError(f"{file.name} carries no wavelengths: give start and stop")
+    values = np.load(file) if file.suffix == ".npy" else _mat(file, _only(file, variable))
+    scale = float(np.iinfo(values.dtype).max) if values.dtype.kind == "u" else 1.0
+    first = np.moveaxis(values, -1, 0) if layout == "y x band" else values
+    cube = torch.from_numpy(np.ascontiguousarray(first, dtype=np.float32)) / scale
+    return cube, torch.linspace(start, stop, len(cube), dtype=torch.float64)
+
+
+def size_and_type(file: Path, variable: str | None) -> tuple[tuple[int, ...], str]:
+    """Shape and type of the cube, from the head of the file."""
+    if file.suffix == ".npy":
+        head = np.load(file, mmap_mode="r")
+        size, kind = head.shape, str(head.dtype)
+    elif file.suffix == ".mat":
+        size, kind = _listed(file)[_only(file, variable)]
+    else:
+        raise ParameterError("file", f"{file.name} is none of .mat, .npy and .exr: save it as one of these")
+    if len(size) != 3:
+        raise ParameterError("file", f"{file.name} holds shape {size}: a cube has three axes")
+    return size, kind
+
+
+def exr_size(file: Path) -> tuple[int, int]:
+    """Rows and columns of a spectral OpenEXR, from its header."""
+    import OpenEXR
+
+    try:
+        with OpenEXR.File(str(file), header_only=True) as opened:
+            header = opened.header()
+    except (RuntimeError, OSError, ValueError) as why:
+        raise ParameterError("file", f"{file} cannot be read as OpenEXR ({str(why).strip()})") from None
+    names = [channel.name for channel in header["channels"]]
+    if not spectral_channels(names):
+        raise ParameterError("file", f"{file.name} has the channels {', '.join(names)}: none is named like T.550,0nm")
+    low, high = header["dataWindow"]
+    return int(high[1] - low[1]) + 1, int(high[0] - low[0]) + 1
+
+
+def _listed(file: Path) -> dict[str, tuple[tuple[int, ...], str]]:
+    """Variables of a .mat file, with shape and type."""
+    try:
+        from scipy.io import whosmat
+    except ImportError:
+        raise ParameterError("file", f"{file.name}: .mat files need scipy: pip install scipy") from None
+    try:
+        return {name: (size, _TYPES.get(kind, kind)) for name, size, kind in whosmat(file)}
+    except (NotImplementedError, ValueError):
+        raise ParameterError(
+            "file", f"{file.name} is no .mat file up to version 7: save it in MATLAB with -v7"
+        ) from None
+
+
+def _only(file: Path, variable: str | None) -> str:
+    """The variable asked for, or the only cube of the file."""
+    held = _listed(file)
+    cubes = [name for name, (size, _) in held.items() if len(size) == 3]
+    if variable in held:
+        return str(variable)
+    if variable is None and len(cubes) == 1:
+        return cubes[0]
+    asked = f"has no variable {variable!r}" if variable is not None else f"holds {len(cubes)} cubes"
+    raise ParameterError("variable", f"{file.name} {asked}: name one of {', '.join(held)}")
+
+
+def _mat(file: Path, variable: str) -> NDArray[Any]:
+    from scipy.io import loadmat
+
+    values: NDArray[Any] = loadmat(file, variable_names=[variable])[variable]
+    return values

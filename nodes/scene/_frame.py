@@ -1,0 +1,38 @@
+"""The frame of a scene: scale to cover it, cut what stands over."""
+
+import math
+
+from torch import Tensor
+
+from neusee.nodes.units import Shape
+
+
+def framed(scene: Tensor, shape: Shape | None) -> Tensor:
+    """Scale linear light evenly until it covers `shape`, then cut the centre: (band, y, x) -> (band, *shape).
+
+    Kornia's antialiased bilinear resampling: no overshoot, so nothing turns negative.
+    """
+    from kornia.geometry.transform import resize
+
+    if shape is None or tuple(scene.shape[-2:]) == tuple(shape):
+        return scene
+    size = covering((scene.shape[-2], scene.shape[-1]), shape)
+    scaled = resize(scene, size, interpolation="bilinear", antialias=True) if size != scene.shape[-2:] else scene
+    top, left = (size[0] - shape[0]) // 2, (size[1] - shape[1]) // 2
+    return scaled[..., top : top + shape[0], left : left + shape[1]].contiguous()
+
+
+def covering(size: tuple[int, int], shape: Shape) -> tuple[int, int]:
+    """The smallest size of the same proportions that covers `shape`."""
+    scale = max(shape[0] / size[0], shape[1] / size[1])
+    y, x = (max(n, math.floor(k * scale + 0.5)) for k, n in zip(size, shape, strict=True))
+    return y, x
+
+
+def enlarged(size: tuple[int, int], shape: Shape | None) -> list[str]:
+    """A note where a frame asks for more pixels than the file has."""
+    if shape is None:
+        return []
+    scale = max(shape[0] / size[0], shape[1] / size[1])
+    text = f"scene enlarged {scale:.2f} times, from {size[0]}x{size[1]} to cover {shape[0]}x{shape[1]}: no new detail"
+    return [text] if scale > 1 else []

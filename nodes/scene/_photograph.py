@@ -1,0 +1,121 @@
+"""A photograph: sRGB files to linear light."""
+
+from pathlib import Path
+from typing import Any
+
+import torch
+from torch import Tensor
+
+from neusee.nodes import Check, ParameterError, node
+from neusee.nodes.scene._frame import enlarged, framed
+from neusee.nodes.units import DataFile, Shape
+
+_MODES = ("RGB", "L", "P", "1", "I", "I;16", "I;16B")
+_FIX = "convert it to 8- or 16-bit sRGB: magick {name} -alpha off -colorspace sRGB -depth 16 {stem}.png"
+_ROTATED = range(5, 9)  #: EXIF orientations that exchange width and height
+
+
+@node(rtol=1e-5)
+def photograph(*, file: DataFile, shape: Shape | None = None) -> Tensor:
+    """Read a photograph as linear light: decode the sRGB curve, turn it upright, and frame it in linear light.
+
+    Shapes: -> (3, y, x) float32, the file's own size or `shape` (scaled to cover it, centre cut).
+    Units:  linear sRGB, 1 = the white of the file.
+    Error:  half a code value (8 bit: 1.8e-3 near white); what a camera's tone curve did is not undone. Read as sRGB:
+            an embedded profile is named, not applied.
+    Raises: ParameterError before the run for other formats, depths and transparency.
+    Source: IEC 61966-2-1:1999 (sRGB); EXIF 2.3, tag Orientation.
+    """
+    from kornia.color import rgb_to_linear_rgb
+
+    return framed(rgb_to_linear_rgb(_codes(file)), shape)
+
+
+@photograph.reference
+def _(*, file: Path, shape: Shape | None = None) -> Tensor:
+    codes = _codes(file).double()
+    return framed(torch.where(codes <= 0.04045, codes / 12.92, ((codes + 0.055) / 1.055) ** 2.4), shape)
+
+
+@photograph.preflight
+def _(*, file: Path, shape: Shape | None = None) -> list[str]:
+    from PIL import Image, UnidentifiedImageError
+
+    try:
+        with Image.open(file) as image:
+            _refuse(file, image)
+            profile = _profile(image)
+            notes = (
+                [f"{file.name}: its colour profile {profile!r} is not applied, it is read as sRGB"] if profile else []
+            )
+            turned = image.getexif().get(0x0112, 1)
+            size = image.size if turned in _ROTATED else image.size[::-1]
+    except UnidentifiedImageError:
+        raise ParameterError("file", f"{file} is no picture that can be read: give a PNG or JPEG file") from None
+    notes += [f"{file.name}: turned upright, as its EXIF orientation {turned} says"] if turned != 1 else []
+    return notes + enlarged(size, shape)
+
+
+@photograph.check
+def _(result: Tensor, **params: Any) -> list[Check]:
+    clipped = float((result >= 1).any(0).float().mean())
+    return [Check(f"mean {float(result.mean()):.3f}, {clipped:.1%} of pixels at white", float(result.max()) > 0)]
+
+
+def _refuse(file: Path, image: Any) -> None:
+    fix = _FIX.format(name=file.name, stem=file.stem)
+    if image.format not in ("PNG", "JPEG", "MPO"):
+        raise ParameterError("file", f"{file} is {image.format}, not PNG or JPEG: {fix}; scene-linear: scene.exr")
+    if "transparency" in image.info or image.mode.endswith("A"):
+        raise ParameterError("file", f"{file} has transparency, which is no light: {fix}")
+    if image.mode not in _MODES:
+        raise ParameterError("file", f"{file} has pixels of kind {image.mode}, not grey or RGB: {fix}")
+
+
+def _profile(image: Any) -> str:
+    """The name of an embedded profile, unless it is sRGB itself."""
+    from io import BytesIO
+
+    from PIL import ImageCms
+
+    if not image.info.get("icc_profile"):
+        return ""
+    try:
+        name = ImageCms.getProfileDescription(ImageCms.ImageCmsProfile(BytesIO(image.info["icc_profile"]))).strip()
+    except (OSError, ImageCms.PyCMSError):
+        name = "unreadable"
+    return "" if "srgb" in name.lower() else name
+
+
+def _codes(file: Path) -> Tensor:
+    """Code values in [0, 1], upright: (3, y, x) float32. Pillow halves 16-bit colour to 8, so kornia_rs reads that."""
+    import numpy as np
+    from PIL import Image, ImageOps
+
+    with Image.open(file) as image:
+        _refuse(file, image)
+        if image.mode == "RGB" and _depth(file) == 16:
+            values = _words(file, image.getexif().get(0x0112, 1))
+        else:
+            upright = ImageOps.exif_transpose(image)
+            values = np.asarray(upright if upright.mode.startswith("I") else upright.convert("RGB"))
+    scale = 255.0 if values.dtype == np.uint8 else 65535.0
+    grey = values if values.ndim == 3 else np.repeat(values[..., None], 3, axis=2)
+    return torch.from_numpy(np.ascontiguousarray(grey.transpose(2, 0, 1), dtype=np.float32)) / scale
+
+
+def _depth(file: Path) -> int:
+    """Bits a channel: byte 24 of a PNG header; every JPEG read here has 8."""
+    head = file.read_bytes()[:26]
+    return head[24] if head.startswith(b"\x89PNG") else 8
+
+
+def _words(file: Path, turned: int) -> Any:
+    """16-bit RGB, turned as the EXIF orientation says."""
+    import numpy as np
+    from kornia_rs.io import read_image_png_u16
+
+    values = np.asarray(read_image_png_u16(str(file), "rgb"))
+    values = values.transpose(1, 0, 2) if turned in _ROTATED else values
+    flip_y, flip_x = turned in (3, 4, 7, 8), turned in (2, 3, 6, 7)
+    return values[:: -1 if flip_y else 1, :: -1 if flip_x else 1]

@@ -1,0 +1,89 @@
+"""Spectral pictures as OpenEXR: one channel a wavelength, named as Fichet, Pacanowski and Wilkie (JCGT 10(3), 2021) do.
+
+Emitted light is ``S0.550,0nm``, reflectance ``T.550,0nm``: the decimal mark is a comma, for a point parts layers.
+"""
+
+import re
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Any, Literal
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from torch import Tensor
+
+_NAME = re.compile(r"(S0|T)\.(\d*,?\d*(?:[eE][-+]?\d+)?)(Y|Z|E|P|T|G|M|k|h|da|d|c|m|u|n|p)?(m|Hz)")
+_PREFIX = {
+    "": 0, "p": -12, "n": -9, "u": -6, "m": -3, "c": -2, "d": -1, "da": 1, "h": 2, "k": 3,
+    "M": 6, "G": 9, "T": 12, "P": 15, "E": 18, "Z": 21, "Y": 24,
+}  # fmt: skip
+_LIGHT = 299_792_458.0  #: m/s
+
+
+def write_spectral(
+    path: Path | str,
+    cube: Tensor,
+    centres: Tensor | Sequence[float],
+    *,
+    kind: Literal["emissive", "reflective"] = "emissive",
+    header: Mapping[str, Any] | None = None,
+) -> None:
+    """Write a cube (band, y, x) with its wavelengths in metres as float32, losslessly.
+
+    Raises: ValueError where cube and wavelengths disagree, or two bands would get one name.
+    """
+    import OpenEXR
+
+    wavelengths = [float(w) for w in centres]
+    if cube.ndim != 3 or len(wavelengths) != len(cube):
+        raise ValueError(f"cube {tuple(cube.shape)} must be (band, y, x) with {len(wavelengths)} bands")
+    names = [_name(w, kind) for w in wavelengths]
+    if len(set(names)) < len(names):
+        raise ValueError(f"bands closer than 1e-6 nm get one name: {names}")
+    planes = cube.detach().cpu().float().contiguous().numpy()
+    about = {"spectralLayoutVersion": "1.0", "compression": OpenEXR.ZIP_COMPRESSION, "type": OpenEXR.scanlineimage}
+    about |= {"emissiveUnits": "W.m^-2"} if kind == "emissive" else {}
+    OpenEXR.File({**about, **(header or {})}, dict(zip(names, planes, strict=True))).write(str(path))
+
+
+def read_spectral(path: Path | str) -> tuple[Tensor, Tensor, dict[str, Any]]:
+    """Read cube (band, y, x) float32, wavelengths (band,) float64 in m, rising, and the header.
+
+    Emission is taken where a file holds both emission and reflectance.
+    Raises: ValueError, with the channels it holds, where none is spectral.
+    """
+    import OpenEXR
+
+    with OpenEXR.File(str(path), separate_channels=True) as opened:
+        header, channels = dict(opened.header()), opened.channels()
+        found = spectral_channels(list(channels))
+        if not found:
+            raise ValueError(
+                f"{path} has the channels {', '.join(channels)}: none is named like S0.550,0nm or T.550,0nm"
+            )
+        planes = [np.asarray(channels[name].pixels, dtype=np.float32) for name in found.values()]
+    cube: NDArray[np.float32] = np.stack(planes)
+    return torch.from_numpy(cube), torch.tensor(list(found), dtype=torch.float64), header
+
+
+def spectral_channels(names: Sequence[str]) -> dict[float, str]:
+    """Wavelength in m to channel, by rising wavelength: emission, or else reflectance."""
+    for kind in ("S0", "T"):
+        matches = [m for m in map(_NAME.fullmatch, names) if m and m[1] == kind and m[2] not in ("", ",")]
+        if matches:
+            return dict(sorted((_wavelength(m), m[0]) for m in matches))
+    return {}
+
+
+def _name(wavelength: float, kind: str) -> str:
+    text = f"{wavelength * 1e9:.6f}".replace(".", ",")
+    return f"{'S0' if kind == 'emissive' else 'T'}.{text}nm"
+
+
+def _wavelength(match: re.Match[str]) -> float:
+    exponent = _PREFIX[match[3] or ""]
+    number = float(f"{match[2].replace(',', '.')}")
+    # nanometres by division, so that 550,0nm reads as the same float64 as 550 / 1e9
+    value = number / 10.0**-exponent if exponent < 0 else number * 10.0**exponent
+    return value if match[4] == "m" else _LIGHT / value

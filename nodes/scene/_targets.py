@@ -1,0 +1,80 @@
+"""Synthetic scenes whose image has a known answer."""
+
+import math
+from typing import Any, Literal
+
+import torch
+from torch import Tensor
+
+from neusee.nodes import Check, ParameterError, node
+from neusee.nodes.units import Fraction, Shape
+
+Kind = Literal["flat", "edge", "slanted_edge", "siemens", "points"]
+_TILT = math.radians(5.0)  #: of the slanted edge, against the columns
+_CYCLES = 36  #: of the star, once round
+_SPACING = 64  #: pixels between points
+
+
+@node(rtol=1e-5)
+def targets(*, kind: Kind, shape: Shape, low: Fraction = 0.0, high: Fraction = 1.0) -> Tensor:
+    """Draw a test target: flat (`high`), an edge through the axis (bright to +x), the same tilted by 5 degrees, a
+    sinusoidal Siemens star of 36 cycles, or points of one pixel every 64 pixels from the axis.
+
+    Shapes: -> (3, y, x) float32, the axis at sample N//2.
+    Units:  linear sRGB, grey between `low` and `high`.
+    Error:  edges are exact area averages of the pixel; the star is its value at the pixel's centre, and grey
+            where it is finer than two pixels a cycle.
+    Raises: ParameterError before the run where low exceeds high.
+    Source: slanted edge and sinusoidal star as in ISO 12233:2017.
+    """
+    y, x = (torch.arange(n, dtype=torch.float64) - n // 2 for n in shape)
+    share = _SHARE[kind](y[:, None], x[None, :]).expand(shape)
+    return (low + (high - low) * share).float().expand(3, *shape).clone()
+
+
+@targets.preflight
+def _(*, low: float = 0.0, high: float = 1.0, **params: Any) -> list[str]:
+    if low > high:
+        raise ParameterError("low", f"low {low:g} is above high {high:g}: exchange them")
+    return []
+
+
+@targets.check
+def _(result: Tensor, *, low: float = 0.0, high: float = 1.0, **params: Any) -> list[Check]:
+    least, most = float(result.min()), float(result.max())
+    return [Check(f"light from {least:.3g} to {most:.3g}", least >= low - 1e-6 and most <= high + 1e-6)]
+
+
+def _flat(y: Tensor, x: Tensor) -> Tensor:
+    return torch.ones_like(y + x)
+
+
+def _edge(y: Tensor, x: Tensor) -> Tensor:
+    return (x + 0.5 + 0 * y).clamp(0, 1)
+
+
+def _slanted(y: Tensor, x: Tensor) -> Tensor:
+    """Share of each pixel beyond a line through the axis: the second integral of a corner, differenced twice."""
+    c, s = math.cos(_TILT), math.sin(_TILT)
+    distance = x * c + y * s
+    corners = [sign * (distance + off).clamp_min(0) ** 2 / 2 for sign, off in _corners(c, s)]
+    return (sum(corners, torch.zeros_like(distance)) / (c * s)).clamp(0, 1)
+
+
+def _corners(c: float, s: float) -> list[tuple[int, float]]:
+    return [(1, (c + s) / 2), (-1, (c - s) / 2), (-1, -(c - s) / 2), (1, -(c + s) / 2)]
+
+
+def _siemens(y: Tensor, x: Tensor) -> Tensor:
+    radius = torch.hypot(y, x)
+    edge = min(int(y.numel()), int(x.numel())) / 2 - 1
+    fine = _CYCLES / math.pi  # radius at which a cycle is two pixels long
+    inside = (edge - radius + 0.5).clamp(0, 1) * (radius - fine + 0.5).clamp(0, 1)
+    return 0.5 + 0.5 * inside * torch.cos(_CYCLES * torch.atan2(y, x))
+
+
+def _points(y: Tensor, x: Tensor) -> Tensor:
+    return ((y % _SPACING == 0) & (x % _SPACING == 0)).double()
+
+
+_SHARE = {"flat": _flat, "edge": _edge, "slanted_edge": _slanted, "siemens": _siemens, "points": _points}
