@@ -23,6 +23,7 @@ class Composed:
     title: str
     root: Value
     problems: tuple[Problem, ...]
+    whole: bool = True  #: whether every group that is named could be read
 
 
 @dataclass(frozen=True, slots=True)
@@ -68,13 +69,13 @@ def compose(recipe: str | Path, arguments: Sequence[str], folder: Path, first: i
             problems += error.problems
     choices, rest = _choose(document.root, overrides, path.parent, problems)
     root = Value({}, document.root.mark, document.root.mark, ())
-    for choice in choices:
-        option = _option(choice, path.parent, folder, problems)
+    options = [_option(choice, path.parent, folder, problems) for choice in choices if choice.option is not None]
+    for option in options:
         root = root if option is None else merge(root, option)
     root = merge(root, _without_defaults(document.root))
     for override in rest:
         root = apply(root, override, problems, [choice.group for choice in choices])
-    return Composed(path.stem, document.title, root, tuple(problems))
+    return Composed(path.stem, document.title, root, tuple(problems), None not in options)
 
 
 def shown(path: Path, folder: Path) -> str:
@@ -165,16 +166,14 @@ def _defaults(root: Value, problems: list[Problem]) -> Iterator[Choice]:
 
 def _option(choice: Choice, beside: Path, folder: Path, problems: list[Problem]) -> Value | None:
     """The values of an option; the folder beside the recipe comes before the packaged one."""
-    if choice.option is None:
-        return None
-    names = (choice.group, choice.option)
+    names = (choice.group, str(choice.option))
     for above in dict.fromkeys((beside, packaged())):
-        path = above / choice.group / f"{choice.option}.yaml"
+        path = above / choice.group / f"{names[1]}.yaml"
         if all(map(_NAME.fullmatch, names)) and path.is_file():
             return _read_option(path, folder, problems)
     groups = groups_of(packaged(), beside)
     if choice.group in groups:
-        message = f"no option {choice.option} in {choice.group}; {nearest(choice.option, groups[choice.group])}"
+        message = f"no option {choice.option} in {choice.group}; {nearest(names[1], groups[choice.group])}"
     else:
         message = f"no group {choice.group}; {nearest(choice.group, groups)}"
     problems.append(Problem(choice.mark, choice.shown, message))

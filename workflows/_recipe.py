@@ -53,15 +53,17 @@ def check(composed: Composed) -> Recipe:
     problems = list(composed.problems)
     root, references = composed.root, References(composed.root, problems)
     steps, absent = declare(root, references, problems)
-    wiring, checker = Wiring(root, steps, absent, references, problems), Checker(problems)
+    wiring, checker = Wiring(root, steps, absent, references, problems), Checker([])
     bound = {step.name: step for step in _bind(root, steps, wiring, checker)}
     problems += cycles(bound, {name: step.value.key for name, step in steps.items()})
-    seed, tolerance = seed_and_tolerance(root, references, problems)
+    seed, tolerance = seed_and_tolerance(root, references, checker.problems)
     outputs = outputs_of(root, wiring)
     expect = expectations(root, wiring)
     references.finish()
-    if problems:
-        raise RecipeError(problems)
+    if not composed.whole:  # without a group, much else looks wrong that is not
+        problems = list(composed.problems)
+    if problems or checker.problems:
+        raise RecipeError([*problems, *checker.problems])
     config = _config(root, bound, steps, checker)
     nulls = {name: f"null ({value.mark})" for name, value in absent.items()}
     title, notes = composed.title, tuple(checker.notes)
