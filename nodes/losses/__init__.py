@@ -1,1 +1,6 @@
 """Losses: what learning minimises."""
+
+from neusee.nodes.losses._mask import bsr, lsr
+from neusee.nodes.losses._restoration import charbonnier, fft_l1
+
+__all__ = ["bsr", "charbonnier", "fft_l1", "lsr"]

@@ -1,1 +1,7 @@
 """Metrics: what a reader of results asks for."""
+
+from neusee.nodes.metrics._contrast import Mtf, encircled, mtf
+from neusee.nodes.metrics._quality import Quality, quality
+from neusee.nodes.metrics._suppression import Peak, Saturated, bsr, lsr, peak, saturated
+
+__all__ = ["Mtf", "Peak", "Quality", "Saturated", "bsr", "encircled", "lsr", "mtf", "peak", "quality", "saturated"]

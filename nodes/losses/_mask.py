@@ -1,0 +1,53 @@
+"""What a mask is trained for: little laser in one place, all of the scene in the field."""
+
+from typing import Annotated
+
+import torch
+from pydantic import Field
+from torch import Tensor
+
+from neusee.nodes import node
+from neusee.nodes.values import Psf
+
+
+@node()
+def lsr(psf: Psf, *, power: Annotated[float, Field(ge=8, le=64)] = 8.0, log: bool = False) -> Tensor:
+    """Add up the laser suppression over the bands, with a peak that has a gradient everywhere.
+
+    The peak of PSF / clear peak is the p-norm over pixels, which sees every bright pixel where the maximum sees one.
+    With ``log`` each band counts by its logarithm, so that 1e-3 pulls as hard as 1.
+
+    Shapes: psf.intensity (band, y, x) -> ().
+    Units:  none.
+    Error:  the p-norm of n equal pixels is n^(1/p) of their peak, never below it: 1 % at p = 8 and one bright pixel.
+    Source: NeuSee, section Two-Stage Training (L_DOE); p-norm for the maximum is ours.
+    """
+    ratio = psf.intensity / psf.clear_peak.to(psf.intensity)[:, None, None]
+    top = ratio.detach().amax((-2, -1), keepdim=True).clamp_min(torch.finfo(ratio.dtype).tiny)
+    norm = (ratio / top).pow(power).sum((-2, -1)).clamp_min(torch.finfo(ratio.dtype).tiny).pow(1.0 / power)
+    peaks = top[:, 0, 0] * norm
+    loss: Tensor = peaks.log().sum() if log else peaks.sum()
+    return loss
+
+
+@lsr.reference
+def _(psf: Psf, *, power: float = 8.0, log: bool = False) -> Tensor:
+    ratio = psf.intensity.double() / psf.clear_peak[:, None, None]
+    peaks = ((power * ratio.flatten(1).log()).logsumexp(1) / power).exp()
+    loss: Tensor = peaks.log().sum() if log else peaks.sum()
+    return loss
+
+
+@node()
+def bsr(image: Tensor, plain_image: Tensor) -> Tensor:
+    """Add up, over the bands, the scene's light through the plain lens over that through the mask.
+
+    Shapes: image and plain_image (..., band, y, x) -> ().
+    Units:  none; the number of bands where nothing is lost.
+    Error:  by energy in the field: blind to sharpness. A band without light counts as 1.
+    Source: NeuSee, section Two-Stage Training (L_DOE), as a ratio of energies.
+    """
+    kept, plain = (x.sum((-2, -1)) for x in (image, plain_image))
+    lit = (plain > 0) & (kept > 0)
+    ratios: Tensor = torch.where(lit, plain / kept.where(lit, 1.0), 1.0)
+    return ratios.sum()

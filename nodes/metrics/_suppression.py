@@ -1,0 +1,138 @@
+"""What the element does to the laser and to the scene, and what is left on the sensor."""
+
+from typing import Annotated, Any, NamedTuple
+
+import torch
+from pydantic import Field
+from torch import Tensor
+
+from neusee.nodes import Check, node
+from neusee.nodes.sensor._digital import Bits, Gain, GainUnit, numbers_per_electron
+from neusee.nodes.sensor._saturation import Efficiency, Well, saturation
+from neusee.nodes.units import PositiveLength, Time
+from neusee.nodes.values import Bands, Psf
+
+
+class Peak(NamedTuple):
+    """The brightest pixel, as a multiple of what saturates."""
+
+    irradiance: Tensor  #: () float64, multiple of saturation
+    damaged: Tensor  #: () float64, 1 where that passes the damage threshold
+
+
+class Saturated(NamedTuple):
+    """Pixels with at least one clipped channel."""
+
+    pixels: Tensor  #: () float64
+    share: Tensor  #: () float64, of all pixels
+
+
+@node(rtol=1e-6)
+def lsr(psf: Psf) -> Tensor:
+    """Find the laser suppression ratio: the brightest pixel of the PSF over that of the clear lens.
+
+    Shapes: psf.intensity (band, y, x) -> (band,) float64.
+    Units:  none; 1 for the clear lens.
+    Error:  of the sampling: a spot between two pixels reads up to 20 % low, so the convention of the PSF counts.
+    Source: NeuSee, section Sensor Image (LSR).
+    """
+    return psf.intensity.amax((-2, -1)).double() / psf.clear_peak.to(psf.intensity.device)
+
+
+@lsr.check
+def _(result: Tensor, *inputs: Psf) -> list[Check]:
+    pixels = inputs[0].intensity.shape[-2] * inputs[0].intensity.shape[-1]
+    floor = float((1.0 / (pixels * inputs[0].clear_peak)).max())
+    return [Check(f"LSR {float(result.min()):.3g} to {float(result.max()):.3g}", bool((result <= 1.05).all())),
+            Check(f"evenly spread light would reach {floor:.2g}")]  # fmt: skip
+
+
+@node(rtol=1e-6)
+def bsr(image: Tensor, plain_image: Tensor) -> Tensor:
+    """Find the background suppression ratio: light of the scene in the field, over that of the plain lens.
+
+    Shapes: image and plain_image (..., band, y, x) -> (..., band) float64.
+    Units:  none; about 1 for an element that absorbs nothing and scatters nothing out of the field.
+    Error:  exact; a band without light has ratio 1. It says nothing of sharpness.
+    Raises: ValueError for images of different shape.
+    Source: NeuSee, section Sensor Image (BSR), as a ratio of energies.
+    """
+    if image.shape != plain_image.shape:
+        raise ValueError(f"image {tuple(image.shape)} and plain image {tuple(plain_image.shape)} differ in shape")
+    kept, plain = (x.sum((-2, -1), dtype=torch.float64) for x in (image, plain_image))
+    lit = plain > 0
+    ratio: Tensor = torch.where(lit, kept / plain.where(lit, 1.0), 1.0)
+    return ratio
+
+
+@bsr.check
+def _(result: Tensor, *inputs: Tensor) -> list[Check]:
+    return [Check(f"BSR {float(result.min()):.3f} to {float(result.max()):.3f}", bool((result <= 1.05).all()))]
+
+
+@node(rtol=1e-6)
+def saturated(raw: Tensor, *, full_well: Well, gain: Gain, gain_unit: GainUnit = "e-/DN", bits: Bits = 16) -> Saturated:
+    """Count the pixels that hold no more: some channel is at the full well or at the end of the converter.
+
+    Shapes: raw (..., channel, y, x) -> two scalars, float64.
+    Units:  raw DN; pixels.
+    Error:  a pixel within one DN of the full well counts as full.
+    Source: NeuSee, Eq. (SensorImage).
+    """
+    full = clipped(raw, full_well=full_well, gain=gain, gain_unit=gain_unit, bits=bits).any(-3).double()
+    return Saturated(full.sum(), full.mean())
+
+
+@saturated.check
+def _(result: Saturated, *inputs: Tensor, **params: Any) -> list[Check]:
+    return [Check(f"{int(result.pixels)} saturated pixels, {float(result.share):.2%}")]
+
+
+def clipped(raw: Tensor, *, full_well: float, gain: float, gain_unit: str, bits: int) -> Tensor:
+    """Which values have come to the full well or to the last number of the converter."""
+    full = int(full_well * numbers_per_electron(gain, gain_unit) - 0.5)
+    marked: Tensor = raw >= max(1, min(2**bits - 1, full))
+    return marked
+
+
+@node(rtol=1e-6)
+def peak(
+    image: Tensor,
+    bands: Bands,
+    level: Tensor,
+    spots: list[Tensor] | None = None,
+    lines: list[Bands] | None = None,
+    *,
+    full_well: Well,
+    quantum_efficiency: Efficiency,
+    pixel_pitch: PositiveLength,
+    exposure: Time,
+    damage: Annotated[float, Field(gt=0)] = 1e6,
+) -> Peak:
+    """Find the brightest pixel, scene and lasers together: the sum over wavelengths of I / I_sat.
+
+    Shapes: image (band, y, x), level (band,), each spot (line band, y, x) -> two scalars, float64.
+    Units:  multiples of saturation; damage the multiple at which a sensor may break.
+    Error:  before the channels: a real channel takes in less. Damage is a threshold, not a model of heat.
+    Raises: ValueError where spots and lines do not pair up.
+    Source: NeuSee, Eq. (peak_irrad_coded); damage above 1e6 as stated there.
+    """
+    sensor = {"full_well": full_well, "quantum_efficiency": quantum_efficiency}
+    if len(spots or ()) != len(lines or ()):
+        raise ValueError(f"{len(spots or ())} spots and {len(lines or ())} lines: give each spot its own `line` step")
+    total = _in_wells(image, saturation(bands, **sensor, pixel_pitch=pixel_pitch, exposure=exposure) / level.cpu())
+    for spot, line in zip(spots or (), lines or (), strict=True):
+        total = total + _in_wells(spot, saturation(line, **sensor, pixel_pitch=pixel_pitch, exposure=exposure))
+    top = total.max().double()
+    return Peak(top, (top > damage).double())
+
+
+def _in_wells(irradiance: Tensor, saturating: Tensor) -> Tensor:
+    """Irradiance over what saturates, summed over wavelengths."""
+    wells: Tensor = torch.tensordot((1.0 / saturating).to(irradiance), irradiance, 1)
+    return wells
+
+
+@peak.check
+def _(result: Peak, *inputs: Any, **params: Any) -> list[Check]:
+    return [Check(f"peak {float(result.irradiance):.3g} I_sat", not bool(result.damaged))]

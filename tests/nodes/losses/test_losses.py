@@ -1,0 +1,96 @@
+"""Losses: their limits, their gradients, and that a gradient step does what they promise."""
+
+import math
+
+import pytest
+import torch
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from neusee.nodes.losses import bsr, charbonnier, fft_l1, lsr
+from neusee.nodes.values import Psf
+
+
+def rand(*shape):
+    return torch.rand(*shape, dtype=torch.float64, generator=torch.Generator().manual_seed(len(shape)))
+
+
+def as_psf(kernel):
+    return Psf(kernel, torch.tensor([0.5, 0.1], dtype=torch.float64))
+
+
+@settings(max_examples=40, deadline=None)
+@given(st.floats(8, 64), st.booleans(), st.floats(-12, 0))
+def test_lsr_agrees_with_its_reference(power, log, size):
+    psf = as_psf(rand(2, 4, 5) * 10**size)
+    torch.testing.assert_close(lsr(psf, power=power, log=log), lsr.ref(psf, power=power, log=log))
+
+
+def test_lsr_lies_just_above_the_peak():
+    kernel = 1e-9 * rand(2, 32, 32)
+    kernel[:, 3, 3] = torch.tensor([0.5, 0.1])
+    assert float(lsr(as_psf(kernel))) == pytest.approx(2.0, rel=1e-6)
+    even = torch.ones(2, 8, 8, dtype=torch.float64) * torch.tensor([0.5, 0.1])[:, None, None]
+    assert float(lsr(as_psf(even), power=16)) == pytest.approx(2 * 64 ** (1 / 16))
+    assert float(lsr(as_psf(even), power=16, log=True)) == pytest.approx(2 * math.log(64) / 16)
+
+
+def test_lsr_does_not_underflow_in_single_precision():
+    kernel = torch.full((2, 4, 4), 1e-9)
+    found = lsr(as_psf(kernel), power=64)
+    assert float(found) == pytest.approx(float(lsr.ref(as_psf(kernel), power=64)), rel=1e-5)
+    assert torch.isfinite(lsr(as_psf(torch.zeros(2, 4, 4))))
+
+
+@pytest.mark.parametrize("log", [False, True])
+def test_lsr_gradient(log):
+    kernel = (1e-3 * rand(2, 4, 4)).requires_grad_()
+    assert torch.autograd.gradcheck(lambda k: lsr(as_psf(k), log=log), (kernel,), eps=1e-8, atol=1e-5)
+    assert torch.autograd.gradgradcheck(lambda k: lsr(as_psf(1e-3 * k), log=log), (rand(2, 2, 2).requires_grad_(),))
+
+
+def test_bsr_counts_lost_light():
+    plain = rand(3, 4, 4)
+    assert float(bsr(plain, plain)) == pytest.approx(3.0)
+    assert float(bsr(plain / 2, plain)) == pytest.approx(6.0)
+    assert float(bsr(plain * 0, plain * 0)) == 3.0
+
+
+def test_bsr_gradient():
+    image, plain = rand(2, 3, 3).requires_grad_(), rand(2, 3, 3) + 1
+    assert torch.autograd.gradcheck(lambda x: bsr(x, plain), (image,))
+    (slope,) = torch.autograd.grad(bsr(image, plain), image)
+    assert bool((slope < 0).all())  # more light, less loss
+
+
+@settings(max_examples=40, deadline=None)
+@given(st.integers(1, 6), st.integers(1, 6), st.floats(0, 1e3))
+def test_charbonnier_lies_within_sqrt_epsilon_of_the_absolute_difference(y, x, scale):
+    a, b = scale * rand(3, y, x), scale * rand(3, y, x).flip(0)
+    l1 = float((a - b).abs().mean())
+    assert l1 - 1e-9 <= float(charbonnier(a, b)) <= l1 + 1e-3 + 1e-9
+    assert float(charbonnier(a, a)) == pytest.approx(1e-3)
+
+
+@settings(max_examples=40, deadline=None)
+@given(st.integers(1, 8), st.integers(1, 8))
+def test_fft_l1_does_not_grow_with_the_picture(y, x):
+    noise, nothing = rand(y, x), torch.zeros(y, x, dtype=torch.float64)
+    rms = float(noise.square().mean().sqrt())
+    found = float(fft_l1(noise, nothing))
+    assert rms / math.sqrt(x * y) - 1e-12 <= found <= rms + 1e-12  # Parseval, then Cauchy and Schwarz
+    point = nothing.clone()
+    point[0, 0] = 1.0
+    assert float(fft_l1(point, nothing)) == pytest.approx(1 / math.sqrt(x * y))
+
+
+@pytest.mark.parametrize("loss", [charbonnier, fft_l1])
+def test_gradients_of_the_restoration_losses(loss):
+    a, b = rand(3, 4, 5).requires_grad_(), rand(1, 3, 4, 5)[0].flip(1)
+    assert torch.autograd.gradcheck(lambda x: loss(x, b), (a,))
+    assert torch.autograd.gradgradcheck(lambda x: loss(x, b), (a,), atol=1e-4)
+    same = b.clone().requires_grad_()
+    loss(same, b).backward()
+    assert torch.isfinite(same.grad).all()
+    with pytest.raises(ValueError, match="differ"):
+        loss(a, b[:2])

@@ -1,0 +1,98 @@
+"""Suppression, peak and saturation: closed forms and both ends of the range."""
+
+import pytest
+import torch
+from hypothesis import given
+from hypothesis import strategies as st
+
+from neusee.nodes.metrics import bsr, lsr, peak, saturated
+from neusee.nodes.optics import spot
+from neusee.nodes.sensor import digitize, expose, full_well, level, saturation
+from neusee.nodes.values import Bands, Psf
+
+SENSOR = {"full_well": 25500.0, "quantum_efficiency": 0.56, "pixel_pitch": 2.9e-6, "exposure": 0.1}
+
+
+def bands(*centres):
+    c = torch.tensor(centres, dtype=torch.float64)
+    return Bands(c, torch.full_like(c, 1e-8), torch.ones_like(c) / len(c))
+
+
+def test_lsr_is_the_peak_over_the_clear_peak():
+    kernel = torch.rand(2, 5, 5)
+    found = lsr(Psf(kernel, torch.tensor([2.0, 4.0], dtype=torch.float64)))
+    assert found.dtype == torch.float64
+    torch.testing.assert_close(found, kernel.amax((1, 2)).double() / torch.tensor([2.0, 4.0], dtype=torch.float64))
+
+
+def test_lsr_check_names_the_floor():
+    psf = Psf(torch.full((1, 10, 10), 0.01), torch.tensor([0.1], dtype=torch.float64))
+    lines = lsr.after(lsr(psf), psf)
+    assert lines[0].ok
+    assert lines[1].text == "evenly spread light would reach 0.1"
+    assert not lsr.after(torch.tensor([1.2]), psf)[0].ok
+
+
+def test_bsr_is_a_ratio_of_energies():
+    plain = torch.rand(3, 4, 4)
+    plain[2] = 0.0
+    found = bsr(plain * torch.tensor([0.5, 0.9, 1.0])[:, None, None], plain)
+    torch.testing.assert_close(found, torch.tensor([0.5, 0.9, 1.0], dtype=torch.float64), rtol=1e-6, atol=0.0)
+    assert bsr.after(found)[0].ok
+    with pytest.raises(ValueError, match="differ"):
+        bsr(plain, plain[..., :3])
+
+
+@pytest.mark.parametrize("rounding", ["nearest", "dithered_floor"])
+@pytest.mark.parametrize(
+    ("gain", "unit", "bits"), [(0.37, "e-/DN", 16), (0.37, "DN/e-", 16), (7.0, "e-/DN", 12), (1e4, "e-/DN", 1)]
+)
+def test_a_full_pixel_counts_whether_well_or_converter_ends_first(gain, unit, bits, rounding):
+    sensor = {"gain": gain, "gain_unit": unit, "bits": bits}
+    electrons = torch.tensor([1e9, 25500.0, 100.0, 0.0]).reshape(1, 2, 2).expand(3, 2, 2)
+    rng = torch.Generator().manual_seed(0)
+    raw = digitize(full_well(electrons, capacity=25500.0), rounding=rounding, rng=rng, **sensor)
+    found = saturated(raw, full_well=25500.0, **sensor)
+    assert (float(found.pixels), float(found.share)) == (2.0, 0.5)
+    assert saturated.after(found)[0].text == "2 saturated pixels, 50.00%"
+
+
+def test_a_pixel_with_one_full_channel_counts_once():
+    raw = torch.zeros(3, 2, 2)
+    raw[0, 0, 0] = raw[1, 0, 0] = raw[2, 1, 1] = 65535.0
+    assert float(saturated(raw, full_well=25500.0, gain=0.37).pixels) == 2.0
+
+
+@given(st.floats(0.0, 1e9))
+def test_the_peak_of_a_laser_alone_is_its_strength(strength):
+    line = bands(530e-9, 534e-9)
+    kernel = torch.zeros(2, 3, 3)
+    kernel[:, 1, 1] = 0.12
+    psf = Psf(kernel, torch.full((2,), 0.12, dtype=torch.float64))
+    dark = torch.zeros(1, 3, 3)
+    laser = spot(psf, line, strength=strength, **SENSOR)
+    found = peak(dark, bands(550e-9), torch.ones(1), [laser], [line], **SENSOR)
+    assert float(found.irradiance) == pytest.approx(strength, rel=1e-5)
+    assert bool(found.damaged) == (float(found.irradiance) > 1e6)
+
+
+def test_scene_and_lasers_add():
+    scene, visible = torch.rand(2, 4, 4), bands(500e-9, 600e-9)
+    factor = level(scene, visible, torch.ones(1, 2), strength=0.7, **SENSOR)
+    found = peak(scene, visible, factor, **SENSOR)
+    assert float(found.irradiance) == pytest.approx(0.7, rel=1e-5)
+    electrons = 0.56 * expose(scene, visible, torch.ones(1, 2), factor, pixel_pitch=2.9e-6, exposure=0.1)
+    assert float(electrons.max()) == pytest.approx(0.7 * 25500, rel=1e-5)
+    even = saturation(visible, **SENSOR)[:, None, None].expand(2, 4, 4).float()
+    both = peak(scene, visible, factor, [even, even], [visible, visible], **SENSOR)
+    assert float(both.irradiance) == pytest.approx(4.7, rel=1e-5)
+    assert peak.after(both)[0].text == "peak 4.7 I_sat"
+
+
+def test_every_spot_needs_its_line():
+    with pytest.raises(ValueError, match="1 spots and 0 lines"):
+        peak(torch.ones(1, 2, 2), bands(5e-7), torch.ones(1), [torch.ones(1, 2, 2)], [], **SENSOR)
+
+
+def test_a_level_of_zero_is_dark():
+    assert float(peak(torch.ones(1, 2, 2), bands(5e-7), torch.zeros(1), **SENSOR).irradiance) == 0.0
