@@ -1,1 +1,7 @@
 """Restoration: from raw digital numbers back to colour."""
+
+from neusee.nodes.restore._electrons import clipped, colour, electrons
+from neusee.nodes.restore._matrix import colour_matrix
+from neusee.nodes.restore._wiener import wiener
+
+__all__ = ["clipped", "colour", "colour_matrix", "electrons", "wiener"]
