@@ -1,0 +1,90 @@
+"""What every node owes: documented shapes, units, errors and source; typed parameters; a small size."""
+
+import ast
+import importlib
+import inspect
+import pkgutil
+from pathlib import Path
+
+import pytest
+
+import neusee.nodes
+from neusee.nodes import Node
+
+ROOT = Path(__file__).parents[2]
+MODULES = [importlib.import_module(m.name) for m in pkgutil.walk_packages(neusee.nodes.__path__, "neusee.nodes.")]
+NODES = sorted(
+    {n for m in MODULES for n in vars(m).values() if isinstance(n, Node) and n.__module__ == m.__name__},
+    key=lambda n: n.path,
+)
+FILES = sorted([*ROOT.glob("nodes/**/*.py"), *ROOT.glob("workflows/**/*.py")])
+every_node = pytest.mark.parametrize("node", NODES, ids=lambda n: n.path)
+every_file = pytest.mark.parametrize("path", FILES, ids=lambda p: str(p.relative_to(ROOT)))
+
+
+def test_the_walk_finds_the_families():
+    assert {n.path.split(".")[0] for n in NODES} >= {"sensor", "optics", "metrics", "losses", "restore"}
+    assert len({n.path for n in NODES}) == len(NODES)
+
+
+@every_node
+def test_docstring_begins_with_one_sentence_of_physics(node):
+    first = inspect.getdoc(node.fn).split("\n\n")[0]
+    assert first.endswith("."), "the first paragraph is a sentence"
+    assert first[0].isupper()
+    assert len(first) <= 240, "one sentence, not a story"
+
+
+@every_node
+@pytest.mark.parametrize("word", ["Shapes:", "Units:", "Error:", "Source:"])
+def test_docstring_names(node, word):
+    lines = [line for line in (inspect.getdoc(node.fn) or "").splitlines() if line.startswith(word)]
+    assert len(lines) == 1, f"{node.path}: one line that begins with {word}"
+    assert len(lines[0].removeprefix(word).strip()) >= 2
+
+
+@every_node
+def test_a_node_that_raises_says_so(node):
+    raises = any(isinstance(item, ast.Raise) for item in ast.walk(ast.parse(inspect.getsource(node.fn))))
+    assert not raises or "Raises:" in node.__doc__
+
+
+@every_node
+def test_every_argument_is_annotated_and_the_model_of_parameters_builds(node):
+    for name in inspect.signature(node.fn).parameters:
+        assert name in node.hints, f"{node.path}: {name} has no annotation"
+    assert "return" in node.hints
+    assert set(node.params.model_fields) == {p.name for p in node._keyword_only}
+
+
+@every_node
+def test_the_family_exports_its_node(node):
+    family = importlib.import_module(f"neusee.nodes.{node.path.split('.')[0]}")
+    assert getattr(family, node.fn.__name__) is node
+    assert node.fn.__name__ in family.__all__
+
+
+@every_node
+def test_hooks_take_what_the_node_takes(node):
+    own = set(inspect.signature(node.fn).parameters)
+    for hook in (node.ref, node.bound, node.before, node.after):
+        taken = {} if hook is None else inspect.signature(hook).parameters
+        for p in taken.values():
+            known = p.name in own or p.kind in (p.VAR_KEYWORD, p.VAR_POSITIONAL) or p.name == "result"
+            assert known or p.kind is not p.KEYWORD_ONLY, f"{node.path}: a hook asks for {p.name}"
+
+
+@every_file
+def test_files_and_functions_are_small(path):
+    text = path.read_text()
+    assert len(text.splitlines()) < 300, f"{path} is too long: split it"
+    for item in ast.walk(ast.parse(text)):
+        if isinstance(item, ast.FunctionDef | ast.AsyncFunctionDef):
+            assert _code_lines(item) <= 40, f"{path}:{item.lineno} {item.name} is too long: split it"
+
+
+def _code_lines(item):
+    """Lines of a function without its docstring."""
+    documented = ast.get_docstring(item, clean=False) is not None
+    first = item.body[0]
+    return item.end_lineno - item.lineno + 1 - (first.end_lineno - first.lineno + 1 if documented else 0)
