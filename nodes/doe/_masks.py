@@ -16,7 +16,9 @@ from neusee.nodes.units import Angle, Count, Length, PositiveLength, Real, Wavel
 
 
 @node()
-def flat(*, samples: Count, pitch: PositiveLength, diameter: PositiveLength, aperture: Aperture = "clip") -> Tensor:
+def flat(
+    *, samples: Count, pitch: PositiveLength, diameter: PositiveLength, aperture: Aperture = "inscribed"
+) -> Tensor:
     """Leave the pupil flat: the plain lens.
 
     Shapes: -> (v, u).
@@ -34,7 +36,7 @@ def vortex(
     samples: Count,
     pitch: PositiveLength,
     diameter: PositiveLength,
-    aperture: Aperture = "clip",
+    aperture: Aperture = "inscribed",
     wavelength: Wavelength = 550e-9,
     material: Material = "fused silica",
 ) -> Tensor:
@@ -56,7 +58,7 @@ def axicon(
     samples: Count,
     pitch: PositiveLength,
     diameter: PositiveLength,
-    aperture: Aperture = "clip",
+    aperture: Aperture = "inscribed",
     wavelength: Wavelength = 550e-9,
     material: Material = "fused silica",
 ) -> Tensor:
@@ -79,7 +81,7 @@ def spiral_axicon(
     samples: Count,
     pitch: PositiveLength,
     diameter: PositiveLength,
-    aperture: Aperture = "clip",
+    aperture: Aperture = "inscribed",
     wavelength: Wavelength = 550e-9,
     material: Material = "fused silica",
 ) -> Tensor:
@@ -102,7 +104,7 @@ def cubic(
     samples: Count,
     pitch: PositiveLength,
     diameter: PositiveLength,
-    aperture: Aperture = "clip",
+    aperture: Aperture = "inscribed",
     wavelength: Wavelength = 550e-9,
     material: Material = "fused silica",
 ) -> Tensor:
@@ -136,7 +138,7 @@ def half_rings(
     samples: Count,
     pitch: PositiveLength,
     diameter: PositiveLength,
-    aperture: Aperture = "clip",
+    aperture: Aperture = "inscribed",
     wavelength: Wavelength = 550e-9,
     material: Material = "fused silica",
 ) -> Tensor:
@@ -161,7 +163,7 @@ def zernike(
     samples: Count,
     pitch: PositiveLength,
     diameter: PositiveLength,
-    aperture: Aperture = "clip",
+    aperture: Aperture = "inscribed",
     wavelength: Wavelength = 550e-9,
     material: Material = "fused silica",
 ) -> Tensor:

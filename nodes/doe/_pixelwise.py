@@ -64,7 +64,7 @@ def pixelwise(
     samples: Count,
     pitch: PositiveLength,
     diameter: PositiveLength,
-    aperture: Aperture = "clip",
+    aperture: Aperture = "inscribed",
     file: DataFile | None = None,
     depth: PositiveLength = 1.2e-6,
     scale: Scale = 0.1,

@@ -104,7 +104,7 @@ def unet(
     samples: Count,
     pitch: PositiveLength,
     diameter: PositiveLength,
-    aperture: Aperture = "clip",
+    aperture: Aperture = "inscribed",
     max_height: PositiveLength = 1.2e-6,
     grid: Count = 270,
     width: Count = 32,

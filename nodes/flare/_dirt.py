@@ -26,7 +26,7 @@ def dirt(
     samples: Count,
     pitch: PositiveLength,
     diameter: PositiveLength,
-    aperture: Aperture = "clip",
+    aperture: Aperture = "inscribed",
     dust: Mean = 0.0,
     dust_radius: Part = 1 / 60,
     scratches: Mean = 0.0,

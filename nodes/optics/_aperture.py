@@ -8,7 +8,7 @@ from torch import Tensor
 
 from neusee.nodes import ParameterError
 
-Aperture = Literal["clip", "stretch"]
+Aperture = Literal["inscribed", "clipped", "stretched"]
 
 
 class Stop(NamedTuple):
@@ -19,12 +19,14 @@ class Stop(NamedTuple):
     diameter: float  #: m, of the clear aperture
 
 
-def stop(samples: int, pitch: float, diameter: float, aperture: Aperture = "clip") -> Stop:
-    """Decide pitch and diameter: the grid clips the aperture, or is stretched to span it.
+def stop(samples: int, pitch: float, diameter: float, aperture: Aperture = "inscribed") -> Stop:
+    """Decide pitch and diameter of an aperture wider than its grid.
+
+    `inscribed` narrows the disc to the grid, `clipped` lets the square grid cut it, `stretched` widens the pitch.
 
     Raises: ParameterError where no sample lies inside the aperture.
     """
-    if aperture == "stretch":
+    if aperture == "stretched":
         return Stop(samples, diameter / samples, diameter)
     nearest = 0.0 if samples % 2 else pitch * math.sqrt(0.5)
     if diameter < 2 * nearest:
@@ -32,7 +34,7 @@ def stop(samples: int, pitch: float, diameter: float, aperture: Aperture = "clip
         raise ParameterError(
             "diameter", f"{diameter * 1e6:.3g} um holds no pupil sample: needs {needed} or a finer pitch"
         )
-    return Stop(samples, pitch, min(diameter, samples * pitch))
+    return Stop(samples, pitch, diameter if aperture == "clipped" else min(diameter, samples * pitch))
 
 
 def axes(grid: Stop, device: torch.device | None = None) -> tuple[Tensor, Tensor]:
@@ -55,11 +57,12 @@ def inside(grid: Stop, device: torch.device | None = None) -> Tensor:
 
 
 def grid_notes(*, samples: int, pitch: float, diameter: float, aperture: Aperture, **_: Any) -> list[str]:
-    """What the grid does to the aperture, for a preflight: nothing, clipped or stretched."""
+    """What becomes of an aperture that does not fit its grid, for a preflight."""
     grid = stop(samples, pitch, diameter, aperture)
     wanted, span = f"{diameter * 1e3:#.3g} mm", f"{samples * pitch * 1e3:#.3g} mm"
-    if grid.diameter < diameter:
-        return [f"aperture {wanted} > pupil grid {span}: clipped, see reading.aperture"]
+    if aperture != "stretched" and diameter > samples * pitch * (1 + 1e-9):
+        open_ = f"a disc of {span}" if aperture == "inscribed" else "a disc cut square"
+        return [f"aperture {wanted} > pupil grid {span}: {aperture}, {open_}; see reading.aperture"]
     if not math.isclose(grid.pitch, pitch):
         change = f"{pitch * 1e6:#.3g} -> {grid.pitch * 1e6:#.3g} um"
         return [f"aperture {wanted} over pupil grid {span}: pitch stretched {change}, see reading.aperture"]

@@ -24,7 +24,7 @@ def pupil(
     *,
     pitch: PositiveLength,
     diameter: PositiveLength,
-    aperture: Aperture = "clip",
+    aperture: Aperture = "inscribed",
     defocus: Waves = 0.0,
     aberrations: dict[Count, Length] = {},  # noqa: B006 (read only)
 ) -> Pupil:
@@ -73,9 +73,9 @@ def _(result: Pupil, *_: Any, pitch: float, diameter: float, aperture: Aperture,
     passed = float(result.amplitude.double().square().sum() / result.aperture.double().sum())
     median, share = phase_steps(result)
     text = f"phase step {median:.3f} turn between samples (median), {share:.1%} above half a turn"
-    clipped = f", clipped by the grid from {diameter * 1e3:#.3g} mm" if used < diameter * (1 - 1e-9) else ""
+    held = f", {aperture} where {diameter * 1e3:#.3g} mm was asked" if used < diameter * (1 - 1e-9) else ""
     return [
-        Check(f"throughput {passed:.4f} of the clear pupil {min(used, diameter) * 1e3:#.3g} mm{clipped}", passed > 0),
+        Check(f"throughput {passed:.4f} of the clear pupil {min(used, diameter) * 1e3:#.3g} mm{held}", passed > 0),
         Check(text if share <= 0.1 else f"{text}: aliased, use finer samples", share <= 0.1),
     ]
 

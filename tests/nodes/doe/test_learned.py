@@ -71,14 +71,14 @@ def test_pixelwise_reads_a_file(tmp_path, suffix):
         np.save(file, relief)
     else:
         save_file({"height": torch.from_numpy(relief), "other": torch.zeros(2)}, file)
-    params = GRID | {"aperture": "clip", "file": file, "depth": 1.2e-6, "scale": 0.1}
+    params = GRID | {"aperture": "inscribed", "file": file, "depth": 1.2e-6, "scale": 0.1}
     assert doe.pixelwise.before(**params) == []
     assert_close(doe.pixelwise(**params, rng=seeded()), torch.from_numpy(relief), rtol=0, atol=0)
 
 
 def test_pixelwise_refuses_a_file_that_does_not_fit(tmp_path):
     np.save(tmp_path / "small.npy", np.zeros((32, 32)))
-    params = GRID | {"aperture": "clip", "depth": 1.2e-6, "scale": 0.1}
+    params = GRID | {"aperture": "inscribed", "depth": 1.2e-6, "scale": 0.1}
     with pytest.raises(ParameterError, match=r"\(32, 32\).*\(64, 64\).*samples to 32") as caught:
         doe.pixelwise.before(**params, file=tmp_path / "small.npy")
     assert caught.value.parameter == "file"
@@ -146,7 +146,7 @@ def test_unet_suppresses_after_a_few_steps():
 def test_unet_loads_its_own_weights_and_no_others(tmp_path):
     net = fresh(4, 32, seeded(9))
     save_file(net.state_dict(), tmp_path / "net.safetensors")
-    params = GRID | {"aperture": "clip", "max_height": 1.2e-6, "grid": 32, "weights": tmp_path / "net.safetensors"}
+    params = GRID | {"aperture": "inscribed", "max_height": 1.2e-6, "grid": 32, "weights": tmp_path / "net.safetensors"}
     assert doe.unet.before(**params, width=4) == []
     loaded = doe.unet(**params, width=4, rng=seeded())
     assert_close(loaded, height_of(net, 64, 32, 1.2e-6).detach(), rtol=0, atol=0)

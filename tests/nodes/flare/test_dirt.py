@@ -163,15 +163,15 @@ def test_dirt_scatters_the_halo_that_a_clean_pupil_has_not():
 
 
 def test_preflight_and_check():
-    paper = {"samples": 2160, "pitch": 3.74e-6, "diameter": 11e-3, "aperture": "clip"}
+    paper = {"samples": 2160, "pitch": 3.74e-6, "diameter": 11e-3, "aperture": "inscribed"}
     (note,) = flare.dirt.before(**paper, dust=3.0)
-    assert "clipped" in note
+    assert "inscribed" in note
     found = flare.dirt(**GRID, dents=0.4, smudges=0.3, rng=seeded())
-    light, bounds = flare.dirt.after(found, **GRID, aperture="clip")
+    light, bounds = flare.dirt.after(found, **GRID, aperture="inscribed")
     assert light.ok
     assert bounds.ok
     assert "by 0.401 waves" in light.text
-    assert not flare.dirt.after(found._replace(amplitude=found.amplitude + 1), **GRID, aperture="clip")[1].ok
+    assert not flare.dirt.after(found._replace(amplitude=found.amplitude + 1), **GRID, aperture="inscribed")[1].ok
 
 
 def test_recipe_cannot_ask_for_negative_dirt():
