@@ -36,7 +36,8 @@ def hyperspectral(
     Units:  reflectance, 1 = white.
     Error:  linear interpolation: h^2/8 of the curvature, some 1e-3 for paints at 10 nm; none on the file's own bands.
             Negative values are clipped.
-    Raises: ParameterError before the run where the file does not fit; ValueError where `bands` go beyond it or values are not finite.
+    Raises: ParameterError before the run where the file does not fit; ValueError where `bands` go beyond it or values
+            are not finite.
     Source: layout of spectral OpenEXR: Fichet, Pacanowski, Wilkie, JCGT 10(3), 2021.
     """
     cube, known = cube_and_wavelengths(file, variable, start, stop, layout)

@@ -1,1 +1,18 @@
-"""Spectra: bands, lines, lifts from RGB, illuminants and responses."""
+"""Spectra: bands, lights, channels, and lifts from three colours to many."""
+
+from neusee.nodes.spectra._bands import bands, line
+from neusee.nodes.spectra._lift import lift_lmmse, lift_mallett
+from neusee.nodes.spectra._lift_mst import lift_mst_plus_plus
+from neusee.nodes.spectra._light import illuminant, illuminate
+from neusee.nodes.spectra._responses import responses
+
+__all__ = [
+    "bands",
+    "illuminant",
+    "illuminate",
+    "lift_lmmse",
+    "lift_mallett",
+    "lift_mst_plus_plus",
+    "line",
+    "responses",
+]

@@ -1,0 +1,102 @@
+"""Where the spectrum is sampled: the bands of a scene, and the few of one laser line."""
+
+import math
+from typing import Any, Literal
+
+import torch
+from torch import Tensor
+
+from neusee.nodes import Check, ParameterError, node
+from neusee.nodes.units import Count, Fraction, PositiveLength, Wavelength
+from neusee.nodes.values import Bands as Samples
+
+_GRID = 10e-9  #: m, spacing of the scene's bands on which the paper samples its lasers
+
+
+@node(rtol=1e-12)
+def bands(*, start: Wavelength, stop: Wavelength, count: Count) -> Samples:
+    """Divide the spectrum into bands with evenly spaced centres, both ends being centres (one band: the middle).
+
+    Shapes: -> centres, widths, weights (band,) float64.
+    Units:  centres and widths m; weights 1.
+    Error:  the first and last bands reach half a width beyond the ends.
+    Raises: ParameterError before the run unless start is below stop.
+    Source: NeuSee: 400 to 700 nm by 10 nm.
+    """
+    if count == 1:
+        centres, width = torch.tensor([(start + stop) / 2], dtype=torch.float64), stop - start
+    else:
+        centres, width = torch.linspace(start, stop, count, dtype=torch.float64), (stop - start) / (count - 1)
+    return Samples(centres, torch.full_like(centres, width), torch.ones_like(centres))
+
+
+@bands.preflight
+def _(*, start: float, stop: float, **params: Any) -> list[str]:
+    if not start < stop:
+        raise ParameterError("start", f"start {start * 1e9:g} nm must be below stop {stop * 1e9:g} nm: exchange them")
+    return []
+
+
+@bands.check
+def _(result: Samples, **params: Any) -> list[Check]:
+    ends = f"{float(result.centres[0]) * 1e9:.4g} to {float(result.centres[-1]) * 1e9:.4g} nm"
+    return [Check(f"{len(result.centres)} bands, {ends}, {float(result.widths[0]) * 1e9:.3g} nm wide")]
+
+
+@node(rtol=1e-9)
+def line(
+    *,
+    wavelength: Wavelength,
+    fwhm: PositiveLength = 10e-9,
+    count: Count = 5,
+    span: PositiveLength | None = None,
+    floor: Fraction = 1e-3,
+    sampling: Literal["integrated", "point"] = "integrated",
+) -> Samples:
+    """Share the energy of a Gaussian laser line, on a floor given in parts of its peak, among a few bands of its own.
+
+    `integrated`: `count` equal bands over `span` (3 fwhm), each with the exact energy inside it; the weights sum to 1.
+    `point`: the `count` nearest multiples of 10 nm with the line's value there, as printed; the sum is not 1.
+
+    Shapes: -> centres, widths, weights (band,) float64.
+    Units:  centres and widths m; weights in parts of the line's energy.
+    Error:  integrated: 4e-4 of the line lies beyond 3 fwhm and is shared out again; the floor beyond `span` (3 % over
+            400-700 nm) is left away. point: the sum is off by up to 5.7 % at fwhm 10 nm.
+    Raises: ParameterError before the run where the bands would reach below 100 nm.
+    Source: NeuSee, laser of 10 nm FWHM with 0.1 % floor; bin integrals by the error function.
+    """
+    sigma = fwhm / (2 * math.sqrt(2 * math.log(2)))
+    if sampling == "point":
+        return _points(wavelength, sigma, count, floor)
+    width = (3 * fwhm if span is None else span) / count
+    edges = width * (torch.arange(count + 1, dtype=torch.float64) - count / 2)
+    inside = torch.erf(edges / (sigma * math.sqrt(2))).diff() / 2
+    weights = inside + floor * width / (sigma * math.sqrt(2 * math.pi))
+    centres = wavelength + (edges[1:] + edges[:-1]) / 2
+    return Samples(centres, torch.full_like(centres, width), weights / weights.sum())
+
+
+@line.preflight
+def _(*, wavelength: float, fwhm: float = 10e-9, count: int = 5, span: float | None = None, **params: Any) -> list[str]:
+    printed = params.get("sampling") == "point"
+    reach = _GRID * count / 2 if printed else (3 * fwhm if span is None else span) / 2
+    if wavelength - reach < 100e-9:
+        name = "count" if printed else "fwhm" if span is None else "span"
+        raise ParameterError(name, f"bands reach down to {(wavelength - reach) * 1e9:.3g} nm: keep them above 100 nm")
+    return ["laser sampled at points of the 10 nm grid: its energy is off by up to 5.7 %"] if printed else []
+
+
+@line.check
+def _(result: Samples, *, wavelength: float, **params: Any) -> list[Check]:
+    total = float(result.weights.sum())
+    mean = float((result.weights * result.centres).sum()) / total
+    text = f"{wavelength * 1e9:.5g} nm in {len(result.centres)} bands: energy {total:.4f}, mean {mean * 1e9:.5g} nm"
+    return [Check(text, abs(total - 1) < 0.01)]
+
+
+def _points(wavelength: float, sigma: float, count: int, floor: float) -> Samples:
+    first = math.floor(wavelength / _GRID - count / 2 + 1 + 1e-9)
+    centres = _GRID * (first + torch.arange(count, dtype=torch.float64))
+    shape: Tensor = torch.exp(-(((centres - wavelength) / sigma) ** 2) / 2) + floor
+    weights = shape * _GRID / (sigma * math.sqrt(2 * math.pi))
+    return Samples(centres, torch.full_like(centres, _GRID), weights)

@@ -1,0 +1,149 @@
+"""MST++: three stages of spectral attention from RGB to 31 bands.
+
+Names of modules are those of the published network, so that its checkpoint loads as it is: 1 619 625 parameters in
+227 tensors. Architecture: Cai et al., CVPRW 2022; reference code caiyuanhao1998/MST-plus-plus (MIT).
+"""
+
+from collections.abc import Iterable
+from typing import cast
+
+import torch
+import torch.nn.functional as F
+from torch import Tensor, nn
+
+BANDS = 31
+
+
+class MSTPlusPlus(nn.Module):
+    """RGB in [0, 1], (n, 3, y, x) of any size -> (n, 31, y, x)."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.conv_in = _conv(3, BANDS)
+        self.body = nn.Sequential(*(Stage(BANDS) for _ in range(3)))
+        self.conv_out = _conv(BANDS, BANDS)
+
+    def forward(self, rgb: Tensor) -> Tensor:
+        height, width = rgb.shape[-2:]
+        first = self.conv_in(_padded(rgb, -height % 8, -width % 8))
+        result: Tensor = self.conv_out(self.body(first)) + first
+        return result[..., :height, :width]
+
+
+class Stage(nn.Module):
+    """A U-Net of spectral attention with two levels, and its input added."""
+
+    def __init__(self, dim: int) -> None:
+        super().__init__()
+        self.embedding = _conv(dim, dim)
+        self.encoder_layers = nn.ModuleList(
+            nn.ModuleList([Blocks(d), nn.Conv2d(d, 2 * d, 4, 2, 1, bias=False)]) for d in (dim, 2 * dim)
+        )
+        self.bottleneck = Blocks(4 * dim)
+        self.decoder_layers = nn.ModuleList(
+            nn.ModuleList([nn.ConvTranspose2d(2 * d, d, 2, 2), nn.Conv2d(2 * d, d, 1, bias=False), Blocks(d)])
+            for d in (2 * dim, dim)
+        )
+        self.mapping = _conv(dim, dim)
+
+    def forward(self, x: Tensor) -> Tensor:
+        inner, skips = self.embedding(x), []
+        for attend, shrink in _parts(self.encoder_layers):
+            skips.append(attend(inner))
+            inner = shrink(skips[-1])
+        inner = self.bottleneck(inner)
+        for (grow, fuse, attend), skip in zip(_parts(self.decoder_layers), reversed(skips), strict=True):
+            inner = attend(fuse(torch.cat([grow(inner), skip], 1)))
+        result: Tensor = self.mapping(inner) + x
+        return result
+
+
+class Blocks(nn.Module):
+    """Spectral attention, then a feed-forward net behind a layer norm; each adds to its input."""
+
+    def __init__(self, dim: int) -> None:
+        super().__init__()
+        self.blocks = nn.ModuleList([nn.ModuleList([SpectralAttention(dim), Normed(dim)])])
+
+    def forward(self, x: Tensor) -> Tensor:
+        for attend, feed in _parts(self.blocks):
+            x = attend(x) + x
+            x = feed(x) + x
+        return x
+
+
+class SpectralAttention(nn.Module):
+    """Every band attends to every band; 31 x 31 weights a head, so the cost is linear in pixels."""
+
+    def __init__(self, dim: int) -> None:
+        super().__init__()
+        self.heads = dim // BANDS
+        self.to_q, self.to_k, self.to_v = (nn.Linear(dim, dim, bias=False) for _ in range(3))
+        self.rescale = nn.Parameter(torch.ones(self.heads, 1, 1))
+        self.proj = nn.Linear(dim, dim)
+        self.pos_emb = nn.Sequential(_depthwise(dim), nn.GELU(), _depthwise(dim))
+
+    def forward(self, x: Tensor) -> Tensor:
+        shape = x.shape
+        pixels = x.flatten(2).transpose(1, 2)
+        value = self.to_v(pixels).transpose(1, 2)
+        query, key, heads = (t.unflatten(1, (self.heads, -1)) for t in (*self._across(pixels), value))
+        scores = (key @ query.transpose(-1, -2)) * self.rescale
+        mixed = (scores.softmax(-1) @ heads).flatten(1, 2).transpose(1, 2)
+        result: Tensor = self.proj(mixed).transpose(1, 2).reshape(shape) + self.pos_emb(value.reshape(shape))
+        return result
+
+    def _across(self, pixels: Tensor) -> tuple[Tensor, Tensor]:
+        """Query and key, each band of length 1 over the picture."""
+        query, key = (F.normalize(to(pixels).transpose(1, 2), dim=-1) for to in (self.to_q, self.to_k))
+        return query, key
+
+
+class Normed(nn.Module):
+    """Layer norm over bands, then the feed-forward net (the published names: norm, fn)."""
+
+    def __init__(self, dim: int) -> None:
+        super().__init__()
+        self.fn = FeedForward(dim)
+        self.norm = nn.LayerNorm(dim)
+
+    def forward(self, x: Tensor) -> Tensor:
+        result: Tensor = self.fn(self.norm(x.movedim(1, -1)).movedim(-1, 1))
+        return result
+
+
+class FeedForward(nn.Module):
+    """Four times as many channels, a 3 x 3 filter on each, and back."""
+
+    def __init__(self, dim: int) -> None:
+        super().__init__()
+        wide, thin = nn.Conv2d(dim, 4 * dim, 1, bias=False), nn.Conv2d(4 * dim, dim, 1, bias=False)
+        self.net = nn.Sequential(wide, nn.GELU(), _depthwise(4 * dim), nn.GELU(), thin)
+
+    def forward(self, x: Tensor) -> Tensor:
+        result: Tensor = self.net(x)
+        return result
+
+
+def _parts(layers: nn.ModuleList) -> Iterable[Iterable[nn.Module]]:
+    return cast(Iterable[Iterable[nn.Module]], layers)
+
+
+def _conv(inputs: int, outputs: int) -> nn.Conv2d:
+    return nn.Conv2d(inputs, outputs, 3, padding=1, bias=False)
+
+
+def _depthwise(dim: int) -> nn.Conv2d:
+    return nn.Conv2d(dim, dim, 3, padding=1, groups=dim, bias=False)
+
+
+def _padded(x: Tensor, down: int, right: int) -> Tensor:
+    """Mirror at the lower and right rim; a picture thinner than the rim is mirrored again and again."""
+    rows, columns = (_mirrored(n, n + add, x.device) for n, add in zip(x.shape[-2:], (down, right), strict=True))
+    return x[..., rows, :][..., columns]
+
+
+def _mirrored(size: int, wanted: int, device: torch.device) -> Tensor:
+    period = max(2 * size - 2, 1)
+    place = torch.arange(wanted, device=device) % period
+    return torch.minimum(place, period - place).clamp_max(size - 1) if size > 1 else place * 0

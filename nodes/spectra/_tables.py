@@ -1,0 +1,115 @@
+"""Measured spectra of colour-science, read once and sampled at the bands; wavelengths in m, float64."""
+
+import functools
+from typing import NamedTuple
+
+import torch
+from torch import Tensor
+
+from neusee.nodes.values import Bands
+
+OBSERVER = "CIE 1931 2 Degree Standard Observer"
+_CHARTS = ("BabelColor Average", "ColorChecker N Ohta", "PMC", "ISO 17321-1")
+
+
+class Table(NamedTuple):
+    """Spectra on one grid of wavelengths."""
+
+    wavelengths: Tensor  #: (sample,) m, rising
+    values: Tensor  #: (spectrum, sample)
+
+    def at(self, centres: Tensor) -> Tensor:
+        """Values between the samples, linearly; beyond the ends the last value: (spectrum, band) on the CPU."""
+        wanted = centres.detach().cpu().double()
+        right = torch.searchsorted(self.wavelengths, wanted).clamp(1, len(self.wavelengths) - 1)
+        low, high = self.wavelengths[right - 1], self.wavelengths[right]
+        share = ((wanted - low) / (high - low)).clamp(0, 1)
+        return self.values[:, right - 1] * (1 - share) + self.values[:, right] * share
+
+    def over(self, bands: Bands) -> Tensor:
+        """Mean over each band of the straight lines between the samples; 0 beyond the ends: (spectrum, band)."""
+        centres, half = bands.centres.detach().cpu().double(), bands.widths.detach().cpu().double() / 2
+        thin = half <= 1e-13
+        mean = (self._below(centres + half) - self._below(centres - half)) / (2 * half).where(~thin, 1.0)
+        inside = (centres >= self.wavelengths[0]) & (centres <= self.wavelengths[-1])
+        return torch.where(thin, self.at(centres) * inside, mean)
+
+    def _below(self, limits: Tensor) -> Tensor:
+        """Integral from the first sample up to each limit, exact for straight lines."""
+        steps = self.wavelengths.diff()
+        areas = ((self.values[:, 1:] + self.values[:, :-1]) / 2 * steps).cumsum(1)
+        whole = torch.cat([torch.zeros_like(areas[:, :1]), areas], 1)
+        x = limits.clamp(self.wavelengths[0], self.wavelengths[-1])
+        left = (torch.searchsorted(self.wavelengths, x) - 1).clamp(0, len(steps) - 1)
+        part = (self.values[:, left] + self.at(x)) / 2 * (x - self.wavelengths[left])
+        return whole[:, left] + part
+
+
+@functools.cache
+def observer() -> Table:
+    """The matching functions of the CIE 1931 observer, 360 to 830 nm by 1 nm."""
+    import colour
+
+    return _table(colour.MSDS_CMFS[OBSERVER])
+
+
+@functools.cache
+def camera(name: str) -> Table:
+    """Measured channels of a camera, red, green, blue."""
+    import colour
+
+    return _table(colour.MSDS_CAMERA_SENSITIVITIES[f"{name} (NPL)"])
+
+
+@functools.cache
+def light(kind: str) -> Table:
+    """Relative power of a CIE illuminant."""
+    import colour
+
+    return _table(colour.SDS_ILLUMINANTS[kind])
+
+
+@functools.cache
+def daylight(temperature: float) -> Table:
+    """Relative power of CIE daylight of a correlated colour temperature, 4000 to 25 000 K."""
+    import colour
+
+    return _table(colour.sd_CIE_illuminant_D_series(colour.temperature.CCT_to_xy_CIE_D(temperature)))
+
+
+@functools.cache
+def mallett() -> Table:
+    """The three basis reflectances of Mallett and Yuksel (2019), 380 to 780 nm by 5 nm."""
+    from colour.recovery import MSDS_BASIS_FUNCTIONS_sRGB_MALLETT2019
+
+    return _table(MSDS_BASIS_FUNCTIONS_sRGB_MALLETT2019)
+
+
+@functools.cache
+def paints() -> tuple[Table, ...]:
+    """Reflectances of the 102 patches of four measured colour charts; some stop at 400 and 700 nm."""
+    import colour
+
+    return tuple(_table(sd) for chart in _CHARTS for sd in colour.SDS_COLOURCHECKERS[chart].values())
+
+
+@functools.cache
+def xyz_to_srgb() -> Tensor:
+    """The matrix of linear sRGB, (3, 3)."""
+    import colour
+
+    return torch.tensor(colour.RGB_COLOURSPACES["sRGB"].matrix_XYZ_to_RGB, dtype=torch.float64)
+
+
+def to_srgb(centres: Tensor) -> Tensor:
+    """Reflectance under D65 to linear sRGB, (3, band): white is (1, 1, 1) on these very bands."""
+    matrix = xyz_to_srgb() @ (observer().at(centres) * light("D65").at(centres))
+    return matrix / matrix.sum(1, keepdim=True)
+
+
+def _table(spectra: object) -> Table:
+    import numpy as np
+
+    values = np.atleast_2d(np.asarray(spectra.values).T)  # type: ignore[attr-defined]
+    wavelengths = torch.tensor(np.asarray(spectra.wavelengths), dtype=torch.float64) / 1e9  # type: ignore[attr-defined]
+    return Table(wavelengths, torch.tensor(values, dtype=torch.float64))
