@@ -94,7 +94,7 @@ def _problems(
                 yield Problem(step, f"{given.name}.{name}", f"is missing: {node.path} needs it")
         else:
             value = _deepest(values[name], e["loc"][1:])
-            wrong.setdefault((value.mark, _said(value)), []).append(_message(e))
+            wrong.setdefault((value.mark, _said(value)), []).append(_message(e) + _in_si(e, value))
     for (mark, path), messages in wrong.items():
         yield Problem(mark, path, ", or ".join(dict.fromkeys(messages)))
 
@@ -132,6 +132,12 @@ def _message(error: ErrorDetails) -> str:
         hint = nearest(str(error["input"]), options)
         text += f"; {hint}" if hint.startswith("did you mean") else ""
     return text[:1].lower() + text[1:]
+
+
+def _in_si(error: ErrorDetails, value: Value) -> str:
+    """What a quantity is in SI, where it is beyond a limit that is given in SI."""
+    limit = next((v for key, v in error.get("ctx", {}).items() if key in ("gt", "ge", "lt", "le")), 0)
+    return f" in SI, not {error['input']:.4g}" if limit and isinstance(value.data, str) else ""
 
 
 def _number_wanted(match: re.Match[str]) -> str:

@@ -106,7 +106,7 @@ def test_8_a_number_out_of_range(refused):
         "argument 1 | sensor.quantum_efficiency = 56 | must be less than or equal to 1"
     ]
     assert refused("lasers.green.wavelength=532 um") == [
-        "argument 1 | lasers.green.wavelength = 532 um | must be less than or equal to 2e-05"
+        "argument 1 | lasers.green.wavelength = 532 um | must be less than or equal to 0.00002 in SI, not 0.000532"
     ]
 
 
@@ -179,6 +179,11 @@ def test_18_no_light_of_the_laser_is_legal_and_no_exposure_is_not(accepted, refu
 def test_19_one_pixel_is_legal_and_none_is_not(accepted, refused):
     assert accepted("sensor.shape=[1, 1]").steps["raw[mask]"].params["shape"] == (1, 1)
     assert refused("sensor.shape=[0, 1]") == ["argument 1 | sensor.shape.0 = 0 | must be greater than or equal to 1"]
+
+
+def test_19_one_wavelength_is_no_range(refused):
+    (problem,) = refused("optics.start=550 nm", "optics.stop=550 nm")
+    assert problem.startswith("argument 1 | optics.start = 550 nm | start 550 nm must be below stop 550 nm")
 
 
 def test_20_a_steep_element_is_legal_before_the_run(accepted):
