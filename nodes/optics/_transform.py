@@ -6,11 +6,13 @@ import torch
 from torch import Tensor
 
 from neusee.nodes.optics._axis import Axis, Sink, Source, centred, unit_phasor
+from neusee.nodes.optics._bluestein import bluestein
 from neusee.nodes.optics._direct import direct, folded
+from neusee.nodes.optics._kaiser_bessel import kaiser_bessel
 from neusee.nodes.optics._workspace import Workspace, borrowed
 
 Method = Literal["auto", "direct", "folded", "bluestein", "kaiser_bessel"]
-_METHODS = {"direct": direct, "folded": folded}
+_METHODS = {"direct": direct, "folded": folded, "bluestein": bluestein, "kaiser_bessel": kaiser_bessel}
 
 
 def propagate(rows: Axis, columns: Axis, source: Source, sink: Sink, work: Workspace, method: Method = "auto") -> None:

@@ -1,0 +1,112 @@
+"""Banded matrices as batches of small dense ones: interpolation and gridding at the speed of a matrix product."""
+
+import copy
+import math
+from collections.abc import Callable
+from typing import NamedTuple
+
+import torch
+from torch import Tensor
+
+_SLACK = 6  #: columns of zeros that let blocks of unequal spacing share one stride
+
+
+class _Run(NamedTuple):
+    """Blocks first..first+count, whose columns begin at start, start + stride, ..."""
+
+    first: int
+    count: int
+    start: int
+    stride: int
+
+
+class Banded:
+    """Rows ``i`` that weigh the columns within ``reach`` of ``origin + step i``; rows come in whole blocks.
+
+    ``n_rows`` is rounded up to whole blocks; the rows beyond are finite and meaningless.
+    """
+
+    def __init__(self, n_rows: int, n_columns: int, origin: float, step: float, reach: float, block: int) -> None:
+        self.n_columns, self.block, self.reach = n_columns, min(block, n_rows), reach
+        self.count = -(-n_rows // self.block)
+        self.n_rows = self.count * self.block
+        self.origin, self.step = origin, step
+        first = [min(max(math.ceil(self._at(b * self.block) - reach), 0), n_columns - 1) for b in range(self.count)]
+        last = [
+            min(max(math.floor(self._at((b + 1) * self.block - 1) + reach), 0), n_columns - 1)
+            for b in range(self.count)
+        ]
+        self.width = min(n_columns, max(z - a for a, z in zip(first, last, strict=True)) + 1 + _SLACK)
+        low = [max(0, z + 1 - self.width) for z in last]
+        high = [min(a, n_columns - self.width) for a in first]
+        self.runs = _runs(low, high, step * self.block)
+        self.weights = torch.empty(0)
+
+    def _at(self, row: int) -> float:
+        return self.origin + self.step * row
+
+    def fill(self, weigh: Callable[[Tensor, Tensor], Tensor]) -> "Banded":
+        """Set the weights to ``weigh(row, column)``, called with float64 indices that broadcast; zero out of reach."""
+        starts = [run.start + i * run.stride for run in self.runs for i in range(run.count)]
+        columns = torch.tensor(starts, dtype=torch.float64)[:, None, None] + torch.arange(self.width)
+        rows = torch.arange(self.n_rows, dtype=torch.float64).view(self.count, self.block, 1)
+        near = (columns - (self.origin + self.step * rows)).abs_() <= self.reach
+        self.weights = torch.where(near, weigh(rows, columns), 0.0)
+        return self
+
+    def to(self, dtype: torch.dtype, device: torch.device) -> "Banded":
+        """Cast the weights and move them."""
+        self.weights = self.weights.to(device, dtype)
+        return self
+
+    def part(self, first: int, last: int) -> "Banded":
+        """Blocks first..last only."""
+        part = copy.copy(self)
+        part.count, part.n_rows = last - first, (last - first) * self.block
+        part.weights, part.runs = self.weights[first:last], []
+        for run in self.runs:
+            a, z = max(run.first, first), min(run.first + run.count, last)
+            if a < z:
+                part.runs.append(_Run(a - first, z - a, run.start + (a - run.first) * run.stride, run.stride))
+        return part
+
+    def left(self, x: Tensor, out: Tensor) -> None:
+        """``out[n_rows, c] = matrix @ x[n_columns, c]``, both contiguous."""
+        wide = x.shape[1]
+        blocks = out.view(self.count, self.block, wide)
+        for first, count, start, stride in self.runs:
+            view = x[start:].as_strided(
+                (count, self.width, wide), (stride * wide, wide, 1), start * wide + x.storage_offset()
+            )
+            torch.bmm(self.weights[first : first + count], view, out=blocks[first : first + count])
+
+    def right(self, x: Tensor, out: Tensor) -> None:
+        """``out[block, r, i] = (x[r, n_columns] @ matrix^T)`` in blocks of rows of the matrix, both contiguous."""
+        tall, wide = x.shape
+        for first, count, start, stride in self.runs:
+            view = x.as_strided((count, tall, self.width), (stride, wide, 1), start + x.storage_offset())
+            torch.bmm(view, self.weights[first : first + count].transpose(1, 2), out=out[first : first + count])
+
+
+def _runs(low: list[int], high: list[int], pace: float) -> list[_Run]:
+    """Cover all blocks with few arithmetic sequences of starts within ``low <= start <= high``."""
+    runs: list[_Run] = []
+    first = 0
+    while first < len(low):
+        run = max(
+            (_longest(low, high, first, stride) for stride in (math.floor(pace), math.ceil(pace))),
+            key=lambda r: r.count,
+        )
+        runs.append(run)
+        first += run.count
+    return runs
+
+
+def _longest(low: list[int], high: list[int], first: int, stride: int) -> _Run:
+    a, z, count = low[first], high[first], 0
+    while first + count < len(low):
+        lower, upper = max(a, low[first + count] - stride * count), min(z, high[first + count] - stride * count)
+        if lower > upper:
+            break
+        a, z, count = lower, upper, count + 1
+    return _Run(first, count, z, stride)
