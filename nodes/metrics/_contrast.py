@@ -28,7 +28,7 @@ def mtf(psf: Psf) -> Mtf:
 
     Shapes: psf.intensity (band, y, x) -> three of (band,) float64.
     Units:  none.
-    Error:  of the window: light outside it counts as lost, and frequencies are those of the window. The cut-off holds
+    Error:  1e-7 of float32, and of the window: light outside it counts as lost, and frequencies are those of the window. The cut-off holds
             for a round aperture and a PSF sampled at points.
     Source: Goodman, Introduction to Fourier Optics, 4th ed., ch. 7 (OTF as autocorrelation of the pupil).
     """
@@ -40,8 +40,8 @@ def _contrast(kernel: Tensor, clear_peak: float) -> tuple[Tensor, Tensor, Tensor
     y, x = kernel.shape
     fy, fx = (torch.fft.fftfreq(n, dtype=torch.float64, device=kernel.device) for n in (y, x))
     inside = torch.hypot(fy[:, None], fx[None, : x // 2 + 1]) <= math.sqrt(4.0 * clear_peak / math.pi)
-    otf = torch.fft.rfft2(kernel.double()).abs()
-    found = (otf / otf[0, 0].clamp_min(1e-300))[inside]
+    otf = torch.fft.rfft2(kernel).abs()
+    found = (otf[inside].double() / otf[0, 0].double().clamp_min(1e-300)).clamp_max(1.0)
     ordered = found.sort().values
     return found.square().mean().sqrt(), ordered[(len(ordered) - 1) // 2], ordered[(len(ordered) - 1) // 100]
 
@@ -64,7 +64,7 @@ def encircled(psf: Psf, *, pixel_pitch: PositiveLength, radius: PositiveLength) 
     sizes = psf.intensity.shape[-2:]
     y, x = ((torch.arange(n, device=psf.intensity.device) - n // 2) * pixel_pitch for n in sizes)
     inside = torch.hypot(y[:, None], x[None, :]) <= radius
-    return (psf.intensity * inside).sum((-2, -1), dtype=torch.float64)
+    return (psf.intensity * inside).sum(-1).sum(-1, dtype=torch.float64)
 
 
 @encircled.check

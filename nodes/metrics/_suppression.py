@@ -53,13 +53,14 @@ def bsr(image: Tensor, plain_image: Tensor) -> Tensor:
 
     Shapes: image and plain_image (..., band, y, x) -> (..., band) float64.
     Units:  none; about 1 for an element that absorbs nothing and scatters nothing out of the field.
-    Error:  exact; a band without light has ratio 1. It says nothing of sharpness.
+    Error:  rows are summed in the precision of the image, 1e-7; a band without light has ratio 1. It
+            says nothing of sharpness.
     Raises: ValueError for images of different shape.
     Source: NeuSee, section Sensor Image (BSR), as a ratio of energies.
     """
     if image.shape != plain_image.shape:
         raise ValueError(f"image {tuple(image.shape)} and plain image {tuple(plain_image.shape)} differ in shape")
-    kept, plain = (x.sum((-2, -1), dtype=torch.float64) for x in (image, plain_image))
+    kept, plain = (x.sum(-1).sum(-1, dtype=torch.float64) for x in (image, plain_image))
     lit = plain > 0
     ratio: Tensor = torch.where(lit, kept / plain.where(lit, 1.0), 1.0)
     return ratio

@@ -44,10 +44,10 @@ def _(radiance: Tensor, psf: Psf, *, border: Border = "zero") -> Tensor:
 
 @image.check
 def _(result: Tensor, radiance: Tensor, psf: Psf, **params: Any) -> list[Check]:
-    before, after = float(radiance.sum(dtype=torch.float64)), float(result.sum(dtype=torch.float64))
+    before, after = (float(x.sum(-1).sum(dtype=torch.float64)) for x in (radiance, result))
     if before <= 0:
         return [Check("no light in the scene")]
-    most = float(psf.intensity.sum(dim=(-2, -1), dtype=torch.float64).amax())
+    most = float(psf.intensity.sum(-1).sum(-1, dtype=torch.float64).amax())
     return [
         Check(f"flux kept {after / before:.2%}", ok=params.get("border") == "reflect" or after <= before * most * 1.001)
     ]

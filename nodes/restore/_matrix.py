@@ -2,13 +2,13 @@
 
 from typing import Any
 
-import numpy as np
 import torch
 from torch import Tensor
 
 from neusee.nodes import Check, node
 from neusee.nodes.sensor._exposure import channel_weights
 from neusee.nodes.sensor._saturation import Efficiency
+from neusee.nodes.spectra._tables import paints, to_srgb
 from neusee.nodes.units import PositiveLength, Time
 from neusee.nodes.values import Bands
 
@@ -39,7 +39,7 @@ def colour_matrix(
     spectra = _paints(bands.centres)
     second = spectra.T @ spectra / len(spectra)
     counts = _counts(bands, illuminant, responses, level, pixel_pitch, exposure, quantum_efficiency)
-    rgb = _daylight(bands.centres)
+    rgb = to_srgb(bands.centres)
     seen = counts @ second @ counts.T
     ridge = (1e-12 * seen.diagonal().mean()).clamp_min(1e-200) * torch.eye(len(seen), dtype=torch.float64)
     matrix: Tensor = torch.linalg.solve(seen + ridge, counts @ second @ rgb.T).T
@@ -51,7 +51,7 @@ def _(result: Tensor, *inputs: Any, **params: float) -> list[Check]:
     bands, illuminant, responses, level = inputs
     spectra = _paints(bands.centres)
     counts = _counts(bands, illuminant, responses, level, **params)
-    off = (spectra @ counts.T @ result.T - spectra @ _daylight(bands.centres).T).square().mean().sqrt()
+    off = (spectra @ counts.T @ result.T - spectra @ to_srgb(bands.centres).T).square().mean().sqrt()
     return [Check(f"rms {float(off):.3f} on colour charts", float(off) < 0.1)]
 
 
@@ -72,25 +72,4 @@ def _counts(
 
 def _paints(centres: Tensor) -> Tensor:
     """Reflectances of the colour charts at these wavelengths: (paint, band) float64."""
-    import colour
-
-    at = centres.cpu().numpy() * 1e9
-    charts = ("BabelColor Average", "ColorChecker N Ohta", "PMC", "ISO 17321-1")
-    found = [_sampled(sd, at) for chart in charts for sd in colour.SDS_COLOURCHECKERS[chart].values()]
-    return torch.tensor(np.stack(found), dtype=torch.float64)
-
-
-def _sampled(sd: Any, at: Any) -> Any:
-    return np.interp(at, sd.wavelengths, sd.values)
-
-
-def _daylight(centres: Tensor) -> Tensor:
-    """Reflectance to linear sRGB under D65, white to (1, 1, 1) on these very bands: (3, band) float64."""
-    import colour
-
-    at = centres.cpu().numpy() * 1e9
-    observer = colour.MSDS_CMFS["CIE 1931 2 Degree Standard Observer"]
-    matching = np.stack([np.interp(at, observer.wavelengths, row) for row in observer.values.T])
-    light = _sampled(colour.SDS_ILLUMINANTS["D65"], at)
-    rgb = colour.RGB_COLOURSPACES["sRGB"].matrix_XYZ_to_RGB @ (matching * light)
-    return torch.tensor(rgb / rgb.sum(1, keepdims=True), dtype=torch.float64)
+    return torch.cat([paint.at(centres) for paint in paints()])
