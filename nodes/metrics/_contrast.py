@@ -28,8 +28,8 @@ def mtf(psf: Psf) -> Mtf:
 
     Shapes: psf.intensity (band, y, x) -> three of (band,) float64.
     Units:  none.
-    Error:  1e-7 of float32, and of the window: light outside it counts as lost, and frequencies are those of the window. The cut-off holds
-            for a round aperture and a PSF sampled at points.
+    Error:  1e-7 in float32, and that of the window: light outside it counts as lost, frequencies are its own. The
+            cut-off holds for a round aperture and a PSF sampled at points.
     Source: Goodman, Introduction to Fourier Optics, 4th ed., ch. 7 (OTF as autocorrelation of the pupil).
     """
     rows = [_contrast(one, float(p)) for one, p in zip(psf.intensity, psf.clear_peak, strict=True)]
