@@ -18,7 +18,7 @@ if TYPE_CHECKING:
     from neusee.workflows._graph import Recipe
 
 HEADER = ("step", "where", "state", "seconds", "output", "check")
-_WIDTHS = (20, 6, 10, 9, 34, 0)
+_WIDTHS = (0, 6, 10, 9, 28, 0)
 
 
 @dataclass
@@ -43,12 +43,20 @@ class Family:
         if not done:
             return (name, "", "…" if self.begun else "", "", "", "")
         ran = sum(d.seconds for d in done if d.state == "run")
-        told = next((d for d in done if any(not c.ok for c in d.checks)), done[0])
-        shape = shape_of(told)
+        last = max(done, key=lambda d: (d.facts is not None, self.members.index(d.step)))
+        told = next((d for d in done if any(not c.ok for c in d.checks)), last)
+        shape = shape_of(last)
         check = "; ".join(("" if c.ok else "LOOK: ") + c.text for c in told.checks)
         why = next((d.why for d in done if d.state in ("run", "left out") and d.why), "")
         check = f"{check}  ({why})" if check and why else check or why
-        return (name, told.device, self.state(), f"{ran:.3f}" if ran else "", f"{shape} {self.unit}".strip(), check)
+        return (
+            name,
+            told.device,
+            self.state(),
+            f"{ran:.3f}" if ran else "",
+            f"{shape} {self.unit}".strip() if shape else "",
+            check,
+        )
 
     def state(self) -> str:
         """``run``, ``cached``, ``left out``, or how many of each."""
@@ -63,9 +71,10 @@ class Plain:
 
     def __init__(self, recipe: Recipe, names: Iterable[str]) -> None:
         self.families = families(recipe, names)
+        self.wide = max((len(f.cells()[0]) for f in self.families.values()), default=0)
 
     def __enter__(self) -> Plain:
-        print(_line(HEADER))
+        print(_line(HEADER, self.wide))
         return self
 
     def __exit__(self, *error: object) -> None:
@@ -77,7 +86,7 @@ class Plain:
         """Take one event of the engine."""
         family = note(self.families, event)
         if event.done is not None and family.awake and len(family.done) == len(family.members):
-            print(_line(family.cells()))
+            print(_line(family.cells(), self.wide))
 
 
 class Live:
@@ -219,9 +228,10 @@ def aligned(rows: Sequence[Sequence[str]], right: bool = True) -> list[str]:
     return lines
 
 
-def _line(cells: Sequence[str]) -> str:
+def _line(cells: Sequence[str], wide: int) -> str:
     """One plain line; the columns keep their places while the cells fit."""
+    widths = (wide, *_WIDTHS[1:])
     padded = [
-        f"{c:>{w}}" if name == "seconds" else f"{c:<{w}}" for c, w, name in zip(cells, _WIDTHS, HEADER, strict=True)
+        f"{c:>{w}}" if name == "seconds" else f"{c:<{w}}" for c, w, name in zip(cells, widths, HEADER, strict=True)
     ]
     return "  " + "  ".join(padded).rstrip()

@@ -39,7 +39,7 @@ FIGURES = (
             "plain": "developed[plain]",
             "mask": "developed[mask]",
             "restored": "restored",
-            "spots": "?spot[mask,*]",
+            "spots": "?spot[plain,*]",
         },
     ),
     Figure(

@@ -38,7 +38,8 @@ def document(
     """Everything there is to say of a run, as plain JSON."""
     recipe, done = result.recipe, list(result.done.values())
     found = expected(recipe, result.value)
-    failed = [f"{d.step}: {c.text}" for d in done for c in d.checks if not c.ok]
+    steps = [_step(d, result) for d in done]
+    failed = [f"{s['step']}: {c['text']}" for s in steps for c in s["checks"] if not c["ok"]]
     counts = Counter[str](d.state for d in done)
     return {
         "recipe": recipe.name,
@@ -61,7 +62,7 @@ def document(
         "readings": _readings(recipe),
         "left_out": [{"step": d.step, "bound": d.bound, "why": d.why} for d in done if d.state == "left out"],
         "absent": [{"step": step, "where": where} for step, where in recipe.absent.items()],
-        "steps": [_step(d, result) for d in done],
+        "steps": steps,
         "figures": _figures(missing),
         "missing": [{"name": n, "title": _title(n), "why": why} for n, why in missing.items()],
         "facts": _facts(result),
@@ -124,7 +125,8 @@ def size_of(count: float) -> str:
 
 def _step(done: Done, result: Result) -> dict[str, Any]:
     node = result.recipe.steps[done.step].node
-    done = _remembered(done, result.store.about(done.key)) if done.state == "asleep" else done
+    about = result.store.about(done.key) if done.state in ("cached", "asleep") else None
+    done = _remembered(done, about) if about else done
     return {
         "step": done.step,
         "node": node.path,
@@ -132,6 +134,7 @@ def _step(done: Done, result: Result) -> dict[str, Any]:
         "state": done.state,
         "why": done.why,
         "seconds": done.seconds,
+        "made_in": about["seconds"] if about else done.seconds,
         "shape": shape_of(done),
         "unit": unit_of(node.__doc__ or ""),
         "size": size_of(done.bytes) if done.bytes else "",
@@ -142,14 +145,12 @@ def _step(done: Done, result: Result) -> dict[str, Any]:
     }
 
 
-def _remembered(done: Done, about: Mapping[str, Any] | None) -> Done:
-    """A step that was not looked at, with what the store says of its result."""
-    if about is None:
-        return done
+def _remembered(done: Done, about: Mapping[str, Any]) -> Done:
+    """A step that was not run, with what the store says of its result."""
     found = about.get("facts")
     facts = Facts(**{**found, "shape": tuple(found["shape"])}) if found else None
     checks = tuple(Check(text, ok) for text, ok in about.get("checks", ()))
-    why = f"not read; made {about['date']} in {about['seconds']:.3g} s"
+    why = f"made {about['date'][:16].replace('T', ' ')} UTC"
     return replace(done, why=why, facts=facts, checks=checks, bytes=about["bytes"])
 
 
