@@ -113,8 +113,7 @@ class _Product(torch.autograd.Function):
         at_a, at_b, at, size, conjugate, length = how
         plane, result = _Plane(length, a), a.new_empty(len(a), *size)
         for one, two, out in zip(a, b, result, strict=True):
-            plane.multiply(one, at_a, two, at_b, conjugate)
-            out.copy_(plane.window(at, size))
+            out.copy_(plane.window(plane.product(one, at_a, two, at_b, conjugate), at, size))
         return result
 
     @staticmethod
@@ -130,31 +129,34 @@ class _Product(torch.autograd.Function):
 
 
 class _Plane:
-    """Room for one band, used again for the next: fresh pages cost more than the transforms."""
+    """Room for the padded rows of one band, used again for the next.
+
+    The columns go without ``out=``: there it costs a copy, 21 ms instead of 12 at 3072 x 1537.
+    """
 
     def __init__(self, length: Corner, like: Tensor) -> None:
-        half = (length[0], length[1] // 2 + 1)
         dtype = torch.complex128 if like.dtype == torch.float64 else torch.complex64
         self.length = length
         self.real = like.new_empty(length)
-        self.rows, self.first, self.second = (like.new_empty(half, dtype=dtype) for _ in range(3))
+        self.rows = like.new_empty((length[0], length[1] // 2 + 1), dtype=dtype)
 
-    def multiply(self, a: Tensor, at_a: Corner, b: Tensor, at_b: Corner, conjugate: bool) -> None:
-        self._spectrum(a, at_a, self.first)
-        self._spectrum(b, at_b, self.second)
-        self.first.mul_(self.second.conj_physical_() if conjugate else self.second)
+    def product(self, a: Tensor, at_a: Corner, b: Tensor, at_b: Corner, conjugate: bool) -> Tensor:
+        first, second = self._spectrum(a, at_a), self._spectrum(b, at_b)
+        both: Tensor = first.mul_(second.conj_physical_() if conjugate else second)
+        return both
 
-    def _spectrum(self, x: Tensor, at: Corner, out: Tensor) -> None:
+    def _spectrum(self, x: Tensor, at: Corner) -> Tensor:
         """Transform only the rows that hold something, then all columns."""
         (y, left), (h, w) = at, x.shape
         for edge in (self.rows[:y], self.rows[y + h :], self.real[:h, :left], self.real[:h, left + w :]):
             edge.zero_()
         self.real[:h, left : left + w] = x
         torch.fft.rfft(self.real[:h], out=self.rows[y : y + h])
-        torch.fft.fft(self.rows, dim=0, out=out)
+        spectrum: Tensor = torch.fft.fft(self.rows, dim=0)
+        return spectrum
 
-    def window(self, at: Corner, size: Corner) -> Tensor:
+    def window(self, spectrum: Tensor, at: Corner, size: Corner) -> Tensor:
         (top, left), (h, w) = at, size
-        torch.fft.ifft(self.first, dim=0, out=self.rows)
-        torch.fft.irfft(self.rows[top : top + h], n=self.length[1], out=self.real[:h])
+        columns = torch.fft.ifft(spectrum, dim=0)
+        torch.fft.irfft(columns[top : top + h], n=self.length[1], out=self.real[:h])
         return self.real[:h, left : left + w]
