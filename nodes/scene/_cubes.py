@@ -51,7 +51,7 @@ def exr_size(file: Path) -> tuple[int, int]:
 
     try:
         with OpenEXR.File(str(file), header_only=True) as opened:
-            header = opened.header()
+            header = dict(opened.header())
     except (RuntimeError, OSError, ValueError) as why:
         raise ParameterError("file", f"{file} cannot be read as OpenEXR ({str(why).strip()})") from None
     names = [channel.name for channel in header["channels"]]
@@ -69,7 +69,7 @@ def _listed(file: Path) -> dict[str, tuple[tuple[int, ...], str]]:
         raise ParameterError("file", f"{file.name}: .mat files need scipy: pip install scipy") from None
     try:
         return {name: (size, _TYPES.get(kind, kind)) for name, size, kind in whosmat(file)}
-    except (NotImplementedError, ValueError):
+    except Exception:  # scipy fails on foreign bytes in many ways
         raise ParameterError(
             "file", f"{file.name} is no .mat file up to version 7: save it in MATLAB with -v7"
         ) from None

@@ -33,11 +33,7 @@ def exr(
     Raises: ParameterError before the run where R, G, B and Y are all missing; ValueError on values not finite.
     Source: OpenEXR technical introduction (chromaticities, adoptedNeutral); matrices of colour-science.
     """
-    linear, name = _linear(file)
-    if not bool(torch.isfinite(linear).all()):
-        bad = int((~torch.isfinite(linear)).sum())
-        raise ValueError(f"{file.name} holds {bad} {name} values that are not finite: replace them, say by the largest")
-    scene = framed(linear, shape) / (white or 1.0)
+    scene = framed(_linear(file), shape) / (white or 1.0)
     return scene.clamp_min(0) if negatives == "clip" else scene
 
 
@@ -55,10 +51,10 @@ def _(*, file: Path, shape: Shape | None = None, **params: Any) -> list[str]:
 
 @exr.check
 def _(result: Tensor, *, file: Path, **params: Any) -> list[Check]:
-    linear, _ = _linear(file)
-    below, least = float((linear < 0).float().mean()), float(linear.min())
+    linear = _linear(file)
+    below, least = int((linear < 0).sum()), float(linear.min())
     text = f"peak {float(result.max()):.4g}, mean {float(result.mean()):.3g}"
-    return [Check(text + (f"; {below:.2%} of values were negative, down to {least:.2g}" if below else ""))]
+    return [Check(text + (f"; {below} of {linear.numel()} values were negative, down to {least:.2g}" if below else ""))]
 
 
 def _header(file: Path) -> dict[str, Any]:
@@ -84,18 +80,20 @@ def _wanted(file: Path, names: list[str]) -> list[str]:
     )
 
 
-def _linear(file: Path) -> tuple[Tensor, str]:
-    """Linear sRGB as the file has it, (3, y, x) float32, and the names of its channels."""
+def _linear(file: Path) -> Tensor:
+    """Linear sRGB as the file has it, (3, y, x) float32."""
     import OpenEXR
 
     with OpenEXR.File(str(file), separate_channels=True) as opened:
-        header, channels = opened.header(), opened.channels()
+        header, channels = dict(opened.header()), opened.channels()
         names = _wanted(file, list(channels))
         pixels = np.stack([np.asarray(channels[name].pixels, dtype=np.float32) for name in names])
+    if bad := int((~np.isfinite(pixels)).sum()):
+        raise ValueError(f"{file.name} holds {bad} values that are not finite: replace them, say by the largest")
     if names == ["Y"]:
-        return torch.from_numpy(pixels).expand(3, -1, -1).clone(), "Y"
+        return torch.from_numpy(pixels).expand(3, -1, -1).clone()
     matrix = torch.from_numpy(_to_srgb(header)).to(torch.float32)
-    return (matrix @ torch.from_numpy(pixels).flatten(1)).reshape(pixels.shape), "RGB"
+    return (matrix @ torch.from_numpy(pixels).flatten(1)).reshape(pixels.shape)
 
 
 def _to_srgb(header: dict[str, Any]) -> NDArray[np.float64]:

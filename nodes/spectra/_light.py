@@ -18,7 +18,7 @@ Kind = Literal[
 
 @node(rtol=1e-9)
 def illuminant(bands: Bands, *, kind: Kind = "daylight", temperature: Temperature = 6504.0) -> Tensor:
-    """Average the relative power of a CIE illuminant over each band; `daylight` takes the temperature, the others have their own.
+    """Average the relative power of a CIE illuminant over each band; `temperature` is that of `daylight` alone.
 
     Shapes: -> (band,) float64.
     Units:  relative, mean 1 over the bands.
@@ -32,8 +32,8 @@ def illuminant(bands: Bands, *, kind: Kind = "daylight", temperature: Temperatur
     first, last = float(table.wavelengths[0]), float(table.wavelengths[-1])
     if low < first - 1e-12 or high > last + 1e-12:
         raise ValueError(
-            f"bands reach from {low * 1e9:.4g} to {high * 1e9:.4g} nm, but {kind} is tabulated from {first * 1e9:.4g} to "
-            f"{last * 1e9:.4g} nm: choose bands inside it"
+            f"bands reach from {low * 1e9:.4g} to {high * 1e9:.4g} nm, but {kind} is tabulated from "
+            f"{first * 1e9:.4g} to {last * 1e9:.4g} nm: choose bands inside it"
         )
     power = table.over(bands)[0]
     if not float(power.mean()) > 0:
