@@ -18,7 +18,7 @@ if TYPE_CHECKING:
     from neusee.workflows._graph import Recipe
 
 HEADER = ("step", "where", "state", "seconds", "output", "check")
-_WIDTHS = (0, 6, 10, 9, 28, 0)
+_WIDTHS = (0, 5, 10, 9, 28, 0)
 
 
 @dataclass

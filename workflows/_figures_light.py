@@ -86,7 +86,8 @@ def _channels(ax: Any, illuminant: Tensor, responses: Tensor, bands: Bands) -> N
 
 
 def _lasers(ax: Any, lines: Mapping[str, Bands]) -> None:
-    """A labelled upright line at each laser's wavelength."""
-    for name, line in lines.items():
+    """An upright line at each laser's wavelength; more than two share a label."""
+    for number, (name, line) in enumerate(lines.items()):
         nm = float((line.centres * line.weights).sum() / line.weights.sum()) * 1e9
-        ax.axvline(nm, color="#555555", linewidth=1.2, linestyle=":", label=f"laser {name}, {nm:.0f} nm")
+        label = f"laser {name}, {nm:.0f} nm" if len(lines) < 3 else f"{len(lines)} lasers" if number == 0 else None
+        ax.axvline(nm, color="#555555", linewidth=1.2, linestyle=":", label=label)

@@ -6,7 +6,6 @@ import itertools
 import math
 import struct
 import sys
-import zlib
 from types import SimpleNamespace
 
 import pytest
@@ -15,7 +14,6 @@ import torch
 from neusee.nodes import node
 from neusee.nodes.values import Bands, Psf, Pupil
 from neusee.workflows import (
-    _exports,
     _figures,
     _figures_graph,
     _figures_light,
@@ -239,32 +237,6 @@ def test_graph_groups_items_and_a_family_that_ran_at_all_ran():
     assert wires == {"a": [], "b": ["a"]}
     assert looks == {"a": "run", "b": "cached"}
     assert counts == {"a": 2, "b": 1}
-
-
-def test_sixteen_bit_png_holds_every_bit():
-    image = torch.randint(0, 65536, (3, 4, 7), generator=torch.Generator().manual_seed(0)).float()
-    content = _exports.png16(image)
-    assert struct.unpack(">IIBB", content[16:26]) == (7, 4, 16, 2)
-    start = content.index(b"IDAT")
-    size = struct.unpack(">I", content[start - 4 : start])[0]
-    lines = zlib.decompress(content[start + 4 : start + 4 + size])
-    rows = [struct.unpack(">21H", lines[r * 43 + 1 : (r + 1) * 43]) for r in range(4)]
-    assert torch.equal(torch.tensor(rows).reshape(4, 7, 3).permute(2, 0, 1).float(), image)
-
-
-@pytest.mark.parametrize("image", [torch.zeros(4, 2, 2), torch.full((3, 2, 2), 65536.0), -torch.ones(3, 2, 2)])
-def test_sixteen_bit_png_refuses_what_it_cannot_hold(image):
-    with pytest.raises(ValueError, match="16-bit PNG"):
-        _exports.png16(image)
-
-
-def test_rgb_exr_reads_back_as_it_was(tmp_path):
-    import OpenEXR
-
-    image = torch.rand(3, 5, 6)
-    (tmp_path / "a.exr").write_bytes(_exports.exr(image))
-    pixels = OpenEXR.File(str(tmp_path / "a.exr")).channels()["RGB"].pixels
-    assert torch.equal(torch.tensor(pixels).permute(2, 0, 1), image)
 
 
 @node()
