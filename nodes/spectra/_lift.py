@@ -44,7 +44,7 @@ def lift_lmmse(rgb: Tensor, bands: Bands) -> Tensor:
     Shapes: rgb (3, y, x) -> (band, y, x).
     Units:  linear sRGB to reflectance; linear, so that HDR values above 1 stay.
     Error:  real paints: PSNR 33.3 dB, mean relative error 0.15 (CAVE balloons); back to sRGB exactly, but where a
-            negative result was clipped.
+            negative result was clipped. White is that of white paint: 0.62 at 400 nm, 0.94 to 1.12 from 420 nm.
     Raises: ValueError where rgb is not (3, y, x), bands leave 380 to 780 nm, or are too few or too close to see colour.
     Source: Wiener estimation as in Pratt and Mancill, Appl. Opt. 15, 73 (1976); charts of colour-science.
     """

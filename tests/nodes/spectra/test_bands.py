@@ -1,0 +1,92 @@
+"""Bands of a scene and of a laser line."""
+
+import itertools
+import math
+
+import pytest
+import torch
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from neusee.nodes import ParameterError
+from neusee.nodes.spectra import bands, line
+
+NM = 1e-9
+
+
+def test_31_bands_have_both_ends_as_centres():
+    result = bands(start=400 * NM, stop=700 * NM, count=31)
+    expected = torch.arange(400, 701, 10, dtype=torch.float64) * NM
+    torch.testing.assert_close(result.centres, expected, atol=1e-18, rtol=0)
+    torch.testing.assert_close(result.widths, torch.full((31,), 10 * NM, dtype=torch.float64), atol=1e-18, rtol=0)
+    assert torch.equal(result.weights, torch.ones(31, dtype=torch.float64))
+
+
+def test_one_band_is_the_middle():
+    result = bands(start=500 * NM, stop=600 * NM, count=1)
+    assert float(result.centres[0]) == pytest.approx(550 * NM)
+    assert float(result.widths[0]) == pytest.approx(100 * NM)
+
+
+def test_refuses_exchanged_ends():
+    with pytest.raises(ParameterError, match=r"700 nm.*400 nm"):
+        bands.before(start=700 * NM, stop=400 * NM, count=31)
+
+
+def test_line_weights_are_the_error_function():
+    result = line(wavelength=532 * NM, floor=0.0)
+    sigma = 10 / math.sqrt(8 * math.log(2))
+    edges = [-15, -9, -3, 3, 9, 15]
+    below = [0.5 * math.erf(e / sigma / math.sqrt(2)) for e in edges]
+    inside = torch.tensor([b - a for a, b in itertools.pairwise(below)], dtype=torch.float64)
+    torch.testing.assert_close(result.weights, inside / inside.sum(), rtol=1e-12, atol=0)
+    assert (result.centres / NM).round(decimals=6).tolist() == [520, 526, 532, 538, 544]
+
+
+def test_floor_is_a_share_of_the_peak():
+    """Its energy is floor x span over the area of the line, 1.0645 fwhm x peak."""
+    without, with_floor = line(wavelength=532 * NM, floor=0.0), line(wavelength=532 * NM, floor=0.1)
+    share = 0.1 * 30 / (10 * math.sqrt(math.pi / math.log(2)) / 2)
+    kept = math.erf(15 / (10 / math.sqrt(8 * math.log(2))) / math.sqrt(2))
+    expected = (without.weights * kept + share / 5) / (kept + share)
+    torch.testing.assert_close(with_floor.weights, expected, rtol=1e-12, atol=0)
+
+
+@settings(max_examples=60, deadline=None)
+@given(
+    at=st.floats(200, 2000),
+    fwhm=st.floats(0.01, 50),
+    count=st.integers(1, 15),
+    floor=st.floats(0, 1),
+    span=st.floats(0.01, 90),
+)
+def test_line_keeps_its_energy_and_place(at, fwhm, count, floor, span):
+    result = line(wavelength=at * NM, fwhm=fwhm * NM, count=count, span=span * NM, floor=floor)
+    assert float(result.weights.sum()) == pytest.approx(1, rel=1e-12)
+    assert float(result.weights.min()) >= 0
+    assert float((result.weights * result.centres).sum()) == pytest.approx(at * NM, rel=1e-9)
+    assert float(result.widths.sum()) == pytest.approx(span * NM, rel=1e-9)
+
+
+@pytest.mark.parametrize(("at", "energy"), [(530, 1.057), (535, 0.943)])
+def test_points_show_the_error_of_the_printed_grid(at, energy):
+    result = line(wavelength=at * NM, floor=0.0, sampling="point")
+    assert float(result.weights.sum()) == pytest.approx(energy, abs=5e-4)
+    rest = (result.centres / NM) % 10
+    assert float(torch.minimum(rest, 10 - rest).max()) < 1e-6
+    assert not line.after(result, wavelength=at * NM)[0].ok
+    assert "5.7 %" in line.before(wavelength=at * NM, sampling="point")[0]
+
+
+@given(at=st.floats(200, 2000), count=st.integers(1, 9))
+def test_points_are_the_nearest_of_the_grid(at, count):
+    result = line(wavelength=at * NM, count=count, sampling="point")
+    assert len(result.centres) == count
+    assert float((result.centres - at * NM).abs().max()) <= (count / 2 * 10 + 1e-6) * NM
+
+
+def test_refuses_bands_below_100_nm():
+    with pytest.raises(ParameterError, match="100 nm") as error:
+        line.before(wavelength=110 * NM)
+    assert error.value.parameter == "fwhm"
+    assert line.before(wavelength=400 * NM) == []
