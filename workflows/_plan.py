@@ -24,28 +24,29 @@ def plan_lines(recipe: Recipe, store: Store, device: str = "cpu") -> list[str]:
     awake, past = _awake(recipe, keys, store), _past(store)
     rows, seconds, size = [], 0.0, 0.0
     for name in order:
-        about = store.about(keys[name])
-        node = recipe.steps[name].node.path
-        known = about or past.get(name) or past.get(node) or {}
+        step, about = recipe.steps[name], store.about(keys[name])
+        known = about or past.get(name) or past.get(step.node.path) or {}
         state = "left out" if left_out.get(name) else "stored" if about else "run" if name in awake else "not needed"
         if state == "run":
-            seconds += known.get("seconds", 0.0)
-            size += known.get("bytes", 0.0)
-        reads = ", ".join(dict.fromkeys(recipe.steps[name].sources))
-        took = f"{known['seconds']:.3f} s" if known else "?"
-        rows.append([name, node, state, took, size_of(known["bytes"]) if known else "?", reads])
+            seconds, size = seconds + known.get("seconds", 0.0), size + known.get("bytes", 0.0)
+        cost = ["", ""] if state == "left out" else _cost(known)
+        rows.append([name, step.node.path, state, *cost, ", ".join(dict.fromkeys(step.sources))])
     count = sum(row[2] == "run" for row in rows)
     last = f"{count} of {len(rows)} steps would run: about {seconds:.3g} s, {size_of(size)} new, as earlier runs took"
-    unknown = [name for name, known in left_out.items() if known is None]
-    note = [f"left out or not, only what feeds it will tell: {', '.join(unknown)}"] if unknown else []
+    unsure = [name for name, known in left_out.items() if known is None]
+    note = [f"left out or not, only what feeds it will tell: {', '.join(unsure)}"] if unsure else []
     return [*_columns([["step", "node", "state", "seconds", "bytes", "reads"], *rows]), *note, last]
+
+
+def _cost(known: dict[str, Any]) -> list[str]:
+    return [f"{known['seconds']:.3f} s", size_of(known["bytes"])] if known else ["?", "?"]
 
 
 def cache_lines(store: Store) -> list[str]:
     """Every result: when, bytes, seconds, step, recipe, key; the newest last."""
     found = sorted(store.entries(), key=lambda entry: str(entry[1].get("date", "")))
     rows = [_entry(key, about) for key, about in found]
-    total = sum(about["bytes"] for _, about in found)
+    total = sum(_size(about) for _, about in found)
     last = f"{len(found)} results, {size_of(total)}, in {store.root}"
     return [*(_columns([["date", "bytes", "seconds", "step", "recipe", "key"], *rows]) if rows else []), last]
 
@@ -77,15 +78,14 @@ def _resolved(
 
 
 def _entry(key: str, about: dict[str, Any]) -> list[str]:
-    took = f"{about.get('seconds', 0.0):.3f}"
-    return [
-        about.get("date", ""),
-        size_of(about["bytes"]),
-        took,
-        about.get("step", ""),
-        about.get("recipe", ""),
-        key[:8],
-    ]
+    took, date = f"{about.get('seconds', 0.0):.3f}", about.get("date", "")[:19].replace("T", " ")
+    return [date, size_of(_size(about)), took, about.get("step", ""), about.get("recipe", ""), key[:8]]
+
+
+def _size(about: dict[str, Any]) -> int:
+    """Bytes of a result, or of the file that it stands for."""
+    size: int = about.get("file_bytes", about["bytes"])
+    return size
 
 
 def _awake(recipe: Recipe, keys: dict[str, str], store: Store) -> set[str]:

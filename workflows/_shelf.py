@@ -48,6 +48,7 @@ class Shelf:
             "seconds": 0.0,
             "date": datetime.now(UTC).isoformat(timespec="seconds"),
             "file": path.name,
+            "file_bytes": len(content),
         }
         self.store.put(key, torch.tensor(list(_checksum(path)), dtype=torch.uint8), about)
         return path
