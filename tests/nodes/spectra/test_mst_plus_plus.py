@@ -27,6 +27,15 @@ def made_up():
     return state
 
 
+@pytest.fixture(autouse=True)
+def one_thread():
+    """Hundreds of tiny tensors: a second thread only waits."""
+    threads = torch.get_num_threads()
+    torch.set_num_threads(1)
+    yield
+    torch.set_num_threads(threads)
+
+
 @pytest.fixture(scope="module")
 def picture():
     return torch.rand(3, 6, 7, generator=generator(3))
