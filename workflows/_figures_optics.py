@@ -95,7 +95,9 @@ def _encircled(ax: Any, psf: Psf, bands: Bands, pitch: float, arm: str) -> None:
         share = torch.zeros(int(radius.max()) + 1, dtype=torch.float64).index_add_(0, radius, light).cumsum(0)
         microns = (torch.arange(len(share)) + 0.5) * pitch * 1e6
         colour = wavelength_colour(wanted)
-        ax.semilogx(microns.numpy(), share.numpy(), color=colour, label=f"{nanometres(wanted):.0f} nm")
+        ax.semilogx(
+            microns.numpy(), share.numpy(), color=colour, label=f"{nanometres(float(bands.centres[band])):.0f} nm"
+        )
     ax.set_ylim(0.0, 1.02)
     ax.set_title(f"{arm}: encircled energy")
     ax.set_xlabel("radius (µm)")

@@ -16,19 +16,25 @@ def overview(
     *, truth: Tensor, plain: Tensor, mask: Tensor, restored: Tensor, spots: Mapping[str, Tensor] | None = None
 ) -> Any:
     """Truth, plain lens, with mask, restored and |error|, all by one stretch, the laser ringed."""
-    white = max(float(torch.quantile(truth.flatten()[:: max(1, truth.numel() // 200_000)].float(), 0.995)), 1e-9)
+    white = _high(truth)
     pictures = {"truth": truth, "plain lens": plain, "with mask": mask, "restored": restored}
     figure, axes = canvas(13.0, 3.4, 1, 5)
     for ax, (name, image) in zip(axes[0], pictures.items(), strict=False):
         picture(ax, encoded(_centre(image, truth) / white), name)
         _ring(ax, spots or {}, truth)
     error = (_centre(restored, truth) - truth).abs().mean(0) / white
-    shown = picture(axes[0, 4], error.cpu().numpy(), "|restored − truth|", cmap="viridis", vmin=0.0)
+    shown = picture(axes[0, 4], error.cpu().numpy(), "|restored − truth|", cmap="viridis", vmin=0.0, vmax=_high(error))
     _ring(axes[0, 4], spots or {}, truth)
-    bar = figure.colorbar(shown, ax=axes[0, 4], fraction=0.046, pad=0.03)
+    bar = figure.colorbar(shown, ax=axes[0, 4], fraction=0.046, pad=0.03, extend="max")
     bar.set_label("fraction of white", fontsize=9)
     bar.ax.tick_params(labelsize=9)
     return figure
+
+
+def _high(values: Tensor) -> float:
+    """The level that only one value in 200 passes."""
+    some = values.detach().flatten()[:: max(1, values.numel() // 200_000)].float()
+    return max(float(torch.quantile(some, 0.995)), 1e-9)
 
 
 def _centre(image: Tensor, like: Tensor) -> Tensor:
