@@ -17,8 +17,10 @@ _SPACING = 64  #: pixels between points
 
 @node(rtol=1e-5)
 def targets(*, kind: Kind, shape: Shape, low: Fraction = 0.0, high: Fraction = 1.0) -> Tensor:
-    """Draw a test target: flat (`high`), an edge through the axis (bright to +x), the same tilted by 5 degrees, a
-    sinusoidal Siemens star of 36 cycles, or points of one pixel every 64 pixels from the axis.
+    """Draw a grey test target whose image has a known answer.
+
+    `flat` is `high` everywhere; `edge` runs through the axis, bright to +x; `slanted_edge` is the same tilted by 5
+    degrees; `siemens` is a sinusoidal star of 36 cycles; `points` are single pixels, 64 apart, one on the axis.
 
     Shapes: -> (3, y, x) float32, the axis at sample N//2.
     Units:  linear sRGB, grey between `low` and `high`.
