@@ -1,1 +1,68 @@
-"""The plumbing: read a recipe, order its steps, find, place and run them, and say what happened."""
+"""The plumbing: read a recipe, order its steps, find, place and run them, and say what happened.
+
+    from neusee.workflows import load, run
+    result = run(load("first_light", ["sensor.read_noise=20 e-"]))
+    result.values["restored"]
+
+Names are imported when they are first used, so that ``neusee --help`` answers without torch.
+"""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING, Any
+
+if TYPE_CHECKING:
+    from neusee.workflows._call import RunError
+    from neusee.workflows._function import as_function
+    from neusee.workflows._graph import Recipe, Step
+    from neusee.workflows._marks import Problem, RecipeError
+    from neusee.workflows._recipe import load, recipes
+    from neusee.workflows._run import Done, Result, run
+    from neusee.workflows._store import Store
+    from neusee.workflows.simulate import Simulation, simulate
+
+_HOME = {
+    "RunError": "_call",
+    "as_function": "_function",
+    "Recipe": "_graph",
+    "Step": "_graph",
+    "Problem": "_marks",
+    "RecipeError": "_marks",
+    "load": "_recipe",
+    "recipes": "_recipe",
+    "Done": "_run",
+    "Result": "_run",
+    "run": "_run",
+    "Store": "_store",
+    "Simulation": "simulate",
+    "simulate": "simulate",
+}
+
+__all__ = [
+    "Done",
+    "Problem",
+    "Recipe",
+    "RecipeError",
+    "Result",
+    "RunError",
+    "Simulation",
+    "Step",
+    "Store",
+    "as_function",
+    "load",
+    "recipes",
+    "run",
+    "simulate",
+]
+
+
+def __getattr__(name: str) -> Any:
+    import importlib
+
+    if name not in _HOME:
+        raise AttributeError(f"module 'neusee.workflows' has no attribute {name!r}")
+    return getattr(importlib.import_module(f"neusee.workflows.{_HOME[name]}"), name)
+
+
+def __dir__() -> list[str]:
+    return sorted({*globals(), *__all__})

@@ -8,7 +8,7 @@ from pydantic import Field
 from torch import Generator, Tensor
 
 from neusee.nodes import Check, Facts, node
-from neusee.nodes.sensor._saturation import Efficiency
+from neusee.nodes.sensor._saturation import Efficiency, Well
 from neusee.nodes.units import Electrons, Fraction
 
 Distribution = Literal["gaussian", "poisson"]
@@ -76,8 +76,11 @@ def normal(like: Tensor, rng: Generator) -> Tensor:
 
 
 @node()
-def dark_current(electrons: Tensor, *, mean: Electrons, rng: Generator) -> Tensor:
+def dark_current(electrons: Tensor, *, mean: Electrons, full_well: Well | None = None, rng: Generator) -> Tensor:
     """Add the electrons that heat frees during the exposure: Poisson of the given mean.
+
+    ``full_well`` only says what the dark is weighed against when it is small enough to leave out: what a laser
+    heaps up above the well is cut off later and cannot hide anything.
 
     Shapes: electrons (..., y, x) -> (..., y, x).
     Units:  e-; mean e- per exposure.
@@ -89,13 +92,15 @@ def dark_current(electrons: Tensor, *, mean: Electrons, rng: Generator) -> Tenso
 
 
 @dark_current.negligible
-def _(electrons: Facts, *, mean: float) -> float:
-    return _share(mean, math.sqrt(mean), electrons.max)
+def _(electrons: Facts, *, mean: float, full_well: float | None) -> float:
+    return _share(mean, math.sqrt(mean), electrons.max, full_well)
 
 
 @node()
-def read_noise(electrons: Tensor, *, pedestal: Electrons, sigma: Electrons, rng: Generator) -> Tensor:
-    """Add the pedestal of the amplifier and its Gaussian noise.
+def read_noise(
+    electrons: Tensor, *, pedestal: Electrons, sigma: Electrons, full_well: Well | None = None, rng: Generator
+) -> Tensor:
+    """Add the pedestal of the amplifier and its Gaussian noise; ``full_well`` as for the dark current.
 
     Shapes: electrons (..., y, x) -> (..., y, x).
     Units:  e-; pedestal e-, the paper's "mean read noise"; sigma e- rms.
@@ -106,11 +111,11 @@ def read_noise(electrons: Tensor, *, pedestal: Electrons, sigma: Electrons, rng:
 
 
 @read_noise.negligible
-def _(electrons: Facts, *, pedestal: float, sigma: float) -> float:
-    return _share(pedestal, sigma, electrons.max)
+def _(electrons: Facts, *, pedestal: float, sigma: float, full_well: float | None) -> float:
+    return _share(pedestal, sigma, electrons.max, full_well)
 
 
-def _share(shift: float, spread: float, top: float) -> float:
-    """Root mean square of what is added, over that of the brightest pixel with it."""
-    added = math.hypot(shift, spread)
+def _share(shift: float, spread: float, brightest: float, full_well: float | None) -> float:
+    """Root mean square of what is added, over that of the brightest pixel that the well can hold, with it."""
+    added, top = math.hypot(shift, spread), min(brightest, brightest if full_well is None else full_well)
     return added / math.hypot(top + shift, spread) if added > 0 else 0.0

@@ -126,7 +126,7 @@ def change(electrons, node, draws=400, **params):
 )
 def test_bounds_are_true_and_not_far(node, params, scale):
     electrons = scale * torch.rand(4, 4, dtype=torch.float64, generator=seeded(1))
-    bound, found = node.bound(Facts.of(electrons), **params), change(electrons, node, **params)
+    bound, found = node.bound(Facts.of(electrons), full_well=None, **params), change(electrons, node, **params)
     # The largest of 16 sampled rms values lies above the true one by a few of its own errors, 1/sqrt(2 * draws).
     assert found <= bound * (1 + 5 / math.sqrt(800) + (2.0 if params.get("mean") == 0.002 else 0.0))
     assert params.get("mean") == 0.002 or bound < 1.1 * found
@@ -134,8 +134,8 @@ def test_bounds_are_true_and_not_far(node, params, scale):
 
 def test_bounds_of_nothing():
     dark = Facts.of(torch.zeros(2, 2))
-    assert dark_current.bound(dark, mean=0.0) == read_noise.bound(dark, pedestal=0.0, sigma=0.0) == 0.0
-    assert dark_current.bound(dark, mean=0.1) == read_noise.bound(dark, pedestal=0.0, sigma=1.0) == 1.0
+    assert dark_current.bound(dark, mean=0.0, full_well=None) == read_noise.bound(dark, pedestal=0.0, sigma=0.0, full_well=None) == 0.0
+    assert dark_current.bound(dark, mean=0.1, full_well=None) == read_noise.bound(dark, pedestal=0.0, sigma=1.0, full_well=None) == 1.0
 
 
 def test_what_a_reader_is_told():
@@ -143,3 +143,12 @@ def test_what_a_reader_is_told():
     assert photon_noise.before(mean="additive", mean_shift=0.2) == []
     assert photon_noise.after(torch.ones(2), torch.ones(2))[0].ok
     assert not photon_noise.after(torch.ones(2), torch.tensor([-5.0, 1.0]))[0].ok
+
+
+def test_a_laser_above_the_well_hides_no_noise():
+    dazzled = Facts.of(torch.tensor([[10.0, 1e7]]))
+    noise = {"pedestal": 390.0, "sigma": 10.5}
+    assert read_noise.bound(dazzled, **noise, full_well=25500.0) > 0.01
+    assert read_noise.bound(dazzled, **noise, full_well=None) < 1e-4
+    dark = dark_current.bound(dazzled, mean=0.002, full_well=25500.0)
+    assert dark == pytest.approx(math.hypot(0.002, math.sqrt(0.002)) / 25500, rel=1e-3)
