@@ -19,7 +19,6 @@ if TYPE_CHECKING:
     from neusee.workflows._recipe import load, recipes
     from neusee.workflows._run import Done, Result, run
     from neusee.workflows._store import Store
-    from neusee.workflows.simulate import Simulation, simulate
 
 _HOME = {
     "RunError": "_call",
@@ -34,8 +33,6 @@ _HOME = {
     "Result": "_run",
     "run": "_run",
     "Store": "_store",
-    "Simulation": "simulate",
-    "simulate": "simulate",
 }
 
 __all__ = [
@@ -45,14 +42,12 @@ __all__ = [
     "RecipeError",
     "Result",
     "RunError",
-    "Simulation",
     "Step",
     "Store",
     "as_function",
     "load",
     "recipes",
     "run",
-    "simulate",
 ]
 
 
