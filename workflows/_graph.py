@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterable, Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import Any
 
 from neusee.nodes import Node
@@ -82,3 +82,23 @@ def in_order(sources: Mapping[str, Iterable[str]], wanted: Iterable[str]) -> lis
         order.setdefault(name)
         stack.pop()
     return list(order)
+
+
+def kept_promises(recipe: Recipe, written: Recipe) -> Recipe:
+    """``recipe`` with the expected numbers that still hold: those of ``written`` whose steps come about as there."""
+    same = {name for name in recipe.steps if _alike(recipe, written, name)}
+    for name in in_order({n: s.sources for n, s in recipe.steps.items()}, recipe.steps):
+        if not same.issuperset(recipe.steps[name].sources):
+            same.discard(name)
+    lost = [e for e in recipe.expect if e in written.expect and e.step not in same]
+    if not lost:
+        return recipe
+    note = f"not compared, because your changes reach them: {', '.join(e.name for e in lost)}"
+    kept = tuple(e for e in recipe.expect if e not in lost)
+    return replace(recipe, expect=kept, notes=(*recipe.notes, note))
+
+
+def _alike(recipe: Recipe, written: Recipe, name: str) -> bool:
+    one, other = recipe.steps[name], written.steps.get(name)
+    seeded = one.node.random and recipe.seed != written.seed
+    return other is not None and not seeded and (one.node, one.params, one.wires) == (other.node, other.params, other.wires)

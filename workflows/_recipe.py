@@ -14,7 +14,7 @@ from typing import Any
 from neusee.workflows._compose import Composed, compose, groups_of, packaged
 from neusee.workflows._config import Config, Setting
 from neusee.workflows._cycles import cycles
-from neusee.workflows._graph import Expectation, Recipe, Step, Wire
+from neusee.workflows._graph import Expectation, Recipe, Step, Wire, kept_promises
 from neusee.workflows._head import expectations, outputs_of, seed_and_tolerance
 from neusee.workflows._marks import Problem, RecipeError
 from neusee.workflows._overrides import arguments_in
@@ -42,10 +42,12 @@ def load(
     """Read and check a packaged recipe, or a file whose name ends in ``.yaml``.
 
     Paths in ``overrides`` are relative to ``folder`` (the working folder), and messages
-    count them from ``first``. Raises `RecipeError` with every problem.
+    count them from ``first``. An expected number whose step the overrides reach is no longer
+    expected, and a note says so. Raises `RecipeError` with every problem.
     """
-    composed = compose(os.fspath(name_or_path), overrides, Path(folder or ".").absolute(), first)
-    return check(composed)
+    name, place = os.fspath(name_or_path), Path(folder or ".").absolute()
+    recipe = check(compose(name, overrides, place, first))
+    return kept_promises(recipe, check(compose(name, (), place))) if recipe.expect and overrides else recipe
 
 
 def check(composed: Composed) -> Recipe:
