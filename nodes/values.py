@@ -37,7 +37,8 @@ class Pupil(NamedTuple):
     amplitude: Tensor  #: (v, u) aperture times dirt
     height: Tensor  #: (v, u) of the diffractive element, m
     path: Tensor  #: (v, u) aberrations and dirt, m of optical path
-    index: Tensor  #: (band,) float64, refractive index of the element minus that of air
+    index: Tensor  # type: ignore[assignment]  # hides tuple.index, which no one asks of a pupil
+    #: (band,) float64, refractive index of the element minus that of air
     wavelengths: Tensor  #: (band,) float64, m
     pitch: Tensor  #: () float64, m between samples, both axes
 

@@ -101,4 +101,8 @@ def kept_promises(recipe: Recipe, written: Recipe) -> Recipe:
 def _alike(recipe: Recipe, written: Recipe, name: str) -> bool:
     one, other = recipe.steps[name], written.steps.get(name)
     seeded = one.node.random and recipe.seed != written.seed
-    return other is not None and not seeded and (one.node, one.params, one.wires) == (other.node, other.params, other.wires)
+    return (
+        other is not None
+        and not seeded
+        and (one.node, one.params, one.wires) == (other.node, other.params, other.wires)
+    )

@@ -133,9 +133,11 @@ def test_bounds_are_true_and_not_far(node, params, scale):
 
 
 def test_bounds_of_nothing():
-    dark = Facts.of(torch.zeros(2, 2))
-    assert dark_current.bound(dark, mean=0.0, full_well=None) == read_noise.bound(dark, pedestal=0.0, sigma=0.0, full_well=None) == 0.0
-    assert dark_current.bound(dark, mean=0.1, full_well=None) == read_noise.bound(dark, pedestal=0.0, sigma=1.0, full_well=None) == 1.0
+    dark, any_well = Facts.of(torch.zeros(2, 2)), {"full_well": None}
+    assert dark_current.bound(dark, mean=0.0, **any_well) == 0.0
+    assert read_noise.bound(dark, pedestal=0.0, sigma=0.0, **any_well) == 0.0
+    assert dark_current.bound(dark, mean=0.1, **any_well) == 1.0
+    assert read_noise.bound(dark, pedestal=0.0, sigma=1.0, **any_well) == 1.0
 
 
 def test_what_a_reader_is_told():
