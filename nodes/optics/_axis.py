@@ -10,7 +10,8 @@ from torch import Tensor
 Source = Callable[
     [int, int, Tensor], None
 ]  #: fill ``planes`` (2, stop - start, n_in) with rows start..stop of the field
-Sink = Callable[[slice, slice, Tensor], None]  #: take a patch (2, rows, columns) of the result; planes are re and im
+Sink = Callable[[slice, slice, Tensor], None]
+#: take a patch (2, ..., columns) of the result, re and im; what stands between, flattened, are the rows
 
 
 @dataclass(frozen=True, slots=True)
@@ -48,7 +49,13 @@ def unit_phasor(turns: Tensor, dtype: torch.dtype) -> Tensor:
     return torch.complex(angle.cos(), angle.sin())
 
 
-def row_chunks(rows: int, columns: int, elements: int = 1 << 18) -> list[tuple[int, int]]:
+def patch_of(x: Tensor, rows: slice, columns: slice, like: Tensor) -> Tensor:
+    """View of ``x[..., rows, columns]`` with its rows split as in ``like``, a patch that a sink was given."""
+    part = x[..., rows, columns]
+    return part.view(*x.shape[:-2], *like.shape[1:])
+
+
+def row_chunks(rows: int, columns: int, elements: int = 1 << 19) -> list[tuple[int, int]]:
     """Ranges of rows small enough that what happens to them stays in cache."""
     step = max(1, min(rows, elements // max(columns, 1)))
     return [(start, min(start + step, rows)) for start in range(0, rows, step)]

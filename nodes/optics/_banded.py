@@ -8,38 +8,41 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
-_SLACK = 6  #: columns of zeros that let blocks of unequal spacing share one stride
+_SLACK = 8  #: columns of zeros that let blocks of unequal spacing share one stride
 
 
 class _Run(NamedTuple):
     """Blocks first..first+count, whose columns begin at start, start + stride, ..."""
 
     first: int
-    count: int
+    blocks: int
     start: int
     stride: int
+
+    @property
+    def starts(self) -> list[int]:
+        return [self.start + i * self.stride for i in range(self.blocks)]
 
 
 class Banded:
     """Rows ``i`` that weigh the columns within ``reach`` of ``origin + step i``; rows come in whole blocks.
 
-    ``n_rows`` is rounded up to whole blocks; the rows beyond are finite and meaningless.
+    ``n_rows`` is rounded up to whole blocks; the rows beyond are finite and meaningless. What is
+    multiplied needs ``margin`` zeros before and behind its ``n_columns``, so that all blocks are alike.
     """
 
     def __init__(self, n_rows: int, n_columns: int, origin: float, step: float, reach: float, block: int) -> None:
-        self.n_columns, self.block, self.reach = n_columns, min(block, n_rows), reach
-        self.count = -(-n_rows // self.block)
+        self.n_columns, self.reach = n_columns, reach
+        self.count = -(-n_rows // block)
+        self.block = -(-n_rows // self.count)
         self.n_rows = self.count * self.block
         self.origin, self.step = origin, step
-        first = [min(max(math.ceil(self._at(b * self.block) - reach), 0), n_columns - 1) for b in range(self.count)]
-        last = [
-            min(max(math.floor(self._at((b + 1) * self.block - 1) + reach), 0), n_columns - 1)
-            for b in range(self.count)
-        ]
-        self.width = min(n_columns, max(z - a for a, z in zip(first, last, strict=True)) + 1 + _SLACK)
-        low = [max(0, z + 1 - self.width) for z in last]
-        high = [min(a, n_columns - self.width) for a in first]
-        self.runs = _runs(low, high, step * self.block)
+        first = [math.ceil(self._at(b * self.block) - reach) for b in range(self.count)]
+        last = [math.floor(self._at((b + 1) * self.block - 1) + reach) for b in range(self.count)]
+        self.width = max(z - a for a, z in zip(first, last, strict=True)) + 1 + _SLACK
+        self.runs = _runs([z + 1 - self.width for z in last], first, step * self.block)
+        starts = [start for run in self.runs for start in run.starts]
+        self.margin = max(0, -min(starts), max(starts) + self.width - n_columns)
         self.weights = torch.empty(0)
 
     def _at(self, row: int) -> float:
@@ -47,7 +50,7 @@ class Banded:
 
     def fill(self, weigh: Callable[[Tensor, Tensor], Tensor]) -> "Banded":
         """Set the weights to ``weigh(row, column)``, called with float64 indices that broadcast; zero out of reach."""
-        starts = [run.start + i * run.stride for run in self.runs for i in range(run.count)]
+        starts = [start for run in self.runs for start in run.starts]
         columns = torch.tensor(starts, dtype=torch.float64)[:, None, None] + torch.arange(self.width)
         rows = torch.arange(self.n_rows, dtype=torch.float64).view(self.count, self.block, 1)
         near = (columns - (self.origin + self.step * rows)).abs_() <= self.reach
@@ -65,27 +68,36 @@ class Banded:
         part.count, part.n_rows = last - first, (last - first) * self.block
         part.weights, part.runs = self.weights[first:last], []
         for run in self.runs:
-            a, z = max(run.first, first), min(run.first + run.count, last)
+            a, z = max(run.first, first), min(run.first + run.blocks, last)
             if a < z:
                 part.runs.append(_Run(a - first, z - a, run.start + (a - run.first) * run.stride, run.stride))
         return part
 
     def left(self, x: Tensor, out: Tensor) -> None:
-        """``out[n_rows, c] = matrix @ x[n_columns, c]``, both contiguous."""
-        wide = x.shape[1]
+        """``out[n_rows, c] = matrix @ x[margin + n_columns + margin, c]``; the rows of ``x`` may stand apart."""
+        wide, pitch = x.shape[1], x.stride(0)
         blocks = out.view(self.count, self.block, wide)
         for first, count, start, stride in self.runs:
-            view = x[start:].as_strided(
-                (count, self.width, wide), (stride * wide, wide, 1), start * wide + x.storage_offset()
-            )
-            torch.bmm(self.weights[first : first + count], view, out=blocks[first : first + count])
+            at = (start + self.margin) * pitch + x.storage_offset()
+            view = x.as_strided((count, self.width, wide), (stride * pitch, pitch, 1), at)
+            _multiply(self.weights[first : first + count], view, blocks[first : first + count])
 
     def right(self, x: Tensor, out: Tensor) -> None:
-        """``out[block, r, i] = (x[r, n_columns] @ matrix^T)`` in blocks of rows of the matrix, both contiguous."""
+        """``out[block, r, i] = (x[r, margin + n_columns + margin] @ matrix^T)``, in blocks of rows of the matrix."""
         tall, wide = x.shape
         for first, count, start, stride in self.runs:
-            view = x.as_strided((count, tall, self.width), (stride, wide, 1), start + x.storage_offset())
-            torch.bmm(view, self.weights[first : first + count].transpose(1, 2), out=out[first : first + count])
+            at = start + self.margin + x.storage_offset()
+            view = x.as_strided((count, tall, self.width), (stride, wide, 1), at)
+            _multiply(view, self.weights[first : first + count].transpose(1, 2), out[first : first + count])
+
+
+def _multiply(a: Tensor, b: Tensor, out: Tensor) -> None:
+    """Batched product; a few large ones go one by one, each on all threads."""
+    if len(a) >= 8:
+        torch.bmm(a, b, out=out)
+        return
+    for x, y, z in zip(a, b, out, strict=True):
+        torch.mm(x, y, out=z)
 
 
 def _runs(low: list[int], high: list[int], pace: float) -> list[_Run]:
@@ -95,10 +107,10 @@ def _runs(low: list[int], high: list[int], pace: float) -> list[_Run]:
     while first < len(low):
         run = max(
             (_longest(low, high, first, stride) for stride in (math.floor(pace), math.ceil(pace))),
-            key=lambda r: r.count,
+            key=lambda r: r.blocks,
         )
         runs.append(run)
-        first += run.count
+        first += run.blocks
     return runs
 
 

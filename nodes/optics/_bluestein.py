@@ -54,11 +54,11 @@ def _convolve(lines: Tensor, chirps: _Chirps, axis: Axis, work: Workspace) -> Te
     torch.mul(lines, chirps.before, out=padded[:, : axis.n_in])
     padded[:, axis.n_in :] = 0
     product = torch.fft.fft(padded, dim=1).mul_(chirps.spectrum)
-    window = torch.fft.ifft(product, dim=1)[:, axis.n_in - 1 : axis.n_in - 1 + axis.n_out]
+    window: Tensor = torch.fft.ifft(product, dim=1)[:, axis.n_in - 1 : axis.n_in - 1 + axis.n_out]
     return window.mul_(chirps.behind)
 
 
-@functools.cache
+@functools.lru_cache(maxsize=256)
 def smooth(n: int, even: bool = False) -> int:
     """The least 2-3-5-smooth number from ``n`` on: an FFT of another length is up to three times slower."""
     n += even and n % 2

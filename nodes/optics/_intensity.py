@@ -8,25 +8,12 @@ import torch
 from torch import Tensor
 from torch.autograd.function import once_differentiable
 
-from neusee.nodes.optics._axis import Axis, Source, centred
+from neusee.nodes.optics._axis import patch_of
+from neusee.nodes.optics._field import Field, Screens, View
 from neusee.nodes.optics._transform import Method, propagate
 from neusee.nodes.optics._workspace import Workspace, borrowed
 
-KEPT_FIELD_BYTES = 1 << 29  #: focal fields up to this size wait for the backward pass; larger ones are computed again
-
-
-@dataclass(frozen=True, slots=True)
-class View:
-    """One window of point samples in one band. ``|U|^2`` is weighed by ``weight`` and by ``envelope_y envelope_x``."""
-
-    band: int
-    rows: Axis
-    columns: Axis
-    turns_height: float  #: turns of phase per metre of height
-    turns_path: float  #: turns of phase per metre of path
-    tilt: tuple[float, float]  #: turns per pupil sample (v, u) that move the window onto the spot
-    weight: float
-    envelope: tuple[Tensor, Tensor] | None = None
+KEPT_FIELD_BYTES = 1 << 30  #: focal fields up to this size wait for the backward pass; larger ones are computed again
 
 
 @dataclass(frozen=True, slots=True)
@@ -38,65 +25,37 @@ class Sampling:
     method: Method = "auto"
 
 
-class Field:
-    """The pupil of one view, row by row: amplitude * exp(2 pi i (height + path + tilt))."""
-
-    def __init__(self, amplitude: Tensor, height: Tensor, path: Tensor, view: View) -> None:
-        self.amplitude, self.height, self.path, self.view = amplitude, height, path, view
-        rows, columns = (centred(n, height.device) for n in height.shape)
-        self.tilt_v, self.tilt_u = rows.mul_(view.tilt[0])[:, None], columns.mul_(view.tilt[1])
-
-    def phasor(self, start: int, stop: int, planes: Tensor, work: Workspace) -> None:
-        """Write cosine and sine of rows start..stop, from float64 turns reduced to half a turn."""
-        shape = stop - start, self.height.shape[1]
-        turns = work.take("turns", *shape, dtype=torch.float64)
-        torch.mul(self.height[start:stop], self.view.turns_height, out=turns)
-        turns.add_(self.path[start:stop], alpha=self.view.turns_path).add_(self.tilt_u).add_(self.tilt_v[start:stop])
-        angle = work.take("angle", *shape)
-        torch.mul(turns.sub_(turns.round()), 2 * math.pi, out=angle)
-        torch.cos(angle, out=planes[0])
-        torch.sin(angle, out=planes[1])
-
-    def rows(self, work: Workspace) -> Source:
-        """The field as a source for a transform."""
-
-        def fill(start: int, stop: int, planes: Tensor) -> None:
-            self.phasor(start, stop, planes, work)
-            planes.mul_(self.amplitude[start:stop])
-
-        return fill
-
-
 class PupilIntensity(torch.autograd.Function):
     """``sum over views of weight * envelope * |U|^2``; the backward pass is the adjoint transform of g U."""
 
     @staticmethod
     def forward(ctx: Any, amplitude: Tensor, height: Tensor, path: Tensor, sampling: Sampling) -> Tensor:
+        screens = Screens.of(amplitude, height, path)
         views, shape = sampling.views, (sampling.views[0].rows.n_out, sampling.views[0].columns.n_out)
-        intensity = torch.zeros(views[-1].band + 1, *shape, dtype=sampling.dtype, device=height.device)
-        keep = any(ctx.needs_input_grad) and len(views) * shape[0] * shape[1] * 8 <= KEPT_FIELD_BYTES
-        ctx.fields = []
+        intensity = torch.empty(views[-1].band + 1, *shape, dtype=sampling.dtype, device=height.device)
+        size = 2 * len(views) * intensity[0].nbytes
+        keep = any(ctx.needs_input_grad) and size <= KEPT_FIELD_BYTES
+        ctx.fields, done = [], -1
         with borrowed(sampling.dtype, height.device) as work:
             for view in views:
-                field = Field(amplitude, height, path, view)
-                kept = torch.empty(2, *shape, dtype=sampling.dtype, device=height.device) if keep else None
-                _add_intensity(field, intensity[view.band], kept, sampling.method, work)
+                kept = torch.empty(2, *shape[::-1], dtype=sampling.dtype, device=height.device) if keep else None
+                field = Field(screens, view, sampling.dtype)
+                _power(field, intensity[view.band], view.band == done, kept, sampling.method, work)
                 ctx.fields.append(kept)
+                done = view.band
         ctx.save_for_backward(amplitude, height, path)
-        ctx.sampling = sampling
+        ctx.sampling, ctx.screens = sampling, screens[3:]
         return intensity
 
     @staticmethod
-    @once_differentiable  # type: ignore[untyped-decorator]
+    @once_differentiable
     def backward(ctx: Any, weight: Tensor) -> tuple[Tensor | None, ...]:
-        amplitude, height, path = ctx.saved_tensors
-        grads = [
-            torch.zeros_like(x) if need else None
-            for x, need in zip(ctx.saved_tensors, ctx.needs_input_grad[:3], strict=True)
-        ]
+        screens = Screens(*ctx.saved_tensors, *ctx.screens)
+        needs = zip(ctx.saved_tensors, ctx.needs_input_grad[:3], strict=True)
+        grads = [torch.zeros_like(x) if need else None for x, need in needs]
         with borrowed(weight.dtype, weight.device) as work:
             for view, kept in zip(ctx.sampling.views, ctx.fields, strict=True):
-                field = Field(amplitude, height, path, view)
+                field = Field(screens, view, weight.dtype)
                 planes = kept if kept is not None else _focal(field, ctx.sampling, work)
                 _add_gradient(field, planes, weight[view.band], grads, ctx.sampling.method, work)
         return (*grads, None)
@@ -107,26 +66,34 @@ def _scaled(view: View, values: Tensor, rows: slice, columns: slice) -> Tensor:
     if view.envelope is None:
         return values.mul_(view.weight)
     y, x = view.envelope
-    return values.mul_(y[rows, None]).mul_(x[columns]).mul_(view.weight)
+    return values.mul_(y[rows].view(*values.shape[:-1], 1)).mul_(x[columns]).mul_(view.weight)
 
 
-def _add_intensity(field: Field, out: Tensor, kept: Tensor | None, method: Method, work: Workspace) -> None:
+def _power(field: Field, out: Tensor, add: bool, kept: Tensor | None, method: Method, work: Workspace) -> None:
+    """Write, or add, the weighed |U|^2 of one view."""
+
     def sink(rows: slice, columns: slice, patch: Tensor) -> None:
         if kept is not None:
-            kept[:, rows, columns] = patch
-        power = work.take("power", *patch.shape[1:])
-        torch.mul(patch[0], patch[0], out=power).addcmul_(patch[1], patch[1])
-        out[rows, columns] += _scaled(field.view, power, rows, columns)
+            _keep(kept, rows, columns, patch)
+        power = _scaled(field.view, patch[0].square().addcmul_(patch[1], patch[1]), rows, columns)
+        into = patch_of(out, rows, columns, patch)
+        into.add_(power) if add else into.copy_(power)
 
     propagate(field.view.rows, field.view.columns, field.rows(work), sink, work, method)
 
 
+def _keep(kept: Tensor, rows: slice, columns: slice, patch: Tensor) -> None:
+    """Store a patch transposed, which is how the fast method makes it and its adjoint wants it."""
+    patch_of(kept.transpose(1, 2), rows, columns, patch).copy_(patch)
+
+
 def _focal(field: Field, sampling: Sampling, work: Workspace) -> Tensor:
+    """The focal field once more, transposed."""
     view = field.view
-    planes = work.take("focal", 2, view.rows.n_out, view.columns.n_out)
+    planes = work.take("focal", 2, view.columns.n_out, view.rows.n_out)
 
     def sink(rows: slice, columns: slice, patch: Tensor) -> None:
-        planes[:, rows, columns] = patch
+        _keep(planes, rows, columns, patch)
 
     propagate(view.rows, view.columns, field.rows(work), sink, work, sampling.method)
     return planes
@@ -135,32 +102,37 @@ def _focal(field: Field, sampling: Sampling, work: Workspace) -> Tensor:
 def _add_gradient(
     field: Field, planes: Tensor, weight: Tensor, grads: list[Tensor | None], method: Method, work: Workspace
 ) -> None:
-    """Add the gradients of ``sum(weight * scaled |U|^2)``: the adjoint of 2 weight U, against the pupil."""
+    """Add the gradients of ``sum(weight * scaled |U|^2)``: the adjoint of 2 weight U, against the pupil.
+
+    It runs on the transposed problem, so that the pupil's rows come back as rows.
+    """
     view, everywhere = field.view, slice(0, planes.shape[2])
+    gain = work.take("gain", *planes.shape[1:]).copy_(weight.T)  # at once: by slabs of a power of two it is slow
 
     def source(start: int, stop: int, out: Tensor) -> None:
-        gain = torch.mul(weight[start:stop], 2.0, out=work.take("gain", stop - start, planes.shape[2]))
-        torch.mul(planes[:, start:stop], _scaled(view, gain, slice(start, stop), everywhere), out=out)
+        _scaled(view, gain[start:stop].mul_(2).T, everywhere, slice(start, stop))
+        torch.mul(planes[:, start:stop], gain[start:stop], out=out)
 
     def sink(rows: slice, columns: slice, patch: Tensor) -> None:
-        _chain(field, rows, columns, patch, grads, work)
+        flat = work.take("flat", 2, columns.stop - columns.start, rows.stop - rows.start)
+        patch_of(flat.transpose(1, 2), slice(None), slice(None), patch).copy_(patch)
+        _chain(field, columns, rows, flat, grads, work)
 
-    propagate(view.rows.adjoint(), view.columns.adjoint(), source, sink, work, method)
+    propagate(view.columns.adjoint(), view.rows.adjoint(), source, sink, work, method)
 
 
 def _chain(
     field: Field, rows: slice, columns: slice, patch: Tensor, grads: list[Tensor | None], work: Workspace
 ) -> None:
     """From the gradient with respect to the field, ``patch``, to amplitude, height and path."""
-    count = rows.stop - rows.start
-    unit = work.take("unit", 2, count, field.height.shape[1])
-    field.phasor(rows.start, rows.stop, unit, work)
-    unit = unit[:, :, columns]
+    unit = work.take("unit", *patch.shape)
+    field.phasor(rows, columns, unit, work)
     if grads[0] is not None:
-        grads[0][rows, columns] += unit[0] * patch[0] + unit[1] * patch[1]
+        grads[0][rows, columns].addcmul_(unit[0], patch[0]).addcmul_(unit[1], patch[1])
     if grads[1] is None and grads[2] is None:
         return
-    turning = (unit[0] * patch[1] - unit[1] * patch[0]).mul_(field.amplitude[rows, columns])
+    turning = torch.mul(unit[0], patch[1], out=work.take("turning", *patch.shape[1:]))
+    turning.addcmul_(unit[1], patch[0], value=-1).mul_(field.screens.amplitude[rows, columns])
     for grad, turns in ((grads[1], field.view.turns_height), (grads[2], field.view.turns_path)):
         if grad is not None:
             grad[rows, columns].add_(turning, alpha=2 * math.pi * turns)

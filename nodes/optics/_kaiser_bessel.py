@@ -1,7 +1,7 @@
 """The scaled transform by two griddings about one short FFT: exact to the kernel's chosen error.
 
 The window needs only ``alpha n_in n_out`` samples of information (800 for 2160 -> 2048 at 550 nm),
-so the pupil is gathered onto a grid 1.5 times finer than that, and the FFT is 1.5 times as long
+so the pupil is gathered onto a grid 1.75 times finer than that, and the FFT is 1.75 times as long
 again, where a chirp needs n_in + n_out. All weights are real: both grids are centred by signs.
 """
 
@@ -34,14 +34,18 @@ class _Kernel(NamedTuple):
         return math.pi * self.width * (1 - 0.5 / self.oversampling)
 
     def __call__(self, x: Tensor) -> Tensor:
-        return torch.special.i0((1 - (2 * x / self.width).square()).clamp_(min=0).sqrt_().mul_(self.beta))
+        root = (1 - (2 * x / self.width).square()).clamp_(min=0).sqrt_()
+        value: Tensor = torch.special.i0(root.mul_(self.beta))
+        return value
 
     def transform(self, f: Tensor) -> Tensor:
         root = (self.beta**2 - (math.pi * self.width * f).square()).sqrt()
         return self.width * torch.sinh(root) / root
 
 
-_SINGLE, _DOUBLE = _Kernel(9, 1.5), _Kernel(18, 2.0)
+_BLOCK = 16
+_COLUMN_BLOCKS = 8
+_SINGLE, _DOUBLE = _Kernel(8, 1.75), _Kernel(18, 2.0)
 
 
 class Plan(NamedTuple):
@@ -61,6 +65,7 @@ class Plan(NamedTuple):
 
     @property
     def cropped(self) -> int:
+        """Where the kept frequencies begin in the FFT's result."""
         return self.length // 2 - (self.kept - 1) // 2
 
 
@@ -70,17 +75,20 @@ def plan(axis: Axis, dtype: torch.dtype, device: torch.device) -> Plan:
     kernel = _SINGLE if dtype == torch.float32 else _DOUBLE
     pitch = 1 / (axis.alpha * axis.n_out * kernel.oversampling)
     points = _odd(math.ceil((axis.n_in - 1) / pitch) + kernel.width)
-    length = smooth(math.ceil(max(points, 3 * kernel.width) * kernel.oversampling), even=True)
-    kept = _odd(math.ceil((axis.n_out - 1) * axis.alpha * pitch * length) + kernel.width)
+    length = smooth(math.ceil(max(points, 2 * _BLOCK) * kernel.oversampling), even=True)
+    spread = _spread(axis, kernel, pitch, length)
+    while spread.n_columns + 2 * spread.margin > length:
+        length = smooth(length + length // 4, even=True)
+        spread = _spread(axis, kernel, pitch, length)
     gather = _gather(axis, kernel, pitch, points, length).to(dtype, device)
-    spread = _spread(axis, kernel, pitch, kept, length).to(dtype, device)
-    return Plan(gather, spread, points, length, kept, axis.sign)
+    kept = spread.n_columns + 2 * spread.margin
+    return Plan(gather, spread.to(dtype, device), points, length, kept, axis.sign)
 
 
 def _gather(axis: Axis, kernel: _Kernel, pitch: float, points: int, length: int) -> Banded:
     """Field onto the grid of ``points``, divided by what the interpolation behind the FFT will multiply by."""
     j0, l0 = (axis.n_in - 1) / 2, (points - 1) // 2
-    band = Banded(points, axis.n_in, j0 - pitch * l0, pitch, pitch * kernel.width / 2, 16)
+    band = Banded(points, axis.n_in, j0 - pitch * l0, pitch, pitch * kernel.width / 2, _BLOCK)
 
     def weigh(row: Tensor, column: Tensor) -> Tensor:
         at = (row - l0).clamp_(max=l0)
@@ -90,10 +98,12 @@ def _gather(axis: Axis, kernel: _Kernel, pitch: float, points: int, length: int)
     return band.fill(weigh)
 
 
-def _spread(axis: Axis, kernel: _Kernel, pitch: float, kept: int, length: int) -> Banded:
+def _spread(axis: Axis, kernel: _Kernel, pitch: float, length: int) -> Banded:
     """The kept frequencies onto the window, divided by the transform of the kernel that gathered."""
-    k0, q0, fine = (axis.n_out - 1) / 2, (kept - 1) // 2, axis.alpha * pitch * length
-    band = Banded(axis.n_out, kept, q0 - fine * k0, fine, kernel.width / 2, 32)
+    k0, fine = (axis.n_out - 1) / 2, axis.alpha * pitch * length
+    kept = _odd(math.ceil((axis.n_out - 1) * fine) + kernel.width)
+    q0 = (kept - 1) // 2
+    band = Banded(axis.n_out, kept, q0 - fine * k0, fine, kernel.width / 2, 2 * _BLOCK)
 
     def weigh(row: Tensor, column: Tensor) -> Tensor:
         at = (row - k0).clamp_(max=k0)
@@ -114,66 +124,79 @@ def _odd(n: int) -> int:
 def kaiser_bessel(rows: Axis, columns: Axis, source: Source, sink: Sink, work: Workspace) -> None:
     """Gather, short FFT, interpolate: columns first, in chunks of rows that stay in cache."""
     along_x, along_y = (plan(axis, work.dtype, work.device) for axis in (columns, rows))
-    half = _rows_to_frequencies(along_x, rows.n_in, columns.n_in, source, work)
+    half = _rows_to_frequencies(along_x, along_y.gather.margin, rows.n_in, source, work)
     spectrum = _columns_to_frequencies(along_y, half, work)
-    _interpolate(rows, columns, spectrum, sink, work)
+    _interpolate(along_x, along_y, (rows.n_out, columns.n_out), spectrum, sink, work)
 
 
-def _rows_to_frequencies(x: Plan, n_rows: int, n_columns: int, source: Source, work: Workspace) -> Tensor:
-    complex_dtype = work.dtype.to_complex()
-    half = work.take("half", n_rows, x.kept, dtype=complex_dtype)
-    for start, stop in row_chunks(n_rows, n_columns):
+def _rows_to_frequencies(x: Plan, margin: int, n_rows: int, source: Source, work: Workspace) -> Tensor:
+    """The kept frequencies along u of every row, between ``margin`` rows of zeros."""
+    kind, wide = work.dtype.to_complex(), x.gather.n_columns
+    half = _zero_margins(work.take("half", n_rows + 2 * margin, x.kept, dtype=kind), 0, margin)
+    for start, stop in row_chunks(n_rows, wide):
         n = stop - start
-        planes = work.take("planes", 2, n, n_columns)
-        source(start, stop, planes)
+        planes = _zero_margins(work.take("planes", 2, n, wide + 2 * x.gather.margin), 2, x.gather.margin)
+        source(start, stop, planes.narrow(2, x.gather.margin, wide))
         blocks = work.take("blocks", x.gather.count, 2 * n, x.gather.block)
-        x.gather.right(planes.view(2 * n, n_columns), blocks)
-        line = work.take("line", n, x.length, dtype=complex_dtype)
+        x.gather.right(planes.flatten(0, 1), blocks)
+        line = work.take("line", n, x.length, dtype=kind)
         _place(blocks, line, x)
-        half[start:stop] = _fft(line, 1, x.sign)[:, x.cropped : x.cropped + x.kept]
+        half[margin + start : margin + stop] = _fft(line, x.sign)[:, x.cropped : x.cropped + x.kept]
     return half
+
+
+def _zero_margins(x: Tensor, dim: int, margin: int) -> Tensor:
+    x.narrow(dim, 0, margin).zero_()
+    x.narrow(dim, x.shape[dim] - margin, margin).zero_()
+    return x
 
 
 def _place(blocks: Tensor, line: Tensor, x: Plan) -> None:
     """Put gathered (re, im) blocks in the middle of zeroed complex lines."""
     count, block, n = x.gather.count, x.gather.block, line.shape[0]
     line[:, : x.padded] = 0
+    parts = blocks.view(count, 2, n, block).permute(1, 2, 0, 3)
+    into = line[:, x.padded : x.padded + count * block]
+    torch.complex(parts[0], parts[1], out=into.view(n, count, block))
     line[:, x.padded + x.points :] = 0
-    whole = x.points // block
-    parts = torch.view_as_real(line)[:, x.padded : x.padded + x.points]
-    source = blocks.view(count, 2, n, block)
-    parts[:, : whole * block].unflatten(1, (whole, block)).copy_(source[:whole].permute(2, 0, 3, 1))
-    if whole < count:
-        parts[:, whole * block :] = source[whole, :, :, : x.points - whole * block].permute(1, 2, 0)
 
 
 def _columns_to_frequencies(y: Plan, half: Tensor, work: Workspace) -> Tensor:
-    """Gather along v straight into the zero-padded columns, and transform them."""
+    """Gather along v straight into the zero-padded columns, and transform them; what returns is transposed."""
     wide = half.shape[1]
-    columns = work.take("columns", y.length + y.gather.block, wide, dtype=half.dtype)
-    top = columns[y.padded : y.padded + y.gather.n_rows]
-    y.gather.left(_flat(half), _flat(top))
+    columns = work.take("columns", y.length, wide, dtype=half.dtype)
+    y.gather.left(_flat(half), _flat(columns[y.padded : y.padded + y.gather.n_rows]))
     columns[: y.padded] = 0
-    columns[y.padded + y.points : y.length] = 0
-    return _fft(columns[: y.length], 0, y.sign)[y.cropped : y.cropped + y.kept]
+    columns[y.padded + y.points :] = 0
+    spectrum = work.take("spectrum", wide, y.kept, dtype=half.dtype)
+    for start, stop in row_chunks(wide, y.length):  # small pieces: what the FFT allocates must not be large
+        lines = _fft(columns[:, start:stop].T, y.sign)
+        spectrum[start:stop] = lines[:, y.cropped : y.cropped + y.kept]
+    return spectrum
 
 
-def _interpolate(rows: Axis, columns: Axis, spectrum: Tensor, sink: Sink, work: Workspace) -> None:
-    x, y = (plan(axis, work.dtype, work.device) for axis in (columns, rows))
-    per_chunk = max(1, (1 << 17) // (columns.n_out * y.spread.block))
-    for first in range(0, y.spread.count, per_chunk):
-        last = min(first + per_chunk, y.spread.count)
-        start, stop = first * y.spread.block, min(last * y.spread.block, rows.n_out)
-        tall = (last - first) * y.spread.block
-        line = work.take("stripe", tall, x.kept, dtype=spectrum.dtype)
-        y.spread.part(first, last).left(_flat(spectrum), _flat(line))
-        planes = work.take("stripes", 2, tall, x.kept)
-        planes.copy_(torch.view_as_real(line).movedim(2, 0))
-        blocks = work.take("tiles", x.spread.count, 2 * tall, x.spread.block)
-        x.spread.right(planes.view(2 * tall, x.kept), blocks)
-        patch = work.take("patch", 2, tall, x.spread.n_rows)
-        patch.view(2, tall, x.spread.count, x.spread.block).copy_(blocks.view(x.spread.count, 2, tall, x.spread.block).permute(1, 2, 0, 3))
-        sink(slice(start, stop), slice(0, columns.n_out), patch[:, : stop - start, : columns.n_out])
+def _interpolate(x: Plan, y: Plan, shape: tuple[int, int], spectrum: Tensor, sink: Sink, work: Workspace) -> None:
+    """Frequencies (x, y), margins included, onto the window, a few columns of it at a time."""
+    for first in range(0, x.spread.count, _COLUMN_BLOCKS):
+        part = x.spread.part(first, min(first + _COLUMN_BLOCKS, x.spread.count))
+        line = work.take("stripe", part.n_rows, spectrum.shape[1], dtype=spectrum.dtype)
+        part.left(_flat(spectrum), _flat(line))
+        planes = work.take("stripes", 2, *line.shape).copy_(torch.view_as_real(line).movedim(2, 0))
+        blocks = work.take("tiles", y.spread.count, 2 * part.n_rows, y.spread.block)
+        y.spread.right(planes.flatten(0, 1), blocks)
+        start, stop = first * part.block, min(first * part.block + part.n_rows, shape[1])
+        tiles = blocks.view(y.spread.count, 2, part.n_rows, y.spread.block).permute(1, 0, 3, 2)
+        _deliver(tiles[..., : stop - start], slice(start, stop), shape[0], sink)
+
+
+def _deliver(tiles: Tensor, columns: slice, n_rows: int, sink: Sink) -> None:
+    """Hand on whole blocks of rows, then what is left of the last."""
+    block = tiles.shape[2]
+    whole = n_rows // block
+    if whole:
+        sink(slice(0, whole * block), columns, tiles[:, :whole])
+    if whole * block < n_rows:
+        sink(slice(whole * block, n_rows), columns, tiles[:, whole, : n_rows - whole * block])
 
 
 def _flat(x: Tensor) -> Tensor:
@@ -181,5 +204,6 @@ def _flat(x: Tensor) -> Tensor:
     return torch.view_as_real(x).flatten(1)
 
 
-def _fft(x: Tensor, dim: int, sign: int) -> Tensor:
-    return torch.fft.fft(x, dim=dim) if sign < 0 else torch.fft.ifft(x, dim=dim, norm="forward")
+def _fft(x: Tensor, sign: int) -> Tensor:
+    result: Tensor = torch.fft.fft(x, dim=1) if sign < 0 else torch.fft.ifft(x, dim=1, norm="forward")
+    return result

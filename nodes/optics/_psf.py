@@ -9,7 +9,8 @@ from torch import Tensor
 
 from neusee.nodes import Check, node
 from neusee.nodes.optics._axis import Axis, centred
-from neusee.nodes.optics._intensity import PupilIntensity, Sampling, View
+from neusee.nodes.optics._field import View
+from neusee.nodes.optics._intensity import PupilIntensity, Sampling
 from neusee.nodes.optics._transform import Method
 from neusee.nodes.units import Angle, PositiveLength, Shape
 from neusee.nodes.values import Psf, Pupil
@@ -98,7 +99,10 @@ def phase_step(pupil: Pupil) -> float:
 def _focus(pupil: Pupil, camera: _Camera, dtype: torch.dtype, method: Method) -> Psf:
     _agree(pupil)
     _refuse_aliases(pupil, camera)
-    views, area, total = [], *_area(pupil)
+    views: list[View] = []
+    area, total = _area(pupil)
+    if not area > 0:
+        raise ValueError("the aperture is closed everywhere: no light to normalise by")
     peaks: list[float] = []
     for band in range(pupil.wavelengths.numel()):
         views += _views(pupil, camera, band, 1 / area, dtype)
@@ -110,7 +114,9 @@ def _focus(pupil: Pupil, camera: _Camera, dtype: torch.dtype, method: Method) ->
 
 def _area(pupil: Pupil) -> tuple[float, float]:
     """Light through the clear pupil and its field on the axis, in samples."""
-    return float(pupil.aperture.square().sum(dtype=torch.float64)), float(pupil.aperture.sum(dtype=torch.float64))
+    rows = pupil.aperture.detach()
+    light, field = torch.bmm(rows[:, None, :], rows[:, :, None]), rows.sum(dim=1)
+    return float(light.sum(dtype=torch.float64)), float(field.sum(dtype=torch.float64))
 
 
 def _alpha(pupil: Pupil, camera: _Camera, band: int) -> float:
@@ -188,8 +194,6 @@ def _agree(pupil: Pupil) -> None:
             f"index {tuple(pupil.index.shape)} and wavelengths {tuple(pupil.wavelengths.shape)} differ: "
             "give one index for each band"
         )
-    if not bool((pupil.aperture > 0).any()):
-        raise ValueError("the aperture is closed everywhere: no light to normalise by")
 
 
 def _refuse_aliases(pupil: Pupil, camera: _Camera) -> None:

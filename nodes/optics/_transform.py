@@ -5,25 +5,44 @@ from typing import Literal
 import torch
 from torch import Tensor
 
-from neusee.nodes.optics._axis import Axis, Sink, Source, centred, unit_phasor
-from neusee.nodes.optics._bluestein import bluestein
+from neusee.nodes.optics._axis import Axis, Sink, Source, centred, patch_of, unit_phasor
+from neusee.nodes.optics._bluestein import bluestein, smooth
 from neusee.nodes.optics._direct import direct, folded
 from neusee.nodes.optics._kaiser_bessel import kaiser_bessel
 from neusee.nodes.optics._workspace import Workspace, borrowed
 
 Method = Literal["auto", "direct", "folded", "bluestein", "kaiser_bessel"]
+_FEW_SAMPLES = 60.0  #: below, the banded products are too few and too long to be fast
 _METHODS = {"direct": direct, "folded": folded, "bluestein": bluestein, "kaiser_bessel": kaiser_bessel}
 
 
 def propagate(rows: Axis, columns: Axis, source: Source, sink: Sink, work: Workspace, method: Method = "auto") -> None:
     """Transform what ``source`` gives, in pieces that fit the cache, and hand the pieces of the result to ``sink``."""
-    name = cheapest(rows, columns, work) if method == "auto" else method
+    name = cheapest(rows, columns, work.device) if method == "auto" else method
     _METHODS[name](rows, columns, source, sink, work)
 
 
-def cheapest(rows: Axis, columns: Axis, work: Workspace) -> str:
-    """The method with the least expected time."""
-    return "folded"
+def cheapest(rows: Axis, columns: Axis, device: torch.device) -> str:
+    """The method with the least expected time; on a GPU matrix products win at every size that fits."""
+    if device.type != "cpu":
+        return "folded"
+    expected = _expected_seconds(rows, columns)
+    return min(expected, key=expected.__getitem__)
+
+
+def _expected_seconds(rows: Axis, columns: Axis) -> dict[str, float]:
+    """Fitted to two cores with AVX-512 (tests/benchmarks/bench_psf.py); only the ratios matter."""
+    n_in, n_out = rows.n_in * columns.n_in, rows.n_out * columns.n_out
+    products = rows.n_in * columns.n_out * (columns.n_in + rows.n_out)
+    chirped = rows.n_in * smooth(columns.n_in + columns.n_out) + columns.n_out * smooth(rows.n_in + rows.n_out)
+    carried = rows.bandwidth * columns.bandwidth
+    few = min(rows.bandwidth, columns.bandwidth) < _FEW_SAMPLES
+    return {
+        "direct": 0.15e-3 + 57e-12 * products,
+        "folded": 0.3e-3 + 0.3e-9 * n_in + 14e-12 * products,
+        "bluestein": 0.15e-3 + 3.5e-9 * chirped,
+        "kaiser_bessel": 0.5e-3 + (2.4e-9 if few else 1.2e-9) * n_in + 35e-9 * carried + 3e-9 * n_out,
+    }
 
 
 def transform(
@@ -52,7 +71,7 @@ def transform(
         into.copy_(planes[:, start:stop])
 
     def sink(rows: slice, columns: slice, patch: Tensor) -> None:
-        parts[:, rows, columns] = patch
+        patch_of(parts, rows, columns, patch).copy_(patch)
 
     with borrowed(real, field.device) as work:
         propagate(axes[0], axes[1], source, sink, work, method)
