@@ -88,6 +88,14 @@ READINGS = (
         "the printed form is half a DN low and adds 1/6 DN^2 of variance",
     ),
     Reading(
+        "direction",
+        "C20",
+        "laser directions drawn with 3 sigma = 0.36 f / W",
+        "width_over_focal_length",
+        "focal_length_over_width",
+        "0.36 W / f = 0.0194 rad keeps the spot on the sensor; as printed, 6.7 rad puts it 0.73 m away and is refused",
+    ),
+    Reading(
         "line",
         "C22",
         "a 10 nm line sampled every 10 nm",

@@ -8,7 +8,7 @@ from pydantic import Field
 from torch import Tensor
 
 from neusee.nodes import Check, node
-from neusee.nodes.units import Angle, Fraction, PositiveLength
+from neusee.nodes.units import Fraction, PositiveLength
 from neusee.nodes.values import Bands
 
 
@@ -23,8 +23,8 @@ class _Ghost(NamedTuple):
 def ghosts(
     spot: Tensor,
     bands: Bands,
+    direction: Tensor,
     *,
-    angle: tuple[Angle, Angle],
     focal_length: PositiveLength,
     pixel_pitch: PositiveLength,
     count: Annotated[int, Field(ge=0, le=1000)] = 8,
@@ -40,8 +40,8 @@ def ghosts(
     Together they carry ``energy`` times the energy of the spot inside the window, over all bands; what falls
     outside the window is lost. The spot itself is not dimmed.
 
-    Shapes: (band, y, x), bands -> (band, y, x).
-    Units:  as the spot (W/m2); angle rad.
+    Shapes: (band, y, x), bands, direction (2,) (n_y, n_x) -> (band, y, x).
+    Units:  as the spot (W/m2); direction rad.
     Error:  energy of a ghost inside the window 1e-6; its edge one pixel wide.
     Raises: ValueError where spot and bands do not belong together.
     Source: Hullin et al., ACM Trans. Graph. 30, 108 (2011), reduced to first order; coatings: Hecht, Optics,
@@ -51,7 +51,7 @@ def ghosts(
         raise ValueError(f"spot is {tuple(spot.shape)}, bands {bands.centres.numel()}: take both of one laser")
     drawn = _draw(count, spread, radius, rng)
     flux = spot.sum((-2, -1), dtype=torch.float64)
-    place = tuple(focal_length * n / pixel_pitch for n in angle)
+    place = tuple(focal_length * n / pixel_pitch for n in direction.tolist())
     total = torch.zeros_like(spot)
     for ghost, colour in zip(drawn, _colours(drawn, bands.centres, flux), strict=True):
         centre = (ghost.magnification * place[0], ghost.magnification * place[1])
@@ -107,7 +107,7 @@ def _part(numbers: Tensor, samples: int) -> slice:
 
 
 @ghosts.check
-def _(result: Tensor, spot: Tensor, bands: Bands, *, energy: float, **_: Any) -> list[Check]:
+def _(result: Tensor, spot: Tensor, *_: Any, energy: float, **__: Any) -> list[Check]:
     whole = float(spot.sum(dtype=torch.float64))
     seen = float(result.sum(dtype=torch.float64)) / whole if whole > 0 else 0.0
     bounded = seen <= energy * (1 + 1e-3)

@@ -27,10 +27,14 @@ def spot(size=301, bands=3):
     return light
 
 
+def towards(y, x):
+    return torch.tensor([y, x], dtype=torch.float64)
+
+
 def ghosts(light=None, angle=(5e-4, -8e-4), **params):
     light = spot() if light is None else light
     line = bands(LINE[: len(light)])
-    return flare.ghosts(light, line, angle=angle, **LENS, **{"radius": 60e-6, "rng": seeded()} | params)
+    return flare.ghosts(light, line, towards(*angle), **LENS, **{"radius": 60e-6, "rng": seeded()} | params)
 
 
 def test_energy_in_is_energy_out():
@@ -77,7 +81,7 @@ def test_colour_differs_between_ghosts_and_energy_follows_the_spot():
     centres = torch.linspace(420e-9, 680e-9, 14, dtype=torch.float64)
     light = torch.zeros(14, 64, 64)
     light[:, 32, 32] = 1e6
-    params = {"angle": (0.0, 0.0), "count": 1} | LENS
+    params = {"direction": towards(0.0, 0.0), "count": 1} | LENS
     first, second = (flare.ghosts(light, bands(centres), **params, rng=seeded(k)).sum((-1, -2)) for k in (1, 2))
     assert float(first.max() / first.min()) > 1.2
     assert not torch.allclose(first, second, rtol=0.05)
@@ -105,25 +109,25 @@ def test_ghosts_are_linear_in_the_spot_and_learn():
     light = torch.rand(2, 9, 9, dtype=torch.float64, requires_grad=True)
 
     def run(x):
-        return flare.ghosts(x, bands(LINE[:2]), angle=(1e-4, 0.0), **LENS, radius=8e-6, energy=0.1, rng=seeded())
+        return flare.ghosts(x, bands(LINE[:2]), towards(1e-4, 0.0), **LENS, radius=8e-6, energy=0.1, rng=seeded())
 
     assert torch.autograd.gradcheck(run, (light,), fast_mode=True)
 
 
 def test_bands_of_another_laser_are_refused():
     with pytest.raises(ValueError, match="of one laser"):
-        flare.ghosts(spot(bands=2), bands(), angle=(0.0, 0.0), **LENS, rng=seeded())
+        flare.ghosts(spot(bands=2), bands(), towards(0.0, 0.0), **LENS, rng=seeded())
 
 
 def test_check_reports_the_share():
     light = spot()
-    (line,) = flare.ghosts.after(ghosts(light, energy=1e-3), light, bands(), energy=1e-3)
+    (line,) = flare.ghosts.after(ghosts(light, energy=1e-3), light, bands(), towards(0.0, 0.0), energy=1e-3)
     assert line.ok
     assert "bring 0.001 of" in line.text
-    assert not flare.ghosts.after(light, light, bands(), energy=1e-3)[0].ok
+    assert not flare.ghosts.after(light, light, bands(), towards(0.0, 0.0), energy=1e-3)[0].ok
 
 
 def test_ghosts_fall_where_the_spot_is():
     line = Bands(*(x.to("meta") for x in bands()))
-    found = flare.ghosts(spot().to("meta"), line, angle=(1e-4, 0.0), **LENS, rng=seeded())
+    found = flare.ghosts(spot().to("meta"), line, towards(1e-4, 0.0), **LENS, rng=seeded())
     assert found.device.type == "meta"
