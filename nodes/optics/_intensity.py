@@ -6,7 +6,6 @@ from typing import Any
 
 import torch
 from torch import Tensor
-from torch.autograd.function import once_differentiable
 
 from neusee.nodes.optics._axis import patch_of
 from neusee.nodes.optics._field import Field, Screens, View
@@ -48,8 +47,9 @@ class PupilIntensity(torch.autograd.Function):
         return intensity
 
     @staticmethod
-    @once_differentiable
     def backward(ctx: Any, weight: Tensor) -> tuple[Tensor | None, ...]:
+        if torch.is_grad_enabled():
+            raise RuntimeError("the PSF has no second derivative here: differentiate without create_graph=True")
         screens = Screens(*ctx.saved_tensors, *ctx.screens)
         needs = zip(ctx.saved_tensors, ctx.needs_input_grad[:3], strict=True)
         grads = [torch.zeros_like(x) if need else None for x, need in needs]

@@ -44,6 +44,7 @@ class _Kernel(NamedTuple):
 
 
 _BLOCK = 16
+_WIDEST = 8  #: a grid is at least this fine, of the input, however little of it the window asks for
 _COLUMN_BLOCKS = 8
 _SINGLE, _DOUBLE = _Kernel(8, 1.75), _Kernel(18, 2.0)
 
@@ -73,7 +74,7 @@ class Plan(NamedTuple):
 def plan(axis: Axis, dtype: torch.dtype, device: torch.device) -> Plan:
     """Grids and weights of one axis; equal axes and later calls share them."""
     kernel = _SINGLE if dtype == torch.float32 else _DOUBLE
-    pitch = 1 / (axis.alpha * axis.n_out * kernel.oversampling)
+    pitch = min(1 / (axis.alpha * axis.n_out * kernel.oversampling), max(axis.n_in, _WIDEST) / _WIDEST)
     points = _odd(math.ceil((axis.n_in - 1) / pitch) + kernel.width)
     length = smooth(math.ceil(max(points, 2 * _BLOCK) * kernel.oversampling), even=True)
     spread = _spread(axis, kernel, pitch, length)

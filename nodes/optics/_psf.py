@@ -55,7 +55,9 @@ def psf(
     Raises: ValueError where the window reaches beyond half the alias-free field, lambda f / (2 pitch), from the spot.
     Source: Goodman, Introduction to Fourier Optics, 3rd edition, eq. 5-14 (field in the focal plane of a lens).
     """
-    camera = _Camera(focal_length, pixel_pitch, shape, _towards(angle, direction), pixel == "zoh", sensor == "integrated")
+    camera = _Camera(
+        focal_length, pixel_pitch, shape, _towards(angle, direction), pixel == "zoh", sensor == "integrated"
+    )
     return _focus(pupil, camera, torch.float64 if precision == "double" else torch.float32, "auto")
 
 
@@ -72,7 +74,9 @@ def _(
     sensor: Literal["point", "integrated"] = "point",
     precision: Literal["single", "double"] = "single",
 ) -> Psf:
-    camera = _Camera(focal_length, pixel_pitch, shape, _towards(angle, direction), pixel == "zoh", sensor == "integrated")
+    camera = _Camera(
+        focal_length, pixel_pitch, shape, _towards(angle, direction), pixel == "zoh", sensor == "integrated"
+    )
     return _focus(pupil, camera, torch.float64, "direct")
 
 
@@ -187,6 +191,9 @@ def _agree(pupil: Pupil) -> None:
             f"index {tuple(pupil.index.shape)} and wavelengths {tuple(pupil.wavelengths.shape)} differ: "
             "give one index for each band"
         )
+
+    if pupil.index.requires_grad or pupil.wavelengths.requires_grad:
+        raise ValueError("index and wavelengths take no gradient here: detach them, or learn amplitude, height or path")
 
 
 def _refuse_aliases(pupil: Pupil, camera: _Camera) -> None:
