@@ -1,0 +1,267 @@
+"""The PSF beside prysm, hcipy, poppy, scipy and finufft: `python tests/benchmarks/bench_psf.py [REPEATS]`.
+
+Everybody gets two threads and the same clear or defocused disc at 550 nm, and returns the intensity. The peers are
+handed the complex pupil and keep their operators; ours starts from the height map and makes the phase each time.
+Calls are interleaved, so that a loaded machine slows all alike, and each is preceded by a pause and by a call that
+does not count, because the threads of one library spin for a while and would slow the next. The error is against the
+double sum in complex128 on a subset of rows and columns, relative to the peak. Prints tables in Markdown.
+"""
+
+# ruff: noqa: E402 (threads are set before anybody starts theirs)
+import os
+
+os.environ.update({name: "2" for name in ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS")})
+
+import statistics
+import subprocess
+import sys
+import time
+import warnings
+from functools import partial
+
+import numpy as np
+import scipy.fft
+import scipy.signal
+import torch
+
+warnings.simplefilter("ignore")
+import finufft
+import hcipy
+import poppy.matrixDFT
+import prysm.propagation
+from prysm.conf import config
+
+from neusee.nodes.optics import psf
+from neusee.nodes.optics._psf import _Camera, _focus
+from neusee.nodes.values import Pupil
+
+WAVELENGTH, FOCAL, PIXEL, DIAMETER, INDEX = 550e-9, 0.11, 2.9e-6, 2160 * 3.74e-6, 0.46
+SIZES = [(2160, 2048), (2160, 1024), (2160, 512), (2160, 256), (2160, 64), (1024, 1024), (256, 256)]
+SLOW = 1.0  #: seconds beyond which a peer is called twice only
+
+
+def pupil(n, waves=0.0, wavelengths=(WAVELENGTH,), height=None):
+    """A clear disc of n samples, with ``waves`` of defocus cut into the element."""
+    x = (torch.arange(n) - (n - 1) / 2) / (n / 2)
+    square = x[:, None] ** 2 + x**2
+    disc = (square <= 1).float()
+    height = (square * waves * WAVELENGTH / INDEX).float() * disc if height is None else height
+    bands = torch.tensor(wavelengths, dtype=torch.float64)
+    pitch = torch.tensor(DIAMETER / n, dtype=torch.float64)
+    return Pupil(disc, disc, height, torch.zeros_like(disc), INDEX + 0 * bands, bands, pitch)
+
+
+def field(p, kind=np.complex64):
+    turns = p.height.double() * (INDEX / WAVELENGTH)
+    return (p.amplitude * torch.exp(2j * torch.pi * turns)).numpy().astype(kind)
+
+
+def ours(p, k, method="auto"):
+    camera = _Camera(FOCAL, PIXEL, (k, k), (0.0, 0.0), False, False)
+    return lambda: _focus(p, camera, torch.float32, method).intensity[0].numpy()
+
+
+def power(u):
+    return u.real**2 + u.imag**2
+
+
+def prysm_call(f, k, method):
+    n, precision = len(f), 32 if f.dtype == np.complex64 else 64
+
+    def call():
+        config.precision = precision
+        lengths = DIAMETER / n * 1e3, FOCAL * 1e3, WAVELENGTH * 1e6, PIXEL * 1e6
+        return power(prysm.propagation.focus_fixed_sampling(f, *lengths, k, method=method))
+
+    return call
+
+
+def hcipy_call(f, k, kind):
+    n, bin_ = len(f), 2 * np.pi * PIXEL / (WAVELENGTH * FOCAL)
+    grids = [
+        hcipy.CartesianGrid(hcipy.RegularCoords([d, d], [m, m], [-z * d, -z * d]))
+        for d, m, z in ((DIAMETER / n, n, (n - 1) / 2), (bin_, k, k // 2))
+    ]
+    transform, values = kind(*grids), hcipy.Field(f.ravel(), grids[0])
+    return lambda: power(np.asarray(transform.forward(values)).reshape(k, k))
+
+
+def poppy_call(f, k):
+    n_lam_d = k * PIXEL * DIAMETER / (WAVELENGTH * FOCAL)
+    return lambda: power(poppy.matrixDFT.matrix_dft(f, n_lam_d, k, offset=(0.5, 0.5), centering="ADJUSTABLE"))
+
+
+def scipy_call(f, k):
+    n, turn = len(f), -2j * np.pi * DIAMETER / len(f) * PIXEL / (WAVELENGTH * FOCAL)
+    czt = scipy.signal.CZT(n, k, np.exp(turn), np.exp(turn * (k // 2)))
+    return lambda: power(czt(czt(f, axis=1), axis=0))
+
+
+def finufft_call(f, k, eps, kind):
+    n, step = len(f), 2 * np.pi * DIAMETER / len(f) * PIXEL / (WAVELENGTH * FOCAL)
+    points = (step * (np.arange(k) - k // 2)).astype("float32" if kind == "complex64" else "float64")
+    plans = [finufft.Plan(2, (n,), m, eps, -1, kind, nthreads=2) for m in (n, k)]
+    for plan in plans:
+        plan.setpts(points)
+
+    def call():
+        rows = np.ascontiguousarray(plans[0].execute(f).T)
+        return power(plans[1].execute(rows)).T
+
+    return call
+
+
+def contenders(n, k, p):
+    f, exact = field(p), field(p, np.complex128)
+    return {
+        "neusee": ours(p, k),
+        "hcipy ZoomFFT c64": hcipy_call(f, k, hcipy.ZoomFastFourierTransform),
+        "hcipy MFT c64": hcipy_call(f, k, hcipy.MatrixFourierTransform),
+        "prysm czt c64": prysm_call(f, k, "czt"),
+        "prysm czt c128": prysm_call(exact, k, "czt"),
+        "prysm mdft c64": prysm_call(f, k, "mdft"),
+        "scipy CZT": scipy_call(f, k),
+        "finufft 1d2 c64, 1e-6": finufft_call(f, k, 1e-6, "complex64"),
+        "finufft 1d2 c128, 1e-8": finufft_call(exact, k, 1e-8, "complex128"),
+        "poppy MFT": poppy_call(exact, k),
+    }
+
+
+def subset(p, k):
+    """Rows and columns, and |U|^2 there, by the double sum in complex128."""
+    n = len(p.height)
+    pick = np.unique(np.r_[np.linspace(0, k - 1, 48).astype(int), np.clip(k // 2 + np.arange(-8, 9), 0, k - 1)])
+    j = np.arange(n) - (n - 1) / 2
+    kernel = np.exp(-2j * np.pi * DIAMETER / n * PIXEL / (WAVELENGTH * FOCAL) * np.outer(pick - k // 2, j))
+    return np.ix_(pick, pick), power(kernel @ field(p, np.complex128) @ kernel.T)
+
+
+def error(image, where, truth):
+    """Largest error over the peak, after the best common scale: normalisations differ."""
+    part = image[where].astype(np.float64)
+    return float(np.abs(part * ((part * truth).sum() / (part**2).sum()) - truth).max() / truth.max())
+
+
+def seconds(call):
+    """Time of a second call in a row, after the threads of whoever ran before have stopped spinning."""
+    time.sleep(0.15)
+    call()
+    start = time.perf_counter()
+    call()
+    return time.perf_counter() - start
+
+
+def interleaved(calls, repeats):
+    """Median seconds of each call, taken in turns; what is slow is taken twice."""
+    times = {name: [] for name in calls}
+    first = {name: seconds(call) for name, call in calls.items()}
+    for turn in range(repeats):
+        for name, call in calls.items():
+            if turn < 2 or first[name] < SLOW:
+                times[name].append(seconds(call))
+    return {name: statistics.median(t) for name, t in times.items()}
+
+
+def forward(repeats):
+    print("| pupil -> window | who | ms | of ours | error, clear | error, 10 waves |\n|---|---|---|---|---|---|")
+    for n, k in SIZES:
+        clear, bent = pupil(n), pupil(n, 10.0)
+        calls, others = contenders(n, k, clear), contenders(n, k, bent)
+        truths = subset(clear, k), subset(bent, k)
+        times = interleaved(calls, repeats)
+        for name, t in sorted(times.items(), key=lambda item: item[1]):
+            errors = error(calls[name](), *truths[0]), error(others[name](), *truths[1])
+            print(f"| {n} -> {k} | {name} | {1e3 * t:.1f} | {t / times['neusee']:.2f} | "
+                  f"{errors[0]:.0e} | {errors[1]:.0e} |", flush=True)  # fmt: skip
+
+
+def methods(repeats):
+    print("\n| pupil -> window | auto | kaiser_bessel | bluestein | folded | direct |\n|---|---|---|---|---|---|")
+    for n, k in SIZES:
+        names = ("auto", "kaiser_bessel", "bluestein", "folded", "direct")
+        times = interleaved({m: ours(pupil(n), k, m) for m in names}, repeats)
+        print(f"| {n} -> {k} | " + " | ".join(f"{1e3 * times[m]:.1f}" for m in names) + " |", flush=True)
+
+
+def plain_autograd(p, k):
+    """What one writes without us: complex matrix products and torch's own gradient."""
+    n = len(p.height)
+    j, x = torch.arange(n).double() - (n - 1) / 2, torch.arange(k).double() - k // 2
+    turns = DIAMETER / n * PIXEL / (WAVELENGTH * FOCAL) * torch.outer(x, j)
+    kernel = torch.exp(-2j * torch.pi * turns).to(torch.complex64)
+
+    def image(height):
+        u = kernel @ (p.amplitude * torch.exp(2j * torch.pi * INDEX / WAVELENGTH * height)) @ kernel.T
+        return u.abs().square()
+
+    return image
+
+
+def backward(repeats):
+    print("\n| pupil -> window | forward ms | forward + backward ms | ratio | torch autograd, matrices: f + b ms |")
+    print("|---|---|---|---|---|")
+    for n, k in SIZES:
+        p = pupil(n, 3.0)
+        camera = dict(focal_length=FOCAL, pixel_pitch=PIXEL, shape=(k, k))
+        weight = torch.rand(k, k)
+
+        def learn(image, p=p, weight=weight):
+            height = p.height.clone().requires_grad_()
+            (image(height) * weight).sum().backward()
+
+        def image(height, p=p, camera=camera):
+            return psf(p._replace(height=height), **camera).intensity[0]
+
+        calls = {"f": ours(p, k), "fb": partial(learn, image), "torch": partial(learn, plain_autograd(p, k))}
+        t = interleaved(calls, repeats)
+        print(f"| {n} -> {k} | {1e3 * t['f']:.1f} | {1e3 * t['fb']:.1f} | {t['fb'] / t['f']:.2f} | "
+              f"{1e3 * t['torch']:.0f} |", flush=True)  # fmt: skip
+
+
+def all_bands(who, learn=False):
+    """31 bands from one rough height map, at full size; prints seconds and peak GB. Runs in its own process."""
+    import resource
+
+    torch.manual_seed(1)
+    bands = [400e-9 + 10e-9 * i for i in range(31)]
+    p = pupil(2160, wavelengths=bands, height=1e-6 * torch.rand(2160, 2160))
+    before = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 2**20
+    start = time.perf_counter()
+    if who == "neusee":
+        height = p.height.requires_grad_(learn)
+        out = psf(p._replace(height=height), focal_length=FOCAL, pixel_pitch=PIXEL, shape=(2048, 2048)).intensity
+        if learn:
+            out.backward(torch.ones(()).expand_as(out))
+    else:
+        out = np.empty((31, 2048, 2048), np.float32)
+        for band, wavelength in enumerate(bands):
+            globals()["WAVELENGTH"] = wavelength
+            out[band] = hcipy_call(field(p), 2048, hcipy.ZoomFastFourierTransform)()
+    took, after = time.perf_counter() - start, resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 2**20
+    print(f"{took:.2f} {after:.2f} {before:.2f}")
+
+
+def spectra():
+    print(
+        "\n| 31 bands, height -> 2048^2 PSFs, a process of its own, cold | s (three runs) | peak GB | before the call |"
+    )
+    print("|---|---|---|---|")
+    for who, title in (("neusee", "neusee"), ("learn", "neusee, forward + backward"), ("hcipy", "hcipy ZoomFFT c64")):
+        runs = [subprocess.run([sys.executable, __file__, "--bands", who], capture_output=True, text=True, check=True)
+                .stdout.split()[-3:] for _ in range(3)]  # fmt: skip
+        print(f"| {title} | {', '.join(r[0] for r in runs)} | {max(r[1] for r in runs)} | {runs[0][2]} |", flush=True)
+
+
+if __name__ == "__main__":
+    torch.set_num_threads(2)
+    with scipy.fft.set_workers(2):
+        if "--bands" in sys.argv:
+            all_bands("hcipy" if sys.argv[-1] == "hcipy" else "neusee", learn=sys.argv[-1] == "learn")
+        else:
+            repeats = int(sys.argv[1]) if len(sys.argv) > 1 else 9
+            print(f"load {os.getloadavg()[0]:.1f} at the start, torch {torch.__version__}, {repeats} repeats\n")
+            forward(repeats)
+            methods(repeats)
+            backward(repeats)
+            spectra()
+            print(f"\nload {os.getloadavg()[0]:.1f} at the end")
