@@ -63,19 +63,17 @@ def transform(
     axes = [Axis(n, k, a, sign) for n, k, a in zip(field.shape, shape, alpha, strict=True)]
     real = field.real.dtype
     before, after = _tilts(axes, centre_in, centre_out, real, field.device)
-    planes = torch.view_as_real(field * before).movedim(2, 0)
     out = torch.empty(shape, dtype=field.dtype, device=field.device)
-    parts = torch.view_as_real(out).movedim(2, 0)
 
     def source(start: int, stop: int, into: Tensor) -> None:
-        into.copy_(planes[:, start:stop])
+        into.copy_(torch.view_as_real((field[start:stop] * before[1]).mul_(before[0][start:stop, None])).movedim(2, 0))
 
     def sink(rows: slice, columns: slice, patch: Tensor) -> None:
-        patch_of(parts, rows, columns, patch).copy_(patch)
+        patch_of(torch.view_as_real(out).movedim(2, 0), rows, columns, patch).copy_(patch)
 
     with borrowed(real, field.device) as work:
         propagate(axes[0], axes[1], source, sink, work, method)
-    return out.mul_(after)
+    return out.mul_(after[0][:, None]).mul_(after[1])
 
 
 def _tilts(
@@ -84,13 +82,12 @@ def _tilts(
     centre_out: tuple[float, float],
     real: torch.dtype,
     device: torch.device,
-) -> tuple[Tensor, Tensor]:
-    """Phasors that turn the transform about the middles into the one about the given centres."""
+) -> tuple[list[Tensor], list[Tensor]]:
+    """Phasors along each axis that turn the transform about the middles into the one about the given centres."""
     before, after = [], []
     for axis, c_in, c_out in zip(axes, centre_in, centre_out, strict=True):
         d_in, d_out = (axis.n_in - 1) / 2 - c_in, (axis.n_out - 1) / 2 - c_out
         a = axis.sign * axis.alpha
-        before.append(centred(axis.n_in, device) * (a * d_out))
-        after.append((centred(axis.n_out, device) + d_out) * (a * d_in))
-    pair = [unit_phasor(v[:, None] + u, real) for v, u in (before, after)]
-    return pair[0], pair[1]
+        before.append(unit_phasor(centred(axis.n_in, device) * (a * d_out), real))
+        after.append(unit_phasor((centred(axis.n_out, device) + d_out) * (a * d_in), real))
+    return before, after

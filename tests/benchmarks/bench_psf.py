@@ -1,8 +1,9 @@
 """The PSF beside prysm, hcipy, poppy, scipy and finufft: `python tests/benchmarks/bench_psf.py [REPEATS]`.
 
 Everybody gets two threads and the same clear or defocused disc at 550 nm, and returns the intensity. The peers are
-handed the complex pupil and keep their operators; ours starts from the height map and makes phase and operators each
-time. What making the complex64 pupil costs in NumPy is a row of its own, and the last column adds it to the peers.
+handed the complex pupil and keep their operators; ours keeps its own, starts from the height map and makes the phase
+each time. What making the complex64 pupil costs in NumPy is a row of its own, and a column adds it to the peers; the
+other way round, `neusee, ready pupil` is handed it as they are.
 Calls are interleaved, so that a loaded machine slows all alike, and each is preceded by a pause and by a call that
 does not count, because the threads of one library spin for a while and would slow the next. The error is against the
 double sum in complex128 on a subset of rows and columns, relative to the peak. Prints tables in Markdown.
@@ -35,6 +36,7 @@ from prysm.conf import config
 
 from neusee.nodes.optics import psf
 from neusee.nodes.optics._psf import _Camera, _focus
+from neusee.nodes.optics._transform import transform
 from neusee.nodes.values import Pupil
 
 WAVELENGTH, FOCAL, PIXEL, DIAMETER, INDEX = 550e-9, 0.11, 2.9e-6, 2160 * 3.74e-6, 0.46
@@ -74,6 +76,14 @@ def pupil_call(p):
 def ours(p, k, method="auto"):
     camera = _Camera(FOCAL, PIXEL, (k, k), (0.0, 0.0), False, False)
     return lambda: _focus(p, camera, torch.float32, method).intensity[0].numpy()
+
+
+def from_field(f, k):
+    """Ours from the same ready complex pupil that the peers get."""
+    n, ready = len(f), torch.from_numpy(f)
+    alpha, centre = DIAMETER / n * PIXEL / (WAVELENGTH * FOCAL), (n - 1) / 2
+    where = ((k, k), (alpha, alpha), (centre, centre), (k // 2, k // 2))
+    return lambda: power(transform(ready, *where).numpy())
 
 
 def power(u):
@@ -130,6 +140,7 @@ def contenders(n, k, p):
     f, exact = field(p), field(p, np.complex128)
     return {
         "neusee": ours(p, k),
+        "neusee, ready pupil": from_field(f, k),
         "hcipy ZoomFFT c64": hcipy_call(f, k, hcipy.ZoomFastFourierTransform),
         "hcipy MFT c64": hcipy_call(f, k, hcipy.MatrixFourierTransform),
         "prysm czt c64": prysm_call(f, k, "czt"),
@@ -188,7 +199,7 @@ def forward(repeats):
         made, mine = times.pop("made"), times["neusee"]
         print(f"| {n} -> {k} | *the complex pupil alone, NumPy* | {1e3 * made:.1f} | | | | |")
         for name, t in sorted(times.items(), key=lambda item: item[1]):
-            whole = 1.0 if name == "neusee" else (t + made) / mine
+            whole = 1.0 if name == "neusee" else (t + made) / mine  # ours with a ready pupil, too: as a peer
             errors = error(calls[name](), *truths[0]), error(others[name](), *truths[1])
             print(f"| {n} -> {k} | {name} | {1e3 * t:.1f} | {t / mine:.2f} | {whole:.2f} | "
                   f"{errors[0]:.0e} | {errors[1]:.0e} |", flush=True)  # fmt: skip
