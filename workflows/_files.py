@@ -5,12 +5,15 @@ from __future__ import annotations
 import csv
 import os
 import shutil
+import time
 from collections.abc import Iterable, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
 from datetime import date
 from pathlib import Path
 from typing import Any
+
+_ABANDONED = 3600.0  #: seconds after which a folder that nobody finished was left by a killed run
 
 
 @dataclass
@@ -47,6 +50,7 @@ class RunFolder:
 def new_run(root: Path, recipe: str, key: str) -> Iterator[RunFolder]:
     """A folder under a temporary name that gets its own name when all is written, and is removed otherwise."""
     root.mkdir(parents=True, exist_ok=True)
+    _sweep(root)
     name = f"{date.today().isoformat()}_{recipe}_{key[:8]}"
     run = RunFolder(root / f".{name}.{os.getpid()}.part")
     shutil.rmtree(run.path, ignore_errors=True)
@@ -58,6 +62,16 @@ def new_run(root: Path, recipe: str, key: str) -> Iterator[RunFolder]:
         shutil.rmtree(run.path, ignore_errors=True)
         raise
     _point(root, run.path.name)
+
+
+def _sweep(root: Path) -> None:
+    """Remove what killed runs left half written; what a run is still writing is younger."""
+    for part in root.glob(".*.part"):
+        try:
+            if time.time() - max(p.stat().st_mtime for p in (part, *part.rglob("*"))) > _ABANDONED:
+                shutil.rmtree(part, ignore_errors=True)
+        except OSError:  # another process was quicker
+            continue
 
 
 def _settle(part: Path, wanted: Path) -> Path:
