@@ -23,8 +23,13 @@ def test_an_abandoned_folder_is_swept_and_a_young_one_is_not(tmp_path):
     assert (tmp_path / "latest" / "a.txt").read_text() == "a"
 
 
-def test_a_run_that_fails_leaves_nothing(tmp_path):
-    with pytest.raises(RuntimeError), new_run(tmp_path, "r", "k" * 8) as folder:
+def failing(root):
+    with new_run(root, "r", "k" * 8) as folder:
         folder.write("a.txt", "a")
         raise RuntimeError
+
+
+def test_a_run_that_fails_leaves_nothing(tmp_path):
+    with pytest.raises(RuntimeError):
+        failing(tmp_path)
     assert list(tmp_path.iterdir()) == []
