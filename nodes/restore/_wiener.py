@@ -6,12 +6,17 @@ from typing import Annotated, Any
 import torch
 from pydantic import Field
 from torch import Tensor
-from torch.nn.functional import avg_pool2d, interpolate, pad
+from torch.nn.functional import avg_pool2d, pad
 
 from neusee.nodes import Check, node
-from neusee.nodes.optics._image import reach, smooth
+from neusee.nodes.restore._unseen import Blurred, most_likely, torus, variance
+from neusee.nodes.sensor._digital import crop
 from neusee.nodes.units import Electrons
 from neusee.nodes.values import Bands, Psf
+
+_FALL = 3.0  #: power of pictures falls with frequency to this power, as that of edges does
+_GREY = 0.95  #: correlation of the channels of pictures
+_LIGHT = 0.999  #: share of the light for which the unknown around the picture has room
 
 
 @node()
@@ -22,42 +27,45 @@ def wiener(
     responses: Tensor,
     bands: Bands,
     clipped: Tensor,
+    glare: list[Tensor] | None = None,
     *,
     balance: Annotated[float, Field(gt=0, allow_inf_nan=False)] = 1.0,
     read_noise: Electrons,
 ) -> Tensor:
-    """Undo the blur of each channel as far as its noise allows: conj(H) / (|H|^2 + balance x noise / signal).
+    """Undo the blur as far as the noise allows: the most likely picture, given the pixels that are seen.
 
-    H belongs to the PSF that the channel sees of a grey scene: the mean over bands, weighted by illuminant x response x
-    wavelength. The signal falls as 1 / frequency^2, as pictures do, with the power that this picture has. The noise is
-    shot and read noise plus what is not known at all: clipped values, which are first filled from around them, and
-    light that came over the edge, where the picture is mirrored and faded to its mean; that falls like the signal.
+    Least squares with a Gaussian prior, which for a picture without edges is the Wiener filter. Each channel has the
+    PSF it sees of a grey scene: the mean over bands, weighted by illuminant x response x wavelength. The prior's power
+    falls as 1 / frequency^3, as that of edges, with the variance of this picture; channels correlate by 0.95. Clipped
+    pixels and what lies beyond the edge are unknown. The patterns of `glare`, wide as the scene, lie over the picture
+    in unknown strength and are taken out: the direction and wavelength of those lasers are then taken as known.
 
-    Shapes: electrons and clipped (3, y, x), psf.intensity (band, any, any), responses (3, band) -> (3, y, x).
-    Units:  e-; the result as if the lens were perfect and lost nothing.
-    Error:  white noise and a grey scene are assumed; a laser's glare that does not clip is taken for scene. Unknown
-            light counts as large as the mean of the picture.
+    Shapes: electrons and clipped (channel, y, x), psf.intensity (band, any, any), responses (channel, band),
+            each glare (channel, at least y, at least x), of which the centre counts -> (channel, y, x).
+    Units:  e-; glare any; the result as if the lens were perfect and lost nothing. `balance` multiplies the noise.
+    Error:  a grey scene is assumed, and noise no smaller in the dark than that of the mean picture. Without `glare` a
+            laser that does not clip is taken for scene. Nothing keeps the result positive: beside lamps hundreds of
+            times as bright as the scene it rings. The iteration ends after a fixed number of steps.
     Raises: ValueError where shapes or bands differ.
-    Source: Wiener filter as in Gonzalez and Woods, Digital Image Processing, 4th ed., ch. 5; filling by push and pull,
-            Gortler et al., The Lumigraph, SIGGRAPH 1996.
+    Source: Wiener filter as in Gonzalez and Woods, Digital Image Processing, 4th ed., ch. 5; as least squares with a
+            prior, Kaipio and Somersalo, Statistical and Computational Inverse Problems, 2005, ch. 3.
     """
     if electrons.shape != clipped.shape or len(responses) != electrons.shape[-3]:
         raise ValueError(
             f"electrons {tuple(electrons.shape)}, clipped {tuple(clipped.shape)} and responses "
             f"{tuple(responses.shape)} must have the same channels and pixels"
         )
+    size = (electrons.shape[-2], electrons.shape[-1])
     kernels = effective_psf(psf, illuminant, responses, bands).to(electrons)
-    layers = zip(electrons, clipped, kernels, strict=True)
-    return torch.stack([_deconvolve(e, c, k, balance, read_noise) for e, c, k in layers])
+    patterns = [crop(pattern.to(electrons), shape=size) for pattern in glare or ()]
+    return _restored(electrons, ~clipped, kernels, _visible(patterns, ~clipped), balance, read_noise)
 
 
 @wiener.check
 def _(result: Tensor, electrons: Tensor, *inputs: Any, **params: float) -> list[Check]:
-    share = float(inputs[-1].any(-3).double().mean())
+    share = float(inputs[4].any(-3).double().mean())
     finite = math.isfinite(float(result.sum()))
-    return [
-        Check(f"{share:.2%} filled in before, mean {float(result.mean() / electrons.mean()):.2f} of the raw", finite)
-    ]
+    return [Check(f"{share:.2%} not seen, mean {float(result.mean() / electrons.mean()):.2f} of the raw", finite)]
 
 
 def effective_psf(psf: Psf, illuminant: Tensor, responses: Tensor, bands: Bands) -> Tensor:
@@ -71,74 +79,79 @@ def effective_psf(psf: Psf, illuminant: Tensor, responses: Tensor, bands: Bands)
     return seen
 
 
-def _deconvolve(electrons: Tensor, clipped: Tensor, kernel: Tensor, balance: float, read: float) -> Tensor:
-    (y, x), kernel = electrons.shape, reach(reach(kernel, -2, electrons.shape[0]), -1, electrons.shape[1])
-    edge = (kernel.shape[0] // 2, kernel.shape[1] // 2)
-    size = (smooth(y + 2 * edge[0]), smooth(x + 2 * edge[1]))
-    picture = filled(electrons, ~clipped)
-    mean = picture.mean()
-    spectrum = torch.fft.rfft2(_faded(picture - mean, edge), s=size)
-    transfer = torch.fft.rfft2(_centred(kernel, size))
-    shape = _fall(size).to(picture)
-    white = (mean + read**2).clamp_min(1e-3) + mean.square() * clipped.double().mean().to(mean)
-    noise = white + mean.square() * _over_the_edge(transfer, (y, x), size) * shape
-    power = _power(spectrum, transfer, shape, white)
-    gain = transfer.conj() / (transfer.abs().square() + balance * noise / (power * shape))
-    sharp: Tensor = torch.fft.irfft2(gain * spectrum, s=size)[edge[0] : edge[0] + y, edge[1] : edge[1] + x]
-    return sharp + mean / kernel.sum().clamp_min(1e-3)
+def _restored(
+    electrons: Tensor, known: Tensor, kernels: Tensor, glare: list[Tensor], balance: float, read: float
+) -> Tensor:
+    """Scale the problem to a scene of mean 0 and variance 1, solve it, and scale back."""
+    y, x = electrons.shape[-2:]
+    known = torch.where(known.any(-1).any(-1)[:, None, None], known, True)
+    picture = electrons - _strengths(electrons, known, glare)
+    mean = _mean(picture, known)
+    noise = _noise(electrons, mean, read)
+    size = torus((y, x), edge(kernels, (y, x)))
+    transfer, power = torch.fft.rfft2(wrapped(kernels, size)), fall(size).to(kernels)
+    seen = _mean((picture - mean).square(), known)
+    passed = variance(transfer.abs().square() * power, size)[:, None, None]
+    scale = (torch.maximum(seen - mean - read**2, 0.01 * seen) / passed.clamp_min(1e-6)).clamp_min(1e-6).sqrt()
+    weight = known * (scale / (balance * noise).sqrt()).square()
+    scaled = tuple(pattern / scale for pattern in glare)
+    spectrum = most_likely(Blurred((picture - mean) / scale, weight, transfer, power, size, _GREY, scaled))
+    sharp: Tensor = torch.fft.irfft2(spectrum, s=size)[:, :y, :x]
+    return sharp * scale + mean / kernels.sum((-2, -1)).clamp_min(1e-3)[:, None, None]
 
 
-def _fall(size: tuple[int, int]) -> Tensor:
-    """Power of pictures by frequency, 1 / frequency^2, with mean 1."""
+def _noise(electrons: Tensor, mean: Tensor, read: float) -> Tensor:
+    """Variance of the noise: that of the mean picture, and more where it is brighter around."""
+    around = avg_pool2d(electrons[None], 9, stride=1, padding=4, count_include_pad=False)[0]
+    return (torch.maximum(around, mean) + read**2).clamp_min(1e-3)
+
+
+def _mean(picture: Tensor, known: Tensor) -> Tensor:
+    """Mean of what is known of each channel: (channel, 1, 1)."""
+    total: Tensor = (picture * known).sum((-2, -1), keepdim=True)
+    return total / known.sum((-2, -1), keepdim=True)
+
+
+def _visible(patterns: list[Tensor], known: Tensor) -> list[Tensor]:
+    """Patterns that are anywhere to be seen, with a greatest value of 1."""
+    peaks = [float((pattern.abs() * known).max()) for pattern in patterns]
+    return [pattern / peak for pattern, peak in zip(patterns, peaks, strict=True) if peak > 0]
+
+
+def _strengths(electrons: Tensor, known: Tensor, glare: list[Tensor]) -> Tensor:
+    """A first guess of what the glare adds: least squares beside a constant."""
+    if not glare:
+        return torch.zeros_like(electrons)
+    patterns = torch.stack(glare).double()
+    flat = torch.stack([(known * (p - _mean(p, known))).flatten() for p in patterns])
+    fit = torch.linalg.pinv(flat @ flat.T, hermitian=True) @ (flat @ electrons.double().flatten())
+    total: Tensor = torch.tensordot(fit, patterns, 1)
+    return total.to(electrons)
+
+
+def fall(size: tuple[int, int]) -> Tensor:
+    """Power of pictures by frequency, half a spectrum of mean 1."""
     fy, fx = (torch.fft.fftfreq(n, dtype=torch.float64) for n in size)
-    fall: Tensor = 1.0 / (fy[:, None].square() + fx[None, : size[1] // 2 + 1].square() + 1.0 / (size[0] * size[1]))
-    return fall / fall.mean()
+    squared = fy[:, None].square() + fx[None, : size[1] // 2 + 1].square() + 1.0 / (size[0] * size[1])
+    power: Tensor = squared ** (-_FALL / 2.0)
+    return power / variance(power, size)
 
 
-def _power(spectrum: Tensor, transfer: Tensor, shape: Tensor, noise: Tensor) -> Tensor:
-    """Variance of the scene that explains the variance of this picture, a hundredth of it at least."""
-    seen: Tensor = spectrum.abs().square().mean() / spectrum.shape[0] / (2 * spectrum.shape[1] - 1)
-    passed: Tensor = (transfer.abs().square() * shape).mean()
-    power: Tensor = torch.maximum(seen - noise, 0.01 * seen) / passed.clamp_min(1e-6)
-    return power.clamp_min(1e-6)
+def edge(kernels: Tensor, picture: tuple[int, int]) -> tuple[int, int]:
+    """How far up and down, left and right, almost all light goes; no farther than 256 pixels or half the picture."""
+    found = []
+    for dim, size in ((-1, picture[0]), (-2, picture[1])):
+        profile = kernels.detach().sum((0, dim)).double()
+        radius = (torch.arange(len(profile), device=profile.device) - len(profile) // 2).abs()
+        inside = profile.new_zeros(int(radius.max()) + 1).index_add(0, radius, profile).cumsum(0)
+        found.append(min(int((inside < _LIGHT * inside[-1]).sum()), max(256, size // 2), size))
+    return found[0], found[1]
 
 
-def _over_the_edge(transfer: Tensor, inside: tuple[int, int], size: tuple[int, int]) -> Tensor:
-    """Mean square share of the light of a pixel that comes from outside the picture."""
-    window = torch.ones(inside, device=transfer.device, dtype=transfer.real.dtype)
-    kept: Tensor = torch.fft.irfft2(torch.fft.rfft2(window, s=size) * transfer, s=size)[: inside[0], : inside[1]]
-    lost: Tensor = transfer[0, 0].real - kept
-    return lost.square().mean()
-
-
-def _centred(kernel: Tensor, size: tuple[int, int]) -> Tensor:
-    """The kernel in zeros, its centre at the first sample."""
-    m, n = kernel.shape
-    return pad(kernel, (0, size[1] - n, 0, size[0] - m)).roll((-(m // 2), -(n // 2)), (0, 1))
-
-
-def _faded(picture: Tensor, edge: tuple[int, int]) -> Tensor:
-    """Mirror the picture at its edges and fade it to nothing."""
-    wide = pad(picture[None, None], (edge[1], edge[1], edge[0], edge[0]), mode="reflect")[0, 0]
-    for dim, width in enumerate(edge):
-        ramp = torch.ones(wide.shape[dim], dtype=wide.dtype, device=wide.device)
-        rise = 0.5 - 0.5 * torch.cos(math.pi * (torch.arange(width, device=wide.device) + 0.5) / max(width, 1))
-        ramp[:width], ramp[wide.shape[dim] - width :] = rise, rise.flip(0)
-        wide = wide * (ramp[:, None] if dim == 0 else ramp)
-    return wide
-
-
-def filled(picture: Tensor, known: Tensor) -> Tensor:
-    """Fill the unknown from ever coarser means of the known around it; nothing known leaves the picture."""
-    if not bool(known.any()):
-        return picture
-    weight = known.to(picture)[None, None]
-    levels = [(picture * weight, weight)]
-    while max(levels[-1][0].shape[-2:]) > 1:
-        levels.append(tuple(avg_pool2d(t, 2, ceil_mode=True) for t in levels[-1]))  # type: ignore[arg-type]
-    total, weight = levels.pop()
-    guess = total / weight
-    for total, weight in reversed(levels):
-        coarse = interpolate(guess, size=total.shape[-2:], mode="bilinear", align_corners=False)
-        guess = torch.where(weight > 0, total / weight.where(weight > 0, 1.0), coarse)
-    return torch.where(known, picture, guess[0, 0])
+def wrapped(kernels: Tensor, size: tuple[int, int]) -> Tensor:
+    """The kernels around the first sample of a torus, with what is wider than that laid over the rest."""
+    (m, n), (y, x) = kernels.shape[-2:], size
+    rows, columns = -(-m // y), -(-n // x)
+    wide = pad(kernels, (0, columns * x - n, 0, rows * y - m))
+    folded = wide.reshape(-1, rows, y, columns, x).sum((1, 3))
+    return folded.roll((-(m // 2), -(n // 2)), (-2, -1))

@@ -9,7 +9,7 @@ from hypothesis import strategies as st
 
 from neusee.nodes.optics import image
 from neusee.nodes.restore import wiener
-from neusee.nodes.restore._wiener import effective_psf, filled
+from neusee.nodes.restore._wiener import effective_psf
 from neusee.nodes.values import Bands, Psf
 
 ONE = torch.ones(1, dtype=torch.float64)
@@ -39,10 +39,10 @@ def seen(truth, psf, border="reflect", seed=0):
     return blurred + (blurred.clamp_min(0) + 10.5**2).sqrt() * noise
 
 
-def run(electrons, psf, clipped=None, **how):
+def run(electrons, psf, clipped=None, glare=None, **how):
     marked = torch.zeros(electrons.shape, dtype=torch.bool) if clipped is None else clipped
     channels = torch.ones(len(electrons), 1, dtype=torch.float64)
-    return wiener(electrons, psf, ONE, channels, BANDS, marked, **{"read_noise": 10.5, **how})
+    return wiener(electrons, psf, ONE, channels, BANDS, marked, glare, **{"read_noise": 10.5, **how})
 
 
 def error(a, b):
@@ -124,7 +124,7 @@ def test_finite_at_every_extreme(y, x, size, value, share, read):
     electrons = torch.full((2, y, x), value)
     clipped = torch.rand(2, y, x, generator=torch.Generator().manual_seed(1)) < share
     for kernel in (torch.rand(1, size, size), torch.zeros(1, size, size)):
-        found = run(electrons, Psf(kernel, ONE), clipped, read_noise=read)
+        found = run(electrons, Psf(kernel, ONE), clipped, [torch.ones(2, y + 1, x + 2)], read_noise=read)
         assert found.shape == electrons.shape
         assert torch.isfinite(found).all()
 
@@ -142,19 +142,48 @@ def test_shapes_must_agree():
         run(torch.ones(1, 4, 4), disc(1, 3), torch.zeros(1, 4, 5, dtype=torch.bool))
 
 
-def test_filling_continues_what_is_around_and_touches_nothing_else():
-    ramp = torch.arange(64.0).expand(64, 64)
-    known = torch.ones(64, 64, dtype=torch.bool)
-    known[20:30, 20:30] = False
-    found = filled(ramp, known)
-    assert torch.equal(found[known], ramp[known])
-    assert float((found - ramp)[~known].abs().max()) < 8
-    assert torch.equal(filled(ramp, torch.zeros_like(known)), ramp)
+def crossed(size=96):
+    """Glare of a laser: a cross of stripes, wider than the picture."""
+    y = torch.arange(2 * size) - size
+    wave = torch.cos(y / 3.0).square()
+    return (wave[:, None] * torch.exp(-((y[None] / 20.0) ** 2)) + wave * torch.exp(-((y[:, None] / 20.0) ** 2)))[None]
 
 
-def test_check_says_what_was_filled():
+@pytest.mark.parametrize("unit", [1.0, 1e-6, 1e6])
+def test_a_known_laser_is_taken_out_whatever_its_strength(unit):
+    truth, psf = scene(), disc(4)
+    bright = seen(truth, psf) + 4000 * crossed()[:, 48:-48, 48:-48]
+    alone, taken = run(seen(truth, psf), psf), run(bright, psf, glare=[unit * crossed()])
+    assert error(run(bright, psf), truth) > 2 * error(alone, truth)
+    assert error(taken, truth) < 1.05 * error(alone, truth)
+
+
+def test_a_laser_that_is_not_there_or_not_seen_changes_little():
+    truth, psf = scene(), disc(4)
+    alone = run(seen(truth, psf), psf)
+    assert torch.equal(run(seen(truth, psf), psf, glare=[0 * crossed()]), alone)
+    assert error(run(seen(truth, psf), psf, glare=[crossed(), crossed()]), alone) < 0.1 * error(alone, truth)
+
+
+def test_what_lies_beyond_the_edge_is_unknown_not_mirrored():
+    """Half of the light of the rim comes from outside, and the picture is better than before even there."""
+    wide, psf = scene(192), disc(16, 65)
+    truth, blurred = (x[:, 48:-48, 48:-48] for x in (wide, seen(wide, psf)))
+    found = run(blurred, psf)
+    assert error(found, truth) < 0.75 * error(blurred, truth)
+    rim = torch.ones_like(truth, dtype=torch.bool)
+    rim[:, 12:-12, 12:-12] = False
+    assert error(found[rim], truth[rim]) < 0.8 * error(blurred[rim], truth[rim])
+
+
+def test_a_point_for_a_psf_and_no_noise_change_nothing():
+    truth = scene()
+    torch.testing.assert_close(run(truth, disc(0), balance=1e-7), truth, rtol=1e-3, atol=1.0)
+
+
+def test_check_says_what_was_not_seen():
     electrons, clipped = torch.full((1, 4, 4), 8.0), torch.zeros(1, 4, 4, dtype=torch.bool)
     clipped[0, 0, 0] = True
     (line,) = wiener.after(electrons, electrons, None, None, None, None, clipped)
-    assert line.text == f"{1 / 16:.2%} filled in before, mean 1.00 of the raw"
+    assert line.text == f"{1 / 16:.2%} not seen, mean 1.00 of the raw"
     assert not wiener.after(electrons * math.nan, electrons, None, None, None, None, clipped)[0].ok
