@@ -43,6 +43,11 @@ class Done:
     device: str = "cpu"
     bytes: int = 0
     bound: float | None = None  #: what leaving the step out may change at most
+    began: float = 0.0  #: s since the run began
+    lane: str = ""  #: which place of the executor computed it
+    peak: int | None = None  #: bytes of memory beside what was there before it ran
+    predicted: float | None = None  #: s that earlier runs made one expect
+    kept: bool = True  #: whether the store has the value
 
 
 @dataclass(frozen=True, slots=True)
