@@ -3,14 +3,16 @@
 Comments, layout and docstrings are left out, so better words keep the cache; helpers and
 constants are in, so a changed constant never serves an old result. The syntax trees'
 digests are kept in a file by the digest of the source, so that a cached run parses nothing.
+Beside it ``code/<digest>.json`` keeps the digests of the single definitions behind a digest:
+no key needs them, but with them one can say which function it was that changed.
 """
 
 from __future__ import annotations
 
-import ast
 import json
 import os
 import sys
+import threading
 import warnings
 from collections.abc import Iterator
 from contextlib import suppress
@@ -20,14 +22,13 @@ from typing import Any
 import xxhash
 
 from neusee.workflows._keys import digest
+from neusee.workflows._syntax import ROOT, Summary, Use, summarise
 
-_ROOT = "neusee.nodes"
-_LEFT_OUT = frozenset({_ROOT, f"{_ROOT}._node"})  #: decide nothing of what a node computes
-_KEPT = 2000  #: summaries in the file
+_LEFT_OUT = frozenset({ROOT, f"{ROOT}._node"})  #: decide nothing of what a node computes
+_KEPT = 1000  #: summaries in the file
 _PYTHON = "{}.{}".format(*sys.version_info)  #: a syntax tree's text changes with it
 _THIS_PROCESS = os.urandom(8).hex()
 
-Summary = tuple[str, list[tuple[int, str, str]], list[str]]  #: tree's digest, imports, names bound by imports
 _edited_since: set[str] = set()  #: loaded modules whose source is no longer what runs
 _frozen: dict[str, tuple[Any, str]] = {}  #: module -> its spec and the digest of its source when first seen
 
@@ -40,52 +41,90 @@ class Code:
         self._summaries: dict[str, Summary] = _read(memo)
         self._new = False
         self._digests: dict[str, str] = {}
+        self._parts: dict[str, dict[str, dict[str, str]]] = {}  # definitions by module behind each digest
+        self._paths: dict[str, Path | None] = {}
 
     def digest(self, module: str) -> str:
-        """Digest of ``module`` and, transitively, of what it imports of `neusee.nodes`."""
+        """Digest of ``module`` and, transitively, of what it imports of `neusee.nodes`.
+
+        Raises `LookupError` where what it imports, or its source, cannot be told.
+        """
         if module not in self._digests:
             seen: dict[str, str] = {}
+            parts: dict[str, dict[str, str]] = {}
             todo = [module]
             while todo:
                 name = todo.pop()
                 if name not in seen:
-                    seen[name], imports = self._look(name)
+                    seen[name], parts[name], imports = self._look(name)
                     todo += imports
-            self._digests[module] = digest(seen)
+            found = self._digests[module] = digest(seen)
+            if _edited_since.isdisjoint(seen):  # else this digest means something in this process alone
+                self._parts[found] = parts
         return self._digests[module]
 
     def save(self) -> None:
         """Keep the summaries that this run had to make; failing to is no failure."""
-        if not self._new:
-            return
-        self._new = False
-        part = self._memo.parent / "tmp" / f"{self._memo.name}.{os.getpid()}"
-        with suppress(OSError):
-            part.parent.mkdir(parents=True, exist_ok=True)
-            part.write_text(json.dumps(dict(list(self._summaries.items())[-_KEPT:])))
-            os.replace(part, self._memo)
+        if self._new:
+            self._new = False
+            _write(self._memo, dict(list(self._summaries.items())[-_KEPT:]), self._memo.parent / "tmp")
+        for found, parts in self._parts.items():
+            path = parts_file(self._memo.parent, found)
+            if not os.path.exists(path):
+                _write(path, parts, self._memo.parent / "tmp")
+        self._parts = {}
 
-    def _look(self, module: str) -> tuple[str, list[str]]:
-        path = _path(module)
+    def _look(self, module: str) -> tuple[str, dict[str, str], list[str]]:
+        path = self._path(module)
         if path is None:
             raise LookupError(f"{module} has no source file, so its results cannot be told from others: put it in one")
-        tree, imports, _ = self._summary(module, path)
-        tree += _THIS_PROCESS if module in _edited_since else ""
+        summary = self._summary(module, path)
+        tree = summary.tree + (_THIS_PROCESS if module in _edited_since else "")
         package = module if path.name == "__init__.py" else module.rpartition(".")[0]
-        names = [n for item in imports for n in self._imported(*item, package)]
-        return tree, [n for n in names if n.startswith(f"{_ROOT}.") and n not in _LEFT_OUT]
+        names = [n for item in summary.imports for n in self._imported(*item, package)]
+        for use in summary.uses:
+            used = self._used(use, package)
+            if used is not None:
+                names += used
+            elif module.startswith(ROOT):
+                what = "the whole of the nodes is used, so that no one can tell what a result depends on"
+                raise LookupError(f"{path}:{use[-1]}: {what}: import what the node needs by its full name")
+        return tree, summary.definitions, [n for n in names if n.startswith(f"{ROOT}.") and n not in _LEFT_OUT]
 
     def _imported(self, level: int, base: str, name: str, package: str) -> Iterator[str]:
         """Modules that one import reads: a submodule alone, or the module that holds the name."""
-        if level:
-            base = ".".join([*package.split(".")[: len(package.split(".")) - level + 1], *filter(None, [base])])
+        base = _absolute(level, base, package)
         below = f"{base}.{name}"
-        if name and below.startswith(_ROOT) and _path(below) is not None:
+        if name and below.startswith(ROOT) and self._path(below) is not None:
             yield below
-            path = None if base in _LEFT_OUT else _path(base)
-            if path is None or name not in self._summary(base, path)[2]:
+            path = None if base in _LEFT_OUT else self._path(base)
+            if path is None or name not in self._summary(base, path).binds:
                 return
         yield base
+
+    def _used(self, use: Use, package: str) -> list[str] | None:
+        """Modules that ``name.a.b`` goes through; None where it does not say which of all the nodes it is about."""
+        level, base, name, chain, _ = use
+        found = [".".join(filter(None, (_absolute(level, base, package), name)))]
+        rest = chain.split(".") if chain else []
+        while rest and self._holds(found[-1], rest[0]):
+            found.append(f"{found[-1]}.{rest.pop(0)}")
+        whole = found[-1] in ("neusee", ROOT) and (not rest or rest[0].startswith("__"))
+        return None if whole else found[1:]
+
+    def _holds(self, module: str, name: str) -> bool:
+        """Whether a name of a module is a module below it."""
+        below = f"{module}.{name}"
+        return below == ROOT or (self._is_package(module) and self._path(below) is not None)
+
+    def _is_package(self, module: str) -> bool:
+        path = self._path(module) if module.startswith(ROOT) else None
+        return path is not None and path.name == "__init__.py"
+
+    def _path(self, module: str) -> Path | None:
+        if module not in self._paths:
+            self._paths[module] = source_file(module)
+        return self._paths[module]
 
     def _summary(self, module: str, path: Path) -> Summary:
         source = _source_digest(module, path)
@@ -96,41 +135,54 @@ class Code:
         return self._summaries[name]
 
 
-def summarise(source: bytes) -> Summary:
-    """Digest of a syntax tree without docstrings, and what it imports."""
-    tree = ast.parse(source)
-    imports: list[tuple[int, str, str]] = []
-    binds: list[str] = []
-    for item in ast.walk(tree):
-        if isinstance(item, ast.Module | ast.FunctionDef | ast.AsyncFunctionDef | ast.ClassDef):
-            if ast.get_docstring(item, clean=False) is not None:
-                item.body = item.body[1:]
-        elif isinstance(item, ast.Import):
-            imports += [(0, alias.name, "") for alias in item.names if alias.name.startswith(_ROOT)]
-        elif isinstance(item, ast.ImportFrom) and (item.level or (item.module or "").startswith("neusee")):
-            imports += [(item.level, item.module or "", alias.name) for alias in item.names]
-            binds += [alias.asname or alias.name for alias in item.names]
-    return digest(ast.dump(tree)), imports, binds
+def parts_file(root: Path, found: str) -> Path:
+    """Where a store keeps the definitions behind a digest of code."""
+    return root / "code" / f"{found}.json"
+
+
+def _absolute(level: int, base: str, package: str) -> str:
+    """The full name of what is imported ``from`` a base."""
+    if not level:
+        return base
+    above = package.split(".")
+    return ".".join([*above[: len(above) - level + 1], *filter(None, [base])])
+
+
+def _write(path: Path, content: Any, folder: Path) -> None:
+    """Write JSON whole or not at all, without a word where that fails."""
+    part = folder / f"{path.name}.{os.getpid()}.{threading.get_ident()}"
+    with suppress(OSError):
+        folder.mkdir(parents=True, exist_ok=True)
+        path.parent.mkdir(exist_ok=True)
+        part.write_text(json.dumps(content))
+        os.replace(part, path)
 
 
 def _read(memo: Path) -> dict[str, Summary]:
-    """Summaries of earlier runs; a damaged file is an empty one."""
+    """Summaries of earlier runs; a damaged file, or one of an older form, is an empty one."""
     try:
-        known = json.loads(memo.read_bytes())
-        return {
-            name: (str(t), [(int(k), str(m), str(n)) for k, m, n in i], list(b)) for name, (t, i, b) in known.items()
-        }
+        return {name: _summary_of(*fields) for name, fields in json.loads(memo.read_bytes()).items()}
     except (OSError, ValueError, TypeError, AttributeError):
         return {}
 
 
-def _path(module: str) -> Path | None:
+def _summary_of(tree: Any, imports: Any, binds: Any, uses: Any, definitions: Any) -> Summary:
+    return Summary(
+        str(tree),
+        [(int(level), str(base), str(name)) for level, base, name in imports],
+        list(binds),
+        [(int(level), str(base), str(name), str(chain), int(line)) for level, base, name, chain, line in uses],
+        {str(label): str(found) for label, found in definitions.items()},
+    )
+
+
+def source_file(module: str) -> Path | None:
     """Source file of a module, without importing it."""
     if module in sys.modules:
         file = getattr(sys.modules[module], "__file__", None)
         return Path(file) if file and os.path.isfile(file) else None
-    inside = module.startswith(f"{_ROOT}.")
-    for folder in getattr(sys.modules.get(_ROOT), "__path__", ()) if inside else ():
+    inside = module.startswith(f"{ROOT}.")
+    for folder in getattr(sys.modules.get(ROOT), "__path__", ()) if inside else ():
         stem = os.path.join(folder, *module.split(".")[2:])
         for file in (f"{stem}.py", os.path.join(stem, "__init__.py")):
             if os.path.isfile(file):

@@ -176,12 +176,75 @@ def test_a_cached_run_parses_nothing(trial, monkeypatch):
     assert trial.run() == (30.5, *NONE)
 
 
-@pytest.mark.parametrize("text", ["", "{", "[]", '{"a": 1}', '{"a": [1]}', "\x00\xff"])
+OLD_MEMO = '{"3.11:0": ["0", [[0, "neusee.nodes", "node"]], ["node"]]}'
+
+
+@pytest.mark.parametrize("text", ["", "{", "[]", '{"a": 1}', '{"a": [1]}', "\x00\xff", OLD_MEMO])
 def test_a_damaged_memo_is_made_again(trial, text):
     trial.run()
     (trial.store / "code.json").write_text(text)
     assert trial.run() == (30.5, *NONE)
     assert len(json.loads((trial.store / "code.json").read_text())) > 3
+
+
+CHAINS = {
+    "from neusee import nodes": "nodes.trial_more.TWO",
+    "import neusee": "neusee.nodes.trial_more.TWO",
+    "import neusee.nodes": "neusee.nodes.trial_more.TWO",
+    "import neusee.nodes as n": "n.trial_more.TWO",
+    "import neusee.nodes.units": "neusee.nodes.trial_more.TWO",
+    "from neusee import nodes as all_of_it": "all_of_it.trial_more.TWO",
+    "from ... import nodes": "nodes.trial_more.TWO",
+    "from neusee.nodes import trial": "trial._deep.trial_more.TWO",
+    "import neusee.nodes.trial as t": "t._deep.trial_more.TWO",
+    "import neusee.nodes.trial": "neusee.nodes.trial._deep.trial_more.TWO",
+}
+
+
+@pytest.mark.parametrize("line", CHAINS)
+def test_what_an_attribute_chain_reads_counts(trial, line):
+    (trial.folder / "trial/_deep.py").write_text("from neusee.nodes import trial_more\n")
+    (trial.folder / "trial/_helper.py").write_text(f"{line}\ndef half(x):\n    return x / {CHAINS[line]}\n")
+    before = Code(trial.store / "code.json").digest("neusee.nodes.trial._helper")
+    trial.edit("trial_more.py", "TWO = 2.0", "TWO = 1.0")
+    assert Code(trial.store / "code.json").digest("neusee.nodes.trial._helper") != before
+
+
+def test_a_chain_reruns_what_it_feeds(trial):
+    text = (
+        "import neusee.nodes as n\nimport neusee.nodes.trial_more\n\n\ndef half(x):\n    return x / n.trial_more.TWO\n"
+    )
+    (trial.folder / "trial/_helper.py").write_text(text)
+    assert trial.run() == (30.5, *FRESH)
+    trial.edit("trial_more.py", "TWO = 2.0", "TWO = 1.0")
+    assert trial.run() == (50.5, *FRESH)
+    trial.edit("trial_more.py", "TWO = 1.0", "TWO = 1.0  # of course")
+    assert trial.run() == (50.5, *NONE)
+
+
+WHOLE = {
+    "from neusee import nodes": 'getattr(nodes, "trial_more").TWO',
+    "from neusee import nodes as all_of_it": "(lambda n: n.trial_more.TWO)(all_of_it)",
+    "import neusee": 'getattr(neusee.nodes, "trial_more").TWO',
+    "import neusee as whole": 'whole.__dict__["nodes"].trial_more.TWO',
+    "import neusee.nodes as n": 'vars(n)["trial_more"].TWO',
+    "from ... import nodes as n": 'vars(n)["trial_more"].TWO',
+}
+
+
+@pytest.mark.parametrize("line", WHOLE)
+def test_a_package_that_is_used_whole_is_refused_with_its_line(trial, line):
+    (trial.folder / "trial/_helper.py").write_text(f"{line}\n\n\ndef half(x):\n    return x / {WHOLE[line]}\n")
+    with pytest.raises(LookupError, match=r"_helper.py:5: the whole of the nodes is used.*by its full name"):
+        Code(trial.store / "code.json").digest("neusee.nodes.trial._head")
+
+
+def test_an_import_that_is_not_used_and_a_name_of_the_package_are_fine(trial):
+    text = (
+        "from neusee import nodes\nimport neusee\n\n\ndef half(x):\n    return x / 2 + 0 * len(nodes.Check.__name__)\n"
+    )
+    (trial.folder / "trial/_helper.py").write_text(text)
+    assert trial.run() == (30.5, *FRESH)
 
 
 SCRIPT = """
