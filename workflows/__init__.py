@@ -1,8 +1,8 @@
 """The plumbing: read a recipe, order its steps, find, place and run them, and say what happened.
 
-    from neusee.workflows import load, run
-    result = run(load("first_light", ["sensor.read_noise=20 e-"]))
-    result.values["restored"]
+    from neusee.workflows import load
+    result = load("first_light", doe="axicon", sensor={"read_noise": "20 e-"}).run()
+    result["restored"], result.numpy("restored"), result.metrics()
 
 Names are imported when they are first used, so that ``neusee --help`` answers without torch.
 """
@@ -17,7 +17,7 @@ if TYPE_CHECKING:
     from neusee.workflows._graph import Recipe, Step
     from neusee.workflows._marks import Problem, RecipeError
     from neusee.workflows._recipe import load, recipes
-    from neusee.workflows._run import Done, Result, run
+    from neusee.workflows._run import Done, Event, Result, run
     from neusee.workflows._store import Store
 
 _HOME = {
@@ -30,6 +30,7 @@ _HOME = {
     "load": "_recipe",
     "recipes": "_recipe",
     "Done": "_run",
+    "Event": "_run",
     "Result": "_run",
     "run": "_run",
     "Store": "_store",
@@ -37,6 +38,7 @@ _HOME = {
 
 __all__ = [
     "Done",
+    "Event",
     "Problem",
     "Recipe",
     "RecipeError",

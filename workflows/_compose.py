@@ -56,15 +56,16 @@ def locate(recipe: str | Path, folder: Path) -> Path:
     raise RecipeError([Problem(Mark("recipe"), str(recipe), f"no such recipe; {nearest(str(recipe), names)}")])
 
 
-def compose(recipe: str | Path, arguments: Sequence[str], folder: Path, first: int = 1) -> Composed:
+def compose(recipe: str | Path, arguments: Sequence[str | Override], folder: Path, first: int = 1) -> Composed:
     """Compose ``recipe``; ``arguments`` count from ``first``, and their paths are relative to ``folder``."""
     path = locate(recipe, folder)
     document = read(path, shown(path, folder))
     problems: list[Problem] = []
     overrides: list[Override] = []
-    for number, text in enumerate(arguments, first):
+    for number, given in enumerate(arguments, first):
+        mark = Mark(f"argument {number}", folder=str(folder))
         try:
-            overrides.append(read_override(text, Mark(f"argument {number}", folder=str(folder))))
+            overrides.append(given if isinstance(given, Override) else read_override(given, mark))
         except RecipeError as error:
             problems += error.problems
     choices, rest = _choose(document.root, overrides, path.parent, problems)

@@ -2,13 +2,16 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping
+from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass, field, replace
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 from neusee.nodes import Node
 from neusee.workflows._config import Config, Setting
 from neusee.workflows._marks import Mark
+
+if TYPE_CHECKING:
+    from neusee.workflows import Event, Result, Store
 
 __all__ = ["Config", "Expectation", "Recipe", "Setting", "Step", "Wire", "in_order", "needed"]
 
@@ -25,6 +28,7 @@ class Step:
     wires: Mapping[str, Wire]  #: by input, in the node's order
     mark: Mark
     param_marks: Mapping[str, Mark]  #: where each value that was given stands
+    device: str = ""  #: where it asks to run: ``cpu``, ``gpu``, ``cuda:1``; empty if anywhere, and never part of a key
 
     @property
     def sources(self) -> tuple[str, ...]:
@@ -48,7 +52,7 @@ class Expectation:
     mark: Mark
 
 
-@dataclass(frozen=True, slots=True)
+@dataclass(frozen=True, slots=True, repr=False)
 class Recipe:
     """A recipe whose every value, wire and file was looked at; nothing of it has run."""
 
@@ -62,6 +66,26 @@ class Recipe:
     config: Config = field(default_factory=Config)
     notes: tuple[str, ...] = ()
     absent: Mapping[str, str] = field(default_factory=dict)  #: step that is null -> where that is written
+
+    def run(
+        self,
+        store: Store | None = None,
+        outputs: Iterable[str] | None = None,
+        watch: Callable[[Event], None] | None = None,
+        device: str = "cpu",
+    ) -> Result:
+        """Run it; see `neusee.workflows.run`. Several threads may do so at once, on one store."""
+        from neusee.workflows import run
+
+        return run(self, store, outputs, watch, device)
+
+    def __repr__(self) -> str:
+        return f"<recipe {self.name}: {len(self.steps)} steps -> {', '.join(self.outputs)}>"
+
+    def _repr_html_(self) -> str:
+        from neusee.workflows._notebook import recipe_html
+
+        return recipe_html(self)
 
 
 def needed(recipe: Recipe, outputs: Iterable[str]) -> list[str]:

@@ -16,11 +16,12 @@ from neusee.workflows._config import Config, Setting
 from neusee.workflows._cycles import cycles
 from neusee.workflows._graph import Expectation, Recipe, Step, Wire, kept_promises
 from neusee.workflows._head import expectations, outputs_of, seed_and_tolerance
+from neusee.workflows._keywords import overrides_of
 from neusee.workflows._marks import Problem, RecipeError
-from neusee.workflows._overrides import arguments_in
+from neusee.workflows._overrides import Override, arguments_in
 from neusee.workflows._params import Checker
 from neusee.workflows._refs import References
-from neusee.workflows._steps import Declared, declare
+from neusee.workflows._steps import Declared, declare, device_of
 from neusee.workflows._wires import Wiring
 from neusee.workflows._yaml import Value
 
@@ -35,19 +36,27 @@ class Titled:
 
 def load(
     name_or_path: str | os.PathLike[str],
+    /,
     overrides: Sequence[str] = (),
     folder: str | os.PathLike[str] | None = None,
     first: int = 1,
+    **values: Any,
 ) -> Recipe:
     """Read and check a packaged recipe, or a file whose name ends in ``.yaml``.
 
-    Paths in ``overrides`` are relative to ``folder`` (the working folder), and messages
-    count them from ``first``. An expected number whose step the overrides reach is no longer
+        load("first_light", ["sensor.read_noise=20 e-"])
+        load("first_light", doe="axicon", sensor={"read_noise": "20 e-"}, lasers={"green": {"strength": 1e4}})
+        load("first_light", **{"sensor.read_noise": "20 e-", "+lasers.red": {"wavelength": "638 nm", …}})
+
+    ``values`` are changes as Python values, made after ``overrides``; a mapping changes what it
+    names and leaves the rest. Paths are relative to ``folder`` (the working folder), and messages
+    count ``overrides`` from ``first``. An expected number whose step a change reaches is no longer
     expected, and a note says so. Raises `RecipeError` with every problem.
     """
     name, place = os.fspath(name_or_path), Path(folder or ".").absolute()
-    recipe = check(compose(name, overrides, place, first))
-    return kept_promises(recipe, check(compose(name, (), place))) if recipe.expect and overrides else recipe
+    changes: tuple[str | Override, ...] = (*overrides, *overrides_of(values, place))
+    recipe = check(compose(name, changes, place, first))
+    return kept_promises(recipe, check(compose(name, (), place))) if recipe.expect and changes else recipe
 
 
 def check(composed: Composed) -> Recipe:
@@ -76,18 +85,20 @@ def _bind(root: Value, steps: dict[str, Declared], wiring: Wiring, checker: Chec
     """Every copy of every step that can be bound."""
     for step in steps.values():
         if not step.items:
-            for part in ("from", "with"):
+            for part in ("from", "with", "device"):
                 wiring.references.touch(step.part(part), step.dims)
         for items in step.items:
-            given = wiring.references.resolve(step.part("with"), step.scope(root, items))
+            scope = step.scope(root, items)
+            given = wiring.references.resolve(step.part("with"), scope)
             wires: dict[str, Wire] = wiring.wires(step, items)
+            device = device_of(step, wiring.references, scope, checker.problems)
             if step.node is None:
                 continue
             params = checker.read(step.node, given, step.value.key)
             if params is not None:
                 checker.preflight(step.node, params, given.items, step.value)
             marks = {str(name): value.mark for name, value in given.items.items()}
-            yield Step(step.instance(items), step.node, params or {}, wires, step.value.key, marks)
+            yield Step(step.instance(items), step.node, params or {}, wires, step.value.key, marks, device)
 
 
 def _config(root: Value, bound: dict[str, Step], steps: dict[str, Declared], checker: Checker) -> Config:

@@ -10,7 +10,7 @@ import resource
 import time
 from collections import Counter
 from collections.abc import Callable, Iterable
-from dataclasses import asdict, dataclass, field, replace
+from dataclasses import asdict, dataclass, replace
 from datetime import UTC, datetime
 from typing import Any, Literal
 
@@ -58,7 +58,7 @@ class Event:
     done: Done | None
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, repr=False)
 class Result:
     """What a run gives: the values that were asked for, and an account of every step they need."""
 
@@ -67,8 +67,8 @@ class Result:
     keys: dict[str, Key]
     seconds: float
     peak_memory: int  #: bytes, of this process so far
-    recipe: Recipe = field(repr=False)
-    store: Store = field(repr=False)
+    recipe: Recipe
+    store: Store
     device: str = "cpu"
 
     def value(self, step: str) -> Any:
@@ -76,6 +76,30 @@ class Result:
         if step in self.values:
             return self.values[step]
         return run(self.recipe, self.store, (step,), device=self.device).values[step]
+
+    __getitem__ = value
+
+    def numpy(self, step: str) -> Any:
+        """The value of a step with a numpy array for every tensor."""
+        from neusee.workflows._notebook import arrays_of
+
+        return arrays_of(self.value(step))
+
+    def metrics(self) -> dict[str, float | list[float]]:
+        """The figures of merit by name, such as ``restored_quality.psnr``; a list where there is one a band."""
+        from neusee.workflows._notebook import numbers_of
+
+        return numbers_of(self)
+
+    def __repr__(self) -> str:
+        from neusee.workflows._notebook import result_line
+
+        return result_line(self)
+
+    def _repr_html_(self) -> str:
+        from neusee.workflows._notebook import result_html
+
+        return result_html(self)
 
 
 def run(

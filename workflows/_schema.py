@@ -23,6 +23,7 @@ Schema = dict[str, Any]
 
 REFERENCE: Schema = {"type": "string", "pattern": r"\$\{.+\}"}  #: ``${a.b}`` may stand for every value
 _WIRE: Schema = {"type": ["string", "null"], "pattern": r"^[^\[\]\s]+(\[[^\[\]]+\])?$|\$\{"}
+_DEVICE: Schema = {"type": ["string", "null"], "pattern": r"^(any|cpu|gpu|mps|cuda(:\d+)?)$|\$\{"}
 _ANY: Schema = {}
 _REFERABLE = {"float", "int", "bool", "literal", "tuple", "list", "dict", "function-before"}  #: not a text as it is
 _NUMBER = r"(\d+\.?\d*|\.\d+)([eE][-+]?\d+)?"
@@ -63,7 +64,7 @@ def _step(nodes: Mapping[str, Node]) -> Schema:
     names: Schema = {"anyOf": [{"enum": list(nodes)}, REFERENCE]}
     return {
         "type": ["object", "null"],
-        "properties": {"node": names, "each": each, "from": _ANY, "with": _ANY},
+        "properties": {"node": names, "each": each, "from": _ANY, "with": _ANY, "device": _DEVICE},
         "additionalProperties": False,
         "allOf": [
             {

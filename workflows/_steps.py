@@ -16,7 +16,8 @@ from neusee.workflows._marks import Problem, nearest
 from neusee.workflows._refs import References, Scope, broken
 from neusee.workflows._yaml import Value, kind
 
-_KEYS = ("node", "each", "from", "with")
+_KEYS = ("node", "each", "from", "with", "device")
+_DEVICE = re.compile(r"any|cpu|gpu|mps|cuda(:\d+)?")
 _NAME = re.compile(r"[^\W\d][\w-]*")
 _ITEM = re.compile(r"[^\[\],\s]+")
 
@@ -39,7 +40,7 @@ class Declared:
         return tuple(map(self.instance, self.items))
 
     def part(self, key: str) -> Value:
-        """What it says under ``from`` or ``with``; an empty mapping if nothing."""
+        """What it says under ``from``, ``with`` or ``device``; an empty mapping if nothing."""
         given = self.value.items.get(key)
         return Value({}, self.value.key, self.value.key, (*self.value.path, key)) if given is None else given
 
@@ -125,6 +126,22 @@ def _dims(step: Value, root: Value, problems: list[Problem]) -> tuple[str, ...] 
                 if not _ITEM.fullmatch(str(key))
             ]
     return tuple(dims) if len(problems) == before else None
+
+
+def device_of(step: Declared, references: References, scope: Scope, problems: list[Problem]) -> str:
+    """Where a copy of a step asks to run; empty where that does not matter."""
+    given = references.resolve(step.part("device"), scope)
+    if broken(given) or given.data in ({}, None, "any"):
+        return ""
+    if not isinstance(given.data, str) or not _DEVICE.fullmatch(given.data):
+        hint = "write any, cpu, gpu, cuda, cuda:1 or mps"
+        problems.append(Problem(given.mark, f"{given.name} = {given.plain}", f"is no device: {hint}"))
+        return ""
+    only = step.node.device if step.node else "any"
+    if only != "any" and (only == "cpu") != (given.data == "cpu"):
+        message = f"{step.node and step.node.path} computes on a {only.upper()} alone"
+        problems.append(Problem(given.mark, f"{given.name} = {given.data}", message))
+    return given.data
 
 
 def _is_item_list(block: Value) -> bool:
