@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import functools
 import re
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
@@ -13,6 +14,8 @@ from neusee.workflows._overrides import Override, apply, read_override
 from neusee.workflows._yaml import Value, kind, read
 
 _NAME = re.compile(r"[\w-]+")
+_MOST_KNOWN = 16
+_known: dict[tuple[int, ...], tuple[tuple[Value, ...], Value]] = {}  #: ids of the parts -> the parts, merged
 
 
 @dataclass(frozen=True, slots=True)
@@ -36,6 +39,7 @@ class Choice:
     shown: str  #: what the user wrote, for a message
 
 
+@functools.cache
 def packaged() -> Path:
     """The folder of the recipes that are installed with the program."""
     return Path(str(files("neusee.recipes")))
@@ -69,11 +73,8 @@ def compose(recipe: str | Path, arguments: Sequence[str | Override], folder: Pat
         except RecipeError as error:
             problems += error.problems
     choices, rest = _choose(document.root, overrides, path.parent, problems)
-    root = Value({}, document.root.mark, document.root.mark, ())
     options = [_option(choice, path.parent, folder, problems) for choice in choices if choice.option is not None]
-    for option in options:
-        root = root if option is None else merge(root, option)
-    root = merge(root, _without_defaults(document.root))
+    root = _merged((*(option for option in options if option is not None), document.root))
     for override in rest:
         root = apply(root, override, problems, [choice.group for choice in choices])
     return Composed(path.stem, document.title, root, tuple(problems), None not in options)
@@ -97,11 +98,28 @@ def merge(below: Value, above: Value) -> Value:
     return replace(below, data=data)
 
 
+def _merged(parts: tuple[Value, ...]) -> Value:
+    """The groups' options and the recipe over one another; of the same parts, the very same value again."""
+    name = tuple(map(id, parts))  # no other value takes an id while `_known` holds the parts
+    found = _known.get(name)
+    if found is None:
+        root = Value({}, parts[-1].mark, parts[-1].mark, ())
+        for part in parts:
+            root = merge(root, _without_defaults(part))
+        found = (parts, root)
+        while len(_known) >= _MOST_KNOWN:
+            _known.pop(next(iter(_known), name), None)
+        _known[name] = found
+    return found[1]
+
+
 def _new_step(value: Value) -> bool:
     return len(value.path) == 2 and value.path[0] == "steps" and "node" in value.items
 
 
 def _without_defaults(root: Value) -> Value:
+    if "defaults" not in root.items:
+        return root
     return replace(root, data={key: value for key, value in root.data.items() if key != "defaults"})
 
 
