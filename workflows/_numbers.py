@@ -13,6 +13,7 @@ from neusee.workflows._roles import BANDS, LINES, TABLE
 Value = Callable[[str], Any]  #: the value of a step, read from the store when it is asked for
 _COLUMNS = ("peak/I_sat", "LSR", "BSR", "PSNR (dB)", "SSIM", "saturated px")
 _DESIGN = 550e-9
+_SMALL = 4096  #: numbers of a result that is given in full
 
 
 def expected(recipe: Recipe, value: Value) -> list[dict[str, Any]]:
@@ -71,12 +72,18 @@ def metrics(recipe: Recipe, keys: Mapping[str, str], value: Value) -> list[list[
     """(step, field, index, value) of every small result of a metric."""
     rows: list[list[Any]] = []
     for name, step in recipe.steps.items():
-        if name not in keys or not step.node.path.startswith("metrics."):
-            continue
-        for field, tensor in _fields(value(name)):
-            if tensor.numel() <= 4096:
-                numbers = tensor.detach().double().flatten().tolist()
-                rows += [[name, field, i if len(numbers) > 1 else "", n] for i, n in enumerate(numbers)]
+        if name in keys and step.node.path.startswith("metrics."):
+            rows += numbers_of(name, value(name))
+    return rows
+
+
+def numbers_of(step: str, found: Any) -> list[list[Any]]:
+    """(step, field, index, value) of a small result; of a large one, such as a picture, nothing."""
+    rows: list[list[Any]] = []
+    for field, tensor in _fields(found):
+        if tensor.numel() <= _SMALL and not tensor.is_complex():
+            numbers = tensor.detach().double().flatten().tolist()
+            rows += [[step, field, i if len(numbers) > 1 else "", n] for i, n in enumerate(numbers)]
     return rows
 
 
