@@ -6,7 +6,7 @@ Everything is looked at before anything runs, and every mistake is reported at o
 from __future__ import annotations
 
 import os
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -17,6 +17,7 @@ from neusee.workflows._cycles import cycles
 from neusee.workflows._graph import Expectation, Recipe, Step, Wire, kept_promises
 from neusee.workflows._head import expectations, outputs_of, seed_and_tolerance
 from neusee.workflows._keywords import overrides_of
+from neusee.workflows._known import keep_graph, keep_recipe, known_graph, known_recipe
 from neusee.workflows._marks import Problem, RecipeError
 from neusee.workflows._overrides import Override, arguments_in
 from neusee.workflows._params import Checker
@@ -56,16 +57,23 @@ def load(
     name, place = os.fspath(name_or_path), Path(folder or ".").absolute()
     changes: tuple[str | Override, ...] = (*overrides, *overrides_of(values, place))
     recipe = check(compose(name, changes, place, first))
-    return kept_promises(recipe, check(compose(name, (), place))) if recipe.expect and changes else recipe
+    return kept_promises(recipe, _as_written(name, place)) if recipe.expect and changes else recipe
+
+
+def _as_written(name: str, place: Path) -> Recipe:
+    """A recipe without changes; it is not checked again while its files and nodes are what they were."""
+    composed = compose(name, (), place)
+    return known_recipe(composed.root) or keep_recipe(composed.root, check(composed))
 
 
 def check(composed: Composed) -> Recipe:
     """A composed recipe with its steps bound, or a `RecipeError` with every problem."""
     problems = list(composed.problems)
     root, references = composed.root, References(composed.root, problems)
-    steps, absent = declare(root, references, problems)
+    graph = known_graph(root)
+    steps, absent = (graph.steps, graph.absent) if graph else declare(root, references, problems)
     wiring, checker = Wiring(root, steps, absent, references, problems), Checker([])
-    bound = {step.name: step for step in _bind(root, steps, wiring, checker)}
+    bound = {step.name: step for step in _bind(root, steps, wiring, checker, graph.wires if graph else {})}
     problems += cycles(bound, {name: step.value.key for name, step in steps.items()})
     seed, tolerance = seed_and_tolerance(root, references, checker.problems)
     outputs = outputs_of(root, wiring)
@@ -75,14 +83,22 @@ def check(composed: Composed) -> Recipe:
         problems = list(composed.problems)
     if problems or checker.problems:
         raise RecipeError([*problems, *checker.problems])
+    if graph is None:
+        keep_graph(root, steps, absent, {name: step.wires for name, step in bound.items()})
     config = _config(root, bound, steps, checker)
     nulls = {name: f"null ({value.mark})" for name, value in absent.items()}
     title, notes = composed.title, tuple(checker.notes)
     return Recipe(composed.name, title, seed, tolerance, outputs, bound, expect, config, notes, nulls)
 
 
-def _bind(root: Value, steps: dict[str, Declared], wiring: Wiring, checker: Checker) -> Iterator[Step]:
-    """Every copy of every step that can be bound."""
+def _bind(
+    root: Value,
+    steps: Mapping[str, Declared],
+    wiring: Wiring,
+    checker: Checker,
+    known: Mapping[str, Mapping[str, Wire]],
+) -> Iterator[Step]:
+    """Every copy of every step that can be bound; ``known`` are wires that were looked at before."""
     for step in steps.values():
         if not step.items:
             for part in ("from", "with", "device"):
@@ -90,7 +106,8 @@ def _bind(root: Value, steps: dict[str, Declared], wiring: Wiring, checker: Chec
         for items in step.items:
             scope = step.scope(root, items)
             given = wiring.references.resolve(step.part("with"), scope)
-            wires: dict[str, Wire] = wiring.wires(step, items)
+            name = step.instance(items)
+            wires = known[name] if name in known else wiring.wires(step, items)
             device = device_of(step, wiring.references, scope, checker.problems)
             if step.node is None:
                 continue
@@ -98,7 +115,7 @@ def _bind(root: Value, steps: dict[str, Declared], wiring: Wiring, checker: Chec
             if params is not None:
                 checker.preflight(step.node, params, given.items, step.value)
             marks = {str(name): value.mark for name, value in given.items.items()}
-            yield Step(step.instance(items), step.node, params or {}, wires, step.value.key, marks, device)
+            yield Step(name, step.node, params or {}, wires, step.value.key, marks, device)
 
 
 def _config(root: Value, bound: dict[str, Step], steps: dict[str, Declared], checker: Checker) -> Config:
