@@ -51,6 +51,7 @@ def _parts(root: Path, found: str) -> Parts:
     """The definitions behind a digest; nothing where the file is missing or damaged."""
     try:
         parts = json.loads(parts_file(root, found).read_bytes())
-        return {str(m): {str(label): str(d) for label, d in inside.items()} for m, inside in parts.items()}
+        whole = all(isinstance(found, str) for inside in parts.values() for found in inside.values())
+        return dict(parts) if whole else {}
     except (OSError, ValueError, TypeError, AttributeError):
         return {}

@@ -107,12 +107,12 @@ def test_a_changed_value_runs_only_what_follows(neusee):
 
 def test_a_row_says_why_it_ran(neusee):
     _, out, _ = neusee("run", "mine.yaml")
-    assert "→" not in out
+    assert "->" not in out
     _, out, _ = neusee("run", "mine.yaml", "mask.max_height=1.3 um")
-    assert "max_height 1.2e-06 → 1.3e-06" in next(line for line in out.splitlines() if line.startswith("  made"))
+    assert "mask.max_height 1.2 -> 1.3 um (argument 2)" in next(line for line in out.splitlines() if line.startswith("  made"))
     _, out, _ = neusee("run", "mine.yaml", "mask.waves=3")
     rows = {line.split()[0]: line for line in out.splitlines() if line.startswith("  ")}
-    assert "waves 2 → 3" in rows["cone"]
+    assert "mask.waves 2 -> 3" in rows["cone"]
     assert "after cone" in rows["made"]
 
 
