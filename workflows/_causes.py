@@ -18,6 +18,7 @@ from neusee.workflows._store import Store
 from neusee.workflows._wording import Wording
 
 Origin = dict[str, Any]  #: what went into a key: node, code, params, inputs, stream
+_FEW = 4  #: steps of an input that are named
 _FAR = 100  #: steps that are looked at for one that came in between
 
 
@@ -131,8 +132,7 @@ class Comparison:
         if len(old) == len(new) and (len(then) < len(old) or not then.keys() & now.keys()):
             found = [self._source(path, *row) for row in zip(labels, new, old, strict=True)]
             return [t for texts, _ in found for t in texts], [p for _, pairs in found for p in pairs]
-        texts = [f"reads {name} now{self._wired(path)}" for name in now if name not in then]
-        texts += [f"reads {name} no more{self._absent(name)}" for name in then if name not in now]
+        texts = self._joined(path, [n for n in now if n not in then], [n for n in then if n not in now])
         pairs = [Pair(name, key, then[name]) for name, key in now.items() if then.get(name, key) != key]
         return texts or ([] if pairs else ["reads its sources in another order"]), pairs
 
@@ -155,6 +155,12 @@ class Comparison:
         if before and after and before["node"] == after["node"]:
             return [], [Pair(label, new, old)]
         return [f"reads {label}, not {was}{self._wired(path)}"], []
+
+    def _joined(self, path: tuple[str, ...], came: list[str], went: list[str]) -> list[str]:
+        """What a step reads in addition, and no more; of items their recipe's list decides, and not the wire."""
+        where = self._wired(path) if any("[" not in name for name in came) else ""
+        texts = [f"reads {_few(came)} now{where}"] if came else []
+        return [*texts, f"reads {_few(went)} no more{self._absent(went[0])}"] if went else texts
 
     def _between(self, key: Key, wanted: tuple[str | None, ...]) -> tuple[list[str], Key | None]:
         """Up along first inputs to one of the ``wanted`` steps: the steps on the way, and its key if it is there."""
@@ -202,6 +208,12 @@ class Comparison:
             f"its noise is drawn on {new[2]}, not on {old[2]}",
         )
         return [text for text, before, after in zip(said, old, new, strict=True) if before != after]
+
+
+def _few(names: list[str]) -> str:
+    """``a, b and 4 more``."""
+    rest = len(names) - _FEW
+    return ", ".join(names) if rest <= 0 else f"{', '.join(names[:_FEW])} and {rest} more"
 
 
 def _listed(value: Any) -> list[Any]:

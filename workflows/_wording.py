@@ -5,9 +5,11 @@ from __future__ import annotations
 import re
 from collections import defaultdict
 from collections.abc import Mapping
+from contextlib import suppress
 from pathlib import Path
 from typing import Any
 
+from neusee.nodes.units import read_quantity
 from neusee.workflows._config import Setting, flow
 from neusee.workflows._graph import Recipe, Step
 
@@ -122,11 +124,16 @@ def _as_written(written: Any, new: Any) -> str:
 
 
 def _unit(written: Any, new: Any) -> tuple[float, str] | None:
-    """What one of the unit of a written quantity is in SI, and its name; None where it has none, or is nought."""
+    """What one of the unit of a written quantity is in SI, and its name; None where it has none."""
     match = _QUANTITY.fullmatch(written.strip()) if isinstance(written, str) else None
-    if match is None or not _is_number(new) or not new or not float(match[1]):
+    if match is None or not _is_number(new):
         return None
-    return new / float(match[1]), match[2]
+    if new and float(match[1]):
+        return new / float(match[1]), match[2]
+    for si in ("m", "s", "rad", "K", "e-", "waves"):
+        with suppress(ValueError):
+            return read_quantity(f"1 {match[2]}", si), match[2]
+    return None
 
 
 def spoken(value: Any) -> str:

@@ -12,9 +12,10 @@ from neusee.workflows import _causes, _why
 from neusee.workflows._causes import Comparison, Pair
 from neusee.workflows._code import Code
 from neusee.workflows._edits import edits
-from neusee.workflows._graph import Recipe, Step
+from neusee.workflows._graph import Recipe, Step, needed
 from neusee.workflows._marks import Mark
 from neusee.workflows._recipe import load
+from neusee.workflows._resolve import resolve
 from neusee.workflows._run import run
 from neusee.workflows._store import Store
 from neusee.workflows._why import explained, why_key_lines, why_lines
@@ -195,7 +196,7 @@ CHANGES = {
     "the seed": (["seed=2"], "restored <- raw <- read: seed 1 -> 2 (argument 2)"),
     "another item": (
         ["+lasers.blue={amount: 3}"],
-        "restored <- raw <- read <- all: reads spot[blue] now (mine.yaml:15:44)",
+        "restored <- raw <- read <- all: reads spot[blue] now",
     ),
     "an item less": (["~lasers.green"], "restored <- raw <- read <- all: reads spot[green] no more"),
     "an input less": (["~steps.restored.from.more"], "restored: reads photo no more"),
@@ -234,6 +235,14 @@ def test_another_node_at_a_step(trial):
     assert trial.causes("restored") == ["restored <- photo: trial.photograph -> trial.bright (mine.yaml:13:17)"]
 
 
+def test_many_items_are_told_in_one(trial):
+    trial.run()
+    more = "+lasers.{0}={{amount: 3}}"
+    assert trial.causes("all", *[more.format(name) for name in "abcdef"]) == [
+        "all: reads spot[a], spot[b], spot[c], spot[d] and 2 more now"
+    ]
+
+
 def test_a_source_that_is_null(trial):
     trial.run()
     trial.edit("mine.yaml", 'photo: {node: trial.photograph, with: {file: "${scene.file}"}}', "photo: null")
@@ -258,10 +267,10 @@ def test_values_that_differ_in_the_last_digit_alone_are_told_apart(trial):
     assert said == "raw: sensor.gain 0.1 -> 0.10000000000000002 (argument 2)"
 
 
-def test_nought_in_a_unit_is_not_said_to_be_in_another(trial):
+def test_nought_has_a_unit_too(trial):
     trial.run()
-    (said,) = trial.causes("raw", "sensor.at=[0 mm, 2 mm]")
-    assert said == "raw: sensor.at [0.001, 2 mm] -> [0 mm, 2 mm] (argument 2)"
+    (said,) = trial.causes("raw", "sensor.at=[0 um, 2 mm]")
+    assert said == "raw: sensor.at [1000 um, 2 mm] -> [0 um, 2 mm] (argument 2)"
 
 
 def test_a_file_of_another_content(trial):
@@ -497,8 +506,6 @@ def chain(length, first, node):
 
 
 def test_a_chain_of_ten_thousand_steps_is_walked_without_recursion(tmp_path, toy):
-    from neusee.workflows._resolve import resolve
-
     length, shelf = 10_000, Shelf(tmp_path, {})
     recipe = chain(length, 2.0, toy.add)
     before = resolve(chain(length, 1.0, toy.add), list(recipe.steps), shelf)
@@ -513,8 +520,6 @@ def test_a_chain_of_ten_thousand_steps_is_walked_without_recursion(tmp_path, toy
 
 
 def test_results_that_are_gone_are_said_to_be(tmp_path, toy):
-    from neusee.workflows._resolve import resolve
-
     shelf = Shelf(tmp_path, {})
     recipe = chain(5, 2.0, toy.add)
     before = resolve(chain(5, 1.0, toy.add), list(recipe.steps), shelf)
@@ -534,3 +539,24 @@ def test_code_of_a_module_that_was_edited_after_its_import_is_not_remembered(tri
         code.digest("neusee.nodes.trial._light")
     code.save()
     assert not list((trial.cache / "code").glob("*.json"))
+
+
+PACKAGED = {
+    "sensor.read_noise=20 e-": "well[mask] <- read[mask]: sensor.read_noise 10.5 -> 20 e- (argument 2)",
+    "optics.bands=25": "scene_photons[mask] <- bands: optics.bands 31 -> 25 (argument 2)",
+    "doe=axicon": "pupil[mask] <- element <- height: doe.half_rings -> doe.axicon (doe/axicon.yaml:5:11)",
+    "sensor=neusee": "raw[mask]: sensor.shape [640, 640] -> [2048, 2048] (sensor/neusee.yaml:3:10)",
+    "seed=8": "digital[mask]: seed 7 -> 8 (argument 2)",
+}
+
+
+@pytest.mark.parametrize("change", PACKAGED)
+def test_a_packaged_recipe_s_changes_are_told_in_its_own_words(tmp_path, change):
+    shelf, recipe, other = Shelf(tmp_path, {}), load("first_light"), load("first_light", [change], first=2)
+    said = PACKAGED[change]
+    step = said.replace(":", " ").split()[0]
+    before = resolve(recipe, needed(recipe, [step]), shelf)
+    shelf.abouts = {key: {"step": before.makers[key], "origin": origin} for key, origin in before.origins.items()}
+    after = resolve(other, needed(other, [step]), shelf)
+    roots = Comparison(shelf, other, after).roots(Pair(step, after.keys[step], before.keys[step]))
+    assert [f"{_why._chain(roots.chain(text))}: {text}" for text in roots.found] == [said]
