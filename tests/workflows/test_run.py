@@ -452,6 +452,7 @@ def test_a_full_disk_costs_one_warning_and_no_second_computation(store, monkeypa
         raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
 
     monkeypatch.setattr(os, "replace", full)
+    monkeypatch.setattr(os, "link", full)
     with warnings_of("cannot be written", 1):
         result = run(diamond(outputs=outputs), store)
     assert result.values["top"] == 72
