@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import importlib.util
-from collections.abc import Mapping, Sequence
+from collections.abc import Collection, Mapping, Sequence
 from typing import TYPE_CHECKING, Any
 
 from neusee.workflows._config import flow
@@ -51,12 +51,13 @@ def dataset(outcomes: Sequence[Outcome], columns: Sequence[Column], paired: bool
     coords = {c.name: ("point" if paired else c.name, list(c.si), {"units": c.unit} if c.unit else {}) for c in columns}
     ran, seconds = numpy.zeros(shape, bool), numpy.full(shape, numpy.nan)
     arrays: dict[str, Any] = {}
-    long = _lengths(outcomes)
+    taken = {"ran", "seconds", *coords}
+    long = _lengths(outcomes, taken)
     for outcome in outcomes:
         place = outcome.point.place[:1] if paired else outcome.point.place
         seconds[place], ran[place] = outcome.seconds, outcome.state != "failed"
         for step, part, index, value in outcome.numbers:
-            name = _variable(step, part)
+            name = _variable(step, part, taken)
             more = (long[name],) if name in long else ()
             if name not in arrays:
                 arrays[name] = numpy.full((*shape, *more), numpy.nan)
@@ -66,16 +67,18 @@ def dataset(outcomes: Sequence[Outcome], columns: Sequence[Column], paired: bool
     return xarray.Dataset({**found, **own}, coords, dict(about))
 
 
-def _lengths(outcomes: Sequence[Outcome]) -> dict[str, int]:
+def _lengths(outcomes: Sequence[Outcome], taken: Collection[str]) -> dict[str, int]:
     """The largest number of values of every result that has several."""
     long: dict[str, int] = {}
     for outcome in outcomes:
         for step, part, index, _ in outcome.numbers:
             if index != "":
-                name = _variable(step, part)
+                name = _variable(step, part, taken)
                 long[name] = max(long.get(name, 0), int(index) + 1)
     return long
 
 
-def _variable(step: str, part: str) -> str:
-    return f"{step}.{part}".rstrip(".").replace("/", "_")
+def _variable(step: str, part: str, taken: Collection[str]) -> str:
+    """Name of a result, apart from the coordinates'."""
+    name = f"{step}.{part}".rstrip(".").replace("/", "_")
+    return f"{name} (result)" if name in taken else name

@@ -61,6 +61,7 @@ class Plan:
     recipe: Recipe  #: of the first point
     checked: tuple[Checked, ...]
     costs: dict[str, float]  #: seconds by step, of those that ran before
+    work: tuple[float, ...]  #: of every point in turn that is not stored: seconds, or steps where none ran before
     notes: tuple[str, ...]
 
     @property
@@ -77,8 +78,9 @@ def planned(
     if checker.problems or checker.first is None:
         raise RecipeError(checker.problems)
     costs = _costs(store)
-    order = best_order([c.job for c in checked], costs, paired)
-    return Plan(checker.first, tuple(checked[i] for i in order), costs, tuple(checker.notes))
+    in_turn = [checked[i] for i in best_order([c.job for c in checked], costs, paired)]
+    work = work_left([c.job for c in in_turn], costs, store.has)
+    return Plan(checker.first, tuple(in_turn), costs, tuple(work), tuple(checker.notes))
 
 
 def outcomes(
@@ -93,7 +95,7 @@ def outcomes(
 
     With ``on_error="stop"`` the error of the first point that fails is raised after its outcome was given.
     """
-    clock = _Clock(work_left(plan.jobs, plan.costs, store.has))
+    clock = _Clock(plan.work)
     for checked in plan.checked:
         started(checked.point)
         began, failure, result = time.perf_counter(), None, None
@@ -130,9 +132,9 @@ def _numbers(result: Result) -> tuple[Number, ...]:
 def _costs(store: Store) -> dict[str, float]:
     """Median seconds of every step that this store has results of."""
     found: dict[str, list[float]] = defaultdict(list)
-    for _, about in store.entries():
-        if about.get("step") and "seconds" in about:
-            found[about["step"]].append(about["seconds"])
+    for row in store.journal.rows():
+        if row["step"] and row["seconds"] is not None:
+            found[row["step"]].append(row["seconds"])
     return {step: median(seconds) for step, seconds in found.items()}
 
 

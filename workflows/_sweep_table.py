@@ -11,6 +11,7 @@ from neusee.nodes import units
 
 if TYPE_CHECKING:
     from neusee.workflows._points import Axis, Point
+    from neusee.workflows._run import Event
     from neusee.workflows._sweep_run import Number, Outcome
 
 AFTER = ("status", "step", "field", "index", "value", "seconds", "cached", "message")  #: columns after the axes
@@ -128,6 +129,7 @@ class Silent:
     points: int
     outcomes: list[Outcome] = field(default_factory=list)
     running: Point | None = None
+    step: str = ""
 
     def __enter__(self) -> Silent:
         return self
@@ -137,7 +139,11 @@ class Silent:
 
     def started(self, point: Point) -> None:
         """A point begins."""
-        self.running = point
+        self.running, self.step = point, ""
+
+    def watch(self, event: Event) -> None:
+        """A step of it begins or ended."""
+        self.step = event.step if event.done is None else ""
 
     def finished(self, outcome: Outcome) -> None:
         """A point ended."""
@@ -211,8 +217,9 @@ class Live(Silent):
             table.add_row(*line, style={"run": "bold", "cached": "cyan", "failed": "red"}[line[state]])
         if self.running is not None:
             left = self.outcomes[-1].left if self.outcomes else 0.0
-            about = f"; about {lasts(left)} left" if left else ""
-            table.caption = f"point {len(self.outcomes) + 1} of {self.points}: {self.running.shown}{about}"
+            about = [f"about {lasts(left)} left"] if left else []
+            now = [f"point {len(self.outcomes) + 1} of {self.points}: {self.running.shown}", *filter(None, [self.step])]
+            table.caption = "; ".join(now + about)
         return table
 
 

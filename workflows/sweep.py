@@ -11,6 +11,7 @@ from __future__ import annotations
 import html
 import os
 import shlex
+import sys
 import time
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from contextlib import closing
@@ -126,15 +127,16 @@ def run_sweep(
         require_xarray("--netcdf")
     began, place = time.perf_counter(), Path().absolute()
     work = _Sweeping(recipe, read_words(words, place, first), place, store or Store(), zip, device)
-    again = _again(recipe, words, zip, on_error, netcdf, device)
+    again = _again(recipe, words, zip, on_error, netcdf, device, out)
     if not quiet:
         print(*work.opening(), sep="\n", flush=True)
     found, state, error = _shown(work, on_error, quiet)
-    if error is not None and not (found and found[-1].state == "failed"):
+    if error is not None and not (on_error == "stop" and found and found[-1].state == "failed"):
         raise error
     result = work.sweep(found, state)
     path = _written(work, result, again, out, netcdf, time.perf_counter() - began)
     if quiet:
+        print(*_failures(result), sep="\n", end="\n" if result.failed else "", file=sys.stderr)
         print(path / "sweep.csv", flush=True)
     else:
         print(*_closing(result, path, again, time.perf_counter() - began), sep="\n", flush=True)
@@ -166,6 +168,8 @@ class _Sweeping:
         yield f"neusee sweep: {recipe.title or recipe.name}"
         yield f"checked  {shared.points} points ({sizes}), {shared.steps} steps: all right"
         yield f"shared   {shared.made} different results: {100 * shared.saved:.0f} % less work than point by point"
+        if self.plan.costs and any(self.plan.work):
+            yield f"time     about {lasts(sum(self.plan.work))}, as earlier runs took"
         yield from (f"note     {line}" for line in self.plan.notes)
 
 
@@ -177,7 +181,10 @@ def _shown(work: _Sweeping, on_error: OnError, quiet: bool) -> tuple[list[Outcom
     """Run the points on the screen that fits; Ctrl-C and a failure end the sweep, and keep what there is."""
     shown = screen(work.columns, len(work.plan.checked), quiet)
     try:
-        with shown, closing(outcomes(work.plan, work.store, on_error, work.device, shown.started)) as running:
+        with (
+            shown,
+            closing(outcomes(work.plan, work.store, on_error, work.device, shown.started, shown.watch)) as running,
+        ):
             for outcome in running:
                 shown.finished(outcome)
     except KeyboardInterrupt:
@@ -193,9 +200,8 @@ def _written(work: _Sweeping, result: Sweep, again: Sequence[str], out: Path, ne
     key = digest([checked.job.keys[name] for checked in work.plan.checked for name in checked.job.outputs])
     with new_run(out / "sweeps", name, key) as folder:
         write_table(folder, result.outcomes, result.columns)
-        write_account(
-            folder, f"{result.title or result.recipe}: {_counted(result)}", _account(work, result, again, seconds)
-        )
+        title = f"{(result.title or result.recipe).rstrip('.')}: {_counted(result)}"
+        write_account(folder, title, _account(work, result, again, seconds))
         if netcdf:
             result.to_xarray().to_netcdf(folder.path / "sweep.nc", engine="h5netcdf")
     return folder.path
@@ -220,11 +226,14 @@ def _account(work: _Sweeping, result: Sweep, again: Sequence[str], seconds: floa
     }
 
 
-def _again(recipe: str, words: Sequence[str], paired: bool, on_error: str, netcdf: bool, device: str) -> list[str]:
+def _again(
+    recipe: str, words: Sequence[str], paired: bool, on_error: str, netcdf: bool, device: str, out: Path
+) -> list[str]:
     """The words that run a sweep again, or let it go on."""
     options = ["--zip"] * paired + ["--netcdf"] * netcdf
     options += ["--on-error", on_error] if on_error != "stop" else []
     options += ["--device", device] if device != "cpu" else []
+    options += ["--out", str(out)] if out != Path("runs") else []
     return ["neusee", "sweep", recipe, *words, *options]
 
 
@@ -232,11 +241,15 @@ def _closing(result: Sweep, path: Path, again: Sequence[str], seconds: float) ->
     """The lines after the last point."""
     yield ""
     yield f"{_counted(result)}  ({lasts(seconds)})"
-    for outcome in result.failed:
-        yield f"  failed: point {outcome.point.number}, {outcome.point.shown}: {outcome.message.splitlines()[0]}"
+    yield from (f"  {line}" for line in _failures(result))
     yield f"table    {path / 'sweep.csv'}"
     if result.state != "complete":
         yield f"partial: what is done is kept; to go on: {shlex.join(again)}"
+
+
+def _failures(result: Sweep) -> Iterator[str]:
+    for outcome in result.failed:
+        yield f"failed: point {outcome.point.number}, {outcome.point.shown}: {outcome.message.splitlines()[0]}"
 
 
 def _counted(result: Sweep) -> str:

@@ -251,7 +251,7 @@ def test_the_account_can_be_read_as_yaml_and_says_how_to_run_it_again(command):
     assert found["overrides"] == ["light.colour=600 nm"]
     assert found["order"] == [1, 2, 4, 3] or found["order"] == [1, 3, 4, 2]
     assert (found["state"], found["points"], found["done"], found["failed"]) == ("complete", 4, 4, [])
-    assert found["again"].endswith(" 'sensor.read_noise=1 e-,2 e-' light.level=1,2 'light.colour=600 nm'")
+    assert " 'sensor.read_noise=1 e-,2 e-' light.level=1,2 'light.colour=600 nm' --out " in found["again"]
     assert found["versions"]["torch"] == torch.__version__
 
 
@@ -264,6 +264,15 @@ def test_a_second_sweep_never_overwrites_the_first(command, tmp_path):
 def test_quiet_says_where_the_table_is_and_nothing_else(command):
     _, folder, out = command(quiet=True)
     assert out == f"{folder.resolve() / 'sweep.csv'}\n"
+
+
+def test_quiet_says_on_stderr_what_failed(recipe, store, tmp_path, capsys):
+    words = ["sensor.read_noise=1 e-,2 e-", "sensor.most=1.5"]
+    assert run_sweep(recipe, words, out=tmp_path / "runs", store=store, quiet=True) == 1
+    found = capsys.readouterr()
+    assert found.out.splitlines() == [str((tmp_path / "runs/sweeps/latest").resolve() / "sweep.csv")]
+    assert found.err.startswith("failed: point 2, sensor.read_noise=2 e-: ")
+    assert "mine.yaml:7:" in found.err
 
 
 def test_plain_lines_and_a_live_table_show_the_same_points(recipe, store, tmp_path, monkeypatch, capsys):
@@ -314,6 +323,20 @@ def test_paired_axes_are_coordinates_of_the_points(recipe, store):
     assert found["quality.mean"].dims == ("point",)
     assert found["sensor.read_noise"].dims == ("point",)
     assert found["quality.mean"].values.tolist() == pytest.approx([501, 1002])
+
+
+def test_a_result_with_the_name_of_an_axis_has_another_name(nodes, write, store):
+    pytest.importorskip("xarray")
+    pytest.importorskip("h5netcdf")
+    pytest.importorskip("h5py")
+    text = """\
+        source: {level: 1.0, count: 1}
+        steps: {source: {node: swept.source, with: "${source}"}}
+        outputs: [source]
+        """
+    path = str(write("".join(line.removeprefix("        ") for line in text.splitlines(True))))
+    found = sweep(path, {"source": [{"level": 1.0}, {"level": 2.0}]}, store=store).to_xarray()
+    assert found["source (result)"].values.tolist() == [1, 2]
 
 
 def test_netcdf_is_read_back_as_it_was(command, recipe, store):
