@@ -18,8 +18,9 @@ from __future__ import annotations
 import functools
 import inspect
 import math
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
+from types import MappingProxyType
 from typing import Any, Literal, TypeVar, get_type_hints
 
 import torch
@@ -85,7 +86,13 @@ class Facts:
 class Node:
     """A function with its typed parameters, its reference, its bound and its checks."""
 
-    def __init__(self, fn: Callable[..., Any], device: Device = "any", rtol: float = 1e-5) -> None:
+    def __init__(
+        self,
+        fn: Callable[..., Any],
+        device: Device = "any",
+        rtol: float = 1e-5,
+        bands: Mapping[str, int] | None = None,
+    ) -> None:
         functools.update_wrapper(self, fn)
         self.fn, self.device, self.rtol = fn, device, rtol
         self.ref: Callable[..., Any] | None = None
@@ -98,6 +105,7 @@ class Node:
         self.optional = frozenset(p.name for p in data if p.default is not p.empty)
         self.random = any(p.name == "rng" for p in pars)
         self._keyword_only = [p for p in pars if p.kind is p.KEYWORD_ONLY and p.name != "rng"]
+        self.bands = bands and self._declared(bands)
 
     def __call__(self, *inputs: Any, **params: Any) -> Any:
         """Call the function itself: no validation, no cache; gradients flow."""
@@ -111,6 +119,14 @@ class Node:
         """The name a recipe writes: ``sensor.digitize``."""
         parts = [p for p in self.fn.__module__.removeprefix("neusee.nodes.").split(".") if not p.startswith("_")]
         return ".".join([*parts, self.fn.__name__])
+
+    def _declared(self, bands: Mapping[str, int]) -> Mapping[str, int]:
+        unknown = sorted(bands.keys() - {*self.inputs, "return"})
+        if unknown or "return" not in bands or len(bands) < 2:
+            raise ValueError(f"{self.path}: bands={dict(bands)} must name 'return' and inputs among {self.inputs}")
+        if self.random:
+            raise ValueError(f"{self.path} draws at random, so that a band is not the same in another stack")
+        return MappingProxyType(dict(bands))
 
     @functools.cached_property
     def hints(self) -> dict[str, Any]:
@@ -150,6 +166,13 @@ class Node:
         return fn
 
 
-def node(device: Device = "any", rtol: float = 1e-5) -> Callable[[Callable[..., Any]], Node]:
-    """Make a node of a function. ``rtol`` is the agreed error against its reference."""
-    return lambda fn: Node(fn, device, rtol)
+def node(
+    device: Device = "any", rtol: float = 1e-5, bands: Mapping[str, int] | None = None
+) -> Callable[[Callable[..., Any]], Node]:
+    """Make a node of a function. ``rtol`` is the agreed error against its reference.
+
+    ``bands`` gives the axis of the bands of some inputs and of the result (``return``): band i of the result depends
+    on band i of those inputs and on the whole of the others, and is the same to the last bit whatever bands stand
+    beside it. Of a named tuple, only the fields in `values.BAND_FIELDS` have that axis.
+    """
+    return lambda fn: Node(fn, device, rtol, bands)

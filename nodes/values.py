@@ -48,3 +48,11 @@ class Psf(NamedTuple):
 
     intensity: Tensor  #: (band, y, x); the sum over an infinite plane is the transmitted share
     clear_peak: Tensor  #: (band,) float64: the pixel on the axis, same lens, no element, no dirt, no aberration
+
+
+#: by class, the fields with one entry a band
+BAND_FIELDS: dict[type, tuple[str, ...]] = {
+    Bands: Bands._fields,
+    Pupil: ("index", "wavelengths"),
+    Psf: Psf._fields,
+}

@@ -13,7 +13,7 @@ Border = Literal["zero", "reflect"]
 Corner = tuple[int, int]
 
 
-@node(rtol=1e-5)
+@node(rtol=1e-5, bands={"radiance": -3, "psf": 0, "return": -3})
 def image(radiance: Tensor, psf: Psf, *, border: Border = "zero") -> Tensor:
     """Convolve each band with its PSF, linearly: what leaves one edge does not come back at the other.
 
