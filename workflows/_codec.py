@@ -2,7 +2,8 @@
 
 The file is written from the tensors' own memory and read through a memory map, so that
 neither way makes a copy. Each tensor begins at a multiple of 64 bytes, as a fresh one
-does: a kernel then takes the same path on a stored value as on a computed one.
+does: a kernel then takes the same path on a stored value as on a computed one. A `Stacked`
+tensor stands in no such file: its layout names one blob for each of its slices.
 """
 
 from __future__ import annotations
@@ -17,6 +18,8 @@ from typing import IO, Any
 import torch
 import xxhash
 from torch import Tensor
+
+from neusee.workflows._blobs import Blobs, Stacked, bytes_of, dtype_of
 
 _ALIGN = 64
 _FILLER = "_"  #: begins the names of entries that only fill up to the next multiple
@@ -91,41 +94,68 @@ class _Listed:
         return self._known[same]
 
 
-def pack(value: Any) -> tuple[Any, list[Tensor]]:
-    """The layout of ``value`` as JSON, and its tensors."""
+def pack(value: Any, blobs: Blobs | None = None) -> tuple[Any, list[Tensor]]:
+    """The layout of ``value`` as JSON, and its tensors; what is `Stacked` goes to ``blobs``, where there are some.
+
+    Raises `TypeError` for what cannot be stored, and `OSError` where ``blobs`` takes none.
+    """
     listed = _Listed()
-    return _layout(value, listed), listed.tensors
+    return _layout(value, listed, blobs), listed.tensors
 
 
-def _layout(item: Any, listed: _Listed) -> dict[str, Any]:
+def _layout(item: Any, listed: _Listed, blobs: Blobs | None) -> dict[str, Any]:
+    if isinstance(item, Stacked):
+        return _layout(item.tensor, listed, None) if blobs is None else _stack_layout(item, blobs)
     if isinstance(item, Tensor):
         return {"tensor": listed.add(item)}
     if isinstance(item, bytes):
         return {"bytes": listed.add(torch.frombuffer(bytearray(item), dtype=torch.uint8) if item else torch.empty(0))}
     if isinstance(item, tuple):
-        return {"class": _class_path(item), "items": [_layout(i, listed) for i in item]}
+        return {"class": _class_path(item), "items": [_layout(i, listed, blobs) for i in item]}
     if isinstance(item, list):
-        return {"list": [_layout(i, listed) for i in item]}
+        return {"list": [_layout(i, listed, blobs) for i in item]}
     if isinstance(item, dict) and all(isinstance(k, str) for k in item):
-        return {"dict": {k: _layout(v, listed) for k, v in item.items()}}
+        return {"dict": {k: _layout(v, listed, blobs) for k, v in item.items()}}
     if item is None or isinstance(item, bool | int | float | str):
         return {"value": item}
     raise TypeError(f"a step must give tensors, numbers, texts, bytes or collections of these, not {type(item)}")
 
 
-def unpack(layout: Any, tensors: list[Tensor]) -> Any:
-    """The value that `pack` took apart."""
+def _stack_layout(item: Stacked, blobs: Blobs) -> dict[str, Any]:
+    written = [blobs.write(name, part) for name, part in zip(item.names, item.tensor.unbind(), strict=True)]
+    kind = str(item.tensor.dtype).removeprefix("torch.")
+    return {"stacked": {"names": item.names, "xxh3": written, "dtype": kind, "shape": list(item.tensor.shape)}}
+
+
+def unpack(layout: Any, tensors: list[Tensor], blobs: Blobs | None = None, verify: bool = True) -> Any:
+    """The value that `pack` took apart; raises `ValueError` where a band of it is lost."""
     ((kind, body),) = ((k, v) for k, v in layout.items() if k != "items")
     if kind == "tensor":
         return tensors[body]
+    if kind == "stacked":
+        if blobs is None:
+            raise ValueError("its bands are stored apart, and no one says where")
+        return blobs.read(body["names"], body["shape"], dtype_of(body["dtype"]), verify, body["xxh3"])
     if kind == "bytes":
         return tensors[body].numpy().tobytes()
     if kind == "class":
-        items = (unpack(i, tensors) for i in layout["items"])
+        items = (unpack(i, tensors, blobs, verify) for i in layout["items"])
         return _class(body)(*items) if body else tuple(items)
     if kind == "list":
-        return [unpack(i, tensors) for i in body]
-    return {k: unpack(v, tensors) for k, v in body.items()} if kind == "dict" else body
+        return [unpack(i, tensors, blobs, verify) for i in body]
+    return {k: unpack(v, tensors, blobs, verify) for k, v in body.items()} if kind == "dict" else body
+
+
+def blobs_in(layout: Any) -> list[str]:
+    """The names of all blobs that a layout needs."""
+    found: list[str] = []
+    todo = [layout]
+    while todo:
+        item = todo.pop()
+        if "stacked" in item:
+            found += item["stacked"]["names"]
+        todo += item.get("items", item.get("list", item.get("dict", {}).values()))
+    return found
 
 
 def _class_path(item: tuple[Any, ...]) -> str:
@@ -148,7 +178,7 @@ def _class(path: str) -> Callable[..., Any]:
 
 def to_text(x: Tensor) -> list[Any]:
     """A small tensor as JSON: type, shape, bytes."""
-    return [*_kind(x), base64.b64encode(_bytes(x)).decode()]
+    return [*_kind(x), base64.b64encode(bytes_of(x)).decode()]
 
 
 def from_text(kind: str, shape: list[int], is_complex: bool, text: str) -> Tensor:
@@ -175,7 +205,7 @@ def write(file: IO[bytes], tensors: list[Tensor]) -> str:
         file.write(block)
         found.update(block)
     for x in tensors:
-        for part in (_bytes(x), bytes(-x.nbytes % _ALIGN)):
+        for part in (bytes_of(x), bytes(-x.nbytes % _ALIGN)):
             file.write(part)
             found.update(part)
     return found.hexdigest()
@@ -201,12 +231,6 @@ def _kind(x: Tensor) -> tuple[str, list[int], bool]:
     if real not in _DTYPES:
         raise TypeError(f"a tensor of {x.dtype} cannot be stored")
     return _DTYPES[real], [*x.shape, 2] if x.is_complex() else list(x.shape), x.is_complex()
-
-
-def _bytes(x: Tensor) -> memoryview:
-    """The bytes of a tensor, without a copy where it is contiguous and on the CPU."""
-    x = x.detach().cpu().resolve_conj().resolve_neg().contiguous()
-    return x.reshape(-1).view(torch.uint8).numpy().data
 
 
 def _tensor(data: Any, offset: int, kind: str, shape: list[int], is_complex: bool) -> Tensor:
