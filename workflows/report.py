@@ -26,6 +26,8 @@ from neusee.workflows._numbers import expected, metrics, table
 from neusee.workflows._readings import in_force
 from neusee.workflows._roles import FIGURES
 from neusee.workflows._run import Done, Result
+from neusee.workflows._timing import said_of, timing
+from neusee.workflows._timing import size_of as size_of
 
 _LIBRARIES = ("torch", "numpy", "kornia", "colour-science", "OpenEXR", "pydantic", "safetensors")
 _UNITS = frozenset(("m", "nm", "rad", "e-", "DN", "photons", "W/m2", "dB"))
@@ -41,6 +43,8 @@ def document(
     steps = [_step(d, result) for d in done]
     failed = [f"{s['step']}: {c['text']}" for s in steps for c in s["checks"] if not c["ok"]]
     counts = Counter[str](d.state for d in done)
+    planned = getattr(result, "schedule", None)
+    time = timing(steps, planned.makespan if planned else None)
     return {
         "recipe": recipe.name,
         "title": recipe.title,
@@ -62,6 +66,7 @@ def document(
         "readings": _readings(recipe),
         "left_out": [{"step": d.step, "bound": d.bound, "why": d.why} for d in done if d.state == "left out"],
         "absent": [{"step": step, "where": where} for step, where in recipe.absent.items()],
+        "timing": {**time, "said": said_of(time)},
         "steps": steps,
         "figures": _figures(missing),
         "missing": [{"name": n, "title": _title(n), "why": why} for n, why in missing.items()],
@@ -114,15 +119,6 @@ def shape_of(done: Done) -> str:
     return " × ".join(map(str, done.facts.shape)) or "number" if done.facts else ""
 
 
-def size_of(count: float) -> str:
-    """Bytes as people read them."""
-    for unit in ("B", "kB", "MB", "GB"):
-        if count < 1000 or unit == "GB":
-            return f"{count:.3g} {unit}"
-        count /= 1000
-    raise AssertionError
-
-
 def _step(done: Done, result: Result) -> dict[str, Any]:
     node = result.recipe.steps[done.step].node
     about = result.store.about(done.key) if done.state in ("cached", "asleep") else None
@@ -134,6 +130,11 @@ def _step(done: Done, result: Result) -> dict[str, Any]:
         "state": done.state,
         "why": done.why,
         "seconds": done.seconds,
+        "predicted": done.predicted,
+        "began": done.began,
+        "lane": done.lane,
+        "peak": done.peak,
+        "kept": done.kept,
         "made_in": about["seconds"] if about else done.seconds,
         "shape": shape_of(done),
         "unit": unit_of(node.__doc__ or ""),

@@ -11,7 +11,7 @@ import pytest
 import torch
 
 from neusee.nodes import Check, node
-from neusee.workflows import _files, _numbers, report
+from neusee.workflows import _files, _numbers, _timing, report
 from neusee.workflows._files import find_run, new_run
 from neusee.workflows._graph import Expectation, Recipe, Step
 from neusee.workflows._marks import Mark
@@ -245,3 +245,65 @@ def test_a_second_run_reads_the_same_numbers_and_says_where_they_come_from(done,
 )
 def test_the_unit_of_a_result_is_read_from_the_docstring(line, unit):
     assert report.unit_of(f"Say.\n\n    {line}\n") == unit
+
+
+# --- time -------------------------------------------------------------------------------------------------------------
+
+
+def row(step, state="run", seconds=0.0, began=0.0, predicted=None, key=None, **more):
+    made = {"made_in": seconds, "bytes": 1000, "kept": True}
+    return {"step": step, "state": state, "seconds": seconds, "began": began, "predicted": predicted} | {
+        "key": key or step,
+        **made,
+        **more,
+    }
+
+
+def test_time_is_added_up_with_each_key_once():
+    rows = [
+        row("a", "asleep", 3.0),
+        row("b", "cached", 5.0, bytes=400),
+        row("twin of b", "cached", 5.0, key="b", bytes=400),
+        row("c", "left out", 9.0),
+        row("d", "run", 1.0, began=0.5, predicted=1.5),
+        row("e", "run", 2.0, began=0.75, kept=False),
+        row("twin of e", "cached", 2.0, key="e"),
+    ]
+    found = _timing.timing(rows, planned=2.5)
+    assert (found["ran"], found["served"], found["steps"], found["told"]) == (2, 4, 7, 1)
+    assert (found["seconds"], found["span"], found["planned"]) == (3.0, 2.25, 2.5)
+    assert (found["predicted"], found["actual"]) == (1.5, 1.0)
+    assert (found["saved"], found["share"]) == (8.0, 8 / 11)
+    assert (found["read"], found["written"]) == (400, 1000)
+    assert _timing.said_of(found) == [
+        "2 of 7 steps ran: 3 s of computing.",
+        "By earlier runs the 1 that ran before were expected to take 1.5 s; they took 1 s.",
+        "The plan, with branches side by side, was 2.5 s long; it took 2.25 s.",
+        "The cache served 4 steps and saved 8 s, 72.7 % of all computing.",
+        "Read from the cache: 400 B; written to it: 1 kB.",
+    ]
+
+
+def test_a_result_that_is_read_counts_before_the_same_one_asleep():
+    rows = [row("a", "asleep", 3.0, key="k"), row("b", "cached", 3.0, key="k", bytes=70)]
+    found = _timing.timing(rows)
+    assert (found["read"], found["saved"], found["share"], found["planned"]) == (70, 3.0, 1.0, None)
+
+
+def test_the_page_says_what_the_cache_saved(done, tmp_path):
+    assert done.document["timing"]["ran"] == 2
+    assert "2 of 2 steps ran" in done.page.read_text()
+    again = simulate(recipe(), Store(tmp_path / "cache"), tmp_path / "runs", ["neusee", "run"])
+    took = sum(s["seconds"] for s in done.document["steps"])
+    assert again.document["timing"]["saved"] == pytest.approx(took)
+    assert again.document["timing"]["share"] == 1.0
+    assert "The cache served 2 steps and saved" in again.page.read_text()
+
+
+def test_a_page_of_before_there_was_an_account_of_time_is_still_written(done):
+    path = done.folder / "provenance.json"
+    doc = json.loads(path.read_text())
+    del doc["timing"]
+    doc["steps"] = [{k: v for k, v in s.items() if k != "predicted"} for s in doc["steps"]]
+    path.write_text(json.dumps(doc))
+    assert "Time" in report.rebuild(done.folder).read_text()
