@@ -1,6 +1,6 @@
 """Spectra: bands, lights, channels, and lifts from three colours to many."""
 
-from neusee.nodes.spectra._bands import bands, line
+from neusee.nodes.spectra._bands import bands, filters, line
 from neusee.nodes.spectra._lift import lift_lmmse, lift_mallett
 from neusee.nodes.spectra._lift_mst import lift_mst_plus_plus
 from neusee.nodes.spectra._light import illuminant, illuminate
@@ -8,6 +8,7 @@ from neusee.nodes.spectra._responses import responses
 
 __all__ = [
     "bands",
+    "filters",
     "illuminant",
     "illuminate",
     "lift_lmmse",

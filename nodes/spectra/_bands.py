@@ -1,9 +1,10 @@
 """Where the spectrum is sampled: the bands of a scene, and the few of one laser line."""
 
 import math
-from typing import Any, Literal
+from typing import Annotated, Any, Literal
 
 import torch
+from pydantic import Field
 from torch import Tensor
 
 from neusee.nodes import Check, ParameterError, node
@@ -41,6 +42,39 @@ def _(*, start: float, stop: float, **params: Any) -> list[str]:
 def _(result: Samples, **params: Any) -> list[Check]:
     ends = f"{float(result.centres[0]) * 1e9:.4g} to {float(result.centres[-1]) * 1e9:.4g} nm"
     return [Check(f"{len(result.centres)} bands, {ends}, {float(result.widths[0]) * 1e9:.3g} nm wide")]
+
+
+@node(rtol=1e-12)
+def filters(
+    *,
+    centres: Annotated[tuple[Wavelength, ...], Field(min_length=1)],
+    widths: Annotated[tuple[PositiveLength, ...], Field(min_length=1)],
+) -> Samples:
+    """Take the bands one by one as they are listed, such as those of a set of filters; one width stands for all.
+
+    A band of its own place and width: changing one leaves the others as they are, to the last bit.
+
+    Shapes: -> centres, widths, weights (band,) float64.
+    Units:  centres and widths m; weights 1.
+    Error:  each filter passes all inside its width and nothing outside; real ones have slopes of some nm.
+    Raises: ParameterError before the run unless there is one width, or one for each centre.
+    Source: the filters' data sheets: central wavelength and full width at half maximum.
+    """
+    centre = torch.tensor(centres, dtype=torch.float64)
+    return Samples(centre, torch.tensor(widths, dtype=torch.float64).expand_as(centre), torch.ones_like(centre))
+
+
+@filters.preflight
+def _(*, centres: tuple[float, ...], widths: tuple[float, ...]) -> list[str]:
+    if len(widths) not in (1, len(centres)):
+        raise ParameterError("widths", f"{len(widths)} widths for {len(centres)} centres: give one, or one for each")
+    return []
+
+
+@filters.check
+def _(result: Samples, **params: Any) -> list[Check]:
+    low, high = float(result.centres.min()) * 1e9, float(result.centres.max()) * 1e9
+    return [Check(f"{len(result.centres)} filters, {low:.4g} to {high:.4g} nm")]
 
 
 @node(rtol=1e-9)

@@ -9,7 +9,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from neusee.nodes import ParameterError
-from neusee.nodes.spectra import bands, line
+from neusee.nodes.spectra import bands, filters, line
 
 NM = 1e-9
 
@@ -31,6 +31,32 @@ def test_one_band_is_the_middle():
 def test_refuses_exchanged_ends():
     with pytest.raises(ParameterError, match=r"700 nm.*400 nm"):
         bands.before(start=700 * NM, stop=400 * NM, count=31)
+
+
+def test_filters_are_the_bands_of_their_list():
+    result = filters(centres=(500 * NM, 450 * NM, 633 * NM), widths=(10 * NM, 25 * NM, 1 * NM))
+    assert result.centres.tolist() == [500 * NM, 450 * NM, 633 * NM]
+    assert result.widths.tolist() == [10 * NM, 25 * NM, 1 * NM]
+    assert result.weights.tolist() == [1, 1, 1]
+    assert filters.after(result)[0].text == "3 filters, 450 to 633 nm"
+
+
+def test_one_width_is_that_of_all_filters():
+    assert filters(centres=(500 * NM, 450 * NM), widths=(10 * NM,)).widths.tolist() == [10 * NM] * 2
+
+
+def test_refuses_widths_that_belong_to_no_filter():
+    with pytest.raises(ParameterError, match="2 widths for 3 centres"):
+        filters.before(centres=(500 * NM,) * 3, widths=(10 * NM,) * 2)
+    assert filters.before(centres=(500 * NM,) * 2, widths=(10 * NM,) * 2) == []
+
+
+def test_filters_are_read_from_a_recipe():
+    read = filters.params(centres=["500 nm", "0.45 um"], widths=["10 nm"])
+    assert read.centres == pytest.approx((500 * NM, 450 * NM))
+    for wrong in ({"centres": [], "widths": ["10 nm"]}, {"centres": ["500 nm"], "widths": ["0 nm"]}):
+        with pytest.raises(ValueError, match=r"at least|greater than"):
+            filters.params(**wrong)
 
 
 def test_line_weights_are_the_error_function():
