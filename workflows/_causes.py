@@ -7,6 +7,7 @@ behind it follows the keys of the inputs that differ.
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any, NamedTuple
 
@@ -17,7 +18,7 @@ from neusee.workflows._resolve import Resolved
 from neusee.workflows._store import Store
 from neusee.workflows._wording import Wording
 
-Origin = dict[str, Any]  #: what went into a key: node, code, params, inputs, stream
+Origin = Mapping[str, Any]  #: what went into a key: node, code, params, inputs, stream
 _FEW = 4  #: steps of an input that are named
 _FAR = 100  #: steps that are looked at for one that came in between
 
@@ -58,6 +59,7 @@ class Comparison:
         self.wording = Wording(recipe)
         self.seen: dict[Pair, Found] = {}
         self._edits: dict[tuple[str, str], list[str]] = {}
+        self._abouts: dict[Key, Mapping[str, Any] | None] = {}
 
     def roots(self, start: Pair, most: float = float("inf")) -> Roots | None:
         """Every root cause once; None as soon as there are more than ``most``."""
@@ -93,12 +95,18 @@ class Comparison:
         return found + self._stream(old.get("stream"), new.get("stream"))
 
     def origin(self, key: Key) -> Origin | None:
-        found = self.resolved.origins.get(key) or (self.store.about(key) or {}).get("origin")
-        return dict(found) if found else None
+        """What went into a key, as far as the recipe or the store knows it."""
+        return self.resolved.origins.get(key) or (self.about(key) or {}).get("origin")
 
     def step(self, key: Key) -> str | None:
         """The step that a key was first made for."""
-        return self.resolved.makers.get(key) or (self.store.about(key) or {}).get("step")
+        return self.resolved.makers.get(key) or (self.about(key) or {}).get("step")
+
+    def about(self, key: Key) -> Mapping[str, Any] | None:
+        """What the store knows of a key; a receipt, too, is read but once."""
+        if key not in self._abouts:
+            self._abouts[key] = self.store.about(key)
+        return self._abouts[key]
 
     def _compare(self, pair: Pair) -> Found:
         old, new = self.origin(pair.old), self.origin(pair.new)

@@ -2,11 +2,11 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Callable, Iterable, Iterator, Mapping
 from dataclasses import replace
 from typing import Any
 
-from neusee.workflows._causes import Comparison, Pair, Roots
+from neusee.workflows._causes import Comparison, Origin, Pair, Roots
 from neusee.workflows._graph import Recipe, Step, needed
 from neusee.workflows._keys import Key
 from neusee.workflows._marks import nearest
@@ -93,7 +93,7 @@ def _unsure(recipe: Recipe, step: str, resolved: Resolved) -> list[str]:
     return [name for name in needed(recipe, [step]) if name in unsure] if unsure else []
 
 
-def _state(about: dict[str, Any] | None) -> str:
+def _state(about: Mapping[str, Any] | None) -> str:
     if about is None:
         return "not stored, so it would run where it is needed"
     made = f"{_date(about)}, made in {about.get('seconds', 0.0):.3g} s"
@@ -101,7 +101,7 @@ def _state(about: dict[str, Any] | None) -> str:
 
 
 def _because(
-    comparison: Comparison, label: str, key: Key, about: dict[str, Any] | None, maker: str = ""
+    comparison: Comparison, label: str, key: Key, about: Mapping[str, Any] | None, maker: str = ""
 ) -> Iterator[str]:
     """What differs from the nearest earlier result, and which that is."""
     rows = _rows(comparison.store, label) or _rows(comparison.store, maker or label)
@@ -117,7 +117,7 @@ def _because(
     if len(roots.found) > _SHOWN:
         yield f"  and {len(roots.found) - _SHOWN} more"
     which = "the earlier result" if len(earlier) == 1 else f"the nearest of {len(earlier)} earlier results"
-    yield f"  beside {which}, {old[:8]} of {_date(comparison.store.about(old) or {})}"
+    yield f"  beside {which}, {old[:8]} of {_date(comparison.about(old) or {})}"
 
 
 def _nearest(comparison: Comparison, label: str, key: Key, earlier: list[Key]) -> tuple[Key, Roots] | None:
@@ -137,18 +137,18 @@ def _nearest(comparison: Comparison, label: str, key: Key, earlier: list[Key]) -
 def _at_once(comparison: Comparison, step: Step, key: Key, earlier: list[Key]) -> str:
     """One line on why a step ran, from what is at hand; empty where it has no earlier result."""
     if key in earlier:
-        return "made before, but its value was not kept"
-    new = comparison.origin(key)
-    found = [_direct(comparison, step, old, new) for old in _origins(comparison, earlier) if new]
-    return min(found, key=len)[0] if found else ""
+        return "made before, but its value is not stored"
+    best: list[str] = []
+    for old in earlier[: -_AT_ONCE - 1 : -1]:
+        before, now = comparison.origin(old), comparison.origin(key)
+        found = _direct(comparison, step, before, now) if before and now else []
+        best = min(filter(None, (best, found)), key=len, default=[])
+        if len(best) == 1:
+            break
+    return best[0] if best else ""
 
 
-def _origins(comparison: Comparison, keys: list[Key]) -> list[dict[str, Any]]:
-    """What went into the newest of some results, the newest first."""
-    return [found for key in keys[: -_AT_ONCE - 1 : -1] if (found := comparison.origin(key))]
-
-
-def _direct(comparison: Comparison, step: Step, old: dict[str, Any], new: dict[str, Any]) -> list[str]:
+def _direct(comparison: Comparison, step: Step, old: Origin, new: Origin) -> list[str]:
     """What differs at a step itself, and then the sources that do."""
     texts = comparison.own(step.name, old, new)
     if old["node"] != new["node"] or len(old["inputs"]) != len(new["inputs"]):
@@ -187,11 +187,10 @@ def _keys(rows: Iterable[dict[str, Any]]) -> list[Key]:
     return list(dict.fromkeys(row["key"] for row in rows))
 
 
-def _date(about: dict[str, Any]) -> str:
+def _date(about: Mapping[str, Any]) -> str:
     return str(about.get("date", "an unknown day"))[:19].replace("T", " ")
 
 
 def _rows(store: Store, step: str | None = None) -> list[dict[str, Any]]:
     """What was made, of one step or of all, the newest last."""
-    found = [{**about, "key": key} for key, about in store.entries() if step in (None, about.get("step"))]
-    return sorted(found, key=lambda row: str(row.get("date", "")))
+    return store.journal.rows() if step is None else store.journal.of_step(step)

@@ -452,13 +452,47 @@ def test_a_cached_run_looks_nothing_up(trial, monkeypatch):
     assert trial.told() == {}
 
 
+def test_a_value_that_was_not_kept_is_said_to_have_been_made(trial):
+    key = trial.run().keys["raw"]
+    about = {
+        name: value for name, value in trial.store.about(key).items() if name not in ("payload", "tensors", "layout")
+    }
+    for path in (trial.cache / key[:2]).glob(f"{key}.*"):
+        path.unlink()
+    assert trial.store.note(key, about)
+    head, *rest = trial.why("raw")
+    assert head.startswith("raw (trial.add): ran 20")
+    assert f"but its value was not kept, key {key[:8]}" in head
+    assert rest == ["  nothing earlier to compare it with: the first result of this step"]
+    recipe, told, store = trial.load(), {}, trial.store
+    run(recipe, store, ["raw"], explained(recipe, store, lambda event: told.update({event.step: event.done})))
+    assert told["raw"].why == "made before, but its value is not stored"
+
+
+@pytest.mark.parametrize("damage", [None, "", "{", "\x00"])
+def test_without_a_journal_the_same_is_said(trial, damage):
+    trial.run()
+    path = trial.cache / "journal.jsonl"
+    path.unlink() if damage is None else path.write_text(damage)
+    assert trial.causes("raw", "sensor.gain=4") == ["raw: sensor.gain 3 -> 4 (argument 2)"]
+
+
+def test_results_that_were_removed_are_passed_over(trial):
+    first = trial.run().keys["raw"]
+    second = trial.run("sensor.gain=5").keys["raw"]
+    for path in trial.cache.glob(f"{second[:2]}/{second}.*"):
+        path.unlink()
+    *_, beside = trial.why("raw", "sensor.gain=4")
+    assert beside.startswith(f"  beside the nearest of 2 earlier results, {first[:8]} of ")
+
+
 def test_a_run_compares_few_results(trial, monkeypatch):
     for gain in range(12):
-        trial.run(f"sensor.gain={gain}")
+        trial.run(f"sensor.gain={gain}", f"sensor.read_noise={gain + 20} e-")
     seen = []
     own = _causes.Comparison.own
     monkeypatch.setattr(_causes.Comparison, "own", lambda self, label, *a: seen.append(label) or own(self, label, *a))
-    assert trial.told("sensor.gain=50")["raw"].startswith("sensor.gain ")
+    assert trial.told("sensor.gain=50", "sensor.read_noise=50 e-")["raw"] == "sensor.gain 11 -> 50 (argument 2)"
     assert seen.count("raw") == _why._AT_ONCE
 
 
