@@ -109,7 +109,7 @@ def _because(
     earlier = keys[: keys.index(key)] if key in keys else keys
     found = _nearest(comparison, label, key, earlier)
     if found is None:
-        yield f"  nothing earlier to compare it with: {'the first' if about else 'no'} result of this step"
+        yield f"  nothing earlier to compare it with: {'the first' if key in keys else 'no'} result of this step"
         return
     old, roots = found
     for text in list(roots.found)[:_SHOWN]:
