@@ -109,7 +109,8 @@ def test_a_row_says_why_it_ran(neusee):
     _, out, _ = neusee("run", "mine.yaml")
     assert "->" not in out
     _, out, _ = neusee("run", "mine.yaml", "mask.max_height=1.3 um")
-    assert "mask.max_height 1.2 -> 1.3 um (argument 2)" in next(line for line in out.splitlines() if line.startswith("  made"))
+    made = next(line for line in out.splitlines() if line.startswith("  made"))
+    assert "mask.max_height 1.2 -> 1.3 um (argument 2)" in made
     _, out, _ = neusee("run", "mine.yaml", "mask.waves=3")
     rows = {line.split()[0]: line for line in out.splitlines() if line.startswith("  ")}
     assert "mask.waves 2 -> 3" in rows["cone"]
