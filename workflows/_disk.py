@@ -10,6 +10,7 @@ from __future__ import annotations
 import errno
 import fcntl
 import itertools
+import math
 import os
 import time
 from collections.abc import Iterator
@@ -124,12 +125,15 @@ class Disk:
         except PermissionError:
             return os.open(path, os.O_RDONLY)
 
-    def sweep(self, dry: bool = False) -> list[tuple[str, int]]:
-        """Remove the temporary files of processes that are dead; those removed, with their bytes."""
+    def sweep(self, dry: bool = False, patience: float = math.inf) -> list[tuple[str, int]]:
+        """Remove the temporary files of processes that are dead; those removed, with their bytes.
+
+        Leases and badges of other machines stay for ``patience`` seconds: a clock that jumps makes none of them old.
+        """
         gone = []
         for entry in os.scandir(f"{self.folder}/tmp"):
             with suppress(OSError):
-                if entry.name != ".lock" and _abandoned(entry):
+                if entry.name != ".lock" and _abandoned(entry, patience):
                     gone.append((entry.path, entry.stat(follow_symlinks=False).st_size))
                     if not dry:
                         os.unlink(entry.path)
@@ -146,14 +150,15 @@ def _locked(file: int) -> bool:
     return True
 
 
-def _abandoned(entry: os.DirEntry[str]) -> bool:
+def _abandoned(entry: os.DirEntry[str], patience: float) -> bool:
     """Whether nobody works on a temporary file any more: its owner is dead, or unknown and it is old."""
     words = entry.name.split(".")
+    presence = words[-1] == "lease" or words[0] == "badge"
     if words[-1] == "lease":
-        with open(entry.path) as file:
-            words = file.readline(200).split()
+        with open(entry.path, "rb") as file:
+            words = file.readline(200).decode(errors="replace").split()
     owner = next(filter(None, map(owner_of, words)), None)
     state = owner.state if owner else "foreign"
     if state == "foreign":
-        return time.time() - entry.stat(follow_symlinks=False).st_mtime > OLD
+        return time.time() - entry.stat(follow_symlinks=False).st_mtime > (patience if presence else OLD)
     return state == "dead"

@@ -9,7 +9,7 @@ from __future__ import annotations
 import json
 import os
 from collections import defaultdict
-from collections.abc import Iterator
+from collections.abc import Collection, Iterator
 from contextlib import suppress
 from typing import Any
 
@@ -60,6 +60,11 @@ class Journal:
         """The lines of a node, the newest last."""
         self._read()
         return self._by_node.get(path, [])
+
+    def mark_evicted(self, keys: Collection[str]) -> None:
+        """Say of these that their values are no longer kept."""
+        self._read()
+        self._replace([{**row, "kept": False} if row["key"] in keys else row for row in self._rows])
 
     def compact(self) -> None:
         """Write it anew, with one line for each result that there is: the newest, and whether its value is kept."""

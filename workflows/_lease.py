@@ -70,22 +70,22 @@ class Leases:
 
         Who had to wait looks for the result once more before computing it.
         """
-        path = f"{self._disk.folder}/tmp/{key}.lease"
+        try:
+            return self._claimed(key, f"{self._disk.folder}/tmp/{key}.lease")
+        except OSError:
+            return Lease()
+
+    def _claimed(self, key: str, path: str) -> Lease | None:
         try:
             return self._taken(path)
         except FileExistsError:
-            pass
-        except OSError:
-            return Lease()
-        found = _look(path)
+            found = _look(path)
         if found is not None and not self._dead(path, found):
             return None
         try:
             return self._taken_over(key, path, found)
         except FileExistsError:
             return None
-        except OSError:
-            return Lease()
 
     def _taken(self, path: str) -> Lease:
         """Two tries: the folder may not be there yet, and our file in it may have been swept away."""

@@ -20,10 +20,9 @@ import xxhash
 
 from neusee.workflows._far import Far
 from neusee.workflows._keys import Key, digest
+from neusee.workflows._payload import stamp_of
 from neusee.workflows._sidecar import About, is_kept, receipt, seal, unseal
 from neusee.workflows._store import Store, Verify
-from neusee.workflows._store import _stamp as stamp_of
-
 
 def open_store(where: str | Path | None = None) -> Store:
     """The store at a folder or a URL (``s3://bucket/name``); None: ``$NEUSEE_CACHE``, else the usual folder.
@@ -36,13 +35,11 @@ def open_store(where: str | Path | None = None) -> Store:
         return RemoteStore(where)
     return Store(where)
 
-
 def local_layer(url: str) -> Path:
     """``$NEUSEE_CACHE_LOCAL``, else a folder of the URL's own in ``~/.cache/neusee``."""
     if named := os.environ.get("NEUSEE_CACHE_LOCAL"):
         return Path(named)
     return Path.home() / ".cache" / "neusee" / digest(url.rstrip("/"))[:16]
-
 
 class RemoteStore(Store):
     """A `Store` whose misses are looked for at ``url``, and whose results go there too."""
@@ -201,10 +198,8 @@ class RemoteStore(Store):
         self._give_up(key)
         warnings.warn(f"the result {key} at {self.url} is damaged ({error}): it is not used", stacklevel=4)
 
-
 def _note(key: Key) -> str:
     return f"{key}.note.json"
-
 
 def _payload(key: Key, xxh3: str) -> str:
     return f"{key}-{xxh3}.safetensors"

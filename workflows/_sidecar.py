@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import json
+import os
+import time
 from collections.abc import Iterator
 from contextlib import suppress
 from typing import Any
@@ -13,6 +15,8 @@ from neusee.workflows._disk import Disk
 
 About = dict[str, Any]
 UNREADABLE = (OSError, ValueError, LookupError, TypeError, AttributeError, ImportError)
+_OF_THE_VALUE = ("layout", "payload", "tensors", "bands")
+_USED = 3600.0  #: s
 _SEAL = ',"seal":"'
 _SEAL_SIZE = len(_SEAL) + 32 + 2
 _encode = json.JSONEncoder(separators=(",", ":")).encode
@@ -42,14 +46,52 @@ def read(disk: Disk, key: str) -> About:
     return about
 
 
+def read_whole(disk: Disk, key: str) -> About:
+    """What stands beside ``key``, whose payload is there and has its size; one of `UNREADABLE` otherwise."""
+    about = read(disk, key)
+    payload = about.get("payload")
+    try:
+        size = os.stat(disk.path(key, "safetensors")).st_size if payload else 0
+    except FileNotFoundError:
+        about = read(disk, key)
+        if is_kept(about):
+            raise
+        return about  # the value went in between
+    if payload and size != payload["size"]:
+        raise ValueError(f"its payload has not the {payload['size']} bytes that were written")
+    return about
+
+
+def has_value(disk: Disk, key: str) -> bool:
+    """Whether ``key`` has a value, or something that one cannot read."""
+    try:
+        return is_kept(read(disk, key))
+    except UNREADABLE:
+        return os.path.exists(disk.path(key, "json"))
+
+
 def is_kept(about: About) -> bool:
     """Whether there is a value, and not the receipt alone."""
     return bool(about.get("kept", True))
 
 
+def bands(about: About) -> list[str]:
+    """The names of the bands of a value that are stored apart."""
+    names: list[str] = (about.get("bands") or {}).get("names", [])
+    return names
+
+
 def receipt(about: About) -> About:
     """All that is known of a result, without its value."""
-    return {k: v for k, v in about.items() if k not in ("layout", "payload", "tensors")} | {"kept": False}
+    return {k: v for k, v in about.items() if k not in _OF_THE_VALUE} | {"kept": False}
+
+
+def note_use(disk: Disk, key: str) -> None:
+    """Write down, in the time of the description's last change, that a value was of use; once an hour will do."""
+    path = disk.path(key, "json")
+    with suppress(OSError):
+        if abs(time.time() - os.stat(path).st_mtime) > _USED:
+            os.utime(path)
 
 
 def names(disk: Disk) -> Iterator[str]:

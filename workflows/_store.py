@@ -11,45 +11,38 @@ written, a run warns once and goes on.
 from __future__ import annotations
 
 import os
-import random
 import time
 import warnings
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Collection, Iterator
 from contextlib import suppress
+from functools import cached_property
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Literal, get_args
+from typing import TYPE_CHECKING, Any
 
-from neusee.workflows import _sidecar
+from neusee.workflows import _payload, _sidecar, _upkeep
 from neusee.workflows._disk import Disk
+from neusee.workflows._evict import LOW, Room
 from neusee.workflows._journal import Journal
 from neusee.workflows._lease import Lease, Leases
 from neusee.workflows._sidecar import UNREADABLE, About, is_kept
 from neusee.workflows._speeds import Speeds
+from neusee.workflows._upkeep import Checked, Swept
+from neusee.workflows._where import Verify as Verify
+from neusee.workflows._where import budget_bytes, verify_mode
+from neusee.workflows._where import default_root as default_root
 
 if TYPE_CHECKING:
     from torch import Tensor
 
-Verify = Literal["always", "sampled", "never"]
+    from neusee.workflows._blobs import Blobs
+
 INLINE = 4096  #: bytes of tensors up to which a result stands in its JSON
-_SAMPLED = 1 / 20  #: of the loads under ``sampled`` that are verified although the file has not been touched
-_USED = 3600.0  #: s after which a use is written down again
-_draw = random.Random()
-
-
-def default_root() -> Path:
-    """``$NEUSEE_CACHE``, else ``cache/`` of the checkout around us, else ``~/.cache/neusee``."""
-    if named := os.environ.get("NEUSEE_CACHE"):
-        return Path(named)
-    here = Path.cwd()
-    for folder in (here, *here.parents):
-        project = folder / "pyproject.toml"
-        if (folder / "cache").is_dir() and project.is_file() and 'name = "neusee"' in project.read_text("utf-8"):
-            return folder / "cache"
-    return Path.home() / ".cache" / "neusee"
 
 
 class Store:
     """Results by key. Every way in which a folder can fail is a missing result, never a wrong one."""
+
+    bands_apart = True  #: whether the bands of a stack are stored one by one, and shared by the results that have them
 
     def __init__(
         self, root: Path | str | None = None, *, verify: Verify | None = None, budget: int | None = None
@@ -61,16 +54,23 @@ class Store:
         What stands in the JSON is always compared, and the size of every payload.
         """
         self.root = default_root() if root is None else Path(root)
-        self.verify = _verify(verify)
+        self.verify = verify_mode(verify)
+        self.budget = budget_bytes(budget)
         self.disk = Disk(self.root)
         self.journal = Journal(self.disk)
         self.code_memo = self.root / "code.json"
         self._leases = Leases(self.disk)
+        self._room = None if self.budget is None else Room(self.disk, self.budget)
         self._speeds = Speeds(self.disk)
         self._known: dict[str, About] = {}
         self._lost: set[str] = set()  # damaged, and perhaps not to be moved away
         self._used: set[str] = set()
         self._warned = False
+
+    @cached_property
+    def blobs(self) -> Blobs:
+        """The bands of stacks."""
+        return _payload.blobs_of(self.disk)
 
     def has(self, key: str) -> bool:
         """Whether there is a value; its payload is not read."""
@@ -84,7 +84,7 @@ class Store:
         if key in self._lost:
             return None
         try:
-            about = self._read(key)
+            about = _sidecar.read_whole(self.disk, key)
         except UNREADABLE as error:
             if os.path.exists(self.disk.path(key, "json")):
                 self._put_aside(key, error)
@@ -97,7 +97,7 @@ class Store:
         about = self.about(key)
         while about is not None and is_kept(about):
             try:
-                value = self._load(key, about)
+                value = self.load(about, self.verify)
             except UNREADABLE as error:
                 before, about = about, self._again(key)
                 if about == before:
@@ -109,12 +109,41 @@ class Store:
         raise KeyError(key)
 
     def put(self, key: str, value: Any, about: About) -> bool:
-        """Keep a value with what is ``about`` it; False, after one warning, where the folder takes none."""
+        """Keep a value with what is ``about`` it; False, after one warning, where the folder takes none.
+
+        False too, and a receipt instead, for a value that the budget has no room for.
+        """
         return self._try(self._write, key, value, about)
 
     def note(self, key: str, about: About) -> bool:
         """Keep what is ``about`` a result without its value, unless there is a value or such a receipt already."""
         return self._try(self._write_receipt, key, about)
+
+    def pin(self, key: str) -> None:
+        """Keep a value whatever the budget. Raises `OSError` where the folder takes nothing."""
+        _upkeep.pin(self.disk, key)
+
+    def unpin(self, key: str) -> None:
+        """Let a value go again when room is needed."""
+        _upkeep.unpin(self.disk, key)
+
+    def pinned(self) -> set[str]:
+        """The keys that are pinned."""
+        return _upkeep.pinned(self.disk)
+
+    def gc(self, budget: int | None = None, dry: bool = False) -> Swept:
+        """Remove what belongs to no result, and values beyond ``budget`` bytes (None: the store's own, if it has one).
+
+        Values that save the fewest seconds a byte go first and leave their receipts; ``dry``: say what would go.
+        """
+        swept = _upkeep.gc(self, self.budget if budget is None else budget, dry)
+        if not dry:
+            self._forget(swept.evicted)
+        return swept
+
+    def check(self) -> Iterator[Checked]:
+        """Read every value, whatever ``verify`` says; what is damaged is put aside."""
+        return _upkeep.check(self)
 
     def entries(self) -> Iterator[tuple[str, About]]:
         """Every result's key and what is known of it, in the order of the keys; receipts too."""
@@ -139,115 +168,84 @@ class Store:
         """What keeping ``size`` bytes takes, as this store's own writes did."""
         return self._speeds.seconds("write", size)
 
-    def _read(self, key: str) -> About:
-        """What stands beside a result, if its payload has its size."""
-        about = _sidecar.read(self.disk, key)
-        try:
-            stat = about.get("payload") and os.stat(self.disk.path(key, "safetensors"))
-        except FileNotFoundError:
-            again = _sidecar.read(self.disk, key)
-            if is_kept(again):
-                raise
-            return again
-        if stat and stat.st_size != about["payload"]["size"]:
-            raise ValueError(f"its payload has not the {about['payload']['size']} bytes that were written")
-        return about
-
     def _again(self, key: str) -> About | None:
         """What stands beside a result now; None where somebody has removed it."""
         self._known.pop(key, None)
-        with suppress(*UNREADABLE):
-            self._known[key] = _sidecar.read(self.disk, key)
-        return self._known.get(key)
+        try:
+            return _sidecar.read(self.disk, key)
+        except UNREADABLE:
+            return None
 
-    def _load(self, key: str, about: About) -> Any:
-        from neusee.workflows import _codec
-
-        began, path = time.perf_counter(), self.disk.path(key, "safetensors")
-        payload = about["payload"]
-        if not payload:
-            return _codec.unpack(about["layout"], [_codec.from_text(*t) for t in about["tensors"]])
-        stamp = _stamp(path)
-        if stamp[1] != payload["size"]:
-            raise ValueError(f"its payload has not the {payload['size']} bytes that were written")
-        check = self._checks(stamp, payload)
-        value = _codec.unpack(about["layout"], _codec.read(path, payload["xxh3"] if check else None))
-        if check:
-            self._speeds.learn("read", payload["size"], time.perf_counter() - began)
+    def load(self, about: About, verify: str) -> Any:
+        """The value that ``about`` describes; one of `UNREADABLE` where it cannot be trusted."""
+        began = time.perf_counter()
+        value, size = _payload.load(self.disk, about, verify, self.blobs)
+        self._speeds.learn("read", size, time.perf_counter() - began)
         return value
 
-    def _checks(self, stamp: list[int], payload: About) -> bool:
-        """Whether this load compares the checksum."""
-        if self.verify != "sampled":
-            return self.verify == "always"
-        return stamp != payload.get("stamp") or _draw.random() < _SAMPLED
-
     def _use(self, key: str) -> None:
-        """Write down, in the time of the description's last change, that a value was of use."""
         if key not in self._used:
             self._used.add(key)
-            path = self.disk.path(key, "json")
-            with suppress(OSError):
-                if abs(time.time() - os.stat(path).st_mtime) > _USED:
-                    os.utime(path)
+            _sidecar.note_use(self.disk, key)
 
-    def _try(self, write: Callable[..., None], key: str, *what: Any) -> bool:
+    def _try(self, write: Callable[..., bool], key: str, *what: Any) -> bool:
         """Write; once more where what it needs was removed meanwhile."""
         try:
             try:
-                write(key, *what)
+                return write(key, *what)
             except FileNotFoundError:
                 self.disk.forget()
-                write(key, *what)
+                return write(key, *what)
         except OSError as error:
             if not self._warned:
                 warnings.warn(f"{self.root} cannot be written ({error}): results are not kept", stacklevel=4)
             self._warned = True
             return False
-        return True
 
-    def _write(self, key: str, value: Any, about: About) -> None:
+    def _write(self, key: str, value: Any, about: About) -> bool:
         from neusee.workflows import _codec
 
         began = time.perf_counter()
-        layout, tensors = _codec.pack(value)
-        size = sum(t.nbytes for t in tensors)
+        layout, tensors = _codec.pack(value, self.blobs if self.bands_apart else None)
+        apart, inline = _codec.blobs_in(layout), sum(t.nbytes for t in tensors)
+        size = max(inline, about.get("bytes") or 0) if apart else inline
         entry = {"key": key, **about, "layout": layout, "bytes": size, "payload": None, "kept": True}
-        if size <= INLINE:
-            entry["tensors"] = [_codec.to_text(t) for t in tensors]
-            self._write_about(key, entry)
+        if self._room and size > LOW * self._room.budget:
+            self._write_receipt(key, entry)
+            return False
+        if inline <= INLINE:
+            entry["tensors"], tensors = [_codec.to_text(t) for t in tensors], []
+        if tensors or apart:
+            self._write_parts(key, entry, tensors, value if apart else None)
+            self._speeds.learn("write", inline, time.perf_counter() - began)
         else:
-            self._write_payload(key, entry, tensors)
-            self._speeds.learn("write", size, time.perf_counter() - began)
+            self._write_about(key, entry)
         self._lost.discard(key)
         self.journal.append(key, entry)
+        self._make_room(size)
+        return True
 
-    def _write_payload(self, key: str, entry: About, tensors: list[Tensor]) -> None:
-        """Write all of it before it gets a name; of two processes with one key the first one's stays."""
+    def _write_parts(self, key: str, entry: About, tensors: list[Tensor], banded: Any) -> None:
+        """What is large first, then what names it; of two processes with one key the first one's stays."""
         from neusee.workflows import _codec
 
         with self.disk.temporary(key) as (part, file):
-            xxh3 = _codec.write(file, tensors)
-            file.flush()
-            os.fsync(file.fileno())
-            entry["payload"] = {"size": file.tell(), "xxh3": xxh3}
-            self._adopt(key, entry, part)
-
-    def _adopt(self, key: str, entry: About, part: str) -> None:
-        """Name a complete payload and then what describes it, unless another process was first."""
-        path = self.disk.path(key, "safetensors")
-        with self.disk.lock():
-            if key in self._lost or not self._stays(key):
-                self.disk.rename(part, path)
-                entry["payload"]["stamp"] = _stamp(path)
+            if tensors:
+                xxh3 = _codec.write(file, tensors)
+                file.flush()
+                os.fsync(file.fileno())
+                entry["payload"] = {"size": file.tell(), "xxh3": xxh3}
+            with self.disk.lock():
+                if key not in self._lost and _sidecar.has_value(self.disk, key):
+                    return
+                if banded is not None:  # bands of no value yet may have been swept
+                    names = _codec.blobs_in(_codec.pack(banded, self.blobs)[0])
+                    entry["bands"] = {"names": names, "newest": _payload.newest(self.disk, names)}
+                if tensors:
+                    path = self.disk.path(key, "safetensors")
+                    self.disk.rename(part, path)
+                    entry["payload"]["stamp"] = _payload.stamp_of(path)
                 self._write_about(key, entry)
-
-    def _stays(self, key: str) -> bool:
-        """Whether another process has already kept this value."""
-        try:
-            return is_kept(_sidecar.read(self.disk, key))
-        except UNREADABLE:
-            return os.path.exists(self.disk.path(key, "json"))
 
     def _write_about(self, key: str, entry: About) -> None:
         """A torn entry fails its seal, so this small file need not wait for the disk."""
@@ -259,7 +257,7 @@ class Store:
                 self.disk.rename(part, path)
         self._known[key] = entry
 
-    def _write_receipt(self, key: str, about: About) -> None:
+    def _write_receipt(self, key: str, about: About) -> bool:
         """What has the name already stays: it tells no less."""
         entry = _sidecar.receipt({"key": key, **about})
         if self.about(key) is None:
@@ -269,8 +267,24 @@ class Store:
                 if self.disk.link(part, self.disk.path(key, "json")):
                     self._known[key] = entry
         self.journal.append(key, entry)
+        return True
+
+    def _make_room(self, size: int) -> None:
+        """Let values go where ``size`` more bytes are too many."""
+        if self._room and (excess := self._room.excess(size)) > 0:
+            gone = {candidate.key for candidate in _upkeep.make_room(self, excess)[0]}
+            self._forget(gone)
+            self.journal.mark_evicted(gone)
+
+    def _forget(self, keys: Collection[str]) -> None:
+        for key in keys:
+            self._known.pop(key, None)
 
     def _put_aside(self, key: str, error: Exception) -> None:
+        self.put_aside(key, error)
+        warnings.warn(f"the stored result {key} is damaged ({error}): it is put aside", stacklevel=5)
+
+    def put_aside(self, key: str, error: Exception) -> None:
         """Move a damaged entry to ``bad/``, where someone may look at it; what another user owns stays."""
         self._known.pop(key, None)
         self._lost.add(key)
@@ -281,19 +295,3 @@ class Store:
                 os.replace(self.disk.path(key, suffix), f"{self.disk.folder}/bad/{key}.{suffix}")
         if not os.path.lexists(self.disk.path(key, "json")):
             self._lost.discard(key)
-        warnings.warn(f"the stored result {key} is damaged ({error}): it is put aside", stacklevel=4)
-
-
-def _verify(wanted: str | None) -> str:
-    """The mode that was asked for, here or in the environment."""
-    name = "verify" if wanted else "NEUSEE_CACHE_VERIFY"
-    found = wanted or os.environ.get("NEUSEE_CACHE_VERIFY") or "always"
-    if found not in get_args(Verify):
-        raise ValueError(f"{name} is {found!r}: write {', '.join(get_args(Verify)[:-1])} or {get_args(Verify)[-1]}")
-    return found
-
-
-def _stamp(path: str) -> list[int]:
-    """What changes when somebody writes to a file."""
-    stat = os.stat(path)
-    return [stat.st_ino, stat.st_size, stat.st_mtime_ns, stat.st_ctime_ns]
