@@ -40,8 +40,8 @@ class Far:
         self._renames, near = bool(kinds & _RENAMES), bool(kinds & _NEAR)
         self._latency = {"down": 5e-4 if near else 0.05, "up": 5e-4 if near else 0.05}
         self._rate = {"down": 4e8 if near else 5e7, "up": 4e8 if near else 5e7}
-        self._resume = {"down": 0.0, "up": 0.0}
-        self._pause = {"down": _PAUSE, "up": _PAUSE}
+        self._resume: dict[Way, float] = {"down": 0.0, "up": 0.0}
+        self._pause: dict[Way, float] = {"down": _PAUSE, "up": _PAUSE}
         self._warned = False
         self._listed: dict[str, tuple[float, set[str]]] = {}
         self._made: set[str] = set()
@@ -188,8 +188,10 @@ class Far:
         return found
 
     def _failed(self, way: Way, error: Exception) -> None:
-        self._resume[way] = time.monotonic() + self._pause[way]
-        self._pause[way] *= 2
+        alone = isinstance(error, PermissionError | FileNotFoundError)  # what may not be written may yet be read
+        for each in (way,) if alone else ("down", "up"):
+            self._resume[each] = time.monotonic() + self._pause[each]
+            self._pause[each] *= 2
         what = "read" if way == "down" else "written"
         self.warn(f"{self.url} cannot be {what} ({type(error).__name__}: {error}): results are kept here alone")
 

@@ -10,9 +10,12 @@ stays. A remote that fails costs one warning; the run goes on with the local lay
 from __future__ import annotations
 
 import os
+import re
 import warnings
 from collections.abc import Iterator
 from concurrent.futures import ThreadPoolExecutor
+from contextlib import ExitStack
+from itertools import starmap
 from pathlib import Path
 from typing import Any
 
@@ -20,9 +23,12 @@ import xxhash
 
 from neusee.workflows._far import Far
 from neusee.workflows._keys import Key, digest
-from neusee.workflows._payload import stamp_of
+from neusee.workflows._payload import newest, stamp_of
 from neusee.workflows._sidecar import About, is_kept, receipt, seal, unseal
 from neusee.workflows._store import Store, Verify
+
+_NAME = re.compile("[0-9a-f]{32}")
+
 
 def open_store(where: str | Path | None = None) -> Store:
     """The store at a folder or a URL (``s3://bucket/name``); None: ``$NEUSEE_CACHE``, else the usual folder.
@@ -35,11 +41,13 @@ def open_store(where: str | Path | None = None) -> Store:
         return RemoteStore(where)
     return Store(where)
 
+
 def local_layer(url: str) -> Path:
     """``$NEUSEE_CACHE_LOCAL``, else a folder of the URL's own in ``~/.cache/neusee``."""
     if named := os.environ.get("NEUSEE_CACHE_LOCAL"):
         return Path(named)
     return Path.home() / ".cache" / "neusee" / digest(url.rstrip("/"))[:16]
+
 
 class RemoteStore(Store):
     """A `Store` whose misses are looked for at ``url``, and whose results go there too."""
@@ -144,21 +152,47 @@ class RemoteStore(Store):
 
     def _brought(self, key: Key, about: About) -> bool:
         """Whether it came, every byte compared with its checksum."""
-        payload = about["payload"]
-        with self.disk.temporary(key) as (part, file):
-            file.close()
-            if payload and not self._fetched(_payload(key, payload["xxh3"]), part, payload):
+        payload, bands = about["payload"], _bands(about["layout"])
+        missing = {name: xxh3 for name, xxh3 in bands.items() if not self.blobs.has(name)}
+        with ExitStack() as files:
+            part, *parts = (self._part(files, name) for name in (key, *missing))
+            if payload and not self._fetched(_payload_name(key, payload["xxh3"]), part, payload):
                 return False
+            with ThreadPoolExecutor(16) as pool:
+                if not all(pool.map(self._far.fetch, starmap(_band_name, missing.items()), parts)):
+                    return False
             with self.disk.lock():
                 if not self._is_here(key):
-                    if payload:
-                        path = self.disk.path(key, "safetensors")
-                        self.disk.rename(part, path)
-                        about = {**about, "payload": {**payload, "stamp": stamp_of(path)}}
-                    self._write_about(key, about)
-                    self._lost.discard(key)
+                    self._named(dict(zip(missing, parts, strict=True)), bands)
+                    self._described(key, about, part)
         self.journal.append(key, about)
         return True
+
+    def _part(self, files: ExitStack, name: str) -> str:
+        part, file = files.enter_context(self.disk.temporary(name))
+        file.close()
+        return part
+
+    def _named(self, parts: dict[str, str], bands: dict[str, str]) -> None:
+        """Put bands in their places; `ValueError` where one is not what was written, or another has its name."""
+        for name, part in parts.items():
+            self.disk.make_folder(str(self.blobs.root))
+            self.disk.link(part, f"{self.blobs.root}/{name[:2]}/{name}")
+        for name, xxh3 in bands.items():
+            blob = self.blobs.about(name)
+            self.blobs.read([name], (1, *blob.shape), blob.dtype, xxh3=[xxh3])
+
+    def _described(self, key: Key, about: About, part: str) -> None:
+        """Put a payload in its place and its description beside it, with the stamps that files have here."""
+        about = dict(about)
+        if about["payload"]:
+            path = self.disk.path(key, "safetensors")
+            self.disk.rename(part, path)
+            about["payload"] = {**about["payload"], "stamp": stamp_of(path)}
+        if names := about.get("bands", {}).get("names"):
+            about["bands"] = {"names": names, "newest": newest(self.disk, names)}
+        self._write_about(key, about)
+        self._lost.discard(key)
 
     def _fetched(self, name: str, part: str, payload: About) -> bool:
         """Whether ``name`` came; `ValueError` where it is not what was written."""
@@ -175,20 +209,31 @@ class RemoteStore(Store):
         return True
 
     def _send(self, key: Key) -> None:
-        """Payload first, then what names it."""
-        name, broken = f"{key}.json", key in self._broken
-        if not broken and self._far.lists(name):
+        """What is large first, then what names it; nothing where it was evicted in between."""
+        name, over = f"{key}.json", key in self._broken
+        if not over and self._far.lists(name):
             return
         try:
             raw = Path(self.disk.path(key, "json")).read_bytes()
-            payload = unseal(raw)["payload"]
+            about = unseal(raw)
+            files = self._files(key, about)
         except (OSError, ValueError, LookupError):
-            return  # evicted in between
-        path = self.disk.path(key, "safetensors")
-        if payload and not (os.path.exists(path) and self._far.send(path, _payload(key, payload["xxh3"]))):
             return
-        if self._far.write(name, raw, over=broken):
+        with ThreadPoolExecutor(16) as pool:
+            sent = pool.map(lambda to: (not over and self._far.lists(to)) or self._far.send(files[to], to), files)
+            if not all(sent):
+                return
+        if self._far.write(name, raw, over):
             self._broken.discard(key)
+
+    def _files(self, key: Key, about: About) -> dict[str, str]:
+        """By name at the remote the path of each file that a value needs beside its description."""
+        found = {}
+        if payload := about["payload"]:
+            found[_payload_name(key, payload["xxh3"])] = self.disk.path(key, "safetensors")
+        for name, xxh3 in _bands(about["layout"]).items():
+            found[_band_name(name, xxh3)] = f"{self.blobs.root}/{name[:2]}/{name}"
+        return found
 
     def _give_up(self, key: Key) -> None:
         self._seen.pop(key, None)
@@ -198,8 +243,28 @@ class RemoteStore(Store):
         self._give_up(key)
         warnings.warn(f"the result {key} at {self.url} is damaged ({error}): it is not used", stacklevel=4)
 
+
 def _note(key: Key) -> str:
     return f"{key}.note.json"
 
-def _payload(key: Key, xxh3: str) -> str:
+
+def _payload_name(key: Key, xxh3: str) -> str:
     return f"{key}-{xxh3}.safetensors"
+
+
+def _band_name(name: str, xxh3: str) -> str:
+    return f"{name}-{xxh3}.band"
+
+
+def _bands(layout: Any) -> dict[str, str]:
+    """Checksum by name of every band that a layout needs."""
+    found: dict[str, str] = {}
+    todo = [layout]
+    while todo:
+        item = todo.pop()
+        if "stacked" in item:
+            found |= zip(item["stacked"]["names"], item["stacked"]["xxh3"], strict=True)
+        todo += item.get("items", item.get("list", item.get("dict", {}).values()))
+    if bad := [name for name in found if not _NAME.fullmatch(name)]:
+        raise ValueError(f"{bad[0]!r} is no name of a band")
+    return found
