@@ -16,6 +16,7 @@ parameter named ``rng`` is filled in by the engine.
 from __future__ import annotations
 
 import functools
+import importlib
 import inspect
 import math
 from collections.abc import Callable, Mapping, Sequence
@@ -114,6 +115,10 @@ class Node:
     def __repr__(self) -> str:
         return f"<node {self.path}>"
 
+    def __reduce__(self) -> tuple[Any, ...]:
+        """A node travels as its name: the other process has its own code, which it can compare."""
+        return _found, (self.fn.__module__, self.fn.__name__)
+
     @property
     def path(self) -> str:
         """The name a recipe writes: ``sensor.digitize``."""
@@ -164,6 +169,11 @@ class Node:
         """Attach ``(result, *inputs, **parameters) -> checks``, run once after computing."""
         self.after = fn
         return fn
+
+
+def _found(module: str, name: str) -> Node:
+    found: Node = getattr(importlib.import_module(module), name)
+    return found
 
 
 def node(

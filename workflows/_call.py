@@ -28,6 +28,17 @@ class RunError(RuntimeError):
             + (f"\n  given {given}" if given else "")
         )
 
+    def __reduce__(self) -> tuple[Any, ...]:
+        return _remade, (self.step, str(self), repr(self.cause))
+
+
+def _remade(step: str, text: str, cause: str) -> RunError:
+    """The error as another process sees it: its text, without the traceback of the cause."""
+    error = RunError.__new__(RunError, text)
+    RuntimeError.__init__(error, text)
+    error.step, error.cause = step, RuntimeError(cause)
+    return error
+
 
 def call(step: Step, inputs: Sequence[Any], params: Mapping[str, Any], seed: int, device: str) -> Any:
     """The result of a step, laid out as the store would give it back; gradients flow."""
@@ -55,8 +66,31 @@ def examine(step: Step, value: Any, inputs: Sequence[Any]) -> tuple[Check, ...]:
 
 
 def place(step: Step, device: str) -> str:
-    """Where a step runs: on ``device``, unless its node is for the CPU alone."""
-    return "cpu" if step.node.device == "cpu" else device
+    """Where a step runs of a device, or of several that commas separate, were there no other work."""
+    return places(step, device.split(","))[0]
+
+
+def places(step: Step, devices: Sequence[str]) -> tuple[str, ...]:
+    """Devices on which a step may run, the preferred one first.
+
+    A recipe's hint goes before that of the node. A random step stays on one kind of device, because
+    its stream, and so its key, depends on it.
+    """
+    hint = step.device or step.node.device
+    if hint == "cpu":
+        return ("cpu",)
+    fits = [d for d in devices if _fits(d, hint)] or list(devices)
+    return tuple(d for d in fits if not step.node.random or _kind(d) == _kind(fits[0]))
+
+
+def _fits(device: str, hint: str) -> bool:
+    if hint in ("any", ""):
+        return True
+    return _kind(device) != "cpu" if hint == "gpu" else device == hint or _kind(device) == hint
+
+
+def _kind(device: str) -> str:
+    return device.partition(":")[0]
 
 
 def to_device(value: Any, device: str) -> Any:

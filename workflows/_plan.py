@@ -1,112 +1,150 @@
-"""What a run would do, without doing it: hits, bytes and seconds, from what earlier runs left behind."""
+"""What a run would do, without doing it: hits, bytes, seconds, memory and place, from what earlier runs left behind."""
 
 from __future__ import annotations
 
-from collections import defaultdict
-from statistics import median
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
 from typing import Any
 
-from neusee.nodes import Facts
-from neusee.workflows._call import RunError, place
-from neusee.workflows._code import Code
+from neusee.workflows._call import places
+from neusee.workflows._costs import Costs, Estimate
 from neusee.workflows._graph import Recipe
-from neusee.workflows._keys import key_of
+from neusee.workflows._keys import Key
+from neusee.workflows._local import lanes_of
+from neusee.workflows._place import Schedule, TooLarge
+from neusee.workflows._prepare import past_costs, prepare
+from neusee.workflows._resolve import resolve
 from neusee.workflows._store import Store
-from neusee.workflows._verdict import judge
+from neusee.workflows._work import Lane, Work
 from neusee.workflows.report import size_of
 from neusee.workflows.simulate import steps_of, wanted
 
 
-def plan_lines(recipe: Recipe, store: Store, device: str = "cpu") -> list[str]:
-    """One line a step: stored or to be run, what it reads, its bytes and seconds as far as they are known."""
+@dataclass(frozen=True)
+class Plan:
+    """What would become of every step."""
+
+    recipe: Recipe
+    order: list[str]
+    keys: dict[str, Key]
+    left_out: dict[str, bool | None]  #: None where only what feeds a step will tell
+    awake: set[str]  #: steps that would run
+    loaded: dict[str, int]  #: stored steps that these would read, and their bytes
+    expected: Mapping[str, Estimate]  #: by step, of those that would run
+    lanes: Mapping[str, str]  #: by step
+    schedule: Schedule | None
+    refused: str = ""  #: why there is not memory enough
+
+
+def planned(recipe: Recipe, store: Store, lanes: Mapping[str, Lane]) -> Plan:
+    """Look up what a run would compute, read and need; compute nothing."""
     order = steps_of(recipe)
-    keys, left_out = _resolved(recipe, order, store, device)
-    awake, past = _awake(recipe, keys, store), _past(store)
-    rows, seconds, size = [], 0.0, 0.0
+    devices = [lane.device for lane in lanes.values()]
+    resolved = resolve(recipe, order, store, ",".join(devices))
+    keys, left_out = resolved.keys, {name: resolved.left_out(name) for name in order}
+    awake, loaded = _awake(recipe, keys, store)
+    works, seen = [], set[Key]()
     for name in order:
-        step, about = recipe.steps[name], store.about(keys[name])
-        known = about or past.get(name) or past.get(step.node.path) or {}
-        state = "left out" if left_out.get(name) else "stored" if about else "run" if name in awake else "not needed"
-        if state == "run":
-            seconds, size = seconds + known.get("seconds", 0.0), size + known.get("bytes", 0.0)
-        cost = ["", ""] if state == "left out" else _cost(known)
-        rows.append([name, step.node.path, state, *cost, ", ".join(dict.fromkeys(step.sources))])
-    count = sum(row[2] == "run" for row in rows)
-    last = f"{count} of {len(rows)} steps would run: about {seconds:.3g} s, {size_of(size)} new, as earlier runs took"
-    unsure = [name for name, known in left_out.items() if known is None]
-    note = [f"left out or not, only what feeds it will tell: {', '.join(unsure)}"] if unsure else []
-    return [*_columns([["step", "node", "state", "seconds", "bytes", "reads"], *rows]), *note, last]
+        if name in awake and not left_out.get(name) and keys[name] not in seen:
+            seen.add(keys[name])
+            works.append(_work(recipe, name, keys, devices))
+    costs = past_costs(store) if works else Costs([])
+    abouts = {work.key: about for work in works if (about := store.about(work.key))}
+    try:
+        found = prepare(works, costs, abouts, lanes, [keys[name] for name in wanted(recipe)])
+    except TooLarge as error:
+        kinds = sorted({lane.kind for lane in lanes.values()} | {"cpu"})
+        expected = {w.step.name: costs.of(w.step, kinds, abouts.get(w.key)) for w in works}
+        return Plan(recipe, order, keys, left_out, awake, loaded, expected, {}, None, str(error))
+    expected = {w.step.name: found.expected[w.key] for w in found.works}
+    where = {w.step.name: w.lane for w in found.works}
+    return Plan(recipe, order, keys, left_out, awake, loaded, expected, where, found.schedule)
 
 
-def _cost(known: dict[str, Any]) -> list[str]:
-    return [f"{known['seconds']:.3f} s", size_of(known["bytes"])] if known else ["?", "?"]
+def plan_lines(recipe: Recipe, store: Store, device: str = "cpu", memory: int | None = None) -> tuple[list[str], bool]:
+    """One line a step: stored or to be run, where, its seconds, bytes and memory as far as they are known; the sums.
+
+    With it, whether the run would be refused for want of memory.
+    """
+    lanes = lanes_of(device.split(","), memory)
+    plan = planned(recipe, store, lanes)
+    rows = [_row(name, plan, store) for name in plan.order]
+    head = ["step", "node", "state", "where", "seconds", "bytes", "memory", "reads"]
+    return [*_columns([head, *rows]), *_sums(plan, lanes)], bool(plan.refused)
 
 
-def cache_lines(store: Store) -> list[str]:
-    """Every result: when, bytes, seconds, step, recipe, key; the newest last."""
-    found = sorted(store.entries(), key=lambda entry: str(entry[1].get("date", "")))
-    rows = [_entry(key, about) for key, about in found]
-    total = sum(_size(about) for _, about in found)
-    last = f"{len(found)} results, {size_of(total)}, in {store.root}"
-    return [*(_columns([["date", "bytes", "seconds", "step", "recipe", "key"], *rows]) if rows else []), last]
+def simulated_lines(recipe: Recipe, store: Store, machines: Path) -> list[str]:
+    """What the whole recipe would take on the machines of a YAML file, with nothing stored."""
+    from neusee.workflows._machines import read_machines
+    from neusee.workflows._plan_cluster import cluster_lines
+
+    cluster = read_machines(machines)
+    costs, kinds = past_costs(store), sorted({"cpu", *(device.kind for device in cluster.devices)})
+    names = steps_of(recipe)
+    return cluster_lines(recipe, {name: costs.of(recipe.steps[name], kinds) for name in names}, cluster)
 
 
-def _resolved(
-    recipe: Recipe, order: list[str], store: Store, device: str
-) -> tuple[dict[str, str], dict[str, bool | None]]:
-    """The key of every step, and which are left out; None where the facts that decide are not known yet."""
-    keys, left_out, code = dict[str, str](), dict[str, bool | None](), Code(store.code_memo)
-
-    def facts_of(name: str) -> Facts | None:
-        found = (store.about(keys[name]) or {}).get("facts")
-        if found is None:
-            raise LookupError(name)
-        return Facts(**{**found, "shape": tuple(found["shape"])})
-
-    for name in order:
-        step = recipe.steps[name]
-        try:
-            verdict = judge(step, step.params, facts_of, recipe.tolerance) if step.node.bound else None
-        except RunError:
-            verdict, left_out[name] = None, None
-        if verdict and verdict.left_out:
-            keys[name], left_out[name] = keys[verdict.instead], True
-        else:
-            keys[name], _ = key_of(step, keys, recipe.seed, code, place(step, device))
-    code.save()
-    return keys, left_out
+def _row(name: str, plan: Plan, store: Store) -> list[str]:
+    step, about = plan.recipe.steps[name], store.about(plan.keys[name])
+    reads = ", ".join(dict.fromkeys(step.sources))
+    if plan.left_out.get(name):
+        return [name, step.node.path, "left out", "", "", "", "", reads]
+    if name in plan.expected:
+        cost = plan.expected[name]
+        where = plan.lanes.get(name, "?")
+        seconds = cost.seconds.get(where.partition(":")[0], cost.seconds["cpu"])
+        if cost.known:
+            memory = size_of(int(cost.bytes + cost.work))
+            return [name, step.node.path, "run", where, f"{seconds:.3f} s", size_of(int(cost.bytes)), memory, reads]
+        return [name, step.node.path, "run", where, "?", "?", "?", reads]
+    state = "stored" if store.has(plan.keys[name]) else "run" if name in plan.awake else "not needed"
+    known = [f"{about['seconds']:.3f} s", size_of(about["bytes"])] if about else ["", ""]
+    return [name, step.node.path, state, "", *known, "", reads]
 
 
-def _entry(key: str, about: dict[str, Any]) -> list[str]:
-    took, date = f"{about.get('seconds', 0.0):.3f}", about.get("date", "")[:19].replace("T", " ")
-    return [date, size_of(_size(about)), took, about.get("step", ""), about.get("recipe", ""), key[:8]]
+def _sums(plan: Plan, lanes: Mapping[str, Lane]) -> list[str]:
+    """What all of it takes, and what is not known yet."""
+    ran, new = len(plan.expected), sum(e.bytes for e in plan.expected.values())
+    guesses = sum(not e.known for e in plan.expected.values())
+    lines = []
+    if unsure := [name for name, known in plan.left_out.items() if known is None]:
+        lines.append(f"left out or not, only what feeds it will tell: {', '.join(unsure)}")
+    took = f"about {plan.schedule.makespan:.3g} s" if plan.schedule else "no schedule"
+    guessed = f", {guesses} of them never measured" if guesses else ""
+    read = size_of(sum(plan.loaded.values()))
+    lines.append(
+        f"{ran} of {len(plan.order)} steps would run{guessed}: {took}, {size_of(int(new))} new, {read} to load"
+    )
+    if plan.schedule:
+        peaks = {name: plan.schedule.peak.get(name, 0.0) for name in lanes}
+        lines += [
+            f"memory  {name}: {size_of(int(peak))} at most, of {size_of(int(lanes[name].memory))}"
+            for name, peak in peaks.items()
+        ]
+    return [*lines, *([f"refused: {plan.refused}"] if plan.refused else [])]
 
 
-def _size(about: dict[str, Any]) -> int:
-    """Bytes of a result, or of the file that it stands for."""
-    size: int = about.get("file_bytes", about["bytes"])
-    return size
+def _work(recipe: Recipe, name: str, keys: Mapping[str, Key], devices: Sequence[str]) -> Work:
+    step = recipe.steps[name]
+    reads = tuple(tuple(keys[s] for s in ((w,) if isinstance(w, str) else w or ())) for w in step.wires.values())
+    return Work(step, keys[name], {}, reads, recipe.seed, recipe.name, places(step, devices)[0], "")
 
 
-def _awake(recipe: Recipe, keys: dict[str, str], store: Store) -> set[str]:
-    """Steps that a run would have to compute: walking back from what is wanted, stopping at what is stored."""
-    found, todo = set[str](), list(wanted(recipe))
+def _awake(recipe: Recipe, keys: Mapping[str, Key], store: Store) -> tuple[set[str], dict[str, int]]:
+    """Steps that a run would compute, walking back from what is wanted, and what it would read on the way."""
+    found, loaded, todo = set[str](), dict[str, int](), [*wanted(recipe)]
     while todo:
         name = todo.pop()
-        if name not in found and not store.has(keys[name]):
+        if name in found or name in loaded:
+            continue
+        if store.has(keys[name]):
+            about: dict[str, Any] = store.about(keys[name]) or {}
+            loaded[name] = about.get("bytes", 0)
+        else:
             found.add(name)
             todo += recipe.steps[name].sources
-    return found
-
-
-def _past(store: Store) -> dict[str, dict[str, Any]]:
-    """Median seconds and bytes of earlier results, by step and by node."""
-    rows: dict[str, list[dict[str, Any]]] = defaultdict(list)
-    for _, about in store.entries():
-        for name in (about.get("step"), (about.get("origin") or {}).get("node")):
-            if name and "seconds" in about:
-                rows[name].append(about)
-    return {name: {f: median(row[f] for row in all_) for f in ("seconds", "bytes")} for name, all_ in rows.items()}
+    return found, loaded
 
 
 def _columns(rows: list[list[str]]) -> list[str]:

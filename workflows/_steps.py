@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import importlib
 import itertools
+import os
 import pkgutil
 import re
 import sys
@@ -155,12 +156,21 @@ def _is_item_list(block: Value) -> bool:
 def find_node(name: str) -> Node:
     """``sensor.digitize`` -> that node; only its family is imported. `LookupError` with the nearest name if none."""
     family, _, attribute = name.partition(".")
-    if family not in families():
+    if not _is_family(family):
         raise LookupError(f"no family {family}; {_elsewhere(attribute) or nearest(family, families())}")
     nodes = nodes_of(family)
     if attribute not in nodes:
         raise LookupError(f"no node {name}; {_elsewhere(attribute) or _in_family(family, attribute, nodes)}")
     return nodes[attribute]
+
+
+def _is_family(name: str) -> bool:
+    """Whether there is such a family: one look, for to list them all reads folders."""
+    if f"{neusee.nodes.__name__}.{name}" not in sys.modules:
+        folders = neusee.nodes.__path__ if name.isidentifier() else []
+        if not any(os.path.isfile(os.path.join(folder, name, "__init__.py")) for folder in folders):
+            return False
+    return bool(nodes_of(name))
 
 
 def _in_family(family: str, attribute: str, nodes: Mapping[str, Node]) -> str:

@@ -7,17 +7,34 @@ from __future__ import annotations
 
 import gc
 import sys
+from collections.abc import Iterator
+from contextlib import contextmanager
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, NoReturn
+from typing import TYPE_CHECKING, Annotated
 
 import typer
 
+from neusee.workflows._cache_commands import cache
+from neusee.workflows._words import (
+    BAD,
+    DONE,
+    FAILED,
+    MISSED,
+    bytes_of,
+    check_device,
+    fail,
+    load,
+    refuse,
+    say,
+    split,
+    the_store,
+)
+
 if TYPE_CHECKING:
     from neusee.workflows._graph import Recipe
+    from neusee.workflows._store import Store
+    from neusee.workflows._work import Executor
     from neusee.workflows.simulate import Simulation
-
-DONE, FAILED, BAD, MISSED = 0, 1, 2, 3
-DEFAULT = "first_light"
 
 app = typer.Typer(
     name="neusee",
@@ -28,7 +45,6 @@ app = typer.Typer(
     rich_markup_mode=None,
     pretty_exceptions_enable=False,
 )
-cache = typer.Typer(help="What was computed.", no_args_is_help=True, rich_markup_mode=None)
 app.add_typer(cache, name="cache")
 
 Words = Annotated[
@@ -40,7 +56,12 @@ Words = Annotated[
     ),
 ]
 Debug = Annotated[bool, typer.Option("--debug", help="Show where in the code an error arose.")]
-Device = Annotated[str, typer.Option("--device", help="Where to compute: cpu, cuda, cuda:1.")]
+Device = Annotated[str, typer.Option("--device", help="Where to compute: cpu, cuda, or several: cuda:0,cuda:1,cpu.")]
+Where = Annotated[
+    str, typer.Option("--executor", help="Who computes: local, dask, dask:4 (workers), or tcp://scheduler:8786.")
+]
+Memory = Annotated[str, typer.Option("--memory", help="What a device may use, such as 6 GB; more is refused.")]
+Out = Annotated[Path, typer.Option("--out", help="Folder for the run's folder.")]
 
 
 @app.command()
@@ -50,16 +71,23 @@ def run(
     quiet: Annotated[bool, typer.Option("--quiet", help="The report's path alone.")] = False,
     debug: Debug = False,
     device: Device = "cpu",
-    out: Annotated[Path, typer.Option("--out", help="Folder for the run's folder.")] = Path("runs"),
+    executor: Where = "local",
+    memory: Memory = "",
+    out: Out = Path("runs"),
 ) -> None:
     """Run a recipe, from the cache where it can, and write its report."""
     recipe, command = load(words)
     from neusee.workflows import _console as console
 
     check_device(device)
+    room = bytes_of(memory, "--memory") if memory else None
     if not (as_json or quiet):
         say(console.opening(recipe, " ".join(command[1:])))
-    done = _simulate(recipe, command, device, out, as_json or quiet)
+    store = the_store()
+    if room is not None:
+        _refuse_too_large(recipe, store, device, room)
+    with _executor(executor, store) as carries_out:
+        done = _simulate(recipe, store, command, device, out, as_json or quiet, carries_out, room)
     if as_json:
         import json
 
@@ -72,13 +100,47 @@ def run(
         raise typer.Exit(MISSED)
 
 
-def _simulate(recipe: Recipe, command: list[str], device: str, out: Path, silent: bool) -> Simulation:
+def _refuse_too_large(recipe: Recipe, store: Store, device: str, memory: int) -> None:
+    """Stop before anything runs where, as far as earlier runs tell, the memory cannot do."""
+    from neusee.workflows._local import lanes_of
+    from neusee.workflows._plan import planned
+
+    if refused := planned(recipe, store, lanes_of(device.split(","), memory)).refused:
+        fail(f"--memory: {refused}")
+
+
+def _simulate(
+    recipe: Recipe,
+    store: Store,
+    command: list[str],
+    device: str,
+    out: Path,
+    silent: bool,
+    executor: Executor | None,
+    memory: int | None,
+) -> Simulation:
     from neusee.workflows._console import screen
-    from neusee.workflows._store import Store
     from neusee.workflows.simulate import simulate, steps_of
 
     with screen(recipe, steps_of(recipe), silent) as shown:
-        return simulate(recipe, Store(), out, command, device, shown.watch)
+        return simulate(recipe, store, out, command, device, shown.watch, executor, memory)
+
+
+@contextmanager
+def _executor(where: str, store: Store) -> Iterator[Executor | None]:
+    """Who computes: this process (None), or a cluster for as long as the command runs."""
+    if where == "local":
+        yield None
+        return
+    kind, _, count = where.partition(":")
+    if not (kind == "dask" and (not count or count == "here" or count.isdecimal())) and "://" not in where:
+        fail(f"--executor {where}: write local, dask, dask:4, or a scheduler's address such as tcp://host:8786")
+    try:
+        from neusee.workflows._dask import cluster
+    except ModuleNotFoundError as error:
+        fail(f'--executor {where}: {error.name} is not installed: pip install "neusee[distributed]"')
+    with cluster(where, store) as found:
+        yield found
 
 
 @app.command()
@@ -91,13 +153,81 @@ def validate(words: Words = None, debug: Debug = False) -> None:
 
 
 @app.command()
-def plan(words: Words = None, debug: Debug = False, device: Device = "cpu") -> None:
-    """Say what would run, and for how long; compute nothing."""
+def plan(
+    words: Words = None,
+    debug: Debug = False,
+    device: Device = "cpu",
+    memory: Memory = "",
+    devices: Annotated[Path | None, typer.Option("--devices", help="A YAML file of machines to simulate.")] = None,
+) -> None:
+    """Say what would run, where, for how long and with how much memory; compute nothing."""
     recipe, _ = load(words)
-    from neusee.workflows._plan import plan_lines
-    from neusee.workflows._store import Store
+    from neusee.workflows import _plan
 
-    say(plan_lines(recipe, Store(), device))
+    check_device(device)
+    if devices is not None:
+        say(_plan.simulated_lines(recipe, the_store(), devices))
+        return
+    room = bytes_of(memory, "--memory") if memory else None
+    lines, refused = _plan.plan_lines(recipe, the_store(), device, room)
+    say(lines)
+    if refused:
+        raise typer.Exit(FAILED)
+
+
+@app.command()
+def why(
+    step: Annotated[str, typer.Argument(help="A step, such as raw or raw[mask].")],
+    words: Words = None,
+    debug: Debug = False,
+    device: Device = "cpu",
+) -> None:
+    """Say what makes a step other than its nearest earlier result: which value, where, or whose code."""
+    recipe, _ = load(words, before=1)
+    from neusee.workflows._why import why_lines
+
+    try:
+        say(why_lines(recipe, the_store(), step, device))
+    except ValueError as error:
+        fail(str(error))
+
+
+@app.command()
+def sweep(
+    words: Words = None,
+    paired: Annotated[bool, typer.Option("--zip", help="Pair the axes' values instead of combining them.")] = False,
+    on_error: Annotated[str, typer.Option("--on-error", help="stop, or continue with the next point.")] = "stop",
+    netcdf: Annotated[bool, typer.Option("--netcdf", help="Write sweep.nc too (needs neusee[xarray]).")] = False,
+    quiet: Annotated[bool, typer.Option("--quiet", help="The table's path alone.")] = False,
+    debug: Debug = False,
+    device: Device = "cpu",
+    out: Out = Path("runs"),
+) -> None:
+    """Run a recipe over values: a=1,2,3 b='linspace(450 nm, 650 nm, 5)'; run it again to go on."""
+    name, words, first = split(words)
+    if on_error not in ("stop", "continue"):
+        fail(f"--on-error {on_error}: write stop or continue")
+    check_device(device)
+    from neusee.workflows._marks import RecipeError
+    from neusee.workflows.sweep import run_sweep
+
+    try:
+        code = run_sweep(
+            name,
+            words,
+            first=first,
+            zip=paired,
+            on_error=on_error,
+            netcdf=netcdf,
+            device=device,
+            out=out,
+            store=the_store(),
+            quiet=quiet,
+        )
+    except RecipeError as error:
+        refuse(error)
+    if code:
+        raise typer.Exit(code)
 
 
 @app.command()
@@ -155,61 +285,6 @@ def report(
         say([str(rebuild(find_run(folder, out)))])
     except FileNotFoundError as error:
         fail(str(error))
-
-
-@cache.command("ls")
-def cache_ls() -> None:
-    """List what is stored: when it was made, bytes, seconds, the step and the recipe it was made for."""
-    from neusee.workflows._plan import cache_lines
-    from neusee.workflows._store import Store
-
-    say(cache_lines(Store()))
-
-
-def load(words: list[str] | None) -> tuple[Recipe, list[str]]:
-    """The recipe that the words name (`first_light` if none does) with its changes, and the words to run it again."""
-    words = list(words or [])
-    named = bool(words) and not _is_change(words[0])
-    name = words.pop(0) if named else DEFAULT
-    for word in words:
-        if not _is_change(word):
-            fail(f"{word}: not a change of a value: write key=value, +key=value or ~key")
-    from neusee.workflows._marks import RecipeError
-    from neusee.workflows._recipe import load as read
-
-    try:
-        recipe = read(name, words, first=1 + named)
-    except RecipeError as error:
-        count = len(error.problems)
-        fail(f"{error}\n{count} problem{'s' * (count > 1)}, nothing was run")
-    gc.freeze()
-    gc.enable()
-    return recipe, ["neusee", "run", name, *words]
-
-
-def check_device(device: str) -> None:
-    """Refuse a device that is no device, or is not here."""
-    import torch
-
-    try:
-        torch.empty(0, device=device)
-    except (RuntimeError, AssertionError) as error:
-        fail(f"--device {device}: {str(error).partition(chr(10))[0]}")
-
-
-def _is_change(word: str) -> bool:
-    return "=" in word or word.startswith(("~", "+"))
-
-
-def say(lines: list[str]) -> None:
-    """Print lines to stdout."""
-    print(*lines, sep="\n", flush=True)
-
-
-def fail(message: str, code: int = BAD) -> NoReturn:
-    """Say on stderr what is wrong and stop."""
-    print(message, file=sys.stderr)
-    raise typer.Exit(code)
 
 
 def main(arguments: list[str] | None = None) -> None:

@@ -21,6 +21,7 @@ from neusee.workflows._run import Done, Event, Result, run
 from neusee.workflows._shelf import Shelf
 from neusee.workflows._store import Store
 from neusee.workflows._why import explained
+from neusee.workflows._work import Executor
 
 _TIMING = ("step", "node", "device", "state", "seconds", "bytes", "key")
 
@@ -52,11 +53,14 @@ def simulate(
     command: Sequence[str],
     device: str = "cpu",
     watch: Callable[[Event], None] | None = None,
+    executor: Executor | None = None,
+    memory: int | None = None,
 ) -> Simulation:
     """Run ``recipe`` and write ``runs/<date>_<recipe>_<key>/``, complete or not at all."""
     with _noted() as notes:
         told: dict[str, Done] = {}
-        result = run(recipe, store, wanted(recipe), explained(recipe, store, _both(told, watch)), device)
+        tell = explained(recipe, store, _both(told, watch))
+        result = run(recipe, store, wanted(recipe), tell, device, executor, memory)
         result = replace(result, done={name: told.get(name, done) for name, done in result.done.items()})
         with new_run(runs, recipe.name, _run_key(result)) as folder:
             doc = _write(result, folder, command, notes)

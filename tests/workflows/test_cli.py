@@ -190,12 +190,12 @@ def test_without_a_name_the_changes_go_to_first_light(neusee):
 
 
 def test_a_failure_while_running_is_exit_code_one_and_has_no_stack(neusee, monkeypatch):
-    from neusee.workflows import _run
+    from neusee.workflows import _work
 
     def burst(*args, **kwargs):
         raise MemoryError("no room for 31 bands")
 
-    monkeypatch.setattr(_run, "call", burst)
+    monkeypatch.setattr(_work, "call", burst)
     code, _, err = neusee("run", "mine.yaml")
     assert code == 1
     assert "no room for 31 bands" in err

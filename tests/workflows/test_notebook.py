@@ -393,7 +393,7 @@ def test_showing_a_result_computes_nothing_that_took_long(store, monkeypatch):
     result = small().run(store, ["half"])
     known = {"peak/I_sat", "row"}
     assert known <= set(Page(result._repr_html_()).words)
-    monkeypatch.setattr(Store, "has", lambda self, key: False)
+    monkeypatch.setattr(Store, "about", lambda self, key: None)
     slow = {name: replace(done, seconds=60.0) for name, done in result.done.items()}
     CALLS.clear()
     words = Page(replace(result, done=slow)._repr_html_()).words

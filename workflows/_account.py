@@ -1,0 +1,40 @@
+"""What became of each step of a run: whether it ran, why, where, and what it took."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Literal
+
+from neusee.nodes import Check, Facts
+from neusee.workflows._keys import Key
+
+State = Literal["run", "cached", "left out", "asleep"]
+
+
+@dataclass(frozen=True, slots=True)
+class Done:
+    """What became of a step, and why."""
+
+    step: str
+    state: State  #: ``asleep``: nothing that ran needed it
+    why: str
+    seconds: float
+    key: Key
+    facts: Facts | None = None
+    checks: tuple[Check, ...] = ()
+    device: str = "cpu"
+    bytes: int = 0
+    bound: float | None = None  #: what leaving the step out may change at most
+    began: float = 0.0  #: s since the run began
+    lane: str = ""  #: which place of the executor computed it
+    peak: int | None = None  #: bytes of memory beside what was there before it ran
+    predicted: float | None = None  #: s that earlier runs made one expect
+    kept: bool = True  #: whether the store has the value
+
+
+@dataclass(frozen=True, slots=True)
+class Event:
+    """For a live table: ``step`` has started (``done`` is None) or has finished."""
+
+    step: str
+    done: Done | None
