@@ -77,11 +77,13 @@ def _named(store: Store, prefix: str, pin: bool) -> str:
 
 
 def _picture_problem(shelf: Shelf, key: str, about: dict[str, Any]) -> str:
-    """What is wrong with the file that an entry stands for; empty where nothing is."""
+    """What is wrong with the file that an entry stands for, which is then put aside; empty where nothing is."""
     name = about.get("file")
     if not name or not is_kept(about) or shelf.find(key, os.path.basename(name)[len(key) :]) is not None:
         return ""
-    return f"its file {name} is not what was written"
+    problem = f"its file {name} is not what was written"
+    shelf.store.put_aside(key, ValueError(problem))
+    return problem
 
 
 def _row(key: str, about: dict[str, Any], pinned: bool) -> list[str]:

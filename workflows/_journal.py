@@ -8,6 +8,8 @@ from __future__ import annotations
 
 import json
 import os
+import re
+import threading
 from collections import defaultdict
 from collections.abc import Collection, Iterator
 from contextlib import suppress
@@ -20,6 +22,7 @@ Row = dict[str, Any]
 _FIELDS = ("step", "recipe", "seconds", "bytes", "device", "peak", "date")
 _TEXT, _NUMBER = str | None, int | float | None
 _KINDS = {"key": str, "step": _TEXT, "node": _TEXT, "seconds": _NUMBER, "bytes": _NUMBER, "kept": bool}
+_HEAD = re.compile(rb'\{"journal":"[0-9a-f]{16}"\}')
 _encode = json.JSONEncoder(separators=(",", ":")).encode
 _SPARE = 20_000  #: lines that were superseded, from which the file is written anew
 
@@ -34,7 +37,7 @@ class Journal:
     """The lines of one store, the newest last."""
 
     def __init__(self, disk: Disk) -> None:
-        self._disk = disk
+        self._disk, self._guard = disk, threading.RLock()
         self._path = f"{disk.folder}/journal.jsonl"
         self._forget()
 
@@ -44,7 +47,8 @@ class Journal:
             try:
                 self._write(b"\n" + _encode(row_of(key, about)).encode())
             except FileNotFoundError:
-                self._rebuild()
+                with self._guard:
+                    self._rebuild()
 
     def rows(self) -> list[Row]:
         """Every line: key, step, recipe, node, seconds, bytes, device, peak, date, kept. Not to be changed."""
@@ -63,8 +67,9 @@ class Journal:
 
     def mark_evicted(self, keys: Collection[str]) -> None:
         """Say of these that their values are no longer kept."""
-        self._read()
-        self._replace([{**row, "kept": False} if row["key"] in keys else row for row in self._rows])
+        with self._guard:
+            self._read()
+            self._replace([{**row, "kept": False} if row["key"] in keys else row for row in self._rows])
 
     def compact(self) -> None:
         """Write it anew, with one line for each result that there is: the newest, and whether its value is kept."""
@@ -75,7 +80,8 @@ class Journal:
             at, row = known.get(key, (-1, row_of(key, about)))
             found.append((at, {**row, "kept": _sidecar.is_kept(about)}))
         found.sort(key=lambda item: (item[0], str(item[1].get("date"))))
-        self._replace([row for _, row in found])
+        with self._guard:
+            self._replace([row for _, row in found])
 
     def _write(self, line: bytes) -> None:
         file = os.open(self._path, os.O_WRONLY | os.O_APPEND)
@@ -88,10 +94,16 @@ class Journal:
         self._rows: list[Row] = []
         self._by_step: dict[str, list[Row]] = defaultdict(list)
         self._by_node: dict[str, list[Row]] = defaultdict(list)
-        self._head, self._offset = b"", 0
+        self._head, self._offset, self._fileless = b"", 0, False
 
     def _read(self) -> None:
-        """Take in what has been added since the last time."""
+        with self._guard:
+            self._take_in()
+
+    def _take_in(self) -> None:
+        """What has been added since the last time; where no file could be made, what was found then."""
+        if self._fileless:
+            return None
         try:
             with open(self._path, "rb") as file:
                 head = file.readline(100).strip()
@@ -103,7 +115,7 @@ class Journal:
             return self._rebuild()
         except OSError:
             return None
-        if not head.startswith(b'{"journal":"'):
+        if not _HEAD.fullmatch(head):
             return self._rebuild()
         self._head, self._offset = head, (self._offset or len(head)) + len(raw)
         for row in _parsed(raw):
@@ -129,12 +141,15 @@ class Journal:
         self._head = f'{{"journal":"{os.urandom(8).hex()}"}}'.encode()
         raw = b"".join([self._head, *(b"\n" + _encode(row).encode() for row in rows)])
         self._offset = len(raw)
-        if rows:
-            with suppress(OSError), self._disk.temporary("journal") as (part, file):
-                file.write(raw)
-                file.flush()
-                self._disk.share(part)
-                os.replace(part, self._path)
+        try:
+            if rows:
+                with self._disk.temporary("journal") as (part, file):
+                    file.write(raw)
+                    file.flush()
+                    self._disk.share(part)
+                    os.replace(part, self._path)
+        except OSError:
+            self._fileless = True
 
 
 def _parsed(raw: bytes) -> Iterator[Row]:

@@ -42,8 +42,6 @@ INLINE = 4096  #: bytes of tensors up to which a result stands in its JSON
 class Store:
     """Results by key. Every way in which a folder can fail is a missing result, never a wrong one."""
 
-    bands_apart = True  #: whether the bands of a stack are stored one by one, and shared by the results that have them
-
     def __init__(
         self, root: Path | str | None = None, *, verify: Verify | None = None, budget: int | None = None
     ) -> None:
@@ -206,7 +204,7 @@ class Store:
         from neusee.workflows import _codec
 
         began = time.perf_counter()
-        layout, tensors = _codec.pack(value, self.blobs if self.bands_apart else None)
+        layout, tensors = _codec.pack(value, self.blobs)
         apart, inline = _codec.blobs_in(layout), sum(t.nbytes for t in tensors)
         size = max(inline, about.get("bytes") or 0) if apart else inline
         entry = {"key": key, **about, "layout": layout, "bytes": size, "payload": None, "kept": True}

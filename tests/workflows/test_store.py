@@ -5,7 +5,10 @@ import json
 import os
 import subprocess
 import sys
+import tempfile
 import time
+import warnings
+from contextlib import suppress
 from pathlib import Path
 
 import pytest
@@ -16,10 +19,11 @@ from hypothesis import strategies as st
 from safetensors.torch import load_file
 
 from neusee.nodes.values import Bands, Pupil
-from neusee.workflows import _codec
+from neusee.workflows import _blobs, _codec, _payload, _sidecar
 from neusee.workflows._store import INLINE, Store, default_root
 
 KEY = "ab" + "0" * 30
+SUM = xxhash.xxh3_128_hexdigest
 BIG = torch.arange(5000, dtype=torch.float32)
 DTYPES = [*_codec._DTYPES, torch.complex64, torch.complex128]
 
@@ -338,6 +342,239 @@ def test_many_killed_writers_leave_no_wrong_entry(tmp_path):
     for i in range(17):
         killed_writers(tmp_path, 3, [0.01 + 0.003 * i, 0.01 * (i % 3), 0.007 * (i % 5)])
         assert check_kept(tmp_path) > 0
+
+
+# receipts
+
+
+def test_a_receipt_is_all_that_is_known_and_no_value(tmp_path):
+    store = Store(tmp_path)
+    assert store.note(KEY, {"step": "s", "seconds": 2.0, "bytes": 10**9, "facts": {"max": 1}})
+    for found in (store, Store(tmp_path)):
+        about = found.about(KEY)
+        assert about == {"key": KEY, "step": "s", "seconds": 2.0, "bytes": 10**9, "facts": {"max": 1}, "kept": False}
+        assert not found.has(KEY)
+        assert dict(found.entries()) == {KEY: about}
+        with pytest.raises(KeyError):
+            found.get(KEY)
+    assert not (tmp_path / "bad").exists()
+
+
+@pytest.mark.parametrize("value", [BIG, BIG[:10]], ids=["large", "small"])
+def test_a_value_takes_the_place_of_a_receipt_and_never_the_reverse(tmp_path, value):
+    reader = Store(tmp_path)
+    Store(tmp_path).note(KEY, {"step": "note"})
+    assert not reader.has(KEY)
+    assert Store(tmp_path).put(KEY, value, {"step": "value"})
+    assert reader.has(KEY)
+    same(reader.get(KEY), value)
+    for store in (reader, Store(tmp_path)):
+        assert store.note(KEY, {"step": "late"})
+        assert store.about(KEY)["step"] == "value"
+        assert store.about(KEY)["kept"] is True
+    same(Store(tmp_path).get(KEY), value)
+
+
+def test_a_note_that_loses_the_race_leaves_the_value(tmp_path, monkeypatch):
+    late = Store(tmp_path)
+    monkeypatch.setattr(late, "about", lambda key: Store(tmp_path).put(key, BIG, {}) and None)
+    assert late.note(KEY, {"step": "late"})
+    same(Store(tmp_path).get(KEY), BIG)
+
+
+def test_entries_from_before_there_were_receipts_are_values(tmp_path):
+    keep(tmp_path, BIG)
+    about = _sidecar.unseal(sidecar(tmp_path).read_bytes())
+    del about["kept"], about["payload"]["stamp"]
+    sidecar(tmp_path).write_bytes(_sidecar.seal(about))
+    assert Store(tmp_path).has(KEY)
+    for verify in ("always", "sampled", "never"):
+        same(Store(tmp_path, verify=verify).get(KEY), BIG)
+
+
+def test_a_damaged_receipt_is_put_aside(tmp_path):
+    Store(tmp_path).note(KEY, {"step": "s"})
+    flip(sidecar(tmp_path), 0.5)
+    with pytest.warns(UserWarning, match="is damaged"):
+        assert Store(tmp_path).about(KEY) is None
+    assert Store(tmp_path).note(KEY, {"step": "s"})
+    assert Store(tmp_path).about(KEY)["step"] == "s"
+
+
+# how far a payload is trusted
+
+
+def test_the_word_for_how_far_to_trust_is_checked(tmp_path, monkeypatch):
+    assert Store(tmp_path).verify == "always"
+    monkeypatch.setenv("NEUSEE_CACHE_VERIFY", "never")
+    assert Store(tmp_path).verify == "never"
+    assert Store(tmp_path, verify="sampled").verify == "sampled"
+    with pytest.raises(ValueError, match="verify is 'often': write always, sampled or never"):
+        Store(tmp_path, verify="often")
+    monkeypatch.setenv("NEUSEE_CACHE_VERIFY", "Always")
+    with pytest.raises(ValueError, match="NEUSEE_CACHE_VERIFY is 'Always': write always, sampled or never"):
+        Store(tmp_path)
+
+
+def quietly_flipped(root):
+    """A bit that changes without the file being touched, as a disk may do it; the file's stamp is put back."""
+    stamp, path = payload(root).stat(), payload(root)
+    flip(path, 0.9)
+    about = _sidecar.unseal(sidecar(root).read_bytes())
+    os.utime(path, ns=(stamp.st_atime_ns, stamp.st_mtime_ns))
+    about["payload"]["stamp"] = _payload.stamp_of(str(path))
+    sidecar(root).write_bytes(_sidecar.seal(about))
+
+
+def test_sampled_finds_what_was_written_to_at_once(tmp_path, monkeypatch):
+    monkeypatch.setattr(_payload._draw, "random", lambda: 0.999)
+    keep(tmp_path, BIG)
+    same(Store(tmp_path, verify="sampled").get(KEY), BIG)
+    flip(payload(tmp_path), 0.9)
+    with pytest.warns(UserWarning, match="is damaged"), pytest.raises(KeyError):
+        Store(tmp_path, verify="sampled").get(KEY)
+
+
+def test_sampled_finds_what_changed_by_itself_one_time_in_twenty(tmp_path, monkeypatch):
+    keep(tmp_path, BIG)
+    quietly_flipped(tmp_path)
+    draws = [(i + 0.5) / 100 for i in reversed(range(100))]
+    monkeypatch.setattr(_payload._draw, "random", lambda: draws.pop(0))
+    for _ in range(95):
+        assert not torch.equal(Store(tmp_path, verify="sampled").get(KEY), BIG)
+    with pytest.warns(UserWarning, match="is damaged"), pytest.raises(KeyError):
+        Store(tmp_path, verify="sampled").get(KEY)
+
+
+def test_never_reads_no_checksum_of_a_payload(tmp_path, monkeypatch):
+    keep(tmp_path, BIG)
+    monkeypatch.setattr(
+        xxhash, "xxh3_128_hexdigest", lambda data: pytest.fail("it did") if len(data) > 9999 else SUM(data)
+    )
+    same(Store(tmp_path, verify="never").get(KEY), BIG)
+
+
+@pytest.mark.parametrize("damage", [name for name in DAMAGES if "payload flipped" not in name])
+def test_never_still_looks_at_sizes_and_descriptions(tmp_path, damage):
+    keep(tmp_path, BIG)
+    DAMAGES[damage](tmp_path)
+    with pytest.warns(UserWarning, match="is damaged"), pytest.raises(KeyError):
+        Store(tmp_path, verify="never").get(KEY)
+
+
+def test_never_looks_at_the_size_when_it_loads(tmp_path):
+    store = Store(tmp_path, verify="never")
+    store.put(KEY, BIG, {})
+    assert store.has(KEY)
+    cut(payload(tmp_path))
+    with pytest.warns(UserWarning, match="is damaged"), pytest.raises(KeyError):
+        store.get(KEY)
+
+
+def test_bands_apart_are_trusted_in_the_same_way(tmp_path, monkeypatch):
+    stack = _blobs.Stacked(torch.rand(3, 2000), ("a" * 32, "b" * 32, "c" * 32))
+    Store(tmp_path).put(KEY, stack, {"bytes": 24000})
+    assert Store(tmp_path).about(KEY)["bytes"] == 24000
+    monkeypatch.setattr(_payload._draw, "random", lambda: 0.999)
+    for verify in ("always", "sampled", "never"):
+        same(Store(tmp_path, verify=verify).get(KEY), stack.tensor)
+    band = tmp_path / "bands" / "bb" / ("b" * 32)
+    flip(band, 0.3)
+    assert not torch.equal(Store(tmp_path, verify="never").get(KEY), stack.tensor)
+    with pytest.warns(UserWarning, match="is damaged"), pytest.raises(KeyError):
+        Store(tmp_path, verify="sampled").get(KEY)
+    assert Store(tmp_path).put(KEY, stack, {"bytes": 24000})
+    same(Store(tmp_path).get(KEY), stack.tensor)
+
+
+# speeds
+
+
+def test_speeds_are_learnt_from_large_transfers_and_remembered(tmp_path):
+    store = Store(tmp_path)
+    assert store.write_seconds(4e8) == pytest.approx(1.0002)
+    assert store.read_seconds(8e9) == pytest.approx(1.00005)
+    for _ in range(40):
+        store._speeds.learn("write", 10**8, 1.0)
+        store._speeds.learn("read", 10**5, 1000.0)
+    for found in (store, Store(tmp_path)):
+        assert found.write_seconds(1e8) == pytest.approx(1.0, rel=0.3)
+        assert found.read_seconds(8e9) == pytest.approx(1.00005)
+
+
+def test_own_transfers_are_learnt_from(tmp_path):
+    store, x = Store(tmp_path), torch.zeros(300_000)
+    store.put(KEY, x, {})
+    wrote = store.write_seconds(1e9)
+    assert wrote != Store(tmp_path / "other").write_seconds(1e9)
+    Store(tmp_path, verify="never").get(KEY)
+    before = store.read_seconds(1e9)
+    store.get(KEY)
+    assert store.read_seconds(1e9) != before
+
+
+@pytest.mark.parametrize("text", ["", "{}", "null", '{"read": "fast", "write": 1}', '{"read": NaN, "write": 0}'])
+def test_speeds_that_make_no_sense_are_forgotten(tmp_path, text):
+    (tmp_path / "speeds.json").write_text(text)
+    assert Store(tmp_path).read_seconds(8e9) == pytest.approx(1.00005)
+    store = Store(tmp_path)
+    store._speeds.learn("read", 10**9, 100.0)
+    assert Store(tmp_path).read_seconds(8e9) == store.read_seconds(8e9) > 1.1
+
+
+# several users
+
+
+@pytest.mark.parametrize("mode", [0o775, 0o2775, 0o777, 0o755])
+def test_who_may_write_in_the_root_may_write_below_it(tmp_path, mode):
+    root = tmp_path / "shared"
+    root.mkdir()
+    root.chmod(mode)
+    before = os.umask(0o022)
+    try:
+        store = Store(root)
+        store.put(KEY, BIG, {})
+        store.note("cd" + "0" * 30, {})
+        store.pin(KEY)
+        store.claim(KEY).release()
+        store.gc()
+    finally:
+        os.umask(before)
+    for path in root.rglob("*"):
+        found = path.stat().st_mode & 0o777
+        if path.is_dir():
+            assert found == mode & 0o777, path
+        elif path.name in ("journal.jsonl", ".lock", "speeds.json"):
+            assert found == mode & 0o666, path
+        else:
+            assert found == 0o644, path
+
+
+def test_another_user_goes_on_where_the_first_one_stopped(tmp_path_factory):
+    if os.geteuid() != 0:
+        pytest.skip("only root can become somebody else")
+    with tempfile.TemporaryDirectory() as folder:
+        root = Path(folder)
+        root.chmod(0o777)
+        Store(root).put(KEY, BIG, {"seconds": 1.0})
+        Store(root).note("cd" + "0" * 30, {})
+        child = os.fork()
+        if child == 0:
+            failed = True
+            with suppress(BaseException):
+                os.setuid(65534)
+                warnings.simplefilter("error")
+                store = Store(root)
+                same(store.get(KEY), BIG)
+                assert store.put("ab" + "1" * 30, BIG, {})
+                assert store.put("cd" + "0" * 30, BIG, {})
+                assert len(store.journal.rows()) == 4
+                assert set(store.gc(budget=0).evicted) == {KEY, "ab" + "1" * 30, "cd" + "0" * 30}
+                failed = False
+            os._exit(failed)
+        assert os.waitpid(child, 0)[1] == 0
+        assert not Store(root).has(KEY)
+        assert Store(root).put(KEY, BIG, {})
 
 
 def test_the_store_stands_where_one_expects_it(tmp_path, monkeypatch):
