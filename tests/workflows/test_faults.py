@@ -352,10 +352,7 @@ def test_another_user_reads_what_it_may_not_write(server):
 
 # crowds
 
-LEASES = pytest.mark.xfail(strict=True, reason="a run does not claim the keys that it computes")
 
-
-@LEASES
 def test_of_four_processes_one_computes_and_all_have_its_value(ward):
     crowd = [ward.server.start(**ward.whose(pause=0.3)) for _ in range(4)]
     found = [child.result() for child in crowd]
@@ -365,7 +362,6 @@ def test_of_four_processes_one_computes_and_all_have_its_value(ward):
     assert all(each["warnings"] == [] for each in found)
 
 
-@LEASES
 def test_four_processes_share_a_row_of_steps(ward):
     crowd = [ward.server.start(**ward.job(pause=0.05)) for _ in range(4)]
     for child in crowd:
@@ -476,7 +472,6 @@ def test_a_wrong_clock_does_no_harm(ward, name):
     assert ward.run(level=1.0, first=clock(name)) == ([], Counter())
 
 
-@LEASES
 @pytest.mark.parametrize("name", CLOCKS)
 def test_processes_whose_clocks_differ_get_on_with_each_other(ward, name):
     """Who is ten years ahead holds nobody for dead, and sweeps away nothing that is being written."""
