@@ -198,14 +198,15 @@ class _Stack:
 
     def add(self, which: list[int], x: Tensor) -> None:
         """Take the bands ``which``."""
-        for i, part in zip(which, x.unbind(self.axis), strict=True):
-            if self.axis % x.dim() == 0 and self._written(i, part):
-                continue
-            if self.held is None:
-                axis = self.axis % x.dim()
-                self.held = x.new_empty(*x.shape[:axis], len(self.names), *x.shape[axis + 1 :])
-            self.held.select(self.axis, i).copy_(part)
-            self.inside.add(i)
+        axis = self.axis % x.dim()
+        slices = x.unbind(axis)
+        if axis == 0 and self._written(which, slices):
+            return
+        if self.held is None:
+            self.held = x.new_empty(*x.shape[:axis], len(self.names), *x.shape[axis + 1 :])
+        for i, part in zip(which, slices, strict=True):
+            self.held.select(axis, i).copy_(part)
+        self.inside.update(which)
 
     def whole(self) -> Tensor | Stacked:
         """All bands; raises `Damaged`."""
@@ -219,9 +220,9 @@ class _Stack:
             part.copy_(self.blobs.read([self.names[i]], (1, *part.shape), part.dtype)[0])
         return self.held
 
-    def _written(self, i: int, part: Tensor) -> bool:
+    def _written(self, which: list[int], slices: Sequence[Tensor]) -> bool:
         try:
-            self.blobs.write(self.names[i], part)
+            self.blobs.write_all([self.names[i] for i in which], slices)
         except OSError:
             return False
         return True

@@ -14,6 +14,7 @@ import os
 import sys
 import weakref
 from collections.abc import Iterator, Sequence
+from concurrent.futures import ThreadPoolExecutor
 from contextlib import suppress
 from dataclasses import dataclass
 from math import prod
@@ -27,6 +28,7 @@ from torch import Tensor
 from neusee.workflows._disk import Disk
 
 _SMALL = 4096  #: bytes up to which a blob need not wait for the disk: a torn one fails its checksum
+_WRITERS = 8
 _FIXED = 0x10  #: MAP_FIXED of Linux and macOS
 _LIBC = ctypes.CDLL(None, use_errno=True) if sys.platform in ("linux", "darwin") else None
 _UNREADABLE = (FileNotFoundError, ValueError, LookupError, TypeError, AttributeError)
@@ -96,6 +98,11 @@ class Blobs:
             if len(data) > _SMALL:
                 os.fsync(file.fileno())
             return self._named(name, part) or xxh3
+
+    def write_all(self, names: Sequence[str], slices: Sequence[Tensor]) -> list[str]:
+        """Write several at a time: a disk syncs many files in little more time than one."""
+        with ThreadPoolExecutor(_WRITERS) as pool:
+            return list(pool.map(self.write, names, slices))
 
     def _named(self, name: str, part: str) -> str | None:
         """Give a complete blob its name; the xxh3 of another that had it first."""

@@ -122,7 +122,7 @@ def _layout(item: Any, listed: _Listed, blobs: Blobs | None) -> dict[str, Any]:
 
 
 def _stack_layout(item: Stacked, blobs: Blobs) -> dict[str, Any]:
-    written = [blobs.write(name, part) for name, part in zip(item.names, item.tensor.unbind(), strict=True)]
+    written = blobs.write_all(item.names, item.tensor.unbind())
     kind = str(item.tensor.dtype).removeprefix("torch.")
     return {"stacked": {"names": item.names, "xxh3": written, "dtype": kind, "shape": list(item.tensor.shape)}}
 
