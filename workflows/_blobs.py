@@ -13,7 +13,7 @@ import mmap
 import os
 import sys
 import weakref
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import suppress
 from dataclasses import dataclass
@@ -140,18 +140,6 @@ class Blobs:
         x = torch.empty(*shape, dtype=dtype)
         self._fill(names, wanted, bytes_of(x), None, verify)
         return x
-
-    def names(self) -> Iterator[tuple[str, int, float]]:
-        """Every blob: name, bytes on disk and time of its last change."""
-        for path in self.root.glob("[0-9a-f][0-9a-f]/*"):
-            with suppress(OSError):
-                stat = path.stat()
-                yield path.name, stat.st_size, stat.st_mtime
-
-    def remove(self, name: str) -> None:
-        """Forget a blob; tensors that are mapped over it keep their bytes."""
-        with suppress(FileNotFoundError):
-            os.unlink(self._path(name))
 
     def _fill(
         self, names: Sequence[str], wanted: Sequence[Blob], into: memoryview, address: int | None, verify: bool

@@ -9,7 +9,7 @@ from neusee.nodes import Node
 from neusee.nodes.optics import image, psf
 from neusee.nodes.spectra import illuminate
 from neusee.nodes.values import Psf, Pupil
-from neusee.workflows import RunError, _bands, _codec, load
+from neusee.workflows import RunError, Store, _bands, _codec, load
 from neusee.workflows._bands import call_by_band, plain_of
 from neusee.workflows._blobs import Blobs, Stacked
 from neusee.workflows._call import call
@@ -232,7 +232,7 @@ def test_a_single_band_is_computed_whole(blobs):
 
 
 CAMERA = """
-outputs: [image]
+outputs: [psf, image]
 filters: {centres: [450 nm, 500 nm, 550 nm, 600 nm, 650 nm], widths: [20 nm, 20 nm, 10 nm, 20 nm, 20 nm]}
 steps:
   bands: {node: spectra.filters, with: {centres: "${filters.centres}", widths: "${filters.widths}"}}
@@ -269,3 +269,28 @@ def test_one_filter_of_five_that_moves_costs_one_fifth(write, blobs):
     expected = walk(load(path, (moved,)), Blobs(blobs.root.parent / "other"))[0]
     assert torch.equal(values["image"], expected["image"])
     assert walk(load(path), blobs)[1] == {"radiance": 0, "psf": 0, "image": 0}
+
+
+def test_a_run_shares_the_bands_that_stayed(write, tmp_path):
+    path = write(CAMERA)
+    store, moved = Store(tmp_path / "cache"), "filters.centres=[450 nm, 500 nm, 552 nm, 600 nm, 650 nm]"
+    first, found = load(path).run(store), load(path, (moved,)).run(store)
+    expected = load(path, (moved,)).run(Store(tmp_path / "other"))
+    for name, written in (("psf", 2), ("image", 1)):
+        assert found.done[name].state == "run"
+        before, after = (set(_codec.blobs_in(store.about(run.keys[name])["layout"])) for run in (first, found))
+        assert len(after) == 5 * written
+        assert len(after - before) == written
+        assert same(found.values[name], expected.values[name])
+        assert same(Store(store.root).get(found.keys[name]), expected.values[name])
+
+
+def test_a_damaged_band_of_a_stored_result_is_mended(write, tmp_path):
+    recipe, root = load(write(CAMERA)), tmp_path / "cache"
+    first = recipe.run(Store(root))
+    for path in sorted(files(Store(root).blobs))[::4]:
+        damage(path) if path.stat().st_size > 200 else path.unlink()
+    with pytest.warns(UserWarning, match="put aside"):
+        again = recipe.run(Store(root))
+    assert all(same(again.values[name], first.values[name]) for name in first.values)
+    assert all(done.state == "cached" for done in recipe.run(Store(root)).done.values() if done.state != "asleep")
