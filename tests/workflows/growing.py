@@ -1,0 +1,73 @@
+"""Many runs in one process, and what it holds afterwards: started by ``test_growth`` as a program of its own."""
+
+from __future__ import annotations
+
+import atexit
+import gc
+import json
+import logging
+import os
+import sys
+import threading
+import tracemalloc
+import warnings
+from pathlib import Path
+
+import torch
+
+from neusee.workflows import Store, load, run
+from neusee.workflows.simulate import simulate
+
+
+def several(path: Path, folder: Path, count: int) -> None:
+    """Run a recipe ``count`` times: new values and known ones, on a store that fills and on empty ones."""
+    for i in range(count):
+        waves = 1 + i / 100 if i % 2 else 2
+        recipe = load(path, [f"mask.waves={waves}"]) if i % 3 else load(path, mask={"waves": waves})
+        store = Store(folder / (f"empty {i}" if i % 10 == 0 else "kept"))
+        if i % 10 == 0:
+            simulate(recipe, store, folder / "runs", ["neusee", "run"])
+        elif i % 10 == 5:
+            recipe.run(store)._repr_html_()
+            recipe._repr_html_()
+        elif i % 2:
+            recipe.run(store)
+        else:
+            run(recipe, store, ["made"])
+
+
+def held() -> dict[str, int]:
+    """Everything that a run might leave behind."""
+    gc.collect()
+    loggers = [logging.root, *(x for x in logging.root.manager.loggerDict.values() if isinstance(x, logging.Logger))]
+    figure = getattr(sys.modules.get("matplotlib.figure"), "Figure", ())  # pyplot, which would count them, is not used
+    return {
+        "bytes": tracemalloc.get_traced_memory()[0],
+        "resident": int(Path("/proc/self/statm").read_text().split()[1]) * os.sysconf("SC_PAGE_SIZE"),
+        "files": len(os.listdir("/proc/self/fd")),
+        "maps": len(Path("/proc/self/maps").read_text().splitlines()),
+        "threads": threading.active_count(),
+        "handlers": sum(len(logger.handlers) for logger in loggers),
+        "loggers": len(loggers),
+        "filters": len(warnings.filters),
+        "at exit": atexit._ncallbacks(),
+        "figures": sum(issubclass(type(x), figure) for x in gc.get_objects()),
+        "tensors": sum(issubclass(type(x), torch.Tensor) for x in gc.get_objects()),
+        "modules": len(sys.modules),
+        "temporary": len(list(Path(os.environ["TMPDIR"]).iterdir())),
+    }
+
+
+def grown(path: Path, folder: Path, warm: int, count: int) -> dict[str, list[int]]:
+    """What is held after ``warm`` runs, and after ``count`` more."""
+    tracemalloc.start()
+    several(path, folder / "warm", warm)
+    before = held()
+    several(path, folder / "then", count)
+    after = held()
+    return {name: [before[name], after[name]] for name in before}
+
+
+if __name__ == "__main__":
+    recipe, folder, warm, count = sys.argv[1:]
+    print(json.dumps(grown(Path(recipe), Path(folder), int(warm), int(count))))
