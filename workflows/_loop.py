@@ -43,6 +43,9 @@ class Loop:
         """Each outcome as it comes, until all work is done; the caller raises where one is an error."""
         while self._open:
             self._hand_out()
+            if not self.busy and not self._held:
+                ready = self._chains[self._ready[-1]][0] if self._ready else None
+                raise RuntimeError(f"no lane takes {ready.step.name if ready else 'what is left'}: they are gone")
             for outcome in self.executor.wait(self._patience()):
                 self._settle(outcome)
                 if not outcome.held:
@@ -68,12 +71,13 @@ class Loop:
                 self.executor.submit(chain)
 
     def _first_for(self, lane: str, device: str) -> int | None:
-        """Where in the ready list the next chain for ``lane`` stands: its own, or one whose own lane is busy."""
+        """Where in the ready list the next chain for ``lane`` stands: its own, or one whose lane is busy or gone."""
         running = [work for chain in self.busy.values() for work in chain]
+        there = self.executor.lanes
         for place in range(len(self._ready) - 1, -1, -1):
             chain = self._chains[self._ready[place]]
             own = chain[0].lane
-            moved = own in self.busy and _kind(chain[0].device) == _kind(device)
+            moved = (own in self.busy or own not in there) and _kind(chain[0].device) == _kind(device)
             if (own == lane or moved) and (not running or self.room(chain[0], running)):
                 return place
         return None

@@ -121,3 +121,15 @@ def test_ten_thousand_steps_need_no_recursion():
     works = [work("0")] + [work(str(i), str(i - 1)) for i in range(1, 10_000)]
     assert len(ran(works, Fake({"a": "cpu"}))) == 10_000
     assert len(chains_of(works, True)) == 1
+
+
+def test_work_of_a_lane_that_is_gone_goes_to_another_of_its_kind():
+    works = [work("a", lane="dead"), work("b", "a", lane="dead")]
+    executor = Fake({"a": "cpu"})
+    assert ran(works, executor) == ["a", "b"]
+    assert {lane for lane, _ in executor.given} == {"a"}
+
+
+def test_work_that_no_lane_can_take_is_an_error_and_no_wait_for_ever():
+    with pytest.raises(RuntimeError, match="no lane takes a"):
+        ran([work("a", lane="dead")], Fake({"g": "cuda:0"}))
