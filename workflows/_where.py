@@ -12,8 +12,13 @@ Verify = Literal["always", "sampled", "never"]
 
 
 def default_root() -> Path:
-    """``$NEUSEE_CACHE``, else ``cache/`` of the checkout around us, else ``~/.cache/neusee``."""
+    """``$NEUSEE_CACHE``, else ``cache/`` of the checkout around us, else ``~/.cache/neusee``.
+
+    Raises `ValueError` where a URL is named.
+    """
     if named := os.environ.get("NEUSEE_CACHE"):
+        if "://" in named:
+            raise ValueError(f"NEUSEE_CACHE is {named!r}, which is no folder: `open_store` takes URLs too")
         return Path(named)
     here = Path.cwd()
     for folder in (here, *here.parents):

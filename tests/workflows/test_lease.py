@@ -20,6 +20,8 @@ from neusee.workflows._store import Store
 KEY = "ab" + "0" * 30
 FAR = "0123456789ab-77-1234"  #: a process of another machine
 
+FORKS = pytest.mark.filterwarnings("ignore:.*multi-threaded.*fork:DeprecationWarning")  # the child uses no other thread
+
 HOLDER = """
 import sys, time
 from pathlib import Path
@@ -117,7 +119,7 @@ def test_a_live_holder_elsewhere_is_waited_for_and_a_killed_one_taken_over(tmp_p
 def test_a_stopped_holder_is_taken_over_and_may_go_on(tmp_path, holder):
     process, store = holder(), Store(tmp_path)
     process.send_signal(signal.SIGSTOP)
-    while me() and Owner(_owner.host(), process.pid, _owner._process(process.pid)[1]).state == "alive":
+    while Owner(_owner.host(), process.pid, _owner._process(process.pid)[1]).state == "alive":
         time.sleep(0.001)
     with store.claim(KEY):
         process.send_signal(signal.SIGCONT)
@@ -249,6 +251,7 @@ def test_heartbeats_are_seen_while_a_lease_is_held_and_end_after_it(tmp_path, mo
         assert Store(tmp_path).claim(KEY) is None
 
 
+@FORKS
 def test_a_forked_child_holds_nothing(tmp_path):
     store = Store(tmp_path)
     with store.claim(KEY) as lease:
@@ -260,6 +263,7 @@ def test_a_forked_child_holds_nothing(tmp_path):
         assert Store(tmp_path).claim(KEY) is None
 
 
+@FORKS
 def test_a_child_may_have_leases_of_its_own(tmp_path):
     store, other = Store(tmp_path), "cd" + "0" * 30
     with store.claim(KEY):

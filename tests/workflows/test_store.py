@@ -144,6 +144,44 @@ def test_entries_are_listed_without_reading_them(tmp_path, monkeypatch):
     assert all(about["bytes"] == BIG.nbytes and about["seconds"] == 1.5 for about in found.values())
 
 
+ACTS = ["put", "note", "get", "has", "gc", "evict", "pin", "unpin", "new", "claim", "check", "forget the journal"]
+
+
+@given(st.lists(st.tuples(st.sampled_from(ACTS), st.integers(0, 3), st.integers(0, 1)), max_size=40))
+def test_whatever_two_users_do_no_value_is_wrong(tmp_path_factory, acts):
+    """No act but an eviction loses a value, none serves another's, and none is taken for damage."""
+    root, there = tmp_path_factory.mktemp("store"), set()
+    users = [Store(root), Store(root)]
+    for act, i, user in acts:
+        store, key = users[user], f"{i:02x}" + "7" * 30
+        value = torch.full((10 if i % 2 else 3000,), float(i))
+        if act == "put":
+            assert store.put(key, value, {"step": f"s{i}", "seconds": float(i)})
+            there.add(key)
+        elif act == "note":
+            assert store.note(key, {"step": f"s{i}", "seconds": float(i)})
+        elif act == "get" and key in there:
+            same(store.get(key), value)
+        elif act == "gc":
+            assert store.gc().evicted == ()
+        elif act == "evict":
+            there -= set(store.gc(budget=5000).evicted)
+        elif act == "pin":
+            store.pin(key)
+        elif act == "unpin":
+            store.unpin(key)
+        elif act == "new":
+            users[user] = Store(root)
+        elif act == "claim":
+            store.claim(key).release()
+        elif act == "check":
+            assert {found.key for found in store.check() if found.about.get("kept")} == there
+        elif act == "forget the journal":
+            (root / "journal.jsonl").unlink(missing_ok=True)
+        assert Store(root).has(key) == (key in there)
+        assert {row["key"] for row in store.journal.rows()} == {key for key, _ in Store(root).entries()}
+
+
 def payload(root: Path) -> Path:
     return root / "ab" / f"{KEY}.safetensors"
 
@@ -550,6 +588,7 @@ def test_who_may_write_in_the_root_may_write_below_it(tmp_path, mode):
             assert found == 0o644, path
 
 
+@pytest.mark.filterwarnings("ignore:.*multi-threaded.*fork:DeprecationWarning")
 def test_another_user_goes_on_where_the_first_one_stopped(tmp_path_factory):
     if os.geteuid() != 0:
         pytest.skip("only root can become somebody else")
@@ -590,6 +629,12 @@ def test_the_store_stands_where_one_expects_it(tmp_path, monkeypatch):
     assert default_root() == tmp_path / "work" / "cache"
     monkeypatch.setenv("NEUSEE_CACHE", str(tmp_path / "named"))
     assert default_root() == tmp_path / "named"
+
+
+def test_a_url_is_no_folder(monkeypatch):
+    monkeypatch.setenv("NEUSEE_CACHE", "s3://bucket/name")
+    with pytest.raises(ValueError, match="'s3://bucket/name', which is no folder: `open_store` takes URLs"):
+        Store()
 
 
 def test_a_description_is_json_that_says_what_it_is(tmp_path):
