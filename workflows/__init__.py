@@ -18,7 +18,9 @@ if TYPE_CHECKING:
     from neusee.workflows._marks import Problem, RecipeError
     from neusee.workflows._recipe import load, recipes
     from neusee.workflows._run import Done, Event, Result, run
+    from neusee.workflows._schedule import Schedule
     from neusee.workflows._store import Store
+    from neusee.workflows._work import Executor
 
 _HOME = {
     "RunError": "_call",
@@ -33,17 +35,21 @@ _HOME = {
     "Event": "_run",
     "Result": "_run",
     "run": "_run",
+    "Schedule": "_schedule",
     "Store": "_store",
+    "Executor": "_work",
 }
 
 __all__ = [
     "Done",
     "Event",
+    "Executor",
     "Problem",
     "Recipe",
     "RecipeError",
     "Result",
     "RunError",
+    "Schedule",
     "Step",
     "Store",
     "as_function",

@@ -11,7 +11,7 @@ from neusee.workflows._config import Config, Setting
 from neusee.workflows._marks import Mark
 
 if TYPE_CHECKING:
-    from neusee.workflows import Event, Result, Store
+    from neusee.workflows import Event, Executor, Result, Store
 
 __all__ = ["Config", "Expectation", "Recipe", "Setting", "Step", "Wire", "in_order", "needed"]
 
@@ -73,11 +73,13 @@ class Recipe:
         outputs: Iterable[str] | None = None,
         watch: Callable[[Event], None] | None = None,
         device: str = "cpu",
+        executor: Executor | None = None,
+        memory: int | None = None,
     ) -> Result:
         """Run it; see `neusee.workflows.run`. Several threads may do so at once, on one store."""
         from neusee.workflows import run
 
-        return run(self, store, outputs, watch, device)
+        return run(self, store, outputs, watch, device, executor, memory)
 
     def __repr__(self) -> str:
         return f"<recipe {self.name}: {len(self.steps)} steps -> {', '.join(self.outputs)}>"

@@ -43,8 +43,7 @@ def document(
     steps = [_step(d, result) for d in done]
     failed = [f"{s['step']}: {c['text']}" for s in steps for c in s["checks"] if not c["ok"]]
     counts = Counter[str](d.state for d in done)
-    planned = getattr(result, "schedule", None)
-    time = timing(steps, planned.makespan if planned else None)
+    time = timing(steps, _planned(result))
     return {
         "recipe": recipe.name,
         "title": recipe.title,
@@ -144,6 +143,15 @@ def _step(done: Done, result: Result) -> dict[str, Any]:
         "bound": done.bound,
         "checks": [{"text": c.text, "ok": c.ok} for c in done.checks],
     }
+
+
+def _planned(result: Result) -> float | None:
+    """How long the plan was, where it was made of known costs and held every step that ran."""
+    ran = [done for done in result.done.values() if done.state == "run"]
+    if result.schedule is None or any(done.predicted is None for done in ran):
+        return None
+    placed = {slot.task for slot in result.schedule.slots}
+    return result.schedule.makespan if all(done.step in placed for done in ran) else None
 
 
 def _remembered(done: Done, about: Mapping[str, Any]) -> Done:

@@ -300,6 +300,24 @@ def test_the_page_says_what_the_cache_saved(done, tmp_path):
     assert "The cache served 2 steps and saved" in again.page.read_text()
 
 
+def test_the_plan_is_compared_where_all_that_ran_was_known(tmp_path):
+    from dataclasses import replace
+
+    from neusee.workflows._schedule import Schedule, Slot
+
+    result = recipe().run(Store(tmp_path / "cache"))
+    slots = (Slot("number", "cpu", 0.0, 1.0), Slot("truth", "cpu", 1.0, 3.0))
+    known = {name: replace(done, predicted=1.5) for name, done in result.done.items()}
+
+    def planned(done, slots):
+        told = replace(result, done=done, schedule=Schedule(slots, 3.0, {"cpu": 0.0}, 0.0))
+        return report.document(told, [], [], {})["timing"]["planned"]
+
+    assert planned(known, slots) == 3.0
+    assert planned(known, slots[:1]) is None
+    assert planned({**known, "truth": replace(known["truth"], predicted=None)}, slots) is None
+
+
 def test_a_page_of_before_there_was_an_account_of_time_is_still_written(done):
     path = done.folder / "provenance.json"
     doc = json.loads(path.read_text())
