@@ -19,6 +19,22 @@ _SCALE = 1 << 30  #: capacities are whole numbers of 31 bits
 Price = Callable[[Key], float]
 
 
+class Below(dict[Key, list[Key]]):
+    """By key the keys that it needs: its sources where it must be computed, none where its value is known."""
+
+    def __init__(self, known: Callable[[Key], bool], sources: Callable[[Key], list[Key]]) -> None:
+        self._known, self._sources = known, sources
+        self.missing = set[Key]()
+
+    def __missing__(self, key: Key) -> list[Key]:
+        if self._known(key):
+            self[key] = []
+        else:
+            self.missing.add(key)
+            self[key] = self._sources(key)
+        return self[key]
+
+
 def worth_a_look(load: float, compute: float) -> bool:
     """Whether a stored value may be cheaper to compute than to load."""
     return load > compute + _GAIN

@@ -7,11 +7,14 @@ from dataclasses import dataclass, replace
 from typing import Any
 
 from neusee.workflows._call import places
+from neusee.workflows._codec import tensors_in
 from neusee.workflows._costs import Costs, Estimate
 from neusee.workflows._keys import Key
+from neusee.workflows._loop import Room
+from neusee.workflows._memory import pool_of
 from neusee.workflows._place import Cluster, Device, Schedule, Slot, Task, heft
 from neusee.workflows._store import Store
-from neusee.workflows._work import Lane, Work
+from neusee.workflows._work import Executor, Lane, Work
 
 _MOST_PARTS = 64  #: into which a step may be cut by bands; how many bands there are is known only when it runs
 
@@ -47,6 +50,21 @@ def prepare(
     schedule = heft(tasks, cluster, [names[key] for key in keep if key in names])
     slots = sorted(schedule.slots, key=lambda slot: (slot.start, slot.end))
     return Prepared([_placed(planned[slot.task], slot, lanes) for slot in slots], expected, schedule)
+
+
+def room_for(expected: Mapping[Key, Estimate], executor: Executor, values: Mapping[Key, Any]) -> Room:
+    """Whether one more step may run beside those that do, given the ``values`` that are held at that moment."""
+
+    def room(work: Work, running: Sequence[Work]) -> bool:
+        pool = pool_of(work.device)
+        beside = [w for w in running if pool_of(w.device) == pool]
+        if not beside or not executor.shares:
+            return True
+        held = sum(t.nbytes for t in tensors_in(list(values.values())) if pool_of(str(t.device)) == pool)
+        need = sum(expected[w.key].bytes + expected[w.key].work for w in (work, *beside))
+        return held + need <= sum(lane.memory for lane in executor.lanes.values() if pool_of(lane.device) == pool)
+
+    return room
 
 
 def _placed(work: Work, slot: Slot, lanes: Mapping[str, Lane]) -> Work:

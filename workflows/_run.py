@@ -16,6 +16,7 @@ from neusee.workflows._graph import Recipe, needed
 from neusee.workflows._keys import Key
 from neusee.workflows._marks import nearest
 from neusee.workflows._place import Schedule
+from neusee.workflows._remote import open_store
 from neusee.workflows._store import Store
 from neusee.workflows._under_way import UnderWay
 from neusee.workflows._work import Executor
@@ -89,7 +90,7 @@ def run(
         if name not in recipe.steps:
             raise ValueError(f"no step {name!r}; {nearest(name, recipe.steps)}")
     work = UnderWay(
-        recipe, store or Store(), device.split(","), watch or (lambda event: None), wanted, executor, memory
+        recipe, store or open_store(), device.split(","), watch or (lambda event: None), wanted, executor, memory
     )
     order = needed(recipe, wanted)
     try:

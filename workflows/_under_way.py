@@ -8,24 +8,22 @@ from __future__ import annotations
 
 import time
 from collections import Counter
-from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator
 from dataclasses import replace
 from typing import Any
 
 from neusee.nodes import Check, Facts
 from neusee.workflows._account import Done, Event
 from neusee.workflows._call import RunError, places
-from neusee.workflows._choose import to_compute_again, worth_a_look
+from neusee.workflows._choose import Below, to_compute_again, worth_a_look
 from neusee.workflows._code import Code
-from neusee.workflows._codec import tensors_in
 from neusee.workflows._costs import Costs, Estimate
 from neusee.workflows._graph import Recipe, Step, Wire, in_order
 from neusee.workflows._keys import Key, key_of
 from neusee.workflows._local import Local
-from neusee.workflows._loop import Loop, Room, chains_of
-from neusee.workflows._memory import pool_of
+from neusee.workflows._loop import Loop, chains_of
 from neusee.workflows._place import Schedule, TooLarge
-from neusee.workflows._prepare import past_costs, prepare
+from neusee.workflows._prepare import past_costs, prepare, room_for
 from neusee.workflows._store import Store
 from neusee.workflows._verdict import Verdict, judge
 from neusee.workflows._work import Executor, Lost, Outcome, Read, Work
@@ -85,10 +83,10 @@ class UnderWay:
     def make(self, targets: list[Key], keep: bool) -> None:
         """Hold the values of ``targets``; with ``keep``, also what cannot be read from the store again."""
         while True:
-            below = _Below(self, frozenset())
+            below = Below(self.known, self.sources)
             order = in_order(below, targets)
             if again := self._dear(below, targets):
-                below = _Below(self, again)
+                below = Below(lambda key, again=again: key not in again and self.known(key), self.sources)  # type: ignore[misc]
                 order = in_order(below, targets)
             try:
                 return self._execute([key for key in order if key in below.missing], again, targets, keep)
@@ -127,7 +125,7 @@ class UnderWay:
         self.receipts[key] = about
         return False
 
-    def _dear(self, below: _Below, targets: list[Key]) -> frozenset[Key]:
+    def _dear(self, below: Below, targets: list[Key]) -> frozenset[Key]:
         """Stored values that take longer to read than to compute again, as far as that is the cheaper way."""
 
         def compute(key: Key) -> float:
@@ -180,7 +178,7 @@ class UnderWay:
         chains = chains_of(prepared.works, fused=not self.executor.shares)
         if not self.executor.shares:  # what another chain reads must lie in the store
             chains = [(*chain[:-1], replace(chain[-1], wanted=True)) for chain in chains]
-        room = self._room(prepared.expected)
+        room = room_for(prepared.expected, self.executor, self.values)
         try:
             for outcome in Loop(chains, self.executor, self._begin, room).outcomes():
                 self._note(outcome, prepared.expected[outcome.work.key])
@@ -205,20 +203,6 @@ class UnderWay:
         self.watch(Event(work.step.name, None))
         below = sum(self.again[key] if key in self.again else self._reading(key) for key in set(work.sources))
         return replace(work, below=below)
-
-    def _room(self, expected: Mapping[Key, Estimate]) -> Room:
-        """Whether one more step may run beside those that do."""
-
-        def room(work: Work, running: Sequence[Work]) -> bool:
-            pool = pool_of(work.device)
-            beside = [w for w in running if pool_of(w.device) == pool]
-            if not beside or not self.executor.shares:
-                return True
-            held = sum(t.nbytes for t in tensors_in(list(self.values.values())) if pool_of(str(t.device)) == pool)
-            need = sum(expected[w.key].bytes + expected[w.key].work for w in (work, *beside))
-            return held + need <= sum(x.memory for x in self.executor.lanes.values() if pool_of(x.device) == pool)
-
-        return room
 
     def _note(self, outcome: Outcome, expected: Estimate) -> None:
         """Take in what became of a step."""
@@ -305,18 +289,3 @@ class UnderWay:
     def _finish(self, done: Done) -> None:
         self.done[done.step] = done
         self.watch(Event(done.step, done))
-
-
-class _Below(dict[Key, list[Key]]):
-    """By key the keys that it needs: its sources where it must be computed, none where its value is known."""
-
-    def __init__(self, work: UnderWay, again: frozenset[Key]) -> None:
-        self.work, self.again, self.missing = work, again, set[Key]()
-
-    def __missing__(self, key: Key) -> list[Key]:
-        if key not in self.again and self.work.known(key):
-            self[key] = []
-        else:
-            self.missing.add(key)
-            self[key] = self.work.sources(key)
-        return self[key]

@@ -68,7 +68,6 @@ class Outcome:
     bytes: int = 0
     peak: int | None = None  #: bytes beside what was there before
     kept: bool = False  #: whether the store has the value
-    known: bool = True  #: whether the store has at least what is known of it
     held: bool = False  #: another process is at it
     found: bool = False  #: another process was quicker, and its result is there
     error: BaseException | None = None
@@ -165,9 +164,9 @@ def _kept(outcome: Outcome, store: Store) -> Outcome:
     about = _about(outcome)
     try:
         if pays(outcome, store):
-            outcome.kept = outcome.known = store.put(work.key, outcome.value, about)
+            outcome.kept = store.put(work.key, outcome.value, about)
         else:
-            outcome.known = store.note(work.key, about)
+            store.note(work.key, about)
     except TypeError as error:
         raise RunError(work.step, [], error) from error
     outcome.value = plain_of(outcome.value)

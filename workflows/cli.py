@@ -217,7 +217,7 @@ def sweep(
             words,
             first=first,
             zip=paired,
-            on_error=on_error,
+            on_error="continue" if on_error == "continue" else "stop",
             netcdf=netcdf,
             device=device,
             out=out,

@@ -24,6 +24,7 @@ from neusee.workflows._console import aligned
 from neusee.workflows._files import new_run
 from neusee.workflows._keys import digest
 from neusee.workflows._points import Argument, Axis, points, read_axes, read_words
+from neusee.workflows._remote import open_store
 from neusee.workflows._store import Store
 from neusee.workflows._sweep_files import dataset, require_xarray, write_account, write_table
 from neusee.workflows._sweep_order import Sharing, sharing
@@ -100,7 +101,7 @@ def sweep(
     """
     place = Path(folder or ".").absolute()
     arguments = [*read_words(overrides, place), *read_axes(axes, place)]
-    work = _Sweeping(os.fspath(recipe), arguments, place, store or Store(), zip, device)
+    work = _Sweeping(os.fspath(recipe), arguments, place, store or open_store(), zip, device)
     found = list(outcomes(work.plan, work.store, on_error, device))
     return work.sweep(found, "complete")
 
@@ -126,7 +127,7 @@ def run_sweep(
     if netcdf:
         require_xarray("--netcdf")
     began, place = time.perf_counter(), Path().absolute()
-    work = _Sweeping(recipe, read_words(words, place, first), place, store or Store(), zip, device)
+    work = _Sweeping(recipe, read_words(words, place, first), place, store or open_store(), zip, device)
     again = _again(recipe, words, zip, on_error, netcdf, device, out)
     if not quiet:
         print(*work.opening(), sep="\n", flush=True)
