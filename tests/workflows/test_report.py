@@ -325,3 +325,17 @@ def test_a_page_of_before_there_was_an_account_of_time_is_still_written(done):
     doc["steps"] = [{k: v for k, v in s.items() if k != "predicted"} for s in doc["steps"]]
     path.write_text(json.dumps(doc))
     assert "Time" in report.rebuild(done.folder).read_text()
+
+
+def test_the_page_shows_what_each_step_was_expected_to_take(done):
+    text = done.page.read_text()
+    assert text.count(" expected</span>") == sum(s["predicted"] is not None for s in done.document["steps"])
+    doc = dict(done.document)
+    doc["steps"] = [{**s, "predicted": 1.25} for s in doc["steps"]]
+    assert report.page(doc, {}).count("1.250 expected</span>") == 2
+
+
+def test_every_row_of_the_page_has_a_cell_for_each_column(done):
+    for body in re.findall(r"<table.*?</table>", done.page.read_text(), re.DOTALL):
+        counts = [len(re.findall(r"<t[hd][ >]", row)) for row in re.findall(r"<tr>.*?</tr>", body, re.DOTALL)]
+        assert len(set(counts)) <= 1, body[:200]
