@@ -25,20 +25,26 @@ __all__ = ["BUS", "Cluster", "Device", "Link", "Move", "Schedule", "Slot", "Task
 def heft(tasks: Sequence[Task], cluster: Cluster, keep: Collection[str] = ()) -> Schedule:
     """Place the task with the longest way to the end first, each where it ends first.
 
-    ``keep`` names the results that are held to the end. If memory is short, an order that holds less
-    at once comes next, and then one device alone.
+    ``keep`` names the results that are held to the end. Where memory is short, orders that hold less at
+    once are tried too. What one device could do alone, and be done sooner, it does alone; and what one
+    could run alone is never refused.
 
     Raises: `TooLarge` where no such plan fits, with what the one that comes closest needs; ValueError
     for tasks that no device runs, or that make no graph.
     """
     graph = Graph(tasks, cluster, keep)
     if len(cluster.devices) == 1:
-        return _alone(graph)
+        return _alone(graph, _able(graph))
     orders = [ranked(graph, upward(graph)), graph.by(range(len(graph.tasks))), frugal(graph)]
     try:
-        return _best(graph, orders)
+        schedule = _best(graph, orders)
     except TooLarge as error:
-        return _alone(graph, error)
+        return _alone(graph, _able(graph), error)  # which tells what one device alone would need, if that is less
+    sooner = {d: took for d in _able(graph) if (took := sum(row[d] for row in graph.seconds)) < schedule.makespan}
+    try:
+        return _alone(graph, sorted(sooner, key=sooner.__getitem__)) if sooner else schedule
+    except TooLarge:
+        return schedule
 
 
 def cpop(tasks: Sequence[Task], cluster: Cluster, keep: Collection[str] = ()) -> Schedule:
@@ -120,11 +126,16 @@ def _critical(graph: Graph, through: Sequence[float]) -> list[int]:
 # --- one device -----------------------------------------------------------------------------------------------------
 
 
-def _alone(graph: Graph, *refused: TooLarge) -> Schedule:
-    """One after another on a device that runs everything, as given or holding little at once: the first that fits."""
+def _able(graph: Graph) -> list[int]:
+    """Devices that can run everything, those with most memory first."""
     devices = graph.cluster.devices
     able = [d for d in range(len(devices)) if all(d in a for a in graph.able)]
-    for d in sorted(able, key=lambda d: -devices[d].memory):
+    return sorted(able, key=lambda d: -devices[d].memory)
+
+
+def _alone(graph: Graph, devices: Sequence[int], *refused: TooLarge) -> Schedule:
+    """One after another on one device, as given or holding little at once: the first that fits."""
+    for d in devices:
         for order in (graph.by(range(len(graph.tasks))), frugal(graph)):
             try:
                 return _sequence(graph, d, order)

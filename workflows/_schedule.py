@@ -145,11 +145,17 @@ class TooLarge(ValueError):
         self.task, self.device, self.needed, self.memory = task, device, needed, memory
         how = f" in {parts} parts" if parts > 1 else ""
         super().__init__(
-            f"{task} does not fit: with its inputs and what must stay there it needs {needed:,.0f} B on {device}{how}, "
-            f"which has {memory:,.0f} B"
+            f"{task} does not fit: with its inputs and what must stay there it needs {_size(needed)} on {device}{how}, "
+            f"which has {_size(memory)}"
         )
 
     @property
     def short(self) -> float:
         """Bytes that are missing."""
         return self.needed - self.memory
+
+
+def _size(count: float) -> str:
+    """Bytes to the last one, and as people read them."""
+    exact = f"{count:,.0f} B"
+    return exact if count < 1e6 else f"{exact} ({count / 1e9:.3g} GB)"
