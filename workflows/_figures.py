@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import importlib
 from collections.abc import Callable, Iterable, Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -14,13 +14,19 @@ from neusee.workflows._code import Code
 from neusee.workflows._keys import digest
 from neusee.workflows._needs import Found, Missing, find
 from neusee.workflows._roles import FIGURES
-from neusee.workflows._run import Result, run
+from neusee.workflows._run import Done, Result, run
+from neusee.workflows._schedule import Schedule, Slot
 from neusee.workflows._shelf import Shelf
 
 GRAPH = (
     "graph",
     "The graph",
     "Each box is a step; items of one step share a box. What reads stands below what it reads.",
+)
+TIMELINE = (
+    "timeline",
+    "Planned and done",
+    "When each step ran, and where. Hollow bars: the plan, of what earlier runs took; a step that never ran has none.",
 )
 
 
@@ -50,6 +56,33 @@ def pictures(result: Result, shelf: Shelf) -> tuple[dict[str, Path], dict[str, s
     code.save()
     made = finished(jobs, result, shelf, missing)
     return {**made, "graph": _graph(result, shelf, drawing)}, missing
+
+
+def timeline(result: Result) -> bytes | None:
+    """When each step ran beside the plan, or None where none did. It differs each time, and so it is not kept."""
+    ran = [done for done in result.done.values() if done.state == "run"]
+    if not ran:
+        return None
+    first = min(done.began for done in ran)
+    rows = [(done.step, done.lane or done.device, done.began - first, done.seconds) for done in ran]
+    known = [done for done in ran if done.predicted is not None]
+    plan = result.schedule or Schedule((), 0.0, {}, 0.0)
+    slots = {slot.task: slot for slot in plan.slots}
+    whole = all(done.step in slots for done in known)
+    planned = tuple(slots[done.step] for done in known) if whole else _in_turn(known)
+    return _function("_timeline:timeline")(schedule=replace(plan, slots=planned), rows=rows)
+
+
+def _in_turn(known: Iterable[Done]) -> tuple[Slot, ...]:
+    """What several plans placed, as one: on each lane one after another, as they ran."""
+    end: dict[str, Slot] = {}
+    slots = []
+    for done in sorted(known, key=lambda done: done.began):
+        lane, before = done.lane or done.device, end.get(done.lane or done.device)
+        start = before.end if before else 0.0
+        slots.append(Slot(done.step, lane, start, start + (done.predicted or 0.0), after=before.task if before else ""))
+        end[lane] = slots[-1]
+    return tuple(slots)
 
 
 def needs(wanted: Mapping[str, str], result: Result, code: Code) -> dict[str, Found]:

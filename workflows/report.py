@@ -67,7 +67,7 @@ def document(
         "absent": [{"step": step, "where": where} for step, where in recipe.absent.items()],
         "timing": {**time, "said": said_of(time)},
         "steps": steps,
-        "figures": _figures(missing),
+        "figures": _figures(missing, bool(time["ran"])),
         "missing": [{"name": n, "title": _title(n), "why": why} for n, why in missing.items()],
         "facts": _facts(result),
         "inputs": _inputs(recipe),
@@ -189,11 +189,11 @@ def _readings(recipe: Recipe) -> list[dict[str, str]]:
     return rows
 
 
-def _figures(missing: Mapping[str, str]) -> list[dict[str, str]]:
-    from neusee.workflows._figures import GRAPH
+def _figures(missing: Mapping[str, str], ran: bool) -> list[dict[str, str]]:
+    from neusee.workflows._figures import GRAPH, TIMELINE
 
-    drawn = [(f.name, f.title, f.caption) for f in FIGURES if f.name not in missing]
-    return [{"name": n, "title": t, "caption": c, "file": f"figures/{n}.png"} for n, t, c in [*drawn, GRAPH]]
+    drawn = [(f.name, f.title, f.caption) for f in FIGURES if f.name not in missing] + [GRAPH] + [TIMELINE] * ran
+    return [{"name": n, "title": t, "caption": c, "file": f"figures/{n}.png"} for n, t, c in drawn]
 
 
 def _title(name: str) -> str:

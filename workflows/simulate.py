@@ -12,7 +12,7 @@ from typing import Any
 
 from neusee.workflows import report
 from neusee.workflows._exports import exports
-from neusee.workflows._figures import pictures
+from neusee.workflows._figures import pictures, timeline
 from neusee.workflows._files import RunFolder, new_run
 from neusee.workflows._graph import Recipe, needed
 from neusee.workflows._keys import digest
@@ -23,7 +23,7 @@ from neusee.workflows._store import Store
 from neusee.workflows._why import explained
 from neusee.workflows._work import Executor
 
-_TIMING = ("step", "node", "device", "state", "seconds", "bytes", "key")
+_TIMING = ("step", "node", "device", "lane", "state", "began", "seconds", "predicted", "peak", "bytes", "key")
 
 
 @dataclass(frozen=True)
@@ -95,15 +95,19 @@ def _write(result: Result, folder: RunFolder, command: Sequence[str], notes: Ite
     doc = report.document(result, command, notes, missing)
     doc["files"] = sorted(files)
     doc["missing"] += [{"name": n, "title": f"data/{n}", "why": why} for n, why in without.items()]
+    shown = {name: path.read_bytes() for name, path in drawn.items()}
     for name, path in drawn.items():
         folder.take(f"figures/{name}.png", path)
+    if bars := timeline(result):
+        folder.write("figures/timeline.png", bars)
+        shown["timeline"] = bars
     for name, path in files.items():
         folder.take(f"data/{name}", path)
     folder.write("recipe.yaml", recipe_text(result.recipe))
     folder.write_rows("metrics.csv", ("step", "field", "index", "value"), doc["metrics"])
     folder.write_rows("timing.csv", _TIMING, [[s[column] for column in _TIMING] for s in doc["steps"]])
     folder.write("provenance.json", json.dumps(doc, indent=1, ensure_ascii=False, allow_nan=True))
-    folder.write("report.html", report.page(doc, {name: path.read_bytes() for name, path in drawn.items()}))
+    folder.write("report.html", report.page(doc, shown))
     return doc
 
 

@@ -5,16 +5,18 @@ from __future__ import annotations
 import csv
 import json
 import re
+from dataclasses import replace
 from html.parser import HTMLParser
 
 import pytest
 import torch
 
 from neusee.nodes import Check, node
-from neusee.workflows import _files, _numbers, _timing, report
+from neusee.workflows import _figures, _files, _numbers, _timeline, _timing, report
 from neusee.workflows._files import find_run, new_run
 from neusee.workflows._graph import Expectation, Recipe, Step
 from neusee.workflows._marks import Mark
+from neusee.workflows._schedule import Schedule, Slot
 from neusee.workflows._store import Store
 from neusee.workflows.simulate import simulate
 
@@ -173,7 +175,7 @@ def test_text_stands_out_from_its_ground(done):
 def test_the_folder_holds_what_the_page_says(done):
     names = {p.relative_to(done.folder).as_posix() for p in done.folder.rglob("*") if p.is_file()}
     assert {"report.html", "recipe.yaml", "provenance.json", "metrics.csv", "timing.csv"} <= names
-    assert {"figures/graph.png", "data/outputs.safetensors"} <= names
+    assert {"figures/graph.png", "figures/timeline.png", "data/outputs.safetensors"} <= names
     doc = json.loads((done.folder / "provenance.json").read_text())
     assert {f["file"] for f in doc["figures"]} == {n for n in names if n.startswith("figures/")}
     assert doc["command"] == "neusee run small 'a=1 m'"
@@ -301,10 +303,6 @@ def test_the_page_says_what_the_cache_saved(done, tmp_path):
 
 
 def test_the_plan_is_compared_where_all_that_ran_was_known(tmp_path):
-    from dataclasses import replace
-
-    from neusee.workflows._schedule import Schedule, Slot
-
     result = recipe().run(Store(tmp_path / "cache"))
     slots = (Slot("number", "cpu", 0.0, 1.0), Slot("truth", "cpu", 1.0, 3.0))
     known = {name: replace(done, predicted=1.5) for name, done in result.done.items()}
@@ -339,3 +337,33 @@ def test_every_row_of_the_page_has_a_cell_for_each_column(done):
     for body in re.findall(r"<table.*?</table>", done.page.read_text(), re.DOTALL):
         counts = [len(re.findall(r"<t[hd][ >]", row)) for row in re.findall(r"<tr>.*?</tr>", body, re.DOTALL)]
         assert len(set(counts)) <= 1, body[:200]
+
+
+def test_the_run_is_drawn_over_time_unless_nothing_ran(done, tmp_path):
+    assert "data:image/png" in done.page.read_text().split('id="time"')[1].split('id="steps"')[0]
+    again = simulate(recipe(), Store(tmp_path / "cache"), tmp_path / "runs", ["neusee", "run"])
+    assert not (again.folder / "figures" / "timeline.png").exists()
+    assert "data:image/png" not in again.page.read_text().split('id="time"')[1].split('id="steps"')[0]
+    assert "timeline" not in {f["name"] for f in again.document["figures"]}
+
+
+def test_only_what_was_known_is_drawn_as_the_plan(tmp_path, monkeypatch):
+    result = recipe().run(Store(tmp_path / "cache"))
+    told = {
+        "number": replace(result.done["number"], predicted=1.0, began=5.0, seconds=2.0, lane="cpu:1"),
+        "truth": replace(result.done["truth"], predicted=None, began=7.0, seconds=1.0, lane="cpu:1"),
+    }
+    plan = Schedule((Slot("number", "cpu:1", 0.0, 1.0), Slot("truth", "cpu:1", 1.0, 99.0)), 99.0, {"cpu:1": 0.0}, 0.0)
+    seen = {}
+    monkeypatch.setattr(_timeline, "timeline", lambda **given: seen.update(given) or b"png")
+    assert _figures.timeline(replace(result, done=told, schedule=plan)) == b"png"
+    assert seen["rows"] == [("number", "cpu:1", 0.0, 2.0), ("truth", "cpu:1", 2.0, 1.0)]
+    assert [slot.task for slot in seen["schedule"].slots] == ["number"]
+    told = {name: replace(done, predicted=1.5) for name, done in told.items()}
+    _figures.timeline(replace(result, done=told, schedule=replace(plan, slots=plan.slots[:1])))
+    assert [(s.task, s.device, s.start, s.end, s.after) for s in seen["schedule"].slots] == [
+        ("number", "cpu:1", 0.0, 1.5, ""),
+        ("truth", "cpu:1", 1.5, 3.0, "number"),
+    ]
+    _figures.timeline(replace(result, schedule=None))
+    assert seen["schedule"].slots == ()
