@@ -80,7 +80,7 @@ class Task:
     sources: tuple[str, ...]
     seconds: Mapping[str, float]  #: by device name; a device that is missing cannot run it
     bytes: float = 0.0  #: of its result
-    work: float = 0.0  #: bytes beside its inputs and its result while it runs
+    work: float = 0.0  #: bytes beside its inputs and its result while it runs; a task of 0 s may hold none
     parts: int = 1  #: into how many band slices it may be cut; ``work`` shrinks by that
     takes: Mapping[str, float] = field(default_factory=dict)  #: bytes of a source that travel here, if not all of it
 
