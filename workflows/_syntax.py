@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import ast
+import threading
 from collections import defaultdict
 from collections.abc import Iterable, Iterator
 from typing import NamedTuple
@@ -10,6 +11,7 @@ from typing import NamedTuple
 from neusee.workflows._keys import digest
 
 ROOT = "neusee.nodes"
+_parsing = threading.Lock()  #: the parser of Python 3.11 loses count of its depth where two threads are in it
 _SHORT = 16  #: digits of a definition's digest: it is told from its earlier self alone
 
 Import = tuple[int, str, str]  #: level, module, name (empty: the module itself)
@@ -28,7 +30,8 @@ class Summary(NamedTuple):
 
 def summarise(source: bytes) -> Summary:
     """Digests of a syntax tree and its parts, without docstrings, and what it imports and uses of `neusee`."""
-    tree = ast.parse(source)
+    with _parsing:
+        tree = ast.parse(source)
     imports: list[Import] = []
     binds: list[str] = []
     bound: dict[str, set[Import]] = defaultdict(set)

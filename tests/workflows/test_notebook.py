@@ -291,6 +291,12 @@ def test_several_threads_run_several_recipes_on_one_store(store):
         assert set(result.done) == {"ramp", "half", "score"}
 
 
+def test_several_threads_read_the_code_of_nodes_at_once(tmp_path):
+    with ThreadPoolExecutor(8) as pool:
+        results = list(pool.map(lambda i: small(1.0).run(Store(tmp_path / str(i))), range(24)))
+    assert len({result.done["half"].key for result in results}) == 1
+
+
 def test_several_threads_load_recipes_of_their_own(toy, write):
     path = write(CAMERA)
     with ThreadPoolExecutor(8) as pool:
