@@ -28,6 +28,8 @@ import torch
 from pydantic import BaseModel, ConfigDict, create_model
 from torch import Tensor
 
+_FEW = 64  #: elements that are looked at one by one, for to call torch five times takes longer
+
 Device = Literal["any", "cpu", "gpu"]
 Fn = TypeVar("Fn", bound=Callable[..., Any])
 
@@ -75,6 +77,9 @@ class Facts:
         if x.numel() == 0:
             return cls(shape, dtype, math.nan, math.nan, 0.0, 0, True)
         x = x.abs() if x.is_complex() else x
+        few = x.reshape(-1).tolist() if x.numel() <= _FEW else []
+        if few and math.isfinite(total := float(sum(few))):
+            return cls(shape, dtype, float(min(few)), float(max(few)), total, sum(v != 0 for v in few), True)
         low, high = (float(v) for v in torch.aminmax(x.to(torch.uint8) if x.dtype == torch.bool else x))
         flat, part = x.reshape(-1), 1 << 20  # in parts, for a float64 copy of 520 MB would take another 1 GB
         total = 0.0
@@ -119,7 +124,7 @@ class Node:
         """A node travels as its name: the other process has its own code, which it can compare."""
         return _found, (self.fn.__module__, self.fn.__name__)
 
-    @property
+    @functools.cached_property
     def path(self) -> str:
         """The name a recipe writes: ``sensor.digitize``."""
         parts = [p for p in self.fn.__module__.removeprefix("neusee.nodes.").split(".") if not p.startswith("_")]

@@ -45,7 +45,7 @@ _NAMES = {name: dtype for dtype, name in _DTYPES.items()}
 
 def each_tensor(change: Callable[[Tensor], Tensor], value: Any) -> Any:
     """``value`` with every tensor in it changed; one that occurs twice is changed once."""
-    return _change(value, change, {})
+    return change(value) if isinstance(value, Tensor) else _change(value, change, {})
 
 
 def _change(item: Any, change: Callable[[Tensor], Tensor], done: dict[int, Tensor]) -> Any:
@@ -64,6 +64,8 @@ def _change(item: Any, change: Callable[[Tensor], Tensor], done: dict[int, Tenso
 
 def tensors_in(value: Any) -> list[Tensor]:
     """Every tensor in ``value``, once."""
+    if isinstance(value, Tensor):
+        return [value]
     found: list[Tensor] = []
     each_tensor(lambda t: found.append(t) or t, value)  # type: ignore[func-returns-value]
     return found

@@ -6,12 +6,13 @@ missing, or is not one, it is made anew from what the results themselves say.
 
 from __future__ import annotations
 
+import itertools
 import json
 import os
 import re
 import threading
 from collections import defaultdict
-from collections.abc import Collection, Iterator
+from collections.abc import Callable, Collection, Iterable, Iterator
 from contextlib import suppress
 from typing import Any
 
@@ -36,8 +37,9 @@ def row_of(key: str, about: Row) -> Row:
 class Journal:
     """The lines of one store, the newest last."""
 
-    def __init__(self, disk: Disk) -> None:
-        self._disk, self._guard = disk, threading.RLock()
+    def __init__(self, disk: Disk, others: Callable[[], Iterable[tuple[str, Row]]] = tuple) -> None:
+        """``others``: results beside those that have files of their own."""
+        self._disk, self._others, self._guard = disk, others, threading.RLock()
         self._path = f"{disk.folder}/journal.jsonl"
         self._forget()
 
@@ -76,7 +78,7 @@ class Journal:
         self._read()
         known = {row["key"]: (i, row) for i, row in enumerate(self._rows)}
         found = []
-        for key, about in _sidecar.each(self._disk):
+        for key, about in self._each():
             at, row = known.get(key, (-1, row_of(key, about)))
             found.append((at, {**row, "kept": _sidecar.is_kept(about)}))
         found.sort(key=lambda item: (item[0], str(item[1].get("date"))))
@@ -129,8 +131,11 @@ class Journal:
         self._by_step[row["step"]].append(row)
         self._by_node[row["node"]].append(row)
 
+    def _each(self) -> Iterator[tuple[str, Row]]:
+        return itertools.chain(_sidecar.each(self._disk), self._others())
+
     def _rebuild(self) -> None:
-        rows = [row_of(key, about) for key, about in _sidecar.each(self._disk)]
+        rows = [row_of(key, about) for key, about in self._each()]
         self._replace(sorted(rows, key=lambda row: str(row["date"])))
 
     def _replace(self, rows: list[Row]) -> None:

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from pathlib import Path
 from typing import Any
 
 from neusee.workflows._call import places
@@ -74,7 +73,7 @@ def plan_lines(recipe: Recipe, store: Store, device: str = "cpu", memory: int | 
     return [*_columns([head, *rows]), *_sums(plan, lanes)], bool(plan.refused)
 
 
-def simulated_lines(recipe: Recipe, store: Store, machines: Path) -> list[str]:
+def simulated_lines(recipe: Recipe, store: Store, machines: str) -> list[str]:
     """What the whole recipe would take on the machines of a YAML file, with nothing stored."""
     from neusee.workflows._machines import read_machines
     from neusee.workflows._plan_cluster import cluster_lines

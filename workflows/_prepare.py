@@ -42,7 +42,7 @@ def prepare(
     if len(lanes) == 1:
         plain = _one_after_another(works, expected, only, keep)
         if plain.peak[only] <= lane.memory:
-            return Prepared([replace(w, lane=only) for w in works], expected, plain)
+            return Prepared([w if w.lane else replace(w, lane=only) for w in works], expected, plain)
     planned = {w.step.name: w for w in works}
     names = {w.key: w.step.name for w in works}
     tasks = [_task(w, expected[w.key], lanes, names) for w in works]
@@ -65,6 +65,18 @@ def room_for(expected: Mapping[Key, Estimate], executor: Executor, values: Mappi
         return held + need <= sum(lane.memory for lane in executor.lanes.values() if pool_of(lane.device) == pool)
 
     return room
+
+
+def joined(first: Schedule | None, then: Schedule | None) -> Schedule | None:
+    """One plan after the other: a run whose verdicts need values makes several."""
+    if first is None or then is None:
+        return first or then
+    by = first.makespan
+    slots = (replace(slot, start=slot.start + by, end=slot.end + by) for slot in then.slots)
+    moves = (replace(m, start=m.start + by, end=m.end + by, until=m.until + by) for m in then.moves)
+    peak = {name: max(first.peak.get(name, 0.0), then.peak.get(name, 0.0)) for name in {**first.peak, **then.peak}}
+    transferred = first.transferred + then.transferred
+    return Schedule((*first.slots, *slots), by + then.makespan, peak, transferred, (*first.moves, *moves))
 
 
 def _placed(work: Work, slot: Slot, lanes: Mapping[str, Lane]) -> Work:

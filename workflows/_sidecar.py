@@ -14,6 +14,7 @@ import xxhash
 from neusee.workflows._disk import Disk
 
 About = dict[str, Any]
+INLINE = 4096  #: bytes of tensors up to which a result stands in its JSON
 UNREADABLE = (OSError, ValueError, LookupError, TypeError, AttributeError, ImportError)
 _OF_THE_VALUE = ("layout", "payload", "tensors", "bands")
 _USED = 3600.0  #: s

@@ -10,6 +10,7 @@ written, a run warns once and goes on.
 
 from __future__ import annotations
 
+import heapq
 import os
 import time
 import warnings
@@ -20,11 +21,12 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from neusee.workflows import _payload, _sidecar, _upkeep
+from neusee.workflows._brief import Brief
 from neusee.workflows._disk import Disk
 from neusee.workflows._evict import LOW, Room
 from neusee.workflows._journal import Journal
 from neusee.workflows._lease import Lease, Leases
-from neusee.workflows._sidecar import UNREADABLE, About, is_kept
+from neusee.workflows._sidecar import INLINE, UNREADABLE, About, is_kept
 from neusee.workflows._speeds import Speeds
 from neusee.workflows._upkeep import Checked, Swept
 from neusee.workflows._where import Verify as Verify
@@ -35,8 +37,6 @@ if TYPE_CHECKING:
     from torch import Tensor
 
     from neusee.workflows._blobs import Blobs
-
-INLINE = 4096  #: bytes of tensors up to which a result stands in its JSON
 
 
 class Store:
@@ -55,7 +55,8 @@ class Store:
         self.verify = verify_mode(verify)
         self.budget = budget_bytes(budget)
         self.disk = Disk(self.root)
-        self.journal = Journal(self.disk)
+        self.brief = Brief(self.disk)
+        self.journal = Journal(self.disk, self.brief.each)
         self.code_memo = self.root / "code.json"
         self._leases = Leases(self.disk)
         self._room = None if self.budget is None else Room(self.disk, self.budget)
@@ -81,13 +82,15 @@ class Store:
             return self._known[key]
         if key in self._lost:
             return None
-        try:
-            about = _sidecar.read_whole(self.disk, key)
-        except UNREADABLE as error:
-            if os.path.exists(self.disk.path(key, "json")):
-                self._put_aside(key, error)
-            return None
-        self._known[key] = about
+        about = self.brief.find(key)
+        if about is None or not is_kept(about):
+            try:
+                about = _sidecar.read_whole(self.disk, key)
+            except UNREADABLE as error:
+                if os.path.exists(self.disk.path(key, "json")):
+                    self._put_aside(key, error)
+        if about is not None:
+            self._known[key] = about
         return about
 
     def get(self, key: str) -> Any:
@@ -107,10 +110,7 @@ class Store:
         raise KeyError(key)
 
     def put(self, key: str, value: Any, about: About) -> bool:
-        """Keep a value with what is ``about`` it; False, after one warning, where the folder takes none.
-
-        False too, and a receipt instead, for a value that the budget has no room for.
-        """
+        """Keep a value with what is ``about`` it; False where the folder takes none (one warning) or the budget."""
         return self._try(self._write, key, value, about)
 
     def note(self, key: str, about: About) -> bool:
@@ -130,10 +130,7 @@ class Store:
         return _upkeep.pinned(self.disk)
 
     def gc(self, budget: int | None = None, dry: bool = False) -> Swept:
-        """Remove what belongs to no result, and values beyond ``budget`` bytes (None: the store's own, if it has one).
-
-        Values that save the fewest seconds a byte go first and leave their receipts; ``dry``: say what would go.
-        """
+        """Remove what belongs to no result, and, beyond ``budget`` (or the store's own), what saves least a byte."""
         swept = _upkeep.gc(self, self.budget if budget is None else budget, dry)
         if not dry:
             self._forget(swept.evicted)
@@ -143,19 +140,19 @@ class Store:
         """Read every value, whatever ``verify`` says; what is damaged is put aside."""
         return _upkeep.check(self)
 
+    def jot(self, key: str, value: Any, about: About) -> bool:
+        """Keep a small value, of a larger one what is ``about`` it, without a file: to lose it is no loss."""
+        return self._try(self._jot, key, value, about)
+
     def entries(self) -> Iterator[tuple[str, About]]:
         """Every result's key and what is known of it, in the order of the keys; receipts too."""
-        for key in _sidecar.names(self.disk):
+        for key in heapq.merge(_sidecar.names(self.disk), (key for key, _ in self.brief.each())):
             about = self.about(key)
             if about is not None:
                 yield key, about
 
     def claim(self, key: str) -> Lease | None:
-        """The right to compute ``key``; None while another live process has it.
-
-        Who was refused asks again from time to time; whoever gets the lease late looks first
-        whether the value has come meanwhile.
-        """
+        """The right to compute ``key``; None while another live process has it. Who gets it late looks again first."""
         return self._leases.claim(key)
 
     def read_seconds(self, size: float) -> float:
@@ -222,6 +219,11 @@ class Store:
         self.journal.append(key, entry)
         self._make_room(size)
         return True
+
+    def _jot(self, key: str, value: Any, about: About) -> bool:
+        entry = self._known[key] = self.brief.put(key, value, about)
+        self.journal.append(key, entry)
+        return is_kept(entry)
 
     def _write_parts(self, key: str, entry: About, tensors: list[Tensor], banded: Any) -> None:
         """What is large first, then what names it; of two processes with one key the first one's stays."""

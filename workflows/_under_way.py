@@ -23,11 +23,12 @@ from neusee.workflows._keys import Key, key_of
 from neusee.workflows._local import Local
 from neusee.workflows._loop import Loop, chains_of
 from neusee.workflows._place import Schedule, TooLarge
-from neusee.workflows._prepare import past_costs, prepare, room_for
+from neusee.workflows._prepare import joined, past_costs, prepare, room_for
 from neusee.workflows._store import Store
 from neusee.workflows._verdict import Verdict, judge
 from neusee.workflows._work import Executor, Lost, Outcome, Read, Work
 
+_QUICK = 1e-3  #: s below which two processes may as well both compute a step
 _UNKNOWN = 100.0  #: s of a step that nobody measured, where to load is weighed against to compute
 
 
@@ -56,6 +57,7 @@ class UnderWay:
         self.values: dict[Key, Any] = {}
         self.facts: dict[Key, Facts | None] = {}
         self.again: dict[Key, float] = {}  # s to have a value again that was computed here
+        self.took: dict[str, float] = {}  # the longest that a step of each node took, s
         self.verdicts: dict[str, Verdict] = {}
         self.done: dict[str, Done] = {}
         self.receipts: dict[Key, dict[str, Any]] = {}  # what is known of values that were not kept
@@ -174,7 +176,7 @@ class UnderWay:
             prepared = prepare(works, self.costs, self.receipts, self.executor.lanes, targets)
         except TooLarge as error:
             raise RunError(self.recipe.steps[error.task], [], error) from error
-        self.schedule = self.schedule or prepared.schedule
+        self.schedule = joined(self.schedule, prepared.schedule)
         chains = chains_of(prepared.works, fused=not self.executor.shares)
         if not self.executor.shares:  # what another chain reads must lie in the store
             chains = [(*chain[:-1], replace(chain[-1], wanted=True)) for chain in chains]
@@ -190,10 +192,11 @@ class UnderWay:
     def _work(self, key: Key, anew: bool, target: bool) -> Work:
         step = self.makers[key]
         reads = tuple(self._read(step.wires.get(name)) for name in step.node.inputs)
-        device = places(step, self.devices)[0]
+        device, lanes = places(step, self.devices)[0], self.executor.lanes
+        lane = next(iter(lanes)) if len(lanes) == 1 else ""
         wanted = target or step.name in self.wanted
         name, seed = self.recipe.name, self.recipe.seed
-        return Work(step, key, self.origins[key], reads, seed, name, device, "", wanted, anew)
+        return Work(step, key, self.origins[key], reads, seed, name, device, lane, wanted, anew=anew)
 
     def _read(self, wire: Wire) -> Read:
         return self.keys[wire] if isinstance(wire, str) else wire and tuple(self.keys[name] for name in wire)
@@ -202,7 +205,8 @@ class UnderWay:
         """Say that a step begins; by now it is known what its inputs would cost to have again."""
         self.watch(Event(work.step.name, None))
         below = sum(self.again[key] if key in self.again else self._reading(key) for key in set(work.sources))
-        return replace(work, below=below)
+        quick = self.took.get(work.step.node.path, _QUICK) < _QUICK
+        return replace(work, below=below, quick=quick)
 
     def _note(self, outcome: Outcome, expected: Estimate) -> None:
         """Take in what became of a step."""
@@ -216,6 +220,8 @@ class UnderWay:
             self._finish(self._cached(key, "another process made it"))
             return
         self.facts[key] = outcome.facts
+        path = step.node.path
+        self.took[path] = max(outcome.seconds, self.took.get(path, 0.0))
         self.again[key] = self.store.read_seconds(outcome.bytes) if outcome.kept else outcome.seconds + work.below
         predicted = expected.seconds[work.device.partition(":")[0]] if expected.known else None
         done = Done(

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import time
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import asdict, dataclass, field
+from dataclasses import dataclass, field, fields
 from datetime import UTC, datetime
 from typing import Any, Protocol
 
@@ -21,10 +21,12 @@ from neusee.workflows._codec import tensors_in
 from neusee.workflows._graph import Step
 from neusee.workflows._keys import Key, plain
 from neusee.workflows._memory import Peak
-from neusee.workflows._store import INLINE, Store
+from neusee.workflows._sidecar import INLINE
+from neusee.workflows._store import Store
 
 Read = Key | tuple[Key, ...] | None  #: what one input reads: one value, a list of them, or nothing
 Fetch = Callable[[Key], Any]
+_FACTS = tuple(f.name for f in fields(Facts))
 _WATCHED = 1 << 20  #: bytes of inputs from which the memory of a step is measured
 
 
@@ -45,6 +47,7 @@ class Work:
     device: str  #: where it computes: ``cpu``, ``cuda:1``
     lane: str  #: which of the executor's places has it
     wanted: bool = False  #: whether the result is asked for, and is kept whatever it costs
+    quick: bool = False  #: whether its like took so little that no other process need wait for it
     anew: bool = False  #: whether to compute it although it is stored, because that is quicker
     below: float = 0.0  #: s to have its inputs again, were this result not kept
     parts: int = 1  #: into how many runs of bands it is cut for want of memory
@@ -110,20 +113,26 @@ class Executor(Protocol):
 
 def carry_out(work: Work, fetch: Fetch, store: Store) -> Outcome:
     """Compute one step and keep what is worth keeping; a failure is part of the outcome."""
+    if work.quick:
+        return _carried_out(work, fetch, store)
     lease = store.claim(work.key)
     if lease is None:
         return Outcome(work, held=True)
     with lease:
         if not work.anew and store.has(work.key):
             return Outcome(work, kept=True, found=True)
-        try:
-            inputs = [_gathered(read, fetch) for read in work.reads]
-        except Lost as error:
-            return Outcome(work, lost=error.args)
-        try:
-            return _kept(_computed(work, inputs, store), store)
-        except Exception as error:
-            return Outcome(work, error=error)
+        return _carried_out(work, fetch, store)
+
+
+def _carried_out(work: Work, fetch: Fetch, store: Store) -> Outcome:
+    try:
+        inputs = [_gathered(read, fetch) for read in work.reads]
+    except Lost as error:
+        return Outcome(work, lost=error.args)
+    try:
+        return _kept(_computed(work, inputs, store), store)
+    except Exception as error:
+        return Outcome(work, error=error)
 
 
 def _gathered(read: Read, fetch: Fetch) -> Any:
@@ -161,23 +170,22 @@ def _computed(work: Work, inputs: list[Any], store: Store) -> Outcome:
 def _kept(outcome: Outcome, store: Store) -> Outcome:
     """Store the value where that pays, and in any case what is known of it."""
     work = outcome.work
-    about = _about(outcome)
     try:
-        if pays(outcome, store):
-            outcome.kept = store.put(work.key, outcome.value, about)
+        small = outcome.bytes <= INLINE
+        if work.quick and (small or not work.wanted) and not _pays(outcome, store, 0):
+            outcome.kept = store.jot(work.key, outcome.value, _about(outcome))
+        elif work.wanted or small or _pays(outcome, store, outcome.bytes):
+            outcome.kept = store.put(work.key, outcome.value, _about(outcome))
         else:
-            store.note(work.key, about)
+            store.note(work.key, _about(outcome))
     except TypeError as error:
         raise RunError(work.step, [], error) from error
     outcome.value = plain_of(outcome.value)
     return outcome
 
 
-def pays(outcome: Outcome, store: Store) -> bool:
-    """Whether to have the result again costs more than to write it now and read it once."""
-    size = outcome.bytes
-    if outcome.work.wanted or size <= INLINE:
-        return True
+def _pays(outcome: Outcome, store: Store, size: int) -> bool:
+    """Whether to have the result again costs more than to write ``size`` bytes now and read them once."""
     return outcome.seconds + outcome.work.below > store.write_seconds(size) + store.read_seconds(size)
 
 
@@ -187,7 +195,7 @@ def _about(outcome: Outcome) -> dict[str, Any]:
         "step": work.step.name,
         "recipe": work.recipe,
         "origin": dict(work.origin),
-        "facts": outcome.facts and asdict(outcome.facts),
+        "facts": outcome.facts and {name: getattr(outcome.facts, name) for name in _FACTS},
         "checks": [[check.text, check.ok] for check in outcome.checks],
         "seconds": outcome.seconds,
         "bytes": outcome.bytes,
@@ -198,4 +206,4 @@ def _about(outcome: Outcome) -> dict[str, Any]:
     }
 
 
-__all__ = ["Executor", "Fetch", "Lane", "Lost", "Outcome", "Read", "Work", "carry_out", "pays"]
+__all__ = ["Executor", "Fetch", "Lane", "Lost", "Outcome", "Read", "Work", "carry_out"]

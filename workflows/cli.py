@@ -15,6 +15,7 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from neusee.workflows._cache_commands import cache
+from neusee.workflows._listings import nodes, recipes, schema
 from neusee.workflows._words import (
     BAD,
     DONE,
@@ -46,6 +47,8 @@ app = typer.Typer(
     pretty_exceptions_enable=False,
 )
 app.add_typer(cache, name="cache")
+for listing in (recipes, nodes, schema):
+    app.command()(listing)
 
 Words = Annotated[
     list[str] | None,
@@ -158,15 +161,20 @@ def plan(
     debug: Debug = False,
     device: Device = "cpu",
     memory: Memory = "",
-    devices: Annotated[Path | None, typer.Option("--devices", help="A YAML file of machines to simulate.")] = None,
+    devices: Annotated[str, typer.Option("--devices", help="Machines to simulate: a YAML file, or eight_a100.")] = "",
 ) -> None:
     """Say what would run, where, for how long and with how much memory; compute nothing."""
     recipe, _ = load(words)
     from neusee.workflows import _plan
 
     check_device(device)
-    if devices is not None:
-        say(_plan.simulated_lines(recipe, the_store(), devices))
+    if devices:
+        from neusee.workflows._marks import RecipeError
+
+        try:
+            say(_plan.simulated_lines(recipe, the_store(), devices))
+        except RecipeError as error:
+            refuse(error)
         return
     room = bytes_of(memory, "--memory") if memory else None
     lines, refused = _plan.plan_lines(recipe, the_store(), device, room)
@@ -237,38 +245,6 @@ def config(words: Words = None, debug: Debug = False) -> None:
     from neusee.workflows.simulate import recipe_text
 
     say(recipe_text(recipe).splitlines())
-
-
-@app.command()
-def recipes() -> None:
-    """List the recipes, each with what it shows."""
-    from neusee.workflows._catalogue import recipe_lines
-
-    say(recipe_lines())
-
-
-@app.command()
-def nodes(
-    name: Annotated[str | None, typer.Argument(help="One node, such as optics.psf, or `reading`.")] = None,
-    debug: Debug = False,
-) -> None:
-    """List what a step can compute, or explain one node."""
-    from neusee.workflows import _catalogue as catalogue
-
-    try:
-        say(catalogue.node_lines(name) if name else catalogue.nodes_lines())
-    except LookupError as error:
-        fail(str(error.args[0]))
-
-
-@app.command()
-def schema() -> None:
-    """Print the JSON schema of recipes, for editors."""
-    import json
-
-    from neusee.workflows._schema import schema as of_recipes
-
-    say([json.dumps(of_recipes(), indent=1)])
 
 
 @app.command()
