@@ -2,7 +2,7 @@
 
     python tests/benchmarks/bench_recipes.py [RECIPE ...]
 
-Without a name: first_light, cold and again, and paper_table1, cold. Each in a fresh cache and a process of its own.
+Without a name: first_light, cold and again, and paper_table1, cold and after one change. Each in a fresh cache and a process of its own.
 """
 
 from __future__ import annotations
@@ -69,10 +69,47 @@ def again(recipe: str, place: Path, repeats: int = 7) -> None:
     print(f"\n`{recipe}`, again: {medians} for `import torch`, ratio {ratio:.2f} (median of {repeats} pairs)")
 
 
+ENGINE = """
+import sys, time
+from neusee.workflows import load
+recipe = load("paper_table1", sys.argv[1:])
+outputs = [n for n in recipe.steps if n.partition("[")[0] in ("raw", "lsr", "bsr", "peak", "saturated", "developed")]
+began = time.perf_counter()
+done = recipe.run(outputs=outputs).done.values()
+ran = sum(d.state == "run" for d in done)
+print(f"{time.perf_counter() - began:.2f} {ran} {len(done)}")
+"""
+
+
+def engine(cache: Path, *changes: str) -> tuple[float, int, int]:
+    """Seconds of the engine alone, from light to developed picture, without restoration; steps that ran; all steps."""
+    command = [sys.executable, "-c", ENGINE, *changes]
+    out = subprocess.run(command, env=os.environ | {"NEUSEE_CACHE": str(cache)}, capture_output=True, check=True)
+    seconds, ran, steps = out.stdout.split()
+    return float(seconds), int(ran), int(steps)
+
+
+def changed(place: Path) -> None:
+    """paper_table1 after one change: the whole command, and the engine up to the developed pictures."""
+    print(
+        "\n| paper_table1, engine up to the developed pictures | seconds | steps that ran | of cold |\n|---|---|---|---|"
+    )
+    cold_seconds, ran, count = engine(place / "engine")
+    print(f"| cold | {cold_seconds:.1f} | {ran} of {count} | 1 |")
+    for change in ("sensor.read_noise=20 e-", "lasers.green.wavelength=550 nm", "sensor.read_noise=10.5 e-"):
+        seconds, ran, count = engine(place / "engine", change)
+        print(f"| `{change}` | {seconds:.2f} | {ran} of {count} | 1/{cold_seconds / seconds:.0f} |")
+    for change in ("sensor.read_noise=20 e-", "lasers.green.wavelength=550 nm"):
+        run = [*NEUSEE, "run", "paper_table1", change, "--out", str(place / "runs"), "--quiet"]
+        print(f"\nthe whole command with `{change}`: {process(run, place / 'cache')[0]:.1f} s")
+
+
 if __name__ == "__main__":
     for name in sys.argv[1:] or ["first_light", "paper_table1"]:
         with tempfile.TemporaryDirectory() as folder:
             cold(name, Path(folder))
-            if name != "paper_table1":
+            if name == "paper_table1":
+                changed(Path(folder))
+            else:
                 again(name, Path(folder))
     print(f"\nlargest child: {resource.getrusage(resource.RUSAGE_CHILDREN).ru_maxrss / 1e6:.2f} GB")
