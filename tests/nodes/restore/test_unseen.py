@@ -5,8 +5,10 @@ from dataclasses import replace
 import pytest
 import torch
 
-from neusee.nodes.restore import _unseen
-from neusee.nodes.restore._unseen import Blurred, halved, most_likely, torus, variance
+from neusee.nodes.restore import _descend, _unseen
+from neusee.nodes.restore._blurred import Blurred, variance
+from neusee.nodes.restore._descend import descend
+from neusee.nodes.restore._unseen import halved, most_likely, torus
 from neusee.nodes.restore._wiener import fall
 
 
@@ -52,7 +54,7 @@ def test_equals_the_full_matrix(channels, grey, hidden):
     expected = by_matrix(seen)
     torch.testing.assert_close(space(seen, most_likely(seen)), expected, rtol=0, atol=1e-9)
     start = torch.zeros_like(seen.transfer)
-    torch.testing.assert_close(space(seen, _unseen._descend(seen, start, 300)), expected, rtol=0, atol=1e-5)
+    torch.testing.assert_close(space(seen, descend(seen, start, 300, 0.0)), expected, rtol=0, atol=1e-5)
 
 
 def test_glare_of_unknown_strength_equals_the_full_matrix():
@@ -62,7 +64,7 @@ def test_glare_of_unknown_strength_equals_the_full_matrix():
     expected = by_matrix(seen, patterns)
     torch.testing.assert_close(space(seen, most_likely(marred)), expected, rtol=0, atol=1e-4)
     start = torch.zeros_like(seen.transfer)
-    torch.testing.assert_close(space(seen, _unseen._descend(marred, start, 300)), expected, rtol=0, atol=1e-4)
+    torch.testing.assert_close(space(seen, descend(marred, start, 300, 0.0)), expected, rtol=0, atol=1e-4)
 
 
 @pytest.mark.parametrize("size", [(24, 24), (96, 80)])
@@ -105,11 +107,32 @@ def test_few_steps_from_a_coarse_start_are_near_the_exact_answer(monkeypatch):
     def error(spectrum):
         return float(space(model, spectrum - truth)[:, :60, :60].square().mean().sqrt())
 
-    found, plain = most_likely(model), _unseen._descend(model, torch.zeros_like(truth), 20)
+    found = most_likely(model)
+    monkeypatch.setattr(_descend, "LOWEST", 0)
+    plain = descend(model, torch.zeros_like(truth), 20, 0.0)
     monkeypatch.setattr(_unseen, "DENSE", 60)
     exact = most_likely(model)
     assert error(found) < 1.1 * error(exact)
     assert error(plain) > 1.5 * error(exact)
+
+
+def slopes(leaves, probe, **how):
+    picture, weight, transfer, power, pattern = (leaf.clone().requires_grad_() for leaf in leaves)
+    model = Blurred(picture, weight, torch.view_as_complex(transfer), power, probe.shape[-2:], 0.5, (pattern,))
+    (space(model, most_likely(model, **how)) * probe).sum().backward()
+    return [leaf.grad for leaf in (picture, weight, transfer, power, pattern)]
+
+
+def test_gradients_through_the_iteration_are_those_of_the_exact_answer(monkeypatch):
+    size, rng = torus((46, 11), (8, 8)), torch.Generator().manual_seed(4)
+    seen = problem((46, 11), size, 2, 0.5)
+    weight = seen.weight * (0.5 + torch.rand(seen.weight.shape, generator=rng, dtype=torch.float64))
+    pattern, probe = (torch.randn(2, *n, generator=rng, dtype=torch.float64) for n in ((46, 11), size))
+    leaves = [seen.picture, weight, torch.view_as_real(seen.transfer), seen.power, pattern]
+    found = slopes(leaves, probe, steps=200, enough=1e-14)
+    monkeypatch.setattr(_unseen, "DENSE", 46)
+    for mine, exact in zip(found, slopes(leaves, probe), strict=True):
+        assert float((mine - exact).norm()) < 1e-3 * float(exact.norm())
 
 
 @pytest.mark.parametrize("picture", [(41, 80), (81, 7), (200, 123)])

@@ -1,0 +1,106 @@
+"""The slowest part of a picture at once: its lowest frequencies, as a dense matrix.
+
+What lies beyond the edge and in holes is told by the rest in the lowest frequencies, where the signal is up to 1e8
+times the noise: there the inverse for a picture without edges is wrong by that factor, and this one is right.
+"""
+
+from __future__ import annotations
+
+import torch
+from torch import Tensor
+from torch.nn.functional import pad
+
+from neusee.nodes.restore._blurred import Blurred, Size, inverse_colour
+
+_LEAST = 1e-11  #: of the matrix, scaled to about 1: what float64 cannot tell from nothing
+MODES = 1000  #: real unknowns of each of at most three channels; of more, as many as three have
+
+
+class Lowest:
+    """The inverse of a blur's normal matrix among its lowest frequencies, from the mean on."""
+
+    def __init__(self, seen: Blurred, gain: Tensor) -> None:
+        """`gain` (channel, fy, fx) scales the matrix: the diagonal of an inverse that is about right."""
+        self.torus = seen.torus
+        self.fy, self.fx = _lowest(seen.torus, min(MODES, 3 * MODES // len(seen.picture)) // 2)
+        self.fy, self.fx = self.fy.to(gain.device), self.fx.to(gain.device)
+        root = gain[:, self.fy, self.fx].double().sqrt()
+        root[:, 0] *= 0.5**0.5  # the mean is its own mirror image
+        root = torch.cat([root, root[:, 1:]], 1).flatten()
+        matrix = root[:, None] * self._matrix(seen) * root
+        matrix.diagonal().add_(_LEAST)
+        factor, unit = torch.linalg.cholesky(matrix), torch.eye(len(root), dtype=root.dtype, device=root.device)
+        self.whiten = (torch.linalg.solve_triangular(factor, unit, upper=False) * root).to(gain)
+
+    def add(self, slope: Tensor, onto: Tensor) -> Tensor:
+        """Add the inverse times `slope` onto a spectrum; give the inner product of both, as pixels."""
+        told = self.whiten @ _real(slope[:, self.fy, self.fx])
+        both = (told @ self.whiten).reshape(len(slope), -1)
+        real, imag = both[:, : len(self.fy)], pad(both[:, len(self.fy) :], (1, 0))
+        step = torch.complex(real, imag)
+        step[:, 0] *= 2.0
+        onto[:, self.fy, self.fx] += step
+        mirrored = (self.fx == 0) & (self.fy > 0)
+        onto[:, -self.fy[mirrored], 0] += step[:, mirrored].conj()
+        rise: Tensor = told.square().sum(dtype=torch.float64) * (2.0 / (self.torus[0] * self.torus[1]))
+        return rise
+
+    def _matrix(self, seen: Blurred) -> Tensor:
+        """Prior, noise and glare, for the real parts and then the imaginary ones of each channel, in float64."""
+        transfer = seen.transfer[:, self.fy, self.fx].to(torch.complex128)
+        inverse = 1.0 / seen.power[self.fy, self.fx].double().clamp_min(1e-30)
+        inverse = torch.cat([2.0 * inverse[:1], inverse[1:], inverse[1:]])
+        own, shared = inverse_colour(len(transfer), seen.grey)
+        colours = own * torch.eye(len(transfer), dtype=torch.float64, device=inverse.device) - shared
+        matrix = torch.einsum("cd,kl->ckdl", colours, inverse.diag())
+        for channel, through in enumerate(transfer):
+            weight = torch.fft.rfft2(seen.weight[channel].double(), s=seen.torus)
+            matrix[channel, :, channel] += self._noise(weight, through)
+        size = len(transfer) * len(inverse)
+        return matrix.reshape(size, size) - self._glare(seen, transfer)
+
+    def _noise(self, weight: Tensor, through: Tensor) -> Tensor:
+        """How one channel's pixels tell its frequencies: each with each, and each with the mirror image of each."""
+        plus, minus = (self._at(weight, s) * through.conj()[:, None] for s in (-1, 1))
+        plus, minus = plus * through, minus * through.conj()
+        top = torch.cat([plus.real + minus.real, (minus.imag - plus.imag)[:, 1:]], 1)
+        bottom = torch.cat([plus.imag + minus.imag, (plus.real - minus.real)[:, 1:]], 1)
+        both: Tensor = torch.cat([top, bottom[1:]]) / (self.torus[0] * self.torus[1])
+        return both
+
+    def _at(self, spectrum: Tensor, sign: int) -> Tensor:
+        """Half a spectrum at the sum or the difference of every two frequencies."""
+        y, x = self.torus
+        fy, fx = self.fy[:, None] + sign * self.fy, (self.fx[:, None] + sign * self.fx) % x
+        far = fx > x // 2
+        values = spectrum[torch.where(far, -fy, fy) % y, torch.where(far, x - fx, fx)]
+        return torch.where(far, values.conj(), values)
+
+    def _glare(self, seen: Blurred, transfer: Tensor) -> Tensor | float:
+        """What the unknown strength of each glare takes away."""
+        if not seen.glare:
+            return 0.0
+        flat = torch.stack(seen.glare).double().flatten(1)
+        weighted = seen.weight.double().flatten() * flat
+        inverse = torch.linalg.pinv(weighted @ flat.T, hermitian=True) * (2.0 / (self.torus[0] * self.torus[1]))
+        shapes = weighted.reshape(-1, *seen.picture.shape)
+        spectra = (torch.fft.rfft2(shape, s=seen.torus)[:, self.fy, self.fx] for shape in shapes)
+        told = torch.stack([_real(transfer.conj() * s) for s in spectra])
+        taken: Tensor = told.T @ inverse @ told
+        return taken
+
+
+def _real(spectrum: Tensor) -> Tensor:
+    """Real parts and imaginary ones, channel by channel; the first frequency has none of these."""
+    return torch.cat([spectrum.real, spectrum.imag[:, 1:]], 1).flatten()
+
+
+def _lowest(size: Size, count: int) -> tuple[Tensor, Tensor]:
+    """The lowest frequencies (fy, fx), one of each with its mirror image, that of no sign left out; the mean first."""
+    reach = (size[0] - 1) // 2
+    fy = torch.arange(-reach, reach + 1)[:, None]
+    fx = torch.arange((size[1] - 1) // 2 + 1)
+    squared = (fy / size[0]).square() + (fx / size[1]).square()
+    squared[:reach, 0] = torch.inf
+    order = squared.flatten().argsort(stable=True)[: min(count, squared.numel() - reach)]
+    return order // len(fx) - reach, order % len(fx)
