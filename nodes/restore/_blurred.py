@@ -56,9 +56,10 @@ def weighing(seen: Blurred) -> Map:
     inverse = torch.linalg.pinv((weighted.double() @ flat.double().T), hermitian=True).to(flat)
 
     def weigh(residual: Tensor) -> Tensor:
-        strengths = inverse @ (weighted @ residual.flatten())
-        told: Tensor = strengths @ weighted
-        return seen.weight * residual - told.reshape(residual.shape)
+        rest = seen.weight * residual
+        for strength, pattern in zip(inverse @ (weighted @ residual.flatten()), weighted, strict=True):
+            rest.addcmul_(strength, pattern.view_as(rest), value=-1.0)
+        return rest
 
     return weigh
 

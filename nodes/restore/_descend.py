@@ -7,7 +7,7 @@ from collections.abc import Iterator
 import torch
 from torch import Tensor
 
-from neusee.nodes.restore._blurred import Blurred, inverse_colour, mixed, weighing
+from neusee.nodes.restore._blurred import Blurred, Size, inverse_colour, mixed, weighing
 from neusee.nodes.restore._lowest import Lowest
 
 LOWEST = 256  #: of a picture of no more pixels a side, each step solves the lowest frequencies at once
@@ -19,9 +19,9 @@ def descend(seen: Blurred, x: Tensor, steps: int, enough: float) -> Tensor:
     if steps < 1:
         return x
     normal, inverse = _Normal(seen), _Inverse(seen)
-    left, change = normal.slope(x), torch.empty_like(x)
-    size = inverse(left, change)
-    way, enough = change.clone(), max(enough, 1e-20 * float(size))
+    left, way, change = normal.slope(x), torch.empty_like(x), torch.empty_like(x)
+    size = inverse(left, way)
+    enough = max(enough, 1e-20 * float(size))
     for _ in range(steps):
         if not float(size) > enough:
             break
@@ -37,8 +37,23 @@ def descend(seen: Blurred, x: Tensor, steps: int, enough: float) -> Tensor:
 
 def pieces(spectrum: Tensor) -> Iterator[slice]:
     """Rows of half a spectrum, a few at a time."""
-    rows = max(1, _PIECE // (len(spectrum) * spectrum.shape[-1]))
-    return (slice(i, i + rows) for i in range(0, spectrum.shape[-2], rows))
+    return _few(spectrum.shape[-2], len(spectrum) * spectrum.shape[-1])
+
+
+def _few(count: int, numbers: int) -> Iterator[slice]:
+    """So many lines of so many numbers each, a few at a time."""
+    step = max(1, _PIECE // numbers)
+    return (slice(i, i + step) for i in range(0, count, step))
+
+
+def corner(spectrum: Tensor, torus: Size, pixels: Tensor) -> None:
+    """Fill pixels with the first corner of what half a spectrum (fy, fx) stands for: `irfft2` in half its time."""
+    rows, columns = pixels.shape
+    tall = spectrum.new_empty(rows, spectrum.shape[1])
+    for some in _few(spectrum.shape[1], torus[0]):
+        tall[:, some] = torch.fft.ifft(spectrum[:, some], dim=0)[:rows]
+    for some in _few(rows, torus[1]):
+        pixels[some] = torch.fft.irfft(tall[some], n=torus[1])[:, :columns]
 
 
 class _Normal:
@@ -47,7 +62,7 @@ class _Normal:
     def __init__(self, seen: Blurred) -> None:
         self.seen, self.weigh = seen, weighing(seen)
         self.inverse = 1.0 / seen.power.clamp_min(1e-30)
-        self.plane = seen.picture.new_zeros(seen.torus)
+        self.plane, self.pixels = seen.picture.new_zeros(seen.torus), torch.empty_like(seen.picture)
 
     def __call__(self, x: Tensor, result: Tensor) -> Tensor:
         """Write its product with x, and give the inner product of the two."""
@@ -58,17 +73,15 @@ class _Normal:
     def slope(self, x: Tensor) -> Tensor:
         """How the log likelihood rises with x."""
         result = torch.empty_like(x)
-        self._gather(self.weigh(self.seen.picture - self._blurred(x, result)), result)
+        self._gather(self.weigh(self._blurred(x, result).neg_().add_(self.seen.picture)), result)
         self._finish(x, result, -1.0)
         return result if self.seen.pull is None else result.add_(self.seen.pull)
 
     def _blurred(self, x: Tensor, room: Tensor) -> Tensor:
-        pixels = torch.empty_like(self.seen.picture)
-        rows, columns = pixels.shape[-2:]
         for channel, transfer in enumerate(self.seen.transfer):
-            spectrum = torch.mul(transfer, x[channel], out=room[channel])
-            pixels[channel] = torch.fft.irfft2(spectrum, s=self.seen.torus)[:rows, :columns]
-        return pixels
+            torch.mul(transfer, x[channel], out=room[channel])
+            corner(room[channel], self.seen.torus, self.pixels[channel])
+        return self.pixels
 
     def _gather(self, pixels: Tensor, result: Tensor) -> None:
         """Spectra of the pixels, yet without the blur."""
@@ -112,12 +125,10 @@ class _Inverse:
         return total if self.lowest is None else total + self.lowest.add(slope, result)
 
 
-def inner(a: Tensor, b: Tensor, torus: tuple[int, int]) -> Tensor:
+def inner(a: Tensor, b: Tensor, torus: Size) -> Tensor:
     """Inner product of pixels, given half of their spectra."""
-    once = (0,) if torus[1] % 2 else (0, -1)
-    total = torch.zeros((), dtype=torch.float64, device=a.device)
-    for p, q in zip(a, b, strict=True):
-        total += 2.0 * torch.vdot(p.flatten(), q.flatten()).real.double()
-        for column in once:
-            total -= torch.vdot(p[:, column], q[:, column]).real.double()
-    return total / (torus[0] * torus[1])
+    whole = torch.stack([torch.vdot(p.flatten(), q.flatten()) for p, q in zip(a, b, strict=True)]).sum() * 2.0
+    for column in (0,) if torus[1] % 2 else (0, -1):
+        whole = whole - torch.linalg.vecdot(a[..., column], b[..., column]).sum()
+    total: Tensor = whole.real.double() / (torus[0] * torus[1])
+    return total

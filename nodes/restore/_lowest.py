@@ -6,6 +6,8 @@ times the noise: there the inverse for a picture without edges is wrong by that 
 
 from __future__ import annotations
 
+import math
+
 import torch
 from torch import Tensor
 from torch.nn.functional import pad
@@ -13,7 +15,8 @@ from torch.nn.functional import pad
 from neusee.nodes.restore._blurred import Blurred, Size, inverse_colour
 
 _LEAST = 1e-11  #: of the matrix, scaled to about 1: what float64 cannot tell from nothing
-MODES = 1000  #: real unknowns of each of at most three channels; of more, as many as three have
+MODES = 1000  #: real unknowns of each of at most three channels; of more, as many as three have,
+SHARE = 24  #: and of a small torus one for so many of its points
 
 
 class Lowest:
@@ -22,15 +25,14 @@ class Lowest:
     def __init__(self, seen: Blurred, gain: Tensor) -> None:
         """`gain` (channel, fy, fx) scales the matrix: the diagonal of an inverse that is about right."""
         self.torus = seen.torus
-        self.fy, self.fx = _lowest(seen.torus, min(MODES, 3 * MODES // len(seen.picture)) // 2)
-        self.fy, self.fx = self.fy.to(gain.device), self.fx.to(gain.device)
+        count = min(MODES, 3 * MODES // len(seen.picture), math.prod(seen.torus) // SHARE)
+        self.fy, self.fx = (f.to(gain.device) for f in _lowest(seen.torus, max(1, count // 2)))
         root = gain[:, self.fy, self.fx].double().sqrt()
         root[:, 0] *= 0.5**0.5  # the mean is its own mirror image
         root = torch.cat([root, root[:, 1:]], 1).flatten()
         matrix = root[:, None] * self._matrix(seen) * root
         matrix.diagonal().add_(_LEAST)
-        factor, unit = torch.linalg.cholesky(matrix), torch.eye(len(root), dtype=root.dtype, device=root.device)
-        self.whiten = (torch.linalg.solve_triangular(factor, unit, upper=False) * root).to(gain)
+        self.whiten = (_inverse(torch.linalg.cholesky(matrix)) * root).to(gain)
 
     def add(self, slope: Tensor, onto: Tensor) -> Tensor:
         """Add the inverse times `slope` onto a spectrum; give the inner product of both, as pixels."""
@@ -88,6 +90,19 @@ class Lowest:
         told = torch.stack([_real(transfer.conj() * s) for s in spectra])
         taken: Tensor = told.T @ inverse @ told
         return taken
+
+
+def _inverse(lower: Tensor) -> Tensor:
+    """Inverse of a lower triangular matrix, by halves: faster than to solve for the unit matrix."""
+    half = len(lower) // 2
+    if half < 128:
+        unit = torch.eye(len(lower), dtype=lower.dtype, device=lower.device)
+        small: Tensor = torch.linalg.solve_triangular(lower, unit, upper=False)
+        return small
+    inverse = torch.zeros_like(lower)
+    inverse[:half, :half], inverse[half:, half:] = _inverse(lower[:half, :half]), _inverse(lower[half:, half:])
+    inverse[half:, :half] = -inverse[half:, half:] @ (lower[half:, :half] @ inverse[:half, :half])
+    return inverse
 
 
 def _real(spectrum: Tensor) -> Tensor:

@@ -22,7 +22,7 @@ from neusee.nodes.restore._descend import descend, inner, pieces
 
 DENSE = 40  #: a picture of no more pixels a side is solved exactly
 STEPS = 20  #: on the finest grid, at most, and four times as many on each coarser one up to
-MOST = 120
+MOST = 100
 ENOUGH = 1e-5  #: it ends where the square distance left, per pixel seen, is this share of the posterior's spread,
 CAREFUL = 8.0  #: and so much less on each coarser grid, where steps are cheap and mend what finer ones cannot
 
@@ -140,7 +140,7 @@ def _exact(seen: Blurred) -> Tensor:
     for pattern in seen.glare:
         shape = root * pattern.double().flatten()
         matrix = matrix + 1e8 * torch.outer(shape, shape) / shape.square().sum().clamp_min(1e-30)
-    matrix = matrix + torch.eye(len(root), dtype=torch.float64, device=root.device)
+    matrix.diagonal().add_(1.0)
     before = torch.zeros_like(fine.transfer) if seen.pull is None else _spread(fine, seen.pull.to(torch.complex128))
     wanted = (root * (seen.picture.double() - fine.blur(before)).flatten())[:, None]
     answer = root * torch.cholesky_solve(wanted, torch.linalg.cholesky(matrix))[:, 0]

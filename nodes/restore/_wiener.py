@@ -1,6 +1,7 @@
 """Wiener deconvolution with the known PSF: the baseline that learns nothing."""
 
 import math
+from itertools import product
 from typing import Annotated, Any
 
 import torch
@@ -59,7 +60,8 @@ def wiener(
     size = (electrons.shape[-2], electrons.shape[-1])
     kernels = effective_psf(psf, illuminant, responses, bands).to(electrons)
     patterns = [crop(pattern.to(electrons), shape=size) for pattern in glare or ()]
-    return _restored(electrons, ~clipped, kernels, _visible(patterns, ~clipped), balance, read_noise)
+    known = (~clipped).to(electrons)
+    return _restored(electrons, known, kernels, _visible(patterns, known), balance, read_noise)
 
 
 @wiener.check
@@ -85,7 +87,7 @@ def _restored(
 ) -> Tensor:
     """Scale the problem to a scene of mean 0 and variance 1, solve it, and scale back."""
     y, x = electrons.shape[-2:]
-    known = torch.where(known.any(-1).any(-1)[:, None, None], known, True)
+    known = torch.where(known.amax((-2, -1), keepdim=True) > 0, known, 1.0)
     picture = electrons - _strengths(electrons, known, glare)
     mean = _mean(picture, known)
     noise = _noise(electrons, mean, read)
@@ -125,11 +127,10 @@ def _strengths(electrons: Tensor, known: Tensor, glare: list[Tensor]) -> Tensor:
     """A first guess of what the glare adds: least squares beside a constant."""
     if not glare:
         return torch.zeros_like(electrons)
-    patterns = torch.stack(glare).double()
-    flat = torch.stack([(known * (p - _mean(p, known))).flatten() for p in patterns])
+    flat = torch.stack([(known * (p - _mean(p, known))).flatten() for p in glare]).double()
     fit = torch.linalg.pinv(flat @ flat.T, hermitian=True) @ (flat @ electrons.double().flatten())
-    total: Tensor = torch.tensordot(fit, patterns, 1)
-    return total.to(electrons)
+    total: Tensor = torch.tensordot(fit.to(electrons), torch.stack(glare), 1)
+    return total
 
 
 def fall(size: tuple[int, int]) -> Tensor:
@@ -155,6 +156,15 @@ def wrapped(kernels: Tensor, size: tuple[int, int]) -> Tensor:
     """The kernels around the first sample of a torus, with what is wider than that laid over the rest."""
     (m, n), (y, x) = kernels.shape[-2:], size
     rows, columns = -(-m // y), -(-n // x)
-    wide = pad(kernels, (0, columns * x - n, 0, rows * y - m))
-    folded = wide if rows == columns == 1 else wide.reshape(-1, rows, y, columns, x).sum((1, 3))
-    return folded.roll((-(m // 2), -(n // 2)), (-2, -1))
+    if rows * columns > 1:
+        wide = pad(kernels, (0, columns * x - n, 0, rows * y - m))
+        folded = wide.reshape(-1, rows, y, columns, x).sum((1, 3))
+        return folded.roll((-(m // 2), -(n // 2)), (-2, -1))
+    around = kernels.new_zeros(len(kernels), y, x)
+    halves = [
+        ((slice(k // 2, k), slice(0, k - k // 2)), (slice(0, k // 2), slice(size[d] - k // 2, size[d])))
+        for d, k in enumerate((m, n))
+    ]
+    for (from_y, to_y), (from_x, to_x) in product(*halves):
+        around[:, to_y, to_x] = kernels[:, from_y, from_x]
+    return around
