@@ -11,6 +11,7 @@ from concurrent.futures import FIRST_COMPLETED, Future, ThreadPoolExecutor, wait
 from typing import Any
 
 from neusee.workflows._keys import Key
+from neusee.workflows._later import Later
 from neusee.workflows._memory import pool_of, there_is
 from neusee.workflows._store import Store
 from neusee.workflows._work import Lane, Outcome, Work, carry_out
@@ -35,6 +36,7 @@ class Local:
         self.lanes = lanes_of(devices, memory)
         self._store, self._fetch = store, fetch
         self._queue: deque[Work] = deque()
+        self.later = Later()
         self._pools: dict[str, ThreadPoolExecutor] = {}
         self._running: set[Future[Outcome]] = set()
 
@@ -44,23 +46,24 @@ class Local:
             if len(self.lanes) == 1:
                 self._queue.append(one)
             else:
-                self._running.add(self._pool(one.lane).submit(carry_out, one, self._fetch, self._store))
+                self._running.add(self._pool(one.lane).submit(carry_out, one, self._fetch, self._store, self.later))
 
     def wait(self, seconds: float | None = None) -> list[Outcome]:
         """Carry out the next step, or wait for a thread to end one."""
         if self._queue:
-            return [carry_out(self._queue.popleft(), self._fetch, self._store)]
+            return [carry_out(self._queue.popleft(), self._fetch, self._store, self.later)]
         if not self._running:
             return []
         done, self._running = wait(self._running, seconds, FIRST_COMPLETED)
         return [future.result() for future in done]
 
     def cancel(self) -> None:
-        """Forget what has not begun, and let what has come to its end."""
+        """Forget what has not begun, let what has come to its end, and write all that is to be kept."""
         self._queue.clear()
         for pool in self._pools.values():
             pool.shutdown(wait=True, cancel_futures=True)
         self._pools, self._running = {}, set()
+        self.later.finish()
 
     def _pool(self, lane: str) -> ThreadPoolExecutor:
         if lane not in self._pools:

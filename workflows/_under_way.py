@@ -165,7 +165,8 @@ class UnderWay:
     def _free(self, keys: Iterable[Key], uses: Counter[Key], keep: bool) -> None:
         """Let go of values at their last use."""
         for key in keys:
-            if uses[key] <= 0 and key in self.values and not (keep and not self.store.has(key)):
+            unsafe = key in self.own.later or (keep and not self.store.has(key))
+            if uses[key] <= 0 and key in self.values and not unsafe:
                 del self.values[key]
 
     def _outcomes(self, plan: list[Key], again: frozenset[Key], targets: list[Key]) -> Iterator[Outcome]:

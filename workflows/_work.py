@@ -17,9 +17,11 @@ import torch
 from neusee.nodes import Check, Facts
 from neusee.workflows._bands import call_by_band, plain_of
 from neusee.workflows._call import RunError, call, examine, versions
-from neusee.workflows._codec import tensors_in
+from neusee.workflows._codec import pack, tensors_in
 from neusee.workflows._graph import Step
 from neusee.workflows._keys import Key, plain
+from neusee.workflows._later import LARGE, Later
+from neusee.workflows._lease import Lease
 from neusee.workflows._memory import Peak
 from neusee.workflows._sidecar import INLINE
 from neusee.workflows._store import Store
@@ -71,6 +73,7 @@ class Outcome:
     bytes: int = 0
     peak: int | None = None  #: bytes beside what was there before
     kept: bool = False  #: whether the store has the value
+    waits: bool = False  #: it is written beside the next steps, and its lease goes with it
     held: bool = False  #: another process is at it
     found: bool = False  #: another process was quicker, and its result is there
     error: BaseException | None = None
@@ -111,26 +114,31 @@ class Executor(Protocol):
         """Begin with nothing more, and wait for what is under way."""
 
 
-def carry_out(work: Work, fetch: Fetch, store: Store) -> Outcome:
-    """Compute one step and keep what is worth keeping; a failure is part of the outcome."""
+def carry_out(work: Work, fetch: Fetch, store: Store, later: Later | None = None) -> Outcome:
+    """Compute one step and keep what is worth keeping, perhaps ``later``; a failure is part of the outcome."""
     if work.quick:
-        return _carried_out(work, fetch, store)
+        return _carried_out(work, fetch, store, None, Lease())
     lease = store.claim(work.key)
     if lease is None:
         return Outcome(work, held=True)
-    with lease:
+    outcome = Outcome(work)
+    try:
         if not work.anew and store.has(work.key):
             return Outcome(work, kept=True, found=True)
-        return _carried_out(work, fetch, store)
+        outcome = _carried_out(work, fetch, store, later, lease)
+        return outcome
+    finally:
+        if not outcome.waits:
+            lease.release()
 
 
-def _carried_out(work: Work, fetch: Fetch, store: Store) -> Outcome:
+def _carried_out(work: Work, fetch: Fetch, store: Store, later: Later | None, lease: Lease) -> Outcome:
     try:
         inputs = [_gathered(read, fetch) for read in work.reads]
     except Lost as error:
         return Outcome(work, lost=error.args)
     try:
-        return _kept(_computed(work, inputs, store), store)
+        return _kept(_computed(work, inputs, store), store, later, lease)
     except Exception as error:
         return Outcome(work, error=error)
 
@@ -167,21 +175,30 @@ def _computed(work: Work, inputs: list[Any], store: Store) -> Outcome:
     return Outcome(work, value, Facts.of(bare), checks, began, seconds, found, peak.bytes)
 
 
-def _kept(outcome: Outcome, store: Store) -> Outcome:
+def _kept(outcome: Outcome, store: Store, later: Later | None, lease: Lease) -> Outcome:
     """Store the value where that pays, and in any case what is known of it."""
-    work = outcome.work
+    work, value, about = outcome.work, outcome.value, _about(outcome)
+    small = outcome.bytes <= INLINE
     try:
-        small = outcome.bytes <= INLINE
         if work.quick and (small or not work.wanted) and not _pays(outcome, store, 0):
-            outcome.kept = store.jot(work.key, outcome.value, _about(outcome))
-        elif work.wanted or small or _pays(outcome, store, outcome.bytes):
-            outcome.kept = store.put(work.key, outcome.value, _about(outcome))
+            outcome.kept = store.jot(work.key, value, about)
+        elif not (work.wanted or small or _pays(outcome, store, outcome.bytes)):
+            store.note(work.key, about)
+        elif later is not None and outcome.bytes >= LARGE:
+            pack(value)  # what cannot be stored is refused here, where the step is known
+            later.add(work.key, outcome.bytes, lambda: _written(store, work.key, value, about, lease))
+            outcome.kept = outcome.waits = True
         else:
-            store.note(work.key, _about(outcome))
+            outcome.kept = store.put(work.key, value, about)
     except TypeError as error:
         raise RunError(work.step, [], error) from error
     outcome.value = plain_of(outcome.value)
     return outcome
+
+
+def _written(store: Store, key: Key, value: Any, about: dict[str, Any], lease: Lease) -> None:
+    with lease:
+        store.put(key, value, about)
 
 
 def _pays(outcome: Outcome, store: Store, size: int) -> bool:

@@ -80,8 +80,9 @@ def saturated(raw: Tensor, *, full_well: Well, gain: Gain, gain_unit: GainUnit =
     Error:  a pixel within one DN of the full well counts as full.
     Source: NeuSee, Eq. (SensorImage).
     """
-    full = clipped(raw, full_well=full_well, gain=gain, gain_unit=gain_unit, bits=bits).any(-3).double()
-    return Saturated(full.sum(), full.mean())
+    full = clipped(raw, full_well=full_well, gain=gain, gain_unit=gain_unit, bits=bits).any(-3)
+    pixels = full.sum().double()
+    return Saturated(pixels, pixels / full.numel())
 
 
 @saturated.check

@@ -42,7 +42,7 @@ def _(electrons: Facts, *, capacity: float) -> float:
 
 @full_well.check
 def _(result: Tensor, electrons: Tensor, *, capacity: float) -> list[Check]:
-    return [Check(f"{int((result >= capacity).sum())} of {result.numel()} full")]
+    return [Check(f"{int(torch.count_nonzero(result >= capacity))} of {result.numel()} full")]
 
 
 @node(rtol=0.0)
@@ -67,8 +67,8 @@ def digitize(
     """
     line = electrons * numbers_per_electron(gain, gain_unit)
     ideal = line.clamp(0, 2**bits - 1)
-    if rounding == "nearest":
-        return ideal + (ideal.round() - ideal).detach()
+    if rounding == "nearest":  # the sum is exact: without a gradient, the rounded number itself
+        return ideal + (ideal.round() - ideal).detach() if ideal.requires_grad else ideal.round_()
     if rng is None:
         raise ValueError("dithered_floor draws random numbers: give rng=torch.Generator()")
     dither = torch.rand(line.shape, generator=rng, device=rng.device, dtype=line.dtype).to(line.device) - 0.5
@@ -104,7 +104,7 @@ def _(*, gain: float, gain_unit: str = "e-/DN", bits: int = 16, **params: object
 
 @digitize.check
 def _(result: Tensor, *inputs: Tensor, bits: int = 16, **params: Any) -> list[Check]:
-    high, low = (float((result == end).double().mean()) for end in (2**bits - 1, 0))
+    high, low = (int(torch.count_nonzero(result == end)) / max(1, result.numel()) for end in (2**bits - 1, 0))
     return [Check(f"{high:.2%} at the top, {low:.2%} at 0 DN", high < 0.5)]
 
 

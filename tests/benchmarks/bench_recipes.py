@@ -2,7 +2,7 @@
 
     python tests/benchmarks/bench_recipes.py [RECIPE ...]
 
-Without a name: first_light, cold and again, and paper_table1, cold and after one change. Each in a fresh cache and a process of its own.
+Without a name: first_light, cold and again; paper_table1, cold and after one change; each in a fresh cache.
 """
 
 from __future__ import annotations
@@ -92,7 +92,7 @@ def engine(cache: Path, *changes: str) -> tuple[float, int, int]:
 def changed(place: Path) -> None:
     """paper_table1 after one change: the whole command, and the engine up to the developed pictures."""
     print(
-        "\n| paper_table1, engine up to the developed pictures | seconds | steps that ran | of cold |\n|---|---|---|---|"
+        "\n| paper_table1, up to the developed pictures | seconds | steps that ran | of cold |\n|---|---|---|---|"
     )
     cold_seconds, ran, count = engine(place / "engine")
     print(f"| cold | {cold_seconds:.1f} | {ran} of {count} | 1 |")
