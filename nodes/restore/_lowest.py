@@ -14,7 +14,7 @@ from torch.nn.functional import pad
 
 from neusee.nodes.restore._blurred import Blurred, Size, inverse_colour
 
-_LEAST = 1e-11  #: of the matrix, scaled to about 1: what float64 cannot tell from nothing
+_LEAST = 1e-11  #: of the largest number of the matrix: what float64 cannot tell from nothing
 MODES = 1000  #: real unknowns of each of at most three channels; of more, as many as three have,
 SHARE = 24  #: and of a small torus one for so many of its points
 
@@ -25,13 +25,13 @@ class Lowest:
     def __init__(self, seen: Blurred, gain: Tensor) -> None:
         """`gain` (channel, fy, fx) scales the matrix: the diagonal of an inverse that is about right."""
         self.torus = seen.torus
-        count = min(MODES, 3 * MODES // len(seen.picture), math.prod(seen.torus) // SHARE)
+        count = min(MODES, 3 * MODES // len(seen.picture), int(math.prod(seen.torus) / SHARE))
         self.fy, self.fx = (f.to(gain.device) for f in _lowest(seen.torus, max(1, count // 2)))
         root = gain[:, self.fy, self.fx].double().sqrt()
         root[:, 0] *= 0.5**0.5  # the mean is its own mirror image
         root = torch.cat([root, root[:, 1:]], 1).flatten()
         matrix = root[:, None] * self._matrix(seen) * root
-        matrix.diagonal().add_(_LEAST)
+        matrix.diagonal().add_(_LEAST * matrix.diagonal().max())
         self.whiten = (_inverse(torch.linalg.cholesky(matrix)) * root).to(gain)
 
     def add(self, slope: Tensor, onto: Tensor) -> Tensor:

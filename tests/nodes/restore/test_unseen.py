@@ -5,9 +5,10 @@ from dataclasses import replace
 import pytest
 import torch
 
-from neusee.nodes.restore import _descend, _unseen
+from neusee.nodes.restore import _descend, _lowest, _unseen
 from neusee.nodes.restore._blurred import Blurred, variance
 from neusee.nodes.restore._descend import descend
+from neusee.nodes.restore._lowest import Lowest
 from neusee.nodes.restore._unseen import halved, most_likely, torus
 from neusee.nodes.restore._wiener import fall
 
@@ -114,6 +115,53 @@ def test_few_steps_from_a_coarse_start_are_near_the_exact_answer(monkeypatch):
     exact = most_likely(model)
     assert error(found) < 1.1 * error(exact)
     assert error(plain) > 1.5 * error(exact)
+
+
+def far(seen, spectrum, answer):
+    """Square distance from the answer in the posterior's own spread: the energy that is left, all pixels together."""
+    slope = seen.slope(answer) - seen.slope(spectrum)
+    return float((space(seen, slope) * space(seen, spectrum - answer)).sum().abs())
+
+
+@pytest.mark.parametrize("single", [False, True])
+@pytest.mark.parametrize("channels", [1, 3])
+def test_it_ends_near_the_answer_as_the_residual_says(channels, single):
+    """The residual tells a tenth to a thirtieth of the square distance; it tells the slowest part too small."""
+    size = torus((90, 70), (9, 9))
+    seen = problem((90, 70), size, channels, 0.9 if channels > 1 else 0.0, hidden=0.2)
+    pattern = torch.rand(seen.picture.shape, dtype=torch.float64, generator=torch.Generator().manual_seed(5))
+    seen = replace(seen, weight=40 * seen.weight, glare=(pattern,))
+    answer, count = most_likely(seen, 400, 1e-14), float((seen.weight > 0).sum())
+    steepest = float(space(seen, seen.slope(0 * answer)).abs().max())
+    assert float(space(seen, seen.slope(answer)).abs().max()) < 1e-7 * steepest
+    rough = Blurred(
+        seen.picture.float(), seen.weight.float(), seen.transfer.to(torch.complex64), seen.power.float(),
+        size, seen.grey, (pattern.float(),),
+    )  # fmt: skip
+    for enough in (1e-1, 1e-3, 1e-5):
+        found = most_likely(rough if single else seen, 100, enough).to(answer)
+        assert far(seen, found, answer) / count < 40 * enough
+
+
+def test_the_lowest_frequencies_are_inverted_exactly(monkeypatch):
+    """With all frequencies but the highest among them, one step is the answer."""
+    seen = problem((11, 9), (15, 13), 2, 0.5, hidden=0.3)
+    pattern = torch.rand(2, 11, 9, dtype=torch.float64, generator=torch.Generator().manual_seed(5))
+    seen = replace(seen, glare=(pattern,))
+    monkeypatch.setattr(_lowest, "SHARE", 0.5)
+    lowest = Lowest(seen, torch.ones_like(seen.transfer.real))
+    assert len(lowest.fy) == (15 * 13 + 1) // 2
+    slope, found = seen.slope(torch.zeros_like(seen.transfer)), torch.zeros_like(seen.transfer)
+    rise = float(lowest.add(slope, found))
+    torch.testing.assert_close(space(seen, found), by_matrix(seen, (pattern,)), rtol=0, atol=1e-5)
+    assert rise == pytest.approx(float((space(seen, slope) * space(seen, found)).sum()), rel=1e-9)
+
+
+@pytest.mark.parametrize("ratio", [1e-12, 1e12])
+def test_finite_where_some_weights_are_beyond_all_others(ratio):
+    seen = problem((50, 45), torus((50, 45), (9, 9)), 2, 0.95, hidden=0.2)
+    seen.weight[:, 20:30, 20:30] *= ratio
+    assert torch.isfinite(most_likely(seen)).all()
 
 
 def slopes(leaves, probe, **how):
