@@ -91,9 +91,7 @@ def engine(cache: Path, *changes: str) -> tuple[float, int, int]:
 
 def changed(place: Path) -> None:
     """paper_table1 after one change: the whole command, and the engine up to the developed pictures."""
-    print(
-        "\n| paper_table1, up to the developed pictures | seconds | steps that ran | of cold |\n|---|---|---|---|"
-    )
+    print("\n| paper_table1, up to the developed pictures | seconds | steps that ran | of cold |\n|---|---|---|---|")
     cold_seconds, ran, count = engine(place / "engine")
     print(f"| cold | {cold_seconds:.1f} | {ran} of {count} | 1 |")
     for change in ("sensor.read_noise=20 e-", "lasers.green.wavelength=550 nm", "sensor.read_noise=10.5 e-"):
