@@ -2,8 +2,8 @@
 
 Linear least squares with a Gaussian prior (Kaipio and Somersalo, Statistical and Computational Inverse Problems, 2005,
 ch. 3), with what lies beyond the edge as unknown as what lies within. Light from there mixes with all that is seen, so
-conjugate gradients get nowhere from a bad start: the problem is solved exactly on a coarse grid, and each finer grid
-starts from the one before.
+conjugate gradients get nowhere from a bad start: the problem is solved exactly on a coarse grid, each finer grid starts
+from the one before, and on the coarser ones each step solves the lowest frequencies at once.
 """
 
 from __future__ import annotations
@@ -23,8 +23,9 @@ from neusee.nodes.restore._descend import descend, inner, pieces
 DENSE = 40  #: a picture of no more pixels a side is solved exactly
 STEPS = 20  #: on the finest grid, at most, and four times as many on each coarser one up to
 MOST = 100
-ENOUGH = 1e-5  #: it ends where the square distance left, per pixel seen, is this share of the posterior's spread,
-CAREFUL = 8.0  #: and so much less on each coarser grid, where steps are cheap and mend what finer ones cannot
+ENOUGH = 1e-5  #: it ends where so much square distance is left per pixel seen, in the answer's own spread, as the
+#: residual tells it: 10 to 30 times too little, since it tells the slowest part too small
+CAREFUL = 8.0  #: so much less is left on each coarser grid, where steps are cheap and mend what finer ones cannot
 
 
 def torus(picture: Size, edge: Size) -> Size:

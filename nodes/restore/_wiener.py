@@ -47,8 +47,9 @@ def wiener(
     Units:  e-; glare any; the result as if the lens were perfect and lost nothing. `balance` multiplies the noise.
     Error:  a grey scene is assumed, and noise no smaller in the dark than that of the mean picture. Without `glare` a
             laser that does not clip is taken for scene. Nothing keeps the result positive: beside lamps hundreds of
-            times as bright as the scene it rings. The iteration ends where the square distance left, per pixel seen, is
-            about 1e-5 of the posterior's spread, or after 20 steps on the finest grid.
+            times as bright as the scene it rings. The iteration ends by its residual, or after 20 steps on the finest
+            grid: behind five half-rings rms 0.005 to 0.02 of the contrast from the converged answer (512 to 2048 pixels
+            a side), behind a plain lens 1e-3; float32 adds 3e-4. Gradients: those of the exact answer, no second ones.
     Raises: ValueError where shapes or bands differ.
     Source: Wiener filter as in Gonzalez and Woods, Digital Image Processing, 4th ed., ch. 5; as least squares with a
             prior, Kaipio and Somersalo, Statistical and Computational Inverse Problems, 2005, ch. 3.
