@@ -197,10 +197,12 @@ def beat(path: str) -> None:
 
 
 def _retire() -> None:
-    for path in _badges.values():
-        with suppress(OSError):
-            os.unlink(path)
-    _badges.clear()
+    """Also runs at the end of the process, when `_beat` may be at it too."""
+    with suppress(KeyError):
+        while True:
+            _, path = _badges.popitem()
+            with suppress(OSError):
+                os.unlink(path)
 
 
 def _forked() -> None:

@@ -63,6 +63,21 @@ def read_whole(disk: Disk, key: str) -> About:
     return about
 
 
+def find(disk: Disk, key: str) -> About | None:
+    """`read_whole`, or None where nothing has the name.
+
+    What cannot be trusted is read again before it is said to be damaged: it may just be taking its name.
+    """
+    for _ in range(2):
+        try:
+            return read_whole(disk, key)
+        except UNREADABLE as error:
+            if not os.path.exists(disk.path(key, "json")):
+                return None
+            damage = error
+    raise damage
+
+
 def has_value(disk: Disk, key: str) -> bool:
     """Whether ``key`` has a value, or something that one cannot read."""
     try:

@@ -85,10 +85,9 @@ class Store:
         about = self.brief.find(key)
         if about is None or not is_kept(about):
             try:
-                about = _sidecar.read_whole(self.disk, key)
+                about = _sidecar.find(self.disk, key)
             except UNREADABLE as error:
-                if os.path.exists(self.disk.path(key, "json")):
-                    self._put_aside(key, error)
+                self._put_aside(key, error)
         if about is not None:
             self._known[key] = about
         return about

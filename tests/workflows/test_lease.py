@@ -252,6 +252,22 @@ def test_heartbeats_are_seen_while_a_lease_is_held_and_end_after_it(tmp_path, mo
 
 
 @FORKS
+def test_two_may_clear_the_badges_away_at_once(tmp_path, monkeypatch):
+    places = {str(i): str(tmp_path / str(i)) for i in range(3)}
+    monkeypatch.setattr(_lease, "_badges", dict(places))
+    removed = []
+
+    def unlink(path):
+        removed.append(path)
+        if len(removed) == 1:
+            _lease._retire()
+
+    monkeypatch.setattr(_lease.os, "unlink", unlink)
+    _lease._retire()
+    assert sorted(removed) == sorted(places.values())
+    assert _lease._badges == {}
+
+
 def test_a_forked_child_holds_nothing(tmp_path):
     store = Store(tmp_path)
     with store.claim(KEY) as lease:

@@ -420,6 +420,24 @@ def test_a_note_that_loses_the_race_leaves_the_value(tmp_path, monkeypatch):
     same(Store(tmp_path).get(KEY), BIG)
 
 
+def test_a_result_that_takes_its_name_while_one_looks_is_not_damaged(tmp_path, monkeypatch):
+    writer, reader = Store(tmp_path), Store(tmp_path)
+    looks = iter([True])
+
+    def read(disk, key, read=_sidecar.read):
+        if next(looks, False):
+            with suppress(FileNotFoundError):
+                read(disk, key)
+            writer.put(key, BIG, {"step": "value"})
+            raise FileNotFoundError(disk.path(key, "json"))
+        return read(disk, key)
+
+    monkeypatch.setattr(_sidecar, "read", read)
+    assert reader.has(KEY)
+    same(reader.get(KEY), BIG)
+    assert not (tmp_path / "bad").exists()
+
+
 def test_entries_from_before_there_were_receipts_are_values(tmp_path):
     keep(tmp_path, BIG)
     about = _sidecar.unseal(sidecar(tmp_path).read_bytes())
