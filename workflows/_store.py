@@ -85,7 +85,7 @@ class Store:
         about = self.brief.find(key)
         if about is None or not is_kept(about):
             try:
-                about = _sidecar.find(self.disk, key)
+                about = _sidecar.find(self.disk, key) or about
             except UNREADABLE as error:
                 self._put_aside(key, error)
         if about is not None:
