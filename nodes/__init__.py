@@ -3,6 +3,6 @@
 Nothing here knows of recipes, caches, devices or graphs.
 """
 
-from neusee.nodes._node import Check, Facts, Node, ParameterError, node
+from neusee.nodes._node import Check, Deviation, Facts, Node, ParameterError, node
 
-__all__ = ["Check", "Facts", "Node", "ParameterError", "node"]
+__all__ = ["Check", "Deviation", "Facts", "Node", "ParameterError", "node"]

@@ -9,6 +9,7 @@ parameter named ``rng`` is filled in by the engine.
 
     @digitize.reference        # float64, slow, plainly right; a test compares to rtol
     @digitize.negligible       # true upper bound of what skipping the step changes
+    @digitize.carries          # how far errors of the inputs can move the result
     @digitize.preflight        # looks at the parameters before anything runs
     @digitize.check            # looks at the result: what a physicist would look at first
 """
@@ -89,8 +90,28 @@ class Facts:
         return cls(shape, dtype, low, high, total, int(torch.count_nonzero(x)), finite)
 
 
+@dataclass(frozen=True, slots=True)
+class Deviation:
+    """How far an input may be from what it ought to be, and what is known of it."""
+
+    bound: float  #: of the largest difference; where the input is random, of its root mean square over the noise
+    facts: Facts | None = None
+
+    @property
+    def share(self) -> float:
+        """The bound as a share of the input's largest element."""
+        if self.bound == 0.0:
+            return 0.0
+        top = max(abs(self.facts.min), abs(self.facts.max)) if self.facts else 0.0
+        return self.bound / top if top > 0 else math.inf
+
+
 class Node:
-    """A function with its typed parameters, its reference, its bound and its checks."""
+    """A function with its typed parameters, its reference, its bound and its checks.
+
+    Cheaper forms, for `neusee.workflows` to choose from where a recipe's tolerance allows it: ``collapsed``, the node
+    that gives `Channels` instead of all bands, and ``mixed``, the one that gives a `Mixture` instead of a cube.
+    """
 
     def __init__(
         self,
@@ -98,9 +119,19 @@ class Node:
         device: Device = "any",
         rtol: float = 1e-5,
         bands: Mapping[str, int] | None = None,
+        channels: Sequence[str] = (),
+        even: Sequence[str] = (),
+        mixtures: Sequence[str] = (),
     ) -> None:
         functools.update_wrapper(self, fn)
         self.fn, self.device, self.rtol = fn, device, rtol
+        self.channels, self.even, self.mixtures = tuple(channels), tuple(even), tuple(mixtures)
+        self.collapsed: Node | None = None
+        self.mixed: Node | None = None
+        self.sums: Callable[[Mapping[str, Any]], bool] | None = None
+        self.spread: Callable[..., float] | None = None
+        self.deviation: Callable[[Any], float] | None = None
+        self.nothing: Callable[..., float] | None = None
         self.ref: Callable[..., Any] | None = None
         self.bound: Callable[..., float] | None = None
         self.before: Callable[..., Sequence[str]] | None = None
@@ -165,6 +196,34 @@ class Node:
         self.bound = fn
         return fn
 
+    def absent(self, fn: Fn) -> Fn:
+        """Attach ``(facts of each input, *, parameters) -> float``: a true bound of the result's largest element.
+
+        Of light that is added to other light: where it is too little, the step and what only feeds it are left out.
+        """
+        self.nothing = fn
+        return fn
+
+    def carries(self, fn: Fn) -> Fn:
+        """Attach ``(a `Deviation` of each input, *, result: Facts, parameters) -> float``: how far the result may be off.
+
+        Both in the maximum norm; behind a random node, in root mean square over the noise. A list input is a list of
+        them, one that is absent None. Without it, nothing is known behind the node, and its inputs are held to the
+        tolerance instead.
+        """
+        self.spread = fn
+        return fn
+
+    def deviates(self, fn: Fn) -> Fn:
+        """Attach ``(result) -> float``: how far a cheaper form may be from the full one, as a share of its largest."""
+        self.deviation = fn
+        return fn
+
+    def even_where(self, fn: Callable[[Mapping[str, Any]], bool]) -> Callable[[Mapping[str, Any]], bool]:
+        """Attach ``(parameters) -> bool``: whether the result is the same for every band."""
+        self.sums = fn
+        return fn
+
     def preflight(self, fn: Fn) -> Fn:
         """Attach ``(*, parameters) -> notes``; it may raise `ParameterError`."""
         self.before = fn
@@ -182,12 +241,21 @@ def _found(module: str, name: str) -> Node:
 
 
 def node(
-    device: Device = "any", rtol: float = 1e-5, bands: Mapping[str, int] | None = None
+    device: Device = "any",
+    rtol: float = 1e-5,
+    bands: Mapping[str, int] | None = None,
+    *,
+    channels: Sequence[str] = (),
+    even: Sequence[str] = (),
+    mixtures: Sequence[str] = (),
 ) -> Callable[[Callable[..., Any]], Node]:
     """Make a node of a function. ``rtol`` is the agreed error against its reference.
 
     ``bands`` gives the axis of the bands of some inputs and of the result (``return``): band i of the result depends
     on band i of those inputs and on the whole of the others, and is the same to the last bit whatever bands stand
     beside it. Of a named tuple, only the fields in `values.BAND_FIELDS` have that axis.
+
+    ``channels`` names the inputs that may be `Channels` instead of an image of all bands; those in ``even`` must then
+    be the same for every band. ``mixtures`` names those that may be a `Mixture` instead of a cube.
     """
-    return lambda fn: Node(fn, device, rtol, bands)
+    return lambda fn: Node(fn, device, rtol, bands, channels, even, mixtures)
