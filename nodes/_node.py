@@ -205,7 +205,7 @@ class Node:
         return fn
 
     def carries(self, fn: Fn) -> Fn:
-        """Attach ``(a `Deviation` of each input, *, result: Facts, parameters) -> float``: how far the result may be off.
+        """Attach ``(a `Deviation` of each input, *, result: Facts, parameters) -> float``: how far off the result may be.
 
         Both in the maximum norm; behind a random node, in root mean square over the noise. A list input is a list of
         them, one that is absent None. Without it, nothing is known behind the node, and its inputs are held to the

@@ -66,7 +66,7 @@ def _over_the_largest(a: Tensor, b: Tensor, norm: Norm) -> float:
     if a.numel() == 0:
         return 0.0
     top, sums = 0.0, Sums(a.numel())
-    for one, other in zip(a.detach().reshape(-1).split(_PART), b.detach().reshape(-1).split(_PART), strict=True):
+    for one, other in zip(_parts(a), _parts(b), strict=True):
         wide = torch.complex128 if one.is_complex() or other.is_complex() else torch.float64
         x, y = one.to(wide).cpu(), other.to(wide).cpu()
         same = (x == y) | (x.isnan() & y.isnan())
@@ -91,3 +91,8 @@ def _largest(sums: Sums) -> float:
 
 def _kind(x: Any) -> str:
     return f"a tensor of {tuple(x.shape)}" if isinstance(x, Tensor) else f"a {type(x).__name__}"
+
+
+def _parts(x: Tensor) -> tuple[Tensor, ...]:
+    parts: tuple[Tensor, ...] = torch.split(x.detach().reshape(-1), _PART)  # type: ignore[no-untyped-call]
+    return parts
