@@ -71,7 +71,7 @@ def digitize(
         return ideal + (ideal.round() - ideal).detach() if ideal.requires_grad else ideal.round_()
     if rng is None:
         raise ValueError("dithered_floor draws random numbers: give rng=torch.Generator()")
-    dither = torch.rand(line.shape, generator=rng, device=rng.device, dtype=line.dtype).to(line.device) - 0.5
+    dither = torch.rand(line.shape, generator=rng, device=rng.device, dtype=torch.float32).to(line) - 0.5
     whole = (line + dither).floor().clamp(0, 2**bits - 1)
     return ideal + (whole - ideal).detach()
 
@@ -91,7 +91,7 @@ def _(
     if rounding == "nearest":
         whole = [round(min(max(x, 0.0), float(top))) for x in line]
     else:
-        dither = torch.rand(electrons.shape, generator=rng, dtype=electrons.dtype).flatten().tolist()
+        dither = torch.rand(electrons.shape, generator=rng, dtype=torch.float32).flatten().tolist()
         whole = [min(max(math.floor(x + d - 0.5), 0), top) for x, d in zip(line, dither, strict=True)]
     return torch.tensor(whole, dtype=electrons.dtype).reshape(electrons.shape)
 

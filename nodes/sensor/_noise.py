@@ -71,8 +71,8 @@ def _poisson(counts: Tensor, rng: Generator) -> Tensor:
 
 
 def normal(like: Tensor, rng: Generator) -> Tensor:
-    """Standard normal numbers in the shape of ``like``, drawn where ``rng`` lives."""
-    return torch.randn(like.shape, generator=rng, device=rng.device, dtype=like.dtype).to(like.device)
+    """Standard normal numbers in the shape of ``like``, drawn where ``rng`` lives; the same in every precision."""
+    return torch.randn(like.shape, generator=rng, device=rng.device, dtype=torch.float32).to(like)
 
 
 @node()

@@ -154,3 +154,19 @@ def test_a_laser_above_the_well_hides_no_noise():
     assert read_noise.bound(dazzled, **noise, full_well=None) < 1e-4
     dark = dark_current.bound(dazzled, mean=0.002, full_well=25500.0)
     assert dark == pytest.approx(math.hypot(0.002, math.sqrt(0.002)) / 25500, rel=1e-3)
+
+
+@pytest.mark.parametrize("dtype", [torch.float16, torch.float64])
+def test_another_precision_draws_the_same_numbers(dtype):
+    electrons = torch.full((64,), 100.0)
+    single = read_noise(electrons, pedestal=0.0, sigma=1.0, rng=seeded())
+    other = read_noise(electrons.to(dtype), pedestal=0.0, sigma=1.0, rng=seeded())
+    torch.testing.assert_close(other.double(), single.double(), rtol=torch.finfo(dtype).eps, atol=1e-4)
+
+
+@pytest.mark.parametrize("distribution", ["gaussian", "poisson"])
+def test_the_noise_of_light_is_the_same_in_single_and_double(distribution):
+    photons = torch.linspace(0, 1e4, 500)
+    how = {"quantum_efficiency": 0.56, "distribution": distribution}
+    single, double = (photon_noise(photons.to(d), rng=seeded(), **how) for d in (torch.float32, torch.float64))
+    torch.testing.assert_close(single.double(), double, rtol=1e-6, atol=1e-2)
