@@ -1,5 +1,6 @@
 """What can be made of a relief: wrapped, limited in depth, cut in steps."""
 
+import math
 from typing import Annotated
 
 import torch
@@ -11,6 +12,7 @@ from neusee.nodes.doe._material import Material, wave_height
 from neusee.nodes.units import PositiveLength, Wavelength
 
 Levels = Annotated[int, Field(ge=2)]
+_VIOLET = 400e-9  #: m, at which a move of the relief is weighed as phase
 
 
 def _quantize(height: Tensor, step: float, levels: int, cyclic: bool) -> Tensor:
@@ -84,10 +86,33 @@ def _(
 def _(
     height: Facts, *, material: Material, wrap_at: float | None, levels: int | None, max_height: float | None
 ) -> float:
-    """0 where nothing is wrapped, cut or stepped; else unbounded: what is small in height is not small in phase."""
+    """What wrapping, cutting and steps move at most, over the deepest that is known to be made; 0 where all fits.
+
+    What is small in height is not small in phase: the bound is never below the phase, in radians at 400 nm, that
+    the move turns. Wrapping turns no phase at ``wrap_at``, and counts in full all the same.
+    """
     top = max_height if wrap_at is None else wave_height(material, wrap_at)
-    fits = height.finite and height.min >= 0 and (top is None or height.max < top)
-    return 0.0 if levels is None and fits else float("inf")
+    if not height.finite or top is None:
+        return 0.0 if height.finite else math.inf
+    ends = torch.tensor([height.min, height.max], dtype=getattr(torch, height.dtype))
+    moved = _moved(ends, float(torch.tensor(top, dtype=ends.dtype)), levels, cyclic=wrap_at is not None)
+    if moved == 0:
+        return 0.0
+    made = fabricate(ends, material=material, wrap_at=wrap_at, levels=levels, max_height=max_height)
+    deepest, turned = float(made.abs().max()), 2 * math.pi * moved / wave_height(material, _VIOLET)
+    return max(turned, moved / deepest if deepest > 0 else math.inf)
+
+
+def _moved(ends: Tensor, top: float, levels: int | None, cyclic: bool) -> float:
+    """Bound of what any height between two ends moves, m; exact without steps."""
+    low, high = (float(end) for end in ends)
+    if not cyclic:
+        return max(high - top, -low, 0.0 if levels is None else top / (levels - 1) / 2)
+    waves = max(abs(math.floor(low / top)), abs(math.floor(high / top)))
+    if levels is None:
+        return top * waves
+    rounded_up = high >= top * (1 - 0.5 / levels) * (1 - 4 * torch.finfo(ends.dtype).eps)  # to a whole wave, so to 0
+    return top * (waves + rounded_up + 0.5 / levels)
 
 
 @fabricate.preflight

@@ -37,7 +37,15 @@ def full_well(electrons: Tensor, *, capacity: Well) -> Tensor:
 
 @full_well.negligible
 def _(electrons: Facts, *, capacity: float) -> float:
-    return max(0.0, electrons.max - capacity) / capacity
+    """What the brightest pixel loses, over the well or over what lies furthest below 0; exact.
+
+    The well is the number that the dtype holds, which lies beside ``capacity`` by up to half a step.
+    """
+    held = float(torch.tensor(capacity, dtype=getattr(torch, electrons.dtype)))
+    if electrons.max <= held:
+        return 0.0
+    largest = max(held, -electrons.min)
+    return (electrons.max - held) / largest if largest > 0 else math.inf
 
 
 @full_well.check

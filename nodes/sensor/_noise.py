@@ -93,7 +93,7 @@ def dark_current(electrons: Tensor, *, mean: Electrons, full_well: Well | None =
 
 @dark_current.negligible
 def _(electrons: Facts, *, mean: float, full_well: float | None) -> float:
-    return _share(mean, math.sqrt(mean), electrons.max, full_well)
+    return _share(mean, math.sqrt(mean), electrons, full_well)
 
 
 @node()
@@ -112,10 +112,18 @@ def read_noise(
 
 @read_noise.negligible
 def _(electrons: Facts, *, pedestal: float, sigma: float, full_well: float | None) -> float:
-    return _share(pedestal, sigma, electrons.max, full_well)
+    return _share(pedestal, sigma, electrons, full_well)
 
 
-def _share(shift: float, spread: float, brightest: float, full_well: float | None) -> float:
-    """Root mean square of what is added, over that of the brightest pixel that the well can hold, with it."""
-    added, top = math.hypot(shift, spread), min(brightest, brightest if full_well is None else full_well)
-    return added / math.hypot(top + shift, spread) if added > 0 else 0.0
+def _share(shift: float, spread: float, electrons: Facts, full_well: float | None) -> float:
+    """Root mean square of what is added, over the largest of the result or over the well, whichever is less.
+
+    The largest is that of the brightest or of the darkest pixel, for below 0 the darkest may be it. The well alone
+    is not enough: in the dark the noise is all there is. Exact for one mean and spread everywhere.
+    """
+    added = math.hypot(shift, spread)
+    if added == 0:
+        return 0.0
+    largest = max(math.hypot(electrons.max + shift, spread), math.hypot(electrons.min + shift, spread))
+    weighed = largest if full_well is None else min(largest, full_well)
+    return added / weighed if weighed > 0 else math.inf

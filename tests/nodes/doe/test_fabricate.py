@@ -117,8 +117,23 @@ def test_negligible_only_where_nothing_changes():
     facts = Facts.of(torch.tensor([[0.0, 1e-6]]))
     assert doe.fabricate.bound(facts, **PLAIN | {"wrap_at": 550e-9}) == 0
     assert doe.fabricate.bound(facts, **PLAIN | {"max_height": 2e-6}) == 0
-    assert doe.fabricate.bound(facts, **PLAIN | {"wrap_at": 400e-9}) == math.inf
-    assert doe.fabricate.bound(facts, **PLAIN | {"wrap_at": 550e-9, "levels": 256}) == math.inf
+    assert doe.fabricate.bound(facts, **PLAIN | {"max_height": float(torch.tensor(1e-6))}) == 0
+    assert doe.fabricate.bound(facts, **PLAIN | {"wrap_at": 400e-9}) > 1
+
+
+def test_small_in_height_is_not_small_in_phase():
+    facts = Facts.of(torch.tensor([[0.0, 0.9e-6]]))
+    step = 0.5e-6 / 255 / wave_height("fused silica", 400e-9)  # half a step, waves
+    bound = doe.fabricate.bound(facts, **PLAIN | {"max_height": 1e-6, "levels": 256})
+    assert bound == pytest.approx(2 * math.pi * step, rel=1e-6)
+
+
+def test_a_relief_that_reaches_one_wave_as_float32_holds_it_is_wrapped():
+    wave = wave_height("fused silica", 551e-9)
+    height = torch.tensor([[0.0, wave]])
+    assert float(height.max()) < wave
+    assert doe.fabricate(height, **PLAIN | {"wrap_at": 551e-9}).abs().max() == 0
+    assert doe.fabricate.bound(Facts.of(height), **PLAIN | {"wrap_at": 551e-9}) == math.inf
 
 
 @pytest.mark.parametrize("params", [{"wrap_at": 550e-9, "levels": 4}, {"max_height": 2e-6, "levels": 4}])

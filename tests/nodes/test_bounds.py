@@ -1,0 +1,147 @@
+"""Every bound of what may be left out: true over random draws, extremes among them, and never far from the truth.
+
+A draw gives what a step is stated to change at most and what it does change. Of noise, the
+change is known in closed form from the moments of its law; the others are measured.
+"""
+
+import math
+from statistics import median
+
+import pytest
+import torch
+from scipy import stats
+
+from neusee.nodes import Facts, doe, sensor
+
+ROUNDING = 1e-9  #: of a bound, in float64
+DRAWS = [30, pytest.param(1000, marks=pytest.mark.slow)]
+FURTHEST = 100.0  #: times the change that a bound may be, at the median
+
+
+class Draw:
+    """Random parameters over decades, with the ends drawn often."""
+
+    def __init__(self, seed):
+        self.rng = torch.Generator().manual_seed(seed)
+
+    def uniform(self, low=0.0, high=1.0):
+        return low + (high - low) * float(torch.rand((), generator=self.rng, dtype=torch.float64))
+
+    def decades(self, low, high):
+        return 10.0 ** self.uniform(math.log10(low), math.log10(high))
+
+    def one_of(self, *choices):
+        return choices[int(self.uniform(0, len(choices)))]
+
+    def often(self, end, otherwise):
+        return end if self.uniform() < 0.15 else otherwise
+
+    def image(self, largest, *shape):
+        """Values over eight decades below ``largest``, some of them 0."""
+        x = largest * 10.0 ** (-8 * torch.rand(*shape, generator=self.rng, dtype=torch.float64))
+        return x.where(torch.rand(*shape, generator=self.rng) > self.often(1.0, self.uniform()), 0.0)
+
+    def electrons(self):
+        """No light, one electron, up to 1e8 wells; now and then below 0."""
+        light = self.image(self.often(1.0, self.decades(1e-3, 2.5e12)), 5, 7)
+        return light - self.often(self.decades(1e-3, 1e3), 0.0)
+
+
+def root_mean_square(electrons, shift, variance):
+    """Largest over the pixels, of the electrons and a noise of that mean and variance."""
+    return float(((electrons + shift).square() + variance).sqrt().max())
+
+
+def noise_change(electrons, shift, variance, full_well):
+    top = root_mean_square(electrons, shift, variance)
+    return math.sqrt(shift**2 + variance) / min(top, full_well or math.inf) if shift or variance else 0.0
+
+
+def dark(draw):
+    electrons, mean = draw.electrons(), draw.often(0.0, draw.decades(1e-9, 1e4))
+    well = draw.often(None, draw.decades(10, 1e6))
+    law = stats.poisson(mean)
+    bound = sensor.dark_current.bound(Facts.of(electrons), mean=mean, full_well=well)
+    return bound, noise_change(electrons, float(law.mean()), float(law.var()), well)
+
+
+def reading(draw):
+    electrons, well = draw.electrons(), draw.often(None, draw.decades(10, 1e6))
+    noise = {"pedestal": draw.often(0.0, draw.decades(1e-6, 1e4)), "sigma": draw.often(0.0, draw.decades(1e-6, 1e4))}
+    bound = sensor.read_noise.bound(Facts.of(electrons), **noise, full_well=well)
+    return bound, noise_change(electrons, noise["pedestal"], noise["sigma"] ** 2, well)
+
+
+def largest_change(result, without):
+    change, top = (float(x.double().abs().max()) for x in (result.double() - without.double(), result))
+    return change / top if top > 0 else math.inf if change > 0 else 0.0
+
+
+def holding(draw):
+    dtype = draw.one_of(torch.float64, torch.float32, torch.bfloat16)
+    electrons, capacity = draw.electrons().to(dtype), draw.decades(1, 1e7)
+    if draw.uniform() < 0.5:  # just above or below the well, where most that is left out lies
+        electrons = electrons.clamp_max(capacity * (1 + draw.decades(1e-9, 1.0)))
+    bound = sensor.full_well.bound(Facts.of(electrons), capacity=capacity)
+    return bound, largest_change(sensor.full_well(electrons, capacity=capacity), electrons)
+
+
+def making(draw):
+    dtype = draw.one_of(torch.float64, torch.float32)
+    wave = draw.often(None, draw.decades(200e-9, 5e-6))
+    levels = draw.one_of(None, None, 2, 4, 16, 256, 65536)
+    deepest = draw.one_of(None, draw.decades(1e-8, 1e-4)) if wave is None else None
+    if wave is None and deepest is None:
+        levels = None
+    material = draw.one_of("fused silica", "PMMA", "BK7", "photoresist")
+    params = {"material": material, "wrap_at": wave, "levels": levels, "max_height": deepest}
+    rough = torch.rand(6, 6, generator=draw.rng, dtype=torch.float64) - draw.often(0.5, 0.0)
+    height = (draw.often(0.0, draw.decades(1e-8, 1e-4)) * rough).to(dtype)
+    bound = doe.fabricate.bound(Facts.of(height), **params)
+    return bound, largest_change(doe.fabricate(height, **params), height)
+
+
+def windowing(draw):
+    image = draw.image(1.0, 2, 4, 4)
+    shape = (int(draw.uniform(1, 5)), int(draw.uniform(1, 5)))
+    same = sensor.crop(image, shape=shape).shape == image.shape
+    return sensor.crop.bound(Facts.of(image), shape=shape), 0.0 if same else math.inf
+
+
+CHANGES = {"dark_current": dark, "read_noise": reading, "full_well": holding, "fabricate": making, "crop": windowing}
+
+
+def hold(case, draws, rounding=ROUNDING):
+    """Every bound holds, and half of them are close; gives how far, at the median and at most."""
+    looseness = []
+    for seed in range(draws):
+        bound, found = case(Draw(seed))
+        assert found <= bound * (1 + rounding), f"draw {seed}: {found} where at most {bound} was stated"
+        if 0 < found < math.inf:
+            looseness.append(bound / found)
+    assert not looseness or median(looseness) <= FURTHEST
+    return (median(looseness), max(looseness)) if looseness else (1.0, 1.0)
+
+
+@pytest.mark.parametrize("draws", DRAWS)
+@pytest.mark.parametrize("name", CHANGES)
+def test_what_is_left_out_changes_no_more_than_stated(name, draws):
+    hold(CHANGES[name], draws, 1e-5 if name == "fabricate" else ROUNDING)
+
+
+def test_noise_that_undoes_what_is_there_is_unbounded():
+    found = Facts.of(torch.full((2, 2), -5.0))
+    assert sensor.read_noise.bound(found, pedestal=5.0, sigma=0.0, full_well=None) == math.inf
+
+
+def test_noise_above_the_well_is_weighed_against_the_well():
+    found = Facts.of(torch.tensor([0.0, 25500.0]))
+    assert sensor.dark_current.bound(found, mean=1e4, full_well=25500.0) == pytest.approx(1e4 / 25500, rel=1e-4)
+
+
+@pytest.mark.parametrize("mean", [1e-6, 1e-3, 0.1, 30.0])
+def test_the_moments_are_those_that_the_node_draws(mean):
+    rng = torch.Generator().manual_seed(3)
+    squares = sensor.dark_current(torch.zeros(1000, 1000), mean=mean, full_well=None, rng=rng).double().square()
+    fourth = mean + 7 * mean**2 + 6 * mean**3 + mean**4
+    assert abs(float(squares.mean()) - mean - mean**2) <= 5 * math.sqrt(fourth / squares.numel())
