@@ -24,7 +24,8 @@ Where = tuple[str | int, ...]  #: keys and indices from the top of a recipe
 _TAG = "tag:yaml.org,2002:"
 _INT = re.compile(r"[-+]?[0-9]+|0o[0-7]+|0x[0-9a-fA-F]+")
 _FLOAT = re.compile(r"[-+]?(?:\.[0-9]+|[0-9]+(?:\.[0-9]*)?)(?:[eE][-+]?[0-9]+)?")
-_MOST = 1_000_000  #: values that aliases may make of one file
+_MOST = 1_000_000  #: values in one file
+_MOST_AGAIN = 100_000  #: of them by aliases
 
 
 @dataclass(frozen=True, slots=True)
@@ -128,6 +129,7 @@ class _Builder:
         self.made: dict[int, Value] = {}
         self.open: set[int] = set()
         self.size: dict[int, int] = {}
+        self.again = 0  # values that aliases made
 
     def value(self, node: Node, path: Where, key: Mark) -> Value:
         mark, tag = self._mark(node), (node.tag or "").replace(_TAG, "!!")
@@ -136,7 +138,9 @@ class _Builder:
         if isinstance(node, ScalarNode):
             return Value(_scalar(node), mark, key, path)
         if id(node) in self.made:
-            return replace(self.made[id(node)], key=key, path=path)
+            self.again += self.size[id(node)]
+            self._refuse_many(self.again, _MOST_AGAIN, mark, path)
+            return replace(_moved(self.made[id(node)], path), key=key)
         if id(node) in self.open:
             return self._refuse(mark, path, "an alias inside the very value that it stands for")
         self.open.add(id(node))
@@ -168,8 +172,11 @@ class _Builder:
         """Refuse a small file that aliases blow up."""
         children = [v for pair in node.value for v in pair] if isinstance(node, MappingNode) else node.value
         self.size[id(node)] = 1 + sum(self.size.get(id(child), 1) for child in children)
-        if self.size[id(node)] > _MOST:
-            raise RecipeError([Problem(made.mark, made.name, f"aliases make more than {_MOST} values of this")])
+        self._refuse_many(self.size[id(node)], _MOST, made.mark, made.path)
+
+    def _refuse_many(self, count: int, most: int, mark: Mark, path: Where) -> None:
+        if count > most:
+            raise RecipeError([Problem(mark, dotted(path), f"aliases make more than {most} values of this")])
 
     def _mark(self, node: Node) -> Mark:
         if not self.start.line:
@@ -179,6 +186,16 @@ class _Builder:
     def _refuse(self, mark: Mark, path: Where, message: str) -> Value:
         self.problems.append(Problem(mark, dotted(path), message))
         return Value(None, mark, mark, path)
+
+
+def _moved(value: Value, path: Where) -> Value:
+    """The same value at another place, and all below it."""
+    data = value.data
+    if isinstance(data, dict):
+        data = {key: _moved(child, (*path, key)) for key, child in data.items()}
+    elif isinstance(data, list):
+        data = [_moved(child, (*path, i)) for i, child in enumerate(data)]
+    return replace(value, data=data, path=path)
 
 
 _KNOWN = {f"!!{name}" for name in ("str", "int", "float", "bool", "null", "map", "seq", "timestamp", "merge", "value")}

@@ -87,6 +87,17 @@ def test_the_config_is_a_recipe_that_says_the_same(read, tmp_path, toy):
     assert "# argument 1" in first.config.to_yaml()
 
 
+def test_every_packaged_recipe_says_itself_again(tmp_path):
+    """Steps that share their parameters by an alias once lost them."""
+    for name in (titled.name for titled in recipes()):
+        first = load(name)
+        (tmp_path / f"{name}.yaml").write_text(first.config.to_yaml(), encoding="utf-8")
+        again = load(f"{name}.yaml", folder=tmp_path)
+        assert {n: (s.params, s.wires) for n, s in again.steps.items()} == {
+            n: (s.params, s.wires) for n, s in first.steps.items()
+        }
+
+
 def test_references_keep_their_type_nest_and_paste(read):
     text = """
     a: {pitch: "${b.pitch}", shape: "${b.shape}", which: one, one: 3, unit: um}

@@ -113,6 +113,7 @@ def test_an_alias_is_the_same_value_again():
     value = parse("a: &x {b: 1}\nc: *x\n", TOP)
     assert value.plain == {"a": {"b": 1}, "c": {"b": 1}}
     assert value.items["c"].path == ("c",)
+    assert [leaf.path for leaf in value.leaves()] == [("a", "b"), ("c", "b")]
     assert str(value.items["c"].key) == "f.yaml:2:1"
 
 
