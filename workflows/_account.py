@@ -3,10 +3,13 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Literal
+from typing import TYPE_CHECKING, Literal
 
 from neusee.nodes import Check, Facts
 from neusee.workflows._keys import Key
+
+if TYPE_CHECKING:
+    from neusee.workflows._work import Outcome
 
 State = Literal["run", "cached", "left out", "asleep"]
 
@@ -29,7 +32,31 @@ class Done:
     lane: str = ""  #: which place of the executor computed it
     peak: int | None = None  #: bytes of memory beside what was there before it ran
     predicted: float | None = None  #: s that earlier runs made one expect
+    error: float | None = None  #: of a cheaper form: how far it may be from the full one, as a share of its largest
     kept: bool = True  #: whether the store has the value
+
+
+def ran(outcome: Outcome, why: str, bound: float | None, began: float, predicted: float | None) -> Done:
+    """The account of a step that was computed in a run that ``began`` then."""
+    work = outcome.work
+    return Done(
+        work.step.name,
+        "run",
+        why,
+        outcome.seconds,
+        work.key,
+        outcome.facts,
+        outcome.checks,
+        work.device,
+        outcome.bytes,
+        bound,
+        outcome.began - began,
+        work.lane,
+        outcome.peak,
+        predicted,
+        outcome.deviation,
+        outcome.kept,
+    )
 
 
 @dataclass(frozen=True, slots=True)

@@ -10,11 +10,12 @@ import torch
 from neusee.nodes import Facts
 from neusee.workflows._call import call, place
 from neusee.workflows._codec import settle
-from neusee.workflows._graph import Recipe, Step, in_order
+from neusee.workflows._economy import economised
+from neusee.workflows._graph import Recipe, Step, in_order, needed
+from neusee.workflows._ledger import Ledger
 from neusee.workflows._marks import nearest
 from neusee.workflows._run import run
 from neusee.workflows._store import Store
-from neusee.workflows._verdict import judge
 
 Theta = Mapping[str, Any]
 
@@ -34,6 +35,7 @@ def as_function(
     """
     wanted = recipe.outputs if outputs is None else tuple(outputs)
     given, tuned = _read(recipe, free)
+    recipe = economised(recipe, wanted, given | tuned.keys())
     sources = {name: () if name in given else step.sources for name, step in recipe.steps.items()}
     order = in_order(sources, wanted)
     if idle := sorted((given | tuned.keys()) - set(order)):
@@ -43,8 +45,9 @@ def as_function(
         if name in given or name in tuned or any(source in live for source in sources[name]):
             live.setdefault(name)
     border = {name for step in live for name in sources[step]} | set(wanted)
-    fixed = run(recipe, store, sorted(border - live.keys()), device=device).values
-    return _Function(recipe, free, wanted, given, tuned, list(live), fixed, device)
+    fixed = run(recipe, store, sorted(border - live.keys()), device=device)
+    left_out = {name: done.bound or 0.0 for name, done in fixed.done.items() if done.state == "left out"}
+    return _Function(recipe, free, wanted, given, tuned, list(live), fixed.values, left_out, device)
 
 
 def _read(recipe: Recipe, free: tuple[str, ...]) -> tuple[set[str], dict[str, dict[str, str]]]:
@@ -76,32 +79,45 @@ class _Function:
         tuned: dict[str, dict[str, str]],
         live: list[str],
         fixed: dict[str, Any],
+        left_out: Mapping[str, float],
         device: str,
     ) -> None:
         self.recipe, self.free, self.wanted, self.device = recipe, free, wanted, device
         self.given, self.tuned, self.live, self.fixed = given, tuned, live, fixed
         self._facts: dict[str, Facts | None] = {}
+        self._left_out, self._before = left_out, needed(recipe, fixed)
         self._last = {source: name for name in live if name not in given for source in recipe.steps[name].sources}
 
     def __call__(self, theta: Theta) -> dict[str, Any]:
         if set(theta) != set(self.free):
             raise ValueError(f"give exactly {', '.join(self.free)}, not {', '.join(theta) or 'nothing'}")
-        values = dict(self.fixed)
+        values, ledger = dict(self.fixed), self._ledger()
         for name in self.live:
             step = self.recipe.steps[name]
-            values[name] = settle(theta[name]) if name in self.given else self._evaluate(step, values, theta)
+            values[name] = settle(theta[name]) if name in self.given else self._evaluate(step, values, theta, ledger)
             for source in () if name in self.given else set(step.sources):
                 if self._last[source] == name and source not in self.wanted:
                     del values[source]
         return {name: values[name] for name in self.wanted}
 
-    def _evaluate(self, step: Step, values: dict[str, Any], theta: Theta) -> Any:
+    def _ledger(self) -> Ledger:
+        """What the fixed steps have spent of the tolerance."""
+        ledger = Ledger(self.recipe)
+        for name in self._before:
+            ledger.pass_on(self.recipe.steps[name])
+            if name in self._left_out:
+                ledger.leave_out(self.recipe.steps[name], self._left_out[name])
+        return ledger
+
+    def _evaluate(self, step: Step, values: dict[str, Any], theta: Theta, ledger: Ledger) -> Any:
         params = {**step.params, **{p: theta[full] for p, full in self.tuned.get(step.name, {}).items()}}
         if step.node.bound is not None:
             with torch.no_grad():
-                verdict = judge(step, params, lambda name: self._facts_of(name, values), self.recipe.tolerance)
+                verdict = ledger.verdict(step, params, lambda name: self._facts_of(name, values))
             if verdict.left_out:
                 return values[verdict.instead]
+        else:
+            ledger.pass_on(step)
         inputs = [_gather(step.wires.get(name), values) for name in step.node.inputs]
         return call(step, inputs, params, self.recipe.seed, place(step, self.device))
 

@@ -13,7 +13,7 @@ from neusee.workflows._marks import Mark
 if TYPE_CHECKING:
     from neusee.workflows import Event, Executor, Result, Store
 
-__all__ = ["Config", "Expectation", "Recipe", "Setting", "Step", "Wire", "in_order", "needed"]
+__all__ = ["Config", "Economy", "Expectation", "Recipe", "Setting", "Step", "Wire", "in_order", "needed"]
 
 Wire = str | tuple[str, ...] | None  #: one step, the steps of all items, or an optional input that is absent
 
@@ -38,6 +38,16 @@ class Step:
 
 def _names(wire: Wire) -> tuple[str, ...]:
     return () if wire is None else (wire,) if isinstance(wire, str) else wire
+
+
+@dataclass(frozen=True, slots=True)
+class Economy:
+    """A cheaper step that stands in for a full one."""
+
+    step: str  #: the full step
+    instead: str  #: the one that is computed
+    within: float  #: what it may change at most, as a share of the largest element of its result
+    why: str
 
 
 @dataclass(frozen=True, slots=True)
@@ -66,6 +76,15 @@ class Recipe:
     config: Config = field(default_factory=Config)
     notes: tuple[str, ...] = ()
     absent: Mapping[str, str] = field(default_factory=dict)  #: step that is null -> where that is written
+    keep_all: bool = False  #: compute every step in full, whatever the tolerance allows
+    economies: tuple[Economy, ...] = ()  #: what stands in for full steps; a recipe as it is read has none
+    strict: float = 1.0  #: share of the tolerance that may be spent: less where a run could not prove that it held
+    whole: Recipe | None = field(default=None, compare=False)  #: the recipe without economies, where this has some
+
+    @property
+    def allowed(self) -> float:
+        """What all that is left out or computed more cheaply may change."""
+        return self.tolerance * self.strict
 
     def run(
         self,

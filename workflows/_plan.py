@@ -8,6 +8,7 @@ from typing import Any
 
 from neusee.workflows._call import places
 from neusee.workflows._costs import Costs, Estimate
+from neusee.workflows._economy import economised
 from neusee.workflows._graph import Recipe
 from neusee.workflows._keys import Key
 from neusee.workflows._local import lanes_of
@@ -38,6 +39,7 @@ class Plan:
 
 def planned(recipe: Recipe, store: Store, lanes: Mapping[str, Lane]) -> Plan:
     """Look up what a run would compute, read and need; compute nothing."""
+    recipe = economised(recipe, wanted(recipe))
     order = steps_of(recipe)
     devices = [lane.device for lane in lanes.values()]
     resolved = resolve(recipe, order, store, ",".join(devices))
@@ -78,7 +80,7 @@ def simulated_lines(recipe: Recipe, store: Store, machines: str) -> list[str]:
     from neusee.workflows._machines import read_machines
     from neusee.workflows._plan_cluster import cluster_lines
 
-    cluster = read_machines(machines)
+    cluster, recipe = read_machines(machines), economised(recipe, wanted(recipe))
     costs, kinds = past_costs(store), sorted({"cpu", *(device.kind for device in cluster.devices)})
     names = steps_of(recipe)
     return cluster_lines(recipe, {name: costs.of(recipe.steps[name], kinds) for name in names}, cluster)

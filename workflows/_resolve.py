@@ -11,8 +11,9 @@ from neusee.workflows._call import RunError, place
 from neusee.workflows._code import Code
 from neusee.workflows._graph import Recipe
 from neusee.workflows._keys import Key, key_of
+from neusee.workflows._ledger import Ledger
 from neusee.workflows._store import Store
-from neusee.workflows._verdict import Verdict, judge
+from neusee.workflows._verdict import Verdict
 
 
 @dataclass(frozen=True, slots=True)
@@ -38,7 +39,7 @@ class Resolved:
 
 def resolve(recipe: Recipe, order: Iterable[str], store: Store, device: str = "cpu") -> Resolved:
     """Give each step of ``order``, in which sources come first, its key as a run on ``device`` would."""
-    found, code = Resolved(), Code(store.code_memo)
+    found, code, ledger = Resolved(), Code(store.code_memo), Ledger(recipe)
 
     def facts_of(name: str) -> Facts | None:
         known = (store.about(found.keys[name]) or {}).get("facts")
@@ -50,9 +51,11 @@ def resolve(recipe: Recipe, order: Iterable[str], store: Store, device: str = "c
         step = recipe.steps[name]
         if step.node.bound is not None:
             try:
-                found.verdicts[name] = judge(step, step.params, facts_of, recipe.tolerance)
+                found.verdicts[name] = ledger.verdict(step, step.params, facts_of)
             except RunError:
                 found.verdicts[name] = None
+        else:
+            ledger.pass_on(step)
         verdict = found.verdicts.get(name)
         if verdict is not None and verdict.left_out:
             found.keys[name] = found.keys[verdict.instead]

@@ -5,23 +5,27 @@ from __future__ import annotations
 import resource
 import time
 from collections.abc import Callable, Iterable
-from dataclasses import dataclass
+from dataclasses import dataclass, field, replace
 from typing import Any
 
 import torch
 
 from neusee.workflows._account import Done, Event
 from neusee.workflows._call import to_device
+from neusee.workflows._economy import economised
 from neusee.workflows._graph import Recipe, needed
 from neusee.workflows._keys import Key
 from neusee.workflows._marks import nearest
 from neusee.workflows._place import Schedule
+from neusee.workflows._proof import Proof, proof
 from neusee.workflows._remote import open_store
 from neusee.workflows._store import Store
 from neusee.workflows._under_way import UnderWay
 from neusee.workflows._work import Executor
 
 __all__ = ["Done", "Event", "Result", "run"]
+
+_LEAST = 1e-3  #: share of the tolerance below which nothing is left out any more
 
 
 @dataclass(frozen=True, repr=False)
@@ -37,6 +41,7 @@ class Result:
     store: Store
     device: str = "cpu"
     schedule: Schedule | None = None  #: what was expected of the steps that ran
+    proof: Proof = field(default_factory=Proof)  #: what was left out, or computed more cheaply, may change at each step
 
     def value(self, step: str) -> Any:
         """The value of any step of the recipe: from this run, from the store, or computed now."""
@@ -89,9 +94,31 @@ def run(
     for name in wanted:
         if name not in recipe.steps:
             raise ValueError(f"no step {name!r}; {nearest(name, recipe.steps)}")
-    work = UnderWay(
-        recipe, store or open_store(), device.split(","), watch or (lambda event: None), wanted, executor, memory
-    )
+    recipe, store, watch = economised(recipe, wanted), store or open_store(), watch or (lambda event: None)
+    while True:
+        result = _attempt(recipe, store, wanted, watch, device, executor, memory, began)
+        if result.proof.worst <= recipe.tolerance:
+            return result
+        recipe = economised(_stricter(recipe, result.proof.worst), wanted)
+
+
+def _stricter(recipe: Recipe, bound: float) -> Recipe:
+    """The recipe with less to spend, where it could not be proved that its tolerance held; in the end nothing."""
+    strict = recipe.strict * min(0.5, 0.8 * recipe.tolerance / bound) if recipe.strict > _LEAST else 0.0
+    return replace(recipe.whole or recipe, strict=strict, keep_all=recipe.keep_all or strict == 0.0)
+
+
+def _attempt(
+    recipe: Recipe,
+    store: Store,
+    wanted: tuple[str, ...],
+    watch: Callable[[Event], None],
+    device: str,
+    executor: Executor | None,
+    memory: int | None,
+    began: float,
+) -> Result:
+    work = UnderWay(recipe, store, device.split(","), watch, wanted, executor, memory)
     order = needed(recipe, wanted)
     try:
         with torch.no_grad():
@@ -103,4 +130,5 @@ def run(
     done = work.account(order)
     peak = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss * 1024
     seconds = time.perf_counter() - began
-    return Result(values, done, work.keys, seconds, peak, recipe, work.store, device, work.schedule)
+    proved = proof(recipe, order, wanted, done, work.known_facts)
+    return Result(values, done, work.keys, seconds, peak, recipe, work.store, device, work.schedule, proved)

@@ -17,6 +17,7 @@ from typing import Any, Literal
 from neusee.workflows._call import RunError, place
 from neusee.workflows._code import Code
 from neusee.workflows._compose import Composed, compose
+from neusee.workflows._economy import economised
 from neusee.workflows._graph import Recipe, needed
 from neusee.workflows._keys import Key, key_of
 from neusee.workflows._marks import Problem, RecipeError
@@ -180,6 +181,7 @@ class _Checker:
         self.first = self.first or recipe
         self.notes.update(dict.fromkeys(recipe.notes))
         keys: dict[str, Key] = {}
+        recipe = economised(recipe, recipe.outputs)
         for name in needed(recipe, recipe.outputs):
             step = recipe.steps[name]
             try:

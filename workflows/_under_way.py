@@ -13,19 +13,20 @@ from dataclasses import replace
 from typing import Any
 
 from neusee.nodes import Check, Facts
-from neusee.workflows._account import Done, Event
+from neusee.workflows._account import Done, Event, ran
 from neusee.workflows._call import RunError, places
 from neusee.workflows._choose import Below, to_compute_again, worth_a_look
 from neusee.workflows._code import Code
 from neusee.workflows._costs import Costs, Estimate
 from neusee.workflows._graph import Recipe, Step, Wire, in_order
 from neusee.workflows._keys import Key, key_of
+from neusee.workflows._ledger import Ledger
 from neusee.workflows._local import Local
 from neusee.workflows._loop import Loop, chains_of
 from neusee.workflows._place import Schedule, TooLarge
 from neusee.workflows._prepare import joined, past_costs, prepare, room_for
 from neusee.workflows._store import Store
-from neusee.workflows._verdict import Verdict, judge
+from neusee.workflows._verdict import Verdict
 from neusee.workflows._work import Executor, Lost, Outcome, Read, Work
 
 _QUICK = 1e-3  #: s below which two processes may as well both compute a step
@@ -59,6 +60,7 @@ class UnderWay:
         self.again: dict[Key, float] = {}  # s to have a value again that was computed here
         self.took: dict[str, float] = {}  # the longest that a step of each node took, s
         self.verdicts: dict[str, Verdict] = {}
+        self.ledger = Ledger(recipe)
         self.done: dict[str, Done] = {}
         self.receipts: dict[Key, dict[str, Any]] = {}  # what is known of values that were not kept
         self.costs: Costs | None = None
@@ -73,6 +75,8 @@ class UnderWay:
                 if verdict.left_out:
                     self._leave_out(step, verdict)
                     continue
+            else:
+                self.ledger.pass_on(step)
             try:
                 kind = places(step, self.devices)[0]
                 key, origin = key_of(step, self.keys, self.recipe.seed, self.code, kind)
@@ -225,24 +229,7 @@ class UnderWay:
         self.took[path] = max(outcome.seconds, self.took.get(path, 0.0))
         self.again[key] = self.store.read_seconds(outcome.bytes) if outcome.kept else outcome.seconds + work.below
         predicted = expected.seconds[work.device.partition(":")[0]] if expected.known else None
-        done = Done(
-            step.name,
-            "run",
-            self._why(step.name, key),
-            outcome.seconds,
-            key,
-            outcome.facts,
-            outcome.checks,
-            work.device,
-            outcome.bytes,
-            self._bound(step.name),
-            outcome.began - self.began,
-            work.lane,
-            outcome.peak,
-            predicted,
-            outcome.kept,
-        )
-        self._finish(done)
+        self._finish(ran(outcome, self._why(step.name, key), self._bound(step.name), self.began, predicted))
 
     def _fetch(self, key: Key) -> Any:
         """A value that was computed, or is stored; `Lost` where it is neither."""
@@ -263,8 +250,8 @@ class UnderWay:
         name = self.makers[key].name
         why = why or f"made {about['date']} in {about['seconds']:.3g} s"
         checks = tuple(Check(text, ok) for text, ok in about["checks"])
-        size, bound = about["bytes"], self._bound(name)
-        return Done(name, "cached", why, seconds, key, self._stored_facts(key), checks, "cpu", size, bound)
+        facts, bound, error = self._stored_facts(key), self._bound(name), about.get("error")
+        return Done(name, "cached", why, seconds, key, facts, checks, "cpu", about["bytes"], bound, error=error)
 
     def _judge(self, step: Step) -> Verdict:
         """The verdict on a step; an input runs first where the bound asks for facts that no one has yet."""
@@ -273,9 +260,14 @@ class UnderWay:
             key = self.keys[name]
             if key not in self.facts and self.store.about(key) is None:
                 self.make([key], keep=True)
-            return self.facts[key] if key in self.facts else self._stored_facts(key)
+            return self.known_facts(name)
 
-        return judge(step, step.params, facts_of, self.recipe.tolerance)
+        return self.ledger.verdict(step, step.params, facts_of)
+
+    def known_facts(self, name: str) -> Facts | None:
+        """Facts of a step that ran, now or before."""
+        key = self.keys[name]
+        return self.facts[key] if key in self.facts else self._stored_facts(key)
 
     def _leave_out(self, step: Step, verdict: Verdict) -> None:
         key = self.keys[step.name] = self.keys[verdict.instead]

@@ -7,6 +7,7 @@ from dataclasses import replace
 from typing import Any
 
 from neusee.workflows._causes import Comparison, Origin, Pair, Roots
+from neusee.workflows._economy import economised
 from neusee.workflows._graph import Recipe, Step, needed
 from neusee.workflows._keys import Key
 from neusee.workflows._marks import nearest
@@ -31,6 +32,7 @@ def why_lines(recipe: Recipe, store: Store, step: str, device: str = "cpu") -> l
     if not names:
         known = {*recipe.steps, *(name.partition("[")[0] for name in recipe.steps)}
         raise ValueError(f"no step {step!r}; {nearest(step, known)}")
+    recipe = economised(recipe, [*recipe.outputs, *names])
     resolved = resolve(recipe, needed(recipe, [*recipe.outputs, *names]), store, device)
     comparison = Comparison(store, recipe, resolved)
     return [line for name in names for line in _step_lines(comparison, recipe, recipe.steps[name], resolved)]

@@ -4,6 +4,9 @@ from __future__ import annotations
 
 import gc
 import sys
+from collections.abc import Iterator
+from contextlib import contextmanager
+from dataclasses import replace
 from typing import TYPE_CHECKING, NoReturn
 
 import typer
@@ -12,6 +15,7 @@ if TYPE_CHECKING:
     from neusee.workflows._graph import Recipe
     from neusee.workflows._marks import RecipeError
     from neusee.workflows._store import Store
+    from neusee.workflows._work import Executor
 
 DONE, FAILED, BAD, MISSED = 0, 1, 2, 3
 DEFAULT = "first_light"
@@ -31,7 +35,7 @@ def split(words: list[str] | None, before: int = 0) -> tuple[str, list[str], int
     return name, words, 1 + named + before
 
 
-def load(words: list[str] | None, before: int = 0) -> tuple[Recipe, list[str]]:
+def load(words: list[str] | None, before: int = 0, keep_all: bool = False) -> tuple[Recipe, list[str]]:
     """The recipe that the words name with its changes, and the words to run it again."""
     name, changes, first = split(words, before)
     from neusee.workflows._marks import RecipeError
@@ -43,6 +47,8 @@ def load(words: list[str] | None, before: int = 0) -> tuple[Recipe, list[str]]:
         refuse(error)
     gc.freeze()
     gc.enable()
+    if keep_all:
+        return replace(recipe, keep_all=True), ["neusee", "run", name, *changes, "--keep-all"]
     return recipe, ["neusee", "run", name, *changes]
 
 
@@ -99,3 +105,20 @@ def bytes_of(text: str, option: str) -> int:
         return read(text)
     except ValueError as error:
         fail(f"{option}: {error}")
+
+
+@contextmanager
+def executor_of(where: str, store: Store) -> Iterator[Executor | None]:
+    """Who computes: this process (None), or a cluster for as long as the command runs."""
+    if where == "local":
+        yield None
+        return
+    kind, _, count = where.partition(":")
+    if not (kind == "dask" and (not count or count == "here" or count.isdecimal())) and "://" not in where:
+        fail(f"--executor {where}: write local, dask, dask:4, or a scheduler's address such as tcp://host:8786")
+    try:
+        from neusee.workflows._dask import cluster
+    except ModuleNotFoundError as error:
+        fail(f'--executor {where}: {error.name} is not installed: pip install "neusee[distributed]"')
+    with cluster(where, store) as found:
+        yield found

@@ -71,6 +71,7 @@ class Outcome:
     began: float = 0.0  #: s of the clock of `time.time`
     seconds: float = 0.0
     bytes: int = 0
+    deviation: float | None = None  #: of a cheaper form, from the full one
     peak: int | None = None  #: bytes beside what was there before
     kept: bool = False  #: whether the store has the value
     waits: bool = False  #: it is written beside the next steps, and its lease goes with it
@@ -172,7 +173,8 @@ def _computed(work: Work, inputs: list[Any], store: Store) -> Outcome:
     if work.origin["params"] != {name: plain(param) for name, param in step.params.items()}:
         raise RunError(step, [], OSError("a file changed while it was read: run again"))
     found = sum(t.nbytes for t in tensors_in(bare))
-    return Outcome(work, value, Facts.of(bare), checks, began, seconds, found, peak.bytes)
+    deviation = step.node.deviation(bare) if step.node.deviation else None
+    return Outcome(work, value, Facts.of(bare), checks, began, seconds, found, deviation, peak.bytes)
 
 
 def _kept(outcome: Outcome, store: Store, later: Later | None, lease: Lease) -> Outcome:
@@ -217,6 +219,7 @@ def _about(outcome: Outcome) -> dict[str, Any]:
         "seconds": outcome.seconds,
         "bytes": outcome.bytes,
         "peak": outcome.peak,
+        "error": outcome.deviation,
         "device": work.device,
         "versions": versions(),
         "date": datetime.now(UTC).isoformat(timespec="seconds"),

@@ -7,8 +7,6 @@ from __future__ import annotations
 
 import gc
 import sys
-from collections.abc import Iterator
-from contextlib import contextmanager
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
@@ -16,6 +14,7 @@ import typer
 
 from neusee.workflows._cache_commands import cache
 from neusee.workflows._listings import nodes, recipes, schema
+from neusee.workflows._study_commands import study
 from neusee.workflows._words import (
     BAD,
     DONE,
@@ -23,6 +22,7 @@ from neusee.workflows._words import (
     MISSED,
     bytes_of,
     check_device,
+    executor_of,
     fail,
     load,
     refuse,
@@ -47,6 +47,7 @@ app = typer.Typer(
     pretty_exceptions_enable=False,
 )
 app.add_typer(cache, name="cache")
+app.add_typer(study, name="study")
 for listing in (recipes, nodes, schema):
     app.command()(listing)
 
@@ -63,6 +64,7 @@ Device = Annotated[str, typer.Option("--device", help="Where to compute: cpu, cu
 Where = Annotated[
     str, typer.Option("--executor", help="Who computes: local, dask, dask:4 (workers), or tcp://scheduler:8786.")
 ]
+KeepAll = Annotated[bool, typer.Option("--keep-all", help="Leave nothing out: every step in full.")]
 Memory = Annotated[str, typer.Option("--memory", help="What a device may use, such as 6 GB; more is refused.")]
 Out = Annotated[Path, typer.Option("--out", help="Folder for the run's folder.")]
 
@@ -76,10 +78,11 @@ def run(
     device: Device = "cpu",
     executor: Where = "local",
     memory: Memory = "",
+    keep_all: KeepAll = False,
     out: Out = Path("runs"),
 ) -> None:
     """Run a recipe, from the cache where it can, and write its report."""
-    recipe, command = load(words)
+    recipe, command = load(words, keep_all=keep_all)
     from neusee.workflows import _console as console
 
     check_device(device)
@@ -89,7 +92,7 @@ def run(
     store = the_store()
     if room is not None:
         _refuse_too_large(recipe, store, device, room)
-    with _executor(executor, store) as carries_out:
+    with executor_of(executor, store) as carries_out:
         done = _simulate(recipe, store, command, device, out, as_json or quiet, carries_out, room)
     if as_json:
         import json
@@ -129,23 +132,6 @@ def _simulate(
         return simulate(recipe, store, out, command, device, shown.watch, executor, memory)
 
 
-@contextmanager
-def _executor(where: str, store: Store) -> Iterator[Executor | None]:
-    """Who computes: this process (None), or a cluster for as long as the command runs."""
-    if where == "local":
-        yield None
-        return
-    kind, _, count = where.partition(":")
-    if not (kind == "dask" and (not count or count == "here" or count.isdecimal())) and "://" not in where:
-        fail(f"--executor {where}: write local, dask, dask:4, or a scheduler's address such as tcp://host:8786")
-    try:
-        from neusee.workflows._dask import cluster
-    except ModuleNotFoundError as error:
-        fail(f'--executor {where}: {error.name} is not installed: pip install "neusee[distributed]"')
-    with cluster(where, store) as found:
-        yield found
-
-
 @app.command()
 def validate(words: Words = None, debug: Debug = False) -> None:
     """Check a recipe: every mistake at once, and nothing is run."""
@@ -161,10 +147,11 @@ def plan(
     debug: Debug = False,
     device: Device = "cpu",
     memory: Memory = "",
+    keep_all: KeepAll = False,
     devices: Annotated[str, typer.Option("--devices", help="Machines to simulate: a YAML file, or eight_a100.")] = "",
 ) -> None:
     """Say what would run, where, for how long and with how much memory; compute nothing."""
-    recipe, _ = load(words)
+    recipe, _ = load(words, keep_all=keep_all)
     from neusee.workflows import _plan
 
     check_device(device)

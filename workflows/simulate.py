@@ -11,6 +11,7 @@ from pathlib import Path
 from typing import Any
 
 from neusee.workflows import report
+from neusee.workflows._economy import economised
 from neusee.workflows._exports import exports
 from neusee.workflows._figures import pictures, timeline
 from neusee.workflows._files import RunFolder, new_run
@@ -59,6 +60,7 @@ def simulate(
     """Run ``recipe`` and write ``runs/<date>_<recipe>_<key>/``, complete or not at all."""
     with _noted() as notes:
         told: dict[str, Done] = {}
+        recipe = economised(recipe, wanted(recipe))
         tell = explained(recipe, store, _both(told, watch))
         result = run(recipe, store, wanted(recipe), tell, device, executor, memory)
         result = replace(result, done={name: told.get(name, done) for name, done in result.done.items()})
@@ -81,7 +83,7 @@ def _both(told: dict[str, Done], watch: Callable[[Event], None] | None) -> Calla
 
 def steps_of(recipe: Recipe) -> list[str]:
     """Every step that a run of ``recipe`` looks at, in running order."""
-    return needed(recipe, wanted(recipe))
+    return needed(economised(recipe, wanted(recipe)), wanted(recipe))
 
 
 def _run_key(result: Result) -> str:
