@@ -7,7 +7,7 @@ import torch
 from pydantic import Field
 from torch import Generator, Tensor
 
-from neusee.nodes import Check, Facts, node
+from neusee.nodes import Check, Deviation, Facts, node
 from neusee.nodes.sensor._saturation import Well
 from neusee.nodes.units import Shape
 
@@ -46,6 +46,11 @@ def _(electrons: Facts, *, capacity: float) -> float:
         return 0.0
     largest = max(held, -electrons.min)
     return (electrons.max - held) / largest if largest > 0 else math.inf
+
+
+@full_well.carries
+def _(electrons: Deviation, **params: Any) -> float:
+    return electrons.bound
 
 
 @full_well.check
@@ -104,6 +109,13 @@ def _(
     return torch.tensor(whole, dtype=electrons.dtype).reshape(electrons.shape)
 
 
+@digitize.carries
+def _(electrons: Deviation, *, result: Facts, gain: float, gain_unit: GainUnit = "e-/DN", **params: Any) -> float:
+    """Rounding: where noise spreads the electrons, a share d of the pixels goes to the next number, rms sqrt(d)."""
+    moved = electrons.bound * numbers_per_electron(gain, gain_unit)
+    return moved + math.sqrt(moved)
+
+
 @digitize.preflight
 def _(*, gain: float, gain_unit: str = "e-/DN", bits: int = 16, **params: object) -> list[str]:
     top = 2**bits - 1
@@ -130,6 +142,11 @@ def crop(image: Tensor, *, shape: Shape) -> Tensor:
         raise ValueError(f"no window of {tuple(shape)} in an image of {tuple(image.shape[-2:])}: enlarge the scene")
     top, left = (m // 2 - n // 2 for n, m in zip(shape, image.shape[-2:], strict=True))
     return image[..., top : top + shape[0], left : left + shape[1]].contiguous()
+
+
+@crop.carries
+def _(image: Deviation, **params: Any) -> float:
+    return image.bound
 
 
 @crop.negligible

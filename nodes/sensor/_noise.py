@@ -7,7 +7,7 @@ import torch
 from pydantic import Field
 from torch import Generator, Tensor
 
-from neusee.nodes import Check, Facts, node
+from neusee.nodes import Check, Deviation, Facts, node
 from neusee.nodes.sensor._saturation import Efficiency, Well
 from neusee.nodes.units import Electrons, Fraction
 
@@ -59,6 +59,15 @@ def _(result: Tensor, photons: Tensor, **params: Any) -> list[Check]:
     return [Check(f"mean {float(result.mean(dtype=torch.float64)):.4g} e-", low >= -1e-4 * max(high, 1.0))]
 
 
+@photon_noise.carries
+def _(photons: Deviation, *, result: Facts, quantum_efficiency: float, spread: float = 1.0, **params: Any) -> float:
+    """Of the mean, and of its root: |sqrt(a) - sqrt(b)| <= sqrt|a - b|, which a Poisson count does not exceed either."""
+    drawn = photons.bound * (quantum_efficiency if params["drawn_in"] == "electrons" else 1.0)
+    kept = params["mean_shift"] + (params["mean"] == "additive")
+    electrons: float = 1.0 if params["drawn_in"] == "electrons" else quantum_efficiency
+    return electrons * (abs(kept) * drawn + spread * math.sqrt(drawn))
+
+
 def _gaussian(counts: Tensor, rng: Generator) -> Tensor:
     lit = counts > 0
     sigma = counts.where(lit, 1.0).sqrt().where(lit, 0.0)  # the square root has no slope at 0
@@ -96,6 +105,11 @@ def _(electrons: Facts, *, mean: float, full_well: float | None) -> float:
     return _share(mean, math.sqrt(mean), electrons, full_well)
 
 
+@dark_current.carries
+def _(electrons: Deviation, **params: Any) -> float:
+    return electrons.bound
+
+
 @node()
 def read_noise(
     electrons: Tensor, *, pedestal: Electrons, sigma: Electrons, full_well: Well | None = None, rng: Generator
@@ -113,6 +127,11 @@ def read_noise(
 @read_noise.negligible
 def _(electrons: Facts, *, pedestal: float, sigma: float, full_well: float | None) -> float:
     return _share(pedestal, sigma, electrons, full_well)
+
+
+@read_noise.carries
+def _(electrons: Deviation, **params: Any) -> float:
+    return electrons.bound
 
 
 def _share(shift: float, spread: float, electrons: Facts, full_well: float | None) -> float:
