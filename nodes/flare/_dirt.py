@@ -1,5 +1,6 @@
 """What lies on the window in front of the lens, with statistics that do not depend on the sampling."""
 
+import math
 from typing import Annotated, Any
 
 import torch
@@ -17,6 +18,8 @@ Mean = Annotated[float, Field(ge=0, le=10_000)]  #: expected number
 Part = Annotated[float, Field(gt=0, le=1)]  #: of the pupil's diameter
 Rms = Annotated[Waves, Field(ge=0)]  #: root mean square path, waves at 550 nm
 WAVE = 550e-9  #: m
+_VIOLET = 400e-9  #: m, at which a path is weighed as phase
+_ROUNDING = 6e-8  #: of an amplitude near 1, float32
 DENT_TERMS = range(4, 16)  #: Noll numbers from defocus to the fourth radial order
 
 
@@ -107,6 +110,20 @@ def _dents(rms: float, rng: torch.Generator) -> dict[int, float]:
     draw = torch.randn(len(DENT_TERMS), generator=rng, device=rng.device, dtype=torch.float64)
     parts = (rms * draw / draw.norm()).tolist()
     return dict(zip(DENT_TERMS, parts, strict=True)) if rms else {}
+
+
+@dirt.absent
+def _(*, dust: float, scratches: float, grease: float, smudges: float, dents: float, **_: Any) -> float:
+    """How far the field behind the window is from that behind clear glass, at 400 nm or longer; 0 where nothing lies.
+
+    A grain or a scratch may be black. A film is a sum of normal numbers that the generator keeps below 8.6, so below
+    31 root mean squares; the twelve terms of a dent reach sqrt(50) of theirs together, at the rim.
+    """
+    if not any((dust, scratches, grease, smudges, dents)):
+        return 0.0
+    blocked = 1.0 if dust or scratches else smudges
+    waves = (31 * grease + math.sqrt(50) * dents) * WAVE / _VIOLET
+    return min(2.0, _ROUNDING + blocked + 2 * math.pi * waves)
 
 
 dirt.preflight(grid_notes)

@@ -11,7 +11,6 @@ from neusee.nodes import Check, Facts, node
 from neusee.nodes.units import Fraction, PositiveLength
 from neusee.nodes.values import Bands
 
-
 _SMALLEST = 0.1  #: radius of a ghost, of the largest
 
 
@@ -68,7 +67,11 @@ def _draw(count: int, spread: float, radius: float, rng: torch.Generator) -> lis
     found = []
     for (place, r, _, *coats), size in zip(draw, sizes, strict=True):
         first, second = (400e-9 + 300e-9 * coat for coat in coats)
-        found.append(_Ghost(spread * (2 * place - 1), radius * (_SMALLEST + (1 - _SMALLEST) * r), size / sum(sizes), (first, second)))
+        found.append(
+            _Ghost(
+                spread * (2 * place - 1), radius * (_SMALLEST + (1 - _SMALLEST) * r), size / sum(sizes), (first, second)
+            )
+        )
     return found
 
 

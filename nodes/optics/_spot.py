@@ -7,10 +7,12 @@ import torch
 from pydantic import Field
 from torch import Tensor
 
-from neusee.nodes import Check, node
+from neusee.nodes import Check, Facts, node
 from neusee.nodes.sensor._saturation import Efficiency, Well, saturation
 from neusee.nodes.units import PositiveLength, Time
 from neusee.nodes.values import Bands, Psf
+
+_LSR = 2.2  #: largest of a pupil that only absorbs and delays; see the bound
 
 
 @node()
@@ -44,6 +46,31 @@ def spot(
     unit = (bands.weights * psf.clear_peak / saturating).sum()
     energy = strength * bands.weights / unit
     return psf.intensity * energy.to(psf.intensity)[:, None, None]
+
+
+@spot.absent
+def _(
+    psf: Facts,
+    bands: Facts,
+    *,
+    strength: float,
+    full_well: float,
+    quantum_efficiency: float,
+    pixel_pitch: float,
+    exposure: float,
+) -> float:
+    """What saturates, times strength, times the largest LSR: no PSF is asked for, so that none need be computed.
+
+    No pixel that samples a point can be brighter than the clear peak, for there all of the pupil is in phase; nor one
+    that averages, up to a width of lambda f / D, within which all pairs of the pupil still add up. A wider one holds
+    1 / 2.2 of the clear pupil's light or more on axis, and no other can hold more than all of it.
+    """
+    if strength == 0:
+        return 0.0
+    ends = torch.tensor([bands.min], dtype=torch.float64)  # what saturates falls with wavelength
+    sensor = {"full_well": full_well, "quantum_efficiency": quantum_efficiency}
+    saturating: Tensor = saturation(Bands(ends, ends, ends), **sensor, pixel_pitch=pixel_pitch, exposure=exposure)
+    return _LSR * strength * float(saturating)
 
 
 @spot.check

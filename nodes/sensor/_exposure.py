@@ -6,7 +6,7 @@ import torch
 from pydantic import Field
 from torch import Tensor
 
-from neusee.nodes import Check, node
+from neusee.nodes import Check, Facts, node
 from neusee.nodes.sensor._saturation import Efficiency, Well, photons_per_joule, saturation
 from neusee.nodes.units import PositiveLength, Time
 from neusee.nodes.values import Bands
@@ -151,3 +151,19 @@ def gather(photons: Tensor, lasers: list[Tensor] | None = None, ghosts: list[Ten
 def _(result: Tensor, photons: Tensor, *others: object, **params: object) -> list[Check]:
     scene, high = float(photons.max()), float(result.max())
     return [Check(f"brightest pixel {high:.4g} photons, scene alone {scene:.4g}", high >= 0)]
+
+
+@expose.absent
+def _(
+    irradiance: Facts,
+    bands: Facts,
+    responses: Facts,
+    level: Facts | None = None,
+    *,
+    pixel_pitch: float,
+    exposure: float,
+) -> float:
+    """As many photons as if every band were as bright as the brightest, and seen best; exact for one band."""
+    photons = float(photons_per_joule(torch.tensor(bands.max))) * exposure * pixel_pitch**2
+    brightest = max(irradiance.max, -irradiance.min) * (1.0 if level is None else level.max)
+    return photons * bands.shape[0] * responses.max * brightest

@@ -11,9 +11,10 @@ import pytest
 import torch
 from scipy import stats
 
-from neusee.nodes import Facts, doe, sensor
+from neusee.nodes import Facts, doe, flare, optics, sensor, spectra
 
 ROUNDING = 1e-9  #: of a bound, in float64
+SINGLE = 1e-5  #: the same, of results in float32
 DRAWS = [30, pytest.param(1000, marks=pytest.mark.slow)]
 FURTHEST = 100.0  #: times the change that a bound may be, at the median
 
@@ -108,6 +109,78 @@ def windowing(draw):
     return sensor.crop.bound(Facts.of(image), shape=shape), 0.0 if same else math.inf
 
 
+class Unread:
+    """Facts that a bound has no business to ask for."""
+
+    def __getattr__(self, name):
+        raise AssertionError(f"read {name}: that input would have to be computed")
+
+
+def laser(draw):
+    wavelength, fwhm = draw.uniform(400e-9, 700e-9), draw.decades(1e-10, 2e-8)
+    return spectra.line(wavelength=wavelength, fwhm=fwhm, count=int(draw.uniform(1, 6)))
+
+
+def relief(draw, samples):
+    """Nothing, a rough surface or a few patches that delay by any phase."""
+    rough = torch.rand(samples, samples, generator=draw.rng, dtype=torch.float64)
+    return (draw.one_of(0.0, draw.decades(1e-9, 1e-5)) * draw.one_of(rough, rough.round())).float()
+
+
+SENSOR = {"full_well": 25500.0, "quantum_efficiency": 0.56, "pixel_pitch": 2.9e-6, "exposure": 0.1}
+
+
+def shining(draw):
+    line, samples = laser(draw), int(draw.uniform(1, 25))
+    lens = {"pitch": draw.decades(2e-5, 4e-4), "diameter": 1.0, "aperture": draw.one_of("inscribed", "clipped")}
+    height = relief(draw, samples)
+    pupil = optics.pupil(height, spectra_index(line), line, **lens)
+    camera = {"focal_length": 0.1, "pixel_pitch": draw.decades(1e-6, 1e-4), "shape": (16, 16), "pixel": "zoh"}
+    psf = optics.psf(pupil, **camera, sensor=draw.one_of("point", "integrated"))
+    power = {"strength": draw.often(0.0, draw.decades(1e-9, 1e8)), **SENSOR, "exposure": draw.decades(1e-6, 1e3)}
+    found = optics.spot(psf, line, **power)
+    return optics.spot.nothing(Unread(), Facts.of(line), **power), float(found.max())
+
+
+def spectra_index(line):
+    return doe.material(line, material="fused silica")
+
+
+def reflecting(draw):
+    line, size = laser(draw), int(draw.uniform(1, 65))
+    spot = draw.image(draw.decades(1e-6, 1e9), len(line.centres), size, size).float()
+    towards = torch.tensor([draw.uniform(-3e-4, 3e-4), draw.uniform(-3e-4, 3e-4)], dtype=torch.float64)
+    lens = {"focal_length": 0.11, "pixel_pitch": draw.decades(1e-6, 3e-5), "count": int(draw.uniform(0, 13))}
+    kind = {"energy": draw.often(0.0, draw.decades(1e-8, 1.0)), "spread": draw.decades(0.1, 10)}
+    params = lens | kind | {"radius": draw.decades(1e-7, 3e-4)}
+    found = flare.ghosts(spot, line, towards, **params, rng=draw.rng)
+    assert bool(found.isfinite().all())
+    return flare.ghosts.nothing(Facts.of(spot), Unread(), Unread(), **params), float(found.max())
+
+
+def counting(draw):
+    bands = laser(draw)
+    light = draw.image(draw.decades(1e-9, 1e9), len(bands.centres), 6, 6)
+    responses = spectra.responses(bands, camera=draw.one_of("CIE 1931", "Nikon 5100", "Sigma SDMerill"))
+    level = draw.one_of(None, torch.full((len(bands.centres),), draw.decades(1e-6, 1e6), dtype=torch.float64))
+    shutter = {"pixel_pitch": draw.decades(1e-6, 1e-4), "exposure": draw.decades(1e-6, 1e3)}
+    inputs = (light, bands, responses, level)
+    bound = sensor.expose.nothing(*(Facts.of(x) for x in inputs), **shutter)
+    return bound, float(sensor.expose(*inputs, **shutter).max())
+
+
+def soiling(draw):
+    marks = {"dust": draw.one_of(0.0, 0.0, draw.decades(0.1, 10)), "scratches": draw.one_of(0.0, 0.0, 3.0)}
+    film = {"grease": draw.one_of(0.0, draw.decades(1e-9, 1.0)), "grease_scale": draw.uniform(0.02, 1)}
+    soft = {"smudges": draw.one_of(0.0, draw.decades(1e-9, 1.0)), "dents": draw.one_of(0.0, draw.decades(1e-9, 1.0))}
+    grid = {"samples": int(draw.uniform(8, 33)), "pitch": 1e-4, "diameter": 3e-3}
+    dirt = flare.dirt(**grid, **marks, **film, **soft, rng=draw.rng)
+    turns = dirt.path.double() / draw.uniform(400e-9, 700e-9)
+    field = torch.polar(dirt.amplitude.double(), 2 * torch.pi * turns)
+    return flare.dirt.nothing(**grid, **marks, **film, **soft), float((field - 1).abs().max())
+
+
+LARGEST = {"spot": shining, "ghosts": reflecting, "expose": counting, "dirt": soiling}
 CHANGES = {"dark_current": dark, "read_noise": reading, "full_well": holding, "fabricate": making, "crop": windowing}
 
 
@@ -126,7 +199,13 @@ def hold(case, draws, rounding=ROUNDING):
 @pytest.mark.parametrize("draws", DRAWS)
 @pytest.mark.parametrize("name", CHANGES)
 def test_what_is_left_out_changes_no_more_than_stated(name, draws):
-    hold(CHANGES[name], draws, 1e-5 if name == "fabricate" else ROUNDING)
+    hold(CHANGES[name], draws, SINGLE if name == "fabricate" else ROUNDING)
+
+
+@pytest.mark.parametrize("draws", DRAWS)
+@pytest.mark.parametrize("name", LARGEST)
+def test_what_is_not_added_is_no_brighter_than_stated(name, draws):
+    hold(LARGEST[name], draws, SINGLE)
 
 
 def test_noise_that_undoes_what_is_there_is_unbounded():
@@ -145,3 +224,11 @@ def test_the_moments_are_those_that_the_node_draws(mean):
     squares = sensor.dark_current(torch.zeros(1000, 1000), mean=mean, full_well=None, rng=rng).double().square()
     fourth = mean + 7 * mean**2 + 6 * mean**3 + mean**4
     assert abs(float(squares.mean()) - mean - mean**2) <= 5 * math.sqrt(fourth / squares.numel())
+
+
+def test_a_clean_window_is_exactly_nothing_and_a_grain_may_be_all():
+    clean = dict.fromkeys(("dust", "scratches", "grease", "smudges", "dents"), 0.0)
+    assert flare.dirt.nothing(**clean) == 0.0
+    assert flare.dirt.nothing(**clean | {"dust": 1.0}) >= 1.0
+    dirt = flare.dirt(samples=16, pitch=1e-4, diameter=1e-3, rng=torch.Generator(), **clean)
+    assert bool((dirt.amplitude == 1).all() and (dirt.path == 0).all())

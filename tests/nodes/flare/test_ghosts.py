@@ -131,3 +131,19 @@ def test_ghosts_fall_where_the_spot_is():
     line = Bands(*(x.to("meta") for x in bands()))
     found = flare.ghosts(spot().to("meta"), line, towards(1e-4, 0.0), **LENS, rng=seeded())
     assert found.device.type == "meta"
+
+
+@pytest.mark.parametrize("angle", [(0.0, 0.0), (1.31825e-5, 1.31825e-5), (5e-4, -8e-4)])
+def test_a_ghost_that_is_smaller_than_a_pixel_is_seen_all_the_same(angle):
+    light = spot()
+    found = ghosts(light, angle=angle, radius=1e-7, energy=1e-3, count=3, spread=1.0)
+    assert float(found.double().sum()) == pytest.approx(1e-3 * float(light.double().sum()), rel=1e-5)
+
+
+def test_no_ghost_is_asked_for_where_nothing_is_reflected():
+    class Unread:
+        pass
+
+    lens = {**LENS, "spread": 2.0, "radius": 3e-4}
+    for nothing in ({"count": 0, "energy": 1e-4}, {"count": 8, "energy": 0.0}):
+        assert flare.ghosts.nothing(Unread(), Unread(), Unread(), **lens, **nothing) == 0.0
