@@ -50,6 +50,23 @@ class Psf(NamedTuple):
     clear_peak: Tensor  #: (band,) float64: the pixel on the axis, same lens, no element, no dirt, no aberration
 
 
+class Mixture(NamedTuple):
+    """A cube of many bands as few planes: band b is about ``sum_k basis[b, k] planes[k]``, strongest first."""
+
+    planes: Tensor  #: (k, y, x)
+    basis: Tensor  #: (band, k) float64
+    rest: Tensor  #: (k + 1, band) float64: bound of max over pixels of |band b less the first r planes|, r = 0 to k
+
+
+class Channels(NamedTuple):
+    """Weighted sums over the bands of an image: ``planes[i] = sum_b rows[i, b] image[b]``."""
+
+    planes: Tensor  #: (row, y, x)
+    rows: Tensor  #: (row, band) float64
+    flux: Tensor  #: (band,) float64, sum of image[b] over its pixels
+    bound: Tensor  #: () float64, bound of max |error| / max |plane|, of the worst row
+
+
 #: by class, the fields with one entry a band
 BAND_FIELDS: dict[type, tuple[str, ...]] = {
     Bands: Bands._fields,

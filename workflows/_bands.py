@@ -64,7 +64,10 @@ def plain_of(value: Any) -> Any:
 
 def band_count(step: Step, inputs: Sequence[Any]) -> int:
     """How many bands a step works on, each for itself; 0 where its node, or what it is given, has none."""
-    found = {x.shape[axis] for axis, value in _banded(step, inputs) for x in _band_tensors(value) if _has(x, axis)}
+    banded = list(_banded(step, inputs))
+    if any(not isinstance(value, Tensor) and type(value) not in BAND_FIELDS for _, value in banded):
+        return 0  # a mixture of planes has no slice of one band
+    found = {x.shape[axis] for axis, value in banded for x in _band_tensors(value) if _has(x, axis)}
     return found.pop() if len(found) == 1 else 0
 
 

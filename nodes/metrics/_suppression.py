@@ -7,10 +7,11 @@ from pydantic import Field
 from torch import Tensor
 
 from neusee.nodes import Check, node
+from neusee.nodes.sensor._channels import weighted
 from neusee.nodes.sensor._digital import Bits, Gain, GainUnit, numbers_per_electron
 from neusee.nodes.sensor._saturation import Efficiency, Well, saturation
 from neusee.nodes.units import PositiveLength, Time
-from neusee.nodes.values import Bands, Psf
+from neusee.nodes.values import Bands, Channels, Psf
 
 
 class Peak(NamedTuple):
@@ -48,8 +49,10 @@ def _(result: Tensor, *inputs: Psf) -> list[Check]:
 
 
 @node(rtol=1e-6)
-def bsr(image: Tensor, plain_image: Tensor) -> Tensor:
+def bsr(image: Tensor | Channels, plain_image: Tensor | Channels) -> Tensor:
     """Find the background suppression ratio: light of the scene in the field, over that of the plain lens.
+
+    Of an image summed over its bands, `Channels`, the light of each band is known still.
 
     Shapes: image and plain_image (..., band, y, x) -> (..., band) float64.
     Units:  none; about 1 for an element that absorbs nothing and scatters nothing out of the field.
@@ -58,16 +61,22 @@ def bsr(image: Tensor, plain_image: Tensor) -> Tensor:
     Raises: ValueError for images of different shape.
     Source: NeuSee, section Sensor Image (BSR), as a ratio of energies.
     """
-    if image.shape != plain_image.shape:
-        raise ValueError(f"image {tuple(image.shape)} and plain image {tuple(plain_image.shape)} differ in shape")
-    kept, plain = (x.sum(-1).sum(-1, dtype=torch.float64) for x in (image, plain_image))
+    here, there = ((*x.flux.shape, *x.planes.shape[1:]) if isinstance(x, Channels) else tuple(x.shape)
+                   for x in (image, plain_image))  # fmt: skip
+    if here != there:
+        raise ValueError(f"image {here} and plain image {there} differ in shape")
+    kept, plain = (x.flux if isinstance(x, Channels) else _light(x) for x in (image, plain_image))
     lit = plain > 0
     ratio: Tensor = torch.where(lit, kept / plain.where(lit, 1.0), 1.0)
     return ratio
 
 
+def _light(image: Tensor) -> Tensor:
+    return image.sum(-1).sum(-1, dtype=torch.float64)
+
+
 @bsr.check
-def _(result: Tensor, *inputs: Tensor) -> list[Check]:
+def _(result: Tensor, *inputs: Tensor | Channels) -> list[Check]:
     return [Check(f"BSR {float(result.min()):.3f} to {float(result.max()):.3f}", bool((result <= 1.05).all()))]
 
 
@@ -99,7 +108,7 @@ def clipped(raw: Tensor, *, full_well: float, gain: float, gain_unit: str, bits:
 
 @node(rtol=1e-6)
 def peak(
-    image: Tensor,
+    image: Tensor | Channels,
     bands: Bands,
     level: Tensor,
     spots: list[Tensor] | None = None,
@@ -116,7 +125,7 @@ def peak(
     Shapes: image (band, y, x), level (band,), each spot (line band, y, x) -> two scalars, float64.
     Units:  multiples of saturation; damage the multiple at which a sensor may break.
     Error:  before the channels: a real channel takes in less. Damage is a threshold, not a model of heat.
-    Raises: ValueError where spots and lines do not pair up.
+    Raises: ValueError where spots and lines do not pair up, or channels of an image hold no row of the well.
     Source: NeuSee, Eq. (peak_irrad_coded); damage above 1e6 as stated there.
     """
     sensor = {"full_well": full_well, "quantum_efficiency": quantum_efficiency}
@@ -129,10 +138,9 @@ def peak(
     return Peak(top, (top > damage).double())
 
 
-def _in_wells(irradiance: Tensor, saturating: Tensor) -> Tensor:
+def _in_wells(irradiance: Tensor | Channels, saturating: Tensor) -> Tensor:
     """Irradiance over what saturates, summed over wavelengths."""
-    wells: Tensor = torch.tensordot((1.0 / saturating).to(irradiance), irradiance, 1)
-    return wells
+    return weighted(irradiance, (1.0 / saturating)[None])[0]
 
 
 @peak.check

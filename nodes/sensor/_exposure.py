@@ -7,16 +7,17 @@ from pydantic import Field
 from torch import Tensor
 
 from neusee.nodes import Check, Facts, node
+from neusee.nodes.sensor._channels import weighted
 from neusee.nodes.sensor._saturation import Efficiency, Well, photons_per_joule, saturation
 from neusee.nodes.units import PositiveLength, Time
-from neusee.nodes.values import Bands
+from neusee.nodes.values import Bands, Channels
 
 Strength = Annotated[float, Field(ge=0, allow_inf_nan=False)]  #: multiple of what saturates
 
 
 @node()
 def expose(
-    irradiance: Tensor,
+    irradiance: Tensor | Channels,
     bands: Bands,
     responses: Tensor,
     level: Tensor | None = None,
@@ -26,25 +27,26 @@ def expose(
 ) -> Tensor:
     """Count the photons that each channel of a pixel takes in: sum over bands of r I level lambda t dx^2 / (h c).
 
+    Of an image that has been summed over its bands, `Channels`, the photons are sums of its planes.
+
     Shapes: irradiance (..., band, y, x), responses (channel, band), level (band,) -> (..., channel, y, x).
     Units:  irradiance W/m2 of the whole band (without level: of the band, with it: any); result photons.
     Error:  one wavelength stands for its band: below (width / wavelength)^2 / 12, 5e-5 at 10 nm.
-    Raises: ValueError where the bands of the inputs differ.
+    Raises: ValueError where the bands of the inputs differ, and where the rows of channels cannot make the weights.
     Source: NeuSee, Eq. (photon_count); the channel sum as EMVA Standard 1288, release 4.0, for each wavelength.
     """
     weights = channel_weights(bands, responses, level, pixel_pitch=pixel_pitch, exposure=exposure)
-    if irradiance.ndim < 3 or irradiance.shape[-3] != weights.shape[1]:
+    if isinstance(irradiance, Tensor) and (irradiance.ndim < 3 or irradiance.shape[-3] != weights.shape[1]):
         raise ValueError(
             f"irradiance {tuple(irradiance.shape)} is not (band, y, x) of {weights.shape[1]} bands: "
             "give irradiance, bands and responses the same `bands` step"
         )
-    flat = weights.to(irradiance) @ irradiance.flatten(-2)
-    return flat.reshape(*flat.shape[:-1], *irradiance.shape[-2:])
+    return weighted(irradiance, weights)
 
 
 @expose.reference
 def _(
-    irradiance: Tensor,
+    irradiance: Tensor | Channels,
     bands: Bands,
     responses: Tensor,
     level: Tensor | None = None,
@@ -53,6 +55,8 @@ def _(
     exposure: float,
 ) -> Tensor:
     weights = channel_weights(bands, responses, level, pixel_pitch=pixel_pitch, exposure=exposure)
+    if isinstance(irradiance, Channels):
+        return weighted(irradiance._replace(planes=irradiance.planes.double()), weights)
     channels = [(row[:, None, None] * irradiance.double()).sum(-3) for row in weights.to(irradiance.device)]
     return torch.stack(channels, -3)
 
@@ -80,7 +84,7 @@ def channel_weights(
 
 @node()
 def level(
-    plain_image: Tensor,
+    plain_image: Tensor | Channels,
     bands: Bands,
     responses: Tensor,
     *,
@@ -99,9 +103,13 @@ def level(
     Shapes: plain_image (..., band, y, x), responses (channel, band) -> (band,) float64.
     Units:  result W/m2 per unit of the image.
     Error:  exact; a scene without light has level 0.
+    Raises: ValueError for `per_band` where the image has been summed over its bands.
     Source: NeuSee, Eq. (peak_irrad_coded).
     """
     if rule == "per_band":
+        if isinstance(plain_image, Channels):
+            raise ValueError("rule per_band needs the peak of each band, and this image is summed over its bands: "
+                             "take rule channel_sum, or keep the image of all bands")  # fmt: skip
         peaks = plain_image.amax((-2, -1)).reshape(-1, len(bands.centres)).amax(0).double()
         top = saturation(
             bands,

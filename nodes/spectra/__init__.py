@@ -1,13 +1,16 @@
 """Spectra: bands, lights, channels, and lifts from three colours to many."""
 
 from neusee.nodes.spectra._bands import bands, filters, line
+from neusee.nodes.spectra._compress import compress
 from neusee.nodes.spectra._lift import lift_lmmse, lift_mallett
 from neusee.nodes.spectra._lift_mst import lift_mst_plus_plus
 from neusee.nodes.spectra._light import illuminant, illuminate
 from neusee.nodes.spectra._responses import responses
+from neusee.nodes.spectra._rows import rows
 
 __all__ = [
     "bands",
+    "compress",
     "filters",
     "illuminant",
     "illuminate",
@@ -16,4 +19,5 @@ __all__ = [
     "lift_mst_plus_plus",
     "line",
     "responses",
+    "rows",
 ]

@@ -8,7 +8,7 @@ from torch import Tensor
 from neusee.nodes import Check, ParameterError, node
 from neusee.nodes.spectra._tables import daylight, light
 from neusee.nodes.units import Temperature
-from neusee.nodes.values import Bands
+from neusee.nodes.values import Bands, Mixture
 
 Kind = Literal[
     "daylight", "D50", "D55", "D65", "D75", "A", "E", "FL2", "FL7", "FL11", "HP1",
@@ -59,8 +59,12 @@ def _(result: Tensor, bands: Bands, *, kind: str = "daylight", temperature: floa
 
 
 @node(bands={"reflectance": -3, "illuminant": 0, "return": -3})
-def illuminate(reflectance: Tensor, illuminant: Tensor, *, times: Literal["once", "twice"] = "once") -> Tensor:
+def illuminate(
+    reflectance: Tensor | Mixture, illuminant: Tensor, *, times: Literal["once", "twice"] = "once"
+) -> Tensor | Mixture:
     """Multiply reflectance by the light on it: once, as light does, or twice, as the paper's chain of formulas says.
+
+    Of a cube in few planes, a `Mixture`, the planes stay and their spectra are multiplied.
 
     Shapes: reflectance (..., band, y, x), illuminant (band,) -> (..., band, y, x).
     Units:  relative spectral radiance, that of a white scene having mean 1 over the bands.
@@ -68,18 +72,34 @@ def illuminate(reflectance: Tensor, illuminant: Tensor, *, times: Literal["once"
     Raises: ValueError where the bands differ.
     Source: NeuSee, T_b and the CIE formula after it; twice is contradiction C5 of its reading.
     """
-    if reflectance.ndim < 3 or illuminant.ndim != 1 or reflectance.shape[-3] != len(illuminant):
-        raise ValueError(
-            f"reflectance {tuple(reflectance.shape)} is not (band, y, x) of the {tuple(illuminant.shape)} bands of the "
-            "illuminant: give both the same `bands` step"
-        )
+    _same_bands(reflectance, illuminant)
     power = illuminant if times == "once" else illuminant.square()
+    if isinstance(reflectance, Mixture):
+        basis = reflectance.basis * power.to(reflectance.basis)[:, None]
+        return Mixture(reflectance.planes, basis, reflectance.rest * power.detach().abs().to(reflectance.rest))
     return reflectance * power.to(reflectance)[:, None, None]
 
 
+def _same_bands(reflectance: Tensor | Mixture, illuminant: Tensor) -> None:
+    shape = tuple(reflectance.shape) if isinstance(reflectance, Tensor) else _shape(reflectance)
+    if len(shape) < 3 or illuminant.ndim != 1 or shape[-3] != len(illuminant):
+        raise ValueError(
+            f"reflectance {shape} is not (band, y, x) of the {tuple(illuminant.shape)} bands of the "
+            "illuminant: give both the same `bands` step"
+        )
+
+
+def _shape(mixture: Mixture) -> tuple[int, ...]:
+    return len(mixture.basis), *mixture.planes.shape[1:]
+
+
 @illuminate.reference
-def _(reflectance: Tensor, illuminant: Tensor, *, times: str = "once") -> Tensor:
+def _(reflectance: Tensor | Mixture, illuminant: Tensor, *, times: str = "once") -> Tensor | Mixture:
     power = [float(p) ** (1 if times == "once" else 2) for p in illuminant]
+    if isinstance(reflectance, Mixture):
+        basis = torch.stack([row.double() * p for row, p in zip(reflectance.basis, power, strict=True)])
+        rest = torch.stack([column * p for column, p in zip(reflectance.rest.T, power, strict=True)], 1)
+        return Mixture(reflectance.planes.double(), basis, rest)
     return torch.stack([reflectance[..., b, :, :].double() * p for b, p in enumerate(power)], -3)
 
 
@@ -89,6 +109,8 @@ def _(*, times: str = "once") -> list[str]:
 
 
 @illuminate.check
-def _(result: Tensor, *inputs: Any, **params: Any) -> list[Check]:
+def _(result: Tensor | Mixture, *inputs: Any, **params: Any) -> list[Check]:
+    if isinstance(result, Mixture):
+        return [Check(f"{len(result.planes)} planes for {len(result.basis)} bands")]
     low = float(result.min())
     return [Check(f"radiance {low:.3g} to {float(result.max()):.4g}", low >= 0)]

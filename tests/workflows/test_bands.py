@@ -8,7 +8,7 @@ import torch
 from neusee.nodes import Node
 from neusee.nodes.optics import image, psf
 from neusee.nodes.spectra import illuminate
-from neusee.nodes.values import Psf, Pupil
+from neusee.nodes.values import Mixture, Psf, Pupil
 from neusee.workflows import RunError, Store, _bands, _codec, load
 from neusee.workflows._bands import call_by_band, plain_of
 from neusee.workflows._blobs import Blobs, Stacked
@@ -219,6 +219,15 @@ def test_a_node_without_bands_is_only_called(blobs):
     made = Made(Node(lambda light: light + 1), blobs)
     assert torch.equal(made(torch.ones(3, 4)), torch.full((3, 4), 2.0))
     assert files(blobs) == set()
+
+
+def test_a_scene_in_few_planes_has_no_band_to_compute_alone(blobs):
+    mixed = Mixture(rand(2, 64, 64), rand(BANDS, 2, dtype=torch.float64), torch.zeros(3, BANDS, dtype=torch.float64))
+    power = rand(BANDS, dtype=torch.float64)
+    step = Step("radiance", illuminate, {"times": "once"}, {}, Mark("test"), {})
+    found = call_by_band(step, [mixed, power], lambda given: illuminate(*given), "code", blobs)
+    torch.testing.assert_close(found.basis, mixed.basis * power[:, None])
+    assert not files(blobs)
 
 
 def test_bands_that_differ_are_left_to_the_node_to_refuse(blobs):
