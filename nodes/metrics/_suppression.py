@@ -48,7 +48,7 @@ def _(result: Tensor, *inputs: Psf) -> list[Check]:
             Check(f"evenly spread light would reach {floor:.2g}")]  # fmt: skip
 
 
-@node(rtol=1e-6)
+@node(rtol=1e-6, channels=("image", "plain_image"))
 def bsr(image: Tensor | Channels, plain_image: Tensor | Channels) -> Tensor:
     """Find the background suppression ratio: light of the scene in the field, over that of the plain lens.
 
@@ -106,7 +106,7 @@ def clipped(raw: Tensor, *, full_well: float, gain: float, gain_unit: str, bits:
     return marked
 
 
-@node(rtol=1e-6)
+@node(rtol=1e-6, channels=("image",), even=("level",))
 def peak(
     image: Tensor | Channels,
     bands: Bands,

@@ -47,3 +47,11 @@ def _(radiance: Mixture, psf: Psf, rows: Tensor, *, border: Border = "zero", wit
 @image_channels.check
 def _(result: Channels, *inputs: Any, **params: Any) -> list[Check]:
     return [Check(f"{len(result.planes)} rows of {len(result.flux)} bands, within {float(result.bound):.2g}")]
+
+
+@image_channels.deviates
+def _(result: Channels) -> float:
+    return float(result.bound)
+
+
+image.collapsed = image_channels

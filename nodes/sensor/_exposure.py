@@ -1,6 +1,7 @@
 """Light to photons: the level of the scene, the channels of the sensor, and all light together."""
 
-from typing import Annotated, Literal
+from collections.abc import Mapping
+from typing import Annotated, Any, Literal
 
 import torch
 from pydantic import Field
@@ -15,7 +16,7 @@ from neusee.nodes.values import Bands, Channels
 Strength = Annotated[float, Field(ge=0, allow_inf_nan=False)]  #: multiple of what saturates
 
 
-@node()
+@node(channels=("irradiance",), even=("level",))
 def expose(
     irradiance: Tensor | Channels,
     bands: Bands,
@@ -82,7 +83,7 @@ def channel_weights(
     return weights if level is None else weights * level.to(weights)
 
 
-@node()
+@node(channels=("plain_image",))
 def level(
     plain_image: Tensor | Channels,
     bands: Bands,
@@ -124,6 +125,11 @@ def level(
         top = torch.tensor(full_well / quantum_efficiency, dtype=torch.float64)
     lit = peaks > 0
     return torch.where(lit, strength * top.to(peaks) / peaks.where(lit, 1.0), 0.0)
+
+
+@level.even_where
+def _(params: Mapping[str, Any]) -> bool:
+    return params.get("rule", "channel_sum") == "channel_sum"
 
 
 @level.preflight

@@ -93,6 +93,12 @@ def _(cube: Tensor, *, within: float = 1e-6) -> Mixture:
     return Mixture(planes[:count], left[:, :count], torch.stack(rest[: count + 1]))
 
 
+@compress.deviates
+def _(result: Mixture) -> float:
+    most = float(result.rest[0].max())
+    return float(result.rest[-1].max()) / most if most > 0 else 0.0
+
+
 @compress.check
 def _(result: Mixture, *inputs: Tensor, **params: float) -> list[Check]:
     most = max(float(result.rest[0].max()), 1e-300)
