@@ -97,7 +97,7 @@ def run(
     recipe, store, watch = economised(recipe, wanted), store or open_store(), watch or (lambda event: None)
     while True:
         result = _attempt(recipe, store, wanted, watch, device, executor, memory, began)
-        if result.proof.worst <= recipe.tolerance:
+        if result.proof.worst <= recipe.tolerance or recipe.keep_all:
             return result
         recipe = economised(_stricter(recipe, result.proof.worst), wanted)
 

@@ -113,7 +113,8 @@ class UnderWay:
             key = self.keys[name]
             twin = self.done.get(self.makers[key].name)
             if twin is None or twin.state == "asleep":
-                self._finish(Done(name, "asleep", "nothing that ran needed it", 0.0, key, bound=self._bound(name)))
+                known = {"bound": self._bound(name), "error": (self.store.about(key) or {}).get("error")}
+                self._finish(Done(name, "asleep", "nothing that ran needed it", 0.0, key, **known))
             else:
                 self._finish(replace(twin, step=name, state="cached", why=f"the same as {twin.step}", seconds=0.0))
         return {name: self.done[name] for name in order}
