@@ -215,7 +215,10 @@ class Node:
         return fn
 
     def deviates(self, fn: Fn) -> Fn:
-        """Attach ``(result) -> float``: how far a cheaper form may be from the full one, as a share of its largest."""
+        """Attach ``(result) -> float``: how far a cheaper form may be from the full one, as a share of its largest.
+
+        What its inputs lack is part of it.
+        """
         self.deviation = fn
         return fn
 

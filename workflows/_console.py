@@ -12,6 +12,7 @@ from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Any
 
 from neusee.workflows._run import Done, Event
+from neusee.workflows._spent import said_of_economies
 from neusee.workflows.report import shape_of, unit_of
 
 if TYPE_CHECKING:
@@ -179,7 +180,8 @@ def opening(recipe: Recipe, command: str) -> list[str]:
 
 def closing(doc: Mapping[str, Any], path: str, again: Sequence[str]) -> list[str]:
     """The lines after everything ran: what was left out, the table, the verdict, where the page is, what to try."""
-    lines = [said_of_left_out(doc)] if doc["left_out"] else []
+    lines = [said_of_economies(doc["spent"])] if doc["spent"]["economies"] else []
+    lines += [said_of_left_out(doc)] if doc["left_out"] else []
     lines += ["", *aligned([["", *doc["table"]["columns"]], *[[r["name"], *r["cells"]] for r in doc["table"]["rows"]]])]
     lines += [f"  {line}" for line in doc["table"]["legend"]]
     lines += ["", f"{doc['verdict']}  ({doc['counts']}, {doc['seconds']:.2f} s)"]

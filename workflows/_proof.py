@@ -71,6 +71,8 @@ def _own(done: Done, facts_of: FactsOf) -> float | None:
 def _carried(step: Step, inputs: list[Deviation | list[Deviation] | None], result: Facts | None) -> float:
     if not any(d.bound for part in inputs for d in _each(part)):
         return 0.0
+    if step.node.deviation is not None:
+        return 0.0  # it tells of all that it lacks
     if step.node.spread is None or result is None or any(math.isinf(d.bound) for part in inputs for d in _each(part)):
         return math.inf
     try:

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import base64
 import json
+import math
 import os
 import platform
 import re
@@ -26,6 +27,7 @@ from neusee.workflows._numbers import expected, metrics, table
 from neusee.workflows._readings import in_force
 from neusee.workflows._roles import FIGURES
 from neusee.workflows._run import Done, Result
+from neusee.workflows._spent import spent
 from neusee.workflows._timing import said_of, timing
 from neusee.workflows._timing import size_of as size_of
 
@@ -64,6 +66,7 @@ def document(
         "notes": [*_sampling(recipe), *recipe.notes, *warnings],
         "readings": _readings(recipe),
         "left_out": [{"step": d.step, "bound": d.bound, "why": d.why} for d in done if d.state == "left out"],
+        "spent": spent(result),
         "absent": [{"step": step, "where": where} for step, where in recipe.absent.items()],
         "timing": {**time, "said": said_of(time)},
         "steps": steps,
@@ -140,7 +143,7 @@ def _step(done: Done, result: Result) -> dict[str, Any]:
         "size": size_of(done.bytes) if done.bytes else "",
         "bytes": done.bytes,
         "key": done.key,
-        "bound": done.bound,
+        "bound": done.bound if done.bound is None or math.isfinite(done.bound) else None,
         "checks": [{"text": c.text, "ok": c.ok} for c in done.checks],
     }
 

@@ -1,5 +1,6 @@
 """Light to photons: the level of the scene, the channels of the sensor, and all light together."""
 
+import math
 from collections.abc import Mapping
 from typing import Annotated, Any, Literal
 
@@ -7,7 +8,7 @@ import torch
 from pydantic import Field
 from torch import Tensor
 
-from neusee.nodes import Check, Facts, node
+from neusee.nodes import Check, Deviation, Facts, node
 from neusee.nodes.sensor._channels import weighted
 from neusee.nodes.sensor._saturation import Efficiency, Well, photons_per_joule, saturation
 from neusee.nodes.units import PositiveLength, Time
@@ -66,6 +67,13 @@ def _(
 def _(result: Tensor, *inputs: object, **params: object) -> list[Check]:
     low, high = float(result.min()), float(result.max())
     return [Check(f"brightest {high:.4g} photons", low >= -1e-3 * high)]
+
+
+@expose.carries
+def _(irradiance: Deviation, *others: Deviation | None, result: Facts, **params: Any) -> float:
+    """No light is negative, so that no channel loses more than the image, or the level, in parts of its largest."""
+    level = others[2] if len(others) > 2 else None
+    return (irradiance.share + (level.share if level else 0.0)) * result.max
 
 
 def channel_weights(
@@ -129,7 +137,14 @@ def level(
 
 @level.even_where
 def _(params: Mapping[str, Any]) -> bool:
-    return params.get("rule", "channel_sum") == "channel_sum"
+    return bool(params.get("rule", "channel_sum") == "channel_sum")
+
+
+@level.carries
+def _(plain_image: Deviation, *others: object, result: Facts, **params: Any) -> float:
+    """What the brightest pixel is off, the level is off the other way."""
+    share = plain_image.share
+    return result.max * share / (1.0 - share) if share < 1.0 else math.inf
 
 
 @level.preflight
@@ -159,6 +174,16 @@ def gather(photons: Tensor, lasers: list[Tensor] | None = None, ghosts: list[Ten
             )
         total = total + added
     return total
+
+
+@gather.carries
+def _(
+    photons: Deviation,
+    lasers: list[Deviation] | None = None,
+    ghosts: list[Deviation] | None = None,
+    **params: Any,
+) -> float:
+    return photons.bound + sum(added.bound for added in (*(lasers or ()), *(ghosts or ())))
 
 
 @gather.check

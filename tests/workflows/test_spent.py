@@ -1,0 +1,101 @@
+"""The page says what was left out, what that may change at most, and, where it was run in full, what it did change."""
+
+import json
+from dataclasses import replace
+
+import pytest
+
+from neusee.workflows import load, report
+from neusee.workflows._economy import economised
+from neusee.workflows._error import error_of
+from neusee.workflows._run import run
+from neusee.workflows._spent import said_of_economies, spent
+from neusee.workflows._store import Store
+from neusee.workflows.simulate import simulate
+
+SMALL = [
+    "optics.samples=90",
+    "optics.pitch=89.76 um",
+    "optics.window=[48, 48]",
+    "scene.shape=[64, 64]",
+    "sensor.shape=[48, 48]",
+    "optics.bands=7",
+    "doe=vortex",
+    "lasers.green.angle=[0.1 mrad, 0 mrad]",
+]
+
+
+@pytest.fixture(scope="module")
+def recipe():
+    return load("first_light", SMALL)
+
+
+@pytest.fixture
+def store(tmp_path):
+    return Store(tmp_path / "cache")
+
+
+def test_sums_over_bands_stand_in_for_images_that_nobody_asks_for(recipe):
+    found = economised(recipe, recipe.outputs)
+    assert {e.step for e in found.economies} == {"image[plain]", "image[mask]"}
+    assert found.steps["scene_photons[mask]"].wires["irradiance"] == "image[mask].channels"
+    assert found.steps["image[mask]"] == recipe.steps["image[mask]"]
+    assert found.whole is recipe
+    assert economised(found, recipe.outputs) is found
+
+
+def test_an_image_that_is_asked_for_is_whole(recipe, store):
+    found = economised(recipe, [*recipe.outputs, "image[mask]"])
+    assert {e.step for e in found.economies} == {"image[plain]"}
+    result = run(recipe, store)
+    assert result["image[mask]"].shape == (7, 64, 64)
+
+
+@pytest.mark.parametrize("change", [{"keep_all": True}, {"tolerance": 0.0}], ids=["keep all", "no tolerance"])
+def test_nothing_stands_in_where_nothing_may(recipe, change):
+    whole = replace(recipe, **change)
+    assert economised(whole, recipe.outputs) is whole
+
+
+def test_bands_that_are_levelled_one_by_one_are_not_summed():
+    recipe = load("first_light", [*SMALL, "reading.level=per_band"])
+    assert economised(recipe, recipe.outputs) is recipe
+
+
+def test_a_scene_that_is_learnt_is_whole(recipe):
+    assert economised(recipe, recipe.outputs, {"scene"}) is recipe
+    assert economised(recipe, recipe.outputs, {"height"}).economies
+
+
+def test_the_errors_are_within_their_bounds_and_these_within_the_tolerance(recipe, store):
+    result, full = run(recipe, store), run(replace(recipe, keep_all=True), store)
+    assert set(result.proof.held) >= {"raw[plain]", "raw[mask]"}
+    assert 0 < result.proof.worst <= recipe.tolerance
+    for name in ("raw[plain]", "raw[mask]"):
+        assert error_of(result[name], full[name]) <= result.proof.worst
+
+
+def test_measured_errors_stand_where_the_full_run_is_stored(recipe, store):
+    result = run(recipe, store)
+    before = spent(result)
+    assert before["measured"] == {}
+    full = run(replace(recipe, keep_all=True), store)
+    after = spent(result)
+    assert set(after["measured"]) == set(recipe.outputs)
+    assert after["measured"]["raw[mask]"] == error_of(result["raw[mask]"], full["raw[mask]"])
+    assert after["economies"][0]["full_seconds"] == pytest.approx(full.done[after["economies"][0]["step"]].seconds)
+    assert spent(full)["economies"] == []
+    assert spent(full)["keep_all"]
+    assert "measured" in said_of_economies(after)
+    assert "measured" not in said_of_economies(before)
+
+
+def test_the_page_says_it(recipe, store, tmp_path):
+    done = simulate(recipe, store, tmp_path / "runs", ["neusee"])
+    page, doc = done.page.read_text(), json.loads((done.folder / "provenance.json").read_text())
+    assert "image[mask].channels" in page
+    assert doc["spent"]["economies"][0]["bound"] <= recipe.tolerance
+    assert max(doc["spent"]["bounds"].values()) <= recipe.tolerance
+    whole = simulate(replace(recipe, keep_all=True), store, tmp_path / "runs", ["neusee"])
+    assert "every step was computed in full" in whole.page.read_text()
+    assert "measured beside --keep-all" in report.page({**doc, "spent": spent(run(recipe, store))}, {})
