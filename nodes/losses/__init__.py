@@ -1,6 +1,7 @@
 """Losses: what learning minimises."""
 
 from neusee.nodes.losses._mask import bsr, lsr
+from neusee.nodes.losses._penalty import gradient_penalty
 from neusee.nodes.losses._restoration import charbonnier, fft_l1
 
-__all__ = ["bsr", "charbonnier", "fft_l1", "lsr"]
+__all__ = ["bsr", "charbonnier", "fft_l1", "gradient_penalty", "lsr"]

@@ -7,8 +7,11 @@ import torch
 from torch import Tensor
 
 from neusee.nodes import Check, node
+from neusee.nodes._precision import single
 from neusee.nodes.units import PositiveLength
 from neusee.nodes.values import Psf
+
+_DARK = 1e-30  #: share of the light that counts as none
 
 
 class Mtf(NamedTuple):
@@ -29,7 +32,8 @@ def mtf(psf: Psf) -> Mtf:
     Shapes: psf.intensity (band, y, x) -> three of (band,) float64.
     Units:  none.
     Error:  1e-7 in float32, and that of the window: light outside it counts as lost, frequencies are its own. The
-            cut-off holds for a round aperture and a PSF sampled at points.
+            cut-off holds for a round aperture and a PSF sampled at points. Without light (1e-30) it is 0. The gradient
+            is that of `rms`: a median hangs on one frequency, and of equal ones it is chance on which.
     Source: Goodman, Introduction to Fourier Optics, 4th ed., ch. 7 (OTF as autocorrelation of the pupil).
     """
     rows = [_contrast(one, float(p)) for one, p in zip(psf.intensity, psf.clear_peak, strict=True)]
@@ -40,10 +44,14 @@ def _contrast(kernel: Tensor, clear_peak: float) -> tuple[Tensor, Tensor, Tensor
     y, x = kernel.shape
     fy, fx = (torch.fft.fftfreq(n, dtype=torch.float64, device=kernel.device) for n in (y, x))
     inside = torch.hypot(fy[:, None], fx[None, : x // 2 + 1]) <= math.sqrt(4.0 * clear_peak / math.pi)
-    otf = torch.fft.rfft2(kernel).abs()
-    found = (otf[inside].double() / otf[0, 0].double().clamp_min(1e-300)).clamp_max(1.0)
-    ordered = found.sort().values
-    return found.square().mean().sqrt(), ordered[(len(ordered) - 1) // 2], ordered[(len(ordered) - 1) // 100]
+    otf = torch.fft.rfft2(single(kernel))
+    whole = otf[0, 0].to(torch.complex128).abs()
+    dark = whole <= _DARK
+    passed = otf[inside].to(torch.complex128).abs() / whole.where(~dark, 1.0)
+    found = passed.where(~dark, 0.0).clamp_max(1.0)
+    ordered = found.detach().sort().values
+    rms: Tensor = torch.linalg.vector_norm(found) / math.sqrt(len(found))
+    return rms, ordered[(len(ordered) - 1) // 2], ordered[(len(ordered) - 1) // 100]
 
 
 @mtf.check

@@ -1,0 +1,172 @@
+"""The catalogue of stiff and extreme cases: what is changed of a recipe, or of what each of its steps is given.
+
+A case changes parameters by ``node.parameter`` (``*.exposure`` of every node), results by the path of the node
+that made them, or, step by step, the inputs. What a node should make of them is not said here: the node's own
+reference and its own documented error are (`_extremes_cell`).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, field
+from typing import Any, Literal
+
+import torch
+from torch import Tensor
+
+from neusee.nodes.values import Pupil
+
+Params = Mapping[str, Any]
+Expect = Literal["accurate", "dim part", "seen"]
+
+
+@dataclass(frozen=True)
+class Size:
+    """How large the small recipe is."""
+
+    pixels: int = 32  #: side of the scene; the rest in proportion
+    samples: int = 64  #: side of the pupil
+    bands: int = 5
+
+
+@dataclass(frozen=True)
+class Case:
+    """One row of the grid."""
+
+    name: str
+    what: str  #: what is extreme about it
+    group: str
+    params: Mapping[str, Any] = field(default_factory=dict)  #: a value, or a function of the step's parameters
+    values: Mapping[str, Callable[[Any], Any]] = field(default_factory=dict)  #: by the start of a node's path
+    inputs: Callable[[Tensor], Tensor] | None = None  #: changes one picture that a step is given
+    alike: bool = False  #: a step that compares two pictures is given the same twice
+    size: Size = field(default_factory=Size)
+    expect: Expect = "accurate"
+
+
+def middle(value: float) -> Callable[[Tensor], Tensor]:
+    """A picture with one element changed, the one in the middle."""
+
+    def change(x: Tensor) -> Tensor:
+        changed = x.clone()
+        changed[tuple(n // 2 for n in x.shape)] = value
+        return changed
+
+    return change
+
+
+def _peak_of(top: float) -> Callable[[Tensor], Tensor]:
+    def change(x: Tensor) -> Tensor:
+        largest = float(x.double().abs().max())
+        return (x.double() * (top / largest if largest > 0 else 0.0)).to(x.dtype)
+
+    return change
+
+
+def _lamp(scene: Tensor) -> Tensor:
+    """The scene a million times darker than one lamp in it."""
+    return middle(1.0)(scene * (1e-6 / scene.max()))
+
+
+def _noise(depth: float) -> Callable[[Tensor], Tensor]:
+    def change(height: Tensor) -> Tensor:
+        rng = torch.Generator().manual_seed(11)
+        return (depth * torch.rand(height.shape, generator=rng, dtype=torch.float64)).to(height.dtype)
+
+    return change
+
+
+def _steps(height: Tensor) -> Tensor:
+    """0.9 of a wave at 550 nm up and down from sample to sample, in fused silica: every step is aliased."""
+    v, u = (torch.arange(n) for n in height.shape)
+    return ((v[:, None] + u) % 2 * 1.076e-6).to(height.dtype)
+
+
+def _opaque(pupil: Pupil) -> Pupil:
+    return pupil._replace(amplitude=pupil.amplitude * 0)
+
+
+def _closed(pupil: Pupil) -> Pupil:
+    return _opaque(pupil)._replace(aperture=pupil.aperture * 0)
+
+
+def _off_axis(share: float) -> Callable[[Params], tuple[float, float]]:
+    """Where a spot lies that many sides of the sensor from its middle along x."""
+    return lambda p: (0.0, share * p["shape"][1] * p["pixel_pitch"] / p["focal_length"])
+
+
+def _one_photon(p: Params) -> float:
+    return float(p["quantum_efficiency"] / p["full_well"])
+
+
+def _scaled(name: str, by: float) -> Callable[[Params], float]:
+    return lambda p: float(p[name] * by)
+
+
+_RELIEFS = ("doe.flat", "doe.vortex", "doe.axicon", "doe.spiral_axicon", "doe.cubic", "doe.half_rings", "doe.zernike",
+            "doe.pixelwise", "doe.unet")  # fmt: skip
+
+
+def _relief(change: Callable[[Tensor], Tensor]) -> dict[str, Callable[[Any], Any]]:
+    return dict.fromkeys(_RELIEFS, change)
+
+
+_BLACK: dict[str, Callable[[Any], Any]] = {"scene.": lambda scene: scene * 0}
+_LASER, _SCENE = "optics.spot.strength", "sensor.level.strength"
+
+USUAL = Case("usual", "the recipe as it is, at this small size", "usual")
+CASES: tuple[Case, ...] = (
+    USUAL,
+    Case("no laser", "a laser of strength 0", "light", {_LASER: 0.0}),
+    Case("laser, black scene", "1e8 times saturation on black", "light", {_LASER: 1e8}, _BLACK),
+    Case("laser, full scene", "1e8 times saturation on a thousandfold overexposed scene", "light",
+         {_LASER: 1e8, _SCENE: 1e3}),
+    Case("zero light", "no scene, no laser", "light", {_LASER: 0.0}, _BLACK),
+    Case("all saturated", "a scene of 1e4 wells", "light", {_SCENE: 1e4}),
+    Case("one photon", "one photon in the brightest pixel", "light", {_LASER: 0.0, _SCENE: _one_photon}),
+    Case("contrast 1e6", "one lamp; the error is that of the rest, over its own brightest", "light",
+         values={"scene.": _lamp}, params={_LASER: 0.0}, expect="dim part"),
+    Case("exposure 1 us", "exposure 1e-6 s", "sensor", {"*.exposure": 1e-6}),
+    Case("exposure 1000 s", "exposure 1e3 s", "sensor", {"*.exposure": 1e3}),
+    Case("well / 1e4", "a full well of 2.55 e-", "sensor", {"*.full_well": _scaled("full_well", 1e-4),
+         "*.capacity": _scaled("capacity", 1e-4)}),
+    Case("well x 1e4", "a full well of 2.55e8 e-", "sensor", {"*.full_well": _scaled("full_well", 1e4),
+         "*.capacity": _scaled("capacity", 1e4)}),
+    Case("gain / 1e4", "a gain of 3.7e-5", "sensor", {"*.gain": _scaled("gain", 1e-4)}),
+    Case("gain x 1e4", "a gain of 3.7e3", "sensor", {"*.gain": _scaled("gain", 1e4)}),
+    Case("400 nm", "all bands from 400 to 401 nm", "spectrum", {"spectra.bands.start": 400e-9,
+         "spectra.bands.stop": 401e-9, "spectra.line.wavelength": 400e-9}),
+    Case("700 nm", "all bands from 699 to 700 nm", "spectrum", {"spectra.bands.start": 699e-9,
+         "spectra.bands.stop": 700e-9, "spectra.line.wavelength": 700e-9}),
+    Case("one band", "one band for the scene, one for the laser", "spectrum", {"spectra.line.count": 1},
+         size=Size(bands=1)),
+    Case("301 bands", "1 nm a band", "spectrum", size=Size(24, 32, 301)),
+    Case("height 0", "a flat element", "relief", values=_relief(torch.zeros_like)),
+    Case("height 100 um", "a random relief, 80 waves deep", "relief", values=_relief(_noise(100e-6))),
+    Case("steps past pi", "0.9 wave from sample to sample", "relief", values=_relief(_steps)),
+    Case("wrapped", "100 um wrapped at 550 nm", "relief", {"doe.fabricate.wrap_at": 550e-9},
+         _relief(_noise(100e-6))),
+    Case("two levels", "100 um wrapped at 550 nm, in two levels", "relief", {"doe.fabricate.wrap_at": 550e-9,
+         "doe.fabricate.levels": 2}, _relief(_noise(100e-6))),
+    Case("opaque pupil", "an amplitude of 0 everywhere", "pupil", values={"optics.pupil": _opaque}),
+    Case("empty pupil", "an aperture of 0 everywhere", "pupil", values={"optics.pupil": _closed}),
+    Case("defocus 100", "a hundred waves of defocus", "pupil", {"optics.pupil.defocus": 100.0}),
+    Case("laser at the edge", "a spot on the edge of the sensor", "pupil", {"optics.direction.angle": _off_axis(0.5)}),
+    Case("laser beyond", "the spot half a sensor beyond its edge", "pupil", {"optics.direction.angle": _off_axis(1.0)}),
+    Case("odd", "odd sides", "size", size=Size(23, 33)),
+    Case("prime", "prime sides", "size", size=Size(29, 61)),
+    Case("1 pixel", "one pixel", "size", size=Size(1, 16)),
+    Case("1 sample", "a pupil of one sample", "size", size=Size(16, 1)),
+    Case("NaN", "one element of each picture is not a number", "numbers", inputs=middle(float("nan")), expect="seen"),
+    Case("Inf", "one element of each picture is infinite", "numbers", inputs=middle(float("inf")), expect="seen"),
+    Case("-Inf", "one element of each picture is minus infinity", "numbers", inputs=middle(float("-inf")),
+         expect="seen"),
+    Case("negative", "every picture with its sign turned", "numbers", inputs=torch.neg),
+    Case("denormal", "every picture scaled to 1e-40", "numbers", inputs=_peak_of(1e-40)),
+    Case("huge", "every picture scaled to 1e15", "numbers", inputs=_peak_of(1e15)),
+    Case("alike", "zero error: the same picture twice", "numbers", alike=True),
+    Case("all zero", "zero gradient: every picture is 0", "numbers", inputs=torch.zeros_like),
+    Case("float16", "every picture in float16", "types", inputs=lambda x: x.to(torch.float16)),
+    Case("bfloat16", "every picture in bfloat16", "types", inputs=lambda x: x.to(torch.bfloat16)),
+    Case("float64", "every picture in float64", "types", inputs=lambda x: x.to(torch.float64)),
+)  # fmt: skip
