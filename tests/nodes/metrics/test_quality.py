@@ -3,6 +3,7 @@
 import numpy as np
 import pytest
 import torch
+from kornia.metrics import ssim
 from skimage.metrics import peak_signal_noise_ratio, structural_similarity
 
 from neusee.nodes.metrics import quality
@@ -19,6 +20,27 @@ def gaussian_ssim(a, b):
     how = {"gaussian_weights": True, "sigma": 1.5, "use_sample_covariance": False, "win_size": 11}
     _, full = structural_similarity(a, b, channel_axis=0, data_range=1.0, full=True, **how)
     return full[:, 5:-5, 5:-5].mean()
+
+
+@pytest.mark.parametrize("shape", [(11, 11), (64, 65), (65, 11), (130, 119)])
+def test_ssim_is_that_of_kornia_at_any_size(shape):
+    torch.manual_seed(0)
+    truth = torch.rand(3, *shape)
+    estimate = (truth + 0.1 * torch.randn_like(truth)).clamp(0, 1)
+    whole = ssim(estimate[None], truth[None], 11, padding="valid")
+    assert float(quality(estimate, truth, domain="linear").ssim) == pytest.approx(float(whole.mean()), abs=1e-6)
+
+
+def test_what_is_compared_by_stripes_has_the_gradient_of_the_whole():
+    torch.manual_seed(0)
+    truth, estimate = torch.rand(2, 3, 70, 20).double()
+    grads = []
+    for measure in (lambda x: quality(x, truth, domain="linear").ssim,
+                    lambda x: ssim(x[None], truth[None], 11, padding="valid").mean()):  # fmt: skip
+        x = estimate.clone().requires_grad_()
+        measure(x).backward()
+        grads.append(x.grad)
+    torch.testing.assert_close(*grads, rtol=1e-6, atol=1e-12)
 
 
 def test_agrees_with_scikit_image():
