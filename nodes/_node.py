@@ -94,8 +94,9 @@ class Facts:
 class Deviation:
     """How far an input may be from what it ought to be, and what is known of it."""
 
-    bound: float  #: of the largest difference; where the input is random, of its root mean square over the noise
+    bound: float  #: of the root mean square of the difference, over the elements and the noise
     facts: Facts | None = None
+    top: float | None = None  #: of how far its largest element is off, as a share of it; None where nobody tells
 
     @property
     def share(self) -> float:
@@ -104,6 +105,11 @@ class Deviation:
             return 0.0
         top = max(abs(self.facts.min), abs(self.facts.max)) if self.facts else 0.0
         return self.bound / top if top > 0 else math.inf
+
+    @property
+    def largest(self) -> float:
+        """The bound on the largest element, as a share of it."""
+        return 0.0 if self.bound == 0.0 else math.inf if self.top is None else self.top
 
 
 class Node:
@@ -130,7 +136,7 @@ class Node:
         self.mixed: Node | None = None
         self.sums: Callable[[Mapping[str, Any]], bool] | None = None
         self.spread: Callable[..., float] | None = None
-        self.deviation: Callable[[Any], float] | None = None
+        self.deviation: Callable[[Any], tuple[float, float]] | None = None
         self.nothing: Callable[..., float] | None = None
         self.ref: Callable[..., Any] | None = None
         self.bound: Callable[..., float] | None = None
@@ -207,17 +213,16 @@ class Node:
     def carries(self, fn: Fn) -> Fn:
         """Attach ``(a `Deviation` of each input, *, result: Facts, parameters) -> float``: how far off the result may be.
 
-        Both in the maximum norm; behind a random node, in root mean square over the noise. A list input is a list of
-        them, one that is absent None. Without it, nothing is known behind the node, and its inputs are held to the
-        tolerance instead.
+        Both in root mean square. A list input is a list of them, one that is absent None. Without it, nothing is
+        known behind the node, and its inputs are held to the tolerance instead.
         """
         self.spread = fn
         return fn
 
     def deviates(self, fn: Fn) -> Fn:
-        """Attach ``(result) -> float``: how far a cheaper form may be from the full one, as a share of its largest.
+        """Attach ``(result) -> (share, share)``: how far a cheaper form may be from the full one, over its largest.
 
-        What its inputs lack is part of it.
+        In root mean square, and of the largest element alone. What its inputs lack is part of it.
         """
         self.deviation = fn
         return fn

@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Literal
+from typing import TYPE_CHECKING, Any, Literal
 
 from neusee.nodes import Check, Facts
 from neusee.workflows._keys import Key
@@ -32,8 +33,14 @@ class Done:
     lane: str = ""  #: which place of the executor computed it
     peak: int | None = None  #: bytes of memory beside what was there before it ran
     predicted: float | None = None  #: s that earlier runs made one expect
-    error: float | None = None  #: of a cheaper form: how far it may be from the full one, as a share of its largest
+    error: tuple[float, float] | None = None  #: of a cheaper form: rms and of the largest element, over the largest
     kept: bool = True  #: whether the store has the value
+
+
+def error_in(about: Mapping[str, Any] | None) -> tuple[float, float] | None:
+    """What a stored result says of its own error."""
+    found = (about or {}).get("error")
+    return (float(found[0]), float(found[1])) if found else None
 
 
 def ran(outcome: Outcome, why: str, bound: float | None, began: float, predicted: float | None) -> Done:

@@ -53,7 +53,8 @@ def proof(
         if math.isinf(carried):
             told = {source: found[source].share for source in step.sources if source in found}
             held |= {source: share for source, share in told.items() if math.isfinite(share)}
-        found[name] = Deviation(carried + (own or 0.0), facts)
+        error = done[name].error
+        found[name] = Deviation(carried + (own or 0.0), facts, error[1] if error else None)
     shares = {name: deviation.share for name, deviation in found.items()}
     held |= {name: shares[name] for name in wanted if math.isfinite(shares.get(name, math.inf))}
     return Proof(shares, held)
@@ -61,7 +62,7 @@ def proof(
 
 def _own(done: Done, facts_of: FactsOf) -> float | None:
     """What a step itself adds, in the unit of its result: as a cheaper form, or by being left out."""
-    share = done.bound if done.state == "left out" else done.error
+    share = done.bound if done.state == "left out" else done.error and done.error[0]
     facts = facts_of(done.step)
     if not share or facts is None:
         return None

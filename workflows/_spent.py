@@ -60,7 +60,7 @@ def _economy(result: Result, costs: Costs, step: str, instead: str, why: str) ->
     took = done.seconds if done and done.state == "run" else about["seconds"] if about else None
     row = {"step": step, "instead": instead, "why": why, "seconds": took, "full_seconds": _seconds(result, costs, step)}
     checks = [check.text for check in done.checks] if done else []
-    return {**row, "bound": done.error if done else None, "what": "; ".join(checks)}
+    return {**row, "bound": done.error[0] if done and done.error else None, "what": "; ".join(checks)}
 
 
 def _omission(result: Result, costs: Costs, step: str) -> dict[str, Any]:

@@ -13,7 +13,7 @@ from dataclasses import replace
 from typing import Any
 
 from neusee.nodes import Check, Facts
-from neusee.workflows._account import Done, Event, ran
+from neusee.workflows._account import Done, Event, error_in, ran
 from neusee.workflows._call import RunError, places
 from neusee.workflows._choose import Below, to_compute_again, worth_a_look
 from neusee.workflows._code import Code
@@ -113,8 +113,8 @@ class UnderWay:
             key = self.keys[name]
             twin = self.done.get(self.makers[key].name)
             if twin is None or twin.state == "asleep":
-                known = {"bound": self._bound(name), "error": (self.store.about(key) or {}).get("error")}
-                self._finish(Done(name, "asleep", "nothing that ran needed it", 0.0, key, **known))
+                bound, error = self._bound(name), error_in(self.store.about(key))
+                self._finish(Done(name, "asleep", "nothing that ran needed it", 0.0, key, bound=bound, error=error))
             else:
                 self._finish(replace(twin, step=name, state="cached", why=f"the same as {twin.step}", seconds=0.0))
         return {name: self.done[name] for name in order}
@@ -251,7 +251,7 @@ class UnderWay:
         name = self.makers[key].name
         why = why or f"made {about['date']} in {about['seconds']:.3g} s"
         checks = tuple(Check(text, ok) for text, ok in about["checks"])
-        facts, bound, error = self._stored_facts(key), self._bound(name), about.get("error")
+        facts, bound, error = self._stored_facts(key), self._bound(name), error_in(about)
         return Done(name, "cached", why, seconds, key, facts, checks, "cpu", about["bytes"], bound, error=error)
 
     def _judge(self, step: Step) -> Verdict:

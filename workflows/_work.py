@@ -71,7 +71,7 @@ class Outcome:
     began: float = 0.0  #: s of the clock of `time.time`
     seconds: float = 0.0
     bytes: int = 0
-    deviation: float | None = None  #: of a cheaper form, from the full one
+    deviation: tuple[float, float] | None = None  #: of a cheaper form, from the full one; see `Node.deviates`
     peak: int | None = None  #: bytes beside what was there before
     kept: bool = False  #: whether the store has the value
     waits: bool = False  #: it is written beside the next steps, and its lease goes with it

@@ -50,8 +50,8 @@ def _(result: Channels, *inputs: Any, **params: Any) -> list[Check]:
 
 
 @image_channels.deviates
-def _(result: Channels) -> float:
-    return float(result.bound)
+def _(result: Channels) -> tuple[float, float]:
+    return float(result.bound), float(result.bound)
 
 
 image.collapsed = image_channels

@@ -145,8 +145,10 @@ def crop(image: Tensor, *, shape: Shape) -> Tensor:
 
 
 @crop.carries
-def _(image: Deviation, **params: Any) -> float:
-    return image.bound
+def _(image: Deviation, *, result: Facts, **params: Any) -> float:
+    """All that is off may lie in the window."""
+    before = math.prod(image.facts.shape) if image.facts else math.inf
+    return image.bound * math.sqrt(before / max(1, math.prod(result.shape)))
 
 
 @crop.negligible

@@ -143,7 +143,7 @@ def _(params: Mapping[str, Any]) -> bool:
 @level.carries
 def _(plain_image: Deviation, *others: object, result: Facts, **params: Any) -> float:
     """What the brightest pixel is off, the level is off the other way."""
-    share = plain_image.share
+    share = plain_image.largest
     return result.max * share / (1.0 - share) if share < 1.0 else math.inf
 
 
