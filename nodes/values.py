@@ -8,6 +8,7 @@ from __future__ import annotations
 
 from typing import NamedTuple
 
+import torch
 from torch import Tensor
 
 
@@ -65,6 +66,7 @@ class Channels(NamedTuple):
     rows: Tensor  #: (row, band) float64
     flux: Tensor  #: (band,) float64, sum of image[b] over its pixels
     bound: Tensor  #: () float64, bound of max |error| / max |plane|, of the worst row
+    kept: Tensor = torch.zeros(5, dtype=torch.int64)  #: planes, kernels, bands, rows and columns of the PSF convolved
 
 
 #: by class, the fields with one entry a band

@@ -1,0 +1,72 @@
+"""Carry out a plan: borders, kernels, the convolutions, and how far their rounding may reach."""
+
+import math
+
+import torch
+from torch import Tensor
+from torch.nn.functional import pad
+
+from neusee.nodes.optics._collapse import Given, Plan, transform
+from neusee.nodes.optics._passed import centred
+from neusee.nodes.optics._summed import Where, summed
+
+_SOME = 16  #: rows of the PSF summed at a time: those of 31 bands stay in the cache
+
+
+def convolved(planes: Tensor, intensity: Tensor, given: Given, plan: Plan) -> Tensor:
+    """The rows of the image: (row, y, x)."""
+    (m, n), zero = plan.window, (0, 0)
+    scene = bordered(planes[: plan.planes], given, plan.window)
+    at = (m - 1, n - 1) if given.reflect else (m // 2, n // 2)
+    where = Where(zero, zero, at, given.size, transform(given, plan.window))
+    return summed(scene, _kernels(intensity, plan), plan.mix, where)
+
+
+def bordered(planes: Tensor, given: Given, window: tuple[int, int]) -> Tensor:
+    """The planes as they are convolved with a PSF of this size."""
+    if not given.reflect:
+        return planes
+    m, n = window
+    around = (n - 1 - n // 2, n // 2, m - 1 - m // 2, m // 2)
+    return pad(planes, around, mode="reflect")
+
+
+def _kernels(intensity: Tensor, plan: Plan) -> Tensor:
+    stack = centred(intensity, plan.window)
+    if plan.kernels is None:
+        return stack if len(plan.bands) == len(stack) else stack[plan.bands.to(stack.device)]
+    weights = plan.kernels.new_zeros(len(plan.kernels), len(stack))
+    weights = weights.index_copy_(1, plan.bands, plan.kernels).to(stack)
+    if stack.requires_grad:
+        return torch.tensordot(weights, stack, 1)
+    sums = stack.new_empty(len(weights), *plan.window)
+    for y in range(0, plan.window[0], _SOME):
+        rows = stack[:, y : y + _SOME]
+        sums[:, y : y + _SOME] = (weights @ rows.flatten(1)).view(-1, *rows.shape[1:])
+    return sums
+
+
+def guessed(planes: Tensor, given: Given) -> Tensor:
+    """About the brightest pixel of each row: a quarter of that without blur, and half of what the blur can leave."""
+    through = given.passed.total
+    bright = torch.tensordot((given.rows * through @ given.basis).to(planes), planes, 1).flatten(1)
+    sharp = torch.maximum(bright.amax(1), -bright.amin(1)).double().cpu()
+    power = ((given.basis @ given.gram) * given.basis).sum(1).clamp_min(0) * given.copies
+    blurred = given.rows.abs() @ (power * through * given.passed.peak).sqrt()
+    return torch.minimum(sharp / 4, blurred / 2)
+
+
+def rounding(given: Given, plan: Plan, found: Tensor, eps: float) -> Tensor:
+    """By row, about the largest error of the transforms.
+
+    Their rounding is as good as white: a share eps sqrt(log2 N) / 2 of the power, spread over all N samples. Of that
+    spread eight sigma, and four roundings of the brightest pixel for what is not spread.
+    """
+    count = math.prod(transform(given, plan.window))
+    u, x, y = plan.mix
+    plane = given.gram.diagonal()[: plan.planes].clamp_min(0).sqrt() * math.sqrt(given.copies)
+    kernel = (given.passed.total * given.passed.peak).sqrt()[plan.bands]
+    kernel = kernel if plan.kernels is None else plan.kernels.abs() @ kernel
+    terms = (plane if x is None else x.abs() @ plane) * (kernel if y is None else y.abs() @ kernel)
+    white = terms[None].sum(1) if u is None else u.abs() @ terms
+    return eps * (8 * math.sqrt(math.log2(count + 1)) * white / math.sqrt(count) + 4 * found)

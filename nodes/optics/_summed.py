@@ -1,0 +1,124 @@
+"""Sums of convolutions of few planes with few kernels, in one pass over the columns of their spectra.
+
+Result i is ``sum_s U[i, s] (X a)_s * (Y b)_s`` with planes a and kernels b. All planes and kernels are transformed
+along their rows; then some columns of all of them at a time are transformed, multiplied and transformed back, in memory
+that the cache holds. At 3072 x 3072 a plane's columns take 11 ms this way and 35 ms in place, on two cores.
+"""
+
+from typing import Any, NamedTuple
+
+import torch
+from torch import Tensor
+
+Corner = tuple[int, int]
+
+_COLUMNS = 32  #: of each spectrum at a time; in a GPU all
+
+
+class Mix(NamedTuple):
+    """Which planes meet which kernels, and in which results; None for the identity."""
+
+    u: Tensor | None  #: (result, s)
+    x: Tensor | None  #: (s, plane)
+    y: Tensor | None  #: (s, kernel)
+
+    def to(self, like: Tensor) -> "Mix":
+        """In the precision and on the device of the planes."""
+        return Mix(*(m if m is None else m.to(like) for m in self))
+
+
+class Where(NamedTuple):
+    """How planes and kernels lie in the zeros of the transform, and which window of it is the result."""
+
+    at_a: Corner
+    at_b: Corner
+    at: Corner
+    size: Corner
+    length: Corner
+    conjugate: bool = False  #: F(b): correlation
+
+
+class Summed(torch.autograd.Function):
+    """Both gradients are sums of the same kind, so that nothing but the inputs is kept and any derivative exists."""
+
+    @staticmethod
+    def forward(ctx: Any, a: Tensor, b: Tensor, mix: Mix, where: Where) -> Tensor:
+        ctx.save_for_backward(a, b)
+        ctx.how = mix, where
+        return _summed(a, b, mix, where)
+
+    @staticmethod
+    def backward(ctx: Any, *grads: Tensor) -> Any:
+        (a, b), (mix, where), grad = ctx.saved_tensors, ctx.how, grads[0]
+        u, x, y = (m if m is None else m.T for m in mix)
+        flip = not where.conjugate
+        of_a = of_b = None
+        if ctx.needs_input_grad[0]:
+            back = where._replace(at_a=where.at, at=where.at_a, size=tuple(a.shape[1:]), conjugate=flip)
+            of_a = summed(grad, b, Mix(x, u, mix.y), back)
+        if ctx.needs_input_grad[1]:
+            back = where._replace(at=where.at_b, size=tuple(b.shape[1:]), conjugate=True)
+            if where.conjugate:
+                of_b = summed(a, grad, Mix(y, mix.x, u), back._replace(at_b=where.at))
+            else:
+                of_b = summed(grad, a, Mix(y, u, mix.x), back._replace(at_a=where.at, at_b=where.at_a))
+        return of_a, of_b, None, None
+
+
+def summed(a: Tensor, b: Tensor, mix: Mix, where: Where) -> Tensor:
+    """Planes (k, y, x) and kernels (q, y, x) to results (r, y, x)."""
+    result: Tensor = Summed.apply(a, b, mix, where)  # type: ignore[no-untyped-call]
+    return result
+
+
+def _summed(a: Tensor, b: Tensor, mix: Mix, where: Where) -> Tensor:
+    mix, (high, wide) = mix.to(a), where.length
+    one, two = _rows(a, where.at_a[1], wide), _rows(b, where.at_b[1], wide)
+    columns = wide // 2 + 1
+    step = columns if a.is_cuda else min(columns, _COLUMNS)
+    first, second = _Columns(one, where.at_a[0], high, step), _Columns(two, where.at_b[0], high, step)
+    result = one.new_empty(_results(mix, a), where.size[0], columns)
+    for c in range(0, columns, step):
+        x, y = _times(mix.x, first.spectra(c)), _times(mix.y, second.spectra(c))
+        found = torch.fft.ifft(_times(mix.u, x * (y.conj() if where.conjugate else y)))
+        found = found[:, : columns - c, where.at[0] : where.at[0] + where.size[0]]
+        result[:, :, c : c + step] = found.transpose(1, 2)
+    pixels: Tensor = torch.fft.irfft(result, n=wide)
+    return pixels[..., where.at[1] : where.at[1] + where.size[1]].contiguous()
+
+
+def _results(mix: Mix, a: Tensor) -> int:
+    return next(len(m) for m in (mix.u, mix.x, a) if m is not None)
+
+
+def _rows(x: Tensor, left: int, wide: int) -> Tensor:
+    """Transform the rows, which begin ``left`` of a longer row of zeros."""
+    if left:
+        x = torch.nn.functional.pad(x, (left, 0))
+    spectra: Tensor = torch.fft.rfft(x, n=wide)
+    return spectra
+
+
+class _Columns:
+    """Some columns at a time, each in one piece, in memory that is used again: fresh memory costs more than they do."""
+
+    def __init__(self, rows: Tensor, top: int, high: int, step: int) -> None:
+        self.rows, self.step = rows, step
+        self.room = rows.new_zeros(len(rows), step, high)
+        self.inside = self.room[..., top : top + rows.shape[1]]
+        self.found = torch.empty_like(self.room)
+
+    def spectra(self, first: int) -> Tensor:
+        """Transform columns from ``first`` on: (plane, column, frequency); beyond the last, those of before."""
+        some = self.rows[:, :, first : first + self.step].transpose(1, 2)
+        self.inside[:, : some.shape[1]] = some
+        torch.fft.fft(self.room, out=self.found)
+        return self.found
+
+
+def _times(matrix: Tensor | None, spectra: Tensor) -> Tensor:
+    """A real matrix times complex spectra."""
+    if matrix is None:
+        return spectra
+    pairs = torch.view_as_real(spectra)
+    return torch.view_as_complex((matrix @ pairs.reshape(len(spectra), -1)).reshape(-1, *pairs.shape[1:]))
