@@ -140,10 +140,12 @@ class Node:
         channels: Sequence[str] = (),
         even: Sequence[str] = (),
         mixtures: Sequence[str] = (),
+        adds: Sequence[tuple[str, ...]] = (),
     ) -> None:
         functools.update_wrapper(self, fn)
         self.fn, self.device, self.rtol = fn, device, rtol
         self.channels, self.even, self.mixtures = tuple(channels), tuple(even), tuple(mixtures)
+        self.adds = tuple(adds)
         self.collapsed: Node | None = None
         self.mixed: Node | None = None
         self.sums: Callable[[Mapping[str, Any]], bool] | None = None
@@ -217,16 +219,16 @@ class Node:
     def absent(self, fn: Fn) -> Fn:
         """Attach ``(facts of each input, *, parameters) -> float``: a true bound of the result's largest element.
 
-        Of light that is added to other light: where it is too little, the step and what only feeds it are left out.
+        Where that is 0, the step and what only feeds it are left out. An input that is absent is given as None.
         """
         self.nothing = fn
         return fn
 
     def carries(self, fn: Fn) -> Fn:
-        """Attach ``(a `Deviation` of each input, *, result: Facts, parameters) -> float``: how far off the result may be.
+        """Attach ``(a `Deviation` of each input, *, result: Facts, parameters) -> float``: how far off the result is.
 
-        Both in root mean square. A list input is a list of them, one that is absent None. Without it, nothing is
-        known behind the node, and its inputs are held to the tolerance instead.
+        At most, both in root mean square. A list input is a list of them, one that is absent None. Without it, nothing
+        is known behind the node, and its inputs are held to the tolerance instead.
         """
         self.spread = fn
         return fn
@@ -268,6 +270,7 @@ def node(
     channels: Sequence[str] = (),
     even: Sequence[str] = (),
     mixtures: Sequence[str] = (),
+    adds: Sequence[tuple[str, ...]] = (),
 ) -> Callable[[Callable[..., Any]], Node]:
     """Make a node of a function. ``rtol`` is the agreed error against its reference.
 
@@ -276,6 +279,7 @@ def node(
     beside it. Of a named tuple, only the fields in `values.BAND_FIELDS` have that axis.
 
     ``channels`` names the inputs that may be `Channels` instead of an image of all bands; those in ``even`` must then
-    be the same for every band. ``mixtures`` names those that may be a `Mixture` instead of a cube.
+    be the same for every band. ``mixtures`` names those that may be a `Mixture` instead of a cube. ``adds`` names those
+    without which nothing changes where they are nothing, an optional input or a list; with each, what goes with it.
     """
-    return lambda fn: Node(fn, device, rtol, bands, channels, even, mixtures)
+    return lambda fn: Node(fn, device, rtol, bands, channels, even, mixtures, adds)

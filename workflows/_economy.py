@@ -13,6 +13,7 @@ from collections.abc import Collection, Iterable, Mapping
 from dataclasses import dataclass, field, replace
 from typing import TYPE_CHECKING, Any
 
+from neusee.workflows._absent import without_nothing
 from neusee.workflows._graph import Economy, Recipe, Step, Wire, in_order, needed
 
 if TYPE_CHECKING:
@@ -23,17 +24,18 @@ _MIXTURE = 0.05  #: share of the tolerance for a mixture, rounded down to a powe
 
 
 def economised(recipe: Recipe, wanted: Iterable[str], pinned: Collection[str] = ()) -> Recipe:
-    """``recipe`` with cheaper steps for what only ``wanted`` needs; as it is with ``keep_all`` or without tolerance.
+    """``recipe`` with cheaper steps for what only ``wanted`` needs; as it is with ``keep_all``.
 
     The scene of an image that follows a step in ``pinned`` stays whole: what is being learnt
     has no mixture yet. A recipe that was economised does not change again.
     """
     wanted = frozenset(wanted)
-    if recipe.keep_all or recipe.allowed <= 0:
+    if recipe.keep_all:
         return recipe
+    recipe = without_nothing(recipe, needed(recipe, sorted(wanted)))
     order = needed(recipe, sorted(wanted))
     images = [recipe.steps[n] for n in order if recipe.steps[n].node.collapsed is not None and n not in wanted]
-    if not images:
+    if not images or recipe.allowed <= 0:
         return recipe
     behind = _behind(recipe, order, pinned)
     draft = _Draft(recipe, wanted, _readers(recipe, order))

@@ -19,7 +19,7 @@ class Ledger:
     """
 
     def __init__(self, recipe: Recipe) -> None:
-        share = 1.0 - 2 * CHANNELS if recipe.economies else 1.0
+        share = 1.0 - 2 * CHANNELS if any(e.within for e in recipe.economies) else 1.0
         self._allowed, self._keep_all = recipe.allowed * share, recipe.keep_all
         self._spent: dict[str, dict[str, float]] = {}  # by step: decision -> its bound; shared where equal
 

@@ -39,11 +39,13 @@ def spent(result: Result) -> dict[str, Any]:
 
 def said_of_economies(account: Mapping[str, Any]) -> str:
     """One line for the console: what stands in for full steps, what that may change, and what it did where known."""
-    names = ", ".join(f"{e['step']} ({_within(e['bound'])})" for e in account["economies"])
+    summed = [f"{e['step']} ({_within(e['bound'])})" for e in account["economies"] if e["instead"]]
+    nothing = [f"{e['step']} (nothing)" for e in account["economies"] if not e["instead"]]
     worst = max(account["bounds"].values(), default=0.0)
     found = max(account["measured"].values(), default=None)
     measured = f", measured {found:.1e}" if found is not None else ""
-    return f"summed   {names}: in all at most {worst:.1e}{measured}; tolerance {account['tolerance']:g}"
+    names = ", ".join([*summed, *nothing])
+    return f"spared   {names}: in all at most {worst:.1e}{measured}; tolerance {account['tolerance']:g}"
 
 
 def _within(bound: float | None) -> str:
@@ -55,7 +57,7 @@ def _left_out(result: Result) -> list[str]:
 
 
 def _economy(result: Result, costs: Costs, step: str, instead: str, why: str) -> dict[str, Any]:
-    done = result.done.get(instead)
+    done = result.done.get(instead) if instead else None
     about = result.store.about(done.key) if done else None
     took = done.seconds if done and done.state == "run" else about["seconds"] if about else None
     row = {"step": step, "instead": instead, "why": why, "seconds": took, "full_seconds": _seconds(result, costs, step)}

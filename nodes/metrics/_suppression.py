@@ -7,6 +7,7 @@ from pydantic import Field
 from torch import Tensor
 
 from neusee.nodes import Check, node
+from neusee.nodes._precision import single
 from neusee.nodes.sensor._channels import weighted
 from neusee.nodes.sensor._digital import Bits, Gain, GainUnit, numbers_per_electron
 from neusee.nodes.sensor._saturation import Efficiency, Well, saturation
@@ -66,13 +67,13 @@ def bsr(image: Tensor | Channels, plain_image: Tensor | Channels) -> Tensor:
     if here != there:
         raise ValueError(f"image {here} and plain image {there} differ in shape")
     kept, plain = (x.flux if isinstance(x, Channels) else _light(x) for x in (image, plain_image))
-    lit = plain > 0
-    ratio: Tensor = torch.where(lit, kept / plain.where(lit, 1.0), 1.0)
+    dark = plain <= 0  # so that what is not a number is seen
+    ratio: Tensor = torch.where(dark, 1.0, kept / plain.where(~dark, 1.0))
     return ratio
 
 
 def _light(image: Tensor) -> Tensor:
-    return image.sum(-1).sum(-1, dtype=torch.float64)
+    return single(image).sum(-1).sum(-1, dtype=torch.float64)
 
 
 @bsr.check
@@ -86,7 +87,7 @@ def saturated(raw: Tensor, *, full_well: Well, gain: Gain, gain_unit: GainUnit =
 
     Shapes: raw (..., channel, y, x) -> two scalars, float64.
     Units:  raw DN; pixels.
-    Error:  a pixel within one DN of the full well counts as full.
+    Error:  a pixel within one DN of the full well counts as full, and so does one that is not a number.
     Source: NeuSee, Eq. (SensorImage).
     """
     full = clipped(raw, full_well=full_well, gain=gain, gain_unit=gain_unit, bits=bits).any(-3)
@@ -102,11 +103,11 @@ def _(result: Saturated, *inputs: Tensor, **params: Any) -> list[Check]:
 def clipped(raw: Tensor, *, full_well: float, gain: float, gain_unit: str, bits: int) -> Tensor:
     """Which values have come to the full well or to the last number of the converter."""
     full = int(full_well * numbers_per_electron(gain, gain_unit) - 0.5)
-    marked: Tensor = raw >= max(1, min(2**bits - 1, full))
+    marked: Tensor = ~(raw < max(1, min(2**bits - 1, full)))  # nor is known what is not a number
     return marked
 
 
-@node(rtol=1e-6, channels=("image",), even=("level",))
+@node(rtol=1e-6, channels=("image",), even=("level",), adds=[("spots", "lines")])
 def peak(
     image: Tensor | Channels,
     bands: Bands,

@@ -7,6 +7,7 @@ import torch
 from torch import Tensor
 
 from neusee.nodes import Check, node
+from neusee.nodes._precision import refuse_half
 from neusee.nodes.optics._aperture import Aperture, Stop, axes, inside, stop
 from neusee.nodes.optics._zernike import surface
 from neusee.nodes.units import Count, Length, PositiveLength, Waves
@@ -15,7 +16,7 @@ from neusee.nodes.values import Bands, Dirt, Pupil
 DEFOCUS_WAVELENGTH = 550e-9  #: m; what a wave of defocus is counted in
 
 
-@node()
+@node(adds=[("dirt",)])
 def pupil(
     height: Tensor,
     index: Tensor,
@@ -37,7 +38,7 @@ def pupil(
     Shapes: height (v, u), index (band,), bands, dirt (v, u) -> Pupil.
     Units:  height m; defocus waves at 550 nm; aberrations m of path, root mean square, by Noll's number.
     Error:  path 1e-7 relative (float32); area of the staircase rim 2 / samples.
-    Raises: ValueError where the shapes do not belong together.
+    Raises: ValueError where the shapes do not belong together, and for a height in half precision.
     Source: Goodman, Introduction to Fourier Optics, 3rd ed., section 6.4; Noll, J. Opt. Soc. Am. 66, 207 (1976).
     """
     _shapes(height, index, bands, dirt)
@@ -58,6 +59,7 @@ def _lens_path(grid: Stop, defocus: float, aberrations: Mapping[int, float], dev
 
 
 def _shapes(height: Tensor, index: Tensor, bands: Bands, dirt: Dirt | None) -> None:
+    refuse_half(height=height)
     if height.ndim != 2 or height.shape[0] != height.shape[1]:
         raise ValueError(f"height is {tuple(height.shape)}: the pupil grid is square, (samples, samples)")
     if index.shape != bands.centres.shape:

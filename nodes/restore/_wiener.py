@@ -10,6 +10,7 @@ from torch import Tensor
 from torch.nn.functional import avg_pool2d, pad
 
 from neusee.nodes import Check, node
+from neusee.nodes._precision import refuse_not_finite, single
 from neusee.nodes.restore._blurred import Blurred, variance
 from neusee.nodes.restore._unseen import most_likely, torus
 from neusee.nodes.sensor._digital import crop
@@ -21,7 +22,7 @@ _GREY = 0.95  #: correlation of the channels of pictures
 _LIGHT = 0.999  #: share of the light for which the unknown around the picture has room
 
 
-@node()
+@node(adds=[("glare",)])
 def wiener(
     electrons: Tensor,
     psf: Psf,
@@ -50,7 +51,7 @@ def wiener(
             times as bright as the scene it rings. The iteration ends by its residual, or after 20 steps on the finest
             grid: behind five half-rings rms 0.005 to 0.02 of the contrast from the converged answer (512 to 2048 pixels
             a side), behind a plain lens 1e-3; float32 adds 3e-4. Gradients: those of the exact answer, no second ones.
-    Raises: ValueError where shapes or bands differ.
+    Raises: ValueError where shapes or bands differ, and for pictures and PSFs that are not finite.
     Source: Wiener filter as in Gonzalez and Woods, Digital Image Processing, 4th ed., ch. 5; as least squares with a
             prior, Kaipio and Somersalo, Statistical and Computational Inverse Problems, 2005, ch. 3.
     """
@@ -59,6 +60,8 @@ def wiener(
             f"electrons {tuple(electrons.shape)}, clipped {tuple(clipped.shape)} and responses "
             f"{tuple(responses.shape)} must have the same channels and pixels"
         )
+    electrons = single(electrons)
+    refuse_not_finite("nothing can be restored from it", electrons=electrons.sum(), psf=psf.intensity.sum())
     size = (electrons.shape[-2], electrons.shape[-1])
     kernels = effective_psf(psf, illuminant, responses, bands).to(electrons)
     patterns = [crop(pattern.to(electrons), shape=size) for pattern in glare or ()]
@@ -79,6 +82,8 @@ def effective_psf(psf: Psf, illuminant: Tensor, responses: Tensor, bands: Bands)
     if len(lengths) > 1:
         raise ValueError(f"PSF, illuminant, responses and bands have {sorted(lengths)} bands: give one `bands` step")
     share = responses.cpu().double() * illuminant.cpu().double() * bands.centres.cpu()
+    blind = share.sum(-1, keepdim=True) <= 0  # a channel that sees none of these bands: one PSF is as good as another
+    share = share.where(~blind, 1.0)
     share = share / share.sum(-1, keepdim=True)
     seen: Tensor = torch.tensordot(share.to(psf.intensity), psf.intensity, 1)
     return seen

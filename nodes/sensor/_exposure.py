@@ -9,6 +9,7 @@ from pydantic import Field
 from torch import Tensor
 
 from neusee.nodes import Check, Deviation, Facts, node
+from neusee.nodes._precision import refuse_not_finite, single
 from neusee.nodes.sensor._channels import weighted
 from neusee.nodes.sensor._saturation import Efficiency, Well, photons_per_joule, saturation
 from neusee.nodes.units import PositiveLength, Time
@@ -112,7 +113,8 @@ def level(
     Shapes: plain_image (..., band, y, x), responses (channel, band) -> (band,) float64.
     Units:  result W/m2 per unit of the image.
     Error:  exact; a scene without light has level 0.
-    Raises: ValueError for `per_band` where the image has been summed over its bands.
+    Raises: ValueError for `per_band` where the image has been summed over its bands, and for an image that is not
+            finite.
     Source: NeuSee, Eq. (peak_irrad_coded).
     """
     if rule == "per_band":
@@ -131,6 +133,7 @@ def level(
         photons: Tensor = expose(plain_image, bands, responses, pixel_pitch=pixel_pitch, exposure=exposure)
         peaks = photons.amax().double().expand(len(bands.centres))
         top = torch.tensor(full_well / quantum_efficiency, dtype=torch.float64)
+    refuse_not_finite("no level makes a picture of it", plain_image=peaks)
     lit = peaks > 0
     return torch.where(lit, strength * top.to(peaks) / peaks.where(lit, 1.0), 0.0)
 
@@ -155,17 +158,17 @@ def _(*, strength: float, rule: str = "channel_sum", **params: object) -> list[s
     return notes + (["level per band: each band alone fills the well"] if rule == "per_band" else [])
 
 
-@node(rtol=1e-6)
+@node(rtol=1e-6, adds=[("lasers",), ("ghosts",)])
 def gather(photons: Tensor, lasers: list[Tensor] | None = None, ghosts: list[Tensor] | None = None) -> Tensor:
     """Add the photons of the scene, of every laser and of every ghost: incoherent light adds.
 
     Shapes: photons (..., channel, y, x), each laser and ghost the same -> (..., channel, y, x).
     Units:  photons.
-    Error:  float32: 6e-8 of the sum.
+    Error:  float32: 6e-8 of the sum. Half precision, which ends at 65504, is added in single.
     Raises: ValueError where a shape differs.
     Source: NeuSee, Eq. (photon_count).
     """
-    total = photons
+    total = single(photons)
     for added in [*(lasers or ()), *(ghosts or ())]:
         if added.shape[-3:] != photons.shape[-3:]:
             raise ValueError(
@@ -203,6 +206,8 @@ def _(
     exposure: float,
 ) -> float:
     """As many photons as if every band were as bright as the brightest, and seen best; exact for one band."""
-    photons = float(photons_per_joule(torch.tensor(bands.max))) * exposure * pixel_pitch**2
-    brightest = max(irradiance.max, -irradiance.min) * (1.0 if level is None else level.max)
-    return photons * bands.shape[0] * responses.max * brightest
+    brightest = max(irradiance.max, -irradiance.min)
+    if brightest == 0:
+        return 0.0
+    photons = float(photons_per_joule(torch.tensor(bands.max, dtype=torch.float64))) * exposure * pixel_pitch**2
+    return photons * bands.shape[0] * responses.max * brightest * (1.0 if level is None else level.max)

@@ -8,10 +8,12 @@ from pydantic import Field
 from torch import Generator, Tensor
 
 from neusee.nodes import Check, Deviation, Facts, node
+from neusee.nodes._precision import single
 from neusee.nodes.sensor._saturation import Efficiency, Well
 from neusee.nodes.units import Electrons, Fraction
 
 Distribution = Literal["gaussian", "poisson"]
+_DARK = 1e-30  #: electrons that count as none: the root of what is denormal has no digits and no end of a slope
 Spread = Annotated[float, Field(ge=0, allow_inf_nan=False)]
 
 
@@ -39,7 +41,7 @@ def photon_noise(
             1e-3 e- above 10 e-. Negative photons (the rounding of a convolution) count as dark.
     Source: NeuSee, section Sensor Image; EMVA Standard 1288, release 4.0 (variance = mean, in electrons).
     """
-    counts = photons.clamp_min(0) * (quantum_efficiency if drawn_in == "electrons" else 1.0)
+    counts = single(photons).clamp_min(0) * (quantum_efficiency if drawn_in == "electrons" else 1.0)
     fluctuation = _poisson(counts, rng) if distribution == "poisson" else _gaussian(counts, rng)
     kept = mean_shift if mean == "literal" else 1.0 + mean_shift
     detected = (kept * counts + spread * fluctuation).clamp_min(0)
@@ -61,7 +63,9 @@ def _(result: Tensor, photons: Tensor, **params: Any) -> list[Check]:
 
 @photon_noise.carries
 def _(photons: Deviation, *, result: Facts, quantum_efficiency: float, spread: float = 1.0, **params: Any) -> float:
-    """Of the mean, and of its root: |sqrt(a) - sqrt(b)| <= sqrt|a - b|, which a Poisson count does not exceed either."""
+    """Of the mean, and of its root: |sqrt(a) - sqrt(b)| <= sqrt|a - b|. Poisson numbers of another mean are others."""
+    if params["distribution"] == "poisson" and photons.bound > 0:
+        return math.inf
     drawn = photons.bound * (quantum_efficiency if params["drawn_in"] == "electrons" else 1.0)
     kept = params["mean_shift"] + (params["mean"] == "additive")
     electrons: float = 1.0 if params["drawn_in"] == "electrons" else quantum_efficiency
@@ -69,7 +73,7 @@ def _(photons: Deviation, *, result: Facts, quantum_efficiency: float, spread: f
 
 
 def _gaussian(counts: Tensor, rng: Generator) -> Tensor:
-    lit = counts > 0
+    lit = ~(counts <= _DARK)  # so that what is not a number is seen
     sigma = counts.where(lit, 1.0).sqrt().where(lit, 0.0)  # the square root has no slope at 0
     return sigma * normal(counts, rng)
 
@@ -96,6 +100,7 @@ def dark_current(electrons: Tensor, *, mean: Electrons, full_well: Well | None =
     Error:  one mean for all pixels: hot pixels are left out.
     Source: NeuSee, section Sensor Image; EMVA Standard 1288, release 4.0 (dark current).
     """
+    electrons = single(electrons)
     rate = torch.full(electrons.shape, mean, dtype=electrons.dtype, device=rng.device)
     return electrons + torch.poisson(rate, generator=rng).to(electrons)
 
@@ -121,6 +126,7 @@ def read_noise(
     Error:  white: row noise and telegraph noise are left out.
     Source: NeuSee, section Sensor Image; Janesick, Photon Transfer, SPIE PM170 (2007).
     """
+    electrons = single(electrons)
     return electrons + (pedestal + sigma * normal(electrons, rng))
 
 

@@ -148,7 +148,7 @@ def test_of_the_tolerance_of_a_recipe_with_economies_half_is_theirs():
     facts = Facts((2,), "float32", 0.0, 100.0, 100.0, 1, True)
     glowing = step("g", glow, {"amount": 0.6}, x="l")
     plain = recipe(step("l", light), glowing)
-    thrifty = replace(plain, economies=(Economy("a", "b", 0.0, ""),))
+    thrifty = replace(plain, economies=(Economy("a", "b", 1e-3, ""),))
     assert Ledger(plain).verdict(glowing, glowing.params, lambda name: facts).left_out
     assert not Ledger(thrifty).verdict(glowing, glowing.params, lambda name: facts).left_out
 

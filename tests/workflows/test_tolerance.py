@@ -1,0 +1,49 @@
+"""Whatever the recipe and its tolerance: a run is finite, keeps its energy, and is as near the full one as it says."""
+
+import importlib.util
+from dataclasses import replace
+from pathlib import Path
+
+import pytest
+import torch
+
+from neusee.workflows._error import error_of
+from neusee.workflows._run import run
+from neusee.workflows._store import Store
+
+SPEC = importlib.util.spec_from_file_location("random_recipes", Path(__file__).with_name("random_recipes.py"))
+random_recipes = importlib.util.module_from_spec(SPEC)
+SPEC.loader.exec_module(random_recipes)
+
+
+def compared(seed, tmp_path):
+    """A drawn recipe as it is run, and in full."""
+    recipe, _ = random_recipes.draw(seed)
+    store = Store(tmp_path)
+    result = run(recipe, store)
+    held = [name for name in result.proof.held if name in recipe.steps]
+    return recipe, result, run(replace(recipe, keep_all=True), store, dict.fromkeys([*recipe.outputs, *held]))
+
+
+def holds(recipe, result, full):
+    """Raises where a value is not finite, light appears from nowhere, or an error is beyond its bound."""
+    for name in recipe.outputs:
+        assert bool(torch.isfinite(result[name]).all()), name
+    for name in full.values.keys() & result.proof.held.keys():
+        assert error_of(result[name], full[name]) <= max(result.proof.held[name], 1e-6), name
+    assert result.proof.worst <= recipe.tolerance
+    for arm in ("plain", "mask"):
+        assert error_of(result[f"raw[{arm}]"], full[f"raw[{arm}]"]) <= recipe.tolerance
+        if recipe.steps["image[plain]"].params["border"] == "zero":
+            assert float(result[f"bsr[{arm}]"].max()) <= 1.0 + 1e-2
+
+
+@pytest.mark.parametrize("seed", range(4))
+def test_a_random_recipe_is_within_its_tolerance(seed, tmp_path):
+    holds(*compared(seed, tmp_path))
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("seed", range(4, 100))
+def test_every_random_recipe_is_within_its_tolerance(seed, tmp_path):
+    holds(*compared(seed, tmp_path))
