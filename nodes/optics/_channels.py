@@ -58,8 +58,8 @@ def _(radiance: Mixture, psf: Psf, rows: Tensor, *, border: Border = "zero", wit
 
 
 @image_channels.deviates
-def _(result: Channels) -> float:
-    return float(result.bound)
+def _(result: Channels) -> tuple[float, float]:
+    return float(result.bound), float(result.bound)
 
 
 @image_channels.check
