@@ -33,7 +33,7 @@ def without_nothing(recipe: Recipe, order: Iterable[str]) -> Recipe:
         if step.node.nothing is not None and _nothing(step, dark):
             dark.setdefault(name)
         elif step.node.adds and not dark.keys().isdisjoint(step.sources):
-            changed[name] = replace(step, wires=_without(step, dark))
+            changed[name] = replace(step, wires=without(step, dark))
     if not changed:
         return recipe
     told = {e.step for e in recipe.economies}
@@ -61,7 +61,7 @@ def _known(wire: Wire, dark: Mapping[str, None]) -> Any:
     return [_known(name, dark) for name in wire]
 
 
-def _without(step: Step, dark: Mapping[str, None]) -> dict[str, Wire]:
+def without(step: Step, dark: Mapping[str, None]) -> dict[str, Wire]:
     """The wires of a step less those that add nothing, and what goes with them."""
     wires = dict(step.wires)
     for light, *others in step.node.adds:

@@ -15,6 +15,7 @@ from typing import Literal
 from torch import Tensor
 
 from neusee.nodes import Facts
+from neusee.workflows._absent import without
 from neusee.workflows._call import RunError
 from neusee.workflows._economy import economised
 from neusee.workflows._graph import Recipe, Step, Wire, in_order, needed
@@ -43,8 +44,7 @@ class Omission:
         readers = set(recipe.steps) if self.kind != "stands in" else set(self.at)
         steps = {**recipe.steps, **{step.name: step for step in self.beside}}
         for name in readers & recipe.steps.keys():
-            step = recipe.steps[name]
-            steps[name] = replace(step, wires={i: self._exchanged(wire) for i, wire in step.wires.items()})
+            steps[name] = replace(recipe.steps[name], wires=self._wires(recipe.steps[name]))
         outputs = tuple(self.value_of(name) for name in recipe.outputs)
         order = in_order({name: step.sources for name, step in steps.items()}, steps)
         return replace(recipe, steps={name: steps[name] for name in order}, outputs=outputs)
@@ -53,11 +53,16 @@ class Omission:
         """The step that gives the value of ``step`` in a recipe that was made so."""
         return self.exchange.get(step, step) if self.kind == "handed on" else step
 
-    def _exchanged(self, wire: Wire) -> Wire:
-        if isinstance(wire, tuple):
-            kept = (self.exchange.get(name, name) for name in wire)
-            return tuple(name for name in kept if name)
-        return wire and (self.exchange.get(wire, wire) or None)
+    def _wires(self, reader: Step) -> Mapping[str, Wire]:
+        if self.kind == "not added":
+            return without(reader, self.exchange)
+        return {i: _exchanged(wire, self.exchange) for i, wire in reader.wires.items()}
+
+
+def _exchanged(wire: Wire, exchange: Mapping[str, str]) -> Wire:
+    if isinstance(wire, tuple):
+        return tuple(exchange.get(name, name) for name in wire)
+    return wire and exchange.get(wire, wire)
 
 
 def omissions(full: Recipe, chosen: Result, facts_of: FactsOf) -> Iterator[Omission]:
@@ -94,13 +99,13 @@ def _not_added(recipe: Recipe, order: list[str], name: str, facts_of: FactsOf) -
 def _stand_ins(full: Recipe, order: list[str], chosen: Result) -> Iterator[Omission]:
     """All images of a recipe together, for what compares two must get both in one form."""
     sparse = economised(replace(full, keep_all=False), full.outputs)
-    if not sparse.economies:
+    exchange = {economy.step: economy.instead for economy in sparse.economies if economy.instead}
+    if not exchange:
         return
-    exchange = {economy.step: economy.instead for economy in sparse.economies}
     beside = tuple(step for name, step in sparse.steps.items() if name not in full.steps)
     at = tuple(n for n in order if not set(exchange.values()).isdisjoint(sparse.steps[n].sources))
     taken = {economy.step for economy in chosen.recipe.economies} >= exchange.keys()
-    why = sparse.economies[0].why
+    why = next(economy.why for economy in sparse.economies if economy.instead)
     yield Omission(", ".join(exchange), "stands in", exchange, math.nan, why, taken, at, beside)
 
 
@@ -111,8 +116,9 @@ def _adding(recipe: Recipe, order: list[str], name: str) -> tuple[str, ...]:
 
 
 def _spares(reader: Step, name: str) -> bool:
-    wires = {i: wire for i, wire in reader.wires.items() if name == wire or (isinstance(wire, tuple) and name in wire)}
-    return all(isinstance(wire, tuple) or i in reader.node.optional for i, wire in wires.items())
+    """Whether a step reads a result only to add it."""
+    read = {i for i, wire in reader.wires.items() if name == wire or (isinstance(wire, tuple) and name in wire)}
+    return read <= {light for light, *_ in reader.node.adds}
 
 
 def _largest(step: Step, facts_of: FactsOf) -> float:

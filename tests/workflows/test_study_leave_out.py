@@ -21,12 +21,12 @@ from neusee.workflows._store import Store
 
 MARK = Mark("recipe.yaml", 1, 1)
 SMALL = (
-    "scene.shape=[96, 96]",
-    "sensor.shape=[64, 64]",
-    "optics.samples=48",
+    "scene.shape=[64, 64]",
+    "sensor.shape=[48, 48]",
+    "optics.samples=40",
     "optics.pitch=100 um",
     "optics.window=[32, 32]",
-    "optics.bands=7",
+    "optics.bands=4",
 )
 OUTPUTS = ("raw[plain]", "raw[mask]", "lsr[mask]", "bsr[mask]")
 
@@ -66,7 +66,7 @@ def _(*, power):
     return 2 * power
 
 
-@node()
+@node(adds=[("lamps",)])
 def both(x: Tensor, lamps: list[Tensor]) -> Tensor:
     return x + sum(lamps)
 
