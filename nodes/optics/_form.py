@@ -28,7 +28,8 @@ def bordered(planes: Tensor, given: Given, window: tuple[int, int]) -> Tensor:
         return planes
     m, n = window
     around = (n - 1 - n // 2, n // 2, m - 1 - m // 2, m // 2)
-    return pad(planes, around, mode="reflect")
+    wide: Tensor = pad(planes, around, mode="reflect")
+    return wide
 
 
 def _kernels(intensity: Tensor, plan: Plan) -> Tensor:

@@ -22,7 +22,7 @@ def compress(cube: Tensor, *, within: Share = 1e-6) -> Mixture:
     Shapes: cube (band, y, x) -> planes (k, y, x), basis (band, k), rest (k + 1, band) float64.
     Units:  planes and rest those of the cube; the basis has none.
     Error:  `rest[k]`, measured on every pixel in float64, is at most `within` times the largest element, but not asked
-            to be below four roundings of the planes. `rest[r]` between none and all: at most five times too large as
+            to be below eight roundings of the planes. `rest[r]` between none and all: at most five times too large as
             a rule. The gradient holds the basis still.
     Raises: ValueError where the cube is not (band, y, x), has no pixels or holds NaN.
     Source: principal components, Pearson 1901; Maloney, J. Opt. Soc. Am. A 3, 1673 (1986) for spectra.

@@ -6,6 +6,7 @@ import torch
 from torch import Tensor
 
 from neusee.nodes import Check, node
+from neusee.nodes._precision import single
 from neusee.nodes.spectra._tables import mallett, paints, to_srgb
 from neusee.nodes.values import Bands
 
@@ -27,7 +28,7 @@ def lift_mallett(rgb: Tensor, bands: Bands) -> Tensor:
 
 @lift_mallett.reference
 def _(rgb: Tensor, bands: Bands) -> Tensor:
-    return torch.einsum("bc,cyx->byx", _basis(bands).to(rgb.device), rgb.double()).clamp_min(0)
+    return torch.einsum("bc,cyx->byx", _basis(bands).to(rgb.device), rgb.double()).relu()
 
 
 @lift_mallett.check
@@ -53,7 +54,7 @@ def lift_lmmse(rgb: Tensor, bands: Bands) -> Tensor:
 
 @lift_lmmse.reference
 def _(rgb: Tensor, bands: Bands) -> Tensor:
-    return torch.einsum("bc,cyx->byx", _estimator(bands).to(rgb.device), rgb.double()).clamp_min(0)
+    return torch.einsum("bc,cyx->byx", _estimator(bands).to(rgb.device), rgb.double()).relu()
 
 
 @lift_lmmse.check
@@ -84,6 +85,7 @@ def needs_rgb(rgb: Tensor) -> None:
 def _lifted(rgb: Tensor, matrix: Tensor) -> Tensor:
     """One product straight into the result, clipped in place: no second cube."""
     needs_rgb(rgb)
+    rgb = single(rgb)
     return torch.relu_(matrix.to(rgb) @ rgb.flatten(1)).reshape(-1, *rgb.shape[1:])
 
 

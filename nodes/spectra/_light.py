@@ -6,6 +6,7 @@ import torch
 from torch import Tensor
 
 from neusee.nodes import Check, ParameterError, node
+from neusee.nodes._precision import single
 from neusee.nodes.spectra._tables import daylight, light
 from neusee.nodes.units import Temperature
 from neusee.nodes.values import Bands, Mixture
@@ -77,6 +78,7 @@ def illuminate(
     if isinstance(reflectance, Mixture):
         basis = reflectance.basis * power.to(reflectance.basis)[:, None]
         return Mixture(reflectance.planes, basis, reflectance.rest * power.detach().abs().to(reflectance.rest))
+    reflectance = single(reflectance)
     return reflectance * power.to(reflectance)[:, None, None]
 
 

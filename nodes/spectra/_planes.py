@@ -7,6 +7,7 @@ import torch
 from torch import Tensor
 
 _PIECE = 4096  #: pixels looked at together: 31 bands of them in float64 are 1 MB and stay in the cache
+_FLOOR = 8  #: roundings of the planes, below which no bound can be had
 _SAMPLE = 4096  #: pixels by which the number of planes is guessed
 
 
@@ -41,7 +42,7 @@ def few_planes(source: Source, within: float) -> Found:
     if scale > 0 and not 1e-280 < float(gram.amax()) < 1e280:
         gram = _looked_at(source, scale)[1]
     axes = torch.linalg.eigh(gram).eigenvectors.flip(1)
-    target = max(within, 4 * torch.finfo(source.dtype).eps) * scale
+    target = max(within, _FLOOR * torch.finfo(source.dtype).eps) * scale
     some = torch.linspace(0, source.pixels - 1, min(source.pixels, _SAMPLE), dtype=torch.float64).long()
     sample, k = source.part(some), 1
     while True:
@@ -95,5 +96,6 @@ def _projected(source: Source, axes: Tensor) -> tuple[Tensor, Tensor, Tensor]:
 def _rest(most: Tensor, planes: Tensor, basis: Tensor, last: Tensor) -> Tensor:
     """What the first r planes leave: measured for none and for all, and between them no more than the others' sum."""
     each = basis.abs() * torch.maximum(planes.amax(1), -planes.amin(1)).double()
+    last = last + 4 * torch.finfo(torch.float64).eps * (most + each.sum(1))  # what measuring it may have lost
     after = each.flip(1).cumsum(1).flip(1).T
     return torch.cat([most[None], last + after[1:], last[None]])
