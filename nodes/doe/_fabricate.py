@@ -8,6 +8,7 @@ from pydantic import Field
 from torch import Tensor
 
 from neusee.nodes import Check, Facts, ParameterError, node
+from neusee.nodes._precision import refuse_half
 from neusee.nodes.doe._material import Material, wave_height
 from neusee.nodes.units import PositiveLength, Wavelength
 
@@ -49,14 +50,16 @@ def fabricate(
 
     Shapes: (v, u) -> (v, u).
     Units:  m.
-    Error:  1e-7 of the unwrapped height (float32).
-    Raises: ParameterError where one wave is deeper than ``max_height``, or levels have no depth to divide.
+    Error:  1e-7 of the result (float32), however often it was wrapped.
+    Raises: ParameterError where one wave is deeper than ``max_height``, or levels have no depth to divide; ValueError
+            for a height in half precision.
     Source: Swanson, MIT Lincoln Laboratory Technical Report 854 (1989), for multi-level elements.
     """
     _refuse(material, wrap_at, levels, max_height)
+    refuse_half(height=height)
     if wrap_at is not None:
         period = wave_height(material, wrap_at)
-        wrapped = height.remainder(period)
+        wrapped = height.double().remainder(period).to(height.dtype)  # the period too is rounded in float32
         return wrapped if levels is None else _quantize(wrapped, period / levels, levels, cyclic=True)
     if max_height is None:
         return height
@@ -95,7 +98,7 @@ def _(
     if not height.finite or top is None:
         return 0.0 if height.finite else math.inf
     ends = torch.tensor([height.min, height.max], dtype=getattr(torch, height.dtype))
-    moved = _moved(ends, float(torch.tensor(top, dtype=ends.dtype)), levels, cyclic=wrap_at is not None)
+    moved = _moved(ends, top, levels, cyclic=wrap_at is not None)
     if moved == 0:
         return 0.0
     made = fabricate(ends, material=material, wrap_at=wrap_at, levels=levels, max_height=max_height)
@@ -107,6 +110,7 @@ def _moved(ends: Tensor, top: float, levels: int | None, cyclic: bool) -> float:
     """Bound of what any height between two ends moves, m; exact without steps."""
     low, high = (float(end) for end in ends)
     if not cyclic:
+        top = float(torch.tensor(top, dtype=ends.dtype))  # where it is cut
         return max(high - top, -low, 0.0 if levels is None else top / (levels - 1) / 2)
     waves = max(abs(math.floor(low / top)), abs(math.floor(high / top)))
     if levels is None:

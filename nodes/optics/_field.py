@@ -7,6 +7,7 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
+from neusee.nodes._precision import refuse_not_finite
 from neusee.nodes.optics._axis import Axis, Source, centred
 from neusee.nodes.optics._workspace import Workspace
 
@@ -38,9 +39,10 @@ class Screens(NamedTuple):
 
     @classmethod
     def of(cls, amplitude: Tensor, height: Tensor, path: Tensor) -> "Screens":
-        """Measure the extents once a call."""
-        extents = (torch.stack(x.detach().aminmax()).abs().max() for x in (height, path))
-        return cls(amplitude, height, path, *(float(x) for x in extents))
+        """Measure the extents once a call. Raises ValueError where one is not finite."""
+        extents = [float(torch.stack(x.detach().aminmax()).abs().max()) for x in (height, path)]
+        refuse_not_finite("no light has such a phase", height=extents[0], path=extents[1])
+        return cls(amplitude, height, path, *extents)
 
 
 class Field:

@@ -8,6 +8,7 @@ import torch
 from torch import Tensor
 
 from neusee.nodes import Check, node
+from neusee.nodes._precision import refuse_half, refuse_not_finite
 from neusee.nodes.optics._axis import Axis, centred
 from neusee.nodes.optics._field import View
 from neusee.nodes.optics._intensity import PupilIntensity, Sampling
@@ -52,7 +53,8 @@ def psf(
     Units: metres -> share of the clear pupil's light per pixel, not normalised to sum one.
     Error: single, 2e-6 of the brightest pixel and 1e-4 of a tail at 1e-8 of it; double, 1e-12;
         integrated, further 1e-5 of the clear peak.
-    Raises: ValueError where the window reaches beyond half the alias-free field, lambda f / (2 pitch), from the spot.
+    Raises: ValueError where the window reaches beyond half the alias-free field, lambda f / (2 pitch), from the spot;
+        for a closed aperture, heights or paths that are not finite, and a pupil in half precision.
     Source: Goodman, Introduction to Fourier Optics, 3rd edition, eq. 5-14 (field in the focal plane of a lens).
     """
     camera = _Camera(
@@ -99,6 +101,7 @@ def _focus(pupil: Pupil, camera: _Camera, dtype: torch.dtype, method: Method) ->
     _refuse_aliases(pupil, camera)
     views: list[View] = []
     area, total = _area(pupil)
+    refuse_not_finite("nothing to normalise by", aperture=area)
     if not area > 0:
         raise ValueError("the aperture is closed everywhere: no light to normalise by")
     peaks: list[float] = []
@@ -187,6 +190,7 @@ def _agree(pupil: Pupil) -> None:
     shapes = {name: tuple(getattr(pupil, name).shape) for name in ("aperture", "amplitude", "height", "path")}
     if len(set(shapes.values())) != 1 or pupil.height.dim() != 2:
         raise ValueError(f"the pupil's parts differ in shape: {shapes}; give each the same (v, u)")
+    refuse_half(amplitude=pupil.amplitude, height=pupil.height, path=pupil.path)
     if pupil.index.shape != pupil.wavelengths.shape or pupil.index.dim() != 1:
         raise ValueError(
             f"index {tuple(pupil.index.shape)} and wavelengths {tuple(pupil.wavelengths.shape)} differ: "

@@ -8,6 +8,7 @@ from pydantic import Field
 from torch import Tensor
 
 from neusee.nodes import Check, Facts, node
+from neusee.nodes._precision import single
 from neusee.nodes.sensor._saturation import Efficiency, Well, saturation
 from neusee.nodes.units import PositiveLength, Time
 from neusee.nodes.values import Bands, Psf
@@ -45,7 +46,8 @@ def spot(
     saturating: Tensor = saturation(bands, **sensor, pixel_pitch=pixel_pitch, exposure=exposure)
     unit = (bands.weights * psf.clear_peak / saturating).sum()
     energy = strength * bands.weights / unit
-    return psf.intensity * energy.to(psf.intensity)[:, None, None]
+    intensity = single(psf.intensity)
+    return intensity * energy.to(intensity)[:, None, None]
 
 
 @spot.absent

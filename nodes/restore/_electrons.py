@@ -4,6 +4,7 @@ import torch
 from torch import Tensor
 
 from neusee.nodes import node
+from neusee.nodes._precision import single
 from neusee.nodes.metrics._suppression import clipped as at_the_end
 from neusee.nodes.sensor._digital import Bits, Gain, GainUnit, numbers_per_electron
 from neusee.nodes.sensor._saturation import Well
@@ -21,7 +22,7 @@ def electrons(
     Error:  the rounding of the converter, 0.29 DN rms; clipped pixels stay clipped.
     Source: NeuSee, Eq. (SensorImage), inverted.
     """
-    return raw / numbers_per_electron(gain, gain_unit) - (pedestal if pedestal_subtracted else 0.0)
+    return single(raw) / numbers_per_electron(gain, gain_unit) - (pedestal if pedestal_subtracted else 0.0)
 
 
 @electrons.preflight
@@ -37,7 +38,7 @@ def clipped(raw: Tensor, *, full_well: Well, gain: Gain, gain_unit: GainUnit = "
 
     Shapes: raw (..., y, x) -> (..., y, x) bool.
     Units:  raw DN.
-    Error:  a value within one DN of the full well is marked too.
+    Error:  a value within one DN of the full well is marked too, and so is what is not a number.
     Source: NeuSee, Eq. (SensorImage).
     """
     return at_the_end(raw, full_well=full_well, gain=gain, gain_unit=gain_unit, bits=bits)
@@ -55,6 +56,7 @@ def colour(channels: Tensor, matrix: Tensor) -> Tensor:
     """
     if channels.ndim < 3 or channels.shape[-3] != matrix.shape[-1]:
         raise ValueError(f"channels {tuple(channels.shape)} do not fit a matrix {tuple(matrix.shape)}: give (3, y, x)")
+    channels = single(channels)
     flat = matrix.to(channels) @ channels.flatten(-2)
     return flat.reshape(*flat.shape[:-1], *channels.shape[-2:])
 

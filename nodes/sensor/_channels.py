@@ -3,6 +3,7 @@
 import torch
 from torch import Tensor
 
+from neusee.nodes._precision import single
 from neusee.nodes.values import Channels
 
 _OFF = 1e-9  #: part of the weights that may lie outside the rows
@@ -14,6 +15,7 @@ def weighted(image: Tensor | Channels, weights: Tensor) -> Tensor:
         mixed = _of_rows(weights, image.rows).to(image.planes)
         summed: Tensor = torch.tensordot(mixed, image.planes, 1)
         return summed
+    image = single(image)
     flat = weights.to(image) @ image.flatten(-2)
     return flat.reshape(*flat.shape[:-1], *image.shape[-2:])
 

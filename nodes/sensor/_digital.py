@@ -8,6 +8,7 @@ from pydantic import Field
 from torch import Generator, Tensor
 
 from neusee.nodes import Check, Deviation, Facts, node
+from neusee.nodes._precision import single
 from neusee.nodes.sensor._saturation import Well
 from neusee.nodes.units import Shape
 
@@ -32,7 +33,7 @@ def full_well(electrons: Tensor, *, capacity: Well) -> Tensor:
             of the well, as the paper prints it.
     Source: NeuSee, Eq. (SensorImage).
     """
-    return electrons.clamp_max(capacity)
+    return single(electrons).clamp_max(capacity)
 
 
 @full_well.negligible
@@ -41,7 +42,8 @@ def _(electrons: Facts, *, capacity: float) -> float:
 
     The well is the number that the dtype holds, which lies beside ``capacity`` by up to half a step.
     """
-    held = float(torch.tensor(capacity, dtype=getattr(torch, electrons.dtype)))
+    dtype = torch.promote_types(getattr(torch, electrons.dtype), torch.float32)
+    held = float(torch.tensor(capacity, dtype=dtype))
     if electrons.max <= held:
         return 0.0
     largest = max(held, -electrons.min)
@@ -70,7 +72,7 @@ def digitize(
 ) -> Tensor:
     """Convert electrons to whole digital numbers that a converter of so many bits can hold.
 
-    Shapes: electrons (..., y, x) -> (..., y, x), whole numbers in the dtype of the input.
+    Shapes: electrons (..., y, x) -> (..., y, x), whole numbers in the dtype of the input (of half precision, float32).
     Units:  electrons e-; gain as gain_unit says; result DN in [0, 2**bits - 1].
     Error:  `nearest` is exact (half to even), with variance 1/12 DN2. `dithered_floor`, floor(x + U(-1/2, 1/2)) as
             printed, lies 1/2 DN low with up to 1/6 DN2 more variance. Integral nonlinearity is left out. The
@@ -78,7 +80,7 @@ def digitize(
     Raises: ValueError for `dithered_floor` without rng.
     Source: NeuSee, Eq. (SensorImage); EMVA Standard 1288, release 4.0 (quantization variance 1/12 DN2).
     """
-    line = electrons * numbers_per_electron(gain, gain_unit)
+    line = single(electrons) * numbers_per_electron(gain, gain_unit)
     ideal = line.clamp(0, 2**bits - 1)
     if rounding == "nearest":  # the sum is exact: without a gradient, the rounded number itself
         return ideal + (ideal.round() - ideal).detach() if ideal.requires_grad else ideal.round_()

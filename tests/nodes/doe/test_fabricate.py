@@ -128,12 +128,14 @@ def test_small_in_height_is_not_small_in_phase():
     assert bound == pytest.approx(2 * math.pi * step, rel=1e-6)
 
 
-def test_a_relief_that_reaches_one_wave_as_float32_holds_it_is_wrapped():
-    wave = wave_height("fused silica", 551e-9)
-    height = torch.tensor([[0.0, wave]])
-    assert float(height.max()) < wave
-    assert doe.fabricate(height, **PLAIN | {"wrap_at": 551e-9}).abs().max() == 0
-    assert doe.fabricate.bound(Facts.of(height), **PLAIN | {"wrap_at": 551e-9}) == math.inf
+@pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
+@pytest.mark.parametrize("wavelength", [540e-9, 549e-9, 551e-9, 552e-9])
+def test_the_bound_tells_a_relief_of_just_one_wave_as_it_is_made(wavelength, dtype):
+    wave = torch.tensor(wave_height("fused silica", wavelength), dtype=dtype)
+    for top in (wave, wave.nextafter(torch.zeros_like(wave)), wave.nextafter(torch.ones_like(wave))):
+        height = torch.stack([torch.zeros_like(top), 0.5 * top, top])[None]
+        changed = not torch.equal(doe.fabricate(height, **PLAIN | {"wrap_at": wavelength}), height)
+        assert (doe.fabricate.bound(Facts.of(height), **PLAIN | {"wrap_at": wavelength}) > 0) == changed
 
 
 @pytest.mark.parametrize("params", [{"wrap_at": 550e-9, "levels": 4}, {"max_height": 2e-6, "levels": 4}])
