@@ -97,11 +97,10 @@ class Bench:
             yield Row(**self.store.get(key))
 
     def _row(self, omission: Omission, alone: Recipe) -> Row:
-        seen = omission.at if omission.kind != "handed on" else ()
-        result = run(alone, self.store, dict.fromkeys((*alone.outputs, *seen)))
-        bound = omission.bound if not math.isnan(omission.bound) else self._proved(omission, result)
-        pairs = [(result.value(omission.value_of(name)), self.truth.value(name)) for name in omission.at]
-        outputs = _worst_by_name(self.recipe.outputs, alone.outputs, result, self.truth)
+        seen = run(alone, self.store, tuple(omission.value_of(name) for name in omission.at))
+        bound = omission.bound if not math.isnan(omission.bound) else _proved(omission, seen)
+        pairs = [(seen.values[omission.value_of(name)], self.truth.value(name)) for name in omission.at]
+        largest = max(largest_error(*pair) for pair in pairs)
         return Row(
             omission.name,
             omission.kind,
@@ -109,12 +108,18 @@ class Bench:
             omission.taken,
             bound,
             max(error_of(*pair) for pair in pairs),
-            max(largest_error(*pair) for pair in pairs),
-            outputs,
-            self._back(omission) if omission.taken else None,
+            largest,
+            *self._reached(omission, alone, changed=largest > 0),
             self._seconds(self.full, alone) - self._seconds(alone, self.full),
-            self._holds(omission, bound, pairs, result),
+            self._holds(omission, bound, pairs, seen),
         )
+
+    def _reached(self, omission: Omission, alone: Recipe, changed: bool) -> tuple[dict[str, float], float | None]:
+        """What comes of it at the outputs, alone and put back; where nothing was changed, nothing does."""
+        if not changed:
+            return dict.fromkeys(self.recipe.outputs, 0.0), 0.0 if omission.taken else None
+        outputs = _worst_by_name(self.recipe.outputs, alone.outputs, run(alone, self.store), self.truth)
+        return outputs, self._back(omission) if omission.taken else None
 
     def _holds(self, omission: Omission, bound: float, pairs: Iterable[tuple[Any, Any]], result: Result) -> bool:
         """Whether a change keeps to its bound: of noise the root mean square, of all else the largest."""
@@ -128,11 +133,6 @@ class Bench:
 
     def _forms(self, omission: Omission, result: Result) -> list[tuple[Recipe, Iterable[str]]]:
         return [(self.full, omission.exchange), (result.recipe, omission.exchange.values()), (self.full, omission.at)]
-
-    def _proved(self, omission: Omission, result: Result) -> float:
-        """What the engine proved of the readers of what stands in."""
-        shares = [result.proof.shares.get(name, 0.0) for name in omission.at]
-        return max(shares)
 
     def _back(self, omission: Omission) -> float:
         """The worst output of the recipe as it chooses, against the same with one omission put back."""
@@ -159,6 +159,11 @@ class Bench:
 def _worst_by_name(names: Sequence[str], made: Sequence[str], result: Result, truth: Result) -> dict[str, float]:
     pairs = zip(names, made, strict=True)
     return {name: error_of(result.values[other], truth.values[name]) for name, other in pairs}
+
+
+def _proved(omission: Omission, result: Result) -> float:
+    """What the engine proved of the readers of what stands in."""
+    return max(result.proof.shares.get(name, 0.0) for name in omission.at)
 
 
 def surely(value: Tensor, reference: Tensor) -> float:

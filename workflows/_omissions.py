@@ -55,7 +55,7 @@ class Omission:
 
     def _wires(self, reader: Step) -> Mapping[str, Wire]:
         if self.kind == "not added":
-            return without(reader, self.exchange)
+            return without(reader, dict.fromkeys(self.exchange))
         return {i: _exchanged(wire, self.exchange) for i, wire in reader.wires.items()}
 
 
