@@ -91,14 +91,14 @@ def _measured(flat: Tensor) -> tuple[float, float, float, int]:
     """Least, greatest, sum and number of what is not zero, by parts that stay in cache: memory is read once."""
     small = flat.dtype == torch.bool or (flat.is_floating_point() and flat.element_size() < 4)
     found = []
-    for part in flat.split(_PART):
+    for part in torch.split(flat, _PART):
         part = part.float() if small else part
         rows = part.view(-1, _ROW) if part.numel() % _ROW == 0 else part[None]
         found.append((*torch.aminmax(part), rows.sum(1).sum(dtype=torch.float64), torch.count_nonzero(part)))
     lows, highs, sums, counts = (torch.stack(each) for each in zip(*found, strict=True))
     low, high, total = (float(x) for x in (lows.min(), highs.max(), sums.sum()))
     if math.isinf(total) and math.isfinite(low) and math.isfinite(high):  # a row went beyond its own type
-        total = float(sum(part.sum(dtype=torch.float64) for part in flat.split(_PART)))
+        total = float(sum(part.sum(dtype=torch.float64) for part in torch.split(flat, _PART)))
     return low, high, total, int(counts.sum())
 
 

@@ -45,10 +45,15 @@ def _darken(amplitude: Tensor, places: list[tuple[float, float]], size: float, o
     rows, columns = window
     y = torch.arange(rows.start, rows.stop, dtype=torch.float32, device=amplitude.device)[:, None]
     x = torch.arange(columns.start, columns.stop, dtype=torch.float32, device=amplitude.device)[None, :]
-    distance = torch.full((1, 1), torch.inf, device=amplitude.device)
+    cover = amplitude.new_zeros(len(y), x.shape[1])
     for start, end in zip(places, places[1:] or places, strict=False):
-        distance = torch.minimum(distance, _distance(y, x, start, end))
-    amplitude[rows, columns] *= 1 - opacity * _cover(distance, size, len(places) == 1)
+        near = _window([start, end], size / 2 + 1, amplitude.shape[-1])
+        if near is None:
+            continue
+        v, u = (slice(n.start - w.start, n.stop - w.start) for n, w in zip(near, window, strict=True))
+        new = _cover(_distance(y[v], x[:, u], start, end), size, len(places) == 1)
+        cover[v, u] = torch.maximum(cover[v, u], new)
+    amplitude[rows, columns] *= 1 - opacity * cover
 
 
 def _window(places: list[tuple[float, float]], margin: float, samples: int) -> tuple[slice, slice] | None:

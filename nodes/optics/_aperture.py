@@ -1,6 +1,7 @@
 """The stop and its grid: the one place that decides pitch and diameter of the pupil."""
 
 import math
+from collections.abc import Iterator
 from typing import Any, Literal, NamedTuple
 
 import torch
@@ -8,6 +9,8 @@ from torch import Tensor
 
 from neusee.nodes import ParameterError
 
+_ALL = slice(None)
+_STRIPE = 1 << 16  #: samples
 Aperture = Literal["inscribed", "clipped", "stretched"]
 
 
@@ -50,10 +53,24 @@ def polar(grid: Stop, device: torch.device | None = None) -> tuple[Tensor, Tenso
     return torch.hypot(v, u), torch.atan2(v.expand(grid.samples, -1), u.expand(grid.samples, -1))
 
 
-def inside(grid: Stop, device: torch.device | None = None) -> Tensor:
-    """Samples whose centre the stop lets through, bool (v, u)."""
+def inside(grid: Stop, device: torch.device | None = None, rows: slice = _ALL) -> Tensor:
+    """Samples whose centre the stop lets through, bool (v, u), or some rows of them."""
     v, u = axes(grid, device)
-    return v.square() + u.square() <= 1
+    return v[rows].square() + u.square() <= 1
+
+
+def opening(grid: Stop, dtype: torch.dtype, device: torch.device | None = None) -> Tensor:
+    """The same as numbers: 1 inside, 0 outside."""
+    clear = torch.empty(grid.samples, grid.samples, dtype=dtype, device=device)
+    for rows in stripes(grid):
+        clear[rows] = inside(grid, device, rows)
+    return clear
+
+
+def stripes(grid: Stop) -> Iterator[slice]:
+    """A few rows of the pupil at a time, of which float64 temporaries stay in cache."""
+    step = max(1, _STRIPE // grid.samples)
+    return (slice(first, first + step) for first in range(0, grid.samples, step))
 
 
 def grid_notes(*, samples: int, pitch: float, diameter: float, aperture: Aperture, **_: Any) -> list[str]:

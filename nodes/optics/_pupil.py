@@ -8,12 +8,13 @@ from torch import Tensor
 
 from neusee.nodes import Check, node
 from neusee.nodes._precision import refuse_half
-from neusee.nodes.optics._aperture import Aperture, Stop, axes, inside, stop
+from neusee.nodes.optics._aperture import Aperture, Stop, axes, inside, opening, stop, stripes
 from neusee.nodes.optics._zernike import surface
 from neusee.nodes.units import Count, Length, PositiveLength, Waves
 from neusee.nodes.values import Bands, Dirt, Pupil
 
 DEFOCUS_WAVELENGTH = 550e-9  #: m; what a wave of defocus is counted in
+_ROWS = 512  #: of a pupil in which its steps are looked at, at least
 
 
 @node(adds=[("dirt",)])
@@ -43,19 +44,27 @@ def pupil(
     """
     _shapes(height, index, bands, dirt)
     grid = stop(height.shape[-1], pitch, diameter, aperture)
-    clear = inside(grid, height.device).to(height.dtype)
-    path = _lens_path(grid, defocus, aberrations, height.device).to(height.dtype)
+    clear = opening(grid, height.dtype, height.device)
+    path = _lens_path(grid, defocus, aberrations, height)
     if dirt is not None:
-        path = path + dirt.path
+        path = dirt.path if path is None else path + dirt.path
+    if path is None:
+        path = torch.zeros_like(height)
     amplitude = clear if dirt is None else clear * dirt.amplitude
     spacing = torch.tensor(grid.pitch, dtype=torch.float64, device=height.device)
     return Pupil(clear, amplitude, height, path, index, bands.centres, spacing)
 
 
-def _lens_path(grid: Stop, defocus: float, aberrations: Mapping[int, float], device: torch.device) -> Tensor:
+def _lens_path(grid: Stop, defocus: float, aberrations: Mapping[int, float], like: Tensor) -> Tensor | None:
+    """Defocus and aberrations; None of a lens without."""
+    if not defocus and not any(aberrations.values()):
+        return None
+    path, device = torch.empty_like(like), like.device
     v, u = axes(grid, device)
-    bowl = torch.where(inside(grid, device), v.square() + u.square(), 0.0)
-    return defocus * DEFOCUS_WAVELENGTH * bowl + surface(aberrations, grid, device)
+    for rows in stripes(grid):
+        bowl = torch.where(inside(grid, device, rows), v[rows].square() + u.square(), 0.0)
+        path[rows] = defocus * DEFOCUS_WAVELENGTH * bowl + surface(aberrations, grid, device, rows)
+    return path
 
 
 def _shapes(height: Tensor, index: Tensor, bands: Bands, dirt: Dirt | None) -> None:
@@ -72,7 +81,7 @@ def _shapes(height: Tensor, index: Tensor, bands: Bands, dirt: Dirt | None) -> N
 @pupil.check
 def _(result: Pupil, *_: Any, pitch: float, diameter: float, aperture: Aperture, **__: Any) -> list[Check]:
     used = float(result.pitch) * result.height.shape[-1]
-    passed = float(result.amplitude.double().square().sum() / result.aperture.double().sum())
+    passed = _light(result.amplitude) / _light(result.aperture)
     median, share = phase_steps(result)
     text = f"phase step {median:.3f} turn between samples (median), {share:.1%} above half a turn"
     held = f", {aperture} where {diameter * 1e3:#.3g} mm was asked" if used < diameter * (1 - 1e-9) else ""
@@ -82,19 +91,26 @@ def _(result: Pupil, *_: Any, pitch: float, diameter: float, aperture: Aperture,
     ]
 
 
+def _light(amplitude: Tensor) -> float:
+    return float(torch.bmm(amplitude[:, None, :], amplitude[:, :, None]).sum(dtype=torch.float64))
+
+
 def phase_steps(pupil: Pupil) -> tuple[float, float]:
     """Steps between neighbours inside the stop, in the band that has most: median in turns, share above one half.
 
+    Of a large pupil every second row or every few is looked at, 512 of them or more.
     A wrapped or split element has steps at its edges by design, so a few large ones mean nothing; many mean
     that the samples cannot follow the phase.
     """
     worst = int((pupil.index / pupil.wavelengths).argmax())
-    turns = (pupil.index[worst] * pupil.height + pupil.path) / pupil.wavelengths[worst]
-    steps = [turns.diff(dim=axis).abs()[_pairs_inside(pupil.aperture, axis)] for axis in (0, 1)]
-    every = torch.cat(steps)
-    return (float(every.median()), float((every > 0.5).double().mean())) if every.numel() else (0.0, 0.0)
-
-
-def _pairs_inside(aperture: Tensor, axis: int) -> Tensor:
-    count = aperture.shape[axis] - 1
-    return (aperture.narrow(axis, 0, count) > 0) & (aperture.narrow(axis, 1, count) > 0)
+    every = max(1, len(pupil.height) // _ROWS)
+    turns, lit = [], []
+    for first in (0, 1):
+        height, path, aperture = (x[first::every] for x in (pupil.height, pupil.path, pupil.aperture))
+        turns.append((pupil.index[worst] * height + path) / pupil.wavelengths[worst])
+        lit.append(aperture > 0)
+    pairs = min(map(len, turns))
+    down = (turns[1][:pairs] - turns[0][:pairs])[lit[1][:pairs] & lit[0][:pairs]]
+    along = turns[0].diff(dim=1)[lit[0][:, 1:] & lit[0][:, :-1]]
+    steps = torch.cat([down, along]).abs()
+    return (float(steps.median()), float((steps > 0.5).double().mean())) if steps.numel() else (0.0, 0.0)

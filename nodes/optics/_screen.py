@@ -9,7 +9,15 @@ from neusee.nodes.optics._aperture import Stop, axes
 
 
 def screen(grid: Stop, scale: float, rng: torch.Generator, device: torch.device | None = None) -> Tensor:
-    """Draw Gaussian noise of mean 0, variance 1 and correlation exp(-(d / scale)**2), float64 (v, u).
+    """Draw Gaussian noise of mean 0, variance 1 and correlation exp(-(d / scale)**2), float64 (v, u)."""
+    rows, columns = factors(grid, scale, rng, device)
+    return rows @ columns
+
+
+def factors(
+    grid: Stop, scale: float, rng: torch.Generator, device: torch.device | None = None
+) -> tuple[Tensor, Tensor]:
+    """The same as two matrices (v, few) and (few, u), for a few rows of their product at a time.
 
     ``scale`` is in units of the diameter. White noise on a lattice is spread by Gaussians of
     width scale / 2; the lattice does not depend on the sampling, so neither does the screen.
@@ -22,4 +30,4 @@ def screen(grid: Stop, scale: float, rng: torch.Generator, device: torch.device 
     centres = (torch.arange(count, dtype=torch.float64, device=line.device) - count // 2) * width
     spread = torch.exp(-((line - centres) ** 2) / (2 * width**2))
     spread = spread / spread.square().sum(1, keepdim=True).sqrt()
-    return spread @ white.to(line.device) @ spread.T
+    return spread @ white.to(line.device), spread.T

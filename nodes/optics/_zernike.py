@@ -8,6 +8,8 @@ from torch import Tensor
 
 from neusee.nodes.optics._aperture import Stop, axes, inside
 
+_ALL = slice(None)
+
 
 def noll(index: int) -> tuple[int, int]:
     """Radial order n and signed azimuthal order m: m > 0 with the cosine, m < 0 with the sine."""
@@ -65,7 +67,9 @@ def combine(coefficients: Mapping[int, float], v: Tensor, u: Tensor) -> Tensor:
     return total
 
 
-def surface(coefficients: Mapping[int, float], grid: Stop, device: torch.device | None = None) -> Tensor:
-    """The same over the stop, float64 (v, u), 0 outside."""
+def surface(
+    coefficients: Mapping[int, float], grid: Stop, device: torch.device | None = None, rows: slice = _ALL
+) -> Tensor:
+    """The same over the stop, float64 (v, u), 0 outside; or some rows of it."""
     v, u = axes(grid, device)
-    return torch.where(inside(grid, device), combine(coefficients, v, u), 0.0)
+    return torch.where(inside(grid, device, rows), combine(coefficients, v[rows], u), 0.0)

@@ -19,7 +19,8 @@ def test_agrees_with_numpy(shape, dtype):
     found, known = Facts.of(x), x.numpy().astype(np.float64)
     assert (found.min, found.max, found.support) == (known.min(), known.max(), np.count_nonzero(known))
     assert found.sum == pytest.approx(known.sum(), rel=2e-7)
-    assert found.finite and found.shape == shape
+    assert found.finite
+    assert found.shape == shape
 
 
 @pytest.mark.parametrize("at", [0, 1 << 17, 200_000])

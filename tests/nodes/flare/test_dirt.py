@@ -1,6 +1,7 @@
 """Dirt: bounded, seeded, the same at every sampling, with the statistics asked for."""
 
 import math
+from itertools import pairwise
 
 import pytest
 import torch
@@ -9,9 +10,11 @@ from hypothesis import strategies as st
 from torch.testing import assert_close
 
 from neusee.nodes import flare
-from neusee.nodes.flare._dirt import _grains, _scratches
-from neusee.nodes.flare._marks import Grain, Scratch, stamp
+from neusee.nodes.flare._dirt import _dents, _grains, _scratches, _streams
+from neusee.nodes.flare._marks import Grain, Scratch, _distance, stamp
 from neusee.nodes.optics._aperture import inside, stop
+from neusee.nodes.optics._screen import screen
+from neusee.nodes.optics._zernike import surface
 
 GRID = {"samples": 128, "pitch": 10e-6, "diameter": 1.28e-3}
 FILTHY = {"dust": 30.0, "scratches": 10.0, "grease": 0.2, "smudges": 0.5, "dents": 0.4}
@@ -177,3 +180,27 @@ def test_preflight_and_check():
 def test_recipe_cannot_ask_for_negative_dirt():
     with pytest.raises(ValueError, match="greater than or equal to 0"):
         flare.dirt.params(samples=8, pitch="1 um", diameter="8 um", grease="-0.1 waves")
+
+
+def test_a_scratch_is_darkest_where_its_nearest_step_says():
+    """Each step darkens its own neighbourhood only; together they are the distance to the whole line."""
+    grid, points = stop(200, 1.0, 200.0), [(-0.3, -0.4), (0.1, -0.35), (0.1, 0.2), (-0.2, 0.3), (-0.2, 0.6)]
+    shade = 1 - stamp(torch.ones(200, 200), [Scratch(points, 3 / 200, 0.7)], grid)
+    y, x = torch.meshgrid(torch.arange(200.0), torch.arange(200.0), indexing="ij")
+    places = [(v * 200 + 99.5, u * 200 + 99.5) for v, u in points]
+    nearest = torch.stack([_distance(y, x, a, b) for a, b in pairwise(places)]).amin(0)
+    assert_close(shade, 0.7 * (2.0 - nearest).clamp(0, 1), rtol=0, atol=1e-6)
+
+
+def test_dirt_is_made_by_stripes_that_fit_together():
+    """A pupil of many stripes: each kind against its formula over the whole plane."""
+    place = {"samples": 401, "pitch": 1e-5, "diameter": 4.01e-3}
+    grid, rngs = stop(**place), _streams(5, seeded())
+    film, patches = screen(grid, 0.05, rngs[2]), screen(grid, 0.15, rngs[3])
+    found = flare.dirt(**place, grease=0.3, smudges=0.4, dents=0.5, rng=seeded())
+    bent = 0.3 * 550e-9 * film + surface(_dents(0.5 * 550e-9, rngs[4]), grid)
+    assert_close(found.path, bent.float(), rtol=1e-6, atol=1e-13)
+    assert_close(found.amplitude, (1 - 0.4 * torch.sigmoid(3 * patches)).float())
+    light, _ = flare.dirt.after(found, **place, aperture="inscribed")
+    inner, open_ = bent.float().double(), inside(grid)
+    assert f"by {float(inner[open_].std(correction=0)) / 550e-9:.3g} waves" in light.text

@@ -222,6 +222,23 @@ def test_wrapped_elements_are_not_called_aliased():
     assert check(p, pitch=2e-6)[1].ok
 
 
+def test_a_large_pupil_is_made_and_checked_by_parts_as_a_whole():
+    """More rows than one stripe has, and more than are looked at one by one."""
+    grid = stop(1100, 10e-6, 11e-3)
+    height = screen(grid, 0.02, torch.Generator().manual_seed(0)).float() * 2e-6
+    p = pupil(height=height, wavelengths=(550,), diameter=11e-3, defocus=2.0, aberrations={5: 1e-7})
+    v, u = axes(grid)
+    path = surface({5: 1e-7}, grid) + 2.0 * 550e-9 * (v.square() + u.square()) * inside(grid)
+    assert_close(p.path, path.float(), rtol=1e-6, atol=1e-15)
+    assert torch.equal(p.aperture > 0, inside(grid))
+    turns = (p.index[0] * p.height.double() + p.path.double()) / p.wavelengths[0]
+    pairs = [(turns.diff(dim=d).abs(), inside(grid).unfold(d, 2, 1).all(-1)) for d in (0, 1)]
+    steps = torch.cat([step[both] for step, both in pairs])
+    median, share = phase_steps(p)
+    assert median == pytest.approx(float(steps.median()), rel=5e-3)
+    assert share == pytest.approx(float((steps > 0.5).double().mean()), abs=2e-3)
+
+
 def test_one_sample_is_a_pupil():
     p = pupil(height=torch.zeros(1, 1), wavelengths=(550,))
     assert float(p.amplitude) == 1
