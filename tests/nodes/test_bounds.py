@@ -142,6 +142,9 @@ def shining(draw):
     return optics.spot.nothing(Unread(), Facts.of(line), **power), float(found.max())
 
 
+GHOSTS = {"focal_length": 0.1, "pixel_pitch": 3e-6, "count": 8, "energy": 1e-4, "spread": 2.0, "radius": 3e-4}
+
+
 def spectra_index(line):
     return doe.material(line, material="fused silica")
 
@@ -206,6 +209,13 @@ def test_what_is_left_out_changes_no_more_than_stated(name, draws):
 @pytest.mark.parametrize("name", LARGEST)
 def test_what_is_not_added_is_no_brighter_than_stated(name, draws):
     hold(LARGEST[name], draws, SINGLE)
+
+
+def test_a_laser_without_light_needs_no_other_fact():
+    nothing = Facts((3, 4, 4), "float32", 0.0, 0.0, 0.0, 0, True)
+    assert sensor.expose.nothing(nothing, Unread(), Unread(), pixel_pitch=1e-6, exposure=1.0) == 0
+    assert optics.spot.nothing(Unread(), Unread(), strength=0.0, **SENSOR) == 0
+    assert flare.ghosts.nothing(nothing, Unread(), Unread(), **GHOSTS) == 0
 
 
 def test_noise_that_undoes_what_is_there_is_unbounded():
