@@ -113,9 +113,8 @@ def _(
 
 @digitize.carries
 def _(electrons: Deviation, *, result: Facts, gain: float, gain_unit: GainUnit = "e-/DN", **params: Any) -> float:
-    """Rounding: where noise spreads the electrons, a share d of the pixels goes to the next number, rms sqrt(d)."""
-    moved = electrons.bound * numbers_per_electron(gain, gain_unit)
-    return moved + math.sqrt(moved)
+    """Of the line before rounding: whatever is near the middle between two numbers may become the next one."""
+    return electrons.bound * numbers_per_electron(gain, gain_unit)
 
 
 @digitize.preflight

@@ -63,13 +63,18 @@ def _(result: Tensor, photons: Tensor, **params: Any) -> list[Check]:
 
 @photon_noise.carries
 def _(photons: Deviation, *, result: Facts, quantum_efficiency: float, spread: float = 1.0, **params: Any) -> float:
-    """Of the mean, and of its root: |sqrt(a) - sqrt(b)| <= sqrt|a - b|. Poisson numbers of another mean are others."""
+    """Of the mean, and of its root: |sqrt(a) - sqrt(b)| is at most sqrt|a - b| and |a - b| / sqrt(a).
+
+    Poisson numbers of another mean are others.
+    """
     if params["distribution"] == "poisson" and photons.bound > 0:
         return math.inf
     drawn = photons.bound * (quantum_efficiency if params["drawn_in"] == "electrons" else 1.0)
     kept = params["mean_shift"] + (params["mean"] == "additive")
     electrons: float = 1.0 if params["drawn_in"] == "electrons" else quantum_efficiency
-    return electrons * (abs(kept) * drawn + spread * math.sqrt(drawn))
+    darkest = photons.facts.min * drawn / photons.bound if photons.facts and photons.bound > 0 else 0.0
+    root = math.sqrt(drawn) if darkest <= drawn else drawn / math.sqrt(darkest)
+    return electrons * (abs(kept) * drawn + spread * root)
 
 
 def _gaussian(counts: Tensor, rng: Generator) -> Tensor:
