@@ -24,10 +24,11 @@ def cut(node: Node, inputs: list[Any], size: Cut) -> list[Any]:
     return found
 
 
-def said(size: Cut) -> str:
+def said(node: Node, size: Cut) -> str:
     """The cut in words; empty of none."""
     side, bands = size
-    parts = [f"the middle {side} × {side}"] * bool(side) + [f"{bands} bands"] * bool(bands)
+    fewer = bands and (node.bands or {}).keys() - {"return"}
+    parts = [f"the middle {side} × {side}"] * bool(side) + [f"{bands} bands"] * bool(fewer)
     return " and ".join(parts)
 
 

@@ -30,7 +30,7 @@ from neusee.workflows._keys import digest, key_of
 from neusee.workflows._run import run
 from neusee.workflows._store import Store
 
-_TIMES = 3  #: cold runs of a point, of which the median counts
+TIMES = 3  #: cold runs of a point, of which the median counts
 _QUICK = 5.0  #: s; what takes longer is run once
 _WITHIN = ("tolerance", "keep_all")  #: fields of a recipe that stand in no key
 
@@ -53,7 +53,8 @@ class Measured:
 
     errors: dict[str, list[float]] = field(default_factory=dict)  #: by output, one a seed
     seconds: list[float] = field(default_factory=list)  #: of the engine, one a cold run
-    computing: float = 0.0  #: s of it in the steps
+    computing: float = 0.0  #: s in the steps, of the first of them
+    load: float = 0.0  #: runnable processes for each core, this one included, as the machine said before
     bound: float | None = None  #: what the engine proved of the worst output
     steps: dict[str, float] = field(default_factory=dict)  #: s by step
     refused: str = ""
@@ -109,9 +110,23 @@ class Bench:
         if self.store.has(key):
             return Point(trial, Measured(**self.store.get(key)))
         found = self._measure(trial.recipe)
-        about = {"step": "study accuracy", "seconds": sum(found.seconds), "date": now()}
-        self.store.put(key, asdict(found), about)
+        self.store.put(key, asdict(found), _about(found.seconds))
         return Point(trial, found)
+
+    def again(self, point: Point, number: int) -> Point:
+        """The point with one more cold run, if it is a quick one; ``number`` tells its runs apart."""
+        recipe, seconds = point.trial.recipe, point.found.seconds
+        if recipe is None or not seconds or seconds[0] >= _QUICK:
+            return point
+        key = digest(self.key(recipe), number)
+        if self.store.has(key):
+            one = [float(s) for s in self.store.get(key)]
+        else:
+            self._warm_up(recipe)
+            with cold(self.store) as store:
+                one = [run(recipe, store, device=self.device).seconds]
+            self.store.put(key, one, _about(one))
+        return Point(point.trial, replace(point.found, seconds=[*seconds, *one]))
 
     def key(self, recipe: Recipe) -> str:
         """What decides a point: both recipes with their code and files, the engine, the seeds and the machine."""
@@ -134,19 +149,16 @@ class Bench:
         return [[keys[name] for name in recipe.outputs], *(getattr(recipe, name) for name in _WITHIN)]
 
     def _measure(self, recipe: Recipe) -> Measured:
-        seconds: list[float] = []
-        errors: dict[str, list[float]] = {}
+        load = os.getloadavg()[0] / (os.cpu_count() or 1) if hasattr(os, "getloadavg") else 0.0
         try:
             self._warm_up(recipe)
-            while not seconds or (max(seconds) < _QUICK and len(seconds) < _TIMES):
-                with cold(self.store) as store:
-                    result = run(recipe, store, device=self.device)
-                    seconds.append(result.seconds)
-                    errors = errors or self._errors(recipe, result.values, store)
+            with cold(self.store) as store:
+                result = run(recipe, store, device=self.device)
+                errors = self._errors(recipe, result.values, store)
         except RunError as error:
             return Measured(refused=f"{error.step}: {error.cause}")
         ran = {name: done.seconds for name, done in result.done.items() if done.state == "run"}
-        return Measured(errors, seconds, sum(ran.values()), result.proof.worst, ran)
+        return Measured(errors, [result.seconds], sum(ran.values()), load, result.proof.worst, ran)
 
     def _warm_up(self, recipe: Recipe) -> None:
         """What a process does only once, such as to import libraries, is no time of the first point."""
@@ -194,6 +206,10 @@ def draws(recipe: Recipe) -> bool:
 def machine() -> Sequence[str]:
     """Where a time was measured; on another machine it is another."""
     return [platform.node(), platform.machine(), str(torch.get_num_threads()), *versions().values()]
+
+
+def _about(seconds: Sequence[float]) -> dict[str, Any]:
+    return {"step": "study accuracy", "seconds": sum(seconds), "date": now()}
 
 
 def now() -> str:

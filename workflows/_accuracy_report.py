@@ -11,13 +11,14 @@ import torch
 
 from neusee.workflows._accuracy_pareto import Choice, cheapest, front, median_ratio
 from neusee.workflows._accuracy_points import Point
-from neusee.workflows._accuracy_steps import StepTried
+from neusee.workflows._accuracy_steps import USED, StepTried
 from neusee.workflows._figures_study import Dot, Line, promises, steps, work_precision
 from neusee.workflows._graph import Recipe
 from neusee.workflows._study_page import Mark, Section
 
 TOLERANCE, KEEP_ALL = "tolerance", "everything kept"
 HEADER = ("part", "line", "setting", "output", "seed", "error", "seconds", "computing", "proved", "refused")
+_BUSY = 1.5  #: processes a core, from which times are not to be trusted
 _FACTOR = 2.0  #: the choice may cost so much more than the cheapest
 
 _REFERENCE = """The reference is the recipe at its own sampling (bands, pupil samples, window), nothing left out,
@@ -26,8 +27,8 @@ own sampling leaves open. The error of an output is the root mean square of its 
 the reference's largest element; the worst output counts. Outputs whose shape a knob changes are not
 compared at its settings and stand as a dash."""
 _TIME = """Run time is what the engine takes for a cold run of the outputs, choosing and writing results included: an
-empty store in a temporary folder, in a process that has imported its libraries. It is the median of three where
-one takes less than 5 s, and a single one otherwise."""
+empty store in a temporary folder, in a process that has imported its libraries. It is the median of three, taken in
+turn with the other points, where one takes less than 5 s, and a single one otherwise."""
 
 
 def power(tolerance: float) -> str:
@@ -77,6 +78,9 @@ def lead(recipe: Recipe, points: Sequence[Point]) -> str:
     said.append(f"{held} of {len(made)} tolerances were held.")
     if ratio is not None:
         said.append(f"The engine's choice costs {ratio:.2f} times the cheapest setting that holds, at the median.")
+    load = max((p.found.load for p in points), default=0.0)
+    if load > _BUSY:
+        said.append(f"The machine was busy with other work ({load:.1f} processes a core): times are long and scatter.")
     return " ".join(said)
 
 
@@ -87,7 +91,7 @@ def pictures(recipe: Recipe, points: Sequence[Point], tried: Sequence[StepTried]
     if sound:
         line = [(p.seconds, p.most) for p in front(sound)]
         title = f"{recipe.name}: error against run time"
-        found["work_precision"] = work_precision(_lines(sound), line, recipe.tolerance, title)
+        found["work_precision"] = work_precision(_lines(recipe, sound), line, recipe.tolerance, title)
     asked = [p for p in sound if p.trial.value is not None]
     if asked:
         names = asked[0].found.errors
@@ -183,7 +187,7 @@ def _steps(tried: Sequence[StepTried], picture: bytes | None) -> Section:
     for s in tried:
         head = (s.step, s.node, f"{100 * s.share:.1f} %")
         on = s.found.cut or "its own inputs"
-        rows += [(*head, f.name, f.error, f.seconds, s.found.reference, on) for f in s.forms]
+        rows += [(*head, f"{f.line} {f.label}".strip(), f.error, f.seconds, s.found.reference, on) for f in s.forms]
         if s.found.refused:
             rows.append((*head, f"not tried: {s.found.refused}", None, None, None, None))
     text = "Steps that take more than a hundredth of the time with everything kept; of several items, the slowest. "
@@ -211,24 +215,28 @@ def table(points: Sequence[Point], tried: Sequence[StepTried]) -> Iterator[tuple
                 yield (*head, name, seed, error, p.seconds, p.found.computing, p.found.bound, "")
     for s in tried:
         for form in s.forms:
-            yield (f"step {s.step}", s.node, form.name, s.found.cut, "", form.error, form.seconds, "", "", "")
+            yield (f"step {s.step}", form.line, form.label, s.found.cut, "", form.error, form.seconds, "", "", "")
         if s.found.refused:
             yield (f"step {s.step}", s.node, "", "", "", "", "", "", "", s.found.refused)
 
 
-def _lines(points: Sequence[Point]) -> list[Line]:
+def _lines(recipe: Recipe, points: Sequence[Point]) -> list[Line]:
     names = dict.fromkeys(p.trial.line for p in points)
-    return [Line(name, [_dot(p) for p in points if p.trial.line == name]) for name in names]
+    lines = {name: [_dot(p, p.trial.recipe is recipe) for p in points if p.trial.line == name] for name in names}
+    return [Line(name, dots, strong=name == TOLERANCE) for name, dots in lines.items()]
 
 
-def _dot(p: Point) -> Dot:
-    return Dot(p.seconds, p.error, p.trial.label, min(p.by_seed), p.most, p.trial.own)
+def _dot(p: Point, own: bool) -> Dot:
+    """A point; the recipe's own setting of a knob is where all lines meet and needs no label."""
+    return Dot(p.seconds, p.error, "" if own else p.trial.label, min(p.by_seed), p.most, p.trial.own)
 
 
 def _diagram(s: StepTried) -> tuple[str, list[Line], float]:
-    lines = [Line(f.name, [Dot(f.seconds, f.error, "")]) for f in s.forms]
+    """The forms of a step by what is changed; what is changed by and by begins with the form that is used."""
+    names = dict.fromkeys(f.line for f in s.forms)
+    lines = [Line(n, [Dot(f.seconds, f.error, f.label) for f in s.forms if f.line == n], n == USED) for n in names]
     on = f"\non {s.found.cut}" if s.found.cut else ""
-    return f"{s.step} ({s.node}){on}", lines, s.found.reference
+    return f"{s.step}\n{s.node}{on}", lines, s.found.reference
 
 
 def _worst(p: Point) -> str:

@@ -12,11 +12,13 @@ import time
 from collections import defaultdict
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import asdict, dataclass, field, replace
+from functools import partial
 from statistics import median
 from typing import Any, Literal, get_args, get_origin
 
 import torch
 
+from neusee.nodes.values import Channels, Mixture, Psf
 from neusee.workflows._accuracy_code import engine
 from neusee.workflows._accuracy_cut import Cut, cut, said
 from neusee.workflows._accuracy_points import machine, now
@@ -33,6 +35,8 @@ SHARE = 0.01  #: of the time, below which a step does not matter
 _ITEM = re.compile(r"\[.*?\]")
 _CUTS: Sequence[Cut] = ((32, 2), (64, 2), (128, 3), (256, 3), (512, 3), (1024, 3), (0, 3), (0, 0))
 _GROWTH = 16.0  #: how much longer the reference may take from one cut to the next, as a direct convolution does
+USED, _PRECISION = "as used", "precision"
+_WINDOWS = (0.75, 0.5, 0.25)  #: of the side of a PSF
 _ALLOWANCES = (1e3, 1e2, 1e1, 1e-1, 1e-2, 1e-3)  #: times what a step that chooses its own form is allowed
 _LONG_ENOUGH, _TIMES = 0.5, 5  #: s, times: a form is called again until one of them is reached
 
@@ -41,7 +45,8 @@ _LONG_ENOUGH, _TIMES = 0.5, 5  #: s, times: a form is called again until one of 
 class Form:
     """One way to compute a step."""
 
-    name: str
+    line: str  #: what is changed
+    label: str  #: to what
     error: float
     seconds: float
 
@@ -116,7 +121,7 @@ def _tried(recipe: Recipe, step: Step, store: Store, patience: float) -> Trying:
         part = cut(step.node, inputs, size)
         forms = [asdict(form) for form in _forms(step, part, truth, recipe.seed)]
     whole = all(a.shape == b.shape for a, b in zip(tensors_in(inputs), tensors_in(part), strict=True))
-    return Trying(forms, seconds, "" if whole else said(size))
+    return Trying(forms, seconds, "" if whole else said(step.node, size))
 
 
 def _gathered(wire: str | tuple[str, ...] | None, values: Mapping[str, Any]) -> Any:
@@ -140,25 +145,52 @@ def _largest(step: Step, inputs: list[Any], seed: int, patience: float) -> tuple
 
 
 def _forms(step: Step, inputs: list[Any], truth: Any, seed: int) -> Iterator[Form]:
-    """As it is used, in double, in each other precision and with other allowances where the node has them, left out."""
-    node = step.node
-    ways: dict[str, Callable[[], Any]] = {"as used": lambda: _call(step, node, inputs, seed)}
-    double = each_tensor(lambda x: x.double() if x.dtype == torch.float32 else x, inputs)
-    if "precision" not in step.params and any(x.dtype == torch.float32 for x in tensors_in(inputs)):
-        ways["inputs in float64"] = lambda: _call(step, node, double, seed)
-    for word in _others(step, "precision"):
-        ways[f"precision {word}"] = lambda word=word: _call(step, node, inputs, seed, precision=word)  # type: ignore[misc]
-    for factor in _ALLOWANCES if "within" in step.params else ():
-        within = step.params["within"] * factor
-        ways[f"within {within:.1e}"] = lambda within=within: _call(step, node, inputs, seed, within=within)  # type: ignore[misc]
-    if node.bound is not None:
-        ways["left out"] = lambda: inputs[0]
-    for name, way in ways.items():
+    """The result of every way to compute the step, as far as it can be compared with the reference's."""
+    for (line, label), way in _ways(step, inputs, seed).items():
         try:
             value, seconds = _timed(way)
-            yield Form(name, error_of(value, truth), seconds)
+            yield Form(line, label, error_of(_meant(value), _meant(truth)), seconds)
         except (ValueError, RuntimeError):  # another shape, or a dtype that the form does not take
             continue
+
+
+def _ways(step: Step, inputs: list[Any], seed: int) -> dict[tuple[str, str], Callable[[], Any]]:
+    """As it is used, in each other precision, allowance and window that it has, and left out."""
+    node = step.node
+    ways: dict[tuple[str, str], Callable[[], Any]] = {(USED, ""): lambda: _call(step, node, inputs, seed)}
+    for word in _others(step, "precision"):
+        ways[_PRECISION, word] = partial(_call, step, node, inputs, seed, precision=word)
+    if "precision" not in step.params and any(x.dtype == torch.float32 for x in tensors_in(inputs)):
+        double = each_tensor(lambda x: x.double() if x.dtype == torch.float32 else x, inputs)
+        ways[_PRECISION, "double"] = partial(_call, step, node, double, seed)
+    for factor in _ALLOWANCES if "within" in step.params else ():
+        within = step.params["within"] * factor
+        ways["error it may choose", f"{within:.0e}".replace("e-0", "e-")] = partial(
+            _call, step, node, inputs, seed, within=within
+        )
+    for share in _WINDOWS if any(isinstance(x, Psf) for x in inputs) else ():
+        smaller = [_inner(x, share) if isinstance(x, Psf) else x for x in inputs]
+        ways["window of the PSF", f"{share:g}"] = partial(_call, step, node, smaller, seed)
+    if node.bound is not None:
+        ways["left out", ""] = lambda: inputs[0]
+    return ways
+
+
+def _inner(psf: Psf, share: float) -> Psf:
+    """The middle of a PSF; its centre stays at N // 2."""
+    x = psf.intensity
+    for axis in (-2, -1):
+        size = x.shape[axis]
+        kept = max(1, round(share * size))
+        x = x.narrow(axis, size // 2 - kept // 2, kept)
+    return psf._replace(intensity=x)
+
+
+def _meant(value: Any) -> Any:
+    """What counts of a result: of a mixture the cube that it stands for, of channels the sums alone."""
+    if isinstance(value, Mixture):
+        return torch.einsum("bk,kyx->byx", value.basis.to(value.planes), value.planes)
+    return (value.planes, value.flux) if isinstance(value, Channels) else value
 
 
 def _others(step: Step, parameter: str) -> tuple[str, ...]:

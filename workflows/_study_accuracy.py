@@ -16,7 +16,7 @@ from typing import Any
 from neusee.workflows import _accuracy_report as report
 from neusee.workflows._accuracy_code import engine
 from neusee.workflows._accuracy_knobs import Knobs, changed, finest, knobs
-from neusee.workflows._accuracy_points import Bench, Point, Trial, now
+from neusee.workflows._accuracy_points import TIMES, Bench, Point, Trial, now
 from neusee.workflows._accuracy_steps import StepTried, that_matter, try_step
 from neusee.workflows._call import versions
 from neusee.workflows._economy import economised
@@ -96,6 +96,9 @@ def _found(recipe: Recipe, bench: Bench, tell: Tell, quick: bool) -> Study:
     for number, trial in enumerate(todo, 1):
         points.append(bench.point(trial))
         tell(f"{number}/{len(todo)}  {report.told(points[-1])}")
+    for number in range(2, TIMES + 1):  # in turn, so that what else the machine does meets all points alike
+        points = [bench.again(point, number) for point in points]
+        tell(f"timed again: {number} of {TIMES}")
     steps = []
     for stage, name, share in _matter(recipe, points):
         steps.append(try_step(stage, name, share, bench.store, _LITTLE if quick else _PATIENCE))
