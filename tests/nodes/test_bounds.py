@@ -135,7 +135,7 @@ def shining(draw):
     lens = {"pitch": draw.decades(2e-5, 4e-4), "diameter": 1.0, "aperture": draw.one_of("inscribed", "clipped")}
     height = relief(draw, samples)
     pupil = optics.pupil(height, spectra_index(line), line, **lens)
-    camera = {"focal_length": 0.1, "pixel_pitch": draw.decades(1e-6, 1e-4), "shape": (16, 16), "pixel": "zoh"}
+    camera = {"focal_length": 0.1, "pixel_pitch": draw.decades(1e-6, 3e-5), "shape": (8, 8), "pixel": "zoh"}
     psf = optics.psf(pupil, **camera, sensor=draw.one_of("point", "integrated"))
     power = {"strength": draw.often(0.0, draw.decades(1e-9, 1e8)), **SENSOR, "exposure": draw.decades(1e-6, 1e3)}
     found = optics.spot(psf, line, **power)
