@@ -24,10 +24,11 @@ import torch
 from neusee.workflows._accuracy_code import engine
 from neusee.workflows._call import RunError, versions
 from neusee.workflows._code import Code
+from neusee.workflows._economy import economised
 from neusee.workflows._error import error_of
 from neusee.workflows._graph import Recipe, needed
 from neusee.workflows._keys import digest, key_of
-from neusee.workflows._run import run
+from neusee.workflows._run import Event, run
 from neusee.workflows._store import Store
 
 TIMES = 3  #: cold runs of a point, of which the median counts
@@ -150,19 +151,27 @@ class Bench:
 
     def _measure(self, recipe: Recipe) -> Measured:
         load = os.getloadavg()[0] / (os.cpu_count() or 1) if hasattr(os, "getloadavg") else 0.0
+        ran: dict[str, float] = {}
+
+        def watch(event: Event) -> None:
+            if event.done is not None and event.done.state == "run":  # again where the engine tries again
+                ran[event.step] = ran.get(event.step, 0.0) + event.done.seconds
+
         try:
             self._warm_up(recipe)
             with cold(self.store) as store:
-                result = run(recipe, store, device=self.device)
+                result = run(recipe, store, watch=watch, device=self.device)
                 errors = self._errors(recipe, result.values, store)
         except RunError as error:
             return Measured(refused=f"{error.step}: {error.cause}")
-        ran = {name: done.seconds for name, done in result.done.items() if done.state == "run"}
         return Measured(errors, [result.seconds], sum(ran.values()), load, result.proof.worst, ran)
 
     def _warm_up(self, recipe: Recipe) -> None:
-        """What a process does only once, such as to import libraries, is no time of the first point."""
+        """What a process does only once, to import libraries and to read code, is no time of the first point."""
         self.truth(0)
+        for step in economised(recipe, recipe.outputs).steps.values():
+            self._code.digest(step.node.fn.__module__)
+        self._code.save()
         if not self._warm:
             with cold(self.store) as store:
                 run(recipe, store, device=self.device)
