@@ -66,7 +66,7 @@ def _strong(given: Given, brightest: Tensor, within: float) -> tuple[Tensor, Ten
     may = given.rows.abs() * (given.rest[0] * given.passed.total)
     share = torch.where(may > 0, may / brightest.clamp_min(1e-300)[:, None], 0.0).amax(0)
     order = share.argsort()
-    weak = order[share[order].cumsum(0) <= _SMALL * within]
+    weak = order[share[order].cumsum(0) <= _SMALL * max(within, 0.0)]
     bands = torch.ones_like(share, dtype=torch.bool).index_fill_(0, weak, False)
     if not bool(bands.any()):
         bands[int(share.argmax())] = True
