@@ -19,6 +19,7 @@ from neusee.workflows._study_page import Mark, Section
 TOLERANCE, KEEP_ALL = "tolerance", "everything kept"
 HEADER = ("part", "line", "setting", "output", "seed", "error", "seconds", "computing", "proved", "refused")
 _BUSY = 1.5  #: processes a core, from which times are not to be trusted
+_NO_WORSE = 2.0  #: times the error of everything kept, which is one draw of its rounding
 _FACTOR = 2.0  #: the choice may cost so much more than the cheapest
 
 _REFERENCE = """The reference is the recipe at its own sampling (bands, pupil samples, window), nothing left out,
@@ -29,6 +30,9 @@ compared at its settings and stand as a dash."""
 _TIME = """Run time is what the engine takes for a cold run of the outputs, choosing and writing results included: an
 empty store in a temporary folder, in a process that has imported its libraries. It is the median of three, taken in
 turn with the other points, where one takes less than 5 s, and a single one otherwise."""
+
+_POISSON = """But the Poisson law takes as many numbers from its stream as the light asks for: light that differs by
+rounding alone can shift the rest of the stream, and the errors then hold the noise."""
 
 
 def power(tolerance: float) -> str:
@@ -76,12 +80,20 @@ def lead(recipe: Recipe, points: Sequence[Point]) -> str:
     made = choices(points)
     held, ratio = sum(c.held for c in made), median_ratio(made)
     said.append(f"{held} of {len(made)} tolerances were held.")
+    if whole is not None and any(_beyond(c, points) for c in made):
+        said.append(f"Those below {whole.most:.1g} cannot be: everything kept is off by so much, by its arithmetic.")
     if ratio is not None:
         said.append(f"The engine's choice costs {ratio:.2f} times the cheapest setting that holds, at the median.")
     load = max((p.found.load for p in points), default=0.0)
     if load > _BUSY:
         said.append(f"The machine was busy with other work ({load:.1f} processes a core): times are long and scatter.")
     return " ".join(said)
+
+
+def _beyond(choice: Choice, points: Sequence[Point]) -> bool:
+    """Whether a tolerance was missed that everything kept, in the recipe's own precision, misses too."""
+    whole = next((p.most for p in points if p.trial.line == KEEP_ALL and p.sound), 0.0)
+    return not choice.held and whole > choice.tolerance and choice.chosen.most <= _NO_WORSE * whole
 
 
 def pictures(recipe: Recipe, points: Sequence[Point], tried: Sequence[StepTried]) -> dict[str, bytes]:
@@ -117,11 +129,14 @@ def sections(
     many = f"Noise was drawn with {seeds} seeds, the same ones for every point: the error is the median over them, "
     many += "and least to most stand beside it. The names of its streams are the same at every point, so that noise "
     many += "itself is no error."
+    if any("poisson" in step.params.values() for step in recipe.steps.values()):
+        many += " " + _POISSON
     text = f"{_REFERENCE}\n\n{_TIME}\n\n{many if seeds > 1 else 'One seed: errors have no range.'}"
+    once = [p for p in points if p.trial.recipe is not recipe]  # a knob as the recipe has it is the recipe
     return [
-        _whole(points, text, drawn.get("work_precision")),
+        _whole(once, text, drawn.get("work_precision")),
         _chosen(points),
-        _outputs(points, drawn.get("promises")),
+        _outputs(once, drawn.get("promises")),
         _steps(tried, drawn.get("steps")),
         _not_turned(points, without),
     ]
@@ -146,9 +161,9 @@ def _whole(points: Sequence[Point], text: str, picture: bytes | None) -> Section
         row = (p.seconds, found.computing, p.error, min(p.by_seed), p.most, found.bound, _worst(p))
         rows.append((p.trial.line, f"{p.trial.label}{' (the recipe)' * p.trial.own}{' *' * (id(p) in best)}", *row))
         if p.trial.value is not None:
-            marks[len(rows) - 1, 6] = _mark(p.most <= p.trial.value)
-    text += "\n\nA star: on the Pareto line, no other point is as quick and as right. "
-    text += "Marks: whether a tolerance was held with every seed."
+            marks[len(rows) - 1, 6] = _mark(Choice(p.trial.value, p, None), points)
+    text += "\n\nA star: on the Pareto line, no other point is as quick and as right. Marks: whether a tolerance was "
+    text += "held with every seed; an exclamation mark where everything kept, in its own precision, misses it too."
     return Section("Error against run time", text, columns, rows, picture, marks)
 
 
@@ -162,7 +177,7 @@ def _chosen(points: Sequence[Point]) -> Section:
         name = f"{other.trial.line} {other.trial.label}".strip() if other else None
         price = (other.most, other.seconds) if other else (None, None)
         rows.append((power(c.tolerance), c.chosen.most, c.chosen.seconds, name, *price, c.ratio))
-        marks[i, 1] = _mark(c.held)
+        marks[i, 1] = _mark(c, points)
         if c.ratio is not None:
             marks[i, 6] = "pass" if c.ratio <= _FACTOR else "warn"
     text = "For each tolerance, the engine's choice against the quickest of all points above whose error it would also "
@@ -243,5 +258,5 @@ def _worst(p: Point) -> str:
     return max(p.found.errors, key=lambda name: max(p.found.errors[name]))
 
 
-def _mark(good: bool) -> Mark:
-    return "pass" if good else "fail"
+def _mark(choice: Choice, points: Sequence[Point]) -> Mark:
+    return "pass" if choice.held else "warn" if _beyond(choice, points) else "fail"

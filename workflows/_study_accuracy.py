@@ -8,6 +8,8 @@ turned one at a time. What is measured is kept: a study that was stopped goes on
 from __future__ import annotations
 
 import json
+import math
+import time
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -16,7 +18,7 @@ from typing import Any
 from neusee.workflows import _accuracy_report as report
 from neusee.workflows._accuracy_code import engine
 from neusee.workflows._accuracy_knobs import Knobs, changed, finest, knobs
-from neusee.workflows._accuracy_points import TIMES, Bench, Point, Trial, now
+from neusee.workflows._accuracy_points import TIMES, Bench, Measured, Point, Trial, now
 from neusee.workflows._accuracy_steps import StepTried, that_matter, try_step
 from neusee.workflows._call import versions
 from neusee.workflows._economy import economised
@@ -54,16 +56,19 @@ def study(
     *,
     seeds: int = 3,
     quick: bool = False,
+    budget: float | None = None,
     device: str = "cpu",
 ) -> Path:
     """Measure and write ``runs/<date>_<recipe>_accuracy_<key>/``; gives the folder.
 
-    Args: seeds: of the noise, for the range of each error. quick: fewer settings. Raises: `ValueError` for no seed.
+    Args: seeds: of the noise, for the range of each error. quick: fewer settings. budget: s after which
+    no other setting of a knob is begun; what is left is said, and measured when the study is run again.
+    Raises: `ValueError` for no seed.
     """
     if seeds < 1:
         raise ValueError(f"seeds={seeds}: a study needs one at least")
     bench = Bench(finest(recipe), store, seeds, device)
-    found = _found(recipe, bench, tell, quick)
+    found = _found(recipe, bench, tell, quick, math.inf if budget is None else time.monotonic() + budget)
     key = digest("accuracy", bench.key(recipe), [_named(p) for p in found.points], quick)
     with new_run(runs, f"{recipe.name}_accuracy", key) as folder:
         _write(found, folder, _provenance(found, bench, command, quick))
@@ -87,14 +92,14 @@ def trials(recipe: Recipe, turned: Knobs, quick: bool) -> Iterator[Trial]:
                 yield Trial(name, change.label, None, refused=error.problems[0].message)
 
 
-def _found(recipe: Recipe, bench: Bench, tell: Tell, quick: bool) -> Study:
+def _found(recipe: Recipe, bench: Bench, tell: Tell, quick: bool, until: float) -> Study:
     turned = knobs(recipe, quick)
     todo = list(trials(recipe, turned, quick))
     tell(f"{len(todo)} points, {bench.seeds} seed{'s' * (bench.seeds > 1)}; the reference first")
     bench.truth(0)
     points = []
     for number, trial in enumerate(todo, 1):
-        points.append(bench.point(trial))
+        points.append(_left(trial) if time.monotonic() > until and _may_wait(trial, bench) else bench.point(trial))
         tell(f"{number}/{len(todo)}  {report.told(points[-1])}")
     for number in range(2, TIMES + 1):  # in turn, so that what else the machine does meets all points alike
         points = [bench.again(point, number) for point in points]
@@ -104,6 +109,16 @@ def _found(recipe: Recipe, bench: Bench, tell: Tell, quick: bool) -> Study:
         steps.append(try_step(stage, name, share, bench.store, _LITTLE if quick else _PATIENCE))
         tell(f"step {name}: {steps[-1].found.refused or f'{len(steps[-1].forms)} forms'}")
     return Study(recipe, tuple(points), tuple(steps), turned.without, bench.seeds)
+
+
+def _may_wait(trial: Trial, bench: Bench) -> bool:
+    """Whether a trial is a knob's, and nothing is known of it yet."""
+    knob = trial.line not in (report.TOLERANCE, report.KEEP_ALL)
+    return knob and trial.recipe is not None and not bench.store.has(bench.key(trial.recipe))
+
+
+def _left(trial: Trial) -> Point:
+    return Point(trial, Measured(refused="left for another time: run the study again to go on"))
 
 
 def _matter(recipe: Recipe, points: Sequence[Point]) -> Iterator[tuple[Recipe, str, float]]:

@@ -15,6 +15,7 @@ from neusee.workflows._accuracy_cut import cut
 from neusee.workflows._accuracy_knobs import changed, finest, knobs
 from neusee.workflows._accuracy_pareto import Choice, cheapest, front, median_ratio
 from neusee.workflows._accuracy_points import TIMES, Bench, Point, Trial
+from neusee.workflows._accuracy_report import lead
 from neusee.workflows._accuracy_steps import that_matter, try_step
 from neusee.workflows._figures_study import EXACT, Dot, Line, work_precision
 from neusee.workflows._store import Store
@@ -290,6 +291,29 @@ def _look_at(folder):
     page = (folder / "report.html").read_text()
     assert "4 of 4 tolerances were held" in page
     assert "pupil samples at the same width" in page
+
+
+@pytest.mark.slow
+def test_what_the_budget_leaves_is_said_and_measured_the_next_time(nodes, recipe, store, tmp_path):
+    folder = study(recipe, store, tmp_path / "runs", [], print, seeds=1, quick=True, budget=0.0)
+    left = [r for r in rows_of(folder) if r["refused"].startswith("left for another time")]
+    assert {r["setting"] for r in left} == {"4", "17", "6", "12", "4×6", "9×12", "double"}
+    assert "left for another time" in (folder / "report.html").read_text()
+    again = study(recipe, store, tmp_path / "runs", [], print, seeds=1, quick=True)
+    assert not [r for r in rows_of(again) if r["refused"].startswith("left")]
+
+
+def test_a_tolerance_finer_than_the_arithmetic_is_told_from_one_that_was_missed(recipe, store):
+    bench = Bench(finest(recipe), store, seeds=1)
+    points = [
+        bench.point(t) for t in trials(recipe, knobs(recipe, True), True) if t.line in ("tolerance", "everything kept")
+    ]
+    fine = bench.point(Trial("tolerance", "1e-9", replace(recipe, tolerance=1e-9), value=1e-9))
+    assert fine.most > 1e-9  # a third in float32
+    said = lead(recipe, [*points, fine])
+    assert "4 of 5 tolerances were held. Those below " in said
+    missed = Point(replace(fine.trial, value=1e-9), replace(fine.found, errors={"raw": [1e-3]}))
+    assert "Those below" not in lead(recipe, [*points, missed])
 
 
 def test_a_study_without_seeds_is_refused(recipe, store, tmp_path):
