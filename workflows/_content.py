@@ -25,6 +25,7 @@ _TIMES = 3  #: cold runs, of which the median counts
 _QUICK = 5.0  #: s; what takes longer is run once
 _WINDOW = ("flare.dirt", "flare.ghosts")
 _UNREAD = "no step refers to it"
+_LIFT = "steps.cube={node: spectra.lift_mallett, from: {rgb: scene, bands: bands}}"  #: of as few bands as one
 _GREY = "steps.scene={node: scene.targets, with: {kind: siemens, shape: '${scene.shape}'}}"
 
 
@@ -95,7 +96,7 @@ def _overrides(recipe: Recipe) -> Mapping[str, Sequence[str]]:
         "clean window": [f"steps.{name}=null" for name in window],
         "grey scene": [_GREY] if "scene" in recipe.steps and "scene.shape" in settings else [],
         "narrow band, 540 to 560 nm": _bands(recipe, "540 nm", "560 nm", 3),
-        "one wavelength": _bands(recipe, "549 nm", "551 nm", 1),
+        "one wavelength": [*_bands(recipe, "549 nm", "551 nm", 1), *([_LIFT] if "cube" in recipe.steps else [])],
     }
     least = [o for name in ("no laser", "clean window", "one wavelength") for o in every[name]]
     return {name: o for name, o in {**every, "one wavelength, no laser, clean window": least}.items() if o}

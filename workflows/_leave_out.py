@@ -98,20 +98,20 @@ class Bench:
 
     def _row(self, omission: Omission, alone: Recipe) -> Row:
         seen = run(alone, self.store, tuple(omission.value_of(name) for name in omission.at))
-        bound = omission.bound if not math.isnan(omission.bound) else _proved(omission, seen)
-        pairs = [(seen.values[omission.value_of(name)], self.truth.value(name)) for name in omission.at]
-        largest = max(largest_error(*pair) for pair in pairs)
+        bounds = _bounds(omission, seen)
+        pairs = {name: (seen.values[omission.value_of(name)], self.truth.value(name)) for name in omission.at}
+        largest = max(largest_error(*pair) for pair in pairs.values())
         return Row(
             omission.name,
             omission.kind,
             omission.why,
             omission.taken,
-            bound,
-            max(error_of(*pair) for pair in pairs),
+            max(bounds.values(), default=math.inf),
+            max(error_of(*pair) for pair in pairs.values()),
             largest,
             *self._reached(omission, alone, changed=largest > 0),
             self._seconds(self.full, alone) - self._seconds(alone, self.full),
-            self._holds(omission, bound, pairs, seen),
+            all(self._holds(omission, bound, pairs[name], seen) for name, bound in bounds.items()),
         )
 
     def _reached(self, omission: Omission, alone: Recipe, changed: bool) -> tuple[dict[str, float], float | None]:
@@ -121,15 +121,14 @@ class Bench:
         outputs = _worst_by_name(self.recipe.outputs, alone.outputs, run(alone, self.store), self.truth)
         return outputs, self._back(omission) if omission.taken else None
 
-    def _holds(self, omission: Omission, bound: float, pairs: Iterable[tuple[Any, Any]], result: Result) -> bool:
-        """Whether a change keeps to its bound: of noise the root mean square, of all else the largest."""
-        steps = self.full.steps
-        if omission.kind == "handed on" and steps[omission.name].node.random:
-            return all(surely(*pair) <= bound for pair in pairs)
-        slack = _ROUNDING if bound else 0.0
-        if omission.kind == "stands in":  # what stands in and the full form each have an agreed error of their own
-            slack = sum(max(r.steps[n].node.rtol for n in names) for r, names in self._forms(omission, result))
-        return all(largest_error(*pair) <= bound * (1 + 1e-5) + slack for pair in pairs)
+    def _holds(self, omission: Omission, bound: float, pair: tuple[Any, Any], result: Result) -> bool:
+        """Whether a change keeps to its bound: of noise and of what stands in on average, of all else the largest."""
+        if omission.kind == "stands in":  # both forms have an agreed error of their own
+            agreed = [max(r.steps[n].node.rtol for n in names) for r, names in self._forms(omission, result)]
+            return error_of(*pair) <= bound + sum(agreed)
+        if omission.kind == "handed on" and self.full.steps[omission.name].node.random:
+            return surely(*pair) <= bound
+        return largest_error(*pair) <= bound * (1 + 1e-5) + (_ROUNDING if bound else 0.0)
 
     def _forms(self, omission: Omission, result: Result) -> list[tuple[Recipe, Iterable[str]]]:
         return [(self.full, omission.exchange), (result.recipe, omission.exchange.values()), (self.full, omission.at)]
@@ -161,9 +160,12 @@ def _worst_by_name(names: Sequence[str], made: Sequence[str], result: Result, tr
     return {name: error_of(result.values[other], truth.values[name]) for name, other in pairs}
 
 
-def _proved(omission: Omission, result: Result) -> float:
-    """What the engine proved of the readers of what stands in."""
-    return max(result.proof.shares.get(name, 0.0) for name in omission.at)
+def _bounds(omission: Omission, result: Result) -> dict[str, float]:
+    """By step that is looked at: what was stated, or what the engine proved of a reader of what stands in."""
+    if omission.kind != "stands in":
+        return dict.fromkeys(omission.at, omission.bound)
+    told = {name: result.proof.of(name) for name in omission.at}
+    return {name: bound for name, bound in told.items() if bound is not None}
 
 
 def surely(value: Tensor, reference: Tensor) -> float:

@@ -23,9 +23,9 @@ from neusee.workflows._study_page import Mark, Section, page
 Tell = Callable[[str], None]
 _COLUMNS = ("what", "name", "kind", "chosen", "bound", "rms", "largest", "outputs", "put back", "seconds", "holds")
 _HOW = {
-    "handed on": "step left out, its input handed on",
+    "handed on": "left out",
     "not added": "not added",
-    "stands in": "sums over bands in its place",
+    "stands in": "summed",
 }
 
 
@@ -117,7 +117,7 @@ def _lead(recipe: Recipe, found: Found) -> str:
 
 def _outputs(recipe: Recipe, found: Found) -> Section:
     rows = [(p.output, p.bound, p.rms, p.largest, recipe.tolerance, _held(p.holds)) for p in found.promises]
-    text = """Each output of the recipe as it chooses, against the same with everything in full (`--keep-all`). The
+    text = """Each output of the recipe as it chooses, against the same with everything in full (--keep-all). The
         error is the root mean square of the difference over the largest element, which is what the tolerance limits;
         the proved bound is what the nodes carry on from what was left out, where they can tell."""
     columns = ("output", "proved bound", "error", "largest difference", "tolerance", "holds")
@@ -125,22 +125,25 @@ def _outputs(recipe: Recipe, found: Found) -> Section:
 
 
 def _omissions(found: Found) -> Section:
-    text = """Each omission alone, everything else in full. The stated bound and the change are shares of the largest
-        element of the step's full result; of what is not added, of what it would be added to; of what stands in, of the
-        steps that read it. For noise the bound limits the root mean square, and holds if one draw gives no more within
-        four standard errors; for all else it limits the largest difference.
+    text = """Each omission alone, everything else in full. A step that is left out hands its input on; light that is
+        not added stays away; of an image that is summed, only the sums over bands that its readers ask for are
+        convolved. The stated bound and the change are shares of the largest element of the step's full result; of what
+        is not added, of what it would be added to; of what is summed, of the steps that read it. For noise and for sums
+        the bound limits the root mean square, where one draw of the noise may lie four standard errors beside the mean;
+        for all else it limits the largest difference.
 
-        `outputs` is the error of the worst output by this omission alone, `put back` the change of the worst output
-        when the recipe as it chooses computes this one in full after all, and `saved` what its steps took, in seconds.
-        A bound that the recipe's tolerance does not allow is tested all the same."""
-    columns = ("step", "how", "why", "chosen", "bound", "error", "largest", "outputs", "put back", "saved s", "holds")
+        Outputs: the error of the worst output by this omission alone. Put back: the change of the worst output when the
+        recipe as it chooses computes this one in full after all. Saved: what its steps took, in seconds. A bound that
+        the tolerance does not allow is tested all the same."""
+    columns = ("step", "how", "chosen", "bound", "error", "largest", "outputs", "put back", "saved s", "holds")
     rows = [(*_told(r), _held(r.holds)) for r in found.rows]
-    return Section("Each omission", text, columns, rows, marks=_marks([r.holds for r in found.rows], 10))
+    marks = _marks([r.holds for r in found.rows], len(columns) - 1)
+    return Section("Each omission", text, columns, rows, marks=marks)
 
 
 def _told(r: Row) -> Sequence[Any]:
     worst = max(r.outputs.values(), default=0.0)
-    return r.name, _HOW[r.kind], r.why, r.taken, r.bound, r.rms, r.largest, worst, r.back, r.seconds
+    return r.name, _HOW[r.kind], r.taken, r.bound, r.rms, r.largest, worst, r.back, r.seconds
 
 
 def _scenes(found: Found) -> Section:
