@@ -152,6 +152,7 @@ class Node:
         self.spread: Callable[..., float] | None = None
         self.deviation: Callable[[Any], tuple[float, float]] | None = None
         self.nothing: Callable[..., float] | None = None
+        self.scale: Callable[..., float] | None = None
         self.ref: Callable[..., Any] | None = None
         self.bound: Callable[..., float] | None = None
         self.before: Callable[..., Sequence[str]] | None = None
@@ -214,6 +215,14 @@ class Node:
         root mean square over the noise. Skipping hands on the first input.
         """
         self.bound = fn
+        return fn
+
+    def weighed(self, fn: Fn) -> Fn:
+        """Attach ``(facts of the first input, *, parameters) -> float``: what `negligible` is a share of.
+
+        Such as the full well, where what is above it is cut off later.
+        """
+        self.scale = fn
         return fn
 
     def absent(self, fn: Fn) -> Fn:

@@ -43,6 +43,12 @@ def error_in(about: Mapping[str, Any] | None) -> tuple[float, float] | None:
     return (float(found[0]), float(found[1])) if found else None
 
 
+def facts_in(about: Mapping[str, Any] | None) -> Facts | None:
+    """What a stored result says of its facts."""
+    found = (about or {}).get("facts")
+    return Facts(**{**found, "shape": tuple(found["shape"])}) if found else None
+
+
 def ran(outcome: Outcome, why: str, bound: float | None, began: float, predicted: float | None) -> Done:
     """The account of a step that was computed in a run that ``began`` then."""
     work = outcome.work

@@ -37,8 +37,29 @@ class Proof:
         return max(self.held.values(), default=0.0)
 
 
+class Unproved(Exception):
+    """What was left out may have changed more than the tolerance allows."""
+
+    def __init__(self, bound: float) -> None:
+        super().__init__(f"changes at most {bound:.2g}")
+        self.bound = bound
+
+
+def border(recipe: Recipe, order: Iterable[str], wanted: Iterable[str]) -> list[str]:
+    """Steps that will be held to the tolerance: what may be off and is wanted, or read by a node that does not tell."""
+    off, found = set[str](), dict[str, None]()
+    for name in order:
+        step = recipe.steps[name]
+        reads = [source for source in step.sources if source in off]
+        if reads and step.node.spread is None and step.node.deviation is None:
+            found |= dict.fromkeys(reads)
+        elif reads or step.node.deviation is not None or step.node.bound is not None:
+            off.add(name)
+    return [*found, *(name for name in wanted if name in off and name not in found)]
+
+
 def proof(
-    recipe: Recipe, order: Iterable[str], wanted: Iterable[str], done: Mapping[str, Done], facts_of: FactsOf
+    recipe: Recipe, order: Iterable[str], wanted: Iterable[str], done: Callable[[str], Done], facts_of: FactsOf
 ) -> Proof:
     """Carry the bounds of a run from step to step, in running order; nothing is computed."""
     found: dict[str, Deviation] = {}
@@ -46,27 +67,30 @@ def proof(
     for name in order:
         step = recipe.steps[name]
         inputs = [_gathered(step.wires.get(i), found) for i in step.node.inputs]
-        own = _own(done[name], facts_of)
+        own = _own(step, done(name), facts_of)
         if own is None and not any(d.bound for part in inputs for d in _each(part)):
             continue  # exact, as almost every step is
         carried, facts = _carried(step, inputs, facts_of(name)), facts_of(name)
         if math.isinf(carried):
             told = {source: found[source].share for source in step.sources if source in found}
             held |= {source: share for source, share in told.items() if math.isfinite(share)}
-        error = done[name].error
+        error = done(name).error
         found[name] = Deviation(carried + (own or 0.0), facts, error[1] if error else None)
     shares = {name: deviation.share for name, deviation in found.items()}
     held |= {name: shares[name] for name in wanted if math.isfinite(shares.get(name, math.inf))}
     return Proof(shares, held)
 
 
-def _own(done: Done, facts_of: FactsOf) -> float | None:
+def _own(step: Step, done: Done, facts_of: FactsOf) -> float | None:
     """What a step itself adds, in the unit of its result: as a cheaper form, or by being left out."""
     share = done.bound if done.state == "left out" else done.error and done.error[0]
     facts = facts_of(done.step)
     if not share or facts is None:
         return None
-    return share * max(abs(facts.min), abs(facts.max)) / max(1.0 - share, 1e-3)
+    largest = max(abs(facts.min), abs(facts.max))
+    if done.state == "left out" and step.node.scale is not None:
+        largest = step.node.scale(facts, **step.params)
+    return share * largest / max(1.0 - share, 1e-3)
 
 
 def _carried(step: Step, inputs: list[Deviation | list[Deviation] | None], result: Facts | None) -> float:

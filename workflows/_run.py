@@ -17,7 +17,7 @@ from neusee.workflows._graph import Recipe, needed
 from neusee.workflows._keys import Key
 from neusee.workflows._marks import nearest
 from neusee.workflows._place import Schedule
-from neusee.workflows._proof import Proof, proof
+from neusee.workflows._proof import Proof, Unproved, border, proof
 from neusee.workflows._remote import open_store
 from neusee.workflows._store import Store
 from neusee.workflows._under_way import UnderWay
@@ -25,7 +25,7 @@ from neusee.workflows._work import Executor
 
 __all__ = ["Done", "Event", "Result", "run"]
 
-_LEAST = 1e-3  #: share of the tolerance below which nothing is left out any more
+_SAFE = 0.8  #: of what would just do, the share that a second attempt may spend
 
 
 @dataclass(frozen=True, repr=False)
@@ -96,39 +96,45 @@ def run(
             raise ValueError(f"no step {name!r}; {nearest(name, recipe.steps)}")
     recipe, store, watch = economised(recipe, wanted), store or open_store(), watch or (lambda event: None)
     while True:
-        result = _attempt(recipe, store, wanted, watch, device, executor, memory, began)
-        if result.proof.worst <= recipe.tolerance or recipe.keep_all:
-            return result
-        recipe = economised(_stricter(recipe, result.proof.worst), wanted)
+        work = UnderWay(recipe, store, device.split(","), watch, wanted, executor, memory)
+        try:
+            return _attempt(work, wanted, began)
+        except Unproved as failed:
+            recipe = economised(_stricter(recipe, failed.bound), wanted)
+        finally:
+            work.close()
 
 
 def _stricter(recipe: Recipe, bound: float) -> Recipe:
-    """The recipe with less to spend, where it could not be proved that its tolerance held; in the end nothing."""
-    strict = recipe.strict * min(0.5, 0.8 * recipe.tolerance / bound) if recipe.strict > _LEAST else 0.0
-    return replace(recipe.whole or recipe, strict=strict, keep_all=recipe.keep_all or strict == 0.0)
+    """The recipe with less to spend, where it could not be proved that its tolerance held; the second time nothing."""
+    strict = _SAFE * recipe.tolerance / bound if recipe.strict == 1.0 else 0.0
+    return replace(recipe.whole or recipe, strict=strict, keep_all=strict == 0.0)
 
 
-def _attempt(
-    recipe: Recipe,
-    store: Store,
-    wanted: tuple[str, ...],
-    watch: Callable[[Event], None],
-    device: str,
-    executor: Executor | None,
-    memory: int | None,
-    began: float,
-) -> Result:
-    work = UnderWay(recipe, store, device.split(","), watch, wanted, executor, memory)
+def _attempt(work: UnderWay, wanted: tuple[str, ...], began: float) -> Result:
+    """Run; first as far as it must be known whether the tolerance holds, and raise `Unproved` where it does not."""
+    recipe, store = work.recipe, work.store
     order = needed(recipe, wanted)
-    try:
-        with torch.no_grad():
-            work.resolve(order)
-            work.make([work.keys[name] for name in wanted], keep=False)
-    finally:
-        work.close()
+    with torch.no_grad():
+        work.resolve(order)
+        first = border(recipe, order, wanted)
+        missing = work.missing(wanted) if first else set()
+        if early := [work.keys[name] for name in first if work.keys[name] in missing]:
+            work.make(early, keep=False)
+        proved = proof(
+            recipe,
+            needed(recipe, first),
+            wanted,
+            lambda name: work.done.get(name) or work.asleep(name),
+            work.known_facts,
+        )
+        if proved.worst > recipe.tolerance and not recipe.keep_all:
+            raise Unproved(proved.worst)
+        work.make([work.keys[name] for name in wanted], keep=False)
     values = {name: to_device(work.values[work.keys[name]], work.devices[0]) for name in wanted}
     done = work.account(order)
     peak = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss * 1024
     seconds = time.perf_counter() - began
-    proved = proof(recipe, order, wanted, done, work.known_facts)
-    return Result(values, done, work.keys, seconds, peak, recipe, work.store, device, work.schedule, proved)
+    proved = proof(recipe, order, wanted, done.__getitem__, work.known_facts)
+    device = ",".join(work.devices)
+    return Result(values, done, work.keys, seconds, peak, recipe, store, device, work.schedule, proved)

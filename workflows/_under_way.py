@@ -13,7 +13,7 @@ from dataclasses import replace
 from typing import Any
 
 from neusee.nodes import Check, Facts
-from neusee.workflows._account import Done, Event, error_in, ran
+from neusee.workflows._account import Done, Event, error_in, facts_in, ran
 from neusee.workflows._call import RunError, places
 from neusee.workflows._choose import Below, to_compute_again, worth_a_look
 from neusee.workflows._code import Code
@@ -113,11 +113,21 @@ class UnderWay:
             key = self.keys[name]
             twin = self.done.get(self.makers[key].name)
             if twin is None or twin.state == "asleep":
-                bound, error = self._bound(name), error_in(self.store.about(key))
-                self._finish(Done(name, "asleep", "nothing that ran needed it", 0.0, key, bound=bound, error=error))
+                self._finish(self.asleep(name))
             else:
                 self._finish(replace(twin, step=name, state="cached", why=f"the same as {twin.step}", seconds=0.0))
         return {name: self.done[name] for name in order}
+
+    def asleep(self, name: str) -> Done:
+        """The account of a step that nothing has needed."""
+        bound, error = self._bound(name), error_in(self.store.about(self.keys[name]))
+        return Done(name, "asleep", "nothing that ran needed it", 0.0, self.keys[name], bound=bound, error=error)
+
+    def missing(self, names: Iterable[str]) -> set[Key]:
+        """What would have to be computed for the values of ``names``."""
+        below = Below(self.known, self.sources)
+        in_order(below, [self.keys[name] for name in names])
+        return set(below.missing)
 
     def sources(self, key: Key) -> list[Key]:
         return [self.keys[name] for name in self.makers[key].sources]
@@ -275,8 +285,7 @@ class UnderWay:
         self._finish(Done(step.name, "left out", verdict.why, 0.0, key, bound=verdict.bound))
 
     def _stored_facts(self, key: Key) -> Facts | None:
-        found = (self.store.about(key) or {}).get("facts")
-        return Facts(**{**found, "shape": tuple(found["shape"])}) if found else None
+        return facts_in(self.store.about(key))
 
     def _why(self, name: str, key: Key) -> str:
         verdict = self.verdicts.get(name)

@@ -74,7 +74,8 @@ def _(photons: Deviation, *, result: Facts, quantum_efficiency: float, spread: f
     electrons: float = 1.0 if params["drawn_in"] == "electrons" else quantum_efficiency
     darkest = photons.facts.min * drawn / photons.bound if photons.facts and photons.bound > 0 else 0.0
     root = math.sqrt(drawn) if darkest <= drawn else drawn / math.sqrt(darkest)
-    return electrons * (abs(kept) * drawn + spread * root)
+    total: float = electrons * (abs(kept) * drawn + spread * root)
+    return total
 
 
 def _gaussian(counts: Tensor, rng: Generator) -> Tensor:
@@ -115,6 +116,11 @@ def _(electrons: Facts, *, mean: float, full_well: float | None) -> float:
     return _share(mean, math.sqrt(mean), electrons, full_well)
 
 
+@dark_current.weighed
+def _(electrons: Facts, *, full_well: float | None, **params: Any) -> float:
+    return _scale(electrons, full_well)
+
+
 @dark_current.carries
 def _(electrons: Deviation, **params: Any) -> float:
     return electrons.bound
@@ -140,9 +146,20 @@ def _(electrons: Facts, *, pedestal: float, sigma: float, full_well: float | Non
     return _share(pedestal, sigma, electrons, full_well)
 
 
+@read_noise.weighed
+def _(electrons: Facts, *, full_well: float | None, **params: Any) -> float:
+    return _scale(electrons, full_well)
+
+
 @read_noise.carries
 def _(electrons: Deviation, **params: Any) -> float:
     return electrons.bound
+
+
+def _scale(electrons: Facts, full_well: float | None) -> float:
+    """The largest count that the well can hold."""
+    largest = max(abs(electrons.max), abs(electrons.min))
+    return largest if full_well is None else min(largest, full_well)
 
 
 def _share(shift: float, spread: float, electrons: Facts, full_well: float | None) -> float:

@@ -230,5 +230,5 @@ def test_lists_and_absent_inputs_are_told_apart(store):
     a = [step("l", light), step("ga", glow, {"amount": 0.2}, x="l"), step("gb", glow, {"amount": 0.1}, x="l")]
     result = run(recipe(*a, Step("out", mixed, {}, {"x": "l", "y": None, "z": ("ga", "gb")}, MARK, {})), store)
     assert result.proof.of("out") == pytest.approx(0.3 / 300, rel=0.02)
-    unknown = proof(result.recipe, list(result.done), ["out"], result.done, lambda name: None)
+    unknown = proof(result.recipe, list(result.done), ["out"], result.done.__getitem__, lambda name: None)
     assert unknown.worst == 0.0
