@@ -65,6 +65,11 @@ def choices(points: Sequence[Point]) -> list[Choice]:
     return [Choice(float(p.trial.value or 0.0), p, cheapest(sound, float(p.trial.value or 0.0))) for p in asked]
 
 
+def missed(points: Sequence[Point]) -> int:
+    """How many tolerances were not held that could be."""
+    return sum(not c.held and not _beyond(c, points) for c in choices(points))
+
+
 def lead(recipe: Recipe, points: Sequence[Point]) -> str:
     """The result in three sentences."""
     own = next((p for p in points if p.trial.own and p.sound), None)

@@ -148,6 +148,7 @@ def _provenance(found: Study, bench: Bench, command: Sequence[str], quick: bool)
         "quick": quick,
         "device": bench.device,
         "machine": report.machine_said(),
+        "failed": report.missed(found.points),  # tolerances
         "engine": engine(),
         **versions(),
     }

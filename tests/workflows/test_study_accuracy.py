@@ -15,11 +15,12 @@ from neusee.workflows._accuracy_cut import cut
 from neusee.workflows._accuracy_knobs import changed, finest, knobs
 from neusee.workflows._accuracy_pareto import Choice, cheapest, front, median_ratio
 from neusee.workflows._accuracy_points import TIMES, Bench, Point, Trial
-from neusee.workflows._accuracy_report import lead
+from neusee.workflows._accuracy_report import lead, missed
 from neusee.workflows._accuracy_steps import that_matter, try_step
 from neusee.workflows._figures_study import EXACT, Dot, Line, work_precision
 from neusee.workflows._store import Store
 from neusee.workflows._study_accuracy import study, trials
+from neusee.workflows.study import failed
 
 RECIPE = """\
 # A camera whose errors are known
@@ -283,6 +284,7 @@ def _look_at(folder):
     assert {p.name for p in folder.iterdir()} == names
     assert {p.stem for p in (folder / "figures").iterdir()} == {"work_precision", "promises", "steps"}
     assert json.loads((folder / "provenance.json").read_text())["command"] == "neusee study"
+    assert failed(folder) == 0
     rows = rows_of(folder)
     asked = [r for r in rows if r["line"] == "tolerance" and r["output"] == "raw"]
     assert [r["setting"] for r in asked] == ["1e-1", "1e-2", "1e-3", "1e-4"]
@@ -312,8 +314,9 @@ def test_a_tolerance_finer_than_the_arithmetic_is_told_from_one_that_was_missed(
     assert fine.most > 1e-9  # a third in float32
     said = lead(recipe, [*points, fine])
     assert "4 of 5 tolerances were held. Those below " in said
-    missed = Point(replace(fine.trial, value=1e-9), replace(fine.found, errors={"raw": [1e-3]}))
-    assert "Those below" not in lead(recipe, [*points, missed])
+    off = Point(replace(fine.trial, value=1e-9), replace(fine.found, errors={"raw": [1e-3]}))
+    assert "Those below" not in lead(recipe, [*points, off])
+    assert (missed([*points, fine]), missed([*points, off])) == (0, 1)
 
 
 def test_a_study_without_seeds_is_refused(recipe, store, tmp_path):
