@@ -229,6 +229,18 @@ def test_the_camera_holds_what_it_states(study):
     assert "http" not in page.replace("http://www.w3.org", "")
 
 
+def test_what_is_nothing_is_left_away_and_changes_nothing(study):
+    clean = [f"dirt.{kind}=0" for kind in ("dust", "scratches", "smudges")]
+    overrides = (*SMALL, *clean, "dirt.grease=0 waves", "dirt.dents=0 waves", "lasers.green.strength=0")
+    recipe = replace(load("dirty_windshield", overrides), outputs=("raw[mask]",))
+    doc, _, _ = study(recipe, contents=False)
+    rows = rows_of(doc)
+    nothing = {"dirt", "laser_photons[mask,green]", "ghost_photons[mask,green]"}
+    assert nothing <= {name for name, row in rows.items() if row["taken"]}
+    assert all(rows[name][part] == 0 for name in nothing for part in ("bound", "largest", "back"))
+    assert doc["failed"] == 0
+
+
 def test_scenes_of_a_recipe(tmp_path):
     scenes = _content.scenes(load("dirty_windshield", SMALL))
     assert all(isinstance(made, Recipe) for made in scenes.values()), scenes
