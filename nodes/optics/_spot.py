@@ -64,8 +64,8 @@ def _(
     """What saturates, times strength, times the largest LSR: no PSF is asked for, so that none need be computed.
 
     No pixel that samples a point can be brighter than the clear peak, for there all of the pupil is in phase; nor one
-    that averages, up to a width of lambda f / D, within which all pairs of the pupil still add up. A wider one holds
-    1 / 2.2 of the clear pupil's light or more on axis, and no other can hold more than all of it.
+    that averages, up to a width of lambda f / D, within which all pairs of the pupil still add up. A wider one, within
+    the alias-free field, holds 1 / 2.2 of the clear pupil's light or more on axis, and no other more than all of it.
     """
     if strength == 0:
         return 0.0
