@@ -133,7 +133,8 @@ def _exact(seen: Blurred) -> Tensor:
     """Solve for the weights of all seen pixels at once, in float64, by Cholesky."""
     channels = len(seen.picture)
     fine = replace(seen, transfer=seen.transfer.to(torch.complex128), power=seen.power.double())
-    root = seen.weight.double().flatten().sqrt()
+    weight = seen.weight.double().flatten()
+    root = weight.where(weight > 0, 1.0).sqrt().where(weight > 0, 0.0)  # at what is not seen the root has no slope
     colours = torch.full((channels, channels), seen.grey, dtype=torch.float64, device=root.device).fill_diagonal_(1.0)
     rows = [torch.cat([colours[i, j] * _covariance(fine, a * b.conj()) for j, b in enumerate(fine.transfer)], 1)
             for i, a in enumerate(fine.transfer)]  # fmt: skip

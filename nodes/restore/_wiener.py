@@ -61,7 +61,9 @@ def wiener(
             f"{tuple(responses.shape)} must have the same channels and pixels"
         )
     electrons = single(electrons)
-    refuse_not_finite("nothing can be restored from it", electrons=electrons.sum(), psf=psf.intensity.sum())
+    for name, values in {"electrons": [electrons], "psf": [psf.intensity], "glare": glare or ()}.items():
+        for x in values:
+            refuse_not_finite("nothing can be restored from it", **{name: x.sum(-1).sum(dtype=torch.float64)})
     size = (electrons.shape[-2], electrons.shape[-1])
     kernels = effective_psf(psf, illuminant, responses, bands).to(electrons)
     patterns = [crop(pattern.to(electrons), shape=size) for pattern in glare or ()]
@@ -85,7 +87,8 @@ def effective_psf(psf: Psf, illuminant: Tensor, responses: Tensor, bands: Bands)
     blind = share.sum(-1, keepdim=True) <= 0  # a channel that sees none of these bands: one PSF is as good as another
     share = share.where(~blind, 1.0)
     share = share / share.sum(-1, keepdim=True)
-    seen: Tensor = torch.tensordot(share.to(psf.intensity), psf.intensity, 1)
+    intensity = single(psf.intensity)
+    seen: Tensor = torch.tensordot(share.to(intensity), intensity, 1)
     return seen
 
 
@@ -101,7 +104,7 @@ def _restored(
     size = torus((y, x), edge(kernels, (y, x)))
     transfer, power = torch.fft.rfft2(wrapped(kernels, size)), fall(size).to(kernels)
     seen = _mean((picture - mean).square(), known)
-    passed = torch.stack([variance(t.abs().square() * power, size) for t in transfer])[:, None, None]
+    passed = torch.stack([variance((t.real.square() + t.imag.square()) * power, size) for t in transfer])[:, None, None]
     scale = (torch.maximum(seen - mean - read**2, 0.01 * seen) / passed.clamp_min(1e-6)).clamp_min(1e-6).sqrt()
     weight = known * (scale / (balance * noise).sqrt()).square()
     scaled = tuple(pattern / scale for pattern in glare)
@@ -126,7 +129,7 @@ def _mean(picture: Tensor, known: Tensor) -> Tensor:
 
 def _visible(patterns: list[Tensor], known: Tensor) -> list[Tensor]:
     """Patterns that are anywhere to be seen, with a greatest value of 1."""
-    peaks = [float((pattern.abs() * known).max()) for pattern in patterns]
+    peaks = [float((pattern.detach().abs() * known).max()) for pattern in patterns]
     return [pattern / peak for pattern, peak in zip(patterns, peaks, strict=True) if peak > 0]
 
 
