@@ -10,7 +10,7 @@ from pathlib import Path
 import pytest
 import torch
 
-from neusee.workflows import load
+from neusee.workflows import _accuracy_code, load
 from neusee.workflows._accuracy_cut import cut
 from neusee.workflows._accuracy_knobs import changed, finest, knobs
 from neusee.workflows._accuracy_pareto import Choice, cheapest, front, median_ratio
@@ -188,6 +188,22 @@ def test_a_point_is_another_with_another_tolerance_recipe_seed_or_number_of_seed
     }
     assert len(keys) == 7
     assert bench.key(recipe) == Bench(finest(recipe), store, seeds=2).key(recipe)
+
+
+def test_the_engine_is_what_running_imports(tmp_path, monkeypatch):
+    """Its digest follows the code of all of that, and neither words nor what is beside it."""
+    monkeypatch.setattr(_accuracy_code, "_HERE", tmp_path)
+    texts = {"_run": "from neusee.workflows._deep import x\n", "_deep": "x = 1\n", "_aside": "y = 1\n"}
+
+    def digest_with(**other):
+        for name, text in {**texts, **other}.items():
+            (tmp_path / f"{name}.py").write_text(text)
+        return _accuracy_code.engine.__wrapped__()
+
+    first = digest_with()
+    assert digest_with(_aside="y = 2\n") == first
+    assert digest_with(_deep='"""Words."""\nx = 1  # more\n') == first
+    assert digest_with(_deep="x = 2\n") != first
 
 
 # --- the Pareto line --------------------------------------------------------------------------------------------------
