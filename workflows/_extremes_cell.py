@@ -19,7 +19,7 @@ from torch.overrides import TorchFunctionMode
 from neusee.workflows._codec import each_tensor, tensors_in
 from neusee.workflows._error import largest_error
 from neusee.workflows._extremes import Case
-from neusee.workflows._extremes_limits import limit_of
+from neusee.workflows._extremes_limits import limit_of, stated_of
 from neusee.workflows._graph import Step
 from neusee.workflows._keys import stream_seed
 from neusee.workflows._study_page import Mark
@@ -65,7 +65,7 @@ def judged(step: Step, inputs: Sequence[Any], case: Case, seed: int) -> Cell | N
         return None
     try:
         if case.expect == "seen":
-            return _seen(step, inputs, given, seed)
+            return _seen(step, inputs, given, case, seed)
         return _compared(step, given, case, seed)
     except ValueError as error:
         return Cell("pass", f"refused: {error}")
@@ -199,9 +199,9 @@ def _slope_error(step: Step, inputs: list[Any], seed: int) -> float | None:
 
 
 def _slight(picture: Tensor) -> float:
-    """The gradient of a mean: where the largest is less, an error counts over this."""
+    """The gradient of a mean, or the least that its type holds in full: of less, an error counts over this."""
     top = float(picture.detach().double().abs().max())
-    return 1.0 / (picture.numel() * max(top, _LEAST))
+    return max(1.0 / (picture.numel() * max(top, _LEAST)), torch.finfo(picture.dtype).tiny)
 
 
 def _true_slopes(step: Step, inputs: list[Any], seed: int) -> list[Tensor] | None:
@@ -248,13 +248,16 @@ def _near(x: Tensor) -> float:
 # --- numbers that are none --------------------------------------------------------------------------------------------
 
 
-def _seen(step: Step, inputs: Sequence[Any], given: list[Any], seed: int) -> Cell:
+def _seen(step: Step, inputs: Sequence[Any], given: list[Any], case: Case, seed: int) -> Cell:
     """A wrong number in any picture is refused, stays to be seen, or, infinite, counts as the limit of large ones."""
     notes, count = [], sum(_is_picture(x) for x in tensors_in(inputs))
     for i in range(count):
         notes.append(_one_seen(step, _only(i, inputs, given), seed))
     hidden = [note for note in notes if note.startswith("hidden")]
-    return Cell("fail", hidden[0]) if hidden else Cell("pass", "; ".join(dict.fromkeys(notes)))
+    stated = stated_of(step.node, case.name)
+    if hidden and stated is None:
+        return Cell("fail", hidden[0])
+    return Cell("pass", f"as stated: {stated}" if hidden else "; ".join(dict.fromkeys(notes)))
 
 
 def _one_seen(step: Step, given: list[Any], seed: int) -> str:

@@ -9,6 +9,7 @@ from torch import Tensor
 from torch.nn.functional import pad
 
 from neusee.nodes import Check, node
+from neusee.nodes._precision import single
 
 _WINDOW, _SIGMA = 11, 1.5  #: pixels, of the Gaussian of SSIM
 _C1, _C2 = 0.01**2, 0.03**2  #: of SSIM, for a white of 1
@@ -64,7 +65,7 @@ def _(result: Quality, *inputs: Tensor, **params: object) -> list[Check]:
 
 def _inside(picture: Tensor, border: int) -> Tensor:
     y, x = picture.shape[-2:]
-    return picture[..., border : max(y - border, border), border : max(x - border, border)]
+    return single(picture)[..., border : max(y - border, border), border : max(x - border, border)]
 
 
 def _shown(picture: Tensor, domain: str) -> Tensor:

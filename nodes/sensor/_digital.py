@@ -101,7 +101,7 @@ def _(
     bits: int = 16,
     rng: Generator | None = None,
 ) -> Tensor:
-    top, slope = 2**bits - 1, numbers_per_electron(gain, gain_unit)
+    top, slope, electrons = 2**bits - 1, numbers_per_electron(gain, gain_unit), single(electrons)
     line = (electrons * slope).flatten().tolist()
     if rounding == "nearest":
         whole = [round(min(max(x, 0.0), float(top))) for x in line]

@@ -5,9 +5,11 @@ import math
 import pytest
 import torch
 
-from neusee.nodes import losses, metrics
+from neusee.nodes import doe, losses, metrics, optics, restore, sensor, spectra
 from neusee.nodes._precision import refuse_half, refuse_not_finite, single
-from neusee.nodes.values import Psf
+from neusee.nodes.doe._material import wave_height
+from neusee.nodes.optics._transform import transform
+from neusee.nodes.values import Bands, Psf, Pupil
 
 
 def psf_of(intensity, clear_peak=0.1):
@@ -136,3 +138,214 @@ def test_a_ratio_of_what_is_no_number_is_none():
         assert math.isnan(float(losses.bsr(*pair)))
     assert math.isnan(float(losses.lsr(psf_of(broken))))
     assert math.isnan(float(losses.gradient_penalty(broken)))
+
+
+def bands_of(count):
+    centres = torch.linspace(450e-9, 650e-9, count, dtype=torch.float64)
+    return Bands(centres, torch.full_like(centres, 10e-9), torch.ones_like(centres))
+
+
+def pupil_of(height, path=None):
+    flat = torch.ones_like(height)
+    wavelengths = torch.tensor([550e-9], dtype=torch.float64)
+    path = torch.zeros_like(height) if path is None else path
+    return Pupil(flat, flat, height, path, torch.tensor([0.46], dtype=torch.float64), wavelengths, torch.tensor(1e-4))
+
+
+LENS = {"focal_length": 0.11, "pixel_pitch": 2.9e-6, "shape": (9, 9)}
+SENSOR = {"full_well": 25500.0, "quantum_efficiency": 0.56, "pixel_pitch": 2.9e-6, "exposure": 0.1}
+
+
+@pytest.mark.parametrize("part", ["height", "path"])
+@pytest.mark.parametrize("wrong", [math.nan, math.inf])
+def test_a_phase_that_is_no_number_is_refused(part, wrong):
+    """A path that was not a number was taken for no path at all, and the picture was that of a clean lens."""
+    screen = torch.zeros(16, 16)
+    screen[3, 4] = wrong
+    pupil = pupil_of(torch.zeros(16, 16))._replace(**{part: screen})
+    with pytest.raises(ValueError, match=f"{part} holds values that are not finite"):
+        optics.psf(pupil, **LENS)
+
+
+def test_the_light_of_what_is_no_number_is_not_left_out():
+    bands, responses = bands_of(2), torch.ones(3, 2, dtype=torch.float64)
+    image = torch.rand(2, 5, 5, generator=torch.Generator().manual_seed(1))
+    image[0, 2, 2] = math.nan
+    for rule in ("channel_sum", "per_band"):
+        with pytest.raises(ValueError, match="plain_image holds values that are not finite"):
+            sensor.level(image, bands, responses, strength=0.7, rule=rule, **SENSOR)
+    assert math.isnan(float(metrics.bsr(image, image)[0]))
+    raw = torch.zeros(3, 5, 5)
+    raw[0, 2, 2] = math.nan
+    well = {"full_well": 25500.0, "gain": 0.37}
+    assert int(restore.clipped(raw, **well).sum()) == 1
+    assert float(metrics.saturated(raw, **well).pixels) == 1
+
+
+# --- sensor, in the dark and in half precision ------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("photons", [0.0, 1e-40])
+def test_the_noise_of_the_dark_has_no_slope_without_end(photons):
+    dark = torch.full((4, 4), photons)
+
+    def noise(x):
+        rng = torch.Generator().manual_seed(1)
+        return sensor.photon_noise(x, quantum_efficiency=0.56, rng=rng).sum()
+
+    assert float(noise(dark)) <= 1e-38
+    assert float(slope_of(noise, dark).abs().max()) <= 1.0
+
+
+def test_half_precision_does_not_end_the_light_at_65504():
+    half = torch.full((3, 4, 4), 60000.0, dtype=torch.float16)
+    assert float(sensor.gather(half, [half]).max()) == 120000
+    assert float(sensor.full_well(half, capacity=255000.0).max()) == 60000
+    assert float(sensor.digitize(half, gain=2.0, gain_unit="DN/e-").max()) == 65535
+    assert float(restore.electrons(half, gain=10.0, pedestal=0.0).max()) == 600000
+    reference = sensor.digitize.ref(half, gain=0.37)
+    torch.testing.assert_close(sensor.digitize(half, gain=0.37), reference, rtol=0, atol=0)
+
+
+# --- reliefs ----------------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("levels", [None, 2])
+def test_a_deep_relief_wraps_as_in_float64(levels):
+    """The period in float32 is off by up to 6e-8 of itself, 83 times over in 100 um."""
+    height = 100e-6 * torch.rand(64, 64, generator=torch.Generator().manual_seed(1))
+    how = {"material": "fused silica", "wrap_at": 550e-9, "levels": levels, "max_height": None}
+    made, exact = doe.fabricate(height, **how), doe.fabricate.ref(height, **how)
+    wave = wave_height("fused silica", 550e-9)
+    assert float((made.double() - exact).abs().max()) <= 1e-7 * wave
+
+
+@pytest.mark.parametrize("half", [torch.float16, torch.bfloat16])
+def test_a_relief_in_half_precision_is_refused(half):
+    height = torch.full((16, 16), 1e-6).to(half)
+    bands = bands_of(1)
+    with pytest.raises(ValueError, match="cannot hold a phase"):
+        optics.pupil(height, torch.tensor([0.46]), bands, pitch=1e-4, diameter=1.6e-3)
+    with pytest.raises(ValueError, match="cannot hold a phase"):
+        optics.psf(pupil_of(height), **LENS)
+    with pytest.raises(ValueError, match="cannot hold a phase"):
+        doe.fabricate(height, wrap_at=550e-9)
+
+
+# --- the image --------------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("border", ["zero", "reflect"])
+def test_a_lamp_a_million_times_as_bright_does_not_drown_the_dark(border):
+    rng = torch.Generator().manual_seed(1)
+    scene = 1e-6 * torch.rand(2, 48, 40, generator=rng)
+    scene[0, 20, 20] = 1.0  # the other band has no lamp
+    kernel = torch.rand(2, 7, 7, generator=rng).pow(8)
+    psf = psf_of(kernel / kernel.sum((-2, -1), keepdim=True))
+    found, exact = optics.image(scene, psf, border=border), optics.image.ref(scene, psf, border=border)
+    dim = exact < 1e-5
+    assert bool(dim[0].any())
+    assert float((found - exact)[dim].abs().max()) <= 1e-5 * float(exact[dim].max())
+    alone = optics.image(scene[1:], Psf(psf.intensity[1:], psf.clear_peak[1:]), border=border)
+    assert torch.equal(found[1:], alone), "a band is the same whatever stands beside it"
+
+
+def test_a_picture_of_usual_contrast_is_transformed_in_single():
+    scene = torch.rand(1, 32, 32, generator=torch.Generator().manual_seed(1), requires_grad=True)
+    psf = psf_of(torch.full((1, 3, 3), 1 / 9))
+    assert optics.image(scene, psf).dtype == torch.float32
+    optics.image(scene, psf).sum().backward()
+    assert bool(scene.grad.isfinite().all())
+
+
+@pytest.mark.parametrize("half", [torch.float16, torch.bfloat16])
+def test_an_image_in_half_precision_is_formed_in_single(half):
+    scene = torch.rand(1, 8, 8, generator=torch.Generator().manual_seed(1)).to(half)
+    psf = psf_of(torch.full((1, 3, 3), 1 / 9))
+    torch.testing.assert_close(optics.image(scene, psf), optics.image(scene.float(), psf))
+
+
+@pytest.mark.parametrize("lift", [spectra.lift_mallett, spectra.lift_lmmse])
+def test_black_has_the_slope_of_the_reference(lift):
+    black = torch.zeros(3, 4, 4, dtype=torch.float64)
+    usual, truth = (slope_of(lambda x, f=f: f(x, bands_of(5)).sum(), black) for f in (lift, lift.ref))
+    torch.testing.assert_close(usual, truth)
+
+
+# --- the scaled transform ---------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("method", ["folded", "bluestein", "kaiser_bessel"])
+@pytest.mark.parametrize(
+    ("shape", "window", "alpha", "off"),
+    [
+        ((1, 1), (1, 1), 1e-3, 0.0),
+        ((1, 16), (7, 1), 5e-3, 0.0),
+        ((61, 59), (31, 29), 1.5e-2, 0.0),
+        ((64, 64), (64, 64), 7.8e-3, 0.0),  # the whole field that is free of aliases
+        ((64, 64), (16, 16), 1e-7, 0.0),  # a pixel so small that all of it is one value
+        ((48, 48), (24, 24), 5e-3, 4e4),  # 200 turns from sample to sample of the tilt
+    ],
+)
+def test_every_method_agrees_with_the_plain_sum_at_the_extremes(method, shape, window, alpha, off):
+    rng = torch.Generator().manual_seed(1)
+    field = torch.complex(*(torch.randn(2, *shape, generator=rng, dtype=torch.float64).unbind(0)))
+    where = {"alpha": (alpha, alpha), "centre_in": (0.0, 0.0), "centre_out": (off, -off)}
+    exact = transform(field, window, **where, method="direct")
+    top = float(exact.abs().max())
+    for dtype, bound in ((torch.complex128, 1e-11), (torch.complex64, 3e-6)):
+        found = transform(field.to(dtype), window, **where, method=method)
+        assert float((found - exact).abs().max()) <= bound * top
+
+
+# --- restoration ------------------------------------------------------------------------------------------------------
+
+
+@pytest.fixture
+def blurred():
+    rng = torch.Generator().manual_seed(1)
+    kernel = torch.rand(3, 5, 5, generator=rng)
+    psf = psf_of(kernel / kernel.sum((-2, -1), keepdim=True))
+    electrons = 1000 * torch.rand(3, 12, 12, generator=rng)
+    clipped = electrons > 900
+    return [electrons, psf, torch.ones(3), torch.rand(3, 3, generator=rng), bands_of(3), clipped]
+
+
+def test_restoration_has_a_slope_beside_clipped_pixels(blurred):
+    def restored(x):
+        return restore.wiener(x, *blurred[1:], read_noise=10.5).square().mean()
+
+    usual = slope_of(restored, blurred[0])
+    assert bool(blurred[5].any())
+    assert bool(usual.isfinite().all())
+    step = 1e-4 * torch.randn(3, 12, 12, generator=torch.Generator().manual_seed(2), dtype=torch.float64)
+    double = [x.double() if torch.is_tensor(x) and x.is_floating_point() else x for x in blurred]
+    double[1] = Psf(double[1].intensity.double(), double[1].clear_peak)
+
+    def wide(x):
+        return float(restore.wiener(x, *double[1:], read_noise=10.5).square().mean())
+
+    moved = (wide(double[0] + step) - wide(double[0] - step)) / 2
+    assert float((usual.double() * step).sum()) == pytest.approx(moved, rel=1e-3)
+
+
+def test_a_channel_that_sees_none_of_the_bands_leaves_the_others_restored(blurred):
+    blurred[3][2] = 0
+    found = restore.wiener(*blurred, read_noise=10.5)
+    assert bool(found.isfinite().all())
+
+
+@pytest.mark.parametrize("wrong", [math.nan, math.inf])
+def test_restoration_refuses_what_is_not_finite(wrong, blurred):
+    broken = blurred[0].clone()
+    broken[1, 3, 3] = wrong
+    with pytest.raises(ValueError, match="electrons holds values that are not finite"):
+        restore.wiener(broken, *blurred[1:], read_noise=10.5)
+    with pytest.raises(ValueError, match="glare holds values that are not finite"):
+        restore.wiener(*blurred, [broken], read_noise=10.5)
+
+
+def test_the_slope_of_a_psf_without_light_is_finite(blurred):
+    dark = torch.full((3, 5, 5), 1e-40)
+    slope = slope_of(lambda k: restore.wiener(blurred[0], psf_of(k), *blurred[2:], read_noise=10.5).sum(), dark)
+    assert bool(slope.isfinite().all())
