@@ -24,19 +24,30 @@ def flux(planes: Tensor, intensity: Tensor, basis: Tensor, size: tuple[int, int]
 
 
 def _boxes(plane: Tensor, kernel: torch.Size, size: tuple[int, int]) -> Tensor:
-    """By sample of the PSF, the sum of the plane over what that sample brings into the field: (m, n) float64."""
-    found = plane.double()
-    for dim in (1, 0):
-        low, high = _ends(kernel[dim], size[dim], plane.shape[dim], plane.device)
-        sums = torch.cat([torch.zeros_like(found.narrow(dim, 0, 1)), found.cumsum(dim)], dim)
-        found = sums.index_select(dim, high) - sums.index_select(dim, low)
-    return found
+    """By sample of the PSF, the sum of the plane over what that sample brings into the field: (m, n) float64.
+
+    Turned by half a turn, the plane has its boxes in the order of the samples.
+    """
+    across = _along(plane.flip(0, 1).cumsum(1, dtype=torch.float64), 1, kernel[1], size[1])
+    return _along(_down(across), 0, kernel[0], size[0])
 
 
-def _ends(kernel: int, size: int, length: int, device: torch.device) -> tuple[Tensor, Tensor]:
-    """Where each box begins and ends, along one axis."""
-    at = torch.arange(kernel, device=device)
-    if length != size:  # the scene has its border about it
-        return kernel - 1 - at, kernel - 1 - at + size
-    low = kernel // 2 - at
-    return low.clamp_min(0), (low + size).clamp_max(size)
+def _down(plane: Tensor) -> Tensor:
+    """Sums from the top, row by row in place: ``cumsum`` takes ten times as long across rows."""
+    if plane.requires_grad:
+        return plane.cumsum(0)
+    rows = plane.unbind(0)
+    for above, row in zip(rows, rows[1:], strict=False):
+        row.add_(above)
+    return plane
+
+
+def _along(sums: Tensor, dim: int, kernel: int, size: int) -> Tensor:
+    """From the sums up to and with each sample, those over each box."""
+    before = kernel // 2
+    if sums.shape[dim] == size:  # zeros about the scene: a box ends with it, or begins with it
+        first = sums.narrow(dim, size - before - 1, before + 1)
+        return torch.cat([first, sums.narrow(dim, -1, 1) - sums.narrow(dim, 0, kernel - before - 1)], dim)
+    first = sums.narrow(dim, size - 1, 1)
+    rest = sums.narrow(dim, size, kernel - 1) - sums.narrow(dim, 0, kernel - 1)
+    return torch.cat([first, rest], dim)

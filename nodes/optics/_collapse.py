@@ -20,8 +20,8 @@ class Given(NamedTuple):
 
     rows: Tensor  #: (row, band)
     basis: Tensor  #: (band, k)
-    rest: Tensor  #: (k + 1, band)
-    most: Tensor  #: (k,) largest |plane|
+    rest: Tensor  #: (k + 1, band) what the first planes leave of each band, in the norm that is asked for
+    most: Tensor  #: (k,) the planes, in that norm
     gram: Tensor  #: (k, k) products of the planes
     copies: int  #: how often a point of the scene may occur: 9 where the border reflects
     passed: Passed
@@ -37,7 +37,7 @@ class Plan(NamedTuple):
     window: tuple[int, int]
     kernels: Tensor | None  #: (kernel, those bands); None: the PSF of each is a kernel
     mix: Mix
-    off: Tensor  #: (row,) bound of max |what is left away|
+    off: Tensor  #: (row,) bound of what is left away
     cost: float  #: s, about, on two cores
     whole: bool  #: nothing is left away that is not zero
 
@@ -95,13 +95,13 @@ def _plans(
         window = given.passed.windows[j]
         return Plan(k, bands, window, kernels, mix, off, _cost(given, window, k, len(bands), kernels, mix), False)
 
-    yield plan(sums, Mix(u, x, None), off)
+    yield plan(sums, Mix(u, x, None, count), off)
     yield plan(None, Mix(rows, basis, None), off)
     if within > 0:
         plane = torch.where(brightest[:, None] > 0, given.most[:k] / brightest[:, None], 0.0).flatten()
         few = _fewer(sums, plane, through, within * brightest - off, brightest)
         if few is not None:
-            yield plan(few[0], Mix(u, x, few[1]), off + few[2])
+            yield plan(few[0], Mix(u, x, few[1], count), off + few[2])
 
 
 def _fewer(

@@ -38,7 +38,7 @@ def _kernels(intensity: Tensor, plan: Plan) -> Tensor:
         return stack if len(plan.bands) == len(stack) else stack[plan.bands.to(stack.device)]
     weights = plan.kernels.new_zeros(len(plan.kernels), len(stack))
     weights = weights.index_copy_(1, plan.bands, plan.kernels).to(stack)
-    if stack.requires_grad:
+    if stack.requires_grad or stack.is_contiguous():
         return torch.tensordot(weights, stack, 1)
     sums = stack.new_empty(len(weights), *plan.window)
     for y in range(0, plan.window[0], _SOME):
@@ -64,7 +64,7 @@ def rounding(given: Given, plan: Plan, found: Tensor, eps: float) -> Tensor:
     spread eight sigma, and four roundings of the brightest pixel for what is not spread.
     """
     count = math.prod(transform(given, plan.window))
-    u, x, y = plan.mix
+    u, x, y, _ = plan.mix
     plane = given.gram.diagonal()[: plan.planes].clamp_min(0).sqrt() * math.sqrt(given.copies)
     kernel = (given.passed.total * given.passed.peak).sqrt()[plan.bands]
     kernel = kernel if plan.kernels is None else plan.kernels.abs() @ kernel

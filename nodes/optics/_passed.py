@@ -57,7 +57,7 @@ def _measured(strip: Tensor) -> tuple[Tensor, Tensor]:
     if strip.shape[1] == 0 or strip.shape[2] == 0:
         zero = torch.zeros(len(strip), dtype=torch.float64)
         return zero, zero
-    low, high = strip.amin((1, 2)), strip.amax((1, 2))
+    low, high = strip.amin(-1).amin(-1), strip.amax(-1).amax(-1)  # `aminmax` takes three times as long
     if bool((low >= 0).all()):
         total = strip.sum(-1).sum(-1, dtype=torch.float64)
     else:

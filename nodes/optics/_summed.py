@@ -21,10 +21,12 @@ class Mix(NamedTuple):
     u: Tensor | None  #: (result, s)
     x: Tensor | None  #: (s, plane)
     y: Tensor | None  #: (s, kernel)
+    results: int = 0  #: where every result has a kernel of its own for every plane, in this order: how many results
 
     def to(self, like: Tensor) -> "Mix":
         """In the precision and on the device of the planes."""
-        return Mix(*(m if m is None else m.to(like) for m in self))
+        u, x, y = (m if m is None else m.to(like) for m in self[:3])
+        return Mix(u, x, y, self.results)
 
 
 class Where(NamedTuple):
@@ -50,7 +52,7 @@ class Summed(torch.autograd.Function):
     @staticmethod
     def backward(ctx: Any, *grads: Tensor) -> Any:
         (a, b), (mix, where), grad = ctx.saved_tensors, ctx.how, grads[0]
-        u, x, y = (m if m is None else m.T for m in mix)
+        u, x, y = (m if m is None else m.T for m in mix[:3])
         flip = not where.conjugate
         of_a = of_b = None
         if ctx.needs_input_grad[0]:
@@ -79,8 +81,8 @@ def _summed(a: Tensor, b: Tensor, mix: Mix, where: Where) -> Tensor:
     first, second = _Columns(one, where.at_a[0], high, step), _Columns(two, where.at_b[0], high, step)
     result = one.new_empty(_results(mix, a), where.size[0], columns)
     for c in range(0, columns, step):
-        x, y = _times(mix.x, first.spectra(c)), _times(mix.y, second.spectra(c))
-        found = torch.fft.ifft(_times(mix.u, x * (y.conj() if where.conjugate else y)))
+        x, y = first.spectra(c), _times(mix.y, second.spectra(c))
+        found = torch.fft.ifft(_mixed(mix, x, y.conj() if where.conjugate else y))
         found = found[:, : columns - c, where.at[0] : where.at[0] + where.size[0]]
         result[:, :, c : c + step] = found.transpose(1, 2)
     pixels: Tensor = torch.fft.irfft(result, n=wide)
@@ -91,11 +93,26 @@ def _results(mix: Mix, a: Tensor) -> int:
     return next(len(m) for m in (mix.u, mix.x, a) if m is not None)
 
 
+def _mixed(mix: Mix, x: Tensor, y: Tensor) -> Tensor:
+    """The spectra of the results."""
+    if not mix.results:
+        return _times(mix.u, _times(mix.x, x) * y)
+    each = y.view(mix.results, len(x), *y.shape[1:])
+    total = x[0] * each[:, 0]
+    for k in range(1, len(x)):
+        total.addcmul_(x[k], each[:, k])
+    return total
+
+
 def _rows(x: Tensor, left: int, wide: int) -> Tensor:
     """Transform the rows, which begin ``left`` of a longer row of zeros."""
-    if left:
-        x = torch.nn.functional.pad(x, (left, 0))
-    spectra: Tensor = torch.fft.rfft(x, n=wide)
+    count, tall, broad = x.shape
+    dtype = torch.complex128 if x.dtype == torch.float64 else torch.complex64
+    spectra = x.new_empty(count, tall, wide // 2 + 1, dtype=dtype)
+    room = x.new_zeros(tall, wide)
+    for plane, spectrum in zip(x, spectra, strict=True):
+        room[:, left : left + broad] = plane
+        torch.fft.rfft(room, out=spectrum)
     return spectra
 
 
