@@ -16,6 +16,7 @@ from neusee.nodes.restore._blurred import Blurred, Size, inverse_colour
 
 _LEAST = 1e-11  #: of the largest number of the matrix: what float64 cannot tell from nothing
 MODES = 1000  #: real unknowns of each of at most three channels; of more, as many as three have,
+_ROWS = 256  #: of the inverse that are read at a time
 SHARE = 24  #: and of a small torus one for so many of its points
 
 
@@ -30,22 +31,28 @@ class Lowest:
         root = gain[:, self.fy, self.fx].double().sqrt()
         root[:, 0] *= 0.5**0.5  # the mean is its own mirror image
         root = torch.cat([root, root[:, 1:]], 1).flatten()
-        matrix = root[:, None] * self._matrix(seen) * root
+        matrix = self._matrix(seen).mul_(root[:, None]).mul_(root)
         matrix.diagonal().add_(_LEAST * matrix.diagonal().max())
-        self.whiten = (_inverse(torch.linalg.cholesky(matrix)) * root).to(gain)
+        whiten = _inverse(torch.linalg.cholesky(matrix)).mul_(root)
+        ends = range(_ROWS, len(whiten) + _ROWS, _ROWS)  # lower triangular: the rest of these rows is 0
+        self.whiten = [whiten[end - _ROWS : end, :end].to(gain, copy=True) for end in ends]
 
     def add(self, slope: Tensor, onto: Tensor) -> Tensor:
         """Add the inverse times `slope` onto a spectrum; give the inner product of both, as pixels."""
-        told = self.whiten @ _real(slope[:, self.fy, self.fx])
-        both = (told @ self.whiten).reshape(len(slope), -1)
+        risen = _real(slope[:, self.fy, self.fx])
+        both, rise = torch.zeros_like(risen), torch.zeros((), dtype=torch.float64, device=slope.device)
+        for some in self.whiten:  # both products while it is in cache
+            told = some @ risen[: some.shape[1]]
+            both[: some.shape[1]] += told @ some
+            rise += told.square().sum(dtype=torch.float64)
+        both = both.reshape(len(slope), -1)
         real, imag = both[:, : len(self.fy)], pad(both[:, len(self.fy) :], (1, 0))
         step = torch.complex(real, imag)
         step[:, 0] *= 2.0
         onto[:, self.fy, self.fx] += step
         mirrored = (self.fx == 0) & (self.fy > 0)
         onto[:, -self.fy[mirrored], 0] += step[:, mirrored].conj()
-        rise: Tensor = told.square().sum(dtype=torch.float64) * (2.0 / (self.torus[0] * self.torus[1]))
-        return rise
+        return rise * (2.0 / (self.torus[0] * self.torus[1]))
 
     def _matrix(self, seen: Blurred) -> Tensor:
         """Prior, noise and glare, for the real parts and then the imaginary ones of each channel, in float64."""
@@ -54,12 +61,13 @@ class Lowest:
         inverse = torch.cat([2.0 * inverse[:1], inverse[1:], inverse[1:]])
         own, shared = inverse_colour(len(transfer), seen.grey)
         colours = own * torch.eye(len(transfer), dtype=torch.float64, device=inverse.device) - shared
-        matrix = torch.einsum("cd,kl->ckdl", colours, inverse.diag())
+        matrix = inverse.new_zeros(len(transfer), len(inverse), len(transfer), len(inverse))
+        matrix.diagonal(dim1=1, dim2=3).copy_(colours[..., None] * inverse)
         for channel, through in enumerate(transfer):
             weight = torch.fft.rfft2(seen.weight[channel].double(), s=seen.torus)
             matrix[channel, :, channel] += self._noise(weight, through)
         size = len(transfer) * len(inverse)
-        return matrix.reshape(size, size) - self._glare(seen, transfer)
+        return self._without_glare(matrix.view(size, size), seen, transfer)
 
     def _noise(self, weight: Tensor, through: Tensor) -> Tensor:
         """How one channel's pixels tell its frequencies: each with each, and each with the mirror image of each."""
@@ -78,31 +86,35 @@ class Lowest:
         values = spectrum[torch.where(far, -fy, fy) % y, torch.where(far, x - fx, fx)]
         return torch.where(far, values.conj(), values)
 
-    def _glare(self, seen: Blurred, transfer: Tensor) -> Tensor | float:
-        """What the unknown strength of each glare takes away."""
+    def _without_glare(self, matrix: Tensor, seen: Blurred, transfer: Tensor) -> Tensor:
+        """Take away, in place, what the unknown strength of each glare hides."""
         if not seen.glare:
-            return 0.0
+            return matrix
         flat = torch.stack(seen.glare).double().flatten(1)
         weighted = seen.weight.double().flatten() * flat
         inverse = torch.linalg.pinv(weighted @ flat.T, hermitian=True) * (2.0 / (self.torus[0] * self.torus[1]))
         shapes = weighted.reshape(-1, *seen.picture.shape)
         spectra = (torch.fft.rfft2(shape, s=seen.torus)[:, self.fy, self.fx] for shape in shapes)
         told = torch.stack([_real(transfer.conj() * s) for s in spectra])
-        taken: Tensor = told.T @ inverse @ told
-        return taken
+        return matrix.addmm_(told.T, inverse @ told, alpha=-1.0)
 
 
 def _inverse(lower: Tensor) -> Tensor:
     """Inverse of a lower triangular matrix, by halves: faster than to solve for the unit matrix."""
+    inverse = torch.zeros_like(lower)
+    _invert(lower, inverse)
+    return inverse
+
+
+def _invert(lower: Tensor, inverse: Tensor) -> None:
     half = len(lower) // 2
     if half < 128:
         unit = torch.eye(len(lower), dtype=lower.dtype, device=lower.device)
-        small: Tensor = torch.linalg.solve_triangular(lower, unit, upper=False)
-        return small
-    inverse = torch.zeros_like(lower)
-    inverse[:half, :half], inverse[half:, half:] = _inverse(lower[:half, :half]), _inverse(lower[half:, half:])
-    inverse[half:, :half] = -inverse[half:, half:] @ (lower[half:, :half] @ inverse[:half, :half])
-    return inverse
+        inverse.copy_(torch.linalg.solve_triangular(lower, unit, upper=False))
+        return
+    _invert(lower[:half, :half], inverse[:half, :half])
+    _invert(lower[half:, half:], inverse[half:, half:])
+    inverse[half:, :half] = (inverse[half:, half:] @ (lower[half:, :half] @ inverse[:half, :half])).neg_()
 
 
 def _real(spectrum: Tensor) -> Tensor:

@@ -143,12 +143,14 @@ def test_it_ends_near_the_answer_as_the_residual_says(channels, single):
         assert far(seen, found, answer) / count < 40 * enough
 
 
-def test_the_lowest_frequencies_are_inverted_exactly(monkeypatch):
+@pytest.mark.parametrize("rows", [50, 1000])
+def test_the_lowest_frequencies_are_inverted_exactly(monkeypatch, rows):
     """With all frequencies but the highest among them, one step is the answer."""
     seen = problem((11, 9), (15, 13), 2, 0.5, hidden=0.3)
     pattern = torch.rand(2, 11, 9, dtype=torch.float64, generator=torch.Generator().manual_seed(5))
     seen = replace(seen, glare=(pattern,))
     monkeypatch.setattr(_lowest, "SHARE", 0.5)
+    monkeypatch.setattr(_lowest, "_ROWS", rows)
     lowest = Lowest(seen, torch.ones_like(seen.transfer.real))
     assert len(lowest.fy) == (15 * 13 + 1) // 2
     slope, found = seen.slope(torch.zeros_like(seen.transfer)), torch.zeros_like(seen.transfer)
