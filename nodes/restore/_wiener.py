@@ -19,6 +19,7 @@ from neusee.nodes.values import Bands, Psf
 
 _FALL = 3.0  #: power of pictures falls with frequency to this power, as that of edges does
 _GREY = 0.95  #: correlation of the channels of pictures
+_ROWS = 64  #: of a picture at a time, of which float64 copies stay in cache
 _LIGHT = 0.999  #: share of the light for which the unknown around the picture has room
 
 
@@ -137,9 +138,18 @@ def _strengths(electrons: Tensor, known: Tensor, glare: list[Tensor]) -> Tensor:
     """A first guess of what the glare adds: least squares beside a constant."""
     if not glare:
         return torch.zeros_like(electrons)
-    flat = torch.stack([(known * (p - _mean(p, known))).flatten() for p in glare]).double()
-    fit = torch.linalg.pinv(flat @ flat.T, hermitian=True) @ (flat @ electrons.double().flatten())
-    total: Tensor = torch.tensordot(fit.to(electrons), torch.stack(glare), 1)
+    means = [_mean(pattern, known) for pattern in glare]
+    products = torch.zeros(len(glare), len(glare) + 1, dtype=torch.float64, device=electrons.device)
+    for channel in range(len(electrons)):
+        for some in range(0, electrons.shape[-2], _ROWS):
+            at = (channel, slice(some, some + _ROWS))
+            flat = [(known[at] * (p[at] - m[channel])).flatten() for p, m in zip(glare, means, strict=True)]
+            every = torch.stack([*flat, electrons[at].flatten()]).double()
+            products += every[:-1] @ every.T
+    fit = (torch.linalg.pinv(products[:, :-1], hermitian=True) @ products[:, -1]).to(electrons)
+    total = torch.zeros_like(electrons)
+    for strength, pattern in zip(fit, glare, strict=True):
+        total = total + strength * pattern
     return total
 
 

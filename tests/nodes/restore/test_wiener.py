@@ -9,7 +9,7 @@ from hypothesis import strategies as st
 
 from neusee.nodes.optics import image
 from neusee.nodes.restore import wiener
-from neusee.nodes.restore._wiener import effective_psf
+from neusee.nodes.restore._wiener import _strengths, effective_psf
 from neusee.nodes.values import Bands, Psf
 
 ONE = torch.ones(1, dtype=torch.float64)
@@ -187,3 +187,16 @@ def test_check_says_what_was_not_seen():
     (line,) = wiener.after(electrons, electrons, None, None, None, None, clipped)
     assert line.text == f"{1 / 16:.2%} not seen, mean 1.00 of the raw"
     assert not wiener.after(electrons * math.nan, electrons, None, None, None, None, clipped)[0].ok
+
+
+def test_the_first_guess_of_the_glare_is_least_squares_beside_a_constant():
+    """Of more rows than are looked at together, in float64 at once."""
+    rng = torch.Generator().manual_seed(0)
+    electrons, one, two = torch.rand(3, 2, 150, 20, generator=rng)
+    known = (torch.rand(2, 150, 20, generator=rng) > 0.2).float()
+    found = _strengths(electrons, known, [one, two])
+    seen = known.double()
+    centred = [p - (seen * p).sum((1, 2), keepdim=True) / seen.sum((1, 2), keepdim=True) for p in (one, two)]
+    design = torch.stack([(seen * c).flatten() for c in centred], 1)
+    fit = torch.linalg.solve(design.T @ design, design.T @ electrons.double().flatten())
+    torch.testing.assert_close(found, (fit[0] * one + fit[1] * two).float(), rtol=1e-5, atol=1e-6)
