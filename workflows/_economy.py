@@ -20,7 +20,7 @@ if TYPE_CHECKING:
     from neusee.nodes import Node
 
 CHANNELS = 0.25  #: share of the tolerance for the channels of one image; the level may follow a second one
-_MIXTURE = 0.05  #: share of the tolerance for a mixture, rounded down to a power of ten so that it is seldom another
+_MIXTURE = 0.1  #: share of the tolerance for a mixture, rounded down to a power of ten so that it is seldom another
 
 
 def economised(recipe: Recipe, wanted: Iterable[str], pinned: Collection[str] = ()) -> Recipe:
@@ -92,7 +92,8 @@ class _Draft:
             "psf": image.wires.get("psf"),
             "rows": self._add(f"{responses}.rows", spectra.rows, {"bands": bands, "responses": responses}, {}, image),
         }
-        self._add(name, node, wires, {**image.params, "within": within}, image)
+        norm = "largest" if any(reader.node.sums is not None for reader in readers) else "rms"
+        self._add(name, node, wires, {**image.params, "within": within, "norm": norm}, image)
         for reader in readers:
             changed = {i: _exchanged(wire, image.name, name) for i, wire in reader.wires.items()}
             self.rewired[reader.name] = replace(reader, wires=changed)

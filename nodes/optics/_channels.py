@@ -1,7 +1,7 @@
 """The image of a scene, summed over its bands before it is formed: few planes in, few out."""
 
 import math
-from typing import Annotated, Any
+from typing import Annotated, Any, Literal
 
 import torch
 from pydantic import Field
@@ -15,23 +15,26 @@ from neusee.nodes.optics._image import Border, image, reach
 from neusee.nodes.optics._passed import passed
 from neusee.nodes.values import Channels, Mixture, Psf
 
+Norm = Literal["largest", "rms"]
 Share = Annotated[float, Field(ge=0, allow_inf_nan=False)]  #: of the brightest pixel
 _TRIES = 3  #: the brightest pixels guessed, known, and all kept
 
 
 @node(rtol=1e-5)
 def image_channels(
-    radiance: Mixture, psf: Psf, rows: Tensor, *, border: Border = "zero", within: Share = 0.0
+    radiance: Mixture, psf: Psf, rows: Tensor, *, border: Border = "zero", within: Share = 0.0, norm: Norm = "largest"
 ) -> Channels:
     """Sum the bands of the image by each row of weights, convolving few planes with few kernels in place of all bands.
 
     Plane i is the sum over k of planes[k] convolved with sum_b rows[i, b] basis[b, k] psf[b]: three planes and three
     rows take 15 transforms where 31 bands take 93. Planes, kernels, bands and the tails of the PSF are left away as
-    far as `within` lets them, whichever saves the most; 0 leaves nothing away.
+    far as `within` lets them, whichever saves the most; 0 leaves nothing away. What it limits is the largest error, or
+    with `rms` its root mean square, for which a scene needs fewer planes.
 
     Shapes: radiance k planes (y, x), psf.intensity (band, any, any), rows (row, band) -> planes (row, y, x).
     Units:  those of the radiance times those of the rows; flux those of the radiance.
-    Error:  `bound`, of the brightest pixel of each row. True bounds: what the mixture leaves, by the sum of each PSF;
+    Error:  `bound`, of the brightest pixel of each row. True bounds: what the mixture leaves, by the sum of each PSF
+            (Young's inequality, as for the root mean square; where the border reflects, three times the scene's);
             tails, by Young's inequality; kernels, by the sum of what they miss. Estimated, not proved: rounding of the
             transforms, from the powers of planes and kernels, some five times what is found. Flux: 1e-6, and what the
             mixture leaves. Gradients reach the planes and the PSF; basis and rows are held still.
@@ -41,15 +44,19 @@ def image_channels(
     planes, intensity = _fitted(radiance, psf, rows)
     unit = rows.detach().abs().amax(1).double().cpu()
     unit = unit.where(unit > 0, 1.0)
-    given = _given(radiance, planes, intensity, rows.detach().double().cpu() / unit[:, None], border, within > 0)
+    scaled = rows.detach().double().cpu() / unit[:, None]
+    given = _given(radiance, planes, intensity, scaled, border, within > 0, norm)
     result, bound, kept = _formed(planes, intensity, given, within)
     wide = bordered(planes, given, (intensity.shape[1], intensity.shape[2]))
     light = flux(wide, intensity, radiance.basis.detach(), given.size)
-    return Channels(result * unit.to(result)[:, None, None], rows.detach().double(), light, bound, kept)
+    largest = bound if norm == "largest" else torch.full_like(bound, math.inf)
+    return Channels(result * unit.to(result)[:, None, None], rows.detach().double(), light, bound, kept, largest)
 
 
 @image_channels.reference
-def _(radiance: Mixture, psf: Psf, rows: Tensor, *, border: Border = "zero", within: float = 0.0) -> Channels:
+def _(
+    radiance: Mixture, psf: Psf, rows: Tensor, *, border: Border = "zero", within: float = 0.0, norm: str = "largest"
+) -> Channels:
     assert image.ref is not None
     cube = torch.tensordot(radiance.basis.double(), radiance.planes.double(), 1)
     bands = image.ref(cube, psf, border=border)
@@ -59,7 +66,7 @@ def _(radiance: Mixture, psf: Psf, rows: Tensor, *, border: Border = "zero", wit
 
 @image_channels.deviates
 def _(result: Channels) -> tuple[float, float]:
-    return float(result.bound), float(result.bound)
+    return float(result.bound), float(result.largest)
 
 
 @image_channels.check
@@ -87,17 +94,24 @@ def _fitted(radiance: Mixture, psf: Psf, rows: Tensor) -> tuple[Tensor, Tensor]:
     return planes.to(dtype), kernel.to(dtype)
 
 
-def _given(radiance: Mixture, planes: Tensor, intensity: Tensor, rows: Tensor, border: Border, cut: bool) -> Given:
-    still = planes.detach()
-    flat = still.flatten(1)
+def _given(
+    radiance: Mixture, planes: Tensor, intensity: Tensor, rows: Tensor, border: Border, cut: bool, norm: Norm
+) -> Given:
+    flat = planes.detach().flatten(1)
     gram = (flat @ flat.T).double().cpu()
+    copies = 9 if border == "reflect" else 1
+    if norm == "rms" and radiance.spread.numel():
+        rest = radiance.spread.double().cpu() * math.sqrt(copies)
+        most = (gram.diagonal() * (1.001 * copies / flat.shape[1])).clamp_min(0).sqrt()
+    else:
+        rest, most = radiance.rest.double().cpu(), torch.maximum(flat.amax(1), -flat.amin(1)).double().cpu()
     return Given(
         rows,
         radiance.basis.detach().double().cpu(),
-        radiance.rest.double().cpu(),
-        torch.maximum(flat.amax(1), -flat.amin(1)).double().cpu(),
+        rest,
+        most,
         gram,
-        9 if border == "reflect" else 1,
+        copies,
         passed(intensity.detach(), cut),
         (planes.shape[1], planes.shape[2]),
         border == "reflect",

@@ -19,8 +19,8 @@ def compress(cube: Tensor, *, within: Share = 1e-6) -> Mixture:
 
     A grey scene has one plane; a linear lift of three colours, where nothing was clipped, has three.
 
-    Shapes: cube (band, y, x) -> planes (k, y, x), basis (band, k), rest (k + 1, band) float64.
-    Units:  planes and rest those of the cube; the basis has none.
+    Shapes: cube (band, y, x) -> planes (k, y, x), basis (band, k), rest and spread (k + 1, band) float64.
+    Units:  planes, rest and spread those of the cube; the basis has none.
     Error:  `rest[k]`, measured on every pixel in float64, is at most `within` times the largest element, but not asked
             to be below eight roundings of the planes. `rest[r]` between none and all: at most five times too large as
             a rule. The gradient holds the basis still.
@@ -41,7 +41,7 @@ def mixture(found: Found, cube: Tensor) -> Mixture:
         planes = torch.tensordot(found.basis.T.to(cube), cube, 1)
     else:
         planes = found.planes.reshape(-1, *cube.shape[-2:])
-    return Mixture(planes, found.basis, found.rest)
+    return Mixture(planes, found.basis, found.rest, found.spread)
 
 
 @compress.reference
@@ -52,7 +52,8 @@ def _(cube: Tensor, *, within: float = 1e-6) -> Mixture:
     most = within * float(left[0].max())
     count = max(1, next((r for r, x in enumerate(left) if float(x.max()) <= most), axes.shape[1]))
     planes = (axes[:, :count].T @ flat).reshape(-1, *cube.shape[1:])
-    return Mixture(planes, axes[:, :count], torch.stack(left[: count + 1]))
+    spread = [(flat - axes[:, :r] @ (axes[:, :r].T @ flat)).square().mean(1).sqrt() for r in range(count + 1)]
+    return Mixture(planes, axes[:, :count], torch.stack(left[: count + 1]), torch.stack(spread))
 
 
 @compress.check

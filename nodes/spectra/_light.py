@@ -77,7 +77,9 @@ def illuminate(
     power = illuminant if times == "once" else illuminant.square()
     if isinstance(reflectance, Mixture):
         basis = reflectance.basis * power.to(reflectance.basis)[:, None]
-        return Mixture(reflectance.planes, basis, reflectance.rest * power.detach().abs().to(reflectance.rest))
+        by = power.detach().abs().to(reflectance.rest)
+        spread = reflectance.spread * by if reflectance.spread.numel() else reflectance.spread
+        return Mixture(reflectance.planes, basis, reflectance.rest * by, spread)
     reflectance = single(reflectance)
     return reflectance * power.to(reflectance)[:, None, None]
 
@@ -101,7 +103,8 @@ def _(reflectance: Tensor | Mixture, illuminant: Tensor, *, times: str = "once")
     if isinstance(reflectance, Mixture):
         basis = torch.stack([row.double() * p for row, p in zip(reflectance.basis, power, strict=True)])
         rest = torch.stack([column * p for column, p in zip(reflectance.rest.T, power, strict=True)], 1)
-        return Mixture(reflectance.planes.double(), basis, rest)
+        spread = [column * p for column, p in zip(reflectance.spread.T, power, strict=False)]
+        return Mixture(reflectance.planes.double(), basis, rest, torch.stack(spread, 1) if spread else rest[:0, :0])
     return torch.stack([reflectance[..., b, :, :].double() * p for b, p in enumerate(power)], -3)
 
 

@@ -30,6 +30,7 @@ class Found(NamedTuple):
     planes: Tensor  #: (k, pixel)
     basis: Tensor  #: (band, k) float64
     rest: Tensor  #: (k + 1, band) float64
+    spread: Tensor  #: (k + 1, band) float64
 
 
 def few_planes(source: Source, within: float) -> Found:
@@ -39,7 +40,8 @@ def few_planes(source: Source, within: float) -> Found:
     """
     most, gram = _looked_at(source)
     scale = float(most.max())
-    if scale > 0 and not 1e-280 < float(gram.amax()) < 1e280:
+    scaled = scale > 0 and not 1e-280 < float(gram.amax()) < 1e280
+    if scaled:
         gram = _looked_at(source, scale)[1]
     axes = torch.linalg.eigh(gram).eigenvectors.flip(1)
     target = max(within, _FLOOR * torch.finfo(source.dtype).eps) * scale
@@ -49,7 +51,9 @@ def few_planes(source: Source, within: float) -> Found:
         k = max(k, _least(sample, axes, target))
         planes, last, worst = _projected(source, axes[:, :k])
         if k == source.bands or float(last.max()) <= target:
-            return Found(planes, axes[:, :k], _rest(most, planes, axes[:, :k], last))
+            rest = _rest(most, planes, axes[:, :k], last)
+            spread = _spread(gram / source.pixels, axes, k, torch.finfo(source.dtype).eps)
+            return Found(planes, axes[:, :k], rest, spread * scale if scaled else spread)
         sample, k = torch.cat([sample, source.part(worst)], 1), k + 1
 
 
@@ -91,6 +95,19 @@ def _projected(source: Source, axes: Tensor) -> tuple[Tensor, Tensor, Tensor]:
             worst = torch.where(top > last, piece.start + left.argmax(1), worst)
             last = torch.maximum(last, top)
     return planes, last, torch.unique(worst)
+
+
+def _spread(power: Tensor, axes: Tensor, count: int, eps: float) -> Tensor:
+    """Root mean square of what the first r planes leave: that of the other axes, and the rounding of the planes.
+
+    ``power``: mean products of the bands. Rounding of the products themselves counts as if it were left too.
+    """
+    each = axes.square() * ((power @ axes) * axes).sum(0).clamp_min(0)
+    after = torch.cat([each.flip(1).cumsum(1).flip(1), torch.zeros_like(each[:, :1])], 1)[:, : count + 1].T
+    total = power.diagonal()
+    double = 64 * torch.finfo(torch.float64).eps * total.sum()
+    planes = torch.arange(count + 1, dtype=total.dtype, device=total.device)[:, None]
+    return (after + double).sqrt() + eps * (planes * total).sqrt()
 
 
 def _rest(most: Tensor, planes: Tensor, basis: Tensor, last: Tensor) -> Tensor:

@@ -1,5 +1,6 @@
 """Sums over the bands of an image: the same as band by band, within their bound, at every extreme."""
 
+import math
 import statistics
 
 import pytest
@@ -124,6 +125,45 @@ def looseness(seed):
     assert error <= float(found.bound), seed
     assert within < 2e-5 or float(found.bound) <= within, seed
     return float(found.bound) / max(error, 1e-300)
+
+
+def rms(found, exact):
+    """The root mean square error of each row's planes over its largest, the worst."""
+    error = (found.double() - exact).square().mean((1, 2)).sqrt()
+    return float(torch.where(error > 0, error / exact.abs().amax((1, 2)), 0.0).amax())
+
+
+def rms_looseness(seed):
+    """The same of the root mean square, which asks for no more planes than the largest error does."""
+    cube, psf, weights, border, within = drawn(seed)
+    scene = compress(cube, within=within / 10)
+    found = image_channels(scene, psf, weights, border=border, within=within, norm="rms")
+    error = rms(found.planes, band_by_band(cube, psf, weights, border))
+    assert error <= float(found.bound), seed
+    assert within < 2e-5 or float(found.bound) <= within, seed
+    assert found.largest == math.inf
+    assert image_channels.deviation(found) == (float(found.bound), math.inf)
+    return float(found.bound) / max(error, 1e-300)
+
+
+def test_bounds_of_the_root_mean_square_hold_and_are_not_loose():
+    assert statistics.median(rms_looseness(seed) for seed in range(30)) < 100
+
+
+@pytest.mark.slow
+def test_bounds_of_the_root_mean_square_hold_over_a_thousand_draws_and_are_not_loose():
+    assert statistics.median(rms_looseness(seed) for seed in range(1000)) < 100
+
+
+def test_where_few_pixels_are_clipped_few_planes_do_for_the_root_mean_square():
+    cube = rand(31, 3).matmul(rand(3, 64 * 64)).reshape(31, 64, 64)
+    cube[:, 5:7, 9] += 0.05 * rand(31, 2, seed=4)
+    psf, scene = spread(31, (30, 30)), compress(cube, within=1e-5)
+    many, few = (image_channels(scene, psf, ROWS, within=3e-3, norm=norm) for norm in ("largest", "rms"))
+    assert int(few.kept[0]) < int(many.kept[0])
+    exact = band_by_band(cube, psf, ROWS)
+    assert rms(few.planes, exact) <= float(few.bound) <= 3e-3
+    assert off(many.planes, exact) <= float(many.largest) == float(many.bound) <= 3e-3
 
 
 def test_bounds_hold_and_are_not_loose():

@@ -23,10 +23,14 @@ def rand(*shape, seed=0, dtype=torch.float32):
     return torch.rand(*shape, generator=seeded(seed), dtype=torch.float64).to(dtype)
 
 
-def left(mixture, cube, r):
+def largest(error):
+    return error.abs().amax((1, 2))
+
+
+def left(mixture, cube, r, norm=largest):
     """What the first r planes leave of each band, in float64."""
     made = torch.tensordot(mixture.basis[:, :r], mixture.planes[:r].double(), 1)
-    return (cube.double() - made).abs().amax((1, 2))
+    return norm(cube.double() - made)
 
 
 def drawn(seed):
@@ -61,6 +65,10 @@ def looseness(seed):
         assert bool((true <= found.rest[r] * (1 + 1e-9)).all())
         lit = true > 1e-12 * float(cube.abs().max())
         ratios += (found.rest[r][lit] / true[lit]).tolist()
+        rms = left(found, cube, r, lambda x: x.square().mean((1, 2)).sqrt())
+        assert bool((rms <= found.spread[r] * (1 + 1e-9)).all())
+        floor = 1e-6 * float(cube.double().square().mean().sqrt()) * len(cube) ** 0.5  # the root of what float64 holds
+        assert bool((found.spread[r] <= 1.01 * rms + floor).all())
     return ratios
 
 
