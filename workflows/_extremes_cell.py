@@ -1,8 +1,8 @@
 """One cell of the grid: a step on the inputs of a case, against float64, forward and gradient.
 
-The reference is the node's own, or the same function on the same inputs in float64; random numbers are drawn
-as the step draws them, so that both see the same. The bound is the node's ``rtol``, over the reference's largest
-element; for a gradient 1e-4 of its largest, or ten times ``rtol`` where that is more.
+The reference is the node's own, or the same function on the same inputs in float64; random numbers are the same.
+The bound is the node's ``rtol``, over the reference's largest element; for a gradient 1e-4 of its largest, or ten
+times ``rtol`` where that is more.
 """
 
 from __future__ import annotations
@@ -46,16 +46,13 @@ class Cell:
     slope_bound: float | None = None
 
 
-class _DrawnInSingle(TorchFunctionMode):
-    """Random numbers as single precision draws them, whatever is asked for."""
+class _CountedInSingle(TorchFunctionMode):
+    """Poisson numbers as of a mean in single precision: of a mean that is another in the last digit they are others."""
 
     def __torch_function__(self, func: Any, types: Any, args: Any = (), kwargs: Any = None) -> Any:
-        kwargs = kwargs or {}
-        if func in (torch.randn, torch.rand) and kwargs.get("dtype") == torch.float64:
-            return func(*args, **kwargs | {"dtype": torch.float32}).double()
         if func is torch.poisson and args[0].dtype == torch.float64:
-            return func(args[0].float(), *args[1:], **kwargs).double()
-        return func(*args, **kwargs)
+            return func(args[0].float(), *args[1:], **(kwargs or {})).double()
+        return func(*args, **(kwargs or {}))
 
 
 def judged(step: Step, inputs: Sequence[Any], case: Case, seed: int) -> Cell | None:
@@ -104,7 +101,7 @@ def _run(step: Step, fn: Any, inputs: Sequence[Any], seed: int, **params: Any) -
 def _in_double(step: Step, inputs: Sequence[Any], seed: int) -> Any:
     wide = [each_tensor(lambda x: x.double() if x.is_floating_point() else x, value) for value in inputs]
     precise = {"precision": "double"} if "precision" in step.params else {}
-    with _DrawnInSingle():
+    with _CountedInSingle():
         return _run(step, step.node.fn, wide, seed, **precise)
 
 

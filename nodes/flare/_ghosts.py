@@ -8,6 +8,7 @@ from pydantic import Field
 from torch import Tensor
 
 from neusee.nodes import Check, Facts, node
+from neusee.nodes._precision import single
 from neusee.nodes.units import Fraction, PositiveLength
 from neusee.nodes.values import Bands
 
@@ -52,6 +53,7 @@ def ghosts(
     if spot.ndim != 3 or spot.shape[0] != bands.centres.numel():
         raise ValueError(f"spot is {tuple(spot.shape)}, bands {bands.centres.numel()}: take both of one laser")
     drawn = _draw(count, spread, radius, rng)
+    spot = single(spot)
     flux = spot.sum(-1).sum(-1, dtype=torch.float64)  # all of it in float64 would be a copy twice as large
     place = tuple(focal_length * n / pixel_pitch for n in direction.tolist())
     total = torch.zeros_like(spot)
@@ -84,7 +86,8 @@ def _colours(drawn: list[_Ghost], wavelengths: Tensor, flux: Tensor) -> list[Ten
     """Gain of each ghost in each band, scaled so that all of them together move exactly the whole flux."""
     raw = [g.share * _reflected(wavelengths, g.tuned[0]) * _reflected(wavelengths, g.tuned[1]) for g in drawn]
     moved = torch.stack(raw).sum(0).mul(flux).sum() if raw else flux.sum()
-    whole = torch.where(moved > 0, flux.sum() / moved, 0.0)
+    dark = moved <= 0  # so that what is not a number is seen
+    whole = torch.where(dark, 0.0, flux.sum() / moved.where(~dark, 1.0))
     return [gain * whole for gain in raw]
 
 

@@ -5,7 +5,7 @@ import math
 import pytest
 import torch
 
-from neusee.nodes import doe, losses, metrics, optics, restore, sensor, spectra
+from neusee.nodes import doe, flare, losses, metrics, optics, restore, sensor, spectra
 from neusee.nodes._precision import refuse_half, refuse_not_finite, single
 from neusee.nodes.doe._material import wave_height
 from neusee.nodes.optics._transform import transform
@@ -349,3 +349,20 @@ def test_the_slope_of_a_psf_without_light_is_finite(blurred):
     dark = torch.full((3, 5, 5), 1e-40)
     slope = slope_of(lambda k: restore.wiener(blurred[0], psf_of(k), *blurred[2:], read_noise=10.5).sum(), dark)
     assert bool(slope.isfinite().all())
+
+
+# --- ghosts -----------------------------------------------------------------------------------------------------------
+
+
+def test_ghosts_of_no_light_have_a_finite_slope_and_those_of_no_number_are_none():
+    def ghosts(x):
+        rng = torch.Generator().manual_seed(1)
+        towards = torch.zeros(2, dtype=torch.float64)
+        return flare.ghosts(x, bands_of(2), towards, focal_length=0.11, pixel_pitch=2.9e-6, rng=rng)
+
+    dark = torch.zeros(2, 32, 32)
+    assert float(ghosts(dark).abs().max()) == 0
+    assert bool(slope_of(lambda x: ghosts(x).sum(), dark).isfinite().all())
+    dark[0, 3, 3] = math.nan
+    assert bool(ghosts(dark).isnan().any())
+    assert ghosts(torch.ones(2, 32, 32, dtype=torch.float16)).dtype == torch.float32

@@ -7,7 +7,8 @@ from dataclasses import replace
 import pytest
 import torch
 
-from neusee.nodes import node
+from neusee.nodes import losses, node
+from neusee.workflows import _extremes_limits
 from neusee.workflows._code import Code
 from neusee.workflows._extremes import CASES, USUAL, Case, Size
 from neusee.workflows._extremes_cell import judged
@@ -16,6 +17,7 @@ from neusee.workflows._figures_stability import number, words
 from neusee.workflows._graph import Step
 from neusee.workflows._marks import Mark
 from neusee.workflows._recipe import load
+from neusee.workflows._steps import find_node
 from neusee.workflows._store import Store
 from neusee.workflows._study_stability import study
 
@@ -122,7 +124,7 @@ def _without_restoration(recipe):
 
 def test_the_study_writes_its_folder_and_counts_what_fails(tmp_path):
     recipe, store, told = _without_restoration(load("laser_free", [])), Store(tmp_path / "store"), []
-    cases = [Case("usual", "as it is", "usual", size=Size(16, 16, 3)), BY_NAME["1 pixel"]]
+    cases = [Case("usual", "as it is", "usual", size=Size(16, 16, 3)), BY_NAME["NaN"]]
     folder = study(recipe, store, tmp_path / "runs", ["neusee"], told.append, cases=cases)
     assert {p.name for p in folder.iterdir()} >= {"report.html", "table.csv", "provenance.json", "figures"}
     assert (folder / "figures/stability.png").read_bytes().startswith(b"\x89PNG")
@@ -144,3 +146,35 @@ def test_words_of_a_cell_say_what_does_not_pass(picture):
     assert number(2.34e-7) == "2e-7"
     assert number(0.0) == "0"
     assert number(float("inf")) == "inf"
+
+
+def test_a_limit_counts_only_as_long_as_the_docstring_states_it(monkeypatch, picture):
+    monkeypatch.setattr(
+        _extremes_limits, "_LIMITS", {("losses.charbonnier", "usual"): (0.5, "by sqrt(epsilon) at most")}
+    )
+    assert _extremes_limits.limit_of(losses.charbonnier, "usual")[0] == 0.5
+    assert _extremes_limits.limit_of(losses.charbonnier, "NaN") is None
+    monkeypatch.setattr(_extremes_limits, "_LIMITS", {("losses.charbonnier", "usual"): (0.5, "whatever it is")})
+    assert _extremes_limits.limit_of(losses.charbonnier, "usual") is None
+
+
+def test_a_step_off_its_bound_within_a_stated_limit_warns(monkeypatch, picture):
+    limit = (1.0, "said here")
+    monkeypatch.setattr("neusee.workflows._extremes_cell.limit_of", lambda node, case: limit)
+    cell = judged(step_of(cancelling), [picture], USUAL, 0)
+    assert (cell.mark, cell.note, cell.bound) == ("warn", "said here", 1.0)
+
+
+def test_what_every_node_states_it_still_states():
+    for path, case in _extremes_limits._STATED:
+        assert _extremes_limits.stated_of(find_node(path), case) is not None
+    for path, case in _extremes_limits._LIMITS:
+        assert _extremes_limits.limit_of(find_node(path), case) is not None
+
+
+def test_poisson_numbers_are_the_same_in_both_precisions(picture):
+    @node()
+    def counted(x: torch.Tensor, *, rng: torch.Generator) -> torch.Tensor:
+        return torch.poisson(100.1 * x, generator=rng)
+
+    assert judged(step_of(counted), [picture], USUAL, 0).mark == "pass"
