@@ -44,7 +44,7 @@ def photon_noise(
     counts = single(photons).clamp_min(0) * (quantum_efficiency if drawn_in == "electrons" else 1.0)
     fluctuation = _poisson(counts, rng) if distribution == "poisson" else _gaussian(counts, rng)
     kept = mean_shift if mean == "literal" else 1.0 + mean_shift
-    detected = (kept * counts + spread * fluctuation).clamp_min(0)
+    detected = (kept * counts).add_(spread * fluctuation).clamp_min(0)
     return detected if drawn_in == "electrons" else detected * quantum_efficiency
 
 
@@ -58,7 +58,8 @@ def _(*, mean: str = "additive", mean_shift: float = 0.0, **params: object) -> l
 @photon_noise.check
 def _(result: Tensor, photons: Tensor, **params: Any) -> list[Check]:
     low, high = float(photons.min()), float(photons.max())
-    return [Check(f"mean {float(result.mean(dtype=torch.float64)):.4g} e-", low >= -1e-4 * max(high, 1.0))]
+    mean = float(result.sum(-1).sum(dtype=torch.float64)) / max(1, result.numel())
+    return [Check(f"mean {mean:.4g} e-", low >= -1e-4 * max(high, 1.0))]
 
 
 @photon_noise.carries
@@ -80,6 +81,8 @@ def _(photons: Deviation, *, result: Facts, quantum_efficiency: float, spread: f
 
 def _gaussian(counts: Tensor, rng: Generator) -> Tensor:
     lit = ~(counts <= _DARK)  # so that what is not a number is seen
+    if not counts.requires_grad:
+        return normal(counts, rng).mul_(counts.where(lit, 0.0).sqrt_())
     sigma = counts.where(lit, 1.0).sqrt().where(lit, 0.0)  # the square root has no slope at 0
     return sigma * normal(counts, rng)
 
@@ -138,7 +141,7 @@ def read_noise(
     Source: NeuSee, section Sensor Image; Janesick, Photon Transfer, SPIE PM170 (2007).
     """
     electrons = single(electrons)
-    return electrons + (pedestal + sigma * normal(electrons, rng))
+    return electrons + normal(electrons, rng).mul_(sigma).add_(pedestal)
 
 
 @read_noise.negligible
