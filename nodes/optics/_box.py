@@ -24,22 +24,19 @@ def flux(planes: Tensor, intensity: Tensor, basis: Tensor, size: tuple[int, int]
 
 
 def _boxes(plane: Tensor, kernel: torch.Size, size: tuple[int, int]) -> Tensor:
-    """By sample of the PSF, the sum of the plane over what that sample brings into the field: (m, n) float64.
+    """By sample of the PSF, the sum of the plane over what that sample brings into the field: (m, n).
 
-    Turned by half a turn, the plane has its boxes in the order of the samples.
+    Turned by half a turn, the plane has its boxes in the order of the samples. It is summed in float64, some rows at a
+    time: in whole planes of it, fresh memory takes longer than the sums.
     """
-    across = _along(plane.flip(0, 1).cumsum(1, dtype=torch.float64), 1, kernel[1], size[1])
-    return _along(_down(across), 0, kernel[0], size[0])
-
-
-def _down(plane: Tensor) -> Tensor:
-    """Sums from the top, row by row in place: ``cumsum`` takes ten times as long across rows."""
-    if plane.requires_grad:
-        return plane.cumsum(0)
-    rows = plane.unbind(0)
-    for above, row in zip(rows, rows[1:], strict=False):
-        row.add_(above)
-    return plane
+    above = torch.ones(_ROWS, _ROWS, dtype=torch.float64, device=plane.device).tril()
+    down, parts = plane.new_zeros(kernel[1], dtype=torch.float64), []
+    for end in range(len(plane), 0, -_ROWS):
+        rows = plane[max(0, end - _ROWS) : end].flip(0, 1).cumsum(1, dtype=torch.float64)
+        sums = above[: len(rows), : len(rows)] @ _along(rows, 1, kernel[1], size[1]) + down
+        down = sums[-1]
+        parts.append(sums.to(plane.dtype))
+    return _along(torch.cat(parts), 0, kernel[0], size[0])
 
 
 def _along(sums: Tensor, dim: int, kernel: int, size: int) -> Tensor:

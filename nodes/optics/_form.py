@@ -39,7 +39,8 @@ def _kernels(intensity: Tensor, plan: Plan) -> Tensor:
     weights = plan.kernels.new_zeros(len(plan.kernels), len(stack))
     weights = weights.index_copy_(1, plan.bands, plan.kernels).to(stack)
     if stack.requires_grad or stack.is_contiguous():
-        return torch.tensordot(weights, stack, 1)
+        kernels: Tensor = torch.tensordot(weights, stack, 1)
+        return kernels
     sums = stack.new_empty(len(weights), *plan.window)
     for y in range(0, plan.window[0], _SOME):
         rows = stack[:, y : y + _SOME]

@@ -12,7 +12,7 @@ from torch import Tensor
 
 Corner = tuple[int, int]
 
-_COLUMNS = 32  #: of each spectrum at a time; in a GPU all
+_COLUMNS = 16  #: of each spectrum at a time; in a GPU all
 
 
 class Mix(NamedTuple):
@@ -75,13 +75,13 @@ def summed(a: Tensor, b: Tensor, mix: Mix, where: Where) -> Tensor:
 
 def _summed(a: Tensor, b: Tensor, mix: Mix, where: Where) -> Tensor:
     mix, (high, wide) = mix.to(a), where.length
-    one, two = _rows(a, where.at_a[1], wide), _rows(b, where.at_b[1], wide)
     columns = wide // 2 + 1
     step = columns if a.is_cuda else min(columns, _COLUMNS)
-    first, second = _Columns(one, where.at_a[0], high, step), _Columns(two, where.at_b[0], high, step)
-    result = one.new_empty(_results(mix, a), where.size[0], columns)
-    for c in range(0, columns, step):
-        x, y = first.spectra(c), _times(mix.y, second.spectra(c))
+    one = _Columns(_rows(a, where.at_a[1], wide, step), where.at_a[0], high)
+    two = _Columns(_rows(b, where.at_b[1], wide, step), where.at_b[0], high)
+    result = one.room.new_empty(_results(mix, a), where.size[0], columns)
+    for i, c in enumerate(range(0, columns, step)):
+        x, y = one.spectra(i), _times(mix.y, two.spectra(i))
         found = torch.fft.ifft(_mixed(mix, x, y.conj() if where.conjugate else y))
         found = found[:, : columns - c, where.at[0] : where.at[0] + where.size[0]]
         result[:, :, c : c + step] = found.transpose(1, 2)
@@ -104,31 +104,38 @@ def _mixed(mix: Mix, x: Tensor, y: Tensor) -> Tensor:
     return total
 
 
-def _rows(x: Tensor, left: int, wide: int) -> Tensor:
-    """Transform the rows, which begin ``left`` of a longer row of zeros."""
+def _rows(x: Tensor, left: int, wide: int, step: int) -> Tensor:
+    """Transform the rows, which begin ``left`` of a longer row of zeros: (plane, block, row, ``step`` columns).
+
+    A block of columns lies in one piece: read from rows 12 kB apart, each element would need a page of its own.
+    """
     count, tall, broad = x.shape
-    dtype = torch.complex128 if x.dtype == torch.float64 else torch.complex64
-    spectra = x.new_empty(count, tall, wide // 2 + 1, dtype=dtype)
+    whole, more = divmod(wide // 2 + 1, step)
     room = x.new_zeros(tall, wide)
-    for plane, spectrum in zip(x, spectra, strict=True):
+    spectrum: Tensor = torch.fft.rfft(room)
+    blocks = spectrum.new_empty(count, whole + (more > 0), tall, step)
+    if more:
+        blocks[:, whole, :, more:] = 0.0
+    for plane, block in zip(x, blocks, strict=True):
         room[:, left : left + broad] = plane
         torch.fft.rfft(room, out=spectrum)
-    return spectra
+        block[:whole] = spectrum[:, : whole * step].view(tall, whole, step).transpose(0, 1)
+        block[whole:, :, :more] = spectrum[:, whole * step :]
+    return blocks
 
 
 class _Columns:
-    """Some columns at a time, each in one piece, in memory that is used again: fresh memory costs more than they do."""
+    """A block of columns at a time, each in one piece, in memory used again: fresh memory costs more than they do."""
 
-    def __init__(self, rows: Tensor, top: int, high: int, step: int) -> None:
-        self.rows, self.step = rows, step
-        self.room = rows.new_zeros(len(rows), step, high)
-        self.inside = self.room[..., top : top + rows.shape[1]]
+    def __init__(self, blocks: Tensor, top: int, high: int) -> None:
+        self.blocks = blocks
+        self.room = blocks.new_zeros(len(blocks), blocks.shape[3], high)
+        self.inside = self.room[..., top : top + blocks.shape[2]]
         self.found = torch.empty_like(self.room)
 
-    def spectra(self, first: int) -> Tensor:
-        """Transform columns from ``first`` on: (plane, column, frequency); beyond the last, those of before."""
-        some = self.rows[:, :, first : first + self.step].transpose(1, 2)
-        self.inside[:, : some.shape[1]] = some
+    def spectra(self, block: int) -> Tensor:
+        """Transform the columns of a block: (plane, column, frequency)."""
+        self.inside.copy_(self.blocks[:, block].transpose(1, 2))
         torch.fft.fft(self.room, out=self.found)
         return self.found
 
