@@ -54,7 +54,7 @@ def told(point: Point) -> str:
     """One line of progress."""
     name = f"{point.trial.line} {point.trial.label}".strip()
     if point.found.refused:
-        return f"{name}: cannot be: {point.found.refused}"
+        return f"{name}: {point.found.refused}"
     return f"{name}: {point.seconds:.3g} s, error {point.error:.2g}"
 
 
