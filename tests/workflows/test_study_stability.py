@@ -142,7 +142,7 @@ def test_the_study_writes_its_folder_and_counts_what_fails(tmp_path):
 
 def test_words_of_a_cell_say_what_does_not_pass(picture):
     cell = judged(step_of(cancelling), [picture], USUAL, 0)
-    assert words(cell).startswith("× ")
+    assert words(cell).startswith("×")
     assert number(2.34e-7) == "2e-7"
     assert number(0.0) == "0"
     assert number(float("inf")) == "inf"
