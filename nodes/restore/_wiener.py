@@ -12,6 +12,7 @@ from torch.nn.functional import avg_pool2d, pad
 from neusee.nodes import Check, node
 from neusee.nodes._precision import refuse_not_finite, single
 from neusee.nodes.restore._blurred import Blurred, variance
+from neusee.nodes.restore._descend import pieces
 from neusee.nodes.restore._unseen import most_likely, torus
 from neusee.nodes.sensor._digital import crop
 from neusee.nodes.units import Electrons
@@ -105,13 +106,22 @@ def _restored(
     size = torus((y, x), edge(kernels, (y, x)))
     transfer, power = torch.fft.rfft2(wrapped(kernels, size)), fall(size).to(kernels)
     seen = _mean((picture - mean).square(), known)
-    passed = torch.stack([variance((t.real.square() + t.imag.square()) * power, size) for t in transfer])[:, None, None]
+    passed = _passed(transfer, power, size)
     scale = (torch.maximum(seen - mean - read**2, 0.01 * seen) / passed.clamp_min(1e-6)).clamp_min(1e-6).sqrt()
     weight = known * (scale / (balance * noise).sqrt()).square()
     scaled = tuple(pattern / scale for pattern in glare)
     spectrum = most_likely(Blurred((picture - mean) / scale, weight, transfer, power, size, _GREY, scaled))
     sharp = torch.stack([torch.fft.irfft2(s, s=size)[:y, :x] for s in spectrum])  # at once takes twice as long
     return sharp * scale + mean / kernels.sum((-2, -1)).clamp_min(1e-3)[:, None, None]
+
+
+def _passed(transfer: Tensor, power: Tensor, size: tuple[int, int]) -> Tensor:
+    """Variance of a blurred picture: (channel, 1, 1); by rows, for its spectrum is large."""
+    total = power.new_zeros(len(transfer))
+    for rows in pieces(transfer):
+        through = transfer[:, rows]
+        total = total + variance((through.real.square() + through.imag.square()) * power[rows], size)
+    return total[:, None, None]
 
 
 def _noise(electrons: Tensor, mean: Tensor, read: float) -> Tensor:
@@ -157,8 +167,9 @@ def fall(size: tuple[int, int]) -> Tensor:
     """Power of pictures by frequency, half a spectrum of mean 1."""
     fy, fx = (torch.fft.fftfreq(n, dtype=torch.float64) for n in size)
     squared = fy[:, None].square() + fx[None, : size[1] // 2 + 1].square() + 1.0 / (size[0] * size[1])
-    power: Tensor = squared ** (-_FALL / 2.0)
-    return power / variance(power, size)
+    power: Tensor = squared.pow_(-_FALL / 2.0)
+    power /= variance(power, size)
+    return power
 
 
 def edge(kernels: Tensor, picture: tuple[int, int]) -> tuple[int, int]:
