@@ -106,7 +106,7 @@ def pictures(recipe: Recipe, points: Sequence[Point], tried: Sequence[StepTried]
     sound = [p for p in points if p.sound]
     found = {}
     if sound:
-        line = [(p.seconds, p.most) for p in front(sound)]
+        line = [(p.seconds, p.error) for p in front(sound)]
         title = f"{recipe.name}: error against run time"
         found["work_precision"] = work_precision(_lines(recipe, sound), line, recipe.tolerance, title)
     asked = [p for p in sound if p.trial.value is not None]
@@ -243,7 +243,8 @@ def table(points: Sequence[Point], tried: Sequence[StepTried]) -> Iterator[tuple
 def _lines(recipe: Recipe, points: Sequence[Point]) -> list[Line]:
     names = dict.fromkeys(p.trial.line for p in points)
     lines = {name: [_dot(p, p.trial.recipe is recipe) for p in points if p.trial.line == name] for name in names}
-    return [Line(name, dots, strong=name == TOLERANCE) for name, dots in lines.items()]
+    turned = (n for n in names if any(p.trial.recipe is not recipe for p in points if p.trial.line == n))
+    return [Line(name, lines[name], strong=name == TOLERANCE) for name in turned]
 
 
 def _dot(p: Point, own: bool) -> Dot:

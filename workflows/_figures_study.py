@@ -88,7 +88,7 @@ def steps(diagrams: Sequence[tuple[str, Sequence[Line], float]]) -> Any:
 
 
 @drawn
-def promises(asked: Sequence[float], measured: dict[str, Sequence[float]], proved: Sequence[float | None]) -> Any:
+def promises(asked: Sequence[float], measured: Mapping[str, Sequence[float]], proved: Sequence[float | None]) -> Any:
     """What each tolerance gave, output by output, and what was proved, against what was asked."""
     figure, axes = canvas(8.4, 5.0)
     ax = axes[0, 0]
