@@ -17,9 +17,10 @@ def flux(planes: Tensor, intensity: Tensor, basis: Tensor, size: tuple[int, int]
     if torch.is_grad_enabled() and (planes.requires_grad or intensity.requires_grad):
         brought = torch.einsum("byx,kyx->bk", intensity, boxes).double()
     else:
-        brought = basis.new_zeros(len(intensity), len(planes), device=intensity.device)
+        brought = basis.new_zeros(len(planes), len(intensity), device=intensity.device)
         for y in range(0, intensity.shape[1], _ROWS):
-            brought += intensity[:, y : y + _ROWS].flatten(1) @ boxes[:, y : y + _ROWS].flatten(1).T
+            brought += boxes[:, y : y + _ROWS].flatten(1) @ intensity[:, y : y + _ROWS].flatten(1).T
+        brought = brought.T
     return (brought * basis.to(brought)).sum(1)
 
 

@@ -2,7 +2,7 @@
 
 from neusee.nodes.spectra._bands import bands, filters, line
 from neusee.nodes.spectra._compress import compress
-from neusee.nodes.spectra._lift import lift_lmmse, lift_mallett
+from neusee.nodes.spectra._lift import lift_lmmse, lift_lmmse_mixture, lift_mallett, lift_mallett_mixture
 from neusee.nodes.spectra._lift_mst import lift_mst_plus_plus
 from neusee.nodes.spectra._light import illuminant, illuminate
 from neusee.nodes.spectra._responses import responses
@@ -15,7 +15,9 @@ __all__ = [
     "illuminant",
     "illuminate",
     "lift_lmmse",
+    "lift_lmmse_mixture",
     "lift_mallett",
+    "lift_mallett_mixture",
     "lift_mst_plus_plus",
     "line",
     "responses",

@@ -1,14 +1,17 @@
 """From three channels to a spectrum, linearly."""
 
 import functools
+from typing import Any
 
 import torch
 from torch import Tensor
 
 from neusee.nodes import Check, node
 from neusee.nodes._precision import single
+from neusee.nodes.spectra._compress import Share, compress, mixture
+from neusee.nodes.spectra._planes import Source, few_planes
 from neusee.nodes.spectra._tables import mallett, paints, to_srgb
-from neusee.nodes.values import Bands
+from neusee.nodes.values import Bands, Mixture
 
 _FIRST, _LAST = 380e-9, 780e-9  #: m, where measured reflectances and the basis are known
 
@@ -34,6 +37,34 @@ def _(rgb: Tensor, bands: Bands) -> Tensor:
 @lift_mallett.check
 def _(result: Tensor, rgb: Tensor, bands: Bands) -> list[Check]:
     return lift_checks(result, rgb, bands, _basis(bands))
+
+
+@node(rtol=1e-6)
+def lift_mallett_mixture(rgb: Tensor, bands: Bands, *, within: Share = 1e-6) -> Mixture:
+    """Give the reflectance of `lift_mallett` as few planes, some pixels at a time: the cube is never in memory.
+
+    Shapes: rgb (3, y, x) -> planes (k, y, x), basis (band, k), rest and spread (k + 1, band) float64.
+    Units:  planes, rest and spread those of reflectance; the basis has none.
+    Error:  as `spectra.compress` of the lift in float64, which `lift_mallett` is within a few of its own roundings.
+    Raises: ValueError as `lift_mallett` and `spectra.compress`.
+    Source: as `lift_mallett`.
+    """
+    return _mixed(rgb, _basis(bands), within)
+
+
+@lift_mallett_mixture.reference
+def _(rgb: Tensor, bands: Bands, *, within: float = 1e-6) -> Mixture:
+    cube = torch.einsum("bc,cyx->byx", _basis(bands).to(rgb.device), rgb.double()).clamp_min(0)
+    found: Mixture = compress.ref(cube, within=within) if compress.ref else compress(cube, within=within)
+    return found
+
+
+@lift_mallett_mixture.check
+def _(result: Mixture, *inputs: Any, **params: Any) -> list[Check]:
+    return list(compress.after(result)) if compress.after else []
+
+
+lift_mallett.mixed = lift_mallett_mixture
 
 
 @node(rtol=1e-5)
@@ -62,6 +93,34 @@ def _(result: Tensor, rgb: Tensor, bands: Bands) -> list[Check]:
     return lift_checks(result, rgb, bands, _estimator(bands))
 
 
+@node(rtol=1e-6)
+def lift_lmmse_mixture(rgb: Tensor, bands: Bands, *, within: Share = 1e-6) -> Mixture:
+    """Give the reflectance of `lift_lmmse` as few planes, some pixels at a time: the cube is never in memory.
+
+    Shapes: rgb (3, y, x) -> planes (k, y, x), basis (band, k), rest and spread (k + 1, band) float64.
+    Units:  planes, rest and spread those of reflectance; the basis has none.
+    Error:  as `spectra.compress` of the lift in float64, which `lift_lmmse` is within a few of its own roundings.
+    Raises: ValueError as `lift_lmmse` and `spectra.compress`.
+    Source: as `lift_lmmse`.
+    """
+    return _mixed(rgb, _estimator(bands), within)
+
+
+@lift_lmmse_mixture.reference
+def _(rgb: Tensor, bands: Bands, *, within: float = 1e-6) -> Mixture:
+    cube = torch.einsum("bc,cyx->byx", _estimator(bands).to(rgb.device), rgb.double()).clamp_min(0)
+    found: Mixture = compress.ref(cube, within=within) if compress.ref else compress(cube, within=within)
+    return found
+
+
+@lift_lmmse_mixture.check
+def _(result: Mixture, *inputs: Any, **params: Any) -> list[Check]:
+    return list(compress.after(result)) if compress.after else []
+
+
+lift_lmmse.mixed = lift_lmmse_mixture
+
+
 def lift_checks(result: Tensor, rgb: Tensor, bands: Bands, matrix: Tensor | None = None) -> list[Check]:
     """What was clipped, and how far the spectra are from the colours they came from, on some 65 000 pixels."""
     step = max(1, rgb[0].numel() // 65536)
@@ -87,6 +146,15 @@ def _lifted(rgb: Tensor, matrix: Tensor) -> Tensor:
     needs_rgb(rgb)
     rgb = single(rgb)
     return torch.relu_(matrix.to(rgb) @ rgb.flatten(1)).reshape(-1, *rgb.shape[1:])
+
+
+def _mixed(rgb: Tensor, matrix: Tensor, within: float) -> Mixture:
+    """The planes; a learnt picture is lifted whole, so that its gradient flows."""
+    needs_rgb(rgb)
+    flat, exact = rgb.detach().flatten(1), matrix.to(rgb.device)
+    dtype = rgb.dtype if rgb.dtype == torch.float64 else torch.float32
+    source = Source(lambda part: (exact @ flat[:, part].double()).clamp_min_(0), len(exact), flat.shape[1], dtype)
+    return mixture(few_planes(source, within), _lifted(rgb, matrix) if rgb.requires_grad else rgb)
 
 
 def _basis(bands: Bands) -> Tensor:

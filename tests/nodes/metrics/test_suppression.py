@@ -8,7 +8,8 @@ from hypothesis import strategies as st
 from neusee.nodes.metrics import bsr, lsr, peak, saturated
 from neusee.nodes.optics import spot
 from neusee.nodes.sensor import digitize, expose, full_well, level, saturation
-from neusee.nodes.values import Bands, Psf
+from neusee.nodes.spectra import rows
+from neusee.nodes.values import Bands, Channels, Psf
 
 SENSOR = {"full_well": 25500.0, "quantum_efficiency": 0.56, "pixel_pitch": 2.9e-6, "exposure": 0.1}
 
@@ -96,3 +97,25 @@ def test_every_spot_needs_its_line():
 
 def test_a_level_of_zero_is_dark():
     assert float(peak(torch.ones(1, 2, 2), bands(5e-7), torch.zeros(1), **SENSOR).irradiance) == 0.0
+
+
+def channels(light, weights):
+    """Sums over the bands of an image, as `optics.image_channels` gives them."""
+    return Channels(torch.tensordot(weights.to(light), light, 1), weights, light.sum((1, 2)).double(), torch.zeros(()))
+
+
+def test_peak_and_bsr_of_channels_are_those_of_all_bands():
+    visible, seen = bands(450e-9, 520e-9, 600e-9), torch.tensor([[0.1, 0.9, 0.2]], dtype=torch.float64)
+    scene, kept = torch.rand(3, 6, 7, dtype=torch.float64), torch.rand(3, 6, 7, dtype=torch.float64)
+    both = [channels(x, rows(visible, seen)) for x in (scene, kept)]
+    factor = level(scene, visible, seen, strength=0.7, **SENSOR)
+    laser = torch.rand(3, 6, 7, dtype=torch.float64)
+    found = [peak(x, visible, factor, [laser], [visible], **SENSOR) for x in (scene, both[0])]
+    torch.testing.assert_close(*found, rtol=1e-12, atol=0)
+    torch.testing.assert_close(bsr(both[1], both[0]), bsr(kept, scene), rtol=1e-12, atol=0)
+    torch.testing.assert_close(bsr(kept, both[0]), bsr(kept, scene), rtol=1e-12, atol=0)
+    with pytest.raises(ValueError, match="differ in shape"):
+        bsr(both[0], scene[:, :3])
+    with pytest.raises(ValueError, match="lies outside its rows"):
+        peak(channels(scene, rows(visible, seen)[:1]), visible, factor, **SENSOR)
+    assert (peak.channels, peak.even, bsr.channels) == (("image",), ("level",), ("image", "plain_image"))

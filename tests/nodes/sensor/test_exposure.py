@@ -6,7 +6,8 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from neusee.nodes.sensor import expose, gather, level, saturation
-from neusee.nodes.values import Bands
+from neusee.nodes.spectra import rows
+from neusee.nodes.values import Bands, Channels
 
 SHUTTER = {"pixel_pitch": 2.9e-6, "exposure": 0.1}
 SENSOR = {"full_well": 25500.0, "quantum_efficiency": 0.56, **SHUTTER}
@@ -99,3 +100,68 @@ def test_checks():
     assert expose.after(torch.ones(3, 2, 2))[0].ok
     assert not expose.after(torch.tensor([-1.0, 1.0]))[0].ok
     assert "scene alone 1" in gather.after(torch.full((3, 1, 1), 4.0), torch.ones(3, 1, 1), [])[0].text
+
+
+def channels(light, weights):
+    """Sums over the bands of an image, as `optics.image_channels` gives them."""
+    return Channels(torch.tensordot(weights.to(light), light, 1), weights, light.sum((1, 2)).double(), torch.zeros(()))
+
+
+def test_channels_give_the_photons_and_the_level_of_all_bands():
+    light = scene(6, 7, dtype=torch.float64)
+    summed = channels(light, rows(BANDS, RESPONSES))
+    factors = [level(x, BANDS, RESPONSES, strength=0.7, **SENSOR) for x in (light, summed)]
+    torch.testing.assert_close(*factors, rtol=1e-12, atol=0)
+    for factor in (None, factors[0]):
+        found = [expose(x, BANDS, RESPONSES, factor, **SHUTTER) for x in (summed, light)]
+        torch.testing.assert_close(*found, rtol=1e-12, atol=0)
+        torch.testing.assert_close(
+            expose.ref(summed, BANDS, RESPONSES, factor, **SHUTTER), found[1], rtol=1e-12, atol=0
+        )
+
+
+def test_channels_in_single_precision_and_of_rows_that_say_the_same_twice():
+    light = scene(6, 7)
+    twice = torch.cat([rows(BANDS, RESPONSES)] * 2)
+    found = expose(channels(light, twice), BANDS, RESPONSES, **SHUTTER)
+    assert found.dtype == torch.float32
+    torch.testing.assert_close(found, expose(light, BANDS, RESPONSES, **SHUTTER), rtol=1e-5, atol=0)
+
+
+def test_channels_of_other_weights_are_refused():
+    summed = channels(scene(2, 2), rows(BANDS, RESPONSES))
+    with pytest.raises(ValueError, match="lies outside its rows"):
+        expose(summed, BANDS, RESPONSES, torch.linspace(1, 2, 5), **SHUTTER)
+    with pytest.raises(ValueError, match="lies outside its rows"):
+        expose(summed, BANDS, RESPONSES + 1e-6 * torch.eye(3, 5), **SHUTTER)
+    with pytest.raises(ValueError, match="per_band needs the peak of each band"):
+        level(summed, BANDS, RESPONSES, strength=0.7, rule="per_band", **SENSOR)
+    fewer = Bands(*(v[:4] for v in BANDS))
+    with pytest.raises(ValueError, match="same `bands` step"):
+        expose(summed, fewer, RESPONSES[:, :4], **SHUTTER)
+
+
+def test_darkness_of_a_level_of_zero_reaches_channels():
+    summed = channels(scene(2, 2), rows(BANDS, RESPONSES))
+    assert not bool(expose(summed, BANDS, RESPONSES, torch.zeros(5), **SHUTTER).any())
+
+
+def test_gradients_through_channels():
+    weights = rows(BANDS, RESPONSES)
+    planes, factor = (
+        (weights @ scene(3, 3, dtype=torch.float64).flatten(1)).reshape(4, 3, 3),
+        torch.ones((), dtype=torch.float64),
+    )
+    summed = channels(scene(3, 3, dtype=torch.float64), weights)
+
+    def photons(planes, factor):
+        return expose(summed._replace(planes=planes * 1e-3), BANDS, RESPONSES, factor.expand(5), **SHUTTER)
+
+    assert torch.autograd.gradcheck(photons, (planes.requires_grad_(), factor.requires_grad_()))
+
+
+def test_nodes_say_which_inputs_may_be_channels():
+    assert (expose.channels, expose.even, level.channels) == (("irradiance",), ("level",), ("plain_image",))
+    assert level.sums({"rule": "channel_sum"})
+    assert level.sums({})
+    assert not level.sums({"rule": "per_band"})

@@ -7,7 +7,7 @@ import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from neusee.nodes.spectra import bands, compress, illuminate, lift_lmmse, responses, rows
+from neusee.nodes.spectra import bands, compress, illuminate, lift_lmmse, lift_mallett, responses, rows
 from neusee.nodes.spectra._lift import _estimator
 from neusee.nodes.values import Bands, Mixture
 
@@ -232,3 +232,25 @@ def test_the_matrix_of_a_lift_is_the_basis_of_its_cube():
     matrix = _estimator(SCENE)
     inside = found.basis @ (found.basis.T @ matrix)
     torch.testing.assert_close(inside, matrix, rtol=0, atol=1e-4)
+
+
+@pytest.mark.parametrize("lift", [lift_lmmse, lift_mallett], ids=lambda n: n.path)
+@pytest.mark.parametrize("within", [1e-6, 1e-2])
+def test_a_lift_to_planes_is_the_lift_whether_clipped_or_not(lift, within):
+    for colours in (rand(3, 60, 61), 0.5 + 0.01 * rand(3, 60, 61)):
+        cube, found = lift(colours, SCENE), lift.mixed(colours, SCENE, within=within)
+        lost = left(found, cube, len(found.planes))
+        assert bool((lost <= found.rest[-1] + 1e-6).all())
+        assert float(found.rest[-1].max()) <= within * float(cube.max())
+        assert len(found.planes) == len(compress(cube, within=within).planes)
+        assert len(found.planes) == len(lift.mixed.ref(colours, SCENE, within=within).planes)
+    assert "planes for 31 bands" in lift.mixed.after(found)[0].text
+
+
+def test_a_lift_to_planes_learns_and_refuses_what_is_no_picture():
+    colours = rand(3, 2, 2, dtype=torch.float64).requires_grad_()
+    found = lift_lmmse.mixed(colours, SCENE)
+    found.planes.square().sum().backward()
+    assert bool((colours.grad != 0).any())
+    with pytest.raises(ValueError, match="three channels"):
+        lift_lmmse.mixed(rand(4, 2, 2), SCENE)
