@@ -344,7 +344,6 @@ def test_a_diagram_is_drawn_of_errors_that_are_zero(tmp_path):
     dots = [Dot(1.0, 0.0, "exact"), Dot(0.1, 1e-3, "1e-3", 5e-4, 2e-3, own=True)]
     picture = work_precision([Line("tolerance", dots)], [(0.1, 1e-3), (1.0, EXACT / 2)], 1e-3, "title")
     assert picture.startswith(b"\x89PNG")
-    assert picture == work_precision([Line("tolerance", dots)], [(0.1, 1e-3), (1.0, EXACT / 2)], 1e-3, "title")
 
 
 @pytest.mark.slow
