@@ -46,6 +46,10 @@ class Cell:
     slope_bound: float | None = None
 
 
+class _Refused(Exception):
+    """The step itself says that it cannot use what it is given."""
+
+
 class _CountedInSingle(TorchFunctionMode):
     """Poisson numbers as of a mean in single precision: of a mean that is another in the last digit they are others."""
 
@@ -61,11 +65,9 @@ def judged(step: Step, inputs: Sequence[Any], case: Case, seed: int) -> Cell | N
     if given is None:
         return None
     try:
-        if case.expect == "seen":
-            return _seen(step, inputs, given, case, seed)
-        return _compared(step, given, case, seed)
-    except ValueError as error:
-        return Cell("pass", f"refused: {error}")
+        return _seen(step, inputs, given, case, seed) if case.expect == "seen" else _compared(step, given, case, seed)
+    except _Refused as refused:
+        return Cell("pass", f"refused: {refused}")
     except Exception as error:
         return Cell("fail", f"{type(error).__name__}: {str(error).splitlines()[0]}")
 
@@ -76,12 +78,12 @@ def _given(step: Step, inputs: Sequence[Any], case: Case) -> list[Any] | None:
     if case.alike:
         if len(given) < 2 or not all(isinstance(x, Tensor) and _is_picture(x) for x in given[:2]):
             return None
-        given[1] = given[0]
+        given[1] = given[0].clone()
     if case.inputs is not None:
         if not any(map(_is_picture, tensors_in(given))):
             return None
         change = case.inputs
-        given = [each_tensor(lambda x: change(x) if _is_picture(x) else x, value) for value in given]
+        given = each_tensor(lambda x: change(x) if _is_picture(x) else x, given)
     return given
 
 
@@ -98,8 +100,16 @@ def _run(step: Step, fn: Any, inputs: Sequence[Any], seed: int, **params: Any) -
     return fn(*inputs, **{**step.params, **params}, **rng)
 
 
+def _as_used(step: Step, inputs: Sequence[Any], seed: int) -> Any:
+    """The step as a run takes it; what it refuses is told apart from what goes wrong here."""
+    try:
+        return _run(step, step.node.fn, inputs, seed)
+    except ValueError as error:
+        raise _Refused(str(error)) from error
+
+
 def _in_double(step: Step, inputs: Sequence[Any], seed: int) -> Any:
-    wide = [each_tensor(lambda x: x.double() if x.is_floating_point() else x, value) for value in inputs]
+    wide = each_tensor(lambda x: x.double() if x.is_floating_point() else x, list(inputs))
     precise = {"precision": "double"} if "precision" in step.params else {}
     with _CountedInSingle():
         return _run(step, step.node.fn, wide, seed, **precise)
@@ -110,7 +120,7 @@ def _in_double(step: Step, inputs: Sequence[Any], seed: int) -> Any:
 
 def _compared(step: Step, inputs: list[Any], case: Case, seed: int) -> Cell:
     with torch.no_grad():
-        value = _run(step, step.node.fn, inputs, seed)
+        value = _as_used(step, inputs, seed)
         truth = _run(step, step.node.ref, inputs, seed) if step.node.ref else _in_double(step, inputs, seed)
     if not _finite(value):
         return Cell("pass", "overflows in the open, as its reference in single") if not _fits(truth) else Cell(
@@ -202,7 +212,7 @@ def _slight(picture: Tensor) -> float:
 
 
 def _true_slopes(step: Step, inputs: list[Any], seed: int) -> list[Tensor] | None:
-    wide = [each_tensor(lambda x: x.double() if _is_picture(x) else x, value) for value in inputs]
+    wide = each_tensor(lambda x: x.double() if _is_picture(x) else x, inputs)
     leaves = [id(w) for w, x in zip(tensors_in(wide), tensors_in(inputs), strict=True) if _is_picture(x)]
     own = step.node.ref
     found = None if own is None else _slopes(wide, lambda given: _run(step, own, given, seed), leaves)
@@ -219,7 +229,7 @@ def _slopes(inputs: list[Any], fn: Any, wanted: list[int] | None = None) -> list
             return leaves[-1]
         return x
 
-    total = _weighed(fn([each_tensor(leaf, value) for value in inputs]))
+    total = _weighed(fn(each_tensor(leaf, inputs)))
     if total is None or not leaves:
         return None
     grads = torch.autograd.grad(total, leaves, allow_unused=True)
@@ -247,7 +257,7 @@ def _near(x: Tensor) -> float:
 
 def _seen(step: Step, inputs: Sequence[Any], given: list[Any], case: Case, seed: int) -> Cell:
     """A wrong number in any picture is refused, stays to be seen, or, infinite, counts as the limit of large ones."""
-    notes, count = [], sum(_is_picture(x) for x in tensors_in(inputs))
+    notes, count = [], sum(_is_picture(x) for x in tensors_in(list(inputs)))
     for i in range(count):
         notes.append(_one_seen(step, _only(i, inputs, given), seed))
     hidden = [note for note in notes if note.startswith("hidden")]
@@ -260,15 +270,15 @@ def _seen(step: Step, inputs: Sequence[Any], given: list[Any], case: Case, seed:
 def _one_seen(step: Step, given: list[Any], seed: int) -> str:
     with torch.no_grad():
         try:
-            value = _run(step, step.node.fn, given, seed)
-        except ValueError as error:
-            return f"refused: {error}"
+            value = _as_used(step, given, seed)
+        except _Refused as refused:
+            return f"refused: {refused}"
         if not _finite(value):
             return "seen"
         bad = next(float(x[~x.isfinite()][0]) for x in tensors_in(given) if _is_picture(x) and not _finite(x))
         if math.isnan(bad):
             return "hidden: a finite result of a number that is none"
-        large = [each_tensor(lambda x: x.nan_to_num(posinf=_HUGE, neginf=-_HUGE), v) for v in given]
+        large = each_tensor(lambda x: x.nan_to_num(posinf=_HUGE, neginf=-_HUGE), given)
         limit = _run(step, step.node.fn, large, seed)
         same = _finite(limit) and largest_error(value, limit) <= max(step.node.rtol, ROUNDING)
         return "as its limit" if same else "hidden: a finite result that is no limit"
@@ -279,4 +289,5 @@ def _only(which: int, inputs: Sequence[Any], given: Sequence[Any]) -> list[Any]:
     old = [x for x in tensors_in(list(inputs)) if _is_picture(x)]
     new = [x for x in tensors_in(list(given)) if _is_picture(x)]
     swap = {id(old[which]): new[which]}
-    return [each_tensor(lambda x: swap.get(id(x), x), value) for value in inputs]
+    only: list[Any] = each_tensor(lambda x: swap.get(id(x), x), list(inputs))
+    return only

@@ -106,31 +106,35 @@ def _row(chain: Chain, same: set[str], store: Store, own: str) -> Iterator[Row]:
         if name in same:
             continue
         key = digest("stability", own, chain.case.name, chain.keys[name], [chain.keys[s] for s in step.sources])
-        cell = _stored(store, key) or _judged(chain, name, store, key)
-        if cell is not None:
-            yield Row(chain.case, name, step.node.path, cell)
+        known = _stored(store, key)
+        if known is None:
+            known = _judged(chain, name, store, key)
+        if known:
+            yield Row(chain.case, name, step.node.path, Cell(**known))
 
 
-def _stored(store: Store, key: Key) -> Cell | None:
+def _stored(store: Store, key: Key) -> dict[str, Any] | None:
+    """The fields of a cell, none where there is none to be had; None where it was never judged."""
     try:
-        return Cell(**store.get(key))
-    except (KeyError, TypeError):
+        found: dict[str, Any] = store.get(key)
+    except KeyError:
         return None
+    return found
 
 
-def _judged(chain: Chain, name: str, store: Store, key: Key) -> Cell | None:
-    """The cell, kept; None where a step before this one refused or nothing was there to change."""
+def _judged(chain: Chain, name: str, store: Store, key: Key) -> dict[str, Any]:
+    """The same, judged now and kept; none where a step before this one refused or the case changes nothing of it."""
     step, began = chain.steps[name], time.perf_counter()
     try:
         inputs = chain.inputs(name)
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore")
+            cell = judged(step, inputs, chain.case, chain.recipe.seed)
     except LookupError:
-        return None
-    with warnings.catch_warnings():
-        warnings.simplefilter("ignore")
-        cell = judged(step, inputs, chain.case, chain.recipe.seed)
-    if cell is not None:
-        store.jot(key, asdict(cell), _about(chain, name, time.perf_counter() - began))
-    return cell
+        cell = None
+    fields = {} if cell is None else asdict(cell)
+    store.jot(key, fields, _about(chain, name, time.perf_counter() - began))
+    return fields
 
 
 def _about(chain: Chain, name: str, seconds: float) -> dict[str, Any]:

@@ -10,7 +10,7 @@ from neusee.nodes import node
 from neusee.nodes._precision import single
 from neusee.nodes.values import Psf
 
-_DARK = 1e-30  #: a ratio that stands for none
+_DARK = 1e-30  #: light, or a ratio, that stands for none
 
 
 @node()
@@ -59,6 +59,6 @@ def bsr(image: Tensor, plain_image: Tensor) -> Tensor:
     Source: NeuSee, section Two-Stage Training (L_DOE), as a ratio of energies.
     """
     kept, plain = (x.sum((-2, -1), dtype=torch.float64) for x in (image, plain_image))
-    dark = (plain <= 0) | (kept <= 0)  # so that what is not a number is seen
+    dark = (plain <= _DARK) | (kept <= _DARK)  # so that what is not a number is seen
     ratios: Tensor = torch.where(dark, 1.0, plain / kept.where(~dark, 1.0))
     return ratios.sum().to(single(image).dtype)

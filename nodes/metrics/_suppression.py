@@ -14,6 +14,8 @@ from neusee.nodes.sensor._saturation import Efficiency, Well, saturation
 from neusee.nodes.units import PositiveLength, Time
 from neusee.nodes.values import Bands, Channels, Psf
 
+_DARK = 1e-30  #: light that counts as none
+
 
 class Peak(NamedTuple):
     """The brightest pixel, as a multiple of what saturates."""
@@ -57,7 +59,7 @@ def bsr(image: Tensor | Channels, plain_image: Tensor | Channels) -> Tensor:
 
     Shapes: image and plain_image (..., band, y, x) -> (..., band) float64.
     Units:  none; about 1 for an element that absorbs nothing and scatters nothing out of the field.
-    Error:  rows are summed in the precision of the image, 1e-7; a band without light has ratio 1. It
+    Error:  rows are summed in the precision of the image, 1e-7; a band without light (1e-30) has ratio 1. It
             says nothing of sharpness.
     Raises: ValueError for images of different shape.
     Source: NeuSee, section Sensor Image (BSR), as a ratio of energies.
@@ -67,7 +69,7 @@ def bsr(image: Tensor | Channels, plain_image: Tensor | Channels) -> Tensor:
     if here != there:
         raise ValueError(f"image {here} and plain image {there} differ in shape")
     kept, plain = (x.flux if isinstance(x, Channels) else _light(x) for x in (image, plain_image))
-    dark = plain <= 0  # so that what is not a number is seen
+    dark = plain <= _DARK  # so that what is not a number is seen
     ratio: Tensor = torch.where(dark, 1.0, kept / plain.where(~dark, 1.0))
     return ratio
 

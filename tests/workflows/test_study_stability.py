@@ -8,7 +8,7 @@ import pytest
 import torch
 
 from neusee.nodes import losses, node
-from neusee.workflows import _extremes_limits
+from neusee.workflows import _extremes_limits, _study_stability
 from neusee.workflows._code import Code
 from neusee.workflows._extremes import CASES, USUAL, Case, Size
 from neusee.workflows._extremes_cell import judged
@@ -122,7 +122,7 @@ def _without_restoration(recipe):
     return replace(recipe, steps=steps)
 
 
-def test_the_study_writes_its_folder_and_counts_what_fails(tmp_path):
+def test_the_study_writes_its_folder_and_counts_what_fails(tmp_path, monkeypatch):
     recipe, store, told = _without_restoration(load("laser_free", [])), Store(tmp_path / "store"), []
     cases = [Case("usual", "as it is", "usual", size=Size(16, 16, 3)), BY_NAME["NaN"]]
     folder = study(recipe, store, tmp_path / "runs", ["neusee"], told.append, cases=cases)
@@ -135,6 +135,7 @@ def test_the_study_writes_its_folder_and_counts_what_fails(tmp_path):
     assert doc["cells"] == len(rows) > 30
     assert len(told) == 2
     before = {row["step"]: row["error"] for row in rows}
+    monkeypatch.setattr(_study_stability, "judged", None)  # what is stored is not judged again
     again = study(recipe, Store(tmp_path / "store"), tmp_path / "runs", ["neusee"], told.append, cases=cases)
     with (again / "table.csv").open() as file:
         assert {row["step"]: row["error"] for row in csv.DictReader(file)} == before
@@ -178,3 +179,22 @@ def test_poisson_numbers_are_the_same_in_both_precisions(picture):
         return torch.poisson(100.1 * x, generator=rng)
 
     assert judged(step_of(counted), [picture], USUAL, 0).mark == "pass"
+
+
+def test_an_error_of_the_study_itself_is_no_refusal(monkeypatch, picture):
+    def wrong(value, truth):
+        raise ValueError("zip() argument 2 is shorter than argument 1")
+
+    monkeypatch.setattr("neusee.workflows._extremes_cell._error", wrong)
+    assert judged(step_of(doubled), [picture], USUAL, 0).mark == "fail"
+
+
+def test_a_picture_that_two_inputs_share_counts_once(picture):
+    @node()
+    def added(x: torch.Tensor, y: torch.Tensor) -> torch.Tensor:
+        return x * 2 + y
+
+    for case in ("usual", "alike", "negative"):
+        cell = judged(step_of(added), [picture, picture], BY_NAME[case], 0)
+        assert cell.mark == "pass"
+        assert cell.slope is not None
