@@ -48,16 +48,26 @@ class Plan(NamedTuple):
         return [self.planes, count, len(self.bands), *self.window]
 
 
+class Fewer(NamedTuple):
+    """Kernels in the order of the light that they move; the wanted ones are mixed of the first few."""
+
+    kernels: Tensor  #: (q, band)
+    mixed: Tensor  #: (row x plane, q)
+    off: Tensor  #: (q - 1, row) bound of what the first 1, 2, ... leave away
+
+
 def choose(given: Given, brightest: Tensor, within: float) -> Plan:
     """The cheapest plan that leaves away no more than ``within`` of the brightest pixel of each row, or the whole."""
     bands, lost = _strong(given, brightest, within)
-    whole = min(_plans(given, bands, lost, len(given.most), 0, brightest, 0.0), key=lambda plan: plan.cost)
+    whole = min(_plans(given, bands, lost, len(given.most), 0), key=lambda plan: plan.cost)
     best = whole._replace(whole=True)
+    if within <= 0:
+        return best
     for k in _enough(given, bands, lost, brightest, within):
+        fewer = _fewer(given, bands, k, brightest)
         for j in range(len(given.passed.windows)):
-            for plan in _plans(given, bands, lost, k, j, brightest, within):
-                if plan.cost < best.cost and bool((plan.off <= within * brightest).all()):
-                    best = plan
+            found = _plans(given, bands, lost, k, j, (within * brightest, fewer))
+            best = min([best, *found], key=lambda plan: plan.cost)
     return best
 
 
@@ -81,15 +91,17 @@ def _enough(given: Given, bands: Tensor, lost: Tensor, brightest: Tensor, within
 
 
 def _plans(
-    given: Given, bands: Tensor, lost: Tensor, k: int, j: int, brightest: Tensor, within: float
+    given: Given, bands: Tensor, lost: Tensor, k: int, j: int, within: tuple[Tensor, Fewer] | None = None
 ) -> Iterator[Plan]:
     """Ways to convolve k planes in a window: a kernel for each plane and row, fewer that these mix, or each band."""
     rows, basis, through = given.rows[:, bands], given.basis[bands, :k], given.passed.total[bands]
     off = lost + rows.abs() @ (given.rest[k, bands] * through) + rows.abs() @ _tail(given, bands, k, j)
+    if within is not None and not bool((off <= within[0]).all()):
+        return
     count = len(rows)
     u = torch.eye(count, dtype=torch.float64).repeat_interleave(k, 1)
     x = torch.eye(k, dtype=torch.float64).repeat(count, 1)
-    sums = (rows[:, None, :] * basis.T).flatten(0, 1)
+    sums = _sums(rows, basis)
 
     def plan(kernels: Tensor | None, mix: Mix, off: Tensor) -> Plan:
         window = given.passed.windows[j]
@@ -97,29 +109,28 @@ def _plans(
 
     yield plan(sums, Mix(u, x, None, count), off)
     yield plan(None, Mix(rows, basis, None), off)
-    if within > 0:
-        plane = torch.where(brightest[:, None] > 0, given.most[:k] / brightest[:, None], 0.0).flatten()
-        few = _fewer(sums, plane, through, within * brightest - off, brightest)
-        if few is not None:
-            yield plan(few[0], Mix(u, x, few[1], count), off + few[2])
+    if within is not None:
+        limit, few = within
+        for q in (few.off + off <= limit).all(1).nonzero()[:1, 0].tolist():
+            yield plan(few.kernels[: q + 1], Mix(u, x, few.mixed[:, : q + 1], count), off + few.off[q])
 
 
-def _fewer(
-    sums: Tensor, plane: Tensor, band: Tensor, left: Tensor, brightest: Tensor
-) -> tuple[Tensor, Tensor, Tensor] | None:
-    """Kernels of which the wanted ones are mixed, how, and by row the bound of what this leaves away.
-
-    Singular values of the wanted sums, each by the light that it moves: ``plane`` of its plane, ``band`` of its band.
-    """
-    scaled = plane[:, None] * sums * band
+def _fewer(given: Given, bands: Tensor, k: int, brightest: Tensor) -> Fewer:
+    """Singular values of the wanted sums, each by the light that it moves: that of its plane and of its band."""
+    rows, band = given.rows[:, bands], given.passed.total[bands]
+    plane = torch.where(brightest[:, None] > 0, given.most[:k] / brightest[:, None], 0.0).flatten()
+    scaled = plane[:, None] * _sums(rows, given.basis[bands, :k]) * band
     a, s, b = torch.linalg.svd(scaled, full_matrices=False)
-    for q in range(1, len(s)):
-        missed = (scaled - (a[:, :q] * s[:q]) @ b[:q]).abs().sum(1)
-        off = missed.reshape(len(brightest), -1).sum(1) * brightest
-        if bool((off <= left).all()):
-            kernels = torch.where(band > 0, b[:q] / band, 0.0)
-            return kernels, torch.where(plane[:, None] > 0, a[:, :q] * s[:q] / plane[:, None], 0.0), off
-    return None
+    off = [(scaled - (a[:, :q] * s[:q]) @ b[:q]).abs().sum(1).reshape(len(rows), -1).sum(1) for q in range(1, len(s))]
+    kernels = torch.where(band > 0, b / band, 0.0)
+    mixed = torch.where(plane[:, None] > 0, a * s / plane[:, None], 0.0)
+    unknown = torch.where((brightest == 0) & (rows != 0).any(1), math.inf, 0.0)  # a row of no weight in the sum above
+    return Fewer(kernels, mixed, torch.stack(off) * brightest + unknown if off else brightest[None][:0])
+
+
+def _sums(rows: Tensor, basis: Tensor) -> Tensor:
+    """The weights of the bands in the kernel of each row and plane."""
+    return (rows[:, None, :] * basis.T).flatten(0, 1)
 
 
 def _tail(given: Given, bands: Tensor, k: int, j: int) -> Tensor:

@@ -62,7 +62,8 @@ def rounding(given: Given, plan: Plan, found: Tensor, eps: float) -> Tensor:
     """By row, about the largest error of the transforms.
 
     Their rounding is as good as white: a share eps sqrt(log2 N) / 2 of the power, spread over all N samples. Of that
-    spread eight sigma, and four roundings of the brightest pixel for what is not spread.
+    spread eight sigma, and ten roundings of the brightest pixel for what is not spread: sums over the bands, planes and
+    rows of a PSF, of which five were found.
     """
     count = math.prod(transform(given, plan.window))
     u, x, y, _ = plan.mix
@@ -71,4 +72,4 @@ def rounding(given: Given, plan: Plan, found: Tensor, eps: float) -> Tensor:
     kernel = kernel if plan.kernels is None else plan.kernels.abs() @ kernel
     terms = (plane if x is None else x.abs() @ plane) * (kernel if y is None else y.abs() @ kernel)
     white = terms[None].sum(1) if u is None else u.abs() @ terms
-    return eps * (8 * math.sqrt(math.log2(count + 1)) * white / math.sqrt(count) + 4 * found)
+    return eps * (8 * math.sqrt(math.log2(count + 1)) * white / math.sqrt(count) + 10 * found)

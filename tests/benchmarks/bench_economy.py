@@ -1,14 +1,15 @@
-"""Sums over the bands of an image, band by band and by few planes: `python tests/benchmarks/bench_economy.py [REPEATS]`.
+"""Sums over the bands of an image, by band and by few planes: `python tests/benchmarks/bench_economy.py [REPEATS]`.
 
-Two tables in Markdown, medians of REPEATS (3) in one process, the ways in turn. First, 31 bands imaged and exposed,
-beside few planes imaged and exposed: `image` and `image_channels` alone, then with `expose`; kept, the error against
-float64 of each way on the small scene, and the bound. Second, what makes a cube few planes, and the lift that makes
-them at once.
+Two tables in Markdown, medians of REPEATS (3) in one process, in seconds of the wall and of the processor, for on a
+machine that others use the wall says little. First, 31 bands imaged, and few planes imaged and their light summed; the
+ratio of the two; the same with `expose`; what was kept, the largest difference and the bound. Second, what makes a
+cube few planes, and the lift that makes them at once.
 """
 
 import statistics
 import sys
 import time
+from functools import partial
 
 import torch
 
@@ -43,73 +44,71 @@ def psf(size):
     return Psf(kernel / kernel.sum((1, 2), keepdim=True), torch.ones(31, dtype=torch.float64))
 
 
-def seconds(work):
-    began = time.perf_counter()
-    found = work()
-    return time.perf_counter() - began, found
-
-
-def medians(works, repeats):
-    """Median seconds of each, in turn; and what each gave the last time."""
-    for work in works:
-        work()
-    each = [[seconds(work) for work in works] for _ in range(repeats)]
-    return [statistics.median(t for t, _ in column) for column in zip(*each, strict=True)], [v for _, v in each[-1]]
+def medians(work, repeats):
+    """Median seconds of wall and processor, and what came of it; one call before that does not count."""
+    found, walls, busy = work(), [], []
+    for _ in range(repeats):
+        wall, cpu = time.perf_counter(), time.process_time()
+        found = work()
+        walls.append(time.perf_counter() - wall)
+        busy.append(time.process_time() - cpu)
+    return statistics.median(walls), statistics.median(busy), found
 
 
 def convolutions(repeats):
     print(
-        "| scene and PSF | rank | rows | within | 31 bands, s | planes, s | ratio | with expose | kept | error | bound |"
+        "| scene, PSF | rank | rows | within | bands, s (CPU) | planes, s (CPU) | ratio (CPU) | exposed (CPU) |", end=""
     )
-    print("|---|---|---|---|---|---|---|---|---|---|---|")
+    print(" kept | difference | bound |\n|---|---|---|---|---|---|---|---|---|---|---|")
     for size in SIZES:
-        stack = psf(size)
         for rank in (3, 6):
-            mixture, cube = scene(rank, size)
-            for count, within in ((3, 0.0), (4, 0.0), (4, 2.5e-4), (4, 1e-2)):
-                row(size, rank, count, within, mixture, cube, stack, repeats)
+            lines(size, rank, repeats)
 
 
-def row(size, rank, count, within, mixture, cube, stack, repeats):
-    weights, seen = rows(SCENE, RESPONSES)[:count], RESPONSES
+def lines(size, rank, repeats):
+    stack, (mixture, cube) = psf(size), scene(rank, size)
+    plain = medians(partial(image, cube, stack), repeats)
+    lit = medians(partial(expose, plain[2], SCENE, RESPONSES, **SHUTTER), repeats)
+    for count, within in ((3, 0.0), (4, 0.0), (4, 2.5e-4), (4, 1e-2)):
+        weights = rows(SCENE, RESPONSES)[:count]
+        few = medians(partial(image_channels, mixture, stack, weights, within=within), repeats)
+        shown = medians(partial(expose, few[2], SCENE, RESPONSES, **SHUTTER), repeats)
+        told = f"| {size[0]} x {size[1]} | {rank} | {count} | {within:g} "
+        print(told + compared(plain, few, lit, shown, weights), flush=True)
 
-    def by_band():
-        return image(cube, stack)
 
-    def by_planes():
-        return image_channels(mixture, stack, weights, within=within)
-
-    (plain, few), (bandwise, channels) = medians([by_band, by_planes], repeats)
-    (plain_lit, few_lit), _ = medians(
-        [lambda: expose(bandwise, SCENE, seen, **SHUTTER), lambda: expose(channels, SCENE, seen, **SHUTTER)], repeats
-    )
-    summed = torch.tensordot(weights.float(), bandwise, 1)
+def compared(plain, few, lit, shown, weights):
+    """The rest of a line."""
+    summed, channels = torch.tensordot(weights.float(), plain[2], 1), few[2]
     error = float(((summed - channels.planes).abs().amax((1, 2)) / summed.amax((1, 2))).max())
     kept = "{} planes, {} kernels, {} bands, {} x {}".format(*channels.kept.tolist())
-    print(
-        f"| {size[0]} x {size[1]} | {rank} | {count} | {within:g} | {plain:.2f} | {few:.3f} | {plain / few:.1f} | "
-        f"{(plain + plain_lit) / (few + few_lit):.1f} | {kept} | {error:.1e} | {float(channels.bound):.1e} |",
-        flush=True,
+    alone, whole = (plain[i] / few[i] for i in (0, 1)), ((plain[i] + lit[i]) / (few[i] + shown[i]) for i in (0, 1))
+    return (
+        f"| {plain[0]:.2f} ({plain[1]:.2f}) | {few[0]:.3f} ({few[1]:.3f}) | {{:.1f}} ({{:.1f}}) ".format(*alone)
+        + "| {:.1f} ({:.1f}) ".format(*whole)
+        + f"| {kept} | {error:.1e} | {float(channels.bound):.1e} |"
     )
 
 
 def planes(repeats):
-    print("\n| 31 x y x x | what | s | planes | left, of the brightest |\n|---|---|---|---|---|")
+    print("\n| 31 x y x x | what | s (CPU) | planes | left, of the brightest |\n|---|---|---|---|---|")
     for size in SIZES:
         for name, colours in (("no clipping", 0.5 + 0.01 * rand(3, *size)), ("clipped", rand(3, *size))):
             cube = lift_lmmse(colours, SCENE)
             for within in (1e-6, 1e-4, 1e-2):
-                (once,), (found,) = medians([lambda c=cube, w=within: compress(c, within=w)], repeats)
-                tell(size, f"compress within {within:g}, {name}", once, found)
+                done = medians(partial(compress, cube, within=within), repeats)
+                tell(size, f"compress within {within:g}, {name}", done)
                 if lift_lmmse.mixed is not None:
-                    works = [lambda c=colours, w=within: lift_lmmse.mixed(c, SCENE, within=w)]
-                    (once,), (found,) = medians(works, repeats)
-                    tell(size, f"lift to planes within {within:g}, {name}", once, found)
+                    done = medians(partial(lift_lmmse.mixed, colours, SCENE, within=within), repeats)
+                    tell(size, f"lift to planes within {within:g}, {name}", done)
 
 
-def tell(size, what, once, found):
+def tell(size, what, done):
+    wall, busy, found = done
     left = float(found.rest[-1].max() / found.rest[0].max())
-    print(f"| {size[0]} x {size[1]} | {what} | {once:.2f} | {len(found.planes)} | {left:.1e} |", flush=True)
+    print(
+        f"| {size[0]} x {size[1]} | {what} | {wall:.2f} ({busy:.2f}) | {len(found.planes)} | {left:.1e} |", flush=True
+    )
 
 
 if __name__ == "__main__":
