@@ -36,8 +36,8 @@ def image_channels(
     Error:  `bound`, of the brightest pixel of each row. True bounds: what the mixture leaves, by the sum of each PSF
             (Young's inequality, as for the root mean square; where the border reflects, three times the scene's);
             tails, by Young's inequality; kernels, by the sum of what they miss. Estimated, not proved: rounding of the
-            transforms, from the powers of planes and kernels, at most what is found, and up to ten times it. Flux: 1e-6, and what the
-            mixture leaves. Gradients reach the planes and the PSF; basis and rows are held still.
+            transforms, from the powers of planes and kernels, two to ten times what was found. Flux: 1e-6, and what
+            the mixture leaves. Gradients reach the planes and the PSF; basis and rows are held still.
     Raises: ValueError where scene, PSF and rows have different bands, or the scene is a batch.
     Source: linearity of incoherent imaging, Goodman, Introduction to Fourier Optics, 4th ed., ch. 7.
     """
