@@ -70,7 +70,7 @@ def study(
     with _one_thread():
         rows = list(_rows(recipe, store, cases, tell))
     doc = _document(recipe, rows, command, time.perf_counter() - began)
-    with new_run(runs, f"{recipe.name}_stability", digest(doc["cells"])) as folder:
+    with new_run(runs, f"{recipe.name}_stability", digest([repr(_line(row)) for row in rows])) as folder:
         _write(folder, recipe, rows, doc)
     return folder.path
 
