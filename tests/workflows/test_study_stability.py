@@ -198,3 +198,11 @@ def test_a_picture_that_two_inputs_share_counts_once(picture):
         cell = judged(step_of(added), [picture, picture], BY_NAME[case], 0)
         assert cell.mark == "pass"
         assert cell.slope is not None
+
+
+def test_a_slope_beyond_the_type_of_its_picture_is_no_fault_of_the_step(picture):
+    @node()
+    def steep(x: torch.Tensor) -> torch.Tensor:
+        return 1 + 1e7 * (x.float() - x.float().detach()) if x.dtype != torch.float64 else 1 + 1e7 * (x - x.detach())
+
+    assert judged(step_of(steep), [picture], BY_NAME["float16"], 0).mark == "pass"
