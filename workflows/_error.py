@@ -94,5 +94,5 @@ def _kind(x: Any) -> str:
 
 
 def _parts(x: Tensor) -> tuple[Tensor, ...]:
-    parts: tuple[Tensor, ...] = torch.split(x.detach().reshape(-1), _PART)  # type: ignore[no-untyped-call]
+    parts: tuple[Tensor, ...] = torch.split(x.detach().reshape(-1), _PART)
     return parts

@@ -186,7 +186,7 @@ def _(
     ghosts: list[Deviation] | None = None,
     **params: Any,
 ) -> float:
-    return photons.bound + sum(added.bound for added in (*(lasers or ()), *(ghosts or ())))
+    return math.fsum(part.bound for part in (photons, *(lasers or ()), *(ghosts or ())))
 
 
 @gather.check
