@@ -158,13 +158,16 @@ def families(recipe: Recipe, names: Iterable[str]) -> dict[str, Family]:
     return found
 
 
-def note(families: Mapping[str, Family], event: Event) -> Family:
-    """Write an event down in its family."""
-    family = families[event.step.partition("[")[0]]
+def note(families: dict[str, Family], event: Event) -> Family:
+    """Write an event down in its family; a run that leaves out less the second time has steps again, and others."""
+    short = event.step.partition("[")[0]
+    family = families.setdefault(short, Family(short, [], ""))
+    if event.step not in family.members:
+        family.members.append(event.step)
     if event.done is None:
         family.begun = True
     else:
-        family.done.append(event.done)
+        family.done = [*(d for d in family.done if d.step != event.step), event.done]
     return family
 
 

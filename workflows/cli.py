@@ -126,8 +126,10 @@ def _simulate(
     memory: int | None,
 ) -> Simulation:
     from neusee.workflows._console import screen
-    from neusee.workflows.simulate import simulate, steps_of
+    from neusee.workflows._economy import economised
+    from neusee.workflows.simulate import simulate, steps_of, wanted
 
+    recipe = economised(recipe, wanted(recipe))
     with screen(recipe, steps_of(recipe), silent) as shown:
         return simulate(recipe, store, out, command, device, shown.watch, executor, memory)
 

@@ -4,6 +4,7 @@ import json
 from dataclasses import replace
 
 import pytest
+from typer.testing import CliRunner
 
 from neusee.workflows import load, report
 from neusee.workflows._economy import economised
@@ -11,6 +12,7 @@ from neusee.workflows._error import error_of
 from neusee.workflows._run import run
 from neusee.workflows._spent import said_of_economies, spent
 from neusee.workflows._store import Store
+from neusee.workflows.cli import app
 from neusee.workflows.simulate import simulate
 
 SMALL = [
@@ -88,6 +90,23 @@ def test_measured_errors_stand_where_the_full_run_is_stored(recipe, store):
     assert spent(full)["keep_all"]
     assert "measured" in said_of_economies(after)
     assert "measured" not in said_of_economies(before)
+
+
+def test_the_command_line_shows_what_stands_in(tmp_path, monkeypatch):
+    monkeypatch.setenv("NEUSEE_CACHE", str(tmp_path / "cache"))
+    done = CliRunner().invoke(app, ["run", "first_light", *SMALL, "--out", str(tmp_path / "runs")])
+    assert done.exit_code == 0, done.output
+    assert "cube.mixture" in done.output
+    assert "spared   image[mask] (at most" in done.output
+
+
+def test_the_command_line_shows_a_run_that_could_not_prove_its_tolerance(tmp_path, monkeypatch):
+    monkeypatch.setenv("NEUSEE_CACHE", str(tmp_path / "cache"))
+    words = ["run", "first_light", *SMALL, "tolerance=1e-7", "--out", str(tmp_path / "runs")]
+    done = CliRunner().invoke(app, words)
+    assert done.exit_code == 0, done.output
+    assert "spared" not in done.output
+    assert "\n  cube  " in done.output
 
 
 def test_the_page_says_it(recipe, store, tmp_path):
