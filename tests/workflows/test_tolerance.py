@@ -50,6 +50,6 @@ def test_a_random_recipe_is_within_its_tolerance(seed, tmp_path):
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("seed", range(100))
-def test_every_random_recipe_is_within_its_tolerance(seed, tmp_path):
+@pytest.mark.parametrize("seed", range(16))
+def test_more_random_recipes_are_within_their_tolerance(seed, tmp_path):
     holds(*compared(seed, tmp_path))
