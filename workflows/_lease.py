@@ -106,9 +106,10 @@ class Leases:
             if now is not None and (found is None or now[:2] != found[:2]):
                 raise FileExistsError(path)
             with _guard:
-                os.link(_badge(self._disk), part)
+                os.link(_badge(self._disk), path if now is None else part)  # of two who find nobody, one is first
             try:
-                os.replace(part, path)
+                if now is not None:
+                    os.replace(part, path)
             finally:
                 with suppress(OSError):
                     os.unlink(part)

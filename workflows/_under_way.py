@@ -261,7 +261,7 @@ class UnderWay:
         name = self.makers[key].name
         why = why or f"made {about['date']} in {about['seconds']:.3g} s"
         checks = tuple(Check(text, ok) for text, ok in about["checks"])
-        facts, bound, error = self._stored_facts(key), self._bound(name), error_in(about)
+        facts, bound, error = facts_in(about), self._bound(name), error_in(about)
         return Done(name, "cached", why, seconds, key, facts, checks, "cpu", about["bytes"], bound, error=error)
 
     def _judge(self, step: Step) -> Verdict:
@@ -278,14 +278,11 @@ class UnderWay:
     def known_facts(self, name: str) -> Facts | None:
         """Facts of a step that ran, now or before."""
         key = self.keys[name]
-        return self.facts[key] if key in self.facts else self._stored_facts(key)
+        return self.facts[key] if key in self.facts else facts_in(self.store.about(key))
 
     def _leave_out(self, step: Step, verdict: Verdict) -> None:
         key = self.keys[step.name] = self.keys[verdict.instead]
         self._finish(Done(step.name, "left out", verdict.why, 0.0, key, bound=verdict.bound))
-
-    def _stored_facts(self, key: Key) -> Facts | None:
-        return facts_in(self.store.about(key))
 
     def _why(self, name: str, key: Key) -> str:
         verdict = self.verdicts.get(name)

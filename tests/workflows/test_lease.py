@@ -105,6 +105,16 @@ def test_many_threads_one_holder(tmp_path):
     assert most == [1] * 24
 
 
+def test_of_two_who_find_that_a_holder_has_gone_one_is_first(tmp_path, monkeypatch):
+    first, second = Store(tmp_path), Store(tmp_path)
+    lease = first.claim(KEY)
+    monkeypatch.setattr(_lease, "_look", lambda path: None)  # as it was a moment ago
+    assert second.claim(KEY) is None
+    monkeypatch.undo()
+    with lease:
+        assert Store(tmp_path).claim(KEY) is None
+
+
 def test_a_live_holder_elsewhere_is_waited_for_and_a_killed_one_taken_over(tmp_path, holder):
     process, store = holder(), Store(tmp_path)
     assert store.claim(KEY) is None

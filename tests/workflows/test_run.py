@@ -442,7 +442,7 @@ def test_all_of_a_store_damaged_at_once_is_computed_again(store):
         data = bytearray(path.read_bytes())
         data[-60] ^= 1
         path.write_bytes(data)
-    with warnings_of("is damaged", 4):
+    with warnings_of("is damaged", len([*store.root.glob("??/*.json")])):
         second = run(diamond(count=BIG), again(store))
     assert torch.equal(second.values["top"], first.values["top"])
 
