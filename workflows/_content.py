@@ -8,7 +8,6 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import asdict, dataclass, replace
-from statistics import median
 
 from neusee.workflows._accuracy_code import engine
 from neusee.workflows._accuracy_knobs import changed
@@ -120,17 +119,17 @@ def _bands(recipe: Recipe, start: str, stop: str, count: int) -> list[str]:
 
 
 def _cost(scene: str, recipe: Recipe, store: Store) -> Cost:
-    seconds: list[float] = []
+    found: list[Result] = []
     try:
-        while not seconds or (max(seconds) < _QUICK and len(seconds) < _TIMES):
-            result = _cold(recipe, store)
-            seconds.append(result.seconds)
+        while not found or (max(r.seconds for r in found) < _QUICK and len(found) < _TIMES):
+            found.append(_cold(recipe, store))
     except RunError as error:
         return Cost(scene, float("nan"), 0.0, 0, (), f"{error.step}: {error.cause}")
+    result = sorted(found, key=lambda r: r.seconds)[len(found) // 2]
     ran = [done.seconds for done in result.done.values() if done.state == "run"]
     left_out = [done.step for done in result.done.values() if done.state == "left out"]
     replaced = [economy.step for economy in result.recipe.economies]
-    return Cost(scene, median(seconds), sum(ran), len(ran), (*left_out, *replaced))
+    return Cost(scene, result.seconds, sum(ran), len(ran), (*left_out, *replaced))
 
 
 def _cold(recipe: Recipe, store: Store) -> Result:

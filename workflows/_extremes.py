@@ -14,6 +14,8 @@ from typing import Any, Literal
 import torch
 from torch import Tensor
 
+from neusee.nodes.optics._direction import field_of_view
+from neusee.nodes.sensor._saturation import photons_that_fill
 from neusee.nodes.values import Pupil
 
 Params = Mapping[str, Any]
@@ -92,11 +94,11 @@ def _closed(pupil: Pupil) -> Pupil:
 
 def _off_axis(share: float) -> Callable[[Params], tuple[float, float]]:
     """Where a spot lies that many sides of the sensor from its middle along x."""
-    return lambda p: (0.0, share * p["shape"][1] * p["pixel_pitch"] / p["focal_length"])
+    return lambda p: (0.0, share * field_of_view(p["focal_length"], p["pixel_pitch"], p["shape"])[1])
 
 
 def _one_photon(p: Params) -> float:
-    return float(p["quantum_efficiency"] / p["full_well"])
+    return 1.0 / photons_that_fill(p["full_well"], p["quantum_efficiency"])
 
 
 def _scaled(name: str, by: float) -> Callable[[Params], float]:

@@ -19,13 +19,14 @@ from torch.overrides import TorchFunctionMode
 from neusee.workflows._codec import each_tensor, tensors_in
 from neusee.workflows._error import largest_error
 from neusee.workflows._extremes import Case
-from neusee.workflows._extremes_limits import limit_of, stated_of
+from neusee.workflows._extremes_limits import stated_of
 from neusee.workflows._graph import Step
 from neusee.workflows._keys import stream_seed
 from neusee.workflows._study_page import Mark
 
 ROUNDING = 2.0**-23  #: a result in single precision is held to no less
 SLOPE = 1e-4  #: a gradient in single precision is held to that
+_NEAR = 0.5  #: of a bound, beyond which what holds is near it
 _STEEPER = 10.0  #: or to so many times the bound of the result, where that is more
 _LEAST = math.sqrt(torch.finfo(torch.float32).tiny)  #: below, an error counts over this: of what is denormal, a root
 _DIM = 1e-3  #: of the brightest, below which a part counts as dim
@@ -134,16 +135,18 @@ def _compared(step: Step, inputs: list[Any], case: Case, seed: int) -> Cell:
     coarse = max(
         (_HALVES.get(x.dtype, 0.0) for x in tensors_in(inputs)), default=0.0
     )  # a gradient has the input's type
-    return _verdict(step, case, error, bound, slope, max(SLOPE, _STEEPER * bound, 2 * coarse))
+    return _verdict(error, bound, slope, max(SLOPE, _STEEPER * bound, 2 * coarse))
 
 
-def _verdict(step: Step, case: Case, error: float, bound: float, slope: float | None, steeper: float) -> Cell:
-    if error <= bound and (slope is None or slope <= steeper):
-        return Cell("pass", "", error, bound, slope, None if slope is None else steeper)
-    limit, words = limit_of(step.node, case.name) or (0.0, "")
-    if error <= max(bound, limit) and (slope or 0.0) <= max(steeper, _STEEPER * limit):
-        return Cell("warn", words, error, max(bound, limit), slope, max(steeper, _STEEPER * limit))
-    return Cell("fail", "", error, bound, slope, steeper)
+def _verdict(error: float, bound: float, slope: float | None, steeper: float) -> Cell:
+    """Within its bound a cell passes; by less than twice, it warns."""
+    used = [error / bound] if slope is None else [error / bound, slope / steeper]
+    limit = None if slope is None else steeper
+    if not all(share <= 1.0 for share in used):  # nor is what is not a number
+        return Cell("fail", "", error, bound, slope, limit)
+    if max(used) > _NEAR:
+        return Cell("warn", "near its bound", error, bound, slope, limit)
+    return Cell("pass", "", error, bound, slope, limit)
 
 
 def _error(value: Any, truth: Any) -> float:

@@ -100,7 +100,7 @@ class Far:
                 self._fs.pipe_file(to, raw, mode="overwrite" if over or self._renames else "create")
             except FileExistsError:
                 pass
-            except (TypeError, NotImplementedError):
+            except (TypeError, NotImplementedError):  # a file system that knows no `mode` has only this call
                 self._fs.pipe_file(to, raw)
             return len(raw)
 

@@ -16,6 +16,7 @@ from typing import Any
 from torch import Tensor
 
 from neusee.nodes import Facts
+from neusee.workflows._account import facts_in
 from neusee.workflows._accuracy_points import now
 from neusee.workflows._error import error_of, largest_error
 from neusee.workflows._graph import Recipe, needed
@@ -70,10 +71,7 @@ class Bench:
 
     def facts(self, step: str) -> Facts | None:
         """Facts of a step in full, without reading it where they are stored."""
-        about = self.store.about(self.truth.keys[step]) or {}
-        if found := about.get("facts"):
-            return Facts(**{**found, "shape": tuple(found["shape"])})
-        return Facts.of(self.truth.value(step))
+        return facts_in(self.store.about(self.truth.keys[step])) or Facts.of(self.truth.value(step))
 
     def promises(self) -> list[Promise]:
         """What became of each output of the recipe as it chooses."""

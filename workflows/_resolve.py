@@ -7,6 +7,7 @@ from dataclasses import dataclass, field
 from typing import Any
 
 from neusee.nodes import Facts
+from neusee.workflows._account import facts_in
 from neusee.workflows._call import RunError, place
 from neusee.workflows._code import Code
 from neusee.workflows._graph import Recipe
@@ -42,10 +43,10 @@ def resolve(recipe: Recipe, order: Iterable[str], store: Store, device: str = "c
     found, code, ledger = Resolved(), Code(store.code_memo), Ledger(recipe)
 
     def facts_of(name: str) -> Facts | None:
-        known = (store.about(found.keys[name]) or {}).get("facts")
+        known = facts_in(store.about(found.keys[name]))
         if known is None:
             raise LookupError(name)
-        return Facts(**{**known, "shape": tuple(known["shape"])})
+        return known
 
     for name in order:
         step = recipe.steps[name]

@@ -7,7 +7,7 @@ from typing import Annotated, Any
 
 import typer
 
-from neusee.workflows._words import FAILED, fail, load, say, the_store
+from neusee.workflows._words import FAILED, Debug, Out, Words, fail, load, say, the_store
 
 study = typer.Typer(
     help="What a recipe's numbers are worth, where it breaks, what it need not compute.",
@@ -15,13 +15,7 @@ study = typer.Typer(
     rich_markup_mode=None,
 )
 
-Words = Annotated[
-    list[str] | None,
-    typer.Argument(metavar="[RECIPE] [OVERRIDE]...", help="As for `neusee run`.", show_default=False),
-]
-Out = Annotated[Path, typer.Option("--out", help="Folder for the study's folder.")]
 Quiet = Annotated[bool, typer.Option("--quiet", help="The page's path alone.")]
-Debug = Annotated[bool, typer.Option("--debug", help="Show where in the code an error arose.")]
 
 
 @study.command()

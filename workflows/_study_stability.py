@@ -35,7 +35,8 @@ node's own reference, or with the same function on the same inputs in float64; t
 the largest element, and the bound is the node's rtol (no less than 1.2e-7, what single precision can hold).
 
 The second number is that of the gradient of a weighted sum of the result with respect to every picture, over its
-largest element; the bound is 1e-4, or ten times the node's rtol where that is more. A number that is none, or infinite,
+largest element; the bound is 1e-4, or ten times the node's rtol where that is more. What holds by less than twice is
+marked as a warning: another machine's rounding may take it over. A number that is none, or infinite,
 must be refused with a reason, stay to be seen in the result, or count as the limit of large numbers. One that refuses
 passes where its error says what is wrong. Empty: the step is given what it is given in the usual case, or nothing."""
 
@@ -186,7 +187,7 @@ def _worst(rows: Sequence[Row]) -> list[Row]:
 def _tables(rows: Sequence[Row]) -> Iterator[Section]:
     told: tuple[tuple[Mark, str, str], ...] = (
         ("fail", "What fails", "Nothing."),
-        ("warn", "Where a node states a limit", "Nowhere."),
+        ("warn", "What holds by less than twice", "Nothing."),
     )
     for mark, heading, nothing in told:
         found = [row for row in rows if row.cell.mark == mark]

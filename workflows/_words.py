@@ -7,7 +7,8 @@ import sys
 from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import replace
-from typing import TYPE_CHECKING, NoReturn
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, NoReturn
 
 import typer
 
@@ -19,6 +20,17 @@ if TYPE_CHECKING:
 
 DONE, FAILED, BAD, MISSED = 0, 1, 2, 3
 DEFAULT = "first_light"
+
+Words = Annotated[
+    list[str] | None,
+    typer.Argument(
+        metavar="[RECIPE] [OVERRIDE]...",
+        help="A recipe's name or file, then changes: a.b=1, +a.b=1, ~a.b, laser=six.",
+        show_default=False,
+    ),
+]
+Debug = Annotated[bool, typer.Option("--debug", help="Show where in the code an error arose.")]
+Out = Annotated[Path, typer.Option("--out", help="Folder for the run's folder.")]
 
 
 def split(words: list[str] | None, before: int = 0) -> tuple[str, list[str], int]:

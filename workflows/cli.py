@@ -20,6 +20,9 @@ from neusee.workflows._words import (
     DONE,
     FAILED,
     MISSED,
+    Debug,
+    Out,
+    Words,
     bytes_of,
     check_device,
     executor_of,
@@ -51,22 +54,12 @@ app.add_typer(study, name="study")
 for listing in (recipes, nodes, schema):
     app.command()(listing)
 
-Words = Annotated[
-    list[str] | None,
-    typer.Argument(
-        metavar="[RECIPE] [OVERRIDE]...",
-        help="A recipe's name or file, then changes: a.b=1, +a.b=1, ~a.b, laser=six.",
-        show_default=False,
-    ),
-]
-Debug = Annotated[bool, typer.Option("--debug", help="Show where in the code an error arose.")]
 Device = Annotated[str, typer.Option("--device", help="Where to compute: cpu, cuda, or several: cuda:0,cuda:1,cpu.")]
 Where = Annotated[
     str, typer.Option("--executor", help="Who computes: local, dask, dask:4 (workers), or tcp://scheduler:8786.")
 ]
 KeepAll = Annotated[bool, typer.Option("--keep-all", help="Leave nothing out: every step in full.")]
 Memory = Annotated[str, typer.Option("--memory", help="What a device may use, such as 6 GB; more is refused.")]
-Out = Annotated[Path, typer.Option("--out", help="Folder for the run's folder.")]
 
 
 @app.command()

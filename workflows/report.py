@@ -21,7 +21,8 @@ from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
 from typing import Any
 
-from neusee.nodes import Check, Facts
+from neusee.nodes import Check
+from neusee.workflows._account import facts_in
 from neusee.workflows._graph import Recipe
 from neusee.workflows._numbers import expected, metrics, table
 from neusee.workflows._readings import in_force
@@ -159,11 +160,9 @@ def _planned(result: Result) -> float | None:
 
 def _remembered(done: Done, about: Mapping[str, Any]) -> Done:
     """A step that was not run, with what the store says of its result."""
-    found = about.get("facts")
-    facts = Facts(**{**found, "shape": tuple(found["shape"])}) if found else None
     checks = tuple(Check(text, ok) for text, ok in about.get("checks", ()))
     why = f"made {about['date'][:16].replace('T', ' ')} UTC"
-    return replace(done, why=why, facts=facts, checks=checks, bytes=about["bytes"])
+    return replace(done, why=why, facts=facts_in(about), checks=checks, bytes=about["bytes"])
 
 
 def unit_of(docstring: str) -> str:

@@ -36,8 +36,14 @@ def direction(
     """
     if angle is not None:
         return torch.tensor(angle, dtype=torch.float64)
-    edges = [side * pixel_pitch / focal_length for side in shape]
+    edges = field_of_view(focal_length, pixel_pitch, shape)
     return torch.stack([_inside(share * edge / 3, edge / 2, rng) for edge in edges])
+
+
+def field_of_view(focal_length: float, pixel_pitch: float, shape: tuple[int, int]) -> tuple[float, float]:
+    """Direction cosines (n_y, n_x) from one edge of the sensor to the other: side x pitch / f."""
+    height, width = (side * pixel_pitch / focal_length for side in shape)
+    return height, width
 
 
 def _inside(sigma: float, edge: float, rng: Generator) -> Tensor:

@@ -29,6 +29,11 @@ def photons_per_joule(centres: Tensor) -> Tensor:
     return centres.double() / (PLANCK * LIGHT)
 
 
+def photons_that_fill(full_well: float, quantum_efficiency: float) -> float:
+    """Photons that fill a pixel: those of which ``full_well`` become electrons."""
+    return full_well / quantum_efficiency
+
+
 @node(rtol=1e-12)
 def saturation(
     bands: Bands, *, full_well: Well, quantum_efficiency: Efficiency, pixel_pitch: PositiveLength, exposure: Time
@@ -41,7 +46,7 @@ def saturation(
             constants give 0.13 % more.
     Source: NeuSee, Eq. (ThresSat).
     """
-    joules = full_well / quantum_efficiency / photons_per_joule(bands.centres)
+    joules = photons_that_fill(full_well, quantum_efficiency) / photons_per_joule(bands.centres)
     return joules / (exposure * pixel_pitch**2)
 
 
@@ -61,7 +66,7 @@ def limits(*, full_well: Well, quantum_efficiency: Efficiency, read_noise: Elect
     Source: EMVA Standard 1288, release 4.0 (SNR_max = sqrt(saturation capacity)).
     """
     decibels = 20.0 * math.log10(full_well / max(read_noise, 1.0))
-    values = (full_well / quantum_efficiency, math.sqrt(full_well), decibels)
+    values = (photons_that_fill(full_well, quantum_efficiency), math.sqrt(full_well), decibels)
     return Limits(*(torch.tensor(v, dtype=torch.float64) for v in values))
 
 

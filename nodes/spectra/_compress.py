@@ -57,6 +57,7 @@ def _(cube: Tensor, *, within: float = 1e-6) -> Mixture:
 
 
 @compress.check
-def _(result: Mixture, *inputs: Tensor, **params: float) -> list[Check]:
+def said_of_planes(result: Mixture, *inputs: object, **params: object) -> list[Check]:
+    """How many planes there are, and how far they are from the cube; of whatever gives a `Mixture`."""
     left = float(result.rest[-1].max()) / max(float(result.rest[0].max()), 1e-300)
     return [Check(f"{len(result.planes)} planes for {len(result.basis)} bands, within {left:.2g} of the brightest")]

@@ -1,14 +1,13 @@
 """From three channels to a spectrum, linearly."""
 
 import functools
-from typing import Any
 
 import torch
 from torch import Tensor
 
-from neusee.nodes import Check, node
+from neusee.nodes import Check, Node, node
 from neusee.nodes._precision import single
-from neusee.nodes.spectra._compress import Share, compress, mixture
+from neusee.nodes.spectra._compress import Share, compress, mixture, said_of_planes
 from neusee.nodes.spectra._planes import Source, few_planes
 from neusee.nodes.spectra._tables import mallett, paints, to_srgb
 from neusee.nodes.values import Bands, Mixture
@@ -54,14 +53,10 @@ def lift_mallett_mixture(rgb: Tensor, bands: Bands, *, within: Share = 1e-6) -> 
 
 @lift_mallett_mixture.reference
 def _(rgb: Tensor, bands: Bands, *, within: float = 1e-6) -> Mixture:
-    cube = torch.einsum("bc,cyx->byx", _basis(bands).to(rgb.device), rgb.double()).clamp_min(0)
-    found: Mixture = compress.ref(cube, within=within) if compress.ref else compress(cube, within=within)
-    return found
+    return _mixed_whole(lift_mallett, rgb, bands, within)
 
 
-@lift_mallett_mixture.check
-def _(result: Mixture, *inputs: Any, **params: Any) -> list[Check]:
-    return list(compress.after(result)) if compress.after else []
+lift_mallett_mixture.check(said_of_planes)
 
 
 lift_mallett.mixed = lift_mallett_mixture
@@ -108,14 +103,10 @@ def lift_lmmse_mixture(rgb: Tensor, bands: Bands, *, within: Share = 1e-6) -> Mi
 
 @lift_lmmse_mixture.reference
 def _(rgb: Tensor, bands: Bands, *, within: float = 1e-6) -> Mixture:
-    cube = torch.einsum("bc,cyx->byx", _estimator(bands).to(rgb.device), rgb.double()).clamp_min(0)
-    found: Mixture = compress.ref(cube, within=within) if compress.ref else compress(cube, within=within)
-    return found
+    return _mixed_whole(lift_lmmse, rgb, bands, within)
 
 
-@lift_lmmse_mixture.check
-def _(result: Mixture, *inputs: Any, **params: Any) -> list[Check]:
-    return list(compress.after(result)) if compress.after else []
+lift_lmmse_mixture.check(said_of_planes)
 
 
 lift_lmmse.mixed = lift_lmmse_mixture
@@ -155,6 +146,14 @@ def _mixed(rgb: Tensor, matrix: Tensor, within: float) -> Mixture:
     dtype = rgb.dtype if rgb.dtype == torch.float64 else torch.float32
     source = Source(lambda part: (exact @ flat[:, part].double()).clamp_min_(0), len(exact), flat.shape[1], dtype)
     return mixture(few_planes(source, within), _lifted(rgb, matrix) if rgb.requires_grad else rgb)
+
+
+def _mixed_whole(lift: Node, rgb: Tensor, bands: Bands, within: float) -> Mixture:
+    """The reference of both: the cube of the other reference, and its own components."""
+    assert lift.ref is not None
+    assert compress.ref is not None
+    found: Mixture = compress.ref(lift.ref(rgb, bands), within=within)
+    return found
 
 
 def _basis(bands: Bands) -> Tensor:

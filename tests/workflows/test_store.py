@@ -338,8 +338,9 @@ from pathlib import Path
 import torch
 from neusee.workflows._store import Store
 torch.set_num_threads(1)
-print("ready", flush=True)
 for i in range(10_000):
+    if i == 2:
+        print("ready", flush=True)
     key = f"{i % 40:02x}" + "5" * 30
     store = Store(Path(sys.argv[1]))
     if not store.has(key):
@@ -350,7 +351,7 @@ for i in range(10_000):
 
 
 def killed_writers(root: Path, count: int, delays: list[float]) -> None:
-    """Processes that write the same keys over and over, each killed in the midst of it."""
+    """Processes that write the same keys over and over, each killed in the midst of it, none before its second."""
     command = [sys.executable, "-c", WRITER, str(root)]
     writers = [subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.DEVNULL) for _ in range(count)]
     for writer, delay in zip(writers, delays, strict=True):

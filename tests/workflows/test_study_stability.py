@@ -7,8 +7,8 @@ from dataclasses import replace
 import pytest
 import torch
 
-from neusee.nodes import losses, node
-from neusee.workflows import _extremes_limits, _study_stability
+from neusee.nodes import node
+from neusee.workflows import _extremes_cell, _extremes_limits, _study_stability
 from neusee.workflows._code import Code
 from neusee.workflows._extremes import CASES, USUAL, Case, Size
 from neusee.workflows._extremes_cell import judged
@@ -149,28 +149,37 @@ def test_words_of_a_cell_say_what_does_not_pass(picture):
     assert number(float("inf")) == "inf"
 
 
-def test_a_limit_counts_only_as_long_as_the_docstring_states_it(monkeypatch, picture):
-    monkeypatch.setattr(
-        _extremes_limits, "_LIMITS", {("losses.charbonnier", "usual"): (0.5, "by sqrt(epsilon) at most")}
-    )
-    assert _extremes_limits.limit_of(losses.charbonnier, "usual")[0] == 0.5
-    assert _extremes_limits.limit_of(losses.charbonnier, "NaN") is None
-    monkeypatch.setattr(_extremes_limits, "_LIMITS", {("losses.charbonnier", "usual"): (0.5, "whatever it is")})
-    assert _extremes_limits.limit_of(losses.charbonnier, "usual") is None
+def test_what_is_stated_counts_only_as_long_as_the_docstring_states_it(monkeypatch):
+    (path, case), words = next(iter(_extremes_limits._STATED.items()))
+    assert _extremes_limits.stated_of(find_node(path), case) == words
+    assert _extremes_limits.stated_of(find_node(path), "usual") is None
+    monkeypatch.setattr(_extremes_limits, "_STATED", {(path, case): "whatever it is"})
+    assert _extremes_limits.stated_of(find_node(path), case) is None
 
 
-def test_a_step_off_its_bound_within_a_stated_limit_warns(monkeypatch, picture):
-    limit = (1.0, "said here")
-    monkeypatch.setattr("neusee.workflows._extremes_cell.limit_of", lambda node, case: limit)
-    cell = judged(step_of(cancelling), [picture], USUAL, 0)
-    assert (cell.mark, cell.note, cell.bound) == ("warn", "said here", 1.0)
+@pytest.mark.parametrize(
+    ("error", "slope", "mark"),
+    [
+        (0.4, None, "pass"),
+        (0.6, None, "warn"),
+        (1.0, 1.0, "warn"),
+        (0.1, 3.9, "warn"),
+        (1.1, None, "fail"),
+        (0.1, 4.1, "fail"),
+        (float("nan"), None, "fail"),
+        (0.1, float("nan"), "fail"),
+    ],
+)
+def test_what_holds_by_less_than_twice_warns(error, slope, mark):
+    cell = _extremes_cell._verdict(error, 1.0, slope, 4.0)
+    assert cell.mark == mark
+    assert (cell.bound, cell.slope_bound) == (1.0, None if slope is None else 4.0)
+    assert [cell.error, cell.slope] == pytest.approx([error, slope], nan_ok=True)
 
 
 def test_what_every_node_states_it_still_states():
     for path, case in _extremes_limits._STATED:
         assert _extremes_limits.stated_of(find_node(path), case) is not None
-    for path, case in _extremes_limits._LIMITS:
-        assert _extremes_limits.limit_of(find_node(path), case) is not None
 
 
 def test_poisson_numbers_are_the_same_in_both_precisions(picture):
