@@ -58,6 +58,9 @@ class Mixture(NamedTuple):
     basis: Tensor  #: (band, k) float64
     rest: Tensor  #: (k + 1, band) float64: bound of max over pixels of |band b less the first r planes|, r = 0 to k
     spread: Tensor = torch.zeros(0, 0, dtype=torch.float64)  #: of the same, in root mean square; empty: not known
+    off: Tensor = torch.zeros(
+        0, 0
+    )  #: (y, x) bound of |band less all planes|, the largest of all bands; empty: not known
 
 
 class Channels(NamedTuple):
@@ -66,9 +69,11 @@ class Channels(NamedTuple):
     planes: Tensor  #: (row, y, x)
     rows: Tensor  #: (row, band) float64
     flux: Tensor  #: (band,) float64, sum of image[b] over its pixels
-    bound: Tensor  #: () float64, bound of the error over max |plane|, of the worst row, in the norm that was asked for
+    bound: Tensor  #: () float64, bound of the root mean square error over max |plane|, of the worst row
     kept: Tensor = torch.zeros(5, dtype=torch.int64)  #: planes, kernels, bands, rows and columns of the PSF convolved
-    largest: Tensor = torch.tensor(torch.inf, dtype=torch.float64)  #: the same of max |error|, where that was asked for
+    largest: Tensor = torch.tensor(
+        torch.inf, dtype=torch.float64
+    )  #: how far max |plane| may be off, over itself; or inf
 
 
 #: by class, the fields with one entry a band

@@ -92,8 +92,8 @@ class _Draft:
             "psf": image.wires.get("psf"),
             "rows": self._add(f"{responses}.rows", spectra.rows, {"bands": bands, "responses": responses}, {}, image),
         }
-        norm = "largest" if any(reader.node.sums is not None for reader in readers) else "rms"
-        self._add(name, node, wires, {**image.params, "within": within, "norm": norm}, image)
+        largest = any(reader.node.sums is not None for reader in readers)  # the level follows the brightest pixel
+        self._add(name, node, wires, {**image.params, "within": within, "largest": largest}, image)
         for reader in readers:
             changed = {i: _exchanged(wire, image.name, name) for i, wire in reader.wires.items()}
             self.rewired[reader.name] = replace(reader, wires=changed)

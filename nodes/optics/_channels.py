@@ -1,7 +1,7 @@
 """The image of a scene, summed over its bands before it is formed: few planes in, few out."""
 
 import math
-from typing import Annotated, Any, Literal
+from typing import Annotated, Any
 
 import torch
 from pydantic import Field
@@ -10,31 +10,31 @@ from torch import Tensor
 from neusee.nodes import Check, node
 from neusee.nodes.optics._box import flux
 from neusee.nodes.optics._collapse import Given, choose
-from neusee.nodes.optics._form import bordered, convolved, guessed, rounding
+from neusee.nodes.optics._form import bordered, convolved, guessed, majorant, rounding
 from neusee.nodes.optics._image import Border, image, reach
 from neusee.nodes.optics._passed import passed
 from neusee.nodes.values import Channels, Mixture, Psf
 
-Norm = Literal["largest", "rms"]
 Share = Annotated[float, Field(ge=0, allow_inf_nan=False)]  #: of the brightest pixel
 _TRIES = 3  #: the brightest pixels guessed, known, and all kept
 
 
 @node(rtol=1e-5)
 def image_channels(
-    radiance: Mixture, psf: Psf, rows: Tensor, *, border: Border = "zero", within: Share = 0.0, norm: Norm = "largest"
+    radiance: Mixture, psf: Psf, rows: Tensor, *, border: Border = "zero", within: Share = 0.0, largest: bool = False
 ) -> Channels:
     """Sum the bands of the image by each row of weights, convolving few planes with few kernels in place of all bands.
 
     Plane i is the sum over k of planes[k] convolved with sum_b rows[i, b] basis[b, k] psf[b]: three planes and three
     rows take 15 transforms where 31 bands take 93. Planes, kernels, bands and the tails of the PSF are left away as
-    far as `within` lets them, whichever saves the most; 0 leaves nothing away. What it limits is the largest error, or
-    with `rms` its root mean square, for which a scene needs fewer planes.
+    far as `within` lets the root mean square error, whichever saves the most; 0 leaves nothing away. With `largest` no
+    more is left away than the mixture does, and how far the brightest pixel may be off is bounded as well.
 
     Shapes: radiance k planes (y, x), psf.intensity (band, any, any), rows (row, band) -> planes (row, y, x).
     Units:  those of the radiance times those of the rows; flux those of the radiance.
     Error:  `bound`, of the brightest pixel of each row. True bounds: what the mixture leaves, by the sum of each PSF
             (Young's inequality, as for the root mean square; where the border reflects, three times the scene's);
+            of the brightest pixel, what every pixel of the mixture may lack, imaged too;
             tails, by Young's inequality; kernels, by the sum of what they miss. Estimated, not proved: rounding of the
             transforms, from the powers of planes and kernels, two to ten times what was found. Flux: 1e-6, and what
             the mixture leaves. Gradients reach the planes and the PSF; basis and rows are held still.
@@ -45,17 +45,18 @@ def image_channels(
     unit = rows.detach().abs().amax(1).double().cpu()
     unit = unit.where(unit > 0, 1.0)
     scaled = rows.detach().double().cpu() / unit[:, None]
-    given = _given(radiance, planes, intensity, scaled, border, within > 0, norm)
-    result, bound, kept = _formed(planes, intensity, given, within)
+    given = _given(radiance, planes, intensity, scaled, border, within > 0 and not largest)
+    result, bound, kept = _formed(planes, intensity, given, 0.0 if largest else within)
+    top = _top(result, radiance, intensity, given) if largest else math.inf
     wide = bordered(planes, given, (intensity.shape[1], intensity.shape[2]))
     light = flux(wide, intensity, radiance.basis.detach(), given.size)
-    largest = bound if norm == "largest" else torch.full_like(bound, math.inf)
-    return Channels(result * unit.to(result)[:, None, None], rows.detach().double(), light, bound, kept, largest)
+    brightest = torch.tensor(top, dtype=torch.float64)
+    return Channels(result * unit.to(result)[:, None, None], rows.detach().double(), light, bound, kept, brightest)
 
 
 @image_channels.reference
 def _(
-    radiance: Mixture, psf: Psf, rows: Tensor, *, border: Border = "zero", within: float = 0.0, norm: str = "largest"
+    radiance: Mixture, psf: Psf, rows: Tensor, *, border: Border = "zero", within: float = 0.0, largest: bool = False
 ) -> Channels:
     assert image.ref is not None
     cube = torch.tensordot(radiance.basis.double(), radiance.planes.double(), 1)
@@ -94,13 +95,11 @@ def _fitted(radiance: Mixture, psf: Psf, rows: Tensor) -> tuple[Tensor, Tensor]:
     return planes.to(dtype), kernel.to(dtype)
 
 
-def _given(
-    radiance: Mixture, planes: Tensor, intensity: Tensor, rows: Tensor, border: Border, cut: bool, norm: Norm
-) -> Given:
+def _given(radiance: Mixture, planes: Tensor, intensity: Tensor, rows: Tensor, border: Border, cut: bool) -> Given:
     flat = planes.detach().flatten(1)
     gram = (flat @ flat.T).double().cpu()
     copies = 9 if border == "reflect" else 1
-    if norm == "rms" and radiance.spread.numel():
+    if radiance.spread.numel():
         rest = radiance.spread.double().cpu() * math.sqrt(copies)
         most = (gram.diagonal() * (1.001 * copies / flat.shape[1])).clamp_min(0).sqrt()
     else:
@@ -134,6 +133,23 @@ def _formed(planes: Tensor, intensity: Tensor, given: Given, within: float) -> t
         brightest = (found - plan.off - lost).clamp_min(0)
         allowed = within / (1 + within) - _share(lost, found) - eps
     return result, torch.tensor(bound, dtype=torch.float64), torch.tensor(plan.kept)
+
+
+def _top(result: Tensor, radiance: Mixture, intensity: Tensor, given: Given) -> float:
+    """How far the brightest pixel of a row may be off, as a share of it: the worst row.
+
+    What the mixture lacks of a pixel, in any band, is imaged by all bands together; the true image lies so far from
+    what was found at most.
+    """
+    if not radiance.off.numel():
+        return math.inf
+    found = result.detach()
+    reach = majorant(radiance.off.to(found), intensity.detach(), given)
+    most, above, below = (x.amax((1, 2)).double().cpu() for x in (found, found + reach, found - reach))
+    lost = rounding(
+        given, choose(given, most, 0.0), found.abs().amax((1, 2)).double().cpu(), torch.finfo(found.dtype).eps
+    )
+    return _share(torch.maximum(above - most, most - below) + lost, most)
 
 
 def _share(off: Tensor, found: Tensor) -> float:

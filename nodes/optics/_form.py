@@ -8,7 +8,7 @@ from torch.nn.functional import pad
 
 from neusee.nodes.optics._collapse import Given, Plan, transform
 from neusee.nodes.optics._passed import centred
-from neusee.nodes.optics._summed import Where, summed
+from neusee.nodes.optics._summed import Mix, Where, summed
 
 _SOME = 16  #: rows of the PSF summed at a time: those of 31 bands stay in the cache
 
@@ -20,6 +20,15 @@ def convolved(planes: Tensor, intensity: Tensor, given: Given, plan: Plan) -> Te
     at = (m - 1, n - 1) if given.reflect else (m // 2, n // 2)
     where = Where(zero, zero, at, given.size, transform(given, plan.window))
     return summed(scene, _kernels(intensity, plan), plan.mix, where)
+
+
+def majorant(off: Tensor, intensity: Tensor, given: Given) -> Tensor:
+    """What ``off`` (y, x) in every band adds to each row at most: (row, y, x)."""
+    count, window = len(given.rows), (intensity.shape[1], intensity.shape[2])
+    mix = Mix(torch.eye(count, dtype=torch.float64), torch.ones(count, 1, dtype=torch.float64), None)
+    every = torch.arange(intensity.shape[0])
+    plan = Plan(1, every, window, given.rows.abs(), mix, given.rows.new_zeros(count), 0.0, True)
+    return convolved(off[None], intensity.abs(), given, plan).clamp_min(0)
 
 
 def bordered(planes: Tensor, given: Given, window: tuple[int, int]) -> Tensor:

@@ -79,7 +79,7 @@ def illuminate(
         basis = reflectance.basis * power.to(reflectance.basis)[:, None]
         by = power.detach().abs().to(reflectance.rest)
         spread = reflectance.spread * by if reflectance.spread.numel() else reflectance.spread
-        return Mixture(reflectance.planes, basis, reflectance.rest * by, spread)
+        return Mixture(reflectance.planes, basis, reflectance.rest * by, spread, reflectance.off * float(by.max()))
     reflectance = single(reflectance)
     return reflectance * power.to(reflectance)[:, None, None]
 
@@ -104,7 +104,8 @@ def _(reflectance: Tensor | Mixture, illuminant: Tensor, *, times: str = "once")
         basis = torch.stack([row.double() * p for row, p in zip(reflectance.basis, power, strict=True)])
         rest = torch.stack([column * p for column, p in zip(reflectance.rest.T, power, strict=True)], 1)
         spread = [column * p for column, p in zip(reflectance.spread.T, power, strict=False)]
-        return Mixture(reflectance.planes.double(), basis, rest, torch.stack(spread, 1) if spread else rest[:0, :0])
+        found = torch.stack(spread, 1) if spread else rest[:0, :0]
+        return Mixture(reflectance.planes.double(), basis, rest, found, reflectance.off.double() * max(power))
     return torch.stack([reflectance[..., b, :, :].double() * p for b, p in enumerate(power)], -3)
 
 

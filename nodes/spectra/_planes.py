@@ -8,13 +8,13 @@ from torch import Tensor
 
 _PIECE = 4096  #: pixels looked at together: 31 bands of them in float64 are 1 MB and stay in the cache
 _FLOOR = 8  #: roundings of the planes, below which no bound can be had
-_SAMPLE = 4096  #: pixels by which the number of planes is guessed
+_ROOT = 2e-7  #: what products in float64 can tell of a root mean square
 
 
 class Source(NamedTuple):
     """A cube that need not be in memory."""
 
-    part: Callable[[slice | Tensor], Tensor]  #: some pixels, (band, pixel) float64, in memory of their own
+    part: Callable[[slice], Tensor]  #: some pixels, (band, pixel) float64, in memory of their own
     bands: int
     pixels: int
     dtype: torch.dtype  #: of the planes
@@ -31,12 +31,13 @@ class Found(NamedTuple):
     basis: Tensor  #: (band, k) float64
     rest: Tensor  #: (k + 1, band) float64
     spread: Tensor  #: (k + 1, band) float64
+    off: Tensor  #: (pixel,)
 
 
 def few_planes(source: Source, within: float) -> Found:
-    """The fewest principal components that come within a share of the largest element; raises ValueError for NaN.
+    """The fewest principal components whose root mean square error is within a share of the largest element.
 
-    A few pixels say how many may do; then all are looked at, and of those that miss the worst join the few.
+    Raises ValueError for NaN. What they leave of every pixel is measured too.
     """
     most, gram = _looked_at(source)
     scale = float(most.max())
@@ -44,17 +45,13 @@ def few_planes(source: Source, within: float) -> Found:
     if scaled:
         gram = _looked_at(source, scale)[1]
     axes = torch.linalg.eigh(gram).eigenvectors.flip(1)
-    target = max(within, _FLOOR * torch.finfo(source.dtype).eps) * scale
-    some = torch.linspace(0, source.pixels - 1, min(source.pixels, _SAMPLE), dtype=torch.float64).long()
-    sample, k = source.part(some), 1
-    while True:
-        k = max(k, _least(sample, axes, target))
-        planes, last, worst = _projected(source, axes[:, :k])
-        if k == source.bands or float(last.max()) <= target:
-            rest = _rest(most, planes, axes[:, :k], last)
-            spread = _spread(gram / source.pixels, axes, k, torch.finfo(source.dtype).eps)
-            return Found(planes, axes[:, :k], rest, spread * scale if scaled else spread)
-        sample, k = torch.cat([sample, source.part(worst)], 1), k + 1
+    target = max(within, _FLOOR * torch.finfo(source.dtype).eps, _ROOT) * scale
+    eps = torch.finfo(source.dtype).eps
+    spread = _spread(gram / source.pixels, axes, source.bands, eps) * (scale if scaled else 1.0)
+    count = max(1, next((k for k, left in enumerate(spread) if float(left.max()) <= target), source.bands))
+    planes, last, off = _projected(source, axes[:, :count])
+    rest = _rest(most, planes, axes[:, :count], last)
+    return Found(planes, axes[:, :count], rest, spread[: count + 1], off)
 
 
 def _looked_at(source: Source, scale: float = 1.0) -> tuple[Tensor, Tensor]:
@@ -72,29 +69,17 @@ def _looked_at(source: Source, scale: float = 1.0) -> tuple[Tensor, Tensor]:
     return most, gram
 
 
-def _least(sample: Tensor, axes: Tensor, target: float) -> int:
-    """How many planes the sample needs."""
-    left = sample.clone()
-    for k in range(axes.shape[1]):
-        if float(left.abs().max()) <= target:
-            return k
-        left -= axes[:, k, None] * (axes[:, k] @ sample)
-    return axes.shape[1]
-
-
 def _projected(source: Source, axes: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-    """Planes in their own precision, the largest that they leave of each band, and the pixels where they do."""
+    """Planes in their own precision, the largest that they leave of each band, and of each pixel."""
     planes = torch.empty(axes.shape[1], source.pixels, dtype=source.dtype, device=axes.device)
-    last, worst = axes.new_zeros(source.bands), torch.zeros(source.bands, dtype=torch.long, device=axes.device)
+    last, off = axes.new_zeros(source.bands), planes.new_empty(source.pixels)
     for piece in source.pieces():
         x = source.part(piece)
         planes[:, piece] = axes.T @ x
         left = x.sub_(axes @ planes[:, piece].double()).abs_()
-        top = left.amax(1)
-        if bool((top > last).any()):
-            worst = torch.where(top > last, piece.start + left.argmax(1), worst)
-            last = torch.maximum(last, top)
-    return planes, last, torch.unique(worst)
+        last = torch.maximum(last, left.amax(1))
+        off[piece] = left.amax(0)
+    return planes, last, off.mul_(1 + 2 * torch.finfo(source.dtype).eps)
 
 
 def _spread(power: Tensor, axes: Tensor, count: int, eps: float) -> Tensor:

@@ -58,7 +58,8 @@ def looseness(seed):
     found = compress(cube, within=within)
     assert found.rest.shape == (len(found.planes) + 1, len(cube))
     target = max(within, 9 * torch.finfo(found.planes.dtype).eps) * float(cube.abs().max())
-    assert len(found.planes) == len(cube) or float(found.rest[-1].max()) <= target
+    assert len(found.planes) == len(cube) or float(found.spread[-1].max()) <= target
+    assert bool((left(found, cube, len(found.planes), lambda x: x.abs().amax(0)) <= found.off.double()).all())
     ratios = []
     for r in range(len(found.planes) + 1):
         true = left(found, cube, r)
@@ -241,7 +242,7 @@ def test_a_lift_to_planes_is_the_lift_whether_clipped_or_not(lift, within):
         cube, found = lift(colours, SCENE), lift.mixed(colours, SCENE, within=within)
         lost = left(found, cube, len(found.planes))
         assert bool((lost <= found.rest[-1] + 1e-6).all())
-        assert float(found.rest[-1].max()) <= within * float(cube.max())
+        assert float(found.spread[-1].max()) <= within * float(cube.max())
         assert len(found.planes) == len(compress(cube, within=within).planes)
         assert len(found.planes) == len(lift.mixed.ref(colours, SCENE, within=within).planes)
     assert "planes for 31 bands" in lift.mixed.after(found)[0].text
