@@ -23,12 +23,13 @@ def convolved(planes: Tensor, intensity: Tensor, given: Given, plan: Plan) -> Te
 
 
 def majorant(off: Tensor, intensity: Tensor, given: Given) -> Tensor:
-    """What ``off`` (y, x) in every band adds to each row at most: (row, y, x)."""
-    count, window = len(given.rows), (intensity.shape[1], intensity.shape[2])
-    mix = Mix(torch.eye(count, dtype=torch.float64), torch.ones(count, 1, dtype=torch.float64), None)
+    """What ``off`` (y, x) in every band adds to any row at most: (y, x); one kernel for all rows."""
+    window = (intensity.shape[1], intensity.shape[2])
+    heaviest = given.rows.abs().amax(0, keepdim=True)
+    one = Mix(torch.ones(1, 1, dtype=torch.float64), torch.ones(1, 1, dtype=torch.float64), None)
     every = torch.arange(intensity.shape[0])
-    plan = Plan(1, every, window, given.rows.abs(), mix, given.rows.new_zeros(count), 0.0, True)
-    return convolved(off[None], intensity.abs(), given, plan).clamp_min(0)
+    plan = Plan(1, every, window, heaviest, one, given.rows.new_zeros(1), 0.0, True)
+    return convolved(off[None], intensity.abs(), given, plan)[0].clamp_min(0)
 
 
 def bordered(planes: Tensor, given: Given, window: tuple[int, int]) -> Tensor:

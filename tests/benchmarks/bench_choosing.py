@@ -1,0 +1,110 @@
+"""What choosing costs, of a cold run and of a cached one: `python tests/benchmarks/bench_choosing.py [RECIPE ...]`.
+
+Choosing is all that a run with `--keep-all` does not do: the recipe made cheaper, the account of the tolerance, the
+proof along the graph, and inside the image of few planes the search for what may be left away and the bounds. Each is
+timed where it is called; time in one that another calls counts once, and steps that it asks for do not count. Beside a
+cached run stands one with `--keep-all`, as long as that is in the store too. The runs are whole, engine and store
+included, and in one process, with the code of the nodes read before. A line by recipe: medians of 3, or of one where
+it takes long.
+"""
+
+import statistics
+import sys
+import tempfile
+import time
+from contextlib import contextmanager
+from dataclasses import replace
+from functools import wraps
+from pathlib import Path
+from unittest import mock
+
+from neusee.nodes.optics import _channels
+from neusee.workflows import _resolve, _run, _under_way, load
+from neusee.workflows._accuracy_points import cold
+from neusee.workflows._ledger import Ledger
+from neusee.workflows._store import Store
+
+ENGINE = ((_run, "economised"), (_run, "border"), (_run, "proof"), (Ledger, "verdict"), (Ledger, "pass_on"))
+NODE = ((_channels, "choose"), (_channels, "guessed"), (_channels, "rounding"), (_channels, "_top"))
+LONG = 20.0  #: s, beyond which one run is enough
+
+
+class Clock:
+    """Seconds in the functions that it watches, the outermost alone."""
+
+    def __init__(self):
+        self.seconds, self.inside = 0.0, False
+
+    def watched(self, function):
+        @wraps(function)
+        def timed(*args, **kwargs):
+            if self.inside:
+                return function(*args, **kwargs)
+            self.inside, began = True, time.perf_counter()
+            try:
+                return function(*args, **kwargs)
+            finally:
+                self.inside = False
+                self.seconds += time.perf_counter() - began
+
+        return timed
+
+    def left_out(self, function):
+        """What is computed because a choice asks for it would be computed anyway."""
+
+        @wraps(function)
+        def timed(*args, **kwargs):
+            inside, self.inside, began = self.inside, False, time.perf_counter()
+            try:
+                return function(*args, **kwargs)
+            finally:
+                self.inside = inside
+                if inside:
+                    self.seconds -= time.perf_counter() - began
+
+        return timed
+
+
+@contextmanager
+def clocks():
+    """One of the engine and one of the node."""
+    engine, node = Clock(), Clock()
+    for clock, places in ((engine, ENGINE), (node, NODE)):
+        for place, name in places:
+            mock.patch.object(place, name, clock.watched(getattr(place, name))).start()
+    make = _under_way.UnderWay.make
+    mock.patch.object(_under_way.UnderWay, "make", engine.left_out(make)).start()
+    try:
+        yield engine, node
+    finally:
+        mock.patch.stopall()
+
+
+def once(recipe, store):
+    with clocks() as (engine, node):
+        result = _run.run(recipe, store)
+    return result.seconds, engine.seconds, node.seconds
+
+
+def line(name):
+    recipe = load(name)
+    full, colds = replace(recipe, keep_all=True), []
+    with tempfile.TemporaryDirectory() as folder:
+        memo = Store(Path(folder))
+        for each in (recipe, full):
+            once(each, memo)
+        cached, whole = ([once(each, Store(Path(folder))) for _ in range(9)] for each in (recipe, full))
+        while len(colds) < 3 and not (colds and colds[0][0] > LONG):
+            with cold(memo) as store:
+                colds.append(once(recipe, store))
+    for what, runs in (("cold", colds), ("cached", cached), ("cached, `--keep-all`", whole)):
+        seconds, engine, node = (statistics.median(column) for column in zip(*runs, strict=True))
+        share = (engine + node) / seconds
+        print(f"| {name} | {what} | {seconds:.4f} | {1e3 * engine:.1f} | {1e3 * node:.1f} | {share:.1%} |", flush=True)
+
+
+if __name__ == "__main__":
+    assert _resolve.Ledger is Ledger is _under_way.Ledger
+    print("| recipe | run | s | engine, ms | node, ms | share |\n|---|---|---|---|---|---|")
+    for name in sys.argv[1:] or ("first_light", "dirty_windshield", "paper_table1"):
+        line(name)
