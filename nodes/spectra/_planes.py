@@ -51,7 +51,8 @@ def few_planes(source: Source, within: float) -> Found:
     count = max(1, next((k for k, left in enumerate(spread) if float(left.max()) <= target), source.bands))
     planes, last, off = _projected(source, axes[:, :count])
     rest = _rest(most, planes, axes[:, :count], last)
-    return Found(planes, axes[:, :count], rest, spread[: count + 1], off)
+    spread = torch.cat([spread[:count], torch.minimum(spread[count], rest[count])[None]])  # of what was measured
+    return Found(planes, axes[:, :count], rest, spread, off)
 
 
 def _looked_at(source: Source, scale: float = 1.0) -> tuple[Tensor, Tensor]:
