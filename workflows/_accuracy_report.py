@@ -86,7 +86,10 @@ def lead(recipe: Recipe, points: Sequence[Point]) -> str:
     held, ratio = sum(c.held for c in made), median_ratio(made)
     said.append(f"{held} of {len(made)} tolerances were held.")
     if whole is not None and any(_beyond(c, points) for c in made):
-        said.append(f"Those below {whole.most:.1g} cannot be: everything kept is off by so much, by its arithmetic.")
+        said.append(
+            f"{sum(_beyond(c, points) for c in made)} cannot be told: everything kept is off by {whole.most:.1g} "
+            "itself, by its arithmetic."
+        )
     if ratio is not None:
         said.append(f"The engine's choice costs {ratio:.2f} times the cheapest setting that holds, at the median.")
     load = max((p.found.load for p in points), default=0.0)
@@ -96,9 +99,9 @@ def lead(recipe: Recipe, points: Sequence[Point]) -> str:
 
 
 def _beyond(choice: Choice, points: Sequence[Point]) -> bool:
-    """Whether a tolerance was missed that everything kept, in the recipe's own precision, misses too."""
+    """Whether a tolerance was missed by no more than everything kept, in the recipe's own precision, is off itself."""
     whole = next((p.most for p in points if p.trial.line == KEEP_ALL and p.sound), 0.0)
-    return not choice.held and whole > choice.tolerance and choice.chosen.most <= _NO_WORSE * whole
+    return not choice.held and choice.chosen.most <= choice.tolerance + _NO_WORSE * whole
 
 
 def pictures(recipe: Recipe, points: Sequence[Point], tried: Sequence[StepTried]) -> dict[str, bytes]:

@@ -9,17 +9,19 @@ value that is asked for by name is always the full one.
 from __future__ import annotations
 
 import math
-from collections.abc import Collection, Iterable, Mapping
+from collections.abc import Collection, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from typing import TYPE_CHECKING, Any
 
 from neusee.workflows._absent import without_nothing
-from neusee.workflows._graph import Economy, Recipe, Step, Wire, in_order, needed
+from neusee.workflows._border import unheard
+from neusee.workflows._graph import UNHEARD, Economy, Recipe, Step, Wire, in_order, needed
 
 if TYPE_CHECKING:
     from neusee.nodes import Node
 
 CHANNELS = 0.25  #: share of the tolerance for the channels of one image; the level may follow a second one
+_LEAST = 2e-5  #: of a tolerance, below which sums over bands can hardly be proved: their rounding alone is 1.4e-6
 _MIXTURE = 0.1  #: share of the tolerance for a mixture, rounded down to a power of ten so that it is seldom another
 
 
@@ -34,15 +36,23 @@ def economised(recipe: Recipe, wanted: Iterable[str], pinned: Collection[str] = 
         return recipe
     recipe = without_nothing(recipe, needed(recipe, sorted(wanted)))
     order = needed(recipe, sorted(wanted))
+    recipe = _limited(recipe, order)
     images = [recipe.steps[n] for n in order if recipe.steps[n].node.collapsed is not None and n not in wanted]
-    if not images or recipe.allowed <= 0:
+    if not images or recipe.tolerance * recipe.strict <= _LEAST:
         return recipe
     behind = _behind(recipe, order, pinned)
     draft = _Draft(recipe, wanted, _readers(recipe, order))
     for image in images:
         if image.name not in pinned and image.wires.get("radiance") not in behind:
             draft.collapse(image)
-    return draft.finished()
+    found = draft.finished()
+    return _limited(found, needed(found, sorted(wanted)))
+
+
+def _limited(recipe: Recipe, order: Sequence[str]) -> Recipe:
+    """The recipe with a limit where nodes do not tell, if its tolerance is larger."""
+    steps = unheard(recipe, order) if recipe.tolerance > UNHEARD else frozenset[str]()
+    return recipe if steps == recipe.unheard else replace(recipe, unheard=steps)
 
 
 def _behind(recipe: Recipe, order: Iterable[str], pinned: Collection[str]) -> set[str]:
@@ -76,7 +86,6 @@ class _Draft:
 
     def collapse(self, image: Step) -> None:
         """Put the channels of an image beside it, if all that reads it asks for sums over its bands."""
-        from neusee.nodes import spectra
 
         readers = [self.rewired.get(name, self.recipe.steps[name]) for name in self.readers.get(image.name, ())]
         spectral = {(r.wires.get("bands"), r.wires.get("responses")) for r in readers if "responses" in r.node.inputs}
@@ -86,11 +95,11 @@ class _Draft:
         bands, responses = spectral.pop()
         if not isinstance(radiance, str) or not isinstance(bands, str) or not isinstance(responses, str):
             return
-        name, within = f"{image.name}.channels", self.recipe.allowed * CHANNELS
+        name, within = f"{image.name}.channels", self.recipe.allowed(image.name) * CHANNELS
         wires = {
             "radiance": self._mixture(radiance, image),
             "psf": image.wires.get("psf"),
-            "rows": self._add(f"{responses}.rows", spectra.rows, {"bands": bands, "responses": responses}, {}, image),
+            "rows": self._rows(bands, responses, readers, image),
         }
         largest = any(reader.node.sums is not None for reader in readers)  # the level follows the brightest pixel
         self._add(name, node, wires, {**image.params, "within": within, "largest": largest}, image)
@@ -123,6 +132,14 @@ class _Draft:
         step = self.recipe.steps[wire]
         return step.node.sums is not None and step.node.sums(step.params)
 
+    def _rows(self, bands: str, responses: str, readers: list[Step], image: Step) -> str:
+        """The step that gives the weights of the bands; with the well's where a step reads bands but no responses."""
+        from neusee.nodes import spectra
+
+        well = any("bands" in r.node.inputs and "responses" not in r.node.inputs for r in readers)
+        name, wires = f"{responses}.{'wells' if well else 'rows'}", {"bands": bands, "responses": responses}
+        return self._add(name, spectra.rows, wires, {"well": well}, image)
+
     def _mixture(self, name: str, image: Step) -> str:
         """The step that gives a cube as a mixture of few planes, made as far up as nodes take one."""
         from neusee.nodes import spectra
@@ -132,7 +149,8 @@ class _Draft:
         if through is not None and name not in self.wanted:
             wires = {**step.wires, through: self._mixture(str(step.wires[through]), image)}
             return self._add(new, step.node, wires, step.params, step)
-        within = {"within": 10.0 ** math.floor(math.log10(self.recipe.allowed * _MIXTURE))}
+        decade = math.floor(math.log10(self.recipe.allowed(image.name) * _MIXTURE))
+        within = {"within": 10.0 ** (decade if self.recipe.strict == 1.0 else decade - 1)}  # never the same again
         if step.node.mixed is not None and name not in self.wanted:
             return self._add(new, step.node.mixed, step.wires, {**step.params, **within}, step)
         return self._add(new, spectra.compress, {"cube": name}, within, step)

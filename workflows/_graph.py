@@ -62,6 +62,9 @@ class Expectation:
     mark: Mark
 
 
+UNHEARD = 1e-3  #: what a figure of merit reads may be off by, for all of it may hang on a small difference
+
+
 @dataclass(frozen=True, slots=True, repr=False)
 class Recipe:
     """A recipe whose every value, wire and file was looked at; nothing of it has run."""
@@ -80,11 +83,15 @@ class Recipe:
     economies: tuple[Economy, ...] = ()  #: what stands in for full steps; a recipe as it is read has none
     strict: float = 1.0  #: share of the tolerance that may be spent: less where a run could not prove that it held
     whole: Recipe | None = field(default=None, compare=False)  #: the recipe without economies, where this has some
+    unheard: frozenset[str] = frozenset()  #: steps whose errors reach a node that does not tell what becomes of them
 
-    @property
-    def allowed(self) -> float:
-        """What all that is left out or computed more cheaply may change."""
-        return self.tolerance * self.strict
+    def limit(self, step: str) -> float:
+        """What the result of a step may be off by: the tolerance, or `UNHEARD` where that is less and no node tells."""
+        return min(self.tolerance, UNHEARD) if step in self.unheard else self.tolerance
+
+    def allowed(self, step: str) -> float:
+        """What all that is left out or computed more cheaply, up to a step, may change of it."""
+        return self.limit(step) * self.strict
 
     def run(
         self,

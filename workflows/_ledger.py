@@ -20,15 +20,15 @@ class Ledger:
 
     def __init__(self, recipe: Recipe) -> None:
         share = 1.0 - 2 * CHANNELS if any(e.within for e in recipe.economies) else 1.0
-        self._allowed, self._keep_all = recipe.allowed * share, recipe.keep_all
+        self._recipe, self._share = recipe, share
         self._spent: dict[str, dict[str, float]] = {}  # by step: decision -> its bound; shared where equal
 
     def verdict(self, step: Step, params: Mapping[str, Any], facts_of: FactsOf) -> Verdict:
         """Whether a step whose node has a bound is left out; with `Recipe.keep_all` nothing is."""
         spent = self.pass_on(step)
-        if self._keep_all:
+        if self._recipe.keep_all:
             return Verdict(float("inf"), False, "everything is kept", "")
-        found = judge(step, params, facts_of, self._allowed - sum(spent.values()))
+        found = judge(step, params, facts_of, self._recipe.allowed(step.name) * self._share - sum(spent.values()))
         if found.left_out:
             self.leave_out(step, found.bound)
         return found

@@ -36,26 +36,18 @@ class Proof:
         """The greatest bound of what is held to the tolerance."""
         return max(self.held.values(), default=0.0)
 
+    def over(self, recipe: Recipe) -> float:
+        """The greatest bound over what it is held to; infinite where nothing is allowed."""
+        shares = [(share, recipe.limit(name)) for name, share in self.held.items() if share > 0]
+        return max((share / limit if limit > 0 else math.inf for share, limit in shares), default=0.0)
+
 
 class Unproved(Exception):
-    """What was left out may have changed more than the tolerance allows."""
+    """What was left out may have changed so many times what is allowed."""
 
-    def __init__(self, bound: float) -> None:
-        super().__init__(f"changes at most {bound:.2g}")
-        self.bound = bound
-
-
-def border(recipe: Recipe, order: Iterable[str], wanted: Iterable[str]) -> list[str]:
-    """Steps that will be held to the tolerance: what may be off and is wanted, or read by a node that does not tell."""
-    off, found = set[str](), dict[str, None]()
-    for name in order:
-        step = recipe.steps[name]
-        reads = [source for source in step.sources if source in off]
-        if reads and step.node.spread is None and step.node.deviation is None:
-            found |= dict.fromkeys(reads)
-        elif reads or step.node.deviation is not None or step.node.bound is not None:
-            off.add(name)
-    return [*found, *(name for name in wanted if name in off and name not in found)]
+    def __init__(self, over: float) -> None:
+        super().__init__(f"changes at most {over:.2g} times what the tolerance allows")
+        self.over = over
 
 
 def proof(

@@ -11,13 +11,14 @@ from typing import Any
 import torch
 
 from neusee.workflows._account import Done, Event
+from neusee.workflows._border import border
 from neusee.workflows._call import to_device
 from neusee.workflows._economy import economised
 from neusee.workflows._graph import Recipe, needed
 from neusee.workflows._keys import Key
 from neusee.workflows._marks import nearest
 from neusee.workflows._place import Schedule
-from neusee.workflows._proof import Proof, Unproved, border, proof
+from neusee.workflows._proof import Proof, Unproved, proof
 from neusee.workflows._remote import open_store
 from neusee.workflows._store import Store
 from neusee.workflows._under_way import UnderWay
@@ -100,14 +101,14 @@ def run(
         try:
             return _attempt(work, wanted, began)
         except Unproved as failed:
-            recipe = economised(_stricter(recipe, failed.bound), wanted)
+            recipe = economised(_stricter(recipe, failed.over), wanted)
         finally:
             work.close()
 
 
-def _stricter(recipe: Recipe, bound: float) -> Recipe:
+def _stricter(recipe: Recipe, over: float) -> Recipe:
     """The recipe with less to spend, where it could not be proved that its tolerance held; the second time nothing."""
-    strict = _SAFE * recipe.tolerance / bound if recipe.strict == 1.0 else 0.0
+    strict = _SAFE / over if recipe.strict == 1.0 else 0.0
     return replace(recipe.whole or recipe, strict=strict, keep_all=strict == 0.0)
 
 
@@ -128,8 +129,9 @@ def _attempt(work: UnderWay, wanted: tuple[str, ...], began: float) -> Result:
             lambda name: work.done.get(name) or work.asleep(name),
             work.known_facts,
         )
-        if proved.worst > recipe.tolerance and not recipe.keep_all:
-            raise Unproved(proved.worst)
+        over = proved.over(recipe)
+        if over > 1.0 and not recipe.keep_all:
+            raise Unproved(over)
         work.make([work.keys[name] for name in wanted], keep=False)
     values = {name: to_device(work.values[work.keys[name]], work.devices[0]) for name in wanted}
     done = work.account(order)

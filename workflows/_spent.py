@@ -27,6 +27,7 @@ def spent(result: Result) -> dict[str, Any]:
     return {
         "tolerance": result.recipe.tolerance,
         "norm": NORM,
+        "held": min(map(result.recipe.limit, result.proof.held), default=result.recipe.tolerance),
         "strict": result.recipe.strict,
         "keep_all": result.recipe.keep_all,
         "bounds": {name: share for name, share in result.proof.held.items() if share > 0},

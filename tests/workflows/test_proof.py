@@ -192,12 +192,25 @@ def test_where_the_bound_grows_on_the_way_less_is_left_out(store):
 
 
 def test_behind_a_node_that_does_not_tell_its_inputs_are_held(store):
-    steps = [*chain(0.5), step("end", opaque, x="out")]
+    steps = [*chain(0.05), step("end", opaque, x="out")]
     result = run(recipe(*steps, outputs="end"), store)
     assert states(result) == ["left out"]
     assert result.proof.of("end") is None
     assert list(result.proof.held) == ["out"]
-    assert 0 < result.proof.worst <= 1e-2
+    assert 0 < result.proof.worst <= 1e-3
+
+
+def test_where_nothing_is_allowed_a_cheaper_form_is_over(store):
+    steps = [step("l", light), step("r", rough, {"digits": 0}, x="l"), step("out", first, pair="r")]
+    result = run(replace(recipe(*steps), tolerance=0.0), store)
+    assert result.recipe.keep_all
+    assert result.proof.over(result.recipe) == math.inf
+
+
+def test_behind_a_node_that_does_not_tell_a_large_tolerance_is_not_spent(store):
+    steps = [*chain(0.5), step("end", opaque, x="out")]  # 5e-3, and 1e-2 is allowed
+    assert states(run(recipe(*steps, outputs="end"), store)) == ["run"]
+    assert states(run(recipe(*steps, outputs="out"), store)) == ["left out"]
 
 
 def test_a_cheaper_form_tells_its_own_error(store):

@@ -6,7 +6,7 @@ from dataclasses import replace
 import pytest
 from typer.testing import CliRunner
 
-from neusee.workflows import load, report
+from neusee.workflows import _economy, load, report
 from neusee.workflows._economy import economised
 from neusee.workflows._error import error_of
 from neusee.workflows._run import run
@@ -46,6 +46,13 @@ def test_sums_over_bands_stand_in_for_images_that_nobody_asks_for(recipe):
     assert economised(found, recipe.outputs) is found
 
 
+def test_the_well_is_summed_only_where_it_is_asked_for(recipe):
+    for outputs, rows in ((["raw[mask]"], "responses.rows"), (["raw[mask]", "peak[mask]"], "responses.wells")):
+        found = economised(recipe, outputs)
+        assert found.steps["image[mask].channels"].wires["rows"] == rows
+        assert found.steps[rows].params["well"] == (rows == "responses.wells")
+
+
 def test_an_image_that_is_asked_for_is_whole(recipe, store):
     found = economised(recipe, [*recipe.outputs, "image[mask]"])
     assert {e.step for e in found.economies} == {"image[plain]"}
@@ -53,7 +60,9 @@ def test_an_image_that_is_asked_for_is_whole(recipe, store):
     assert result["image[mask]"].shape == (7, 64, 64)
 
 
-@pytest.mark.parametrize("change", [{"keep_all": True}, {"tolerance": 0.0}], ids=["keep all", "no tolerance"])
+@pytest.mark.parametrize(
+    "change", [{"keep_all": True}, {"tolerance": 0.0}, {"tolerance": 1e-5}], ids=["keep all", "no tolerance", "fine"]
+)
 def test_nothing_stands_in_where_nothing_may(recipe, change):
     whole = replace(recipe, **change)
     assert economised(whole, recipe.outputs) is whole
@@ -75,6 +84,18 @@ def test_the_errors_are_within_their_bounds_and_these_within_the_tolerance(recip
     assert 0 < result.proof.worst <= recipe.tolerance
     for name in ("raw[plain]", "raw[mask]"):
         assert error_of(result[name], full[name]) <= result.proof.worst
+
+
+def test_a_large_tolerance_spoils_no_figure_of_merit(recipe, store):
+    wide = replace(recipe, tolerance=0.1)
+    result, full = run(wide, store), run(replace(recipe, keep_all=True), store)
+    assert "read[plain]" in result.done
+    assert result.done["read[plain]"].state != "left out"
+    assert (spent(result)["held"], spent(full)["held"]) == (1e-3, recipe.tolerance)
+    assert result.proof.worst <= 1e-3
+    for arm in ("plain", "mask"):
+        assert error_of(result[f"developed_quality[{arm}]"], full[f"developed_quality[{arm}]"]) <= 0.1
+    assert run(wide, store, ["raw[plain]"]).recipe.limit("raw[plain]") == 0.1
 
 
 def test_measured_errors_stand_where_the_full_run_is_stored(recipe, store):
@@ -102,6 +123,7 @@ def test_the_command_line_shows_what_stands_in(tmp_path, monkeypatch):
 
 def test_the_command_line_shows_a_run_that_could_not_prove_its_tolerance(tmp_path, monkeypatch):
     monkeypatch.setenv("NEUSEE_CACHE", str(tmp_path / "cache"))
+    monkeypatch.setattr(_economy, "_LEAST", 0.0)  # so fine a tolerance would not even be tried
     words = ["run", "first_light", *SMALL, "tolerance=1e-7", "--out", str(tmp_path / "runs")]
     done = CliRunner().invoke(app, words)
     assert done.exit_code == 0, done.output

@@ -223,6 +223,7 @@ def test_rows_are_photons_of_each_channel_and_wells():
     torch.testing.assert_close(found[:3], seen * SCENE.centres, rtol=1e-15, atol=0)
     torch.testing.assert_close(found[3], SCENE.centres, rtol=0, atol=0)
     assert rows.after(found)[0].text == "4 rows of 31 bands, rank 4"
+    assert torch.equal(rows(SCENE, seen, well=False), found[:3])
     with pytest.raises(ValueError, match="same `bands` step"):
         rows(Bands(*(v[:5] for v in SCENE)), seen)
 
