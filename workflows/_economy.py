@@ -86,7 +86,6 @@ class _Draft:
 
     def collapse(self, image: Step) -> None:
         """Put the channels of an image beside it, if all that reads it asks for sums over its bands."""
-
         readers = [self.rewired.get(name, self.recipe.steps[name]) for name in self.readers.get(image.name, ())]
         spectral = {(r.wires.get("bands"), r.wires.get("responses")) for r in readers if "responses" in r.node.inputs}
         node, radiance = image.node.collapsed, image.wires.get("radiance")

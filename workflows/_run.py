@@ -122,13 +122,12 @@ def _attempt(work: UnderWay, wanted: tuple[str, ...], began: float) -> Result:
         missing = work.missing(wanted) if first else set()
         if early := [work.keys[name] for name in first if work.keys[name] in missing]:
             work.make(early, keep=False)
-        proved = proof(
-            recipe,
-            needed(recipe, first),
-            wanted,
-            lambda name: work.done.get(name) or work.asleep(name),
-            work.known_facts,
-        )
+
+        def known(name: str) -> Done:
+            return work.done.get(name) or work.asleep(name)
+
+        lead = order if first and not missing else needed(recipe, first)
+        proved = proof(recipe, lead, wanted, known, work.known_facts)
         over = proved.over(recipe)
         if over > 1.0 and not recipe.keep_all:
             raise Unproved(over)
@@ -137,6 +136,7 @@ def _attempt(work: UnderWay, wanted: tuple[str, ...], began: float) -> Result:
     done = work.account(order)
     peak = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss * 1024
     seconds = time.perf_counter() - began
-    proved = proof(recipe, order, wanted, done.__getitem__, work.known_facts)
+    if missing:  # else all was known before
+        proved = proof(recipe, order, wanted, done.__getitem__, work.known_facts)
     device = ",".join(work.devices)
     return Result(values, done, work.keys, seconds, peak, recipe, store, device, work.schedule, proved)

@@ -51,7 +51,9 @@ def image_channels(
     wide = bordered(planes, given, (intensity.shape[1], intensity.shape[2]))
     light = flux(wide, intensity, radiance.basis.detach(), given.size)
     brightest = torch.tensor(top, dtype=torch.float64)
-    return Channels(result * unit.to(result)[:, None, None], rows.detach().double(), light, bound, kept, brightest)
+    scale = unit.to(result)[:, None, None]
+    result = result * scale if result.requires_grad else result.mul_(scale)
+    return Channels(result, rows.detach().double(), light, bound, kept, brightest)
 
 
 @image_channels.reference

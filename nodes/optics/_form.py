@@ -15,21 +15,26 @@ _SOME = 16  #: rows of the PSF summed at a time: those of 31 bands stay in the c
 
 def convolved(planes: Tensor, intensity: Tensor, given: Given, plan: Plan) -> Tensor:
     """The rows of the image: (row, y, x)."""
-    (m, n), zero = plan.window, (0, 0)
     scene = bordered(planes[: plan.planes], given, plan.window)
+    return summed(scene, _kernels(intensity, plan), plan.mix, _where(given, plan.window))
+
+
+def _where(given: Given, window: tuple[int, int]) -> Where:
+    """The part of the convolution that is the image."""
+    (m, n), zero = window, (0, 0)
     at = (m - 1, n - 1) if given.reflect else (m // 2, n // 2)
-    where = Where(zero, zero, at, given.size, transform(given, plan.window))
-    return summed(scene, _kernels(intensity, plan), plan.mix, where)
+    return Where(zero, zero, at, given.size, transform(given, window))
 
 
 def majorant(off: Tensor, intensity: Tensor, given: Given) -> Tensor:
     """What ``off`` (y, x) in every band adds to any row at most: (y, x); one kernel for all rows."""
     window = (intensity.shape[1], intensity.shape[2])
-    heaviest = given.rows.abs().amax(0, keepdim=True)
-    one = Mix(torch.ones(1, 1, dtype=torch.float64), torch.ones(1, 1, dtype=torch.float64), None)
-    every = torch.arange(intensity.shape[0])
-    plan = Plan(1, every, window, heaviest, one, given.rows.new_zeros(1), 0.0, True)
-    return convolved(off[None], intensity.abs(), given, plan)[0].clamp_min(0)
+    heaviest = given.rows.abs().amax(0).to(intensity)
+    kernel = intensity.new_empty(1, *window)
+    for y in range(0, window[0], _SOME):  # the absolute values of some rows: those of all would be a second stack
+        kernel[0, y : y + _SOME] = torch.tensordot(heaviest, intensity[:, y : y + _SOME].abs(), 1)
+    reached = summed(bordered(off[None], given, window), kernel, Mix(None, None, None), _where(given, window))
+    return reached[0].clamp_min_(0)
 
 
 def bordered(planes: Tensor, given: Given, window: tuple[int, int]) -> Tensor:
