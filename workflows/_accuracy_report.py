@@ -171,7 +171,7 @@ def _whole(points: Sequence[Point], text: str, picture: bytes | None) -> Section
         if p.trial.value is not None:
             marks[len(rows) - 1, 6] = _mark(Choice(p.trial.value, p, None), points)
     text += "\n\nA star: on the Pareto line, no other point is as quick and as right. Marks: whether a tolerance was "
-    text += "held with every seed; an exclamation mark where it was missed by what the arithmetic of everything kept does."
+    text += "held with every seed; an exclamation mark where only arithmetic, that of everything kept, misses it."
     return Section("Error against run time", text, columns, rows, picture, marks)
 
 
