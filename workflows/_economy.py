@@ -148,8 +148,7 @@ class _Draft:
         if through is not None and name not in self.wanted:
             wires = {**step.wires, through: self._mixture(str(step.wires[through]), image)}
             return self._add(new, step.node, wires, step.params, step)
-        decade = math.floor(math.log10(self.recipe.allowed(image.name) * _MIXTURE))
-        within = {"within": 10.0 ** (decade if self.recipe.strict == 1.0 else decade - 1)}  # never the same again
+        within = {"within": 10.0 ** math.floor(math.log10(self.recipe.allowed(image.name) * _MIXTURE))}
         if step.node.mixed is not None and name not in self.wanted:
             return self._add(new, step.node.mixed, step.wires, {**step.params, **within}, step)
         return self._add(new, spectra.compress, {"cube": name}, within, step)

@@ -30,7 +30,7 @@ Words = Annotated[
     ),
 ]
 Debug = Annotated[bool, typer.Option("--debug", help="Show where in the code an error arose.")]
-Out = Annotated[Path, typer.Option("--out", help="Folder for the run's folder.")]
+Out = Annotated[Path, typer.Option("--out", help="Folder in which to make the folder of results.")]
 
 
 def split(words: list[str] | None, before: int = 0) -> tuple[str, list[str], int]:

@@ -36,7 +36,7 @@ def image_channels(
             (Young's inequality, as for the root mean square; where the border reflects, three times the scene's);
             of the brightest pixel, what every pixel of the mixture may lack, imaged too;
             tails, by Young's inequality; kernels, by the sum of what they miss. Estimated, not proved: rounding of the
-            transforms, from the powers of planes and kernels, two to ten times what was found. Flux: 1e-6, and what
+            transforms, from the powers of planes and kernels, never less than was found. Flux: 1e-6, and what
             the mixture leaves. Gradients reach the planes and the PSF; basis and rows are held still.
     Raises: ValueError where scene, PSF and rows have different bands, or the scene is a batch.
     Source: linearity of incoherent imaging, Goodman, Introduction to Fourier Optics, 4th ed., ch. 7.

@@ -1,6 +1,7 @@
 """Carry out a plan: borders, kernels, the convolutions, and how far their rounding may reach."""
 
 import math
+from collections.abc import Callable
 
 import torch
 from torch import Tensor
@@ -30,9 +31,7 @@ def majorant(off: Tensor, intensity: Tensor, given: Given) -> Tensor:
     """What ``off`` (y, x) in every band adds to any row at most: (y, x); one kernel for all rows."""
     window = (intensity.shape[1], intensity.shape[2])
     heaviest = given.rows.abs().amax(0).to(intensity)
-    kernel = intensity.new_empty(1, *window)
-    for y in range(0, window[0], _SOME):  # the absolute values of some rows: those of all would be a second stack
-        kernel[0, y : y + _SOME] = torch.tensordot(heaviest, intensity[:, y : y + _SOME].abs(), 1)
+    kernel = _summed_bands(heaviest[None], intensity, torch.abs)  # of all at once they would be a second stack
     reached = summed(bordered(off[None], given, window), kernel, Mix(None, None, None), _where(given, window))
     return reached[0].clamp_min_(0)
 
@@ -56,9 +55,14 @@ def _kernels(intensity: Tensor, plan: Plan) -> Tensor:
     if stack.requires_grad or stack.is_contiguous():
         kernels: Tensor = torch.tensordot(weights, stack, 1)
         return kernels
-    sums = stack.new_empty(len(weights), *plan.window)
-    for y in range(0, plan.window[0], _SOME):
-        rows = stack[:, y : y + _SOME]
+    return _summed_bands(weights, stack)
+
+
+def _summed_bands(weights: Tensor, stack: Tensor, of: Callable[[Tensor], Tensor] = lambda rows: rows) -> Tensor:
+    """Sums (kernel, y, x) over the bands of a stack, or ``of`` it, some rows at a time."""
+    sums = stack.new_empty(len(weights), *stack.shape[1:])
+    for y in range(0, stack.shape[1], _SOME):
+        rows = of(stack[:, y : y + _SOME])
         sums[:, y : y + _SOME] = (weights @ rows.flatten(1)).view(-1, *rows.shape[1:])
     return sums
 

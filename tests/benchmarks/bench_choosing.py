@@ -25,7 +25,7 @@ from neusee.workflows._ledger import Ledger
 from neusee.workflows._store import Store
 
 ENGINE = ((_run, "economised"), (_run, "border"), (_run, "proof"), (Ledger, "verdict"), (Ledger, "pass_on"))
-NODE = ((_channels, "choose"), (_channels, "guessed"), (_channels, "rounding"), (_channels, "_top"))
+NODE = tuple((_channels, name) for name in ("passed", "choose", "guessed", "rounding", "_top"))
 LONG = 20.0  #: s, beyond which one run is enough
 
 
