@@ -1,5 +1,6 @@
 """A relief drawn by a network from the pupil coordinates alone: a smooth prior with a million numbers."""
 
+from functools import partial
 from itertools import pairwise
 from pathlib import Path
 from typing import Any
@@ -8,7 +9,9 @@ import torch
 from torch import Tensor, nn
 from torch.nn import functional as F
 
-from neusee.nodes import ParameterError, node
+from neusee.nodes import node
+from neusee.nodes._bicubic import enlarge
+from neusee.nodes._weights import loaded, same_layout
 from neusee.nodes.doe._relief import relief_checks
 from neusee.nodes.optics._aperture import Aperture, grid_notes
 from neusee.nodes.units import Count, DataFile, PositiveLength
@@ -48,18 +51,6 @@ def _edged(x: Tensor) -> Tensor:
     return torch.cat([x[..., :1], x, x[..., -1:]], dim=-1)
 
 
-def _cubic(size: int, new: int, like: Tensor) -> Tensor:
-    """Matrix (new, size) of bicubic interpolation between grids of the same extent."""
-    one = torch.eye(size, dtype=like.dtype, device=like.device)[None, None]
-    return F.interpolate(one, size=(new, size), mode="bicubic", align_corners=False)[0, 0]
-
-
-def enlarge(image: Tensor, height: int, width: int) -> Tensor:
-    """Resample (…, y, x) bicubically by two small matrix products: deterministic and differentiable at will."""
-    rows, columns = _cubic(image.shape[-2], height, image), _cubic(image.shape[-1], width, image)
-    return rows @ image @ columns.T
-
-
 def coordinates(grid: int, device: torch.device | None = None) -> Tensor:
     """What the network sees: u and v from -1 to 1 across the pupil grid, (2, grid, grid)."""
     line = (torch.arange(grid, dtype=torch.float64, device=device) - (grid - 1) / 2) * (2 / grid)
@@ -90,14 +81,6 @@ def fresh(width: int, grid: int, rng: torch.Generator) -> HeightNet:
     return net
 
 
-def _load(weights: Path, width: int) -> HeightNet:
-    from safetensors.torch import load_file
-
-    net = HeightNet(width)
-    net.load_state_dict(load_file(weights))
-    return net
-
-
 @node()
 def unet(
     *,
@@ -120,32 +103,15 @@ def unet(
     Error:  1e-6 of max_height (float32).
     Source: "Learning to See Through Flare", "Neural Representation of the DOE"; the layer widths are ours.
     """
-    net = fresh(width, min(grid, samples), rng) if weights is None else _load(weights, width)
+    net = fresh(width, min(grid, samples), rng) if weights is None else loaded(partial(HeightNet, width), weights)
     return height_of(net, samples, grid, max_height).detach()
 
 
 @unet.preflight
 def _(*, width: int, weights: Path | None, **rest: Any) -> list[str]:
     if weights is not None:
-        _same_layout(weights, width)
+        same_layout(partial(HeightNet, width), weights, width)
     return grid_notes(**rest)
-
-
-def _same_layout(weights: Path, width: int) -> None:
-    from safetensors import SafetensorError, safe_open
-
-    with torch.device("meta"):
-        wanted = {name: tuple(tensor.shape) for name, tensor in HeightNet(width).state_dict().items()}
-    try:
-        with safe_open(weights, framework="pt") as tensors:
-            found = {name: tuple(tensors.get_slice(name).get_shape()) for name in tensors.keys()}  # noqa: SIM118
-    except SafetensorError as error:
-        raise ParameterError("weights", f"{weights.name} is no safetensors file: {error}") from error
-    odd = sorted(name for name in wanted | found if wanted.get(name) != found.get(name))
-    if odd:
-        name = odd[0]
-        text = f"{weights.name}: {name} is {found.get(name)}, this network (width {width}) has {wanted.get(name)}"
-        raise ParameterError("weights", text)
 
 
 unet.check(relief_checks)

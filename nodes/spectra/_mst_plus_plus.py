@@ -11,6 +11,8 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor, nn
 
+from neusee.nodes._mirror import mirrored
+
 BANDS = 31
 
 
@@ -25,7 +27,7 @@ class MSTPlusPlus(nn.Module):
 
     def forward(self, rgb: Tensor) -> Tensor:
         height, width = rgb.shape[-2:]
-        first = self.conv_in(_padded(rgb, -height % 8, -width % 8))
+        first = self.conv_in(mirrored(rgb, -height % 8, -width % 8))
         result: Tensor = self.conv_out(self.body(first)) + first
         return result[..., :height, :width]
 
@@ -135,15 +137,3 @@ def _conv(inputs: int, outputs: int) -> nn.Conv2d:
 
 def _depthwise(dim: int) -> nn.Conv2d:
     return nn.Conv2d(dim, dim, 3, padding=1, groups=dim, bias=False)
-
-
-def _padded(x: Tensor, down: int, right: int) -> Tensor:
-    """Mirror at the lower and right rim; a picture thinner than the rim is mirrored again and again."""
-    rows, columns = (_mirrored(n, n + add, x.device) for n, add in zip(x.shape[-2:], (down, right), strict=True))
-    return x[..., rows, :][..., columns]
-
-
-def _mirrored(size: int, wanted: int, device: torch.device) -> Tensor:
-    period = max(2 * size - 2, 1)
-    place = torch.arange(wanted, device=device) % period
-    return torch.minimum(place, period - place).clamp_max(size - 1) if size > 1 else place * 0

@@ -9,7 +9,8 @@ from safetensors.torch import save_file
 from torch.testing import assert_close
 
 from neusee.nodes import ParameterError, doe
-from neusee.nodes.doe._unet import HeightNet, coordinates, enlarge, fresh, height_of
+from neusee.nodes._bicubic import enlarge
+from neusee.nodes.doe._unet import HeightNet, coordinates, fresh, height_of
 
 GRID = {"samples": 64, "pitch": 5e-6, "diameter": 320e-6}
 
@@ -156,9 +157,3 @@ def test_unet_loads_its_own_weights_and_no_others(tmp_path):
     (tmp_path / "text.safetensors").write_text("no")
     with pytest.raises(ParameterError, match="no safetensors file"):
         doe.unet.before(**params | {"weights": tmp_path / "text.safetensors"}, width=4)
-
-
-def test_enlarge_is_torch_bicubic():
-    image = torch.randn(5, 7, dtype=torch.float64, generator=seeded())
-    wanted = torch.nn.functional.interpolate(image[None, None], size=(13, 9), mode="bicubic", align_corners=False)[0, 0]
-    assert_close(enlarge(image, 13, 9), wanted, rtol=0, atol=1e-13)

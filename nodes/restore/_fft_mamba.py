@@ -1,0 +1,82 @@
+"""The paper's restoration: a network that scans a picture and its spectrum, coarse and then fine."""
+
+from functools import partial
+from pathlib import Path
+from typing import Any
+
+import torch
+from torch import Tensor, nn
+from torch.nn import functional as F
+
+from neusee.nodes import node
+from neusee.nodes._bicubic import resize
+from neusee.nodes.restore._mamba import Block
+from neusee.nodes.restore._memory import Kind
+from neusee.nodes.restore._network import Restorer, fitting, restored, restorer_checks
+from neusee.nodes.units import Count, DataFile
+
+
+class FFTMamba(Restorer):
+    """Blocks that take turns between rows and columns; two passes with the same weights, the fine one shown the coarse.
+
+    Published: eight blocks, two scales, which modules there are. Ours: their sizes and how they are put together.
+    """
+
+    def __init__(self, width: int = 64, blocks: int = 8, states: int = 16, shuffle: int = 2, ssm: Kind = "s6") -> None:
+        super().__init__()
+        self.shuffle, self.multiple = shuffle, 2 * shuffle
+        inside = 3 * shuffle**2
+        self.enter = nn.Conv2d(2 * inside, width, 3, padding=1)
+        self.blocks = nn.Sequential(*(Block(width, states, bool(i % 2), ssm) for i in range(blocks)))
+        self.leave = nn.Conv2d(width, width, 3, padding=1)
+        self.last = nn.Conv2d(width, inside, 3, padding=1)
+
+    def scales(self, picture: Tensor) -> tuple[Tensor, Tensor]:
+        y, x = picture.shape[-2:]
+        small = resize(picture, y // 2, x // 2)
+        coarse = self.improved(small, small)
+        return coarse, self.improved(picture, resize(coarse, y, x))
+
+    def improved(self, picture: Tensor, guess: Tensor) -> Tensor:
+        """One pass: the picture with what is missing, seen beside a first guess of the restored one."""
+        first = self.enter(F.pixel_unshuffle(torch.cat([picture, guess], 1), self.shuffle))
+        missing = self.last(first + self.leave(self.blocks(first)))
+        return picture + F.pixel_shuffle(missing, self.shuffle)
+
+
+@node()
+def fft_mamba(
+    picture: Tensor,
+    *,
+    weights: DataFile | None = None,
+    width: Count = 64,
+    blocks: Count = 8,
+    states: Count = 16,
+    shuffle: Count = 2,
+    ssm: Kind = "s6",
+) -> Tensor:
+    """Restore a colour picture with the FFT-Mamba network.
+
+    Each block scans the picture there and back by rows or by columns, scans its spectrum from low to high frequencies
+    and back to draw a gate for it, and weighs both. One pass at half the size; one at the full size, which sees it.
+    ``ssm`` is the scan: s6 has a decay for each channel and state, ssd one for 16 channels, of which matrices are made.
+
+    Shapes: picture (3, y, x) of any size -> (3, y, x).
+    Units:  linear sRGB, as the weights were trained on.
+    Error:  float32, 1e-5; of the restoration, what the training reached.
+    Raises: ParameterError before the run without weights, or where they do not fit; ValueError for a picture
+            that is no colour picture or not finite.
+    Source: NeuSee, section Image Restoration; Gu and Dao, Mamba, 2023 (s6), Dao and Gu, Mamba-2, 2024
+            (ssd); sizes and wiring are ours.
+    """
+    return restored(picture, partial(FFTMamba, width, blocks, states, shuffle, ssm), weights)
+
+
+@fft_mamba.preflight
+def _(*, weights: Path | None = None, **sizes: Any) -> list[str]:
+    return fitting(partial(FFTMamba, **sizes), weights, sizes["width"])
+
+
+@fft_mamba.check
+def _(result: Tensor, picture: Tensor, **params: Any) -> list[Any]:
+    return restorer_checks(result, picture)

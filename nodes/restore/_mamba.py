@@ -1,0 +1,90 @@
+"""Blocks of the FFT-Mamba network: scans over the picture and over its spectrum, and a gate between them."""
+
+import torch
+from torch import Tensor, nn
+from torch.nn import functional as F
+
+from neusee.nodes._precision import single
+from neusee.nodes.restore._memory import BothWays, Kind
+from neusee.nodes.restore._network import ChannelNorm, Scale, gated
+from neusee.nodes.restore._radial import radial_order
+
+
+class Spatial(nn.Module):
+    """Scan the picture row by row, or column by column, and let it through a gate."""
+
+    def __init__(self, width: int, states: int, by_columns: bool, kind: Kind = "s6") -> None:
+        super().__init__()
+        inner, self.by_columns = 2 * width, by_columns
+        self.enter = nn.Conv2d(width, 2 * inner, 1)
+        self.mix = nn.Conv2d(inner, inner, 3, padding=1, groups=inner)
+        self.scan = BothWays(inner, states, -(-width // 16), kind)
+        self.norm = nn.LayerNorm(inner)
+        self.leave = nn.Conv2d(inner, width, 1)
+
+    def forward(self, x: Tensor) -> Tensor:
+        value, gate = self.enter(x).chunk(2, 1)
+        value = F.silu(self.mix(value))
+        value = value.mT if self.by_columns else value
+        scanned = self.norm(self.scan(value.flatten(2).transpose(1, 2)))
+        scanned = scanned.transpose(1, 2).unflatten(2, value.shape[-2:])
+        scanned = scanned.mT if self.by_columns else scanned
+        result: Tensor = self.leave(scanned * F.silu(gate))
+        return result
+
+
+class Frequency(nn.Module):
+    """Multiply the spectrum by a gate that a scan from low to high frequencies and back has drawn.
+
+    Real and imaginary parts, for phase has no slope at 0. Near 1 at the start: the picture passes as it is.
+    """
+
+    def __init__(self, width: int, states: int, kind: Kind = "s6") -> None:
+        super().__init__()
+        self.norm = nn.LayerNorm(2 * width)
+        self.enter = nn.Linear(2 * width, 2 * width)
+        self.scan = BothWays(width, states, -(-width // 16), kind)
+        self.scanned = nn.LayerNorm(width)
+        self.leave = nn.Linear(width, 2 * width)
+        self.strength = nn.Parameter(torch.empty(()))
+
+    def start(self, rng: torch.Generator) -> None:
+        nn.init.constant_(self.strength, 0.1)
+
+    def forward(self, x: Tensor) -> Tensor:
+        x, size = single(x), (x.shape[-2], x.shape[-1])
+        order, place = radial_order(size, x.device)
+        with torch.autocast(x.device.type, enabled=False):  # a spectrum has no half precision
+            spectrum = torch.fft.rfft2(x, norm="ortho")
+            sorted_ = spectrum.flatten(2).index_select(2, order)
+            seen = self.norm(torch.cat([sorted_.real, sorted_.imag], 1).transpose(1, 2))
+        value, gate = self.enter(seen).chunk(2, -1)
+        drawn = single(self.leave(self.scanned(self.scan(F.silu(value))) * F.silu(gate)))
+        real, imaginary = drawn.transpose(1, 2).index_select(2, place).chunk(2, 1)
+        with torch.autocast(x.device.type, enabled=False):
+            factor = 1 + self.strength * torch.complex(real, imaginary).view_as(spectrum)
+            result: Tensor = torch.fft.irfft2(spectrum * factor, s=size, norm="ortho")
+        return result
+
+
+class Block(nn.Module):
+    """What the two scans find, weighed against each other at every pixel; then a gated feed-forward."""
+
+    def __init__(self, width: int, states: int, by_columns: bool, kind: Kind = "s6") -> None:
+        super().__init__()
+        self.norm, self.second_norm = ChannelNorm(width), ChannelNorm(width)
+        self.spatial = Spatial(width, states, by_columns, kind)
+        self.frequency = Frequency(width, states, kind)
+        self.weigh = nn.Conv2d(2 * width, width, 1)
+        self.widen = nn.Conv2d(width, 4 * width, 1)
+        self.mix = nn.Conv2d(4 * width, 4 * width, 3, padding=1, groups=4 * width)
+        self.narrow = nn.Conv2d(2 * width, width, 1)
+        self.scale, self.second_scale = Scale(width), Scale(width)
+
+    def forward(self, x: Tensor) -> Tensor:
+        seen = self.norm(x)
+        near, far = self.spatial(seen), self.frequency(seen)
+        share = torch.sigmoid(self.weigh(torch.cat([near.to(far), far], 1)))
+        x = x + self.scale(share * near + (1 - share) * far)
+        result: Tensor = x + self.second_scale(self.narrow(gated(self.mix(self.widen(self.second_norm(x))))))
+        return result
