@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import math
 import re
+from glob import glob
 from pathlib import Path
 from typing import Annotated, Any
 
@@ -45,6 +46,18 @@ def read_quantity(value: Any, si: str) -> float:
     return number * _SCALE[si][unit]
 
 
+def read_any(text: Any) -> tuple[float, str]:
+    """Read ``"550 nm"`` or ``0.56`` as a finite number and its SI unit, empty where it has none; else ValueError."""
+    match = _NUMBER.fullmatch(str(text).strip())
+    unit = match[2].strip() if match else ""
+    si = next((si for si, known in _SCALE.items() if unit in known), "")
+    if isinstance(text, bool) or match is None or (unit and not si):
+        raise ValueError(f"{text} is no number and no quantity, such as 0.5 or '1 um'")
+    if not math.isfinite(float(match[1])):
+        raise ValueError(f"{text} is not finite")
+    return float(match[1]) * (_SCALE[si][unit] if si else 1.0), si
+
+
 def _reader(si: str) -> BeforeValidator:
     return BeforeValidator(lambda value: read_quantity(value, si), json_schema_input_type=str)
 
@@ -80,3 +93,21 @@ def _existing(path: Path) -> Path:
 
 
 DataFile = Annotated[Path, AfterValidator(_existing), IsFile()]  #: path of a file that exists
+
+
+def _found(given: Any) -> list[Path]:
+    """The files that a path, a pattern, a folder or a list of these means, in the order of their names."""
+    if isinstance(given, list | tuple):
+        return [path for each in given for path in _found(each)]
+    path = Path(given)
+    if path.is_file():
+        return [path]
+    inside = path.iterdir() if path.is_dir() else map(Path, glob(str(given)))
+    files = sorted(each for each in inside if each.is_file() and not each.name.startswith("."))
+    if not files:
+        raise ValueError(f"no such file, and no folder or pattern that holds one: {path}")
+    return files
+
+
+#: one file or more: a path, a folder, a pattern such as ``dark/*.png``, or a list of these
+DataFiles = Annotated[tuple[Path, ...], BeforeValidator(_found, json_schema_input_type=str | list[str]), IsFile()]

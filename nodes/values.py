@@ -76,6 +76,24 @@ class Channels(NamedTuple):
     )  #: how far max |plane| may be off, over itself; or inf
 
 
+class Levels(NamedTuple):
+    """Frames of one flat illumination after another, reduced to all that a fit of the sensor needs.
+
+    Of a level whose numbers are clipped, or too few to be as good as continuous, every number is counted; a cell says
+    how often one of them occurs in one level.
+    """
+
+    photons: Tensor  #: (level,) float64, mean photons in a pixel and exposure; 0 in the dark
+    exposure: Tensor  #: (level,) float64, s
+    numbers: Tensor  #: (level,) float64, pixels of all frames, whose mean is `mean`
+    mean: Tensor  #: (level,) float64, DN
+    variance: Tensor  #: (level,) float64, DN2
+    freedom: Tensor  #: (level,) float64, degrees of freedom of the variance
+    cell_level: Tensor  #: (cell,) int64, rising
+    cell_value: Tensor  #: (cell,) float64, DN, rising within a level
+    cell_count: Tensor  #: (cell,) float64
+
+
 #: by class, the fields with one entry a band
 BAND_FIELDS: dict[type, tuple[str, ...]] = {
     Bands: Bands._fields,

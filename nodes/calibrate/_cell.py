@@ -1,0 +1,71 @@
+"""How often a converter gives a number, of a Gaussian signal that ends at a full well: exact in the quantiser.
+
+Nothing is taken for continuous, and no variance of quantization is added.
+"""
+
+from __future__ import annotations
+
+import math
+from typing import Literal
+
+import torch
+from torch import Tensor
+from torch.special import log_ndtr
+
+Rounding = Literal["nearest", "dithered_floor"]
+_LEAST = 1e-300  #: probability below which none is told from none at all
+
+
+def log_cell(value: Tensor, mean: Tensor, sd: Tensor, well: Tensor, rounding: Rounding, top: int) -> Tensor:
+    """Logarithm of the probability of a whole number; minus infinity where it cannot be.
+
+    Shapes: all broadcast.
+    Units:  DN; ``well`` is the signal of a full pixel, above which there is none, ``top`` the converter's last number.
+    Error:  `nearest` 1e-13 of the logarithm; `dithered_floor` 1e-15 sd**2 of the probability.
+    Source: s = round(x) or floor(x + U(-1/2, 1/2)); NeuSee, Eq. (SensorImage).
+    """
+    if rounding == "nearest":
+        low = torch.where(value <= 0, -math.inf, value - 0.5)
+        high = torch.where((value >= top) | (value + 0.5 >= well), math.inf, value + 0.5)
+        return torch.where(low < well, _between(low, high, mean, sd), -math.inf)
+    found = _dithered(value, mean, sd, well, top)
+    return torch.where(found > _LEAST, found.clamp_min(_LEAST).log(), -math.inf)
+
+
+def _between(low: Tensor, high: Tensor, mean: Tensor, sd: Tensor) -> Tensor:
+    """log P(low < x < high), on that side of the mean where nothing cancels."""
+    a, b = (low - mean) / sd, (high - mean) / sd
+    above = a + b > 0
+    a, b = torch.where(above, -b, a), torch.where(above, -a, b)
+    far, near = log_ndtr(a), log_ndtr(b)
+    found: Tensor = near + torch.log(-torch.expm1((far - near).clamp_max(-_LEAST)))
+    return found
+
+
+def _dithered(value: Tensor, mean: Tensor, sd: Tensor, well: Tensor, top: int) -> Tensor:
+    """floor(x + U(-1/2, 1/2)) = k: a triangle about k + 1/2, one wide on either side, over the law of x.
+
+    By parts, from the integral G of the distribution: G'' is the density, and the triangle has three corners. Beyond
+    the well there is no x, and what would be there stands at the well. Above the mean G is taken less its asymptote,
+    x - mean, so that far out nothing cancels: with the triangle at the well the asymptotes add up to nothing.
+    """
+    middle = value + 0.5
+    start, end = middle - 1.0, torch.minimum(torch.maximum(well, middle - 1.0), middle + 1.0)
+    inner = torch.minimum(middle, end)
+    above = middle > mean
+    g0, g1, g2 = (_integral(x, mean, sd, above) for x in (start, inner, end))
+    at_well = torch.where(above, 0.0, (1.0 - (end - middle).abs()))
+    within = at_well + g0 - 2.0 * g1 + g2
+    lowest = torch.where(above, 1.0, middle + 1.0 - torch.maximum(end, middle)) + g2 - g1
+    highest = torch.where(above, 0.0, inner - start) + g0 - g1
+    return torch.where(value <= 0, lowest, torch.where(value >= top, highest, within)).clamp_min(0.0)
+
+
+def _integral(x: Tensor, mean: Tensor, sd: Tensor, above: Tensor) -> Tensor:
+    """Integral of the distribution up to x; where ``above``, less x - mean."""
+    z = (x - mean) / sd
+    density = torch.exp(-0.5 * z.square()) / math.sqrt(2.0 * math.pi)
+    side = torch.where(above, z, -z)
+    share = 0.5 * torch.special.erfc(side / math.sqrt(2.0))  # `ndtr` has no digits left below -8
+    found: Tensor = sd * (density - side * share)
+    return found

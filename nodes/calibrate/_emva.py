@@ -1,0 +1,128 @@
+"""The linear camera model of EMVA 1288, fitted as the standard prescribes: a first answer, and a start for others."""
+
+from __future__ import annotations
+
+import math
+from typing import Annotated, NamedTuple
+
+import torch
+from pydantic import Field
+from torch import Tensor
+
+from neusee.nodes import Check, node
+from neusee.nodes.values import Levels
+
+Share = Annotated[float, Field(gt=0, le=1)]
+_QUANTIZATION = 1.0 / 12.0  #: DN2, of rounding to the nearest number
+
+
+class LeastSquares(NamedTuple):
+    """What a photon-transfer measurement gives; all () float64, errors as standard errors of the noise alone."""
+
+    gain: Tensor  #: K, DN/e-
+    efficiency: Tensor  #: electrons per photon
+    dark_noise: Tensor  #: sigma_d, e-
+    dark_signal: Tensor  #: of the shortest exposure, DN
+    dark_current: Tensor  #: e-/s; not a number where all darks were exposed alike
+    saturation: Tensor  #: electrons in the level of the largest variance, dark signal not counted
+    gain_error: Tensor
+    efficiency_error: Tensor
+    dark_noise_error: Tensor
+    fitted: Tensor  #: lit levels that both lines were fitted to
+
+
+@node(rtol=1e-9)
+def least_squares(levels: Levels, *, share: Share = 0.7) -> LeastSquares:
+    """Fit gain, quantum efficiency and dark noise: straight lines through the origin, up to a share of saturation.
+
+    Saturation is where the variance is greatest. The slope of mean over photons is the responsivity, that of variance
+    over mean the gain, each less the dark of the nearest exposure.
+
+    Shapes: levels (level,) -> ten scalars.
+    Units:  K DN/e-; dark noise, saturation e-; dark current e-/s.
+    Error:  as far as the camera is linear and Poisson. Every level weighs the same, as the standard has it, so that the
+            brightest decide. The rounding of a converter is taken to add 1/12 DN2; dithered, it adds up to 1/6. The
+            errors leave out the scatter of means in x, drift and non-linearity, which are larger in real cameras.
+    Raises: ValueError without a dark level, without two lit ones below saturation, and for a camera without response.
+    Source: EMVA Standard 1288, release 4.0 Linear, sections 6.6 to 6.8.
+    """
+    dark = levels.photons == 0
+    if not bool(dark.any()):
+        raise ValueError("no dark frames, so that the offset of the camera is not known: give frames without light")
+    if int((~dark).sum()) < 2:
+        raise ValueError(f"{int((~dark).sum())} lit level: a line needs at least two of different light")
+    nearest = (levels.exposure[~dark, None] - levels.exposure[dark]).abs().argmin(1)
+    lit, below = _only(levels, ~dark), _only(levels, dark.nonzero().squeeze(1)[nearest])
+    mean, variance = lit.mean - below.mean, lit.variance - below.variance
+    full = mean[lit.variance.argmax()]
+    used = (mean <= share * full).nonzero().squeeze(1)
+    if len(set(lit.photons[used].tolist())) < 2:
+        raise ValueError(f"{len(used)} lit level(s) below {share:.0%} of saturation, {float(full):.4g} DN above the "
+                         "dark: give two or more of different light there")  # fmt: skip
+    gain, response = _slope(mean[used], variance[used]), _slope(lit.photons[used], mean[used])
+    if not (float(gain) > 0 and float(response) > 0):
+        raise ValueError(f"slopes {float(gain):.3g} DN/e- and {float(response):.3g} DN a photon: brighter frames must "
+                         "be brighter and noisier; see that the light and the levels belong together")  # fmt: skip
+    scatter = 2 * lit.variance.square() / lit.freedom
+    dim = 2 * below.variance.square() / below.freedom
+    off = _error(mean[used], scatter[used], dim[used], nearest[used]) / gain
+    faint = lit.variance / lit.numbers, below.variance / below.numbers
+    weak = _error(lit.photons[used], faint[0][used], faint[1][used], nearest[used]) / response
+    noise, doubt = _dark_noise(levels, dark)
+    efficiency = response / gain
+    return LeastSquares(
+        gain,
+        efficiency,
+        noise / gain,
+        levels.mean[_first(levels, dark)],
+        _dark_current(levels, dark) / gain,
+        full / gain,
+        off * gain,
+        efficiency * torch.hypot(off, weak),
+        torch.hypot(doubt, off * noise) / gain,
+        torch.tensor(float(len(used)), dtype=torch.float64),
+    )
+
+
+@least_squares.check
+def _(result: LeastSquares, levels: Levels, **params: float) -> list[Check]:
+    text = (
+        f"K {float(result.gain):.4g} DN/e-, QE {float(result.efficiency):.3g}, dark noise "
+        f"{float(result.dark_noise):.4g} e-, from {int(result.fitted)} of {len(levels.mean)} levels"
+    )
+    return [Check(text, 0.0 < float(result.efficiency) <= 1.0)]
+
+
+def _only(levels: Levels, which: Tensor) -> Levels:
+    """Some of the levels, without their histograms."""
+    return Levels._make([*(x[which] for x in levels[:6]), *(x[:0] for x in levels[6:])])
+
+
+def _slope(x: Tensor, y: Tensor) -> Tensor:
+    """Of the line through the origin."""
+    return (x @ y) / (x @ x)
+
+
+def _error(x: Tensor, own: Tensor, dark: Tensor, which: Tensor) -> Tensor:
+    """Standard error of that slope, where y is less a dark that several levels may share."""
+    shared = torch.zeros(int(which.max()) + 1, dtype=x.dtype, device=x.device).index_add_(0, which, x * dark.sqrt())
+    return (x.square() @ own + shared.square().sum()).sqrt() / (x @ x)
+
+
+def _first(levels: Levels, dark: Tensor) -> Tensor:
+    """The dark of the shortest exposure."""
+    return torch.where(dark, levels.exposure, math.inf).argmin()
+
+
+def _dark_noise(levels: Levels, dark: Tensor) -> tuple[Tensor, Tensor]:
+    """Standard deviation of the dark without its rounding, and its standard error, DN; infinite if rounding is all."""
+    variance, freedom = (x[_first(levels, dark)] for x in (levels.variance, levels.freedom))
+    noise = (variance - _QUANTIZATION).clamp_min(0.0).sqrt()
+    return noise, torch.where(noise > 0, variance / (2 * freedom).sqrt() / noise, math.inf)
+
+
+def _dark_current(levels: Levels, dark: Tensor) -> Tensor:
+    """Rise of the dark signal with exposure, DN/s."""
+    time, signal = levels.exposure[dark], levels.mean[dark]
+    apart = time - time.mean()
+    return torch.where(time.max() > time.min(), (apart @ signal) / (apart @ apart), math.nan)

@@ -1,0 +1,84 @@
+"""Parameters that are free: what was believed of each beforehand, and the coordinates in which they are walked."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping
+from dataclasses import dataclass
+from functools import cached_property
+from typing import Annotated, ClassVar, NamedTuple
+
+import torch
+from pydantic import Field
+from torch import Tensor
+
+Factor = Annotated[float, Field(gt=1, allow_inf_nan=False)]  #: one standard deviation of the logarithm, as a ratio
+Positive = Annotated[float, Field(gt=0, allow_inf_nan=False)]
+Pair = tuple[float, float]
+
+
+class Prior(NamedTuple):
+    """Independent normal laws, in an order that is agreed on; not a number where a parameter is held."""
+
+    centre: Tensor  #: (parameter,) float64, of the logarithm; of a linear parameter itself
+    width: Tensor  #: (parameter,) float64, standard deviation of the same
+
+
+def believed(given: Mapping[str, Pair | None], linear: frozenset[str]) -> Prior:
+    """Of each a median and a factor, of a linear one a mean and a standard deviation; None where it is held."""
+    laws = [_law(name, pair, name in linear) for name, pair in given.items()]
+    if all(math.isnan(width) for _, width in laws):
+        raise ValueError(f"no parameter is free: give a prior of one of {', '.join(given)}")
+    centre, width = torch.tensor(laws, dtype=torch.float64).unbind(1)
+    return Prior(centre, width)
+
+
+def freed(names: tuple[str, ...], prior: Prior) -> tuple[str, ...]:
+    """Those of ``names`` that a prior lets vary."""
+    return tuple(name for name, width in zip(names, prior.width.tolist(), strict=True) if not math.isnan(width))
+
+
+def _law(name: str, pair: Pair | None, linear: bool) -> Pair:
+    if pair is None:
+        return math.nan, math.nan
+    if not pair[1] > 0 or not (linear or pair[0] > 0):
+        raise ValueError(f"{name}: [{pair[0]:g}, {pair[1]:g}] is no law: median and width must be positive")
+    return pair if linear else (math.log(pair[0]), math.log(pair[1]))
+
+
+@dataclass(frozen=True)
+class Free:
+    """Free parameters and their prior; how they are walked is said by each kind of coordinates."""
+
+    linear: ClassVar[frozenset[str]]  #: that may be none, or less
+    edged: ClassVar[frozenset[str]] = frozenset()  #: of which a number that is rounded shows edges and no slope: what
+    #: is told of the one that is free stands in the last row of `Likelihood.scaled`
+
+    names: tuple[str, ...]  #: of the free parameters
+    prior: Prior
+    held: Mapping[str, float]  #: what the others are
+
+    def draw(self, count: int, rng: torch.Generator) -> dict[str, Tensor]:
+        """Parameters from the prior: (count,)."""
+        return self.from_whitened(torch.randn(count, len(self.names), generator=rng, dtype=torch.float64))
+
+    def whitened(self, parameters: Mapping[str, Tensor]) -> Tensor:
+        """(..., free) in standard deviations of the prior from its centre."""
+        value = torch.stack([self._walked(name, parameters[name]) for name in self.names], -1)
+        return (value - self._centre) / self._width
+
+    def from_whitened(self, z: Tensor) -> dict[str, Tensor]:
+        """The inverse of `whitened`."""
+        found = (self._centre + self._width * z).unbind(-1)
+        return {name: x if name in self.linear else x.exp() for x, name in zip(found, self.names, strict=True)}
+
+    def _walked(self, name: str, value: Tensor) -> Tensor:
+        return value if name in self.linear else value.log()
+
+    @cached_property
+    def _centre(self) -> Tensor:
+        return self.prior.centre[self.prior.width.isfinite()]
+
+    @cached_property
+    def _width(self) -> Tensor:
+        return self.prior.width[self.prior.width.isfinite()]

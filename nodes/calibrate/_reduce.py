@@ -1,0 +1,150 @@
+"""Frames of a flat illumination to what a fit of the sensor needs: counts, means, variances, and histograms at ends."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterator
+from typing import Annotated, Any, Literal
+
+import torch
+from pydantic import Field
+from torch import Tensor
+
+from neusee.nodes import Check, node
+from neusee.nodes.units import Time
+from neusee.nodes.values import Levels
+
+Photons = Annotated[float, Field(ge=0, allow_inf_nan=False)]  #: per pixel and exposure
+Temporal = Literal["temporal", "steady"]
+Scatter = Literal["all", "temporal", "steady"]
+_PIECE = 1 << 20  #: numbers that are looked at together, so that no second copy of a stack is made
+_TOP = 1 << 24  #: DN; more than any converter gives, and where float32 stops counting
+_COARSE = 0.8  #: DN, standard deviation below which whole numbers are too coarse for a mean and a variance
+_FEW, _SURE, _RATIO = 8, 5.0, 5.0  #: numbers at an end that count at all; beyond chance, in sigma; a multiple
+
+
+@node(rtol=1e-12)
+def reduce(frames: Tensor, *, photons: Photons, exposure: Time, scatter: Scatter = "all") -> Levels:
+    """Reduce the frames of one flat illumination to their mean and variance, and to a histogram where these mislead.
+
+    `all`: every pixel of every frame is alike, as in a simulation. `temporal`: the variance is that within a pixel from
+    frame to frame, of two frames half the mean squared difference. `steady`: the same without what all pixels have in
+    common, half the squared difference of the means, as of a lamp that drifts: what `camera` wants. The histogram is
+    kept where numbers pile up at an end, and where they scatter by less than 0.8 DN.
+
+    Shapes: frames (frame, y, x) -> one level.
+    Units:  frames DN, whole; photons per pixel and exposure; exposure s; mean DN; variance DN2.
+    Error:  counted in whole numbers: 1e-15. What piles up counts by a Gaussian of the mean and the variance of all
+            pixels: of `all` 5 sigma more than it has at an end, of the others, whose pixels differ, 5 times as much.
+    Raises: ValueError for numbers that are not whole, negative or not finite, for a stack that is not (frame, y, x),
+            for a single number, for `temporal` and `steady` of one frame, and for `steady` of one pixel.
+    Source: EMVA Standard 1288, release 4.0 Linear, sections 6.5 and 6.6.
+    """
+    if frames.ndim != 3 or not frames.numel():
+        raise ValueError(f"frames {tuple(frames.shape)} are not (frame, y, x): give a stack, one frame as (1, y, x)")
+    if scatter != "all" and len(frames) < 2:
+        raise ValueError("one frame has no temporal variance: give two frames or more, or take scatter: all")
+    if frames.numel() < 2 or (scatter == "steady" and frames[0].numel() < 2):
+        raise ValueError("one number has no variance: give more pixels or frames")
+    value, count = histogram(frames)
+    total = float(count.sum())
+    mean = float((value * count).sum()) / total
+    spread = float(((value.double() - mean).square() * count).sum())
+    if scatter == "all":
+        freedom, variance = total - 1, spread / (total - 1)
+    else:
+        freedom = total - total / len(frames) - (scatter == "steady") * (len(frames) - 1)
+        variance = _within(frames, scatter == "steady") / freedom
+    kept = _kept(value.double(), count.double(), mean, math.sqrt(spread / total), scatter == "all")
+    moments = (torch.tensor([x], dtype=torch.float64) for x in (photons, exposure, total, mean, variance, freedom))
+    value, count = (value, count) if kept else (value[:0], count[:0])
+    return Levels._make([*moments, torch.zeros(len(value), dtype=torch.int64), value.double(), count.double()])
+
+
+@reduce.check
+def _(result: Levels, *inputs: Tensor, **params: Any) -> list[Check]:
+    text = f"mean {float(result.mean):.5g} DN, variance {float(result.variance):.4g} DN2"
+    return [Check(text + (f", histogram of {len(result.cell_value)} numbers" if len(result.cell_value) else ""))]
+
+
+@node(rtol=0.0)
+def levels(parts: list[Levels]) -> Levels:
+    """Join levels to one measurement, in the order given.
+
+    Shapes: each (level,) and (cell,) -> all of them, one behind the other.
+    Units:  as in `Levels`.
+    Error:  exact.
+    Raises: ValueError without a level.
+    Source: EMVA Standard 1288, release 4.0 Linear, section 6.5 (a measurement is a series of levels).
+    """
+    if not parts:
+        raise ValueError("no levels to join: wire at least one")
+    joined = [torch.cat(each) for each in zip(*parts, strict=True)]
+    before, shifted = 0, []
+    for part in parts:
+        shifted.append(part.cell_level + before)
+        before += len(part.mean)
+    return Levels(*joined)._replace(cell_level=torch.cat(shifted))
+
+
+@levels.check
+def _(result: Levels, *inputs: object) -> list[Check]:
+    dark, counted = int((result.photons == 0).sum()), len(set(result.cell_level.tolist()))
+    return [Check(f"{len(result.mean)} levels, {dark} dark, {counted} with a histogram")]
+
+
+def histogram(frames: Tensor) -> tuple[Tensor, Tensor]:
+    """The whole numbers that occur, rising, and how often each does: two (cell,) int64."""
+    counts = torch.zeros(0, dtype=torch.int64, device=frames.device)
+    for piece in _pieces(frames.reshape(1, -1)):
+        found = torch.bincount(_whole(piece).reshape(-1), minlength=len(counts))
+        found[: len(counts)] += counts
+        counts = found
+    value = counts.nonzero().squeeze(1)
+    return value.cpu(), counts[value].cpu()
+
+
+def _pieces(rows: Tensor) -> Iterator[Tensor]:
+    """``rows`` cut into columns that together hold about as many numbers as are looked at together."""
+    return iter(torch.split(rows, max(1, _PIECE // len(rows)), 1))
+
+
+def _whole(piece: Tensor) -> Tensor:
+    """The same as int64; refuses what is no number of a converter."""
+    whole = piece.to(torch.int64)
+    low, high = (int(end) for end in torch.aminmax(whole))
+    if low < 0 or high >= _TOP or (piece.is_floating_point() and not bool((whole == piece).all())):
+        bad = (whole < 0) | (whole >= _TOP) | (whole != piece)
+        raise ValueError(
+            f"frames hold {float(piece[bad][0]):g}, which is no digital number: give whole numbers from 0 to {_TOP - 1}"
+            ", as the camera gives them, neither corrected nor scaled"
+        )
+    return whole
+
+
+def _within(frames: Tensor, steady: bool) -> float:
+    """Sum over the pixels of the squared deviations from the mean of each pixel, and from that of each frame."""
+    parts, sums = [], torch.zeros(len(frames), dtype=torch.float64)
+    for piece in _pieces(frames.reshape(len(frames), -1)):
+        numbers = piece.double()
+        apart = numbers - numbers.mean(0)
+        parts.append(float(apart.square().sum()))
+        sums += apart.sum(1).cpu()
+    common = float(sums.square().sum()) / frames[0].numel() if steady else 0.0
+    return max(0.0, math.fsum(parts) - common)
+
+
+def _kept(value: Tensor, count: Tensor, mean: float, sigma: float, alike: bool) -> bool:
+    """Whether mean and variance tell less than the histogram does."""
+    if sigma < _COARSE:
+        return True
+    ends = ((value >= value[-1] - 1, value[-1] - 1.5), (value <= value[0] + 1, value[0] - 0.5))
+    return any(_piled(float(count[at].sum()), float(count.sum()), float(low) - mean, sigma, alike) for at, low in ends)
+
+
+def _piled(held: float, total: float, low: float, sigma: float, alike: bool) -> bool:
+    """Whether two neighbouring numbers, the lower from ``low`` above the mean, are held by more pixels than they would
+    be of a Gaussian."""
+    expected = total * 0.5 * abs(math.erf((low + 2.0) / sigma / math.sqrt(2)) - math.erf(low / sigma / math.sqrt(2)))
+    more = _SURE * math.sqrt(expected) if alike else (_RATIO - 1) * expected
+    return held >= _FEW and held - expected > more

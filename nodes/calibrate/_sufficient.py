@@ -1,0 +1,92 @@
+"""All that levels tell of a sensor whose pixels are alike, in as few numbers as hold it."""
+
+from __future__ import annotations
+
+import math
+from typing import NamedTuple
+
+import torch
+from torch import Tensor
+
+from neusee.nodes import Check, node
+from neusee.nodes.values import Levels
+
+_EDGE = 4  #: DN from either end that are counted one by one: a full well touches two or three numbers
+_COARSE = 0.8  #: DN, standard deviation below which mean and variance do not hold all
+
+
+class Sufficient(NamedTuple):
+    """Of each level mean and variance of most pixels, and the rest counted number by number; nothing stands twice."""
+
+    photons: Tensor  #: (level,) float64, in a pixel and exposure
+    exposure: Tensor  #: (level,) float64, s
+    numbers: Tensor  #: (level,) float64, pixels of `mean` and `variance`
+    mean: Tensor  #: (level,) float64, DN
+    variance: Tensor  #: (level,) float64, DN2
+    freedom: Tensor  #: (level,) float64, degrees of freedom of the variance
+    cell_level: Tensor  #: (cell,) int64, rising
+    cell_value: Tensor  #: (cell,) float64, DN
+    cell_count: Tensor  #: (cell,) float64
+
+
+@node(rtol=1e-9)
+def sufficient(levels: Levels) -> Sufficient:
+    """Take apart levels whose numbers were counted: those at an end stay counted, of the rest moments are enough.
+
+    Between the ends numbers are as good as continuous, and mean and variance hold all that they tell; at a full well
+    one number more or less tells a lot. Levels of less than 0.8 DN of scatter are counted whole.
+
+    Shapes: levels (level,), cells (cell,) -> the same with at most ten cells a level that is not coarse.
+    Units:  those of `Levels`.
+    Error:  1e-12 of the moments. Of what is counted the pixels are taken to be alike.
+    Source: Fisher, Phil. Trans. R. Soc. A 222, 309 (1922), sufficiency.
+    """
+    moments = torch.stack([levels.numbers, levels.mean, levels.variance, levels.freedom], 1)
+    kept = torch.ones(len(levels.cell_level), dtype=torch.bool)
+    for one in sorted(set(levels.cell_level.tolist())):
+        at = levels.cell_level == one
+        inner, found = _inner(levels.cell_value[at], levels.cell_count[at], math.sqrt(float(levels.variance[one])))
+        moments[one], kept[at] = found, ~inner
+    level, value, count = (x[kept] for x in (levels.cell_level, levels.cell_value, levels.cell_count))
+    numbers, mean, variance, freedom = moments.T.contiguous()
+    return Sufficient(levels.photons, levels.exposure, numbers, mean, variance, freedom, level, value, count)
+
+
+@sufficient.check
+def _(result: Sufficient, *inputs: Levels) -> list[Check]:
+    counted = len(set(result.cell_level.tolist()))
+    return [Check(f"{len(result.mean)} levels, {counted} with numbers counted: {len(result.cell_level)} in all")]
+
+
+@sufficient.reference
+def _(levels: Levels) -> Sufficient:
+    cells = list(zip(levels.cell_level.tolist(), levels.cell_value.tolist(), levels.cell_count.tolist(), strict=True))
+    rows = torch.stack([levels.numbers, levels.mean, levels.variance, levels.freedom], 1).tolist()
+    left = []
+    for level in range(len(rows)):
+        own = [(v, n) for at, v, n in cells if at == level]
+        if not own:
+            continue
+        low, high = own[0][0] + _EDGE, own[-1][0] - _EDGE
+        inside = [(v, n) for v, n in own if low < v < high and rows[level][2] ** 0.5 >= _COARSE]
+        count: float = math.fsum(n for _, n in inside)
+        if count < 2:
+            inside, count = [], 0.0
+        middle: float = math.fsum(v * n for v, n in inside) / count if count else 0.0
+        square = math.fsum((v - middle) ** 2 * n for v, n in inside)
+        rows[level] = [count, middle, square / (count - 1) if count else 0.0, count - 1 if count else 0.0]
+        left += [(level, v, n) for v, n in own if (v, n) not in inside]
+    cell = torch.tensor(left, dtype=torch.float64).reshape(-1, 3).unbind(1)
+    numbers, mean, variance, freedom = torch.tensor(rows, dtype=torch.float64).unbind(1)
+    return Sufficient(levels.photons, levels.exposure, numbers, mean, variance, freedom, cell[0].long(), *cell[1:])
+
+
+def _inner(value: Tensor, count: Tensor, sd: float) -> tuple[Tensor, Tensor]:
+    """Which numbers go into moments, and those: pixels, mean, variance, degrees of freedom."""
+    inner = (value > value[0] + _EDGE) & (value < value[-1] - _EDGE)
+    total = float(count[inner].sum())
+    if sd < _COARSE or total < 2:
+        return torch.zeros_like(inner), torch.zeros(4, dtype=torch.float64)
+    mean = (value[inner] * count[inner]).sum() / total
+    variance = ((value[inner] - mean).square() * count[inner]).sum() / (total - 1)
+    return inner, torch.stack([torch.tensor(total, dtype=torch.float64), mean, variance, torch.tensor(total - 1.0)])

@@ -1,0 +1,90 @@
+"""Moments that another program has measured, from a table."""
+
+from __future__ import annotations
+
+import csv
+import math
+from pathlib import Path
+from typing import Any, Literal
+
+import torch
+
+from neusee.nodes import Check, ParameterError, node
+from neusee.nodes.units import DataFile
+from neusee.nodes.values import Levels
+
+_SECONDS = {"s": 1.0, "ms": 1e-3, "us": 1e-6, "ns": 1e-9}
+_NUMBERS = {"photons": ">= 0", "exposure": "> 0", "pixels": ">= 1", "mean": "finite", "variance": ">= 0"}
+
+
+@node(rtol=0.0)
+def table(
+    *,
+    file: DataFile,
+    photons: str = "photons",
+    exposure: str = "exposure_s",
+    pixels: str = "pixels",
+    mean: str = "mean",
+    variance: str = "variance",
+    drift: str | None = None,
+    exposure_unit: Literal["s", "ms", "us", "ns"] = "s",
+) -> Levels:
+    """Read the moments of pairs of frames from a CSV file, a level a line, by the names of its columns.
+
+    ``drift`` names the difference of the two means, where that was taken off the variance: half its square is put back,
+    for EMVA does not take it off.
+
+    Shapes: -> (level,), in the order of the file; no histograms.
+    Units:  photons per pixel and exposure; exposure as its unit says; pixels of one frame; mean DN; variance DN2.
+    Error:  exact.
+    Raises: ParameterError before the run for a column that is missing; ValueError for what is no number.
+    Source: EMVA Standard 1288, release 4.0 Linear, section 6.6 (variance of a pair of frames).
+    """
+    names = {"photons": photons, "exposure": exposure, "pixels": pixels, "mean": mean, "variance": variance}
+    rows = _rows(file, {**names, **({} if drift is None else {"drift": drift})})
+    if not rows:
+        raise ValueError(f"{file.name} has no line below its header: give a level a line")
+    columns = {name: torch.tensor([row[name] for row in rows], dtype=torch.float64) for name in rows[0]}
+    measured = columns["variance"] + (columns["drift"].square() / 2 if drift is not None else 0.0)
+    times, number = columns["exposure"] * _SECONDS[exposure_unit], columns["pixels"]
+    none = torch.zeros(0, dtype=torch.float64)
+    return Levels(columns["photons"], times, 2 * number, columns["mean"], measured, number, none.long(), none, none)
+
+
+@table.preflight
+def _(*, file: Path, exposure_unit: str = "s", **names: Any) -> list[str]:
+    with file.open(newline="", encoding="utf-8-sig") as opened:
+        header = next(csv.reader(opened), [])
+    for parameter, column in names.items():
+        if column is not None and column not in header:
+            raise ParameterError(parameter, f"{file.name} has no column {column!r}: name one of {', '.join(header)}")
+    return []
+
+
+@table.check
+def _(result: Levels, **params: Any) -> list[Check]:
+    dark = int((result.photons == 0).sum())
+    return [Check(f"{len(result.mean)} levels, {dark} dark", dark > 0)]
+
+
+def _rows(file: Path, columns: dict[str, str]) -> list[dict[str, float]]:
+    with file.open(newline="", encoding="utf-8-sig") as opened:
+        reader = csv.DictReader(opened)
+        return [_read(row, columns, f"{file.name}:{reader.line_num}") for row in reader]
+
+
+def _read(row: dict[str, str], columns: dict[str, str], where: str) -> dict[str, float]:
+    return {name: _number(row.get(column), name, f"{where}: column {column}") for name, column in columns.items()}
+
+
+def _number(text: str | None, name: str, where: str) -> float:
+    wanted = _NUMBERS.get(name, "finite")
+    try:
+        number = float(text or "")
+    except ValueError:
+        number = math.nan
+    least = {">= 0": number >= 0, "> 0": number > 0, ">= 1": number >= 1 and number.is_integer()}
+    if not math.isfinite(number) or not least.get(wanted, True):
+        kind = "whole number" if name == "pixels" else "number"
+        raise ValueError(f"{where}: {text!r} is no {name}: write a {kind}, {wanted}")
+    return number
