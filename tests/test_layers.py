@@ -1,6 +1,7 @@
 """Layers: nodes know nothing of workflows, one room for emcee, full names, and nothing heavy on import."""
 
 import ast
+import functools
 import subprocess
 import sys
 from pathlib import Path
@@ -24,6 +25,7 @@ def imports(tree):
             yield from ((a.name, id(item) in top) for a in item.names)
 
 
+@functools.cache
 def parsed(path):
     return list(imports(ast.parse(path.read_text())))
 

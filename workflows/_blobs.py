@@ -173,8 +173,10 @@ class Blobs:
 
 def bytes_of(x: Tensor) -> memoryview:
     """The bytes of a tensor, without a copy where it is contiguous and on the CPU."""
-    x = x.detach().cpu().resolve_conj().resolve_neg().contiguous()
-    return x.reshape(-1).view(torch.uint8).numpy().data
+    flat = x.detach().cpu().resolve_conj().resolve_neg().contiguous().reshape(-1)
+    if flat.stride() != (1,):  # a single element is contiguous whatever its stride, and yet cannot be seen as bytes
+        flat = flat.clone(memory_format=torch.contiguous_format)
+    return flat.view(torch.uint8).numpy().data
 
 
 def dtype_of(name: str) -> torch.dtype:

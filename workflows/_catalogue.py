@@ -17,7 +17,18 @@ from neusee.workflows._recipe import groups, recipes
 from neusee.workflows._steps import all_nodes
 
 _FOLDER = Path(neusee.recipes.__file__).parent
-_KINDS = ("PositiveLength", "Length", "Wavelength", "Time", "Angle", "Temperature", "Electrons", "Waves", "DataFile")
+_KINDS = (
+    "PositiveLength",
+    "Length",
+    "Wavelength",
+    "Time",
+    "Angle",
+    "Temperature",
+    "Electrons",
+    "Waves",
+    "DataFile",
+    "DataFiles",
+)
 _SAID = {
     "PositiveLength": "length > 0, such as 2.9 um",
     "Length": "length, such as 50 nm",
@@ -28,6 +39,7 @@ _SAID = {
     "Electrons": "charge >= 0, such as 390 e-",
     "Waves": "wavelengths of path, such as 2 waves",
     "DataFile": "a file",
+    "DataFiles": "files: a path, a folder, a pattern such as dark/*.png, or a list of these",
 }
 
 
@@ -88,6 +100,8 @@ def _kind(hint: Any) -> str:
     for name in _KINDS:
         if hint == getattr(units, name):
             return _SAID[name]
+    if any(isinstance(extra, units.IsFile) for extra in getattr(hint, "__metadata__", ())):
+        return _SAID["DataFile"]  # and what it names
     arguments = get_args(hint)
     if arguments and all(isinstance(a, str) for a in arguments):
         return " | ".join(arguments)

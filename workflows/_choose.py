@@ -9,8 +9,10 @@ never cut.
 
 from __future__ import annotations
 
+from collections import Counter
 from collections.abc import Callable, Iterable, Sequence
 
+from neusee.workflows._graph import in_order
 from neusee.workflows._keys import Key
 
 _GAIN = 1e-3  #: s that recomputing a value must save before anyone looks
@@ -33,6 +35,17 @@ class Below(dict[Key, list[Key]]):
             self.missing.add(key)
             self[key] = self._sources(key)
         return self[key]
+
+
+def uses_of(
+    plan: Iterable[Key], targets: Sequence[Key], known: Callable[[Key], bool], sources: Callable[[Key], list[Key]]
+) -> Counter[Key]:
+    """How often ``plan``, ``targets``, and what has yet to be computed for them afterwards, take each value."""
+    below, uses = Below(known, sources), Counter(targets)
+    in_order(below, targets)
+    for key in below.missing.union(plan):
+        uses.update(sources(key))
+    return uses
 
 
 def worth_a_look(load: float, compute: float) -> bool:

@@ -78,7 +78,7 @@ def settle(value: Any) -> Any:
 
 def _settled(x: Tensor) -> Tensor:
     x = x.resolve_conj().resolve_neg().contiguous()
-    return x.clone() if x.untyped_storage().nbytes() > x.nbytes else x
+    return x.clone(memory_format=torch.contiguous_format) if x.untyped_storage().nbytes() > x.nbytes else x
 
 
 class _Listed:

@@ -185,7 +185,8 @@ def closing(doc: Mapping[str, Any], path: str, again: Sequence[str]) -> list[str
     """The lines after everything ran: what was left out, the table, the verdict, where the page is, what to try."""
     lines = [said_of_economies(doc["spent"])] if doc["spent"]["economies"] else []
     lines += [said_of_left_out(doc)] if doc["left_out"] else []
-    lines += ["", *aligned([["", *doc["table"]["columns"]], *[[r["name"], *r["cells"]] for r in doc["table"]["rows"]]])]
+    rows = [[row["name"], *row["cells"]] for row in doc["table"]["rows"]]
+    lines += ["", *aligned([["", *doc["table"]["columns"]], *rows])] if rows else []
     lines += [f"  {line}" for line in doc["table"]["legend"]]
     lines += ["", f"{doc['verdict']}  ({doc['counts']}, {doc['seconds']:.2f} s)"]
     for e in doc["expected"]:

@@ -113,14 +113,15 @@ def _diagram(ax: Any, lines: Sequence[Line], styles: Styles, exact: float, *also
     """Lines and marks; ``also``: an error and a time that must be in the picture too, where there are such."""
     ax.set_xscale("log")
     ax.set_yscale("log")
-    for line in lines:
-        _draw(ax, line, *styles[line.name], exact)
     dots = [d for line in lines for d in line.dots]
     tolerance, seconds = (*also, None, None)[:2]
     x = [d.seconds for d in dots] + ([] if seconds is None else [seconds])
     y = [max(e, exact) for d in dots for e in (d.error, d.most or d.error)] + ([] if tolerance is None else [tolerance])
+    # before anything is drawn: left to itself the axis warns of errors that differ in their last digit alone
     ax.set_xlim(*_room(x, 10.0, 1.5))
     ax.set_ylim(*_room(y, 100.0, 4.0))
+    for line in lines:
+        _draw(ax, line, *styles[line.name], exact)
     _tick_seconds(ax)
     _say_exact(ax, [d.error for d in dots], exact)
 

@@ -2,10 +2,13 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Iterable, Mapping
+from functools import cached_property
 from typing import Any
 
 import torch
+from torch import Tensor
 
 from neusee.nodes import Facts
 from neusee.workflows._call import call, place
@@ -85,13 +88,13 @@ class _Function:
         self.recipe, self.free, self.wanted, self.device = recipe, free, wanted, device
         self.given, self.tuned, self.live, self.fixed = given, tuned, live, fixed
         self._facts: dict[str, Facts | None] = {}
-        self._left_out, self._before = left_out, needed(recipe, fixed)
+        self._spent = _spent(recipe, fixed, left_out)
         self._last = {source: name for name in live if name not in given for source in recipe.steps[name].sources}
 
     def __call__(self, theta: Theta) -> dict[str, Any]:
         if set(theta) != set(self.free):
             raise ValueError(f"give exactly {', '.join(self.free)}, not {', '.join(theta) or 'nothing'}")
-        values, ledger = dict(self.fixed), self._ledger()
+        values, ledger = dict(self.fixed), self._spent.copy()
         for name in self.live:
             step = self.recipe.steps[name]
             values[name] = settle(theta[name]) if name in self.given else self._evaluate(step, values, theta, ledger)
@@ -99,15 +102,6 @@ class _Function:
                 if self._last[source] == name and source not in self.wanted:
                     del values[source]
         return {name: values[name] for name in self.wanted}
-
-    def _ledger(self) -> Ledger:
-        """What the fixed steps have spent of the tolerance."""
-        ledger = Ledger(self.recipe)
-        for name in self._before:
-            ledger.pass_on(self.recipe.steps[name])
-            if name in self._left_out:
-                ledger.leave_out(self.recipe.steps[name], self._left_out[name])
-        return ledger
 
     def _evaluate(self, step: Step, values: dict[str, Any], theta: Theta, ledger: Ledger) -> Any:
         params = {**step.params, **{p: theta[full] for p, full in self.tuned.get(step.name, {}).items()}}
@@ -121,12 +115,60 @@ class _Function:
         inputs = [_gather(step.wires.get(name), values) for name in step.node.inputs]
         return call(step, inputs, params, self.recipe.seed, place(step, self.device))
 
-    def _facts_of(self, name: str, values: dict[str, Any]) -> Facts | None:
+    def _facts_of(self, name: str, values: dict[str, Any]) -> Any:
         if name not in self.fixed:
-            return Facts.of(values[name])
+            value = values[name]
+            return _Ends(value) if isinstance(value, Tensor) and value.dtype == torch.float32 else Facts.of(value)
         if name not in self._facts:
             self._facts[name] = Facts.of(self.fixed[name])
         return self._facts[name]
+
+
+class _Ends:
+    """Facts of a picture that each call makes anew, its least and greatest first: a bound rarely asks for more."""
+
+    def __init__(self, value: Tensor) -> None:
+        self._value = value.detach()
+        self.shape, self.dtype = tuple(value.shape), "float32"
+
+    @cached_property
+    def _ends(self) -> tuple[float, float]:
+        if self._value.numel() == 0:
+            return math.nan, math.nan
+        low, high = torch.aminmax(self._value)
+        return float(low), float(high)
+
+    @property
+    def min(self) -> float:
+        return self._ends[0]
+
+    @property
+    def max(self) -> float:
+        return self._ends[1]
+
+    @property
+    def finite(self) -> bool:
+        """Whether all is finite; then the sum is, which is taken in double precision."""
+        return self._value.numel() == 0 or all(map(math.isfinite, self._ends))
+
+    @cached_property
+    def _whole(self) -> Facts:
+        found = Facts.of(self._value)
+        assert found is not None
+        return found
+
+    def __getattr__(self, name: str) -> Any:
+        return getattr(self._whole, name)
+
+
+def _spent(recipe: Recipe, fixed: Mapping[str, Any], left_out: Mapping[str, float]) -> Ledger:
+    """What the fixed steps have spent of the tolerance."""
+    ledger = Ledger(recipe)
+    for name in needed(recipe, fixed):
+        ledger.pass_on(recipe.steps[name])
+        if name in left_out:
+            ledger.leave_out(recipe.steps[name], left_out[name])
+    return ledger
 
 
 def _gather(wire: str | tuple[str, ...] | None, values: Mapping[str, Any]) -> Any:

@@ -12,6 +12,7 @@ from neusee.workflows._marks import Mark
 
 if TYPE_CHECKING:
     from neusee.workflows import Event, Executor, Result, Store
+    from neusee.workflows._uncertain import Uncertain
 
 __all__ = ["Config", "Economy", "Expectation", "Recipe", "Setting", "Step", "Wire", "in_order", "needed"]
 
@@ -83,6 +84,7 @@ class Recipe:
     economies: tuple[Economy, ...] = ()  #: what stands in for full steps; a recipe as it is read has none
     strict: float = 1.0  #: share of the tolerance that may be spent: less where a run could not prove that it held
     whole: Recipe | None = field(default=None, compare=False)  #: the recipe without economies, where this has some
+    uncertain: Uncertain | None = field(default=None, compare=False)  #: what the study of uncertainty draws from
     unheard: frozenset[str] = frozenset()  #: steps whose errors reach a node that does not tell what becomes of them
 
     def limit(self, step: str) -> float:

@@ -6,15 +6,19 @@ another process which wants the same result finds either the one or the other.
 
 from __future__ import annotations
 
+import os
+import sys
 import threading
 from collections.abc import Callable
 from concurrent.futures import FIRST_COMPLETED, Future, ThreadPoolExecutor, wait
+from contextlib import suppress
 from typing import Any
 
 from neusee.workflows._keys import Key
 
 LARGE = 1 << 20  #: bytes from which a result is written beside the next step
 _ROOM = 1 << 29  #: bytes that may wait; one larger result waits alone
+_NICE = 10
 
 
 class Later:
@@ -35,7 +39,7 @@ class Later:
         while self._sizes and sum(list(self._sizes.values())) + size > _ROOM:
             wait([self._writes[key] for key in list(self._sizes) if key in self._writes], return_when=FIRST_COMPLETED)
         with self._guard:
-            self._pool = self._pool or ThreadPoolExecutor(1, "neusee store")
+            self._pool = self._pool or ThreadPoolExecutor(1, "neusee store", _yielding)
             self._sizes[key] = size
             self._writes[key] = self._pool.submit(self._write, key, write)
 
@@ -54,3 +58,10 @@ class Later:
             write()
         finally:
             del self._sizes[key]
+
+
+def _yielding() -> None:
+    """Let whoever computes go first: its threads wait for each other, so that one without a core delays them all."""
+    if sys.platform == "linux":  # elsewhere it would be the whole process; threads that this one starts are as nice
+        with suppress(OSError):
+            os.setpriority(os.PRIO_PROCESS, threading.get_native_id(), _NICE)

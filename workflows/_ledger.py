@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
+from copy import copy
 from typing import Any
 
 from neusee.workflows._economy import CHANNELS
@@ -22,6 +23,12 @@ class Ledger:
         share = 1.0 - 2 * CHANNELS if any(e.within for e in recipe.economies) else 1.0
         self._recipe, self._share = recipe, share
         self._spent: dict[str, dict[str, float]] = {}  # by step: decision -> its bound; shared where equal
+
+    def copy(self) -> Ledger:
+        """The same account, to be carried on by itself."""
+        found = copy(self)
+        found._spent = dict(self._spent)
+        return found
 
     def verdict(self, step: Step, params: Mapping[str, Any], facts_of: FactsOf) -> Verdict:
         """Whether a step whose node has a bound is left out; with `Recipe.keep_all` nothing is."""

@@ -30,13 +30,14 @@ def expected(recipe: Recipe, value: Value) -> list[dict[str, Any]]:
 
 
 def table(recipe: Recipe, keys: Mapping[str, str], value: Value) -> dict[str, Any]:
-    """Plain lens, with mask, restored: one row each, a cell where the recipe has the step."""
+    """Plain lens, with mask, restored: one row each, a cell where the recipe has the step; no rows without a cell."""
     band, where = _band(recipe, keys, value)
     rows = []
     for name, cells in TABLE.items():
         known = {column: value(step) for column, step in cells.items() if step in keys}
         rows.append({"name": name, "cells": _cells(known, band)})
     legend = [f"LSR at {where}; BSR is the mean over the bands."] if any(r["cells"][1] for r in rows) else []
+    rows = rows if any(any(row["cells"]) for row in rows) else []
     return {"columns": list(_COLUMNS), "rows": rows, "legend": legend}
 
 

@@ -10,7 +10,9 @@ from dataclasses import dataclass, replace
 from neusee.workflows._marks import Mark, Problem, RecipeError
 from neusee.workflows._yaml import Value, parse
 
-RESERVED = frozenset({"steps", "seed", "tolerance", "outputs", "expect"})  #: keys that are no parameter block
+RESERVED = frozenset(
+    {"steps", "seed", "tolerance", "outputs", "expect", "posterior"}
+)  #: keys that are no parameter block
 
 Trail = list[tuple[Value, str | int]]  #: values along a path, each with the key that leads on
 
@@ -94,7 +96,7 @@ def _fault(root: Value, o: Override, trail: Trail, missing: tuple[str, ...], gro
 def _implied(root: Value, path: tuple[str, ...]) -> bool:
     """Whether a path need not be written to exist: a key of the recipe itself, or of one of its steps."""
     if path[0] != "steps":
-        return path[0] in RESERVED and (len(path) == 1 or path[0] == "expect")
+        return path[0] in RESERVED and (len(path) == 1 or path[0] in ("expect", "posterior"))
     steps = root.items.get("steps")
     return len(path) > 2 and steps is not None and path[1] in steps.items
 

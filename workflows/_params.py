@@ -27,7 +27,8 @@ class Checker:
 
     problems: list[Problem]
     notes: dict[str, None] = field(default_factory=dict)
-    files: dict[tuple[str | int, ...], str] = field(default_factory=dict)  #: path of a value -> the file in full
+    #: path of a value -> the file, or files, in full
+    files: dict[tuple[str | int, ...], str | list[str]] = field(default_factory=dict)
 
     def read(self, node: Node, given: Value, step: Mark) -> dict[str, Any] | None:
         """Validated parameters with the node's defaults, or None if there are problems."""
@@ -63,11 +64,13 @@ class Checker:
 
     def _plain(self, node: Node, name: str, value: Value) -> Any:
         """A value alone; the path of a file is taken from the folder of the YAML file that names it."""
-        if name in node.hints and _is_file(node.hints[name]) and isinstance(value.data, str):
-            path = os.path.normpath(Path(value.mark.folder) / Path(value.data).expanduser())
-            self.files[value.path] = os.path.abspath(path)
-            return path
-        return value.plain
+        given = value.data if isinstance(value.data, list) else [value]
+        if name not in node.hints or not _is_file(node.hints[name]) or not all(isinstance(v.data, str) for v in given):
+            return value.plain
+        paths = [os.path.normpath(Path(v.mark.folder) / Path(v.data).expanduser()) for v in given]
+        full = [os.path.abspath(path) for path in paths]
+        self.files[value.path] = full if isinstance(value.data, list) else full[0]
+        return paths if isinstance(value.data, list) else paths[0]
 
 
 def _is_file(hint: Any) -> bool:

@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import os
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -23,8 +23,9 @@ from neusee.workflows._overrides import Override, arguments_in
 from neusee.workflows._params import Checker
 from neusee.workflows._refs import References
 from neusee.workflows._steps import Declared, declare, device_of
+from neusee.workflows._uncertain import Uncertain, settle
 from neusee.workflows._wires import Wiring
-from neusee.workflows._yaml import Value
+from neusee.workflows._yaml import Value, Where
 
 
 @dataclass(frozen=True, slots=True)
@@ -68,6 +69,7 @@ def _as_written(name: str, place: Path) -> Recipe:
 
 def check(composed: Composed) -> Recipe:
     """A composed recipe with its steps bound, or a `RecipeError` with every problem."""
+    composed, uncertain = settle(composed)
     problems = list(composed.problems)
     root, references = composed.root, References(composed.root, problems)
     graph = known_graph(root)
@@ -85,10 +87,11 @@ def check(composed: Composed) -> Recipe:
         raise RecipeError([*problems, *checker.problems])
     if graph is None:
         keep_graph(root, steps, absent, {name: step.wires for name, step in bound.items()})
-    config = _config(root, bound, steps, checker)
+    config = _config(root, bound, steps, checker, references.spare, uncertain)
     nulls = {name: f"null ({value.mark})" for name, value in absent.items()}
-    title, notes = composed.title, tuple(checker.notes)
-    return Recipe(composed.name, title, seed, tolerance, outputs, bound, expect, config, notes, nulls)
+    notes = (*checker.notes, *(uncertain.notes if uncertain else ()))
+    told = composed.name, composed.title, seed, tolerance, outputs, bound, expect, config, notes, nulls
+    return Recipe(*told, uncertain=uncertain)
 
 
 def _bind(
@@ -118,17 +121,27 @@ def _bind(
             yield Step(name, step.node, params or {}, wires, step.value.key, marks, device)
 
 
-def _config(root: Value, bound: dict[str, Step], steps: dict[str, Declared], checker: Checker) -> Config:
+def _config(
+    root: Value,
+    bound: dict[str, Step],
+    steps: dict[str, Declared],
+    checker: Checker,
+    spare: set[Where],
+    uncertain: Uncertain | None,
+) -> Config:
     """Final values by path: what was written, and after each step's what its node has by default."""
     settings: dict[str, Setting] = {}
     for key, block in root.items.items():
         if key != "steps":
-            settings |= _settings(block, checker)
+            settings |= {name: found for name, found in _settings(block, checker) if found.path not in spare}
             continue
         for name, step in block.items.items():
-            settings |= _settings(step, checker)
+            settings |= dict(_settings(step, checker))
             if str(name) in steps:
                 settings |= _defaults(steps[str(name)], bound)
+    for name, law in uncertain.laws.items() if uncertain else ():
+        if name in settings:
+            settings[name] = replace(settings[name], value=law.text)
     return Config(settings)
 
 

@@ -6,8 +6,10 @@ import difflib
 import re
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
+from pathlib import Path
 from typing import Any
 
+from neusee.workflows._compose import packaged
 from neusee.workflows._marks import Problem
 from neusee.workflows._overrides import RESERVED
 from neusee.workflows._yaml import Value, Where, dotted
@@ -45,6 +47,7 @@ class References:
         self.known: dict[Where, Value] = {}
         self.open: list[Where] = []
         self.lacking: list[tuple[Where, Problem]] = []
+        self.spare: set[Where] = set()  #: values of packaged options that this recipe has no use for
 
     def resolve(self, value: Value, scope: Scope) -> Value:
         """``value`` with every reference followed; what cannot be followed is a problem, and None."""
@@ -139,11 +142,17 @@ class References:
         return ((name,) for name in (block.items if block else ()))
 
     def finish(self) -> None:
-        """Report the values that nothing refers to, and the references to nothing; a pair of these is one mistake."""
+        """Report the values that nothing refers to, and the references to nothing; a pair of these is one mistake.
+
+        A packaged option may say more than a recipe asks: a camera needs the pitch of its sensor, a laboratory not.
+        """
         wanted = dict(self.lacking)
         misspelt = set()
         for leaf in [leaf for leaf in self._block_leaves() if not self._is_used(leaf.path)]:
             instead = self._instead(leaf) or ()
+            if _is_packaged(leaf) and instead not in wanted:
+                self.spare.add(leaf.path)
+                continue
             misspelt.add(instead)
             shown = dotted(instead[-1:] if instead[:-1] == leaf.path[:-1] else instead)
             hint = f"; did you mean {shown}?" if shown else ": no step refers to it"
@@ -163,6 +172,11 @@ class References:
         known = {*self.used, *(wanted for wanted, _ in self.lacking)}
         known |= {(name,) for name in (*RESERVED, "defaults")} if len(leaf.path) == 1 else set()
         return _nearest(leaf.path, known)
+
+
+def _is_packaged(leaf: Value) -> bool:
+    """Whether a value stands in an option that came with the program, and not in a recipe or an argument."""
+    return leaf.key.line > 0 and leaf.mark.line > 0 and Path(leaf.mark.folder).parent == packaged()
 
 
 def _nearest(path: Where, known: set[Where]) -> Where | None:

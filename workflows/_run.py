@@ -119,9 +119,9 @@ def _attempt(work: UnderWay, wanted: tuple[str, ...], began: float) -> Result:
     with torch.no_grad():
         work.resolve(order)
         first = border(recipe, order, wanted)
-        missing = work.missing(wanted) if first else set()
+        missing, targets = work.missing(wanted) if first else set(), [work.keys[name] for name in wanted]
         if early := [work.keys[name] for name in first if work.keys[name] in missing]:
-            work.make(early, keep=False)
+            work.make(early, keep=False, later=targets)
 
         def known(name: str) -> Done:
             return work.done.get(name) or work.asleep(name)
@@ -131,7 +131,7 @@ def _attempt(work: UnderWay, wanted: tuple[str, ...], began: float) -> Result:
         over = proved.over(recipe)
         if over > 1.0 and not recipe.keep_all:
             raise Unproved(over)
-        work.make([work.keys[name] for name in wanted], keep=False)
+        work.make(targets, keep=False)
     values = {name: to_device(work.values[work.keys[name]], work.devices[0]) for name in wanted}
     done = work.account(order)
     peak = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss * 1024

@@ -15,13 +15,15 @@ from pydantic.json_schema import GenerateJsonSchema, JsonSchemaValue
 from pydantic_core import core_schema
 
 from neusee.nodes import Node, units
+from neusee.workflows._law import KINDS as LAWS
 from neusee.workflows._recipe import groups
 from neusee.workflows._steps import all_nodes
 from neusee.workflows._wires import takes_many
 
 Schema = dict[str, Any]
 
-REFERENCE: Schema = {"type": "string", "pattern": r"\$\{.+\}"}  #: ``${a.b}`` may stand for every value
+#: ``${a.b}`` or a law may stand for every value
+REFERENCE: Schema = {"type": "string", "pattern": rf"\$\{{.+\}}|^({'|'.join(LAWS)})\(.+\)$"}
 _WIRE: Schema = {"type": ["string", "null"], "pattern": r"^[^\[\]\s]+(\[[^\[\]]+\])?$|\$\{"}
 _DEVICE: Schema = {"type": ["string", "null"], "pattern": r"^(any|cpu|gpu|mps|cuda(:\d+)?)$|\$\{"}
 _ANY: Schema = {}
@@ -42,6 +44,7 @@ def schema() -> Schema:
             "seed": {"anyOf": [{"type": "integer", "minimum": 0}, REFERENCE]},
             "tolerance": {"anyOf": [{"type": "number", "minimum": 0}, REFERENCE]},
             "outputs": {"type": ["array", "string"], "items": {"type": "string"}},
+            "posterior": {"anyOf": [{"type": "string"}, {"type": "object"}, {"type": "null"}]},
             "expect": {"type": "object", "additionalProperties": {"$ref": "#/$defs/expectation"}},
         },
         "additionalProperties": True,

@@ -1,19 +1,35 @@
-"""``neusee study``: error against run time, stiff and extreme cases, and what is left out."""
+"""``neusee study``: error against run time, extreme cases, what is left out, posteriors and what they leave open."""
 
 from __future__ import annotations
 
+from enum import StrEnum
 from pathlib import Path
 from typing import Annotated, Any
 
 import typer
 
-from neusee.workflows._words import FAILED, Debug, Out, Words, fail, load, say, the_store
+from neusee.workflows._words import FAILED, Debug, Out, Words, check_device, fail, load, say, the_store
 
 study = typer.Typer(
     help="What a recipe's numbers are worth, where it breaks, what it need not compute.",
     no_args_is_help=True,
     rich_markup_mode=None,
 )
+
+
+class Move(StrEnum):
+    """The moves of `calibrate`."""
+
+    DE = "de"
+    STRETCH = "stretch"
+
+
+class Points(StrEnum):
+    """How inputs are drawn."""
+
+    DRAWS = "draws"
+    SOBOL = "sobol"
+
 
 Quiet = Annotated[bool, typer.Option("--quiet", help="The page's path alone.")]
 
@@ -43,6 +59,39 @@ def leave_out(words: Words = None, quiet: Quiet = False, debug: Debug = False, o
     _made("leave-out", words, quiet, out)
 
 
+@study.command()
+def calibration(
+    words: Words = None,
+    simulations: Annotated[int, typer.Option("--simulations", min=20, help="Sensors drawn from the prior.")] = 200,
+    move: Annotated[Move, typer.Option("--move", help="How walkers move.")] = Move.DE,
+    quiet: Quiet = False,
+    debug: Debug = False,
+    out: Out = Path("runs"),
+) -> None:
+    """Simulate sensors, calibrate each, rank the truth among the draws; fail where ranks or coverage are not right."""
+    _made("calibration", words, quiet, out, simulations=simulations, move=move.value)
+
+
+@study.command()
+def uncertainty(
+    words: Words = None,
+    error: Annotated[
+        float, typer.Option("--error", min=1e-3, max=1.0, help="Of each sd, relative; ends there.")
+    ] = 0.05,
+    most: Annotated[int, typer.Option("--most", min=64, help="Draws, at most.")] = 1000,
+    points: Annotated[Points, typer.Option("--points", help="Independent draws, or points of Sobol.")] = Points.DRAWS,
+    workers: Annotated[int, typer.Option("--workers", min=0, help="Draws at once; 0: one a core.")] = 0,
+    device: Annotated[str, typer.Option("--device", help="Where to compute: cpu or cuda.")] = "cpu",
+    quiet: Quiet = False,
+    debug: Debug = False,
+    out: Out = Path("runs"),
+) -> None:
+    """Draw what is uncertain (laws such as "normal(1 e-, 0.1 e-)", a posterior); show how the outputs scatter."""
+    check_device(device)
+    how = {"error": error, "most": most, "points": points.value, "workers": workers, "device": device}
+    _made("uncertainty", words, quiet, out, **how)
+
+
 def _made(kind: str, words: list[str] | None, quiet: bool, out: Path, **options: Any) -> None:
     recipe, command = load(words)
     from neusee.workflows import study as studies
@@ -53,7 +102,7 @@ def _made(kind: str, words: list[str] | None, quiet: bool, out: Path, **options:
     tell = (lambda line: None) if quiet else (lambda line: say([line]))
     try:
         folder = studies.made(kind, recipe, the_store(), out, command, tell, **options)
-    except (RunError, ValueError) as error:
+    except (RunError, ValueError, ImportError) as error:
         fail(str(error), FAILED)
     say([str(folder / "report.html")])
     if count := studies.failed(folder):

@@ -29,14 +29,18 @@ class Section:
     marks: Mapping[tuple[int, int], Mark] = field(default_factory=dict)  #: (row, column), from 0
 
 
-def page(title: str, lead: str, sections: Sequence[Section], provenance: Mapping[str, Any]) -> str:
-    """The page: ``lead`` says the result, each section shows a part of it, ``provenance`` what made it."""
+def page(title: str, lead: str, sections: Sequence[Section], provenance: Mapping[str, Any], banner: str = "") -> str:
+    """The page: ``lead`` says the result, each section shows a part of it, ``provenance`` what made it.
+
+    ``banner`` stands above all, in red: why the result must not be used.
+    """
     from jinja2 import Environment, StrictUndefined
 
     environment = Environment(autoescape=True, undefined=StrictUndefined)
     template = environment.from_string(Path(__file__).with_name("_study_page.html.j2").read_text(encoding="utf-8"))
     return template.render(
         title=title,
+        banner=banner,
         lead=_paragraphs(lead),
         sections=[_section(f"s{i}", s) for i, s in enumerate(sections)],
         provenance=[(name, _plain(value)) for name, value in provenance.items()],

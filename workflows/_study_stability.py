@@ -7,7 +7,6 @@ import json
 import time
 import warnings
 from collections.abc import Callable, Iterator, Sequence
-from contextlib import contextmanager
 from dataclasses import asdict, dataclass
 from datetime import UTC, datetime
 from pathlib import Path
@@ -23,6 +22,7 @@ from neusee.workflows._figures_stability import grid_picture
 from neusee.workflows._files import RunFolder, new_run
 from neusee.workflows._graph import Recipe
 from neusee.workflows._keys import Key, digest, file_digest
+from neusee.workflows._one_thread import one_thread
 from neusee.workflows._store import Store
 from neusee.workflows._study_page import Mark, Section, page
 
@@ -68,25 +68,12 @@ def study(
 ) -> Path:
     """Judge every step of ``recipe``, and its losses, in every case; cells that are stored are not judged again."""
     began = time.perf_counter()
-    with _one_thread():
+    with one_thread():
         rows = list(_rows(recipe, store, cases, tell))
     doc = _document(recipe, rows, command, time.perf_counter() - began)
     with new_run(runs, f"{recipe.name}_stability", digest([repr(_line(row)) for row in rows])) as folder:
         _write(folder, recipe, rows, doc)
     return folder.path
-
-
-@contextmanager
-def _one_thread() -> Iterator[None]:
-    """Pictures of 32 pixels are done before a second thread is awake."""
-    import torch
-
-    before = torch.get_num_threads()
-    torch.set_num_threads(1)
-    try:
-        yield
-    finally:
-        torch.set_num_threads(before)
 
 
 def _rows(recipe: Recipe, store: Store, cases: Sequence[Case], tell: Tell) -> Iterator[Row]:

@@ -8,14 +8,14 @@ from __future__ import annotations
 
 import time
 from collections import Counter
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import replace
 from typing import Any
 
 from neusee.nodes import Check, Facts
 from neusee.workflows._account import Done, Event, error_in, facts_in, ran
 from neusee.workflows._call import RunError, places
-from neusee.workflows._choose import Below, to_compute_again, worth_a_look
+from neusee.workflows._choose import Below, to_compute_again, uses_of, worth_a_look
 from neusee.workflows._code import Code
 from neusee.workflows._costs import Costs, Estimate
 from neusee.workflows._graph import Recipe, Step, Wire, in_order
@@ -86,8 +86,8 @@ class UnderWay:
             if key not in self.makers:
                 self.makers[key], self.origins[key] = step, origin
 
-    def make(self, targets: list[Key], keep: bool) -> None:
-        """Hold the values of ``targets``; with ``keep``, also what cannot be read from the store again."""
+    def make(self, targets: list[Key], keep: bool, later: Sequence[Key] = ()) -> None:
+        """Hold the values of ``targets``, what ``later`` needs of those made, and with ``keep`` what no store holds."""
         while True:
             below = Below(self.known, self.sources)
             order = in_order(below, targets)
@@ -95,7 +95,9 @@ class UnderWay:
                 below = Below(lambda key, again=again: key not in again and self.known(key), self.sources)  # type: ignore[misc]
                 order = in_order(below, targets)
             try:
-                return self._execute([key for key in order if key in below.missing], again, targets, keep)
+                plan = [key for key in order if key in below.missing]
+                uses = uses_of(plan, [*targets, *later], self.known, self.sources)
+                return self._execute(plan, again, targets, keep, uses)
             except Lost:
                 continue
 
@@ -162,10 +164,9 @@ class UnderWay:
         about = self.store.about(key)
         return self.store.read_seconds(about["bytes"]) if about else float("inf")
 
-    def _execute(self, plan: list[Key], again: frozenset[Key], targets: list[Key], keep: bool) -> None:
-        uses = Counter(targets)
-        for key in plan:
-            uses.update(self.sources(key))
+    def _execute(
+        self, plan: list[Key], again: frozenset[Key], targets: list[Key], keep: bool, uses: Counter[Key]
+    ) -> None:
         self._free(list(self.values), uses, keep)
         if plan:
             for outcome in self._outcomes(plan, again, targets):

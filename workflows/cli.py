@@ -13,6 +13,7 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from neusee.workflows._cache_commands import cache
+from neusee.workflows._calibrate_command import calibrate
 from neusee.workflows._listings import nodes, recipes, schema
 from neusee.workflows._study_commands import study
 from neusee.workflows._words import (
@@ -51,8 +52,8 @@ app = typer.Typer(
 )
 app.add_typer(cache, name="cache")
 app.add_typer(study, name="study")
-for listing in (recipes, nodes, schema):
-    app.command()(listing)
+for command in (calibrate, recipes, nodes, schema):
+    app.command()(command)
 
 Device = Annotated[str, typer.Option("--device", help="Where to compute: cpu, cuda, or several: cuda:0,cuda:1,cpu.")]
 Where = Annotated[

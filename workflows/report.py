@@ -31,6 +31,7 @@ from neusee.workflows._run import Done, Result
 from neusee.workflows._spent import spent
 from neusee.workflows._timing import said_of, timing
 from neusee.workflows._timing import size_of as size_of
+from neusee.workflows._uncertain import told
 
 _LIBRARIES = ("torch", "numpy", "kornia", "colour-science", "OpenEXR", "pydantic", "safetensors")
 _UNITS = frozenset(("m", "nm", "rad", "e-", "DN", "photons", "W/m2", "dB"))
@@ -65,6 +66,7 @@ def document(
         "table": table(recipe, result.keys, result.value),
         "metrics": metrics(recipe, result.keys, result.value),
         "notes": [*_sampling(recipe), *recipe.notes, *warnings],
+        "posterior": told(recipe.uncertain.standings) if recipe.uncertain else [],
         "readings": _readings(recipe),
         "left_out": [{"step": d.step, "bound": d.bound, "why": d.why} for d in done if d.state == "left out"],
         "spent": spent(result),

@@ -3,6 +3,8 @@
     study.accuracy(load("first_light"))     error against run time, over tolerances and knobs
     study.stability(load("first_light"))    stiff and extreme cases against float64
     study.leave_out(load("first_light"))    each omission beside the full computation
+    study.calibration(load("calibrate"))    whether the posterior of a sensor is right, by simulations
+    study.uncertainty(load("first_light", ["sensor.read_noise=normal(10.5 e-, 0.5 e-)"]))    what outputs are worth
 
 Each writes a folder with a page, a table and pictures, and goes on where it was interrupted.
 """
@@ -11,6 +13,7 @@ from __future__ import annotations
 
 import json
 from collections.abc import Callable, Sequence
+from importlib import import_module
 from pathlib import Path
 from typing import Any
 
@@ -18,7 +21,7 @@ from neusee.workflows._graph import Recipe
 from neusee.workflows._remote import open_store
 from neusee.workflows._store import Store
 
-KINDS = ("accuracy", "stability", "leave-out")
+KINDS = ("accuracy", "stability", "leave-out", "calibration", "uncertainty")
 
 
 def accuracy(recipe: Recipe, **how: Any) -> Path:
@@ -36,6 +39,16 @@ def leave_out(recipe: Recipe, **how: Any) -> Path:
     return made("leave-out", recipe, **how)
 
 
+def calibration(recipe: Recipe, **how: Any) -> Path:
+    """Ranks of the truth among draws from the posterior of simulated frames; see `made`."""
+    return made("calibration", recipe, **how)
+
+
+def uncertainty(recipe: Recipe, **how: Any) -> Path:
+    """How outputs scatter over draws of what the recipe is not sure of; see `made`."""
+    return made("uncertainty", recipe, **how)
+
+
 def made(
     kind: str,
     recipe: Recipe,
@@ -50,14 +63,12 @@ def made(
     Args: store: where its points are kept, so that it goes on where it was interrupted. runs: where
     the folder is made. tell: is given a line for each point that is done. options: of the kind of study.
     """
-    from neusee.workflows import _study_accuracy, _study_leave_out, _study_stability
-
-    studies = {"accuracy": _study_accuracy, "stability": _study_stability, "leave-out": _study_leave_out}
-    folder: Path = studies[kind].study(recipe, store or open_store(), runs, list(command), tell, **options)
+    module = import_module(f"neusee.workflows._study_{kind.replace('-', '_')}")
+    folder: Path = module.study(recipe, store or open_store(), runs, list(command), tell, **options)
     return folder
 
 
 def failed(folder: Path) -> int:
-    """How many cells or bounds of a finished study do not hold."""
+    """How many cells, bounds or bars of a finished study do not hold."""
     found: dict[str, Any] = json.loads((folder / "provenance.json").read_text())
     return int(found.get("failed", 0))

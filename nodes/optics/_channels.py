@@ -9,7 +9,7 @@ from torch import Tensor
 
 from neusee.nodes import Check, node
 from neusee.nodes.optics._box import flux
-from neusee.nodes.optics._collapse import Given, choose
+from neusee.nodes.optics._collapse import Given, choose, with_windows
 from neusee.nodes.optics._form import bordered, convolved, guessed, majorant, rounding
 from neusee.nodes.optics._image import Border, image, reach
 from neusee.nodes.optics._passed import passed
@@ -45,7 +45,7 @@ def image_channels(
     unit = rows.detach().abs().amax(1).double().cpu()
     unit = unit.where(unit > 0, 1.0)
     scaled = rows.detach().double().cpu() / unit[:, None]
-    given = _given(radiance, planes, intensity, scaled, border, within > 0 and not largest)
+    given = _given(radiance, planes, intensity, scaled, border)
     result, bound, kept = _formed(planes, intensity, given, 0.0 if largest else within)
     top = _top(result, radiance, intensity, given) if largest else math.inf
     wide = bordered(planes, given, (intensity.shape[1], intensity.shape[2]))
@@ -97,7 +97,7 @@ def _fitted(radiance: Mixture, psf: Psf, rows: Tensor) -> tuple[Tensor, Tensor]:
     return planes.to(dtype), kernel.to(dtype)
 
 
-def _given(radiance: Mixture, planes: Tensor, intensity: Tensor, rows: Tensor, border: Border, cut: bool) -> Given:
+def _given(radiance: Mixture, planes: Tensor, intensity: Tensor, rows: Tensor, border: Border) -> Given:
     flat = planes.detach().flatten(1)
     gram = (flat @ flat.T).double().cpu()
     copies = 9 if border == "reflect" else 1
@@ -113,7 +113,7 @@ def _given(radiance: Mixture, planes: Tensor, intensity: Tensor, rows: Tensor, b
         most,
         gram,
         copies,
-        passed(intensity.detach(), cut),
+        passed(intensity.detach()),
         (planes.shape[1], planes.shape[2]),
         border == "reflect",
     )
@@ -122,8 +122,10 @@ def _given(radiance: Mixture, planes: Tensor, intensity: Tensor, rows: Tensor, b
 def _formed(planes: Tensor, intensity: Tensor, given: Given, within: float) -> tuple[Tensor, Tensor, Tensor]:
     """Rows of the image, their bound and what was kept; the brightest pixels are guessed at first, then known."""
     eps = torch.finfo(planes.dtype).eps
-    brightest = guessed(planes.detach(), given) if within > 0 else given.rows.new_zeros(len(given.rows))
-    allowed = within / (1 + within) - 16 * eps
+    brightest, allowed = given.rows.new_zeros(len(given.rows)), within / (1 + within) - 16 * eps
+    if within > 0:
+        brightest = guessed(planes.detach(), given)
+        given = with_windows(given, intensity.detach(), brightest, allowed)
     for attempt in range(_TRIES):
         plan = choose(given, brightest, allowed if attempt < _TRIES - 1 else 0.0)
         result = convolved(planes, intensity, given, plan)
@@ -141,17 +143,17 @@ def _top(result: Tensor, radiance: Mixture, intensity: Tensor, given: Given) -> 
     """How far the brightest pixel of a row may be off, as a share of it: the worst row.
 
     What the mixture lacks of a pixel, in any band, is imaged by all bands together; the true image lies so far from
-    what was found at most.
+    what was found at most. Below it lies no farther than above: at the brightest pixel found, as far as there.
     """
     if not radiance.off.numel():
         return math.inf
     found = result.detach()
-    reach = majorant(radiance.off.to(found), intensity.detach(), given)
-    most, above, below = (x.amax((1, 2)).double().cpu() for x in (found, found + reach, found - reach))
-    lost = rounding(
-        given, choose(given, most, 0.0), found.abs().amax((1, 2)).double().cpu(), torch.finfo(found.dtype).eps
-    )
-    return _share(torch.maximum(above - most, most - below) + lost, most)
+    lacks = majorant(radiance.off.to(found), intensity.detach(), given)
+    low, most = (torch.stack(ends).double().cpu() for ends in zip(*map(torch.aminmax, found), strict=True))
+    room = torch.empty_like(lacks)
+    above = torch.stack([torch.add(row, lacks, out=room).amax() for row in found]).double().cpu()
+    lost = rounding(given, choose(given, most, 0.0), torch.maximum(most, -low), torch.finfo(found.dtype).eps)
+    return _share(above - most + lost, most)
 
 
 def _share(off: Tensor, found: Tensor) -> float:

@@ -8,11 +8,12 @@ import torch
 from torch import Tensor
 
 from neusee.nodes.optics._image import smooth
-from neusee.nodes.optics._passed import Passed
+from neusee.nodes.optics._passed import Passed, by_window
 from neusee.nodes.optics._summed import Mix
 
 _SMALL = 0.05  #: of the bound goes to bands that are too weak
 _FARTHER = 6  #: planes more than are needed that are tried
+_EVERY = 8  #: one band of so many is asked first whether a smaller window may do
 
 
 class Given(NamedTuple):
@@ -54,6 +55,24 @@ class Fewer(NamedTuple):
     kernels: Tensor  #: (q, band)
     mixed: Tensor  #: (row x plane, q)
     off: Tensor  #: (q - 1, row) bound of what the first 1, 2, ... leave away
+
+
+def with_windows(given: Given, intensity: Tensor, brightest: Tensor, within: float) -> Given:
+    """What smaller windows of the PSF would lose, unless a few bands alone would lose too much in any of them."""
+    few, signed = slice(_EVERY // 2, None, _EVERY), given.passed.signed
+    if len(intensity) > _EVERY:
+        some = given._replace(rows=given.rows[:, few], basis=given.basis[few], rest=given.rest[:, few])
+        if not _narrow(some._replace(passed=by_window(intensity[few], signed)), within * brightest):
+            return given
+    return given._replace(passed=by_window(intensity, signed))
+
+
+def _narrow(given: Given, limit: Tensor) -> bool:
+    """Whether the largest window but one may do for any number of planes."""
+    bands, planes = torch.arange(len(given.basis)), range(1, len(given.most) + 1)
+    return len(given.passed.windows) > 1 and any(
+        bool((given.rows.abs() @ _tail(given, bands, k, 1) <= limit).all()) for k in planes
+    )
 
 
 def choose(given: Given, brightest: Tensor, within: float) -> Plan:

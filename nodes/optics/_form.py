@@ -1,7 +1,6 @@
 """Carry out a plan: borders, kernels, the convolutions, and how far their rounding may reach."""
 
 import math
-from collections.abc import Callable
 
 import torch
 from torch import Tensor
@@ -31,7 +30,7 @@ def majorant(off: Tensor, intensity: Tensor, given: Given) -> Tensor:
     """What ``off`` (y, x) in every band adds to any row at most: (y, x); one kernel for all rows."""
     window = (intensity.shape[1], intensity.shape[2])
     heaviest = given.rows.abs().amax(0).to(intensity)
-    kernel = _summed_bands(heaviest[None], intensity, torch.abs)  # of all at once they would be a second stack
+    kernel = _summed_bands(heaviest[None], intensity, given.passed.signed)
     reached = summed(bordered(off[None], given, window), kernel, Mix(None, None, None), _where(given, window))
     return reached[0].clamp_min_(0)
 
@@ -52,17 +51,17 @@ def _kernels(intensity: Tensor, plan: Plan) -> Tensor:
         return stack if len(plan.bands) == len(stack) else stack[plan.bands.to(stack.device)]
     weights = plan.kernels.new_zeros(len(plan.kernels), len(stack))
     weights = weights.index_copy_(1, plan.bands, plan.kernels).to(stack)
-    if stack.requires_grad or stack.is_contiguous():
-        kernels: Tensor = torch.tensordot(weights, stack, 1)
-        return kernels
     return _summed_bands(weights, stack)
 
 
-def _summed_bands(weights: Tensor, stack: Tensor, of: Callable[[Tensor], Tensor] = lambda rows: rows) -> Tensor:
-    """Sums (kernel, y, x) over the bands of a stack, or ``of`` it, some rows at a time."""
+def _summed_bands(weights: Tensor, stack: Tensor, absolute: bool = False) -> Tensor:
+    """Sums (kernel, y, x) over the bands of a stack, or of its size; where that is a copy, of some rows at a time."""
+    if stack.requires_grad or (stack.is_contiguous() and not absolute):
+        return (weights @ stack.flatten(1)).view(-1, *stack.shape[1:])
     sums = stack.new_empty(len(weights), *stack.shape[1:])
     for y in range(0, stack.shape[1], _SOME):
-        rows = of(stack[:, y : y + _SOME])
+        rows = stack[:, y : y + _SOME]
+        rows = rows.abs() if absolute else rows
         sums[:, y : y + _SOME] = (weights @ rows.flatten(1)).view(-1, *rows.shape[1:])
     return sums
 
@@ -70,8 +69,10 @@ def _summed_bands(weights: Tensor, stack: Tensor, of: Callable[[Tensor], Tensor]
 def guessed(planes: Tensor, given: Given) -> Tensor:
     """About the brightest pixel of each row: a quarter of that without blur, and half of what the blur can leave."""
     through = given.passed.total
-    bright = torch.tensordot((given.rows * through @ given.basis).to(planes), planes, 1).flatten(1)
-    sharp = torch.maximum(bright.amax(1), -bright.amin(1)).double().cpu()
+    room, sharp = planes.new_empty(planes[0].numel()), torch.zeros_like(given.rows[:, 0])
+    for i, weights in enumerate((given.rows * through @ given.basis).to(planes)):
+        bright = torch.mv(planes.flatten(1).T, weights, out=room)
+        sharp[i] = torch.maximum(bright.amax(), -bright.amin())
     power = ((given.basis @ given.gram) * given.basis).sum(1).clamp_min(0) * given.copies
     blurred = given.rows.abs() @ (power * through * given.passed.peak).sqrt()
     return torch.minimum(sharp / 4, blurred / 2)

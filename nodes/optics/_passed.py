@@ -1,12 +1,13 @@
 """What a stack of PSFs lets through inside and outside of windows about its centre."""
 
+from itertools import pairwise
 from typing import NamedTuple
 
 import torch
 from torch import Tensor
 
-_SAMPLES = 1 << 16  #: of a band at a time: those of 31 bands stay in the cache
 _LADDER = (1.0, 0.75, 0.5, 0.375, 0.25, 0.1875, 0.125, 0.0625, 0.03125, 0.015625)
+_ROUNDED = 4e-6  #: of a sum in single precision: cascades of a few dozen additions in a row, a few deep
 
 
 class Passed(NamedTuple):
@@ -17,55 +18,61 @@ class Passed(NamedTuple):
     peak: Tensor  #: (band,) its largest
     beyond: Tensor  #: (window, band) sum of |PSF| outside
     above: Tensor  #: (window, band) the largest outside
+    signed: bool  #: the PSF is negative somewhere
 
 
-def passed(intensity: Tensor, cut: bool) -> Passed:
-    """Measure (band, y, x); without ``cut`` the whole is the only window."""
+def passed(intensity: Tensor) -> Passed:
+    """Measure (band, y, x) whole: its only window."""
+    ends = [torch.aminmax(band) for band in intensity]  # over several dimensions it takes three times as long
+    low, high = (torch.stack(found).double().cpu() for found in zip(*ends, strict=True))
+    signed = not bool((low >= 0).all())  # NaN too
+    rows = (intensity.abs() if signed else intensity).sum(2)
+    total = rows.sum(1, dtype=torch.float64).cpu() * (1 + _ROUNDED)
+    nothing = torch.zeros_like(total)[None]
+    window = (intensity.shape[1], intensity.shape[2])
+    return Passed([window], total, torch.maximum(high, -low), nothing, nothing, signed)
+
+
+def by_window(intensity: Tensor, signed: bool) -> Passed:
+    """Measure (band, y, x) by windows that lie in one another: their edges cut it into pieces, each read once."""
     m, n = intensity.shape[1:]
-    steps = _LADDER if cut else _LADDER[:1]
-    windows = list(dict.fromkeys((max(1, round(m * f)), max(1, round(n * f))) for f in steps))
-    sums, tops = [torch.zeros(len(intensity), dtype=torch.float64)], [torch.zeros(len(intensity), dtype=torch.float64)]
-    inside = intensity
-    for window in windows[1:]:
-        inner = centred(inside, window)
-        parts = [_measured(strip) for strip in _around(inside, window)]
-        sums.append(sums[-1] + sum(part[0] for part in parts))
-        tops.append(torch.stack([tops[-1], *(part[1] for part in parts)]).amax(0))
-        inside = inner
-    core, top = _measured(inside)
-    return Passed(windows, sums[-1] + core, torch.maximum(tops[-1], top), torch.stack(sums), torch.stack(tops))
+    windows = list(dict.fromkeys((max(1, round(m * f)), max(1, round(n * f))) for f in _LADDER))
+    tall, wide = ([_inside(whole, w[axis]) for w in windows] for axis, whole in enumerate((m, n)))
+    sums, tops = _pieces(intensity.abs() if signed else intensity, _cuts(tall), _cuts(wide))
+    beyond, above = torch.zeros(2, len(windows), len(intensity), dtype=torch.float64)
+    for j, (y, x) in enumerate(zip(tall, wide, strict=True)):
+        outside = ~torch.outer(_covered(y, _cuts(tall)), _covered(x, _cuts(wide)))
+        if bool(outside.any()):
+            beyond[j], above[j] = sums[:, outside].sum(1), tops[:, outside].amax(1)
+    return Passed(windows, sums.sum((1, 2)), tops.amax((1, 2)), beyond, above, signed)
 
 
 def centred(stack: Tensor, window: tuple[int, int]) -> Tensor:
     """The samples of a window about the centre, sample n // 2, which is then the window's own."""
-    top, left = _corner(stack, window)
-    return stack[:, top : top + window[0], left : left + window[1]]
+    (top, bottom), (left, right) = (_inside(n, w) for n, w in zip(stack.shape[1:], window, strict=True))
+    return stack[:, top:bottom, left:right]
 
 
-def _corner(stack: Tensor, window: tuple[int, int]) -> tuple[int, int]:
-    return stack.shape[1] // 2 - window[0] // 2, stack.shape[2] // 2 - window[1] // 2
+def _inside(whole: int, window: int) -> tuple[int, int]:
+    first = whole // 2 - window // 2
+    return first, first + window
 
 
-def _around(stack: Tensor, window: tuple[int, int]) -> list[Tensor]:
-    """What lies outside the window, in four strips."""
-    (top, left), (h, w) = _corner(stack, window), window
-    middle = stack[:, top : top + h]
-    return [stack[:, :top], stack[:, top + h :], middle[..., :left], middle[..., left + w :]]
+def _cuts(spans: list[tuple[int, int]]) -> list[int]:
+    return sorted({edge for span in spans for edge in span})
 
 
-def _measured(strip: Tensor) -> tuple[Tensor, Tensor]:
-    """Sum and largest of |samples|, by band; the sum a little above what rounding may have lost."""
-    if strip.shape[1] == 0 or strip.shape[2] == 0:
-        zero = torch.zeros(len(strip), dtype=torch.float64)
-        return zero, zero
-    step = strip.shape[1] if strip.is_cuda else max(1, _SAMPLES // strip.shape[2])
-    parts = [_looked_at(strip[:, y : y + step]) for y in range(0, strip.shape[1], step)]
-    total, top = (torch.stack(found) for found in zip(*parts, strict=True))
-    return total.sum(0).cpu() * (1 + 1e-6), top.amax(0).double().cpu()
+def _covered(span: tuple[int, int], cuts: list[int]) -> Tensor:
+    """Which pieces between the cuts lie in the span."""
+    return torch.tensor([span[0] <= cut < span[1] for cut in cuts[:-1]])
 
 
-def _looked_at(rows: Tensor) -> tuple[Tensor, Tensor]:
-    """Sum and largest of |samples| of some rows, which are read from memory once."""
-    low, high = rows.amin(-1).amin(-1), rows.amax(-1).amax(-1)  # `aminmax` takes three times as long
-    size = rows if bool((low >= 0).all()) else rows.abs()
-    return size.sum(-1).sum(-1, dtype=torch.float64), torch.maximum(high, -low)
+def _pieces(size: Tensor, rows: list[int], columns: list[int]) -> tuple[Tensor, Tensor]:
+    """Sum, a little above what rounding may have lost, and largest of each piece: (band, rows, columns).
+
+    Few calls with much in each: of many small ones, each waits for whatever else the machine does.
+    """
+    along = [(size[:, a:b].sum(1), size[:, a:b].amax(1)) for a, b in pairwise(rows)]
+    sums, tops = (torch.stack(found, 1).double().cpu() for found in zip(*along, strict=True))
+    total = torch.stack([sums[..., a:b].sum(-1) for a, b in pairwise(columns)], -1) * (1 + _ROUNDED)
+    return total, torch.stack([tops[..., a:b].amax(-1) for a, b in pairwise(columns)], -1)

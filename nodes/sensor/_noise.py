@@ -1,6 +1,8 @@
 """What the sensor adds: the noise of arriving light, of the dark and of reading out."""
 
 import math
+from collections.abc import Callable
+from itertools import pairwise
 from typing import Annotated, Any, Literal
 
 import torch
@@ -13,6 +15,7 @@ from neusee.nodes.sensor._saturation import Efficiency, Well
 from neusee.nodes.units import Electrons, Fraction
 
 Distribution = Literal["gaussian", "poisson"]
+_PART = 1 << 15  #: elements: more of them torch would cut into threads, which wait for each other where others compute
 _DARK = 1e-30  #: electrons that count as none: the root of what is denormal has no digits and no end of a slope
 Spread = Annotated[float, Field(ge=0, allow_inf_nan=False)]
 
@@ -41,11 +44,15 @@ def photon_noise(
             1e-3 e- above 10 e-. Negative photons (the rounding of a convolution) count as dark.
     Source: NeuSee, section Sensor Image; EMVA Standard 1288, release 4.0 (variance = mean, in electrons).
     """
-    counts = single(photons).clamp_min(0) * (quantum_efficiency if drawn_in == "electrons" else 1.0)
-    fluctuation = _poisson(counts, rng) if distribution == "poisson" else _gaussian(counts, rng)
     kept = mean_shift if mean == "literal" else 1.0 + mean_shift
-    detected = (kept * counts).add_(spread * fluctuation).clamp_min(0)
-    return detected if drawn_in == "electrons" else detected * quantum_efficiency
+
+    def detected(some: Tensor) -> Tensor:
+        counts = some.clamp_min(0) * (quantum_efficiency if drawn_in == "electrons" else 1.0)
+        fluctuation = _poisson(counts, rng) if distribution == "poisson" else _gaussian(counts, rng)
+        found = (kept * counts).add_(spread * fluctuation).clamp_min(0)
+        return found if drawn_in == "electrons" else found * quantum_efficiency
+
+    return _by_parts(detected, single(photons), rng)
 
 
 @photon_noise.preflight
@@ -92,6 +99,21 @@ def _poisson(counts: Tensor, rng: Generator) -> Tensor:
     return torch.poisson(still.to(rng.device), generator=rng).to(counts) - still
 
 
+def _by_parts(compute: Callable[[Tensor], Tensor], whole: Tensor, rng: Generator) -> Tensor:
+    """``compute(whole)`` to the last bit, by parts that stay in cache: a picture is read and written once, not often.
+
+    The stream must not show where it was cut: fewer than 16 normal numbers are drawn in another way than more are.
+    """
+    count = whole.numel()
+    if torch.is_grad_enabled() or {whole.device.type, rng.device.type} != {"cpu"} or count < 2 * _PART:
+        return compute(whole)
+    made, flat = torch.empty(whole.shape, dtype=whole.dtype), whole.reshape(-1)
+    ends = [*range(_PART, count - _PART, _PART), count]
+    for first, last in pairwise([0, *ends]):
+        made.view(-1)[first:last] = compute(flat[first:last])
+    return made
+
+
 def normal(like: Tensor, rng: Generator) -> Tensor:
     """Standard normal numbers in the shape of ``like``, drawn where ``rng`` lives; the same in every precision."""
     return torch.randn(like.shape, generator=rng, device=rng.device, dtype=torch.float32).to(like)
@@ -109,9 +131,12 @@ def dark_current(electrons: Tensor, *, mean: Electrons, full_well: Well | None =
     Error:  one mean for all pixels: hot pixels are left out.
     Source: NeuSee, section Sensor Image; EMVA Standard 1288, release 4.0 (dark current).
     """
-    electrons = single(electrons)
-    rate = torch.full(electrons.shape, mean, dtype=electrons.dtype, device=rng.device)
-    return electrons + torch.poisson(rate, generator=rng).to(electrons)
+
+    def heated(some: Tensor) -> Tensor:
+        rate = torch.full(some.shape, mean, dtype=some.dtype, device=rng.device)
+        return some + torch.poisson(rate, generator=rng).to(some)
+
+    return _by_parts(heated, single(electrons), rng)
 
 
 @dark_current.negligible
@@ -140,8 +165,11 @@ def read_noise(
     Error:  white: row noise and telegraph noise are left out.
     Source: NeuSee, section Sensor Image; Janesick, Photon Transfer, SPIE PM170 (2007).
     """
-    electrons = single(electrons)
-    return electrons + normal(electrons, rng).mul_(sigma).add_(pedestal)
+
+    def read(some: Tensor) -> Tensor:
+        return some + normal(some, rng).mul_(sigma).add_(pedestal)
+
+    return _by_parts(read, single(electrons), rng)
 
 
 @read_noise.negligible

@@ -4,8 +4,9 @@ Choosing is all that a run with `--keep-all` does not do: the recipe made cheape
 proof along the graph, and inside the image of few planes the search for what may be left away and the bounds. Each is
 timed where it is called; time in one that another calls counts once, and steps that it asks for do not count. Beside a
 cached run stands one with `--keep-all`, as long as that is in the store too. The runs are whole, engine and store
-included, and in one process, with the code of the nodes read before. A line by recipe: medians of 3, or of one where
-it takes long.
+included, and in one process, with the code of the nodes read before. While the store writes large results, its threads
+take the cores from whatever is computed, and the clock runs on: a cold run whose store takes nothing shows what
+choosing takes by itself, and is the shorter run to compare it with. Medians of 3, or of one where it takes long.
 """
 
 import statistics
@@ -25,8 +26,15 @@ from neusee.workflows._ledger import Ledger
 from neusee.workflows._store import Store
 
 ENGINE = ((_run, "economised"), (_run, "border"), (_run, "proof"), (Ledger, "verdict"), (Ledger, "pass_on"))
-NODE = tuple((_channels, name) for name in ("passed", "choose", "guessed", "rounding", "_top"))
+NODE = tuple((_channels, name) for name in ("passed", "with_windows", "choose", "guessed", "rounding", "_top"))
 LONG = 20.0  #: s, beyond which one run is enough
+
+
+class Unwritten(Store):
+    """Takes no result: all stays in memory."""
+
+    def put(self, key, value, about):
+        return False
 
 
 class Clock:
@@ -86,18 +94,25 @@ def once(recipe, store):
     return result.seconds, engine.seconds, node.seconds
 
 
+def fresh(recipe, memo, kind):
+    runs = []
+    while len(runs) < 3 and not (runs and runs[0][0] > LONG):
+        with cold(memo) as store:
+            runs.append(once(recipe, kind(store.root)))
+    return runs
+
+
 def line(name):
     recipe = load(name)
-    full, colds = replace(recipe, keep_all=True), []
+    full = replace(recipe, keep_all=True)
     with tempfile.TemporaryDirectory() as folder:
         memo = Store(Path(folder))
         for each in (recipe, full):
             once(each, memo)
         cached, whole = ([once(each, Store(Path(folder))) for _ in range(9)] for each in (recipe, full))
-        while len(colds) < 3 and not (colds and colds[0][0] > LONG):
-            with cold(memo) as store:
-                colds.append(once(recipe, store))
-    for what, runs in (("cold", colds), ("cached", cached), ("cached, `--keep-all`", whole)):
+        colds, unwritten = (fresh(recipe, memo, kind) for kind in (Store, Unwritten))
+    rows = {"cold": colds, "cold, nothing written": unwritten, "cached": cached, "cached, `--keep-all`": whole}
+    for what, runs in rows.items():
         seconds, engine, node = (statistics.median(column) for column in zip(*runs, strict=True))
         share = (engine + node) / seconds
         print(f"| {name} | {what} | {seconds:.4f} | {1e3 * engine:.1f} | {1e3 * node:.1f} | {share:.1%} |", flush=True)

@@ -48,3 +48,12 @@ def mistakes(read):
         return [" | ".join(filter(None, (str(p.mark), p.path, p.message))) for p in caught.value.problems]
 
     return mistakes
+
+
+@pytest.fixture
+def one_thread():
+    """What is computed is over before a second thread is awake."""
+    from neusee.workflows._one_thread import one_thread
+
+    with one_thread():
+        yield

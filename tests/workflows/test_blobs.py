@@ -2,6 +2,7 @@
 
 import gc
 import json
+import math
 import os
 import threading
 from pathlib import Path
@@ -11,7 +12,7 @@ import torch
 
 from neusee.nodes.values import Psf
 from neusee.workflows import _blobs, _codec
-from neusee.workflows._blobs import Blobs, Damaged, Stacked
+from neusee.workflows._blobs import Blobs, Damaged, Stacked, bytes_of
 
 PAGES = (4, 32, 64)  #: float32 slices of two pages
 DTYPES = [*_codec._DTYPES, torch.complex64, torch.complex128]
@@ -264,3 +265,11 @@ def test_a_layout_with_blobs_needs_their_folder(blobs):
     layout, tensors = _codec.pack(Stacked(x, tuple(names_of(x))), blobs)
     with pytest.raises(ValueError, match="apart"):
         _codec.unpack(layout, tensors)
+
+
+@pytest.mark.parametrize("shape", [(1, 4), (4, 1), (1, 1), (3, 4)])
+def test_a_column_of_any_stride_has_its_bytes(shape):
+    """One element of a row is contiguous by definition, with the stride of the row."""
+    x = torch.arange(math.prod(shape), dtype=torch.float64).reshape(shape)
+    for column in (*x.unbind(1), *x.unbind(0)):
+        assert bytes(bytes_of(column)) == bytes(bytes_of(column.clone(memory_format=torch.contiguous_format)))

@@ -1,14 +1,15 @@
 """A recipe as a function: the same bits as a run, with gradients, computing no more than it must."""
 
+import math
 from dataclasses import replace
 
 import pytest
 import torch
 from torch.autograd import gradcheck
 
-from neusee.nodes import node
+from neusee.nodes import Facts, node
 from neusee.workflows._call import RunError
-from neusee.workflows._function import as_function
+from neusee.workflows._function import _Ends, as_function
 from neusee.workflows._graph import Recipe, Step
 from neusee.workflows._marks import Mark
 from neusee.workflows._run import run
@@ -214,3 +215,12 @@ def test_a_chain_of_ten_thousand_steps(store):
         4,
     )
     assert CALLS == ["psf"] * 9
+
+
+@pytest.mark.parametrize("values", [[1.0, -2.0, 3.5], [math.nan, 1.0], [math.inf, -1.0], []])
+def test_the_ends_of_a_picture_are_those_of_its_facts(values):
+    x = torch.tensor(values)
+    quick, whole = _Ends(x), Facts.of(x)
+    for name in ("shape", "dtype", "min", "max", "finite", "sum", "support"):
+        one, other = getattr(quick, name), getattr(whole, name)
+        assert one == other or (one != one and other != other), name

@@ -1,9 +1,11 @@
 """Large results are written beside the next steps, and a run that has ended has written all of them."""
 
 import importlib.util
+import os
 import sys
 import threading
 import time
+from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 
 import pytest
@@ -39,6 +41,26 @@ class Slow(Store):
 
 
 STEPS = {"a": (make, {}, {"n": N}), "b": (slow, {"x": "a"}, {"seconds": 0.5}), "m": (mean, {"x": "b"}, {})}
+
+
+def niceness():
+    return os.getpriority(os.PRIO_PROCESS, threading.get_native_id())
+
+
+@pytest.mark.skipif(sys.platform != "linux", reason="elsewhere priorities belong to processes, not to threads")
+def test_who_writes_yields_to_who_computes():
+    found, before, later = [], niceness(), Later()
+
+    def write():
+        found.append(niceness())
+        with ThreadPoolExecutor(1) as pool:  # as the bands of a stack are written
+            found.append(pool.submit(niceness).result())
+
+    later.add("key", 1, write)
+    later.finish()
+    assert min(found) > before or before >= 19
+    assert len(set(found)) == 1
+    assert niceness() == before
 
 
 def test_a_run_that_has_ended_has_written_all(tmp_path):

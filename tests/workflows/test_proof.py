@@ -200,6 +200,17 @@ def test_behind_a_node_that_does_not_tell_its_inputs_are_held(store):
     assert 0 < result.proof.worst <= 1e-3
 
 
+def test_what_the_proof_made_and_the_rest_needs_is_not_made_again(store, monkeypatch):
+    """Nothing can be read from the store; what the rest takes is held from before the proof."""
+    monkeypatch.setattr(Store, "put", lambda self, key, value, about: False)
+    steps = [step("l", light), step("r", rough, {"digits": 3}, x="l"), step("f", first, pair="r")]
+    steps += [step("end", opaque, x="f"), step("out", mixed, x="end", y="l")]
+    events = []
+    result = run(recipe(*steps), store, watch=events.append)
+    assert list(result.proof.held) == ["f"]
+    assert [e.step for e in events if e.done is None] == ["l", "r", "f", "end", "out"]
+
+
 def test_where_nothing_is_allowed_a_cheaper_form_is_over(store):
     steps = [step("l", light), step("r", rough, {"digits": 0}, x="l"), step("out", first, pair="r")]
     result = run(replace(recipe(*steps), tolerance=0.0), store)

@@ -3,6 +3,7 @@
 import csv
 import importlib.util
 import json
+import math
 import sys
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -17,7 +18,7 @@ from neusee.workflows._accuracy_pareto import Choice, cheapest, front, median_ra
 from neusee.workflows._accuracy_points import TIMES, Bench, Point, Trial
 from neusee.workflows._accuracy_report import lead, missed
 from neusee.workflows._accuracy_steps import that_matter, try_step
-from neusee.workflows._figures_study import EXACT, Dot, Line, work_precision
+from neusee.workflows._figures_study import EXACT, Dot, Line, steps, work_precision
 from neusee.workflows._store import Store
 from neusee.workflows._study_accuracy import study, trials
 from neusee.workflows.study import failed
@@ -355,3 +356,9 @@ def test_first_light_in_small(tmp_path):
     asked = [r for r in rows_of(folder) if r["line"] == "tolerance"]
     assert asked
     assert all(float(r["error"]) <= float(r["setting"]) for r in asked)
+
+
+@pytest.mark.parametrize("error", [3e-17, 2e-7, 0.0])
+def test_errors_that_differ_in_their_last_digit_alone_are_drawn_without_a_warning(error):
+    dots = [Dot(0.1, error, "a"), Dot(0.1, math.nextafter(error, 1.0), "b", error, math.nextafter(error, 1.0))]
+    assert steps([("image", [Line("precision", dots)], 0.1)])

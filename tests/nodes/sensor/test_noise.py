@@ -170,3 +170,22 @@ def test_the_noise_of_light_is_the_same_in_single_and_double(distribution):
     how = {"quantum_efficiency": 0.56, "distribution": distribution}
     single, double = (photon_noise(photons.to(d), rng=seeded(), **how) for d in (torch.float32, torch.float64))
     torch.testing.assert_close(single.double(), double, rtol=1e-6, atol=1e-2)
+
+
+@pytest.mark.parametrize("shape", [(3, 100, 217), (65536 + 5,), (3 * 32768 + 15,), (1, 65536), (2, 256, 129)])
+@pytest.mark.parametrize("dtype", [torch.float16, torch.float32, torch.float64])
+def test_parts_that_stay_in_cache_are_the_whole_to_the_last_bit(shape, dtype):
+    """With a gradient all is computed at once, without one by parts."""
+    x = (torch.rand(shape, generator=torch.Generator().manual_seed(1)) * 300 - 2).to(dtype)
+    makers = [
+        lambda rng: photon_noise(x, quantum_efficiency=0.56, spread=1.2, mean_shift=0.1, rng=rng),
+        lambda rng: photon_noise(x, quantum_efficiency=0.56, distribution="poisson", drawn_in="photons", rng=rng),
+        lambda rng: dark_current(x.mT if x.ndim > 1 else x, mean=0.3, rng=rng),
+        lambda rng: read_noise(x.mT if x.ndim > 1 else x, pedestal=3.0, sigma=2.0, rng=rng),
+    ]
+    for make in makers:
+        whole = make(torch.Generator().manual_seed(2))
+        with torch.no_grad():
+            parts = make(torch.Generator().manual_seed(2))
+        assert torch.equal(parts, whole)
+        assert (parts.shape, parts.dtype) == (whole.shape, whole.dtype)

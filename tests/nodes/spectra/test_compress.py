@@ -4,7 +4,7 @@ import statistics
 
 import pytest
 import torch
-from hypothesis import given, settings
+from hypothesis import example, given, settings
 from hypothesis import strategies as st
 
 from neusee.nodes.spectra import bands, compress, illuminate, lift_lmmse, lift_mallett, responses, rows
@@ -191,11 +191,12 @@ def test_the_check_says_how_many():
 
 @settings(max_examples=20, deadline=None)
 @given(st.integers(1, 8), st.integers(1, 9), st.integers(1, 9), st.integers(0, 99), st.sampled_from([0.0, 1e-6, 1e-2]))
+@example(6, 2, 3, 41, 1e-2)  # one pixel is off by more than the root mean square, which alone is promised
 def test_any_shape_keeps_its_bound(count, y, x, seed, within):
     cube = rand(count, y, x, seed=seed) - 0.2
     found = compress(cube, within=within)
     assert bool((left(found, cube, len(found.planes)) <= found.rest[-1]).all())
-    assert float(found.rest[-1].max()) <= max(within, 1e-6) * float(cube.abs().max())
+    assert float(found.spread[-1].max()) <= max(within, 1e-6) * float(cube.abs().max())
 
 
 @pytest.mark.parametrize("times", ["once", "twice"])

@@ -1,0 +1,6 @@
+import os
+
+# Most of what is tested is over before a second thread is awake, and where others compute, threads that wait for each
+# other take many times as long. Before torch is imported; processes that a test starts inherit it. Tests of several
+# threads ask for them.
+os.environ.setdefault("OMP_NUM_THREADS", "1")

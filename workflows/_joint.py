@@ -1,0 +1,229 @@
+"""What is known of several values at once: draws, or a mean with a covariance, and the files that hold them."""
+
+from __future__ import annotations
+
+import csv
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
+from glob import glob
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+from zipfile import BadZipFile
+
+import numpy as np
+
+from neusee.nodes.units import read_any
+
+if TYPE_CHECKING:
+    from numpy.typing import NDArray
+
+    Places = NDArray[np.float64]
+
+NINETY = 1.6448536269514722  #: standard deviations on either side that hold 90 % of a normal law
+_LEAST = 30  #: draws that can tell anything of a law
+_JITTER = 1e-10  #: added to a correlation of 1, so that its factor exists
+_FILES = "the folder of `neusee calibrate`, its posterior.json, draws in .npz or .csv, or a mean and sd in .json, .yaml"
+
+
+@dataclass(frozen=True)
+class Joint:
+    """Values that are known together, and how they come of standard normal numbers that know nothing of each other.
+
+    The first number moves the first value and all that goes with it, the second what is left of the second, and so
+    on: the factor of Cholesky of the correlation. Of draws the values keep their own laws, and the correlation is that
+    of their normal scores (a Gaussian copula).
+    """
+
+    names: tuple[str, ...]
+    mean: Places  #: (name,)
+    sd: Places  #: (name,)
+    factor: Places  #: (name, name), lower
+    draws: Places | None = None  #: (draw, name)
+
+    @classmethod
+    def of_draws(cls, names: Sequence[str], draws: Places) -> Joint:
+        """Raises ValueError for too few, for what is not finite and for a value that does not vary."""
+        if len(draws) < _LEAST:
+            raise ValueError(f"{len(draws)} draws: {_LEAST} at least can tell anything")
+        if not np.isfinite(draws).all():
+            raise ValueError("not every draw is finite")
+        if still := [name for name, x in zip(names, draws.T, strict=True) if np.ptp(x) == 0]:
+            raise ValueError(f"every draw of {still[0]} is the same: leave it out")
+        correlation = np.atleast_2d(np.corrcoef(_scores(draws).T))
+        return cls(tuple(names), draws.mean(0), draws.std(0, ddof=1), _factor(correlation), draws)
+
+    @classmethod
+    def of_normal(cls, names: Sequence[str], mean: Places, sd: Places, correlation: Places) -> Joint:
+        """Raises ValueError for what is no correlation, and for a deviation that is none."""
+        count = len(names)
+        if correlation.shape != (count, count) or not np.allclose(correlation, correlation.T):
+            raise ValueError(f"the correlation must be a symmetric matrix of {count} x {count}")
+        if not (np.isfinite(sd) & (sd > 0)).all():
+            raise ValueError("every standard deviation must be greater than 0")
+        if not np.allclose(np.diag(correlation), 1.0) or np.linalg.eigvalsh(correlation)[0] < -1e-9:
+            raise ValueError("the correlation must have ones on its diagonal and no negative eigenvalue")
+        return cls(tuple(names), mean, sd, _factor(correlation))
+
+    def at(self, z: Places) -> Places:
+        """(…, name) values at (…, name) standard normal numbers."""
+        score = z @ self.factor.T
+        if self.draws is None:
+            return np.asarray(self.mean + self.sd * score, np.float64)
+        from scipy.special import ndtr
+
+        share = np.arange(1, len(self.draws) + 1) / (len(self.draws) + 1)
+        columns = [np.interp(ndtr(score[..., i]), share, np.sort(x)) for i, x in enumerate(self.draws.T)]
+        return np.stack(columns, -1)
+
+    def numbers(self) -> Places:
+        """(draw, name) the standard normal numbers that the draws stand for."""
+        assert self.draws is not None
+        return np.asarray(np.linalg.solve(self.factor, _scores(self.draws).T).T, np.float64)
+
+    def below(self, name: str, value: float) -> float:
+        """The share of the law of ``name`` that lies below ``value``."""
+        i = self.names.index(name)
+        if self.draws is not None:
+            return float((self.draws[:, i] < value).mean())
+        from scipy.special import ndtr
+
+        return float(ndtr((value - self.mean[i]) / self.sd[i]))
+
+    def interval(self, name: str) -> tuple[float, float]:
+        """5 and 95 %."""
+        i = self.names.index(name)
+        if self.draws is not None:
+            low, high = np.quantile(self.draws[:, i], [0.05, 0.95])
+            return float(low), float(high)
+        return float(self.mean[i] - NINETY * self.sd[i]), float(self.mean[i] + NINETY * self.sd[i])
+
+    def only(self, names: Sequence[str]) -> Joint:
+        """Of some of the values; what is known of the rest is forgotten."""
+        at = [self.names.index(name) for name in names]
+        if self.draws is not None:
+            return Joint.of_draws(names, self.draws[:, at])
+        whole = self.factor @ self.factor.T
+        scale = np.sqrt(np.diag(whole))
+        return Joint.of_normal(names, self.mean[at], self.sd[at], (whole / scale / scale[:, None])[np.ix_(at, at)])
+
+
+def _scores(draws: Places) -> Places:
+    """(draw, name) normal scores of the ranks; what is equal has one rank."""
+    from scipy.special import ndtri
+    from scipy.stats import rankdata
+
+    return np.asarray(ndtri(rankdata(draws, axis=0) / (len(draws) + 1)), np.float64)
+
+
+def _factor(correlation: Places) -> Places:
+    return np.asarray(np.linalg.cholesky(correlation + _JITTER * np.eye(len(correlation))), np.float64)
+
+
+@dataclass(frozen=True)
+class Posterior:
+    """A joint law with what its file says beside it."""
+
+    joint: Joint
+    kinds: Mapping[str, str] = field(default_factory=dict)  #: of `neusee calibrate`: estimate, upper, lower, none
+    units: Mapping[str, str] = field(default_factory=dict)  #: of `neusee calibrate`, in words
+
+    def kind(self, name: str) -> str:
+        """What is told of a value; what came from elsewhere is an estimate."""
+        return self.kinds.get(name, "estimate")
+
+
+def read_posterior(path: Path) -> Posterior:
+    """Read a posterior, of a pattern the newest; raises ValueError that says what is wrong with it."""
+    if any(sign in str(path) for sign in "*?["):
+        path = max(map(Path, glob(str(path))), key=lambda each: (each.stat().st_mtime, each), default=path)
+    if path.is_dir():
+        path = path / "posterior.json"
+    if not path.is_file():
+        raise ValueError(f"no such file: {path}; give {_FILES}")
+    try:
+        if path.suffix == ".npz":
+            return Posterior(_drawn(_arrays(path)))
+        if path.suffix == ".csv":
+            return Posterior(_drawn(_columns(path)))
+        if path.suffix in (".json", ".yaml", ".yml"):
+            return _document(path)
+    except (OSError, KeyError, TypeError, BadZipFile, UnicodeDecodeError) as error:
+        raise ValueError(f"{path.name} cannot be read as a posterior: {error!r}") from None
+    raise ValueError(f"{path.name} is no posterior: give {_FILES}")
+
+
+def _document(path: Path) -> Posterior:
+    """What `neusee calibrate` wrote, or a summary by mean and deviation."""
+    from ruamel.yaml import YAML
+    from ruamel.yaml.error import YAMLError
+
+    try:
+        doc: Any = YAML(typ="safe", pure=True).load(path.read_text(encoding="utf-8"))
+    except YAMLError as error:
+        raise ValueError(f"{path.name} cannot be read: {' '.join(str(error).split())}") from None
+    if not isinstance(doc, dict):
+        raise ValueError(f"{path.name} holds no mapping")
+    if "parameters" not in doc:
+        return Posterior(summary(doc))
+    if doc.get("failed"):
+        wrong = [check["name"] for check in doc.get("checks", ()) if check["mark"] == "fail"]
+        raise ValueError(f"the calibration is not fit for use: {doc['failed']} checks fail ({'; '.join(wrong)})")
+    joint = read_posterior(path.with_name("draws.npz")).joint
+    kinds = {name: str(row["kind"]) for name, row in doc["parameters"].items()}
+    units = {name: str(row["unit"]) for name, row in doc["parameters"].items()}
+    return Posterior(joint, kinds, units)
+
+
+def _drawn(columns: Mapping[str, Places]) -> Joint:
+    lengths = {len(x) for x in columns.values()}
+    if len(lengths) != 1:
+        raise ValueError("not every value has as many draws" if lengths else "it holds no draws")
+    return Joint.of_draws(tuple(columns), np.stack(list(columns.values()), 1))
+
+
+def _arrays(path: Path) -> dict[str, Places]:
+    with path.open("rb") as file:
+        if file.read(2) != b"PK":
+            raise ValueError(f"{path.name} cannot be read: it is no .npz file")
+    with np.load(path) as found:
+        return {name: np.asarray(found[name], np.float64).reshape(-1) for name in found}
+
+
+def _columns(path: Path) -> dict[str, Places]:
+    with path.open(newline="", encoding="utf-8") as file:
+        header, *rows = list(csv.reader(file)) or [[]]
+    if short := [n for n, row in enumerate(rows, 2) if len(row) != len(header)]:
+        raise ValueError(f"line {short[0]} has not {len(header)} values, as the first line has")
+    try:
+        numbers = np.array(rows, np.float64).reshape(-1, len(header))
+    except ValueError as error:
+        raise ValueError(f"below the names of the first line there must be numbers: {error}") from None
+    return {name.strip(): numbers[:, i] for i, name in enumerate(header)}
+
+
+def summary(given: Mapping[str, Any]) -> Joint:
+    """Of ``mean``, ``sd`` and perhaps ``correlation``, or of ``mean`` and ``covariance``; in SI or with units."""
+    if strange := sorted(set(given) - {"mean", "sd", "correlation", "covariance"}):
+        raise ValueError(f"{strange[0]} is unknown: give mean with sd and perhaps correlation, or mean with covariance")
+    if not isinstance(given.get("mean"), dict) or ("sd" in given) == ("covariance" in given):
+        raise ValueError("a summary needs mean: {name: value}, and either sd: {name: value} or covariance: [[…], …]")
+    names = [str(name) for name in given["mean"]]
+    mean = np.array([read_any(x)[0] for x in given["mean"].values()])
+    if "covariance" in given:
+        covariance = _matrix(given["covariance"])
+        sd = np.sqrt(np.diag(covariance).clip(0)) if covariance.ndim == 2 else np.zeros(0)
+        if sd.shape != mean.shape or not (sd > 0).all():
+            raise ValueError(f"the covariance must be a matrix of {len(names)} x {len(names)} with positive variances")
+        return Joint.of_normal(names, mean, sd, covariance / sd / sd[:, None])
+    if not isinstance(given["sd"], dict) or set(map(str, given["sd"])) != set(names):
+        raise ValueError("sd must name what mean names")
+    sd = np.array([read_any(given["sd"][name])[0] for name in given["mean"]])
+    correlation = _matrix(given["correlation"]) if "correlation" in given else np.eye(len(names))
+    return Joint.of_normal(names, mean, sd, correlation)
+
+
+def _matrix(given: Any) -> Places:
+    try:
+        return np.array(given, np.float64)
+    except (TypeError, ValueError):
+        raise ValueError("a matrix is a list of rows of numbers, all of one length") from None

@@ -1,0 +1,97 @@
+"""A scalar that is not known for certain: ``normal(10.5 e-, 0.5 e-)`` in the place of ``10.5 e-``."""
+
+from __future__ import annotations
+
+import re
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from neusee.nodes.units import read_any
+
+if TYPE_CHECKING:
+    from numpy.typing import NDArray
+
+    Places = NDArray[np.float64]
+
+#: by kind, what its two arguments are
+KINDS = {
+    "normal": ("the mean", "the standard deviation"),
+    "lognormal": ("the median", "the factor of one standard deviation"),
+    "uniform": ("the least", "the largest value"),
+    "loguniform": ("the least", "the largest value"),
+}
+_BEGIN = re.compile(rf"\s*({'|'.join(KINDS)})\(")
+_CALL = re.compile(rf"({'|'.join(KINDS)})\((.*)\)", re.DOTALL)
+
+
+@dataclass(frozen=True)
+class Law:
+    """A law of one number, by its two arguments in SI."""
+
+    kind: str
+    text: str  #: as it was written
+    first: float
+    second: float
+    unit: str  #: SI unit of a draw; empty for a number without one
+
+    def at(self, z: Places) -> Places:
+        """The value that lies where ``z`` lies in the standard normal law."""
+        from scipy.special import ndtr
+
+        a, b = self.first, self.second
+        with np.errstate(over="ignore"):
+            if self.kind == "normal":
+                found = a + b * z
+            elif self.kind == "lognormal":
+                found = a * np.exp(np.log(b) * z)
+            elif self.kind == "uniform":
+                found = a + (b - a) * ndtr(z)
+            else:
+                found = a * np.exp(np.log(b / a) * ndtr(z))
+        return np.asarray(found, np.float64)
+
+    @property
+    def median(self) -> float:
+        """What a run takes that draws nothing."""
+        return float(self.at(np.zeros(())))
+
+
+def is_law(text: Any) -> bool:
+    """Whether a value is written as one, or begins as one."""
+    return isinstance(text, str) and _BEGIN.match(text) is not None
+
+
+def read_law(text: str) -> Law:
+    """Read a law; raises ValueError that says what to write."""
+    match = _CALL.fullmatch(text.strip())
+    if match is None:
+        raise ValueError("is no whole law: write kind(…, …), and within [ ] or { } in quotes")
+    kind, given = match[1], [part.strip() for part in match[2].split(",")]
+    if len(given) != 2 or not all(given):
+        raise ValueError(f"needs {' and '.join(KINDS[kind])}: write {kind}(…, …)")
+    (first, unit), (second, other) = read_any(given[0]), read_any(given[1])
+    if kind == "lognormal":
+        if other:
+            raise ValueError(f"{KINDS[kind][1]} is a number without unit, such as 1.1, not {given[1]}")
+    elif unit != other:
+        raise ValueError(f"{given[0]} and {given[1]} are not of one unit")
+    if fault := _fault(kind, first, second):
+        raise ValueError(fault)
+    return Law(kind, text.strip(), first, second, unit)
+
+
+def _fault(kind: str, first: float, second: float) -> str:
+    if kind == "normal":
+        return "" if second > 0 else "the standard deviation must be greater than 0"
+    if kind == "lognormal":
+        return "" if first > 0 and second > 1 else "the median must be greater than 0, and the factor than 1"
+    if not first < second:
+        return "the least value comes first, and the largest is greater"
+    return "" if kind == "uniform" or first > 0 else "the least value must be greater than 0"
+
+
+def written(value: float, unit: str) -> str | float:
+    """A value in SI as a recipe has it."""
+    return f"{value!r} {unit}" if unit else value
