@@ -61,16 +61,17 @@ def held() -> dict[str, int]:
     }
 
 
-def grown(path: Path, folder: Path, warm: int, count: int) -> dict[str, list[int]]:
-    """What is held after ``warm`` runs, and after ``count`` more."""
+def grown(path: Path, folder: Path, warm: int, count: int, times: int) -> dict[str, list[int]]:
+    """What is held after ``warm`` runs, and after each further ``count`` of them."""
     tracemalloc.start()
     several(path, folder / "warm", warm)
-    before = held()
-    several(path, folder / "then", count)
-    after = held()
-    return {name: [before[name], after[name]] for name in before}
+    seen = [held()]
+    for i in range(times):
+        several(path, folder / f"then {i}", count)
+        seen.append(held())
+    return {name: [each[name] for each in seen] for name in seen[0]}
 
 
 if __name__ == "__main__":
-    recipe, folder, warm, count = sys.argv[1:]
-    print(json.dumps(grown(Path(recipe), Path(folder), int(warm), int(count))))
+    recipe, folder, *numbers = sys.argv[1:]
+    print(json.dumps(grown(Path(recipe), Path(folder), *map(int, numbers))))
