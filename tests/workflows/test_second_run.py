@@ -10,6 +10,7 @@ import pytest
 
 
 @pytest.mark.slow
+@pytest.mark.alone
 def test_a_cached_first_light_draws_nothing_and_starts_like_a_bare_torch(tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     monkeypatch.setenv("NEUSEE_CACHE", str(tmp_path / "cache"))
