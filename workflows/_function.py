@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Collection, Iterable, Mapping
 from functools import cached_property
 from typing import Any
 
@@ -29,12 +29,14 @@ def as_function(
     outputs: Iterable[str] | None = None,
     store: Store | None = None,
     device: str = "cpu",
-) -> Callable[[Theta], dict[str, Any]]:
+    redraw: Collection[str] = (),
+) -> _Function:
     """The recipe as ``theta -> {output: value}``, bit for bit what `run` gives, with gradients.
 
     Args: free: parameters such as ``"spot.strength"``, or steps whose whole value is given,
     such as ``"height"``. What they cannot reach is computed once, here, or read from the
     store. Noise is the same at every call: its stream depends on the seed and the step.
+    Random steps in ``redraw`` are computed at every call, which may be given another seed.
     """
     wanted = recipe.outputs if outputs is None else tuple(outputs)
     given, tuned = _read(recipe, free)
@@ -45,7 +47,8 @@ def as_function(
         raise ValueError(f"no output depends on {', '.join(idle)}")
     live: dict[str, None] = {}
     for name in order:
-        if name in given or name in tuned or any(source in live for source in sources[name]):
+        free_itself = name in given or name in tuned or name in redraw
+        if free_itself or any(source in live for source in sources[name]):
             live.setdefault(name)
     border = {name for step in live for name in sources[step]} | set(wanted)
     fixed = run(recipe, store, sorted(border - live.keys()), device=device)
@@ -91,19 +94,21 @@ class _Function:
         self._spent = _spent(recipe, fixed, left_out)
         self._last = {source: name for name in live if name not in given for source in recipe.steps[name].sources}
 
-    def __call__(self, theta: Theta) -> dict[str, Any]:
+    def __call__(self, theta: Theta, seed: int | None = None) -> dict[str, Any]:
+        """Outputs at ``theta``; noise as of ``seed``, or of the recipe's own."""
+        seed = self.recipe.seed if seed is None else seed
         if set(theta) != set(self.free):
             raise ValueError(f"give exactly {', '.join(self.free)}, not {', '.join(theta) or 'nothing'}")
         values, ledger = dict(self.fixed), self._spent.copy()
         for name in self.live:
-            step = self.recipe.steps[name]
-            values[name] = settle(theta[name]) if name in self.given else self._evaluate(step, values, theta, ledger)
-            for source in () if name in self.given else set(step.sources):
+            step, given = self.recipe.steps[name], name in self.given
+            values[name] = settle(theta[name]) if given else self._evaluate(step, values, theta, ledger, seed)
+            for source in () if given else set(step.sources):
                 if self._last[source] == name and source not in self.wanted:
                     del values[source]
         return {name: values[name] for name in self.wanted}
 
-    def _evaluate(self, step: Step, values: dict[str, Any], theta: Theta, ledger: Ledger) -> Any:
+    def _evaluate(self, step: Step, values: dict[str, Any], theta: Theta, ledger: Ledger, seed: int) -> Any:
         params = {**step.params, **{p: theta[full] for p, full in self.tuned.get(step.name, {}).items()}}
         if step.node.bound is not None:
             with torch.no_grad():
@@ -113,7 +118,7 @@ class _Function:
         else:
             ledger.pass_on(step)
         inputs = [_gather(step.wires.get(name), values) for name in step.node.inputs]
-        return call(step, inputs, params, self.recipe.seed, place(step, self.device))
+        return call(step, inputs, params, seed, place(step, self.device))
 
     def _facts_of(self, name: str, values: dict[str, Any]) -> Any:
         if name not in self.fixed:

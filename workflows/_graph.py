@@ -12,6 +12,7 @@ from neusee.workflows._marks import Mark
 
 if TYPE_CHECKING:
     from neusee.workflows import Event, Executor, Result, Store
+    from neusee.workflows._training import Training
     from neusee.workflows._uncertain import Uncertain
 
 __all__ = ["Config", "Economy", "Expectation", "Recipe", "Setting", "Step", "Wire", "in_order", "needed"]
@@ -85,6 +86,7 @@ class Recipe:
     strict: float = 1.0  #: share of the tolerance that may be spent: less where a run could not prove that it held
     whole: Recipe | None = field(default=None, compare=False)  #: the recipe without economies, where this has some
     uncertain: Uncertain | None = field(default=None, compare=False)  #: what the study of uncertainty draws from
+    training: Training | None = field(default=None, compare=False)  #: how it is learnt
     unheard: frozenset[str] = frozenset()  #: steps whose errors reach a node that does not tell what becomes of them
 
     def limit(self, step: str) -> float:

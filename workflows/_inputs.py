@@ -44,8 +44,12 @@ class Inputs:
     readers: Mapping[str, tuple[tuple[Index, str], ...]]  #: by ``step.parameter``: where in it stands which input
 
     @classmethod
-    def of(cls, recipe: Recipe) -> Inputs:
-        """Raises ValueError for a recipe that is sure of all, or whose outputs hang on nothing uncertain."""
+    def of(cls, recipe: Recipe, outputs: Sequence[str] | None = None) -> Inputs:
+        """What reaches the outputs, the recipe's own or others.
+
+        Raises ValueError for a recipe that is sure of all, or whose outputs hang on nothing uncertain.
+        """
+        outputs = recipe.outputs if outputs is None else outputs
         uncertain = recipe.uncertain
         if uncertain is None or not uncertain.names:
             raise ValueError(
@@ -54,7 +58,7 @@ class Inputs:
             )
         found: dict[str, list[tuple[Index, str]]] = {}
         for name in uncertain.names:
-            for reader, index in _readers(recipe, uncertain, name):
+            for reader, index in _readers(recipe, uncertain, name, outputs):
                 found.setdefault(reader, []).append((index, name))
         reached = {name for places in found.values() for _, name in places}
         if not reached:
@@ -133,7 +137,7 @@ def _only(uncertain: Uncertain, names: Collection[str]) -> Uncertain:
     return replace(uncertain, laws=laws, joint=joint.only(kept) if joint and kept else None)
 
 
-def _readers(recipe: Recipe, uncertain: Uncertain, name: str) -> Iterator[tuple[str, Index]]:
+def _readers(recipe: Recipe, uncertain: Uncertain, name: str, outputs: Sequence[str]) -> Iterator[tuple[str, Index]]:
     """The parameters of steps that the outputs need, and where in them the value of ``name`` stands."""
     if name in uncertain.laws:
         probe = float(uncertain.laws[name].at(np.array(_PROBE)))
@@ -144,7 +148,7 @@ def _readers(recipe: Recipe, uncertain: Uncertain, name: str) -> Iterator[tuple[
     changed: Recipe = uncertain.at({name: probe})
     if changed.steps.keys() != recipe.steps.keys() or changed.outputs != recipe.outputs:
         raise ValueError(f"{name} decides which steps there are: it cannot be drawn")
-    for step in needed(recipe, recipe.outputs):
+    for step in needed(recipe, outputs):
         before, after = recipe.steps[step], changed.steps[step]
         for param, value in after.params.items():
             for index, new in _changed(before.params[param], value):

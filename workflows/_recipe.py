@@ -23,6 +23,8 @@ from neusee.workflows._overrides import Override, arguments_in
 from neusee.workflows._params import Checker
 from neusee.workflows._refs import References
 from neusee.workflows._steps import Declared, declare, device_of
+from neusee.workflows._training import KEY as TRAINING
+from neusee.workflows._training import read_training
 from neusee.workflows._uncertain import Uncertain, settle
 from neusee.workflows._wires import Wiring
 from neusee.workflows._yaml import Value, Where
@@ -69,6 +71,8 @@ def _as_written(name: str, place: Path) -> Recipe:
 
 def check(composed: Composed) -> Recipe:
     """A composed recipe with its steps bound, or a `RecipeError` with every problem."""
+    learnt = composed.root.items.get(TRAINING)
+    composed, training = read_training(composed)
     composed, uncertain = settle(composed)
     problems = list(composed.problems)
     root, references = composed.root, References(composed.root, problems)
@@ -88,10 +92,12 @@ def check(composed: Composed) -> Recipe:
     if graph is None:
         keep_graph(root, steps, absent, {name: step.wires for name, step in bound.items()})
     config = _config(root, bound, steps, checker, references.spare, uncertain)
+    if learnt is not None:
+        config = Config({**config.settings, **dict(_settings(learnt, checker))})
     nulls = {name: f"null ({value.mark})" for name, value in absent.items()}
     notes = (*checker.notes, *(uncertain.notes if uncertain else ()))
     told = composed.name, composed.title, seed, tolerance, outputs, bound, expect, config, notes, nulls
-    return Recipe(*told, uncertain=uncertain)
+    return Recipe(*told, uncertain=uncertain, training=training)
 
 
 def _bind(

@@ -45,6 +45,7 @@ def schema() -> Schema:
             "tolerance": {"anyOf": [{"type": "number", "minimum": 0}, REFERENCE]},
             "outputs": {"type": ["array", "string"], "items": {"type": "string"}},
             "posterior": {"anyOf": [{"type": "string"}, {"type": "object"}, {"type": "null"}]},
+            "train": {"type": ["object", "null"]},
             "expect": {"type": "object", "additionalProperties": {"$ref": "#/$defs/expectation"}},
         },
         "additionalProperties": True,

@@ -1,0 +1,230 @@
+"""Learning: two stages from a clean start, the same pictures whoever asks, and a killed training that goes on."""
+
+import csv
+import os
+import re
+import signal
+import subprocess
+import sys
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+from PIL import Image
+from safetensors.torch import load_file
+
+from neusee.nodes.doe._learned import LEARNT
+from neusee.workflows import RecipeError, Store, as_function, load
+from neusee.workflows._photographs import Photographs
+from neusee.workflows._samples import Samples, Shared
+from neusee.workflows._training import Rates
+from neusee.workflows.train import train
+
+ROOT = Path(__file__).parents[2]
+TINY = [
+    "optics.samples=64", "optics.pitch=126.2 um", "optics.bands=5", "optics.window=[48, 48]", "scene.shape=[48, 48]",
+    "sensor.shape=[32, 32]", "doe.grid=32", "train.network.kind=unet", "train.network.width=4", "train.critics.width=4",
+    "train.stages.1.iterations=4", "train.stages.2.iterations=3", "train.keep=2",
+]  # fmt: skip
+
+pytestmark = pytest.mark.usefixtures("one_thread")
+
+
+@pytest.fixture
+def photographs(tmp_path):
+    folder = tmp_path / "photographs" / "deep"
+    folder.mkdir(parents=True)
+    rng = np.random.default_rng(5)
+    for i, size in enumerate([(60, 70), (20, 24), (50, 50)]):
+        coarse = Image.fromarray(rng.integers(0, 256, (5, 5, 3), dtype=np.uint8))
+        coarse.resize(size[::-1], Image.Resampling.BICUBIC).save(folder / f"{i}.png")
+    (folder / "broken.jpg").write_bytes(b"no picture")
+    Image.open(folder / "0.png").save(folder / "cut.jpg")
+    whole = (folder / "cut.jpg").read_bytes()
+    (folder / "cut.jpg").write_bytes(whole[: len(whole) - 300])  # its header is as good as any
+    return folder.parent
+
+
+@pytest.fixture
+def tiny(photographs):
+    return load("train_small", [*TINY, f"train.photographs={photographs}"])
+
+
+def trained(recipe, folder, stages=(1, 2), watch=None):
+    return train(recipe, Store(folder / "store"), folder / "runs", ["neusee", "train"], lambda line: None, stages,
+                 watch=watch)  # fmt: skip
+
+
+def losses(folder):
+    with (folder / "losses.csv").open(newline="") as file:
+        return list(csv.DictReader(file))
+
+
+def test_both_stages_at_64_pixels_and_31_bands(tmp_path, photographs):
+    small = ["train.stages.1.iterations=3", "train.stages.2.iterations=3", "train.stages.1.batch=2"]
+    recipe = load("train_small", [*small, f"train.photographs={photographs}"])
+    folder = trained(recipe, tmp_path, [1])
+    before = (folder / "mask.safetensors").read_bytes()
+    assert trained(recipe, tmp_path, [2]) == folder
+    assert (folder / "mask.safetensors").read_bytes() == before
+    rows = losses(folder)
+    assert [(row["stage"], row["iteration"]) for row in rows] == [(s, i) for s in "12" for i in "012"]
+    assert all(np.isfinite(float(x)) for row in rows for x in row.values() if x)
+    lsr = [float(row["LSR"]) for row in rows if row["LSR"]]
+    assert lsr[-1] < lsr[0]
+    height = load_file(folder / "mask.safetensors")["height"]
+    assert height.shape == (128, 128)
+    files = [f"doe.file={folder / 'mask.safetensors'}", f"restore.weights={folder / 'network.safetensors'}"]
+    own = ["doe=pixelwise", "restore=fft_mamba", "restore.width=16", *files, "outputs=[restored, lsr]"]
+    made = load("train_small", own).run(Store(tmp_path / "store"))
+    assert made["restored"].shape == (3, 64, 64)
+    assert (folder / "curves.png").stat().st_size > 10_000
+    assert sorted(path.name for path in (folder / "pictures").iterdir()) == ["stage1_000003.png", "stage2_000003.png"]
+
+
+def test_a_killed_training_goes_on_to_the_same_weights(tmp_path, tiny, photographs):
+    whole = trained(tiny, tmp_path / "whole")
+    code = f"""
+import os, signal
+from pathlib import Path
+from neusee.workflows import Store, load
+from neusee.workflows.train import train
+def watch(stage, done, found):
+    if (stage, done) == (2, 1):
+        os.kill(os.getpid(), signal.SIGKILL)
+here = Path({str(tmp_path / "killed")!r})
+recipe = load("train_small", {[*TINY, f"train.photographs={photographs}"]!r})
+train(recipe, Store(here / "store"), here / "runs", [], print, watch=watch)
+"""
+    env = {**os.environ, "PYTHONPATH": str(ROOT / ".src"), "OMP_NUM_THREADS": "1"}
+    done = subprocess.run([sys.executable, "-c", code], env=env, capture_output=True, text=True, check=False)
+    assert done.returncode == -signal.SIGKILL, done.stderr
+    again = trained(tiny, tmp_path / "killed")
+    assert again.name == whole.name
+    for name in ("mask.safetensors", "network.safetensors"):
+        assert (again / name).read_bytes() == (whole / name).read_bytes(), name
+    same = [[{**row, "seconds": ""} for row in losses(folder)] for folder in (whole, again)]
+    assert same[0] == same[1]
+
+
+def test_a_picture_is_the_same_in_whatever_order(tmp_path, tiny):
+    sources = Photographs.under(tiny.training.photographs)
+    samples = Samples(tiny, tiny.training, sources, Store(tmp_path), "cpu")
+    height = LEARNT["doe.unet"](tiny.steps["height"].params, torch.Generator().manual_seed(3))()
+    shared = Shared.of(samples.shared({"height": height})).values
+    first = [samples(shared, 1, number) for number in (0, 1, 2)]
+    again = [samples(shared, 1, number) for number in (2, 0, 1)]
+    assert all(torch.equal(first[n].picture, x.picture) for n, x in zip((2, 0, 1), again, strict=True))
+    assert not torch.equal(first[0].picture, first[1].picture)
+    assert not torch.equal(first[0].truth, samples(shared, 2, 0).truth)
+    assert all(400e-9 <= x.drawn["lasers.drawn.wavelength"] <= 700e-9 for x in first)
+
+
+def test_the_gradient_through_the_cut_is_the_whole_one(tmp_path):
+    recipe = load("train_small", [*TINY, "laser=green", "sensor.read_noise=10 e-", "tolerance=0"])
+    how = recipe.training
+    samples = Samples(recipe, how, Photographs((recipe.steps["scene"].params["file"],)), Store(tmp_path), "cpu")
+    relief = LEARNT["doe.unet"](recipe.steps["height"].params, torch.Generator().manual_seed(3))
+    shared = Shared.of(samples.shared({"height": relief()}))
+    for number in (0, 1):
+        sample = samples(shared.values, 1, number)
+        (sample.picture - sample.truth).square().mean().backward()
+    shared.back()
+    cut = [p.grad.clone() for p in relief.parameters()]
+    relief.zero_grad()
+    loss = torch.zeros(())
+    names = [*samples._readers, "scene", "height"]
+    noise = [name for name, step in recipe.steps.items() if step.node.random and name.endswith(("[mask]", "[green]"))]
+    f = as_function(recipe, *names, outputs=[how.picture, how.truth], store=Store(tmp_path), redraw=noise)
+    for number in (0, 1):
+        seen = samples(shared.values, 1, number)
+        theta = {**samples._readers, "height": relief(), "scene": _scene(samples, number)}
+        theta |= samples._inputs.theta({k: v for k, v in seen.drawn.items() if k in samples._inputs.names})
+        if seen.drawn.get("laser") == "none":
+            theta |= dict.fromkeys(samples._lasers, 0.0)
+        found = f(theta, seed=seen.drawn["noise"])
+        loss = loss + (found[how.picture] - found[how.truth]).square().mean()
+    loss.backward()
+    for a, b in zip(cut, (p.grad for p in relief.parameters()), strict=True):
+        assert float((a - b).norm()) <= 2e-4 * float(b.norm()) + 1e-9
+
+
+def _scene(samples, number):
+    return samples.photographs.crop(samples.shape, (samples.seed, 1, number, 2))
+
+
+def test_what_is_not_a_number_stops_and_is_kept(tmp_path, tiny, monkeypatch):
+    from neusee.nodes import losses
+
+    monkeypatch.setattr(losses, "charbonnier", lambda a, b: (a - b).mean() * float("nan"))
+    with pytest.raises(ArithmeticError, match=r"stage 1, iteration 0, pictures 0 to 1: not finite: reconstruction"):
+        trained(tiny, tmp_path)
+    (folder,) = (tmp_path / "runs").iterdir()
+    kept = torch.load(folder / "not_finite_1_0.pt", weights_only=True)
+    assert {"relief", "net", "critics"} <= kept["parts"].keys()
+    assert not (folder / "network.safetensors").exists()
+
+
+def test_the_second_stage_needs_the_first(tmp_path, tiny):
+    with pytest.raises(ValueError, match="stage 2 needs stage 1"):
+        trained(tiny, tmp_path, [2])
+
+
+def test_a_state_that_is_none_is_not_gone_on_from(tmp_path, tiny):
+    folder = trained(tiny, tmp_path, [1])
+    (folder / "state.pt").write_bytes(b"half")
+    with pytest.raises(ValueError, match="cannot be gone on from"):
+        trained(tiny, tmp_path)
+
+
+def test_photographs_are_found_and_broken_ones_said(photographs, tmp_path):
+    found = Photographs.under(photographs)
+    assert [path.name for path in found.paths] == ["0.png", "1.png", "2.png", "cut.jpg"]
+    assert [path.name for path in found.broken] == ["broken.jpg"]
+    pictures = [found.crop((30, 30), (1, i)) for i in range(20)]
+    assert {p.shape for p in pictures} == {(3, 30, 30)}
+    assert [path.name for path in found.broken] == ["broken.jpg", "cut.jpg"]
+    assert len({float(p.sum()) for p in pictures}) > 10
+    (tmp_path / "none").mkdir()
+    with pytest.raises(ValueError, match="no photograph"):
+        Photographs.under(tmp_path / "none")
+
+
+@pytest.mark.parametrize(
+    ("change", "said"),
+    [
+        ("train.stages.1.iterations=-1", "train.stages.1.iterations"),
+        ("+train.fish=1", "is not known here"),
+        ("train.photographs=nowhere", "is no folder"),
+        ("train.network.kind=foo", "fft_mamba"),
+    ],
+)
+def test_a_mistake_is_located(change, said):
+    with pytest.raises(RecipeError, match=said) as caught:
+        load("train_small", [change])
+    assert all("argument 1" in str(problem.mark) for problem in caught.value.problems)
+
+
+@pytest.mark.parametrize(("doe", "said"), [("axicon", "of which nothing is learnt"), ("unet", "")])
+def test_only_what_learns_can_be_learnt(tmp_path, photographs, doe, said):
+    changes = [c for c in TINY if not c.startswith("doe.") or doe == "unet"]
+    recipe = load("train_small", [f"doe={doe}", *changes,
+                                  f"train.photographs={photographs}"])  # fmt: skip
+    if said:
+        with pytest.raises(ValueError, match=said):
+            trained(recipe, tmp_path)
+    else:
+        assert trained(recipe, tmp_path).is_dir()
+
+
+def test_a_recipe_without_a_word_on_learning_is_refused(tmp_path):
+    with pytest.raises(ValueError, match=re.escape("add `train: recommended`")):
+        trained(load("first_light"), tmp_path)
+
+
+def test_rates_fall_as_the_paper_prints_them():
+    printed = Rates(factor=0.3, least=0)
+    shares = [printed.share(i) for i in (0, 1999, 2000, 3000, 5000)]
+    assert shares == pytest.approx([1, 1, 0.5, 0.15, 0.0135])
+    assert 2e-4 * printed.share(10_000) == pytest.approx(6.6e-9, rel=0.01)

@@ -1,0 +1,81 @@
+"""``neusee train``: learn the element and the restoration of a recipe."""
+
+from __future__ import annotations
+
+from enum import StrEnum
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated
+
+import typer
+
+from neusee.workflows._words import FAILED, Debug, Out, Words, check_device, fail, load, say, the_store
+
+if TYPE_CHECKING:
+    from collections.abc import Mapping
+
+
+class Stages(StrEnum):
+    """What is learnt."""
+
+    FIRST = "1"
+    SECOND = "2"
+    BOTH = "both"
+
+
+def train(
+    words: Words = None,
+    stage: Annotated[Stages, typer.Option("--stage", help="1: element and network; 2: network; both.")] = Stages.BOTH,
+    device: Annotated[str, typer.Option("--device", help="Where to learn: cpu or cuda.")] = "cpu",
+    quiet: Annotated[bool, typer.Option("--quiet", help="The folder alone.")] = False,
+    debug: Debug = False,
+    out: Out = Path("runs"),
+) -> None:
+    """Learn a recipe's element and restoration; run it again to go on where it was stopped."""
+    recipe, command = load(words or ["train_small"])
+    check_device(device)
+    from neusee.workflows._call import RunError
+    from neusee.workflows.train import train as learn
+
+    stages = (1, 2) if stage is Stages.BOTH else (int(stage.value),)
+    tell = (lambda line: None) if quiet else (lambda line: say([line]))
+    told = ["neusee", "train", *command[2:], "--stage", stage.value]
+    try:
+        with _bar(quiet, {s: recipe.training.stages[s].iterations for s in recipe.training.stages}
+                  if recipe.training else {}) as bar:  # fmt: skip
+            folder = learn(recipe, the_store(), out, told, tell, stages, device, bar.watch)
+    except (RunError, ValueError, ArithmeticError) as error:
+        fail(str(error), FAILED)
+    if not quiet:
+        say(_next(folder))
+    say([str(folder)])
+
+
+def _next(folder: Path) -> list[str]:
+    mask, network = folder / "mask.safetensors", folder / "network.safetensors"
+    return [f"element: {mask}", f"network: {network}", f"curves:  {folder / 'curves.png'}"]
+
+
+class _bar:
+    """The losses on the way, where somebody looks."""
+
+    def __init__(self, quiet: bool, lengths: Mapping[int, int]) -> None:
+        from rich.console import Console
+        from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
+
+        columns = TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn(), TimeRemainingColumn()
+        console = Console(stderr=True)
+        self._shown = Progress(*columns, TextColumn("{task.fields[losses]}"), console=console,
+                               disable=quiet or not console.is_terminal)  # fmt: skip
+        self._tasks = {s: self._shown.add_task(f"stage {s}", total=n, losses="") for s, n in lengths.items()}
+
+    def __enter__(self) -> _bar:
+        self._shown.start()
+        return self
+
+    def __exit__(self, *error: object) -> None:
+        self._shown.stop()
+
+    def watch(self, stage: int, done: int, found: Mapping[str, float]) -> None:
+        """An iteration was done."""
+        said = " ".join(f"{name} {found[name]:.3g}" for name in ("LSR", "L1", "critics") if name in found)
+        self._shown.update(self._tasks[stage], completed=done, losses=said)

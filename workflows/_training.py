@@ -1,0 +1,141 @@
+"""How a recipe is learnt: its ``train`` block, read and checked where it stands."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from pathlib import Path
+from typing import Annotated, Any, Literal
+
+from pydantic import BaseModel, ConfigDict, Field, ValidationError
+
+from neusee.workflows._compose import Composed
+from neusee.workflows._marks import Mark, Problem, nearest
+from neusee.workflows._yaml import Value
+
+KEY = "train"  #: of a recipe
+
+Weight = Annotated[float, Field(ge=0, allow_inf_nan=False)]
+Share = Annotated[float, Field(ge=0, le=1)]
+Beta = Annotated[float, Field(ge=0, lt=1)]
+Number = Annotated[int, Field(ge=1)]
+
+
+class _Block(BaseModel):
+    model_config = ConfigDict(extra="forbid", frozen=True)
+
+
+class Network(_Block):
+    """Which network restores, and how wide it is."""
+
+    kind: Literal["fft_mamba", "unet", "nafnet"] = "fft_mamba"
+    width: Annotated[int, Field(ge=2)] = 64
+
+
+class Critics(_Block):
+    """The two critics and their momenta."""
+
+    width: Annotated[int, Field(ge=2)] = 64
+    betas: tuple[Beta, Beta] = (0.0, 0.9)
+
+
+class Rates(_Block):
+    """Learning rates and how they fall: halved once, then by a factor at a time, and never below the least."""
+
+    weights: Annotated[float, Field(gt=0)] = 2e-4
+    biases: Annotated[float, Field(gt=0)] = 4e-4
+    element: Annotated[float, Field(gt=0)] = 2e-4
+    halve: Number = 2000
+    every: Number = 1000
+    factor: Annotated[float, Field(gt=0, le=1)] = 0.7
+    least: Weight = 1e-6
+
+    def share(self, iteration: int) -> float:
+        """By what a rate is multiplied at an iteration of a stage, counted from 0."""
+        if iteration < self.halve:
+            return 1.0
+        return float(0.5 * self.factor ** ((iteration - self.halve) // self.every))
+
+
+class Stage(_Block):
+    """How long, over how many pictures at a time, and for what; a weight of 0 leaves a term out."""
+
+    iterations: Annotated[int, Field(ge=0)]
+    batch: Number = 8
+    lsr: Weight = 0.0
+    bsr: Weight = 0.0
+    adversarial: Weight = 0.1
+    penalty: Weight = 1.0
+    reconstruction: Weight = 1.0
+
+
+class Training(_Block):
+    """A recipe's ``train`` block."""
+
+    photographs: Path | None = None
+    learn: str = "height"
+    scene: str = "scene"
+    picture: str = "developed[mask]"
+    truth: str = "truth"
+    psf: str = "psf[mask]"
+    light: str = "bsr[mask]"  #: step that gives the light kept, by band
+    network: Network = Network()
+    size: tuple[Number, Number] | None = None
+    critics: Critics = Critics()
+    betas: tuple[Beta, Beta] = (0.9, 0.999)
+    rates: Rates = Rates()
+    laser_free: Share = 0.0
+    average: Annotated[float, Field(ge=0, lt=1)] = 0.999
+    precision: Literal["float32", "bfloat16"] = "float32"
+    logarithm: bool = True
+    stages: dict[Annotated[int, Field(ge=1, le=2)], Stage]
+    keep: Number = 100
+    show: Number = 500
+
+
+def read_training(composed: Composed) -> tuple[Composed, Training | None]:
+    """The recipe without its ``train`` block, and the block; what is wrong with it becomes a problem of the recipe."""
+    block = composed.root.items.get(KEY)
+    if block is None:
+        return composed, None
+    rest = replace(composed.root, data={key: v for key, v in composed.root.data.items() if key != KEY})
+    composed = replace(composed, root=rest)
+    try:
+        found = Training.model_validate(block.plain, context={"folder": block.mark.folder})
+    except ValidationError as error:
+        problems = [_problem(block, each) for each in error.errors()]
+        return replace(composed, problems=(*composed.problems, *problems)), None
+    return _with_folder(composed, block, found)
+
+
+def _with_folder(composed: Composed, block: Value, found: Training) -> tuple[Composed, Training | None]:
+    """A relative folder of photographs is relative to the file that names it."""
+    if found.photographs is None:
+        return composed, found
+    mark = block.items["photographs"].mark
+    path = Path(mark.folder) / found.photographs.expanduser()
+    if not path.is_dir():
+        problem = Problem(mark, f"{KEY}.photographs", f"{path} is no folder")
+        return replace(composed, problems=(*composed.problems, problem)), None
+    return composed, found.model_copy(update={"photographs": path})
+
+
+def _problem(block: Value, error: Any) -> Problem:
+    """Where it stands, as far as what pydantic names is there, and what to write."""
+    at, path = block, [KEY]
+    for key in error["loc"]:
+        below = {str(k): v for k, v in at.items.items()}
+        if str(key) in below:
+            at = below[str(key)]
+            path.append(str(key))
+    mark: Mark = at.key if error["type"] == "extra_forbidden" else at.mark
+    text = str(error["msg"])
+    if error["type"] == "extra_forbidden":
+        text = f"is not known here; {nearest(path[-1], _fields(error['loc'][:-1]))}"
+    elif error["type"] == "missing":
+        text = f"lacks {error['loc'][-1]}"
+    return Problem(mark, ".".join(path), text)
+
+
+def _fields(where: tuple[int | str, ...]) -> list[str]:
+    blocks: dict[str, type[BaseModel]] = {"network": Network, "critics": Critics, "rates": Rates, "stages": Stage}
+    return list((blocks[str(where[0])] if where else Training).model_fields)

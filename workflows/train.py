@@ -1,0 +1,214 @@
+"""Learn an element and the restoration behind it: two stages, resumed to the last bit, one folder."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import torch
+
+from neusee.nodes import doe
+from neusee.workflows._call import versions
+from neusee.workflows._figures_training import curves, strip
+from neusee.workflows._graph import Recipe
+from neusee.workflows._keys import digest
+from neusee.workflows._learner import Learner, Losses, NotFinite
+from neusee.workflows._photographs import Photographs
+from neusee.workflows._samples import Sample, Samples
+from neusee.workflows._store import Store
+from neusee.workflows._training import KEY, Stage, Training
+from neusee.workflows._training_state import Rows, export, packed, replaced, restore, unpacked, weights_of, write_json
+
+Tell = Callable[[str], None]
+Watch = Callable[[int, int, Mapping[str, float]], None]  #: stage, iterations done of it, what was found
+
+
+def train(
+    recipe: Recipe,
+    store: Store,
+    runs: Path,
+    command: Sequence[str],
+    tell: Tell,
+    stages: Sequence[int] = (1, 2),
+    device: str = "cpu",
+    watch: Watch | None = None,
+) -> Path:
+    """Learn through the stages, or go on where an earlier call of the same was stopped; the folder.
+
+    Raises ValueError for a recipe that says not how, a folder without photographs, or a second stage before the first;
+    ArithmeticError where a loss is no number, with all that led to it beside the state.
+    """
+    how = recipe.training
+    if how is None:
+        raise ValueError(f"{recipe.name} says not how it is learnt: add `train: recommended` to its defaults")
+    photographs = _photographs(recipe, how)
+    folder = runs / f"{recipe.name}_train_{_name(recipe, how, photographs)}"
+    folder.mkdir(parents=True, exist_ok=True)
+    _Course(recipe, how, photographs, store, folder, tell, device, watch).through(stages, command)
+    return folder
+
+
+def _photographs(recipe: Recipe, how: Training) -> Photographs:
+    if how.photographs is not None:
+        return Photographs.under(how.photographs)
+    file = recipe.steps[how.scene].params.get("file") if how.scene in recipe.steps else None
+    if not isinstance(file, Path):
+        raise ValueError("train.photographs: name a folder of photographs")
+    return Photographs((file,))
+
+
+def _name(recipe: Recipe, how: Training, photographs: Photographs) -> str:
+    """What decides a training, but for how often it is kept and shown: another begins anew in a folder of its own."""
+    settings = recipe.config.settings.items()
+    values = {name: str(setting.value) for name, setting in settings if not name.startswith(f"{KEY}.")}
+    said = how.model_copy(update={"keep": 1, "show": 1}).model_dump(mode="json")
+    return digest("training", values, said, [path.name for path in photographs.paths])[:8]
+
+
+class _Course:
+    """One training: where it stands, and how it goes on."""
+
+    def __init__(
+        self,
+        recipe: Recipe,
+        how: Training,
+        photographs: Photographs,
+        store: Store,
+        folder: Path,
+        tell: Tell,
+        device: str,
+        watch: Watch | None,
+    ) -> None:
+        self.recipe, self.how, self.photographs, self.store = recipe, how, photographs, store
+        self.folder, self.tell, self.device, self.watch = folder, tell, device, watch
+        self.learner = Learner(recipe, how, device)
+        self.rows = Rows(folder / "losses.csv")
+        self.state = folder / "state.pt"
+        self.stage, self.iteration = min(how.stages), 0
+        self._go_on()
+
+    def _go_on(self) -> None:
+        if not self.state.exists():
+            return self._begin()
+        found = unpacked(self.state, self.device)
+        self.stage, self.iteration = found["stage"], found["iteration"]
+        self._begin()
+        restore(self.learner.parts(), found)
+        self.rows.cut(self.stage, self.iteration)
+        self.tell(f"goes on in stage {self.stage} after {self.iteration} iterations")
+
+    def _begin(self) -> None:
+        """Fresh moments for the stage; after the last there is nothing to move."""
+        self.learner.begin(self.how.stages.get(self.stage, Stage(iterations=0)), self.stage == 1)
+
+    def through(self, stages: Sequence[int], command: Sequence[str]) -> None:
+        """The stages that are asked for, and what comes out of them."""
+        for number in stages:
+            if number not in self.how.stages:
+                raise ValueError(f"train.stages has no stage {number}")
+            if number > self.stage:
+                raise ValueError(f"stage {number} needs stage {self.stage}: its {self._length} iterations first")
+            if number == self.stage:
+                self._through()
+        if self.rows.rows:
+            self._close(command)
+
+    @property
+    def _length(self) -> int:
+        return self.how.stages[self.stage].iterations
+
+    def _through(self) -> None:
+        """To the end of the stage, and to the beginning of the next."""
+        learns = self.stage == 1
+        samples = self._samples(learns)
+        while self.iteration < self._length:
+            self._iterate(samples)
+            if self.iteration % self.how.keep == 0 and self.iteration < self._length:
+                self._keep()
+        self._export(learns)
+        self.stage, self.iteration = self.stage + 1, 0
+        self._begin()
+        self._keep()
+
+    def _samples(self, learns: bool) -> Samples:
+        parts = self.recipe, self.how, self.photographs, self.store, self.device
+        return Samples(*parts, None if learns else frozen(self.recipe, self.how, self.folder))
+
+    def _iterate(self, samples: Samples) -> None:
+        began, number = time.perf_counter(), self.iteration
+        rate = self.learner.set_rates(number)
+        before = packed(self.learner.parts(), stage=self.stage, iteration=number) if number == 0 else b""
+        try:
+            found, seen = self.learner.iterate(samples, self.stage, number)
+        except NotFinite as error:
+            raise self._dumped(error, before) from error
+        found |= {"rate": rate, "seconds": time.perf_counter() - began}
+        self.rows.add(self.stage, number, found)
+        self.iteration += 1
+        if self.iteration % self.how.show == 0 or self.iteration == self._length:
+            self._show(seen[0])
+        if self.watch is not None:
+            self.watch(self.stage, self.iteration, found)
+
+    def _dumped(self, error: NotFinite, before: bytes) -> ArithmeticError:
+        """Keep what led to a number that is none: the weights, and which pictures."""
+        path = self.folder / f"not_finite_{self.stage}_{self.iteration}.pt"
+        batch = self.how.stages[self.stage].batch
+        pictures = [self.iteration * batch + i for i in range(batch)]
+        here = {"stage": self.stage, "iteration": self.iteration, "pictures": pictures}
+        replaced(path, before or packed(self.learner.parts(), **here))
+        self.rows.keep()
+        said = f"stage {self.stage}, iteration {self.iteration}, pictures {pictures[0]} to {pictures[-1]}"
+        return ArithmeticError(f"{said}: {error}; weights of that moment: {path}")
+
+    def _keep(self) -> None:
+        """First the rows, then the state: rows that are too many are cut off, lacking ones would be lost."""
+        self.rows.keep()
+        replaced(self.state, packed(self.learner.parts(), stage=self.stage, iteration=self.iteration))
+
+    def _show(self, sample: Sample) -> None:
+        with torch.no_grad():
+            restored = self.learner.net(sample.picture[None])[0].float()
+        shown = strip([sample.picture.detach(), restored, sample.truth])
+        (self.folder / "pictures").mkdir(exist_ok=True)
+        replaced(self.folder / "pictures" / f"stage{self.stage}_{self.iteration:06d}.png", shown)
+
+    def _export(self, learns: bool) -> None:
+        if learns:
+            with torch.no_grad():
+                export(self.folder, "mask", {"height": self.learner.relief()})
+        net = self.learner.average or self.learner.net
+        export(self.folder, "network", weights_of(net))
+
+    def _close(self, command: Sequence[str]) -> None:
+        replaced(self.folder / "curves.png", curves(self.rows.rows))
+        broken = {str(path): why for path, why in self.photographs.broken.items()}
+        document: dict[str, Any] = {
+            "command": list(command),
+            "recipe": self.recipe.name,
+            "train": self.how.model_dump(mode="json"),
+            "photographs": len(self.photographs.paths),
+            "broken": broken,
+            "iterations": {str(s): sum(int(r["stage"]) == s for r in self.rows.rows) for s in self.how.stages},
+            "seconds": sum(float(r["seconds"]) for r in self.rows.rows),
+            "last": self.rows.rows[-1],
+            "versions": versions(),
+        }
+        write_json(self.folder / "training.json", document)
+
+
+def frozen(recipe: Recipe, how: Training, folder: Path) -> Recipe:
+    """The recipe with the element that was learnt in place of the one that learns: a step like any other."""
+    file = folder / "mask.safetensors"
+    if not file.is_file():
+        raise ValueError(f"{file} is not there: stage 1 makes it")
+    step = recipe.steps[how.learn]
+    grid = {name: step.params[name] for name in ("samples", "pitch", "diameter", "aperture")}
+    params = {**grid, "file": file, "depth": 1e-6, "scale": 0.1}
+    return replace(recipe, steps={**recipe.steps, how.learn: replace(step, node=doe.pixelwise, params=params)})
+
+
+__all__ = ["Losses", "frozen", "train"]
