@@ -81,7 +81,8 @@ def _key(recipe: Recipe, how: MaskTraining, store: Store | None) -> str:
     code = Code((store or Store()).code_memo)
     steps = [recipe.steps[name] for name in needed(recipe, [how.psf, how.plain])]
     nodes = sorted({step.node.fn.__module__ for step in steps} | set(_LEARNT_WITH))
-    settings = how.model_dump(mode="json", exclude={"save_every"})
+    settings = how.model_dump(mode="json", exclude={"save_every", "start"})
+    settings["start"] = how.start and file_digest(how.start)
     rooms = [file_digest(path) for path in sorted(Path(__file__).parent.glob("_design*.py"))]
     return digest("mask", recipe.config.to_yaml(), recipe.seed, settings, [code.digest(node) for node in nodes], rooms)
 

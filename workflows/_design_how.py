@@ -8,7 +8,7 @@ from typing import Annotated, Any, Literal
 from pydantic import BaseModel, ConfigDict, Field, model_validator
 
 from neusee.nodes.doe._material import Material
-from neusee.nodes.units import Count, PositiveLength, Wavelength
+from neusee.nodes.units import Count, DataFile, PositiveLength, Wavelength
 
 Weight = Annotated[float, Field(ge=0, allow_inf_nan=False)]
 Kind = Literal["pixelwise", "zernike", "rings", "unet", "five_half_rings"]
@@ -54,6 +54,7 @@ class MaskTraining(BaseModel):
     max_height: PositiveLength = 1.2e-6  #: pixelwise, unet
     grid: Count = 270  #: pixelwise, unet: places along an axis
     scale: Annotated[float, Field(gt=0, le=1)] = 0.02  #: pixelwise: features of the start, in diameters
+    start: DataFile | None = None  #: pixelwise: a relief to start from, such as that of another kind
     width: Count = 16  #: unet: channels of its first layer
     modes: Count = 100  #: zernike: polynomials, from Noll's number 4 on
     waves: Annotated[float, Field(gt=0)] = 5.0  #: zernike: root mean square of the start

@@ -15,6 +15,7 @@ import torch
 from torch import Tensor, nn
 
 from neusee.nodes.doe import _shapes, half_rings
+from neusee.nodes.doe._pixelwise import _read as read_relief
 from neusee.nodes.optics._aperture import Stop
 from neusee.workflows._design_how import DesignError, MaskTraining
 from neusee.workflows._design_terms import Terms
@@ -71,12 +72,23 @@ def shape_of(how: MaskTraining, start: int) -> nn.Module:
     """The numbers to learn, as they are at a start."""
     rng = torch.Generator().manual_seed(how.seed + _APART * start)
     if how.kind == "pixelwise":
-        return _shapes.Pixels(how.grid, how.max_height, how.scale, rng)
+        return _shapes.Pixels(how.grid, how.max_height, how.scale, rng, _start(how))
     if how.kind == "zernike":
         return _shapes.Modes(how.modes, how.waves, how.wavelength, how.material, rng)
     if how.kind == "rings":
         return _shapes.Rings(how.rings, how.sided, how.noise, how.wavelength, how.material, rng)
     return _shapes.Drawn(how.width, how.grid, how.max_height, rng)
+
+
+def _start(how: MaskTraining) -> Tensor | None:
+    """The relief that pixels start from."""
+    if how.start is None:
+        return None
+    height = read_relief(how.start)
+    if float(height.max()) > how.max_height:
+        deep, most = f"{float(height.max()) * 1e6:.3g} um", f"{how.max_height * 1e6:.3g} um"
+        raise DesignError(f"start: {how.start.name} is {deep} deep: set max_height to more than {most}")
+    return height
 
 
 def rate(how: MaskTraining, number: int) -> float:

@@ -19,6 +19,7 @@ from neusee.nodes.optics._screen import screen
 from neusee.nodes.optics._zernike import combine
 
 Make = Callable[[Stop], Tensor]
+_END = 0.01  #: share of the depth, at its ends, that a start is kept out of: a sigmoid has no slope there
 
 
 class _Kept:
@@ -34,13 +35,22 @@ class _Kept:
 
 
 class Pixels(nn.Module):
-    """A height for each of ``grid`` x ``grid`` places, a sigmoid between 0 and ``max_height``; smooth between them."""
+    """A height for each of ``grid`` x ``grid`` places, a sigmoid between 0 and ``max_height``; smooth between them.
 
-    def __init__(self, grid: int, max_height: float, scale: float, rng: torch.Generator) -> None:
+    It starts from a smooth random relief with features of ``scale`` diameters, or from ``start``.
+    """
+
+    def __init__(
+        self, grid: int, max_height: float, scale: float, rng: torch.Generator, start: Tensor | None = None
+    ) -> None:
         super().__init__()
         self.max_height = max_height
-        drawn = 1.5 * screen(stop(grid, 1.0, float(grid)), scale, rng)
-        self.logits = nn.Parameter(drawn.to(torch.float32))
+        if start is None:
+            logits = 1.5 * screen(stop(grid, 1.0, float(grid)), scale, rng)
+        else:
+            share = enlarge(start.double() / max_height, grid, grid)
+            logits = torch.logit(share.clamp(_END, 1 - _END))
+        self.logits = nn.Parameter(logits.to(torch.float32))
 
     def forward(self, grid: Stop) -> Tensor:
         """Height (v, u)."""

@@ -3,8 +3,10 @@
     python tests/benchmarks/bench_design.py FOLDER PIECE [PIECE ...]
 
 Pieces: `known` (masks of a formula), the name of a design below, `designs` (all of them), `table` (of what lies in
-FOLDER). Each design is kept in FOLDER and not repeated; an interrupted one goes on. Learned on a pupil of half the
-samples and a window of 504 pixels, judged on the 540 samples, 31 bands and 512 pixels of the recipe.
+FOLDER). Each design is kept in FOLDER and not repeated; an interrupted one goes on. All are judged on the 540
+samples, 31 bands and 512 pixels of the recipe. Those of few numbers are learned on a pupil of half the samples and a
+window of 504 pixels; pixels are learned on what they are judged on, for a deep relief is not known between coarse
+samples.
 """
 
 from __future__ import annotations

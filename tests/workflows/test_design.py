@@ -133,6 +133,16 @@ def test_what_is_learnt_on_few_samples_is_made_on_all(recipe, store, tmp_path):
     assert read(folder)["mean"] == pytest.approx(figures(terms, height)["mean"])
 
 
+def test_pixels_start_from_the_relief_of_another_kind(recipe, store, tmp_path):
+    first = design(recipe, how(kind="rings", iterations=2), store, tmp_path, quiet)
+    file, deep = str(first / "mask.safetensors"), read(first)["depth"] * 1e6
+    given = how(iterations=8, grid=64, start=file, max_height=f"{1.2 * deep} um", learning_rate=1e-4)
+    second = design(recipe, given, store, tmp_path, quiet)
+    assert read(second)["loss"] < read(first)["loss"]
+    with pytest.raises(DesignError, match=r"start: mask.safetensors is .* deep: set max_height"):
+        design(recipe, how(iterations=1, start=file, max_height="1 um"), store, tmp_path, quiet)
+
+
 def test_all_bands_are_seen_in_time(recipe, store):
     terms = Terms(recipe, how(bands=2), store)
     drawn = [terms.drawn(number) for number in range(40)]
