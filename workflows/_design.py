@@ -27,6 +27,7 @@ from neusee.workflows._graph import Recipe, needed
 from neusee.workflows._keys import digest, file_digest
 from neusee.workflows._marks import RecipeError
 from neusee.workflows._store import Store
+from neusee.workflows._study_page import page
 
 __all__ = ["DesignError", "MaskTraining", "Weights", "design", "figures"]
 
@@ -56,7 +57,7 @@ def design(
         height = learnt.height(full.stop).detach().to("cpu", torch.float32).contiguous()
         found = figures(full, height.to(full.device))
     with new_run(out, f"{recipe.name}_mask", key) as folder:
-        _write(folder, recipe, how, learnt, height, found)
+        _write(folder, full, learnt, height, found)
     kept.path.unlink(missing_ok=True)
     tell(said(found))
     return folder.path
@@ -113,18 +114,29 @@ def said(found: Mapping[str, Any]) -> str:
     )
 
 
-def _write(
-    folder: RunFolder, recipe: Recipe, how: MaskTraining, learnt: Learnt, height: Tensor, found: Mapping[str, Any]
-) -> None:
+def _write(folder: RunFolder, terms: Terms, learnt: Learnt, height: Tensor, found: Mapping[str, Any]) -> None:
     from safetensors.torch import save
 
+    from neusee.workflows._design_page import pictures, sections
+
+    recipe, how = terms.recipe, terms.how
     folder.write("mask.safetensors", save({"height": height}))
     header = list(dict.fromkeys(name for row in learnt.history for name in row))
     folder.write_rows("history.csv", header, [[row.get(name, "") for name in header] for row in learnt.history])
     doc = {"recipe": recipe.name, "kind": how.kind, "loss": learnt.loss, **found, "numbers": learnt.numbers}
     folder.write("mask.json", json.dumps(doc, indent=1))
     provenance = {
-        "stage": "mask", "recipe": recipe.name, "date": now(), "settings": how.model_dump(mode="json"),
-        "config": recipe.config.to_yaml(), "versions": versions(),
-    }  # fmt: skip
-    folder.write("provenance.json", json.dumps(provenance, indent=1, ensure_ascii=False))
+        "stage": "mask",
+        "recipe": recipe.name,
+        "date": now(),
+        "settings": how.model_dump(mode="json"),
+        "versions": versions(),
+    }
+    written = provenance | {"config": recipe.config.to_yaml()}
+    folder.write("provenance.json", json.dumps(written, indent=1, ensure_ascii=False))
+    with torch.no_grad():
+        shown = pictures(terms, height.to(terms.device), learnt)
+    for name, picture in shown.items():
+        folder.write(f"figures/{name}.png", picture)
+    title = f"{recipe.name}: a mask designed without images"
+    folder.write("report.html", page(title, f"{how.kind}: {said(found)}.", sections(found, shown), provenance))

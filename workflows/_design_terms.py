@@ -12,7 +12,7 @@ from torch import Tensor
 
 from neusee.nodes import losses
 from neusee.nodes.optics._aperture import Stop, stop
-from neusee.nodes.values import BAND_FIELDS, Bands, Psf
+from neusee.nodes.values import BAND_FIELDS, Bands, Psf, Pupil
 from neusee.workflows._design_how import DesignError, MaskTraining, needs_step
 from neusee.workflows._function import as_function
 from neusee.workflows._graph import Recipe, needed
@@ -55,6 +55,15 @@ class Terms:
         """The PSF behind a relief, of some bands or all."""
         bands = self.bands if chosen is None else _some(self.bands, chosen)
         found: Psf = self._function({self.how.height: height, self._bands: bands})[self.how.psf]
+        return found
+
+    def pupil(self, height: Tensor) -> Pupil:
+        """The pupil that a relief makes."""
+        name = self.recipe.steps[self.how.psf].wires.get("pupil")
+        if not isinstance(name, str):
+            raise DesignError(f"psf: {self.how.psf} has no pupil: name a step of optics.psf")
+        function = as_function(self.recipe, self.how.height, outputs=[name], device=str(self.device))
+        found: Pupil = function({self.how.height: height})[name]
         return found
 
     def plain(self, chosen: Sequence[int] | None = None) -> Psf:

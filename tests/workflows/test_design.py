@@ -9,14 +9,14 @@ from pydantic import ValidationError
 from safetensors.torch import load_file
 
 from neusee.nodes.doe import half_rings
-from neusee.workflows import _design_learn, load
+from neusee.workflows import _design_learn, _design_page, load
 from neusee.workflows._design import DesignError, MaskTraining, design, figures
 from neusee.workflows._design_terms import Terms
 from neusee.workflows._store import Store
 
 SMALL = ["optics.samples=64", "optics.pitch=126 um", "optics.window=[80, 80]", "optics.bands=5"]
 QUICK = {"bands": 3, "grid": 32, "width": 4, "modes": 20, "rings": 10, "waves": 1.0, "noise": 0.3, "scale": 0.2,
-         "max_height": "4 um", "weights": {"lsr": 1.0, "bsr": 2.0, "contrast": 0.5}}  # fmt: skip
+         "max_height": "4 um", "polish": 10, "weights": {"lsr": 1.0, "bsr": 2.0, "contrast": 0.5}}  # fmt: skip
 
 
 def quiet(_):
@@ -35,6 +35,13 @@ def store(tmp_path_factory):
 @pytest.fixture(scope="module")
 def recipe():
     return load("first_light", SMALL)
+
+
+@pytest.fixture(autouse=True)
+def without_pictures(request, monkeypatch):
+    """Pictures take longer than what is tested; one test looks at them."""
+    if "file_is_the_mask" not in request.node.name:
+        monkeypatch.setattr(_design_page, "pictures", lambda *_: {})
 
 
 def loss_of(terms, height):
@@ -74,6 +81,12 @@ def test_the_file_is_the_mask_and_the_bounds_hold_on_it(recipe, store, tmp_path)
     assert bool((bands["median_mtf"] <= bands["median_mtf_bound"]).all())
     assert not list(tmp_path.glob(".*state*"))
     assert (tmp_path / "latest").exists()
+    assert {path.name for path in (folder / "figures").iterdir()} == {
+        "relief.png", "psf.png", "suppression.png", "history.png"
+    }  # fmt: skip
+    text = (folder / "report.html").read_text()
+    assert "median MTF" in text
+    assert "even light" in text
 
 
 @pytest.mark.parametrize(("kind", "values"), [("pixelwise", {}), ("unet", {"starts": 2}),
