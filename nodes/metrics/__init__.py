@@ -1,7 +1,22 @@
 """Metrics: what a reader of results asks for."""
 
 from neusee.nodes.metrics._contrast import Mtf, encircled, mtf
+from neusee.nodes.metrics._limits import Limits, limits
 from neusee.nodes.metrics._quality import Quality, quality
 from neusee.nodes.metrics._suppression import Peak, Saturated, bsr, lsr, peak, saturated
 
-__all__ = ["Mtf", "Peak", "Quality", "Saturated", "bsr", "encircled", "lsr", "mtf", "peak", "quality", "saturated"]
+__all__ = [
+    "Limits",
+    "Mtf",
+    "Peak",
+    "Quality",
+    "Saturated",
+    "bsr",
+    "encircled",
+    "limits",
+    "lsr",
+    "mtf",
+    "peak",
+    "quality",
+    "saturated",
+]

@@ -1,0 +1,60 @@
+"""What no mask beats: light that stays in the field shines somewhere, and a low peak leaves little contrast."""
+
+import math
+from typing import NamedTuple
+
+import torch
+from torch import Tensor
+
+from neusee.nodes import Check, node
+from neusee.nodes.values import Psf
+
+_DARK = 1e-30  #: share of the light that counts as none
+
+
+class Limits(NamedTuple):
+    """Bounds from this PSF's window, light and peak alone, and what it makes of them."""
+
+    floor: Tensor  #: (band,) float64, LSR if the light in the window were spread evenly over it
+    rms: Tensor  #: (band,) float64, root mean square contrast over all frequencies that the pixels sample
+    bound: Tensor  #: (band,) float64, above which that cannot be: sqrt(LSR p0 / light)
+    passed: Tensor  #: (band,) float64, the bound of the root mean square over the frequencies of the clear aperture
+    median: Tensor  #: (band,) float64, the bound of the median over these
+
+
+@node(rtol=1e-6)
+def limits(psf: Psf) -> Limits:
+    """Find what bounds suppression and contrast: an even spread of the light, and Parseval's theorem.
+
+    Light E in N pixels has a peak of E / N at least, and LSR = peak / p0. The mean of |OTF|**2 over all frequencies is
+    the sum of PSF**2, which is no more than peak times light; over a share s of the frequencies it is at most 1 / s
+    times that, and half of these lie above the median: median <= sqrt(2 LSR p0 / (E s)).
+
+    Shapes: psf.intensity (band, y, x) -> five of (band,) float64.
+    Units:  none.
+    Error:  1e-6 in float32. The floor is that of the window: a wider field has a lower one. Without light (1e-30) all
+            are 0.
+    Source: Parseval's theorem; the cut-off of the clear aperture as in `metrics.mtf`.
+    """
+    rows = [_limits(one.double(), float(p)) for one, p in zip(psf.intensity, psf.clear_peak, strict=True)]
+    return Limits(*(torch.stack(column) for column in zip(*rows, strict=True)))
+
+
+def _limits(kernel: Tensor, clear_peak: float) -> tuple[Tensor, ...]:
+    light, peak = kernel.sum(), kernel.amax()
+    dark = light <= _DARK  # so that what is not a number is seen
+    whole = light.where(~dark, 1.0)
+    fy, fx = (torch.fft.fftfreq(n, dtype=torch.float64, device=kernel.device) for n in kernel.shape)
+    share = (torch.hypot(fy[:, None], fx) <= math.sqrt(4.0 * clear_peak / math.pi)).double().mean()
+    bound = (peak / whole).sqrt()
+    passed = bound / share.sqrt()
+    found = (light / (kernel.numel() * clear_peak), kernel.square().sum().sqrt() / whole, bound, passed)
+    return tuple(x.where(~dark, 0.0) for x in (*found, math.sqrt(2.0) * passed))
+
+
+@limits.check
+def _(result: Limits, psf: Psf) -> list[Check]:
+    low, high = float(result.floor.min()), float(result.floor.max())
+    held = bool((result.rms <= result.bound * (1 + 1e-6)).all())
+    return [Check(f"even light: LSR {low:.3g} to {high:.3g}; rms contrast {float(result.rms.mean()):.3g}, at most "
+                  f"{float(result.bound.mean()):.3g}", held)]  # fmt: skip

@@ -1,0 +1,123 @@
+"""Masks without images: what the known ones do, what can be designed, and whether a learned one is five times better.
+
+    python tests/benchmarks/bench_design.py FOLDER PIECE [PIECE ...]
+
+Pieces: `known` (masks of a formula), the name of a design below, `designs` (all of them), `table` (of what lies in
+FOLDER). Each design is kept in FOLDER and not repeated; an interrupted one goes on. All are judged on the 540
+samples, 31 bands and 512 pixels of the recipe. Those of few numbers are learned on a pupil of half the samples and a
+window of 504 pixels; pixels are learned on what they are judged on, for a deep relief is not known between coarse
+samples.
+"""
+
+from __future__ import annotations
+
+import json
+import sys
+import time
+from pathlib import Path
+
+import torch
+
+from neusee.nodes import doe
+from neusee.workflows import load
+from neusee.workflows._design import MaskTraining, design, figures
+from neusee.workflows._design_terms import Terms
+from neusee.workflows._store import Store
+
+AT = {"optics.samples": 270, "optics.pitch": "29.92 um", "optics.window": [504, 504]}
+COMMON = {"at": AT, "weights": {"lsr": 1.0, "bsr": 4.0}}
+RINGS = {"kind": "five_half_rings", "bands": 5, "population": 70, "iterations": 40, "save_every": 5}
+DEEP = {
+    "kind": "pixelwise",
+    "max_height": "20 um",
+    "scale": 0.1,
+    "learning_rate": 0.03,
+    "iterations": 250,
+    "at": {},
+    "bands": 5,
+}
+DESIGNS = {
+    "five half-rings, evolved": RINGS,
+    "five half-rings, evolved, slopes of either sign": RINGS | {"slopes": [-48.0, 48.0], "iterations": 25},
+    "Zernike, 150 polynomials": {"kind": "zernike", "modes": 150, "waves": 6.0, "iterations": 200},
+    "rings, 40 sided": {"kind": "rings", "learning_rate": 0.01, "noise": 0.5, "iterations": 200},
+    "UNet": {"kind": "unet", "max_height": "20 um", "width": 16, "grid": 135, "iterations": 150},
+    "pixelwise, 20 um deep": DEEP,
+    "pixelwise, 5 um deep": DEEP | {"max_height": "5 um", "scale": 0.04, "learning_rate": 0.05},
+    **{
+        f"pixelwise, 20 um deep, contrast {weight}": DEEP
+        | {"iterations": 120, "weights": {"lsr": 1.0, "bsr": 4.0, "contrast": weight}}
+        for weight in (0.5, 1.0, 2.0, 4.0)
+    },
+}
+
+
+def known(samples: int, pitch: float, diameter: float) -> dict[str, torch.Tensor]:
+    """Reliefs of a formula, fused silica, waves at 550 nm."""
+    grid = {"samples": samples, "pitch": pitch, "diameter": diameter}
+    return {
+        "plain": doe.flat(**grid),
+        "vortex, charge 8": doe.vortex(charge=8, **grid),
+        "axicon, 20 waves": doe.axicon(waves=20.0, **grid),
+        "spiral axicon, 20 waves, charge 8": doe.spiral_axicon(waves=20.0, charge=8, **grid),
+        "half-ring, 20 waves": doe.half_rings(waves=(20.0,), **grid),
+        "five half-rings, (12, 18, 24, 30, 36)": doe.half_rings(waves=(12.0, 18.0, 24.0, 30.0, 36.0), **grid),
+        "five half-rings, (16, 28, 40, 52, 64)": doe.half_rings(waves=(16.0, 28.0, 40.0, 52.0, 64.0), **grid),
+    }
+
+
+def one(name: str, folder: Path) -> None:
+    """Design a mask, unless it is there."""
+    place = folder / f"{name}.json"
+    if place.is_file():
+        return
+    how, began = MaskTraining.model_validate({**COMMON, **DESIGNS[name]}), time.perf_counter()
+    made = design(load("first_light"), how, Store(folder / "cache"), folder / "runs", lambda s: print(f"{name}: {s}"))
+    found = json.loads((made / "mask.json").read_text())
+    place.write_text(json.dumps(found | {"seconds": time.perf_counter() - began, "folder": made.name}))
+
+
+def formulas(folder: Path) -> None:
+    """Judge the masks of a formula."""
+    terms = Terms(load("first_light"), MaskTraining(), Store(folder / "cache"))
+    for name, height in known(*terms.stop).items():
+        (folder / f"{name}.json").write_text(json.dumps(figures(terms, height) | {"seconds": 0.0}))
+
+
+def table(folder: Path) -> None:
+    """Print what is known, masks of a formula first."""
+    print("| mask | mean LSR | worst LSR | BSR | median MTF | bound of it | even light | relief, µm | s |")
+    print("|---|---|---|---|---|---|---|---|---|")
+    for name in [*known(16, 1e-4, 1.6e-3), *DESIGNS]:
+        place = folder / f"{name}.json"
+        if place.is_file():
+            found = json.loads(place.read_text())
+            mean, worst = found["mean"], max(found["bands"]["lsr"])
+            cells = [f"{mean['lsr']:.3g}", f"{worst:.3g}", f"{mean['bsr']:.3f}", f"{mean['median_mtf']:.2e}",
+                     f"{mean['median_mtf_bound']:.2e}", f"{mean['energy_floor']:.2e}",
+                     f"{found['depth'] * 1e6:.3g}", f"{found['seconds']:.0f}"]  # fmt: skip
+            print(f"| {name} | {' | '.join(cells)} |")
+    for name in DESIGNS:
+        place = folder / f"{name}.json"
+        numbers = json.loads(place.read_text())["numbers"] if place.is_file() else {}
+        if "orientation" in numbers:
+            print(f"{name}: {numbers}")
+
+
+def main(folder: Path, pieces: list[str]) -> None:
+    """Do the pieces in turn."""
+    folder.mkdir(parents=True, exist_ok=True)
+    torch.set_num_threads(1)
+    for piece in pieces:
+        if piece == "known":
+            formulas(folder)
+        elif piece == "table":
+            table(folder)
+        else:
+            for name in DESIGNS if piece == "designs" else [piece]:
+                one(name, folder)
+
+
+if __name__ == "__main__":
+    sys.stdout.reconfigure(line_buffering=True)
+    main(Path(sys.argv[1]), sys.argv[2:])

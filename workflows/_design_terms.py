@@ -1,0 +1,119 @@
+"""The terms that a mask is designed on: a relief through the recipe's own graph, and what its PSF is worth."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import replace
+from functools import cached_property
+from typing import Any
+
+import torch
+from torch import Tensor
+
+from neusee.nodes import losses
+from neusee.nodes.optics._aperture import Stop, stop
+from neusee.nodes.values import BAND_FIELDS, Bands, Psf, Pupil
+from neusee.workflows._design_how import DesignError, MaskTraining, needs_step
+from neusee.workflows._function import as_function
+from neusee.workflows._graph import Recipe, needed
+from neusee.workflows._run import run
+from neusee.workflows._store import Store
+
+_PRIME = 1_000_003
+
+
+class Terms:
+    """The loss of a relief and its parts, on all bands of a recipe or some of them."""
+
+    def __init__(self, recipe: Recipe, how: MaskTraining, store: Store | None, device: str = "cpu") -> None:
+        for setting in ("height", "psf", "plain"):
+            needs_step(recipe.steps, getattr(how, setting), setting)
+        self.how, self.recipe = how, replace(recipe, keep_all=True)  # a bound of the relief's effect has no gradient
+        self._bands = _bands_step(self.recipe, how.psf)
+        self._function = as_function(
+            self.recipe, how.height, self._bands, outputs=[how.psf], store=store, device=device
+        )
+        done = run(self.recipe, store, [self._bands, how.plain], device=device)
+        self.bands: Bands = done[self._bands]
+        self._plain: Psf = done[how.plain]
+        self.device = self._plain.intensity.device
+
+    @cached_property
+    def stop(self) -> Stop:
+        """The pupil's grid, as the step that is replaced has it."""
+        params = self.recipe.steps[self.how.height].params
+        if missing := [name for name in ("samples", "pitch", "diameter", "aperture") if name not in params]:
+            raise DesignError(f"height: {self.how.height} has no {missing[0]}: take a recipe whose mask is a doe")
+        return stop(*(params[name] for name in ("samples", "pitch", "diameter", "aperture")))
+
+    @property
+    def count(self) -> int:
+        """Bands of the recipe."""
+        return len(self.bands.centres)
+
+    def psf(self, height: Tensor, chosen: Sequence[int] | None = None) -> Psf:
+        """The PSF behind a relief, of some bands or all."""
+        bands = self.bands if chosen is None else _some(self.bands, chosen)
+        found: Psf = self._function({self.how.height: height, self._bands: bands})[self.how.psf]
+        return found
+
+    def pupil(self, height: Tensor) -> Pupil:
+        """The pupil that a relief makes."""
+        name = self.recipe.steps[self.how.psf].wires.get("pupil")
+        if not isinstance(name, str):
+            raise DesignError(f"psf: {self.how.psf} has no pupil: name a step of optics.psf")
+        function = as_function(self.recipe, self.how.height, outputs=[name], device=str(self.device))
+        found: Pupil = function({self.how.height: height})[name]
+        return found
+
+    def plain(self, chosen: Sequence[int] | None = None) -> Psf:
+        """The PSF of the lens without a mask."""
+        return self._plain if chosen is None else _some(self._plain, chosen)
+
+    def parts(self, height: Tensor, chosen: Sequence[int] | None = None) -> dict[str, Tensor]:
+        """Each term that counts, by name, as a mean over the bands."""
+        psf, plain, weights, how = self.psf(height, chosen), self.plain(chosen), self.how.weights, self.how
+        found = {}
+        if weights.lsr:
+            found["lsr"] = losses.lsr(psf, power=how.power, log=how.log)
+        if weights.bsr:
+            found["bsr"] = losses.bsr(psf.intensity, plain.intensity)
+        if weights.contrast:
+            found["contrast"] = losses.contrast(psf, floor=how.floor)
+        return {name: term / len(psf.intensity) for name, term in found.items()}
+
+    def total(self, parts: dict[str, Tensor]) -> Tensor:
+        """The weighted sum."""
+        return torch.stack([getattr(self.how.weights, name) * term for name, term in parts.items()]).sum()
+
+    def drawn(self, number: int) -> list[int] | None:
+        """The bands of an iteration: one of each stretch of the spectrum, by chance, so that in time all are seen."""
+        wanted = self.how.bands
+        if wanted is None or wanted >= self.count:
+            return None
+        rng = torch.Generator().manual_seed(self.how.seed * _PRIME + number)
+        places = (torch.arange(wanted) + torch.rand(wanted, generator=rng)) * (self.count / wanted)
+        return [min(int(place), self.count - 1) for place in places]
+
+    def even(self) -> list[int] | None:
+        """The same bands every time, from the first to the last."""
+        wanted = self.how.bands
+        if wanted is None or wanted >= self.count:
+            return None
+        return [round(float(place)) for place in torch.linspace(0, self.count - 1, wanted)]
+
+
+def _bands_step(recipe: Recipe, psf: str) -> str:
+    found = [name for name in needed(recipe, [psf]) if recipe.steps[name].node.path == "spectra.bands"]
+    if len(found) != 1:
+        raise DesignError(
+            f"psf: {psf} hangs on {len(found)} steps of spectra.bands ({', '.join(found)}); one is needed"
+        )
+    return found[0]
+
+
+def _some(value: Any, chosen: Sequence[int]) -> Any:
+    """Some bands of what has one entry a band."""
+    rows = torch.tensor(list(chosen))
+    changed = {name: getattr(value, name) for name in BAND_FIELDS[type(value)]}
+    return value._replace(**{name: x.index_select(0, rows.to(x.device)) for name, x in changed.items()})
