@@ -29,12 +29,14 @@ def as_function(
     outputs: Iterable[str] | None = None,
     store: Store | None = None,
     device: str = "cpu",
+    caller: Callable[..., Any] = call,
 ) -> Callable[[Theta], dict[str, Any]]:
     """The recipe as ``theta -> {output: value}``, bit for bit what `run` gives, with gradients.
 
     Args: free: parameters such as ``"spot.strength"``, or steps whose whole value is given,
     such as ``"height"``. What they cannot reach is computed once, here, or read from the
     store. Noise is the same at every call: its stream depends on the seed and the step.
+    ``caller`` is asked for every live step in place of `call`: to keep some, or for another seed.
     """
     wanted = recipe.outputs if outputs is None else tuple(outputs)
     given, tuned = _read(recipe, free)
@@ -50,7 +52,7 @@ def as_function(
     border = {name for step in live for name in sources[step]} | set(wanted)
     fixed = run(recipe, store, sorted(border - live.keys()), device=device)
     left_out = {name: done.bound or 0.0 for name, done in fixed.done.items() if done.state == "left out"}
-    return _Function(recipe, free, wanted, given, tuned, list(live), fixed.values, left_out, device)
+    return _Function(recipe, free, wanted, given, tuned, list(live), fixed.values, left_out, device, caller)
 
 
 def _read(recipe: Recipe, free: tuple[str, ...]) -> tuple[set[str], dict[str, dict[str, str]]]:
@@ -84,7 +86,9 @@ class _Function:
         fixed: dict[str, Any],
         left_out: Mapping[str, float],
         device: str,
+        caller: Callable[..., Any] = call,
     ) -> None:
+        self._caller = caller
         self.recipe, self.free, self.wanted, self.device = recipe, free, wanted, device
         self.given, self.tuned, self.live, self.fixed = given, tuned, live, fixed
         self._facts: dict[str, Facts | None] = {}
@@ -113,7 +117,7 @@ class _Function:
         else:
             ledger.pass_on(step)
         inputs = [_gather(step.wires.get(name), values) for name in step.node.inputs]
-        return call(step, inputs, params, self.recipe.seed, place(step, self.device))
+        return self._caller(step, inputs, params, self.recipe.seed, place(step, self.device))
 
     def _facts_of(self, name: str, values: dict[str, Any]) -> Any:
         if name not in self.fixed:
