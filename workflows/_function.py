@@ -29,14 +29,23 @@ def as_function(
     outputs: Iterable[str] | None = None,
     store: Store | None = None,
     device: str = "cpu",
+<<<<<<< HEAD
     redraw: Collection[str] = (),
 ) -> _Function:
+=======
+    caller: Callable[..., Any] = call,
+) -> Callable[[Theta], dict[str, Any]]:
+>>>>>>> evaluate
     """The recipe as ``theta -> {output: value}``, bit for bit what `run` gives, with gradients.
 
     Args: free: parameters such as ``"spot.strength"``, or steps whose whole value is given,
     such as ``"height"``. What they cannot reach is computed once, here, or read from the
     store. Noise is the same at every call: its stream depends on the seed and the step.
+<<<<<<< HEAD
     Random steps in ``redraw`` are computed at every call, which may be given another seed.
+=======
+    ``caller`` is asked for every live step in place of `call`: to keep some, or for another seed.
+>>>>>>> evaluate
     """
     wanted = recipe.outputs if outputs is None else tuple(outputs)
     given, tuned = _read(recipe, free)
@@ -53,7 +62,7 @@ def as_function(
     border = {name for step in live for name in sources[step]} | set(wanted)
     fixed = run(recipe, store, sorted(border - live.keys()), device=device)
     left_out = {name: done.bound or 0.0 for name, done in fixed.done.items() if done.state == "left out"}
-    return _Function(recipe, free, wanted, given, tuned, list(live), fixed.values, left_out, device)
+    return _Function(recipe, free, wanted, given, tuned, list(live), fixed.values, left_out, device, caller)
 
 
 def _read(recipe: Recipe, free: tuple[str, ...]) -> tuple[set[str], dict[str, dict[str, str]]]:
@@ -87,7 +96,9 @@ class _Function:
         fixed: dict[str, Any],
         left_out: Mapping[str, float],
         device: str,
+        caller: Callable[..., Any] = call,
     ) -> None:
+        self._caller = caller
         self.recipe, self.free, self.wanted, self.device = recipe, free, wanted, device
         self.given, self.tuned, self.live, self.fixed = given, tuned, live, fixed
         self._facts: dict[str, Facts | None] = {}
@@ -118,7 +129,11 @@ class _Function:
         else:
             ledger.pass_on(step)
         inputs = [_gather(step.wires.get(name), values) for name in step.node.inputs]
+<<<<<<< HEAD
         return call(step, inputs, params, seed, place(step, self.device))
+=======
+        return self._caller(step, inputs, params, self.recipe.seed, place(step, self.device))
+>>>>>>> evaluate
 
     def _facts_of(self, name: str, values: dict[str, Any]) -> Any:
         if name not in self.fixed:

@@ -14,6 +14,7 @@ import typer
 
 from neusee.workflows._cache_commands import cache
 from neusee.workflows._calibrate_command import calibrate
+from neusee.workflows._evaluate_command import evaluate
 from neusee.workflows._listings import nodes, recipes, schema
 from neusee.workflows._study_commands import study
 from neusee.workflows._train_command import train
@@ -53,7 +54,7 @@ app = typer.Typer(
 )
 app.add_typer(cache, name="cache")
 app.add_typer(study, name="study")
-for command in (calibrate, train, recipes, nodes, schema):
+for command in (calibrate, evaluate, train, recipes, nodes, schema):
     app.command()(command)
 
 Device = Annotated[str, typer.Option("--device", help="Where to compute: cpu, cuda, or several: cuda:0,cuda:1,cpu.")]

@@ -42,7 +42,8 @@ def photographs(tmp_path):
     (folder / "broken.jpg").write_bytes(b"no picture")
     Image.open(folder / "0.png").save(folder / "cut.jpg")
     whole = (folder / "cut.jpg").read_bytes()
-    (folder / "cut.jpg").write_bytes(whole[: len(whole) - 300])  # its header is as good as any
+    end = whole[-2:]
+    (folder / "cut.jpg").write_bytes(whole[: len(whole) // 2] + end)  # its header and its end are as good as any
     return folder.parent
 
 
@@ -151,7 +152,7 @@ def test_the_gradient_through_the_cut_is_the_whole_one(tmp_path):
 
 
 def _scene(samples, number):
-    return samples.photographs.crop(samples.shape, (samples.seed, 1, number, 2))
+    return samples.photographs.crop(samples.shape, samples.seed, (1, number))
 
 
 def test_what_is_not_a_number_stops_and_is_kept(tmp_path, tiny, monkeypatch):
@@ -182,7 +183,7 @@ def test_photographs_are_found_and_broken_ones_said(photographs, tmp_path):
     found = Photographs.under(photographs)
     assert [path.name for path in found.paths] == ["0.png", "1.png", "2.png", "cut.jpg"]
     assert [path.name for path in found.broken] == ["broken.jpg"]
-    pictures = [found.crop((30, 30), (1, i)) for i in range(20)]
+    pictures = [found.crop((30, 30), 1, i) for i in range(20)]
     assert {p.shape for p in pictures} == {(3, 30, 30)}
     assert [path.name for path in found.broken] == ["broken.jpg", "cut.jpg"]
     assert len({float(p.sum()) for p in pictures}) > 10
