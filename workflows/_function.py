@@ -29,23 +29,19 @@ def as_function(
     outputs: Iterable[str] | None = None,
     store: Store | None = None,
     device: str = "cpu",
-<<<<<<< HEAD
     redraw: Collection[str] = (),
-) -> _Function:
-=======
     caller: Callable[..., Any] = call,
-) -> Callable[[Theta], dict[str, Any]]:
->>>>>>> evaluate
+) -> _Function:
     """The recipe as ``theta -> {output: value}``, bit for bit what `run` gives, with gradients.
 
-    Args: free: parameters such as ``"spot.strength"``, or steps whose whole value is given,
-    such as ``"height"``. What they cannot reach is computed once, here, or read from the
-    store. Noise is the same at every call: its stream depends on the seed and the step.
-<<<<<<< HEAD
-    Random steps in ``redraw`` are computed at every call, which may be given another seed.
-=======
-    ``caller`` is asked for every live step in place of `call`: to keep some, or for another seed.
->>>>>>> evaluate
+        Args: free: parameters such as ``"spot.strength"``, or steps whose whole value is given,
+        such as ``"height"``. What they cannot reach is computed once, here, or read from the
+        store. Noise is the same at every call: its stream depends on the seed and the step.
+    <<<<<<< HEAD
+        Random steps in ``redraw`` are computed at every call, which may be given another seed.
+    =======
+        ``caller`` is asked for every live step in place of `call`: to keep some, or for another seed.
+    >>>>>>> evaluate
     """
     wanted = recipe.outputs if outputs is None else tuple(outputs)
     given, tuned = _read(recipe, free)
@@ -129,11 +125,7 @@ class _Function:
         else:
             ledger.pass_on(step)
         inputs = [_gather(step.wires.get(name), values) for name in step.node.inputs]
-<<<<<<< HEAD
-        return call(step, inputs, params, seed, place(step, self.device))
-=======
-        return self._caller(step, inputs, params, self.recipe.seed, place(step, self.device))
->>>>>>> evaluate
+        return self._caller(step, inputs, params, seed, place(step, self.device))
 
     def _facts_of(self, name: str, values: dict[str, Any]) -> Any:
         if name not in self.fixed:

@@ -115,7 +115,10 @@ class Samples:
         if rng.random() < self.how.laser_free:
             theta |= dict.fromkeys(self._lasers, 0.0)
             drawn["laser"] = "none"
-        theta |= {**shared, self.how.scene: self.photographs.crop(self.shape, self.seed, (stage, number)).to(self.device)}
+        theta |= {
+            **shared,
+            self.how.scene: self.photographs.crop(self.shape, self.seed, (stage, number)).to(self.device),
+        }
         noise = int(rng.integers(_SEEDS))
         found = self._each(theta, seed=noise)
         picture, truth = found[self.how.picture], found[self.how.truth]
