@@ -41,13 +41,19 @@ FROM_RINGS = DEEP | {"start": "five half-rings, evolved", "max_height": "130 um"
                      "iterations": 120}  # fmt: skip
 DESIGNS = {
     "five half-rings, evolved": RINGS,
-    "five half-rings, evolved on 11 bands": RINGS
-    | {"slopes": [-48.0, 48.0], "bands": 11, "population": 50, "iterations": 20},
-    "Zernike, 150 polynomials": {"kind": "zernike", "modes": 150, "waves": 2.5, "iterations": 200},
-    "rings, 40 sided": {"kind": "rings", "learning_rate": 0.01, "noise": 0.5, "iterations": 200},
-    "UNet": {"kind": "unet", "max_height": "20 um", "width": 16, "grid": 135, "iterations": 150},
+    "five half-rings, evolved, slopes to 64": RINGS
+    | {"slopes": [4.0, 64.0], "population": 50, "iterations": 12, "polish": 200},
+    "Zernike, 150 polynomials": {
+        "kind": "zernike",
+        "modes": 150,
+        "waves": 2.5,
+        "learning_rate": 0.02,
+        "iterations": 120,
+    },
+    "rings, 40 sided": {"kind": "rings", "learning_rate": 0.01, "noise": 0.5, "iterations": 80},
+    "UNet": {"kind": "unet", "max_height": "20 um", "width": 16, "grid": 135, "iterations": 80},
     "pixelwise, 20 um deep": DEEP,
-    "pixelwise, 5 um deep": DEEP | {"max_height": "5 um", "scale": 0.04, "learning_rate": 0.05},
+    "pixelwise, 5 um deep": DEEP | {"max_height": "5 um", "scale": 0.04, "learning_rate": 0.05, "iterations": 150},
     **{
         f"pixelwise, 20 um deep, contrast {weight}": DEEP
         | {"iterations": 120, "weights": {"lsr": 1.0, "bsr": 4.0, "contrast": weight}}
