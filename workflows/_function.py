@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Collection, Iterable, Mapping
+from collections.abc import Callable, Collection, Iterable, Mapping
 from functools import cached_property
 from typing import Any
 
@@ -34,14 +34,11 @@ def as_function(
 ) -> _Function:
     """The recipe as ``theta -> {output: value}``, bit for bit what `run` gives, with gradients.
 
-        Args: free: parameters such as ``"spot.strength"``, or steps whose whole value is given,
-        such as ``"height"``. What they cannot reach is computed once, here, or read from the
-        store. Noise is the same at every call: its stream depends on the seed and the step.
-    <<<<<<< HEAD
-        Random steps in ``redraw`` are computed at every call, which may be given another seed.
-    =======
-        ``caller`` is asked for every live step in place of `call`: to keep some, or for another seed.
-    >>>>>>> evaluate
+    Args: free: parameters such as ``"spot.strength"``, or steps whose whole value is given,
+    such as ``"height"``. What they cannot reach is computed once, here, or read from the
+    store. Noise is the same at every call: its stream depends on the seed and the step.
+    Random steps in ``redraw`` are computed at every call, which may be given another seed.
+    ``caller`` is asked for every live step in place of `call`: to keep some, or for another seed.
     """
     wanted = recipe.outputs if outputs is None else tuple(outputs)
     given, tuned = _read(recipe, free)

@@ -74,9 +74,9 @@ class Modes(nn.Module):
         self._basis = _Kept(self._polynomials)
 
     def _polynomials(self, grid: Stop) -> Tensor:
-        v, u = axes(grid)
+        v, u = axes(grid, self.waves.device)
         each = [combine({4 + k: 1.0}, v, u).expand(grid.samples, grid.samples) for k in range(len(self.waves))]
-        return torch.stack(each).where(inside(grid), 0.0).to(torch.float32)
+        return torch.stack(each).where(inside(grid, v.device), 0.0).to(torch.float32)
 
     def forward(self, grid: Stop) -> Tensor:
         """Height (v, u)."""
@@ -104,12 +104,12 @@ class Rings(nn.Module):
         self._zones = _Kept(self._zone)
 
     def _zone(self, grid: Stop) -> Tensor:
-        v, u = axes(grid)
+        v, u = axes(grid, self.slopes.device)
         return ((v.square() + u.square()) * len(self.slopes)).floor().long().clamp(max=len(self.slopes) - 1)
 
     def forward(self, grid: Stop) -> Tensor:
         """Height (v, u)."""
-        v, u = axes(grid)
+        v, u = axes(grid, self.slopes.device)
         zone = self._zones(grid)
         phase = self.slopes.double()[zone] * torch.hypot(v, u) + self.steps.double()[zone]
         side = torch.sign(u) if self.sided else torch.ones_like(u)

@@ -15,6 +15,7 @@ import json
 import sys
 import time
 from pathlib import Path
+from typing import Any
 
 import torch
 
@@ -36,18 +37,34 @@ DEEP = {
     "at": {},
     "bands": 5,
 }
+FROM_RINGS = DEEP | {"start": "five half-rings, evolved", "max_height": "130 um", "grid": 540, "learning_rate": 0.002,
+                     "iterations": 120}  # fmt: skip
 DESIGNS = {
     "five half-rings, evolved": RINGS,
-    "five half-rings, evolved, slopes of either sign": RINGS | {"slopes": [-48.0, 48.0], "iterations": 25},
-    "Zernike, 150 polynomials": {"kind": "zernike", "modes": 150, "waves": 6.0, "iterations": 200},
-    "rings, 40 sided": {"kind": "rings", "learning_rate": 0.01, "noise": 0.5, "iterations": 200},
-    "UNet": {"kind": "unet", "max_height": "20 um", "width": 16, "grid": 135, "iterations": 150},
+    "five half-rings, evolved, slopes to 64": RINGS
+    | {"slopes": [4.0, 64.0], "population": 50, "iterations": 12, "polish": 200},
+    "Zernike, 150 polynomials": {
+        "kind": "zernike",
+        "modes": 150,
+        "waves": 2.5,
+        "learning_rate": 0.02,
+        "iterations": 120,
+    },
+    "rings, 40 sided": {"kind": "rings", "learning_rate": 0.01, "noise": 0.5, "iterations": 80},
+    "UNet": {"kind": "unet", "max_height": "20 um", "width": 16, "grid": 135, "iterations": 80},
     "pixelwise, 20 um deep": DEEP,
-    "pixelwise, 5 um deep": DEEP | {"max_height": "5 um", "scale": 0.04, "learning_rate": 0.05},
+    "pixelwise, 5 um deep": DEEP | {"max_height": "5 um", "scale": 0.04, "learning_rate": 0.05, "iterations": 150},
     **{
         f"pixelwise, 20 um deep, contrast {weight}": DEEP
         | {"iterations": 120, "weights": {"lsr": 1.0, "bsr": 4.0, "contrast": weight}}
         for weight in (0.5, 1.0, 2.0, 4.0)
+    },
+    "pixelwise from the evolved half-rings, contrast 2.0, slowly": FROM_RINGS
+    | {"weights": {"lsr": 1.0, "bsr": 4.0, "contrast": 2.0}, "learning_rate": 0.001, "iterations": 300, "power": 24},
+    **{
+        f"pixelwise from the evolved half-rings, contrast {weight}": FROM_RINGS
+        | {"weights": {"lsr": 1.0, "bsr": 4.0, "contrast": weight}}
+        for weight in (0.0, 1.0, 2.0, 4.0)
     },
 }
 
@@ -66,12 +83,21 @@ def known(samples: int, pitch: float, diameter: float) -> dict[str, torch.Tensor
     }
 
 
+def read(folder: Path, name: str) -> dict[str, Any]:
+    """The figures of a mask."""
+    found: dict[str, Any] = json.loads((folder / f"{name}.json").read_text())
+    return found
+
+
 def one(name: str, folder: Path) -> None:
     """Design a mask, unless it is there."""
     place = folder / f"{name}.json"
     if place.is_file():
         return
-    how, began = MaskTraining.model_validate({**COMMON, **DESIGNS[name]}), time.perf_counter()
+    values, began = {**COMMON, **DESIGNS[name]}, time.perf_counter()
+    if "start" in values:  # the relief of another design
+        values["start"] = folder / "runs" / read(folder, values["start"])["folder"] / "mask.safetensors"
+    how = MaskTraining.model_validate(values)
     made = design(load("first_light"), how, Store(folder / "cache"), folder / "runs", lambda s: print(f"{name}: {s}"))
     found = json.loads((made / "mask.json").read_text())
     place.write_text(json.dumps(found | {"seconds": time.perf_counter() - began, "folder": made.name}))
@@ -91,7 +117,7 @@ def table(folder: Path) -> None:
     for name in [*known(16, 1e-4, 1.6e-3), *DESIGNS]:
         place = folder / f"{name}.json"
         if place.is_file():
-            found = json.loads(place.read_text())
+            found = read(folder, name)
             mean, worst = found["mean"], max(found["bands"]["lsr"])
             cells = [f"{mean['lsr']:.3g}", f"{worst:.3g}", f"{mean['bsr']:.3f}", f"{mean['median_mtf']:.2e}",
                      f"{mean['median_mtf_bound']:.2e}", f"{mean['energy_floor']:.2e}",
@@ -99,7 +125,7 @@ def table(folder: Path) -> None:
             print(f"| {name} | {' | '.join(cells)} |")
     for name in DESIGNS:
         place = folder / f"{name}.json"
-        numbers = json.loads(place.read_text())["numbers"] if place.is_file() else {}
+        numbers = read(folder, name)["numbers"] if place.is_file() else {}
         if "orientation" in numbers:
             print(f"{name}: {numbers}")
 

@@ -42,8 +42,7 @@ def photographs(tmp_path):
     (folder / "broken.jpg").write_bytes(b"no picture")
     Image.open(folder / "0.png").save(folder / "cut.jpg")
     whole = (folder / "cut.jpg").read_bytes()
-    end = whole[-2:]
-    (folder / "cut.jpg").write_bytes(whole[: len(whole) // 2] + end)  # its header and its end are as good as any
+    (folder / "cut.jpg").write_bytes(whole[:640] + whole[-2:])  # its header and its end are as good as any
     return folder.parent
 
 
