@@ -40,9 +40,6 @@ def photographs(tmp_path):
         coarse = Image.fromarray(rng.integers(0, 256, (5, 5, 3), dtype=np.uint8))
         coarse.resize(size[::-1], Image.Resampling.BICUBIC).save(folder / f"{i}.png")
     (folder / "broken.jpg").write_bytes(b"no picture")
-    Image.open(folder / "0.png").save(folder / "cut.jpg")
-    whole = (folder / "cut.jpg").read_bytes()
-    (folder / "cut.jpg").write_bytes(whole[:640] + whole[-2:])  # its header and its end are as good as any
     return folder.parent
 
 
@@ -180,11 +177,12 @@ def test_a_state_that_is_none_is_not_gone_on_from(tmp_path, tiny):
 
 def test_photographs_are_found_and_broken_ones_said(photographs, tmp_path):
     found = Photographs.under(photographs)
-    assert [path.name for path in found.paths] == ["0.png", "1.png", "2.png", "cut.jpg"]
+    assert [path.name for path in found.paths] == ["0.png", "1.png", "2.png"]
     assert [path.name for path in found.broken] == ["broken.jpg"]
+    found.paths[1].unlink()
     pictures = [found.crop((30, 30), 1, i) for i in range(20)]
     assert {p.shape for p in pictures} == {(3, 30, 30)}
-    assert [path.name for path in found.broken] == ["broken.jpg", "cut.jpg"]
+    assert [path.name for path in found.broken] == ["broken.jpg", "1.png"]
     assert len({float(p.sum()) for p in pictures}) > 10
     (tmp_path / "none").mkdir()
     with pytest.raises(ValueError, match="no photograph"):
