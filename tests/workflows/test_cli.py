@@ -253,7 +253,7 @@ def test_report_is_written_again(neusee, here):
 def test_recipes_nodes_schema_and_cache_say_what_there_is(neusee, here):
     _, out, _ = neusee("recipes")
     assert out.splitlines()[0].startswith("axicon")
-    assert "laser: green" in out
+    assert "laser: drawn, green" in out
     _, out, _ = neusee("nodes")
     assert "doe.axicon" in out
     _, out, _ = neusee("nodes", "doe.fabricate")
