@@ -40,14 +40,16 @@ def cases(panels: Sequence[Panel]) -> Any:
     rows = list(panels[0].pictures)
     white = high(panels[0].pictures["truth"])
     figure, axes = canvas(1.95 * len(panels) + 0.6, 2.0 * len(rows) + 0.3, len(rows), len(panels))
-    for column, panel in zip(axes.T, panels, strict=True):
-        for ax, (name, shown) in zip(column, panel.pictures.items(), strict=True):
-            picture(ax, encoded(shown / white), "")
-            if ax is column[0]:
-                ax.set_title("no laser" if not panel.strength else f"{panel.case}, {_power(panel.strength)}")
-            if column is axes.T[0]:
-                ax.set_ylabel(_broken(name), fontsize=10)
+    for i, panel in enumerate(panels):
+        for j, (name, shown) in enumerate(panel.pictures.items()):
+            picture(axes[j, i], encoded(shown / white), _over(panel) if j == 0 else "")
+            if i == 0:
+                axes[j, i].set_ylabel(_broken(name), fontsize=10)
     return figure
+
+
+def _over(panel: Panel) -> str:
+    return f"{panel.case}, {_power(panel.strength)}" if panel.strength else "no laser"
 
 
 def _power(strength: float) -> str:
