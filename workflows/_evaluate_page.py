@@ -20,7 +20,7 @@ _EACH = ("mean", "low", "high")
 COLUMNS = ("pipeline", "mask", "restorer", "scenes", *(f"{m} {e}" for m in METRICS for e in _EACH),
            *(f"{name} {e}" for name in ("l1 less", "l1 gain", "l1 small gain") for e in _EACH))  # fmt: skip
 _COARSE = 1.05  #: the band of the aperture is a disc, counted by the grid of frequencies that the pixels sample
-_DIGITS = {"psnr": ".2f", "l1": ".4f", "ssim": ".3f"}
+_DIGITS = {"psnr": ".2f", "l1": ".4f", "ssim": ".3f", "saturated": ".0f", "damaged": ".2f"}
 
 
 def drawn(found: Evaluated) -> dict[str, bytes]:
@@ -60,7 +60,7 @@ def lead(found: Evaluated) -> str:
     """What came out."""
     best = min(found.pipelines, key=lambda p: float(found.tables[p.name].scenes("l1").mean()))
     said = _said(mean(found.tables[best.name].scenes("l1")), "l1")
-    strengths = ", ".join("none" if k == 0 else f"{k:g}" for k in found.strengths)
+    strengths = ", ".join("none" if k == 0 else f"{k:g}".replace("e+0", "e") for k in found.strengths)
     enough = len(found.scenes) >= len(CASES)
     few = "" if enough else f" These are too few scenes for all {len(CASES)} cases of the protocol."
     return f"""{len(found.scenes)} scenes, laser strengths {strengths} (multiples of what saturates a pixel of the

@@ -31,6 +31,12 @@ def most_contrast(psf: Psf) -> Tensor:
     return (peak / kept / _share(psf.clear_peak.double())).sqrt()
 
 
+def most_unsuppressed(psf: Psf) -> Tensor:
+    """The same of an element with an LSR of 1 that keeps all light: (band,); it goes as the root of the LSR."""
+    clear_peak = psf.clear_peak.double()
+    return (clear_peak / _share(clear_peak)).sqrt()
+
+
 def _share(clear_peak: Tensor) -> Tensor:
     """Share of the sampled frequencies within the cut-off sqrt(4 p0 / pi): a disc, cut by the square's edges."""
     radius = (4.0 * clear_peak / math.pi).sqrt()

@@ -8,7 +8,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from neusee.nodes.metrics import lsr, mtf
-from neusee.nodes.metrics._bounds import _share, least_lsr, most_contrast
+from neusee.nodes.metrics._bounds import _share, least_lsr, most_contrast, most_unsuppressed
 from neusee.nodes.values import Psf
 
 
@@ -34,3 +34,13 @@ def test_the_share_of_frequencies_is_that_of_a_disc_cut_by_the_square():
     for p0 in (0.05, 0.12, 0.19, 0.25, 0.35, 0.5):
         counted = (torch.hypot(f[:, None], f) <= math.sqrt(4 * p0 / math.pi)).double().mean()
         assert float(_share(torch.tensor([p0], dtype=torch.float64))) == pytest.approx(float(counted), abs=1e-3)
+
+
+def test_a_lens_whose_cut_off_is_sampled_has_at_most_half_the_contrast_in_root_mean_square():
+    """mean |OTF|^2 over the band <= mean OTF = p0 / 4 p0."""
+    clear = torch.zeros((1, 16, 16))
+    clear[0, 8, 8], clear[0, 0, 0] = 0.12, 0.88 * 0.1
+    found = psf(clear, 0.12)
+    assert float(most_unsuppressed(found)) == pytest.approx(0.5, rel=1e-12)
+    kept = 0.12 + 0.088
+    assert float(most_contrast(found)) == pytest.approx(0.5 / math.sqrt(kept), rel=1e-6)
