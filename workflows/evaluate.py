@@ -3,7 +3,8 @@
     evaluate("first_light", read_pipelines("flat+none, five_half_rings+wiener", Path()), data=Path("photographs"))
 
 Each point, of a scene, a laser's strength and a pipeline, is a run of the recipe that the pipeline makes, to the last
-bit; points are kept in the store, so that what was stopped goes on.
+bit; but what a run would compute again and more strictly, because it could not prove its tolerance, is computed once.
+Points are kept in the store, so that what was stopped goes on.
 """
 
 from __future__ import annotations
