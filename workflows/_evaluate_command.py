@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, Any
 
 import typer
 
@@ -35,36 +35,40 @@ def evaluate(
     """Judge masks and restorers on many scenes and laser strengths, as the paper does; run it again to go on."""
     name, changes, _ = split(words)
     check_device(device)
-    from neusee.workflows import evaluate as protocol
-    from neusee.workflows._call import RunError
-
-    folder = Path.cwd()
     tell = (lambda line: None) if quiet else (lambda line: say([line]))
     how = {"data": data, "scenes": scenes, "strengths": strengths, "small": small, "reference": reference}
     given = [f"--{key} {value}" for key, value in how.items() if value]
     command = ["neusee", "evaluate", name, *changes, f'--pipelines "{pipelines}"', *given]
+    folder = _evaluated(
+        name,
+        changes,
+        pipelines,
+        data=Path(data).expanduser() if data else None,
+        count=scenes,
+        strengths=_numbers(strengths),
+        small=small,
+        reference=reference.replace(" ", ""),
+        runs=out,
+        command=command,
+        tell=tell,
+        device=device,
+    )
+    say([str(folder / "report.html")])
+
+
+def _evaluated(name: str, changes: list[str], pipelines: str, **how: Any) -> Path:
+    """The folder of the evaluation, or one line of what is wrong."""
+    from neusee.workflows import evaluate as protocol
+    from neusee.workflows._call import RunError
+
+    here = Path.cwd()
     try:
-        made = protocol.evaluate(
-            name,
-            protocol.read_pipelines(pipelines, folder),
-            changes,
-            data=Path(data).expanduser() if data else None,
-            count=scenes,
-            strengths=_numbers(strengths),
-            small=small,
-            reference=reference.replace(" ", ""),
-            store=the_store(),
-            runs=out,
-            command=command,
-            tell=tell,
-            device=device,
-            folder=folder,
-        )
+        read = protocol.read_pipelines(pipelines, here)
+        return protocol.evaluate(name, read, changes, store=the_store(), folder=here, **how)
     except protocol.Refused as error:
         fail(str(error))
     except RunError as error:
         fail(str(error), FAILED)
-    say([str(made / "report.html")])
 
 
 def _numbers(text: str) -> list[float]:

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from neusee.nodes import metrics
+from neusee.nodes.metrics._bounds import least_lsr, most_contrast, most_unsuppressed
 from neusee.workflows._evaluate_pipelines import NONE, Composed
 from neusee.workflows._run import run
 from neusee.workflows._store import Store
@@ -28,8 +28,9 @@ class Mask:
     bsr: Numbers  #: mean over scenes
     median: Numbers  #: contrast, within the band of the clear aperture
     rms: Numbers  #: of the same
-    floor: Numbers  #: least LSR of the light that is kept in the field
+    floor: Numbers  #: least LSR of light that is kept in the field
     most: Numbers  #: most rms contrast that the peak allows
+    unsuppressed: Numbers  #: the same of a mask with an LSR of 1 that keeps all light
 
 
 def masks(
@@ -48,7 +49,6 @@ def _mask(pipeline: Composed, store: Store, device: str, bsr: Numbers) -> Mask:
     wanted = ("bands", "lsr[mask]", "mtf[mask]", "psf[mask]")
     values = run(pipeline.recipes[NONE], store, wanted, device=device).values
     bands, lsr, mtf, psf = (values[name] for name in wanted)
-    bounds = metrics.limits(psf)
-    each = (lsr, mtf.median, mtf.rms, bounds.floor, bounds.passed)
-    suppression, median, rms, floor, most = (x.double().cpu().numpy() for x in each)
-    return Mask(bands.centres.double().cpu().numpy() * 1e9, suppression, bsr, median, rms, floor, most)
+    each = (lsr, mtf.median, mtf.rms, least_lsr(psf), most_contrast(psf), most_unsuppressed(psf))
+    suppression, *rest = (x.double().cpu().numpy() for x in each)
+    return Mask(bands.centres.double().cpu().numpy() * 1e9, suppression, bsr, *rest)

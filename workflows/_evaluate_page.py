@@ -9,19 +9,18 @@ from dataclasses import asdict
 from typing import TYPE_CHECKING, Any
 
 from neusee.workflows import _figures_evaluate as figures
-from neusee.workflows._evaluate_numbers import METRICS, Interval, difference, gain, mean
+from neusee.workflows._evaluate_numbers import METRICS, Interval, mean
 from neusee.workflows._evaluate_pipelines import CASES
 from neusee.workflows._study_page import Mark, Section
 
 if TYPE_CHECKING:
-    from neusee.workflows._evaluate_pipelines import Pipeline
     from neusee.workflows.evaluate import Evaluated
 
 _EACH = ("mean", "low", "high")
 COLUMNS = ("pipeline", "mask", "restorer", "scenes", *(f"{m} {e}" for m in METRICS for e in _EACH),
            *(f"{name} {e}" for name in ("l1 less", "l1 gain", "l1 small gain") for e in _EACH))  # fmt: skip
 _COARSE = 1.05  #: the band of the aperture is a disc, counted by the grid of frequencies that the pixels sample
-_DIGITS = {"psnr": ".2f", "l1": ".4f", "ssim": ".3f"}
+_DIGITS = {"psnr": ".2f", "l1": ".4f", "ssim": ".3f", "saturated": ".0f", "damaged": ".2f"}
 
 
 def drawn(found: Evaluated) -> dict[str, bytes]:
@@ -41,7 +40,7 @@ def summary(found: Evaluated) -> dict[str, Any]:
             "mask": p.front,
             "restorer": p.back,
             **{metric: asdict(mean(found.tables[p.name].scenes(metric))) for metric in METRICS},
-            "against": {name: asdict(x) for name, x in _against(found, p).items()},
+            "against": {name: asdict(x) for name, x in found.against[p.name].items()},
         }
         for p in found.pipelines
     }
@@ -51,27 +50,17 @@ def rows(found: Evaluated) -> list[Sequence[Any]]:
     """The same as a table."""
     listed: list[Sequence[Any]] = []
     for p in found.pipelines:
-        each = [mean(found.tables[p.name].scenes(metric)) for metric in METRICS] + list(_against(found, p).values())
+        each = [mean(found.tables[p.name].scenes(metric)) for metric in METRICS] + list(found.against[p.name].values())
         numbers = [x for interval in each for x in (interval.mean, interval.low, interval.high)]
         listed.append((p.name, p.front, p.back, len(found.scenes), *("" if math.isnan(x) else x for x in numbers)))
     return listed
-
-
-def _against(found: Evaluated, pipeline: Pipeline) -> dict[str, Interval]:
-    own, other = found.tables[pipeline.name], found.tables[found.reference]
-    seed = found.recipe.seed
-    return {
-        "l1 less": difference(other.scenes("l1"), own.scenes("l1")),
-        "l1 gain": gain(own.scenes("l1"), other.scenes("l1"), seed),
-        "l1 small gain": gain(own.scenes("l1 small"), other.scenes("l1 small"), seed),
-    }
 
 
 def lead(found: Evaluated) -> str:
     """What came out."""
     best = min(found.pipelines, key=lambda p: float(found.tables[p.name].scenes("l1").mean()))
     said = _said(mean(found.tables[best.name].scenes("l1")), "l1")
-    strengths = ", ".join("none" if k == 0 else f"{k:g}" for k in found.strengths)
+    strengths = ", ".join("none" if k == 0 else f"{k:g}".replace("e+0", "e") for k in found.strengths)
     enough = len(found.scenes) >= len(CASES)
     few = "" if enough else f" These are too few scenes for all {len(CASES)} cases of the protocol."
     return f"""{len(found.scenes)} scenes, laser strengths {strengths} (multiples of what saturates a pixel of the
@@ -106,7 +95,11 @@ def _cell(found: Evaluated, name: str | None) -> str | None:
 
 def _said(x: Interval, metric: str) -> str:
     how = _DIGITS.get(metric.partition(" ")[0], ".3g")
-    return f"{x.mean:{how}}" if math.isnan(x.half) else f"{x.mean:{how}} ± {x.half:{how}}"
+    return (
+        f"{x.mean:{how}}"
+        if math.isnan(x.half)
+        else f"{x.mean:{how}}\N{NO-BREAK SPACE}±\N{NO-BREAK SPACE}{x.half:{how}}"
+    )
 
 
 def _numbers(found: Evaluated) -> Section:
@@ -133,7 +126,7 @@ def _compared(found: Evaluated) -> Section:
     for p in found.pipelines:
         if p.name == found.reference:
             continue
-        less, share, small = _against(found, p).values()
+        less, share, small = found.against[p.name].values()
         for column, interval in ((1, less), (2, share), (3, small)):
             if interval.sure:
                 marks[len(listed), column] = "pass" if interval.mean > 0 else "fail"

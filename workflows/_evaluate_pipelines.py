@@ -78,11 +78,24 @@ class Composed:
     """A pipeline with its recipe for each case."""
 
     pipeline: Pipeline
-    recipes: dict[str, Recipe]  #: by case
+    recipes: _Recipes  #: by case
 
     @property
     def name(self) -> str:
         return self.pipeline.name
+
+
+class _Recipes(dict[str, Recipe]):
+    """The recipe of each case, read when it is first asked for: they differ in one wavelength."""
+
+    def __init__(self, recipe: str, words: Sequence[str], fwhm: float, folder: Path) -> None:
+        super().__init__()
+        self._how = recipe, words, fwhm, folder
+
+    def __missing__(self, case: str) -> Recipe:
+        recipe, words, fwhm, folder = self._how
+        self[case] = load(recipe, [*words, _laser(CASES[case], fwhm)], folder)
+        return self[case]
 
 
 def read_pipelines(text: str, folder: Path) -> list[Pipeline]:
@@ -113,9 +126,11 @@ def composed(recipe: str, changes: Sequence[str], pipelines: Sequence[Pipeline],
     wrong: dict[str, None] = {}
     for pipeline in pipelines:
         try:
-            words = [*changes, *_words(pipeline, folder)]
-            recipes = {case: _with(recipe, words, _laser(metres, fwhm), folder) for case, metres in CASES.items()}
-            found.append(Composed(pipeline, {case: _checked(one, pipeline) for case, one in recipes.items()}))
+            words = [*changes, *_words(pipeline)]
+            recipes = _Recipes(recipe, words, fwhm, folder)
+            for case in (NONE, next(iter(CASES))):
+                _check(recipes[case], pipeline)
+            found.append(Composed(pipeline, recipes))
         except RecipeError as error:
             wrong |= dict.fromkeys(f"{pipeline.name}: {_said(problem)}" for problem in error.problems)
         except Refused as error:
@@ -129,11 +144,7 @@ def _said(problem: Problem) -> str:
     return " ".join(str(RecipeError([problem])).split())
 
 
-def _with(recipe: str, words: Sequence[str], laser: str, folder: Path) -> Recipe:
-    return load(recipe, [*words, laser], folder)
-
-
-def _words(pipeline: Pipeline, folder: Path) -> list[str]:
+def _words(pipeline: Pipeline) -> list[str]:
     """The changes of the recipe that make it this pipeline."""
     words = [f"doe={pipeline.mask}"]
     if pipeline.relief:
@@ -178,8 +189,7 @@ def _fwhm(recipe: str, changes: Sequence[str], folder: Path) -> float:
     return float(widths[0]) if widths else 10e-9
 
 
-def _checked(recipe: Recipe, pipeline: Pipeline) -> Recipe:
+def _check(recipe: Recipe, pipeline: Pipeline) -> None:
     lacking = [name for name in ("scene", *pipeline.outputs, "lsr[mask]", "mtf[mask]") if name not in recipe.steps]
     if lacking:
         raise Refused(f"an evaluation needs the steps {', '.join(lacking)}, which {recipe.name} has not")
-    return recipe

@@ -40,14 +40,16 @@ def cases(panels: Sequence[Panel]) -> Any:
     rows = list(panels[0].pictures)
     white = high(panels[0].pictures["truth"])
     figure, axes = canvas(1.95 * len(panels) + 0.6, 2.0 * len(rows) + 0.3, len(rows), len(panels))
-    for column, panel in zip(axes.T, panels, strict=True):
-        for ax, (name, shown) in zip(column, panel.pictures.items(), strict=True):
-            picture(ax, encoded(shown / white), "")
-            if ax is column[0]:
-                ax.set_title("no laser" if not panel.strength else f"{panel.case}, {_power(panel.strength)}")
-            if column is axes.T[0]:
-                ax.set_ylabel(_broken(name), fontsize=10)
+    for i, panel in enumerate(panels):
+        for j, (name, shown) in enumerate(panel.pictures.items()):
+            picture(axes[j, i], encoded(shown / white), _over(panel) if j == 0 else "")
+            if i == 0:
+                axes[j, i].set_ylabel(_broken(name), fontsize=10)
     return figure
+
+
+def _over(panel: Panel) -> str:
+    return f"{panel.case}, {_power(panel.strength)}" if panel.strength else "no laser"
 
 
 def _power(strength: float) -> str:
@@ -127,8 +129,7 @@ def plane(masks: Mapping[str, Mask]) -> Any:
     floor = float(np.mean([mask.floor.mean() for mask in masks.values()]))
     least = min(floor, *(float(mask.lsr.mean()) for mask in masks.values()))
     x = np.geomspace(least / 3, 1.6, 200)
-    share = float(np.mean([(m.lsr / m.most**2).mean() for m in masks.values() if m.most.all()]))
-    bound = np.sqrt(x / share).clip(max=1)
+    bound = (float(next(iter(masks.values())).unsuppressed.mean()) * np.sqrt(x)).clip(max=1)
     ax.fill_between(x, bound, 1.5, color=_GREY, alpha=0.15, linewidth=0)
     ax.plot(x, bound, color=_GREY, linewidth=1.2, label="rms contrast: no mask is above (Parseval)")
     ax.axvspan(x[0], floor, color=BLUE, alpha=0.12, linewidth=0, label="LSR: no mask that keeps its light is here")

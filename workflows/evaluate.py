@@ -3,7 +3,8 @@
     evaluate("first_light", read_pipelines("flat+none, five_half_rings+wiener", Path()), data=Path("photographs"))
 
 Each point, of a scene, a laser's strength and a pipeline, is a run of the recipe that the pipeline makes, to the last
-bit; points are kept in the store, so that what was stopped goes on.
+bit; but what a run would compute again and more strictly, because it could not prove its tolerance, is computed once.
+Points are kept in the store, so that what was stopped goes on.
 """
 
 from __future__ import annotations
@@ -19,7 +20,7 @@ import numpy as np
 
 from neusee.workflows._accuracy_points import now
 from neusee.workflows._call import versions
-from neusee.workflows._evaluate_numbers import METRICS, Table, table
+from neusee.workflows._evaluate_numbers import METRICS, Interval, Table, against, table
 from neusee.workflows._evaluate_optics import Mask, masks
 from neusee.workflows._evaluate_pictures import Panel, panels
 from neusee.workflows._evaluate_pipelines import NONE, Composed, Pipeline, Refused, composed, read_pipelines
@@ -54,6 +55,7 @@ class Evaluated:
     reference: str  #: the pipeline that others are compared with
     points: dict[str, list[dict[float, Point]]]  #: by pipeline, and scene by scene
     tables: dict[str, Table]  #: by pipeline
+    against: dict[str, dict[str, Interval]]  #: by pipeline, what the reference's L1 is more
     masks: dict[str, Mask]  #: by mask
     panels: Sequence[Panel]
     pipelines: Sequence[Pipeline]
@@ -94,7 +96,8 @@ def evaluate(
     drawn = panels(bench, each, shown[0], strengths)
     tables = {name: table(found, strengths) for name, found in points.items()}
     least = min(small, *(base.steps["truth"].params["shape"])) if "truth" in base.steps else small
-    rest = (reference, points, tables, optics, drawn, list(pipelines))
+    more = {name: against(own, tables[reference], base.seed) for name, own in tables.items()}
+    rest = (reference, points, tables, more, optics, drawn, list(pipelines))
     found = Evaluated(base, shown, broken, strengths, least, *rest)
     doc = _document(found, bench, command, time.perf_counter() - began)
     with new_run(runs, f"{base.name}_evaluate", digest(doc["summary"])) as made:

@@ -8,6 +8,7 @@ from torch import Tensor
 
 from neusee.nodes import Check, node
 from neusee.nodes._precision import single
+from neusee.nodes.metrics._bounds import least_lsr
 from neusee.nodes.sensor._channels import weighted
 from neusee.nodes.sensor._digital import Bits, Gain, GainUnit, numbers_per_electron
 from neusee.nodes.sensor._saturation import Efficiency, Well, saturation
@@ -45,8 +46,7 @@ def lsr(psf: Psf) -> Tensor:
 
 @lsr.check
 def _(result: Tensor, *inputs: Psf) -> list[Check]:
-    pixels = inputs[0].intensity.shape[-2] * inputs[0].intensity.shape[-1]
-    floor = float((1.0 / (pixels * inputs[0].clear_peak)).max())
+    floor = float(least_lsr(inputs[0]).max())
     return [Check(f"LSR {float(result.min()):.3g} to {float(result.max()):.3g}", bool((result <= 1.05).all())),
             Check(f"evenly spread light would reach {floor:.2g}")]  # fmt: skip
 
