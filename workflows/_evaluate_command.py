@@ -37,8 +37,7 @@ def evaluate(
     check_device(device)
     tell = (lambda line: None) if quiet else (lambda line: say([line]))
     how = {"data": data, "scenes": scenes, "strengths": strengths, "small": small, "reference": reference}
-    given = [f"--{key} {value}" for key, value in how.items() if value]
-    command = ["neusee", "evaluate", name, *changes, f'--pipelines "{pipelines}"', *given]
+    command = ["neusee", "evaluate", name, *changes, f'--pipelines "{pipelines}"', *_given(how)]
     folder = _evaluated(
         name,
         changes,
@@ -54,6 +53,10 @@ def evaluate(
         device=device,
     )
     say([str(folder / "report.html")])
+
+
+def _given(how: dict[str, Any]) -> list[str]:
+    return [f"--{key} {value}" for key, value in how.items() if value]
 
 
 def _evaluated(name: str, changes: list[str], pipelines: str, **how: Any) -> Path:
