@@ -78,13 +78,17 @@ class Rows:
         self.rows.append({name: str(row.get(name, "")) for name in COLUMNS})
 
     def keep(self) -> None:
-        """Write what is new."""
-        new = self._kept == 0
-        with self._path.open("w" if new else "a", newline="", encoding="utf-8") as file:
-            writer = csv.DictWriter(file, COLUMNS)
-            if new:
-                writer.writeheader()
-            writer.writerows(self.rows[self._kept :])
+        """Write what is new; at first all of it, whole or not at all."""
+        text = io.StringIO(newline="")
+        writer = csv.DictWriter(text, COLUMNS)
+        if self._kept == 0:
+            writer.writeheader()
+        writer.writerows(self.rows[self._kept :])
+        if self._kept == 0:
+            replaced(self._path, text.getvalue().encode())
+        else:
+            with self._path.open("ab") as file:
+                file.write(text.getvalue().encode())
         self._kept = len(self.rows)
 
 

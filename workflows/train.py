@@ -15,7 +15,7 @@ from neusee.workflows._call import versions
 from neusee.workflows._figures_training import curves, strip
 from neusee.workflows._graph import Recipe
 from neusee.workflows._keys import digest
-from neusee.workflows._learner import Learner, Losses, NotFinite
+from neusee.workflows._learner import Learner, NotFinite
 from neusee.workflows._photographs import Photographs
 from neusee.workflows._samples import Sample, Samples
 from neusee.workflows._store import Store
@@ -140,11 +140,10 @@ class _Course:
     def _iterate(self, samples: Samples) -> None:
         began, number = time.perf_counter(), self.iteration
         rate = self.learner.set_rates(number)
-        before = packed(self.learner.parts(), stage=self.stage, iteration=number) if number == 0 else b""
         try:
             found, seen = self.learner.iterate(samples, self.stage, number)
         except NotFinite as error:
-            raise self._dumped(error, before) from error
+            raise self._dumped(error) from error
         found |= {"rate": rate, "seconds": time.perf_counter() - began}
         self.rows.add(self.stage, number, found)
         self.iteration += 1
@@ -153,13 +152,13 @@ class _Course:
         if self.watch is not None:
             self.watch(self.stage, self.iteration, found)
 
-    def _dumped(self, error: NotFinite, before: bytes) -> ArithmeticError:
+    def _dumped(self, error: NotFinite) -> ArithmeticError:
         """Keep what led to a number that is none: the weights, and which pictures."""
         path = self.folder / f"not_finite_{self.stage}_{self.iteration}.pt"
         batch = self.how.stages[self.stage].batch
         pictures = [self.iteration * batch + i for i in range(batch)]
         here = {"stage": self.stage, "iteration": self.iteration, "pictures": pictures}
-        replaced(path, before or packed(self.learner.parts(), **here))
+        replaced(path, packed(self.learner.parts(), **here))
         self.rows.keep()
         said = f"stage {self.stage}, iteration {self.iteration}, pictures {pictures[0]} to {pictures[-1]}"
         return ArithmeticError(f"{said}: {error}; weights of that moment: {path}")
@@ -209,6 +208,3 @@ def frozen(recipe: Recipe, how: Training, folder: Path) -> Recipe:
     grid = {name: step.params[name] for name in ("samples", "pitch", "diameter", "aperture")}
     params = {**grid, "file": file, "depth": 1e-6, "scale": 0.1}
     return replace(recipe, steps={**recipe.steps, how.learn: replace(step, node=doe.pixelwise, params=params)})
-
-
-__all__ = ["Losses", "frozen", "train"]

@@ -151,6 +151,15 @@ def _scene(samples, number):
     return samples.photographs.crop(samples.shape, samples.seed, (1, number))
 
 
+def test_it_runs_as_printed_too(tmp_path, photographs):
+    strength = 'lasers.drawn.strength="uniform(0, 2e6)"'
+    recipe = load("train_small", ["train=as_printed", *TINY, strength, f"train.photographs={photographs}"])
+    rows = losses(trained(recipe, tmp_path))
+    assert len(rows) == 7
+    assert all(np.isfinite(float(x)) for row in rows for x in row.values() if x)
+    assert [bool(row["reconstruction"]) for row in rows] == [False] * 4 + [True] * 3
+
+
 def test_what_is_not_a_number_stops_and_is_kept(tmp_path, tiny, monkeypatch):
     from neusee.nodes import losses
 
@@ -160,6 +169,7 @@ def test_what_is_not_a_number_stops_and_is_kept(tmp_path, tiny, monkeypatch):
     (folder,) = (tmp_path / "runs").iterdir()
     kept = torch.load(folder / "not_finite_1_0.pt", weights_only=True)
     assert {"relief", "net", "critics"} <= kept["parts"].keys()
+    assert kept["pictures"] == [0, 1]
     assert not (folder / "network.safetensors").exists()
 
 

@@ -22,10 +22,9 @@ RATES = [1e-6, 1e-3, 0.1, 1.0, 50.0, 200.0, "mix"]
 @pytest.fixture(scope="session")
 def cpp():
     """One compilation for all, of a second or two, where the user keeps such libraries."""
-    try:
-        _scan_cpp.operators()
-    except _scan_cpp.NoCompilerError as error:
-        pytest.skip(f"not compiled: {error}")
+    if shutil.which("g++") is None:
+        pytest.skip("no g++: the torch backend is tested by itself")
+    _scan_cpp.operators()  # where there is a compiler, code that does not compile is a failure
 
 
 @pytest.fixture(params=["torch", "cpp"])
