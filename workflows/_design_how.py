@@ -63,7 +63,7 @@ class MaskTraining(BaseModel):
     noise: Annotated[float, Field(ge=0)] = 1.0  #: rings: chance on each slope of the start, in waves
     slopes: tuple[float, float] = (4.0, 48.0)  #: five_half_rings: least and greatest, in waves at the rim
     population: Annotated[int, Field(ge=5)] = 70  #: five_half_rings
-    polish: Annotated[int, Field(ge=0)] = 300  #: five_half_rings: masks tried downhill from the best
+    polish: Annotated[int, Field(ge=0)] = 300  #: five_half_rings: masks tried downhill from the best, on all bands
     wavelength: Wavelength = 550e-9  #: that waves are counted in
     material: Material = "fused silica"  #: and of what
 

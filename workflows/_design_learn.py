@@ -196,7 +196,7 @@ class _Judge:
     def __init__(self, terms: Terms, how: MaskTraining, kept: Kept, tell: Tell) -> None:
         self.terms, self.how, self.kept, self.tell = terms, how, kept, tell
         self.known: list[float] = list(kept.read().get("values", []))
-        self.asked, self.chosen = 0, terms.even()
+        self.asked, self.chosen = 0, terms.even()  # None: all bands
         if self.known:
             tell(f"going on after {len(self.known)} masks")
 
@@ -236,7 +236,7 @@ def _population(
     import numpy as np
     from scipy.optimize import differential_evolution, minimize
 
-    rng, first = np.random.default_rng((how.seed, start)), judge.asked
+    rng, first, judge.chosen = np.random.default_rng((how.seed, start)), judge.asked, judge.terms.even()
     low, high = bounds.T
 
     def told(genes: Any, convergence: float) -> None:
@@ -257,7 +257,8 @@ def _population(
             callback=told,
             x0=_USUAL if _holds(how) else None,
         )
-        if how.polish:  # the peak hangs on the slopes to a tenth of a wave, which chance seldom meets
+        if how.polish:  # the peak hangs on the slopes to a tenth of a wave, and what suits few bands suits these alone
+            judge.chosen = None
             simplex = found.x + np.concatenate([np.zeros((1, len(low))), 0.01 * np.diag(high - low)])
             fine = {"maxfev": how.polish, "initial_simplex": np.clip(simplex, low, high)}
             found = minimize(judge, found.x, method="Nelder-Mead", bounds=bounds, options=fine)
