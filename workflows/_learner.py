@@ -14,6 +14,7 @@ from torch.utils.checkpoint import checkpoint
 from neusee.nodes import losses
 from neusee.nodes._bicubic import resize
 from neusee.nodes.doe._learned import LEARNT
+from neusee.nodes.optics._aperture import stop
 from neusee.nodes.restore._critic import critics, slopes
 from neusee.nodes.restore._fft_mamba import FFTMamba
 from neusee.nodes.restore._nafnet import NAFNet
@@ -24,7 +25,7 @@ from neusee.workflows._graph import Recipe
 from neusee.workflows._keys import stream_seed
 from neusee.workflows._marks import nearest
 from neusee.workflows._samples import Sample, Samples, Shared
-from neusee.workflows._training import Stage, Training
+from neusee.workflows._training import GRID, Stage, Training
 
 _NETWORKS = {"fft_mamba": FFTMamba, "unet": UNet, "nafnet": NAFNet}
 _STEEPEST = 10.0  #: norm of a gradient, above which it is shortened
@@ -56,18 +57,28 @@ class Scales:
 class Learner:
     """All that learns, on one device."""
 
-    def __init__(self, recipe: Recipe, how: Training, device: str) -> None:
+    def __init__(self, recipe: Recipe, how: Training, device: str, designed: bool = False) -> None:
         self.how, self.seed, self.device = how, recipe.seed, device
-        step = recipe.steps[how.learn]
-        if step.node.path not in LEARNT:
-            text = f"{how.learn} is {step.node.path}, of which nothing is learnt; {nearest(step.node.path, LEARNT)}"
-            raise ValueError(f"train: {text}")
-        self.relief = LEARNT[step.node.path](step.params, self._rng("element"))
+        self._step = recipe.steps[how.learn]
+        self.relief = nn.Module() if designed else self._start()
         kind, width = _NETWORKS[how.network.kind], how.network.width
         self.net: Restorer = started(lambda: kind(width), self._rng("network"))
         self.critics = nn.ModuleList(critics(self._rng("critics"), how.critics.width))
         self.average = _averaged(self.net, how.average) if how.average else None
         self.begin(Stage(iterations=0), learns=True)
+
+    def _start(self) -> nn.Module:
+        """The relief that learns; one that was designed does not."""
+        path = self._step.node.path
+        if path not in LEARNT:
+            text = f"{self.how.learn} is {path}, of which nothing is learnt; {nearest(path, LEARNT)}"
+            raise ValueError(f"train: {text}; or design it without images: --stage mask")
+        return LEARNT[path](self._step.params, self._rng("element"))
+
+    def height(self) -> Tensor:
+        """The relief (v, u) in m."""
+        made: Tensor = self.relief(stop(*(self._step.params[name] for name in GRID)))
+        return made
 
     def _rng(self, *names: object) -> torch.Generator:
         return torch.Generator(self.device).manual_seed(stream_seed(self.seed, " ".join(map(str, ("train", *names)))))
@@ -102,7 +113,7 @@ class Learner:
     def iterate(self, samples: Samples, stage: int, iteration: int) -> tuple[Losses, list[Sample]]:
         """Look at a batch of pictures, one after another, and move a step; raises `NotFinite` before a bad one."""
         self.makers.zero_grad(set_to_none=True)
-        shared = Shared.of(samples.shared({self.how.learn: self.relief()}) if samples.shared else {})
+        shared = Shared.of(samples.shared({self.how.learn: self.height()}) if samples.shared else {})
         found = self._element(shared) if self.learns else {}
         batch, seen, pairs = self.stage.batch, list[Sample](), list[tuple[Scales, Scales]]()
         for i in range(batch):
