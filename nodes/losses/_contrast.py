@@ -58,7 +58,8 @@ def _(psf: Psf, *, floor: float = 1e-4) -> Tensor:
         otf = torch.fft.fft2(kernel)[:, : x // 2 + 1]
         fy, fx = torch.fft.fftfreq(y, dtype=torch.float64), torch.fft.rfftfreq(x, dtype=torch.float64)
         inside = fy[:, None].square() + fx.square() <= 4.0 * peak / math.pi
-        whole = float(otf[0, 0].real.detach())
-        passed = otf[inside].abs().square() / whole**2 if not whole <= _DARK else torch.zeros(int(inside.sum()))
+        whole = otf[0, 0].real
+        dark = bool(whole.detach() <= _DARK)
+        passed = torch.zeros(int(inside.sum())) if dark else otf[inside].abs().square() / whole**2
         total = total - (passed + floor**2).sqrt().log().mean()
     return total

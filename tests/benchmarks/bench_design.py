@@ -62,35 +62,34 @@ DESIGNS = {
         | {"iterations": 120, "weights": {"lsr": 1.0, "bsr": 4.0, "contrast": weight}}
         for weight in (0.5, 1.0, 2.0, 4.0)
     },
-    **{
-        f"pixelwise, 5 um deep, contrast {weight}, long": DEEP
-        | {
-            "max_height": "5 um",
-            "scale": 0.04,
-            "learning_rate": 0.05,
-            "iterations": 900,
-            "power": 24,
-            "weights": {"lsr": 1.0, "bsr": 4.0, "contrast": weight},
-        }
-        for weight in (0.0, 1.0, 3.0)
-    },
-    "UNet, 5 um deep, long": {
-        "kind": "unet",
-        "max_height": "5 um",
-        "width": 16,
-        "grid": 270,
-        "iterations": 500,
-        "at": {},
-        "bands": 5,
-        "weights": {"lsr": 1.0, "bsr": 4.0, "contrast": 1.0},
-    },
     "pixelwise from the polished half-rings, contrast 2.0, slowly": FROM_RINGS
     | {
         "start": "five half-rings, evolved, slopes to 68, polished",
         "learning_rate": 0.001,
-        "iterations": 500,
+        "iterations": 250,
         "weights": {"lsr": 1.0, "bsr": 4.0, "contrast": 2.0},
         "power": 24,
+    },
+    "UNet, 5 um deep": {
+        "kind": "unet",
+        "max_height": "5 um",
+        "grid": 135,
+        "iterations": 200,
+        "at": FINER,
+        "bands": 5,
+        "weights": {"lsr": 1.0, "bsr": 4.0, "contrast": 1.0},
+    },
+    **{
+        f"pixelwise, 5 um deep, contrast {weight}": DEEP
+        | {
+            "max_height": "5 um",
+            "scale": 0.04,
+            "learning_rate": 0.05,
+            "iterations": 300,
+            "power": 24,
+            "weights": {"lsr": 1.0, "bsr": 4.0, "contrast": weight},
+        }
+        for weight in (1.0, 3.0)
     },
     "pixelwise from the evolved half-rings, contrast 2.0, slowly": FROM_RINGS
     | {"weights": {"lsr": 1.0, "bsr": 4.0, "contrast": 2.0}, "learning_rate": 0.001, "iterations": 300, "power": 24},
