@@ -45,9 +45,9 @@ def _lost(kernel: Tensor, clear_peak: float, floor: float) -> Tensor:
     light = kernel.sum()
     dark = light.detach() <= _DARK  # so that what is not a number is seen
     otf = torch.fft.rfft2(kernel / light.where(~dark, 1.0))[inside]
-    square = (otf.real.square() + otf.imag.square()).where(~dark, 0.0)
+    square = (otf.real.square() + otf.imag.square()).where(~dark, 0.0).double()  # the floor is lost beside 1 in single
     lost: Tensor = -0.5 * (square + floor**2).log().mean()
-    return lost
+    return lost.to(kernel)
 
 
 @contrast.reference

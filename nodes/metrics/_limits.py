@@ -44,10 +44,10 @@ def limits(psf: Psf) -> Limits:
 
 def _limits(kernel: Tensor) -> tuple[Tensor, Tensor, Tensor]:
     """Light, root mean square contrast and its bound."""
+    dark = kernel.sum() <= _DARK  # so that what is not a number is seen
+    kernel = kernel.where(~dark, 1.0)  # a root has no slope at 0
     light, peak = kernel.sum(), kernel.amax()
-    dark = light <= _DARK  # so that what is not a number is seen
-    whole = light.where(~dark, 1.0)
-    found = (light, kernel.square().sum().sqrt() / whole, (peak / whole).sqrt())
+    found = (light, kernel.square().sum().sqrt() / light, (peak / light).sqrt())
     return tuple(x.where(~dark, 0.0) for x in found)  # type: ignore[return-value]
 
 

@@ -91,6 +91,16 @@ DESIGNS = {
         }
         for weight in (1.0, 3.0)
     },
+    "pixelwise, 5 um deep, contrast 1.0, then 2.5": DEEP
+    | {
+        "start": "pixelwise, 5 um deep, contrast 1.0",
+        "max_height": "5 um",
+        "grid": 540,
+        "learning_rate": 0.03,
+        "iterations": 130,
+        "power": 32,
+        "weights": {"lsr": 1.0, "bsr": 4.0, "contrast": 2.5},
+    },
     "pixelwise from the evolved half-rings, contrast 2.0, slowly": FROM_RINGS
     | {"weights": {"lsr": 1.0, "bsr": 4.0, "contrast": 2.0}, "learning_rate": 0.001, "iterations": 300, "power": 24},
     **{

@@ -56,3 +56,11 @@ def test_a_lens_whose_cut_off_is_sampled_has_at_most_half_the_contrast_in_root_m
     found = psf(clear, 0.12)
     assert float(most_unsuppressed(found)) == pytest.approx(0.5, rel=2e-3)
     assert float(limits(found).passed) == pytest.approx(0.5 / math.sqrt(0.12 + 0.088), rel=2e-3)
+
+
+@pytest.mark.parametrize("scale", [0.0, -1.0, 1e-40])
+def test_without_light_all_are_zero_and_pull_nowhere(scale):
+    dark = (scale * torch.ones((1, 8, 8), dtype=torch.float64)).requires_grad_()
+    found = limits(psf(dark, 0.12))
+    assert all(float(x.detach()) == 0 for x in found)
+    assert float(torch.autograd.grad(sum(x.sum() for x in found), dark)[0].abs().max()) == 0
