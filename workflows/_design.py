@@ -7,7 +7,8 @@ as any other mask, on every band and at the full sampling of the recipe.
 from __future__ import annotations
 
 import json
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -19,7 +20,7 @@ from neusee.workflows._accuracy_knobs import changed
 from neusee.workflows._accuracy_points import now
 from neusee.workflows._call import versions
 from neusee.workflows._code import Code
-from neusee.workflows._design_how import DesignError, MaskTraining, Weights, state_file
+from neusee.workflows._design_how import DesignError, MaskTraining, Weights, need_steps, state_file
 from neusee.workflows._design_learn import Kept, Learnt, learn
 from neusee.workflows._design_terms import Terms
 from neusee.workflows._files import RunFolder, new_run
@@ -33,7 +34,7 @@ __all__ = ["DesignError", "MaskTraining", "Weights", "design", "figures"]
 
 Tell = Callable[[str], None]
 _LEARNT_WITH = tuple(
-    f"neusee.nodes.{name}" for name in ("doe._masks", "doe._shapes", "losses._contrast", "losses._mask")
+    f"neusee.nodes.{name}" for name in ("doe._masks", "doe._learned", "losses._contrast", "losses._mask")
 )
 
 
@@ -48,19 +49,74 @@ def design(
 
     Raises: `DesignError` where the recipe has no such steps, or a loss that is not finite.
     """
-    learning = Terms(_at(recipe, how), how, store, device)
-    full = Terms(recipe, how, store, device) if how.at else learning
+    need_steps(recipe.steps, how)
     key = _key(recipe, how, store)
     kept = Kept(state_file(out, recipe.name, key))
-    learnt = learn(learning, how, kept, tell)
-    with torch.no_grad():
-        height = learnt.height(full.stop).detach().to("cpu", torch.float32).contiguous()
-        found = figures(full, height.to(full.device))
+    made = Made.of(recipe, how, store, kept, tell, device)
     with new_run(out, f"{recipe.name}_mask", key) as folder:
-        _write(folder, full, learnt, height, found)
+        made.write(folder)
     kept.path.unlink(missing_ok=True)
-    tell(said(found))
     return folder.path
+
+
+@dataclass(frozen=True)
+class Made:
+    """A designed relief, at the sampling of its recipe, and what it does."""
+
+    terms: Terms
+    learnt: Learnt
+    height: Tensor
+    found: Mapping[str, Any]
+
+    @classmethod
+    def of(
+        cls, recipe: Recipe, how: MaskTraining, store: Store | None, kept: Kept, tell: Tell, device: str = "cpu"
+    ) -> Made:
+        """Learn it, or go on from what is kept, and judge it; raises `DesignError` as `design` does."""
+        learning = Terms(_at(recipe, how), how, store, device)
+        full = Terms(recipe, how, store, device) if how.at else learning
+        tell(f"to be made: {full.fabrication}")
+        learnt = learn(learning, how, kept, tell)
+        with torch.no_grad():
+            height = learnt.height(full.stop).detach().to("cpu", torch.float32).contiguous()
+            found = figures(full, height.to(full.device))
+        tell(said(found))
+        return cls(full, learnt, height, found)
+
+    def write(self, folder: RunFolder, command: Sequence[str] = ()) -> None:
+        """Write relief, curve, page and settings; ``mask.json`` at last, so that where it is all of it is."""
+        from safetensors.torch import save
+
+        learnt, recipe, how = self.learnt, self.terms.recipe, self.terms.how
+        folder.write("mask.safetensors", save({"height": self.height}))
+        header = list(dict.fromkeys(name for row in learnt.history for name in row))
+        folder.write_rows("history.csv", header, [[row.get(name, "") for name in header] for row in learnt.history])
+        self._page(folder, command)
+        made = {"fabrication": self.terms.fabrication.values, "numbers": learnt.numbers}
+        doc = {"recipe": recipe.name, "kind": how.kind, "loss": learnt.loss, **self.found, **made}
+        folder.write("mask.json", json.dumps(doc, indent=1))
+
+    def _page(self, folder: RunFolder, command: Sequence[str]) -> None:
+        from neusee.workflows._design_page import pictures, sections
+
+        recipe, how = self.terms.recipe, self.terms.how
+        provenance = {
+            "stage": "mask",
+            "recipe": recipe.name,
+            **({"command": " ".join(command)} if command else {}),
+            "date": now(),
+            "settings": how.model_dump(mode="json"),
+            "versions": versions(),
+        }
+        written = provenance | {"config": recipe.config.to_yaml()}
+        folder.write("provenance.json", json.dumps(written, indent=1, ensure_ascii=False))
+        with torch.no_grad():
+            shown = pictures(self.terms, self.height.to(self.terms.device), self.learnt)
+        for name, picture in shown.items():
+            folder.write(f"figures/{name}.png", picture)
+        title, intro = f"{recipe.name}: a mask designed without images", f"{how.kind}: {said(self.found)}."
+        body = sections(self.found, self.terms.fabrication, shown)
+        folder.write("report.html", page(title, intro, body, provenance))
 
 
 def _at(recipe: Recipe, how: MaskTraining) -> Recipe:
@@ -112,31 +168,3 @@ def said(found: Mapping[str, Any]) -> str:
         f"median MTF {mean['median_mtf']:.3g} (at most {mean['median_mtf_bound']:.2g}), "
         f"relief {found['depth'] * 1e6:.3g} um deep"
     )
-
-
-def _write(folder: RunFolder, terms: Terms, learnt: Learnt, height: Tensor, found: Mapping[str, Any]) -> None:
-    from safetensors.torch import save
-
-    from neusee.workflows._design_page import pictures, sections
-
-    recipe, how = terms.recipe, terms.how
-    folder.write("mask.safetensors", save({"height": height}))
-    header = list(dict.fromkeys(name for row in learnt.history for name in row))
-    folder.write_rows("history.csv", header, [[row.get(name, "") for name in header] for row in learnt.history])
-    doc = {"recipe": recipe.name, "kind": how.kind, "loss": learnt.loss, **found, "numbers": learnt.numbers}
-    folder.write("mask.json", json.dumps(doc, indent=1))
-    provenance = {
-        "stage": "mask",
-        "recipe": recipe.name,
-        "date": now(),
-        "settings": how.model_dump(mode="json"),
-        "versions": versions(),
-    }
-    written = provenance | {"config": recipe.config.to_yaml()}
-    folder.write("provenance.json", json.dumps(written, indent=1, ensure_ascii=False))
-    with torch.no_grad():
-        shown = pictures(terms, height.to(terms.device), learnt)
-    for name, picture in shown.items():
-        folder.write(f"figures/{name}.png", picture)
-    title = f"{recipe.name}: a mask designed without images"
-    folder.write("report.html", page(title, f"{how.kind}: {said(found)}.", sections(found, shown), provenance))

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Annotated, Any, Literal
+from typing import Annotated, Any, Literal, Self
 
 from pydantic import BaseModel, ConfigDict, Field, model_validator
 
@@ -12,7 +12,7 @@ from neusee.nodes.units import Count, DataFile, PositiveLength, Wavelength
 
 Weight = Annotated[float, Field(ge=0, allow_inf_nan=False)]
 Kind = Literal["pixelwise", "zernike", "rings", "unet", "five_half_rings"]
-_RATE = {"pixelwise": 0.1, "zernike": 0.1, "rings": 0.1, "unet": 2e-3, "five_half_rings": 1.0}
+_RATE = {"pixelwise": 0.05, "zernike": 0.1, "rings": 0.1, "unet": 2e-3, "five_half_rings": 1.0}
 
 
 class Weights(BaseModel):
@@ -31,8 +31,8 @@ class Weights(BaseModel):
         return self
 
 
-class MaskTraining(BaseModel):
-    """What is learnt, on what terms, and for how long."""
+class MaskSettings(BaseModel):
+    """What is learnt, on what terms, and for how long: ``train.mask`` of a recipe."""
 
     model_config = ConfigDict(extra="forbid", frozen=True)
 
@@ -40,7 +40,7 @@ class MaskTraining(BaseModel):
     iterations: Count = 300  #: of Adam; of five_half_rings, generations
     learning_rate: Annotated[float, Field(gt=0, allow_inf_nan=False)] | None = None  #: None: what suits the kind
     schedule: Literal["cosine", "step"] = "cosine"  #: `step`: halved at each fifth of the iterations
-    weights: Weights = Weights()
+    weights: Weights = Weights(bsr=4.0, contrast=1.0)
     power: Annotated[float, Field(ge=8, le=64)] = 16.0  #: of the norm that stands for the peak
     log: bool = True  #: each band by the logarithm of its LSR
     floor: Annotated[float, Field(gt=0, le=0.1)] = 1e-4  #: contrast below which little is won
@@ -51,9 +51,9 @@ class MaskTraining(BaseModel):
     save_every: Count = 50  #: iterations
 
     # what the kinds are made of
-    max_height: PositiveLength = 1.2e-6  #: pixelwise, unet
+    max_height: PositiveLength = 5 * 1e-6  #: pixelwise, unet; to the last bit what `5 um` is
     grid: Count = 270  #: pixelwise, unet: places along an axis
-    scale: Annotated[float, Field(gt=0, le=1)] = 0.02  #: pixelwise: features of the start, in diameters
+    scale: Annotated[float, Field(gt=0, le=1)] = 0.04  #: pixelwise: features of the start, in diameters
     start: DataFile | None = None  #: pixelwise: a relief to start from, such as that of another kind
     width: Count = 16  #: unet: channels of its first layer
     modes: Count = 100  #: zernike: polynomials, from Noll's number 4 on
@@ -63,37 +63,43 @@ class MaskTraining(BaseModel):
     noise: Annotated[float, Field(ge=0)] = 1.0  #: rings: chance on each slope of the start, in waves
     slopes: tuple[float, float] = (4.0, 48.0)  #: five_half_rings: least and greatest, in waves at the rim
     population: Annotated[int, Field(ge=5)] = 70  #: five_half_rings
-    polish: Annotated[int, Field(ge=0)] = 300  #: five_half_rings: masks tried downhill from the best
+    polish: Annotated[int, Field(ge=0)] = 300  #: five_half_rings: masks tried downhill from the best, on all bands
     wavelength: Wavelength = 550e-9  #: that waves are counted in
     material: Material = "fused silica"  #: and of what
+    feature: PositiveLength | None = None  #: least that can be made, `doe.smooth`; depth and levels are the recipe's
 
-    # where in the recipe
-    height: str = "height"  #: the step that is replaced
-    psf: str = "psf[mask]"
-    plain: str = "psf[plain]"
+    plain: str = "psf[plain]"  #: the step of the lens without a mask
 
     @model_validator(mode="after")
-    def _rising(self) -> MaskTraining:
+    def _rising(self) -> Self:
         if not self.slopes[0] < self.slopes[1]:
             raise ValueError(f"slopes {self.slopes}: give the least first")
         return self
 
     @property
     def rate(self) -> float:
-        """The learning rate, or what suits the kind: of logits and waves 0.1, of a network's weights 2e-3."""
+        """The learning rate, or what suits the kind: of logits 0.05, of waves 0.1, of a network's weights 2e-3."""
         return _RATE[self.kind] if self.learning_rate is None else self.learning_rate
+
+
+class MaskTraining(MaskSettings):
+    """The same with the steps that it is learnt on."""
+
+    height: str = "height"  #: the step that is replaced
+    psf: str = "psf[mask]"
 
 
 class DesignError(ValueError):
     """A mask that cannot be designed as asked; says where, and what to change."""
 
 
-def needs_step(recipe_steps: Any, name: str, setting: str) -> None:
+def need_steps(recipe_steps: Any, how: MaskTraining) -> None:
     """Refuse a step that is not there, with the setting that names it."""
     from neusee.workflows._marks import nearest
 
-    if name not in recipe_steps:
-        raise DesignError(f"{setting}: the recipe has no step {name!r}; {nearest(name, recipe_steps)}")
+    for setting, name in (("height", how.height), ("psf", how.psf), ("plain", how.plain)):
+        if name not in recipe_steps:
+            raise DesignError(f"{setting}: the recipe has no step {name!r}; {nearest(name, recipe_steps)}")
 
 
 def state_file(out: Path, recipe: str, key: str) -> Path:

@@ -14,7 +14,9 @@ from typing import Any
 import torch
 from torch import Tensor, nn
 
-from neusee.nodes.doe import _shapes, half_rings
+from neusee.nodes.doe import half_rings
+from neusee.nodes.doe._learned import Drawn, Modes, Pixels, Rings, Written
+from neusee.nodes.doe._material import wave_height
 from neusee.nodes.doe._pixelwise import _read as read_relief
 from neusee.nodes.optics._aperture import Stop
 from neusee.workflows._design_how import DesignError, MaskTraining
@@ -70,14 +72,18 @@ def learn(terms: Terms, how: MaskTraining, kept: Kept, tell: Tell) -> Learnt:
 
 def shape_of(how: MaskTraining, start: int) -> nn.Module:
     """The numbers to learn, as they are at a start."""
-    rng = torch.Generator().manual_seed(how.seed + _APART * start)
+    shape = _free(how, torch.Generator().manual_seed(how.seed + _APART * start))
+    return shape if how.feature is None else Written(shape, how.feature)
+
+
+def _free(how: MaskTraining, rng: torch.Generator) -> nn.Module:
     if how.kind == "pixelwise":
-        return _shapes.Pixels(how.grid, how.max_height, how.scale, rng, _start(how))
+        return Pixels(how.grid, how.max_height, how.scale, rng, _start(how))
     if how.kind == "zernike":
-        return _shapes.Modes(how.modes, how.waves, how.wavelength, how.material, rng)
+        return Modes(how.modes, how.waves, how.wavelength, how.material, rng)
     if how.kind == "rings":
-        return _shapes.Rings(how.rings, how.sided, how.noise, how.wavelength, how.material, rng)
-    return _shapes.Drawn(how.width, how.grid, how.max_height, rng)
+        return Rings(how.rings, how.sided, how.noise, how.wavelength, how.material, rng)
+    return Drawn(how.width, how.grid, how.max_height, rng)
 
 
 def _start(how: MaskTraining) -> Tensor | None:
@@ -168,8 +174,9 @@ def _copied(state: dict[str, Tensor]) -> dict[str, Tensor]:
 
 def _few(shape: nn.Module) -> dict[str, Any]:
     """The numbers of a mask that a table can hold."""
-    return {name: x.tolist() for name, x in shape.state_dict().items() if x.numel() <= 1000 and x.dim() == 1
-            and not isinstance(shape, _shapes.Drawn)}  # fmt: skip
+    inner: Any = shape.shape if isinstance(shape, Written) else shape
+    return {name: x.tolist() for name, x in inner.state_dict().items() if x.numel() <= 1000 and x.dim() == 1
+            and not isinstance(inner, Drawn)}  # fmt: skip
 
 
 # --- by differential evolution ----------------------------------------------------------------------------------------
@@ -187,7 +194,7 @@ def half_ring_relief(genes: Any, how: MaskTraining) -> Callable[[Stop], Tensor]:
         )  # fmt: skip
         return made
 
-    return height
+    return height if how.feature is None else Written(height, how.feature)
 
 
 class _Judge:
@@ -196,7 +203,7 @@ class _Judge:
     def __init__(self, terms: Terms, how: MaskTraining, kept: Kept, tell: Tell) -> None:
         self.terms, self.how, self.kept, self.tell = terms, how, kept, tell
         self.known: list[float] = list(kept.read().get("values", []))
-        self.asked, self.chosen = 0, terms.even()
+        self.asked, self.chosen = 0, terms.even()  # None: all bands
         if self.known:
             tell(f"going on after {len(self.known)} masks")
 
@@ -217,6 +224,8 @@ class _Judge:
 def _evolve(terms: Terms, how: MaskTraining, kept: Kept, tell: Tell) -> Learnt:
     import numpy as np
 
+    if (most := _steepest(terms, how)) < how.slopes[1]:
+        tell(f"slopes: those above {most:.3g} waves are too steep for the pupil's samples: take more of them")
     judge, history = _Judge(terms, how, kept, tell), list[dict[str, float]]()
     best: tuple[float, Any] = (math.inf, None)
     bounds = np.array([how.slopes] * 5 + [(0.0, 1.0), (0.0, math.pi)])
@@ -236,7 +245,7 @@ def _population(
     import numpy as np
     from scipy.optimize import differential_evolution, minimize
 
-    rng, first = np.random.default_rng((how.seed, start)), judge.asked
+    rng, first, judge.chosen = np.random.default_rng((how.seed, start)), judge.asked, judge.terms.even()
     low, high = bounds.T
 
     def told(genes: Any, convergence: float) -> None:
@@ -257,13 +266,20 @@ def _population(
             callback=told,
             x0=_USUAL if _holds(how) else None,
         )
-        if how.polish:  # the peak hangs on the slopes to a tenth of a wave, which chance seldom meets
+        if how.polish:  # the peak hangs on the slopes to a tenth of a wave, and what suits few bands suits these alone
+            judge.chosen = None
             simplex = found.x + np.concatenate([np.zeros((1, len(low))), 0.01 * np.diag(high - low)])
             fine = {"maxfev": how.polish, "initial_simplex": np.clip(simplex, low, high)}
             found = minimize(judge, found.x, method="Nelder-Mead", bounds=bounds, options=fine)
     except RuntimeError as error:  # scipy takes a refusal for a fault of its own call
         raise error.__cause__ if isinstance(error.__cause__, DesignError) else error from None
     return float(found.fun), found.x
+
+
+def _steepest(terms: Terms, how: MaskTraining) -> float:
+    """The slope, in waves at the rim, that turns half a wave a sample in the first band: Nyquist's limit."""
+    turned = wave_height(how.material, how.wavelength) / wave_height(how.material, float(terms.bands.centres.min()))
+    return terms.stop.diameter / (4 * terms.stop.pitch * turned)
 
 
 def _holds(how: MaskTraining) -> bool:

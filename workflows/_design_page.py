@@ -9,7 +9,7 @@ from torch import Tensor
 
 from neusee.workflows import _figures_optics as optics
 from neusee.workflows._design_learn import Learnt
-from neusee.workflows._design_terms import Terms
+from neusee.workflows._design_terms import Fabrication, Terms
 from neusee.workflows._figures_style import canvas, drawn
 from neusee.workflows._study_page import Section
 
@@ -44,7 +44,7 @@ def history(rows: Sequence[Mapping[str, float]]) -> Any:
     return figure
 
 
-def sections(found: Mapping[str, Any], shown: Mapping[str, bytes]) -> list[Section]:
+def sections(found: Mapping[str, Any], made: Fabrication, shown: Mapping[str, bytes]) -> list[Section]:
     """What the page says."""
     bands = found["bands"]
     columns = [[1e9 * value for value in bands["wavelength"]], *(bands[name] for name in _NAMES)]
@@ -55,6 +55,7 @@ def sections(found: Mapping[str, Any], shown: Mapping[str, bytes]) -> list[Secti
     )
     parts = [
         Section("Relief", "Height, and the phase that it is at three wavelengths.", picture=shown.get("relief")),
+        Section("To be made", f"{made}.", ("limit", "value"), [(name, text) for name, text in made.rows()]),
         Section("Light", "The spread light beside the plain lens's.", picture=shown.get("psf")),
         Section("Suppression", "", picture=shown.get("suppression")),
         Section("By wavelength", bounds, _COLUMNS, list(zip(*columns, strict=True))),

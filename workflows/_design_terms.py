@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from dataclasses import replace
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import Any
 
@@ -13,21 +13,52 @@ from torch import Tensor
 from neusee.nodes import losses
 from neusee.nodes.optics._aperture import Stop, stop
 from neusee.nodes.values import BAND_FIELDS, Bands, Psf, Pupil
-from neusee.workflows._design_how import DesignError, MaskTraining, needs_step
+from neusee.workflows._design_how import DesignError, MaskTraining, need_steps
 from neusee.workflows._function import as_function
 from neusee.workflows._graph import Recipe, needed
 from neusee.workflows._run import run
 from neusee.workflows._store import Store
 
 _PRIME = 1_000_003
+_FREE = "not limited"
+
+
+@dataclass(frozen=True)
+class Fabrication:
+    """What a workshop can make, as a mask is designed for it; `None` where nothing is said."""
+
+    values: Mapping[str, Any]
+
+    @classmethod
+    def of(cls, recipe: Recipe, how: MaskTraining) -> Fabrication:
+        """The limits of the recipe's `doe.fabricate` between relief and PSF, and the least feature."""
+        steps = [recipe.steps[name] for name in needed(recipe, [how.psf])]
+        made = [step.params for step in steps if step.node.path == "doe.fabricate"]
+        limits = {name: made[0][name] if made else None for name in ("levels", "max_height", "wrap_at")}
+        return cls({**limits, "feature": how.feature})
+
+    def rows(self) -> list[tuple[str, str]]:
+        """Each limit in words."""
+        words = {"levels": "levels", "max_height": "greatest height", "wrap_at": "wrapped at one wave of",
+                 "feature": "least feature"}  # fmt: skip
+        return [(words[name], _limit(name, value)) for name, value in self.values.items()]
+
+    def __str__(self) -> str:
+        said = [f"{name} {text}" for name, text in self.rows() if text != _FREE]
+        return ", ".join(said) or "whatever is learnt: nothing is limited"
+
+
+def _limit(name: str, value: Any) -> str:
+    if value is None:
+        return _FREE
+    return str(value) if name == "levels" else f"{value * 1e6:.4g} um"
 
 
 class Terms:
     """The loss of a relief and its parts, on all bands of a recipe or some of them."""
 
     def __init__(self, recipe: Recipe, how: MaskTraining, store: Store | None, device: str = "cpu") -> None:
-        for setting in ("height", "psf", "plain"):
-            needs_step(recipe.steps, getattr(how, setting), setting)
+        need_steps(recipe.steps, how)
         self.how, self.recipe = how, replace(recipe, keep_all=True)  # a bound of the relief's effect has no gradient
         self._bands = _bands_step(self.recipe, how.psf)
         self._function = as_function(
@@ -37,6 +68,11 @@ class Terms:
         self.bands: Bands = done[self._bands]
         self._plain: Psf = done[how.plain]
         self.device = self._plain.intensity.device
+
+    @property
+    def fabrication(self) -> Fabrication:
+        """What the relief is designed for."""
+        return Fabrication.of(self.recipe, self.how)
 
     @cached_property
     def stop(self) -> Stop:

@@ -8,7 +8,8 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from neusee.nodes.metrics._bounds import least_lsr, most_contrast, most_unsuppressed
+from neusee.nodes import metrics
+from neusee.nodes.metrics._limits import least_lsr, most_unsuppressed
 from neusee.workflows._evaluate_pipelines import NONE, Composed
 from neusee.workflows._run import run
 from neusee.workflows._store import Store
@@ -49,6 +50,6 @@ def _mask(pipeline: Composed, store: Store, device: str, bsr: Numbers) -> Mask:
     wanted = ("bands", "lsr[mask]", "mtf[mask]", "psf[mask]")
     values = run(pipeline.recipes[NONE], store, wanted, device=device).values
     bands, lsr, mtf, psf = (values[name] for name in wanted)
-    each = (lsr, mtf.median, mtf.rms, least_lsr(psf), most_contrast(psf), most_unsuppressed(psf))
+    each = (lsr, mtf.median, mtf.rms, least_lsr(psf), metrics.limits(psf).passed, most_unsuppressed(psf))
     suppression, *rest = (x.double().cpu().numpy() for x in each)
     return Mask(bands.centres.double().cpu().numpy() * 1e9, suppression, bsr, *rest)

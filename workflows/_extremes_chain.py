@@ -8,6 +8,7 @@ from typing import Any
 
 import torch
 
+from neusee.nodes import Node
 from neusee.workflows._call import RunError, call
 from neusee.workflows._code import Code
 from neusee.workflows._extremes import Case, Size
@@ -15,24 +16,37 @@ from neusee.workflows._graph import Recipe, Step, in_order
 from neusee.workflows._keys import Key, digest, key_of
 from neusee.workflows._steps import find_node
 
-_COMPARES = {  # a loss takes what the metric beside it takes
+_COMPARES: dict[str, tuple[tuple[str, dict[str, Any]], ...]] = {  # a loss takes what the metric beside it takes
     "metrics.lsr": (("losses.lsr", {}), ("losses.lsr", {"log": True})),
     "metrics.bsr": (("losses.bsr", {}),),
+    "metrics.mtf": (("losses.contrast", {}), ("metrics.limits", {})),
+    "doe.fabricate": (("doe.smooth", {"feature": "400 um"}),),  # three samples of the small pupil
     "metrics.quality": (("losses.charbonnier", {}), ("losses.fft_l1", {}), ("losses.gradient_penalty", {})),
 }
 _SMALLER = {"pixels": 256, "levels": 6, "grid": 16, "width": 4}  #: what else makes a step long
 
 
 def with_losses(recipe: Recipe) -> dict[str, Step]:
-    """Every step of the recipe, and the losses of what it measures."""
+    """Every step of the recipe, the losses of what it measures, and what else is made of the same."""
     steps = dict(recipe.steps)
     for name, step in recipe.steps.items():
         for path, params in _COMPARES.get(step.node.path, ()):
             node = find_node(path)
             wires = {given: step.wires[own] for given, own in zip(node.inputs, step.node.inputs, strict=False)}
-            own = f"loss {path.partition('.')[2]}{' log' if params else ''} of {name}"
-            steps[own] = Step(own, node, node.params(**params).model_dump(), wires, step.mark, {})
+            room, _, what = path.partition(".")
+            own = f"{'loss ' if room == 'losses' else ''}{what}{' log' if 'log' in params else ''} of {name}"
+            given = node.params(**params, **_grid(recipe, node, step)).model_dump()
+            steps[own] = Step(own, node, given, wires, step.mark, {})
     return steps
+
+
+def _grid(recipe: Recipe, node: Node, step: Step) -> dict[str, Any]:
+    """The pupil's grid, for what has to know it: that of the relief."""
+    if "samples" not in node.params.model_fields:
+        return {}
+    relief = recipe.steps[step.sources[0]].params
+    lengths = {name: f"{relief[name]!r} m" for name in ("pitch", "diameter")}
+    return {"samples": relief["samples"], "aperture": relief["aperture"], **lengths}
 
 
 def smaller(steps: Mapping[str, Step], size: Size) -> dict[str, Step]:

@@ -14,17 +14,18 @@ from torch.utils.checkpoint import checkpoint
 from neusee.nodes import losses
 from neusee.nodes._bicubic import resize
 from neusee.nodes.doe._learned import LEARNT
+from neusee.nodes.optics._aperture import stop
 from neusee.nodes.restore._critic import critics, slopes
 from neusee.nodes.restore._fft_mamba import FFTMamba
 from neusee.nodes.restore._nafnet import NAFNet
 from neusee.nodes.restore._network import Restorer, parameter_groups, started
 from neusee.nodes.restore._unet import UNet
 from neusee.nodes.values import Psf
-from neusee.workflows._graph import Recipe
+from neusee.workflows._graph import Recipe, Step
 from neusee.workflows._keys import stream_seed
 from neusee.workflows._marks import nearest
 from neusee.workflows._samples import Sample, Samples, Shared
-from neusee.workflows._training import Network, Stage, Training
+from neusee.workflows._training import GRID, Network, Stage, Training
 
 _STEEPEST = 10.0  #: norm of a gradient, above which it is shortened
 Losses = dict[str, float]
@@ -55,22 +56,29 @@ class Scales:
 class Learner:
     """All that learns, on one device."""
 
-    def __init__(self, recipe: Recipe, how: Training, device: str) -> None:
+    def __init__(self, recipe: Recipe, how: Training, device: str, designed: bool = False) -> None:
         self.how, self.seed, self.device = how, recipe.seed, device
-        self.relief = self._relief(recipe, how.learn)
+        self._step = recipe.steps[how.learn] if how.learn else None
+        self.relief = nn.Module() if designed or self._step is None else self._start(self._step)
         self.net: Restorer = started(lambda: _made(how.network), self._rng("network"))
         self.critics = nn.ModuleList(critics(self._rng("critics"), how.critics.width))
         self.average = _averaged(self.net, how.average) if how.average else None
         self.begin(Stage(iterations=0), learns=True)
 
-    def _relief(self, recipe: Recipe, learn: str | None) -> nn.Module:
-        if learn is None:
-            return nn.Module()  # of which nothing is kept, moved or asked
-        step = recipe.steps[learn]
-        if step.node.path not in LEARNT:
-            text = f"{learn} is {step.node.path}, of which nothing is learnt; {nearest(step.node.path, LEARNT)}"
-            raise ValueError(f"train: {text}")
-        return LEARNT[step.node.path](step.params, self._rng("element"))
+    def _start(self, step: Step) -> nn.Module:
+        """The relief that learns; one that was designed does not."""
+        path = step.node.path
+        if path not in LEARNT:
+            text = f"{self.how.learn} is {path}, of which nothing is learnt; {nearest(path, LEARNT)}"
+            raise ValueError(f"train: {text}; or design it without images: --stage mask")
+        return LEARNT[path](step.params, self._rng("element"))
+
+    def height(self) -> Tensor:
+        """The relief (v, u) in m; raises ValueError where none learns."""
+        if self._step is None:
+            raise ValueError("train.learn: no element learns")
+        made: Tensor = self.relief(stop(*(self._step.params[name] for name in GRID)))
+        return made
 
     def _rng(self, *names: object) -> torch.Generator:
         return torch.Generator(self.device).manual_seed(stream_seed(self.seed, " ".join(map(str, ("train", *names)))))
@@ -105,7 +113,7 @@ class Learner:
     def iterate(self, samples: Samples, stage: int, iteration: int) -> tuple[Losses, list[Sample]]:
         """Look at a batch of pictures, one after another, and move a step; raises `NotFinite` before a bad one."""
         self.makers.zero_grad(set_to_none=True)
-        free = {self.how.learn: self.relief()} if samples.shared else {}
+        free = {str(self.how.learn): self.height()} if samples.shared else {}
         shared = Shared.of(samples.shared(free) if samples.shared else {})
         found = self._element(shared) if self.learns else {}
         batch, seen, pairs = self.stage.batch, list[Sample](), list[tuple[Scales, Scales]]()
@@ -197,7 +205,7 @@ def _backward(terms: Sequence[Tensor]) -> None:
 def _made(network: Network) -> Restorer:
     if network.kind == "fft_mamba":
         return FFTMamba(network.width, shuffle=network.shuffle)
-    return {"unet": UNet, "nafnet": NAFNet}[network.kind](network.width)
+    return UNet(network.width) if network.kind == "unet" else NAFNet(network.width)
 
 
 def _averaged(net: nn.Module, decay: float) -> AveragedModel:

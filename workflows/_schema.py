@@ -18,6 +18,7 @@ from neusee.nodes import Node, units
 from neusee.workflows._law import KINDS as LAWS
 from neusee.workflows._recipe import groups
 from neusee.workflows._steps import all_nodes
+from neusee.workflows._training import Training
 from neusee.workflows._wires import takes_many
 
 Schema = dict[str, Any]
@@ -45,11 +46,11 @@ def schema() -> Schema:
             "tolerance": {"anyOf": [{"type": "number", "minimum": 0}, REFERENCE]},
             "outputs": {"type": ["array", "string"], "items": {"type": "string"}},
             "posterior": {"anyOf": [{"type": "string"}, {"type": "object"}, {"type": "null"}]},
-            "train": {"type": ["object", "null"]},
+            "train": {"anyOf": [{"$ref": "#/$defs/train"}, {"type": "null"}]},
             "expect": {"type": "object", "additionalProperties": {"$ref": "#/$defs/expectation"}},
         },
         "additionalProperties": True,
-        "$defs": {"step": _step(nodes), "expectation": _expectation(), **_parameters(nodes)},
+        "$defs": {"step": _step(nodes), "expectation": _expectation(), **_parameters(nodes), **_training()},
     }
 
 
@@ -111,6 +112,15 @@ def _parameters(nodes: Mapping[str, Node]) -> Schema:
         allowed = {"type": ["object", "null"], "properties": model.get("properties", {}), "additionalProperties": False}
         found[name] = allowed | ({"$defs": model["$defs"]} if "$defs" in model else {})
     return found
+
+
+def _training() -> Schema:
+    """How a recipe is learnt; a file need not say all of it."""
+    model = Training.model_json_schema(schema_generator=_Generator, ref_template="#/$defs/train.{model}")
+    blocks = {f"train.{name}": block for name, block in model.pop("$defs").items()}
+    for block in (model, *blocks.values()):
+        block.pop("required", None)
+    return {**blocks, "train": model}
 
 
 class _Generator(GenerateJsonSchema):

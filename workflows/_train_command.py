@@ -20,37 +20,48 @@ class Stages(StrEnum):
     FIRST = "1"
     SECOND = "2"
     BOTH = "both"
+    MASK = "mask"
+
+
+_STAGES = "1: element and network; 2: network; both; mask: element without images, then 2."
+_NUMBERS = {Stages.FIRST: (1,), Stages.SECOND: (2,), Stages.BOTH: (1, 2), Stages.MASK: (0,)}  #: of `train`
 
 
 def train(
     words: Words = None,
-    stage: Annotated[Stages, typer.Option("--stage", help="1: element and network; 2: network; both.")] = Stages.BOTH,
+    stage: Annotated[Stages, typer.Option("--stage", help=_STAGES)] = Stages.BOTH,
     device: Annotated[str, typer.Option("--device", help="Where to learn: cpu or cuda.")] = "cpu",
     quiet: Annotated[bool, typer.Option("--quiet", help="The folder alone.")] = False,
     debug: Debug = False,
     out: Out = Path("runs"),
 ) -> None:
-    """Learn a recipe's element and restoration; run it again to go on where it was stopped."""
+    """Learn a recipe's element and restoration; run it again to go on where it was stopped.
+
+    With --stage mask the element is designed without images, as train.mask says; --stage 2 then goes on from it.
+    """
     recipe, command = load(words or ["train_small"])
     check_device(device)
     from neusee.workflows._call import RunError
     from neusee.workflows.train import train as learn
 
     there = recipe.training.learnt if recipe.training else ()
-    stages = there if stage is Stages.BOTH else (int(stage.value),)
+    stages = there if stage is Stages.BOTH else _NUMBERS[stage]
     tell = (lambda line: None) if quiet else (lambda line: say([line]))
     told = ["neusee", "train", *command[2:], "--stage", stage.value]
     try:
-        with _bar(quiet, {s: recipe.training.stages[s].iterations for s in there} if recipe.training else {}) as bar:
+        lengths = {s: recipe.training.stages[s].iterations for s in there} if recipe.training else {}
+        with _bar(quiet, lengths if stage is not Stages.MASK else {}) as bar:
             folder = learn(recipe, the_store(), out, told, tell, stages, device, bar.watch)
     except (RunError, ValueError, ArithmeticError) as error:
         fail(str(error), FAILED)
     if not quiet:
-        say(_next(folder))
+        say(_next(folder, stage))
     say([str(folder)])
 
 
-def _next(folder: Path) -> list[str]:
+def _next(folder: Path, stage: Stages) -> list[str]:
+    if stage is Stages.MASK:
+        return [f"element: {folder / 'mask.safetensors'}", f"report:  {folder / 'report.html'}"]
     mask, network = folder / "mask.safetensors", folder / "network.safetensors"
     element = [f"element: {mask}"] if mask.is_file() else []
     return [*element, f"network: {network}", f"curves:  {folder / 'curves.png'}"]

@@ -9,10 +9,12 @@ from typing import Annotated, Any, Literal
 from pydantic import BaseModel, ConfigDict, Field, ValidationError
 
 from neusee.workflows._compose import Composed
+from neusee.workflows._design_how import MaskSettings, MaskTraining, Weights
 from neusee.workflows._marks import Mark, Problem, nearest
 from neusee.workflows._yaml import Value
 
 KEY = "train"  #: of a recipe
+GRID = ("samples", "pitch", "diameter", "aperture")  #: parameters of every relief
 
 Weight = Annotated[float, Field(ge=0, allow_inf_nan=False)]
 Share = Annotated[float, Field(ge=0, le=1)]
@@ -91,6 +93,7 @@ class Training(_Block):
     average: Annotated[float, Field(ge=0, lt=1)] = 0.999
     precision: Literal["float32", "bfloat16"] = "float32"
     logarithm: bool = True
+    mask: MaskSettings = MaskSettings()  #: the element without images, in place of stage 1
     stages: dict[Annotated[int, Field(ge=1, le=2)], Stage]
     keep: Number = 100
     show: Number = 500
@@ -99,6 +102,11 @@ class Training(_Block):
     def learnt(self) -> tuple[int, ...]:
         """The stages there are."""
         return tuple(sorted(n for n in self.stages if self.learn or n != 1))
+
+    @property
+    def design(self) -> MaskTraining:
+        """How the element is designed without images: on the steps that the stages learn from too."""
+        return MaskTraining.model_construct(**dict(self.mask), height=self.learn, psf=self.psf)
 
 
 def read_training(composed: Composed) -> tuple[Composed, Training | None]:
@@ -109,11 +117,21 @@ def read_training(composed: Composed) -> tuple[Composed, Training | None]:
     rest = replace(composed.root, data={key: v for key, v in composed.root.data.items() if key != KEY})
     composed = replace(composed, root=rest)
     try:
-        found = Training.model_validate(block.plain, context={"folder": block.mark.folder})
+        found = Training.model_validate(_placed(block))
     except ValidationError as error:
         problems = [_problem(block, each) for each in error.errors()]
         return replace(composed, problems=(*composed.problems, *problems)), None
     return _with_folder(composed, block, found)
+
+
+def _placed(block: Value) -> Any:
+    """The block with the path of a relief to start from relative to the file that names it."""
+    plain, mask = block.plain, block.items.get("mask")
+    start = mask.items.get("start") if mask else None
+    if start is None or not isinstance(start.plain, str):
+        return plain
+    path = Path(start.mark.folder) / Path(start.plain).expanduser()
+    return {**plain, "mask": {**plain["mask"], "start": path}}
 
 
 def _with_folder(composed: Composed, block: Value, found: Training) -> tuple[Composed, Training | None]:
@@ -146,5 +164,7 @@ def _problem(block: Value, error: Any) -> Problem:
 
 
 def _fields(where: tuple[int | str, ...]) -> list[str]:
-    blocks: dict[str, type[BaseModel]] = {"network": Network, "critics": Critics, "rates": Rates, "stages": Stage}
-    return list((blocks[str(where[0])] if where else Training).model_fields)
+    blocks: dict[str, type[BaseModel]] = {"network": Network, "critics": Critics, "rates": Rates, "stages": Stage,
+                                          "mask": MaskSettings, "mask.weights": Weights}  # fmt: skip
+    name = ".".join(map(str, where if where[:1] == ("mask",) else where[:1]))
+    return list((blocks[name] if where else Training).model_fields)

@@ -1,4 +1,4 @@
-"""Learn an element and the restoration behind it: two stages, resumed to the last bit, one folder."""
+"""Learn an element and the restoration behind it, in stages: resumed to the last bit, one folder."""
 
 from __future__ import annotations
 
@@ -12,6 +12,7 @@ import torch
 
 from neusee.nodes import doe
 from neusee.workflows._call import versions
+from neusee.workflows._design_how import MaskSettings
 from neusee.workflows._figures_training import curves, strip
 from neusee.workflows._graph import Recipe
 from neusee.workflows._keys import digest
@@ -19,7 +20,8 @@ from neusee.workflows._learner import Learner, NotFinite
 from neusee.workflows._photographs import Photographs
 from neusee.workflows._samples import Sample, Samples
 from neusee.workflows._store import Store
-from neusee.workflows._training import KEY, Stage, Training
+from neusee.workflows._training import GRID, KEY, Stage, Training
+from neusee.workflows._training_mask import MASK, design_in, designed
 from neusee.workflows._training_state import Rows, export, packed, replaced, restore, unpacked, weights_of, write_json
 
 Tell = Callable[[str], None]
@@ -38,33 +40,41 @@ def train(
 ) -> Path:
     """Learn through the stages, or go on where an earlier call of the same was stopped; the folder.
 
-    Raises ValueError for a recipe that says not how, a folder without photographs, or a second stage before the first;
-    ArithmeticError where a loss is no number, with all that led to it beside the state.
+    Stage 0 designs the element without images, in place of stage 1.
+
+    Raises ValueError for a recipe that says not how, a folder without photographs, a second stage before there is an
+    element, or a first one where that was designed; ArithmeticError where a loss is no number, with all that led to it
+    beside the state.
     """
     how = recipe.training
     if how is None:
         raise ValueError(f"{recipe.name} says not how it is learnt: add `train: recommended` to its defaults")
-    photographs = _photographs(recipe, how)
+    with_pictures = [number for number in stages if number != MASK]
+    photographs = _photographs(recipe, how, bool(with_pictures))
     folder = runs / f"{recipe.name}_train_{_name(recipe, how, photographs)}"
     folder.mkdir(parents=True, exist_ok=True)
-    _Course(recipe, how, photographs, store, folder, tell, device, watch).through(stages, command)
+    if MASK in stages:
+        design_in(folder, recipe, how, store, command, tell, device)
+    if with_pictures:
+        _Course(recipe, how, photographs, store, folder, tell, device, watch).through(with_pictures, command)
     return folder
 
 
-def _photographs(recipe: Recipe, how: Training) -> Photographs:
+def _photographs(recipe: Recipe, how: Training, needed: bool) -> Photographs:
     if how.photographs is not None:
         return Photographs.under(how.photographs)
     file = recipe.steps[how.scene].params.get("file") if how.scene in recipe.steps else None
-    if not isinstance(file, Path):
+    if not isinstance(file, Path) and needed:
         raise ValueError("train.photographs: name a folder of photographs")
-    return Photographs((file,))
+    return Photographs((file,) if isinstance(file, Path) else ())
 
 
 def _name(recipe: Recipe, how: Training, photographs: Photographs) -> str:
     """What decides a training, but for how often it is kept and shown: another begins anew in a folder of its own."""
     settings = recipe.config.settings.items()
     values = {name: str(setting.value) for name, setting in settings if not name.startswith(f"{KEY}.")}
-    said = how.model_copy(update={"keep": 1, "show": 1}).model_dump(mode="json")
+    usual = {"mask"} if how.mask == MaskSettings() else set()  # trainings from before there was a mask go on
+    said = how.model_copy(update={"keep": 1, "show": 1}).model_dump(mode="json", exclude=usual)
     return digest("training", values, said, [path.name for path in photographs.paths])[:8]
 
 
@@ -84,10 +94,11 @@ class _Course:
     ) -> None:
         self.recipe, self.how, self.photographs, self.store = recipe, how, photographs, store
         self.folder, self.tell, self.device, self.watch = folder, tell, device, watch
-        self.learner = Learner(recipe, how, device)
+        self.designed = designed(folder)
+        self.learner = Learner(recipe, how, device, self.designed)
         self.rows = Rows(folder / "losses.csv")
         self.state = folder / "state.pt"
-        self.stage, self.iteration = min(how.learnt), 0
+        self.stage, self.iteration = 2 if self.designed else min(how.learnt), 0
         self._go_on()
 
     def _go_on(self) -> None:
@@ -106,11 +117,14 @@ class _Course:
 
     def through(self, stages: Sequence[int], command: Sequence[str]) -> None:
         """The stages that are asked for, and what comes out of them."""
+        if self.designed and 1 in stages:
+            raise ValueError(f"the element in {self.folder} was designed without images: --stage 2 goes on from it")
         for number in stages:
             if number not in self.how.learnt:
                 raise ValueError(f"there is no stage {number}: train.stages and train.learn leave {self.how.learnt}")
             if number > self.stage:
-                raise ValueError(f"stage {number} needs stage {self.stage}: its {self._length} iterations first")
+                first = f"its {self._length} iterations first, or --stage mask"
+                raise ValueError(f"stage {number} needs stage {self.stage}: {first}")
             if number == self.stage:
                 self._through()
         if self.rows.rows:
@@ -178,7 +192,7 @@ class _Course:
     def _export(self, learns: bool) -> None:
         if learns:
             with torch.no_grad():
-                export(self.folder, "mask", {"height": self.learner.relief()})
+                export(self.folder, "mask", {"height": self.learner.height()})
         net = self.learner.average or self.learner.net
         export(self.folder, "network", weights_of(net))
 
@@ -188,6 +202,7 @@ class _Course:
         document: dict[str, Any] = {
             "command": list(command),
             "recipe": self.recipe.name,
+            "element": "designed without images" if self.designed else "learnt in stage 1",
             "train": self.how.model_dump(mode="json"),
             "photographs": len(self.photographs.paths),
             "broken": broken,
@@ -205,8 +220,8 @@ def frozen(recipe: Recipe, how: Training, folder: Path) -> Recipe:
         return recipe
     file = folder / "mask.safetensors"
     if not file.is_file():
-        raise ValueError(f"{file} is not there: stage 1 makes it")
+        raise ValueError(f"{file} is not there: --stage 1 or mask makes it")
     step = recipe.steps[how.learn]
-    grid = {name: step.params[name] for name in ("samples", "pitch", "diameter", "aperture")}
+    grid = {name: step.params[name] for name in GRID}
     params = {**grid, "file": file, "depth": 1e-6, "scale": 0.1}
     return replace(recipe, steps={**recipe.steps, how.learn: replace(step, node=doe.pixelwise, params=params)})

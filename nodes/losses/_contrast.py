@@ -45,9 +45,9 @@ def _lost(kernel: Tensor, clear_peak: float, floor: float) -> Tensor:
     light = kernel.sum()
     dark = light.detach() <= _DARK  # so that what is not a number is seen
     otf = torch.fft.rfft2(kernel / light.where(~dark, 1.0))[inside]
-    square = (otf.real.square() + otf.imag.square()).where(~dark, 0.0)
+    square = (otf.real.square() + otf.imag.square()).where(~dark, 0.0).double()  # the floor is lost beside 1 in single
     lost: Tensor = -0.5 * (square + floor**2).log().mean()
-    return lost
+    return lost.to(kernel)
 
 
 @contrast.reference
@@ -58,7 +58,8 @@ def _(psf: Psf, *, floor: float = 1e-4) -> Tensor:
         otf = torch.fft.fft2(kernel)[:, : x // 2 + 1]
         fy, fx = torch.fft.fftfreq(y, dtype=torch.float64), torch.fft.rfftfreq(x, dtype=torch.float64)
         inside = fy[:, None].square() + fx.square() <= 4.0 * peak / math.pi
-        whole = float(otf[0, 0].real.detach())
-        passed = otf[inside].abs().square() / whole**2 if not whole <= _DARK else torch.zeros(int(inside.sum()))
+        whole = otf[0, 0].real
+        dark = bool(whole.detach() <= _DARK)
+        passed = torch.zeros(int(inside.sum())) if dark else otf[inside].abs().square() / whole**2
         total = total - (passed + floor**2).sqrt().log().mean()
     return total

@@ -36,20 +36,19 @@ def limits(psf: Psf) -> Limits:
             are 0.
     Source: Parseval's theorem; the cut-off of the clear aperture as in `metrics.mtf`.
     """
-    rows = [_limits(one.double(), float(p)) for one, p in zip(psf.intensity, psf.clear_peak, strict=True)]
-    return Limits(*(torch.stack(column) for column in zip(*rows, strict=True)))
+    rows = [_limits(one.double()) for one in psf.intensity]
+    light, rms, bound = (torch.stack(column) for column in zip(*rows, strict=True))
+    passed = bound / shares(psf).to(bound).sqrt()
+    return Limits(light * least_lsr(psf).to(light), rms, bound, passed, math.sqrt(2.0) * passed)
 
 
-def _limits(kernel: Tensor, clear_peak: float) -> tuple[Tensor, ...]:
+def _limits(kernel: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+    """Light, root mean square contrast and its bound."""
+    dark = kernel.sum() <= _DARK  # so that what is not a number is seen
+    kernel = kernel.where(~dark, 1.0)  # a root has no slope at 0
     light, peak = kernel.sum(), kernel.amax()
-    dark = light <= _DARK  # so that what is not a number is seen
-    whole = light.where(~dark, 1.0)
-    fy, fx = (torch.fft.fftfreq(n, dtype=torch.float64, device=kernel.device) for n in kernel.shape)
-    share = (torch.hypot(fy[:, None], fx) <= math.sqrt(4.0 * clear_peak / math.pi)).double().mean()
-    bound = (peak / whole).sqrt()
-    passed = bound / share.sqrt()
-    found = (light / (kernel.numel() * clear_peak), kernel.square().sum().sqrt() / whole, bound, passed)
-    return tuple(x.where(~dark, 0.0) for x in (*found, math.sqrt(2.0) * passed))
+    found = (light, kernel.square().sum().sqrt() / light, (peak / light).sqrt())
+    return tuple(x.where(~dark, 0.0) for x in found)  # type: ignore[return-value]
 
 
 @limits.check
@@ -58,3 +57,30 @@ def _(result: Limits, psf: Psf) -> list[Check]:
     held = bool((result.rms <= result.bound * (1 + 1e-6)).all())
     return [Check(f"even light: LSR {low:.3g} to {high:.3g}; rms contrast {float(result.rms.mean()):.3g}, at most "
                   f"{float(result.bound.mean()):.3g}", held)]  # fmt: skip
+
+
+# --- of any mask behind this lens -------------------------------------------------------------------------------------
+
+
+def least_lsr(psf: Psf) -> Tensor:
+    """The laser suppression ratio of light spread evenly over the field: (band,) float64.
+
+    The field has N pixels and the clear lens puts a share p0 of the light into the brightest one, so an element that
+    keeps all light in the field has no pixel below 1/N, and LSR >= 1 / (N p0). One that scatters light out of the
+    field may go below by the share that it keeps.
+    """
+    pixels = psf.intensity.shape[-2] * psf.intensity.shape[-1]
+    return 1.0 / (pixels * psf.clear_peak.double())
+
+
+def most_unsuppressed(psf: Psf) -> Tensor:
+    """`Limits.passed` of an element with an LSR of 1 that keeps all light: (band,); it goes as the root of the LSR."""
+    clear_peak = psf.clear_peak.double()
+    return (clear_peak / shares(psf).to(clear_peak)).sqrt()
+
+
+def shares(psf: Psf) -> Tensor:
+    """Share of the frequencies that the pixels sample within the cut-off sqrt(4 p0 / pi): (band,) float64."""
+    fy, fx = (torch.fft.fftfreq(n, dtype=torch.float64) for n in psf.intensity.shape[-2:])
+    radius = torch.hypot(fy[:, None], fx)
+    return torch.stack([(radius <= math.sqrt(4.0 * float(p) / math.pi)).double().mean() for p in psf.clear_peak])

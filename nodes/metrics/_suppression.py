@@ -8,7 +8,7 @@ from torch import Tensor
 
 from neusee.nodes import Check, node
 from neusee.nodes._precision import single
-from neusee.nodes.metrics._bounds import least_lsr
+from neusee.nodes.metrics._limits import least_lsr
 from neusee.nodes.sensor._channels import weighted
 from neusee.nodes.sensor._digital import Bits, Gain, GainUnit, numbers_per_electron
 from neusee.nodes.sensor._saturation import Efficiency, Well, saturation

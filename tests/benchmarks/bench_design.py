@@ -26,6 +26,7 @@ from neusee.workflows._design_terms import Terms
 from neusee.workflows._store import Store
 
 AT = {"optics.samples": 270, "optics.pitch": "29.92 um", "optics.window": [504, 504]}
+FINER = {"optics.samples": 405, "optics.pitch": "19.94667 um"}  # at 400 nm 72 waves (of 550 nm) are its Nyquist limit
 COMMON = {"at": AT, "weights": {"lsr": 1.0, "bsr": 4.0}}
 RINGS = {"kind": "five_half_rings", "bands": 5, "population": 70, "iterations": 40, "save_every": 5}
 DEEP = {
@@ -43,6 +44,8 @@ DESIGNS = {
     "five half-rings, evolved": RINGS,
     "five half-rings, evolved, slopes to 64": RINGS
     | {"slopes": [4.0, 64.0], "population": 50, "iterations": 12, "polish": 200},
+    "five half-rings, evolved, slopes to 68, polished": RINGS
+    | {"slopes": [4.0, 68.0], "population": 50, "iterations": 36, "bands": 11, "polish": 350, "at": FINER},
     "Zernike, 150 polynomials": {
         "kind": "zernike",
         "modes": 150,
@@ -58,6 +61,42 @@ DESIGNS = {
         f"pixelwise, 20 um deep, contrast {weight}": DEEP
         | {"iterations": 120, "weights": {"lsr": 1.0, "bsr": 4.0, "contrast": weight}}
         for weight in (0.5, 1.0, 2.0, 4.0)
+    },
+    "pixelwise from the polished half-rings, contrast 2.0, slowly": FROM_RINGS
+    | {
+        "start": "five half-rings, evolved, slopes to 68, polished",
+        "learning_rate": 0.001,
+        "iterations": 250,
+        "weights": {"lsr": 1.0, "bsr": 4.0, "contrast": 2.0},
+        "power": 24,
+    },
+    "UNet, 5 um deep": {
+        "kind": "unet",
+        "max_height": "5 um",
+        "grid": 135,
+        "iterations": 200,
+        "at": FINER,
+        "bands": 5,
+        "weights": {"lsr": 1.0, "bsr": 4.0, "contrast": 1.0},
+    },
+    "pixelwise, 5 um deep, contrast 1.0": DEEP
+    | {
+        "max_height": "5 um",
+        "scale": 0.04,
+        "learning_rate": 0.05,
+        "iterations": 300,
+        "power": 24,
+        "weights": {"lsr": 1.0, "bsr": 4.0, "contrast": 1.0},
+    },
+    "pixelwise, 5 um deep, contrast 1.0, then 2.5": DEEP
+    | {
+        "start": "pixelwise, 5 um deep, contrast 1.0",
+        "max_height": "5 um",
+        "grid": 540,
+        "learning_rate": 0.03,
+        "iterations": 130,
+        "power": 32,
+        "weights": {"lsr": 1.0, "bsr": 4.0, "contrast": 2.5},
     },
     "pixelwise from the evolved half-rings, contrast 2.0, slowly": FROM_RINGS
     | {"weights": {"lsr": 1.0, "bsr": 4.0, "contrast": 2.0}, "learning_rate": 0.001, "iterations": 300, "power": 24},

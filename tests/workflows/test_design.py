@@ -111,7 +111,7 @@ def test_an_interrupted_design_goes_on_bit_for_bit(kind, values, recipe, store, 
     assert not (tmp_path / "parts" / "latest").exists()
     calls[0] = -1000
     resumed = design(recipe, given, store, tmp_path / "parts", heard.append)
-    assert "going on" in heard[0]
+    assert any("going on" in line for line in heard)
     one, two = (load_file(folder / "mask.safetensors")["height"] for folder in (whole, resumed))
     assert torch.equal(one, two)
     assert (whole / "history.csv").read_text() == (resumed / "history.csv").read_text()

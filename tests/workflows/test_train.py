@@ -1,6 +1,7 @@
 """Learning: two stages from a clean start, the same pictures whoever asks, and a killed training that goes on."""
 
 import csv
+import json
 import os
 import re
 import signal
@@ -16,11 +17,12 @@ from PIL import Image
 from safetensors.torch import load_file
 
 from neusee.nodes.doe._learned import LEARNT
-from neusee.workflows import RecipeError, Store, as_function, load
+from neusee.nodes.optics._aperture import stop
+from neusee.workflows import RecipeError, Store, as_function, cli, load
 from neusee.workflows._photographs import Photographs
 from neusee.workflows._samples import Samples, Shared
-from neusee.workflows._training import Rates
-from neusee.workflows.train import train
+from neusee.workflows._training import GRID, MaskSettings, Rates
+from neusee.workflows.train import frozen, train
 
 ROOT = Path(__file__).parents[2]
 TINY = [
@@ -54,6 +56,10 @@ def tiny(photographs):
 def trained(recipe, folder, stages=(1, 2), watch=None):
     return train(recipe, Store(folder / "store"), folder / "runs", ["neusee", "train"], lambda line: None, stages,
                  watch=watch)  # fmt: skip
+
+
+def pupil(recipe):
+    return stop(*(recipe.steps["height"].params[name] for name in GRID))
 
 
 def losses(folder):
@@ -111,7 +117,7 @@ train(recipe, Store(here / "store"), here / "runs", [], print, watch=watch)
 def test_a_picture_is_the_same_in_whatever_order(tmp_path, tiny):
     sources = Photographs.under(tiny.training.photographs)
     samples = Samples(tiny, tiny.training, sources, Store(tmp_path), "cpu")
-    height = LEARNT["doe.unet"](tiny.steps["height"].params, torch.Generator().manual_seed(3))()
+    height = LEARNT["doe.unet"](tiny.steps["height"].params, torch.Generator().manual_seed(3))(pupil(tiny))
     shared = Shared.of(samples.shared({"height": height})).values
     first = [samples(shared, 1, number) for number in (0, 1, 2)]
     again = [samples(shared, 1, number) for number in (2, 0, 1)]
@@ -126,7 +132,7 @@ def test_the_gradient_through_the_cut_is_the_whole_one(tmp_path):
     how = recipe.training
     samples = Samples(recipe, how, Photographs((recipe.steps["scene"].params["file"],)), Store(tmp_path), "cpu")
     relief = LEARNT["doe.unet"](recipe.steps["height"].params, torch.Generator().manual_seed(3))
-    shared = Shared.of(samples.shared({"height": relief()}))
+    shared = Shared.of(samples.shared({"height": relief(pupil(recipe))}))
     for number in (0, 1):
         sample = samples(shared.values, 1, number)
         (sample.picture - sample.truth).square().mean().backward()
@@ -139,7 +145,7 @@ def test_the_gradient_through_the_cut_is_the_whole_one(tmp_path):
     f = as_function(recipe, *names, outputs=[how.picture, how.truth], store=Store(tmp_path), redraw=noise)
     for number in (0, 1):
         seen = samples(shared.values, 1, number)
-        theta = {**samples._readers, "height": relief(), "scene": _scene(samples, number)}
+        theta = {**samples._readers, "height": relief(pupil(recipe)), "scene": _scene(samples, number)}
         theta |= samples._inputs.theta({k: v for k, v in seen.drawn.items() if k in samples._inputs.names})
         if seen.drawn.get("laser") == "none":
             theta |= dict.fromkeys(samples._lasers, 0.0)
@@ -281,3 +287,102 @@ def test_rates_fall_as_the_paper_prints_them():
     shares = [printed.share(i) for i in (0, 1999, 2000, 3000, 5000)]
     assert shares == pytest.approx([1, 1, 0.5, 0.15, 0.0135])
     assert 2e-4 * printed.share(10_000) == pytest.approx(6.6e-9, rel=0.01)
+
+
+# --- the element without images ---------------------------------------------------------------------------------------
+
+MASK = ["train.mask.iterations=4", "+train.mask.grid=32", "+train.mask.bands=3", "train.mask.max_height=3 um"]
+
+
+@pytest.fixture
+def command(tmp_path, monkeypatch, capfd):
+    """Call the command line in a folder of its own; the exit code, stdout and stderr."""
+    monkeypatch.setenv("NEUSEE_CACHE", str(tmp_path / "store"))
+    monkeypatch.chdir(tmp_path)
+
+    def call(*words):
+        with pytest.raises(SystemExit) as end:
+            cli.main(["train", *words])
+        return (end.value.code or 0, *capfd.readouterr())
+
+    return call
+
+
+def test_a_mask_is_designed_and_stage_2_learns_behind_it(command, tmp_path, photographs):
+    words = ["train_small", *TINY, *MASK, f"train.photographs={photographs}", "train.mask.feature=300 um",
+             "element.levels=16", "element.max_height=3 um"]  # fmt: skip
+    code, out, err = command(*words, "--stage", "mask")
+    assert (code, err) == (0, "")
+    assert "levels 16, greatest height 3 um, least feature 300 um" in out
+    folder = Path(out.splitlines()[-1])
+    height = load_file(folder / "mask.safetensors")["height"]
+    assert height.shape == (64, 64)
+    assert "least feature" in (folder / "report.html").read_text()
+    made = json.loads((folder / "mask.json").read_text())
+    assert made["fabrication"] == {"levels": 16, "max_height": 3e-6, "wrap_at": None, "feature": 3e-4}
+    assert not (folder / "mask.state").exists()
+    before = (folder / "mask.safetensors").stat().st_mtime_ns
+    assert "the mask is designed" in command(*words, "--stage", "mask")[1]
+    for stage in ("1", "both"):
+        code, _, err = command(*words, "--stage", stage)
+        assert code != 0
+        assert "was designed without images: --stage 2" in err
+    code, out, err = command(*words, "--stage", "2", "--quiet")
+    assert (code, Path(out.strip()), err) == (0, folder, "")
+    assert (folder / "mask.safetensors").stat().st_mtime_ns == before
+    assert [(row["stage"], row["iteration"]) for row in losses(folder)] == [("2", i) for i in "012"]
+    assert json.loads((folder / "training.json").read_text())["element"] == "designed without images"
+    assert torch.equal(_element_of(words, folder), height)
+
+
+def _element_of(words, folder):
+    """The relief that stage 2 sees."""
+    recipe = load(words[0], words[1:])
+    return frozen(recipe, recipe.training, folder).run(Store(folder / "own"), outputs=["height"])["height"]
+
+
+def test_a_mask_is_designed_where_nothing_else_could_learn(command, tmp_path, photographs):
+    changes = [c for c in TINY if not c.startswith("doe.")]
+    words = ["train_small", "doe=five_half_rings", *changes, "train.mask.kind=five_half_rings",
+             "train.mask.iterations=1", "+train.mask.population=5", "+train.mask.polish=5", "+train.mask.bands=2",
+             f"train.photographs={photographs}"]  # fmt: skip
+    assert "of which nothing is learnt" in command(*words)[2]
+    code, out, err = command(*words, "--stage", "mask")
+    assert (code, err) == (0, "")
+    assert "too steep for the pupil's samples" in out
+    code, out, err = command(*words, "--stage", "2", "--quiet")
+    assert (code, err) == (0, "")
+    assert (Path(out.strip()) / "network.safetensors").is_file()
+
+
+def test_a_mask_is_not_designed_over_one_that_learns(tmp_path, tiny, photographs):
+    folder = trained(tiny, tmp_path, [1])
+    before = (folder / "mask.safetensors").read_bytes()
+    with pytest.raises(ValueError, match="stage 1 has begun"):
+        trained(tiny, tmp_path, [0])
+    assert (folder / "mask.safetensors").read_bytes() == before
+
+
+def test_the_recommended_mask_is_that_of_trainings_that_say_nothing_of_it():
+    """Else a training that was begun without a word on masks would begin anew."""
+    assert load("train_small").training.mask == MaskSettings()
+
+
+@pytest.mark.parametrize(
+    ("change", "said"),
+    [
+        ("train.mask.kind=cubic", "train.mask.kind: .*five_half_rings"),
+        ("+train.mask.fish=1", "train.mask.fish: is not known here"),
+        ("+train.mask.weights.lsrr=1", "train.mask.weights.lsrr: is not known here; .*lsr"),
+        ("train.mask.max_height=3", "train.mask.max_height: .*needs a unit"),
+        ("+train.mask.slopes=[9, 3]", "train.mask: .*give the least first"),
+        ("+train.mask.start=no.npy", "train.mask.start: .*no such file"),
+    ],
+)
+def test_a_mistake_of_the_mask_is_located(change, said):
+    with pytest.raises(RecipeError) as caught:
+        load("train_small", [change])
+    (problem,) = caught.value.problems
+    assert re.search(said, f"{problem.path}: {problem.message}")
+    if "slopes" not in change:
+        assert "argument 1" in str(problem.mark)

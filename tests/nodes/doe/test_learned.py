@@ -13,6 +13,7 @@ from neusee.nodes import ParameterError, doe
 from neusee.nodes._bicubic import enlarge
 from neusee.nodes.doe._learned import LEARNT
 from neusee.nodes.doe._unet import HeightNet, coordinates, fresh, height_of
+from neusee.nodes.optics._aperture import stop
 
 GRID = {"samples": 64, "pitch": 5e-6, "diameter": 320e-6}
 
@@ -180,10 +181,11 @@ def test_pixelwise_reads_levels_of_a_grey_picture(tmp_path):
 def test_every_sample_of_a_formula_can_be_freed(name, params):
     start = getattr(doe, name)(**GRID, **params)
     freed = LEARNT[f"doe.{name}"]({**GRID, **params}, seeded())
-    moved = freed().detach() - start
+    grid = stop(**GRID)
+    moved = freed(grid).detach() - start
     assert_close(moved, torch.full_like(moved, float(moved.mean())), rtol=1e-3, atol=1e-10)  # a piston
-    slope = torch.autograd.grad(suppression(freed()), freed.logits)[0]
+    slope = torch.autograd.grad(suppression(freed(grid)), freed.logits)[0]
     assert float(slope.abs().max()) > 0
-    height = freed().detach()
+    height = freed(grid).detach()
     assert float(height.min()) > 0
-    assert float(height.max()) < freed.depth
+    assert float(height.max()) < freed.max_height

@@ -6,8 +6,8 @@ import pytest
 import torch
 
 from neusee.nodes.doe import smooth
+from neusee.nodes.doe._learned import Drawn, Modes, Pixels, Rings, Written
 from neusee.nodes.doe._masks import half_rings, zernike
-from neusee.nodes.doe._shapes import Drawn, Modes, Pixels, Rings
 from neusee.nodes.optics._aperture import stop
 
 GRID = {"samples": 24, "pitch": 2e-6, "diameter": 48e-6}
@@ -59,10 +59,11 @@ def test_what_does_not_fit_is_refused_and_a_narrow_spot_said():
 def shapes():
     rng = torch.Generator().manual_seed(1)
     return [Pixels(32, 1e-6, 0.1, rng), Modes(12, 2.0, 550e-9, "PMMA", rng), Rings(10, True, 1.0, 550e-9, "PMMA", rng),
-            Rings(7, False, 1.0, 550e-9, "PMMA", rng), Drawn(4, 32, 1e-6, rng)]  # fmt: skip
+            Rings(7, False, 1.0, 550e-9, "PMMA", rng), Drawn(4, 32, 1e-6, rng),
+            Written(Pixels(32, 1e-6, 0.1, rng), 60e-6)]  # fmt: skip
 
 
-@pytest.mark.parametrize("number", range(5))
+@pytest.mark.parametrize("number", range(6))
 def test_a_relief_counts_from_zero_at_every_sampling_and_reaches_all_its_numbers(number):
     shape = shapes()[number]
     for samples in (32, 48):
