@@ -46,6 +46,7 @@ def schema() -> Schema:
             "outputs": {"type": ["array", "string"], "items": {"type": "string"}},
             "posterior": {"anyOf": [{"type": "string"}, {"type": "object"}, {"type": "null"}]},
             "train": {"type": ["object", "null"]},
+            "train_lift": {"type": ["object", "null"]},
             "expect": {"type": "object", "additionalProperties": {"$ref": "#/$defs/expectation"}},
         },
         "additionalProperties": True,
