@@ -66,7 +66,7 @@ class Learner:
         kind, width = _NETWORKS[how.network.kind], how.network.width
         self.net: Restorer = started(lambda: kind(width), self._rng("network"))
         self.critics = nn.ModuleList(critics(self._rng("critics"), how.critics.width))
-        self.average = _averaged(self.net, how.average) if how.average else None
+        self.average = averaged(self.net, how.average) if how.average else None
         self.begin(Stage(iterations=0), learns=True)
 
     def _rng(self, *names: object) -> torch.Generator:
@@ -190,6 +190,7 @@ def _backward(terms: Sequence[Tensor]) -> None:
         sum(terms[1:], terms[0]).backward()  # type: ignore[no-untyped-call]
 
 
-def _averaged(net: nn.Module, decay: float) -> AveragedModel:
+def averaged(net: nn.Module, decay: float) -> AveragedModel:
+    """A running mean of a network's weights."""
     mean = get_ema_multi_avg_fn(decay)  # type: ignore[no-untyped-call]
     return AveragedModel(net, multi_avg_fn=mean)

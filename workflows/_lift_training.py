@@ -32,16 +32,17 @@ class LiftTraining(BaseModel):
     rate: Annotated[float, Field(gt=0, allow_inf_nan=False)] = 4e-4
     least: Annotated[float, Field(ge=0, allow_inf_nan=False)] = 1e-6
     betas: tuple[Beta, Beta] = (0.9, 0.999)
-    floor: Annotated[float, Field(gt=0, le=1)] = 0.05
-    average: Beta = 0.999
+    warm: Annotated[int, Field(ge=0)] = 200
+    floor: Annotated[float, Field(gt=0, le=1)] = 0.02
+    average: Beta = 0.998
     judge: Number = 32
     keep: Number = 100
     show: Number = 1000
 
     def rate_at(self, iteration: int) -> float:
-        """The learning rate of an iteration, from 0: half a cosine from `rate` to `least`."""
-        least = min(self.least, self.rate)
-        return least + (self.rate - least) * 0.5 * (1 + math.cos(math.pi * iteration / self.iterations))
+        """The learning rate of an iteration, from 0: half a cosine from `rate` to `least`, rising evenly at first."""
+        least, rising = min(self.least, self.rate), min(1.0, (iteration + 1) / max(self.warm, 1))
+        return rising * (least + (self.rate - least) * 0.5 * (1 + math.cos(math.pi * iteration / self.iterations)))
 
 
 def read_lift_training(composed: Composed) -> tuple[Composed, LiftTraining | None]:

@@ -12,7 +12,7 @@ from neusee.nodes._precision import single
 
 @node()
 def mrae(
-    estimate: Tensor, truth: Tensor, *, floor: Annotated[float, Field(gt=0, allow_inf_nan=False)] = 0.05
+    estimate: Tensor, truth: Tensor, *, floor: Annotated[float, Field(gt=0, allow_inf_nan=False)] = 0.02
 ) -> Tensor:
     """Average the absolute difference over the truth, which counts as `floor` at least.
 
@@ -35,7 +35,7 @@ def mrae(
 
 
 @mrae.reference
-def _(estimate: Tensor, truth: Tensor, *, floor: float = 0.05) -> Tensor:
+def _(estimate: Tensor, truth: Tensor, *, floor: float = 0.02) -> Tensor:
     wanted = truth.double()
     share = (estimate.double() - wanted).abs() / torch.maximum(wanted.abs(), torch.tensor(floor, dtype=torch.float64))
     return share.sum() / share.numel()

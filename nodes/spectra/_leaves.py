@@ -24,7 +24,7 @@ def leaves(
     *,
     shape: Shape,
     smallest: Annotated[float, Field(ge=0.5)] = 2.0,
-    darkest: Annotated[float, Field(gt=0, le=1)] = 0.03,
+    darkest: Annotated[float, Field(gt=0, le=1)] = 0.1,
     texture: Fraction = 0.3,
     shade: Fraction = 0.5,
     daylights: Fraction = 0.2,

@@ -36,7 +36,7 @@ def lift_mst_plus_plus(
     Source: Cai et al., MST++, CVPR Workshops 2022 (NTIRE spectral recovery).
     """
     needs_rgb(rgb)
-    _needs_bands(bands)
+    needs_bands(bands)
     network = _loaded(weights) if weights is not None else _untrained(untrained, rng)
     return torch.relu_(through(network.to(rgb), rgb[None])[0])
 
@@ -90,7 +90,8 @@ def started(rng: torch.Generator, linear: Tensor | None = None) -> MSTPlusPlus:
     return network
 
 
-def _needs_bands(bands: Bands) -> None:
+def needs_bands(bands: Bands) -> None:
+    """Refuse bands that MST++ does not give."""
     centres = bands.centres.cpu().double()
     wanted = torch.linspace(400e-9, 700e-9, BANDS, dtype=torch.float64)
     if len(centres) != BANDS or float((centres - wanted).abs().max()) > 0.5e-9:
