@@ -87,7 +87,8 @@ def _mixtures(known: Tensor, count: int, mixed: int, thickness: tuple[float, flo
     sums = (weights[..., None] * known[_drawn(len(known), (count, mixed), rng)]).sum(1)
     even: Tensor = torch.rand(count, 1, **how)  # type: ignore[call-overload]
     power: Tensor = thickness[0] * (thickness[1] / thickness[0]) ** even
-    return sums.clamp(_DARKEST, 1.0) ** power
+    found: Tensor = sums.clamp(_DARKEST, 1.0) ** power
+    return found
 
 
 def _drawn(of: int, shape: tuple[int, ...], rng: torch.Generator) -> Tensor:

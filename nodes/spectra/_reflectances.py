@@ -138,7 +138,10 @@ def _mat(file: Path) -> tuple[Numbers, Numbers]:
         from scipy.io import loadmat
     except ImportError:
         raise ValueError(".mat files need scipy: pip install scipy") from None
-    held = loadmat(file)
+    try:
+        held = loadmat(file)
+    except Exception as why:  # scipy fails on foreign bytes in many ways
+        raise ValueError(f"no .mat file up to version 7: {why}") from None
     name = next(name.removeprefix("sur_") for name in [*held, "sur_"] if name.startswith("sur_"))
     start, step, count = np.asarray(held[f"S_{name}"], np.float64).ravel()
     return start + step * np.arange(int(count)), np.asarray(held[f"sur_{name}"], np.float64).T

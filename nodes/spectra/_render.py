@@ -32,7 +32,8 @@ def render(reflectance: Tensor, bands: Bands) -> Tensor:
 @render.reference
 def _(reflectance: Tensor, bands: Bands) -> Tensor:
     matrix = to_srgb(bands.centres).to(reflectance.device)
-    return (matrix @ reflectance.double().flatten(-2)).unflatten(-1, reflectance.shape[-2:])
+    found = matrix @ reflectance.double().flatten(-2)
+    return found.reshape(*found.shape[:-1], *reflectance.shape[-2:])
 
 
 @render.check
