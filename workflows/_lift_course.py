@@ -23,6 +23,7 @@ Tell = Callable[[str], None]
 Watch = Callable[[int, Mapping[str, float]], None]  #: iterations done, what was found
 _COLUMNS = ("iteration", "MRAE", "RMSE", "slope", "rate", "seconds")
 _NETWORK = "mst_plus_plus"
+_ABOUT = "training.json"  #: what is written last
 
 
 def train_lift(
@@ -82,7 +83,9 @@ class _Course:
             tell(f"goes on after {self.iteration} iterations")
 
     def through(self, recipe: Recipe, command: Sequence[str]) -> None:
-        """To the end, and what comes out of it."""
+        """To the end, and what comes out of it; what is finished stays as it is."""
+        if self.iteration == self.how.iterations and (self.folder / _ABOUT).is_file():
+            return
         while self.iteration < self.how.iterations:
             self._iterate()
             if self.iteration % self.how.show == 0 and self.iteration < self.how.iterations:
@@ -133,4 +136,4 @@ class _Course:
             "seconds": sum(float(row["seconds"]) for row in self.rows.rows),
             "versions": versions(),
         }
-        write_json(self.folder / "training.json", document)
+        write_json(self.folder / _ABOUT, document)

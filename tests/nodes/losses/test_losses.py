@@ -101,7 +101,9 @@ def test_mrae_is_the_published_measure_above_its_floor_and_bounded_below():
     estimate = torch.tensor([0.4, 0.12, 0.01], requires_grad=True)
     assert float(mrae(estimate.detach()[:2], truth[:2], floor=0.01)) == pytest.approx((0.2 + 0.2) / 2)
     loss = mrae(estimate, truth, floor=0.02)
-    torch.testing.assert_close(loss.detach().double(), mrae.ref(estimate.detach(), truth, floor=0.02), rtol=1e-6, atol=0)
+    torch.testing.assert_close(
+        loss.detach().double(), mrae.ref(estimate.detach(), truth, floor=0.02), rtol=1e-6, atol=0
+    )
     loss.backward()
     assert float(estimate.grad.abs().max()) <= 1 / 0.02 / 3 * (1 + 1e-6)
     with pytest.raises(ValueError, match="differ"):
