@@ -18,7 +18,7 @@ import torch
 from torch import Tensor
 
 from neusee.nodes.scene import hyperspectral
-from neusee.nodes.spectra import (  # fmt: skip
+from neusee.nodes.spectra import (
     bands,
     leaves,
     lift_lmmse,
@@ -28,6 +28,7 @@ from neusee.nodes.spectra import (  # fmt: skip
     reflectances,
     render,
 )
+from neusee.nodes.spectra._lift import wiener
 
 SCENE = bands(start=400e-9, stop=700e-9, count=31)
 PICTURES, SIZE, LEAST = 32, (64, 64), 1e-2
@@ -35,10 +36,11 @@ Lift = Callable[[Tensor], Tensor]
 
 
 def lifts(weights: Path) -> dict[str, Lift]:
-    """The three lifts of a recipe, MST++ with these weights."""
-    rng = torch.Generator()
+    """The three lifts of a recipe, MST++ with these weights, and the estimate that its training starts at."""
+    rng, linear = torch.Generator(), wiener(reflectances(SCENE), SCENE.centres)
     return {
         "lmmse": lambda rgb: lift_lmmse(rgb, SCENE),
+        "lmmse over all sets": lambda rgb: torch.einsum("bc,cyx->byx", linear, rgb).clamp_min(0),
         "mallett": lambda rgb: lift_mallett(rgb, SCENE),
         "MST++": lambda rgb: lift_mst_plus_plus(rgb.float(), SCENE, weights=weights, rng=rng),
     }
