@@ -84,7 +84,7 @@ def _start(how: MaskTraining) -> Tensor | None:
     """The relief that pixels start from."""
     if how.start is None:
         return None
-    height = read_relief(how.start)
+    height = read_relief(how.start, how.max_height)
     if float(height.max()) > how.max_height:
         deep, most = f"{float(height.max()) * 1e6:.3g} um", f"{how.max_height * 1e6:.3g} um"
         raise DesignError(f"start: {how.start.name} is {deep} deep: set max_height to more than {most}")

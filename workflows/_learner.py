@@ -24,9 +24,8 @@ from neusee.workflows._graph import Recipe
 from neusee.workflows._keys import stream_seed
 from neusee.workflows._marks import nearest
 from neusee.workflows._samples import Sample, Samples, Shared
-from neusee.workflows._training import Stage, Training
+from neusee.workflows._training import Network, Stage, Training
 
-_NETWORKS = {"fft_mamba": FFTMamba, "unet": UNet, "nafnet": NAFNet}
 _STEEPEST = 10.0  #: norm of a gradient, above which it is shortened
 Losses = dict[str, float]
 
@@ -58,16 +57,20 @@ class Learner:
 
     def __init__(self, recipe: Recipe, how: Training, device: str) -> None:
         self.how, self.seed, self.device = how, recipe.seed, device
-        step = recipe.steps[how.learn]
-        if step.node.path not in LEARNT:
-            text = f"{how.learn} is {step.node.path}, of which nothing is learnt; {nearest(step.node.path, LEARNT)}"
-            raise ValueError(f"train: {text}")
-        self.relief = LEARNT[step.node.path](step.params, self._rng("element"))
-        kind, width = _NETWORKS[how.network.kind], how.network.width
-        self.net: Restorer = started(lambda: kind(width), self._rng("network"))
+        self.relief = self._relief(recipe, how.learn)
+        self.net: Restorer = started(lambda: _made(how.network), self._rng("network"))
         self.critics = nn.ModuleList(critics(self._rng("critics"), how.critics.width))
-        self.average = averaged(self.net, how.average) if how.average else None
+        self.average = _averaged(self.net, how.average) if how.average else None
         self.begin(Stage(iterations=0), learns=True)
+
+    def _relief(self, recipe: Recipe, learn: str | None) -> nn.Module:
+        if learn is None:
+            return nn.Module()  # of which nothing is kept, moved or asked
+        step = recipe.steps[learn]
+        if step.node.path not in LEARNT:
+            text = f"{learn} is {step.node.path}, of which nothing is learnt; {nearest(step.node.path, LEARNT)}"
+            raise ValueError(f"train: {text}")
+        return LEARNT[step.node.path](step.params, self._rng("element"))
 
     def _rng(self, *names: object) -> torch.Generator:
         return torch.Generator(self.device).manual_seed(stream_seed(self.seed, " ".join(map(str, ("train", *names)))))
@@ -102,7 +105,8 @@ class Learner:
     def iterate(self, samples: Samples, stage: int, iteration: int) -> tuple[Losses, list[Sample]]:
         """Look at a batch of pictures, one after another, and move a step; raises `NotFinite` before a bad one."""
         self.makers.zero_grad(set_to_none=True)
-        shared = Shared.of(samples.shared({self.how.learn: self.relief()}) if samples.shared else {})
+        free = {self.how.learn: self.relief()} if samples.shared else {}
+        shared = Shared.of(samples.shared(free) if samples.shared else {})
         found = self._element(shared) if self.learns else {}
         batch, seen, pairs = self.stage.batch, list[Sample](), list[tuple[Scales, Scales]]()
         for i in range(batch):
@@ -141,8 +145,8 @@ class Learner:
         low = torch.autocast(self.device.partition(":")[0], torch.bfloat16, self.how.precision == "bfloat16")
         picture = sample.picture if self.learns else sample.picture.detach()
         with low:
-            coarse, fine = self.net.pyramid(picture[None])
-        estimate, truth = Scales(coarse.float(), fine.float()), Scales.of(sample.truth[None].detach())
+            coarse, fine = self.net.pyramid(picture)
+        estimate, truth = Scales(coarse.float(), fine.float()), Scales.of(sample.truth.detach())
         terms = {"L1": (0.0, (estimate.fine - truth.fine).abs().mean())}
         if self.stage.bsr:
             terms["BSR"] = (self.stage.bsr, (1.0 / sample.light.clamp_min(1e-30)).sum())
@@ -190,7 +194,12 @@ def _backward(terms: Sequence[Tensor]) -> None:
         sum(terms[1:], terms[0]).backward()  # type: ignore[no-untyped-call]
 
 
-def averaged(net: nn.Module, decay: float) -> AveragedModel:
-    """A running mean of a network's weights."""
+def _made(network: Network) -> Restorer:
+    if network.kind == "fft_mamba":
+        return FFTMamba(network.width, shuffle=network.shuffle)
+    return {"unet": UNet, "nafnet": NAFNet}[network.kind](network.width)
+
+
+def _averaged(net: nn.Module, decay: float) -> AveragedModel:
     mean = get_ema_multi_avg_fn(decay)  # type: ignore[no-untyped-call]
     return AveragedModel(net, multi_avg_fn=mean)

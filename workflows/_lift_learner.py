@@ -7,6 +7,7 @@ from typing import Any
 
 import torch
 from torch import Tensor, nn
+from torch.optim.swa_utils import AveragedModel, get_ema_multi_avg_fn
 
 from neusee.nodes import losses
 from neusee.nodes.spectra import render
@@ -16,7 +17,7 @@ from neusee.nodes.values import Bands
 from neusee.workflows._function import as_function
 from neusee.workflows._graph import Recipe, needed
 from neusee.workflows._keys import stream_seed
-from neusee.workflows._learner import NotFinite, averaged
+from neusee.workflows._learner import NotFinite
 from neusee.workflows._lift_training import LiftTraining
 from neusee.workflows._marks import nearest
 from neusee.workflows._store import Store
@@ -67,7 +68,7 @@ class LiftLearner:
         self.linear = wiener(pairs.measured.cpu(), pairs.bands.centres.cpu()).to(device, torch.float32)
         self.net = started(rng, self.linear if how.start == "linear" else None)
         self.optimiser = torch.optim.Adam(self.net.parameters(), lr=how.rate, betas=how.betas)
-        self.average = averaged(self.net, how.average) if how.average else None
+        self.average = _averaged(self.net, how.average) if how.average else None
 
     def parts(self) -> dict[str, Any]:
         """All that a later iteration depends on."""
@@ -114,6 +115,11 @@ class LiftLearner:
         """Spectra of a picture by the network, and linearly."""
         linear = torch.einsum("bc,cyx->byx", self.linear, picture)
         return {"mst_plus_plus": through(self.best(), picture[None])[0].clamp_min(0), "linear": linear.clamp_min(0)}
+
+
+def _averaged(net: nn.Module, decay: float) -> AveragedModel:
+    mean = get_ema_multi_avg_fn(decay)  # type: ignore[no-untyped-call]
+    return AveragedModel(net, multi_avg_fn=mean)
 
 
 def _rmse(estimate: Tensor, truth: Tensor) -> Losses:

@@ -30,10 +30,10 @@ _SEEDS = 2**31
 
 @dataclass(frozen=True)
 class Sample:
-    """One picture."""
+    """One picture, or patches of it."""
 
-    picture: Tensor  #: (3, y, x) what the camera gives, developed
-    truth: Tensor  #: (3, y, x)
+    picture: Tensor  #: (n, 3, y, x) what the camera gives, developed
+    truth: Tensor  #: (n, 3, y, x)
     light: Tensor  #: (band,) share of the scene's light that the element keeps
     drawn: Mapping[str, Any]  #: what it was made with
 
@@ -77,6 +77,8 @@ class Samples:
     ) -> None:
         learn = None if frozen else how.learn
         self.how, self.photographs, self.device, self.seed = how, photographs, device, recipe.seed
+        self._pool = how.pool if frozen else None
+        self._kept: dict[tuple[int, int], Sample] = {}
         wanted = (how.picture, how.truth, how.light, how.psf)
         _present(recipe, (*wanted, how.scene, *([learn] if learn else [])))
         self._inputs = Inputs.of(recipe, wanted) if recipe.uncertain and recipe.uncertain.names else None
@@ -105,6 +107,14 @@ class Samples:
 
     def __call__(self, shared: Mapping[str, Any], stage: int, number: int) -> Sample:
         """The picture of this number: the same whoever asks, and in whatever order."""
+        if self._pool is None:
+            return self._made(shared, stage, number)
+        number %= self._pool
+        if (stage, number) not in self._kept:
+            self._kept[stage, number] = self._made(shared, stage, number)
+        return self._kept[stage, number]
+
+    def _made(self, shared: Mapping[str, Any], stage: int, number: int) -> Sample:
         seed = (self.seed, stage, number)
         rng = np.random.default_rng((*seed, 1))
         theta, drawn = dict(self._readers), dict[str, Any]()
@@ -124,7 +134,20 @@ class Samples:
         picture, truth = found[self.how.picture], found[self.how.truth]
         if self.how.size is not None:
             picture, truth = _resized(picture, self.how.size), _resized(truth, self.how.size)
+        picture, truth = self._patches(torch.stack([picture, truth]), rng)
         return Sample(picture, truth, found[self.how.light], {**drawn, "noise": noise, "number": number})
+
+    def _patches(self, both: Tensor, rng: np.random.Generator) -> Tensor:
+        """(2, 3, y, x) -> (2, n, 3, y, x): the same places of a picture and of its truth, or all of it."""
+        if self.how.patch is None:
+            return both[:, None]
+        size, patch = (both.shape[-2], both.shape[-1]), self.how.patch
+        if any(have < want for have, want in zip(size, patch, strict=True)):
+            raise ValueError(f"train.patch: {list(patch)} is larger than the picture, {list(size)}")
+        places = [
+            [int(rng.integers(h - w + 1)) for h, w in zip(size, patch, strict=True)] for _ in range(self.how.patches)
+        ]
+        return torch.stack([both[..., y : y + patch[0], x : x + patch[1]] for y, x in places], 1)
 
 
 def _resized(picture: Tensor, size: Sequence[int]) -> Tensor:

@@ -42,12 +42,12 @@ def train(
     from neusee.workflows._call import RunError
     from neusee.workflows.train import train as learn
 
-    stages = (1, 2) if stage is Stages.BOTH else (int(stage.value),)
+    there = recipe.training.learnt if recipe.training else ()
+    stages = there if stage is Stages.BOTH else (int(stage.value),)
     tell = (lambda line: None) if quiet else (lambda line: say([line]))
     told = ["neusee", "train", *command[2:], "--stage", stage.value]
     try:
-        with _bar(quiet, {s: recipe.training.stages[s].iterations for s in recipe.training.stages}
-                  if recipe.training else {}) as bar:  # fmt: skip
+        with _bar(quiet, {s: recipe.training.stages[s].iterations for s in there} if recipe.training else {}) as bar:
             folder = learn(recipe, the_store(), out, told, tell, stages, device, bar.watch)
     except (RunError, ValueError, ArithmeticError) as error:
         fail(str(error), FAILED)
@@ -77,7 +77,8 @@ def _lift(recipe: Recipe, told: list[str], out: Path, device: str, quiet: bool) 
 
 def _next(folder: Path) -> list[str]:
     mask, network = folder / "mask.safetensors", folder / "network.safetensors"
-    return [f"element: {mask}", f"network: {network}", f"curves:  {folder / 'curves.png'}"]
+    element = [f"element: {mask}"] if mask.is_file() else []
+    return [*element, f"network: {network}", f"curves:  {folder / 'curves.png'}"]
 
 
 class _bar:

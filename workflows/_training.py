@@ -29,6 +29,7 @@ class Network(_Block):
 
     kind: Literal["fft_mamba", "unet", "nafnet"] = "fft_mamba"
     width: Annotated[int, Field(ge=2)] = 64
+    shuffle: Annotated[int, Field(ge=1, le=8)] = 2  #: of fft_mamba: pixels along an axis that are scanned as one
 
 
 class Critics(_Block):
@@ -72,7 +73,7 @@ class Training(_Block):
     """A recipe's ``train`` block."""
 
     photographs: Path | None = None
-    learn: str = "height"
+    learn: str | None = "height"  #: None: the recipe's own element stays, and stage 1 falls away
     scene: str = "scene"
     picture: str = "developed[mask]"
     truth: str = "truth"
@@ -80,6 +81,9 @@ class Training(_Block):
     light: str = "bsr[mask]"  #: step that gives the light kept, by band
     network: Network = Network()
     size: tuple[Number, Number] | None = None
+    patch: tuple[Number, Number] | None = None  #: pixels (y, x) that are cut out of a picture to learn from
+    patches: Number = 1  #: of each picture
+    pool: Number | None = None  #: pictures that come again and again where the element is still; None: always new ones
     critics: Critics = Critics()
     betas: tuple[Beta, Beta] = (0.9, 0.999)
     rates: Rates = Rates()
@@ -90,6 +94,11 @@ class Training(_Block):
     stages: dict[Annotated[int, Field(ge=1, le=2)], Stage]
     keep: Number = 100
     show: Number = 500
+
+    @property
+    def learnt(self) -> tuple[int, ...]:
+        """The stages there are."""
+        return tuple(sorted(n for n in self.stages if self.learn or n != 1))
 
 
 def read_training(composed: Composed) -> tuple[Composed, Training | None]:

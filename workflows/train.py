@@ -87,7 +87,7 @@ class _Course:
         self.learner = Learner(recipe, how, device)
         self.rows = Rows(folder / "losses.csv")
         self.state = folder / "state.pt"
-        self.stage, self.iteration = min(how.stages), 0
+        self.stage, self.iteration = min(how.learnt), 0
         self._go_on()
 
     def _go_on(self) -> None:
@@ -107,8 +107,8 @@ class _Course:
     def through(self, stages: Sequence[int], command: Sequence[str]) -> None:
         """The stages that are asked for, and what comes out of them."""
         for number in stages:
-            if number not in self.how.stages:
-                raise ValueError(f"train.stages has no stage {number}")
+            if number not in self.how.learnt:
+                raise ValueError(f"there is no stage {number}: train.stages and train.learn leave {self.how.learnt}")
             if number > self.stage:
                 raise ValueError(f"stage {number} needs stage {self.stage}: its {self._length} iterations first")
             if number == self.stage:
@@ -170,8 +170,8 @@ class _Course:
 
     def _show(self, sample: Sample) -> None:
         with torch.no_grad():
-            restored = self.learner.net(sample.picture[None])[0].float()
-        shown = strip([sample.picture.detach(), restored, sample.truth])
+            restored = self.learner.net(sample.picture[:1])[0].float()
+        shown = strip([sample.picture[0].detach(), restored, sample.truth[0]])
         (self.folder / "pictures").mkdir(exist_ok=True)
         replaced(self.folder / "pictures" / f"stage{self.stage}_{self.iteration:06d}.png", shown)
 
@@ -201,6 +201,8 @@ class _Course:
 
 def frozen(recipe: Recipe, how: Training, folder: Path) -> Recipe:
     """The recipe with the element that was learnt in place of the one that learns: a step like any other."""
+    if how.learn is None:
+        return recipe
     file = folder / "mask.safetensors"
     if not file.is_file():
         raise ValueError(f"{file} is not there: stage 1 makes it")

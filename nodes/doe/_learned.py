@@ -7,8 +7,11 @@ import torch
 from torch import Tensor, nn
 
 from neusee.nodes._weights import loaded
+from neusee.nodes.doe._masks import axicon, cubic, half_rings, spiral_axicon, vortex, zernike
 from neusee.nodes.doe._pixelwise import pixelwise
 from neusee.nodes.doe._unet import HeightNet, fresh, height_of
+
+_ROOM = 0.05  #: of a formula's depth, above and below
 
 
 class FreeRelief(nn.Module):
@@ -41,6 +44,17 @@ def _free(params: Mapping[str, Any], rng: torch.Generator) -> FreeRelief:
     return FreeRelief(start.to(rng.device), params["depth"])
 
 
+def _freed(make: Callable[..., Tensor]) -> Callable[[Mapping[str, Any], torch.Generator], FreeRelief]:
+    """Start as a formula has it, lifted off the ends, where a sigmoid has no slope: a piston is not seen."""
+
+    def start(params: Mapping[str, Any], rng: torch.Generator) -> FreeRelief:
+        height = make(**params)
+        room = _ROOM * float(height.amax())
+        return FreeRelief((height + room).to(rng.device), float(height.amax()) + 2 * room)
+
+    return start
+
+
 def _drawn(params: Mapping[str, Any], rng: torch.Generator) -> DrawnRelief:
     width, samples, grid, weights = (params[name] for name in ("width", "samples", "grid", "weights"))
     if weights is None:
@@ -50,8 +64,9 @@ def _drawn(params: Mapping[str, Any], rng: torch.Generator) -> DrawnRelief:
     return DrawnRelief(net, samples, grid, params["max_height"])
 
 
-#: by node: a relief that starts as the node draws it, from the node's own parameters
+#: by node: a relief that starts as the node draws it, from the node's own parameters; a flat one has no slope to leave
 LEARNT: dict[str, Callable[[Mapping[str, Any], torch.Generator], nn.Module]] = {
     "doe.pixelwise": _free,
     "doe.unet": _drawn,
+    **{make.path: _freed(make) for make in (half_rings, axicon, spiral_axicon, vortex, cubic, zernike)},
 }

@@ -1,7 +1,7 @@
 """A relief given sample by sample: from a file, or a smooth random one to start learning from."""
 
 from pathlib import Path
-from typing import Annotated, Any
+from typing import TYPE_CHECKING, Annotated, Any
 
 import torch
 from pydantic import Field
@@ -13,6 +13,10 @@ from neusee.nodes.optics._aperture import Aperture, grid_notes, stop
 from neusee.nodes.optics._screen import screen
 from neusee.nodes.units import Count, DataFile, PositiveLength
 
+if TYPE_CHECKING:
+    from PIL.Image import Image
+
+_GREYS = {"L": 255, "I;16": 65535, "I;16B": 65535, "I": 65535}  #: the whitest level of each kind of grey picture
 Scale = Annotated[float, Field(gt=0, le=1)]  #: part of the pupil's diameter
 
 
@@ -24,7 +28,7 @@ def _header(file: Path) -> tuple[int, ...]:
         return _stated(file)
     except ParameterError:
         raise
-    except (SafetensorError, ValueError, EOFError) as error:
+    except (SafetensorError, OSError, ValueError, EOFError) as error:
         raise ParameterError("file", f"{file.name} cannot be read as a relief: {error}") from error
 
 
@@ -38,7 +42,21 @@ def _stated(file: Path) -> tuple[int, ...]:
 
         with safe_open(file, framework="pt") as tensors:
             return tuple(tensors.get_slice(_name(file, list(tensors.keys()))).get_shape())
-    raise ParameterError("file", f"{file.name}: a relief is read from .npy or .safetensors")
+    if file.suffix == ".png":
+        with _levels(file) as picture:
+            return picture.height, picture.width
+    raise ParameterError("file", f"{file.name}: a relief is read from .npy, .safetensors or grey .png")
+
+
+def _levels(file: Path) -> "Image":
+    """A grey picture, open."""
+    from PIL import Image
+
+    picture = Image.open(file)
+    if picture.mode not in _GREYS:
+        picture.close()
+        raise ParameterError("file", f"{file.name} is {picture.mode}, not grey: a level for each sample, 8 or 16 bit")
+    return picture
 
 
 def _name(file: Path, names: list[str]) -> str:
@@ -47,10 +65,14 @@ def _name(file: Path, names: list[str]) -> str:
     raise ParameterError("file", f"{file.name} holds {', '.join(sorted(names)) or 'nothing'}: name the relief 'height'")
 
 
-def _read(file: Path) -> Tensor:
-    if file.suffix == ".npy":
-        import numpy as np
+def _read(file: Path, depth: float) -> Tensor:
+    import numpy as np
 
+    if file.suffix == ".png":
+        with _levels(file) as picture:
+            levels = torch.from_numpy(np.asarray(picture, dtype=np.float64))
+            return (levels * (depth / _GREYS[picture.mode])).to(torch.float32)
+    if file.suffix == ".npy":
         return torch.from_numpy(np.load(file, allow_pickle=False)).to(torch.float32)
     from safetensors.torch import load_file
 
@@ -75,16 +97,17 @@ def pixelwise(
     The drawn one is a start for learning: a flat relief sits on a saddle where suppression has no gradient.
 
     Shapes: -> (v, u).
-    Units:  m.
+    Units:  m; of a .png, levels, of which the whitest is ``depth``.
     Error:  exact.
-    Raises: ValueError where the file does not fit the grid, or holds a height below 0 or not finite.
+    Raises: ParameterError for a file that is no relief; ValueError where it does not fit the grid, or holds a height
+            below 0 or not finite.
     Source: by definition.
     """
     if file is None:
         noise = screen(stop(samples, pitch, diameter, aperture), scale, rng)
         return (depth * torch.sigmoid(1.5 * noise)).to(torch.float32)
     _fits(file, _header(file), samples)
-    height = _read(file)
+    height = _read(file, depth)
     if not bool(torch.isfinite(height).all()) or float(height.min()) < 0:
         low = float(height.min())
         raise ValueError(f"{file.name}: lowest height {low:.3g} m; a relief is finite and counted up from 0")

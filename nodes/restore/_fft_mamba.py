@@ -12,7 +12,7 @@ from neusee.nodes import node
 from neusee.nodes._bicubic import resize
 from neusee.nodes.restore._mamba import Block
 from neusee.nodes.restore._memory import Kind
-from neusee.nodes.restore._network import Restorer, fitting, restored, restorer_checks
+from neusee.nodes.restore._network import Restorer, Tile, fitting, restored, restorer_checks
 from neusee.nodes.units import Count, DataFile
 
 
@@ -54,11 +54,16 @@ def fft_mamba(
     states: Count = 16,
     shuffle: Count = 2,
     ssm: Kind = "s6",
+    tile: Tile | None = None,
+    reduce: Count = 1,
 ) -> Tensor:
     """Restore a colour picture with the FFT-Mamba network.
 
     Each block scans the picture there and back by rows or by columns, scans its spectrum from low to high frequencies
     and back to draw a gate for it, and weighs both. One pass at half the size; one at the full size, which sees it.
+    ``tile``: a larger picture is restored in pieces of this side, which overlap: give that of the pictures it learnt
+    from, for the longer a scan, the less a network knows it. ``reduce``: it is made smaller by this factor before, and
+    larger again afterwards, where all that is finer is lost behind an element.
     ``ssm`` is the scan: s6 has a decay for each channel and state, ssd one for 16 channels, of which matrices are made.
 
     Shapes: picture (3, y, x) of any size -> (3, y, x).
@@ -69,11 +74,11 @@ def fft_mamba(
     Source: NeuSee, section Image Restoration; Gu and Dao, Mamba, 2023 (s6), Dao and Gu, Mamba-2, 2024
             (ssd); sizes and wiring are ours.
     """
-    return restored(picture, partial(FFTMamba, width, blocks, states, shuffle, ssm), weights)
+    return restored(picture, partial(FFTMamba, width, blocks, states, shuffle, ssm), weights, tile, reduce)
 
 
 @fft_mamba.preflight
-def _(*, weights: Path | None = None, **sizes: Any) -> list[str]:
+def _(*, weights: Path | None = None, tile: int | None = None, reduce: int = 1, **sizes: Any) -> list[str]:
     return fitting(partial(FFTMamba, **sizes), weights, sizes["width"])
 
 

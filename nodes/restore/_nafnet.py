@@ -8,7 +8,7 @@ from typing import Any
 from torch import Tensor, nn
 
 from neusee.nodes import node
-from neusee.nodes.restore._network import ChannelNorm, Flat, Scale, fitting, restored, restorer_checks
+from neusee.nodes.restore._network import ChannelNorm, Flat, Scale, Tile, fitting, restored, restorer_checks
 from neusee.nodes.units import Count, DataFile
 
 
@@ -71,8 +71,12 @@ def _multiplied(x: Tensor) -> Tensor:
 
 
 @node()
-def nafnet(picture: Tensor, *, weights: DataFile | None = None, width: Count = 16) -> Tensor:
+def nafnet(
+    picture: Tensor, *, weights: DataFile | None = None, width: Count = 16, tile: Tile | None = None, reduce: Count = 1
+) -> Tensor:
     """Restore a colour picture with a small NAFNet: a strong baseline.
+
+    ``tile`` and ``reduce`` as in `fft_mamba`.
 
     Shapes: picture (3, y, x) of any size -> (3, y, x).
     Units:  linear sRGB, as the weights were trained on.
@@ -82,11 +86,11 @@ def nafnet(picture: Tensor, *, weights: DataFile | None = None, width: Count = 1
             that is no colour picture or not finite.
     Source: Chen et al., Simple Baselines for Image Restoration, ECCV 2022; fewer blocks, and factors that start at 0.1.
     """
-    return restored(picture, partial(NAFNet, width), weights)
+    return restored(picture, partial(NAFNet, width), weights, tile, reduce)
 
 
 @nafnet.preflight
-def _(*, weights: Path | None = None, width: int = 16) -> list[str]:
+def _(*, weights: Path | None = None, width: int = 16, tile: int | None = None, reduce: int = 1) -> list[str]:
     return fitting(partial(NAFNet, width), weights, width)
 
 

@@ -4,9 +4,10 @@ import math
 from abc import ABC, abstractmethod
 from collections.abc import Callable
 from pathlib import Path
-from typing import Any, TypeVar
+from typing import Annotated, Any, TypeVar
 
 import torch
+from pydantic import Field
 from torch import Tensor, nn
 from torch.nn import functional as F
 
@@ -15,8 +16,11 @@ from neusee.nodes._bicubic import resize
 from neusee.nodes._mirror import mirrored
 from neusee.nodes._precision import refuse_not_finite, single
 from neusee.nodes._weights import empty, loaded, same_layout
+from neusee.nodes.restore._tiles import tiled
+from neusee.nodes.units import Count
 
 Net = TypeVar("Net", bound=nn.Module)
+Tile = Annotated[Count, Field(ge=32)]  #: side of a piece, pixels
 LEAK = 0.2  #: of what is negative, where a layer leaks
 LEAKY = nn.init.calculate_gain("leaky_relu", LEAK)
 LAYERS = (nn.Conv2d, nn.ConvTranspose2d, nn.Linear)
@@ -106,16 +110,28 @@ def parameter_groups(net: nn.Module, weights: float = 2e-4, biases: float = 4e-4
     return [{"params": others, "lr": weights}, {"params": of_layers, "lr": biases}]
 
 
-def restored(picture: Tensor, make: Callable[[], Restorer], weights: Path | None) -> Tensor:
-    """The picture through the network with these weights, in single precision; gradients reach the picture alone."""
+def restored(
+    picture: Tensor, make: Callable[[], Restorer], weights: Path | None, tile: int | None = None, reduce: int = 1
+) -> Tensor:
+    """The picture through the network with these weights, in single precision; gradients reach the picture alone.
+
+    ``tile``: the side of the pieces it is restored in, where it is larger. ``reduce``: by what it is made smaller
+    before, and larger again afterwards, antialiased.
+    """
     if picture.ndim != 3 or len(picture) != 3:
         raise ValueError(f"a picture {tuple(picture.shape)} is no colour picture: give (3, y, x)")
     refuse_not_finite("one of them is soon everywhere", picture=picture)
     net = loaded(make, _needed(weights)).requires_grad_(False).eval().to(picture.device)
     exact = torch.backends.cudnn.flags(enabled=True, benchmark=False, deterministic=True, allow_tf32=False)
     with exact, torch.autocast(picture.device.type, enabled=False):
-        result: Tensor = net(picture.float()[None])[0]
-    return result
+        y, x = picture.shape[-2:]
+        whole = picture.float()[None]
+        if reduce > 1:
+            whole = resize(whole, -(-y // reduce), -(-x // reduce))
+        result: Tensor = net(whole) if tile is None else tiled(net, whole, tile)
+        if reduce > 1:
+            result = resize(result, y, x)
+    return result[0]
 
 
 def fitting(make: Callable[[], Restorer], weights: Path | None, width: int) -> list[str]:

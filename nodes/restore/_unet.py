@@ -9,7 +9,7 @@ import torch
 from torch import Tensor, nn
 
 from neusee.nodes import node
-from neusee.nodes.restore._network import LEAK, LEAKY, Flat, fitting, restored, restorer_checks
+from neusee.nodes.restore._network import LEAK, LEAKY, Flat, Tile, fitting, restored, restorer_checks
 from neusee.nodes.units import Count, DataFile
 
 
@@ -44,8 +44,12 @@ def _pair(inputs: int, outputs: int) -> nn.Sequential:
 
 
 @node()
-def unet(picture: Tensor, *, weights: DataFile | None = None, width: Count = 32) -> Tensor:
+def unet(
+    picture: Tensor, *, weights: DataFile | None = None, width: Count = 32, tile: Tile | None = None, reduce: Count = 1
+) -> Tensor:
     """Restore a colour picture with a plain UNet: a baseline.
+
+    ``tile`` and ``reduce`` as in `fft_mamba`.
 
     Shapes: picture (3, y, x) of any size -> (3, y, x).
     Units:  linear sRGB, as the weights were trained on.
@@ -54,11 +58,11 @@ def unet(picture: Tensor, *, weights: DataFile | None = None, width: Count = 32)
             that is no colour picture or not finite.
     Source: Ronneberger et al., U-Net, MICCAI 2015; four levels, padded convolutions and the picture added are ours.
     """
-    return restored(picture, partial(UNet, width), weights)
+    return restored(picture, partial(UNet, width), weights, tile, reduce)
 
 
 @unet.preflight
-def _(*, weights: Path | None = None, width: int = 32) -> list[str]:
+def _(*, weights: Path | None = None, width: int = 32, tile: int | None = None, reduce: int = 1) -> list[str]:
     return fitting(partial(UNet, width), weights, width)
 
 

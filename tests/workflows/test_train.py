@@ -6,6 +6,7 @@ import re
 import signal
 import subprocess
 import sys
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -27,6 +28,8 @@ TINY = [
     "sensor.shape=[32, 32]", "doe.grid=32", "train.network.kind=unet", "train.network.width=4", "train.critics.width=4",
     "train.stages.1.iterations=4", "train.stages.2.iterations=3", "train.keep=2",
 ]  # fmt: skip
+
+STILL = [word for word in TINY if not word.startswith("doe.")]
 
 pytestmark = pytest.mark.usefixtures("one_thread")
 
@@ -149,6 +152,48 @@ def test_the_gradient_through_the_cut_is_the_whole_one(tmp_path):
 
 def _scene(samples, number):
     return samples.photographs.crop(samples.shape, samples.seed, (1, number))
+
+
+def samples_of(recipe, folder, still=False):
+    sources = Photographs.under(recipe.training.photographs)
+    return Samples(recipe, recipe.training, sources, Store(folder), "cpu", recipe if still else None)
+
+
+def test_patches_are_the_same_places_of_a_picture_and_its_truth(tmp_path, photographs):
+    recipe = load("train_small", [*STILL, "doe=flat", f"train.photographs={photographs}"])
+    whole = samples_of(recipe, tmp_path, still=True)({}, 2, 0)
+    how = recipe.training.model_copy(update={"patch": (12, 9), "patches": 2})
+    cut = samples_of(replace(recipe, training=how), tmp_path, still=True)({}, 2, 0)
+    assert cut.picture.shape == cut.truth.shape == (2, 3, 12, 9)
+    places = [(y, x) for y in range(21) for x in range(24)]
+    for part, true in zip(cut.picture, cut.truth, strict=True):
+        same = [(y, x) for y, x in places if torch.equal(whole.picture[0, :, y : y + 12, x : x + 9], part)]
+        assert len(same) == 1
+        ((y, x),) = same
+        assert torch.equal(whole.truth[0, :, y : y + 12, x : x + 9], true)
+    too_large = replace(recipe, training=how.model_copy(update={"patch": (40, 9)}))
+    with pytest.raises(ValueError, match=r"train\.patch: \[40, 9\] is larger than the picture, \[32, 32\]"):
+        samples_of(too_large, tmp_path, still=True)({}, 2, 0)
+
+
+def test_a_pool_comes_again_where_the_element_is_still(tmp_path, photographs):
+    recipe = load("train_small", [*STILL, "doe=flat", "train.pool=2", f"train.photographs={photographs}"])
+    samples = samples_of(recipe, tmp_path, still=True)
+    first, second, third = (samples({}, 2, number) for number in range(3))
+    assert third is first
+    assert not torch.equal(first.picture, second.picture)
+    again = samples_of(recipe, tmp_path, still=True)({}, 2, 2)  # as after a kill
+    assert torch.equal(again.picture, first.picture)
+
+
+def test_a_network_is_learnt_behind_an_element_that_stays(tmp_path, photographs):
+    words = [*STILL, "doe=half_ring", "train.learn=null", f"train.photographs={photographs}"]
+    recipe = load("train_small", words)
+    folder = trained(recipe, tmp_path, recipe.training.learnt)
+    assert not (folder / "mask.safetensors").exists()
+    assert [row["stage"] for row in losses(folder)] == ["2"] * 3
+    with pytest.raises(ValueError, match="there is no stage 1"):
+        trained(recipe, tmp_path, [1])
 
 
 def test_it_runs_as_printed_too(tmp_path, photographs):

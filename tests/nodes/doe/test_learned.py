@@ -5,11 +5,13 @@ import math
 import numpy as np
 import pytest
 import torch
+from PIL import Image
 from safetensors.torch import save_file
 from torch.testing import assert_close
 
 from neusee.nodes import ParameterError, doe
 from neusee.nodes._bicubic import enlarge
+from neusee.nodes.doe._learned import LEARNT
 from neusee.nodes.doe._unet import HeightNet, coordinates, fresh, height_of
 
 GRID = {"samples": 64, "pitch": 5e-6, "diameter": 320e-6}
@@ -87,7 +89,7 @@ def test_pixelwise_refuses_a_file_that_does_not_fit(tmp_path):
     with pytest.raises(ValueError, match="counted up from 0"):
         doe.pixelwise(**params, file=tmp_path / "low.npy", rng=seeded())
     (tmp_path / "relief.txt").write_text("0")
-    with pytest.raises(ParameterError, match=r"npy or \.safetensors"):
+    with pytest.raises(ParameterError, match=r"npy, \.safetensors or grey"):
         doe.pixelwise.before(**params, file=tmp_path / "relief.txt")
     for name in ("bad.npy", "bad.safetensors"):
         (tmp_path / name).write_text("no relief")
@@ -157,3 +159,31 @@ def test_unet_loads_its_own_weights_and_no_others(tmp_path):
     (tmp_path / "text.safetensors").write_text("no")
     with pytest.raises(ParameterError, match="no safetensors file"):
         doe.unet.before(**params | {"weights": tmp_path / "text.safetensors"}, width=4)
+
+
+def test_pixelwise_reads_levels_of_a_grey_picture(tmp_path):
+    levels = np.random.default_rng(1).integers(0, 65536, (64, 64), dtype=np.uint16)
+    Image.fromarray(levels).save(tmp_path / "deep.png")
+    Image.fromarray((levels >> 8).astype(np.uint8)).save(tmp_path / "shallow.png")
+    Image.fromarray(np.zeros((64, 64, 3), np.uint8)).save(tmp_path / "coloured.png")
+    (tmp_path / "broken.png").write_bytes((tmp_path / "deep.png").read_bytes()[:30])
+    for name, top in (("deep", 65535), ("shallow", 255)):
+        found = doe.pixelwise(**GRID, file=tmp_path / f"{name}.png", depth=5e-6, rng=seeded())
+        wanted = torch.from_numpy((levels if top > 255 else levels >> 8).astype(np.float64)) * 5e-6 / top
+        assert_close(found.double(), wanted, rtol=1e-6, atol=0)
+    for name, said in (("coloured", "not grey"), ("broken", "cannot be read")):
+        with pytest.raises(ParameterError, match=said):
+            doe.pixelwise.before(**GRID, aperture="inscribed", depth=5e-6, scale=0.1, file=tmp_path / f"{name}.png")
+
+
+@pytest.mark.parametrize(("name", "params"), [("half_rings", {"waves": (9.0,)}), ("cubic", {"waves": 3.0})])
+def test_every_sample_of_a_formula_can_be_freed(name, params):
+    start = getattr(doe, name)(**GRID, **params)
+    freed = LEARNT[f"doe.{name}"]({**GRID, **params}, seeded())
+    moved = freed().detach() - start
+    assert_close(moved, torch.full_like(moved, float(moved.mean())), rtol=1e-3, atol=1e-10)  # a piston
+    slope = torch.autograd.grad(suppression(freed()), freed.logits)[0]
+    assert float(slope.abs().max()) > 0
+    height = freed().detach()
+    assert float(height.min()) > 0
+    assert float(height.max()) < freed.depth
