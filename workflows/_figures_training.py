@@ -26,7 +26,7 @@ def curves(rows: Sequence[Mapping[str, str]]) -> Any:
             at, values = columns(rows, stage, name)
             at = [i + first * (stage == 2) for i in at]
             ax.plot(at, values, color=colour, alpha=0.25, linewidth=0.7)
-            ax.plot(at, _middle(values), color=colour, linewidth=1.5, label=f"stage {stage}")
+            ax.plot(at, middle(values), color=colour, linewidth=1.5, label=f"stage {stage}")
         if name in ("LSR", "L1", "reconstruction", "rate"):
             ax.set_yscale("log", nonpositive="mask")
         ax.set_title(name)
@@ -37,7 +37,7 @@ def curves(rows: Sequence[Mapping[str, str]]) -> Any:
     return figure
 
 
-def _middle(values: Sequence[float]) -> list[float]:
+def middle(values: Sequence[float]) -> list[float]:
     """The median of about a twentieth of the course around each value."""
     import statistics
 

@@ -12,6 +12,7 @@ from neusee.workflows._marks import Mark
 
 if TYPE_CHECKING:
     from neusee.workflows import Event, Executor, Result, Store
+    from neusee.workflows._lift_training import LiftTraining
     from neusee.workflows._training import Training
     from neusee.workflows._uncertain import Uncertain
 
@@ -87,6 +88,7 @@ class Recipe:
     whole: Recipe | None = field(default=None, compare=False)  #: the recipe without economies, where this has some
     uncertain: Uncertain | None = field(default=None, compare=False)  #: what the study of uncertainty draws from
     training: Training | None = field(default=None, compare=False)  #: how it is learnt
+    lifting: LiftTraining | None = field(default=None, compare=False)  #: how a lift is learnt from its pictures
     unheard: frozenset[str] = frozenset()  #: steps whose errors reach a node that does not tell what becomes of them
 
     def limit(self, step: str) -> float:

@@ -18,6 +18,8 @@ from neusee.workflows._graph import Expectation, Recipe, Step, Wire, kept_promis
 from neusee.workflows._head import expectations, outputs_of, seed_and_tolerance
 from neusee.workflows._keywords import overrides_of
 from neusee.workflows._known import keep_graph, keep_recipe, known_graph, known_recipe
+from neusee.workflows._lift_training import KEY as LIFTING
+from neusee.workflows._lift_training import read_lift_training
 from neusee.workflows._marks import Problem, RecipeError
 from neusee.workflows._overrides import Override, arguments_in
 from neusee.workflows._params import Checker
@@ -71,8 +73,9 @@ def _as_written(name: str, place: Path) -> Recipe:
 
 def check(composed: Composed) -> Recipe:
     """A composed recipe with its steps bound, or a `RecipeError` with every problem."""
-    learnt = composed.root.items.get(TRAINING)
+    learnt = [composed.root.items[key] for key in (TRAINING, LIFTING) if key in composed.root.items]
     composed, training = read_training(composed)
+    composed, lifting = read_lift_training(composed)
     composed, uncertain = settle(composed)
     problems = list(composed.problems)
     root, references = composed.root, References(composed.root, problems)
@@ -92,12 +95,12 @@ def check(composed: Composed) -> Recipe:
     if graph is None:
         keep_graph(root, steps, absent, {name: step.wires for name, step in bound.items()})
     config = _config(root, bound, steps, checker, references.spare, uncertain)
-    if learnt is not None:
-        config = Config({**config.settings, **dict(_settings(learnt, checker))})
+    for block in learnt:
+        config = Config({**config.settings, **dict(_settings(block, checker))})
     nulls = {name: f"null ({value.mark})" for name, value in absent.items()}
     notes = (*checker.notes, *(uncertain.notes if uncertain else ()))
     told = composed.name, composed.title, seed, tolerance, outputs, bound, expect, config, notes, nulls
-    return Recipe(*told, uncertain=uncertain, training=training)
+    return Recipe(*told, uncertain=uncertain, training=training, lifting=lifting)
 
 
 def _bind(

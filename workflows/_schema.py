@@ -47,6 +47,7 @@ def schema() -> Schema:
             "outputs": {"type": ["array", "string"], "items": {"type": "string"}},
             "posterior": {"anyOf": [{"type": "string"}, {"type": "object"}, {"type": "null"}]},
             "train": {"anyOf": [{"$ref": "#/$defs/train"}, {"type": "null"}]},
+            "train_lift": {"type": ["object", "null"]},
             "expect": {"type": "object", "additionalProperties": {"$ref": "#/$defs/expectation"}},
         },
         "additionalProperties": True,

@@ -13,6 +13,8 @@ from neusee.workflows._words import FAILED, Debug, Out, Words, check_device, fai
 if TYPE_CHECKING:
     from collections.abc import Mapping
 
+    from neusee.workflows._graph import Recipe
+
 
 class Stages(StrEnum):
     """What is learnt."""
@@ -41,6 +43,10 @@ def train(
     """
     recipe, command = load(words or ["train_small"])
     check_device(device)
+    if recipe.lifting is not None:
+        if stage is not Stages.BOTH:
+            fail(f"--stage {stage.value}: {recipe.name} learns a lift, which has no stages: leave it out")
+        return _lift(recipe, ["neusee", "train", *command[2:]], out, device, quiet)
     from neusee.workflows._call import RunError
     from neusee.workflows.train import train as learn
 
@@ -56,6 +62,25 @@ def train(
         fail(str(error), FAILED)
     if not quiet:
         say(_next(folder, stage))
+    say([str(folder)])
+
+
+def _lift(recipe: Recipe, told: list[str], out: Path, device: str, quiet: bool) -> None:
+    """Learn a lift from RGB to spectra."""
+    from neusee.workflows._call import RunError
+    from neusee.workflows._lift_course import train_lift
+
+    assert recipe.lifting is not None
+    tell = (lambda line: None) if quiet else (lambda line: say([line]))
+    try:
+        with _bar(quiet, {1: recipe.lifting.iterations}) as bar:
+            folder = train_lift(recipe, the_store(), out, told, tell, device, lambda n, found: bar.watch(1, n, found))
+    except (RunError, ValueError, ArithmeticError) as error:
+        fail(str(error), FAILED)
+    if not quiet:
+        weights = folder / "mst_plus_plus.safetensors"
+        say([f"weights: {weights}", f"curves:  {folder / 'curves.png'}", f"judged:  {folder / 'training.json'}",
+             f"next:    neusee run first_light lift=mst_plus_plus lift.weights={weights}"])  # fmt: skip
     say([str(folder)])
 
 
@@ -89,5 +114,7 @@ class _bar:
 
     def watch(self, stage: int, done: int, found: Mapping[str, float]) -> None:
         """An iteration was done."""
-        said = " ".join(f"{name} {found[name]:.3g}" for name in ("LSR", "L1", "critics") if name in found)
+        said = " ".join(
+            f"{name} {found[name]:.3g}" for name in ("LSR", "L1", "critics", "MRAE", "RMSE") if name in found
+        )
         self._shown.update(self._tasks[stage], completed=done, losses=said)

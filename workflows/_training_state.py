@@ -59,8 +59,8 @@ def restore(parts: Mapping[str, Any], found: Mapping[str, Any]) -> None:
 class Rows:
     """``losses.csv``: a row for each iteration; those after the state that is gone on from are cut off."""
 
-    def __init__(self, path: Path) -> None:
-        self._path = path
+    def __init__(self, path: Path, columns: Sequence[str] = COLUMNS) -> None:
+        self._path, self._columns = path, columns
         self.rows: list[dict[str, str]] = []
         self._kept = 0
 
@@ -75,12 +75,12 @@ class Rows:
     def add(self, stage: int, iteration: int, found: Mapping[str, float]) -> None:
         """Note an iteration; it is on disk with the next `keep`."""
         row = {"stage": stage, "iteration": iteration, **{name: f"{x:.6g}" for name, x in found.items()}}
-        self.rows.append({name: str(row.get(name, "")) for name in COLUMNS})
+        self.rows.append({name: str(row.get(name, "")) for name in self._columns})
 
     def keep(self) -> None:
         """Write what is new; at first all of it, whole or not at all."""
         text = io.StringIO(newline="")
-        writer = csv.DictWriter(text, COLUMNS)
+        writer = csv.DictWriter(text, self._columns)
         if self._kept == 0:
             writer.writeheader()
         writer.writerows(self.rows[self._kept :])
@@ -94,7 +94,9 @@ class Rows:
 
 def _place(row: Mapping[str, str | None]) -> tuple[int, int]:
     try:
-        return int(row["stage"] or 0), int(row["iteration"] or 0)
+        if None in row.values():
+            raise ValueError("not all of its columns")
+        return int(row.get("stage") or 0), int(row["iteration"] or 0)
     except (ValueError, TypeError, KeyError):
         return (1 << 62, 0)  # half a row of a process that was killed
 

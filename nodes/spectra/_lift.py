@@ -157,12 +157,12 @@ def _mixed_whole(lift: Node, rgb: Tensor, bands: Bands, within: float) -> Mixtur
 
 
 def _basis(bands: Bands) -> Tensor:
-    _inside(bands)
+    inside_charts(bands)
     return mallett().at(bands.centres).T
 
 
 def _estimator(bands: Bands) -> Tensor:
-    _inside(bands)
+    inside_charts(bands)
     return _solved(tuple(float(c) for c in bands.centres))
 
 
@@ -170,17 +170,22 @@ def _estimator(bands: Bands) -> Tensor:
 def _solved(centres: tuple[float, ...]) -> Tensor:
     """W, (band, 3) float64."""
     at = torch.tensor(centres, dtype=torch.float64)
-    known = torch.cat([paint.at(at) for paint in paints()])
-    second, rgb = known.T @ known / len(known), to_srgb(at)
+    return wiener(torch.cat([paint.at(at) for paint in paints()]), at)
+
+
+def wiener(known: Tensor, centres: Tensor) -> Tensor:
+    """W of known reflectances (spectrum, band): the matrix (band, 3) float64 from linear sRGB to the likeliest one."""
+    second, rgb = known.T @ known / len(known), to_srgb(centres)
     seen = rgb @ second @ rgb.T
     if len(centres) < 3 or not float(torch.linalg.cond(seen)) < 1e10:
-        ends = f"{len(centres)} bands from {centres[0] * 1e9:.4g} to {centres[-1] * 1e9:.4g} nm"
+        ends = f"{len(centres)} bands from {float(centres[0]) * 1e9:.4g} to {float(centres[-1]) * 1e9:.4g} nm"
         raise ValueError(f"{ends} cannot carry three colours: use more bands, such as 31 from 400 to 700 nm")
     weights: Tensor = torch.linalg.solve(seen, rgb @ second).T
     return weights
 
 
-def _inside(bands: Bands) -> None:
+def inside_charts(bands: Bands) -> None:
+    """Refuse bands at which no chart was measured."""
     low, high = float(bands.centres.min()), float(bands.centres.max())
     if low < _FIRST - 1e-12 or high > _LAST + 1e-12:
         raise ValueError(

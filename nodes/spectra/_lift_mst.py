@@ -36,13 +36,9 @@ def lift_mst_plus_plus(
     Source: Cai et al., MST++, CVPR Workshops 2022 (NTIRE spectral recovery).
     """
     needs_rgb(rgb)
-    _needs_bands(bands)
+    needs_bands(bands)
     network = _loaded(weights) if weights is not None else _untrained(untrained, rng)
-    low, high = rgb.amin(), rgb.amax()
-    span = high - low
-    stretched = (rgb - low) / span.where(span > 0, 1.0)
-    cube: Tensor = network.to(rgb)(stretched[None])[0]
-    return torch.relu_(cube * span + low)
+    return torch.relu_(through(network.to(rgb), rgb[None])[0])
 
 
 @lift_mst_plus_plus.reference
@@ -72,7 +68,30 @@ def _(result: Tensor, rgb: Tensor, bands: Bands, *, weights: Path | None = None,
     return lift_checks(result, rgb, bands) + noise
 
 
-def _needs_bands(bands: Bands) -> None:
+def through(network: nn.Module, rgb: Tensor) -> Tensor:
+    """Pictures (n, 3, y, x) through MST++, each stretched to [0, 1] and back: (n, 31, y, x), not yet clipped."""
+    low, high = rgb.amin((1, 2, 3), keepdim=True), rgb.amax((1, 2, 3), keepdim=True)
+    span = high - low
+    cube: Tensor = network((rgb - low) / span.where(span > 0, 1.0))
+    return cube * span + low
+
+
+def started(rng: torch.Generator, linear: Tensor | None = None) -> MSTPlusPlus:
+    """A network to train, its layers orthogonal; given W (31, 3), its first estimate is W times each pixel's colour.
+
+    The linear estimate stands in the long skip around the body, whose last layer is 0: what is learnt is what the
+    shapes in a picture and a curved estimate know better.
+    """
+    network = _untrained("allow", rng).requires_grad_(True).train()
+    if linear is not None:
+        with torch.no_grad():
+            network.conv_in.weight.zero_()[:, :, 1, 1] = linear.to(network.conv_in.weight)
+            network.conv_out.weight.zero_()
+    return network
+
+
+def needs_bands(bands: Bands) -> None:
+    """Refuse bands that MST++ does not give."""
     centres = bands.centres.cpu().double()
     wanted = torch.linspace(400e-9, 700e-9, BANDS, dtype=torch.float64)
     if len(centres) != BANDS or float((centres - wanted).abs().max()) > 0.5e-9:
@@ -94,7 +113,7 @@ def _loaded(weights: Path) -> nn.Module:
     return network
 
 
-def _untrained(untrained: str, rng: torch.Generator) -> nn.Module:
+def _untrained(untrained: str, rng: torch.Generator) -> MSTPlusPlus:
     if untrained != "allow":
         raise ValueError("MST++ has no weights: give the file of its checkpoint, or set untrained: allow")
     network = _empty().to_empty(device=rng.device)

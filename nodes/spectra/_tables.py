@@ -94,6 +94,18 @@ def paints() -> tuple[Table, ...]:
 
 
 @functools.cache
+def gamut_samples(name: str) -> Table:
+    """Reflectances on which colour rendition is judged: the 99 objects of CIE 2017, or the 15 paints of the CQS."""
+    import colour
+
+    if name == "CQS":
+        return _table(colour.colorimetry.sds_and_msds_to_msds(list(colour.quality.SDS_VS["NIST CQS 9.0"].values())))
+    from colour.quality.cfi2017 import load_TCS_CIE2017
+
+    return _table(load_TCS_CIE2017(colour.SpectralShape(380, 780, 5)))
+
+
+@functools.cache
 def xyz_to_srgb() -> Tensor:
     """The matrix of linear sRGB, (3, 3)."""
     import colour

@@ -7,7 +7,7 @@ import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from neusee.nodes.losses import bsr, charbonnier, fft_l1, lsr
+from neusee.nodes.losses import bsr, charbonnier, fft_l1, lsr, mrae
 from neusee.nodes.values import Psf
 
 
@@ -94,3 +94,17 @@ def test_gradients_of_the_restoration_losses(loss):
     assert torch.isfinite(same.grad).all()
     with pytest.raises(ValueError, match="differ"):
         loss(a, b[:2])
+
+
+def test_mrae_is_the_published_measure_above_its_floor_and_bounded_below():
+    truth = torch.tensor([0.5, 0.1, 0.0])
+    estimate = torch.tensor([0.4, 0.12, 0.01], requires_grad=True)
+    assert float(mrae(estimate.detach()[:2], truth[:2], floor=0.01)) == pytest.approx((0.2 + 0.2) / 2)
+    loss = mrae(estimate, truth, floor=0.02)
+    torch.testing.assert_close(
+        loss.detach().double(), mrae.ref(estimate.detach(), truth, floor=0.02), rtol=1e-6, atol=0
+    )
+    loss.backward()
+    assert float(estimate.grad.abs().max()) <= 1 / 0.02 / 3 * (1 + 1e-6)
+    with pytest.raises(ValueError, match="differ"):
+        mrae(estimate, truth[:2])
