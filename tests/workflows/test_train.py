@@ -17,7 +17,8 @@ from safetensors.torch import load_file
 from neusee.nodes.doe._learned import LEARNT
 from neusee.workflows import RecipeError, Store, as_function, load
 from neusee.workflows._photographs import Photographs
-from neusee.workflows._samples import Samples, Shared
+from neusee.workflows._samples import Samples
+from neusee.workflows._shared import Shared
 from neusee.workflows._training import Rates
 from neusee.workflows.train import train
 
