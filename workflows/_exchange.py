@@ -105,5 +105,5 @@ def _exchanged(mesh: Mesh, each: Tensor) -> Tensor:
 def _from_each(mesh: Mesh, x: Tensor) -> Tensor:
     """What every process has of the same shape, one after another."""
     found = x.new_empty(mesh.band, *x.shape)
-    dist.all_gather_into_tensor(found.flatten(0, 1) if x.dim() else found, x, group=mesh.group)
+    dist.all_gather(list(found.unbind()), x, group=mesh.group)
     return found

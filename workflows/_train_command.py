@@ -26,28 +26,37 @@ def train(
     words: Words = None,
     stage: Annotated[Stages, typer.Option("--stage", help="1: element and network; 2: network; both.")] = Stages.BOTH,
     device: Annotated[str, typer.Option("--device", help="Where to learn: cpu or cuda.")] = "cpu",
+    mesh: Annotated[
+        str, typer.Option("--mesh", help="DATAxBAND processes, as torchrun starts them: 4x2; else all share the data.")
+    ] = "",
     quiet: Annotated[bool, typer.Option("--quiet", help="The folder alone.")] = False,
     debug: Debug = False,
     out: Out = Path("runs"),
 ) -> None:
     """Learn a recipe's element and restoration; run it again to go on where it was stopped."""
     recipe, command = load(words or ["train_small"])
-    check_device(device)
     from neusee.workflows._call import RunError
+    from neusee.workflows._mesh import MeshError, device_here, joined, processes
     from neusee.workflows.train import train as learn
 
+    device, (rank, world) = device_here(device), processes()
+    check_device(device)
+    quiet, who = quiet or rank > 0, f"process {rank}: " if world > 1 else ""
     stages = (1, 2) if stage is Stages.BOTH else (int(stage.value),)
     tell = (lambda line: None) if quiet else (lambda line: say([line]))
-    told = ["neusee", "train", *command[2:], "--stage", stage.value]
+    told = ["neusee", "train", *command[2:], "--stage", stage.value, *(["--mesh", mesh] if mesh else [])]
+    lengths = {s: how.iterations for s, how in recipe.training.stages.items()} if recipe.training else {}
     try:
-        with _bar(quiet, {s: recipe.training.stages[s].iterations for s in recipe.training.stages}
-                  if recipe.training else {}) as bar:  # fmt: skip
-            folder = learn(recipe, the_store(), out, told, tell, stages, device, bar.watch)
+        with joined(mesh, device) as processes_here, _bar(quiet, lengths) as bar:
+            folder = learn(recipe, the_store(), out, told, tell, stages, device, bar.watch, processes_here)
+    except MeshError as error:
+        fail(f"{who}{error}")
     except (RunError, ValueError, ArithmeticError) as error:
-        fail(str(error), FAILED)
+        fail(f"{who}{error}", FAILED)
     if not quiet:
         say(_next(folder))
-    say([str(folder)])
+    if rank == 0:
+        say([str(folder)])
 
 
 def _next(folder: Path) -> list[str]:
