@@ -85,7 +85,7 @@ def _woven(each: Tensor, axis: int, count: int) -> Tensor:
 def _unwoven(mesh: Mesh, x: Tensor, axis: int, count: int) -> Tensor:
     most = -(-count // mesh.band)
     whole = _filled(x.movedim(axis, 0), most * mesh.band)
-    return whole.unflatten(0, (most, mesh.band)).transpose(0, 1).contiguous()
+    return whole.reshape(most, mesh.band, *whole.shape[1:]).transpose(0, 1).contiguous()
 
 
 def _added(each: Tensor) -> Tensor:

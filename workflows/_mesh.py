@@ -71,7 +71,7 @@ class Mesh:
         dist.all_gather_object(said, about)
         for rank, other in enumerate(said):
             if other != said[0]:
-                raise MeshError(f"process 0 has {said[0]}, process {rank} has {other}: give all the same folder")
+                raise MeshError(f"process 0 is at {said[0]}, process {rank} at {other}: let all see the same folder")
 
     def numbers(self, found: Mapping[str, float], names: Sequence[str], device: str) -> dict[str, float]:
         """The sum of each of ``names`` over all; of one process, what it found."""
@@ -96,7 +96,7 @@ def _add(own: Sequence[nn.Parameter]) -> None:
     grads = [torch.zeros_like(p) if p.grad is None else p.grad for p in own]
     flat = torch.cat([*(g.reshape(-1) for g in grads), there])
     dist.all_reduce(flat)
-    *sums, counts = flat.split([*(p.numel() for p in own), len(own)])
+    *sums, counts = torch.split(flat, [*(p.numel() for p in own), len(own)])
     for p, total, count in zip(own, sums, counts.tolist(), strict=True):
         p.grad = total.view_as(p).clone() if count else None
 

@@ -59,7 +59,8 @@ class Shards:
                 steps.add(name)
             elif sources & (behind | steps):
                 behind.add(name)
-        rows = {name: found for name in steps if (found := _rows(recipe, name, wanted, behind, store)) is not None}
+        summed_alone = {n: asked for n in sorted(steps) if (asked := _asked(recipe, n, wanted, behind, live))}
+        rows = {name: _rows(recipe, asked, store) for name, asked in summed_alone.items()}
         return cls(recipe, mesh, count, frozenset(steps), frozenset(behind), rows)
 
     @property
@@ -151,11 +152,16 @@ def _count(recipe: Recipe, psf: str, spectral: set[str], store: Store, mesh: Mes
     return count
 
 
-def _rows(recipe: Recipe, name: str, wanted: Sequence[str], behind: set[str], store: Store) -> Tensor | None:
-    """The weights of the sums that are read of an image, where nothing else is."""
-    asked: Asked | None = None if name in wanted else asked_of(recipe, name, wanted)
-    if asked is None or not behind.issuperset(asked.readers):
-        return None
+def _asked(
+    recipe: Recipe, name: str, wanted: Sequence[str], behind: Collection[str], live: Collection[str]
+) -> Asked | None:
+    """The sums that are read of an image, where nothing else is and their weights are always the same."""
+    asked = None if name in wanted else asked_of(recipe, name, wanted)
+    still = asked is not None and asked.bands not in live and asked.responses not in live
+    return asked if asked is not None and still and set(behind).issuperset(asked.readers) else None
+
+
+def _rows(recipe: Recipe, asked: Asked, store: Store) -> Tensor:
     found = run(recipe, store, [asked.bands, asked.responses]).values
     rows: Tensor = spectra.rows(found[asked.bands], found[asked.responses], well=asked.well)
     return rows

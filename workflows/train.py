@@ -110,7 +110,7 @@ class _Course:
         self.state = folder / "state.pt"
         self.stage, self.iteration = min(how.stages), 0
         self._go_on()
-        mesh.agree(f"{folder} in stage {self.stage} after {self.iteration} iterations")
+        mesh.agree(f"{folder.name} in stage {self.stage} after {self.iteration} iterations")
 
     def _go_on(self) -> None:
         if not self.state.exists():

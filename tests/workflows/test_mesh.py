@@ -139,12 +139,16 @@ def test_another_mesh_goes_on_to_the_same_weights(tmp_path):
 
 @pytest.mark.slow
 def test_four_processes_find_the_gradients_of_one(tmp_path):
-    jobs = [(name, mesh, "step", words) for name, words in (("every", EVERY), ("few", FEW))
-            for mesh in ("1x1", "2x2", "1x4", "1x3")]  # fmt: skip
+    each = {"every": EVERY, "few": FEW, "by band": [*EVERY, "reading.level=per_band"]}
+    meshes = {"every": ["2x2", "1x4"], "few": ["2x2", "1x3"], "by band": ["2x2"]}
+    jobs = [(name, mesh, "step", each[name]) for name in each for mesh in ("1x1", *meshes[name])]
     found = processes(tmp_path, jobs)
-    for name in ("every", "few"):
-        for mesh in ("2x2", "1x4", "1x3"):
+    for name, among in meshes.items():
+        for mesh in among:
             same(stepped(found[name, mesh]), stepped(found[name, "1x1"]))
+    shared = stepped(found["by band", "2x2"])["shared"]
+    assert shared["cut"] == ["image[mask]", "image[plain]"]
+    assert shared["sums"] == [], "the peak of each band is asked for"
 
 
 @pytest.mark.slow

@@ -157,3 +157,11 @@ def test_unet_loads_its_own_weights_and_no_others(tmp_path):
     (tmp_path / "text.safetensors").write_text("no")
     with pytest.raises(ParameterError, match="no safetensors file"):
         doe.unet.before(**params | {"weights": tmp_path / "text.safetensors"}, width=4)
+
+
+def test_a_network_in_double_precision_draws_in_double_precision():
+    net = fresh(4, 16, seeded(3))
+    single = height_of(net, 24, 16, 1.2e-6)
+    double = height_of(net.double(), 24, 16, 1.2e-6)
+    assert double.dtype == torch.float64
+    assert_close(single.double(), double, rtol=1e-5, atol=1e-12)
