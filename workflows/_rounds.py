@@ -47,22 +47,35 @@ class Pictures:
         """A picture of this process alone."""
         return self._end(_only(theta, self._end.free), seed)
 
+    @property
+    def by_band(self) -> bool:
+        """Whether processes that share bands begin each other's pictures."""
+        return self._start is not None
+
     @contextmanager
     def together(
-        self, shared: Shared, drawn: Sequence[tuple[Theta, int]], place: int
-    ) -> Iterator[dict[str, Any] | None]:
-        """Begin all pictures of a round, and go on with that at ``place``; None where there is none.
+        self, shared: Shared, drawn: Mapping[int, tuple[Theta, int]], mine: int | None
+    ) -> Iterator[dict[str, Any]]:
+        """Begin all pictures of a round, and go on with ``mine``; a process without one only begins those of others.
 
         What was found of the gradient when the block ends goes back to where the bands came from.
         """
-        mine = drawn[place] if place < len(drawn) else None
         if self._start is None:
-            yield None if mine is None else self.alone({**shared.seen, **mine[0]}, mine[1])
+            yield self._finished(shared, drawn, mine, {})
             return
-        begun = [self._start(_only({**shared.values, **theta}, self._start.free), seed) for theta, seed in drawn]
+        start = self._start
+        begun = [start(_only({**shared.values, **theta}, start.free), seed) for theta, seed in drawn.values()]
         cut = _Cut(begun, self._cut, self.shards)
-        yield None if mine is None else self.alone({**shared.seen, **mine[0], **cut.values}, mine[1])
+        yield self._finished(shared, drawn, mine, cut.values)
         cut.back()
+
+    def _finished(
+        self, shared: Shared, drawn: Mapping[int, tuple[Theta, int]], mine: int | None, cut: Theta
+    ) -> dict[str, Any]:
+        if mine is None:
+            return {}
+        theta, seed = drawn[mine]
+        return self.alone({**shared.seen, **theta, **cut}, seed)
 
 
 class _Cut:

@@ -71,15 +71,21 @@ class Samples:
         learnt = _behind(recipe, order, {learn} if learn else set())
         if how.psf in drawn:
             raise ValueError(f"{how.psf} is drawn anew with each picture: its suppression cannot be learnt from")
-        outputs = [how.picture, how.truth, how.light]
         self.shards = Shards.of(recipe, how.psf, wanted, drawn | learnt, store, mesh)
         drawn |= self.shards.behind
-        border = _border(recipe, order, learnt - drawn, drawn, how.psf)
-        run: dict[str, Any] = {"store": store, "device": device}
-        ways = {**run, "caller": self.shards.call}
-        self.shared = as_function(recipe, learn, outputs=border, **ways) if learn else None
-        self._whole = [n for n in border if n in self.shards.steps and _read_outside(recipe, order, n, self.shards)]
-        self._each = Pictures(recipe, [*border, how.scene, *self._readers], outputs, noise, self.shards, run)
+        self._divide(recipe, learn, noise, drawn, _border(recipe, order, learnt - drawn, drawn, how.psf), store)
+
+    def _divide(
+        self, recipe: Recipe, learn: str | None, noise: set[str], drawn: set[str], border: list[str], store: Store
+    ) -> None:
+        """What follows the element alone and ends at ``border``, and what is computed for each picture."""
+        ways: dict[str, Any] = {"store": store, "device": self.device}
+        within, outputs = [*border, self.how.scene, *self._readers], [self.how.picture, self.how.truth, self.how.light]
+        shared = {**ways, "caller": self.shards.call}
+        self.shared = as_function(recipe, learn, outputs=border, **shared) if learn else None
+        read = {source for reader in drawn - self.shards.steps for source in recipe.steps[reader].sources}
+        self._whole = [name for name in border if name in self.shards.steps & read]
+        self._each = Pictures(recipe, within, outputs, noise, self.shards, ways)
 
     def begin(self, height: Tensor) -> Shared:
         """What follows the element alone, for all pictures of an iteration."""
@@ -99,10 +105,12 @@ class Samples:
         group = range(self.mesh.row, count, self.mesh.data)
         for begin in range(0, len(group), self.mesh.band):
             together = group[begin : begin + self.mesh.band]
-            drawn = [self._drawn(stage, first + i) for i in together]
-            with self._each.together(shared, [(theta, noise) for theta, noise, _ in drawn], self.mesh.column) as found:
-                if found is not None:
-                    yield together[self.mesh.column], self._sample(found, drawn[self.mesh.column][2])
+            mine = together[self.mesh.column] if self.mesh.column < len(together) else None
+            begun = {i: self._drawn(stage, first + i) for i in together if i == mine or self._each.by_band}
+            parts = {i: (theta, noise) for i, (theta, noise, _) in begun.items()}
+            with self._each.together(shared, parts, mine) as found:
+                if mine is not None:
+                    yield mine, self._sample(found, begun[mine][2])
 
     def __call__(self, shared: Mapping[str, Any], stage: int, number: int) -> Sample:
         """The picture of this number: the same whoever asks, and in whatever order."""
@@ -126,7 +134,7 @@ class Samples:
         return theta, noise, {**drawn, "noise": noise, "number": number}
 
     def _sample(self, found: Mapping[str, Any], drawn: Mapping[str, Any]) -> Sample:
-        picture, truth = found[self.how.picture], found[self.how.truth]
+        picture, truth = (found[name].to(self.how.dtype) for name in (self.how.picture, self.how.truth))
         if self.how.size is not None:
             picture, truth = _resized(picture, self.how.size), _resized(truth, self.how.size)
         return Sample(picture, truth, found[self.how.light], drawn)
@@ -162,11 +170,6 @@ def _border(recipe: Recipe, order: Sequence[str], made: set[str], drawn: set[str
     """What of ``made`` a picture reads, and the PSF."""
     read = {source for reader in drawn for source in recipe.steps[reader].sources}
     return [name for name in order if name in made and (name == psf or name in read)]
-
-
-def _read_outside(recipe: Recipe, order: Sequence[str], name: str, shards: Shards) -> bool:
-    """Whether a step reads all bands of one that is shared by band."""
-    return any(name in recipe.steps[reader].sources for reader in order if reader not in shards.steps)
 
 
 def _behind(recipe: Recipe, order: Sequence[str], first: set[str]) -> set[str]:
