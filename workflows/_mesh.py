@@ -139,7 +139,9 @@ def joined(text: str, device: str) -> Iterator[Mesh]:
         return
     if device.startswith("cuda"):
         torch.cuda.set_device(device)
-    dist.init_process_group("nccl" if device.startswith("cuda") else "gloo")
+        dist.init_process_group("nccl", device_id=torch.device(device))
+    else:
+        dist.init_process_group("gloo")
     groups = [dist.new_group(list(range(row * band, (row + 1) * band))) for row in range(data)]
     yield Mesh(data, band, rank, groups[rank // band])
     dist.destroy_process_group()  # after an error all end, and nobody waits for the others
