@@ -7,7 +7,7 @@ blob of that name. The content is hashed at the speed of memory, where computing
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Collection, Iterator, Sequence
 from math import ceil
 from typing import Any
 
@@ -67,7 +67,7 @@ def band_count(step: Step, inputs: Sequence[Any]) -> int:
     banded = list(_banded(step, inputs))
     if any(not isinstance(value, Tensor) and type(value) not in BAND_FIELDS for _, value in banded):
         return 0  # a mixture of planes has no slice of one band
-    found = {x.shape[axis] for axis, value in banded for x in _band_tensors(value) if _has(x, axis)}
+    found = {x.shape[axis] for axis, value in banded for x in band_tensors(value) if _has(x, axis)}
     return found.pop() if len(found) == 1 else 0
 
 
@@ -80,7 +80,7 @@ def band_keys(step: Step, inputs: Sequence[Any], code: str) -> list[str]:
         axis = _axis(step, name, value)
         same.append([name, axis, content(value if axis is None else _without_bands(value))])
         if axis is not None:
-            each += [[_hashed(part) for part in x.unbind(axis)] for x in _band_tensors(value)]
+            each += [[_hashed(part) for part in x.unbind(axis)] for x in band_tensors(value)]
     return [digest(same, list(band)) for band in zip(*each, strict=True)]
 
 
@@ -105,11 +105,18 @@ def _banded(step: Step, inputs: Sequence[Any]) -> Iterator[tuple[int, Any]]:
             yield axis, value
 
 
-def _band_tensors(value: Any) -> list[Tensor]:
+def band_tensors(value: Any) -> list[Tensor]:
     """The tensors of a value that have bands."""
     if isinstance(value, Tensor):
         return [value]
     return [getattr(value, name) for name in BAND_FIELDS[type(value)]]
+
+
+def with_band_tensors(value: Any, tensors: Sequence[Tensor]) -> Any:
+    """``value`` with others in place of its tensors that have bands."""
+    if isinstance(value, Tensor):
+        return tensors[0]
+    return value._replace(**dict(zip(BAND_FIELDS[type(value)], tensors, strict=True)))
 
 
 def _without_bands(value: Any) -> Any:
@@ -120,12 +127,12 @@ def _has(x: Tensor, axis: int) -> bool:
     return -x.dim() <= axis < x.dim()
 
 
-def _taken(step: Step, inputs: Sequence[Any], which: list[int]) -> list[Any]:
-    """The inputs with a few of their bands."""
+def taken(step: Step, inputs: Sequence[Any], which: list[int], of: Collection[str] | None = None) -> list[Any]:
+    """The inputs with a few of their bands; ``of``: only of these, for the others have no more than these."""
     found = list(inputs)
     for i, (name, value) in enumerate(zip(step.node.inputs, inputs, strict=False)):
         axis = _axis(step, name, value)
-        if axis is None:
+        if axis is None or (of is not None and name not in of):
             continue
         if isinstance(value, Tensor):
             found[i] = _slices(value, axis, which)
@@ -157,7 +164,7 @@ def _rebuilt(step: Step, items: list[Any]) -> Any:
 
 def _stacked(step: Step, value: Any, keys: list[str]) -> Any:
     """A result that was computed whole, with the names of its bands where it is large."""
-    tensors = _band_tensors(value)
+    tensors = band_tensors(value)
     leading = all(x.shape[0] == len(keys) and _leads(step, x) for x in tensors)
     if not leading or sum(x.nbytes for x in tensors) < LEAST:
         return value
@@ -186,7 +193,7 @@ def _gathered(
     stacks = [_Stack(axis, [f"{key}.{n}" for key in keys], blobs) for n in range(_fields(step))]
     for start in range(0, len(missing), size):
         which = missing[start : start + size]
-        for stack, x in zip(stacks, _band_tensors(evaluate(_taken(step, inputs, which))), strict=True):
+        for stack, x in zip(stacks, band_tensors(evaluate(taken(step, inputs, which))), strict=True):
             stack.add(which, x)
     return _rebuilt(step, [stack.whole() for stack in stacks])
 

@@ -73,6 +73,24 @@ def _readers(recipe: Recipe, order: Iterable[str]) -> dict[str, list[str]]:
     return found
 
 
+@dataclass(frozen=True)
+class Asked:
+    """What is read of an image: sums over its bands, by the channels' weights, and by the well's or not."""
+
+    bands: str
+    responses: str
+    readers: tuple[str, ...]
+    well: bool
+
+
+def asked_of(recipe: Recipe, image: str, wanted: Iterable[str]) -> Asked | None:
+    """What the steps that ``wanted`` needs read of an image; None where it is more than sums over its bands."""
+    names = _readers(recipe, needed(recipe, wanted)).get(image, [])
+    readers = [recipe.steps[name] for name in names]
+    found = _Draft(recipe, frozenset(wanted), {}).spectral(image, readers)
+    return found and Asked(*found, tuple(names), _well(readers))
+
+
 @dataclass
 class _Draft:
     """A recipe while steps are put beside its own."""
@@ -87,13 +105,10 @@ class _Draft:
     def collapse(self, image: Step) -> None:
         """Put the channels of an image beside it, if all that reads it asks for sums over its bands."""
         readers = [self.rewired.get(name, self.recipe.steps[name]) for name in self.readers.get(image.name, ())]
-        spectral = {(r.wires.get("bands"), r.wires.get("responses")) for r in readers if "responses" in r.node.inputs}
-        node, radiance = image.node.collapsed, image.wires.get("radiance")
-        if node is None or len(spectral) != 1 or not all(self._sums(r, image.name) for r in readers):
+        node, radiance, spectral = image.node.collapsed, image.wires.get("radiance"), self.spectral(image.name, readers)
+        if node is None or spectral is None or not isinstance(radiance, str):
             return
-        bands, responses = spectral.pop()
-        if not isinstance(radiance, str) or not isinstance(bands, str) or not isinstance(responses, str):
-            return
+        bands, responses = spectral
         name, within = f"{image.name}.channels", self.recipe.allowed(image.name) * CHANNELS
         wires = {
             "radiance": self._mixture(radiance, image),
@@ -106,6 +121,14 @@ class _Draft:
             changed = {i: _exchanged(wire, image.name, name) for i, wire in reader.wires.items()}
             self.rewired[reader.name] = replace(reader, wires=changed)
         self.economies.append(Economy(image.name, name, within, "only sums over its bands are asked for"))
+
+    def spectral(self, image: str, readers: Sequence[Step]) -> tuple[str, str] | None:
+        """The bands and responses by which all ``readers`` ask for sums over an image; None where one asks for more."""
+        found = {(r.wires.get("bands"), r.wires.get("responses")) for r in readers if "responses" in r.node.inputs}
+        if len(found) != 1 or not all(self._sums(r, image) for r in readers):
+            return None
+        bands, responses = found.pop()
+        return (bands, responses) if isinstance(bands, str) and isinstance(responses, str) else None
 
     def finished(self) -> Recipe:
         """The recipe with the steps that stand in."""
@@ -135,7 +158,7 @@ class _Draft:
         """The step that gives the weights of the bands; with the well's where a step reads bands but no responses."""
         from neusee.nodes import spectra
 
-        well = any("bands" in r.node.inputs and "responses" not in r.node.inputs for r in readers)
+        well = _well(readers)
         name, wires = f"{responses}.{'wells' if well else 'rows'}", {"bands": bands, "responses": responses}
         return self._add(name, spectra.rows, wires, {"well": well}, image)
 
@@ -157,6 +180,11 @@ class _Draft:
         """A step that stands where ``like`` is written; gives its name."""
         self.added[name] = Step(name, node, params, wires, like.mark, {}, like.device)
         return name
+
+
+def _well(readers: Iterable[Step]) -> bool:
+    """Whether a step reads bands but no responses."""
+    return any("bands" in r.node.inputs and "responses" not in r.node.inputs for r in readers)
 
 
 def _exchanged(wire: Wire, old: str, new: str) -> Wire:

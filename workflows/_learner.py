@@ -15,7 +15,7 @@ from neusee.nodes import losses
 from neusee.nodes._bicubic import resize
 from neusee.nodes.doe._learned import LEARNT
 from neusee.nodes.optics._aperture import stop
-from neusee.nodes.restore._critic import critics, slopes
+from neusee.nodes.restore._critic import critics, passed_over, slopes
 from neusee.nodes.restore._fft_mamba import FFTMamba
 from neusee.nodes.restore._nafnet import NAFNet
 from neusee.nodes.restore._network import Restorer, parameter_groups, started
@@ -24,7 +24,9 @@ from neusee.nodes.values import Psf
 from neusee.workflows._graph import Recipe, Step
 from neusee.workflows._keys import stream_seed
 from neusee.workflows._marks import nearest
-from neusee.workflows._samples import Sample, Samples, Shared
+from neusee.workflows._mesh import ALONE, Mesh
+from neusee.workflows._samples import Sample, Samples
+from neusee.workflows._shared import Shared
 from neusee.workflows._training import GRID, Network, Stage, Training
 
 _STEEPEST = 10.0  #: norm of a gradient, above which it is shortened
@@ -54,14 +56,14 @@ class Scales:
 
 
 class Learner:
-    """All that learns, on one device."""
+    """All that learns, on one device; in every process of a mesh the same."""
 
-    def __init__(self, recipe: Recipe, how: Training, device: str, designed: bool = False) -> None:
-        self.how, self.seed, self.device = how, recipe.seed, device
+    def __init__(self, recipe: Recipe, how: Training, device: str, designed: bool = False, mesh: Mesh = ALONE) -> None:
+        self.how, self.seed, self.device, self.mesh = how, recipe.seed, device, mesh
         self._step = recipe.steps[how.learn] if how.learn else None
-        self.relief = nn.Module() if designed or self._step is None else self._start(self._step)
-        self.net: Restorer = started(lambda: _made(how.network), self._rng("network"))
-        self.critics = nn.ModuleList(critics(self._rng("critics"), how.critics.width))
+        self.relief = nn.Module() if designed or self._step is None else self._start(self._step).to(how.dtype)
+        self.net: Restorer = started(lambda: _made(how.network), self._rng("network")).to(how.dtype)
+        self.critics = nn.ModuleList(critics(self._rng("critics"), how.critics.width)).to(how.dtype)
         self.average = _averaged(self.net, how.average) if how.average else None
         self.begin(Stage(iterations=0), learns=True)
 
@@ -111,21 +113,23 @@ class Learner:
     # --- one iteration ------------------------------------------------------------------------------------------------
 
     def iterate(self, samples: Samples, stage: int, iteration: int) -> tuple[Losses, list[Sample]]:
-        """Look at a batch of pictures, one after another, and move a step; raises `NotFinite` before a bad one."""
+        """Look at a batch of pictures, one after another, and move a step; raises `NotFinite` before a bad one.
+
+        Of several processes each looks at its own, and all move by the sum; the pictures are those of this one.
+        """
         self.makers.zero_grad(set_to_none=True)
-        free = {str(self.how.learn): self.height()} if samples.shared else {}
-        shared = Shared.of(samples.shared(free) if samples.shared else {})
-        found = self._element(shared) if self.learns else {}
-        batch, seen, pairs = self.stage.batch, list[Sample](), list[tuple[Scales, Scales]]()
-        for i in range(batch):
-            sample = samples(shared.values, stage, iteration * batch + i)
+        shared = samples.begin(self.height()) if samples.shared else Shared.of({})
+        found = self._element(shared, samples) if self.learns else {}
+        batch, seen, pairs = self.stage.batch, list[Sample](), dict[int, tuple[Scales, Scales]]()
+        for i, sample in samples.batch(shared, stage, iteration * batch, batch):
             terms, truth, estimate = self._restored(sample)
+            pairs[i] = (truth, estimate)
             _backward([weight * term / batch for weight, term in terms.values() if weight])
             for name, (_, term) in terms.items():
                 found[name] = found.get(name, 0.0) + float(term.detach()) / batch
             seen.append(sample)
-            pairs.append((truth, estimate))
         shared.back()
+        found = self.mesh.numbers(found, self._names(), self.device)
         found["slope"] = self._move(self.makers, found, (self.net, self.relief) if self.learns else (self.net,))
         if self.average:
             self.average.update_parameters(self.net)
@@ -133,16 +137,26 @@ class Learner:
             found |= self._judge(pairs, self._rng("between", stage, iteration))
         return found, seen
 
-    def _element(self, shared: Shared) -> Losses:
-        """The suppression of each band, one band at a time: what its norm needs is made again on the way back."""
+    def _names(self) -> list[str]:
+        """What an iteration of the stage finds, in whatever process."""
+        weights = {"BSR": self.stage.bsr, "reconstruction": self.stage.reconstruction,
+                   "adversarial": self.stage.adversarial}  # fmt: skip
+        return [*(["LSR"] if self.learns else []), "L1", *(name for name, weight in weights.items() if weight)]
+
+    def _element(self, shared: Shared, samples: Samples) -> Losses:
+        """The suppression of each band, one band at a time: what its norm needs is made again on the way back.
+
+        Each process has its own bands, or a share of all of them, so that over all processes each band counts once.
+        """
         psf: Psf = shared.values[self.how.psf]
+        count, times = samples.counted(self.how.psf, len(psf.clear_peak))
         with torch.no_grad():
             peaks = psf.intensity.detach().amax((-2, -1)).double() / psf.clear_peak
         if self.stage.lsr:
             for one in range(len(psf.clear_peak)):
                 loss = checkpoint(self._suppression, psf.intensity, psf.clear_peak, one, use_reentrant=False)
-                (self.stage.lsr * loss).backward()
-        return {"LSR": float(peaks.mean())}
+                (self.stage.lsr / times * loss).backward()
+        return {"LSR": float(peaks.mean()) * (len(peaks) / count) / times}
 
     def _suppression(self, intensity: Tensor, clear: Tensor, band: int) -> Tensor:
         one: Tensor = losses.lsr(Psf(intensity[band : band + 1], clear[band : band + 1]), log=self.how.logarithm)
@@ -154,7 +168,8 @@ class Learner:
         picture = sample.picture if self.learns else sample.picture.detach()
         with low:
             coarse, fine = self.net.pyramid(picture)
-        estimate, truth = Scales(coarse.float(), fine.float()), Scales.of(sample.truth.detach())
+        estimate = Scales(coarse.to(self.how.dtype), fine.to(self.how.dtype))
+        truth = Scales.of(sample.truth.detach())
         terms = {"L1": (0.0, (estimate.fine - truth.fine).abs().mean())}
         if self.stage.bsr:
             terms["BSR"] = (self.stage.bsr, (1.0 / sample.light.clamp_min(1e-30)).sum())
@@ -169,26 +184,32 @@ class Learner:
             terms["adversarial"] = (self.stage.adversarial, sum(scores, torch.zeros((), device=fine.device)))
         return terms, truth, Scales(estimate.coarse.detach(), estimate.fine.detach())
 
-    def _judge(self, pairs: Sequence[tuple[Scales, Scales]], rng: torch.Generator) -> Losses:
-        """Let the critics learn to tell truth and estimates apart."""
+    def _judge(self, pairs: Mapping[int, tuple[Scales, Scales]], rng: torch.Generator) -> Losses:
+        """Let the critics learn to tell truth and estimates apart; the stream is the same whoever has the pictures."""
         self.judges.zero_grad(set_to_none=True)
-        found = {"critics": 0.0, "penalty": 0.0}
-        for truth, estimate in pairs:
-            for critic, t, e in zip(self.critics, truth, estimate, strict=True):
+        found, batch = {"critics": 0.0, "penalty": 0.0}, self.stage.batch
+        for i in range(batch):
+            if i not in pairs:
+                for _ in self.critics:
+                    passed_over(rng)
+                continue
+            for critic, t, e in zip(self.critics, *pairs[i], strict=True):
                 apart = (critic(e) - critic(t)).mean()
                 steep = losses.gradient_penalty(slopes(critic, t, e, rng))
-                _backward([(self.stage.adversarial * apart + self.stage.penalty * steep) / len(pairs)])
-                found["critics"] += float(apart.detach()) / len(pairs)
-                found["penalty"] += float(steep.detach()) / len(pairs)
+                _backward([(self.stage.adversarial * apart + self.stage.penalty * steep) / batch])
+                found["critics"] += float(apart.detach()) / batch
+                found["penalty"] += float(steep.detach()) / batch
+        found = self.mesh.numbers(found, tuple(found), self.device)
         self._move(self.judges, found, self.critics)
         return found
 
-    @staticmethod
-    def _move(optimiser: torch.optim.Optimizer, found: Mapping[str, float], parts: Iterable[nn.Module]) -> float:
+    def _move(self, optimiser: torch.optim.Optimizer, found: Mapping[str, float], parts: Iterable[nn.Module]) -> float:
         """One step against the gradient, unless it or a loss is not finite; the steepest gradient of a part.
 
         Each part is limited by itself: the suppression pulls at the element a thousand times as hard as at a network.
         """
+        parts = list(parts)
+        self.mesh.add_gradients(parts)
         norm = max(float(nn.utils.clip_grad_norm_(part.parameters(), _STEEPEST)) for part in parts)
         wrong = [name for name, x in {**found, "norm of the gradient": norm}.items() if not abs(x) < float("inf")]
         if wrong:

@@ -2,12 +2,13 @@
 
 A recipe falls into three: what neither learns nor is drawn is computed once; what follows the element alone is
 computed once an iteration; what follows a scene, a draw or a random step is computed for each picture. Between the
-second and the third the gradient waits until all pictures are done, so that no more than one of them is held.
+second and the third the gradient waits until all pictures are done, so that no more than one of them is held. Of
+several processes each has its own pictures, and along a band axis its own bands of what is shared.
 """
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -15,12 +16,15 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from neusee.workflows._codec import each_tensor, tensors_in
 from neusee.workflows._economy import economised
 from neusee.workflows._function import as_function
 from neusee.workflows._graph import Recipe, needed
 from neusee.workflows._inputs import Inputs
+from neusee.workflows._mesh import ALONE, Mesh
 from neusee.workflows._photographs import Photographs
+from neusee.workflows._rounds import Pictures
+from neusee.workflows._shards import Shards
+from neusee.workflows._shared import Shared
 from neusee.workflows._store import Store
 from neusee.workflows._training import Training
 
@@ -38,31 +42,6 @@ class Sample:
     drawn: Mapping[str, Any]  #: what it was made with
 
 
-@dataclass(frozen=True)
-class Shared:
-    """What follows the element alone, cut off from it: gradients gather here until `back`."""
-
-    made: Mapping[str, Any]  #: with its history
-    values: Mapping[str, Any]  #: without
-
-    @classmethod
-    def of(cls, made: Mapping[str, Any]) -> Shared:
-        """Cut what was made off from how it was made."""
-        leaves = {name: each_tensor(_leaf, value) for name, value in made.items()}
-        return cls(made, leaves)
-
-    def back(self) -> None:
-        """Send what has gathered on to the element."""
-        pairs = zip(tensors_in(dict(self.made)), tensors_in(dict(self.values)), strict=True)
-        found = [(x, leaf.grad) for x, leaf in pairs if x.requires_grad and leaf.grad is not None]
-        if found:
-            torch.autograd.backward([x for x, _ in found], [grad for _, grad in found])
-
-
-def _leaf(x: Tensor) -> Tensor:
-    return x.detach().requires_grad_(x.requires_grad)
-
-
 class Samples:
     """Draws pictures through a recipe whose element learns, or through the same recipe ``frozen``."""
 
@@ -74,9 +53,10 @@ class Samples:
         store: Store,
         device: str,
         frozen: Recipe | None = None,
+        mesh: Mesh = ALONE,
     ) -> None:
         learn = None if frozen else how.learn
-        self.how, self.photographs, self.device, self.seed = how, photographs, device, recipe.seed
+        self.how, self.photographs, self.device, self.seed, self.mesh = how, photographs, device, recipe.seed, mesh
         self._pool = how.pool if frozen else None
         self._kept: dict[tuple[int, int], Sample] = {}
         wanted = (how.picture, how.truth, how.light, how.psf)
@@ -94,29 +74,71 @@ class Samples:
         learnt = _behind(recipe, order, {learn} if learn else set())
         if how.psf in drawn:
             raise ValueError(f"{how.psf} is drawn anew with each picture: its suppression cannot be learnt from")
-        border = [
-            name
-            for name in order
-            if name in learnt - drawn
-            and (name == how.psf or any(name in recipe.steps[reader].sources for reader in drawn))
-        ]
-        within = [*border, how.scene, *self._readers]
-        outputs = [how.picture, how.truth, how.light]
-        self.shared = as_function(recipe, learn, outputs=border, store=store, device=device) if learn else None
-        self._each = as_function(recipe, *within, outputs=outputs, store=store, device=device, redraw=noise)
+        self.shards = Shards.of(recipe, how.psf, wanted, drawn | learnt, store, mesh)
+        drawn |= self.shards.behind
+        self._divide(recipe, learn, noise, drawn, _border(recipe, order, learnt - drawn, drawn, how.psf), store)
+
+    def _divide(
+        self, recipe: Recipe, learn: str | None, noise: set[str], drawn: set[str], border: list[str], store: Store
+    ) -> None:
+        """What follows the element alone and ends at ``border``, and what is computed for each picture."""
+        ways: dict[str, Any] = {"store": store, "device": self.device}
+        within, outputs = [*border, self.how.scene, *self._readers], [self.how.picture, self.how.truth, self.how.light]
+        shared = {**ways, "caller": self.shards.call}
+        self.shared = as_function(recipe, learn, outputs=border, **shared) if learn else None
+        read = {source for reader in drawn - self.shards.steps for source in recipe.steps[reader].sources}
+        self._whole = [name for name in border if name in self.shards.steps & read]
+        self._each = Pictures(recipe, within, outputs, noise, self.shards, ways)
+
+    def begin(self, height: Tensor) -> Shared:
+        """What follows the element alone, for all pictures of an iteration."""
+        made = self.shared({str(self.how.learn): height}) if self.shared else {}
+        return Shared.of(made, self.shards, self._whole)
+
+    def counted(self, name: str, here: int) -> tuple[int, int]:
+        """Of ``here`` bands of a result: how many there are in all, and how many processes have each."""
+        by_band = name in self.shards.steps
+        return (self.shards.count, self.mesh.data) if by_band else (here, self.mesh.size)
+
+    def batch(self, shared: Shared, stage: int, first: int, count: int) -> Iterator[tuple[int, Sample]]:
+        """This process's pictures of ``count`` from number ``first`` on, each with its place among them.
+
+        To be gone through to the end, for what comes behind a picture goes back to all that had a share in it.
+        """
+        group = range(self.mesh.row, count, self.mesh.data)
+        for begin in range(0, len(group), self.mesh.band):
+            together = group[begin : begin + self.mesh.band]
+            mine = together[self.mesh.column] if self.mesh.column < len(together) else None
+            if self._pool is not None and not self._each.by_band:  # nobody else has a share in it
+                if mine is not None:
+                    yield mine, self(shared.seen, stage, first + mine)
+                continue
+            begun = {
+                i: self._drawn(stage, (first + i) % (self._pool or _SEEDS))
+                for i in together
+                if i == mine or self._each.by_band
+            }
+            parts = {i: (theta, noise) for i, (theta, noise, _) in begun.items()}
+            with self._each.together(shared, parts, mine) as found:
+                if mine is not None:
+                    yield mine, self._sample(found, begun[mine][2])
 
     def __call__(self, shared: Mapping[str, Any], stage: int, number: int) -> Sample:
         """The picture of this number: the same whoever asks, and in whatever order."""
         if self._pool is None:
-            return self._made(shared, stage, number)
+            return self._alone(shared, stage, number)
         number %= self._pool
         if (stage, number) not in self._kept:
-            self._kept[stage, number] = self._made(shared, stage, number)
+            self._kept[stage, number] = self._alone(shared, stage, number)
         return self._kept[stage, number]
 
-    def _made(self, shared: Mapping[str, Any], stage: int, number: int) -> Sample:
-        seed = (self.seed, stage, number)
-        rng = np.random.default_rng((*seed, 1))
+    def _alone(self, shared: Mapping[str, Any], stage: int, number: int) -> Sample:
+        theta, noise, drawn = self._drawn(stage, number)
+        return self._sample(self._each.alone({**shared, **theta}, noise), drawn)
+
+    def _drawn(self, stage: int, number: int) -> tuple[dict[str, Any], int, dict[str, Any]]:
+        """What a picture is made of, the seed of its noise, and all that was drawn."""
+        rng = np.random.default_rng((self.seed, stage, number, 1))
         theta, drawn = dict(self._readers), dict[str, Any]()
         if self._inputs is not None:
             values = self._inputs.at(rng.standard_normal((1, len(self._inputs.names))))[0]
@@ -125,25 +147,26 @@ class Samples:
         if rng.random() < self.how.laser_free:
             theta |= dict.fromkeys(self._lasers, 0.0)
             drawn["laser"] = "none"
-        theta |= {
-            **shared,
-            self.how.scene: self.photographs.crop(self.shape, self.seed, (stage, number)).to(self.device),
-        }
+        scene = self.photographs.crop(self.shape, self.seed, (stage, number))
+        theta |= {self.how.scene: scene.to(self.device, self.how.dtype)}
         noise = int(rng.integers(_SEEDS))
-        found = self._each(theta, seed=noise)
-        picture, truth = found[self.how.picture], found[self.how.truth]
+        return theta, noise, {**drawn, "noise": noise, "number": number}
+
+    def _sample(self, found: Mapping[str, Any], drawn: Mapping[str, Any]) -> Sample:
+        picture, truth = (found[name].to(self.how.dtype) for name in (self.how.picture, self.how.truth))
         if self.how.size is not None:
             picture, truth = _resized(picture, self.how.size), _resized(truth, self.how.size)
-        picture, truth = self._patches(torch.stack([picture, truth]), rng)
-        return Sample(picture, truth, found[self.how.light], {**drawn, "noise": noise, "number": number})
+        picture, truth = self._patches(torch.stack([picture, truth]), drawn["noise"])
+        return Sample(picture, truth, found[self.how.light], drawn)
 
-    def _patches(self, both: Tensor, rng: np.random.Generator) -> Tensor:
+    def _patches(self, both: Tensor, seed: int) -> Tensor:
         """(2, 3, y, x) -> (2, n, 3, y, x): the same places of a picture and of its truth, or all of it."""
         if self.how.patch is None:
             return both[:, None]
         size, patch = (both.shape[-2], both.shape[-1]), self.how.patch
         if any(have < want for have, want in zip(size, patch, strict=True)):
             raise ValueError(f"train.patch: {list(patch)} is larger than the picture, {list(size)}")
+        rng = np.random.default_rng((seed, 2))
         places = [
             [int(rng.integers(h - w + 1)) for h, w in zip(size, patch, strict=True)] for _ in range(self.how.patches)
         ]
@@ -174,6 +197,12 @@ def _frame(recipe: Recipe, scene: str) -> tuple[int, int]:
 def _given(recipe: Recipe, name: str) -> Any:
     step, _, param = name.rpartition(".")
     return recipe.steps[step].params[param]
+
+
+def _border(recipe: Recipe, order: Sequence[str], made: set[str], drawn: set[str], psf: str) -> list[str]:
+    """What of ``made`` a picture reads, and the PSF."""
+    read = {source for reader in drawn for source in recipe.steps[reader].sources}
+    return [name for name in order if name in made and (name == psf or name in read)]
 
 
 def _behind(recipe: Recipe, order: Sequence[str], first: set[str]) -> set[str]:

@@ -33,6 +33,9 @@ def train(
     words: Words = None,
     stage: Annotated[Stages, typer.Option("--stage", help=_STAGES)] = Stages.BOTH,
     device: Annotated[str, typer.Option("--device", help="Where to learn: cpu or cuda.")] = "cpu",
+    mesh: Annotated[
+        str, typer.Option("--mesh", help="DATAxBAND processes, as torchrun starts them: 4x2; else all share the data.")
+    ] = "",
     quiet: Annotated[bool, typer.Option("--quiet", help="The folder alone.")] = False,
     debug: Debug = False,
     out: Out = Path("runs"),
@@ -42,27 +45,34 @@ def train(
     With --stage mask the element is designed without images, as train.mask says; --stage 2 then goes on from it.
     """
     recipe, command = load(words or ["train_small"])
-    check_device(device)
     if recipe.lifting is not None:
-        if stage is not Stages.BOTH:
-            fail(f"--stage {stage.value}: {recipe.name} learns a lift, which has no stages: leave it out")
+        if stage is not Stages.BOTH or mesh:
+            fail(f"{recipe.name} learns a lift, which has neither stages nor a mesh: leave --stage and --mesh out")
+        check_device(device)
         return _lift(recipe, ["neusee", "train", *command[2:]], out, device, quiet)
     from neusee.workflows._call import RunError
+    from neusee.workflows._mesh import MeshError, device_here, joined, processes
     from neusee.workflows.train import train as learn
 
+    device, (rank, world) = device_here(device), processes()
+    check_device(device)
+    quiet, who = quiet or rank > 0, f"process {rank}: " if world > 1 else ""
     there = recipe.training.learnt if recipe.training else ()
     stages = there if stage is Stages.BOTH else _NUMBERS[stage]
     tell = (lambda line: None) if quiet else (lambda line: say([line]))
-    told = ["neusee", "train", *command[2:], "--stage", stage.value]
+    told = ["neusee", "train", *command[2:], "--stage", stage.value, *(["--mesh", mesh] if mesh else [])]
+    lengths = {s: recipe.training.stages[s].iterations for s in stages if s} if recipe.training else {}
     try:
-        lengths = {s: recipe.training.stages[s].iterations for s in there} if recipe.training else {}
-        with _bar(quiet, lengths if stage is not Stages.MASK else {}) as bar:
-            folder = learn(recipe, the_store(), out, told, tell, stages, device, bar.watch)
+        with joined(mesh, device) as processes_here, _bar(quiet, lengths) as bar:
+            folder = learn(recipe, the_store(), out, told, tell, stages, device, bar.watch, processes_here)
+    except MeshError as error:
+        fail(f"{who}{error}")
     except (RunError, ValueError, ArithmeticError) as error:
-        fail(str(error), FAILED)
+        fail(f"{who}{error}", FAILED)
     if not quiet:
         say(_next(folder, stage))
-    say([str(folder)])
+    if rank == 0:
+        say([str(folder)])
 
 
 def _lift(recipe: Recipe, told: list[str], out: Path, device: str, quiet: bool) -> None:

@@ -6,6 +6,7 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
+import torch
 from pydantic import BaseModel, ConfigDict, Field, ValidationError
 
 from neusee.workflows._compose import Composed
@@ -91,7 +92,7 @@ class Training(_Block):
     rates: Rates = Rates()
     laser_free: Share = 0.0
     average: Annotated[float, Field(ge=0, lt=1)] = 0.999
-    precision: Literal["float32", "bfloat16"] = "float32"
+    precision: Literal["float32", "bfloat16", "float64"] = "float32"
     logarithm: bool = True
     mask: MaskSettings = MaskSettings()  #: the element without images, in place of stage 1
     stages: dict[Annotated[int, Field(ge=1, le=2)], Stage]
@@ -107,6 +108,11 @@ class Training(_Block):
     def design(self) -> MaskTraining:
         """How the element is designed without images: on the steps that the stages learn from too."""
         return MaskTraining.model_construct(**dict(self.mask), height=self.learn, psf=self.psf)
+
+    @property
+    def dtype(self) -> torch.dtype:
+        """Of what learns and of the scenes; bfloat16 is for what a network computes, not for what it is."""
+        return torch.float64 if self.precision == "float64" else torch.float32
 
 
 def read_training(composed: Composed) -> tuple[Composed, Training | None]:

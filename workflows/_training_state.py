@@ -64,13 +64,14 @@ class Rows:
         self.rows: list[dict[str, str]] = []
         self._kept = 0
 
-    def cut(self, stage: int, iteration: int) -> None:
+    def cut(self, stage: int, iteration: int, write: bool = True) -> None:
         """Keep what came before an iteration of a stage."""
         if self._path.exists():
             with self._path.open(newline="", encoding="utf-8") as file:
                 self.rows = [row for row in csv.DictReader(file) if _place(row) < (stage, iteration)]
         self._kept = 0
-        self.keep()
+        if write:
+            self.keep()
 
     def add(self, stage: int, iteration: int, found: Mapping[str, float]) -> None:
         """Note an iteration; it is on disk with the next `keep`."""

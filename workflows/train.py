@@ -17,6 +17,7 @@ from neusee.workflows._figures_training import curves, strip
 from neusee.workflows._graph import Recipe
 from neusee.workflows._keys import digest
 from neusee.workflows._learner import Learner, NotFinite
+from neusee.workflows._mesh import ALONE, Mesh, MeshError
 from neusee.workflows._photographs import Photographs
 from neusee.workflows._samples import Sample, Samples
 from neusee.workflows._store import Store
@@ -37,27 +38,48 @@ def train(
     stages: Sequence[int] = (1, 2),
     device: str = "cpu",
     watch: Watch | None = None,
+    mesh: Mesh = ALONE,
 ) -> Path:
     """Learn through the stages, or go on where an earlier call of the same was stopped; the folder.
 
     Stage 0 designs the element without images, in place of stage 1.
 
+    Of the processes of a mesh each calls this, with the same arguments and a folder that all of them see; the first
+    alone writes, and an error in one ends them all. The mesh decides no number but by rounding.
+
     Raises ValueError for a recipe that says not how, a folder without photographs, a second stage before there is an
-    element, or a first one where that was designed; ArithmeticError where a loss is no number, with all that led to it
-    beside the state.
+    element, a first one where that was designed, or a mesh that does not fit; ArithmeticError where a loss is no
+    number, with all that led to it beside the state.
     """
     how = recipe.training
     if how is None:
         raise ValueError(f"{recipe.name} says not how it is learnt: add `train: recommended` to its defaults")
     with_pictures = [number for number in stages if number != MASK]
+    if MASK in stages and mesh.size > 1:
+        raise MeshError("--stage mask is designed by one process: start it without torchrun")
+    _divided(recipe, how, mesh)
     photographs = _photographs(recipe, how, bool(with_pictures))
     folder = runs / f"{recipe.name}_train_{_name(recipe, how, photographs)}"
     folder.mkdir(parents=True, exist_ok=True)
+    if not mesh.first:
+        tell, watch = (lambda line: None), None
     if MASK in stages:
         design_in(folder, recipe, how, store, command, tell, device)
     if with_pictures:
-        _Course(recipe, how, photographs, store, folder, tell, device, watch).through(with_pictures, command)
+        _Course(recipe, how, photographs, store, folder, tell, device, watch, mesh).through(with_pictures, command)
     return folder
+
+
+def _divided(recipe: Recipe, how: Training, mesh: Mesh) -> None:
+    """Refuse a batch of which the processes of the data axis cannot have equal shares."""
+    for number, stage in how.stages.items():
+        if stage.batch % mesh.data:
+            path = f"{KEY}.stages.{number}.batch"
+            where = recipe.config.settings.get(path)
+            raise MeshError(
+                f"{where.source if where else recipe.name}   {path}   {stage.batch} pictures cannot be shared equally "
+                f"among {mesh.data}: --mesh {mesh} needs a multiple of {mesh.data}"
+            )
 
 
 def _photographs(recipe: Recipe, how: Training, needed: bool) -> Photographs:
@@ -91,15 +113,17 @@ class _Course:
         tell: Tell,
         device: str,
         watch: Watch | None,
+        mesh: Mesh,
     ) -> None:
         self.recipe, self.how, self.photographs, self.store = recipe, how, photographs, store
-        self.folder, self.tell, self.device, self.watch = folder, tell, device, watch
+        self.folder, self.tell, self.device, self.watch, self.mesh = folder, tell, device, watch, mesh
         self.designed = designed(folder)
-        self.learner = Learner(recipe, how, device, self.designed)
+        self.learner = Learner(recipe, how, device, self.designed, mesh)
         self.rows = Rows(folder / "losses.csv")
         self.state = folder / "state.pt"
         self.stage, self.iteration = 2 if self.designed else min(how.learnt), 0
         self._go_on()
+        mesh.agree(f"{folder.name} in stage {self.stage} after {self.iteration} iterations")
 
     def _go_on(self) -> None:
         if not self.state.exists():
@@ -108,7 +132,7 @@ class _Course:
         self.stage, self.iteration = found["stage"], found["iteration"]
         self._begin()
         restore(self.learner.parts(), found)
-        self.rows.cut(self.stage, self.iteration)
+        self.rows.cut(self.stage, self.iteration, self.mesh.first)
         self.tell(f"goes on in stage {self.stage} after {self.iteration} iterations")
 
     def _begin(self) -> None:
@@ -127,7 +151,7 @@ class _Course:
                 raise ValueError(f"stage {number} needs stage {self.stage}: {first}")
             if number == self.stage:
                 self._through()
-        if self.rows.rows:
+        if self.rows.rows and self.mesh.first:
             self._close(command)
 
     @property
@@ -142,14 +166,16 @@ class _Course:
             self._iterate(samples)
             if self.iteration % self.how.keep == 0 and self.iteration < self._length:
                 self._keep()
-        self._export(learns)
+        if self.mesh.first:
+            self._export(learns)
         self.stage, self.iteration = self.stage + 1, 0
         self._begin()
         self._keep()
+        self.mesh.wait()  # for the mask that is frozen now
 
     def _samples(self, learns: bool) -> Samples:
         parts = self.recipe, self.how, self.photographs, self.store, self.device
-        return Samples(*parts, None if learns else frozen(self.recipe, self.how, self.folder))
+        return Samples(*parts, None if learns else frozen(self.recipe, self.how, self.folder), self.mesh)
 
     def _iterate(self, samples: Samples) -> None:
         began, number = time.perf_counter(), self.iteration
@@ -161,7 +187,7 @@ class _Course:
         found |= {"rate": rate, "seconds": time.perf_counter() - began}
         self.rows.add(self.stage, number, found)
         self.iteration += 1
-        if self.iteration % self.how.show == 0 or self.iteration == self._length:
+        if self.mesh.first and (self.iteration % self.how.show == 0 or self.iteration == self._length):
             self._show(seen[0])
         if self.watch is not None:
             self.watch(self.stage, self.iteration, found)
@@ -172,13 +198,16 @@ class _Course:
         batch = self.how.stages[self.stage].batch
         pictures = [self.iteration * batch + i for i in range(batch)]
         here = {"stage": self.stage, "iteration": self.iteration, "pictures": pictures}
-        replaced(path, packed(self.learner.parts(), **here))
-        self.rows.keep()
+        if self.mesh.first:
+            replaced(path, packed(self.learner.parts(), **here))
+            self.rows.keep()
         said = f"stage {self.stage}, iteration {self.iteration}, pictures {pictures[0]} to {pictures[-1]}"
         return ArithmeticError(f"{said}: {error}; weights of that moment: {path}")
 
     def _keep(self) -> None:
         """First the rows, then the state: rows that are too many are cut off, lacking ones would be lost."""
+        if not self.mesh.first:
+            return
         self.rows.keep()
         replaced(self.state, packed(self.learner.parts(), stage=self.stage, iteration=self.iteration))
 
@@ -205,6 +234,7 @@ class _Course:
             "element": "designed without images" if self.designed else "learnt in stage 1",
             "train": self.how.model_dump(mode="json"),
             "photographs": len(self.photographs.paths),
+            "mesh": str(self.mesh),
             "broken": broken,
             "iterations": {str(s): sum(int(r["stage"]) == s for r in self.rows.rows) for s in self.how.stages},
             "seconds": sum(float(r["seconds"]) for r in self.rows.rows),

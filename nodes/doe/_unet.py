@@ -60,8 +60,8 @@ def coordinates(grid: int, device: torch.device | None = None) -> Tensor:
 
 def height_of(net: nn.Module, samples: int, grid: int, max_height: float) -> Tensor:
     """Relief (samples, samples) between 0 and ``max_height``, through which the network learns."""
-    device = next(net.parameters()).device
-    logits = net(coordinates(min(grid, samples), device))
+    like = next(net.parameters())
+    logits = net(coordinates(min(grid, samples), like.device).to(like))
     return max_height * torch.sigmoid(enlarge(logits, samples, samples))
 
 

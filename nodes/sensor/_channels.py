@@ -20,6 +20,13 @@ def weighted(image: Tensor | Channels, weights: Tensor) -> Tensor:
     return flat.reshape(*flat.shape[:-1], *image.shape[-2:])
 
 
+def summed(image: Tensor, rows: Tensor) -> Channels:
+    """Sum an image (..., band, y, x) by each of ``rows`` (row, band), exactly; of some of its bands, their share."""
+    exact = torch.zeros((), dtype=torch.float64)
+    light = single(image).sum(-1).sum(-1, dtype=torch.float64)
+    return Channels(weighted(image, rows), rows.detach().double(), light, exact, largest=exact)
+
+
 def _of_rows(weights: Tensor, rows: Tensor) -> Tensor:
     """M with weights = M rows, by least squares in float64; the gradient reaches the weights."""
     known = rows.detach().cpu().double()

@@ -20,7 +20,8 @@ from neusee.nodes.doe._learned import LEARNT
 from neusee.nodes.optics._aperture import stop
 from neusee.workflows import RecipeError, Store, as_function, cli, load
 from neusee.workflows._photographs import Photographs
-from neusee.workflows._samples import Samples, Shared
+from neusee.workflows._samples import Samples
+from neusee.workflows._shared import Shared
 from neusee.workflows._training import GRID, MaskSettings, Rates
 from neusee.workflows.train import frozen, train
 

@@ -189,3 +189,11 @@ def test_every_sample_of_a_formula_can_be_freed(name, params):
     height = freed(grid).detach()
     assert float(height.min()) > 0
     assert float(height.max()) < freed.max_height
+
+
+def test_a_network_in_double_precision_draws_in_double_precision():
+    net = fresh(4, 16, seeded(3))
+    single = height_of(net, 24, 16, 1.2e-6)
+    double = height_of(net.double(), 24, 16, 1.2e-6)
+    assert double.dtype == torch.float64
+    assert_close(single.double(), double, rtol=1e-5, atol=1e-12)
