@@ -266,7 +266,7 @@ def test_a_mistake_is_located(change, said):
     assert all("argument 1" in str(problem.mark) for problem in caught.value.problems)
 
 
-@pytest.mark.parametrize(("doe", "said"), [("axicon", "of which nothing is learnt"), ("unet", "")])
+@pytest.mark.parametrize(("doe", "said"), [("flat", "of which nothing is learnt"), ("unet", ""), ("axicon", "")])
 def test_only_what_learns_can_be_learnt(tmp_path, photographs, doe, said):
     changes = [c for c in TINY if not c.startswith("doe.") or doe == "unet"]
     recipe = load("train_small", [f"doe={doe}", *changes,
