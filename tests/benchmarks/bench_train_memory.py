@@ -107,7 +107,9 @@ def main():
         bytes_ = law(ROWS, found)
         worst = max(abs(np.dot(terms(*row), bytes_) / x - 1) for row, x in zip(ROWS, found, strict=True))
         said = ", ".join(f"{x:.3g} a {n}" for x, n in zip(bytes_, NAMES, strict=True))
-        print(f"\nstage {stage}, {name}: {said}; within {worst:.1%}; {FULL}: {np.dot(terms(*FULL), bytes_) / 1e9:.2f} GB")
+        print(
+            f"\nstage {stage}, {name}: {said}; within {worst:.1%}; {FULL}: {np.dot(terms(*FULL), bytes_) / 1e9:.2f} GB"
+        )
 
 
 if __name__ == "__main__":

@@ -75,7 +75,16 @@ def gradients(scan, values, seen):
 def test_a_long_line_is_that_of_the_loop(rate, even, backend):
     values = draw(65_536, rate=rate, kind=torch.float32, even=even)
     truth = loop(*values)
-    assert worst(selective_scan(*values, backend=backend), truth) < (1e-6 if backend == "torch" else 3e-7)
+    assert worst(selective_scan(*values, backend=backend), truth) < (8e-7 if backend == "torch" else 3e-7)
+
+
+@pytest.mark.parametrize("seed", [1, 2])
+@pytest.mark.parametrize("steps", [(16, 1), (10, 9)])
+def test_a_state_that_hardly_decays_is_not_rounded_away_in_wide_lines(monkeypatch, steps, seed):
+    """As many carries as lines of 1536 numbers and more have; 2e-6 where they are in single precision."""
+    values = draw(65_536, 2, 2, rate=1e-6, kind=torch.float32, even=True, seed=seed)
+    monkeypatch.setattr(_scan_torch, "plan", lambda *_: _scan_torch.Plan(*steps))
+    assert worst(selective_scan(*values, backend="torch"), loop(*values)) < 4e-7
 
 
 @pytest.mark.parametrize("rate", [1e-6, "mix", 200.0])
