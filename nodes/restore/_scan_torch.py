@@ -111,7 +111,7 @@ def _walk(h: Tensor, lost: list[Tensor], start: Tensor, back: bool = False) -> T
     left, kept, given = rows[-1].double(), shares[-1].double(), torch.empty_like(rows[-1])
     for chunk in range(h.shape[1])[turn]:
         given[chunk] = start
-        start = left[chunk].add_(start).addcmul_(kept[chunk], start)
+        start = (left[chunk] + start).addcmul_(kept[chunk], start)
     h.addcmul_(through, given).add_(given)
     return start
 
