@@ -12,7 +12,7 @@ import numpy as np
 import pytest
 import torch
 
-from neusee.nodes.restore import _scan_cpp, _scan_torch
+from neusee.nodes.restore import _scan, _scan_cpp, _scan_torch
 from neusee.nodes.restore._scan import by_mamba, reference, selective_scan
 
 ROOT = Path(__file__).parents[3]
@@ -235,8 +235,9 @@ def test_what_cannot_be_scanned_is_refused():
         selective_scan(values[0][0], *values[1:])
     with pytest.raises(ValueError, match="backend is 'fast'"):
         selective_scan(*values, backend="fast")
-    with pytest.raises(ValueError, match="float32 on CUDA"):
-        selective_scan(*values, backend="mamba_ssm")
+    for backend in ("mamba_ssm", "triton"):
+        with pytest.raises(ValueError, match=f"the backend {backend} is for float32 on CUDA"):
+            selective_scan(*values, backend=backend)
 
 
 def test_the_kernel_of_mamba_gets_the_length_last_and_one_derivative(monkeypatch):
@@ -267,6 +268,30 @@ def test_the_environment_chooses(monkeypatch):
     monkeypatch.setenv("NEUSEE_SCAN", "fortran")
     with pytest.raises(ValueError, match="NEUSEE_SCAN is 'fortran'"):
         selective_scan(*values)
+
+
+@pytest.mark.parametrize(
+    ("there", "named", "chosen"),
+    [
+        (("triton", "mamba_ssm"), "", "triton"),
+        (("triton", "mamba_ssm"), "mamba_ssm", "mamba_ssm"),
+        (("mamba_ssm",), "", "mamba_ssm"),
+        (("mamba_ssm",), "triton", "torch"),
+        ((), "", "torch"),
+    ],
+)
+def test_on_a_gpu_what_is_installed_scans(monkeypatch, there, named, chosen):
+    monkeypatch.setenv("NEUSEE_SCAN", named)
+    monkeypatch.setattr(_scan.importlib.util, "find_spec", lambda name: name in there)
+    _scan._say_once.cache_clear()
+    u = types.SimpleNamespace(device=torch.device("cuda"))
+    assert _scan._auto(u, torch.float64) == "torch"
+    if chosen == "torch":
+        with pytest.warns(UserWarning, match=r"^neither Triton nor mamba_ssm is here.*: torch computes it") as said:
+            assert [_scan._auto(u, torch.float32), _scan._auto(u, torch.float32)] == ["torch"] * 2
+        assert len(said) == 1
+    else:
+        assert _scan._auto(u, torch.float32) == chosen
 
 
 def test_without_a_compiler_torch_computes_and_it_is_said_once(monkeypatch, tmp_path):
