@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
+from functools import partial
 from typing import Any
 
 import torch
@@ -63,8 +64,8 @@ class Learner:
             text = f"{how.learn} is {step.node.path}, of which nothing is learnt; {nearest(step.node.path, LEARNT)}"
             raise ValueError(f"train: {text}")
         self.relief = LEARNT[step.node.path](step.params, self._rng("element"))
-        kind, width = _NETWORKS[how.network.kind], how.network.width
-        self.net: Restorer = started(lambda: kind(width), self._rng("network"))
+        kind = partial(_NETWORKS[how.network.kind], how.network.width, **how.network.options)
+        self.net: Restorer = started(kind, self._rng("network"))
         self.critics = nn.ModuleList(critics(self._rng("critics"), how.critics.width))
         self.average = _averaged(self.net, how.average) if how.average else None
         self.begin(Stage(iterations=0), learns=True)

@@ -6,7 +6,7 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
-from pydantic import BaseModel, ConfigDict, Field, ValidationError
+from pydantic import BaseModel, ConfigDict, Field, ValidationError, model_validator
 
 from neusee.workflows._compose import Composed
 from neusee.workflows._marks import Mark, Problem, nearest
@@ -29,6 +29,20 @@ class Network(_Block):
 
     kind: Literal["fft_mamba", "unet", "nafnet"] = "fft_mamba"
     width: Annotated[int, Field(ge=2)] = 64
+    directions: Literal[2, 4] = 2  #: of fft_mamba, as the next two
+    pyramid: bool = False
+    frequency: Literal["complex", "amp_phase"] = "complex"
+
+    @property
+    def options(self) -> dict[str, Any]:
+        """What is not as usual, beside kind and width."""
+        return self.model_dump(exclude={"kind", "width"}, exclude_defaults=True)
+
+    @model_validator(mode="after")
+    def _fits(self) -> Network:
+        if self.options and self.kind != "fft_mamba":
+            raise ValueError(f"{', '.join(self.options)}: of fft_mamba alone, not of {self.kind}")
+        return self
 
 
 class Critics(_Block):

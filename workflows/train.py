@@ -11,6 +11,7 @@ from typing import Any
 import torch
 
 from neusee.nodes import doe
+from neusee.nodes._weights import told
 from neusee.workflows._call import versions
 from neusee.workflows._figures_training import curves, strip
 from neusee.workflows._graph import Recipe
@@ -65,6 +66,7 @@ def _name(recipe: Recipe, how: Training, photographs: Photographs) -> str:
     settings = recipe.config.settings.items()
     values = {name: str(setting.value) for name, setting in settings if not name.startswith(f"{KEY}.")}
     said = how.model_copy(update={"keep": 1, "show": 1}).model_dump(mode="json")
+    said["network"] = {"kind": how.network.kind, "width": how.network.width, **how.network.options}
     return digest("training", values, said, [path.name for path in photographs.paths])[:8]
 
 
@@ -180,7 +182,7 @@ class _Course:
             with torch.no_grad():
                 export(self.folder, "mask", {"height": self.learner.relief()})
         net = self.learner.average or self.learner.net
-        export(self.folder, "network", weights_of(net))
+        export(self.folder, "network", weights_of(net), told(self.learner.net))
 
     def _close(self, command: Sequence[str]) -> None:
         replaced(self.folder / "curves.png", curves(self.rows.rows))

@@ -5,7 +5,8 @@ sensor grow together. Each row is a process of its own, one thread, and its seco
 plans): the largest sum of bytes of tensors that live at once, what lived before among them, and by how much the
 largest resident size exceeds the size after the imports. Prints a table in Markdown, a law fitted to all rows but the
 last by least squares of relative errors, what it gives for that one, and for 2048 x 2048 x 31, the network at
-256 x 256, eight pictures at a time. The UNet that draws the element has a grid of 64, which is little; the recipe's has 270.
+256 x 256, eight pictures at a time. The UNet that draws the element has a grid of 64, which is little; the recipe's
+has 270.
 
 `... one SIDE BANDS BATCH NET STAGE` is one row.
 """

@@ -206,12 +206,31 @@ def test_photographs_are_found_and_broken_ones_said(photographs, tmp_path):
         ("+train.fish=1", "is not known here"),
         ("train.photographs=nowhere", "is no folder"),
         ("train.network.kind=foo", "fft_mamba"),
+        ("train.network.directions=3", "train.network.directions"),
+        ("train.network.frequency=phase", "amp_phase"),
     ],
 )
 def test_a_mistake_is_located(change, said):
     with pytest.raises(RecipeError, match=said) as caught:
         load("train_small", [change])
     assert all("argument 1" in str(problem.mark) for problem in caught.value.problems)
+
+
+def test_options_of_one_network_are_refused_of_another():
+    with pytest.raises(RecipeError, match="directions, pyramid: of fft_mamba alone, not of unet"):
+        load("train_small", ["train.network.kind=unet", "train.network.pyramid=true", "train.network.directions=4"])
+
+
+def test_a_network_with_options_is_learnt_and_restores_only_with_them(tmp_path, photographs):
+    options = ["directions=4", "pyramid=true", "frequency=amp_phase"]
+    own = [*TINY, "train.network.kind=fft_mamba", *(f"train.network.{x}" for x in options)]
+    recipe = load("train_small", [*own, "train.stages.1.batch=1", "train.stages.1.iterations=1",
+                                  f"train.photographs={photographs}"])  # fmt: skip
+    folder = trained(recipe, tmp_path, [1])
+    run = ["restore=fft_mamba", "restore.width=4", f"restore.weights={folder / 'network.safetensors'}"]
+    with pytest.raises(RecipeError, match="learnt with directions: 4"):
+        load("first_light", run)
+    load("first_light", [*run, *(f"restore.{x}" for x in options)])
 
 
 @pytest.mark.parametrize(("doe", "said"), [("axicon", "of which nothing is learnt"), ("unet", "")])
