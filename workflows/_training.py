@@ -104,6 +104,7 @@ class Training(_Block):
     stages: dict[Annotated[int, Field(ge=1, le=2)], Stage]
     keep: Number = 100
     show: Number = 500
+    tensorboard: bool = False
 
 
 def read_training(composed: Composed) -> tuple[Composed, Training | None]:

@@ -21,6 +21,7 @@ from neusee.workflows._photographs import Photographs
 from neusee.workflows._samples import Sample, Samples
 from neusee.workflows._store import Store
 from neusee.workflows._training import KEY, Stage, Training
+from neusee.workflows._training_board import Board
 from neusee.workflows._training_state import Rows, export, packed, replaced, restore, unpacked, weights_of, write_json
 
 Tell = Callable[[str], None]
@@ -48,7 +49,12 @@ def train(
     photographs = _photographs(recipe, how)
     folder = runs / f"{recipe.name}_train_{_name(recipe, how, photographs)}"
     folder.mkdir(parents=True, exist_ok=True)
-    _Course(recipe, how, photographs, store, folder, tell, device, watch).through(stages, command)
+    course = _Course(recipe, how, photographs, store, folder, tell, device, watch)
+    try:
+        course.through(stages, command)
+    finally:
+        if course.board is not None:
+            course.board.close()
     return folder
 
 
@@ -65,7 +71,7 @@ def _name(recipe: Recipe, how: Training, photographs: Photographs) -> str:
     """What decides a training, but for how often it is kept and shown: another begins anew in a folder of its own."""
     settings = recipe.config.settings.items()
     values = {name: str(setting.value) for name, setting in settings if not name.startswith(f"{KEY}.")}
-    said = how.model_copy(update={"keep": 1, "show": 1}).model_dump(mode="json")
+    said = how.model_copy(update={"keep": 1, "show": 1}).model_dump(mode="json", exclude={"tensorboard"})
     said["network"] = {"kind": how.network.kind, "width": how.network.width, **how.network.options}
     return digest("training", values, said, [path.name for path in photographs.paths])[:8]
 
@@ -91,6 +97,7 @@ class _Course:
         self.state = folder / "state.pt"
         self.stage, self.iteration = min(how.stages), 0
         self._go_on()
+        self.board = Board(folder, self._behind) if how.tensorboard else None
 
     def _go_on(self) -> None:
         if not self.state.exists():
@@ -117,6 +124,11 @@ class _Course:
                 self._through()
         if self.rows.rows:
             self._close(command)
+
+    @property
+    def _behind(self) -> int:
+        """Iterations of all stages that are done."""
+        return self.iteration + sum(s.iterations for number, s in self.how.stages.items() if number < self.stage)
 
     @property
     def _length(self) -> int:
@@ -148,6 +160,8 @@ class _Course:
             raise self._dumped(error) from error
         found |= {"rate": rate, "seconds": time.perf_counter() - began}
         self.rows.add(self.stage, number, found)
+        if self.board is not None:
+            self.board.row(self._behind, found)
         self.iteration += 1
         if self.iteration % self.how.show == 0 or self.iteration == self._length:
             self._show(seen[0])
@@ -168,12 +182,16 @@ class _Course:
     def _keep(self) -> None:
         """First the rows, then the state: rows that are too many are cut off, lacking ones would be lost."""
         self.rows.keep()
+        if self.board is not None:
+            self.board.keep()
         replaced(self.state, packed(self.learner.parts(), stage=self.stage, iteration=self.iteration))
 
     def _show(self, sample: Sample) -> None:
         with torch.no_grad():
             restored = self.learner.net(sample.picture[None])[0].float()
         shown = strip([sample.picture.detach(), restored, sample.truth])
+        if self.board is not None:
+            self.board.picture(self._behind - 1, self.stage, shown)
         (self.folder / "pictures").mkdir(exist_ok=True)
         replaced(self.folder / "pictures" / f"stage{self.stage}_{self.iteration:06d}.png", shown)
 

@@ -1,6 +1,7 @@
 """Learning: two stages from a clean start, the same pictures whoever asks, and a killed training that goes on."""
 
 import csv
+import importlib.util
 import os
 import re
 import signal
@@ -158,6 +159,43 @@ def test_it_runs_as_printed_too(tmp_path, photographs):
     assert len(rows) == 7
     assert all(np.isfinite(float(x)) for row in rows for x in row.values() if x)
     assert [bool(row["reconstruction"]) for row in rows] == [False] * 4 + [True] * 3
+
+
+BOARD = pytest.mark.skipif(not importlib.util.find_spec("tensorboard"), reason='pip install -e ".[tensorboard]"')
+
+
+@BOARD
+@pytest.mark.filterwarnings("ignore::DeprecationWarning")  # of TensorBoard's own
+def test_tensorboard_shows_each_iteration_once_and_the_pictures(tmp_path, photographs):
+    from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
+
+    changes = [*TINY, "train.tensorboard=true", "train.show=2", f"train.photographs={photographs}"]
+
+    def stopped(stage, done, found):
+        if (stage, done) == (1, 3):
+            raise KeyboardInterrupt
+
+    with pytest.raises(KeyboardInterrupt):
+        trained(load("train_small", changes), tmp_path, watch=stopped)
+    folder = trained(load("train_small", changes), tmp_path)
+    assert folder.name == trained(load("train_small", [*changes, "train.tensorboard=false"]), tmp_path).name
+    events = EventAccumulator(str(folder / "tensorboard")).Reload()
+    assert {"LSR", "BSR", "L1", "critics", "rate"} <= set(events.Tags()["scalars"])
+    shown = events.Scalars("L1")
+    assert [event.step for event in shown] == list(range(7))
+    assert [event.value for event in shown] == pytest.approx([float(row["L1"]) for row in losses(folder)], rel=1e-5)
+    assert [event.step for event in events.Scalars("LSR")] == list(range(4))
+    assert [event.step for event in events.Images("stage 1")] == [1, 3]
+    assert [event.step for event in events.Images("stage 2")] == [5, 6]
+
+
+def test_tensorboard_that_is_not_installed_is_said_before_anything_is_learnt(tmp_path, photographs, monkeypatch):
+    monkeypatch.setitem(sys.modules, "torch.utils.tensorboard", None)
+    recipe = load("train_small", [*TINY, "train.tensorboard=true", f"train.photographs={photographs}"])
+    with pytest.raises(
+        ValueError, match=r'train.tensorboard: TensorBoard is not here.*pip install -e "\.\[tensorboard\]"'
+    ):
+        trained(recipe, tmp_path)
 
 
 def test_what_is_not_a_number_stops_and_is_kept(tmp_path, tiny, monkeypatch):
