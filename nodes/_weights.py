@@ -1,8 +1,9 @@
 """Weights of a network in a safetensors file, and whether they are this network's."""
 
-from collections.abc import Callable
+import json
+from collections.abc import Callable, Mapping
 from pathlib import Path
-from typing import TypeVar
+from typing import Any, TypeVar
 
 import torch
 from torch import nn
@@ -10,6 +11,7 @@ from torch import nn
 from neusee.nodes import ParameterError
 
 Net = TypeVar("Net", bound=nn.Module)
+OPTIONS = "neusee.options"  #: of a file's metadata: what of its network its tensors may not tell
 
 
 def empty(make: Callable[[], Net]) -> Net:
@@ -27,18 +29,40 @@ def loaded(make: Callable[[], Net], weights: Path) -> Net:
     return net.float()
 
 
+def told(net: nn.Module) -> dict[str, str]:
+    """Metadata of a file of this network's weights: its ``options``, where it has some."""
+    options = getattr(net, "options", None)
+    return {} if options is None else {OPTIONS: json.dumps(options, sort_keys=True)}
+
+
 def same_layout(make: Callable[[], nn.Module], weights: Path, width: int) -> None:
-    """Refuse a file unless its tensors have the names and shapes of this network's."""
+    """Refuse a file unless its tensors have the names and shapes of this network's, and what it tells the options."""
     from safetensors import SafetensorError, safe_open
 
-    wanted = {name: tuple(tensor.shape) for name, tensor in empty(make).state_dict().items()}
+    net = empty(make)
+    wanted = {name: tuple(tensor.shape) for name, tensor in net.state_dict().items()}
     try:
         with safe_open(weights, framework="pt") as tensors:
             found = {name: tuple(tensors.get_slice(name).get_shape()) for name in tensors.keys()}  # noqa: SIM118
+            said = (tensors.metadata() or {}).get(OPTIONS)
     except SafetensorError as error:
         raise ParameterError("weights", f"{weights.name} is no safetensors file: {error}") from error
+    if said is not None:
+        _same_options(json.loads(said), getattr(net, "options", {}), weights)
     odd = sorted(name for name in wanted | found if wanted.get(name) != found.get(name))
     if odd:
         name = odd[0]
         text = f"{weights.name}: {name} is {found.get(name)}, this network (width {width}) has {wanted.get(name)}"
         raise ParameterError("weights", text)
+
+
+def _same_options(learnt: Mapping[str, Any], options: Mapping[str, Any], weights: Path) -> None:
+    """Other options may have tensors of the same names and shapes, and make another picture of them."""
+    for name in options:
+        if name in learnt and learnt[name] != options[name]:
+            text = f"{weights.name} was learnt with {name}: {_word(learnt[name])}, and this network has {name}: "
+            raise ParameterError("weights", f"{text}{_word(options[name])}; write {name}: {_word(learnt[name])}")
+
+
+def _word(value: object) -> str:
+    return value if isinstance(value, str) else json.dumps(value)

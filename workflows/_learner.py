@@ -225,7 +225,7 @@ def _backward(terms: Sequence[Tensor]) -> None:
 
 def _made(network: Network) -> Restorer:
     if network.kind == "fft_mamba":
-        return FFTMamba(network.width, shuffle=network.shuffle)
+        return FFTMamba(network.width, **network.options)
     return UNet(network.width) if network.kind == "unet" else NAFNet(network.width)
 
 

@@ -7,7 +7,7 @@ from pathlib import Path
 from typing import Annotated, Any, Literal
 
 import torch
-from pydantic import BaseModel, ConfigDict, Field, ValidationError
+from pydantic import BaseModel, ConfigDict, Field, ValidationError, model_validator
 
 from neusee.workflows._compose import Composed
 from neusee.workflows._design_how import MaskSettings, MaskTraining, Weights
@@ -33,6 +33,20 @@ class Network(_Block):
     kind: Literal["fft_mamba", "unet", "nafnet"] = "fft_mamba"
     width: Annotated[int, Field(ge=2)] = 64
     shuffle: Annotated[int, Field(ge=1, le=8)] = 2  #: of fft_mamba: pixels along an axis that are scanned as one
+    directions: Literal[2, 4] = 2  #: of fft_mamba, as the next two
+    pyramid: bool = False
+    frequency: Literal["complex", "amp_phase"] = "complex"
+
+    @property
+    def options(self) -> dict[str, Any]:
+        """What is not as usual, beside kind and width."""
+        return self.model_dump(exclude={"kind", "width"}, exclude_defaults=True)
+
+    @model_validator(mode="after")
+    def _fits(self) -> Network:
+        if self.options and self.kind != "fft_mamba":
+            raise ValueError(f"{', '.join(self.options)}: of fft_mamba alone, not of {self.kind}")
+        return self
 
 
 class Critics(_Block):
@@ -98,6 +112,7 @@ class Training(_Block):
     stages: dict[Annotated[int, Field(ge=1, le=2)], Stage]
     keep: Number = 100
     show: Number = 500
+    tensorboard: bool = False
 
     @property
     def learnt(self) -> tuple[int, ...]:

@@ -102,12 +102,15 @@ def _place(row: Mapping[str, str | None]) -> tuple[int, int]:
         return (1 << 62, 0)  # half a row of a process that was killed
 
 
-def export(folder: Path, name: str, tensors: Mapping[str, torch.Tensor]) -> Path:
-    """Tensors as a safetensors file, whole or not at all."""
+def export(
+    folder: Path, name: str, tensors: Mapping[str, torch.Tensor], about: Mapping[str, str] | None = None
+) -> Path:
+    """Tensors as a safetensors file, with what is told about them, whole or not at all."""
     from safetensors.torch import save
 
     path = folder / f"{name}.safetensors"
-    replaced(path, save({key: x.detach().cpu().contiguous() for key, x in tensors.items()}))
+    whole = {key: x.detach().cpu().contiguous() for key, x in tensors.items()}
+    replaced(path, save(whole, dict(about) if about else None))
     return path
 
 

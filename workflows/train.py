@@ -11,6 +11,7 @@ from typing import Any
 import torch
 
 from neusee.nodes import doe
+from neusee.nodes._weights import told
 from neusee.workflows._call import versions
 from neusee.workflows._design_how import MaskSettings
 from neusee.workflows._figures_training import curves, strip
@@ -22,6 +23,7 @@ from neusee.workflows._photographs import Photographs
 from neusee.workflows._samples import Sample, Samples
 from neusee.workflows._store import Store
 from neusee.workflows._training import GRID, KEY, Stage, Training
+from neusee.workflows._training_board import Board
 from neusee.workflows._training_mask import MASK, design_in, designed
 from neusee.workflows._training_state import Rows, export, packed, replaced, restore, unpacked, weights_of, write_json
 
@@ -66,7 +68,12 @@ def train(
     if MASK in stages:
         design_in(folder, recipe, how, store, command, tell, device)
     if with_pictures:
-        _Course(recipe, how, photographs, store, folder, tell, device, watch, mesh).through(with_pictures, command)
+        course = _Course(recipe, how, photographs, store, folder, tell, device, watch, mesh)
+        try:
+            course.through(with_pictures, command)
+        finally:
+            if course.board is not None:
+                course.board.close()
     return folder
 
 
@@ -96,7 +103,9 @@ def _name(recipe: Recipe, how: Training, photographs: Photographs) -> str:
     settings = recipe.config.settings.items()
     values = {name: str(setting.value) for name, setting in settings if not name.startswith(f"{KEY}.")}
     usual = {"mask"} if how.mask == MaskSettings() else set()  # trainings from before there was a mask go on
-    said = how.model_copy(update={"keep": 1, "show": 1}).model_dump(mode="json", exclude=usual)
+    still = how.model_copy(update={"keep": 1, "show": 1})
+    said = still.model_dump(mode="json", exclude={"tensorboard", *usual})
+    said["network"] = {"kind": how.network.kind, "width": how.network.width, **how.network.options}
     return digest("training", values, said, [path.name for path in photographs.paths])[:8]
 
 
@@ -124,6 +133,7 @@ class _Course:
         self.stage, self.iteration = 2 if self.designed else min(how.learnt), 0
         self._go_on()
         mesh.agree(f"{folder.name} in stage {self.stage} after {self.iteration} iterations")
+        self.board = Board(folder, self._behind) if how.tensorboard and mesh.first else None
 
     def _go_on(self) -> None:
         if not self.state.exists():
@@ -153,6 +163,11 @@ class _Course:
                 self._through()
         if self.rows.rows and self.mesh.first:
             self._close(command)
+
+    @property
+    def _behind(self) -> int:
+        """Iterations of all stages that are done."""
+        return self.iteration + sum(s.iterations for number, s in self.how.stages.items() if number < self.stage)
 
     @property
     def _length(self) -> int:
@@ -186,6 +201,8 @@ class _Course:
             raise self._dumped(error) from error
         found |= {"rate": rate, "seconds": time.perf_counter() - began}
         self.rows.add(self.stage, number, found)
+        if self.board is not None:
+            self.board.row(self._behind, found)
         self.iteration += 1
         if self.mesh.first and (self.iteration % self.how.show == 0 or self.iteration == self._length):
             self._show(seen[0])
@@ -209,12 +226,16 @@ class _Course:
         if not self.mesh.first:
             return
         self.rows.keep()
+        if self.board is not None:
+            self.board.keep()
         replaced(self.state, packed(self.learner.parts(), stage=self.stage, iteration=self.iteration))
 
     def _show(self, sample: Sample) -> None:
         with torch.no_grad():
             restored = self.learner.net(sample.picture[:1])[0].float()
         shown = strip([sample.picture[0].detach(), restored, sample.truth[0]])
+        if self.board is not None:
+            self.board.picture(self._behind - 1, self.stage, shown)
         (self.folder / "pictures").mkdir(exist_ok=True)
         replaced(self.folder / "pictures" / f"stage{self.stage}_{self.iteration:06d}.png", shown)
 
@@ -223,7 +244,7 @@ class _Course:
             with torch.no_grad():
                 export(self.folder, "mask", {"height": self.learner.height()})
         net = self.learner.average or self.learner.net
-        export(self.folder, "network", weights_of(net))
+        export(self.folder, "network", weights_of(net), told(self.learner.net))
 
     def _close(self, command: Sequence[str]) -> None:
         replaced(self.folder / "curves.png", curves(self.rows.rows))

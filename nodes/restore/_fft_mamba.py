@@ -10,7 +10,7 @@ from torch.nn import functional as F
 
 from neusee.nodes import node
 from neusee.nodes._bicubic import resize
-from neusee.nodes.restore._mamba import Block
+from neusee.nodes.restore._mamba import Block, Directions, Form
 from neusee.nodes.restore._memory import Kind
 from neusee.nodes.restore._network import Restorer, Tile, fitting, restored, restorer_checks
 from neusee.nodes.units import Count, DataFile
@@ -19,20 +19,38 @@ from neusee.nodes.units import Count, DataFile
 class FFTMamba(Restorer):
     """Blocks that take turns between rows and columns; two passes with the same weights, the fine one shown the coarse.
 
-    Published: eight blocks, two scales, which modules there are. Ours: their sizes and how they are put together.
+    With ``directions`` 4 every block scans both. As a ``pyramid`` it has one pass, and the coarse estimate is the fine
+    one made smaller. Published: eight blocks, two scales, which modules there are. Ours: their sizes and how they are
+    put together.
     """
 
-    def __init__(self, width: int = 64, blocks: int = 8, states: int = 16, shuffle: int = 2, ssm: Kind = "s6") -> None:
+    def __init__(
+        self,
+        width: int = 64,
+        blocks: int = 8,
+        states: int = 16,
+        shuffle: int = 2,
+        ssm: Kind = "s6",
+        directions: Directions = 2,
+        pyramid: bool = False,
+        frequency: Form = "complex",
+    ) -> None:
         super().__init__()
-        self.shuffle, self.multiple = shuffle, 2 * shuffle
+        self.shuffle, self.multiple, self.one_pass = shuffle, 2 * shuffle, pyramid
+        self.options = {"ssm": ssm, "directions": directions, "pyramid": pyramid, "frequency": frequency}
         inside = 3 * shuffle**2
         self.enter = nn.Conv2d(2 * inside, width, 3, padding=1)
-        self.blocks = nn.Sequential(*(Block(width, states, bool(i % 2), ssm) for i in range(blocks)))
+        self.blocks = nn.Sequential(
+            *(Block(width, states, bool(i % 2), ssm, directions, frequency) for i in range(blocks))
+        )
         self.leave = nn.Conv2d(width, width, 3, padding=1)
         self.last = nn.Conv2d(width, inside, 3, padding=1)
 
     def scales(self, picture: Tensor) -> tuple[Tensor, Tensor]:
         y, x = picture.shape[-2:]
+        if self.one_pass:
+            fine = self.improved(picture, picture)
+            return resize(fine, y // 2, x // 2), fine
         small = resize(picture, y // 2, x // 2)
         coarse = self.improved(small, small)
         return coarse, self.improved(picture, resize(coarse, y, x))
@@ -54,6 +72,9 @@ def fft_mamba(
     states: Count = 16,
     shuffle: Count = 2,
     ssm: Kind = "s6",
+    directions: Directions = 2,
+    pyramid: bool = False,
+    frequency: Form = "complex",
     tile: Tile | None = None,
     reduce: Count = 1,
 ) -> Tensor:
@@ -65,6 +86,8 @@ def fft_mamba(
     from, for the longer a scan, the less a network knows it. ``reduce``: it is made smaller by this factor before, and
     larger again afterwards, where all that is finer is lost behind an element.
     ``ssm`` is the scan: s6 has a decay for each channel and state, ssd one for 16 channels, of which matrices are made.
+    ``directions`` 4: each block scans rows and columns. ``pyramid``: one pass, at the full size. ``frequency``
+    amp_phase, to compare: the gate is drawn from amplitude and phase, and turns and scales.
 
     Shapes: picture (3, y, x) of any size -> (3, y, x).
     Units:  linear sRGB, as the weights were trained on.
@@ -74,7 +97,8 @@ def fft_mamba(
     Source: NeuSee, section Image Restoration; Gu and Dao, Mamba, 2023 (s6), Dao and Gu, Mamba-2, 2024
             (ssd); sizes and wiring are ours.
     """
-    return restored(picture, partial(FFTMamba, width, blocks, states, shuffle, ssm), weights, tile, reduce)
+    kind = partial(FFTMamba, width, blocks, states, shuffle, ssm, directions, pyramid, frequency)
+    return restored(picture, kind, weights, tile, reduce)
 
 
 @fft_mamba.preflight

@@ -1,6 +1,9 @@
 """The selective scan: a linear recurrence whose step, input and output each position chooses for itself."""
 
+import functools
+import importlib.util
 import os
+import warnings
 from typing import Literal, get_args
 
 import torch
@@ -8,7 +11,7 @@ from torch import Tensor
 
 from neusee.nodes.restore import _scan_cpp, _scan_torch
 
-Backend = Literal["torch", "cpp", "mamba_ssm"]
+Backend = Literal["torch", "cpp", "triton", "mamba_ssm"]
 
 
 def selective_scan(
@@ -19,19 +22,19 @@ def selective_scan(
     C: Tensor,
     D: Tensor | None = None,
     *,
-    backend: Literal["auto", "torch", "cpp", "mamba_ssm"] = "auto",
+    backend: Literal["auto", "torch", "cpp", "triton", "mamba_ssm"] = "auto",
 ) -> Tensor:
     """Run h_t = exp(dt_t A) h_(t-1) + dt_t B_t u_t from h = 0 and read y_t = C_t . h_t + D u_t.
 
     ``A`` is negative and ``dt`` positive: decays are at most 1 and only ever multiplied, so that nothing overflows at
-    any length. ``backend`` "auto" is mamba_ssm where it is installed and the tensors are its, C++ on a CPU where there
-    is a compiler, and torch else; ``NEUSEE_SCAN=torch`` makes it torch everywhere.
+    any length. ``backend`` "auto" is C++ on a CPU where there is a compiler, on CUDA, in float32, a Triton kernel or
+    else mamba_ssm where these are installed, and torch else; ``NEUSEE_SCAN=torch`` makes it torch everywhere.
     Differentiable once: a gradient of its gradient is refused.
 
     Shapes: u, dt (batch, length, d), A (d, n), B, C (batch, length, n), D (d) -> (batch, length, d).
     Units:  none; dt in those of 1 / A.
-    Error:  float32, also from half precision and under autocast: of the largest |y|, over 65 536 steps, 2e-7 in C++
-            and 1e-6 in torch, there 2e-6 where dt |A| is below 1e-5. float64 if any input is: 1e-12.
+    Error:  float32, also from half precision and under autocast: of the largest |y|, over 65 536 steps and for
+            dt |A| from 1e-6 to 200, 2e-7 in C++ and Triton, 7e-7 in torch. float64 if any input is: 1e-12.
     Raises: ValueError for shapes that do not fit and for a backend that these tensors, or this machine, do not have.
     Source: Gu and Dao, Mamba: Linear-Time Sequence Modeling with Selective State Spaces, 2023, algorithm 2.
     """
@@ -90,22 +93,39 @@ def _kind(*tensors: Tensor) -> torch.dtype:
 
 def _auto(u: Tensor, kind: torch.dtype) -> Backend:
     named = os.environ.get("NEUSEE_SCAN") or ""
-    if named not in ("", "torch", "cpp"):
-        raise ValueError(f"NEUSEE_SCAN is {named!r}: write torch or cpp")
-    if u.device.type == "cpu" and named != "torch":
+    if named not in ("", *get_args(Backend)):
+        raise ValueError(f"NEUSEE_SCAN is {named!r}: write torch or cpp, or on CUDA triton or mamba_ssm")
+    if named == "torch":
+        return "torch"
+    if u.device.type == "cpu":
         return "cpp" if _scan_cpp.compiled() else "torch"
-    if u.device.type == "cuda" and named != "torch" and kind == torch.float32 and _mamba_is_there():
-        return "mamba_ssm"
+    if u.device.type == "cuda" and kind == torch.float32:
+        return _kernel(named)
     return "torch"
+
+
+def _kernel(named: str) -> Backend:
+    """What scans on CUDA: what is named if it is installed, else what is."""
+    if named != "mamba_ssm" and importlib.util.find_spec("triton"):
+        return "triton"
+    if named != "triton" and importlib.util.find_spec("mamba_ssm"):
+        return "mamba_ssm"
+    _say_once(f"neither Triton nor mamba_ssm is here for the selective scan{named and f' ({named} is asked for)'}")
+    return "torch"
+
+
+@functools.cache
+def _say_once(why: str) -> None:
+    warnings.warn(f"{why}: torch computes it, slower", stacklevel=5)
 
 
 def _run(backend: str, u: Tensor, dt: Tensor, A: Tensor, B: Tensor, C: Tensor) -> Tensor:
     if backend not in get_args(Backend):
         raise ValueError(f"backend is {backend!r}: write auto, {', '.join(get_args(Backend))}")
-    if backend == "mamba_ssm":
+    if backend in ("triton", "mamba_ssm"):
         if u.device.type != "cuda" or u.dtype != torch.float32:
-            raise ValueError(f"the backend mamba_ssm is for float32 on CUDA, and u is {u.dtype} on {u.device}")
-        return by_mamba(u, dt, A, B, C)
+            raise ValueError(f"the backend {backend} is for float32 on CUDA, and u is {u.dtype} on {u.device}")
+        return (by_mamba if backend == "mamba_ssm" else by_triton)(u, dt, A, B, C)
     if backend == "cpp" and u.device.type != "cpu":
         raise ValueError(f"the backend cpp is for the CPU, and u is on {u.device}")
     scan = _scan_cpp.Scan if backend == "cpp" and _scan_cpp.compiled() else _scan_torch.Scan
@@ -113,12 +133,14 @@ def _run(backend: str, u: Tensor, dt: Tensor, A: Tensor, B: Tensor, C: Tensor) -
     return y
 
 
-def _mamba_is_there() -> bool:
-    try:
-        from mamba_ssm.ops import selective_scan_interface  # noqa: F401
-    except ImportError:
-        return False
-    return True
+def by_triton(*tensors: Tensor) -> Tensor:
+    """By our own kernel; a `ValueError` where Triton is not installed."""
+    if not importlib.util.find_spec("triton"):
+        raise ValueError("the backend triton is not here: it comes with torch's CUDA builds")
+    from neusee.nodes.restore import _scan_triton
+
+    y: Tensor = _scan_triton.Scan.apply(*tensors)  # type: ignore[no-untyped-call]
+    return y
 
 
 class _Once(torch.autograd.Function):

@@ -3,10 +3,10 @@
 The length is cut into segments that stay in a cache, and a segment into chunks that are walked side by side: as many
 operations as a chunk has steps, then one for each chunk's carry. Only the states between segments are kept; the rest
 is computed again on the way back. Decays enter as exp(x) - 1: one near 1 that is rounded forgets wrongly at each step.
+What one chunk hands to the next is in float64, for a state that hardly decays is rounded as often as it is handed on.
 """
 
 from collections.abc import Iterator
-from itertools import pairwise
 from typing import Any, NamedTuple
 
 import torch
@@ -63,27 +63,28 @@ class _Segment:
         """(step, chunk, batch, m) -> (batch, rows, m)."""
         return x.permute(2, 1, 0, 3).flatten(1, 2)[:, : self.size]
 
-    def states(self, start: Tensor) -> Tensor:
-        """After each step, from ``start`` (batch, d, n)."""
+    def states(self, start: Tensor) -> tuple[Tensor, Tensor]:
+        """After each step, from ``start`` (batch, d, n); the last one's, in float64."""
         h = self.pushed[..., None] * self.into[..., None, :]
-        _walk(h, list(self.lost.unbind(0)), start)
-        return h
+        return h, _walk(h, list(self.lost.unbind(0)), start)
 
-    def slopes(self, seen: Tensor, end: Tensor) -> Tensor:
-        """Of the states: what is ``seen`` of each, and what the next step leaves of the next one's; ``end`` beyond."""
+    def slopes(self, seen: Tensor, end: Tensor) -> tuple[Tensor, Tensor]:
+        """Of the states: what is ``seen`` of each, and what the next step leaves of the next one's; ``end`` beyond.
+
+        And of the state before the first step, in float64.
+        """
         g = seen[..., None] * self.out[..., None, :]
         first, *others = self.lost.unbind(0)
         next_chunk = torch.cat([first[1:], torch.zeros_like(first[:1])])
-        _walk(g, [next_chunk, *others[::-1]], end, back=True)
-        return g
+        at_first = _walk(g, [next_chunk, *others[::-1]], end, back=True)
+        return g, at_first + first[0] * at_first
 
     def gradients(self, dy: Tensor, start: Tensor, end: Tensor) -> tuple[Tensor, ...]:
         """Of u, dt, B, C, each (batch, rows, m), of A, and of the state before the first step, (batch, d, n)."""
         seen = self.turn(dy)
-        h, g = self.states(start), self.slopes(seen, end)
+        (h, _), (g, before) = self.states(start), self.slopes(seen, end)
         pushed = (g @ self.into[..., None])[..., 0]
         into, out = (seen_by[..., None, :] @ x for seen_by, x in ((self.pushed, g), (seen, h)))
-        before = torch.addcmul(g[0, 0], self.lost[0, 0], g[0, 0])
         g[1:] *= h[:-1]
         g[0, 1:] *= h[-1, :-1]
         g[0, 0] *= start
@@ -94,31 +95,25 @@ class _Segment:
         return *(self.back(x) for x in lines), rate, before
 
 
-def _walk(h: Tensor, lost: list[Tensor], start: Tensor, back: bool = False) -> None:
+def _walk(h: Tensor, lost: list[Tensor], start: Tensor, back: bool = False) -> Tensor:
     """Turn pushes (step, chunk, ...) into states: h_i <- h_i + h_(i-1) + lost_i * h_(i-1), from ``start``.
 
-    ``back`` walks from the last to the first; ``lost``, one (chunk, ...) a step, is in the order of the walk.
+    ``back`` walks from the last to the first; ``lost``, one (chunk, ...) a step, is in the order of the walk. Every
+    chunk begins with nothing, and is then given what the ones before it left; what the last leaves, in float64.
     """
     turn = slice(None, None, -1 if back else 1)
-    rows, chunks = h.unbind(0)[turn], range(h.shape[1])[turn]
-    rows[0][chunks[0]].addcmul_(lost[0][chunks[0]], start).add_(start)
-    for less, before, now in zip(lost[1:], rows, rows[1:], strict=False):
+    rows, through = h.unbind(0)[turn], torch.empty_like(h)
+    shares = through.unbind(0)[turn]
+    shares[0].copy_(lost[0])
+    for less, before, now, share, further in zip(lost[1:], rows, rows[1:], shares, shares[1:], strict=False):
         now.addcmul_(less, before).add_(before)
-    if len(chunks) > 1:
-        through = _through(h, lost, turn)
-        for last, chunk in pairwise(chunks):
-            carry = rows[-1][last]
-            h[:, chunk].addcmul_(through[:, chunk], carry).add_(carry)
-
-
-def _through(like: Tensor, lost: list[Tensor], turn: slice) -> Tensor:
-    """Product of a chunk's decays up to each step, less one: (1 + e)(1 + l) - 1, so that what is near 0 stays exact."""
-    whole = torch.empty_like(like)
-    rows = whole.unbind(0)[turn]
-    rows[0].copy_(lost[0])
-    for less, before, now in zip(lost[1:], rows, rows[1:], strict=False):
-        torch.add(less, before, out=now).addcmul_(less, before)
-    return whole
+        torch.add(less, share, out=further).addcmul_(less, share)  # (1 + e)(1 + l) - 1: what is near 0 stays exact
+    left, kept, given = rows[-1].double(), shares[-1].double(), torch.empty_like(rows[-1])
+    for chunk in range(h.shape[1])[turn]:
+        given[chunk] = start
+        start = (left[chunk] + start).addcmul_(kept[chunk], start)
+    h.addcmul_(through, given).add_(given)
+    return start
 
 
 def _segments(length: int, how: Plan) -> Iterator[slice]:
@@ -133,13 +128,12 @@ class Scan(torch.autograd.Function):
         u, dt, rate, *into_out = given
         (batch, length, _), (d, n) = u.shape, rate.shape
         ctx.how = plan(length, batch * d * n, u.is_cuda)
-        y, state, starts = torch.empty_like(u), u.new_zeros(batch, d, n), []
+        y, state, starts = torch.empty_like(u), u.new_zeros(batch, d, n, dtype=torch.float64), list[Tensor]()
         for rows in _segments(length, ctx.how):
-            starts.append(state)
+            starts.append(state.to(u))
             part = _Segment(ctx.how, rows, rate, u, dt, *into_out)
-            h = part.states(state)
+            h, state = part.states(state)
             y[:, rows] = part.back((h @ part.out[..., None])[..., 0])
-            state = h[-1, -1].clone()
         ctx.save_for_backward(*given, torch.stack(starts))
         return y
 
@@ -148,8 +142,8 @@ class Scan(torch.autograd.Function):
         refuse_twice()
         *given, starts = ctx.saved_tensors
         u, dt, rate, *into_out = given
-        du, ddt, dA, dB, dC = (torch.zeros_like(x) if x is rate else torch.empty_like(x) for x in given)
-        end = torch.zeros_like(starts[0])
+        du, ddt, dB, dC = (torch.empty_like(x) for x in (u, dt, *into_out))
+        end, dA = torch.zeros_like(starts[0], dtype=torch.float64), torch.zeros_like(rate, dtype=torch.float64)
         with torch.autocast(u.device.type, enabled=False):
             for rows, start in reversed(list(zip(_segments(u.shape[1], ctx.how), starts, strict=True))):
                 part = _Segment(ctx.how, rows, rate, u, dt, *into_out)
@@ -157,4 +151,4 @@ class Scan(torch.autograd.Function):
                 for whole, line in zip((du, ddt, dB, dC), lines, strict=True):
                     whole[:, rows] = line
                 dA += slope
-        return du, ddt, dA, dB, dC
+        return du, ddt, dA.to(rate), dB, dC

@@ -1,6 +1,7 @@
 """Learning: two stages from a clean start, the same pictures whoever asks, and a killed training that goes on."""
 
 import csv
+import importlib.util
 import json
 import os
 import re
@@ -212,6 +213,43 @@ def test_it_runs_as_printed_too(tmp_path, photographs):
     assert [bool(row["reconstruction"]) for row in rows] == [False] * 4 + [True] * 3
 
 
+BOARD = pytest.mark.skipif(not importlib.util.find_spec("tensorboard"), reason='pip install -e ".[tensorboard]"')
+
+
+@BOARD
+@pytest.mark.filterwarnings("ignore::DeprecationWarning")  # of TensorBoard's own
+def test_tensorboard_shows_each_iteration_once_and_the_pictures(tmp_path, photographs):
+    from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
+
+    changes = [*TINY, "train.tensorboard=true", "train.show=2", f"train.photographs={photographs}"]
+
+    def stopped(stage, done, found):
+        if (stage, done) == (1, 3):
+            raise KeyboardInterrupt
+
+    with pytest.raises(KeyboardInterrupt):
+        trained(load("train_small", changes), tmp_path, watch=stopped)
+    folder = trained(load("train_small", changes), tmp_path)
+    assert folder.name == trained(load("train_small", [*changes, "train.tensorboard=false"]), tmp_path).name
+    events = EventAccumulator(str(folder / "tensorboard")).Reload()
+    assert {"LSR", "BSR", "L1", "critics", "rate"} <= set(events.Tags()["scalars"])
+    shown = events.Scalars("L1")
+    assert [event.step for event in shown] == list(range(7))
+    assert [event.value for event in shown] == pytest.approx([float(row["L1"]) for row in losses(folder)], rel=1e-5)
+    assert [event.step for event in events.Scalars("LSR")] == list(range(4))
+    assert [event.step for event in events.Images("stage 1")] == [1, 3]
+    assert [event.step for event in events.Images("stage 2")] == [5, 6]
+
+
+def test_tensorboard_that_is_not_installed_is_said_before_anything_is_learnt(tmp_path, photographs, monkeypatch):
+    monkeypatch.setitem(sys.modules, "torch.utils.tensorboard", None)
+    recipe = load("train_small", [*TINY, "train.tensorboard=true", f"train.photographs={photographs}"])
+    with pytest.raises(
+        ValueError, match=r'train.tensorboard: TensorBoard is not here.*pip install -e "\.\[tensorboard\]"'
+    ):
+        trained(recipe, tmp_path)
+
+
 def test_what_is_not_a_number_stops_and_is_kept(tmp_path, tiny, monkeypatch):
     from neusee.nodes import losses
 
@@ -258,12 +296,31 @@ def test_photographs_are_found_and_broken_ones_said(photographs, tmp_path):
         ("+train.fish=1", "is not known here"),
         ("train.photographs=nowhere", "is no folder"),
         ("train.network.kind=foo", "fft_mamba"),
+        ("train.network.directions=3", "train.network.directions"),
+        ("train.network.frequency=phase", "amp_phase"),
     ],
 )
 def test_a_mistake_is_located(change, said):
     with pytest.raises(RecipeError, match=said) as caught:
         load("train_small", [change])
     assert all("argument 1" in str(problem.mark) for problem in caught.value.problems)
+
+
+def test_options_of_one_network_are_refused_of_another():
+    with pytest.raises(RecipeError, match="directions, pyramid: of fft_mamba alone, not of unet"):
+        load("train_small", ["train.network.kind=unet", "train.network.pyramid=true", "train.network.directions=4"])
+
+
+def test_a_network_with_options_is_learnt_and_restores_only_with_them(tmp_path, photographs):
+    options = ["directions=4", "pyramid=true", "frequency=amp_phase"]
+    own = [*TINY, "train.network.kind=fft_mamba", *(f"train.network.{x}" for x in options)]
+    recipe = load("train_small", [*own, "train.stages.1.batch=1", "train.stages.1.iterations=1",
+                                  f"train.photographs={photographs}"])  # fmt: skip
+    folder = trained(recipe, tmp_path, [1])
+    run = ["restore=fft_mamba", "restore.width=4", f"restore.weights={folder / 'network.safetensors'}"]
+    with pytest.raises(RecipeError, match="learnt with directions: 4"):
+        load("first_light", run)
+    load("first_light", [*run, *(f"restore.{x}" for x in options)])
 
 
 @pytest.mark.parametrize(("doe", "said"), [("flat", "of which nothing is learnt"), ("unet", ""), ("axicon", "")])

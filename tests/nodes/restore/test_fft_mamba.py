@@ -6,12 +6,16 @@ from fractions import Fraction
 
 import pytest
 import torch
+from safetensors.torch import save_file
 from torch.nn.functional import softplus
 from torch.testing import assert_close
 
+from neusee.nodes import ParameterError
+from neusee.nodes._weights import told
+from neusee.nodes.restore import fft_mamba
 from neusee.nodes.restore._dual import dual_scan
 from neusee.nodes.restore._fft_mamba import FFTMamba
-from neusee.nodes.restore._mamba import Block, Frequency, Spatial
+from neusee.nodes.restore._mamba import SMALL, Block, Frequency, Spatial, _Phase
 from neusee.nodes.restore._memory import BothWays, DualScan, Scan, _decay, _step
 from neusee.nodes.restore._network import started
 from neusee.nodes.restore._radial import radial_order
@@ -32,7 +36,7 @@ def begun(make):
     return started(make, seeded()).requires_grad_(False)
 
 
-def parameters(width, blocks, states, shuffle, ssm="s6"):
+def parameters(width, blocks, states, shuffle, ssm="s6", directions=2, pyramid=False, frequency="complex"):
     """Written out part by part, biases last in each."""
     rank = -(-width // 16)
 
@@ -43,12 +47,12 @@ def parameters(width, blocks, states, shuffle, ssm="s6"):
         return 2 * (d * (rank + 2 * states) + rank * d + d + d * states + d)
 
     inner = 2 * width
-    spatial = (width * 2 * inner + 2 * inner) + (9 * inner + inner) + both_ways(inner) + 2 * inner
+    spatial = (width * 2 * inner + 2 * inner) + (9 * inner + inner) + directions // 2 * both_ways(inner) + 2 * inner
     spatial += inner * width + width
-    frequency = 2 * inner + (inner * inner + inner) + both_ways(width) + 2 * width + (width * inner + inner) + 1
+    spectral = 2 * inner + (inner * inner + inner) + both_ways(width) + 2 * width + (width * inner + inner) + 1
     weigh = inner * width + width
     feed = (width * 4 * width + 4 * width) + (9 * 4 * width + 4 * width) + (inner * width + width)
-    block = 2 * 2 * width + spatial + frequency + weigh + feed + 2 * width
+    block = 2 * 2 * width + spatial + spectral + weigh + feed + 2 * width
     inside = 3 * shuffle**2
     ends = (9 * 2 * inside * width + width) + (9 * width * width + width) + (9 * width * inside + inside)
     return blocks * block + ends
@@ -56,7 +60,18 @@ def parameters(width, blocks, states, shuffle, ssm="s6"):
 
 @pytest.mark.parametrize(
     "sizes",
-    [(64, 8, 16, 2), (64, 8, 16, 4), (48, 8, 16, 4), (20, 3, 5, 1), (64, 8, 16, 2, "ssd"), (20, 3, 5, 1, "ssd")],
+    [
+        (64, 8, 16, 2),
+        (64, 8, 16, 4),
+        (48, 8, 16, 4),
+        (20, 3, 5, 1),
+        (64, 8, 16, 2, "ssd"),
+        (20, 3, 5, 1, "ssd"),
+        (64, 8, 16, 2, "s6", 4),
+        (20, 3, 5, 1, "ssd", 4),
+        (64, 8, 16, 2, "s6", 2, True),
+        (20, 3, 5, 1, "s6", 4, True, "amp_phase"),
+    ],
 )
 def test_has_as_many_parameters_as_its_parts(sizes):
     with torch.device("meta"):
@@ -68,6 +83,13 @@ def test_the_usual_network_has_938_thousand_parameters_in_eight_blocks():
         net = FFTMamba()
     assert sum(p.numel() for p in net.parameters()) == 937_876
     assert [block.spatial.by_columns for block in net.blocks] == [False, True] * 4
+
+
+def test_four_directions_are_a_ninth_more_parameters():
+    assert parameters(64, 8, 16, 2, "s6", 4) - parameters(64, 8, 16, 2) == 8 * 2 * (128 * 36 + 4 * 128 + 128 + 128 * 17)
+    with torch.device("meta"):
+        names = FFTMamba(20, 2, 5, 1).state_dict().keys()
+    assert not any("across" in name for name in names), "files of before have none"
 
 
 # --- the line of frequencies ------------------------------------------------------------------------------------------
@@ -315,3 +337,89 @@ def test_the_fine_pass_sees_the_coarse_one_and_both_have_the_same_weights():
     up = torch.nn.functional.interpolate(coarse, size=(16, 16), mode="bicubic", antialias=True)
     assert_close(fine, net.improved(picture, up), rtol=0, atol=1e-5)
     assert not torch.allclose(fine, net.improved(picture, picture), rtol=0, atol=1e-4)
+
+
+@pytest.mark.parametrize("frequency", ["complex", "amp_phase"])
+@pytest.mark.parametrize("pyramid", [False, True])
+@pytest.mark.parametrize("directions", [2, 4])
+def test_every_option_gives_two_scales_of_any_size_and_slopes(directions, pyramid, frequency):
+    options = {"directions": directions, "pyramid": pyramid, "frequency": frequency}
+    net = started(lambda: FFTMamba(4, 2, 2, 2, **options), seeded())
+    picture = torch.rand(1, 3, 9, 14, generator=seeded())
+    coarse, fine = net.pyramid(picture)
+    assert (coarse.shape, fine.shape) == ((1, 3, 5, 7), (1, 3, 9, 14))
+    assert float((fine - picture).detach().abs().mean()) < 0.5
+    (coarse.square().sum() + fine.square().sum()).backward()
+    assert all(p.grad is not None and bool(p.grad.isfinite().all()) for p in net.parameters())
+
+
+def test_a_pyramid_has_one_pass_and_its_coarse_estimate_is_the_fine_one_made_smaller():
+    net, picture = begun(lambda: FFTMamba(4, 1, 2, pyramid=True)), torch.rand(1, 3, 16, 16, generator=seeded())
+    passes = []
+    net.blocks.register_forward_hook(lambda *call: passes.append(1))
+    coarse, fine = net.pyramid(picture)
+    assert len(passes) == 1
+    smaller = torch.nn.functional.interpolate(fine, size=(8, 8), mode="bicubic", antialias=True)
+    assert_close(coarse, smaller, rtol=0, atol=1e-5)
+    assert_close(fine, net.improved(picture, picture), rtol=0, atol=1e-6)
+
+
+def test_four_directions_add_a_scan_across():
+    """With the scans of one way alone, a pixel changes what is right of it in its row, and below it in its column."""
+    part = begun(lambda: Spatial(4, 3, False, directions=4))
+    part.scan.back, part.across.back, part.mix = (torch.nn.Identity() for _ in range(3))
+    before = drawn(1, 4, 5, 6)
+    after = before.clone()
+    after[..., 2, 3] += 1
+    change = (part(after) - part(before)).abs().amax((0, 1))
+    assert not change[:2, :3].any()
+    assert not change[2, :3].any()
+    assert float(change[2:, 3:].min()) > 0
+    assert float(change[:, 4:].min()) > 0, "columns come after columns"
+
+
+def test_amplitude_and_phase_have_their_slopes_where_there_is_an_amplitude_and_finite_ones_where_not():
+    real, imaginary = (drawn(50, seed=seed).double().requires_grad_() for seed in (1, 2))
+    ours = torch.autograd.grad(_Phase.apply(real, imaginary).sum(), (real, imaginary))
+    true = torch.autograd.grad(torch.atan2(imaginary, real).sum(), (real, imaginary))
+    share = (real.square() + imaginary.square()).detach()
+    for one, other in zip(ours, true, strict=True):
+        assert_close(one, other * share / (share + SMALL))
+    part = begun(lambda: Frequency(4, 3, form="amp_phase"))
+    for size in (1.0, 1e-6, 0.0):
+        x = (size * drawn(1, 4, 8, 8)).requires_grad_()
+        part(x).sum().backward()
+        assert float(x.grad.abs().max()) < 100
+
+
+@pytest.mark.parametrize("size", [(8, 8), (7, 5)])
+def test_a_constant_gate_of_amplitude_scales_the_picture_and_one_of_phase_turns_it(size):
+    part, x = begun(lambda: Frequency(4, 3, form="amp_phase")), drawn(2, 4, *size)
+    part.leave.weight.zero_()
+    part.leave.bias[:4] = 3.0
+    assert_close(part(x), 1.3 * x, rtol=1e-5, atol=1e-5)
+    part.leave.bias[:4] = 0.0
+    part.leave.bias[4:] = 10 * torch.pi
+    assert_close(part(x), -x, rtol=1e-5, atol=1e-5)
+
+
+@pytest.mark.parametrize(
+    ("option", "learnt", "said"),
+    [
+        ("pyramid", True, "was learnt with pyramid: true, and this network has pyramid: false; write pyramid: true"),
+        ("frequency", "amp_phase", "frequency: amp_phase, and this network has frequency: complex"),
+        ("directions", 4, "directions: 4, and this network has directions: 2"),
+        ("ssm", "ssd", "ssm: ssd, and this network has ssm: s6"),
+    ],
+)
+def test_a_file_of_weights_tells_what_its_tensors_do_not(tmp_path, option, learnt, said):
+    sizes = {"width": 4, "blocks": 1, "states": 2, "shuffle": 2}
+    usual = {"ssm": "s6", "directions": 2, "pyramid": False, "frequency": "complex"}
+    net = begun(lambda: FFTMamba(**sizes, **{option: learnt}))
+    save_file(net.state_dict(), file := tmp_path / "net.safetensors", told(net))
+    with pytest.raises(ParameterError, match=f"net.safetensors.*{said}") as caught:
+        fft_mamba.before(**sizes, **usual, weights=file)
+    assert caught.value.parameter == "weights"
+    assert fft_mamba.before(**sizes, **usual | {option: learnt}, weights=file) == []
+    picture = torch.rand(3, 12, 16, generator=seeded())
+    assert torch.equal(fft_mamba(picture, **sizes, **{option: learnt}, weights=file), net(picture[None])[0])

@@ -1,0 +1,46 @@
+"""A training in TensorBoard, beside its table: the losses over the iterations, and the pictures."""
+
+from __future__ import annotations
+
+import importlib
+import io
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+
+class Board:
+    """Events in ``tensorboard/`` of the folder; the second stage's follow the first's."""
+
+    def __init__(self, folder: Path, first: int) -> None:
+        """From iteration ``first`` of both stages on; what an earlier process wrote of it and after is not shown.
+
+        Raises ValueError where TensorBoard is not installed.
+        """
+        try:
+            there = importlib.import_module("torch.utils.tensorboard")
+        except ImportError as error:
+            text = f'TensorBoard is not here ({error}): pip install -e ".[tensorboard]", or leave it false'
+            raise ValueError(f"train.tensorboard: {text}") from error
+        self._writer: Any = there.SummaryWriter(str(folder / "tensorboard"), purge_step=first)
+
+    def row(self, iteration: int, found: Mapping[str, float]) -> None:
+        """Note what an iteration found."""
+        for name, value in found.items():
+            self._writer.add_scalar(name, value, iteration)
+
+    def picture(self, iteration: int, stage: int, shown: bytes) -> None:
+        """Note a picture, a PNG."""
+        import numpy as np
+        from PIL import Image
+
+        with Image.open(io.BytesIO(shown)) as image:
+            self._writer.add_image(f"stage {stage}", np.asarray(image), iteration, dataformats="HWC")
+
+    def keep(self) -> None:
+        """Have on disk what was noted."""
+        self._writer.flush()
+
+    def close(self) -> None:
+        """End the file."""
+        self._writer.close()
