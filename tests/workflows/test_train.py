@@ -19,7 +19,7 @@ from safetensors.torch import load_file
 
 from neusee.nodes.doe._learned import LEARNT
 from neusee.nodes.optics._aperture import stop
-from neusee.workflows import RecipeError, Store, as_function, cli, load
+from neusee.workflows import RecipeError, Store, _design_page, as_function, cli, load
 from neusee.workflows._photographs import Photographs
 from neusee.workflows._samples import Samples
 from neusee.workflows._shared import Shared
@@ -357,6 +357,7 @@ def command(tmp_path, monkeypatch, capfd):
     """Call the command line in a folder of its own; the exit code, stdout and stderr."""
     monkeypatch.setenv("NEUSEE_CACHE", str(tmp_path / "store"))
     monkeypatch.chdir(tmp_path)
+    monkeypatch.setattr(_design_page, "pictures", lambda *_: {})  # they take longer than what is tested
 
     def call(*words):
         with pytest.raises(SystemExit) as end:
