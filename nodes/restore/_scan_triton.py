@@ -7,7 +7,8 @@ what rounding takes from a state is added with its next step.
 """
 
 # Triton reads the annotations of a kernel, and knows none of ours.
-# mypy: disable-error-code="no-untyped-def, no-untyped-call, misc"
+# mypy: disallow-untyped-defs=False, disallow-incomplete-defs=False
+# mypy: disallow-untyped-calls=False, disallow-untyped-decorators=False
 
 import functools
 from typing import Any
