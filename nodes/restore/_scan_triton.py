@@ -46,7 +46,7 @@ def _add(total, missed, more):
     return now, more - (now - total)
 
 
-@triton.jit  # type: ignore[untyped-decorator]
+@triton.jit
 def _forward(
     u, dt, A, B, C, y, states, length, d, n,
     channels: tl.constexpr, wide: tl.constexpr, chunk: tl.constexpr,
@@ -71,7 +71,7 @@ def _forward(
             tl.store(y + row * d + at_d, tl.sum(h * out[None, :], 1), mask=some_d)
 
 
-@triton.jit  # type: ignore[untyped-decorator]
+@triton.jit
 def _backward(
     u, dt, A, B, C, dy, states, room,
     du, ddt, dA, dB, dC, length, d, n,

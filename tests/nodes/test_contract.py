@@ -2,6 +2,7 @@
 
 import ast
 import importlib
+import importlib.util
 import inspect
 import pkgutil
 from pathlib import Path
@@ -12,7 +13,12 @@ import neusee.nodes
 from neusee.nodes import Node
 
 ROOT = Path(__file__).parents[2]
-MODULES = [importlib.import_module(m.name) for m in pkgutil.walk_packages(neusee.nodes.__path__, "neusee.nodes.")]
+ONLY_WITH = {"neusee.nodes.restore._scan_triton": "triton"}  #: what torch brings on CUDA alone; it holds no nodes
+MODULES = [
+    importlib.import_module(m.name)
+    for m in pkgutil.walk_packages(neusee.nodes.__path__, "neusee.nodes.")
+    if importlib.util.find_spec(ONLY_WITH.get(m.name, "torch"))
+]
 NODES = sorted(
     {n for m in MODULES for n in vars(m).values() if isinstance(n, Node) and n.__module__ == m.__name__},
     key=lambda n: n.path,
