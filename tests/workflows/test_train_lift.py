@@ -57,6 +57,25 @@ def test_the_weights_are_those_that_the_lift_takes(whole):
     assert [path.name for path in (whole / "pictures").iterdir()] == ["000004.png"]
 
 
+def same(again, whole):
+    assert again.name == whole.name
+    assert (again / "mst_plus_plus.safetensors").read_bytes() == (whole / "mst_plus_plus.safetensors").read_bytes()
+    assert losses(again) == losses(whole)
+
+
+def test_a_training_that_is_stopped_goes_on_to_the_same_weights(tmp_path, whole):
+    def watch(done, found):
+        if done == 3:
+            raise KeyboardInterrupt
+
+    with pytest.raises(KeyboardInterrupt):
+        trained(load("train_lift", TINY), tmp_path, watch)
+    (folder,) = (tmp_path / "runs").iterdir()
+    assert not (folder / "mst_plus_plus.safetensors").exists()
+    same(trained(load("train_lift", TINY), tmp_path), whole)
+
+
+@pytest.mark.slow
 def test_a_killed_training_goes_on_to_the_same_weights(tmp_path, whole):
     code = f"""
 import os, signal
@@ -72,10 +91,7 @@ train_lift(load("train_lift", {TINY!r}), Store(here / "store"), here / "runs", [
     env = {**os.environ, "PYTHONPATH": str(ROOT / ".src"), "OMP_NUM_THREADS": "1"}
     done = subprocess.run([sys.executable, "-c", code], env=env, capture_output=True, text=True, check=False)
     assert done.returncode == -signal.SIGKILL, done.stderr
-    again = trained(load("train_lift", TINY), tmp_path)
-    assert again.name == whole.name
-    assert (again / "mst_plus_plus.safetensors").read_bytes() == (whole / "mst_plus_plus.safetensors").read_bytes()
-    assert losses(again) == losses(whole)
+    same(trained(load("train_lift", TINY), tmp_path), whole)
 
 
 def test_a_finished_training_is_not_repeated(whole):
