@@ -5,6 +5,7 @@ from functools import partial
 import pytest
 import torch
 from safetensors.torch import save_file
+from torch.testing import assert_close
 
 from neusee.nodes.restore._fft_mamba import FFTMamba
 from neusee.nodes.restore._nafnet import NAFNet
@@ -48,7 +49,7 @@ def test_a_recipe_names_its_network_and_the_picture_goes_through_it(name, tmp_pa
         with torch.no_grad():
             wanted = net(found["developed[mask]"][None])[0]
         assert wanted.shape == (3, 22, 30)
-        assert torch.equal(found["restored"], wanted)
+        assert_close(found["restored"], wanted, rtol=1e-5, atol=1e-6)  # convolutions round by where their memory lies
         assert not torch.equal(wanted, found["developed[mask]"])
 
 
