@@ -191,7 +191,7 @@ class Learner:
         for i in range(batch):
             if i not in pairs:
                 for _ in self.critics:
-                    passed_over(rng)
+                    passed_over(rng, self.how.patches if self.how.patch else 1)
                 continue
             for critic, t, e in zip(self.critics, *pairs[i], strict=True):
                 apart = (critic(e) - critic(t)).mean()

@@ -40,9 +40,9 @@ def critics(rng: torch.Generator, width: int = 64) -> tuple[Critic, Critic]:
     return first, second
 
 
-def passed_over(rng: torch.Generator) -> None:
-    """Draw what `slopes` draws for one picture, where another process looks at it."""
-    torch.rand(1, 1, 1, 1, generator=rng, device=rng.device)
+def passed_over(rng: torch.Generator, count: int = 1) -> None:
+    """Draw what `slopes` draws for ``count`` pictures, where another process looks at them."""
+    torch.rand(count, 1, 1, 1, generator=rng, device=rng.device)
 
 
 def slopes(critic: nn.Module, truth: Tensor, estimate: Tensor, rng: torch.Generator) -> Tensor:
