@@ -37,9 +37,9 @@ def timed(job: dict[str, Any], mesh: Mesh) -> None:
     """Seconds of some iterations after the first."""
     recipe = load("train_small", job["words"])
     how = recipe.training
-    learner = Learner(recipe, how, "cpu", mesh)
+    learner = Learner(recipe, how, "cpu", mesh=mesh)
     learner.begin(how.stages[1], True)
-    samples = Samples(recipe, how, _photographs(recipe, how), Store(Path(job["store"])), "cpu", None, mesh)
+    samples = Samples(recipe, how, _photographs(recipe, how, True), Store(Path(job["store"])), "cpu", None, mesh)
     seconds = []
     for iteration in range(1 + TIMES):
         began = time.perf_counter()

@@ -61,7 +61,7 @@ def measured(side, bands, batch, net, stage):
     how, before = recipe.training, resident("VmRSS")
     with tempfile.TemporaryDirectory() as folder, LiveBytes() as live:
         learner, store = Learner(recipe, how, "cpu"), Store(Path(folder) / "store")
-        export(Path(folder), "mask", {"height": learner.relief().detach()})
+        export(Path(folder), "mask", {"height": learner.height().detach()})
         still = frozen(recipe, how, Path(folder)) if stage == 2 else None
         samples = Samples(recipe, how, Photographs((recipe.steps["scene"].params["file"],)), store, "cpu", still)
         learner.begin(how.stages[stage], stage == 1)

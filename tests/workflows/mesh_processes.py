@@ -34,9 +34,9 @@ def step(job: dict[str, Any], mesh: Mesh) -> None:
     """Gradients and losses of one iteration, as `Learner` leaves them."""
     recipe = load("train_small", job["words"])
     how = recipe.training
-    learner = Learner(recipe, how, "cpu", mesh)
+    learner = Learner(recipe, how, "cpu", mesh=mesh)
     learner.begin(how.stages[1], True)
-    samples = Samples(recipe, how, _photographs(recipe, how), Store(Path(job["store"])), "cpu", None, mesh)
+    samples = Samples(recipe, how, _photographs(recipe, how, True), Store(Path(job["store"])), "cpu", None, mesh)
     losses, _ = learner.iterate(samples, 1, 0)
     if mesh.first:
         parts = {n: getattr(learner, n).named_parameters() for n in ("relief", "net", "critics")}

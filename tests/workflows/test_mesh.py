@@ -207,4 +207,4 @@ def test_a_psf_that_couples_its_bands_is_named(tmp_path):
 
 def samples(recipe, folder, mesh):
     how = recipe.training
-    return Samples(recipe, how, _photographs(recipe, how), Store(folder), "cpu", None, mesh)
+    return Samples(recipe, how, _photographs(recipe, how, True), Store(folder), "cpu", None, mesh)

@@ -402,7 +402,7 @@ def _element_of(words, folder):
 
 def test_a_mask_is_designed_where_nothing_else_could_learn(command, tmp_path, photographs):
     changes = [c for c in TINY if not c.startswith("doe.")]
-    words = ["train_small", "doe=five_half_rings", *changes, "train.mask.kind=five_half_rings",
+    words = ["train_small", "doe=flat", *changes, "train.mask.kind=five_half_rings",
              "train.mask.iterations=1", "+train.mask.population=5", "+train.mask.polish=5", "+train.mask.bands=2",
              f"train.photographs={photographs}"]  # fmt: skip
     assert "of which nothing is learnt" in command(*words)[2]

@@ -182,7 +182,7 @@ def test_the_command_learns_a_lift_and_knows_no_stages(tmp_path, capsys, monkeyp
     with pytest.raises(SystemExit) as error:
         main(["train", "train_lift", *TINY, "--stage", "1"])
     assert error.value.code == 2
-    assert "no stages" in capsys.readouterr().err
+    assert "neither stages nor a mesh" in capsys.readouterr().err
     with pytest.raises(SystemExit) as done:
         main(["train", "train_lift", *TINY, "train_lift.iterations=1", "--out", str(tmp_path / "runs")])
     assert done.value.code == 0

@@ -93,7 +93,7 @@ def test_a_product_of_few_planes_has_as_many(rank, dtype):
     found = compress(cube.to(dtype))
     assert len(found.planes) == rank
     assert found.planes.dtype == dtype
-    assert float(found.rest[-1].max()) < 32 * torch.finfo(dtype).eps * float(cube.abs().max())
+    assert float(found.rest[-1].max()) < 128 * torch.finfo(dtype).eps * float(cube.abs().max())
 
 
 def test_a_linear_lift_without_clipping_has_three_planes_and_a_grey_one_has_one():
