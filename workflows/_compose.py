@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import functools
 import re
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass, replace
 from importlib.resources import files
 from pathlib import Path
@@ -27,6 +27,14 @@ class Composed:
     root: Value
     problems: tuple[Problem, ...]
     whole: bool = True  #: whether every group that is named could be read
+
+    def without(self, key: str) -> Composed:
+        """The same but for one block, which is read apart."""
+        return replace(self, root=replace(self.root, data={k: v for k, v in self.root.data.items() if k != key}))
+
+    def with_problems(self, problems: Iterable[Problem]) -> Composed:
+        """The same, with what else is wrong."""
+        return replace(self, problems=(*self.problems, *problems))
 
 
 @dataclass(frozen=True, slots=True)

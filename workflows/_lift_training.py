@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-from dataclasses import replace
 from typing import Annotated, Any, Literal
 
 from pydantic import BaseModel, ConfigDict, Field, ValidationError
@@ -50,13 +49,11 @@ def read_lift_training(composed: Composed) -> tuple[Composed, LiftTraining | Non
     block = composed.root.items.get(KEY)
     if block is None:
         return composed, None
-    rest = replace(composed.root, data={key: v for key, v in composed.root.data.items() if key != KEY})
-    composed = replace(composed, root=rest)
+    composed = composed.without(KEY)
     try:
         return composed, LiftTraining.model_validate(block.plain)
     except ValidationError as error:
-        problems = [_problem(block, each) for each in error.errors()]
-        return replace(composed, problems=(*composed.problems, *problems)), None
+        return composed.with_problems(_problem(block, each) for each in error.errors()), None
 
 
 def _problem(block: Value, error: Any) -> Problem:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
@@ -135,13 +134,11 @@ def read_training(composed: Composed) -> tuple[Composed, Training | None]:
     block = composed.root.items.get(KEY)
     if block is None:
         return composed, None
-    rest = replace(composed.root, data={key: v for key, v in composed.root.data.items() if key != KEY})
-    composed = replace(composed, root=rest)
+    composed = composed.without(KEY)
     try:
         found = Training.model_validate(_placed(block))
     except ValidationError as error:
-        problems = [_problem(block, each) for each in error.errors()]
-        return replace(composed, problems=(*composed.problems, *problems)), None
+        return composed.with_problems(_problem(block, each) for each in error.errors()), None
     return _with_folder(composed, block, found)
 
 
@@ -163,7 +160,7 @@ def _with_folder(composed: Composed, block: Value, found: Training) -> tuple[Com
     path = Path(mark.folder) / found.photographs.expanduser()
     if not path.is_dir():
         problem = Problem(mark, f"{KEY}.photographs", f"{path} is no folder")
-        return replace(composed, problems=(*composed.problems, problem)), None
+        return composed.with_problems([problem]), None
     return composed, found.model_copy(update={"photographs": path})
 
 

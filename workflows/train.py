@@ -246,13 +246,20 @@ class _Course:
         net = self.learner.average or self.learner.net
         export(self.folder, "network", weights_of(net), told(self.learner.net))
 
+    @property
+    def _element(self) -> str:
+        """Where the element comes from."""
+        if self.how.learn is None:
+            return "the recipe's own"
+        return "designed without images" if self.designed else "learnt in stage 1"
+
     def _close(self, command: Sequence[str]) -> None:
         replaced(self.folder / "curves.png", curves(self.rows.rows))
         broken = {str(path): why for path, why in self.photographs.broken.items()}
         document: dict[str, Any] = {
             "command": list(command),
             "recipe": self.recipe.name,
-            "element": "designed without images" if self.designed else "learnt in stage 1",
+            "element": self._element,
             "train": self.how.model_dump(mode="json"),
             "photographs": len(self.photographs.paths),
             "mesh": str(self.mesh),

@@ -49,7 +49,9 @@ def test_a_recipe_names_its_network_and_the_picture_goes_through_it(name, tmp_pa
         with torch.no_grad():
             wanted = net(found["developed[mask]"][None])[0]
         assert wanted.shape == (3, 22, 30)
-        assert_close(found["restored"], wanted, rtol=1e-5, atol=1e-6)  # convolutions round by where their memory lies
+        assert_close(
+            found["restored"], wanted, rtol=2e-6, atol=2e-6
+        )  # weights lie elsewhere, by which some processors round
         assert not torch.equal(wanted, found["developed[mask]"])
 
 

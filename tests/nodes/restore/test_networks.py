@@ -252,9 +252,9 @@ def test_the_node_gives_what_the_network_gives(name, saved):
     with torch.no_grad():
         wanted = net(picture[None])[0]
     found = node(picture, **PARAMS[name], weights=path)
-    assert_close(found, wanted, rtol=1e-5, atol=1e-5)  # convolutions round by where their memory lies
+    assert torch.equal(found, node(picture, **PARAMS[name], weights=path))
+    assert_close(found, wanted, rtol=2e-6, atol=2e-6)  # weights lie elsewhere, by which some processors round
     assert not found.requires_grad
-    assert_close(found, node(picture, **PARAMS[name], weights=path), rtol=1e-5, atol=1e-5)
     assert node.after(found, picture, **PARAMS[name], weights=path)[0].ok
     _, other = saved(name, 1)
     assert float((found - node(picture, **PARAMS[name], weights=other)).abs().max()) > 1e-2

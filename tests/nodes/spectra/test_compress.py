@@ -93,7 +93,8 @@ def test_a_product_of_few_planes_has_as_many(rank, dtype):
     found = compress(cube.to(dtype))
     assert len(found.planes) == rank
     assert found.planes.dtype == dtype
-    assert float(found.rest[-1].max()) < 128 * torch.finfo(dtype).eps * float(cube.abs().max())
+    rounding = 2 * len(cube) * torch.finfo(dtype).eps  # of a sum over the bands, there and back; 47 eps were seen
+    assert float(found.rest[-1].max()) < rounding * float(cube.abs().max())
 
 
 def test_a_linear_lift_without_clipping_has_three_planes_and_a_grey_one_has_one():
