@@ -11,8 +11,8 @@ from neusee.nodes.doe._material import Material
 from neusee.nodes.units import Count, DataFile, PositiveLength, Wavelength
 
 Weight = Annotated[float, Field(ge=0, allow_inf_nan=False)]
-Kind = Literal["pixelwise", "zernike", "rings", "unet", "five_half_rings"]
-_RATE = {"pixelwise": 0.05, "zernike": 0.1, "rings": 0.1, "unet": 2e-3, "five_half_rings": 1.0}
+Kind = Literal["pixelwise", "element", "zernike", "rings", "unet", "five_half_rings"]
+_RATE = {"pixelwise": 0.05, "element": 4e-3, "zernike": 0.1, "rings": 0.1, "unet": 2e-3, "five_half_rings": 1.0}
 
 
 class Weights(BaseModel):
@@ -23,10 +23,11 @@ class Weights(BaseModel):
     lsr: Weight = 1.0  #: `losses.lsr`
     bsr: Weight = 1.0  #: `losses.bsr` of a point on the axis: the light that left the field
     contrast: Weight = 0.0  #: `losses.contrast`
+    wiener: Weight = 0.0  #: `losses.wiener`, of all bands at once: what a Wiener filter does not bring back
 
     @model_validator(mode="after")
     def _some(self) -> Weights:
-        if not (self.lsr or self.bsr or self.contrast):
+        if not (self.lsr or self.bsr or self.contrast or self.wiener):
             raise ValueError("every weight is 0: nothing to learn")
         return self
 
@@ -36,14 +37,18 @@ class MaskSettings(BaseModel):
 
     model_config = ConfigDict(extra="forbid", frozen=True)
 
-    kind: Kind = "pixelwise"
+    kind: Kind = "pixelwise"  #: `element`: every sample of the recipe's own relief, from its formula or file on
     iterations: Count = 300  #: of Adam; of five_half_rings, generations
     learning_rate: Annotated[float, Field(gt=0, allow_inf_nan=False)] | None = None  #: None: what suits the kind
     schedule: Literal["cosine", "step"] = "cosine"  #: `step`: halved at each fifth of the iterations
     weights: Weights = Weights(bsr=4.0, contrast=1.0)
     power: Annotated[float, Field(ge=8, le=64)] = 16.0  #: of the norm that stands for the peak
     log: bool = True  #: each band by the logarithm of its LSR
+    enough: Annotated[float, Field(gt=0, le=1)] | None = None  #: LSR below which, in the mean, no less is asked for
     floor: Annotated[float, Field(gt=0, le=0.1)] = 1e-4  #: contrast below which little is won
+    up_to: Annotated[float, Field(gt=0, le=0.5)] | None = None  #: cycles a pixel: what is finer does not count
+    noise_share: Annotated[float, Field(gt=0, allow_inf_nan=False)] = 1e-3  #: of `losses.wiener`, of the variance
+    colour: Annotated[float, Field(ge=0, le=1)] = 1.0  #: of `losses.wiener`: share of the variance that is of one band
     bands: Count | None = 7  #: of the recipe's, at a time; None: all of them
     seed: int = 0
     starts: Count = 1  #: independent ones, of which the best on all bands is kept
@@ -69,6 +74,8 @@ class MaskSettings(BaseModel):
     feature: PositiveLength | None = None  #: least that can be made, `doe.smooth`; depth and levels are the recipe's
 
     plain: str = "psf[plain]"  #: the step of the lens without a mask
+    illuminant: str = "illuminant"  #: of `losses.wiener`
+    responses: str = "responses"
 
     @model_validator(mode="after")
     def _rising(self) -> Self:
@@ -78,7 +85,7 @@ class MaskSettings(BaseModel):
 
     @property
     def rate(self) -> float:
-        """The learning rate, or what suits the kind: of logits 0.05, of waves 0.1, of a network's weights 2e-3."""
+        """The learning rate, or what suits the kind: logits 0.05, near a formula 4e-3, waves 0.1, weights 2e-3."""
         return _RATE[self.kind] if self.learning_rate is None else self.learning_rate
 
 
@@ -97,7 +104,8 @@ def need_steps(recipe_steps: Any, how: MaskTraining) -> None:
     """Refuse a step that is not there, with the setting that names it."""
     from neusee.workflows._marks import nearest
 
-    for setting, name in (("height", how.height), ("psf", how.psf), ("plain", how.plain)):
+    asked = ["height", "psf", "plain", *(["illuminant", "responses"] if how.weights.wiener else [])]
+    for setting, name in ((setting, getattr(how, setting)) for setting in asked):
         if name not in recipe_steps:
             raise DesignError(f"{setting}: the recipe has no step {name!r}; {nearest(name, recipe_steps)}")
 

@@ -15,12 +15,13 @@ import torch
 from torch import Tensor, nn
 
 from neusee.nodes.doe import half_rings
-from neusee.nodes.doe._learned import Drawn, Modes, Pixels, Rings, Written
+from neusee.nodes.doe._learned import LEARNT, Drawn, Modes, Pixels, Rings, Written
 from neusee.nodes.doe._material import wave_height
 from neusee.nodes.doe._pixelwise import _read as read_relief
 from neusee.nodes.optics._aperture import Stop
 from neusee.workflows._design_how import DesignError, MaskTraining
 from neusee.workflows._design_terms import Terms
+from neusee.workflows._graph import Step
 
 Tell = Callable[[str], None]
 _APART = 7919  #: between the streams of two starts
@@ -70,13 +71,17 @@ def learn(terms: Terms, how: MaskTraining, kept: Kept, tell: Tell) -> Learnt:
 # --- by gradients -----------------------------------------------------------------------------------------------------
 
 
-def shape_of(how: MaskTraining, start: int) -> nn.Module:
-    """The numbers to learn, as they are at a start."""
-    shape = _free(how, torch.Generator().manual_seed(how.seed + _APART * start))
+def shape_of(how: MaskTraining, start: int, step: Step) -> nn.Module:
+    """The numbers to learn, as they are at a start; ``step`` is that of the relief."""
+    shape = _free(how, torch.Generator().manual_seed(how.seed + _APART * start), step)
     return shape if how.feature is None else Written(shape, how.feature)
 
 
-def _free(how: MaskTraining, rng: torch.Generator) -> nn.Module:
+def _free(how: MaskTraining, rng: torch.Generator, step: Step) -> nn.Module:
+    if how.kind == "element":
+        if step.node.path not in LEARNT:
+            raise DesignError(f"kind: {step.name} is {step.node.path}, whose samples are not learnt")
+        return LEARNT[step.node.path](step.params, rng)
     if how.kind == "pixelwise":
         return Pixels(how.grid, how.max_height, how.scale, rng, _start(how))
     if how.kind == "zernike":
@@ -110,7 +115,7 @@ def _descend(terms: Terms, how: MaskTraining, kept: Kept, tell: Tell) -> Learnt:
     if state["start"] or "shape" in state:
         tell(f"going on from start {state['start'] + 1}, iteration {state.get('iteration', 0)}")
     for start in range(state["start"], how.starts):
-        shape = shape_of(how, start).to(terms.device)
+        shape = shape_of(how, start, terms.relief).to(terms.device)
         _one_start(terms, how, shape, start, state, kept, tell)
         with torch.no_grad():
             loss = float(terms.total(terms.parts(shape(terms.stop))))
@@ -123,7 +128,7 @@ def _descend(terms: Terms, how: MaskTraining, kept: Kept, tell: Tell) -> Learnt:
             state.pop(name, None)
         state["start"] = start + 1
         kept.write(state)
-    best = shape_of(how, state["best"]["start"])
+    best = shape_of(how, state["best"]["start"], terms.relief)
     best.load_state_dict(state["best"]["shape"])
     return Learnt(best, state["best"]["loss"], _few(best), state["history"])
 

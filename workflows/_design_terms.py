@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
@@ -15,7 +16,7 @@ from neusee.nodes.optics._aperture import Stop, stop
 from neusee.nodes.values import BAND_FIELDS, Bands, Psf, Pupil
 from neusee.workflows._design_how import DesignError, MaskTraining, need_steps
 from neusee.workflows._function import as_function
-from neusee.workflows._graph import Recipe, needed
+from neusee.workflows._graph import Recipe, Step, needed
 from neusee.workflows._run import run
 from neusee.workflows._store import Store
 
@@ -64,7 +65,9 @@ class Terms:
         self._function = as_function(
             self.recipe, how.height, self._bands, outputs=[how.psf], store=store, device=device
         )
-        done = run(self.recipe, store, [self._bands, how.plain], device=device)
+        seen = [how.illuminant, how.responses] if how.weights.wiener else []
+        done = run(self.recipe, store, [self._bands, how.plain, *seen], device=device)
+        self._seen: list[Tensor] = [done[name] for name in seen]
         self.bands: Bands = done[self._bands]
         self._plain: Psf = done[how.plain]
         self.device = self._plain.intensity.device
@@ -74,10 +77,15 @@ class Terms:
         """What the relief is designed for."""
         return Fabrication.of(self.recipe, self.how)
 
+    @property
+    def relief(self) -> Step:
+        """The step that is replaced."""
+        return self.recipe.steps[self.how.height]
+
     @cached_property
     def stop(self) -> Stop:
         """The pupil's grid, as the step that is replaced has it."""
-        params = self.recipe.steps[self.how.height].params
+        params = self.relief.params
         if missing := [name for name in ("samples", "pitch", "diameter", "aperture") if name not in params]:
             raise DesignError(f"height: {self.how.height} has no {missing[0]}: take a recipe whose mask is a doe")
         return stop(*(params[name] for name in ("samples", "pitch", "diameter", "aperture")))
@@ -111,12 +119,34 @@ class Terms:
         psf, plain, weights, how = self.psf(height, chosen), self.plain(chosen), self.how.weights, self.how
         found = {}
         if weights.lsr:
-            found["lsr"] = losses.lsr(psf, power=how.power, log=how.log)
+            found["lsr"] = self._suppression(psf)
         if weights.bsr:
             found["bsr"] = losses.bsr(psf.intensity, plain.intensity)
         if weights.contrast:
-            found["contrast"] = losses.contrast(psf, floor=how.floor)
-        return {name: term / len(psf.intensity) for name, term in found.items()}
+            found["contrast"] = losses.contrast(psf, floor=how.floor, up_to=how.up_to)
+        found = {name: term / len(psf.intensity) for name, term in found.items()}
+        if weights.wiener:  # of channels, each of which sees all bands
+            found["wiener"] = self._left_wrong(psf, chosen)
+        return found
+
+    def _suppression(self, psf: Psf) -> Tensor:
+        """The sum over bands, no less than what is enough of each in the mean."""
+        how, count = self.how, len(psf.intensity)
+        found: Tensor = losses.lsr(psf, power=how.power, log=how.log)
+        if how.enough is None:
+            return found
+        return found.clamp_min(count * (math.log(how.enough) if how.log else how.enough))
+
+    def _left_wrong(self, psf: Psf, chosen: Sequence[int] | None) -> Tensor:
+        bands = self.bands if chosen is None else _some(self.bands, chosen)
+        light, responses = self._seen
+        if chosen is not None:
+            light, responses = light[..., list(chosen)], responses[..., list(chosen)]
+        how = self.how
+        found: Tensor = losses.wiener(
+            psf, light, responses, bands, noise=how.noise_share, colour=how.colour, up_to=how.up_to
+        )
+        return found
 
     def total(self, parts: dict[str, Tensor]) -> Tensor:
         """The weighted sum."""

@@ -2,6 +2,7 @@
 
 import csv
 import json
+import math
 
 import pytest
 import torch
@@ -57,7 +58,7 @@ def read(folder):
 def test_every_kind_lowers_its_loss_on_all_bands(kind, recipe, store, tmp_path):
     given = how(kind=kind, iterations=15)
     terms = Terms(recipe, given, store)
-    before = loss_of(terms, _design_learn.shape_of(given, 0)(terms.stop))
+    before = loss_of(terms, _design_learn.shape_of(given, 0, terms.relief)(terms.stop))
     folder = design(recipe, given, store, tmp_path, quiet)
     found = read(folder)
     assert found["loss"] < before - 0.1
@@ -165,8 +166,45 @@ def test_all_bands_are_seen_in_time(recipe, store):
     assert Terms(recipe, how(bands=None), store).drawn(0) is None
 
 
+def test_the_recipes_own_relief_is_learnt_sample_by_sample_until_it_is_enough(store, tmp_path):
+    """From a half-ring on: what a filter leaves wrong falls, and an LSR that is enough pulls no more."""
+    ring = load("half_ring", [*SMALL, "doe.waves=[2]"])
+    weights = {"lsr": 2.0, "bsr": 1.0, "wiener": 1.0}
+    given = how(kind="element", iterations=12, weights=weights, up_to=0.1, enough=0.3, bands=None, learning_rate=0.02)
+    terms = Terms(ring, given, store)
+    start = ring.run(store, outputs=["height"])["height"]
+    before, after = (
+        terms.parts(height)
+        for height in (
+            start,
+            load_file(design(ring, given, store, tmp_path, quiet) / "mask.safetensors")["height"],
+        )
+    )
+    assert float(before["lsr"]) == pytest.approx(math.log(0.3), rel=1e-6)
+    assert float(after["lsr"]) == pytest.approx(math.log(0.3), rel=1e-6)
+    assert float(after["wiener"]) < float(before["wiener"]) - 0.05
+    free = Terms(ring, given.model_copy(update={"enough": None}), store)
+    assert float(free.parts(start)["lsr"]) < math.log(0.3)
+
+
+def test_a_filter_leaves_the_same_wrong_of_all_bands_chosen_or_not(recipe, store):
+    given = how(bands=None, weights={"wiener": 1.0})
+    terms = Terms(recipe, given, store)
+    height = recipe.run(store, outputs=["height"])["height"]
+    whole, chosen = (float(terms.parts(height, bands)["wiener"]) for bands in (None, range(5)))
+    assert whole == pytest.approx(chosen, rel=1e-6)
+    assert float(terms.parts(height, [1, 3])["wiener"]) != pytest.approx(whole, rel=1e-3)
+
+
+def test_a_relief_that_is_not_learnt_is_refused(store, tmp_path):
+    flat = load("plain_lens", SMALL)
+    with pytest.raises(DesignError, match=r"kind: height is doe.flat, whose samples are not learnt"):
+        design(flat, how(kind="element", iterations=1), store, tmp_path, quiet)
+
+
 @pytest.mark.parametrize(("values", "said"), [
     ({"height": "hight"}, r"height: .*'hight'.*height"),
+    ({"weights": {"wiener": 1.0}, "responses": "response"}, r"responses: .*'response'.*responses"),
     ({"psf": "psf[mast]"}, r"psf: .*psf\[mast\]"),
     ({"at": {"optics.sample": 3}}, r"at: .*sample"),
 ])  # fmt: skip

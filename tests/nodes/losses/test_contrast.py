@@ -47,6 +47,20 @@ def test_a_point_has_all_contrast_and_even_light_none():
     assert float(contrast(as_psf(even), floor=1e-3)) == pytest.approx(-math.log(1e-3) * (1 - 1 / count), rel=1e-4)
 
 
+@pytest.mark.parametrize("up_to", [0.05, 0.1, 0.5])
+def test_a_gaussian_loses_up_to_a_frequency_what_its_transform_says(up_to):
+    """OTF of exp(-r^2 / (2 s^2)): exp(-2 pi^2 s^2 f^2); the mean of its logarithm by the mean square frequency."""
+    at, s = torch.arange(64, dtype=torch.float64) - 32, 2.0
+    line = torch.exp(-at.square() / (2 * s**2))
+    psf = as_psf((line[:, None] * line)[None], peak=0.1)
+    fy, fx = torch.fft.fftfreq(64, dtype=torch.float64)[:, None], torch.fft.rfftfreq(64, dtype=torch.float64)
+    square = fy.square() + fx.square()
+    kept = square[square.sqrt() <= min(up_to, math.sqrt(0.4 / math.pi))]
+    whole = 2 * math.pi**2 * s**2 * float(kept.mean())
+    assert float(contrast(psf, floor=1e-12, up_to=up_to)) == pytest.approx(whole, rel=1e-9)
+    torch.testing.assert_close(contrast(psf, up_to=up_to), contrast.ref(psf, up_to=up_to))
+
+
 def test_gradient():
     kernel = rand(2, 5, 6).requires_grad_()
     assert torch.autograd.gradcheck(lambda k: contrast(as_psf(k)), (kernel,))

@@ -1,0 +1,114 @@
+"""What a mask takes from the scene for good: the part of a picture that no Wiener filter brings back."""
+
+from typing import Annotated
+
+import torch
+from pydantic import Field
+from torch import Tensor
+
+from neusee.nodes import node
+from neusee.nodes._precision import single
+from neusee.nodes.restore._wiener import effective_psf, fall
+from neusee.nodes.values import Bands, Psf
+
+Frequency = Annotated[float, Field(gt=0, le=0.5)]  #: cycles a pixel
+Share = Annotated[float, Field(ge=0, le=1)]
+Noise = Annotated[float, Field(gt=0, allow_inf_nan=False)]
+
+
+@node()
+def wiener(
+    psf: Psf,
+    illuminant: Tensor,
+    responses: Tensor,
+    bands: Bands,
+    *,
+    noise: Noise = 1e-3,
+    colour: Share = 1.0,
+    up_to: Frequency | None = None,
+) -> Tensor:
+    """Take the share of a picture's variance that a Wiener filter leaves wrong: its logarithm, mean over channels.
+
+    Pictures whose power falls as that of `restore.wiener`'s prior, filtered with the PSF that a channel sees of a grey
+    scene. Wrong is, by frequency, what the noise hides, and for the share ``colour`` of the variance, which is of one
+    band alone, what that band's PSF differs from the channel's by. ``up_to`` leaves out what is finer, which a picture
+    that is made smaller loses.
+
+    Shapes: psf.intensity (band, y, x), responses (channel, band) -> ().
+    Units:  none; ``noise``: variance of a pixel's noise, of the picture's variance; up_to in cycles a pixel.
+    Error:  1e-5 in float32. Clipped pixels, the edge and that noise follows the light are not in it: a measure to
+            compare masks by, not an error to expect.
+    Raises: ValueError where bands differ.
+    Source: Wiener filter as in Goodman, Introduction to Fourier Optics, 4th ed., ch. 8; the share of one band is ours.
+    """
+    y, x = psf.intensity.shape[-2:]
+    intensity = single(psf.intensity)
+    effective = effective_psf(psf, illuminant, responses, bands).to(intensity)
+    shares = _shares(illuminant, responses, bands).to(intensity)
+    signal = (fall((y, x)) / noise).to(intensity)  # of a frequency's noise
+    counted = _counted((y, x), up_to).to(intensity)
+    each, lost = torch.fft.rfft2(intensity), list[Tensor]()
+    for channel, share in zip(torch.fft.rfft2(effective), shares, strict=True):
+        passed = signal * _square(channel)
+        filtered = signal * passed / (passed + 1).square()  # of the filter, its square
+        apart = torch.tensordot(share, _square(each - channel), 1)
+        wrong = 1 / (passed + 1) + colour * filtered * apart
+        lost.append((wrong * signal * counted).sum() / (signal * counted).sum())
+    result: Tensor = torch.stack(lost).clamp_min(1e-30).log().mean()
+    return result
+
+
+def _square(spectrum: Tensor) -> Tensor:
+    return spectrum.real.square() + spectrum.imag.square()
+
+
+def _shares(illuminant: Tensor, responses: Tensor, bands: Bands) -> Tensor:
+    """Of a grey scene's signal in each channel, by band; even where a channel sees none of them."""
+    seen = responses.cpu().double() * illuminant.cpu().double() * bands.centres.cpu()
+    blind = seen.sum(-1, keepdim=True) <= 0
+    seen = seen.where(~blind, 1.0)
+    return seen / seen.sum(-1, keepdim=True)
+
+
+def _counted(size: tuple[int, int], up_to: float | None) -> Tensor:
+    """How often each of half a spectrum's frequencies counts: those without a mirror once, the mean never."""
+    y, x = size
+    fy, fx = torch.fft.fftfreq(y, dtype=torch.float64), torch.fft.rfftfreq(x, dtype=torch.float64)
+    times = torch.full((y, x // 2 + 1), 2.0, dtype=torch.float64)
+    times[:, 0] = 1.0
+    if x % 2 == 0:
+        times[:, -1] = 1.0
+    times[0, 0] = 0.0
+    if up_to is not None:
+        times[fy[:, None].square() + fx.square() > up_to**2] = 0.0
+    return times
+
+
+@wiener.reference
+def _(
+    psf: Psf,
+    illuminant: Tensor,
+    responses: Tensor,
+    bands: Bands,
+    *,
+    noise: float = 1e-3,
+    colour: float = 1.0,
+    up_to: float | None = None,
+) -> Tensor:
+    y, x = psf.intensity.shape[-2:]
+    fy, fx = torch.fft.fftfreq(y, dtype=torch.float64), torch.fft.fftfreq(x, dtype=torch.float64)
+    square = fy[:, None].square() + fx.square()
+    power = (square + 1 / (x * y)) ** -1.5
+    signal = power / power.mean() / noise
+    counted = (square > 0) & (square <= (up_to or 1.0) ** 2)
+    each = torch.fft.fft2(psf.intensity.double())
+    shares = _shares(illuminant, responses, bands).to(each.device)
+    logs = []
+    for share in shares:
+        channel = (share[:, None, None] * each).sum(0)
+        filtered = signal * channel.conj() / (signal * channel.abs().square() + 1)
+        wrong = signal * (1 - filtered * channel).abs().square() + filtered.abs().square()
+        for weight, band in zip(share, each, strict=True):
+            wrong = wrong + colour * weight * signal * (filtered * (band - channel)).abs().square()
+        logs.append((wrong[counted].sum() / signal[counted].sum()).clamp_min(1e-30).log())
+    return torch.stack(logs).mean()
