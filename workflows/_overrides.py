@@ -126,7 +126,7 @@ def _close(name: str, other: str | int) -> bool:
 
 def _rebuild(trail: Trail, missing: tuple[str, ...], o: Override) -> Value:
     """The values along the trail made anew, from the inside out."""
-    made = o.value
+    made = _placed(trail, missing, o)
     for n in range(len(missing) - 1, 0, -1):
         assert made is not None
         made = Value({_key(missing[n]): made}, o.mark, o.mark, o.path[: len(o.path) - len(missing) + n])
@@ -134,6 +134,13 @@ def _rebuild(trail: Trail, missing: tuple[str, ...], o: Override) -> Value:
         made = _with(here, _key(key) if missing and here is trail[-1][0] else key, made, o.mark)
     assert made is not None
     return made
+
+
+def _placed(trail: Trail, missing: tuple[str, ...], o: Override) -> Value | None:
+    """The value, which knows where it comes to stand: a number is a number there, as in the file."""
+    there = tuple(key for _, key in trail)
+    where = (*there[:-1], *map(_key, missing)) if missing else there
+    return o.value if o.value is None or where == o.path else parse(o.text.partition("=")[2], o.mark, where)
 
 
 def _key(part: str | int) -> str | int:

@@ -110,6 +110,17 @@ def test_a_value_can_be_taken_away(composed):
     assert root["outputs"] == []
 
 
+def test_a_value_below_a_number_knows_its_place_as_the_file_has_it(files, write):
+    """Written out again, `2` and `'2'` would be two keys."""
+    write("steps:\n  a: {node: toy.height, with: {samples: 3}}\nlens: {2: {f: 1}}\n", "two.yaml")
+    leaves = compose("two.yaml", ["lens.2.f=5", "+lens.3=7", "+lens.2.g={h: 1}"], files).root.items["lens"].leaves()
+    assert {leaf.path: leaf.plain for leaf in leaves} == {
+        ("lens", 2, "f"): 5,
+        ("lens", 2, "g", "h"): 1,
+        ("lens", 3): 7,
+    }
+
+
 def test_the_last_argument_wins(composed):
     assert composed("lens.f=4", "lens.f=5")[0]["lens"]["f"] == 5
 
