@@ -77,6 +77,7 @@ def fft_mamba(
     frequency: Form = "complex",
     tile: Tile | None = None,
     reduce: Count = 1,
+    detail: bool = False,
 ) -> Tensor:
     """Restore a colour picture with the FFT-Mamba network.
 
@@ -84,7 +85,8 @@ def fft_mamba(
     and back to draw a gate for it, and weighs both. One pass at half the size; one at the full size, which sees it.
     ``tile``: a larger picture is restored in pieces of this side, which overlap: give that of the pictures it learnt
     from, for the longer a scan, the less a network knows it. ``reduce``: it is made smaller by this factor before, and
-    larger again afterwards, where all that is finer is lost behind an element.
+    larger again afterwards, where all that is finer is lost behind an element; ``detail``: where it is not, because the
+    picture is deconvolved, what is finer stays as it was.
     ``ssm`` is the scan: s6 has a decay for each channel and state, ssd one for 16 channels, of which matrices are made.
     ``directions`` 4: each block scans rows and columns. ``pyramid``: one pass, at the full size. ``frequency``
     amp_phase, to compare: the gate is drawn from amplitude and phase, and turns and scales.
@@ -98,11 +100,13 @@ def fft_mamba(
             (ssd); sizes and wiring are ours.
     """
     kind = partial(FFTMamba, width, blocks, states, shuffle, ssm, directions, pyramid, frequency)
-    return restored(picture, kind, weights, tile, reduce)
+    return restored(picture, kind, weights, tile, reduce, detail)
 
 
 @fft_mamba.preflight
-def _(*, weights: Path | None = None, tile: int | None = None, reduce: int = 1, **sizes: Any) -> list[str]:
+def _(
+    *, weights: Path | None = None, tile: int | None = None, reduce: int = 1, detail: bool = False, **sizes: Any
+) -> list[str]:
     return fitting(partial(FFTMamba, **sizes), weights, sizes["width"])
 
 

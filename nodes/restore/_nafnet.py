@@ -72,11 +72,17 @@ def _multiplied(x: Tensor) -> Tensor:
 
 @node()
 def nafnet(
-    picture: Tensor, *, weights: DataFile | None = None, width: Count = 16, tile: Tile | None = None, reduce: Count = 1
+    picture: Tensor,
+    *,
+    weights: DataFile | None = None,
+    width: Count = 16,
+    tile: Tile | None = None,
+    reduce: Count = 1,
+    detail: bool = False,
 ) -> Tensor:
     """Restore a colour picture with a small NAFNet: a strong baseline.
 
-    ``tile`` and ``reduce`` as in `fft_mamba`.
+    ``tile``, ``reduce`` and ``detail`` as in `fft_mamba`.
 
     Shapes: picture (3, y, x) of any size -> (3, y, x).
     Units:  linear sRGB, as the weights were trained on.
@@ -86,11 +92,11 @@ def nafnet(
             that is no colour picture or not finite.
     Source: Chen et al., Simple Baselines for Image Restoration, ECCV 2022; fewer blocks, and factors that start at 0.1.
     """
-    return restored(picture, partial(NAFNet, width), weights, tile, reduce)
+    return restored(picture, partial(NAFNet, width), weights, tile, reduce, detail)
 
 
 @nafnet.preflight
-def _(*, weights: Path | None = None, width: int = 16, tile: int | None = None, reduce: int = 1) -> list[str]:
+def _(*, weights: Path | None = None, width: int = 16, **how: Any) -> list[str]:
     return fitting(partial(NAFNet, width), weights, width)
 
 

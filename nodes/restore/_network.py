@@ -111,12 +111,17 @@ def parameter_groups(net: nn.Module, weights: float = 2e-4, biases: float = 4e-4
 
 
 def restored(
-    picture: Tensor, make: Callable[[], Restorer], weights: Path | None, tile: int | None = None, reduce: int = 1
+    picture: Tensor,
+    make: Callable[[], Restorer],
+    weights: Path | None,
+    tile: int | None = None,
+    reduce: int = 1,
+    detail: bool = False,
 ) -> Tensor:
     """The picture through the network with these weights, in single precision; gradients reach the picture alone.
 
     ``tile``: the side of the pieces it is restored in, where it is larger. ``reduce``: by what it is made smaller
-    before, and larger again afterwards, antialiased.
+    before, and larger again afterwards, antialiased; with ``detail`` what that loses is added as it was.
     """
     if picture.ndim != 3 or len(picture) != 3:
         raise ValueError(f"a picture {tuple(picture.shape)} is no colour picture: give (3, y, x)")
@@ -126,11 +131,10 @@ def restored(
     with exact, torch.autocast(picture.device.type, enabled=False):
         y, x = picture.shape[-2:]
         whole = picture.float()[None]
+        seen = whole if reduce == 1 else resize(whole, -(-y // reduce), -(-x // reduce))
+        result: Tensor = net(seen) if tile is None else tiled(net, seen, tile)
         if reduce > 1:
-            whole = resize(whole, -(-y // reduce), -(-x // reduce))
-        result: Tensor = net(whole) if tile is None else tiled(net, whole, tile)
-        if reduce > 1:
-            result = resize(result, y, x)
+            result = whole + resize(result - seen, y, x) if detail else resize(result, y, x)
     return result[0]
 
 

@@ -45,11 +45,17 @@ def _pair(inputs: int, outputs: int) -> nn.Sequential:
 
 @node()
 def unet(
-    picture: Tensor, *, weights: DataFile | None = None, width: Count = 32, tile: Tile | None = None, reduce: Count = 1
+    picture: Tensor,
+    *,
+    weights: DataFile | None = None,
+    width: Count = 32,
+    tile: Tile | None = None,
+    reduce: Count = 1,
+    detail: bool = False,
 ) -> Tensor:
     """Restore a colour picture with a plain UNet: a baseline.
 
-    ``tile`` and ``reduce`` as in `fft_mamba`.
+    ``tile``, ``reduce`` and ``detail`` as in `fft_mamba`.
 
     Shapes: picture (3, y, x) of any size -> (3, y, x).
     Units:  linear sRGB, as the weights were trained on.
@@ -58,11 +64,11 @@ def unet(
             that is no colour picture or not finite.
     Source: Ronneberger et al., U-Net, MICCAI 2015; four levels, padded convolutions and the picture added are ours.
     """
-    return restored(picture, partial(UNet, width), weights, tile, reduce)
+    return restored(picture, partial(UNet, width), weights, tile, reduce, detail)
 
 
 @unet.preflight
-def _(*, weights: Path | None = None, width: int = 32, tile: int | None = None, reduce: int = 1) -> list[str]:
+def _(*, weights: Path | None = None, width: int = 32, **how: Any) -> list[str]:
     return fitting(partial(UNet, width), weights, width)
 
 

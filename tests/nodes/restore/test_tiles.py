@@ -72,3 +72,15 @@ def test_a_node_restores_a_picture_made_smaller(tmp_path):
     with torch.no_grad():
         wanted = resize(net(resize(picture[None], 18, 11)), 70, 41)[0]
     assert_close(found, wanted, rtol=1e-6, atol=1e-7)
+    small = resize(picture[None], 18, 11)
+    kept = restore.nafnet(picture, weights=file, width=4, reduce=4, detail=True)
+    with torch.no_grad():
+        assert_close(kept, (picture[None] + resize(net(small) - small, 70, 41))[0], rtol=1e-6, atol=1e-6)
+
+
+def test_detail_changes_nothing_where_nothing_is_made_smaller(tmp_path):
+    file = tmp_path / "net.safetensors"
+    save_file(started(lambda: NAFNet(4), seeded()).state_dict(), file)
+    picture = torch.rand(3, 40, 41, generator=seeded())
+    given = {"weights": file, "width": 4}
+    assert torch.equal(restore.nafnet(picture, **given, detail=True), restore.nafnet(picture, **given))
