@@ -63,8 +63,12 @@ def lead(found: Evaluated) -> str:
     strengths = ", ".join("none" if k == 0 else f"{k:g}".replace("e+0", "e") for k in found.strengths)
     enough = len(found.scenes) >= len(CASES)
     few = "" if enough else f" These are too few scenes for all {len(CASES)} cases of the protocol."
+    uncertain = found.recipe.uncertain
+    laws = [name for name in (uncertain.names if uncertain else ()) if not name.startswith("lasers.")]
+    drawn = f" Drawn anew for each scene: {', '.join(laws)}." if laws else ""
     return f"""{len(found.scenes)} scenes, laser strengths {strengths} (multiples of what saturates a pixel of the
-        plain lens), {len(found.pipelines)} pipelines of a mask and a restorer. Least L1: {best.name}, {said}.{few}"""
+        plain lens), {len(found.pipelines)} pipelines of a mask and a restorer. Least L1: {best.name}, {said}.
+        {few}{drawn}"""
 
 
 def sections(found: Evaluated, shown: Mapping[str, bytes]) -> list[Section]:

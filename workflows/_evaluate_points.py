@@ -21,6 +21,7 @@ from neusee.workflows._evaluate_pipelines import BEAM, NONE, Composed
 from neusee.workflows._evaluate_scenes import Scene
 from neusee.workflows._function import as_function
 from neusee.workflows._graph import Recipe, Step, needed
+from neusee.workflows._inputs import Inputs
 from neusee.workflows._keys import digest, key_of
 from neusee.workflows._store import Store
 
@@ -53,6 +54,7 @@ class Bench:
         self.seconds = 0.0  #: of them
         self._code = Code(store.code_memo)
         self._functions: dict[tuple[str, str], Any] = {}
+        self._drawn: dict[Any, tuple[Recipe, Inputs]] = {}  #: the recipe is kept, so that no other gets its identity
         self._fixed: dict[str, Any] = {}  #: by key: what no scene reaches, one copy for all functions
         self._kept = _Kept()
 
@@ -76,9 +78,9 @@ class Bench:
         function = self._function(pipeline, wanted.lit, outputs)
         self._kept.turn(wanted)
         with torch.no_grad():
-            found: dict[str, Any] = function(
-                {"scene": wanted.scene.picture, **_moved(pipeline.recipes[wanted.lit], wanted, outputs)}
-            )
+            changed = self._changed(pipeline.recipes[wanted.lit], wanted, outputs)
+            known = {name: value for name, value in changed.items() if name in function.free}
+            found: dict[str, Any] = function({"scene": wanted.scene.picture, **known})
         return found
 
     def forget(self) -> None:
@@ -92,7 +94,7 @@ class Bench:
         """What decides a point: the keys of a run with its values, and how its pictures are compared."""
         recipe, outputs = pipeline.recipes[wanted.lit], pipeline.pipeline.outputs
         params: dict[str, dict[str, Any]] = {}
-        for name, value in _moved(recipe, wanted, outputs).items():
+        for name, value in self._changed(recipe, wanted, outputs).items():
             step, _, param = name.rpartition(".")
             params.setdefault(step, {})[param] = value
         steps = {
@@ -119,15 +121,34 @@ class Bench:
         name = (f"{pipeline.name} {outputs}", case)
         if name not in self._functions:
             recipe = pipeline.recipes[case]
-            free = ["scene"]
+            whole = economised(recipe, outputs)  # as `run` would: the scene is given, and not learnt
+            there = set(needed(whole, outputs))
+            inputs = self._inputs(recipe, outputs)
+            readers = [name for name in (inputs.readers if inputs else ()) if name.rpartition(".")[0] in there]
+            free = ["scene", *readers]
             if case != NONE:
                 free += [f"direction[{BEAM}].angle", *(f"{spot}.strength" for spot in _spots(recipe, outputs))]
-            whole = economised(recipe, outputs)  # as `run` would: the scene is given, and not learnt
             caller = self._kept.caller(_reached(whole, [n for n in whole.steps if n.partition("[")[0] in _MOVED]))
             found: Any = as_function(whole, *free, outputs=outputs, store=self.store, device=self.device, caller=caller)
             self._share(found, whole)
             self._functions[name] = found
         return self._functions[name]
+
+    def _changed(self, recipe: Recipe, wanted: Wanted, outputs: Sequence[str]) -> dict[str, Any]:
+        """The parameters that are other than the recipe's: drawn for the scene, and the laser's of the point."""
+        inputs = self._inputs(recipe, outputs)
+        drawn = inputs.theta(wanted.scene.drawn(inputs)) if inputs else {}
+        return drawn | _moved(recipe, wanted, outputs)
+
+    def _inputs(self, recipe: Recipe, outputs: Sequence[str]) -> Inputs | None:
+        """What the recipe draws from a law, where an output hangs on it."""
+        if recipe.uncertain is None or not recipe.uncertain.names:
+            return None
+        key = (id(recipe), tuple(outputs))
+        if key not in self._drawn:
+            with suppress(ValueError):  # no output depends on any
+                self._drawn[key] = (recipe, Inputs.of(recipe, outputs))
+        return self._drawn[key][1] if key in self._drawn else None
 
     def _share(self, function: Any, recipe: Recipe) -> None:
         """Let functions hold one copy of what they have in common, so that what follows from it is common too."""

@@ -14,7 +14,8 @@ from neusee.workflows._call import call
 from neusee.workflows._code import Code
 from neusee.workflows._evaluate_pipelines import BEAM, CASES, NONE, Refused
 from neusee.workflows._graph import Recipe
-from neusee.workflows._keys import digest, key_of
+from neusee.workflows._inputs import Inputs
+from neusee.workflows._keys import digest, key_of, stream_seed
 from neusee.workflows._photographs import chosen, crop, crop_key, listed
 from neusee.workflows._run import run
 from neusee.workflows._store import Store
@@ -44,6 +45,13 @@ class Scene:
     def key(self, code: Code) -> str:
         """What decides the picture."""
         return self.source.key(self.number, code)
+
+    def drawn(self, inputs: Inputs) -> dict[str, float]:
+        """What the recipe has a law for, in SI: the same whatever the mask, the restorer and the laser."""
+        import numpy as np
+
+        z = [np.random.default_rng([self.seed, stream_seed(0, name)]).standard_normal() for name in inputs.names]
+        return dict(zip(inputs.names, map(float, inputs.at(np.array([z]))[0]), strict=True))
 
     def angle(self, recipe: Recipe) -> tuple[float, float]:
         """Direction cosines (y, x) of the laser, drawn as the paper draws them."""

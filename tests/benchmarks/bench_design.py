@@ -3,23 +3,26 @@
     python tests/benchmarks/bench_design.py FOLDER PIECE [PIECE ...]
 
 Pieces: `known` (masks of a formula), the name of a design below, `designs` (all of them), `table` (of what lies in
-FOLDER). Each design is kept in FOLDER and not repeated; an interrupted one goes on. All are judged on the 540
-samples, 31 bands and 512 pixels of the recipe. Those of few numbers are learned on a pupil of half the samples and a
-window of 504 pixels; pixels are learned on what they are judged on, for a deep relief is not known between coarse
-samples.
+FOLDER), `filter` (half-rings, and the one made for a Wiener filter: what such a filter leaves wrong, and why). Each
+design is kept in FOLDER and not repeated; an interrupted one goes on. All are judged on the 540 samples, 31 bands and
+512 pixels of the recipe. Those of few numbers are learned on a pupil of half the samples and a window of 504 pixels;
+pixels are learned on what they are judged on, for a deep relief is not known between coarse samples.
 """
 
 from __future__ import annotations
 
+import copy
 import json
+import math
 import sys
 import time
 from pathlib import Path
 from typing import Any
 
 import torch
+from safetensors.torch import load_file
 
-from neusee.nodes import doe
+from neusee.nodes import doe, losses, metrics
 from neusee.workflows import load
 from neusee.workflows._design import MaskTraining, design, figures
 from neusee.workflows._design_terms import Terms
@@ -27,6 +30,8 @@ from neusee.workflows._store import Store
 
 AT = {"optics.samples": 270, "optics.pitch": "29.92 um", "optics.window": [504, 504]}
 FINER = {"optics.samples": 405, "optics.pitch": "19.94667 um"}  # at 400 nm 72 waves (of 550 nm) are its Nyquist limit
+FIVE = (12.0, 18.0, 24.0, 30.0, 36.0)
+HALF_RINGS = (3.0, 5.0, 8.0, 12.0, 14.0, 20.0, 30.0)
 COMMON = {"at": AT, "weights": {"lsr": 1.0, "bsr": 4.0}}
 RINGS = {"kind": "five_half_rings", "bands": 5, "population": 70, "iterations": 40, "save_every": 5}
 DEEP = {
@@ -106,6 +111,20 @@ DESIGNS = {
         for weight in (0.0, 1.0, 2.0, 4.0)
     },
 }
+FOR_A_FILTER = "half-ring of 14 waves, then its samples, for a Wiener filter"
+DESIGNS[FOR_A_FILTER] = {
+    "kind": "element",
+    "iterations": 160,
+    "learning_rate": 4e-3,
+    "bands": None,
+    "weights": {"lsr": 2.0, "bsr": 1.0, "wiener": 1.0},
+    "power": 24,
+    "enough": 0.0098,
+    "up_to": 0.0625,
+    "noise_share": 7e-4,
+    "at": {},
+}
+OWN = {FOR_A_FILTER: ("half_ring", ["doe.waves=[14]"])}  #: the recipe whose own relief it starts from
 
 
 def known(samples: int, pitch: float, diameter: float) -> dict[str, torch.Tensor]:
@@ -137,7 +156,8 @@ def one(name: str, folder: Path) -> None:
     if "start" in values:  # the relief of another design
         values["start"] = folder / "runs" / read(folder, values["start"])["folder"] / "mask.safetensors"
     how = MaskTraining.model_validate(values)
-    made = design(load("first_light"), how, Store(folder / "cache"), folder / "runs", lambda s: print(f"{name}: {s}"))
+    recipe, words = OWN.get(name, ("first_light", []))
+    made = design(load(recipe, words), how, Store(folder / "cache"), folder / "runs", lambda s: print(f"{name}: {s}"))
     found = json.loads((made / "mask.json").read_text())
     place.write_text(json.dumps(found | {"seconds": time.perf_counter() - began, "folder": made.name}))
 
@@ -147,6 +167,37 @@ def formulas(folder: Path) -> None:
     terms = Terms(load("first_light"), MaskTraining(), Store(folder / "cache"))
     for name, height in known(*terms.stop).items():
         (folder / f"{name}.json").write_text(json.dumps(figures(terms, height) | {"seconds": 0.0}))
+
+
+def filtered(folder: Path) -> None:
+    """What a Wiener filter leaves wrong of a picture seen at an eighth: by noise alone, and by colour too."""
+    how = MaskTraining.model_validate(DESIGNS[FOR_A_FILTER] | {"weights": {"wiener": 1.0}})
+    terms = Terms(load("half_ring"), how, Store(folder / "cache"))
+    masks = {f"half-ring, {waves} waves": doe.half_rings(waves=(waves,), **grid(terms)) for waves in HALF_RINGS}
+    made = folder / "runs" / read(folder, FOR_A_FILTER)["folder"] / "mask.safetensors"
+    masks |= {"five half-rings, (12, 18, 24, 30, 36)": doe.half_rings(waves=FIVE, **grid(terms))}
+    masks |= {FOR_A_FILTER: load_file(made)["height"]}
+    print("| mask | mean LSR | contrast to 0.0625 | wrong by noise | and by colour |")
+    print("|---|---|---|---|---|")
+    for name, height in masks.items():
+        with torch.no_grad():
+            psf = terms.psf(height)
+            kept = math.exp(-float(losses.contrast(psf, up_to=how.up_to)) / terms.count)
+            wrong = [math.exp(float(Terms.parts(_as(terms, colour), height)["wiener"])) for colour in (0.0, 1.0)]
+        cells = [f"{float(metrics.lsr(psf).mean()):.3g}", f"{kept:.3g}", *(f"{x:.2e}" for x in wrong)]
+        print(f"| {name} | {' | '.join(cells)} |")
+
+
+def grid(terms: Terms) -> dict[str, Any]:
+    """The pupil's grid, as masks of a formula take it."""
+    return {"samples": terms.stop.samples, "pitch": terms.stop.pitch, "diameter": terms.stop.diameter}
+
+
+def _as(terms: Terms, colour: float) -> Terms:
+    """The same terms with another share of what is of one band."""
+    other = copy.copy(terms)
+    other.how = terms.how.model_copy(update={"colour": colour})
+    return other
 
 
 def table(folder: Path) -> None:
@@ -178,6 +229,8 @@ def main(folder: Path, pieces: list[str]) -> None:
             formulas(folder)
         elif piece == "table":
             table(folder)
+        elif piece == "filter":
+            filtered(folder)
         else:
             for name in DESIGNS if piece == "designs" else [piece]:
                 one(name, folder)

@@ -19,6 +19,7 @@ from neusee.workflows._evaluate_numbers import difference, gain, mean, table
 from neusee.workflows._evaluate_pipelines import CASES, Refused, composed, read_pipelines
 from neusee.workflows._evaluate_points import Bench, Wanted
 from neusee.workflows._evaluate_scenes import scenes
+from neusee.workflows._inputs import Inputs
 from neusee.workflows._run import run
 from neusee.workflows._store import Store
 from neusee.workflows.cli import app
@@ -52,7 +53,7 @@ def pipelines(text, *more):
     return composed("first_light", [*SMALL, *more], read_pipelines(text, HERE), HERE)
 
 
-def by_hand(tmp_path, scene, pipeline, strength):
+def by_hand(tmp_path, scene, pipeline, strength, more=()):
     """The recipe with the scene in a file and the laser as anyone would write them."""
     from neusee.workflows._photographs import chosen
 
@@ -64,7 +65,7 @@ def by_hand(tmp_path, scene, pipeline, strength):
     path = chosen(scene.source.paths, 7, scene.number)
     words = [f"doe={line.mask}", laser, f"seed={scene.seed}", f"scene.file={path}"]
     words += [f"restore={line.restorer}"] if line.restorer != "none" else []
-    recipe = load("first_light", [*SMALL, *words])
+    recipe = load("first_light", [*SMALL, *words, *more])
     return run(recipe, Store(tmp_path / "by_hand"), line.outputs)
 
 
@@ -89,6 +90,35 @@ def test_a_point_is_a_run_with_its_values_to_the_last_bit(tmp_path, store, name,
     assert found["bsr"] == wanted["bsr[mask]"].tolist()
     small = quality(*(resize(wanted[k].clamp(0, 1), 16, 16) for k in (step.picture, "truth")))
     assert found["l1 small"] == float(small.l1)
+
+
+def test_what_a_recipe_has_laws_for_is_drawn_for_each_scene(tmp_path, store):
+    """The paper's sampling: a run with the drawn values, the same for all masks and strengths of a scene."""
+    Image.fromarray(np.random.default_rng(1).integers(0, 256, (32, 32, 3), dtype=np.uint8)).save(tmp_path / "0.png")
+    laws = {
+        "sensor.c1": "uniform(0, 0.25)",
+        "sensor.background": "uniform(0.3, 0.7)",
+        "sensor.pedestal": "uniform(350 e-, 400 e-)",
+    }
+    each = pipelines(BARE, *(f"{name}={law}" for name, law in laws.items()))
+    shown, _ = scenes(load("first_light", SMALL), store, tmp_path, 2)
+    bench, seen = Bench(store, 16), list[dict[str, float]]()
+    for scene in shown:
+        for pipeline in each:
+            recipe = pipeline.recipes[scene.case]
+            seen.append(scene.drawn(Inputs.of(recipe, pipeline.pipeline.outputs)))
+            units = {
+                name: f"{value!r} e-" if name == "sensor.pedestal" else repr(value) for name, value in seen[-1].items()
+            }
+            wanted = by_hand(tmp_path, scene, pipeline, 1e4, [f"{name}={text}" for name, text in units.items()])
+            found = bench.point(pipeline, Wanted(scene, scene.case, 1e4))
+            assert found["l1"] == float(wanted[pipeline.pipeline.quality].l1)
+            assert found["peak"] == float(wanted["peak[mask]"].irradiance)
+    assert seen[0] == seen[1] != seen[2] == seen[3]
+    assert seen[0].keys() == laws.keys()
+    assert 0 < seen[0]["sensor.c1"] < 0.25
+    (plain, _), (still, _) = each, pipelines(BARE)
+    assert bench.key(plain, Wanted(shown[0], "none", 0.0)) != bench.key(still, Wanted(shown[0], "none", 0.0))
 
 
 def test_what_several_points_share_is_computed_once(store, monkeypatch):

@@ -194,6 +194,26 @@ def test_a_pool_comes_again_where_the_element_is_still(tmp_path, photographs):
     assert torch.equal(again.picture, first.picture)
 
 
+def test_a_network_is_learnt_behind_the_recipes_own_restorer(tmp_path, photographs):
+    """It sees what the Wiener filter made, and in stage 1 the element is learnt through the filter."""
+    words = [*STILL, "doe=half_ring", "doe.waves=[2]", "laser=none", "restore=wiener", "train.stages.1.iterations=1",
+             f"train.photographs={photographs}"]  # fmt: skip
+    coded, filtered = (
+        samples_of(load("train_small", [*words, *more]), tmp_path, still=True)({}, 2, 0)
+        for more in ([], ["train.picture=restored"])
+    )
+    assert torch.equal(coded.truth, filtered.truth)
+    far = [float((sample.picture - sample.truth).abs().mean()) for sample in (coded, filtered)]
+    assert far[1] < 0.7 * far[0]
+    alone = ["train.stages.1.lsr=0", "train.stages.1.bsr=0", "train.stages.1.adversarial=0"]
+    recipe = load("train_small", [*words, *alone, "train.picture=restored"])
+    folder = trained(recipe, tmp_path, [1])
+    start = recipe.run(Store(tmp_path / "store"), outputs=["height"])["height"]
+    learnt = load_file(folder / "mask.safetensors")["height"]
+    moved = learnt - start - (learnt - start).mean()
+    assert float(moved.abs().max()) > 1e-10  # a step of 2e-4 in a logit; rounding: 1e-13
+
+
 def test_a_network_is_learnt_behind_an_element_that_stays(tmp_path, photographs):
     words = [*STILL, "doe=half_ring", "train.learn=null", f"train.photographs={photographs}"]
     recipe = load("train_small", words)
