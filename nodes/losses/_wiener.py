@@ -8,7 +8,7 @@ from torch import Tensor
 
 from neusee.nodes import node
 from neusee.nodes._precision import single
-from neusee.nodes.restore._wiener import effective_psf, fall
+from neusee.nodes.restore._wiener import effective_psf, fall, grey_shares
 from neusee.nodes.values import Bands, Psf
 
 Frequency = Annotated[float, Field(gt=0, le=0.5)]  #: cycles a pixel
@@ -44,7 +44,7 @@ def wiener(
     y, x = psf.intensity.shape[-2:]
     intensity = single(psf.intensity)
     effective = effective_psf(psf, illuminant, responses, bands).to(intensity)
-    shares = _shares(illuminant, responses, bands).to(intensity)
+    shares = grey_shares(illuminant, responses, bands).to(intensity)
     signal = (fall((y, x)) / noise).to(intensity)  # of a frequency's noise
     counted = _counted((y, x), up_to).to(intensity)
     each, lost = torch.fft.rfft2(intensity), list[Tensor]()
@@ -60,14 +60,6 @@ def wiener(
 
 def _square(spectrum: Tensor) -> Tensor:
     return spectrum.real.square() + spectrum.imag.square()
-
-
-def _shares(illuminant: Tensor, responses: Tensor, bands: Bands) -> Tensor:
-    """Of a grey scene's signal in each channel, by band; even where a channel sees none of them."""
-    seen = responses.cpu().double() * illuminant.cpu().double() * bands.centres.cpu()
-    blind = seen.sum(-1, keepdim=True) <= 0
-    seen = seen.where(~blind, 1.0)
-    return seen / seen.sum(-1, keepdim=True)
 
 
 def _counted(size: tuple[int, int], up_to: float | None) -> Tensor:
@@ -102,9 +94,9 @@ def _(
     signal = power / power.mean() / noise
     counted = (square > 0) & (square <= (up_to or 1.0) ** 2)
     each = torch.fft.fft2(psf.intensity.double())
-    shares = _shares(illuminant, responses, bands).to(each.device)
+    seen = responses.double() * (illuminant.double() * bands.centres)
     logs = []
-    for share in shares:
+    for share in seen / seen.sum(-1, keepdim=True):
         channel = (share[:, None, None] * each).sum(0)
         filtered = signal * channel.conj() / (signal * channel.abs().square() + 1)
         wrong = signal * (1 - filtered * channel).abs().square() + filtered.abs().square()

@@ -85,13 +85,17 @@ def effective_psf(psf: Psf, illuminant: Tensor, responses: Tensor, bands: Bands)
     lengths = {len(psf.intensity), len(illuminant), responses.shape[-1], len(bands.centres)}
     if len(lengths) > 1:
         raise ValueError(f"PSF, illuminant, responses and bands have {sorted(lengths)} bands: give one `bands` step")
+    intensity = single(psf.intensity)
+    seen: Tensor = torch.tensordot(grey_shares(illuminant, responses, bands).to(intensity), intensity, 1)
+    return seen
+
+
+def grey_shares(illuminant: Tensor, responses: Tensor, bands: Bands) -> Tensor:
+    """Of what each channel sees of a grey scene, the share of each band: (channel, band), float64."""
     share = responses.cpu().double() * illuminant.cpu().double() * bands.centres.cpu()
     blind = share.sum(-1, keepdim=True) <= 0  # a channel that sees none of these bands: one PSF is as good as another
     share = share.where(~blind, 1.0)
-    share = share / share.sum(-1, keepdim=True)
-    intensity = single(psf.intensity)
-    seen: Tensor = torch.tensordot(share.to(intensity), intensity, 1)
-    return seen
+    return share / share.sum(-1, keepdim=True)
 
 
 def _restored(
