@@ -205,7 +205,7 @@ def test_a_network_is_learnt_behind_the_recipes_own_restorer(tmp_path, photograp
     assert torch.equal(coded.truth, filtered.truth)
     far = [float((sample.picture - sample.truth).abs().mean()) for sample in (coded, filtered)]
     assert far[1] < 0.7 * far[0]
-    alone = ["train.stages.1.lsr=0", "train.stages.1.bsr=0", "train.stages.1.adversarial=0"]
+    alone = ["train.stages.1.batch=1", "train.stages.1.lsr=0", "train.stages.1.bsr=0", "train.stages.1.adversarial=0"]
     recipe = load("train_small", [*words, *alone, "train.picture=restored"])
     folder = trained(recipe, tmp_path, [1])
     start = recipe.run(Store(tmp_path / "store"), outputs=["height"])["height"]
