@@ -54,7 +54,9 @@ class Bench:
         self.seconds = 0.0  #: of them
         self._code = Code(store.code_memo)
         self._functions: dict[tuple[str, str], Any] = {}
-        self._drawn: dict[Any, tuple[Recipe, Inputs]] = {}  #: the recipe is kept, so that no other gets its identity
+        self._drawn: dict[
+            Any, tuple[Recipe, Inputs | None]
+        ] = {}  #: the recipe is kept, so that no other gets its identity
         self._fixed: dict[str, Any] = {}  #: by key: what no scene reaches, one copy for all functions
         self._kept = _Kept()
 
@@ -146,9 +148,10 @@ class Bench:
             return None
         key = (id(recipe), tuple(outputs))
         if key not in self._drawn:
+            self._drawn[key] = (recipe, None)
             with suppress(ValueError):  # no output depends on any
                 self._drawn[key] = (recipe, Inputs.of(recipe, outputs))
-        return self._drawn[key][1] if key in self._drawn else None
+        return self._drawn[key][1]
 
     def _share(self, function: Any, recipe: Recipe) -> None:
         """Let functions hold one copy of what they have in common, so that what follows from it is common too."""

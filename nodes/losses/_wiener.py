@@ -8,10 +8,11 @@ from torch import Tensor
 
 from neusee.nodes import node
 from neusee.nodes._precision import single
+from neusee.nodes.losses._contrast import Frequency
+from neusee.nodes.restore._blurred import variance
 from neusee.nodes.restore._wiener import effective_psf, fall, grey_shares
 from neusee.nodes.values import Bands, Psf
 
-Frequency = Annotated[float, Field(gt=0, le=0.5)]  #: cycles a pixel
 Share = Annotated[float, Field(ge=0, le=1)]
 Noise = Annotated[float, Field(gt=0, allow_inf_nan=False)]
 
@@ -46,14 +47,14 @@ def wiener(
     effective = effective_psf(psf, illuminant, responses, bands).to(intensity)
     shares = grey_shares(illuminant, responses, bands).to(intensity)
     signal = (fall((y, x)) / noise).to(intensity)  # of a frequency's noise
-    counted = _counted((y, x), up_to).to(intensity)
+    known = signal * _counted((y, x), up_to).to(signal)
     each, lost = torch.fft.rfft2(intensity), list[Tensor]()
     for channel, share in zip(torch.fft.rfft2(effective), shares, strict=True):
         passed = signal * _square(channel)
         filtered = signal * passed / (passed + 1).square()  # of the filter, its square
         apart = torch.tensordot(share, _square(each - channel), 1)
         wrong = 1 / (passed + 1) + colour * filtered * apart
-        lost.append((wrong * signal * counted).sum() / (signal * counted).sum())
+        lost.append(variance(wrong * known, (y, x)) / variance(known, (y, x)))
     result: Tensor = torch.stack(lost).clamp_min(1e-30).log().mean()
     return result
 
@@ -63,17 +64,11 @@ def _square(spectrum: Tensor) -> Tensor:
 
 
 def _counted(size: tuple[int, int], up_to: float | None) -> Tensor:
-    """How often each of half a spectrum's frequencies counts: those without a mirror once, the mean never."""
-    y, x = size
-    fy, fx = torch.fft.fftfreq(y, dtype=torch.float64), torch.fft.rfftfreq(x, dtype=torch.float64)
-    times = torch.full((y, x // 2 + 1), 2.0, dtype=torch.float64)
-    times[:, 0] = 1.0
-    if x % 2 == 0:
-        times[:, -1] = 1.0
-    times[0, 0] = 0.0
-    if up_to is not None:
-        times[fy[:, None].square() + fx.square() > up_to**2] = 0.0
-    return times
+    """Which frequencies of half a spectrum count: up to ``up_to``, and never the mean."""
+    fy, fx = torch.fft.fftfreq(size[0], dtype=torch.float64), torch.fft.rfftfreq(size[1], dtype=torch.float64)
+    square = fy[:, None].square() + fx.square()
+    inside: Tensor = (square > 0) & (square <= (1.0 if up_to is None else up_to**2))
+    return inside
 
 
 @wiener.reference

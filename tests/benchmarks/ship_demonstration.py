@@ -26,7 +26,7 @@ def mask(file: Path, out: Path) -> None:
     height = height - height.min()
     depth = float(height.max()) * (65535 / ((LEVELS - 1) * STEP))  # the depth that white stands for
     levels = (height / float(height.max()) * (LEVELS - 1)).round().numpy().astype(np.uint16) * STEP
-    Image.fromarray(levels.astype(np.uint16)).save(out / "demonstration_mask.png", optimize=True)
+    Image.fromarray(levels).save(out / "demonstration_mask.png", optimize=True)
     wrong = torch.from_numpy(levels.astype(np.float64)) * depth / 65535 - height
     print(
         f"doe.depth: {depth * 1e6:.4f} um; levels change the relief by {float(wrong.abs().max()) * 1e9:.2f} nm at most"

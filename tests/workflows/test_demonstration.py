@@ -1,4 +1,4 @@
-"""What ships trained: it is small, it fits its recipes, and it restores better than the filter it stands behind."""
+"""What ships trained: it is small, it fits its recipes, and on first light's photograph it helps the filter."""
 
 from pathlib import Path
 
@@ -14,7 +14,7 @@ def test_all_data_that_ships_is_less_than_a_megabyte():
 
 
 def test_what_ships_fits_its_recipes():
-    recipe = load("demonstration")
+    recipe = load("demonstration")  # refuses a relief of another grid, and weights of another network
     assert recipe.steps["height"].params["file"].name == "demonstration_mask.png"
     assert recipe.steps["restored"].params["weights"].name == "demonstration_network.safetensors"
     assert {"restored", "wiener", "wiener_quality"} <= set(recipe.outputs)
