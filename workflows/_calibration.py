@@ -15,6 +15,7 @@ from typing import Any
 import numpy as np
 
 from neusee.nodes.values import Levels
+from neusee.workflows._accuracy_code import engine
 from neusee.workflows._accuracy_points import now
 from neusee.workflows._call import versions
 from neusee.workflows._files import RunFolder, new_run
@@ -31,7 +32,6 @@ from neusee.workflows._store import Store
 from neusee.workflows._study_page import page
 
 Tell = Callable[[str], None]
-_EDITION = 1  #: of how draws are made; another gives other draws
 _KEPT = 4000  #: draws that go into the folder
 
 
@@ -76,7 +76,7 @@ def found(recipe: Recipe, store: Store, tell: Tell, *, walkers: int, move: str, 
         raise Refused(told.refused)
     for line in told.directions:
         tell(f"not told: {line}")
-    key = digest("posterior", _EDITION, problem.key, walkers, move, recipe.seed)
+    key = digest("posterior", engine("calibrate"), problem.key, walkers, move, recipe.seed)
     file = store.root / "posterior" / f"{key}.h5"
     chains = emcee_room.sample(problem, top, file, seed=recipe.seed, walkers=walkers, how=move, wanted=draws, tell=tell)
     law = weighed(problem, top, recipe.seed)

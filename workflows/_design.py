@@ -16,6 +16,7 @@ import torch
 from torch import Tensor
 
 from neusee.nodes import metrics
+from neusee.workflows._accuracy_code import engine
 from neusee.workflows._accuracy_knobs import changed
 from neusee.workflows._accuracy_points import now
 from neusee.workflows._call import versions
@@ -140,8 +141,9 @@ def _key(recipe: Recipe, how: MaskTraining, store: Store | None) -> str:
     nodes = sorted({step.node.fn.__module__ for step in steps} | set(_LEARNT_WITH))
     settings = how.model_dump(mode="json", exclude={"save_every", "start"})
     settings["start"] = how.start and file_digest(how.start)
-    rooms = [file_digest(path) for path in sorted(Path(__file__).parent.glob("_design*.py"))]
-    return digest("mask", recipe.config.to_yaml(), recipe.seed, settings, [code.digest(node) for node in nodes], rooms)
+    return digest(
+        "mask", recipe.config.to_yaml(), recipe.seed, settings, [code.digest(node) for node in nodes], engine("_design")
+    )
 
 
 def figures(terms: Terms, height: Tensor) -> dict[str, Any]:

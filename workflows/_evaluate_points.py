@@ -13,6 +13,7 @@ from torch import Tensor
 
 from neusee.nodes._bicubic import resize
 from neusee.nodes.metrics import quality
+from neusee.workflows._accuracy_code import engine
 from neusee.workflows._accuracy_points import now
 from neusee.workflows._call import call, place
 from neusee.workflows._code import Code
@@ -25,7 +26,6 @@ from neusee.workflows._inputs import Inputs
 from neusee.workflows._keys import digest, key_of
 from neusee.workflows._store import Store
 
-EDITION = 1  #: of what is kept of a point
 _MOVED = ("spot", "photons")  #: steps with whose results, and all that follows, another strength is another scene
 
 Point = dict[str, Any]  #: numbers by name; ``bsr`` is a list
@@ -106,7 +106,7 @@ class Bench:
         keys = self._keys(replace(recipe, steps={**recipe.steps, **steps}), wanted, outputs)
         within = [recipe.tolerance, recipe.keep_all, self.device.partition(":")[0], self.small]
         own = [self._code.digest(f"neusee.nodes.{name}") for name in ("metrics._quality", "_bicubic")]
-        return digest("evaluate", EDITION, [keys[name] for name in outputs], within, own)
+        return digest("evaluate", engine("_evaluate_points"), [keys[name] for name in outputs], within, own)
 
     def _keys(self, recipe: Recipe, wanted: Wanted, outputs: Sequence[str]) -> dict[str, str]:
         """By step. Noise is that of the scene; what no scene reaches, such as a mask that is drawn, is the recipe's."""

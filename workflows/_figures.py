@@ -8,8 +8,7 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
-import xxhash
-
+from neusee.workflows._accuracy_code import engine
 from neusee.workflows._code import Code
 from neusee.workflows._keys import digest
 from neusee.workflows._needs import Found, Missing, find
@@ -128,8 +127,7 @@ def _function(path: str) -> Callable[..., bytes]:
 
 def _drawing() -> str:
     """Digest of everything that draws, so that a better picture is drawn again."""
-    folder = Path(__file__).parent
-    return xxhash.xxh3_128_hexdigest(b"".join(p.read_bytes() for p in sorted(folder.glob("_figures_*.py"))))
+    return engine(*sorted({figure.draw.partition(":")[0] for figure in FIGURES}), "_figures_graph")
 
 
 def _graph(result: Result, shelf: Shelf, drawing: str) -> Path:

@@ -10,23 +10,22 @@ from __future__ import annotations
 import math
 from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import asdict, dataclass, replace
-from pathlib import Path
 from typing import Any
 
 from torch import Tensor
 
 from neusee.nodes import Facts
 from neusee.workflows._account import facts_in
+from neusee.workflows._accuracy_code import engine
 from neusee.workflows._accuracy_points import now
 from neusee.workflows._error import error_of, largest_error
 from neusee.workflows._graph import Recipe, needed
-from neusee.workflows._keys import Key, digest, file_digest
+from neusee.workflows._keys import Key, digest
 from neusee.workflows._omissions import Omission, omissions
 from neusee.workflows._resolve import resolve
 from neusee.workflows._run import Result, run
 from neusee.workflows._store import Store
 
-_MEASURE = ("_leave_out.py", "_omissions.py", "_error.py", "_proof.py")
 _SURE = 4.0  #: standard errors that a mean over pixels may lie beside that over the noise
 _ROUNDING = 2e-7  #: of a sum in float32, as a share of its largest element
 
@@ -151,7 +150,7 @@ class Bench:
         said = [[resolve(r, needed(r, r.outputs), self.store).keys[n] for n in r.outputs] for r in (self.full, alone)]
         chosen = [[name, self.chosen.keys[name]] for name in self.recipe.outputs]
         told = [omission.name, omission.kind, repr(omission.bound), omission.why, omission.taken]
-        return digest("leave-out", said, chosen, told, [file_digest(Path(__file__).with_name(f)) for f in _MEASURE])
+        return digest("leave-out", said, chosen, told, engine("_leave_out"))
 
 
 def _worst_by_name(names: Sequence[str], made: Sequence[str], result: Result, truth: Result) -> dict[str, float]:

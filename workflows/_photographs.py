@@ -13,9 +13,9 @@ import numpy as np
 from torch import Tensor
 
 from neusee.nodes import ParameterError
+from neusee.workflows._accuracy_code import engine
 from neusee.workflows._keys import digest, file_digest
 
-EDITION = 1  #: of how a part is cut
 _PICTURES = frozenset({".png", ".jpg", ".jpeg", ".jpe", ".webp", ".tif", ".tiff", ".bmp", ".gif"})
 _ENDS = {b"\xff\xd8": b"\xff\xd9", b"\x89P": b"IEND"}  #: first bytes of a format -> what stands near its end
 _TAIL = 1 << 16  #: bytes at the end of a file in which that is looked for: some cameras write more behind it
@@ -101,7 +101,7 @@ def _decoded(path: Path) -> Tensor:
 def crop_key(path: Path, shape: tuple[int, int], seed: int, index: Index, code: Any) -> str:
     """What decides `crop`: the file's content, the size, the draw and the code that decodes."""
     own = [code.digest(f"neusee.nodes.{name}") for name in ("scene._photograph", "_bicubic")]
-    return digest("photograph", EDITION, file_digest(path), list(shape), seed, _indices(index), own)
+    return digest("photograph", engine("_photographs"), file_digest(path), list(shape), seed, _indices(index), own)
 
 
 def _place(size: tuple[int, int], shape: tuple[int, int], seed: int, index: Index) -> tuple[int, int]:

@@ -12,7 +12,7 @@ from datetime import UTC, datetime
 from pathlib import Path
 from typing import Any
 
-from neusee.workflows import _extremes, _extremes_cell, _extremes_chain, _extremes_limits
+from neusee.workflows._accuracy_code import engine
 from neusee.workflows._call import versions
 from neusee.workflows._code import Code
 from neusee.workflows._extremes import CASES, USUAL, Case
@@ -21,13 +21,12 @@ from neusee.workflows._extremes_chain import Chain, untouched
 from neusee.workflows._figures_stability import grid_picture
 from neusee.workflows._files import RunFolder, new_run
 from neusee.workflows._graph import Recipe
-from neusee.workflows._keys import Key, digest, file_digest
+from neusee.workflows._keys import Key, digest
 from neusee.workflows._one_thread import one_thread
 from neusee.workflows._store import Store
 from neusee.workflows._study_page import Mark, Section, page
 
 Tell = Callable[[str], None]
-_OWN = (_extremes, _extremes_cell, _extremes_chain, _extremes_limits)  #: what decides a cell, beside the node
 _COLUMNS = ("case", "step", "node", "mark", "error", "bound", "gradient error", "gradient bound", "note")
 _HOW = """Each step is given what the recipe gives it, at a small size, with one thing changed: a parameter of the
 recipe, the result of one of its steps, or the pictures that the step itself is given. Its result is compared with the
@@ -78,7 +77,7 @@ def study(
 
 def _rows(recipe: Recipe, store: Store, cases: Sequence[Case], tell: Tell) -> Iterator[Row]:
     code = Code(store.code_memo)
-    own = digest([file_digest(Path(str(m.__file__))) for m in _OWN])
+    own = engine("_extremes", "_extremes_cell")
     usual = Chain.of(recipe, USUAL, code)
     for number, case in enumerate(cases, 1):
         chain = usual if case is USUAL else Chain.of(recipe, case, code)

@@ -17,6 +17,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from neusee.workflows._accuracy_code import engine
 from neusee.workflows._accuracy_points import now
 from neusee.workflows._call import place
 from neusee.workflows._code import Code
@@ -34,7 +35,6 @@ if TYPE_CHECKING:
     Places = NDArray[np.float64]
 
 Numbers = dict[str, list[float]]  #: by quantity, such as ``restored_quality.psnr``, its elements
-_EDITION = 1  #: of what is kept of a draw
 _ARENAS, _MAPPED, _TRIM = -8, -4, -1  #: M_ARENA_MAX, M_MMAP_MAX and M_TRIM_THRESHOLD of glibc's mallopt
 _NARROW = 8  #: columns that a table has at most; what has more of both is a picture
 
@@ -79,7 +79,7 @@ class Draws:
     def pictures(self, values: Places) -> dict[str, tuple[Tensor, Tensor]]:
         """Mean and standard deviation of every output that is a picture, pixel by pixel; its numbers are kept too."""
         keys = [self.key(row) for row in values]
-        whole = digest("uncertainty pictures", _EDITION, keys)
+        whole = digest("uncertainty pictures", keys)
         if (first := self._kept(keys[0])) is not None and not first["pictures"]:
             return {}
         with suppress(KeyError):
@@ -101,7 +101,9 @@ class Draws:
         recipe = self.inputs.recipe
         keys = self._keys(self.inputs.theta(self._named(row)))
         within = [recipe.tolerance, recipe.keep_all, self.device.partition(":")[0]]
-        return digest("uncertainty draw", _EDITION, [[name, keys[name]] for name in self.outputs], within)
+        return digest(
+            "uncertainty draw", engine("_uncertainty_draws"), [[name, keys[name]] for name in self.outputs], within
+        )
 
     def _keys(self, theta: Mapping[str, Any]) -> dict[str, str]:
         """By step; without ``theta``, of those alone that no input reaches."""

@@ -205,6 +205,14 @@ def test_the_engine_is_what_running_imports(tmp_path, monkeypatch):
     assert digest_with(_aside="y = 2\n") == first
     assert digest_with(_deep='"""Words."""\nx = 1  # more\n') == first
     assert digest_with(_deep="x = 2\n") != first
+    with pytest.raises(LookupError, match="_gone has no source file"):
+        digest_with(_deep="from neusee.workflows._gone import x\n")
+
+
+@pytest.mark.parametrize("module", sorted(p.stem for p in Path(_accuracy_code.__file__).parent.glob("*.py")))
+def test_every_module_of_the_program_has_a_digest(module):
+    """None imports, at its top, what the digest cannot find."""
+    assert len(_accuracy_code.engine(module)) == 32
 
 
 # --- the Pareto line --------------------------------------------------------------------------------------------------
