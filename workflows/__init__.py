@@ -12,32 +12,32 @@ from __future__ import annotations
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
-    from neusee.workflows._call import RunError
-    from neusee.workflows._function import as_function
-    from neusee.workflows._graph import Recipe, Step
-    from neusee.workflows._marks import Problem, RecipeError
-    from neusee.workflows._recipe import load, recipes
-    from neusee.workflows._run import Done, Event, Result, run
-    from neusee.workflows._schedule import Schedule
-    from neusee.workflows._store import Store
-    from neusee.workflows._work import Executor
+    from neusee.workflows.engine.differentiable_function import as_function
+    from neusee.workflows.engine.node_call import RunError
+    from neusee.workflows.engine.runner import Done, Event, Result, run
+    from neusee.workflows.engine.step_job import Executor
+    from neusee.workflows.graph.diagnostics import Problem, RecipeError
+    from neusee.workflows.graph.recipe_graph import Recipe, Step
+    from neusee.workflows.placement.tasks_and_devices import Schedule
+    from neusee.workflows.recipe.loading import load, recipes
+    from neusee.workflows.store.result_store import Store
 
 _HOME = {
-    "RunError": "_call",
-    "as_function": "_function",
-    "Recipe": "_graph",
-    "Step": "_graph",
-    "Problem": "_marks",
-    "RecipeError": "_marks",
-    "load": "_recipe",
-    "recipes": "_recipe",
-    "Done": "_run",
-    "Event": "_run",
-    "Result": "_run",
-    "run": "_run",
-    "Schedule": "_schedule",
-    "Store": "_store",
-    "Executor": "_work",
+    "RunError": "engine.node_call",
+    "as_function": "engine.differentiable_function",
+    "Recipe": "graph.recipe_graph",
+    "Step": "graph.recipe_graph",
+    "Problem": "graph.diagnostics",
+    "RecipeError": "graph.diagnostics",
+    "load": "recipe.loading",
+    "recipes": "recipe.loading",
+    "Done": "engine.runner",
+    "Event": "engine.runner",
+    "Result": "engine.runner",
+    "run": "engine.runner",
+    "Schedule": "placement.tasks_and_devices",
+    "Store": "store.result_store",
+    "Executor": "engine.step_job",
 }
 
 __all__ = [

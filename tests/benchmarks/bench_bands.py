@@ -21,12 +21,12 @@ import torch
 from neusee.nodes.optics import image, psf
 from neusee.nodes.spectra import illuminate
 from neusee.nodes.values import Psf, Pupil
-from neusee.workflows import _codec
-from neusee.workflows._bands import call_by_band, plain_of
-from neusee.workflows._blobs import Blobs, Stacked
-from neusee.workflows._call import call
-from neusee.workflows._graph import Step
-from neusee.workflows._marks import Mark
+from neusee.workflows.engine.band_results import call_by_band, plain_of
+from neusee.workflows.engine.node_call import call
+from neusee.workflows.graph.diagnostics import Mark
+from neusee.workflows.graph.recipe_graph import Step
+from neusee.workflows.store import serialization as _codec
+from neusee.workflows.store.band_files import Blobs, Stacked
 
 BANDS, PARTS = 31, 8
 LENS = {"focal_length": 0.11, "pixel_pitch": 2.9e-6}

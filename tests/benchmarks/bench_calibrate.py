@@ -28,13 +28,13 @@ import torch
 from numpyro.infer import MCMC, NUTS
 
 from neusee.nodes.calibrate._cell import log_cell
-from neusee.workflows import calibrate
-from neusee.workflows._posterior import Problem
-from neusee.workflows._posterior_begin import begin
-from neusee.workflows._posterior_start import peak
-from neusee.workflows._recipe import load
-from neusee.workflows._run import run
-from neusee.workflows._store import Store
+from neusee.workflows.calibration import emcee_sampler as calibrate
+from neusee.workflows.calibration.initial_guess import begin
+from neusee.workflows.calibration.log_posterior import Problem
+from neusee.workflows.calibration.posterior_mode import peak
+from neusee.workflows.engine.runner import run
+from neusee.workflows.recipe.loading import load
+from neusee.workflows.store.result_store import Store
 
 jax.config.update("jax_enable_x64", True)
 LIT = "~levels.full"  # NUTS has no slope where the converter cuts a level off: both then know five parameters

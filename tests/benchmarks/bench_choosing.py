@@ -20,10 +20,13 @@ from pathlib import Path
 from unittest import mock
 
 from neusee.nodes.optics import _channels
-from neusee.workflows import _resolve, _run, _under_way, load
-from neusee.workflows._accuracy_points import cold
-from neusee.workflows._ledger import Ledger
-from neusee.workflows._store import Store
+from neusee.workflows import load
+from neusee.workflows.engine import execution as _under_way
+from neusee.workflows.engine import resolve_keys as _resolve
+from neusee.workflows.engine import runner as _run
+from neusee.workflows.store.result_store import Store
+from neusee.workflows.studies.accuracy.work_precision_points import cold
+from neusee.workflows.tolerance.error_budget import Ledger
 
 ENGINE = ((_run, "economised"), (_run, "border"), (_run, "proof"), (Ledger, "verdict"), (Ledger, "pass_on"))
 NODE = tuple((_channels, name) for name in ("passed", "with_windows", "choose", "guessed", "rounding", "_top"))

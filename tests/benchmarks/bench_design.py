@@ -24,9 +24,9 @@ from safetensors.torch import load_file
 
 from neusee.nodes import doe, losses, metrics
 from neusee.workflows import load
-from neusee.workflows._design import MaskTraining, design, figures
-from neusee.workflows._design_terms import Terms
-from neusee.workflows._store import Store
+from neusee.workflows.store.result_store import Store
+from neusee.workflows.training.mask_design.design_run import MaskTraining, design, figures
+from neusee.workflows.training.mask_design.design_terms import Terms
 
 AT = {"optics.samples": 270, "optics.pitch": "29.92 um", "optics.window": [504, 504]}
 FINER = {"optics.samples": 405, "optics.pitch": "19.94667 um"}  # at 400 nm 72 waves (of 550 nm) are its Nyquist limit

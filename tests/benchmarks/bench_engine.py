@@ -16,14 +16,14 @@ from pathlib import Path
 import torch
 
 from neusee.nodes import node
-from neusee.workflows import _codec
-from neusee.workflows._code import Code
-from neusee.workflows._function import as_function
-from neusee.workflows._graph import Recipe, Step
-from neusee.workflows._keys import key_of
-from neusee.workflows._marks import Mark
-from neusee.workflows._run import run
-from neusee.workflows._store import Store
+from neusee.workflows.engine.differentiable_function import as_function
+from neusee.workflows.engine.runner import run
+from neusee.workflows.graph.diagnostics import Mark
+from neusee.workflows.graph.recipe_graph import Recipe, Step
+from neusee.workflows.keys.cache_key import key_of
+from neusee.workflows.keys.code_digest import Code
+from neusee.workflows.store import serialization as _codec
+from neusee.workflows.store.result_store import Store
 
 MB = 1e6
 STACK = 31 * 2048 * 2048

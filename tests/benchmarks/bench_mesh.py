@@ -23,9 +23,9 @@ import mesh_processes
 from mesh_processes import DO, _photographs, start
 
 from neusee.workflows import Store, load
-from neusee.workflows._learner import Learner
-from neusee.workflows._mesh import Mesh
-from neusee.workflows._samples import Samples
+from neusee.workflows.training.parallel.process_mesh import Mesh
+from neusee.workflows.training.training_iteration import Learner
+from neusee.workflows.training.training_pictures import Samples
 
 DOUBLE = ["train.precision=float64", "steps.psf.with.precision=double", "steps.laser_psf.with.precision=double"]
 PLAIN = ["train.network.kind=unet", "train.stages.1.batch=4"]

@@ -26,7 +26,7 @@ import torch
 from bench_engine import MB, chain, new_run, wide
 from hamilton import driver
 
-from neusee.workflows import _codec
+from neusee.workflows.store import serialization as _codec
 
 STEPS, LONG = 1000, 10_000
 COUNT = int(111e6 / 4)  #: numbers in one of nine arrays that make 1 GB
@@ -235,10 +235,10 @@ import neusee.nodes
 from pathlib import Path
 neusee.nodes.__path__ = [*neusee.nodes.__path__, folder]
 from neusee.nodes import peer_case as case
-from neusee.workflows._graph import Recipe, Step
-from neusee.workflows._marks import Mark
-from neusee.workflows._run import run
-from neusee.workflows._store import Store
+from neusee.workflows.graph.recipe_graph import Recipe, Step
+from neusee.workflows.graph.diagnostics import Mark
+from neusee.workflows.engine.runner import run
+from neusee.workflows.store.result_store import Store
 for key, value in given.items():
     if not isinstance(value, float):
         torch.save(value.state_dict() if key == "net" else value, f"{folder}/{key}.pt")

@@ -13,7 +13,7 @@ from dataclasses import replace
 from pathlib import Path
 from statistics import mean
 
-from neusee.workflows._place import Cluster, Device, Task, TooLarge, cpop, heft
+from neusee.workflows.placement.heft_and_cpop import Cluster, Device, Task, TooLarge, cpop, heft
 
 SPEC = importlib.util.spec_from_file_location("plans", Path(__file__).parents[1] / "workflows" / "plans.py")
 plans = importlib.util.module_from_spec(SPEC)

@@ -17,8 +17,8 @@ from typing import Any
 import torch
 
 from neusee.workflows import load
-from neusee.workflows._store import Store
-from neusee.workflows.train import train
+from neusee.workflows.store.result_store import Store
+from neusee.workflows.training.run_training import train
 
 SMALL = [
     "optics.samples=96", "optics.pitch=84.1 um", "optics.bands=9", "optics.window=[72, 72]", "scene.shape=[72, 72]",

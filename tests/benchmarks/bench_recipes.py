@@ -18,7 +18,7 @@ import time
 from collections import defaultdict
 from pathlib import Path
 
-NEUSEE = [sys.executable, "-c", "from neusee.workflows.cli import main; raise SystemExit(main())"]
+NEUSEE = [sys.executable, "-c", "from neusee.workflows.cli.app import main; raise SystemExit(main())"]
 
 
 def process(command: list[str], cache: Path) -> tuple[float, float]:

@@ -12,12 +12,12 @@ from statistics import median
 import emcee
 import torch
 
-from neusee.workflows import calibrate
-from neusee.workflows._recipe import load
-from neusee.workflows._remote import open_store
-from neusee.workflows._sbc import Bench
-from neusee.workflows._sbc_bars import verdicts
-from neusee.workflows._sbc_draws import walked
+from neusee.workflows.calibration import emcee_sampler as calibrate
+from neusee.workflows.recipe.loading import load
+from neusee.workflows.store.remote_store import open_store
+from neusee.workflows.studies.calibration.independent_draws import walked
+from neusee.workflows.studies.calibration.rank_uniformity import verdicts
+from neusee.workflows.studies.calibration.simulated_sensors import Bench
 
 
 def main(count=1000, move="de", *overrides):

@@ -24,13 +24,13 @@ import torch
 sys.path.insert(0, str(Path(__file__).parents[1] / "workflows"))
 import random_recipes
 
-from neusee.workflows._accuracy_knobs import changed, knobs
-from neusee.workflows._accuracy_points import cold
-from neusee.workflows._call import RunError
-from neusee.workflows._error import error_of
-from neusee.workflows._marks import RecipeError
-from neusee.workflows._run import run
-from neusee.workflows._store import Store
+from neusee.workflows.engine.node_call import RunError
+from neusee.workflows.engine.runner import run
+from neusee.workflows.graph.diagnostics import RecipeError
+from neusee.workflows.store.result_store import Store
+from neusee.workflows.studies.accuracy.recipe_knobs import changed, knobs
+from neusee.workflows.studies.accuracy.work_precision_points import cold
+from neusee.workflows.tolerance.error_norm import error_of
 
 OUTPUTS = ("raw[plain]", "raw[mask]")
 AGAIN = 3  #: runs of those that might be the cheapest, of which the median counts

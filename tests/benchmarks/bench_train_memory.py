@@ -27,11 +27,11 @@ sys.path.insert(0, str(Path(__file__).parents[1]))
 from live_bytes import LiveBytes
 
 from neusee.workflows import Store, load
-from neusee.workflows._learner import Learner
-from neusee.workflows._photographs import Photographs
-from neusee.workflows._samples import Samples
-from neusee.workflows._training_state import export
-from neusee.workflows.train import frozen
+from neusee.workflows.training.checkpoint import export
+from neusee.workflows.training.photograph_folder import Photographs
+from neusee.workflows.training.run_training import frozen
+from neusee.workflows.training.training_iteration import Learner
+from neusee.workflows.training.training_pictures import Samples
 
 SIDES, FULL = (128, 192, 256, 384, 512), (2048, 31, 8, 256)
 #: side, bands, batch, side of the network's pictures

@@ -17,8 +17,8 @@ import time
 from pathlib import Path
 
 from neusee.workflows import load
-from neusee.workflows._run import run
-from neusee.workflows._store import Store
+from neusee.workflows.engine.runner import run
+from neusee.workflows.store.result_store import Store
 
 OUTPUTS = "outputs=[saturated, lsr, transfer]"
 LAWS = [

@@ -32,7 +32,7 @@ def write(tmp_path):
 @pytest.fixture
 def read(toy, write, tmp_path):
     """Load a recipe of toy nodes from its text and arguments."""
-    from neusee.workflows._recipe import load
+    from neusee.workflows.recipe.loading import load
 
     return lambda text, *arguments: load(write(text), arguments, tmp_path)
 
@@ -40,7 +40,7 @@ def read(toy, write, tmp_path):
 @pytest.fixture
 def mistakes(read):
     """What a recipe of toy nodes is refused with: one line each, with single spaces between the columns."""
-    from neusee.workflows._marks import RecipeError
+    from neusee.workflows.graph.diagnostics import RecipeError
 
     def mistakes(text, *arguments):
         with pytest.raises(RecipeError) as caught:
@@ -53,7 +53,7 @@ def mistakes(read):
 @pytest.fixture
 def one_thread():
     """What is computed is over before a second thread is awake."""
-    from neusee.workflows._one_thread import one_thread
+    from neusee.workflows.engine.threads import one_thread
 
     with one_thread():
         yield

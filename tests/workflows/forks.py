@@ -92,7 +92,7 @@ def serve() -> None:
     import torch
 
     import neusee.nodes
-    import neusee.workflows._run  # noqa: F401  # so that a child need not
+    import neusee.workflows.engine.runner  # noqa: F401  # so that a child need not
 
     torch.set_num_threads(1)
     signal.signal(signal.SIGCHLD, signal.SIG_IGN)  # nobody asks for their ends
@@ -125,10 +125,10 @@ def once(job: dict[str, Any]) -> dict[str, Any]:
     import importlib
 
     import neusee.nodes
-    from neusee.workflows._graph import Recipe, Step
-    from neusee.workflows._marks import Mark
-    from neusee.workflows._run import run
-    from neusee.workflows._store import Store
+    from neusee.workflows.engine.runner import run
+    from neusee.workflows.graph.diagnostics import Mark
+    from neusee.workflows.graph.recipe_graph import Recipe, Step
+    from neusee.workflows.store.result_store import Store
 
     neusee.nodes.__path__ = [*neusee.nodes.__path__, job["folder"]]
     family = importlib.import_module(f"neusee.nodes.{job['family']}")

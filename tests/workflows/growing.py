@@ -17,7 +17,7 @@ from pathlib import Path
 import torch
 
 from neusee.workflows import Store, load, run
-from neusee.workflows.simulate import simulate
+from neusee.workflows.simulation.simulate_recipe import simulate
 
 
 def several(path: Path, folder: Path, count: int) -> None:

@@ -22,10 +22,10 @@ from typing import Any
 import torch
 
 from neusee.workflows import Store, load
-from neusee.workflows._learner import Learner
-from neusee.workflows._mesh import Mesh, joined
-from neusee.workflows._samples import Samples
-from neusee.workflows.train import _photographs, train
+from neusee.workflows.training.parallel.process_mesh import Mesh, joined
+from neusee.workflows.training.run_training import _photographs, train
+from neusee.workflows.training.training_iteration import Learner
+from neusee.workflows.training.training_pictures import Samples
 
 LONGEST = 120.0  #: s, after which a process counts as hanging
 

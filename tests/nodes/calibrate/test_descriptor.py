@@ -11,7 +11,7 @@ from pydantic import ValidationError
 
 from neusee.nodes.calibrate import descriptor, reduce
 from neusee.nodes.calibrate._descriptor import _parsed
-from neusee.workflows._keys import plain
+from neusee.workflows.keys.cache_key import plain
 
 DATA = Path(os.environ.get("NEUSEE_EMVA1288", Path(__file__).parents[3] / "../shared/data/emva1288"))
 TEXT = """# EMVA1288 data

@@ -1,0 +1,135 @@
+"""Large results are written beside the next steps, and a run that has ended has written all of them."""
+
+import importlib.util
+import os
+import sys
+import threading
+import time
+from concurrent.futures import ThreadPoolExecutor
+from pathlib import Path
+
+import pytest
+import torch
+
+from neusee.workflows.engine import write_behind as _later
+from neusee.workflows.engine.node_call import RunError
+from neusee.workflows.engine.runner import run
+from neusee.workflows.engine.write_behind import Later
+from neusee.workflows.store.result_store import Store
+
+SPEC = importlib.util.spec_from_file_location("engine_toys", Path(__file__).with_name("test_engine_choices.py"))
+toys = importlib.util.module_from_spec(SPEC)
+sys.modules["engine_toys"] = toys  # the engine looks there for the code of a node
+SPEC.loader.exec_module(toys)
+add, make, mean, slow, recipe, states = toys.add, toys.make, toys.mean, toys.slow, toys.recipe, toys.states
+N = 1 << 19
+
+
+class Slow(Store):
+    """A store that takes its time to write, and says when."""
+
+    def __init__(self, root, seconds=0.5):
+        super().__init__(root)
+        self.seconds, self.threads, self.claims = seconds, [], []
+
+    def put(self, key, value, about):
+        if about["bytes"] >= _later.LARGE:
+            self.threads.append(threading.current_thread().name)
+            self.claims.append(Store(self.root).claim(key))
+            time.sleep(self.seconds)
+        return super().put(key, value, about)
+
+
+STEPS = {"a": (make, {}, {"n": N}), "b": (slow, {"x": "a"}, {"seconds": 0.5}), "m": (mean, {"x": "b"}, {})}
+
+
+def niceness():
+    return os.getpriority(os.PRIO_PROCESS, threading.get_native_id())
+
+
+@pytest.mark.skipif(sys.platform != "linux", reason="elsewhere priorities belong to processes, not to threads")
+def test_who_writes_yields_to_who_computes():
+    found, before, later = [], niceness(), Later()
+
+    def write():
+        found.append(niceness())
+        with ThreadPoolExecutor(1) as pool:  # as the bands of a stack are written
+            found.append(pool.submit(niceness).result())
+
+    later.add("key", 1, write)
+    later.finish()
+    assert min(found) > before or before >= 19
+    assert len(set(found)) == 1
+    assert niceness() == before
+
+
+def test_a_run_that_has_ended_has_written_all(tmp_path):
+    store = Slow(tmp_path)
+    run(recipe("a b m", **STEPS), store)
+    assert all(name != "MainThread" for name in store.threads)
+    assert len(store.threads) == 2
+    assert set(states(run(recipe("a b m", **STEPS), Store(tmp_path))).values()) == {"cached"}
+
+
+def test_what_waits_keeps_its_lease(tmp_path):
+    store = Slow(tmp_path, 0.0)
+    run(recipe("a b m", **STEPS), store)
+    assert store.claims == [None, None]
+    done = run(recipe("a b m", **STEPS), store)
+    for key in done.keys.values():
+        with Store(tmp_path).claim(key) as free:
+            assert free is not None
+
+
+def test_writing_and_computing_overlap(tmp_path):
+    store = Slow(tmp_path)
+    done = run(recipe("a b m", **STEPS), store).done
+    assert done["b"].began < done["a"].began + done["a"].seconds + 0.4, "b began before a was written"
+
+
+def test_what_waits_is_not_computed_again(tmp_path):
+    store = Slow(tmp_path)
+    steps = {**STEPS, "c": (add, {"x": "b"}, {})}
+    result = run(recipe("a c", **steps), store)
+    assert {d.state for d in result.done.values()} == {"run"}
+    assert torch.equal(result.values["a"], torch.ones(N))
+
+
+def test_a_failure_keeps_what_was_finished_before_it(tmp_path):
+    steps = {**STEPS, "f": (add, {"x": "b"}, {"k": "no number"})}
+    with pytest.raises(RunError, match="f \\("):
+        run(recipe("a b f", **steps), Slow(tmp_path))
+    assert set(states(run(recipe("a b", **steps), Store(tmp_path))).values()) == {"cached"}
+
+
+def test_a_disk_that_is_full_costs_one_warning_and_no_value(tmp_path, monkeypatch):
+    def full(*args):
+        raise OSError(28, "No space left on device")
+
+    monkeypatch.setattr("os.fsync", full)
+    with pytest.warns(UserWarning, match="cannot be written") as seen:
+        result = run(recipe("a b m", **STEPS), Store(tmp_path))
+    assert len(seen) == 1
+    assert result.values["m"] == 2
+
+
+def test_an_error_of_the_writer_is_an_error_of_the_run(tmp_path):
+    class Broken(Store):
+        def put(self, key, value, about):
+            raise RuntimeError("the disk speaks in tongues")
+
+    with pytest.raises(RuntimeError, match="tongues"):
+        run(recipe("a", **STEPS), Broken(tmp_path))
+
+
+def test_no_more_waits_than_there_is_room_for(monkeypatch):
+    monkeypatch.setattr(_later, "_ROOM", 100)
+    later, gate, most = Later(), threading.Event(), []
+    later.add("a", 80, lambda: gate.wait(10))
+    threading.Timer(0.2, gate.set).start()
+    began = time.monotonic()
+    later.add("b", 80, lambda: most.append("a" in later))
+    assert time.monotonic() - began > 0.1
+    later.finish()
+    assert most == [False]
+    assert "b" not in later

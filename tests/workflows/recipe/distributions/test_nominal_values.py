@@ -1,0 +1,293 @@
+"""Laws in the place of values, posteriors over several: read where they are right, and refused where they stand."""
+
+import json
+import math
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+from scipy import stats
+
+from neusee.workflows import load
+from neusee.workflows.graph.diagnostics import RecipeError
+from neusee.workflows.recipe.distributions.joint import Joint, read_posterior, summary
+from neusee.workflows.recipe.distributions.scalar import is_law, read_law
+from neusee.workflows.simulation.simulate_recipe import recipe_text
+
+NOISE = "sensor.read_noise=normal(10.5 e-, 0.5 e-)"
+
+
+def drawn(count=4000, rho=0.9, seed=1):
+    """Gain and pedestal that go together, and a noise that does not; the gain is log-normal."""
+    rng = np.random.default_rng(seed)
+    z = rng.standard_normal((count, 3))
+    tied = rho * z[:, 0] + math.sqrt(1 - rho**2) * z[:, 1]
+    return np.stack([0.37 * np.exp(0.01 * z[:, 0]), 390 + 2 * tied, 10.5 + 0.1 * z[:, 2]], 1)
+
+
+NAMES = ("gain", "pedestal", "read_noise")
+
+
+@pytest.fixture
+def calibrated(tmp_path):
+    """The folder of a calibration."""
+
+    def make(kinds=("estimate",) * 3, failed=0, units=("e-/DN", "e-", "e-"), extra=()):
+        folder = tmp_path / "found"
+        folder.mkdir(exist_ok=True)
+        columns = dict(zip(NAMES, drawn().T, strict=True))
+        rows = {name: {"kind": k, "unit": u} for name, k, u in zip(NAMES, kinds, units, strict=True)}
+        for name, unit in extra:
+            columns[name], rows[name] = 0.002 + 1e-4 * drawn()[:, 2], {"kind": "upper", "unit": unit}
+        np.savez(folder / "draws.npz", **columns)
+        checks = [{"name": "chains agree", "mark": "fail" if failed else "pass"}]
+        (folder / "posterior.json").write_text(json.dumps({"parameters": rows, "failed": failed, "checks": checks}))
+        return folder
+
+    return make
+
+
+# --- laws -------------------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(
+    ("text", "law"),
+    [
+        ("normal(10.5 e-, 0.5 e-)", stats.norm(10.5, 0.5)),
+        ("lognormal(0.37, 1.02)", stats.lognorm(math.log(1.02), scale=0.37)),
+        ("uniform(1 um, 3 um)", stats.uniform(1e-6, 2e-6)),
+        ("loguniform(1e-3, 1e3)", stats.loguniform(1e-3, 1e3)),
+    ],
+)
+def test_a_law_is_that_of_scipy(text, law):
+    z = np.linspace(-4, 4, 41)
+    assert read_law(text).at(z) == pytest.approx(law.ppf(stats.norm.cdf(z)), rel=1e-9)
+    assert read_law(text).median == pytest.approx(law.median())
+
+
+@given(st.floats(1e-12, 1e12), st.floats(1.0001, 1e3), st.sampled_from(["lognormal", "loguniform"]))
+def test_what_is_drawn_from_a_positive_law_is_positive_and_rises(first, factor, kind):
+    law = read_law(f"{kind}({first!r}, {factor if kind == 'lognormal' else first * factor!r})")
+    drawn = law.at(np.linspace(-5, 5, 11))
+    assert (drawn > 0).all()
+    assert (np.diff(drawn) > 0).all()
+
+
+@given(st.text(max_size=30))
+def test_no_text_breaks_the_reader(text):
+    if is_law(text):
+        with pytest.raises(ValueError, match=r"\w"):
+            read_law(text)
+
+
+@pytest.mark.parametrize(
+    ("law", "message"),
+    [
+        ("normal(10.5 e-)", "needs the mean and the standard deviation"),
+        ("normal(10.5 e-, 1 nm)", "not of one unit"),
+        ("normal(10.5 e-, 0 e-)", "greater than 0"),
+        ("normal(10.5 e-, -1 e-)", "greater than 0"),
+        ("normal(1e999 e-, 1 e-)", "not finite"),
+        ("normal(1 kg, 2 kg)", "no quantity"),
+        ("lognormal(10 e-, 1.1 e-)", "number without unit"),
+        ("lognormal(10 e-, 0.9)", "factor"),
+        ("uniform(3 e-, 3 e-)", "least value comes first"),
+        ("loguniform(0 e-, 3 e-)", "greater than 0"),
+        ("normal(10 e-", "no whole law"),
+    ],
+)
+def test_a_law_that_is_none_is_refused_once_and_where_it_stands(law, message):
+    with pytest.raises(RecipeError, match=message) as error:
+        load("first_light", [f"sensor.read_noise={law}"])
+    assert str(error.value).startswith("argument 1 ")
+    assert len(error.value.problems) == 1
+
+
+def test_a_law_of_the_wrong_unit_is_refused_by_what_reads_it():
+    with pytest.raises(RecipeError, match="wrong unit"):
+        load("first_light", ["sensor.read_noise=normal(10 nm, 1 nm)"])
+
+
+def test_a_run_takes_the_median_and_keeps_the_law_in_its_text():
+    recipe = load("first_light", ["sensor.read_noise=lognormal(20 e-, 1.1)"])
+    assert recipe.steps["read[plain]"].params["sigma"] == pytest.approx(20.0)
+    assert "run at 20 e-" in " ".join(recipe.notes)
+    assert "lognormal(20 e-, 1.1)" in recipe_text(recipe)
+
+
+def test_a_recipe_that_is_sure_of_all_is_what_it_was():
+    recipe = load("first_light")
+    assert recipe.uncertain is None
+    assert recipe == load("first_light", ["posterior=null"])
+
+
+# --- joint laws -------------------------------------------------------------------------------------------------------
+
+
+def test_draws_come_back_from_their_numbers():
+    draws = drawn()
+    joint = Joint.of_draws(NAMES, draws)
+    back = joint.at(joint.numbers())
+    assert back == pytest.approx(draws, rel=1e-6)
+    assert np.corrcoef(joint.numbers().T) == pytest.approx(np.eye(3), abs=0.05)
+
+
+def test_points_of_draws_have_their_laws_and_their_correlation():
+    joint = Joint.of_draws(NAMES, drawn())
+    made = joint.at(np.random.default_rng(5).standard_normal((20000, 3)))
+    assert made.std(0) == pytest.approx(joint.sd, rel=0.03)
+    assert np.corrcoef(made.T)[0, 1] == pytest.approx(0.9, abs=0.01)
+    assert stats.kstest(made[:, 0], joint.draws[:, 0]).pvalue > 1e-3
+
+
+@given(st.floats(-0.99999, 0.99999), st.floats(1e-6, 1e6), st.floats(1e-6, 1e6))
+def test_a_normal_law_has_its_covariance(rho, a, b):
+    covariance = [[a * a, rho * a * b], [rho * a * b, b * b]]
+    joint = summary({"mean": {"x": 0.0, "y": 1.0}, "covariance": covariance})
+    factor = joint.factor * joint.sd[:, None]
+    assert factor @ factor.T == pytest.approx(np.array(covariance), rel=1e-6)
+
+
+def test_some_of_a_normal_law_is_that_of_all():
+    covariance = np.cov(drawn().T)
+    joint = summary({"mean": dict.fromkeys(NAMES, 1.0), "covariance": covariance.tolist()}).only(NAMES[1:])
+    factor = joint.factor * joint.sd[:, None]
+    assert factor @ factor.T == pytest.approx(covariance[1:, 1:], rel=1e-6, abs=1e-12)
+
+
+def test_values_that_are_one_and_the_same_are_drawn_as_such():
+    x = drawn()[:, :1]
+    joint = Joint.of_draws(("a", "b"), np.concatenate([x, 2 * x], 1))
+    made = joint.at(np.random.default_rng(1).standard_normal((100, 2)))
+    assert made[:, 1] == pytest.approx(2 * made[:, 0], rel=1e-3)
+
+
+@pytest.mark.parametrize(
+    ("name", "content", "message"),
+    [
+        ("a.csv", "gain,pedestal\n1,2\n3\n", "line 3"),
+        ("a.csv", "gain\n1\nx\n", "there must be numbers"),
+        ("a.csv", "gain\n" + "1\n" * 50, "is the same"),
+        ("a.csv", "gain\n1\n2\n", "2 draws"),
+        ("a.csv", "gain\n" + "nan\n" * 50, "finite"),
+        ("a.json", "{", "cannot be read"),
+        ("a.json", "[1]", "no mapping"),
+        ("a.json", '{"parameters": {"gain": {}}}', "no such file"),
+        ("a.yaml", "mean: {gain: 1}", "needs mean"),
+        ("a.yaml", "mean: {gain: 1}\nsd: {well: 1}", "sd must name"),
+        ("a.yaml", "mean: {gain: 1}\nsd: {gain: 0}", "greater than 0"),
+        ("a.yaml", "mean: {a: 1, b: 1}\ncovariance: [[1, 2], [2, 1]]", "eigenvalue"),
+        ("a.yaml", "mean: {a: 1, b: 1}\ncovariance: [[1, 2], [1]]", "matrix"),
+        ("a.yaml", "mean: {a: 1}\nsd: {a: 1}\nwidth: 1", "width is unknown"),
+        ("a.txt", "1", "is no posterior"),
+        ("a.npz", "1", "cannot be read"),
+    ],
+)
+def test_a_file_that_is_no_posterior_is_refused(tmp_path, name, content, message):
+    (tmp_path / name).write_text(content)
+    with pytest.raises(RecipeError, match=message) as error:
+        load("first_light", [f"posterior={tmp_path / name}"])
+    assert str(error.value).startswith("argument 1 ")
+
+
+def test_a_file_that_is_not_there_is_refused(tmp_path):
+    with pytest.raises(RecipeError, match="no such file"):
+        load("first_light", [f"posterior={tmp_path / 'none'}"])
+
+
+def test_of_a_pattern_the_newest_is_read(tmp_path):
+    import os
+
+    for n, mean in enumerate((1.0, 2.0)):
+        path = tmp_path / f"{n}.yaml"
+        path.write_text(f"mean: {{gain: {mean}}}\nsd: {{gain: 0.1}}")
+        os.utime(path, (1000 - n, 1000 - n))
+    assert read_posterior(tmp_path / "*.yaml").joint.mean == pytest.approx([1.0])
+
+
+# --- a posterior in a recipe ------------------------------------------------------------------------------------------
+
+
+def gain_of(recipe):
+    return recipe.steps["digital[plain]"].params["gain"]
+
+
+def test_a_run_takes_the_mean_of_what_is_told_and_no_value_of_what_is_not(calibrated):
+    recipe = load("first_light", [f"posterior={calibrated(kinds=('estimate', 'estimate', 'upper'))}"])
+    assert gain_of(recipe) == pytest.approx(drawn()[:, 0].mean())
+    assert recipe.steps["read[plain]"].params["sigma"] == 10.5
+    used = {s.path: s.why for s in recipe.uncertain.standings}
+    assert used == {"sensor.gain": "mean", "sensor.pedestal": "mean", "sensor.read_noise": "recipe"}
+
+
+def test_a_run_takes_a_draw_with_all_that_goes_with_it(calibrated):
+    recipe = load("first_light", posterior={"file": str(calibrated()), "use": 17})
+    read = recipe.steps["read[mask]"].params
+    assert (gain_of(recipe), read["pedestal"], read["sigma"]) == pytest.approx(tuple(drawn()[17]))
+
+
+def test_a_run_may_keep_its_own(calibrated):
+    recipe = load("first_light", posterior={"file": str(calibrated()), "use": "nominal"})
+    assert recipe.steps == load("first_light").steps
+    assert len(recipe.uncertain.names) == 3
+
+
+def test_an_argument_is_stronger_than_the_posterior(calibrated):
+    recipe = load("first_light", [f"posterior={calibrated()}", "sensor.gain=0.5"])
+    assert gain_of(recipe) == 0.5
+    assert "sensor.gain" not in recipe.uncertain.names
+    assert "sensor.gain is what the argument says" in " ".join(recipe.notes)
+
+
+@pytest.mark.parametrize(
+    ("said", "message"),
+    [
+        ({"use": 4000}, "0 to 3999"),
+        ({"use": "median"}, "write mean, nominal"),
+        ({"use": True}, "write mean, nominal"),
+        ({"values": {"sensor.gain": "slope"}}, "slope is not in the posterior"),
+        ({"values": {"sensor.speed": "gain"}}, "no sensor.speed"),
+        ({"values": {"sensor.camera": "gain"}}, "no number"),
+        ({"take": "mean"}, "unknown"),
+    ],
+)
+def test_what_cannot_be_taken_of_a_posterior_is_refused(calibrated, said, message):
+    with pytest.raises(RecipeError, match=message):
+        load("first_light", posterior={"file": str(calibrated()), **said})
+
+
+def test_a_calibration_that_is_not_fit_for_use_is_refused(calibrated):
+    with pytest.raises(RecipeError, match="not fit for use: 1 checks fail \\(chains agree\\)"):
+        load("first_light", [f"posterior={calibrated(failed=1)}"])
+
+
+def test_numbers_of_another_convention_are_refused(calibrated):
+    with pytest.raises(RecipeError, match="its gain is in DN/e-"):
+        load("first_light", [f"posterior={calibrated(units=('DN/e-', 'e-', 'e-'))}"])
+    with pytest.raises(RecipeError, match=r"its dark current is in 1 s, the recipe exposes 0.1 s"):
+        load("first_light", [f"posterior={calibrated(extra=[('dark_current', 'e- in 1 s')])}"])
+
+
+def test_a_law_and_a_posterior_of_one_value_are_refused(calibrated, tmp_path):
+    own = tmp_path / "own.yaml"
+    groups = "camera: neusee, scene: china, illuminant: daylight, lift: lmmse, laser: green, optics: small"
+    groups += ", sensor: small, doe: five_half_rings, flare: clean, restore: wiener, reading: coherent"
+    lines = [f"  - {group}" for group in groups.split(", ")]
+    text = ["defaults:", *lines, "sensor: {gain: 'normal(0.37, 0.01)'}", f"posterior: {calibrated()}", "outputs: [raw]"]
+    own.write_text("\n".join(text))
+    with pytest.raises(RecipeError, match=r"own.yaml:13.*sensor.gain +is a law here and in the posterior"):
+        load(own)
+
+
+def test_values_may_have_other_names_and_a_summary_may_stand_in_the_recipe():
+    said = {
+        "mean": {"dark_noise": "12 e-"},
+        "sd": {"dark_noise": "0.5 e-"},
+        "values": {"sensor.read_noise": "dark_noise"},
+    }
+    recipe = load("first_light", posterior=said)
+    assert recipe.steps["read[plain]"].params["sigma"] == 12.0
+    assert recipe.uncertain.standings[0].below == pytest.approx(stats.norm.cdf(-3.0))
+    assert recipe.uncertain.standings[0].far
+    assert "far from its posterior, 12 ± 0.5 e-" in " ".join(recipe.notes)

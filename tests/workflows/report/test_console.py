@@ -1,0 +1,84 @@
+"""What is printed while steps run: items share a line, states are told apart, sleepers are one line."""
+
+from __future__ import annotations
+
+import io
+
+import pytest
+import torch
+
+from neusee.nodes import Check, Facts, node
+from neusee.workflows.engine.runner import Done, Event
+from neusee.workflows.graph.diagnostics import Mark
+from neusee.workflows.graph.recipe_graph import Recipe, Step
+from neusee.workflows.report import console as _console
+
+
+@node()
+def charge(x: torch.Tensor) -> torch.Tensor:
+    """Count. Units: result e-."""
+    return x
+
+
+charge.__doc__ = "Count.\n\n    Units:  photons; result e-.\n"
+NAMES = ["spot[mask,green]", "spot[mask,red]", "raw"]
+
+
+def recipe() -> Recipe:
+    steps = {name: Step(name, charge, {}, {"x": None}, Mark("a.yaml", 1, 1), {}) for name in NAMES}
+    return Recipe("r", "", 1, 0.0, ("raw",), steps)
+
+
+def done(step: str, state: str, seconds: float = 0.25, ok: bool = True) -> Event:
+    facts = Facts((3, 4, 5), "float32", 0.0, 1.0, 1.0, 1, True)
+    return Event(step, Done(step, state, "", seconds, "k", facts, (Check("peak 3", ok),)))
+
+
+def test_items_share_a_line_that_comes_when_the_last_is_done(capsys):
+    with _console.Plain(recipe(), NAMES) as shown:
+        shown.watch(Event(NAMES[0], None))
+        shown.watch(done(NAMES[0], "run"))
+        assert "spot" not in capsys.readouterr().out
+        shown.watch(done(NAMES[1], "cached"))
+        out = capsys.readouterr().out
+        shown.watch(done("raw", "asleep"))
+    assert " ".join(out.split()) == "spot ×2 cpu 1 run, 1 cached 0.250 3 × 4 × 5 e- peak 3"
+    rest = capsys.readouterr().out
+    assert "raw" not in rest
+    assert "1 steps were not looked at" in rest
+
+
+def test_a_check_that_does_not_hold_is_shown_of_all_items(capsys):
+    with _console.Plain(recipe(), NAMES) as shown:
+        shown.watch(done(NAMES[0], "run"))
+        shown.watch(done(NAMES[1], "run", ok=False))
+    assert "LOOK: peak 3" in capsys.readouterr().out
+
+
+@pytest.mark.parametrize("width", [60, 120])
+def test_the_live_table_shows_what_has_begun(width):
+    from rich.console import Console
+
+    shown = _console.Live(recipe(), NAMES)
+    out = io.StringIO()
+    console = Console(file=out, width=width)
+    shown.watch(Event("raw", None))
+    console.print(shown)
+    assert "raw" in out.getvalue()
+    assert "…" in out.getvalue()
+    assert "spot" not in out.getvalue()
+    shown.watch(done("raw", "left out"))
+    console.print(shown)
+    assert "left out" in out.getvalue()
+
+
+def test_nothing_is_printed_where_silence_was_asked_for(capsys):
+    with _console.screen(recipe(), NAMES, silent=True) as shown:
+        shown.watch(done("raw", "run"))
+    assert capsys.readouterr().out == ""
+
+
+def test_left_out_steps_are_named_once_with_the_largest_bound():
+    rows = [{"step": f"dark[{i}]", "bound": b} for i, b in (("a", 1e-5), ("b", 3e-5))]
+    line = _console.said_of_left_out({"left_out": rows, "tolerance": 1e-3})
+    assert line == "left out dark (at most 3.0e-05); tolerance 0.001"

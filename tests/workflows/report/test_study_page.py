@@ -1,0 +1,88 @@
+"""The page of a study: what is in its cells, what its colours say, and that it stands alone."""
+
+import base64
+import re
+from html.parser import HTMLParser
+
+import pytest
+
+from neusee.workflows.report.study_page import Section, page, said
+
+PNG = b"\x89PNG\r\n\x1a\n and what follows"
+
+
+class Cells(HTMLParser):
+    """Every table cell with its classes, every picture, and every address that would be fetched."""
+
+    def __init__(self, text):
+        super().__init__()
+        self.cells, self.pictures, self.fetched, self._class = [], [], [], None
+        self.feed(text)
+
+    def handle_starttag(self, tag, attributes):
+        found = dict(attributes)
+        self._class = found.get("class") or "" if tag == "td" else None
+        if tag == "img":
+            self.pictures.append(found["src"])
+        self.fetched += [found[a] for a in ("src", "href") if not found.get(a, "#").startswith(("#", "data:"))]
+
+    def handle_data(self, data):
+        if self._class is not None:
+            self.cells.append((data, self._class))
+            self._class = None
+
+
+def made(**how):
+    section = Section("Cases", "One.\n\nTwo <b>.", ("case", "error"), [["dark", 1.23456e-4], ["<one>", None]], **how)
+    return page("Study of x", "It holds.", [section], {"neusee": "0.1", "seeds": [1, 2]})
+
+
+def test_cells_hold_numbers_to_three_digits_and_marks_as_classes():
+    found = Cells(made(marks={(0, 1): "fail", (1, 0): "pass"})).cells
+    assert found[:4] == [("dark", ""), ("0.000123", "n fail"), ("<one>", "pass"), ("–", "")]
+    assert ("[1, 2]", "key") in found
+
+
+def test_a_mark_where_there_is_no_cell_is_refused():
+    with pytest.raises(ValueError, match=r"Cases: a mark at \(2, 0\)"):
+        made(marks={(2, 0): "fail"})
+
+
+def test_the_page_carries_its_picture_and_fetches_nothing():
+    text = made(picture=PNG)
+    found = Cells(text)
+    assert [base64.b64decode(p.split(",")[1]) for p in found.pictures] == [PNG]
+    assert found.fetched == []
+    assert not re.search(r"@import|url\(|<script|https?:", text)
+
+
+def test_text_is_escaped_and_a_blank_line_begins_a_paragraph():
+    text = made()
+    assert "<p>One.</p>\n<p>Two &lt;b&gt;.</p>" in text
+    assert "<b>" not in text
+
+
+def contrast(ink, paper):
+    def luminance(colour):
+        parts = [int(colour[i : i + 2], 16) / 255 for i in (1, 3, 5)]
+        linear = [p / 12.92 if p <= 0.04045 else ((p + 0.055) / 1.055) ** 2.4 for p in parts]
+        return 0.2126 * linear[0] + 0.7152 * linear[1] + 0.0722 * linear[2]
+
+    light, dark = sorted((luminance(ink), luminance(paper)), reverse=True)
+    return (light + 0.05) / (dark + 0.05)
+
+
+def test_every_ink_is_read_on_its_ground_in_light_and_in_dark():
+    schemes = [
+        dict(re.findall(r"--([\w-]+): (#\w{6})", block)) for block in re.findall(r":root \{(.*?)\}", made(), re.S)
+    ]
+    assert len(schemes) == 2
+    for colours in schemes:
+        pairs = [("ink", "paper"), ("soft", "paper"), ("link", "paper")]
+        pairs += [(f"{kind}-ink", kind) for kind in ("good", "watch", "bad")]
+        assert min(contrast(colours[a], colours[b]) for a, b in pairs) >= 4.5  # WCAG 2.1, level AA
+
+
+@pytest.mark.parametrize(("value", "text"), [(3, "3"), (True, "yes"), (2.0, "2"), (1e-9, "1e-09"), ("a", "a")])
+def test_what_a_cell_says(value, text):
+    assert said(value) == text

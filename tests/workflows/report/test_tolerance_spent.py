@@ -1,0 +1,144 @@
+"""The page says what was left out, what that may change at most, and, where it was run in full, what it did change."""
+
+import json
+from dataclasses import replace
+
+import pytest
+from typer.testing import CliRunner
+
+from neusee.workflows import load
+from neusee.workflows.cli.app import app
+from neusee.workflows.engine.runner import run
+from neusee.workflows.report import run_page as report
+from neusee.workflows.report.tolerance_spent import said_of_economies, spent
+from neusee.workflows.simulation.simulate_recipe import simulate
+from neusee.workflows.store.result_store import Store
+from neusee.workflows.tolerance import cheaper_steps as _economy
+from neusee.workflows.tolerance.cheaper_steps import economised
+from neusee.workflows.tolerance.error_norm import error_of
+
+SMALL = [
+    "optics.samples=90",
+    "optics.pitch=89.76 um",
+    "optics.window=[48, 48]",
+    "scene.shape=[64, 64]",
+    "sensor.shape=[48, 48]",
+    "optics.bands=7",
+    "doe=vortex",
+    "lasers.green.angle=[0.1 mrad, 0 mrad]",
+]
+
+
+@pytest.fixture(scope="module")
+def recipe():
+    return load("first_light", SMALL)
+
+
+@pytest.fixture
+def store(tmp_path):
+    return Store(tmp_path / "cache")
+
+
+def test_sums_over_bands_stand_in_for_images_that_nobody_asks_for(recipe):
+    found = economised(recipe, recipe.outputs)
+    assert {e.step for e in found.economies} == {"image[plain]", "image[mask]"}
+    assert found.steps["scene_photons[mask]"].wires["irradiance"] == "image[mask].channels"
+    assert found.steps["image[mask]"] == recipe.steps["image[mask]"]
+    assert found.whole is recipe
+    assert economised(found, recipe.outputs) is found
+
+
+def test_the_well_is_summed_only_where_it_is_asked_for(recipe):
+    for outputs, rows in ((["raw[mask]"], "responses.rows"), (["raw[mask]", "peak[mask]"], "responses.wells")):
+        found = economised(recipe, outputs)
+        assert found.steps["image[mask].channels"].wires["rows"] == rows
+        assert found.steps[rows].params["well"] == (rows == "responses.wells")
+
+
+def test_an_image_that_is_asked_for_is_whole(recipe, store):
+    found = economised(recipe, [*recipe.outputs, "image[mask]"])
+    assert {e.step for e in found.economies} == {"image[plain]"}
+    result = run(recipe, store)
+    assert result["image[mask]"].shape == (7, 64, 64)
+
+
+@pytest.mark.parametrize(
+    "change", [{"keep_all": True}, {"tolerance": 0.0}, {"tolerance": 1e-5}], ids=["keep all", "no tolerance", "fine"]
+)
+def test_nothing_stands_in_where_nothing_may(recipe, change):
+    whole = replace(recipe, **change)
+    assert economised(whole, recipe.outputs) is whole
+
+
+def test_bands_that_are_levelled_one_by_one_are_not_summed():
+    recipe = load("first_light", [*SMALL, "reading.level=per_band"])
+    assert economised(recipe, recipe.outputs) is recipe
+
+
+def test_a_scene_that_is_learnt_is_whole(recipe):
+    assert economised(recipe, recipe.outputs, {"scene"}) is recipe
+    assert economised(recipe, recipe.outputs, {"height"}).economies
+
+
+def test_the_errors_are_within_their_bounds_and_these_within_the_tolerance(recipe, store):
+    result, full = run(recipe, store), run(replace(recipe, keep_all=True), store)
+    assert set(result.proof.held) >= {"raw[plain]", "raw[mask]"}
+    assert 0 < result.proof.worst <= recipe.tolerance
+    for name in ("raw[plain]", "raw[mask]"):
+        assert error_of(result[name], full[name]) <= result.proof.worst
+
+
+def test_a_large_tolerance_spoils_no_figure_of_merit(recipe, store):
+    wide = replace(recipe, tolerance=0.1)
+    result, full = run(wide, store), run(replace(recipe, keep_all=True), store)
+    assert "read[plain]" in result.done
+    assert result.done["read[plain]"].state != "left out"
+    assert (spent(result)["held"], spent(full)["held"]) == (1e-3, recipe.tolerance)
+    assert result.proof.worst <= 1e-3
+    for arm in ("plain", "mask"):
+        assert error_of(result[f"developed_quality[{arm}]"], full[f"developed_quality[{arm}]"]) <= 0.1
+    assert run(wide, store, ["raw[plain]"]).recipe.limit("raw[plain]") == 0.1
+
+
+def test_measured_errors_stand_where_the_full_run_is_stored(recipe, store):
+    result = run(recipe, store)
+    before = spent(result)
+    assert before["measured"] == {}
+    full = run(replace(recipe, keep_all=True), store)
+    after = spent(result)
+    assert set(after["measured"]) == set(recipe.outputs)
+    assert after["measured"]["raw[mask]"] == error_of(result["raw[mask]"], full["raw[mask]"])
+    assert after["economies"][0]["full_seconds"] == pytest.approx(full.done[after["economies"][0]["step"]].seconds)
+    assert spent(full)["economies"] == []
+    assert spent(full)["keep_all"]
+    assert "measured" in said_of_economies(after)
+    assert "measured" not in said_of_economies(before)
+
+
+def test_the_command_line_shows_what_stands_in(tmp_path, monkeypatch):
+    monkeypatch.setenv("NEUSEE_CACHE", str(tmp_path / "cache"))
+    done = CliRunner().invoke(app, ["run", "first_light", *SMALL, "--out", str(tmp_path / "runs")])
+    assert done.exit_code == 0, done.output
+    assert "cube.mixture" in done.output
+    assert "spared   image[mask] (at most" in done.output
+
+
+def test_the_command_line_shows_a_run_that_could_not_prove_its_tolerance(tmp_path, monkeypatch):
+    monkeypatch.setenv("NEUSEE_CACHE", str(tmp_path / "cache"))
+    monkeypatch.setattr(_economy, "_LEAST", 0.0)  # so fine a tolerance would not even be tried
+    words = ["run", "first_light", *SMALL, "tolerance=1e-7", "--out", str(tmp_path / "runs")]
+    done = CliRunner().invoke(app, words)
+    assert done.exit_code == 0, done.output
+    assert "spared" not in done.output
+    assert "\n  cube  " in done.output
+
+
+def test_the_page_says_it(recipe, store, tmp_path):
+    done = simulate(recipe, store, tmp_path / "runs", ["neusee"])
+    page, doc = done.page.read_text(), json.loads((done.folder / "provenance.json").read_text())
+    assert "image[mask].channels" in page
+    assert doc["spent"]["economies"][0]["bound"] <= recipe.tolerance
+    assert max(doc["spent"]["bounds"].values()) <= recipe.tolerance
+    whole = simulate(replace(recipe, keep_all=True), store, tmp_path / "runs", ["neusee"])
+    assert "every step was computed in full" in whole.page.read_text()
+    assert "measured beside --keep-all" in report.page({**doc, "spent": spent(run(recipe, store))}, {})

@@ -1,0 +1,219 @@
+"""The stability study: what counts as a failure, that it is found, kept, drawn and counted."""
+
+import csv
+import json
+from dataclasses import replace
+
+import pytest
+import torch
+
+from neusee.nodes import node
+from neusee.workflows.graph.diagnostics import Mark
+from neusee.workflows.graph.recipe_graph import Step
+from neusee.workflows.keys.code_digest import Code
+from neusee.workflows.recipe.loading import load
+from neusee.workflows.recipe.step_declarations import find_node
+from neusee.workflows.store.result_store import Store
+from neusee.workflows.studies.stability import case_result as _extremes_cell
+from neusee.workflows.studies.stability import stability_study as _study_stability
+from neusee.workflows.studies.stability import stated_limits as _extremes_limits
+from neusee.workflows.studies.stability.case_recipe import Chain, untouched
+from neusee.workflows.studies.stability.case_result import judged
+from neusee.workflows.studies.stability.extreme_cases import CASES, USUAL, Case, Size
+from neusee.workflows.studies.stability.stability_figures import number, words
+from neusee.workflows.studies.stability.stability_study import study
+
+BY_NAME = {case.name: case for case in CASES}
+
+
+def step_of(fn, **params):
+    return Step("it", fn, params, {}, Mark("test"), {})
+
+
+@node(rtol=1e-5)
+def doubled(x: torch.Tensor) -> torch.Tensor:
+    return x * 2
+
+
+@node(rtol=1e-5)
+def cancelling(x: torch.Tensor) -> torch.Tensor:
+    return (x + 1e6) - 1e6
+
+
+@node()
+def hiding(x: torch.Tensor) -> torch.Tensor:
+    return torch.where(x > 0, x, 0.0)
+
+
+@node()
+def rooted(x: torch.Tensor) -> torch.Tensor:
+    return (x - x.amin()).sqrt()
+
+
+@node()
+def refusing(x: torch.Tensor) -> torch.Tensor:
+    if not bool(x.isfinite().all()):
+        raise ValueError("x holds values that are not finite: replace them")
+    return x
+
+
+@node()
+def breaking(x: torch.Tensor) -> torch.Tensor:
+    raise RuntimeError("index out of range in self")
+
+
+@pytest.fixture
+def picture():
+    return torch.rand(8, 8, generator=torch.Generator().manual_seed(1))
+
+
+def test_a_step_within_its_bound_passes_with_both_numbers(picture):
+    cell = judged(step_of(doubled), [picture], USUAL, 0)
+    assert cell.mark == "pass"
+    assert 0 <= cell.error <= cell.bound == 1e-5
+    assert 0 <= cell.slope <= cell.slope_bound
+
+
+@pytest.mark.parametrize(
+    ("fn", "case"),
+    [(cancelling, "usual"), (rooted, "usual"), (hiding, "NaN"), (breaking, "usual"), (breaking, "NaN")],
+)
+def test_what_is_wrong_fails(fn, case, picture):
+    assert judged(step_of(fn), [picture], BY_NAME[case], 0).mark == "fail"
+
+
+@pytest.mark.parametrize(("fn", "case"), [(refusing, "NaN"), (doubled, "NaN"), (doubled, "Inf"), (doubled, "float16")])
+def test_what_is_refused_seen_or_of_its_precision_passes(fn, case, picture):
+    assert judged(step_of(fn), [picture], BY_NAME[case], 0).mark == "pass"
+
+
+def test_a_number_that_is_none_is_tried_in_each_picture_alone(picture):
+    @node()
+    def blind(x: torch.Tensor, y: torch.Tensor) -> torch.Tensor:
+        return x + torch.where(y > 2, y, 0.0)
+
+    assert judged(step_of(blind), [picture, picture + 0], BY_NAME["NaN"], 0).mark == "fail"
+
+
+def test_a_case_that_changes_nothing_of_a_step_has_no_cell(picture):
+    assert judged(step_of(doubled), [], BY_NAME["NaN"], 0) is None
+    assert judged(step_of(doubled), [picture], BY_NAME["alike"], 0) is None
+
+
+def test_names_and_groups_of_the_catalogue_are_in_order():
+    assert len(BY_NAME) == len(CASES)
+    groups = [case.group for case in CASES]
+    assert len(dict.fromkeys(groups)) == sum(a != b for a, b in zip(groups, ["", *groups], strict=False))
+
+
+def test_small_chains_keep_the_pupil_and_know_what_a_case_touches(tmp_path):
+    recipe, code = load("first_light", []), Code(tmp_path / "code.json")
+    usual = Chain.of(recipe, USUAL, code)
+    pupil = usual.steps["pupil[mask]"].params
+    whole = recipe.steps["flat"].params
+    assert pupil["pitch"] * USUAL.size.samples == pytest.approx(whole["pitch"] * whole["samples"])
+    dim = Chain.of(recipe, BY_NAME["exposure 1 us"], code)
+    same = set(untouched(dim, usual))
+    assert {"psf[mask]", "image[mask]"} <= same
+    assert not {"scene_photons[mask]", "spot[mask,green]", "charge[mask]"} & same
+
+
+def _without_restoration(recipe):
+    """It is half of the time, and what is tested is the study."""
+    steps = {n: s for n, s in recipe.steps.items() if n not in ("deconvolved", "restored", "restored_quality")}
+    return replace(recipe, steps=steps)
+
+
+def test_the_study_writes_its_folder_and_counts_what_fails(tmp_path, monkeypatch):
+    recipe, store, told = _without_restoration(load("laser_free", [])), Store(tmp_path / "store"), []
+    cases = [Case("usual", "as it is", "usual", size=Size(16, 16, 3)), BY_NAME["NaN"]]
+    folder = study(recipe, store, tmp_path / "runs", ["neusee"], told.append, cases=cases)
+    assert {p.name for p in folder.iterdir()} >= {"report.html", "table.csv", "provenance.json", "figures"}
+    assert (folder / "figures/stability.png").read_bytes().startswith(b"\x89PNG")
+    with (folder / "table.csv").open() as file:
+        rows = list(csv.DictReader(file))
+    doc = json.loads((folder / "provenance.json").read_text())
+    assert doc["failed"] == sum(row["mark"] == "fail" for row in rows) == 0
+    assert doc["cells"] == len(rows) > 30
+    assert len(told) == 2
+    before = {row["step"]: row["error"] for row in rows}
+    monkeypatch.setattr(_study_stability, "judged", None)  # what is stored is not judged again
+    again = study(recipe, Store(tmp_path / "store"), tmp_path / "runs", ["neusee"], told.append, cases=cases)
+    with (again / "table.csv").open() as file:
+        assert {row["step"]: row["error"] for row in csv.DictReader(file)} == before
+
+
+def test_words_of_a_cell_say_what_does_not_pass(picture):
+    cell = judged(step_of(cancelling), [picture], USUAL, 0)
+    assert words(cell).startswith("×")
+    assert number(2.34e-7) == "2e-7"
+    assert number(0.0) == "0"
+    assert number(float("inf")) == "inf"
+
+
+def test_what_is_stated_counts_only_as_long_as_the_docstring_states_it(monkeypatch):
+    (path, case), words = next(iter(_extremes_limits._STATED.items()))
+    assert _extremes_limits.stated_of(find_node(path), case) == words
+    assert _extremes_limits.stated_of(find_node(path), "usual") is None
+    monkeypatch.setattr(_extremes_limits, "_STATED", {(path, case): "whatever it is"})
+    assert _extremes_limits.stated_of(find_node(path), case) is None
+
+
+@pytest.mark.parametrize(
+    ("error", "slope", "mark"),
+    [
+        (0.4, None, "pass"),
+        (0.6, None, "warn"),
+        (1.0, 1.0, "warn"),
+        (0.1, 3.9, "warn"),
+        (1.1, None, "fail"),
+        (0.1, 4.1, "fail"),
+        (float("nan"), None, "fail"),
+        (0.1, float("nan"), "fail"),
+    ],
+)
+def test_what_holds_by_less_than_twice_warns(error, slope, mark):
+    cell = _extremes_cell._verdict(error, 1.0, slope, 4.0)
+    assert cell.mark == mark
+    assert (cell.bound, cell.slope_bound) == (1.0, None if slope is None else 4.0)
+    assert [cell.error, cell.slope] == pytest.approx([error, slope], nan_ok=True)
+
+
+def test_what_every_node_states_it_still_states():
+    for path, case in _extremes_limits._STATED:
+        assert _extremes_limits.stated_of(find_node(path), case) is not None
+
+
+def test_poisson_numbers_are_the_same_in_both_precisions(picture):
+    @node()
+    def counted(x: torch.Tensor, *, rng: torch.Generator) -> torch.Tensor:
+        return torch.poisson(100.1 * x, generator=rng)
+
+    assert judged(step_of(counted), [picture], USUAL, 0).mark == "pass"
+
+
+def test_an_error_of_the_study_itself_is_no_refusal(monkeypatch, picture):
+    def wrong(value, truth):
+        raise ValueError("zip() argument 2 is shorter than argument 1")
+
+    monkeypatch.setattr("neusee.workflows.studies.stability.case_result._error", wrong)
+    assert judged(step_of(doubled), [picture], USUAL, 0).mark == "fail"
+
+
+def test_a_picture_that_two_inputs_share_counts_once(picture):
+    @node()
+    def added(x: torch.Tensor, y: torch.Tensor) -> torch.Tensor:
+        return x * 2 + y
+
+    for case in ("usual", "alike", "negative"):
+        cell = judged(step_of(added), [picture, picture], BY_NAME[case], 0)
+        assert cell.mark == "pass"
+        assert cell.slope is not None
+
+
+def test_a_slope_beyond_the_type_of_its_picture_is_no_fault_of_the_step(picture):
+    @node()
+    def steep(x: torch.Tensor) -> torch.Tensor:
+        return 1 + 1e7 * (x.float() - x.float().detach()) if x.dtype != torch.float64 else 1 + 1e7 * (x - x.detach())
+
+    assert judged(step_of(steep), [picture], BY_NAME["float16"], 0).mark == "pass"

@@ -1,0 +1,332 @@
+"""The study of uncertainty: draws are runs, deviations are those of closed forms, and what was stopped goes on."""
+
+import json
+import math
+
+import numpy as np
+import pytest
+import torch
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from typer.testing import CliRunner
+
+from neusee.workflows import load
+from neusee.workflows.cli.app import app
+from neusee.workflows.engine.runner import run
+from neusee.workflows.graph.recipe_graph import needed
+from neusee.workflows.recipe.distributions.uncertain_inputs import SCRAMBLES, Inputs
+from neusee.workflows.simulation.simulate_recipe import simulate
+from neusee.workflows.store.result_store import Store
+from neusee.workflows.studies.run_study import failed, made
+from neusee.workflows.studies.uncertainty.output_draws import Draws, quantities
+from neusee.workflows.studies.uncertainty.scatter_estimate import scatter
+from neusee.workflows.studies.uncertainty.sobol_indices import indices
+
+SMALL = ["optics.samples=96", "optics.pitch=84.15 um", "optics.bands=7", "optics.window=[24, 24]"]
+SMALL += ["scene.shape=[32, 32]", "sensor.shape=[24, 24]", "lasers.green.strength=1e6"]
+LAWS = ["sensor.read_noise=normal(10.5 e-, 0.5 e-)", "sensor.gain=lognormal(0.37, 1.02)"]
+NOISE = ["outputs=[transfer, lsr]", *SMALL, LAWS[0]]  #: which moves the dark noise of a curve and nothing of an LSR
+
+
+@pytest.fixture(scope="module")
+def store(tmp_path_factory):
+    """What no draw reaches is computed once."""
+    return Store(tmp_path_factory.mktemp("uncertainty"))
+
+
+def small(outputs, *more):
+    return load("first_light", [f"outputs=[{outputs}]", *SMALL, *more])
+
+
+# --- inputs -----------------------------------------------------------------------------------------------------------
+
+
+def test_what_a_draw_changes_is_what_a_recipe_with_its_values_says():
+    inputs = Inputs.of(small("raw, restored_quality", *LAWS, "lasers.green.angle.0=normal(0.1 deg, 0.01 deg)"))
+    assert set(inputs.names) == {"sensor.read_noise", "sensor.gain", "lasers.green.angle.0"}
+    for row in inputs.independent(5, 1).values:
+        values = dict(zip(inputs.names, map(float, row), strict=True))
+        said = inputs.uncertain.at(values)
+        for reader, value in inputs.theta(values).items():
+            step, _, param = reader.rpartition(".")
+            assert value == said.steps[step].params[param], reader
+        changed = set()
+        for step in needed(said, said.outputs):
+            before = inputs.recipe.steps[step].params
+            changed |= {f"{step}.{p}" for p, value in said.steps[step].params.items() if value != before[p]}
+        assert changed == set(inputs.readers)
+
+
+def test_what_reaches_no_output_is_not_drawn():
+    inputs = Inputs.of(small("lsr, saturated", *LAWS, "element.wrap_at=normal(500 nm, 1 nm)"))
+    assert "sensor.gain" in inputs.names
+    with pytest.raises(ValueError, match=r"no output depends on sensor\.read_noise"):
+        Inputs.of(small("lsr", LAWS[0]))
+
+
+def test_a_recipe_that_is_sure_of_all_has_nothing_to_draw():
+    with pytest.raises(ValueError, match="nothing is uncertain: write a law"):
+        Inputs.of(small("raw"))
+
+
+def test_a_draw_beyond_a_limit_is_refused_before_anything_runs(tmp_path):
+    recipe = small("transfer", "sensor.read_noise=normal(1 e-, 1 e-)")
+    with pytest.raises(ValueError, match=r"argument 9 +sensor\.read_noise = -.* e- +is drawn, but must be greater"):
+        made("uncertainty", recipe, Store(tmp_path / "store"), tmp_path / "runs")
+    assert not (tmp_path / "runs").exists()
+
+
+def test_a_value_that_is_no_number_cannot_be_drawn():
+    with pytest.raises(ValueError, match=r"optics\.samples|whole number"):
+        Inputs.of(small("lsr", "optics.samples=uniform(90, 100)"))
+
+
+@given(st.integers(0, 2**31), st.integers(3, 6))
+@settings(max_examples=10, deadline=None)
+def test_more_draws_begin_with_the_same(seed, power):
+    inputs = Inputs.of(_CHEAP)
+    few, many = inputs.independent(20, seed), inputs.independent(50, seed)
+    assert (few.values == many.values[:20]).all()
+    some = SCRAMBLES * 2**power
+    assert (inputs.sobol(some, seed).values == inputs.sobol(2 * some, seed).values[:some]).all()
+
+
+def test_points_of_sobol_are_even():
+    """Means of 2**7 points in each of 8 sequences are far closer to the law's than those of draws."""
+    inputs = Inputs.of(_CHEAP)
+    z = inputs.sobol(1024, 1).z
+    assert np.abs(z.mean(0)).max() < 2e-3
+    assert z.std(0) == pytest.approx(1.0, abs=5e-3)
+    for n in range(SCRAMBLES):
+        each = z[n::SCRAMBLES]
+        assert ((each > 0).sum(0) == len(each) // 2).all()
+
+
+_CHEAP = load("first_light", NOISE)
+
+
+def test_joint_draws_are_taken_whole(tmp_path):
+    rng = np.random.default_rng(1)
+    draws = {"gain": 0.37 + 0.01 * rng.standard_normal(200), "read_noise": 10 + rng.standard_normal(200)}
+    np.savez(tmp_path / "draws.npz", **draws)
+    inputs = Inputs.of(small("transfer", f"posterior={tmp_path / 'draws.npz'}", "sensor.pedestal=normal(390 e-, 1 e-)"))
+    assert inputs.most == 200
+    found = inputs.independent(200, 3).values[:, 1:]
+    rows = np.stack([draws["gain"], draws["read_noise"]], 1)
+    assert (found[np.argsort(found[:, 0])] == rows[np.argsort(rows[:, 0])]).all()
+
+
+# --- draws ------------------------------------------------------------------------------------------------------------
+
+
+def test_a_draw_is_a_run_with_its_values_to_the_last_bit(store):
+    recipe = small("raw, saturated, developed_quality, transfer", *LAWS)
+    inputs = Inputs.of(recipe)
+    draws = Draws(inputs, store)
+    row = inputs.independent(3, 1).values[2]
+    found = draws.numbers(row[None])[0]
+    said = inputs.uncertain.at(dict(zip(inputs.names, map(float, row), strict=True)))
+    assert found == quantities(run(said, store).values)
+    assert found["saturated[mask].pixels"][0] > 0
+
+
+def test_draws_at_once_are_those_one_after_another(store, tmp_path):
+    inputs = Inputs.of(small("developed_quality, transfer, lsr", *LAWS, "optics.defocus=normal(0.3 waves, 0.1 waves)"))
+    values = inputs.independent(6, 1).values
+    one = Draws(inputs, Store(tmp_path / "one"), workers=1).numbers(values)
+    assert Draws(inputs, Store(tmp_path / "many"), workers=3).numbers(values) == one
+
+
+def test_a_key_hangs_on_all_that_decides_a_draw(tmp_path):
+    recipe = small("transfer", *LAWS)
+    inputs = Inputs.of(recipe)
+    row = inputs.independent(1, 1).values[0]
+    keys = {Draws(inputs, Store(tmp_path)).key(row), Draws(inputs, Store(tmp_path)).key(row * (1 + 1e-15))}
+    for other in (small("transfer", *LAWS, "sensor.bits=12"), small("transfer", *LAWS, "seed=8")):
+        keys.add(Draws(Inputs.of(other), Store(tmp_path)).key(row))
+    assert len(keys) == 4
+
+
+def test_pictures_have_the_mean_and_deviation_of_all_draws(store):
+    inputs = Inputs.of(small("raw", *LAWS))
+    values = inputs.independent(5, 1).values
+    mean, sd = Draws(inputs, store).pictures(values)["raw[mask]"]
+    names = inputs.names
+    each = [run(inputs.uncertain.at(dict(zip(names, map(float, v), strict=True))), store)["raw[mask]"] for v in values]
+    whole = torch.stack(each).double()
+    assert torch.allclose(mean.double(), whole.mean(0), rtol=1e-5)
+    assert torch.allclose(sd.double(), whole.std(0), rtol=1e-4, atol=1e-2)
+
+
+# --- statistics -------------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(("law", "kurtosis"), [("normal", 3.0), ("uniform", 1.8), ("exponential", 9.0)])
+def test_the_error_of_a_deviation_is_that_of_the_closed_form(law, kurtosis):
+    """sqrt((kurtosis - 1) / 4n), and what repetitions show."""
+    rng = np.random.default_rng(1)
+    draws = getattr(rng, law)(size=(400, 2000))
+    shown = draws.std(0, ddof=1)
+    said = np.array([scatter(x[:, None]).error for x in draws.T[:300]])
+    assert np.median(said) == pytest.approx(math.sqrt((kurtosis - 1) / 1600), rel=0.15)
+    assert np.median(said) == pytest.approx(shown.std() / shown.mean(), rel=0.15)
+
+
+def test_the_error_of_sequences_is_what_repetitions_show():
+    inputs = Inputs.of(small("transfer", *LAWS))
+    deviations, said = [], []
+    for seed in range(60):
+        z = inputs.sobol(256, seed).z
+        y = (np.exp(0.4 * z[:, 0]) + 0.2 * z[:, 1])[:, None]
+        deviations.append(float(y.std(ddof=1)))
+        said.append(scatter(y, SCRAMBLES).error)
+    shown = np.std(deviations) / np.mean(deviations)
+    assert np.sqrt(np.mean(np.square(said))) == pytest.approx(shown, rel=0.35)
+    plain = [float(np.exp(0.4 * np.random.default_rng(s).standard_normal(256)).std()) for s in range(60)]
+    assert shown < 0.6 * np.std(plain) / np.mean(plain)
+
+
+def test_what_does_not_vary_has_no_deviation_and_no_error():
+    found = scatter(np.full((100, 2), 0.1 + 0.2))
+    assert found.still
+    assert found.error == 0.0
+
+
+def test_what_is_infinite_in_a_draw_is_no_error_of_the_study():
+    x = np.array([[1.0, 2.0], [math.inf, 4.0], [3.0, 6.0]])
+    assert scatter(x).sd[1] == 2.0
+    assert scatter(x).mean[0] == math.inf
+
+
+def test_shares_of_a_variance_are_those_of_the_closed_form():
+    """y = 3 a + 2 b + 2 a b + c**2 / 2: variances 9, 4, 4 and 1/2."""
+    z = np.random.default_rng(1).standard_normal((800, 4))
+    a, b, c, _ = z.T
+    found = indices(["a", "b", "c", "d"], z, 3 * a + 2 * b + 2 * a * b + c**2 / 2, 1)
+    whole = 9 + 4 + 4 + 0.5
+    assert found.told
+    assert found.total == pytest.approx([13 / whole, 8 / whole, 0.5 / whole, 0.0], abs=0.03)
+    assert found.first == pytest.approx([9 / whole, 4 / whole, 0.5 / whole, 0.0], abs=0.08)
+
+
+def test_shares_of_one_draw_that_differs_are_numbers():
+    z, y = np.random.default_rng(1).standard_normal((64, 1)), np.full(64, 3.0)
+    y[0] = 4.0
+    found = indices(["a"], z, y, 1)
+    assert np.isfinite([*found.first, *found.first_error, *found.total, *found.total_error]).all()
+    assert not found.told
+
+
+def test_a_polynomial_that_tells_nothing_is_not_believed():
+    z = np.random.default_rng(1).standard_normal((400, 2))
+    assert not indices(["a", "b"], z, np.sign(np.sin(9 * z[:, 0])), 1).told
+
+
+# --- the study --------------------------------------------------------------------------------------------------------
+
+
+def test_deviations_are_those_of_the_closed_form(tmp_path, store):
+    """Dark noise K**2 (sigma**2 + dark) + 1/12 with sigma of 10.5 ± 0.5: variance K**4 (4 m**2 s**2 + 2 s**4)."""
+    folder = made("uncertainty", load("first_light", NOISE), store, tmp_path, most=400)
+    doc = json.loads((folder / "provenance.json").read_text())
+    floor = 2  # the dark level's prediction
+    found, error = doc["quantities"]["transfer"]["sd"][floor], doc["quantities"]["transfer"]["error"]
+    wanted = math.sqrt(4 * 10.5**2 * 0.5**2 + 2 * 0.5**4) / 0.37**2
+    assert abs(found / wanted - 1) < 3 * error
+    assert error <= 0.05
+    assert doc["failed"] == failed(folder) == 0
+    assert doc["still"] == ["lsr[plain]", "lsr[mask]"]
+
+
+def test_points_of_sobol_find_the_same_with_fewer(tmp_path, store):
+    folder = made("uncertainty", load("first_light", NOISE), store, tmp_path, most=512, points="sobol", error=0.02)
+    doc = json.loads((folder / "provenance.json").read_text())
+    wanted = math.sqrt(4 * 10.5**2 * 0.5**2 + 2 * 0.5**4) / 0.37**2
+    assert doc["quantities"]["transfer"]["sd"][2] == pytest.approx(wanted, rel=0.06)
+    assert doc["draws"] <= 256
+
+
+def test_what_was_stopped_goes_on_with_the_same(tmp_path, store, monkeypatch):
+    recipe = small("developed_quality, saturated, raw", *LAWS)
+    whole = made("uncertainty", recipe, Store(tmp_path / "whole"), tmp_path / "a", most=80)
+    real, calls = Draws._result, []
+
+    def stops(self, row):
+        calls.append(row)
+        if len(calls) > 70:
+            raise KeyboardInterrupt
+        return real(self, row)
+
+    monkeypatch.setattr(Draws, "_result", stops)
+    with pytest.raises(KeyboardInterrupt):
+        made("uncertainty", recipe, Store(tmp_path / "store"), tmp_path / "b", most=80)
+    monkeypatch.setattr(Draws, "_result", real)
+    again = made("uncertainty", recipe, Store(tmp_path / "store"), tmp_path / "b", most=80)
+    one, other = (json.loads((folder / "provenance.json").read_text()) for folder in (whole, again))
+    assert one["quantities"] == other["quantities"]
+    assert 0 < other["computed"] < one["computed"] - 60
+    last = made("uncertainty", recipe, Store(tmp_path / "store"), tmp_path / "c", most=80)
+    assert json.loads((last / "provenance.json").read_text())["computed"] == 0
+    with np.load(again / "pictures.npz") as a, np.load(last / "pictures.npz") as b:
+        assert all((a[name] == b[name]).all() for name in a)
+
+
+def test_the_command_writes_a_page_and_fails_where_too_few_draws_were_allowed(tmp_path, store, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setenv("NEUSEE_CACHE", str(store.root))
+    words = ["developed_quality, transfer, raw, lsr", *SMALL, *LAWS, "optics.defocus=normal(0.3 waves, 0.1 waves)"]
+    words = [f"outputs=[{words[0]}]", *words[1:]]
+    done = CliRunner().invoke(app, ["study", "uncertainty", "first_light", *words, "--most", "64", "--error", "0.02"])
+    assert done.exit_code == 1
+    assert "1 do not hold" in done.output
+    folder = tmp_path / "runs" / "latest"
+    text = (folder / "report.html").read_text()
+    for said in ("What moves them", "What does not vary", "sensor.gain", "is known to", "Photon-transfer curve"):
+        assert (said in text) == (said != "What does not vary"), said
+    assert {p.stem for p in (folder / "figures").iterdir()} == {"bands", "numbers", "pictures", "tornado", "transfer"}
+    with np.load(folder / "draws.npz") as draws:
+        assert draws["sensor.gain"].shape == (64,)
+        assert draws["lsr[mask]"].shape == (64, 7)
+    assert (folder / "table.csv").read_text().startswith("quantity,element,at the medians")
+
+
+@pytest.mark.parametrize(
+    ("option", "said"),
+    [(["--device", "gpu9"], "--device gpu9"), (["--points", "grid"], "grid"), (["--most", "3"], "64")],
+)
+def test_an_option_that_cannot_be_is_refused(option, said):
+    done = CliRunner().invoke(app, ["study", "uncertainty", "first_light", LAWS[0], *option])
+    assert done.exit_code == 2
+    assert said in done.output
+
+
+def test_pictures_alone_are_no_numbers(tmp_path, store):
+    with pytest.raises(ValueError, match="pictures alone"):
+        made("uncertainty", small("raw", *LAWS), store, tmp_path)
+
+
+def test_a_run_with_a_posterior_says_where_the_recipe_lies(tmp_path, store):
+    said = {"mean": {"gain": 0.38}, "sd": {"gain": 0.002}}
+    recipe = load("first_light", ["outputs=[transfer]", *SMALL], posterior=said)
+    done = simulate(recipe, store, tmp_path, ["neusee"])
+    (row,) = done.document["posterior"]
+    assert (row["path"], row["own"], row["used"], row["far"]) == ("sensor.gain", "0.37", "0.38", True)
+    text = done.page.read_text()
+    assert "The sensor beside its posterior" in text
+    assert "sensor.gain = 0.37 is far from its posterior, 0.38 ± 0.002" in text
+    assert "gain: 0.38" in (done.folder / "recipe.yaml").read_text()
+
+
+def test_what_is_not_finite_fails_and_is_said(tmp_path, store, monkeypatch):
+    real = Draws.numbers
+
+    def broken(self, values):
+        found = real(self, values)
+        return [{**numbers, "developed_quality[mask].psnr": [math.nan]} for numbers in found]
+
+    monkeypatch.setattr(Draws, "numbers", broken)
+    folder = made("uncertainty", small("developed_quality", *LAWS), store, tmp_path, most=64, error=1.0)
+    assert failed(folder) == 1
+    assert "Not finite in some draw: developed_quality[mask].psnr" in (folder / "report.html").read_text()
+    table = (folder / "table.csv").read_text()
+    assert "developed_quality[mask].psnr,,nan,nan" in table

@@ -1,0 +1,258 @@
+"""A tolerance is shared, spent along the graph, and proved to hold; where it is not, less is left out."""
+
+import math
+from dataclasses import replace
+
+import pytest
+import torch
+
+from neusee.nodes import Deviation, Facts, node
+from neusee.workflows.engine.runner import run
+from neusee.workflows.graph.diagnostics import Mark
+from neusee.workflows.graph.recipe_graph import Economy, Recipe, Step
+from neusee.workflows.store.result_store import Store
+from neusee.workflows.tolerance.error_budget import Ledger
+from neusee.workflows.tolerance.error_norm import largest_error
+from neusee.workflows.tolerance.error_propagation import proof
+
+MARK = Mark("recipe.yaml", 1, 1)
+
+
+@node()
+def light(*, top: float = 100.0):
+    return torch.linspace(0.0, top, 101)
+
+
+@node()
+def glow(x, *, amount: float = 0.0):
+    """Add a constant."""
+    return x + amount
+
+
+@glow.negligible
+def _(x, *, amount):
+    return abs(amount) / (x.max + amount)
+
+
+@glow.carries
+def _(x, *, result, amount):
+    return x.bound
+
+
+@node()
+def power(x, *, factor: float = 1.0):
+    return x * factor
+
+
+@power.carries
+def _(x, *, result, factor):
+    return factor * x.bound
+
+
+@node()
+def corner(x):
+    """Keep the darkest few."""
+    return x[:3]
+
+
+@corner.carries
+def _(x, *, result):
+    return x.bound * math.sqrt(x.facts.shape[0] / 3)
+
+
+@node()
+def mixed(x, y=None, z=()):
+    return x + (0 if y is None else y) + sum(z or ())
+
+
+@mixed.carries
+def _(x, y, z, *, result):
+    return x.bound + (y.bound if y else 0) + sum(d.bound for d in z or ())
+
+
+@node()
+def opaque(x):
+    return x.sin()
+
+
+@node()
+def rough(x, *, digits: int = 2):
+    """A cheaper form: rounded."""
+    return (x, torch.tensor(0.5 * 10.0**-digits / float(x.max())))
+
+
+@rough.deviates
+def _(result):
+    return float(result[1]), float(result[1])
+
+
+@node()
+def first(pair):
+    return pair[0]
+
+
+@first.carries
+def _(pair, *, result):
+    return pair.share * result.max
+
+
+def step(name, node, params=None, **wires):
+    read = {i: wires.get(i) for i in node.inputs}
+    values = {k: v.default for k, v in node.params.model_fields.items()} | (params or {})
+    return Step(name, node, values, read, MARK, {})
+
+
+def recipe(*steps, outputs="out", tolerance=1e-2, **more):
+    return Recipe("test", "", 7, tolerance, tuple(outputs.split()), {s.name: s for s in steps}, **more)
+
+
+def chain(*amounts, last=None):
+    steps = [step("l", light)]
+    for i, amount in enumerate(amounts):
+        steps.append(step(f"g{i}", glow, {"amount": amount}, x=steps[-1].name))
+    return [*steps, last or step("out", power, x=steps[-1].name)]
+
+
+@pytest.fixture
+def store(tmp_path):
+    return Store(tmp_path)
+
+
+def states(result):
+    return [result.done[name].state for name in result.done if name.startswith("g")]
+
+
+# --- the ledger -----------------------------------------------------------------------------------------------------
+
+
+def test_what_is_left_out_upstream_leaves_less_for_what_follows(store):
+    result = run(recipe(*chain(0.6, 0.6, 0.3)), store)
+    assert states(result) == ["left out", "run", "left out"]
+    assert largest_error(result["out"], run(recipe(*chain(0.6, 0.6, 0.3), keep_all=True), store)["out"]) <= 1e-2
+
+
+def test_branches_that_meet_add_up_and_those_that_do_not_have_each_the_whole(store):
+    a = [step("l", light), step("ga", glow, {"amount": 0.6}, x="l"), step("gb", glow, {"amount": 0.6}, x="l")]
+    apart = recipe(*a, step("o1", power, x="ga"), step("o2", power, x="gb"), outputs="o1 o2")
+    assert states(run(apart, store)) == ["left out", "left out"]
+    both = step("s", mixed, x="ga", y="gb")
+    after = recipe(*a, both, step("gc", glow, {"amount": 0.1}, x="s"), step("out", power, x="gc"))
+    assert states(run(after, store)) == ["left out", "left out", "run"]
+
+
+def test_with_keep_all_nothing_is_left_out(store):
+    assert states(run(recipe(*chain(0.0, 0.1), keep_all=True), store)) == ["run", "run"]
+
+
+def test_of_the_tolerance_of_a_recipe_with_economies_half_is_theirs():
+    facts = Facts((2,), "float32", 0.0, 100.0, 100.0, 1, True)
+    glowing = step("g", glow, {"amount": 0.6}, x="l")
+    plain = recipe(step("l", light), glowing)
+    thrifty = replace(plain, economies=(Economy("a", "b", 1e-3, ""),))
+    assert Ledger(plain).verdict(glowing, glowing.params, lambda name: facts).left_out
+    assert not Ledger(thrifty).verdict(glowing, glowing.params, lambda name: facts).left_out
+
+
+def test_a_long_chain_shares_one_account():
+    steps = chain(0.1, *[50.0] * 2000)
+    ledger = Ledger(recipe(*steps))
+    facts = Facts((2,), "float32", 0.0, 100.0, 100.0, 1, True)
+    for each in steps[1:-1]:
+        ledger.verdict(each, each.params, lambda name: facts)
+    assert len({id(spent) for spent in ledger._spent.values()}) == 1
+
+
+# --- the proof ------------------------------------------------------------------------------------------------------
+
+
+def test_an_exact_run_proves_nothing_and_asks_for_nothing(store):
+    result = run(recipe(*chain(), keep_all=True), store)
+    assert result.proof.shares == {}
+    assert result.proof.worst == 0.0
+    assert result.proof.of("out") == 0.0
+
+
+def test_the_bound_holds_and_is_carried(store):
+    steps = chain(0.5, 0.2, last=step("out", power, {"factor": 3.0}, x="g1"))
+    result, full = run(recipe(*steps), store), run(recipe(*steps, keep_all=True), store)
+    measured = largest_error(result["out"], full["out"])
+    assert 0 < measured <= result.proof.of("out") <= 1.1 * measured
+
+
+def test_where_the_bound_grows_on_the_way_less_is_left_out(store):
+    """What was 0.5 % of all the light is 25 % of what the window keeps."""
+    steps = chain(0.5, last=step("out", corner, x="g0"))
+    result = run(recipe(*steps), store)
+    assert states(result) == ["run"]
+    assert result.recipe.strict < 1
+    assert torch.equal(result["out"], run(recipe(*steps, keep_all=True), store)["out"])
+    again = run(recipe(*steps), store)
+    assert states(again) != ["left out"]
+    assert torch.equal(again["out"], result["out"])
+
+
+def test_behind_a_node_that_does_not_tell_its_inputs_are_held(store):
+    steps = [*chain(0.05), step("end", opaque, x="out")]
+    result = run(recipe(*steps, outputs="end"), store)
+    assert states(result) == ["left out"]
+    assert result.proof.of("end") is None
+    assert list(result.proof.held) == ["out"]
+    assert 0 < result.proof.worst <= 1e-3
+
+
+def test_what_the_proof_made_and_the_rest_needs_is_not_made_again(store, monkeypatch):
+    """Nothing can be read from the store; what the rest takes is held from before the proof."""
+    monkeypatch.setattr(Store, "put", lambda self, key, value, about: False)
+    steps = [step("l", light), step("r", rough, {"digits": 3}, x="l"), step("f", first, pair="r")]
+    steps += [step("end", opaque, x="f"), step("out", mixed, x="end", y="l")]
+    events = []
+    result = run(recipe(*steps), store, watch=events.append)
+    assert list(result.proof.held) == ["f"]
+    assert [e.step for e in events if e.done is None] == ["l", "r", "f", "end", "out"]
+
+
+def test_where_nothing_is_allowed_a_cheaper_form_is_over(store):
+    steps = [step("l", light), step("r", rough, {"digits": 0}, x="l"), step("out", first, pair="r")]
+    result = run(replace(recipe(*steps), tolerance=0.0), store)
+    assert result.recipe.keep_all
+    assert result.proof.over(result.recipe) == math.inf
+
+
+def test_behind_a_node_that_does_not_tell_a_large_tolerance_is_not_spent(store):
+    steps = [*chain(0.5), step("end", opaque, x="out")]  # 5e-3, and 1e-2 is allowed
+    assert states(run(recipe(*steps, outputs="end"), store)) == ["run"]
+    assert states(run(recipe(*steps, outputs="out"), store)) == ["left out"]
+
+
+def test_a_cheaper_form_tells_its_own_error(store):
+    steps = [step("l", light), step("r", rough, {"digits": 0}, x="l"), step("out", first, pair="r")]
+    result = run(recipe(*steps), store)
+    assert result.done["r"].error == pytest.approx((0.005, 0.005))
+    assert result.proof.of("out") == pytest.approx(0.005, rel=0.01)
+    again = run(recipe(*steps), Store(store.root))
+    assert again.done["out"].state == "cached"
+    assert again.proof.of("out") == pytest.approx(0.005, rel=0.01)
+
+
+def test_nothing_is_left_out_in_the_end_where_no_share_is_small_enough(store):
+    steps = [step("l", light), step("r", rough, {"digits": -1}, x="l"), step("out", first, pair="r")]
+    result = run(recipe(*steps), store)
+    assert result.recipe.keep_all
+    assert result.done["r"].error[0] > 1e-2
+
+
+NONE = [(0.0, None, 0.0), (1.0, None, math.inf), (1.0, (0.0, 0.0), math.inf)]
+
+
+@pytest.mark.parametrize(("bound", "facts", "share"), NONE)
+def test_a_share_of_nothing_is_infinite(bound, facts, share):
+    known = facts and Facts((1,), "float32", *facts, 0.0, 0, True)
+    assert Deviation(bound, known).share == share
+
+
+def test_lists_and_absent_inputs_are_told_apart(store):
+    a = [step("l", light), step("ga", glow, {"amount": 0.2}, x="l"), step("gb", glow, {"amount": 0.1}, x="l")]
+    result = run(recipe(*a, Step("out", mixed, {}, {"x": "l", "y": None, "z": ("ga", "gb")}, MARK, {})), store)
+    assert result.proof.of("out") == pytest.approx(0.3 / 300, rel=0.02)
+    unknown = proof(result.recipe, list(result.done), ["out"], result.done.__getitem__, lambda name: None)
+    assert unknown.worst == 0.0

@@ -1,0 +1,210 @@
+"""Several processes learn what one learns: gradients, resumption, and an end for all where one fails."""
+
+import json
+import os
+import re
+import subprocess
+import sys
+from dataclasses import replace
+from pathlib import Path
+
+import pytest
+import torch
+from safetensors.torch import load_file
+
+from neusee.nodes import doe
+from neusee.workflows import Store, load
+from neusee.workflows.training.parallel.band_shards import Shards
+from neusee.workflows.training.parallel.process_mesh import Mesh, MeshError, shape_of
+from neusee.workflows.training.run_training import _photographs, train
+from neusee.workflows.training.training_pictures import Samples
+
+ROOT = Path(__file__).parents[4]
+SMALL = [
+    "optics.samples=48", "optics.pitch=168.27 um", "optics.bands=5", "optics.window=[40, 40]", "scene.shape=[40, 40]",
+    "sensor.shape=[32, 32]", "doe=pixelwise", "train.network.kind=unet", "train.network.width=4",
+    "train.critics.width=4", "train.precision=float64", "steps.psf.with.precision=double",
+    "steps.laser_psf.with.precision=double",
+]  # fmt: skip
+EVERY = [*SMALL, "tolerance=0"]  #: each band of each picture is imaged
+FEW = [*SMALL, "train.stages.1.lsr=0", "train.stages.1.bsr=0"]  #: a few planes are; nothing drowns the network
+SHORT = [*EVERY, "train.stages.1.iterations=3", "train.stages.2.iterations=1", "train.keep=1", "train.show=2"]
+JOBS = [
+    ("every", "1x1", "step", EVERY), ("every", "2x1", "step", EVERY), ("every", "1x2", "step", EVERY),
+    ("few", "1x1", "step", FEW), ("few", "1x2", "step", FEW), ("broken", "2x1", "fail", SHORT),
+]  # fmt: skip
+
+
+def processes(folder, jobs):
+    """Do the jobs, one after another, each in processes of its own; by what it is called and its mesh, its folder."""
+    made = [
+        {"folder": str(folder / f"{name} {mesh}"), "store": str(folder / "store"), "runs": str(folder / name),
+         "mesh": mesh, "do": do, "words": words}
+        for name, mesh, do, words in jobs
+    ]  # fmt: skip
+    (folder / "jobs.json").write_text(json.dumps(made))
+    script = Path(__file__).parents[2] / "mesh_processes.py"
+    environment = {**os.environ, "OMP_NUM_THREADS": "1", "PYTHONPATH": str(ROOT / ".src")}
+    done = subprocess.run([sys.executable, script, folder / "jobs.json"], env=environment, capture_output=True,
+                          text=True, check=False)  # fmt: skip
+    assert done.returncode == 0, done.stderr
+    return {(name, mesh): Path(job["folder"]) for (name, mesh, *_), job in zip(jobs, made, strict=True)}
+
+
+@pytest.fixture(scope="module")
+def done(tmp_path_factory):
+    return processes(tmp_path_factory.mktemp("mesh"), JOBS)
+
+
+def codes(folder):
+    return json.loads((folder / "codes.json").read_text())
+
+
+def stepped(folder):
+    """What one iteration found, where all its processes ended well."""
+    assert not any(codes(folder)), errors(folder)
+    return torch.load(folder / "step.pt", weights_only=True)
+
+
+def errors(folder):
+    return "\n".join(path.read_text() for path in sorted(folder.glob("error_*.txt")))
+
+
+def apart(found, expected):
+    """By part, how far gradients are from the expected ones, as a share of their norm."""
+    parts = {}
+    for part in ("relief", "net", "critics"):
+        names = [name for name in expected["grads"] if name.startswith(f"{part}.")]
+        assert all(expected["grads"][n].dtype == torch.float64 for n in names)
+        off, all_of_it = (
+            torch.cat([x.flatten() for x in each]).norm()
+            for each in (
+                [found["grads"][n] - expected["grads"][n] for n in names],
+                [expected["grads"][n] for n in names],
+            )
+        )
+        assert all_of_it > 0
+        parts[part] = float(off / all_of_it)
+    return parts
+
+
+def same(found, expected):
+    assert max(apart(found, expected).values()) <= 1e-12
+    assert found["losses"].keys() == expected["losses"].keys()
+    for name, value in expected["losses"].items():
+        assert found["losses"][name] == pytest.approx(value, rel=1e-12), name
+
+
+def test_two_processes_find_the_gradients_of_one(done):
+    one, data, band = (stepped(done["every", mesh]) for mesh in ("1x1", "2x1", "1x2"))
+    same(data, one)
+    same(band, one)
+    assert not data["shared"]["steps"]
+    assert band["shared"]["steps"] == ["image[mask]", "image[plain]", "psf[mask]", "radiance"]
+    assert band["shared"]["cut"] == band["shared"]["sums"] == ["image[mask]", "image[plain]"]
+
+
+def test_what_is_imaged_in_a_few_planes_needs_the_gathered_psf(done):
+    one, band = (stepped(done["few", mesh]) for mesh in ("1x1", "1x2"))
+    same(band, one)
+    assert band["shared"] == {"steps": ["psf[mask]"], "cut": [], "sums": []}
+
+
+def test_one_that_fails_ends_all(done):
+    broken = done["broken", "2x1"]
+    assert codes(broken) == [1, 1], "each ends by itself, and with an error"
+    assert "this one cannot go on" in (broken / "error_1.txt").read_text()
+    (folder,) = (broken.parent / "broken").iterdir()
+    kept = torch.load(folder / "state.pt", weights_only=True)
+    assert (kept["stage"], kept["iteration"]) == (1, 1), "of what all had done"
+    assert not (folder / "mask.safetensors").exists()
+
+
+@pytest.mark.slow
+def test_another_mesh_goes_on_to_the_same_weights(tmp_path):
+    jobs = [("whole", "1x1", "train"), ("broken", "2x1", "fail"), ("broken", "1x2", "train")]
+    found = processes(tmp_path, [(*job, SHORT) for job in jobs])
+    assert not any(codes(found["broken", "1x2"])), errors(found["broken", "1x2"])
+    (one,), (two,) = ((tmp_path / name).iterdir() for name in ("whole", "broken"))
+    assert one.name == two.name
+    for file in ("mask", "network"):
+        expected, made = (load_file(folder / f"{file}.safetensors") for folder in (one, two))
+        for name, x in expected.items():
+            assert float((made[name] - x).norm()) <= 1e-9 * float(x.norm()), name
+    rows = [[line.split(",")[:-1] for line in (f / "losses.csv").read_text().splitlines()] for f in (one, two)]
+    assert rows[0] == rows[1]
+    assert len(rows[0]) == 1 + 4
+    assert json.loads((two / "training.json").read_text())["mesh"] == "1x2"
+
+
+@pytest.mark.slow
+def test_four_processes_find_the_gradients_of_one(tmp_path):
+    each = {"every": EVERY, "few": FEW, "by band": [*EVERY, "reading.level=per_band"]}
+    meshes = {"every": ["2x2", "1x4"], "few": ["2x2", "1x3"], "by band": ["2x2"]}
+    jobs = [(name, mesh, "step", each[name]) for name in each for mesh in ("1x1", *meshes[name])]
+    found = processes(tmp_path, jobs)
+    for name, among in meshes.items():
+        for mesh in among:
+            same(stepped(found[name, mesh]), stepped(found[name, "1x1"]))
+    shared = stepped(found["by band", "2x2"])["shared"]
+    assert shared["cut"] == ["image[mask]", "image[plain]"]
+    assert shared["sums"] == [], "the peak of each band is asked for"
+
+
+@pytest.mark.slow
+def test_torchrun_starts_it_and_stops_all_where_one_fails(tmp_path):
+    words = [word.replace("float64", "float32") for word in SHORT]
+    environment = {**os.environ, "OMP_NUM_THREADS": "1", "PYTHONPATH": str(ROOT / ".src"),
+                   "NEUSEE_CACHE": str(tmp_path / "cache")}  # fmt: skip
+    start = [sys.executable, "-m", "torch.distributed.run", "--standalone", "--nproc-per-node", "2", "-m",
+             "neusee.workflows.cli", "train", "train_small", *words, "--out", str(tmp_path / "runs")]  # fmt: skip
+    once = subprocess.run([*start, "--mesh", "1x2"], env=environment, capture_output=True, text=True, check=False)
+    assert once.returncode == 0, once.stderr
+    (folder,) = (tmp_path / "runs").iterdir()
+    assert once.stdout.splitlines().count(str(folder)) == 1
+    assert json.loads((folder / "training.json").read_text())["command"][-2:] == ["--mesh", "1x2"]
+    wrong = subprocess.run([*start, "--mesh", "2x2"], env=environment, capture_output=True, text=True, check=False)
+    assert wrong.returncode != 0
+    assert "--mesh 2x2 is for 4 processes and there are 2" in wrong.stderr
+
+
+@pytest.mark.parametrize(("text", "world", "shape"), [("", 1, (1, 1)), ("", 4, (4, 1)), ("2x4", 8, (2, 4))])
+def test_a_mesh_is_read(text, world, shape):
+    assert shape_of(text, world) == shape
+
+
+@pytest.mark.parametrize(
+    ("text", "world", "said"),
+    [
+        ("2x2", 1, "there is 1: start torchrun --nproc-per-node 4"),
+        ("3", 3, "write DATAxBAND"),
+        ("0x2", 2, "write DATA"),
+    ],
+)
+def test_a_mesh_that_does_not_fit_is_refused(text, world, said):
+    with pytest.raises(MeshError, match=re.escape(said)):
+        shape_of(text, world)
+
+
+def test_a_batch_that_cannot_be_shared_is_refused_where_it_stands(tmp_path):
+    recipe = load("train_small", [*EVERY, "train.stages.1.batch=3"])
+    with pytest.raises(MeshError, match=r"argument \d+   train\.stages\.1\.batch   3 pictures .* multiple of 2"):
+        train(recipe, Store(tmp_path), tmp_path, [], print, mesh=Mesh(2, 1))
+
+
+def test_more_processes_than_bands_are_refused_where_the_bands_stand(tmp_path):
+    recipe = load("train_small", EVERY)
+    with pytest.raises(MeshError, match=r"neusee\.yaml:\d+:\d+: bands has 5 bands, which 6 processes cannot share"):
+        samples(recipe, tmp_path, Mesh(1, 6))
+
+
+def test_a_psf_that_couples_its_bands_is_named(tmp_path):
+    recipe = load("train_small", EVERY)
+    coupled = replace(recipe, steps={**recipe.steps, "psf[mask]": replace(recipe.steps["psf[mask]"], node=doe.flat)})
+    with pytest.raises(MeshError, match=r"psf\[mask\] \(doe.flat\) couples its bands.* write --mesh 2x1"):
+        Shards.of(coupled, "psf[mask]", ["psf[mask]"], {"psf[mask]"}, Store(tmp_path), Mesh(1, 2))
+
+
+def samples(recipe, folder, mesh):
+    how = recipe.training
+    return Samples(recipe, how, _photographs(recipe, how, True), Store(folder), "cpu", None, mesh)

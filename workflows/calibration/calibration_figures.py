@@ -1,0 +1,85 @@
+"""Pictures of a calibration: the photon-transfer curve that the posterior predicts, its corners and its chains."""
+
+from __future__ import annotations
+
+import warnings
+from collections.abc import Sequence
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from neusee.workflows.report.figures.style import BLACK, BLUE, ORANGE, VERMILION, canvas, drawn
+
+if TYPE_CHECKING:
+    from numpy.typing import NDArray
+
+    from neusee.workflows.calibration.log_posterior import Places
+
+_BAND = (5.0, 50.0, 95.0)  #: percentiles
+_POINTS = 1500  #: of a chain that are drawn
+_LEAST = 0.1  #: DN2, where a level without any scatter is drawn
+
+
+@drawn
+def transfer(measured: Places, predicted: Places, whole: NDArray[np.bool_]) -> Any:
+    """Variance against mean, and how far each level lies from what the posterior predicts.
+
+    ``measured`` (3, level): mean, variance, degrees of freedom; ``predicted`` (2, draw, level): mean and variance, with
+    the chance of another such measurement; ``whole`` (level,): not cut off by an end.
+    """
+    figure, axes = canvas(9.0, 7.2, 2, 1, sharex=True, height_ratios=(2.2, 1.0))
+    above, below = axes[0, 0], axes[1, 0]
+    order = np.flatnonzero(whole)[np.argsort(predicted[0].mean(0)[whole])]
+    mean, (low, middle, high) = predicted[0].mean(0)[order], np.percentile(predicted[1], _BAND, axis=0)[:, order]
+    above.fill_between(mean, low, high, color=BLUE, alpha=0.25, linewidth=0, label="predicted, 90 %")
+    above.plot(mean, middle, color=BLUE, linewidth=1.2, label="predicted, median")
+    for at, style in ((whole, {"color": BLACK}), (~whole, {"color": VERMILION, "markerfacecolor": "none"})):
+        if at.any():
+            label = "measured" if style["color"] == BLACK else "cut off or coarse: counted number by number"
+            above.plot(measured[0, at], measured[1, at].clip(_LEAST), "o", markersize=5, label=label, **style)
+    above.set(xscale="log", yscale="log", ylabel="temporal variance (DN²)", title="Photon-transfer curve")
+    above.legend(loc="upper left")
+    at = whole
+    centre, width = predicted[1].mean(0)[at], predicted[1].std(0)[at]
+    below.axhspan(-2, 2, color=BLUE, alpha=0.12, linewidth=0)
+    below.axhline(0, color=BLUE, linewidth=1.0)
+    below.plot(measured[0, at], (measured[1, at] - centre) / width, "o", color=BLACK, markersize=5)
+    below.set(xlabel="mean (DN)", ylabel="off, in sd of\nthe prediction")
+    reach = max(3.5, 1.1 * float(np.abs((measured[1, at] - centre) / width).max(initial=0.0)))
+    below.set_ylim(-reach, reach)
+    return figure
+
+
+@drawn
+def corners(draws: Places, names: Sequence[str], nominal: Sequence[float]) -> Any:
+    """Every pair of parameters; orange: what the recipe says."""
+    import corner
+    from matplotlib.backends.backend_agg import FigureCanvasAgg
+    from matplotlib.figure import Figure
+
+    size = 1.75 * len(names) + 0.6
+    figure = Figure(figsize=(size, size), dpi=100)
+    FigureCanvasAgg(figure)
+    how: dict[str, Any] = {"label_kwargs": {"fontsize": 10}, "max_n_ticks": 3, "color": BLUE, "plot_datapoints": False}
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")  # of contours that few draws reach
+        corner.corner(draws, labels=list(names), truths=list(nominal), truth_color=ORANGE, fig=figure, **how)
+    return figure
+
+
+@drawn
+def traces(draws: Places, labels: Sequence[str]) -> Any:
+    """Each coordinate by step: the median and the middle 90 % of the walkers of each ensemble."""
+    count = len(labels)
+    figure, axes = canvas(9.0, 1.35 * count + 0.5, count, 1, sharex=True)
+    every = max(1, draws.shape[1] // _POINTS)
+    for i, label in enumerate(labels):
+        ax = axes[i, 0]
+        for ensemble, colour in zip(draws[:, ::every, :, i], (BLUE, ORANGE, "#009E73", VERMILION), strict=False):
+            low, middle, high = np.percentile(ensemble, _BAND, axis=1)
+            steps = np.arange(len(middle)) * every
+            ax.fill_between(steps, low, high, color=colour, alpha=0.12, linewidth=0)
+            ax.plot(steps, middle, color=colour, linewidth=0.8)
+        ax.set_ylabel(label, fontsize=9, rotation=0, ha="right", va="center")
+    axes[-1, 0].set_xlabel("step, without what was thrown away")
+    return figure

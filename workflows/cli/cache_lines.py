@@ -1,0 +1,108 @@
+"""What `neusee cache ls`, `verify`, `gc` and `pin` print."""
+
+from __future__ import annotations
+
+import os
+from typing import Any
+
+from neusee.workflows.report.run_timing import size_of
+from neusee.workflows.store.budget_eviction import bytes_of
+from neusee.workflows.store.derived_files import Shelf
+from neusee.workflows.store.metadata import is_kept
+from neusee.workflows.store.result_store import Store
+
+
+def ls_lines(store: Store) -> list[str]:
+    """Every result: when, bytes, seconds, step, recipe, key, and whether it is pinned or a receipt; the newest last."""
+    found = sorted(store.entries(), key=lambda entry: str(entry[1].get("date", "")))
+    pins = store.pinned()
+    rows = [_row(key, about, key in pins) for key, about in found]
+    kept = [about for _, about in found if is_kept(about)]
+    last = f"{_count(len(kept), 'result')}, {size_of(sum(map(_size, kept)))}, in {store.root}"
+    if len(kept) < len(found):
+        last += f"; of {_count(len(found) - len(kept), 'more result')} the receipt alone"
+    if store.budget is not None:
+        last += f"; the budget is {size_of(store.budget)}"
+    head = ["date", "bytes", "seconds", "step", "recipe", "key", ""]
+    return [*(_columns([head, *rows]) if rows else []), last]
+
+
+def verify_lines(store: Store) -> tuple[list[str], int]:
+    """Read every value and every picture; a line for each that is damaged, and how many they are."""
+    count, size, bad = 0, 0, list[str]()
+    shelf = Shelf(store)
+    for found in store.check():
+        about = found.about or {}
+        problem = found.problem or _picture_problem(shelf, found.key, about)
+        if problem:
+            bad.append(f"{found.key}  {about.get('step') or '?'}  {problem}")
+        elif is_kept(about):
+            count, size = count + 1, size + _size(about)
+    last = f"{_count(count, 'result')}, {size_of(size)}, as written"
+    if bad:
+        last += f"; {len(bad)} damaged, put aside in {store.root / 'bad'}: a next run computes what it needs of them"
+    return [*bad, last], len(bad)
+
+
+def gc_lines(store: Store, budget: str | None = None, dry: bool = False) -> list[str]:
+    """Remove what belongs to no result, and values beyond ``budget``, such as ``20 GB``. Raises `ValueError`."""
+    abouts = dict(store.entries())
+    swept = store.gc(None if budget is None else bytes_of(budget), dry)
+    rows = [[*_row(key, abouts[key], False)[1:4], key[:8]] for key in swept.evicted if key in abouts]
+    went = f"{_count(len(swept.evicted), 'value')} and {_count(swept.orphans, 'file')} that belonged to no result"
+    last = f"{went} {'would go' if dry else 'went'}: {size_of(swept.freed)}; {size_of(swept.left)} stay in {store.root}"
+    refused = f"{_count(len(swept.refused), 'value')} of other users could not be removed"
+    return [*(_columns(rows) if rows else []), *([refused] if swept.refused else []), last]
+
+
+def pin_lines(store: Store, prefix: str, pin: bool = True) -> list[str]:
+    """Pin or unpin the value whose key begins with ``prefix``; a `ValueError` where none or several do."""
+    key = _named(store, prefix, pin)
+    if pin:
+        store.pin(key)
+    else:
+        store.unpin(key)
+    step = (store.about(key) or {}).get("step") or "a value that is not here"
+    return [f"{'pinned' if pin else 'no longer pinned'}: {key}  {step}"]
+
+
+def _named(store: Store, prefix: str, pin: bool) -> str:
+    keys = store.pinned() if not pin else {key for key, about in store.entries() if is_kept(about)}
+    found = sorted(key for key in keys if key.startswith(prefix.lower()))
+    if len(found) != 1:
+        what = "value" if pin else "pinned value"
+        few = f"these begin so: {', '.join(key[:12] for key in found[:5])}" if found else f"no {what} begins so"
+        raise ValueError(f"{prefix!r} names no single {what}: {few} (`neusee cache ls` lists them)")
+    return found[0]
+
+
+def _picture_problem(shelf: Shelf, key: str, about: dict[str, Any]) -> str:
+    """What is wrong with the file that an entry stands for, which is then put aside; empty where nothing is."""
+    name = about.get("file")
+    if not name or not is_kept(about) or shelf.find(key, os.path.basename(name)[len(key) :]) is not None:
+        return ""
+    problem = f"its file {name} is not what was written"
+    shelf.store.put_aside(key, ValueError(problem))
+    return problem
+
+
+def _row(key: str, about: dict[str, Any], pinned: bool) -> list[str]:
+    took, date = f"{about.get('seconds') or 0.0:.3f}", str(about.get("date") or "")[:19].replace("T", " ")
+    mark = "pinned" if pinned else "" if is_kept(about) else "receipt"
+    return [date, size_of(_size(about)), took, about.get("step") or "", about.get("recipe") or "", key[:8], mark]
+
+
+def _size(about: dict[str, Any]) -> int:
+    """Bytes of a result, or of the file that it stands for."""
+    size: int = about.get("file_bytes") or about.get("bytes") or 0
+    return size
+
+
+def _count(count: int, what: str) -> str:
+    return f"{count} {what}{'s' * (count != 1)}"
+
+
+def _columns(rows: list[list[str]]) -> list[str]:
+    """Left-aligned columns."""
+    widths = [max(len(row[i]) for row in rows) for i in range(len(rows[0]))]
+    return ["  ".join(f"{cell:<{wide}}" for cell, wide in zip(row, widths, strict=True)).rstrip() for row in rows]

@@ -1,0 +1,52 @@
+"""``neusee calibrate``: what calibration frames tell of a sensor."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+from neusee.workflows.cli.command_frame import FAILED, MISSED, Debug, Out, Words, fail, load, say, the_store
+
+
+def calibrate(
+    words: Words = None,
+    walkers: Annotated[int, typer.Option("--walkers", min=16, help="Of each of the four ensembles.")] = 64,
+    move: Annotated[str, typer.Option("--move", help="How they walk: de or stretch.")] = "de",
+    draws: Annotated[int, typer.Option("--draws", min=100, help="Independent draws, at least.")] = 1000,
+    quiet: Annotated[bool, typer.Option("--quiet", help="The page's path alone.")] = False,
+    debug: Debug = False,
+    out: Out = Path("runs"),
+) -> None:
+    """Find the posterior of a recipe's sensor from its levels, checked; run it again to go on."""
+    recipe, command = load(words)
+    from neusee.workflows.calibration import run_calibration as _calibration
+    from neusee.workflows.engine.node_call import RunError
+
+    tell = (lambda line: None) if quiet else (lambda line: say([line]))
+    how = {"walkers": walkers, "move": move, "draws": draws}
+    command = ["neusee", "calibrate", *command[2:], *(f"--{name} {value}" for name, value in how.items())]
+    try:
+        folder = _calibration.calibrate(
+            recipe, the_store(), out, command, tell, walkers=walkers, move=move, draws=draws
+        )
+    except _calibration.Refused as error:
+        fail(f"refused, nothing was drawn: {error}", FAILED)
+    except (RunError, ValueError, ImportError) as error:
+        fail(str(error), FAILED)
+    document = json.loads((folder / "posterior.json").read_text())
+    if not quiet:
+        say(_lines(document["parameters"]))
+    say([str(folder / "report.html")])
+    if count := document["failed"]:
+        wrong = "; ".join(f"{c['name']}: {c['found']}" for c in document["checks"] if c["mark"] == "fail")
+        fail(f"not fit for use: {count} checks fail ({wrong}); see {folder / 'report.html'}", MISSED)
+
+
+def _lines(parameters: dict[str, dict[str, object]]) -> list[str]:
+    from neusee.workflows.calibration.calibration_page import Row
+
+    rows = [Row(**{"mean": 0.0, "sd": 0.0, **row}) for row in parameters.values()]  # type: ignore[arg-type]
+    return [f"{row.name.replace('_', ' '):20s} {row.said}" for row in rows]

@@ -1,0 +1,130 @@
+"""``neusee train``: learn the element and the restoration of a recipe."""
+
+from __future__ import annotations
+
+from enum import StrEnum
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated
+
+import typer
+
+from neusee.workflows.cli.command_frame import FAILED, Debug, Out, Words, check_device, fail, load, say, the_store
+
+if TYPE_CHECKING:
+    from collections.abc import Mapping
+
+    from neusee.workflows.graph.recipe_graph import Recipe
+
+
+class Stages(StrEnum):
+    """What is learnt."""
+
+    FIRST = "1"
+    SECOND = "2"
+    BOTH = "both"
+    MASK = "mask"
+
+
+_STAGES = "1: element and network; 2: network; both; mask: element without images, then 2."
+_NUMBERS = {Stages.FIRST: (1,), Stages.SECOND: (2,), Stages.BOTH: (1, 2), Stages.MASK: (0,)}  #: of `train`
+
+
+def train(
+    words: Words = None,
+    stage: Annotated[Stages, typer.Option("--stage", help=_STAGES)] = Stages.BOTH,
+    device: Annotated[str, typer.Option("--device", help="Where to learn: cpu or cuda.")] = "cpu",
+    mesh: Annotated[
+        str, typer.Option("--mesh", help="DATAxBAND processes, as torchrun starts them: 4x2; else all share the data.")
+    ] = "",
+    quiet: Annotated[bool, typer.Option("--quiet", help="The folder alone.")] = False,
+    debug: Debug = False,
+    out: Out = Path("runs"),
+) -> None:
+    """Learn a recipe's element and restoration; run it again to go on where it was stopped.
+
+    With --stage mask the element is designed without images, as train.mask says; --stage 2 then goes on from it.
+    """
+    recipe, command = load(words or ["train_small"])
+    if recipe.lifting is not None:
+        if stage is not Stages.BOTH or mesh:
+            fail(f"{recipe.name} learns a lift, which has neither stages nor a mesh: leave --stage and --mesh out")
+        check_device(device)
+        return _lift(recipe, ["neusee", "train", *command[2:]], out, device, quiet)
+    from neusee.workflows.engine.node_call import RunError
+    from neusee.workflows.training.parallel.process_mesh import MeshError, device_here, joined, processes
+    from neusee.workflows.training.run_training import train as learn
+
+    device, (rank, world) = device_here(device), processes()
+    check_device(device)
+    quiet, who = quiet or rank > 0, f"process {rank}: " if world > 1 else ""
+    there = recipe.training.learnt if recipe.training else ()
+    stages = there if stage is Stages.BOTH else _NUMBERS[stage]
+    tell = (lambda line: None) if quiet else (lambda line: say([line]))
+    told = ["neusee", "train", *command[2:], "--stage", stage.value, *(["--mesh", mesh] if mesh else [])]
+    lengths = {s: recipe.training.stages[s].iterations for s in stages if s} if recipe.training else {}
+    try:
+        with joined(mesh, device) as processes_here, _bar(quiet, lengths) as bar:
+            folder = learn(recipe, the_store(), out, told, tell, stages, device, bar.watch, processes_here)
+    except MeshError as error:
+        fail(f"{who}{error}")
+    except (RunError, ValueError, ArithmeticError) as error:
+        fail(f"{who}{error}", FAILED)
+    if not quiet:
+        say(_next(folder, stage))
+    if rank == 0:
+        say([str(folder)])
+
+
+def _lift(recipe: Recipe, told: list[str], out: Path, device: str, quiet: bool) -> None:
+    """Learn a lift from RGB to spectra."""
+    from neusee.workflows.engine.node_call import RunError
+    from neusee.workflows.training.lift.lift_run import train_lift
+
+    assert recipe.lifting is not None
+    tell = (lambda line: None) if quiet else (lambda line: say([line]))
+    try:
+        with _bar(quiet, {1: recipe.lifting.iterations}) as bar:
+            folder = train_lift(recipe, the_store(), out, told, tell, device, lambda n, found: bar.watch(1, n, found))
+    except (RunError, ValueError, ArithmeticError) as error:
+        fail(str(error), FAILED)
+    if not quiet:
+        weights = folder / "mst_plus_plus.safetensors"
+        say([f"weights: {weights}", f"curves:  {folder / 'curves.png'}", f"judged:  {folder / 'training.json'}",
+             f"next:    neusee run first_light lift=mst_plus_plus lift.weights={weights}"])  # fmt: skip
+    say([str(folder)])
+
+
+def _next(folder: Path, stage: Stages) -> list[str]:
+    if stage is Stages.MASK:
+        return [f"element: {folder / 'mask.safetensors'}", f"report:  {folder / 'report.html'}"]
+    mask, network = folder / "mask.safetensors", folder / "network.safetensors"
+    element = [f"element: {mask}"] if mask.is_file() else []
+    return [*element, f"network: {network}", f"curves:  {folder / 'curves.png'}"]
+
+
+class _bar:
+    """The losses on the way, where somebody looks."""
+
+    def __init__(self, quiet: bool, lengths: Mapping[int, int]) -> None:
+        from rich.console import Console
+        from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
+
+        columns = TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn(), TimeRemainingColumn()
+        console = Console(stderr=True)
+        self._shown = Progress(*columns, TextColumn("{task.fields[losses]}"), console=console,
+                               disable=quiet or not console.is_terminal)  # fmt: skip
+        self._tasks = {s: self._shown.add_task(f"stage {s}", total=n, losses="") for s, n in lengths.items()}
+
+    def __enter__(self) -> _bar:
+        self._shown.start()
+        return self
+
+    def __exit__(self, *error: object) -> None:
+        self._shown.stop()
+
+    def watch(self, stage: int, done: int, found: Mapping[str, float]) -> None:
+        """An iteration was done."""
+        said = " ".join(
+            f"{name} {found[name]:.3g}" for name in ("LSR", "L1", "critics", "MRAE", "RMSE") if name in found
+        )
+        self._shown.update(self._tasks[stage], completed=done, losses=said)

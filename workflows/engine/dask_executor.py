@@ -1,0 +1,220 @@
+"""Work on a dask.distributed cluster: keys travel, tensors never.
+
+A task is a chain of steps with the keys of what it reads. The worker reads values by key from
+the store, or from those it made or read before, and writes the end of the chain to the store.
+Only what is known of the results comes back. Whatever happens to a worker, what it finished
+is stored, and putting a result twice does no harm.
+"""
+
+from __future__ import annotations
+
+import time
+from collections import OrderedDict
+from collections.abc import Iterator, Mapping, Sequence
+from contextlib import ExitStack, contextmanager
+from dataclasses import replace
+from typing import Any
+
+import torch
+
+from neusee.workflows.engine.memory_use import there_is
+from neusee.workflows.engine.node_call import RunError
+from neusee.workflows.engine.step_job import Lane, Lost, Outcome, Work, carry_out
+from neusee.workflows.keys.cache_key import Key
+from neusee.workflows.keys.code_digest import Code
+from neusee.workflows.store.remote_store import open_store
+from neusee.workflows.store.result_store import Store
+from neusee.workflows.store.serialization import tensors_in
+
+_SHARE = 0.4  #: of the planned memory for values that a worker's next tasks may read
+_PLANNED = 0.6  #: of a worker's memory that a task may be planned with
+_LOOK = 1.0  #: s between looks at which workers there are
+_TRIES = 3  #: workers that one chain may bring down before it is given up
+
+
+class Dask:
+    """An `Executor` of a cluster; ``client`` is a `distributed.Client`, and every worker can open ``store``."""
+
+    shares = False
+
+    def __init__(self, client: Any, store: Store) -> None:
+        self.client, self.where = client, getattr(store, "url", None) or str(store.root.absolute())
+        self.threads = torch.get_num_threads()  # sums over threads round as they do here
+        self._lanes: dict[str, Lane] = {}
+        self._looked = -_LOOK
+        self._running: dict[Any, tuple[Work, ...]] = {}
+        self._tries: dict[Key, int] = {}
+
+    @property
+    def lanes(self) -> Mapping[str, Lane]:
+        """One lane a worker; looked up again once a second, for workers come and go."""
+        if time.monotonic() - self._looked > _LOOK or not self._lanes:
+            self._look()
+        return self._lanes
+
+    def submit(self, work: Sequence[Work]) -> None:
+        """Send one chain to the worker of its lane, or to another if that one goes."""
+        self._tries[work[0].key] = self._tries.get(work[0].key, 0) + 1
+        future = self.client.submit(
+            work_here,
+            tuple(work),
+            self.where,
+            self.threads,
+            _SHARE * min((lane.memory for lane in self._lanes.values()), default=0.0),
+            key=f"neusee-{work[0].key}-{work[-1].key}-{self._tries[work[0].key]}",
+            workers=[work[0].lane] if work[0].lane in self._lanes else None,
+            allow_other_workers=True,
+            pure=False,
+            retries=_TRIES,
+        )
+        self._running[future] = tuple(work)
+
+    def wait(self, seconds: float | None = None) -> list[Outcome]:
+        """What came back since."""
+        from distributed import wait
+
+        if not self._running:
+            return []
+        try:
+            with self.client.as_current():
+                done = wait(list(self._running), seconds, return_when="FIRST_COMPLETED").done
+        except TimeoutError:
+            return []
+        return [outcome for future in done for outcome in self._taken(future)]
+
+    def cancel(self) -> None:
+        """Take back what has not begun; what is under way ends, and its results are stored."""
+        if self._running:
+            self.client.cancel(list(self._running))
+            self._running = {}
+
+    def _taken(self, future: Any) -> list[Outcome]:
+        """The outcomes of a chain; where its workers died under it, an error that says so."""
+        chain = self._running.pop(future)
+        if future.status == "finished":
+            found: list[Outcome] = future.result()
+            return [_of_lane(outcome, chain[0].lane) for outcome in found]
+        cause = future.exception() if future.status == "error" else None
+        if cause is None and self._tries[chain[0].key] < _TRIES:  # lost with its worker or its scheduler
+            self.submit(chain)
+            return []
+        text = f"no worker could carry it out ({cause or future.status})"
+        return [Outcome(chain[0], error=RunError(chain[0].step, [], OSError(text)))]
+
+    def _look(self) -> None:
+        """Find out which workers there are and what they compute on; wait for the first."""
+        if not self.client.nthreads():
+            self.client.wait_for_workers(1, timeout=60)
+        there = self.client.nthreads()
+        new = [address for address in there if address not in self._lanes]
+        found = self.client.run(lane_here, workers=new) if new else {}
+        known = {**self._lanes, **{address: Lane(*about) for address, about in found.items()}}
+        self._lanes = {address: known[address] for address in sorted(there) if address in known}
+        self._looked = time.monotonic()
+
+
+def _of_lane(outcome: Outcome, lane: str) -> Outcome:
+    """As the one who submitted it knows it: the lane is where it was sent, wherever it went."""
+    outcome.work = replace(outcome.work, lane=lane)
+    return outcome
+
+
+# --- on a worker ----------------------------------------------------------------------------------------------------
+
+
+class _Here:
+    """What one worker keeps between tasks: the store, digests of the code it runs, the values it used last."""
+
+    def __init__(self, where: str, room: float) -> None:
+        self.store = open_store(where)
+        self.code = Code(self.store.code_memo)
+        self.values: OrderedDict[Key, Any] = OrderedDict()
+        self.room, self.held = room, 0
+
+    def fetch(self, key: Key) -> Any:
+        if key not in self.values:
+            try:
+                self.keep(key, self.store.get(key))
+            except KeyError:
+                raise Lost(key) from None
+        self.values.move_to_end(key)
+        return self.values[key]
+
+    def keep(self, key: Key, value: Any) -> None:
+        self.held += _size(value) - _size(self.values.get(key))
+        self.values[key] = value
+        self.values.move_to_end(key)
+        while self.held > self.room and len(self.values) > 1:
+            self.held -= _size(self.values.popitem(last=False)[1])
+
+
+_here: dict[str, _Here] = {}
+
+
+def lane_here(dask_worker: Any) -> tuple[str, float]:
+    """The device of a worker and the bytes that may be planned with; dask fills in the worker."""
+    if torch.cuda.is_available():
+        return "cuda:0", _PLANNED * there_is("cuda:0")
+    allowed = getattr(dask_worker.memory_manager, "memory_limit", None)
+    return "cpu", _PLANNED * min(there_is("cpu"), allowed or float("inf"))
+
+
+def work_here(chain: tuple[Work, ...], where: str, threads: int, room: float) -> list[Outcome]:
+    """Carry out a chain; the outcomes go back without their values, ``room`` bytes of which stay here."""
+    if torch.get_num_threads() != threads:
+        torch.set_num_threads(threads)
+    here = _here.get(where) or _here.setdefault(where, _Here(where, room))
+    outcomes: list[Outcome] = []
+    below = chain[0].below
+    for work in chain:
+        outcome = _one_here(replace(work, below=below), here)
+        outcomes.append(outcome)
+        if outcome.held or outcome.error or outcome.lost:
+            break
+        below = 0.0 if outcome.kept else outcome.seconds + below
+    return [_light(outcome) for outcome in outcomes]
+
+
+def _one_here(work: Work, here: _Here) -> Outcome:
+    own = here.code.digest(work.step.node.fn.__module__)
+    if own != work.origin["code"]:
+        text = f"a worker has other code of {work.step.node.path}: give it the version that runs here"
+        return Outcome(work, error=RunError(work.step, [], OSError(text)))
+    outcome = carry_out(work, here.fetch, here.store)
+    if outcome.value is not None:
+        here.keep(work.key, outcome.value)
+    return outcome
+
+
+def _light(outcome: Outcome) -> Outcome:
+    """What may travel: no value, and an error without the objects that it came from."""
+    outcome.value = None
+    if outcome.error is not None and not isinstance(outcome.error, RunError):
+        outcome.error = RunError(outcome.work.step, [], outcome.error)
+    return outcome
+
+
+def _size(value: Any) -> int:
+    return 0 if value is None else sum(t.nbytes for t in tensors_in(value))
+
+
+# --- from the command line ------------------------------------------------------------------------------------------
+
+
+@contextmanager
+def cluster(where: str, store: Store) -> Iterator[Dask]:
+    """``dask`` or ``dask:4`` (workers on this machine), ``dask:here`` (in this process), or a scheduler's address."""
+    from distributed import Client, LocalCluster
+
+    kind, _, count = where.partition(":")
+    with ExitStack() as open_now:
+        if kind == "dask":
+            here = count == "here"
+            workers = 1 if here or not count else int(count)
+            made = LocalCluster(
+                n_workers=workers, threads_per_worker=1, processes=not here, dashboard_address=None, silence_logs=40
+            )
+            address: Any = open_now.enter_context(made)
+        else:
+            address = where
+        yield Dask(open_now.enter_context(Client(address, set_as_default=False)), store)

@@ -1,0 +1,186 @@
+"""A recipe as a differentiable function of some of its parameters or steps."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Collection, Iterable, Mapping
+from functools import cached_property
+from typing import Any
+
+import torch
+from torch import Tensor
+
+from neusee.nodes import Facts
+from neusee.workflows.engine.node_call import call, place
+from neusee.workflows.engine.runner import run
+from neusee.workflows.graph.diagnostics import nearest
+from neusee.workflows.graph.recipe_graph import Recipe, Step, in_order, needed
+from neusee.workflows.store.result_store import Store
+from neusee.workflows.store.serialization import settle
+from neusee.workflows.tolerance.cheaper_steps import economised
+from neusee.workflows.tolerance.error_budget import Ledger
+
+Theta = Mapping[str, Any]
+
+
+def as_function(
+    recipe: Recipe,
+    *free: str,
+    outputs: Iterable[str] | None = None,
+    store: Store | None = None,
+    device: str = "cpu",
+    redraw: Collection[str] = (),
+    caller: Callable[..., Any] = call,
+) -> _Function:
+    """The recipe as ``theta -> {output: value}``, bit for bit what `run` gives, with gradients.
+
+    Args: free: parameters such as ``"spot.strength"``, or steps whose whole value is given,
+    such as ``"height"``. What they cannot reach is computed once, here, or read from the
+    store. Noise is the same at every call: its stream depends on the seed and the step.
+    Random steps in ``redraw`` are computed at every call, which may be given another seed.
+    ``caller`` is asked for every live step in place of `call`: to keep some, or for another seed.
+    """
+    wanted = recipe.outputs if outputs is None else tuple(outputs)
+    given, tuned = _read(recipe, free)
+    recipe = economised(recipe, wanted, given | tuned.keys())
+    sources = {name: () if name in given else step.sources for name, step in recipe.steps.items()}
+    order = in_order(sources, wanted)
+    if idle := sorted((given | tuned.keys()) - set(order)):
+        raise ValueError(f"no output depends on {', '.join(idle)}")
+    live: dict[str, None] = {}
+    for name in order:
+        free_itself = name in given or name in tuned or name in redraw
+        if free_itself or any(source in live for source in sources[name]):
+            live.setdefault(name)
+    border = {name for step in live for name in sources[step]} | set(wanted)
+    fixed = run(recipe, store, sorted(border - live.keys()), device=device)
+    left_out = {name: done.bound or 0.0 for name, done in fixed.done.items() if done.state == "left out"}
+    return _Function(recipe, free, wanted, given, tuned, list(live), fixed.values, left_out, device, caller)
+
+
+def _read(recipe: Recipe, free: tuple[str, ...]) -> tuple[set[str], dict[str, dict[str, str]]]:
+    """Steps that are given whole, and by step the free parameters with their full names."""
+    given: set[str] = set()
+    tuned: dict[str, dict[str, str]] = {}
+    for name in free:
+        step, _, param = name.rpartition(".")
+        if name in recipe.steps:
+            given.add(name)
+        elif step not in recipe.steps:
+            raise ValueError(f"no step {step or name!r}; {nearest(step or name, recipe.steps)}")
+        elif param not in recipe.steps[step].params:
+            raise ValueError(f"{step} has no parameter {param!r}; {nearest(param, recipe.steps[step].params)}")
+        else:
+            tuned.setdefault(step, {})[param] = name
+    return given, tuned
+
+
+class _Function:
+    """The live part of a recipe, with the values of everything that feeds it."""
+
+    def __init__(
+        self,
+        recipe: Recipe,
+        free: tuple[str, ...],
+        wanted: tuple[str, ...],
+        given: set[str],
+        tuned: dict[str, dict[str, str]],
+        live: list[str],
+        fixed: dict[str, Any],
+        left_out: Mapping[str, float],
+        device: str,
+        caller: Callable[..., Any] = call,
+    ) -> None:
+        self._caller = caller
+        self.recipe, self.free, self.wanted, self.device = recipe, free, wanted, device
+        self.given, self.tuned, self.live, self.fixed = given, tuned, live, fixed
+        self._facts: dict[str, Facts | None] = {}
+        self._spent = _spent(recipe, fixed, left_out)
+        self._last = {source: name for name in live if name not in given for source in recipe.steps[name].sources}
+
+    def __call__(self, theta: Theta, seed: int | None = None) -> dict[str, Any]:
+        """Outputs at ``theta``; noise as of ``seed``, or of the recipe's own."""
+        seed = self.recipe.seed if seed is None else seed
+        if set(theta) != set(self.free):
+            raise ValueError(f"give exactly {', '.join(self.free)}, not {', '.join(theta) or 'nothing'}")
+        values, ledger = dict(self.fixed), self._spent.copy()
+        for name in self.live:
+            step, given = self.recipe.steps[name], name in self.given
+            values[name] = settle(theta[name]) if given else self._evaluate(step, values, theta, ledger, seed)
+            for source in () if given else set(step.sources):
+                if self._last[source] == name and source not in self.wanted:
+                    del values[source]
+        return {name: values[name] for name in self.wanted}
+
+    def _evaluate(self, step: Step, values: dict[str, Any], theta: Theta, ledger: Ledger, seed: int) -> Any:
+        params = {**step.params, **{p: theta[full] for p, full in self.tuned.get(step.name, {}).items()}}
+        if step.node.bound is not None:
+            with torch.no_grad():
+                verdict = ledger.verdict(step, params, lambda name: self._facts_of(name, values))
+            if verdict.left_out:
+                return values[verdict.instead]
+        else:
+            ledger.pass_on(step)
+        inputs = [_gather(step.wires.get(name), values) for name in step.node.inputs]
+        return self._caller(step, inputs, params, seed, place(step, self.device))
+
+    def _facts_of(self, name: str, values: dict[str, Any]) -> Any:
+        if name not in self.fixed:
+            value = values[name]
+            return _Ends(value) if isinstance(value, Tensor) and value.dtype == torch.float32 else Facts.of(value)
+        if name not in self._facts:
+            self._facts[name] = Facts.of(self.fixed[name])
+        return self._facts[name]
+
+
+class _Ends:
+    """Facts of a picture that each call makes anew, its least and greatest first: a bound rarely asks for more."""
+
+    def __init__(self, value: Tensor) -> None:
+        self._value = value.detach()
+        self.shape, self.dtype = tuple(value.shape), "float32"
+
+    @cached_property
+    def _ends(self) -> tuple[float, float]:
+        if self._value.numel() == 0:
+            return math.nan, math.nan
+        low, high = torch.aminmax(self._value)
+        return float(low), float(high)
+
+    @property
+    def min(self) -> float:
+        return self._ends[0]
+
+    @property
+    def max(self) -> float:
+        return self._ends[1]
+
+    @property
+    def finite(self) -> bool:
+        """Whether all is finite; then the sum is, which is taken in double precision."""
+        return self._value.numel() == 0 or all(map(math.isfinite, self._ends))
+
+    @cached_property
+    def _whole(self) -> Facts:
+        found = Facts.of(self._value)
+        assert found is not None
+        return found
+
+    def __getattr__(self, name: str) -> Any:
+        return getattr(self._whole, name)
+
+
+def _spent(recipe: Recipe, fixed: Mapping[str, Any], left_out: Mapping[str, float]) -> Ledger:
+    """What the fixed steps have spent of the tolerance."""
+    ledger = Ledger(recipe)
+    for name in needed(recipe, fixed):
+        ledger.pass_on(recipe.steps[name])
+        if name in left_out:
+            ledger.leave_out(recipe.steps[name], left_out[name])
+    return ledger
+
+
+def _gather(wire: str | tuple[str, ...] | None, values: Mapping[str, Any]) -> Any:
+    if wire is None or isinstance(wire, str):
+        return None if wire is None else values[wire]
+    return [values[name] for name in wire]

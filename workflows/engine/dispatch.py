@@ -1,0 +1,155 @@
+"""Hand out work as its inputs become ready, and take in what comes of it."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import replace
+
+from neusee.workflows.engine.step_job import Executor, Outcome, Work
+from neusee.workflows.keys.cache_key import Key
+
+_FIRST_LOOK, _LONGEST = 0.01, 0.5  #: s between looks at work that another process holds
+
+Chain = tuple[Work, ...]  #: steps of which each feeds the next and nothing else
+Room = Callable[[Work, Sequence[Work]], bool]  #: whether there is memory for one more beside those that run
+
+
+class Loop:
+    """The state of one plan: what waits for inputs, what is ready, what each lane does."""
+
+    def __init__(
+        self,
+        chains: Sequence[Chain],
+        executor: Executor,
+        begin: Callable[[Work], Work],
+        room: Room,
+    ) -> None:
+        self.executor, self.begin, self.room = executor, begin, room
+        self.busy: dict[str, Chain] = {}
+        self._chain_of = {work.key: i for i, chain in enumerate(chains) for work in chain}
+        self._chains = list(chains)
+        self._missing = [self._outside(chain) for chain in chains]
+        self._after: dict[Key, list[int]] = {}
+        for i, missing in enumerate(self._missing):
+            for key in missing:
+                self._after.setdefault(key, []).append(i)
+        self._ready = [i for i, missing in enumerate(self._missing) if not missing]
+        self._ready.reverse()  # the next one is the last: a list pops there
+        self._held: dict[int, tuple[float, float]] = {}  # chain -> when to look again, and how long to wait then
+        self._open = len(chains)
+
+    def outcomes(self) -> Iterator[Outcome]:
+        """Each outcome as it comes, until all work is done; the caller raises where one is an error."""
+        while self._open:
+            self._hand_out()
+            if not self.busy and not self._held:
+                ready = self._chains[self._ready[-1]][0] if self._ready else None
+                raise RuntimeError(f"no lane takes {ready.step.name if ready else 'what is left'}: they are gone")
+            for outcome in self.executor.wait(self._patience()):
+                self._settle(outcome)
+                if not outcome.held:
+                    yield outcome
+
+    def _outside(self, chain: Chain) -> set[Key]:
+        """Keys of this plan that a chain reads from other chains."""
+        own = {work.key for work in chain}
+        return {key for work in chain for key in work.sources if key in self._chain_of and key not in own}
+
+    def _hand_out(self) -> None:
+        """Give every idle lane the first ready chain that may go there."""
+        self._look_again()
+        for lane, where in self.executor.lanes.items():
+            if lane in self.busy or not self._ready:
+                continue
+            place = self._first_for(lane, where.device)
+            if place is not None:
+                chain = self._chains[self._ready.pop(place)]
+                if chain[0].lane != lane:
+                    chain = tuple(_moved(work, lane, where.device) for work in chain)
+                chain = self.busy[lane] = (self.begin(chain[0]), *chain[1:])
+                self.executor.submit(chain)
+
+    def _first_for(self, lane: str, device: str) -> int | None:
+        """Where in the ready list the next chain for ``lane`` stands: its own, or one whose lane is busy or gone."""
+        running = [work for chain in self.busy.values() for work in chain]
+        there = self.executor.lanes
+        for place in range(len(self._ready) - 1, -1, -1):
+            chain = self._chains[self._ready[place]]
+            own = chain[0].lane
+            moved = (own in self.busy or own not in there) and _kind(chain[0].device) == _kind(device)
+            if (own == lane or moved) and (not running or self.room(chain[0], running)):
+                return place
+        return None
+
+    def _look_again(self) -> None:
+        now = time.monotonic()
+        for i in [i for i, (when, _) in self._held.items() if when <= now]:
+            self._ready.append(i)
+            self._held[i] = (float("inf"), self._held[i][1])
+
+    def _patience(self) -> float | None:
+        """How long to wait for what is under way; where all else is held by others, sleep here."""
+        waits = [when for when, _ in self._held.values() if when < float("inf")]
+        if not waits:
+            return None
+        pause = max(0.0, min(waits) - time.monotonic())
+        if not self.busy:
+            time.sleep(pause)
+        return pause
+
+    def _settle(self, outcome: Outcome) -> None:
+        """Free the lane, and release what waited for this key."""
+        i = self._chain_of[outcome.work.key]
+        chain = self._chains[i]
+        last = outcome.work.key == chain[-1].key
+        if outcome.held:
+            pause = min(_LONGEST, 2 * self._held.get(i, (0.0, _FIRST_LOOK / 2))[1])
+            self._held[i] = (time.monotonic() + pause, pause)
+            self._chains[i] = chain[[w.key for w in chain].index(outcome.work.key) :]
+        elif last:
+            self._open -= 1
+            self._held.pop(i, None)
+        if outcome.held or last or outcome.error or outcome.lost:
+            self.busy.pop(outcome.work.lane, None)
+        if outcome.held:
+            return
+        freed = []
+        for waiting in self._after.pop(outcome.work.key, ()):
+            self._missing[waiting].discard(outcome.work.key)
+            if not self._missing[waiting]:
+                freed.append(waiting)
+        self._ready += sorted(freed, reverse=True)
+        if len(self.executor.lanes) > 1 or freed:
+            self._ready.sort(reverse=True)
+
+
+def chains_of(works: Sequence[Work], fused: bool) -> list[Chain]:
+    """Every step alone, or, ``fused``, with those that follow it and nothing else on the same lane."""
+    if not fused:
+        return [(work,) for work in works]
+    readers: dict[Key, int] = {}
+    for work in works:
+        for key in set(work.sources):
+            readers[key] = readers.get(key, 0) + 1
+    planned = {work.key for work in works}
+    chains: dict[Key, list[Work]] = {}  # by the key at their end
+    for work in works:
+        above = [key for key in dict.fromkeys(work.sources) if key in planned]
+        chain = chains.get(above[0]) if len(above) == 1 else None
+        if chain and readers[above[0]] == 1 and not chain[-1].wanted and chain[-1].lane == work.lane:
+            del chains[above[0]]
+            chains[work.key] = [*chain, work]
+        else:
+            chains[work.key] = [work]
+    order = {work.key: i for i, work in enumerate(works)}
+    return [tuple(chain) for chain in sorted(chains.values(), key=lambda c: order[c[0].key])]
+
+
+def _moved(work: Work, lane: str, device: str) -> Work:
+    """``work`` on another lane; what computes on the CPU beside an accelerator does so there too."""
+    return replace(work, lane=lane, device=device if _kind(work.device) == _kind(device) else work.device)
+
+
+def _kind(device: str) -> str:
+    return device.partition(":")[0]

@@ -1,0 +1,298 @@
+"""A run under way: keys first, then the cheapest way to the values that are wanted, then the account.
+
+Nothing here is recursive over the graph, and values are held by key: two steps that are
+the same computation are computed once, and a step that is left out shares its input's key.
+"""
+
+from __future__ import annotations
+
+import time
+from collections import Counter
+from collections.abc import Callable, Iterable, Iterator, Sequence
+from dataclasses import replace
+from typing import Any
+
+from neusee.nodes import Check, Facts
+from neusee.workflows.engine.cost_model import Costs, Estimate
+from neusee.workflows.engine.dispatch import Loop, chains_of
+from neusee.workflows.engine.load_or_recompute import Below, to_compute_again, uses_of, worth_a_look
+from neusee.workflows.engine.local_executor import Local
+from neusee.workflows.engine.node_call import RunError, places
+from neusee.workflows.engine.placement_inputs import joined, past_costs, prepare, room_for
+from neusee.workflows.engine.step_job import Executor, Lost, Outcome, Read, Work
+from neusee.workflows.engine.step_record import Done, Event, error_in, facts_in, ran
+from neusee.workflows.graph.recipe_graph import Recipe, Step, Wire, in_order
+from neusee.workflows.keys.cache_key import Key, key_of
+from neusee.workflows.keys.code_digest import Code
+from neusee.workflows.placement.heft_and_cpop import Schedule, TooLarge
+from neusee.workflows.store.result_store import Store
+from neusee.workflows.tolerance.error_budget import Ledger
+from neusee.workflows.tolerance.skip_decision import Verdict
+
+_QUICK = 1e-3  #: s below which two processes may as well both compute a step
+_UNKNOWN = 100.0  #: s of a step that nobody measured, where to load is weighed against to compute
+
+
+class UnderWay:
+    """One run under way."""
+
+    def __init__(
+        self,
+        recipe: Recipe,
+        store: Store,
+        devices: list[str],
+        watch: Callable[[Event], None],
+        wanted: Iterable[str],
+        executor: Executor | None,
+        memory: int | None,
+    ) -> None:
+        self.recipe, self.store, self.devices, self.watch = recipe, store, devices, watch
+        self.wanted = frozenset(wanted)
+        self.own = Local(devices, store, self._fetch, memory)
+        self.executor = executor or self.own
+        self.code = Code(store.code_memo)
+        self.began = time.time()
+        self.keys: dict[str, Key] = {}
+        self.makers: dict[Key, Step] = {}  # the first step of each key
+        self.origins: dict[Key, dict[str, Any]] = {}  # what went into each key
+        self.values: dict[Key, Any] = {}
+        self.facts: dict[Key, Facts | None] = {}
+        self.again: dict[Key, float] = {}  # s to have a value again that was computed here
+        self.took: dict[str, float] = {}  # the longest that a step of each node took, s
+        self.verdicts: dict[str, Verdict] = {}
+        self.ledger = Ledger(recipe)
+        self.done: dict[str, Done] = {}
+        self.receipts: dict[Key, dict[str, Any]] = {}  # what is known of values that were not kept
+        self.costs: Costs | None = None
+        self.schedule: Schedule | None = None
+
+    def resolve(self, order: list[str]) -> None:
+        """Give every step its key, and leave out those whose bound allows it."""
+        for name in order:
+            step = self.recipe.steps[name]
+            if step.node.bound is not None:
+                verdict = self.verdicts[name] = self._judge(step)
+                if verdict.left_out:
+                    self._leave_out(step, verdict)
+                    continue
+            else:
+                self.ledger.pass_on(step)
+            try:
+                kind = places(step, self.devices)[0]
+                key, origin = key_of(step, self.keys, self.recipe.seed, self.code, kind)
+            except (OSError, LookupError, TypeError) as error:
+                raise RunError(step, [], error) from error
+            self.keys[name] = key
+            if key not in self.makers:
+                self.makers[key], self.origins[key] = step, origin
+
+    def make(self, targets: list[Key], keep: bool, later: Sequence[Key] = ()) -> None:
+        """Hold the values of ``targets``, what ``later`` needs of those made, and with ``keep`` what no store holds."""
+        while True:
+            below = Below(self.known, self.sources)
+            order = in_order(below, targets)
+            if again := self._dear(below, targets):
+                below = Below(lambda key, again=again: key not in again and self.known(key), self.sources)  # type: ignore[misc]
+                order = in_order(below, targets)
+            try:
+                plan = [key for key in order if key in below.missing]
+                uses = uses_of(plan, [*targets, *later], self.known, self.sources)
+                return self._execute(plan, again, targets, keep, uses)
+            except Lost:
+                continue
+
+    def close(self) -> None:
+        """Keep what was learnt of the code, and let go of the executor, which holds this run that holds it."""
+        self.code.save()
+        self.own.cancel()
+        del self.own, self.executor
+
+    def account(self, order: list[str]) -> dict[str, Done]:
+        """What became of every step, in running order."""
+        for name in order:
+            if name in self.done:
+                continue
+            key = self.keys[name]
+            twin = self.done.get(self.makers[key].name)
+            if twin is None or twin.state == "asleep":
+                self._finish(self.asleep(name))
+            else:
+                self._finish(replace(twin, step=name, state="cached", why=f"the same as {twin.step}", seconds=0.0))
+        return {name: self.done[name] for name in order}
+
+    def asleep(self, name: str) -> Done:
+        """The account of a step that nothing has needed."""
+        bound, error = self._bound(name), error_in(self.store.about(self.keys[name]))
+        return Done(name, "asleep", "nothing that ran needed it", 0.0, self.keys[name], bound=bound, error=error)
+
+    def missing(self, names: Iterable[str]) -> set[Key]:
+        """What would have to be computed for the values of ``names``."""
+        below = Below(self.known, self.sources)
+        in_order(below, [self.keys[name] for name in names])
+        return set(below.missing)
+
+    def sources(self, key: Key) -> list[Key]:
+        return [self.keys[name] for name in self.makers[key].sources]
+
+    def known(self, key: Key) -> bool:
+        """Whether the value is in memory or in the store; what is known without it is remembered."""
+        if key in self.values:
+            return True
+        about = self.store.about(key)
+        if about is None or about.get("kept", True):
+            return about is not None
+        self.receipts[key] = about
+        return False
+
+    def _dear(self, below: Below, targets: list[Key]) -> frozenset[Key]:
+        """Stored values that take longer to read than to compute again, as far as that is the cheaper way."""
+
+        def compute(key: Key) -> float:
+            about = self.receipts.get(key) or self.store.about(key)
+            return float(about["seconds"]) if about else _UNKNOWN
+
+        def load(key: Key) -> float:
+            return 0.0 if key in self.values else self._reading(key) if self.known(key) else float("inf")
+
+        read = [key for key in below if key not in below.missing and key not in self.values]
+        if not any(worth_a_look(self._reading(key), compute(key)) for key in read):
+            return frozenset()
+        return frozenset(to_compute_again(targets, self.sources, load, compute))
+
+    def _reading(self, key: Key) -> float:
+        """Seconds to read a stored value."""
+        about = self.store.about(key)
+        return self.store.read_seconds(about["bytes"]) if about else float("inf")
+
+    def _execute(
+        self, plan: list[Key], again: frozenset[Key], targets: list[Key], keep: bool, uses: Counter[Key]
+    ) -> None:
+        self._free(list(self.values), uses, keep)
+        if plan:
+            for outcome in self._outcomes(plan, again, targets):
+                key, sources = outcome.work.key, outcome.work.sources
+                if outcome.value is not None or not outcome.kept:
+                    self.values[key] = outcome.value
+                uses.subtract(sources)
+                self._free([*sources, key], uses, keep)
+        for key in targets:
+            self._fetch(key)
+
+    def _free(self, keys: Iterable[Key], uses: Counter[Key], keep: bool) -> None:
+        """Let go of values at their last use."""
+        for key in keys:
+            unsafe = key in self.own.later or (keep and not self.store.has(key))
+            if uses[key] <= 0 and key in self.values and not unsafe:
+                del self.values[key]
+
+    def _outcomes(self, plan: list[Key], again: frozenset[Key], targets: list[Key]) -> Iterator[Outcome]:
+        """Carry the plan out; what ends is noted, and the first failure stops what has not begun."""
+        works = [self._work(key, key in again, key in targets) for key in plan]
+        self.costs = self.costs or past_costs(self.store)
+        try:
+            prepared = prepare(works, self.costs, self.receipts, self.executor.lanes, targets)
+        except TooLarge as error:
+            raise RunError(self.recipe.steps[error.task], [], error) from error
+        self.schedule = joined(self.schedule, prepared.schedule)
+        chains = chains_of(prepared.works, fused=not self.executor.shares)
+        if not self.executor.shares:  # what another chain reads must lie in the store
+            chains = [(*chain[:-1], replace(chain[-1], wanted=True)) for chain in chains]
+        room = room_for(prepared.expected, self.executor, self.values)
+        try:
+            for outcome in Loop(chains, self.executor, self._begin, room).outcomes():
+                self._note(outcome, prepared.expected[outcome.work.key])
+                yield outcome
+        except BaseException:
+            self.executor.cancel()
+            raise
+
+    def _work(self, key: Key, anew: bool, target: bool) -> Work:
+        step = self.makers[key]
+        reads = tuple(self._read(step.wires.get(name)) for name in step.node.inputs)
+        device, lanes = places(step, self.devices)[0], self.executor.lanes
+        lane = next(iter(lanes)) if len(lanes) == 1 else ""
+        wanted = target or step.name in self.wanted
+        name, seed = self.recipe.name, self.recipe.seed
+        return Work(step, key, self.origins[key], reads, seed, name, device, lane, wanted, anew=anew)
+
+    def _read(self, wire: Wire) -> Read:
+        return self.keys[wire] if isinstance(wire, str) else wire and tuple(self.keys[name] for name in wire)
+
+    def _begin(self, work: Work) -> Work:
+        """Say that a step begins; by now it is known what its inputs would cost to have again."""
+        self.watch(Event(work.step.name, None))
+        below = sum(self.again[key] if key in self.again else self._reading(key) for key in set(work.sources))
+        quick = self.took.get(work.step.node.path, _QUICK) < _QUICK
+        return replace(work, below=below, quick=quick)
+
+    def _note(self, outcome: Outcome, expected: Estimate) -> None:
+        """Take in what became of a step."""
+        work = outcome.work
+        step, key = work.step, work.key
+        if outcome.lost:
+            raise Lost(*outcome.lost)
+        if outcome.error is not None:
+            raise outcome.error if isinstance(outcome.error, RunError) else RunError(step, [], outcome.error)
+        if outcome.found:
+            self._finish(self._cached(key, "another process made it"))
+            return
+        self.facts[key] = outcome.facts
+        path = step.node.path
+        self.took[path] = max(outcome.seconds, self.took.get(path, 0.0))
+        self.again[key] = self.store.read_seconds(outcome.bytes) if outcome.kept else outcome.seconds + work.below
+        predicted = expected.seconds[work.device.partition(":")[0]] if expected.known else None
+        self._finish(ran(outcome, self._why(step.name, key), self._bound(step.name), self.began, predicted))
+
+    def _fetch(self, key: Key) -> Any:
+        """A value that was computed, or is stored; `Lost` where it is neither."""
+        if key not in self.values:
+            began = time.perf_counter()
+            try:
+                self.values[key] = self.store.get(key)
+            except KeyError:
+                raise Lost(key) from None
+            if self.makers[key].name not in self.done:
+                self._finish(self._cached(key, seconds=time.perf_counter() - began))
+        return self.values[key]
+
+    def _cached(self, key: Key, why: str = "", seconds: float = 0.0) -> Done:
+        about = self.store.about(key)
+        if about is None:
+            raise Lost(key)
+        name = self.makers[key].name
+        why = why or f"made {about['date']} in {about['seconds']:.3g} s"
+        checks = tuple(Check(text, ok) for text, ok in about["checks"])
+        facts, bound, error = facts_in(about), self._bound(name), error_in(about)
+        return Done(name, "cached", why, seconds, key, facts, checks, "cpu", about["bytes"], bound, error=error)
+
+    def _judge(self, step: Step) -> Verdict:
+        """The verdict on a step; an input runs first where the bound asks for facts that no one has yet."""
+
+        def facts_of(name: str) -> Facts | None:
+            key = self.keys[name]
+            if key not in self.facts and self.store.about(key) is None:
+                self.make([key], keep=True)
+            return self.known_facts(name)
+
+        return self.ledger.verdict(step, step.params, facts_of)
+
+    def known_facts(self, name: str) -> Facts | None:
+        """Facts of a step that ran, now or before."""
+        key = self.keys[name]
+        return self.facts[key] if key in self.facts else facts_in(self.store.about(key))
+
+    def _leave_out(self, step: Step, verdict: Verdict) -> None:
+        key = self.keys[step.name] = self.keys[verdict.instead]
+        self._finish(Done(step.name, "left out", verdict.why, 0.0, key, bound=verdict.bound))
+
+    def _why(self, name: str, key: Key) -> str:
+        verdict = self.verdicts.get(name)
+        why = "quicker to compute than to keep" if key in self.receipts else "not in the store"
+        return f"{why}; {verdict.why}" if verdict else why
+
+    def _bound(self, name: str) -> float | None:
+        return self.verdicts[name].bound if name in self.verdicts else None
+
+    def _finish(self, done: Done) -> None:
+        self.done[done.step] = done
+        self.watch(Event(done.step, done))

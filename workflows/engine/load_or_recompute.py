@@ -1,0 +1,111 @@
+"""Load or recompute, whichever is cheaper: exactly, as a smallest cut.
+
+Each value is either loaded, for the price of reading it, or computed, for its seconds and with
+its inputs at hand. The cheapest choice for a whole graph is a smallest cut (Xin et al., Helix,
+PVLDB 12(4), 2018, section 5): ``have v`` and ``compute v`` are two nodes, loading is the edge
+between them, computing the edge to the sink, and an input that must be at hand one that is
+never cut.
+"""
+
+from __future__ import annotations
+
+from collections import Counter
+from collections.abc import Callable, Iterable, Sequence
+
+from neusee.workflows.graph.recipe_graph import in_order
+from neusee.workflows.keys.cache_key import Key
+
+_GAIN = 1e-3  #: s that recomputing a value must save before anyone looks
+_SCALE = 1 << 30  #: capacities are whole numbers of 31 bits
+
+Price = Callable[[Key], float]
+
+
+class Below(dict[Key, list[Key]]):
+    """By key the keys that it needs: its sources where it must be computed, none where its value is known."""
+
+    def __init__(self, known: Callable[[Key], bool], sources: Callable[[Key], list[Key]]) -> None:
+        self._known, self._sources = known, sources
+        self.missing = set[Key]()
+
+    def __missing__(self, key: Key) -> list[Key]:
+        if self._known(key):
+            self[key] = []
+        else:
+            self.missing.add(key)
+            self[key] = self._sources(key)
+        return self[key]
+
+
+def uses_of(
+    plan: Iterable[Key], targets: Sequence[Key], known: Callable[[Key], bool], sources: Callable[[Key], list[Key]]
+) -> Counter[Key]:
+    """How often ``plan``, ``targets``, and what has yet to be computed for them afterwards, take each value."""
+    below, uses = Below(known, sources), Counter(targets)
+    in_order(below, targets)
+    for key in below.missing.union(plan):
+        uses.update(sources(key))
+    return uses
+
+
+def worth_a_look(load: float, compute: float) -> bool:
+    """Whether a stored value may be cheaper to compute than to load."""
+    return load > compute + _GAIN
+
+
+def to_compute_again(
+    targets: Sequence[Key], sources: Callable[[Key], Sequence[Key]], load: Price, compute: Price
+) -> set[Key]:
+    """Stored keys that are cheaper to compute than to load.
+
+    ``load`` gives inf for what is not stored, 0 for what is in memory.
+    """
+    reach = _reached(targets, sources)
+    computed = _smallest_cut(targets, reach, sources, load, compute)
+    return {key for key in computed if load(key) < float("inf")}
+
+
+def _reached(targets: Iterable[Key], sources: Callable[[Key], Sequence[Key]]) -> list[Key]:
+    seen, todo = dict[Key, None](), list(targets)
+    while todo:
+        key = todo.pop()
+        if key not in seen:
+            seen[key] = None
+            todo += sources(key)
+    return list(seen)
+
+
+def _smallest_cut(
+    targets: Sequence[Key], keys: Sequence[Key], sources: Callable[[Key], Sequence[Key]], load: Price, compute: Price
+) -> set[Key]:
+    """Keys whose ``compute`` node lies on the source's side."""
+    import numpy as np
+    from scipy.sparse import csr_array
+    from scipy.sparse.csgraph import breadth_first_order, maximum_flow
+
+    number = {key: i for i, key in enumerate(keys)}
+    source, sink, never = 2 * len(keys), 2 * len(keys) + 1, 2**31 - 1
+    edges = [(source, 2 * number[key], never) for key in dict.fromkeys(targets)]
+    unit = _unit(keys, load, compute)
+    for key in keys:
+        have, make = 2 * number[key], 2 * number[key] + 1
+        edges.append((have, make, _whole(load(key), unit)))
+        edges.append((make, sink, max(1, _whole(compute(key), unit))))
+        edges += [(make, 2 * number[below], never) for below in dict.fromkeys(sources(key))]
+    rows, columns, capacities = (np.array(part, dtype=np.int32) for part in zip(*edges, strict=True))
+    graph = csr_array((capacities, (rows, columns)), shape=(sink + 1, sink + 1))
+    rest = graph - maximum_flow(graph, source, sink).flow
+    rest.data = np.where(rest.data > 0, rest.data, 0)
+    rest.eliminate_zeros()
+    reached = set(breadth_first_order(rest, source, return_predecessors=False).tolist())
+    return {key for key in keys if 2 * number[key] + 1 in reached}
+
+
+def _unit(keys: Sequence[Key], load: Price, compute: Price) -> float:
+    """s to one unit of capacity, so that the sum of all finite prices stays below the edges that are never cut."""
+    total = sum(price(key) for key in keys for price in (load, compute) if price(key) < float("inf"))
+    return max(total, 1e-9) / _SCALE
+
+
+def _whole(seconds: float, unit: float) -> int:
+    return 2**31 - 1 if seconds == float("inf") else int(seconds / unit)

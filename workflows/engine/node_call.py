@@ -1,0 +1,117 @@
+"""Call the node of one step: on its device, with its random stream, and with an error that says where."""
+
+from __future__ import annotations
+
+import functools
+import platform
+from collections.abc import Mapping, Sequence
+from importlib.metadata import PackageNotFoundError, version
+from typing import Any
+
+import torch
+from torch import Tensor
+
+from neusee.nodes import Check
+from neusee.workflows.graph.recipe_graph import Step
+from neusee.workflows.keys.cache_key import stream_seed
+from neusee.workflows.store.serialization import each_tensor, settle, tensors_in
+
+
+class RunError(RuntimeError):
+    """A step failed. Names it, its node, where it is written, what it was given, and the cause."""
+
+    def __init__(self, step: Step, inputs: Sequence[Any], cause: BaseException) -> None:
+        self.step, self.cause = step.name, cause
+        given = ", ".join(f"{name} {_shape(value)}" for name, value in zip(step.node.inputs, inputs, strict=False))
+        super().__init__(
+            f"{step.mark}   {step.name} ({step.node.path}): {type(cause).__name__}: {cause}"
+            + (f"\n  given {given}" if given else "")
+        )
+
+    def __reduce__(self) -> tuple[Any, ...]:
+        return _remade, (self.step, str(self), repr(self.cause))
+
+
+def _remade(step: str, text: str, cause: str) -> RunError:
+    """The error as another process sees it: its text, without the traceback of the cause."""
+    error = RunError.__new__(RunError, text)
+    RuntimeError.__init__(error, text)
+    error.step, error.cause = step, RuntimeError(cause)
+    return error
+
+
+def call(step: Step, inputs: Sequence[Any], params: Mapping[str, Any], seed: int, device: str) -> Any:
+    """The result of a step, laid out as the store would give it back; gradients flow."""
+    moved = [to_device(value, device) for value in inputs]
+    rng = {"rng": torch.Generator(device).manual_seed(stream_seed(seed, step.name))} if step.node.random else {}
+    tensors = tensors_in(moved)
+    before = [x._version for x in tensors]
+    try:
+        value = settle(step.node(*moved, **params, **rng))
+    except Exception as error:
+        raise RunError(step, inputs, error) from error
+    if before != [x._version for x in tensors]:
+        raise RunError(step, inputs, ValueError("the node changed its input in place: let it work on a copy"))
+    return value
+
+
+def examine(step: Step, value: Any, inputs: Sequence[Any]) -> tuple[Check, ...]:
+    """What the node's own check says of a result; a check that fails to run is a check that failed."""
+    if step.node.after is None:
+        return ()
+    try:
+        return tuple(step.node.after(value, *inputs, **step.params))
+    except Exception as error:
+        return (Check(f"the check itself failed: {type(error).__name__}: {error}", False),)
+
+
+def place(step: Step, device: str) -> str:
+    """Where a step runs of a device, or of several that commas separate, were there no other work."""
+    return places(step, device.split(","))[0]
+
+
+def places(step: Step, devices: Sequence[str]) -> tuple[str, ...]:
+    """Devices on which a step may run, the preferred one first.
+
+    A recipe's hint goes before that of the node. A random step stays on one kind of device, because
+    its stream, and so its key, depends on it.
+    """
+    hint = step.device or step.node.device
+    if hint == "cpu":
+        return ("cpu",)
+    fits = [d for d in devices if _fits(d, hint)] or list(devices)
+    return tuple(d for d in fits if not step.node.random or _kind(d) == _kind(fits[0]))
+
+
+def _fits(device: str, hint: str) -> bool:
+    if hint in ("any", ""):
+        return True
+    return _kind(device) != "cpu" if hint == "gpu" else device == hint or _kind(device) == hint
+
+
+def _kind(device: str) -> str:
+    return device.partition(":")[0]
+
+
+def to_device(value: Any, device: str) -> Any:
+    return each_tensor(lambda x: x.to(device), value)
+
+
+@functools.cache
+def versions() -> dict[str, str]:
+    """Of Python and of what computes; kept beside each result, but not in its key."""
+    found = {"python": platform.python_version()}
+    for name in ("neusee", "torch", "kornia", "colour-science", "OpenEXR"):
+        try:
+            found[name] = version(name)
+        except PackageNotFoundError:
+            found[name] = "none"
+    return found
+
+
+def _shape(value: Any) -> str:
+    if isinstance(value, Tensor):
+        return f"{tuple(value.shape)} {str(value.dtype).removeprefix('torch.')}"
+    if isinstance(value, list | tuple):
+        return f"{type(value).__name__}[{', '.join(_shape(v) for v in value)}]"
+    return "absent" if value is None else type(value).__name__

@@ -1,0 +1,132 @@
+"""From the steps that must run to work on lanes: what each will cost, where it goes, whether there is memory for it."""
+
+from __future__ import annotations
+
+from collections.abc import Collection, Mapping, Sequence
+from dataclasses import dataclass, replace
+from typing import Any
+
+from neusee.workflows.engine.cost_model import Costs, Estimate
+from neusee.workflows.engine.dispatch import Room
+from neusee.workflows.engine.memory_use import pool_of
+from neusee.workflows.engine.node_call import places
+from neusee.workflows.engine.step_job import Executor, Lane, Work
+from neusee.workflows.keys.cache_key import Key
+from neusee.workflows.placement.heft_and_cpop import Cluster, Device, Schedule, Slot, Task, heft
+from neusee.workflows.store.result_store import Store
+from neusee.workflows.store.serialization import tensors_in
+
+_MOST_PARTS = 64  #: into which a step may be cut by bands; how many bands there are is known only when it runs
+
+
+@dataclass(frozen=True, slots=True)
+class Prepared:
+    """Work in the order in which it should begin, what it should take, and when it should be where."""
+
+    works: list[Work]
+    expected: Mapping[Key, Estimate]
+    schedule: Schedule | None
+
+
+def prepare(
+    works: Sequence[Work],
+    costs: Costs,
+    abouts: Mapping[Key, Mapping[str, Any]],
+    lanes: Mapping[str, Lane],
+    keep: Collection[Key],
+) -> Prepared:
+    """Give every piece of work a lane and a device. Raises `TooLarge` where the memory cannot do."""
+    kinds = sorted({lane.kind for lane in lanes.values()} | {"cpu"})
+    expected = {w.key: costs.of(w.step, kinds, abouts.get(w.key)) for w in works}
+    only, lane = next(iter(lanes.items()))
+    if len(lanes) == 1:
+        plain = _one_after_another(works, expected, only, keep)
+        if plain.peak[only] <= lane.memory:
+            return Prepared([w if w.lane else replace(w, lane=only) for w in works], expected, plain)
+    planned = {w.step.name: w for w in works}
+    names = {w.key: w.step.name for w in works}
+    tasks = [_task(w, expected[w.key], lanes, names) for w in works]
+    cluster = Cluster(tuple(Device(name, lane.kind, lane.memory) for name, lane in lanes.items()))
+    schedule = heft(tasks, cluster, [names[key] for key in keep if key in names])
+    slots = sorted(schedule.slots, key=lambda slot: (slot.start, slot.end))
+    return Prepared([_placed(planned[slot.task], slot, lanes) for slot in slots], expected, schedule)
+
+
+def room_for(expected: Mapping[Key, Estimate], executor: Executor, values: Mapping[Key, Any]) -> Room:
+    """Whether one more step may run beside those that do, given the ``values`` that are held at that moment."""
+
+    def room(work: Work, running: Sequence[Work]) -> bool:
+        pool = pool_of(work.device)
+        beside = [w for w in running if pool_of(w.device) == pool]
+        if not beside or not executor.shares:
+            return True
+        held = sum(t.nbytes for t in tensors_in(list(values.values())) if pool_of(str(t.device)) == pool)
+        need = sum(expected[w.key].bytes + expected[w.key].work for w in (work, *beside))
+        return held + need <= sum(lane.memory for lane in executor.lanes.values() if pool_of(lane.device) == pool)
+
+    return room
+
+
+def joined(first: Schedule | None, then: Schedule | None) -> Schedule | None:
+    """One plan after the other: a run whose verdicts need values makes several."""
+    if first is None or then is None:
+        return first or then
+    by = first.makespan
+    slots = (replace(slot, start=slot.start + by, end=slot.end + by) for slot in then.slots)
+    moves = (replace(m, start=m.start + by, end=m.end + by, until=m.until + by) for m in then.moves)
+    peak = {name: max(first.peak.get(name, 0.0), then.peak.get(name, 0.0)) for name in {**first.peak, **then.peak}}
+    transferred = first.transferred + then.transferred
+    return Schedule((*first.slots, *slots), by + then.makespan, peak, transferred, (*first.moves, *moves))
+
+
+def _placed(work: Work, slot: Slot, lanes: Mapping[str, Lane]) -> Work:
+    device = "cpu" if _cpu_only(work) else lanes[slot.device].device
+    return replace(work, lane=slot.device, device=device, parts=slot.parts)
+
+
+def _task(work: Work, estimate: Estimate, lanes: Mapping[str, Lane], names: Mapping[Key, str]) -> Task:
+    if _cpu_only(work):
+        seconds = {name: estimate.seconds["cpu"] for name in _of_kind("cpu", lanes) or lanes}
+    else:
+        allowed = places(work.step, [lane.device for lane in lanes.values()])
+        here = {name: lane for name, lane in lanes.items() if lane.device in allowed}
+        seconds = {name: estimate.seconds[lane.kind] for name, lane in here.items()}
+    sources = tuple(dict.fromkeys(names[key] for key in work.sources if key in names))
+    parts = _MOST_PARTS if work.step.node.bands else 1
+    return Task(work.step.name, sources, seconds, estimate.bytes, estimate.work, parts)
+
+
+def _cpu_only(work: Work) -> bool:
+    """Whether a step computes on the CPU of whatever lane it gets; the key of a random one says of what kind it is."""
+    hint = work.step.device or work.step.node.device
+    return hint == "cpu" or (work.step.node.random and work.device == "cpu")
+
+
+def _of_kind(kind: str, lanes: Mapping[str, Lane]) -> list[str]:
+    return [name for name, lane in lanes.items() if lane.kind == kind]
+
+
+def _one_after_another(
+    works: Sequence[Work], expected: Mapping[Key, Estimate], lane: str, keep: Collection[Key]
+) -> Schedule:
+    """The works in their order, each result let go after its last use."""
+    last = {key: work.key for work in works for key in work.sources}
+    now, held, most, slots = 0.0, 0.0, 0.0, []
+    for work in works:
+        cost = expected[work.key]
+        held += cost.bytes
+        most = max(most, held + cost.work)
+        ended = {key for key in (*work.sources, work.key) if last.get(key, work.key) == work.key and key not in keep}
+        held -= sum(expected[key].bytes for key in ended if key in expected)
+        slots.append(Slot(work.step.name, lane, now, now + cost.seconds[_kind(work.device)], 1))
+        now = slots[-1].end
+    return Schedule(tuple(slots), now, {lane: most}, 0.0)
+
+
+def _kind(device: str) -> str:
+    return device.partition(":")[0]
+
+
+def past_costs(store: Store) -> Costs:
+    """Costs of all that a store remembers."""
+    return Costs(store.journal.rows())

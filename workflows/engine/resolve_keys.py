@@ -1,0 +1,68 @@
+"""The keys that a run would give the steps of a recipe, found without running anything."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Mapping
+from dataclasses import dataclass, field
+from typing import Any
+
+from neusee.nodes import Facts
+from neusee.workflows.engine.node_call import RunError, place
+from neusee.workflows.engine.step_record import facts_in
+from neusee.workflows.graph.recipe_graph import Recipe
+from neusee.workflows.keys.cache_key import Key, key_of
+from neusee.workflows.keys.code_digest import Code
+from neusee.workflows.store.result_store import Store
+from neusee.workflows.tolerance.error_budget import Ledger
+from neusee.workflows.tolerance.skip_decision import Verdict
+
+
+@dataclass(frozen=True, slots=True)
+class Resolved:
+    """Keys, what went into them, and which steps are left out."""
+
+    keys: dict[str, Key] = field(default_factory=dict)
+    origins: dict[Key, Mapping[str, Any]] = field(default_factory=dict)
+    makers: dict[Key, str] = field(default_factory=dict)  #: the first step of each key that is not left out
+    verdicts: dict[str, Verdict | None] = field(default_factory=dict)  #: None where facts are missing that decide
+
+    def left_out(self, name: str) -> bool | None:
+        """Whether a step is left out; None where only what feeds it will tell, and it is taken to run."""
+        verdict = self.verdicts.get(name)
+        return None if verdict is None and name in self.verdicts else verdict is not None and verdict.left_out
+
+    def stands_for(self, name: str) -> str:
+        """The step whose result a step hands on: itself, unless it is left out."""
+        while (verdict := self.verdicts.get(name)) is not None and verdict.left_out:
+            name = verdict.instead
+        return name
+
+
+def resolve(recipe: Recipe, order: Iterable[str], store: Store, device: str = "cpu") -> Resolved:
+    """Give each step of ``order``, in which sources come first, its key as a run on ``device`` would."""
+    found, code, ledger = Resolved(), Code(store.code_memo), Ledger(recipe)
+
+    def facts_of(name: str) -> Facts | None:
+        known = facts_in(store.about(found.keys[name]))
+        if known is None:
+            raise LookupError(name)
+        return known
+
+    for name in order:
+        step = recipe.steps[name]
+        if step.node.bound is not None:
+            try:
+                found.verdicts[name] = ledger.verdict(step, step.params, facts_of)
+            except RunError:
+                found.verdicts[name] = None
+        else:
+            ledger.pass_on(step)
+        verdict = found.verdicts.get(name)
+        if verdict is not None and verdict.left_out:
+            found.keys[name] = found.keys[verdict.instead]
+            continue
+        key, origin = key_of(step, found.keys, recipe.seed, code, place(step, device))
+        found.keys[name], found.origins[key] = key, origin
+        found.makers.setdefault(key, name)
+    code.save()
+    return found

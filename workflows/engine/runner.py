@@ -1,0 +1,142 @@
+"""Run a recipe: walk back from what is wanted, stop at what is known, compute the rest."""
+
+from __future__ import annotations
+
+import resource
+import time
+from collections.abc import Callable, Iterable
+from dataclasses import dataclass, field, replace
+from typing import Any
+
+import torch
+
+from neusee.workflows.engine.execution import UnderWay
+from neusee.workflows.engine.node_call import to_device
+from neusee.workflows.engine.step_job import Executor
+from neusee.workflows.engine.step_record import Done, Event
+from neusee.workflows.graph.diagnostics import nearest
+from neusee.workflows.graph.recipe_graph import Recipe, needed
+from neusee.workflows.keys.cache_key import Key
+from neusee.workflows.placement.heft_and_cpop import Schedule
+from neusee.workflows.store.remote_store import open_store
+from neusee.workflows.store.result_store import Store
+from neusee.workflows.tolerance.cheaper_steps import economised
+from neusee.workflows.tolerance.error_propagation import Proof, Unproved, proof
+from neusee.workflows.tolerance.tolerance_frontier import border
+
+__all__ = ["Done", "Event", "Result", "run"]
+
+_SAFE = 0.8  #: of what would just do, the share that a second attempt may spend
+
+
+@dataclass(frozen=True, repr=False)
+class Result:
+    """What a run gives: the values that were asked for, and an account of every step they need."""
+
+    values: dict[str, Any]
+    done: dict[str, Done]
+    keys: dict[str, Key]
+    seconds: float
+    peak_memory: int  #: bytes, of this process so far
+    recipe: Recipe
+    store: Store
+    device: str = "cpu"
+    schedule: Schedule | None = None  #: what was expected of the steps that ran
+    proof: Proof = field(default_factory=Proof)  #: what was left out, or computed more cheaply, may change at each step
+
+    def value(self, step: str) -> Any:
+        """The value of any step of the recipe: from this run, from the store, or computed now."""
+        if step in self.values:
+            return self.values[step]
+        return run(self.recipe, self.store, (step,), device=self.device).values[step]
+
+    __getitem__ = value
+
+    def numpy(self, step: str) -> Any:
+        """The value of a step with a numpy array for every tensor."""
+        from neusee.workflows.report.notebook import arrays_of
+
+        return arrays_of(self.value(step))
+
+    def metrics(self) -> dict[str, float | list[float]]:
+        """The figures of merit by name, such as ``restored_quality.psnr``; a list where there is one a band."""
+        from neusee.workflows.report.notebook import numbers_of
+
+        return numbers_of(self)
+
+    def __repr__(self) -> str:
+        from neusee.workflows.report.notebook import result_line
+
+        return result_line(self)
+
+    def _repr_html_(self) -> str:
+        from neusee.workflows.report.notebook import result_html
+
+        return result_html(self)
+
+
+def run(
+    recipe: Recipe,
+    store: Store | None = None,
+    outputs: Iterable[str] | None = None,
+    watch: Callable[[Event], None] | None = None,
+    device: str = "cpu",
+    executor: Executor | None = None,
+    memory: int | None = None,
+) -> Result:
+    """Give the values of ``outputs`` (the recipe's own, if None), computing what ``store`` does not hold.
+
+    Args: device: one or several, ``cuda:0,cuda:1,cpu``, the preferred one first. executor: where to
+    compute instead of this process. memory: bytes that may be planned with, of each device;
+    nine tenths of what there is if None. Raises `RunError`, naming the step.
+    """
+    began = time.perf_counter()
+    wanted = recipe.outputs if outputs is None else tuple(outputs)
+    for name in wanted:
+        if name not in recipe.steps:
+            raise ValueError(f"no step {name!r}; {nearest(name, recipe.steps)}")
+    recipe, store, watch = economised(recipe, wanted), store or open_store(), watch or (lambda event: None)
+    while True:
+        work = UnderWay(recipe, store, device.split(","), watch, wanted, executor, memory)
+        try:
+            return _attempt(work, wanted, began)
+        except Unproved as failed:
+            recipe = economised(_stricter(recipe, failed.over), wanted)
+        finally:
+            work.close()
+
+
+def _stricter(recipe: Recipe, over: float) -> Recipe:
+    """The recipe with less to spend, where it could not be proved that its tolerance held; the second time nothing."""
+    strict = _SAFE / over if recipe.strict == 1.0 else 0.0
+    return replace(recipe.whole or recipe, strict=strict, keep_all=strict == 0.0)
+
+
+def _attempt(work: UnderWay, wanted: tuple[str, ...], began: float) -> Result:
+    """Run; first as far as it must be known whether the tolerance holds, and raise `Unproved` where it does not."""
+    recipe, store = work.recipe, work.store
+    order = needed(recipe, wanted)
+    with torch.no_grad():
+        work.resolve(order)
+        first = border(recipe, order, wanted)
+        missing, targets = work.missing(wanted) if first else set(), [work.keys[name] for name in wanted]
+        if early := [work.keys[name] for name in first if work.keys[name] in missing]:
+            work.make(early, keep=False, later=targets)
+
+        def known(name: str) -> Done:
+            return work.done.get(name) or work.asleep(name)
+
+        lead = order if first and not missing else needed(recipe, first)
+        proved = proof(recipe, lead, wanted, known, work.known_facts)
+        over = proved.over(recipe)
+        if over > 1.0 and not recipe.keep_all:
+            raise Unproved(over)
+        work.make(targets, keep=False)
+    values = {name: to_device(work.values[work.keys[name]], work.devices[0]) for name in wanted}
+    done = work.account(order)
+    peak = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss * 1024
+    seconds = time.perf_counter() - began
+    if missing:  # else all was known before
+        proved = proof(recipe, order, wanted, done.__getitem__, work.known_facts)
+    device = ",".join(work.devices)
+    return Result(values, done, work.keys, seconds, peak, recipe, store, device, work.schedule, proved)

@@ -1,0 +1,150 @@
+"""Pictures of an evaluation: cases, error over strength, suppression by wavelength, suppression against contrast."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from neusee.workflows.evaluation.confidence_intervals import Table, mean
+from neusee.workflows.report.figures.camera_overview import high
+from neusee.workflows.report.figures.style import BLACK, BLUE, GREEN, ORANGE, VERMILION, canvas, drawn, encoded, picture
+
+if TYPE_CHECKING:
+    from numpy.typing import NDArray
+
+    from neusee.workflows.evaluation.comparison_pictures import Panel
+    from neusee.workflows.evaluation.mask_optics import Mask
+
+    Numbers = NDArray[np.float64]
+
+_COLOURS = (BLUE, VERMILION, GREEN, ORANGE, "#56B4E9", "#CC79A7", BLACK, "#777777")
+_STYLES = ("-", "--", ":", "-.")  #: after as many lines as there are colours
+_GREY = "#777777"
+_LETTERS = 16  #: of a row's name before it is broken
+
+
+def _looks(names: Sequence[str]) -> dict[str, dict[str, Any]]:
+    """A colour and a dash for each name, the same in every figure."""
+    count = len(_COLOURS)
+    return {
+        name: {"color": _COLOURS[i % count], "linestyle": _STYLES[i // count % len(_STYLES)]}
+        for i, name in enumerate(names)
+    }
+
+
+@drawn
+def cases(panels: Sequence[Panel]) -> Any:
+    """Truth, plain lens and every pipeline (rows) behind each laser and behind none, all by one stretch."""
+    rows = list(panels[0].pictures)
+    white = high(panels[0].pictures["truth"])
+    figure, axes = canvas(1.95 * len(panels) + 0.6, 2.0 * len(rows) + 0.3, len(rows), len(panels))
+    for i, panel in enumerate(panels):
+        for j, (name, shown) in enumerate(panel.pictures.items()):
+            picture(axes[j, i], encoded(shown / white), _over(panel) if j == 0 else "")
+            if i == 0:
+                axes[j, i].set_ylabel(_broken(name), fontsize=10)
+    return figure
+
+
+def _over(panel: Panel) -> str:
+    return f"{panel.case}, {_power(panel.strength)}" if panel.strength else "no laser"
+
+
+def _power(strength: float) -> str:
+    return f"$10^{{{np.log10(strength):.3g}}}$"
+
+
+def _broken(name: str) -> str:
+    """A long name on several lines."""
+    return name if len(name) <= _LETTERS else name.replace("+", "\n+ ").replace("@", "\n@ ")
+
+
+@drawn
+def strengths(tables: Mapping[str, Table], small: int) -> Any:
+    """L1 over the laser's strength: mean over scenes and its 95 % interval, at full size and reduced."""
+    figure, axes = canvas(11.0, 4.2, 1, 2, sharex=True)
+    looks = _looks(list(tables))
+    whole = ((axes[0, 0], "l1", "full size"), (axes[0, 1], "l1 small", f"shorter side {small} pixels"))
+    for ax, metric, title in whole:
+        for name, table in tables.items():
+            _line(ax, table, metric, looks[name], name)
+        ax.set_title(f"L1, {title}")
+        ax.set_xlabel("laser strength (multiples of saturation)")
+        _axis(ax, next(iter(tables.values())).strengths)
+    axes[0, 0].set_ylabel("L1 (sRGB, 0 to 1)")
+    handles, labels = axes[0, 0].get_legend_handles_labels()
+    figure.legend(handles, labels, loc="outside lower center", ncols=min(3, len(labels)))
+    return figure
+
+
+def _line(ax: Any, table: Table, metric: str, look: Mapping[str, Any], name: str) -> None:
+    found = [mean(table.at(metric, i)) for i in range(len(table.strengths))]
+    at = _places(table.strengths)
+    ax.plot(at, [x.mean for x in found], marker="o", markersize=4, linewidth=1.4, label=name, **look)
+    low, up = ([getattr(x, end) for x in found] for end in ("low", "high"))
+    ax.fill_between(at, low, up, color=look["color"], alpha=0.15, linewidth=0)
+
+
+def _places(values: Sequence[float]) -> list[float]:
+    """Decades; no laser stands one step before the weakest."""
+    logs = [float(np.log10(k)) for k in values if k > 0]
+    return [float(np.log10(k)) if k > 0 else (min(logs) - 1 if logs else 0.0) for k in values]
+
+
+def _axis(ax: Any, values: Sequence[float]) -> None:
+    ax.set_xticks(_places(values), ["none" if k == 0 else _power(k) for k in values])
+    ax.set_ylim(bottom=0)
+
+
+@drawn
+def curves(masks: Mapping[str, Mask]) -> Any:
+    """LSR and BSR of every mask at each wavelength."""
+    figure, axes = canvas(11.0, 4.2, 1, 2, sharex=True)
+    looks = _looks(list(masks))
+    left, right = axes[0]
+    for name, mask in masks.items():
+        left.plot(mask.wavelengths, mask.lsr, linewidth=1.6, label=name, **looks[name])
+        right.plot(mask.wavelengths, mask.bsr, linewidth=1.6, **looks[name])
+    one = next(iter(masks.values()))
+    left.plot(one.wavelengths, one.floor, color=_GREY, linewidth=1.2, linestyle=(0, (1, 2)), label="energy floor")
+    left.set_yscale("log")
+    left.set_title("laser suppression ratio: less is better")
+    right.set_title("background suppression ratio: 1 is best")
+    right.set_ylim(0, max(1.1, 1.05 * max(float(mask.bsr.max()) for mask in masks.values())))
+    for ax, name in ((left, "LSR"), (right, "BSR")):
+        ax.set_xlabel("wavelength (nm)")
+        ax.set_ylabel(name)
+    handles, labels = left.get_legend_handles_labels()
+    figure.legend(handles, labels, loc="outside lower center", ncols=min(5, len(labels)))
+    return figure
+
+
+@drawn
+def plane(masks: Mapping[str, Mask]) -> Any:
+    """Mean LSR against the contrast that is left, with what no mask passes."""
+    figure, axes = canvas(8.4, 5.2)
+    ax = axes[0, 0]
+    floor = float(np.mean([mask.floor.mean() for mask in masks.values()]))
+    least = min(floor, *(float(mask.lsr.mean()) for mask in masks.values()))
+    x = np.geomspace(least / 3, 1.6, 200)
+    bound = (float(next(iter(masks.values())).unsuppressed.mean()) * np.sqrt(x)).clip(max=1)
+    ax.fill_between(x, bound, 1.5, color=_GREY, alpha=0.15, linewidth=0)
+    ax.plot(x, bound, color=_GREY, linewidth=1.2, label="rms contrast: no mask is above (Parseval)")
+    ax.axvspan(x[0], floor, color=BLUE, alpha=0.12, linewidth=0, label="LSR: no mask that keeps its light is here")
+    looks = _looks(list(masks))
+    for name, mask in masks.items():
+        at, colour = float(mask.lsr.mean()), looks[name]["color"]
+        ax.plot([at, at], [mask.median.mean(), mask.rms.mean()], color=colour, linewidth=0.8)
+        ax.plot(at, mask.rms.mean(), "o", markersize=6, markerfacecolor="none", color=colour)
+        ax.plot(at, mask.median.mean(), "o", markersize=7, color=colour, label=name)
+    ax.set_xscale("log")
+    ax.set_yscale("log")
+    ax.set_xlim(x[0], x[-1])
+    lowest = min(float(mask.median.mean()) for mask in masks.values())
+    ax.set_ylim(max(min(lowest, float(bound[0])) / 2, 1e-6), 1.2)
+    ax.set_xlabel("mean LSR: to the left, lasers are weaker")
+    ax.set_ylabel("contrast: dot median, ring rms")
+    figure.legend(*ax.get_legend_handles_labels(), loc="outside lower center", ncols=2)
+    return figure

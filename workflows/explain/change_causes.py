@@ -1,0 +1,228 @@
+"""What makes one result another than an earlier one: at a step itself, and up through all that feeds it.
+
+A pair is a present result beside a past one. Pairs are compared by what went into their
+keys, so that no tensor is read and nothing need have run; the walk from a pair to the pairs
+behind it follows the keys of the inputs that differ.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import Any, NamedTuple
+
+from neusee.workflows.engine.resolve_keys import Resolved
+from neusee.workflows.explain.change_wording import Wording
+from neusee.workflows.explain.code_changes import edits
+from neusee.workflows.graph.recipe_graph import Recipe
+from neusee.workflows.keys.cache_key import Key
+from neusee.workflows.store.result_store import Store
+
+Origin = Mapping[str, Any]  #: what went into a key: node, code, params, inputs, stream
+_FEW = 4  #: steps of an input that are named
+_FAR = 100  #: steps that are looked at for one that came in between
+
+
+class Pair(NamedTuple):
+    """A step's result now, beside one that was stored earlier."""
+
+    label: str
+    new: Key
+    old: Key
+
+
+Found = tuple[list[str], list[Pair]]  #: causes at a pair itself, and the pairs behind it
+
+
+@dataclass(frozen=True, slots=True)
+class Roots:
+    """Differences that no other step explains, the nearest first, and how each one reaches the first pair."""
+
+    found: dict[str, Pair]  #: by what is said of it
+    above: dict[Pair, Pair | None]
+
+    def chain(self, text: str) -> list[str]:
+        """Steps from the first one to the one where it arose."""
+        way: list[str] = []
+        pair: Pair | None = self.found[text]
+        while pair is not None:
+            way.append(pair.label)
+            pair = self.above[pair]
+        return way[::-1]
+
+
+class Comparison:
+    """Compares present results, of a recipe if there is one, with stored ones."""
+
+    def __init__(self, store: Store, recipe: Recipe | None = None, resolved: Resolved | None = None) -> None:
+        self.store, self.recipe, self.resolved = store, recipe, resolved or Resolved()
+        self.wording = Wording(recipe)
+        self.seen: dict[Pair, Found] = {}
+        self._edits: dict[tuple[str, str], list[str]] = {}
+        self._abouts: dict[Key, Mapping[str, Any] | None] = {}
+
+    def roots(self, start: Pair, most: float = float("inf")) -> Roots | None:
+        """Every root cause once; None as soon as there are more than ``most``."""
+        above: dict[Pair, Pair | None] = {start: None}
+        found: dict[str, Pair] = {}
+        todo = [start]
+        for pair in todo:  # grows while it is walked, so that the nearest come first
+            texts, below = self.compare(pair)
+            for text in texts:
+                found.setdefault(text, pair)
+            if len(found) > most:
+                return None
+            for other in below:
+                if other not in above:
+                    above[other] = pair
+                    todo.append(other)
+        return Roots(found, above)
+
+    def compare(self, pair: Pair) -> Found:
+        """What differs at a pair itself, and the pairs of sources that differ."""
+        if pair not in self.seen:
+            self.seen[pair] = self._compare(pair)
+        return self.seen[pair]
+
+    def own(self, label: str, old: Origin, new: Origin) -> list[str]:
+        """What differs between two origins of a step, but for its inputs."""
+        if old["node"] != new["node"]:
+            where = self.wording.source("steps", label.partition("[")[0], "node")
+            return [f"{old['node']} -> {new['node']}{where}"]
+        found = self.wording.params(label, old["params"], new["params"])
+        if old["code"] != new["code"]:
+            found += self._edited(old["code"], new["code"]) or [f"the code of {new['node']} changed"]
+        return found + self._stream(old.get("stream"), new.get("stream"))
+
+    def origin(self, key: Key) -> Origin | None:
+        """What went into a key, as far as the recipe or the store knows it."""
+        return self.resolved.origins.get(key) or (self.about(key) or {}).get("origin")
+
+    def step(self, key: Key) -> str | None:
+        """The step that a key was first made for."""
+        return self.resolved.makers.get(key) or (self.about(key) or {}).get("step")
+
+    def about(self, key: Key) -> Mapping[str, Any] | None:
+        """What the store knows of a key; a receipt, too, is read but once."""
+        if key not in self._abouts:
+            self._abouts[key] = self.store.about(key)
+        return self._abouts[key]
+
+    def _compare(self, pair: Pair) -> Found:
+        old, new = self.origin(pair.old), self.origin(pair.new)
+        if old is None or new is None:
+            return [f"what {pair.label} was {'then' if old is None else 'made of'} is no longer known"], []
+        texts = self.own(pair.label, old, new)
+        if old["node"] != new["node"] or len(old["inputs"]) != len(new["inputs"]):
+            return texts, []
+        pairs: list[Pair] = []
+        for (path, labels), after, before in zip(self._labels(pair, new), new["inputs"], old["inputs"], strict=True):
+            if after != before:
+                more, behind = self._input(path, labels, _listed(after), _listed(before))
+                texts, pairs = texts + more, pairs + behind
+        return texts, pairs
+
+    def _labels(self, pair: Pair, origin: Origin) -> list[tuple[tuple[str, ...], list[str]]]:
+        """By input, where a recipe says what feeds it, and the steps that do: else the steps that made its keys."""
+        step = self.recipe.steps.get(pair.label) if self.recipe else None
+        if step is None or self.resolved.keys.get(pair.label) != pair.new:
+            return [((), [self.step(key) or "a step" for key in _listed(keys)]) for keys in origin["inputs"]]
+        path = ("steps", pair.label.partition("[")[0], "from")
+        wires = [(name, _listed(step.wires.get(name))) for name in step.node.inputs]
+        return [((*path, name), [self.resolved.stands_for(wire) for wire in wired]) for name, wired in wires]
+
+    def _input(self, path: tuple[str, ...], labels: list[str], new: list[Key], old: list[Key]) -> Found:
+        """One input, which takes one step or many."""
+        if len(new) == 1 and len(old) == 1:
+            return self._source(path, labels[0], new[0], old[0])
+        then = dict(zip([self.step(key) or key for key in old], old, strict=True))
+        now = dict(zip(labels, new, strict=True))
+        if len(old) == len(new) and (len(then) < len(old) or not then.keys() & now.keys()):
+            found = [self._source(path, *row) for row in zip(labels, new, old, strict=True)]
+            return [t for texts, _ in found for t in texts], [p for _, pairs in found for p in pairs]
+        texts = self._joined(path, [n for n in now if n not in then], [n for n in then if n not in now])
+        pairs = [Pair(name, key, then[name]) for name, key in now.items() if then.get(name, key) != key]
+        return texts or ([] if pairs else ["reads its sources in another order"]), pairs
+
+    def _source(self, path: tuple[str, ...], label: str, new: Key, old: Key) -> Found:
+        """A source that is not what it was: changed, exchanged, left out, or with a step in between."""
+        if new == old:
+            return [], []
+        was = self.step(old)
+        if was in (None, label, self.step(new)):
+            return [], [Pair(label, new, old)]
+        between, key = self._between(new, (was,))
+        if key is not None:
+            texts = [self._came(name) or f"reads {label}, not {was}{self._wired(path)}" for name in between]
+            return list(dict.fromkeys(texts)), [Pair(str(was), key, old)] if key != old else []
+        between, key = self._between(old, (label, self.step(new)))
+        if key is not None:
+            texts = [self._went(name) or f"reads {label}, not {was}{self._wired(path)}" for name in between]
+            return list(dict.fromkeys(texts)), [Pair(label, new, key)] if key != new else []
+        before, after = self.origin(old), self.origin(new)
+        if before and after and before["node"] == after["node"]:
+            return [], [Pair(label, new, old)]
+        return [f"reads {label}, not {was}{self._wired(path)}"], []
+
+    def _joined(self, path: tuple[str, ...], came: list[str], went: list[str]) -> list[str]:
+        """What a step reads in addition, and no more; of items their recipe's list decides, and not the wire."""
+        where = self._wired(path) if any("[" not in name for name in came) else ""
+        texts = [f"reads {_few(came)} now{where}"] if came else []
+        return [*texts, f"reads {_few(went)} no more{self._absent(went[0])}"] if went else texts
+
+    def _between(self, key: Key, wanted: tuple[str | None, ...]) -> tuple[list[str], Key | None]:
+        """Up along first inputs to one of the ``wanted`` steps: the steps on the way, and its key if it is there."""
+        passed: list[str] = []
+        for _ in range(_FAR):
+            first = next(iter((self.origin(key) or {}).get("inputs", ())), None)
+            if not isinstance(first, str):
+                break
+            passed.append(self.step(key) or "a step")
+            key = first
+            if self.step(key) in wanted:
+                return passed, key
+        return [], None
+
+    def _came(self, name: str) -> str:
+        if name not in self.resolved.verdicts:
+            return ""
+        verdict = self.resolved.verdicts[name]
+        return f"{name} is no longer left out: {verdict.why if verdict else 'or is, as what feeds it will tell'}"
+
+    def _went(self, name: str) -> str:
+        verdict = self.resolved.verdicts.get(name)
+        return f"{name} is left out now: {verdict.why}" if verdict and verdict.left_out else ""
+
+    def _wired(self, path: tuple[str, ...]) -> str:
+        """Where it is written what an input reads."""
+        return self.wording.source(*path) or self.wording.source(*path[:-1]) if path else ""
+
+    def _absent(self, name: str) -> str:
+        said = self.recipe.absent.get(name.partition("[")[0]) if self.recipe else None
+        return f": it is {said}" if said else ""
+
+    def _edited(self, old: str, new: str) -> list[str]:
+        if (old, new) not in self._edits:
+            self._edits[old, new] = edits(self.store.root, old, new)
+        return self._edits[old, new]
+
+    def _stream(self, old: list[Any] | None, new: list[Any] | None) -> list[str]:
+        """What differs in how the noise of a step is drawn."""
+        if old is None or new is None:
+            return [] if old == new else ["it draws noise now" if new else "it draws no noise any more"]
+        said = (
+            f"seed {old[0]} -> {new[0]}{self.wording.source('seed')}",
+            f"its noise is that of {new[1]}, not of {old[1]}",
+            f"its noise is drawn on {new[2]}, not on {old[2]}",
+        )
+        return [text for text, before, after in zip(said, old, new, strict=True) if before != after]
+
+
+def _few(names: list[str]) -> str:
+    """``a, b and 4 more``."""
+    rest = len(names) - _FEW
+    return ", ".join(names) if rest <= 0 else f"{', '.join(names[:_FEW])} and {rest} more"
+
+
+def _listed(value: Any) -> list[Any]:
+    return [] if value is None else [value] if isinstance(value, str) else list(value)

@@ -1,0 +1,151 @@
+"""Changes of parameters in the words of the recipe: its paths, its units, and where the value is written."""
+
+from __future__ import annotations
+
+import re
+from collections import defaultdict
+from collections.abc import Mapping
+from contextlib import suppress
+from pathlib import Path
+from typing import Any
+
+from neusee.nodes.units import read_quantity
+from neusee.workflows.graph.final_values import Setting, flow
+from neusee.workflows.graph.recipe_graph import Recipe, Step
+
+_QUANTITY = re.compile(r"([-+]?(?:\d+\.?\d*|\.\d+)(?:[eE][-+]?\d+)?)\s*(\D.*)")
+_ABSENT = object()
+
+
+class Wording:
+    """Says what changed; without a recipe, in the parameter's own name and in SI."""
+
+    def __init__(self, recipe: Recipe | None = None) -> None:
+        self._recipe = recipe
+        self._by_mark: dict[str, list[Setting]] | None = None
+
+    def params(self, label: str, old: Mapping[str, Any], new: Mapping[str, Any]) -> list[str]:
+        """One clause for each parameter of a step, as `plain` makes them, that differs."""
+        step = self._recipe.steps.get(label) if self._recipe else None
+        names = [n for n in dict.fromkeys([*old, *new]) if old.get(n) != new.get(n)]
+        return [self._param(step, n, old.get(n, _ABSENT), new.get(n, _ABSENT)) for n in names]
+
+    def source(self, *path: str) -> str:
+        """`` (recipe.yaml:3:7)`` of a value of the recipe; nothing where it is not known."""
+        setting = self._recipe.config.settings.get(".".join(path)) if self._recipe else None
+        return f" ({setting.source})" if setting else ""
+
+    def _param(self, step: Step | None, name: str, old: Any, new: Any) -> str:
+        if new is _ABSENT:
+            return f"{name} is no parameter any more"
+        setting, source = self._setting(step, name)
+        path = ".".join(map(str, setting.path)) if setting else name
+        where = f" ({source})" if source else ""
+        if isinstance(new, Mapping) and "file" in new:
+            inside = f" ({path}{f', {source}' if source else ''})" if setting else where
+            return f"file {_file(step, name)}: {_other_file(old, new)}{inside}"
+        written = setting.value if setting and not (isinstance(setting.value, str) and "${" in setting.value) else None
+        if old is _ABSENT:
+            return f"{path} is new: {_as_written(written, new)}{where}"
+        before, after = _both(written, old, new)
+        return f"{path} {before} -> {after}{where}"
+
+    def _setting(self, step: Step | None, name: str) -> tuple[Setting | None, str]:
+        """What the recipe says of a parameter, wherever it says so, and where."""
+        if step is None:
+            return None, ""
+        if name not in step.param_marks:
+            return None, f"default of {step.node.path}"
+        mark = str(step.param_marks[name])
+        found = self._marked().get(mark, [])
+        here = ("steps", step.name.partition("[")[0], "with", name)
+        named = [s for s in found if s.path == here] or [s for s in found if s.path[-1:] == (name,)]
+        setting = (named or found)[0] if named or len(found) == 1 else None
+        return setting, setting.source if setting else mark
+
+    def _marked(self) -> dict[str, list[Setting]]:
+        """What was written, by where it stands."""
+        if self._by_mark is None:
+            self._by_mark = defaultdict(list)
+            for setting in self._recipe.config.settings.values() if self._recipe else ():
+                if not setting.default:
+                    self._by_mark[setting.source.partition(", ")[0]].append(setting)
+        return self._by_mark
+
+
+def _file(step: Step | None, name: str) -> str:
+    value = step.params.get(name) if step else None
+    return value.name if isinstance(value, Path) else name
+
+
+def _other_file(old: Any, new: Mapping[str, Any]) -> str:
+    if not isinstance(old, Mapping) or "file" not in old:
+        return "is given now"
+    return "other content" if old["file"] != new["file"] else f"{new['suffix']}, not {old['suffix']}"
+
+
+def _both(written: Any, old: Any, new: Any) -> tuple[str, str]:
+    """Old and new value, in the unit in which the new one is written."""
+    after = _as_written(written, new)
+    if isinstance(old, list) and isinstance(new, list) and len(old) == len(new):
+        parts = written if isinstance(written, list) and len(written) == len(old) else [None] * len(old)
+        return f"[{', '.join(map(_in_unit_of, parts, new, old))}]", after
+    if isinstance(old, Mapping) and isinstance(new, Mapping):
+        return _items(old, new)
+    unit = _unit(written, new)
+    before = spoken(old / unit[0]) if unit and _is_number(old) else spoken(old)
+    if before in (spoken(new), after.partition(" ")[0]):  # they differ by less than is shown
+        return repr(old), repr(new)
+    return before, after
+
+
+def _in_unit_of(written: Any, new: Any, old: Any) -> str:
+    """An old number with the unit of the one that is written now."""
+    unit = _unit(written, new)
+    return f"{spoken(old / unit[0])} {unit[1]}" if unit and _is_number(old) else spoken(old)
+
+
+def _is_number(value: Any) -> bool:
+    return isinstance(value, float | int) and not isinstance(value, bool)
+
+
+def _items(old: Mapping[str, Any], new: Mapping[str, Any]) -> tuple[str, str]:
+    """The entries of two mappings that differ."""
+    pairs = [[(str(key), value) for key, value in m.get("items", ())] for m in (old, new)]
+    only = [[f"{k}: {spoken(v)}" for k, v in pairs[i] if (k, v) not in pairs[1 - i]] for i in (0, 1)]
+    return f"{{{', '.join(only[0])}}}", f"{{{', '.join(only[1])}}}"
+
+
+def _as_written(written: Any, new: Any) -> str:
+    """A new value as its user wrote it, where that says more than the number."""
+    if _unit(written, new) or (isinstance(written, list) and isinstance(new, list)):
+        return flow(written)
+    return spoken(new)
+
+
+def _unit(written: Any, new: Any) -> tuple[float, str] | None:
+    """What one of the unit of a written quantity is in SI, and its name; None where it has none."""
+    match = _QUANTITY.fullmatch(written.strip()) if isinstance(written, str) else None
+    if match is None or not _is_number(new):
+        return None
+    if new and float(match[1]):
+        return new / float(match[1]), match[2]
+    for si in ("m", "s", "rad", "K", "e-", "waves"):
+        with suppress(ValueError):
+            return read_quantity(f"1 {match[2]}", si), match[2]
+    return None
+
+
+def spoken(value: Any) -> str:
+    """A parameter, as `plain` makes it, in few words."""
+    if isinstance(value, float):
+        return f"{value:.6g}"
+    if isinstance(value, Mapping):
+        return f"a {value['suffix']} file".replace("  ", " ") if "file" in value else flow_of_items(value)
+    if isinstance(value, list):
+        return f"[{', '.join(map(spoken, value))}]"
+    return "none" if value is None else flow(value)
+
+
+def flow_of_items(value: Mapping[str, Any]) -> str:
+    return f"{{{', '.join(f'{spoken(k)}: {spoken(v)}' for k, v in value.get('items', ()))}}}"

@@ -1,0 +1,154 @@
+"""What a run would do, without doing it: hits, bytes, seconds, memory and place, from what earlier runs left behind."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+from neusee.workflows.engine.cost_model import Costs, Estimate
+from neusee.workflows.engine.local_executor import lanes_of
+from neusee.workflows.engine.node_call import places
+from neusee.workflows.engine.placement_inputs import past_costs, prepare
+from neusee.workflows.engine.resolve_keys import resolve
+from neusee.workflows.engine.step_job import Lane, Work
+from neusee.workflows.graph.recipe_graph import Recipe
+from neusee.workflows.keys.cache_key import Key
+from neusee.workflows.placement.heft_and_cpop import Schedule, TooLarge
+from neusee.workflows.report.run_page import size_of
+from neusee.workflows.simulation.simulate_recipe import steps_of, wanted
+from neusee.workflows.store.result_store import Store
+from neusee.workflows.tolerance.cheaper_steps import economised
+
+
+@dataclass(frozen=True)
+class Plan:
+    """What would become of every step."""
+
+    recipe: Recipe
+    order: list[str]
+    keys: dict[str, Key]
+    left_out: dict[str, bool | None]  #: None where only what feeds a step will tell
+    awake: set[str]  #: steps that would run
+    loaded: dict[str, int]  #: stored steps that these would read, and their bytes
+    expected: Mapping[str, Estimate]  #: by step, of those that would run
+    lanes: Mapping[str, str]  #: by step
+    schedule: Schedule | None
+    refused: str = ""  #: why there is not memory enough
+
+
+def planned(recipe: Recipe, store: Store, lanes: Mapping[str, Lane]) -> Plan:
+    """Look up what a run would compute, read and need; compute nothing."""
+    recipe = economised(recipe, wanted(recipe))
+    order = steps_of(recipe)
+    devices = [lane.device for lane in lanes.values()]
+    resolved = resolve(recipe, order, store, ",".join(devices))
+    keys, left_out = resolved.keys, {name: resolved.left_out(name) for name in order}
+    awake, loaded = _awake(recipe, keys, store)
+    works, seen = [], set[Key]()
+    for name in order:
+        if name in awake and not left_out.get(name) and keys[name] not in seen:
+            seen.add(keys[name])
+            works.append(_work(recipe, name, keys, devices))
+    costs = past_costs(store) if works else Costs([])
+    abouts = {work.key: about for work in works if (about := store.about(work.key))}
+    try:
+        found = prepare(works, costs, abouts, lanes, [keys[name] for name in wanted(recipe)])
+    except TooLarge as error:
+        kinds = sorted({lane.kind for lane in lanes.values()} | {"cpu"})
+        expected = {w.step.name: costs.of(w.step, kinds, abouts.get(w.key)) for w in works}
+        return Plan(recipe, order, keys, left_out, awake, loaded, expected, {}, None, str(error))
+    expected = {w.step.name: found.expected[w.key] for w in found.works}
+    where = {w.step.name: w.lane for w in found.works}
+    return Plan(recipe, order, keys, left_out, awake, loaded, expected, where, found.schedule)
+
+
+def plan_lines(recipe: Recipe, store: Store, device: str = "cpu", memory: int | None = None) -> tuple[list[str], bool]:
+    """One line a step: stored or to be run, where, its seconds, bytes and memory as far as they are known; the sums.
+
+    With it, whether the run would be refused for want of memory.
+    """
+    lanes = lanes_of(device.split(","), memory)
+    plan = planned(recipe, store, lanes)
+    rows = [_row(name, plan, store) for name in plan.order]
+    head = ["step", "node", "state", "where", "seconds", "bytes", "memory", "reads"]
+    return [*_columns([head, *rows]), *_sums(plan, lanes)], bool(plan.refused)
+
+
+def simulated_lines(recipe: Recipe, store: Store, machines: str) -> list[str]:
+    """What the whole recipe would take on the machines of a YAML file, with nothing stored."""
+    from neusee.workflows.explain.cluster_forecast import cluster_lines
+    from neusee.workflows.placement.machine_file import read_machines
+
+    cluster, recipe = read_machines(machines), economised(recipe, wanted(recipe))
+    costs, kinds = past_costs(store), sorted({"cpu", *(device.kind for device in cluster.devices)})
+    names = steps_of(recipe)
+    return cluster_lines(recipe, {name: costs.of(recipe.steps[name], kinds) for name in names}, cluster)
+
+
+def _row(name: str, plan: Plan, store: Store) -> list[str]:
+    step, about = plan.recipe.steps[name], store.about(plan.keys[name])
+    reads = ", ".join(dict.fromkeys(step.sources))
+    if plan.left_out.get(name):
+        return [name, step.node.path, "left out", "", "", "", "", reads]
+    if name in plan.expected:
+        cost = plan.expected[name]
+        where = plan.lanes.get(name, "?")
+        seconds = cost.seconds.get(where.partition(":")[0], cost.seconds["cpu"])
+        if cost.known:
+            memory = size_of(int(cost.bytes + cost.work))
+            return [name, step.node.path, "run", where, f"{seconds:.3f} s", size_of(int(cost.bytes)), memory, reads]
+        return [name, step.node.path, "run", where, "?", "?", "?", reads]
+    state = "stored" if store.has(plan.keys[name]) else "run" if name in plan.awake else "not needed"
+    known = [f"{about['seconds']:.3f} s", size_of(about["bytes"])] if about else ["", ""]
+    return [name, step.node.path, state, "", *known, "", reads]
+
+
+def _sums(plan: Plan, lanes: Mapping[str, Lane]) -> list[str]:
+    """What all of it takes, and what is not known yet."""
+    ran, new = len(plan.expected), sum(e.bytes for e in plan.expected.values())
+    guesses = sum(not e.known for e in plan.expected.values())
+    lines = []
+    if unsure := [name for name, known in plan.left_out.items() if known is None]:
+        lines.append(f"left out or not, only what feeds it will tell: {', '.join(unsure)}")
+    took = f"about {plan.schedule.makespan:.3g} s" if plan.schedule else "no schedule"
+    guessed = f", {guesses} of them never measured" if guesses else ""
+    read = size_of(sum(plan.loaded.values()))
+    lines.append(
+        f"{ran} of {len(plan.order)} steps would run{guessed}: {took}, {size_of(int(new))} new, {read} to load"
+    )
+    if plan.schedule:
+        peaks = {name: plan.schedule.peak.get(name, 0.0) for name in lanes}
+        lines += [
+            f"memory  {name}: {size_of(int(peak))} at most, of {size_of(int(lanes[name].memory))}"
+            for name, peak in peaks.items()
+        ]
+    return [*lines, *([f"refused: {plan.refused}"] if plan.refused else [])]
+
+
+def _work(recipe: Recipe, name: str, keys: Mapping[str, Key], devices: Sequence[str]) -> Work:
+    step = recipe.steps[name]
+    reads = tuple(tuple(keys[s] for s in ((w,) if isinstance(w, str) else w or ())) for w in step.wires.values())
+    return Work(step, keys[name], {}, reads, recipe.seed, recipe.name, places(step, devices)[0], "")
+
+
+def _awake(recipe: Recipe, keys: Mapping[str, Key], store: Store) -> tuple[set[str], dict[str, int]]:
+    """Steps that a run would compute, walking back from what is wanted, and what it would read on the way."""
+    found, loaded, todo = set[str](), dict[str, int](), [*wanted(recipe)]
+    while todo:
+        name = todo.pop()
+        if name in found or name in loaded:
+            continue
+        if store.has(keys[name]):
+            about: dict[str, Any] = store.about(keys[name]) or {}
+            loaded[name] = about.get("bytes", 0)
+        else:
+            found.add(name)
+            todo += recipe.steps[name].sources
+    return found, loaded
+
+
+def _columns(rows: list[list[str]]) -> list[str]:
+    """Left-aligned columns."""
+    widths = [max(len(row[i]) for row in rows) for i in range(len(rows[0]))]
+    return ["  ".join(f"{cell:<{wide}}" for cell, wide in zip(row, widths, strict=True)).rstrip() for row in rows]

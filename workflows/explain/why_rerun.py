@@ -1,0 +1,198 @@
+"""Why a step ran, or would: what differs from the nearest earlier result of the same step, and where it began."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterable, Iterator, Mapping
+from dataclasses import replace
+from typing import Any
+
+from neusee.workflows.engine.resolve_keys import Resolved, resolve
+from neusee.workflows.engine.runner import Event
+from neusee.workflows.explain.change_causes import Comparison, Origin, Pair, Roots
+from neusee.workflows.explain.change_wording import spoken
+from neusee.workflows.graph.diagnostics import nearest
+from neusee.workflows.graph.recipe_graph import Recipe, Step, needed
+from neusee.workflows.keys.cache_key import Key
+from neusee.workflows.store.result_store import Store
+from neusee.workflows.tolerance.cheaper_steps import economised
+
+_CANDIDATES = 200  #: earlier results of a step that are compared, the newest ones
+_PAIRS = 20_000  #: comparisons after which no further earlier result is taken up
+_AT_ONCE = 5  #: earlier results that a step is compared with while a run goes on
+_SHOWN = 10  #: causes that are listed
+_LINKS = 6  #: steps of a chain that are named
+
+
+def why_lines(recipe: Recipe, store: Store, step: str, device: str = "cpu") -> list[str]:
+    """Whether ``step``, or each of its items, is stored, and what makes it another than the nearest earlier result.
+
+    Raises `ValueError` with the nearest name where there is no such step.
+    """
+    names = [name for name in recipe.steps if step in (name, name.partition("[")[0])]
+    if not names:
+        known = {*recipe.steps, *(name.partition("[")[0] for name in recipe.steps)}
+        raise ValueError(f"no step {step!r}; {nearest(step, known)}")
+    recipe = economised(recipe, [*recipe.outputs, *names])
+    resolved = resolve(recipe, needed(recipe, [*recipe.outputs, *names]), store, device)
+    comparison = Comparison(store, recipe, resolved)
+    return [line for name in names for line in _step_lines(comparison, recipe, recipe.steps[name], resolved)]
+
+
+def why_key_lines(store: Store, prefix: str) -> list[str]:
+    """What went into the one result whose key begins with ``prefix``, and how it differs from an earlier one.
+
+    Raises `LookupError` where there is no such result, or more than one.
+    """
+    found = sorted(dict.fromkeys(row["key"] for row in _rows(store) if row["key"].startswith(prefix)))
+    if len(found) != 1:
+        some = f"; there are {', '.join(key[:12] for key in found[:5])}" if found else ""
+        raise LookupError(f"{len(found) or 'no'} results have a key that begins with {prefix!r}{some}")
+    key, about = found[0], store.about(found[0])
+    if about is None:
+        raise LookupError(f"the result {found[0]} is no longer there")
+    comparison = Comparison(store)
+    head = f"{about['step']} of {about.get('recipe') or 'a recipe'}: {_state(about)}, key {key}"
+    return [head, *_made_of(comparison, key), *_because(comparison, about["step"], key, about)]
+
+
+def explained(recipe: Recipe, store: Store, watch: Callable[[Event], None]) -> Callable[[Event], None]:
+    """``watch``, told also why each step that ran did so."""
+    comparison = Comparison(store, recipe)
+    before: dict[str, list[Key]] = {}
+
+    def tell(event: Event) -> None:
+        done = event.done
+        if done is None:
+            before[event.step] = _keys(_rows(store, event.step))
+        elif done.state == "run":
+            why = _at_once(comparison, recipe.steps[done.step], done.key, before.pop(done.step, []))
+            event = Event(event.step, replace(done, why=why))
+        watch(event)
+
+    return tell
+
+
+def _step_lines(comparison: Comparison, recipe: Recipe, step: Step, resolved: Resolved) -> list[str]:
+    """One step: its state, and what makes it so."""
+    key, verdict = resolved.keys[step.name], resolved.verdicts.get(step.name)
+    head = f"{step.name} ({step.node.path})"
+    if verdict is not None and verdict.left_out:
+        return [f"{head}: left out, {verdict.instead} stands for it: {verdict.why}"]
+    about = comparison.store.about(key)
+    lines = [f"{head}: {_state(about)}, key {key[:8]}"]
+    maker = resolved.makers[key]
+    if maker != step.name:
+        lines.append(f"  the same computation as {maker}")
+    unsure = _unsure(recipe, step.name, resolved)
+    if unsure:
+        lines.append(f"  left out or not, only what feeds it will tell: {', '.join(unsure[:_SHOWN])}")
+    return [*lines, *_because(comparison, step.name, key, about, maker)]
+
+
+def _unsure(recipe: Recipe, step: str, resolved: Resolved) -> list[str]:
+    """Steps behind a step that may be left out: it was taken that they run."""
+    unsure = {name for name in resolved.verdicts if resolved.left_out(name) is None}
+    return [name for name in needed(recipe, [step]) if name in unsure] if unsure else []
+
+
+def _state(about: Mapping[str, Any] | None) -> str:
+    if about is None:
+        return "not stored, so it would run where it is needed"
+    made = f"{_date(about)}, made in {about.get('seconds', 0.0):.3g} s"
+    return f"stored since {made}" if about.get("kept", True) else f"ran {made}, but its value was not kept"
+
+
+def _because(
+    comparison: Comparison, label: str, key: Key, about: Mapping[str, Any] | None, maker: str = ""
+) -> Iterator[str]:
+    """What differs from the nearest earlier result, and which that is."""
+    rows = _rows(comparison.store, label) or _rows(comparison.store, maker or label)
+    keys = _keys(rows)
+    earlier = keys[: keys.index(key)] if key in keys else keys
+    found = _nearest(comparison, label, key, earlier)
+    if found is None:
+        yield f"  nothing earlier to compare it with: {'the first' if key in keys else 'no'} result of this step"
+        return
+    old, roots = found
+    for text in list(roots.found)[:_SHOWN]:
+        yield f"  {_chain(roots.chain(text))}: {text}"
+    if len(roots.found) > _SHOWN:
+        yield f"  and {len(roots.found) - _SHOWN} more"
+    which = "the earlier result" if len(earlier) == 1 else f"the nearest of {len(earlier)} earlier results"
+    yield f"  beside {which}, {old[:8]} of {_date(comparison.about(old) or {})}"
+
+
+def _nearest(comparison: Comparison, label: str, key: Key, earlier: list[Key]) -> tuple[Key, Roots] | None:
+    """Of the newest earlier results the one with the fewest root causes, the newest of these."""
+    best: tuple[Key, Roots] | None = None
+    for old in earlier[: -_CANDIDATES - 1 : -1]:
+        if comparison.origin(old) is None:
+            continue
+        most = len(best[1].found) - 1 if best else float("inf")
+        roots = comparison.roots(Pair(label, key, old), most)
+        best = (old, roots) if roots is not None else best
+        if best and (len(best[1].found) <= 1 or len(comparison.seen) > _PAIRS):
+            break
+    return best
+
+
+def _at_once(comparison: Comparison, step: Step, key: Key, earlier: list[Key]) -> str:
+    """One line on why a step ran, from what is at hand; empty where it has no earlier result."""
+    if key in earlier:
+        return "made before, but its value is not stored"
+    best: list[str] = []
+    for old in earlier[: -_AT_ONCE - 1 : -1]:
+        before, now = comparison.origin(old), comparison.origin(key)
+        found = _direct(comparison, step, before, now) if before and now else []
+        best = min(filter(None, (best, found)), key=len, default=[])
+        if len(best) == 1:
+            break
+    return best[0] if best else ""
+
+
+def _direct(comparison: Comparison, step: Step, old: Origin, new: Origin) -> list[str]:
+    """What differs at a step itself, and then the sources that do."""
+    texts = comparison.own(step.name, old, new)
+    if old["node"] != new["node"] or len(old["inputs"]) != len(new["inputs"]):
+        return texts
+    for name, before, after in zip(step.node.inputs, old["inputs"], new["inputs"], strict=True):
+        if before != after:
+            wire = step.wires.get(name)
+            texts.append(f"after {wire if isinstance(wire, str) else name}")
+    return texts or ["nothing changed"]
+
+
+def _made_of(comparison: Comparison, key: Key) -> Iterator[str]:
+    """What went into a key, one line each."""
+    origin = comparison.origin(key)
+    if origin is None:
+        return
+    yield f"  node    {origin['node']}, code {origin['code'][:8]}"
+    for name, value in origin["params"].items():
+        yield f"  with    {name} = {spoken(value)}"
+    for given in origin["inputs"]:
+        for source in [given] if isinstance(given, str) else given or ():
+            yield f"  from    {comparison.step(source) or 'a step that is no longer known'}, {source[:8]}"
+    if stream := origin.get("stream"):
+        yield f"  noise   seed {stream[0]}, of {stream[1]}, on {stream[2]}"
+
+
+def _chain(names: list[str]) -> str:
+    """``restored <- raw <- read``, short."""
+    if len(names) > _LINKS:
+        names = [*names[: _LINKS - 2], f"({len(names) - _LINKS + 1} more)", names[-1]]
+    return " <- ".join(names)
+
+
+def _keys(rows: Iterable[dict[str, Any]]) -> list[Key]:
+    """Keys in the order in which they were first made."""
+    return list(dict.fromkeys(row["key"] for row in rows))
+
+
+def _date(about: Mapping[str, Any]) -> str:
+    return str(about.get("date", "an unknown day"))[:19].replace("T", " ")
+
+
+def _rows(store: Store, step: str | None = None) -> list[dict[str, Any]]:
+    """What was made, of one step or of all, the newest last."""
+    return store.journal.rows() if step is None else store.journal.of_step(step)

@@ -1,0 +1,166 @@
+"""The graph of a checked recipe: steps, their wires and the order in which they run."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterable, Mapping
+from dataclasses import dataclass, field, replace
+from typing import TYPE_CHECKING, Any
+
+from neusee.nodes import Node
+from neusee.workflows.graph.diagnostics import Mark
+from neusee.workflows.graph.final_values import Config, Setting
+
+if TYPE_CHECKING:
+    from neusee.workflows import Event, Executor, Result, Store
+    from neusee.workflows.recipe.blocks.train_block import Training
+    from neusee.workflows.recipe.blocks.train_lift_block import LiftTraining
+    from neusee.workflows.recipe.distributions.nominal_values import Uncertain
+
+__all__ = ["Config", "Economy", "Expectation", "Recipe", "Setting", "Step", "Wire", "in_order", "needed"]
+
+Wire = str | tuple[str, ...] | None  #: one step, the steps of all items, or an optional input that is absent
+
+
+@dataclass(frozen=True, slots=True)
+class Step:
+    """One bound step: a node, its validated parameters and the steps that feed it."""
+
+    name: str  #: ``psf[mask]``, ``spot[mask,green]``
+    node: Node
+    params: Mapping[str, Any]  #: validated, SI, with the node's defaults
+    wires: Mapping[str, Wire]  #: by input, in the node's order
+    mark: Mark
+    param_marks: Mapping[str, Mark]  #: where each value that was given stands
+    device: str = ""  #: where it asks to run: ``cpu``, ``gpu``, ``cuda:1``; empty if anywhere, and never part of a key
+
+    @property
+    def sources(self) -> tuple[str, ...]:
+        """Every step that feeds this one, in the order of the inputs."""
+        return tuple(name for wire in self.wires.values() for name in _names(wire))
+
+
+def _names(wire: Wire) -> tuple[str, ...]:
+    return () if wire is None else (wire,) if isinstance(wire, str) else wire
+
+
+@dataclass(frozen=True, slots=True)
+class Economy:
+    """A cheaper step that stands in for a full one."""
+
+    step: str  #: the full step
+    instead: str  #: the one that is computed
+    within: float  #: what it may change at most, as a share of the largest element of its result
+    why: str
+
+
+@dataclass(frozen=True, slots=True)
+class Expectation:
+    """A number that the recipe promises: ``step`` at ``at`` is ``value`` within ``rtol``."""
+
+    name: str
+    step: str
+    at: tuple[int | str, ...]  #: indices, or the name of a field of a named tuple
+    value: float
+    rtol: float
+    mark: Mark
+
+
+UNHEARD = 1e-3  #: what a figure of merit reads may be off by, for all of it may hang on a small difference
+
+
+@dataclass(frozen=True, slots=True, repr=False)
+class Recipe:
+    """A recipe whose every value, wire and file was looked at; nothing of it has run."""
+
+    name: str
+    title: str
+    seed: int
+    tolerance: float
+    outputs: tuple[str, ...]
+    steps: Mapping[str, Step]
+    expect: tuple[Expectation, ...] = ()
+    config: Config = field(default_factory=Config)
+    notes: tuple[str, ...] = ()
+    absent: Mapping[str, str] = field(default_factory=dict)  #: step that is null -> where that is written
+    keep_all: bool = False  #: compute every step in full, whatever the tolerance allows
+    economies: tuple[Economy, ...] = ()  #: what stands in for full steps; a recipe as it is read has none
+    strict: float = 1.0  #: share of the tolerance that may be spent: less where a run could not prove that it held
+    whole: Recipe | None = field(default=None, compare=False)  #: the recipe without economies, where this has some
+    uncertain: Uncertain | None = field(default=None, compare=False)  #: what the study of uncertainty draws from
+    training: Training | None = field(default=None, compare=False)  #: how it is learnt
+    lifting: LiftTraining | None = field(default=None, compare=False)  #: how a lift is learnt from its pictures
+    unheard: frozenset[str] = frozenset()  #: steps whose errors reach a node that does not tell what becomes of them
+
+    def limit(self, step: str) -> float:
+        """What the result of a step may be off by: the tolerance, or `UNHEARD` where that is less and no node tells."""
+        return min(self.tolerance, UNHEARD) if step in self.unheard else self.tolerance
+
+    def allowed(self, step: str) -> float:
+        """What all that is left out or computed more cheaply, up to a step, may change of it."""
+        return self.limit(step) * self.strict
+
+    def run(
+        self,
+        store: Store | None = None,
+        outputs: Iterable[str] | None = None,
+        watch: Callable[[Event], None] | None = None,
+        device: str = "cpu",
+        executor: Executor | None = None,
+        memory: int | None = None,
+    ) -> Result:
+        """Run it; see `neusee.workflows.run`. Several threads may do so at once, on one store."""
+        from neusee.workflows import run
+
+        return run(self, store, outputs, watch, device, executor, memory)
+
+    def __repr__(self) -> str:
+        return f"<recipe {self.name}: {len(self.steps)} steps -> {', '.join(self.outputs)}>"
+
+    def _repr_html_(self) -> str:
+        from neusee.workflows.report.notebook import recipe_html
+
+        return recipe_html(self)
+
+
+def needed(recipe: Recipe, outputs: Iterable[str]) -> list[str]:
+    """Steps that ``outputs`` need, each after its sources."""
+    return in_order({name: step.sources for name, step in recipe.steps.items()}, outputs)
+
+
+def in_order(sources: Mapping[str, Iterable[str]], wanted: Iterable[str]) -> list[str]:
+    """Names after their sources, without recursion; a cycle must have been ruled out before."""
+    order: dict[str, None] = {}
+    stack = [(name, iter(sources[name])) for name in reversed(list(wanted))]
+    while stack:
+        name, rest = stack[-1]
+        below = next((s for s in rest if s not in order), None)
+        if below is not None:
+            stack.append((below, iter(sources[below])))
+            continue
+        order.setdefault(name)
+        stack.pop()
+    return list(order)
+
+
+def kept_promises(recipe: Recipe, written: Recipe) -> Recipe:
+    """``recipe`` with the expected numbers that still hold: those of ``written`` whose steps come about as there."""
+    same = {name for name in recipe.steps if _alike(recipe, written, name)}
+    for name in in_order({n: s.sources for n, s in recipe.steps.items()}, recipe.steps):
+        if not same.issuperset(recipe.steps[name].sources):
+            same.discard(name)
+    lost = [e for e in recipe.expect if e in written.expect and e.step not in same]
+    if not lost:
+        return recipe
+    note = f"not compared, because your changes reach them: {', '.join(e.name for e in lost)}"
+    kept = tuple(e for e in recipe.expect if e not in lost)
+    return replace(recipe, expect=kept, notes=(*recipe.notes, note))
+
+
+def _alike(recipe: Recipe, written: Recipe, name: str) -> bool:
+    one, other = recipe.steps[name], written.steps.get(name)
+    seeded = one.node.random and recipe.seed != written.seed
+    return (
+        other is not None
+        and not seeded
+        and (one.node, one.params, one.wires) == (other.node, other.params, other.wires)
+    )

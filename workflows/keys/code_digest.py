@@ -1,0 +1,218 @@
+"""Digests of code: what a node's module says, and every `neusee.nodes` module it imports.
+
+Comments, layout and docstrings are left out, so better words keep the cache; helpers and
+constants are in, so a changed constant never serves an old result. The syntax trees'
+digests are kept in a file by the digest of the source, so that a cached run parses nothing.
+Beside it ``code/<digest>.json`` keeps the digests of the single definitions behind a digest:
+no key needs them, but with them one can say which function it was that changed.
+"""
+
+from __future__ import annotations
+
+import json
+import os
+import sys
+import threading
+import warnings
+from collections.abc import Iterator
+from contextlib import suppress
+from pathlib import Path
+from typing import Any
+
+import xxhash
+
+from neusee.workflows.keys.cache_key import digest
+from neusee.workflows.keys.source_summary import ROOT, Summary, Use, summarise
+
+_LEFT_OUT = frozenset({ROOT, f"{ROOT}._node"})  #: decide nothing of what a node computes
+_KEPT = 1000  #: summaries in the file
+_PYTHON = "{}.{}".format(*sys.version_info)  #: a syntax tree's text changes with it
+_THIS_PROCESS = os.urandom(8).hex()
+
+_edited_since: set[str] = set()  #: loaded modules whose source is no longer what runs
+_frozen: dict[str, tuple[Any, str]] = {}  #: module -> its spec and the digest of its source when first seen
+
+
+class Code:
+    """Digests of modules, for the length of one run."""
+
+    def __init__(self, memo: Path) -> None:
+        self._memo = memo
+        self._summaries: dict[str, Summary] = _read(memo)
+        self._new = False
+        self._digests: dict[str, str] = {}
+        self._parts: dict[str, dict[str, dict[str, str]]] = {}  # definitions by module behind each digest
+        self._paths: dict[str, Path | None] = {}
+
+    def digest(self, module: str) -> str:
+        """Digest of ``module`` and, transitively, of what it imports of `neusee.nodes`.
+
+        Raises `LookupError` where what it imports, or its source, cannot be told.
+        """
+        if module not in self._digests:
+            seen: dict[str, str] = {}
+            parts: dict[str, dict[str, str]] = {}
+            todo = [module]
+            while todo:
+                name = todo.pop()
+                if name not in seen:
+                    seen[name], parts[name], imports = self._look(name)
+                    todo += imports
+            found = self._digests[module] = digest(seen)
+            if _edited_since.isdisjoint(seen):  # else this digest means something in this process alone
+                self._parts[found] = parts
+        return self._digests[module]
+
+    def save(self) -> None:
+        """Keep the summaries that this run had to make; failing to is no failure."""
+        if self._new:
+            self._new = False
+            _write(self._memo, dict(list(self._summaries.items())[-_KEPT:]), self._memo.parent / "tmp")
+        for found, parts in self._parts.items():
+            path = parts_file(self._memo.parent, found)
+            if not os.path.exists(path):
+                _write(path, parts, self._memo.parent / "tmp")
+        self._parts = {}
+
+    def _look(self, module: str) -> tuple[str, dict[str, str], list[str]]:
+        path = self._path(module)
+        if path is None:
+            raise LookupError(f"{module} has no source file, so its results cannot be told from others: put it in one")
+        summary = self._summary(module, path)
+        tree = summary.tree + (_THIS_PROCESS if module in _edited_since else "")
+        package = module if path.name == "__init__.py" else module.rpartition(".")[0]
+        names = [n for item in summary.imports for n in self._imported(*item, package)]
+        for use in summary.uses:
+            used = self._used(use, package)
+            if used is not None:
+                names += used
+            elif module.startswith(ROOT):
+                what = "the whole of the nodes is used, so that no one can tell what a result depends on"
+                raise LookupError(f"{path}:{use[-1]}: {what}: import what the node needs by its full name")
+        return tree, summary.definitions, [n for n in names if n.startswith(f"{ROOT}.") and n not in _LEFT_OUT]
+
+    def _imported(self, level: int, base: str, name: str, package: str) -> Iterator[str]:
+        """Modules that one import reads: a submodule alone, or the module that holds the name."""
+        base = _absolute(level, base, package)
+        below = f"{base}.{name}"
+        if name and below.startswith(ROOT) and self._path(below) is not None:
+            yield below
+            path = None if base in _LEFT_OUT else self._path(base)
+            if path is None or name not in self._summary(base, path).binds:
+                return
+        yield base
+
+    def _used(self, use: Use, package: str) -> list[str] | None:
+        """Modules that ``name.a.b`` goes through; None where it does not say which of all the nodes it is about."""
+        level, base, name, chain, _ = use
+        found = [".".join(filter(None, (_absolute(level, base, package), name)))]
+        rest = chain.split(".") if chain else []
+        while rest and self._holds(found[-1], rest[0]):
+            found.append(f"{found[-1]}.{rest.pop(0)}")
+        whole = found[-1] in ("neusee", ROOT) and (not rest or rest[0].startswith("__"))
+        return None if whole else found[1:]
+
+    def _holds(self, module: str, name: str) -> bool:
+        """Whether a name of a module is a module below it."""
+        below = f"{module}.{name}"
+        return below == ROOT or (self._is_package(module) and self._path(below) is not None)
+
+    def _is_package(self, module: str) -> bool:
+        path = self._path(module) if module.startswith(ROOT) else None
+        return path is not None and path.name == "__init__.py"
+
+    def _path(self, module: str) -> Path | None:
+        if module not in self._paths:
+            self._paths[module] = source_file(module)
+        return self._paths[module]
+
+    def _summary(self, module: str, path: Path) -> Summary:
+        source = _source_digest(module, path)
+        name = f"{_PYTHON}:{source}"
+        if name not in self._summaries:
+            self._summaries[name] = summarise(path.read_bytes())
+            self._new = True
+        return self._summaries[name]
+
+
+def parts_file(root: Path, found: str) -> Path:
+    """Where a store keeps the definitions behind a digest of code."""
+    return root / "code" / f"{found}.json"
+
+
+def _absolute(level: int, base: str, package: str) -> str:
+    """The full name of what is imported ``from`` a base."""
+    if not level:
+        return base
+    above = package.split(".")
+    return ".".join([*above[: len(above) - level + 1], *filter(None, [base])])
+
+
+def _write(path: Path, content: Any, folder: Path) -> None:
+    """Write JSON whole or not at all, without a word where that fails."""
+    part = folder / f"{path.name}.{os.getpid()}.{threading.get_ident()}"
+    with suppress(OSError):
+        folder.mkdir(parents=True, exist_ok=True)
+        path.parent.mkdir(exist_ok=True)
+        part.write_text(json.dumps(content))
+        os.replace(part, path)
+
+
+def _read(memo: Path) -> dict[str, Summary]:
+    """Summaries of earlier runs; a damaged file, or one of an older form, is an empty one."""
+    try:
+        return {name: _summary_of(*fields) for name, fields in json.loads(memo.read_bytes()).items()}
+    except (OSError, ValueError, TypeError, AttributeError):
+        return {}
+
+
+def _summary_of(tree: Any, imports: Any, binds: Any, uses: Any, definitions: Any) -> Summary:
+    return Summary(
+        str(tree),
+        [(int(level), str(base), str(name)) for level, base, name in imports],
+        list(binds),
+        [(int(level), str(base), str(name), str(chain), int(line)) for level, base, name, chain, line in uses],
+        {str(label): str(found) for label, found in definitions.items()},
+    )
+
+
+def source_file(module: str) -> Path | None:
+    """Source file of a module, without importing it."""
+    if module in sys.modules:
+        file = getattr(sys.modules[module], "__file__", None)
+        return Path(file) if file and os.path.isfile(file) else None
+    inside = module.startswith(f"{ROOT}.")
+    for folder in getattr(sys.modules.get(ROOT), "__path__", ()) if inside else ():
+        stem = os.path.join(folder, *module.split(".")[2:])
+        for file in (f"{stem}.py", os.path.join(stem, "__init__.py")):
+            if os.path.isfile(file):
+                return Path(file)
+    return None
+
+
+def _source_digest(module: str, path: Path) -> str:
+    """xxh3 of a source; of a loaded module, as it was when first seen, for that is what runs."""
+    spec = getattr(sys.modules.get(module), "__spec__", None)
+    if spec is not None and module in _frozen and _frozen[module][0] is spec:
+        return _frozen[module][1]
+    found = xxhash.xxh3_128_hexdigest(path.read_bytes())
+    _edited_since.discard(module)
+    if spec is not None:
+        _frozen[module] = (spec, found)
+        if _edited(spec, path):
+            _edited_since.add(module)
+            warnings.warn(f"{path} was edited after it was imported: start again to keep its results", stacklevel=2)
+    return found
+
+
+def _edited(spec: Any, path: Path) -> bool:
+    """Whether the byte code that Python left at import is of another source than ``path`` now holds."""
+    try:
+        with open(spec.cached or "", "rb") as file:
+            head = file.read(16)
+        stat = os.stat(path)
+        writable = os.access(os.path.dirname(spec.cached), os.W_OK) and not sys.dont_write_bytecode
+    except OSError:
+        return False
+    stamp = b"".join((int(n) & 0xFFFFFFFF).to_bytes(4, "little") for n in (stat.st_mtime, stat.st_size))
+    return writable and head[4:8] == bytes(4) and head[8:] != stamp

@@ -1,0 +1,64 @@
+"""A digest of the program itself: of some of its modules, and of all that they import of `neusee.workflows`.
+
+What is stored of a study, a design or a posterior is keyed by it, so that a change of the code that made a result
+never serves the old one. It is the one identity of code outside nodes, which `Code` digests.
+"""
+
+from __future__ import annotations
+
+import ast
+import functools
+from collections.abc import Iterator
+from pathlib import Path
+
+from neusee.workflows.keys.cache_key import digest
+from neusee.workflows.keys.source_summary import summarise
+
+_HERE = Path(__file__).parents[1]
+_ROOT = "neusee.workflows"
+
+
+@functools.cache
+def engine(*modules: str) -> str:
+    """Return the digest of ``modules`` of neusee.workflows (``engine.runner`` by default) and of what they import.
+
+    Only imports at the top of a module count: by them a run is decided.
+
+    Raises: `LookupError` where a module, or one that it imports, has no source file. A digest that passed over it
+    would not change when that module does.
+    """
+    seen: dict[str, str] = {}
+    todo = list(modules or ("engine.runner",))
+    while todo:
+        name = todo.pop()
+        if name in seen:
+            continue
+        path = _source(name)
+        if path is None:
+            raise LookupError(f"{_ROOT}.{name} has no source file below {_HERE}, so its results cannot be keyed")
+        source = path.read_bytes()
+        seen[name] = summarise(source).tree
+        todo += imported(ast.parse(source))
+    return digest(seen)
+
+
+def imported(tree: ast.Module) -> Iterator[str]:
+    """Yield the modules of neusee.workflows that are imported at the top, by their names below it."""
+    for item in tree.body:
+        if isinstance(item, ast.Import):
+            yield from (_below(alias.name) for alias in item.names if alias.name.startswith(f"{_ROOT}."))
+        elif isinstance(item, ast.ImportFrom) and f"{item.module}.".startswith(f"{_ROOT}."):
+            base = _below(item.module or "")
+            for alias in item.names:
+                module = f"{base}.{alias.name}".lstrip(".")
+                yield module if _source(module) is not None or not base else base
+
+
+def _below(module: str) -> str:
+    return module.removeprefix(_ROOT).lstrip(".")
+
+
+def _source(name: str) -> Path | None:
+    """Return the file of a module or a package, or None."""
+    stem = _HERE.joinpath(*name.split("."))
+    return next((p for p in (stem.with_suffix(".py"), stem / "__init__.py") if p.is_file()), None)

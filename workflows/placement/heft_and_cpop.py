@@ -1,0 +1,183 @@
+"""Which task runs when and where: HEFT with insertion and CPOP, with memory as a hard constraint.
+
+A pure function of tasks, costs and devices, for this machine and for those that nobody here owns.
+Results leave a device after their last use, a task that does not fit is cut into band parts, waits
+or goes elsewhere, and what fits nowhere is refused with the number of bytes that it needs.
+
+Source: Topcuoglu, Hariri, Wu, IEEE Transactions on Parallel and Distributed Systems 13 (2002) 260.
+"""
+
+from __future__ import annotations
+
+import heapq
+import math
+from bisect import bisect_left
+from collections.abc import Collection, Mapping, Sequence
+from dataclasses import replace
+
+from neusee.workflows.placement.partial_schedule import Board
+from neusee.workflows.placement.task_priorities import Graph, downward, frugal, ranked, upward
+from neusee.workflows.placement.tasks_and_devices import (
+    BUS,
+    Cluster,
+    Device,
+    Link,
+    Move,
+    Schedule,
+    Slot,
+    Task,
+    TooLarge,
+)
+
+__all__ = ["BUS", "Cluster", "Device", "Link", "Move", "Schedule", "Slot", "Task", "TooLarge", "cpop", "heft"]
+
+
+def heft(tasks: Sequence[Task], cluster: Cluster, keep: Collection[str] = ()) -> Schedule:
+    """Place the task with the longest way to the end first, each where it ends first.
+
+    ``keep`` names the results that are held to the end. Where memory is short, orders that hold less at
+    once are tried too. What one device could do alone, and be done sooner, it does alone; and what one
+    could run alone is never refused.
+
+    Raises: `TooLarge` where no such plan fits, with what the one that comes closest needs; ValueError
+    for tasks that no device runs, or that make no graph.
+    """
+    graph = Graph(tasks, cluster, keep)
+    if len(cluster.devices) == 1:
+        return _alone(graph, _able(graph))
+    orders = [ranked(graph, upward(graph)), graph.by(range(len(graph.tasks))), frugal(graph)]
+    try:
+        schedule = _best(graph, orders)
+    except TooLarge as error:
+        return _alone(graph, _able(graph), error)  # which tells what one device alone would need, if that is less
+    sooner = {d: took for d in _able(graph) if (took := sum(row[d] for row in graph.seconds)) < schedule.makespan}
+    try:
+        return _alone(graph, sorted(sooner, key=sooner.__getitem__)) if sooner else schedule
+    except TooLarge:
+        return schedule
+
+
+def cpop(tasks: Sequence[Task], cluster: Cluster, keep: Collection[str] = ()) -> Schedule:
+    """Place the critical path on the one device that runs it fastest, and all else where it ends first.
+
+    Raises: as `heft`.
+    """
+    graph = Graph(tasks, cluster, keep)
+    through = [up + down for up, down in zip(upward(graph), downward(graph), strict=True)]
+    path = _critical(graph, through)
+    costs = [sum(graph.seconds[i][d] for i in path) for d in range(len(cluster.devices))]
+    fastest = costs.index(min(costs))
+    return _best(graph, [ranked(graph, through)], {i: fastest for i in path if fastest in graph.able[i]})
+
+
+def _best(graph: Graph, orders: Sequence[Sequence[int]], pinned: Mapping[int, int] | None = None) -> Schedule:
+    """The schedule of the first order, if it fits as it is; else of that order which ends first with the memory."""
+    pinned = pinned or {}
+    memory = {device.name: device.memory for device in graph.cluster.devices}
+    best, refused = _placed(Board(graph, bounded=False), orders[0], pinned).schedule(), list[TooLarge]()
+    if all(peak <= memory[name] for name, peak in best.peak.items()):
+        return best
+    found: list[Schedule] = []
+    for order in (*orders[1:], orders[0]):
+        below = min((schedule.makespan for schedule in found), default=math.inf)
+        board = _placed(Board(graph), order, pinned, below)
+        if board.refused:
+            refused.append(board.too_large())
+        elif len(board.placed) == len(order):
+            found.append(board.schedule())
+    if not found:
+        raise min(refused, key=lambda error: error.short)
+    return min(found, key=lambda schedule: schedule.makespan)
+
+
+def _placed(board: Board, order: Sequence[int], pinned: Mapping[int, int], below: float = math.inf) -> Board:
+    """Place tasks in an order; those of ``pinned`` on their device, if they ever fit there.
+
+    A task for which there is no memory lets those go first that follow it and may give some back. It
+    stops half-way where it cannot end before ``below``.
+    """
+    graph = board.graph
+    missing, turn = [len(sources) for sources in graph.sources], {i: n for n, i in enumerate(order)}
+    ready = [n for n, i in enumerate(order) if not missing[i]]
+    waiting: list[int] = []
+    while ready or waiting:
+        forced = not ready
+        if forced:
+            ready, waiting = [min(waiting)], sorted(waiting)[1:]
+        n = heapq.heappop(ready)
+        i = order[n]
+        if forced:
+            board.force(i)
+        elif not (i in pinned and board.place(i, [pinned[i]])) and not board.place(i, graph.able[i]):
+            waiting.append(n)
+            continue
+        if below < math.inf and (forced or board.end[i] >= below):
+            return board
+        for reader in graph.readers[i]:
+            missing[reader] -= 1
+            if not missing[reader]:
+                heapq.heappush(ready, turn[reader])
+        if waiting and board.gave_back(i):
+            ready, waiting = [*ready, *waiting], []
+            heapq.heapify(ready)
+    return board
+
+
+def _critical(graph: Graph, through: Sequence[float]) -> list[int]:
+    """From the first task with the longest way through it, always on to the reader with the longest."""
+    at = max((i for i, sources in enumerate(graph.sources) if not sources), key=through.__getitem__, default=-1)
+    path = []
+    while at >= 0:
+        path.append(at)
+        at = max(graph.readers[at], key=through.__getitem__, default=-1)
+    return path
+
+
+# --- one device -----------------------------------------------------------------------------------------------------
+
+
+def _able(graph: Graph) -> list[int]:
+    """Devices that can run everything, those with most memory first."""
+    devices = graph.cluster.devices
+    able = [d for d in range(len(devices)) if all(d in a for a in graph.able)]
+    return sorted(able, key=lambda d: -devices[d].memory)
+
+
+def _alone(graph: Graph, devices: Sequence[int], *refused: TooLarge) -> Schedule:
+    """One after another on one device, as given or holding little at once: the first that fits."""
+    for d in devices:
+        for order in (graph.by(range(len(graph.tasks))), frugal(graph)):
+            try:
+                return _sequence(graph, d, order)
+            except TooLarge as error:
+                refused = (*refused, error)
+    raise min(refused, key=lambda error: error.short)
+
+
+def _sequence(graph: Graph, d: int, order: Sequence[int]) -> Schedule:
+    """Tasks one after another on device ``d``; what is refused would run with just the memory that is named."""
+    board, name, limit = Board(graph, bounded=False), graph.cluster.devices[d].name, graph.cluster.devices[d].memory
+    left, held, peak, at = [len(readers) for readers in graph.readers], 0.0, 0.0, 0.0
+    needed, largest = 0.0, 0
+    for i in order:
+        held += graph.own[i]
+        board.parts[i] = _fewest(graph, i, limit - held)
+        peak = max(peak, held + graph.work(i, board.parts[i]))
+        least = held + graph.work(i, graph.tasks[i].parts)
+        needed, largest = (least, i) if least > needed else (needed, largest)
+        began, at = at, at + graph.seconds[i][d]
+        board.put(i, d, began, at)
+        for j in graph.sources[i]:
+            left[j] -= 1
+        held -= sum(graph.own[j] for j in (*graph.sources[i], i) if not left[j] and j not in graph.kept)
+    if needed > limit:
+        task = graph.tasks[largest]
+        raise TooLarge(task.name, name, needed, limit, task.parts)
+    schedule = board.schedule()
+    return replace(schedule, peak={**schedule.peak, name: peak})
+
+
+def _fewest(graph: Graph, i: int, room: float) -> int:
+    """The smallest number of parts whose work fits into ``room``, or as many as there are."""
+    most = graph.tasks[i].parts
+    return 1 + bisect_left(range(1, most), True, key=lambda parts: graph.work(i, parts) <= room)

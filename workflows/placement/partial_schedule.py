@@ -1,0 +1,266 @@
+"""Tasks being placed one by one: which gaps the devices have, and what memory is promised to whom."""
+
+from __future__ import annotations
+
+import math
+from bisect import bisect_left
+from collections.abc import Iterator, Sequence
+
+from neusee.workflows.placement.memory_profile import Hold, Room, stacked, without
+from neusee.workflows.placement.task_priorities import Graph
+from neusee.workflows.placement.tasks_and_devices import Move, Schedule, Slot, TooLarge
+
+Copy = tuple[float, float, float]  #: leaves its source, arrives, last use
+Of = tuple[int, float, int]  #: which task's result, how many bytes of it, on which device
+
+
+class Board:
+    """One schedule in the making: each task is placed after its sources, and never moves again."""
+
+    def __init__(self, graph: Graph, bounded: bool = True) -> None:
+        self.graph, devices, count = graph, graph.cluster.devices, len(graph.tasks)
+        self.where, self.parts = [-1] * count, [1] * count
+        self.start, self.end = [0.0] * count, [0.0] * count
+        self.free_at: list[float] = [0.0] * count  # when the last reader placed so far has what it needs
+        self.left = [len(readers) for readers in graph.readers]
+        self.gaps: list[tuple[list[float], list[float]]] = [([0.0], [math.inf]) for _ in devices]
+        most = sum(graph.own) + max((graph.work(i, 1) for i in range(count)), default=0.0)
+        sent = sum(max(0.0, math.ceil(s)) for t, sizes in enumerate(graph.sizes) for s in sizes if graph.tasks[t].takes)
+        self.rooms = [Room(d.memory) if bounded and d.memory < most + sent else None for d in devices]
+        self.links = [[graph.cluster.link(a.name, b.name) for b in devices] for a in devices]
+        self.least = [own + graph.work(i, graph.tasks[i].parts) for i, own in enumerate(graph.own)]
+        self.copies: dict[Of, list[Copy]] = {}
+        self.placed: list[int] = []
+        self.refused: list[tuple[int, int, float]] = []  # task, device, bytes it needs there
+
+    # --- where and when -------------------------------------------------------------------------------------------
+
+    def place(self, i: int, among: Sequence[int]) -> bool:
+        """Give task ``i`` the slot of ``among`` in which it ends first; False if none ever has the memory."""
+        best, on, begin = math.inf, -1, 0.0
+        for d in among:
+            room = self.rooms[d]
+            if room is not None and (room.free() < self.least[i] or self._needs(i, d) > room.limit):
+                continue
+            ready, seconds = self._ready(i, d), self.graph.seconds[i][d]
+            if ready + seconds >= best:
+                continue
+            start = self._slot(i, d, ready, seconds, best)
+            if start + seconds < best:
+                best, on, begin = start + seconds, d, start
+        if on >= 0:
+            self._commit(i, on, begin, best)
+        return on >= 0
+
+    def gave_back(self, i: int) -> bool:
+        """Whether placing task ``i`` made memory free for those that had none."""
+        return any(not self.left[j] for j in self.graph.sources[i]) or bool(self.refused)
+
+    def force(self, i: int) -> None:
+        """Place a task that fits nowhere as if one device had the memory, and note how much that is."""
+        able = [d for d in self.graph.able[i] if self.rooms[d] is not None]
+        needs = {d: self._needs(i, d) for d in able}
+        d = min(able, key=lambda d: (needs[d] - self.graph.cluster.devices[d].memory, d))
+        room = self.rooms[d]
+        assert room is not None
+        self.refused.append((i, d, needs[d]))
+        room.limit = needs[d]
+        self.place(i, [d])
+
+    def _ready(self, i: int, d: int) -> float:
+        """When the last input of ``i`` can be on device ``d``."""
+        ready = 0.0
+        for j, size in zip(self.graph.sources[i], self.graph.sizes[i], strict=True):
+            at = self.end[j]
+            if self.where[j] != d:
+                at += self.links[self.where[j]][d].seconds(size)
+            ready = max(ready, at)
+        return ready
+
+    def _slot(self, i: int, d: int, ready: float, seconds: float, best: float) -> float:
+        """The first start in a gap of ``d`` that is long enough and has the memory; infinity if not before ``best``."""
+        starts, ends = self.gaps[d]
+        for gap in range(bisect_left(ends, ready + seconds), len(ends)):
+            start = max(starts[gap], ready)
+            if start + seconds >= best:
+                return math.inf
+            if start + seconds > ends[gap]:
+                continue
+            start = self._fitting(i, d, start, seconds, ends[gap])
+            if start + seconds <= ends[gap] and start < math.inf:
+                return start
+            ready = max(ready, start)
+        return math.inf
+
+    def _fitting(self, i: int, d: int, start: float, seconds: float, end: float) -> float:
+        """The first moment from ``start`` on at which there is the memory, or one at which it is past ``end``."""
+        room, parts = self.rooms[d], self.graph.tasks[i].parts
+        if room is None:
+            return start
+        while start + seconds <= end and start < math.inf:
+            wait = room.wait(self._holds(i, d, start, start + seconds, parts))
+            if not wait:
+                return start
+            start = max(start + wait, math.nextafter(start, math.inf))
+        return start
+
+    def _holds(self, i: int, d: int, start: float, end: float, parts: int) -> list[Hold]:
+        """All memory that ``i`` takes beside what is on ``d`` already: result, work, and copies of its inputs."""
+        graph = self.graph
+        holds = [(start, math.inf if graph.held(i) else end, graph.own[i]), (start, end, graph.work(i, parts))]
+        for of, leaves in self._arriving(i, d, start):
+            spans = without(leaves, end, ((a, until) for a, _, until in self.copies.get(of, ())))
+            holds += [(a, b, float(math.ceil(of[1]))) for a, b in spans]
+        return holds
+
+    def _arriving(self, i: int, d: int, start: float) -> Iterator[tuple[Of, float]]:
+        """The inputs that are made elsewhere, and when they must leave there to be in time."""
+        for j, size in zip(self.graph.sources[i], self.graph.sizes[i], strict=True):
+            if self.where[j] != d:
+                leaves = start - self.links[self.where[j]][d].seconds(size)
+                yield (j, size, d), max(leaves, self.end[j])
+
+    def _needs(self, i: int, d: int) -> float:
+        """Bytes that ``d`` must have for ``i`` to run there after all that was placed before."""
+        graph, room = self.graph, self.rooms[d]
+        assert room is not None
+        pairs = zip(graph.sources[i], graph.sizes[i], strict=True)
+        copies = sum(math.ceil(size) for j, size in pairs if self.where[j] != d)
+        return room.limit - room.free() + self.least[i] + copies
+
+    # --- what that takes ------------------------------------------------------------------------------------------
+
+    def _commit(self, i: int, d: int, start: float, end: float) -> None:
+        graph, room = self.graph, self.rooms[d]
+        if room is not None:
+            self.parts[i] = self._fewest(i, d, start, end, room)
+            for hold in self._holds(i, d, start, end, self.parts[i]):
+                room.add(*hold)
+        self.put(i, d, start, end)
+        self._fill(d, start, end)
+        for of, leaves in self._arriving(i, d, start):
+            self.copies[of] = _joined([*self.copies.get(of, ()), (leaves, start, end)])
+        for j in graph.sources[i]:
+            self.free_at[j] = max(self.free_at[j], end if self.where[j] == d else start)
+            self.left[j] -= 1
+            home = self.rooms[self.where[j]]
+            if not self.left[j] and j not in graph.kept and home is not None:
+                home.add(self.free_at[j], math.inf, -graph.own[j])
+
+    def put(self, i: int, d: int, start: float, end: float) -> None:
+        self.where[i], self.start[i], self.end[i], self.free_at[i] = d, start, end, end
+        self.placed.append(i)
+
+    def _fewest(self, i: int, d: int, start: float, end: float, room: Room) -> int:
+        """The smallest number of parts with which ``i`` fits into its slot; cut into all of them, it does."""
+
+        def fits(parts: int) -> bool:
+            return not room.wait(self._holds(i, d, start, end, parts))
+
+        return 1 + bisect_left(range(1, self.graph.tasks[i].parts), True, key=fits)
+
+    def _fill(self, d: int, start: float, end: float) -> None:
+        """Cut a slot out of the gap that it lies in."""
+        starts, ends = self.gaps[d]
+        gap = bisect_left(ends, end)
+        left = [(a, b) for a, b in ((starts[gap], start), (end, ends[gap])) if a < b]
+        starts[gap : gap + 1] = [a for a, _ in left]
+        ends[gap : gap + 1] = [b for _, b in left]
+
+    # --- the end --------------------------------------------------------------------------------------------------
+
+    def too_large(self) -> TooLarge:
+        """Why the first task that had to be forced does not fit, and what all that were forced need there."""
+        graph, (i, d, _) = self.graph, self.refused[0]
+        needed, device = max(n for _, on, n in self.refused if on == d), graph.cluster.devices[d]
+        return TooLarge(graph.tasks[i].name, device.name, needed, device.memory, graph.tasks[i].parts)
+
+    def schedule(self) -> Schedule:
+        """The whole schedule."""
+        devices = self.graph.cluster.devices
+        self._bridge()
+        moves = sorted(self._moves(), key=lambda m: (m.start, m.task, m.device))
+        slots = sorted(self._slots(), key=lambda slot: (slot.start, slot.end))
+        held = self._held()
+        peak = {device.name: _highest(held[d]) for d, device in enumerate(devices)}
+        return Schedule(tuple(slots), max(self.end, default=0.0), peak, sum(m.bytes for m in moves), tuple(moves))
+
+    def _bridge(self) -> None:
+        """Where there is the memory, keep a copy for its next use instead of sending it again."""
+        for (j, size, d), copies in self.copies.items():
+            room, kept = self.rooms[d], copies[:1]
+            for copy in copies[1:]:
+                leaves, arrives, until = kept[-1]
+                if room is None or room.highest(until, copy[0]) + math.ceil(size) <= room.limit:
+                    if room is not None:
+                        room.add(until, copy[0], math.ceil(size))
+                    kept[-1] = (leaves, arrives, max(until, copy[2]))
+                else:
+                    kept.append(copy)
+            self.copies[j, size, d] = kept
+
+    def _moves(self) -> Iterator[Move]:
+        devices = self.graph.cluster.devices
+        for (j, size, d), copies in self.copies.items():
+            task, source = self.graph.tasks[j].name, devices[self.where[j]].name
+            for leaves, arrives, until in copies:
+                yield Move(task, size, source, devices[d].name, leaves, arrives, until)
+
+    def _held(self) -> list[list[Hold]]:
+        """By device, every span of memory that the schedule takes in the end."""
+        graph, held = self.graph, list[list[Hold]]([] for _ in self.rooms)
+        until, over = list(self.end), max(self.end, default=0.0)
+        for (j, size, d), copies in self.copies.items():
+            held[d] += [(leaves, last, float(math.ceil(size))) for leaves, _, last in copies]
+            until[j] = max(until[j], copies[-1][1])
+        for i, sources in enumerate(graph.sources):
+            for j in sources:
+                if self.where[j] == self.where[i]:
+                    until[j] = max(until[j], self.end[i])
+        for i, d in enumerate(self.where):
+            held[d].append((self.start[i], over if i in graph.kept else until[i], graph.own[i]))
+            held[d].append((self.start[i], self.end[i], graph.work(i, self.parts[i])))
+        return held
+
+    def _slots(self) -> Iterator[Slot]:
+        """Every slot, with the task that kept it from beginning earlier."""
+        tasks, devices, turn = self.graph.tasks, self.graph.cluster.devices, [0] * len(self.where)
+        for number, i in enumerate(self.placed):
+            turn[i] = number
+        before, ended = [-1] * len(devices), dict[float, int]()
+        for i in sorted(self.placed, key=lambda i: (self.start[i], turn[i])):
+            d, start = self.where[i], self.start[i]
+            after = self._waited(i, before[d], ended.get(start, -1))
+            name = tasks[after].name if after >= 0 else ""
+            yield Slot(tasks[i].name, devices[d].name, start, self.end[i], self.parts[i], name)
+            before[d] = i
+            ended[self.end[i]] = i
+
+    def _waited(self, i: int, before: int, other: int) -> int:
+        """What ``i`` waited for: an input, its device, or the end of another task, which freed memory."""
+        start, d = self.start[i], self.where[i]
+        for j, size in zip(self.graph.sources[i], self.graph.sizes[i], strict=True):
+            sent = 0.0 if self.where[j] == d else self.links[self.where[j]][d].seconds(size)
+            if self.end[j] + sent == start:
+                return j
+        if start == 0.0 or (before >= 0 and self.end[before] == start):
+            return before
+        candidates = [j for j in (before, *self.graph.sources[i]) if j >= 0]
+        return other if other >= 0 else max(candidates, key=self.end.__getitem__, default=-1)
+
+
+def _highest(holds: list[Hold]) -> float:
+    """Most bytes at once."""
+    return max((size for _, _, size in stacked(holds)), default=0.0)
+
+
+def _joined(copies: list[Copy]) -> list[Copy]:
+    """Copies in order of time, those that touch as one."""
+    joined: list[Copy] = []
+    for leaves, arrives, until in sorted(copies):
+        if joined and leaves <= joined[-1][2]:
+            first = joined[-1]
+            joined[-1] = (first[0], first[1], max(first[2], until))
+        else:
+            joined.append((leaves, arrives, until))
+    return joined

@@ -1,0 +1,69 @@
+"""How a lift from RGB to spectra is learnt: a recipe's ``train_lift`` block, read and checked where it stands."""
+
+from __future__ import annotations
+
+import math
+from typing import Annotated, Any, Literal
+
+from pydantic import BaseModel, ConfigDict, Field, ValidationError
+
+from neusee.workflows.graph.diagnostics import Problem, nearest
+from neusee.workflows.recipe.text.composition import Composed
+from neusee.workflows.recipe.text.yaml_values import Value
+
+KEY = "train_lift"  #: of a recipe
+
+Beta = Annotated[float, Field(ge=0, lt=1)]
+Number = Annotated[int, Field(ge=1)]
+
+
+class LiftTraining(BaseModel):
+    """A recipe's ``train_lift`` block."""
+
+    model_config = ConfigDict(extra="forbid", frozen=True)
+
+    measured: str = "measured"
+    picture: str = "picture"
+    cube: str = "cube"
+    start: Literal["linear", "random"] = "linear"
+    iterations: Number
+    batch: Number = 4
+    rate: Annotated[float, Field(gt=0, allow_inf_nan=False)] = 4e-4
+    least: Annotated[float, Field(ge=0, allow_inf_nan=False)] = 1e-6
+    betas: tuple[Beta, Beta] = (0.9, 0.999)
+    warm: Annotated[int, Field(ge=0)] = 200
+    floor: Annotated[float, Field(gt=0, le=1)] = 0.02
+    average: Beta = 0.998
+    judge: Number = 32
+    keep: Number = 100
+    show: Number = 1000
+
+    def rate_at(self, iteration: int) -> float:
+        """The learning rate of an iteration, from 0: half a cosine from `rate` to `least`, rising evenly at first."""
+        least, rising = min(self.least, self.rate), min(1.0, (iteration + 1) / max(self.warm, 1))
+        return rising * (least + (self.rate - least) * 0.5 * (1 + math.cos(math.pi * iteration / self.iterations)))
+
+
+def read_lift_training(composed: Composed) -> tuple[Composed, LiftTraining | None]:
+    """The recipe without its ``train_lift`` block, and the block; what is wrong with it becomes a problem."""
+    block = composed.root.items.get(KEY)
+    if block is None:
+        return composed, None
+    composed = composed.without(KEY)
+    try:
+        return composed, LiftTraining.model_validate(block.plain)
+    except ValidationError as error:
+        return composed.with_problems(_problem(block, each) for each in error.errors()), None
+
+
+def _problem(block: Value, error: Any) -> Problem:
+    """Where it stands, as far as what pydantic names is there, and what to write."""
+    names = [str(key) for key in error["loc"]]
+    below = {str(key): value for key, value in block.items.items()}
+    at = below.get(names[0], block) if names else block
+    path = ".".join([KEY, *names[: at is not block]])
+    if error["type"] == "extra_forbidden":
+        return Problem(at.key, path, f"is not known here; {nearest(names[0], LiftTraining.model_fields)}")
+    if error["type"] == "missing":
+        return Problem(at.mark, path, f"lacks {names[-1]}")
+    return Problem(at.mark, path, str(error["msg"]))

@@ -1,0 +1,274 @@
+"""What a recipe is not sure of: laws in the place of values, and a ``posterior`` over several of them.
+
+A run takes the median of a law and what ``posterior`` says it shall take; the study of uncertainty draws from both.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass, field, replace
+from pathlib import Path
+from typing import Any
+
+from neusee.nodes.units import read_any
+from neusee.workflows.graph.diagnostics import Mark, Problem, nearest
+from neusee.workflows.recipe.distributions.joint import Joint, Posterior, read_posterior, summary
+from neusee.workflows.recipe.distributions.scalar import Law, is_law, read_law, written
+from neusee.workflows.recipe.text.composition import Composed
+from neusee.workflows.recipe.text.references import BROKEN
+from neusee.workflows.recipe.text.yaml_values import Value, Where, dotted
+
+KEY = "posterior"  #: of a recipe
+_BLOCK = "sensor"  #: whose values a calibration names without it
+_SAID = ("file", "use", "values")
+_SUMMARY = ("mean", "sd", "correlation", "covariance")
+_FAR = 0.005  #: share of a posterior beyond which a recipe's own value is far off
+
+
+@dataclass(frozen=True)
+class Standing:
+    """A value of the recipe beside its posterior."""
+
+    path: str
+    own: str  #: what the recipe says
+    kind: str  #: estimate, upper, lower, none
+    mean: float
+    sd: float
+    low: float  #: 5 %
+    high: float  #: 95 %
+    unit: str
+    below: float  #: share of the posterior below the recipe's own value
+    used: str  #: what a run takes
+    why: str  #: where it takes that from
+
+    @property
+    def far(self) -> bool:
+        """Whether the recipe's own value lies where there is hardly any posterior."""
+        return not _FAR <= self.below <= 1 - _FAR
+
+
+@dataclass(frozen=True)
+class Uncertain:
+    """What can be drawn from, and the recipe that it belongs to."""
+
+    composed: Composed  #: with a value in the place of every law
+    laws: Mapping[str, Law]  #: by path
+    joint: Joint | None  #: its names are paths
+    standings: tuple[Standing, ...] = ()
+    notes: tuple[str, ...] = ()
+    source: str = ""  #: of the posterior
+    units: Mapping[str, str] = field(default_factory=dict)  #: SI unit by path of what is in the joint law
+
+    @property
+    def names(self) -> tuple[str, ...]:
+        """Paths of all that is uncertain."""
+        return (*self.laws, *(self.joint.names if self.joint else ()))
+
+    def said(self, name: str) -> str:
+        """Its law, or where its posterior is from."""
+        return self.laws[name].text if name in self.laws else f"posterior {self.source}"
+
+    def at(self, values: Mapping[str, float]) -> Any:
+        """The recipe with these values, in SI, checked anew; raises `RecipeError`."""
+        from neusee.workflows.recipe.loading import check
+
+        root = self.composed.root
+        for path, value in values.items():
+            unit = self.laws[path].unit if path in self.laws else self.units[path]
+            root = put(root, tuple(path.split(".")), written(value, unit))
+        return check(replace(self.composed, root=root))
+
+
+def settle(composed: Composed) -> tuple[Composed, Uncertain | None]:
+    """The recipe with a value in the place of all that is uncertain; of one that is sure of all, itself."""
+    laws, root = dict[str, Law](), composed.root
+    problems = list(composed.problems)
+    for path, leaf in _laws(root):
+        try:
+            laws[dotted(path)] = law = read_law(leaf.data)
+        except ValueError as error:
+            problems.append(Problem(leaf.mark, f"{dotted(path)} = {leaf.data}", str(error)))
+            root = put(root, path, BROKEN)
+            continue
+        root = put(root, path, written(law.median, law.unit))
+    given = root.items.get(KEY)
+    if given is None and not laws and len(problems) == len(composed.problems):
+        return composed, None
+    notes = [f"{path} is {law.text}: run at {_said(law.median, law.unit)}" for path, law in laws.items()]
+    found = _Reader(replace(root, data={key: v for key, v in root.data.items() if key != KEY}), laws, problems)
+    if given is not None:
+        found.read(given)
+    settled = replace(composed, root=found.root, problems=tuple(problems))
+    rest = (tuple(found.standings), (*notes, *found.notes), found.source, found.units)
+    return settled, Uncertain(replace(settled, problems=()), laws, found.joint, *rest)
+
+
+def _laws(root: Value) -> Iterator[tuple[Where, Value]]:
+    """Every scalar that is written as a law, by the keys that lead to it: an alias stands at several places."""
+    stack: list[tuple[Where, Value]] = [((key,), value) for key, value in root.items.items() if key != KEY]
+    while stack:
+        path, value = stack.pop()
+        if is_law(value.data):
+            yield path, value
+        stack += [((*path, key), child) for key, child in value.items.items()]
+
+
+def put(root: Value, path: Where, data: Any, mark: Mark | None = None) -> Value:
+    """``root`` with another scalar at ``path``, which must be there."""
+    if not path:
+        return replace(root, data=data, mark=mark or root.mark)
+    key = next(key for key in root.items if str(key) == str(path[0]))
+    child = put(root.items[key], path[1:], data, mark)
+    if isinstance(root.data, list):
+        return replace(root, data=[child if i == key else value for i, value in enumerate(root.data)])
+    return replace(root, data={**root.data, key: child})
+
+
+def _at(root: Value, path: str) -> Value | None:
+    here: Value | None = root
+    for part in path.split("."):
+        here = next((value for key, value in here.items.items() if str(key) == part), None) if here else None
+    return here
+
+
+class _Reader:
+    """Reads ``posterior`` of a recipe, and puts what a run shall take in its place."""
+
+    def __init__(self, root: Value, laws: Mapping[str, Law], problems: list[Problem]) -> None:
+        self.root, self.laws, self.problems = root, laws, problems
+        self.joint: Joint | None = None
+        self.standings: list[Standing] = []
+        self.notes: list[str] = []
+        self.units: dict[str, str] = {}
+        self.source = ""
+
+    def read(self, given: Value) -> None:
+        """Apply it; every mistake is a problem that stands where it was written."""
+        if given.data is None:
+            return
+        said = given.items if isinstance(given.data, dict) else {"file": given}
+        if strange := [v for key, v in said.items() if key not in (*_SAID, *_SUMMARY)]:
+            return self._fail(strange[0].key, strange[0].name, f"unknown; {nearest(strange[0].name, _SAID)}")
+        try:
+            posterior = self._posterior(given, said)
+            use = self._use(said.get("use"), posterior)
+            pairs = self._pairs(said.get("values"), posterior, given)
+        except ValueError as error:
+            return self._fail(given.mark, KEY, str(error))
+        self._apply(posterior, pairs, use, given.mark)
+
+    def _posterior(self, given: Value, said: Mapping[Any, Value]) -> Posterior:
+        if any(key in said for key in _SUMMARY):
+            self.source = f"summary at {given.mark}"
+            return Posterior(summary({key: _flat(v) for key, v in said.items() if key in _SUMMARY}))
+        file = said.get("file")
+        if file is None or not isinstance(file.data, str):
+            raise ValueError("write posterior: PATH, or posterior: {file: PATH, use: mean}")
+        path = Path(file.mark.folder) / Path(file.data).expanduser()
+        self.source = str(file.data)
+        return read_posterior(path)
+
+    def _use(self, given: Value | None, posterior: Posterior) -> str | int:
+        use = "mean" if given is None else given.data
+        drawn = posterior.joint.draws
+        if use in ("mean", "nominal"):
+            return str(use)
+        if isinstance(use, int) and not isinstance(use, bool) and drawn is not None and 0 <= use < len(drawn):
+            return use
+        some = f", or the number of a draw, 0 to {len(drawn) - 1}" if drawn is not None else ""
+        raise ValueError(f"use = {use}: write mean, nominal (what the recipe says){some}")
+
+    def _pairs(self, given: Value | None, posterior: Posterior, whole: Value) -> dict[str, str]:
+        """Names of the posterior by the path of the recipe's value."""
+        names = posterior.joint.names
+        if given is not None and not isinstance(given.data, dict):
+            raise ValueError("values: write {path of the recipe: name in the posterior}")
+        if given is not None:
+            pairs = {path: str(name) for path, name in _flat(given).items()}
+            if wrong := [name for name in pairs.values() if name not in names]:
+                raise ValueError(f"values: {wrong[0]} is not in the posterior; {nearest(wrong[0], names)}")
+        else:
+            all_pairs = {name if "." in name else f"{_BLOCK}.{name}": name for name in names}
+            pairs = {path: name for path, name in all_pairs.items() if _at(self.root, path) is not None}
+            if lost := [name for path, name in all_pairs.items() if path not in pairs]:
+                self.notes.append(f"of the posterior, this recipe has no {', '.join(lost)}")
+        if wrong := [path for path in pairs if _at(self.root, path) is None]:
+            raise ValueError(f"values: the recipe has no {wrong[0]}")
+        if not pairs:
+            raise ValueError(f"no value of the recipe is in the posterior, which knows {', '.join(names)}")
+        self._conventions(posterior, pairs)
+        return pairs
+
+    def _conventions(self, posterior: Posterior, pairs: Mapping[str, str]) -> None:
+        """A number means what it says only by the convention that it was found by."""
+        unit = _at(self.root, "reading.gain_unit")
+        if "gain" in pairs.values() and unit is not None and posterior.units.get("gain", unit.data) != unit.data:
+            raise ValueError(f"its gain is in {posterior.units['gain']}, the recipe reads {unit.data}: set the reading")
+        exposure = _at(self.root, f"{_BLOCK}.exposure")
+        words = posterior.units.get("dark_current", "")
+        if "dark_current" in pairs.values() and exposure is not None and " in " in words:
+            told, own = read_any(words.partition(" in ")[2])[0], read_any(exposure.data)[0]
+            if abs(told - own) > 1e-9 * own:
+                raise ValueError(f"its dark current is in {told:g} s, the recipe exposes {own:g} s")
+
+    def _apply(self, posterior: Posterior, pairs: Mapping[str, str], use: str | int, mark: Mark) -> None:
+        kept = {}
+        for path, name in pairs.items():
+            value = _at(self.root, path)
+            assert value is not None
+            if path in self.laws or value.mark.line == 0:
+                if path in self.laws and value.mark.line:
+                    self._fail(value.mark, path, "is a law here and in the posterior: leave one out")
+                self.notes.append(f"{path} is what the argument says, not the posterior")
+                continue
+            try:
+                own, unit = read_any(value.data)
+            except ValueError as error:
+                self._fail(value.mark, path, f"is in the posterior, but {error}")
+                continue
+            kept[path] = name
+            self.units[path] = unit
+            self._stand(posterior, path, name, own, use, mark)
+        if kept:
+            joint = posterior.joint.only(tuple(kept.values()))
+            self.joint = replace(joint, names=tuple(kept))
+
+    def _stand(self, posterior: Posterior, path: str, name: str, own: float, use: str | int, mark: Mark) -> None:
+        """Where the recipe's own value lies, and what a run takes in its place."""
+        joint, unit, kind = posterior.joint, self.units[path], posterior.kind(name)
+        i = joint.names.index(name)
+        taken, why = own, "recipe"
+        if isinstance(use, int):
+            assert joint.draws is not None
+            taken, why = float(joint.draws[use, i]), f"draw {use}"
+        elif kind == "estimate" and use == "mean":
+            taken, why = float(joint.mean[i]), "mean"
+        if taken != own:
+            self.root = put(self.root, tuple(path.split(".")), written(taken, unit), mark)
+        low, high = joint.interval(name)
+        numbers = (float(joint.mean[i]), float(joint.sd[i]), low, high)
+        words = (unit, joint.below(name, own), _said(taken, unit), why)
+        standing = Standing(path, _said(own, unit), kind, *numbers, *words)
+        self.standings.append(standing)
+        if standing.far:
+            law = f"{standing.mean:.6g} ± {standing.sd:.2g} {unit}".rstrip()
+            self.notes.append(f"{path} = {standing.own} is far from its posterior, {law} ({self.source})")
+
+    def _fail(self, mark: Mark, path: str, message: str) -> None:
+        self.problems.append(Problem(mark, path, message))
+
+
+def _flat(value: Value) -> Any:
+    """A mapping by dotted paths, however deep an argument made it; of all else its plain value."""
+    if not isinstance(value.data, dict):
+        return value.plain
+    return {dotted(leaf.path[len(value.path) :]): leaf.plain for leaf in value.leaves() if leaf is not value}
+
+
+def _said(value: float, unit: str) -> str:
+    return f"{value:.6g} {unit}".rstrip()
+
+
+def told(standings: Sequence[Standing]) -> list[dict[str, Any]]:
+    """As plain JSON."""
+    return [{**{name: getattr(s, name) for name in Standing.__dataclass_fields__}, "far": s.far} for s in standings]

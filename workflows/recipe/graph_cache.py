@@ -1,0 +1,95 @@
+"""What was found out of a recipe's graph, for as long as the graph, its items and its nodes stay what they were.
+
+Which node a step names and which steps feed it hang on the ``steps`` and on the names of the
+items, and on no other value: a thousand points of a sweep need not ask again. The parameters,
+the files and all else that a value decides are looked at every time.
+"""
+
+from __future__ import annotations
+
+import sys
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import TypeVar
+
+import neusee.nodes
+from neusee.workflows.graph.recipe_graph import Recipe, Wire
+from neusee.workflows.recipe.step_declarations import Declared
+from neusee.workflows.recipe.text.yaml_values import Value
+
+K = TypeVar("K")
+V = TypeVar("V")
+Names = tuple[tuple[str, tuple[str, ...] | None], ...]  #: of every block: its items, or None if it is no list of items
+
+_MOST = 16
+_graphs: dict[tuple[int, Names], KnownGraph] = {}
+_written: dict[int, tuple[Value, Recipe]] = {}  #: id of a top mapping -> that mapping, and its recipe
+
+
+@dataclass(frozen=True, slots=True)
+class KnownGraph:
+    """Steps and wires in which nothing was wrong."""
+
+    value: Value  #: the ``steps``, held so that no other value takes its id
+    steps: dict[str, Declared]
+    absent: dict[str, Value]
+    wires: Mapping[str, Mapping[str, Wire]]  #: of the bound steps whose wires are no references
+
+
+def known_graph(root: Value) -> KnownGraph | None:
+    """What is known of the graph of a recipe, if its nodes are still those of the program."""
+    steps = root.items.get("steps")
+    found = _graphs.get((id(steps), _names(root)))
+    return found if found is not None and all(map(_current, found.steps.values())) else None
+
+
+def keep_graph(
+    root: Value, steps: dict[str, Declared], absent: dict[str, Value], wires: Mapping[str, Mapping[str, Wire]]
+) -> None:
+    """Remember a graph in which nothing is wrong, but for its references: they are followed every time."""
+    if any(_refers(step.value.items.get("node")) for step in steps.values()):
+        return
+    fixed = [name for step in steps.values() if not _refers(step.value.items.get("from")) for name in step.instances]
+    value = root.items["steps"]
+    found = KnownGraph(value, steps, absent, {name: wires[name] for name in fixed})
+    remember(_graphs, (id(value), _names(root)), found)
+
+
+def known_recipe(root: Value) -> Recipe | None:
+    """The recipe of a top mapping that was checked before."""
+    found = _written.get(id(root))
+    return found[1] if found is not None and known_graph(root) is not None else None
+
+
+def keep_recipe(root: Value, recipe: Recipe) -> Recipe:
+    """Remember the recipe of a top mapping."""
+    remember(_written, id(root), (root, recipe))
+    return recipe
+
+
+def remember(known: dict[K, V], name: K, value: V) -> None:
+    """Keep what was made, and let the oldest go."""
+    while len(known) >= _MOST:
+        known.pop(next(iter(known), name), None)
+    known[name] = value
+
+
+def _names(root: Value) -> Names:
+    blocks = ((str(key), block.data) for key, block in root.items.items() if key != "steps")
+    return tuple((key, _items(data) if isinstance(data, dict) else None) for key, data in blocks)
+
+
+def _items(block: dict[str | int, Value]) -> tuple[str, ...] | None:
+    return tuple(map(str, block)) if all(isinstance(item.data, dict) for item in block.values()) else None
+
+
+def _current(step: Declared) -> bool:
+    """Whether the node that a step names is still the one that was found."""
+    family, _, name = str(step.value.items["node"].data).partition(".")
+    return getattr(sys.modules.get(f"{neusee.nodes.__name__}.{family}"), name, None) is step.node
+
+
+def _refers(value: Value | None) -> bool:
+    if value is None:
+        return False
+    return "${" in value.data if isinstance(value.data, str) else any(map(_refers, value.items.values()))

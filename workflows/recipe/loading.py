@@ -1,0 +1,196 @@
+"""From a recipe's name, or its file, and arguments to steps that are checked and ready to run.
+
+Everything is looked at before anything runs, and every mistake is reported at once.
+"""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any
+
+from neusee.workflows.graph.diagnostics import Problem, RecipeError
+from neusee.workflows.graph.final_values import Config, Setting
+from neusee.workflows.graph.recipe_graph import Expectation, Recipe, Step, Wire, kept_promises
+from neusee.workflows.recipe.blocks.train_block import KEY as TRAINING
+from neusee.workflows.recipe.blocks.train_block import read_training
+from neusee.workflows.recipe.blocks.train_lift_block import KEY as LIFTING
+from neusee.workflows.recipe.blocks.train_lift_block import read_lift_training
+from neusee.workflows.recipe.cycle_check import cycles
+from neusee.workflows.recipe.distributions.nominal_values import Uncertain, settle
+from neusee.workflows.recipe.global_settings import expectations, outputs_of, seed_and_tolerance
+from neusee.workflows.recipe.graph_cache import keep_graph, keep_recipe, known_graph, known_recipe
+from neusee.workflows.recipe.parameters import Checker
+from neusee.workflows.recipe.step_declarations import Declared, declare, device_of
+from neusee.workflows.recipe.text.composition import Composed, compose, groups_of, packaged
+from neusee.workflows.recipe.text.overrides import Override, arguments_in
+from neusee.workflows.recipe.text.python_overrides import overrides_of
+from neusee.workflows.recipe.text.references import References
+from neusee.workflows.recipe.text.yaml_values import Value, Where
+from neusee.workflows.recipe.wiring import Wiring
+
+
+@dataclass(frozen=True, slots=True)
+class Titled:
+    """A packaged recipe or an option of a group, and the first line that says what it shows."""
+
+    name: str
+    title: str
+
+
+def load(
+    name_or_path: str | os.PathLike[str],
+    /,
+    overrides: Sequence[str] = (),
+    folder: str | os.PathLike[str] | None = None,
+    first: int = 1,
+    **values: Any,
+) -> Recipe:
+    """Read and check a packaged recipe, or a file whose name ends in ``.yaml``.
+
+        load("first_light", ["sensor.read_noise=20 e-"])
+        load("first_light", doe="axicon", sensor={"read_noise": "20 e-"}, lasers={"green": {"strength": 1e4}})
+        load("first_light", **{"sensor.read_noise": "20 e-", "+lasers.red": {"wavelength": "638 nm", …}})
+
+    ``values`` are changes as Python values, made after ``overrides``; a mapping changes what it
+    names and leaves the rest. Paths are relative to ``folder`` (the working folder), and messages
+    count ``overrides`` from ``first``. An expected number whose step a change reaches is no longer
+    expected, and a note says so. Raises `RecipeError` with every problem.
+    """
+    name, place = os.fspath(name_or_path), Path(folder or ".").absolute()
+    changes: tuple[str | Override, ...] = (*overrides, *overrides_of(values, place))
+    recipe = check(compose(name, changes, place, first))
+    return kept_promises(recipe, _as_written(name, place)) if recipe.expect and changes else recipe
+
+
+def _as_written(name: str, place: Path) -> Recipe:
+    """A recipe without changes; it is not checked again while its files and nodes are what they were."""
+    composed = compose(name, (), place)
+    return known_recipe(composed.root) or keep_recipe(composed.root, check(composed))
+
+
+def check(composed: Composed) -> Recipe:
+    """A composed recipe with its steps bound, or a `RecipeError` with every problem."""
+    learnt = [composed.root.items[key] for key in (TRAINING, LIFTING) if key in composed.root.items]
+    composed, training = read_training(composed)
+    composed, lifting = read_lift_training(composed)
+    composed, uncertain = settle(composed)
+    problems = list(composed.problems)
+    root, references = composed.root, References(composed.root, problems)
+    graph = known_graph(root)
+    steps, absent = (graph.steps, graph.absent) if graph else declare(root, references, problems)
+    wiring, checker = Wiring(root, steps, absent, references, problems), Checker([])
+    bound = {step.name: step for step in _bind(root, steps, wiring, checker, graph.wires if graph else {})}
+    problems += cycles(bound, {name: step.value.key for name, step in steps.items()})
+    seed, tolerance = seed_and_tolerance(root, references, checker.problems)
+    outputs = outputs_of(root, wiring)
+    expect = expectations(root, wiring)
+    references.finish()
+    if not composed.whole:  # without a group, much else looks wrong that is not
+        problems = list(composed.problems)
+    if problems or checker.problems:
+        raise RecipeError([*problems, *checker.problems])
+    if graph is None:
+        keep_graph(root, steps, absent, {name: step.wires for name, step in bound.items()})
+    config = _config(root, bound, steps, checker, references.spare, uncertain)
+    for block in learnt:
+        config = Config({**config.settings, **dict(_settings(block, checker))})
+    nulls = {name: f"null ({value.mark})" for name, value in absent.items()}
+    notes = (*checker.notes, *(uncertain.notes if uncertain else ()))
+    told = composed.name, composed.title, seed, tolerance, outputs, bound, expect, config, notes, nulls
+    return Recipe(*told, uncertain=uncertain, training=training, lifting=lifting)
+
+
+def _bind(
+    root: Value,
+    steps: Mapping[str, Declared],
+    wiring: Wiring,
+    checker: Checker,
+    known: Mapping[str, Mapping[str, Wire]],
+) -> Iterator[Step]:
+    """Every copy of every step that can be bound; ``known`` are wires that were looked at before."""
+    for step in steps.values():
+        if not step.items:
+            for part in ("from", "with", "device"):
+                wiring.references.touch(step.part(part), step.dims)
+        for items in step.items:
+            scope = step.scope(root, items)
+            given = wiring.references.resolve(step.part("with"), scope)
+            name = step.instance(items)
+            wires = known[name] if name in known else wiring.wires(step, items)
+            device = device_of(step, wiring.references, scope, checker.problems)
+            if step.node is None:
+                continue
+            params = checker.read(step.node, given, step.value.key)
+            if params is not None:
+                checker.preflight(step.node, params, given.items, step.value)
+            marks = {str(name): value.mark for name, value in given.items.items()}
+            yield Step(name, step.node, params or {}, wires, step.value.key, marks, device)
+
+
+def _config(
+    root: Value,
+    bound: dict[str, Step],
+    steps: dict[str, Declared],
+    checker: Checker,
+    spare: set[Where],
+    uncertain: Uncertain | None,
+) -> Config:
+    """Final values by path: what was written, and after each step's what its node has by default."""
+    settings: dict[str, Setting] = {}
+    for key, block in root.items.items():
+        if key != "steps":
+            settings |= {name: found for name, found in _settings(block, checker) if found.path not in spare}
+            continue
+        for name, step in block.items.items():
+            settings |= dict(_settings(step, checker))
+            if str(name) in steps:
+                settings |= _defaults(steps[str(name)], bound)
+    for name, law in uncertain.laws.items() if uncertain else ():
+        if name in settings:
+            settings[name] = replace(settings[name], value=law.text)
+    return Config(settings)
+
+
+def _settings(block: Value, checker: Checker) -> Iterator[tuple[str, Setting]]:
+    for leaf in block.leaves():
+        value: Any = checker.files.get(leaf.path, leaf.plain)
+        sources = dict.fromkeys(map(str, (leaf.mark, *arguments_in(leaf))))
+        yield leaf.name, Setting(value, ", ".join(sources), leaf.path)
+
+
+def _defaults(step: Declared, bound: dict[str, Step]) -> Iterator[tuple[str, Setting]]:
+    """Parameters of a step that no one wrote, in SI."""
+    first = bound.get(step.instances[0]) if step.instances else None
+    for name, value in (first.params if first else {}).items():
+        if first and name not in first.param_marks:
+            path = (*step.value.path, "with", name)
+            yield ".".join(map(str, path)), Setting(value, f"default of {first.node.path}", path, True)
+
+
+# --- what there is --------------------------------------------------------------------------------------------------
+
+
+def recipes() -> list[Titled]:
+    """The packaged recipes."""
+    return [_titled(path) for path in sorted(packaged().glob("*.yaml"))]
+
+
+def groups(beside: Path | None = None) -> dict[str, list[Titled]]:
+    """The options of every group: packaged, and beside a recipe of one's own."""
+    folders = [folder for folder in (beside, packaged()) if folder]
+    return {
+        group: [_titled(next(p for f in folders if (p := f / group / f"{name}.yaml").is_file())) for name in names]
+        for group, names in groups_of(*folders).items()
+    }
+
+
+def _titled(path: Path) -> Titled:
+    with path.open(encoding="utf-8") as file:
+        first = file.readline().strip()
+    return Titled(path.stem, first.lstrip("# ") if first.startswith("#") else "")
+
+
+__all__ = ["Expectation", "Problem", "Recipe", "RecipeError", "Titled", "check", "groups", "load", "recipes"]

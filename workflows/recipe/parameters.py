@@ -1,0 +1,147 @@
+"""Parameters: what a recipe gives, against what a node's signature allows."""
+
+from __future__ import annotations
+
+import os
+import re
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any, get_args
+
+from pydantic import ValidationError
+from pydantic_core import ErrorDetails
+
+from neusee.nodes import Node, ParameterError
+from neusee.nodes.units import IsFile
+from neusee.workflows.graph.diagnostics import Mark, Problem, nearest
+from neusee.workflows.recipe.text.references import broken
+from neusee.workflows.recipe.text.yaml_values import Value, kind
+
+_LONGEST = 40  #: characters of a value that a message repeats
+
+
+@dataclass(slots=True)
+class Checker:
+    """Checks the parameters of one step after another and gathers what is wrong or worth a note."""
+
+    problems: list[Problem]
+    notes: dict[str, None] = field(default_factory=dict)
+    #: path of a value -> the file, or files, in full
+    files: dict[tuple[str | int, ...], str | list[str]] = field(default_factory=dict)
+
+    def read(self, node: Node, given: Value, step: Mark) -> dict[str, Any] | None:
+        """Validated parameters with the node's defaults, or None if there are problems."""
+        if given.data is not None and not isinstance(given.data, dict):
+            message = f"must be a mapping of parameters, not {kind(given)}"
+            self.problems.append(Problem(given.mark, given.name, message))
+            return None
+        if broken(given):
+            return None
+        values = {str(name): value for name, value in given.items.items()}
+        plain = {name: self._plain(node, name, value) for name, value in values.items()}
+        try:
+            model = node.params.model_validate(plain)
+        except ValidationError as error:
+            self.problems += _problems(error, node, values, given, step)
+            return None
+        return {name: getattr(model, name) for name in node.params.model_fields}
+
+    def preflight(self, node: Node, params: Mapping[str, Any], values: Mapping[str, Value], step: Value) -> None:
+        """Let the node look at its parameters before anything runs."""
+        if node.before is None:
+            return
+        try:
+            self.notes.update(dict.fromkeys(node.before(**params)))
+        except ParameterError as error:
+            value = values.get(error.parameter)
+            if value is None:
+                self.problems.append(Problem(step.key, f"{step.name}.with.{error.parameter}", str(error)))
+            else:
+                self.problems.append(Problem(value.mark, _said(value), str(error)))
+        except (ValueError, OSError) as error:
+            self.problems.append(Problem(step.key, step.name, str(error)))
+
+    def _plain(self, node: Node, name: str, value: Value) -> Any:
+        """A value alone; the path of a file is taken from the folder of the YAML file that names it."""
+        given = value.data if isinstance(value.data, list) else [value]
+        if name not in node.hints or not _is_file(node.hints[name]) or not all(isinstance(v.data, str) for v in given):
+            return value.plain
+        paths = [os.path.normpath(Path(v.mark.folder) / Path(v.data).expanduser()) for v in given]
+        full = [os.path.abspath(path) for path in paths]
+        self.files[value.path] = full if isinstance(value.data, list) else full[0]
+        return paths if isinstance(value.data, list) else paths[0]
+
+
+def _is_file(hint: Any) -> bool:
+    """Whether an annotation holds `IsFile` anywhere."""
+    extras = getattr(hint, "__metadata__", ())
+    return any(isinstance(extra, IsFile) for extra in extras) or any(map(_is_file, get_args(hint)))
+
+
+def _problems(
+    error: ValidationError, node: Node, values: Mapping[str, Value], given: Value, step: Mark
+) -> Iterator[Problem]:
+    """One problem for each value that is wrong, unknown or missing."""
+    details = error.errors(include_url=False)
+    strangers = [str(e["loc"][0]) for e in details if e["type"] == "extra_forbidden"]
+    meant = {nearest(name, node.params.model_fields) for name in strangers}
+    wrong: dict[tuple[Mark, str], list[str]] = {}
+    for e in details:
+        name = str(e["loc"][0])
+        if e["type"] == "extra_forbidden":
+            hint = nearest(name, node.params.model_fields)
+            yield Problem(values[name].key, f"{given.name}.{name}", f"unknown to {node.path}; {hint}")
+        elif e["type"] == "missing" and len(e["loc"]) == 1:
+            if f"did you mean {name}?" not in meant:
+                yield Problem(step, f"{given.name}.{name}", f"is missing: {node.path} needs it")
+        else:
+            value = _deepest(values[name], e["loc"][1:])
+            wrong.setdefault((value.mark, _said(value)), []).append(_message(e) + _in_si(e, value))
+    for (mark, path), messages in wrong.items():
+        yield Problem(mark, path, ", or ".join(dict.fromkeys(messages)))
+
+
+def _deepest(value: Value, path: tuple[int | str, ...]) -> Value:
+    """The part of a value that an error is about."""
+    for part in path:
+        by_name = {str(key): child for key, child in value.items.items()}
+        if str(part) not in by_name:
+            break
+        value = by_name[str(part)]
+    return value
+
+
+def _said(value: Value) -> str:
+    """``sensor.gain = -1``."""
+    text = str(value.plain)
+    return f"{value.name} = {text if len(text) <= _LONGEST else text[: _LONGEST - 1] + '…'}"
+
+
+def _message(error: ErrorDetails) -> str:
+    """What pydantic says, as one line that says what to write."""
+    if error["type"] == "missing":
+        return f"must have at least {int(error['loc'][-1]) + 1} values"
+    text = error["msg"].removeprefix("Value error, ")
+    text = re.sub(
+        r"^Input should be (a valid |valid )?", lambda m: "must be a " if m[1] == "a valid " else "must be ", text
+    )
+    text = re.sub(r"^must be a (?=[aeiou])", "must be an ", text)
+    text = text.replace("must be a tuple", "must be a list, such as [1, 2]").replace("a dictionary", "a mapping")
+    text = text.replace("must be an integer, got a number with a fractional part", "must be a whole number")
+    text = re.sub(r"must be an? (integer|number), unable to parse .*", _number_wanted, text)
+    if error["type"] == "literal_error":
+        options = re.findall(r"'([^']*)'", error.get("ctx", {}).get("expected", ""))
+        hint = nearest(str(error["input"]), options)
+        text += f"; {hint}" if hint.startswith("did you mean") else ""
+    return text[:1].lower() + text[1:]
+
+
+def _in_si(error: ErrorDetails, value: Value) -> str:
+    """What a quantity is in SI, where it is beyond a limit that is given in SI."""
+    limit = next((v for key, v in error.get("ctx", {}).items() if key in ("gt", "ge", "lt", "le")), 0)
+    return f" in SI, not {error['input']:.4g}" if limit and isinstance(value.data, str) else ""
+
+
+def _number_wanted(match: re.Match[str]) -> str:
+    return "must be a whole number" if match[1] == "integer" else "must be a number"

@@ -1,0 +1,164 @@
+"""Arguments over a recipe: ``a.b=1``, ``+a.b=1``, ``~a.b``."""
+
+from __future__ import annotations
+
+import difflib
+import re
+from collections.abc import Iterable, Iterator
+from dataclasses import dataclass, replace
+
+from neusee.workflows.graph.diagnostics import Mark, Problem, RecipeError
+from neusee.workflows.recipe.text.yaml_values import Value, parse
+
+RESERVED = frozenset(
+    {"steps", "seed", "tolerance", "outputs", "expect", "posterior"}
+)  #: keys that are no parameter block
+
+Trail = list[tuple[Value, str | int]]  #: values along a path, each with the key that leads on
+
+_SYNTAX = re.compile(r"(?P<sign>[+~]?)(?P<path>[^\s=+~.]+(?:\.[^\s=.]+)*)(?:=(?P<value>.*))?", re.DOTALL)
+_HELP = "is no override: write path=value, +path=value, ~path or group=option"
+
+
+@dataclass(frozen=True, slots=True)
+class Override:
+    """One argument, read."""
+
+    text: str
+    sign: str  #: ``""`` changes a value, ``+`` adds one, ``~`` takes one away
+    path: tuple[str, ...]
+    value: Value | None
+    mark: Mark
+
+    @property
+    def value_is_collection(self) -> bool:
+        return self.value is not None and isinstance(self.value.data, dict | list)
+
+
+def read_override(text: str, mark: Mark) -> Override:
+    """Read one argument; its value is YAML, so that ``20 e-`` stays a text."""
+    match = _SYNTAX.fullmatch(text)
+    if match is None:
+        raise RecipeError([Problem(mark, text, _HELP)])
+    sign, path, value = match["sign"], tuple(match["path"].split(".")), match["value"]
+    if sign == "~":
+        if value is not None:
+            raise RecipeError([Problem(mark, text, f"~ takes a value away and gives none: write ~{match['path']}")])
+        return Override(text, sign, path, None, mark)
+    if value is None:
+        raise RecipeError([Problem(mark, text, f"has no value: write {text}=VALUE")])
+    if not value.strip():
+        raise RecipeError([Problem(mark, text, f"has no value: write {text}VALUE, or {text}null for none")])
+    try:
+        return Override(text, sign, path, parse(value, mark, path), mark)
+    except RecipeError as error:
+        raise RecipeError([Problem(mark, text, p.message) for p in error.problems]) from None
+
+
+def apply(root: Value, override: Override, problems: list[Problem], groups: Iterable[str] = ()) -> Value:
+    """``root`` with one value changed, added or taken away; a mistake leaves it as it was."""
+    trail, missing = _follow(root, override.path)
+    fault = _fault(root, override, trail, missing, groups)
+    if fault:
+        problems.append(Problem(override.mark, override.text, fault))
+        return root
+    return _rebuild(trail, missing, override)
+
+
+def _follow(root: Value, path: tuple[str, ...]) -> tuple[Trail, tuple[str, ...]]:
+    """The values along ``path`` with the key that leads on, and the part of the path that is not there."""
+    trail: Trail = []
+    here = root
+    for n, part in enumerate(path):
+        items = here.items
+        key: str | int = int(part) if part not in items and part.isdecimal() and int(part) in items else part
+        if key not in items:
+            return [*trail, (here, part)], path[n:]
+        trail.append((here, key))
+        here = items[key]
+    return trail, ()
+
+
+def _fault(root: Value, o: Override, trail: Trail, missing: tuple[str, ...], groups: Iterable[str]) -> str | None:
+    """What is wrong with an override, or None."""
+    here = trail[-1][0]
+    if not missing:
+        return "is there already: leave out the + to change it" if o.sign == "+" else None
+    if isinstance(here.data, list):
+        if o.sign == "+" and len(missing) == 1 and missing[0] == str(len(here.data)):
+            return None
+        return f"{here.name} has {len(here.data)} values: 0 to {len(here.data) - 1}"
+    if o.sign == "+" or (o.sign == "" and _implied(root, o.path)):
+        return None if isinstance(here.data, dict | None) else f"{here.name} is one value, not a mapping"
+    return f"unknown; {_suggest(root, o.path, groups)}"
+
+
+def _implied(root: Value, path: tuple[str, ...]) -> bool:
+    """Whether a path need not be written to exist: a key of the recipe itself, or of one of its steps."""
+    if path[0] != "steps":
+        return path[0] in RESERVED and (len(path) == 1 or path[0] in ("expect", "posterior"))
+    steps = root.items.get("steps")
+    return len(path) > 2 and steps is not None and path[1] in steps.items
+
+
+def _suggest(root: Value, path: tuple[str, ...], groups: Iterable[str]) -> str:
+    """The nearest path that exists; a new one is never the first advice for what may be a typo."""
+    here, found = root, list[str]()
+    for part in path:
+        names = {str(key): value for key, value in here.items.items()}
+        also = (*RESERVED, *groups) if here is root else ()
+        close = difflib.get_close_matches(part, {*names, *also}, 1)
+        if not close:
+            break
+        found += close
+        here = names.get(close[0], Value(None, here.mark, here.key, ()))
+    if len(found) == len(path):
+        return f"did you mean {'.'.join(found)}?"
+    same = {leaf.name for leaf in root.leaves() if leaf.path[0] not in RESERVED and _close(path[-1], leaf.path[-1])}
+    if same:
+        return f"did you mean {' or '.join(sorted(same)[:3])}?"
+    return f"{here.name or 'the recipe'} has {', '.join(map(str, here.items)) or 'no such value'}"
+
+
+def _close(name: str, other: str | int) -> bool:
+    return bool(difflib.get_close_matches(name, [str(other)], 1, 0.75))
+
+
+def _rebuild(trail: Trail, missing: tuple[str, ...], o: Override) -> Value:
+    """The values along the trail made anew, from the inside out."""
+    made = _placed(trail, missing, o)
+    for n in range(len(missing) - 1, 0, -1):
+        assert made is not None
+        made = Value({_key(missing[n]): made}, o.mark, o.mark, o.path[: len(o.path) - len(missing) + n])
+    for here, key in reversed(trail):
+        made = _with(here, _key(key) if missing and here is trail[-1][0] else key, made, o.mark)
+    assert made is not None
+    return made
+
+
+def _placed(trail: Trail, missing: tuple[str, ...], o: Override) -> Value | None:
+    """The value, which knows where it comes to stand: a number is a number there, as in the file."""
+    there = tuple(key for _, key in trail)
+    where = (*there[:-1], *map(_key, missing)) if missing else there
+    return o.value if o.value is None or where == o.path else parse(o.text.partition("=")[2], o.mark, where)
+
+
+def _key(part: str | int) -> str | int:
+    return int(part) if isinstance(part, str) and part.isdecimal() else part
+
+
+def _with(here: Value, key: str | int, made: Value | None, mark: Mark) -> Value:
+    items = {k: v for k, v in here.items.items() if made is not None or k != key}
+    if made is not None:
+        items[key] = made
+    if isinstance(here.data, list):
+        return replace(here, data=[replace(v, path=(*here.path, i)) for i, v in enumerate(items.values())])
+    return replace(here, data=items) if here.data is not None else Value(items, mark, here.key, here.path)
+
+
+def arguments_in(value: Value) -> Iterator[Mark]:
+    """Arguments that changed a part of a value."""
+    for child in value.items.values():
+        if not child.mark.line:
+            yield child.mark
+        yield from arguments_in(child)

@@ -1,0 +1,93 @@
+"""Changes of a recipe as Python values: ``sensor={"read_noise": "20 e-"}`` is ``sensor.read_noise=20 e-``.
+
+A mapping changes what it names and leaves the rest; an empty one, and a step with its
+``node``, stand for the whole. A text is taken as it is, not read as YAML.
+"""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Iterator, Mapping
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+from neusee.workflows.graph.diagnostics import Mark, Problem, RecipeError
+from neusee.workflows.graph.final_values import flow
+from neusee.workflows.recipe.text.overrides import Override, read_override
+from neusee.workflows.recipe.text.yaml_values import Value, Where
+
+_ALLOWED = "give a number, a text, True or False, None, a list or a mapping"
+_LONGEST = 40  #: characters of a value that a message repeats
+
+
+def overrides_of(values: Mapping[str, Any], folder: Path) -> list[Override]:
+    """The changes that keyword arguments ask for; a `RecipeError` names everything that cannot stand in a recipe."""
+    found: list[Override] = []
+    problems: list[Problem] = []
+    for key, value in values.items():
+        mark = Mark(f"argument {key}", folder=str(folder))
+        try:
+            found += _read(key, value, mark)
+        except RecipeError as error:
+            problems += error.problems
+    if problems:
+        raise RecipeError(problems)
+    return found
+
+
+def _read(key: str, given: Any, mark: Mark) -> Iterator[Override]:
+    """One keyword: its sign and path as on the command line, then each value below it."""
+    if key.startswith("~") and given is not None:
+        raise RecipeError([Problem(mark, key, f"~ takes a value away and gives none: write {{{key!r}: None}}")])
+    try:
+        named = read_override(key if key.startswith("~") else f"{key}=null", mark)
+    except RecipeError as error:
+        raise RecipeError([Problem(mark, key, p.message) for p in error.problems]) from None
+    if named.sign:
+        yield named if named.sign == "~" else _override(named, named.path, given)
+        return
+    stack = [(named.path, given)]
+    while stack:
+        path, value = stack.pop()
+        if isinstance(value, Mapping) and value and not _whole_step(path, value):
+            stack += [((*path, str(_key(name, mark, path))), below) for name, below in reversed(list(value.items()))]
+        else:
+            yield _override(named, path, value)
+
+
+def _whole_step(path: tuple[str, ...], value: Mapping[Any, Any]) -> bool:
+    return len(path) == 2 and path[0] == "steps" and "node" in value
+
+
+def _override(named: Override, path: tuple[str, ...], given: Any) -> Override:
+    name = ".".join(path)
+    mark = named.mark if path == named.path else replace(named.mark, file=f"argument {name}")
+    value = _value(given, mark, path)
+    shown = flow(value.plain)
+    shown = shown if len(shown) <= _LONGEST else shown[: _LONGEST - 1] + "…"
+    return Override(f"{named.sign}{name}={shown}", named.sign, path, value, mark)
+
+
+def _value(given: Any, mark: Mark, path: Where) -> Value:
+    """A Python value as the reader of a file would give it."""
+    if isinstance(given, Mapping):
+        data = {_key(key, mark, path): _value(item, mark, (*path, str(key))) for key, item in given.items()}
+        return Value(data, mark, mark, path)
+    if isinstance(given, list | tuple | range):
+        return Value([_value(item, mark, (*path, i)) for i, item in enumerate(given)], mark, mark, path)
+    if isinstance(given, os.PathLike):
+        return Value(os.fspath(given), mark, mark, path)
+    if given is None or isinstance(given, bool | int | float | str):
+        return Value(given, mark, mark, path)
+    listed = given.tolist() if hasattr(given, "tolist") else given  # a number or an array of numpy or torch
+    if not isinstance(listed, bool | int | float | str | list):
+        message = f"a recipe holds no {type(given).__name__}: {_ALLOWED}"
+        raise RecipeError([Problem(mark, ".".join(map(str, path)), message)])
+    return _value(listed, mark, path)
+
+
+def _key(key: Any, mark: Mark, path: Where) -> str | int:
+    if isinstance(key, str | int) and not isinstance(key, bool) and key != "":
+        return key
+    raise RecipeError([Problem(mark, ".".join(map(str, path)), f"a key is a name or a whole number, not {key!r}")])

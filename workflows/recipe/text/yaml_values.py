@@ -1,0 +1,262 @@
+"""YAML 1.2 to plain values that know where they stand.
+
+``1e3`` is a number, ``on`` a word, ``010`` ten, and a key that stands twice is a mistake.
+"""
+
+from __future__ import annotations
+
+import math
+import re
+from collections.abc import Iterator
+from dataclasses import dataclass, replace
+from functools import lru_cache
+from pathlib import Path
+from typing import Any
+
+from ruamel.yaml import YAML
+from ruamel.yaml.error import MarkedYAMLError, YAMLError, YAMLStreamError
+from ruamel.yaml.nodes import MappingNode, Node, ScalarNode
+
+from neusee.workflows.graph.diagnostics import Mark, Problem, RecipeError
+
+Where = tuple[str | int, ...]  #: keys and indices from the top of a recipe
+
+_TAG = "tag:yaml.org,2002:"
+_INT = re.compile(r"[-+]?[0-9]+|0o[0-7]+|0x[0-9a-fA-F]+")
+_FLOAT = re.compile(r"[-+]?(?:\.[0-9]+|[0-9]+(?:\.[0-9]*)?)(?:[eE][-+]?[0-9]+)?")
+_MOST = 1_000_000  #: values in one file
+_MOST_AGAIN = 100_000  #: of them by aliases
+
+
+@dataclass(frozen=True, slots=True)
+class Value:
+    """A scalar, a list of values or a mapping of values, with the place of its key and its own."""
+
+    data: Any  #: None, bool, int, float, str, list[Value] or dict[str | int, Value]
+    mark: Mark
+    key: Mark
+    path: Where
+
+    @property
+    def name(self) -> str:
+        return dotted(self.path)
+
+    @property
+    def plain(self) -> Any:
+        """The value alone."""
+        if isinstance(self.data, dict):
+            return {key: value.plain for key, value in self.data.items()}
+        return [value.plain for value in self.data] if isinstance(self.data, list) else self.data
+
+    @property
+    def items(self) -> dict[Any, Value]:
+        """Its values by key or index; of a scalar, none."""
+        if isinstance(self.data, dict):
+            return self.data
+        return dict(enumerate(self.data)) if isinstance(self.data, list) else {}
+
+    def leaves(self) -> Iterator[Value]:
+        """Scalars, lists and empty mappings below a mapping, in order."""
+        if not isinstance(self.data, dict) or not self.data:
+            yield self
+            return
+        for value in self.data.values():
+            yield from value.leaves()
+
+
+@dataclass(frozen=True, slots=True)
+class Document:
+    """One file: its top mapping, and its first line where that is a comment."""
+
+    root: Value
+    title: str
+
+
+def dotted(path: Where) -> str:
+    return ".".join(map(str, path))
+
+
+def read(path: Path, shown: str) -> Document:
+    """Read a file known to the user as ``shown``; a `RecipeError` locates everything that is wrong with it."""
+    try:
+        text = path.read_bytes().decode("utf-8-sig")
+    except UnicodeDecodeError as error:
+        before = error.object[: error.start].decode("utf-8", "replace")
+        mark = Mark(shown, before.count("\n") + 1, len(before.rpartition("\n")[2]) + 1)
+        raise RecipeError([Problem(mark, "", f"byte 0x{error.object[error.start]:02x} is not UTF-8")]) from None
+    except OSError as error:
+        raise RecipeError([Problem(Mark(shown), "", f"cannot be read: {error.strerror}")]) from None
+    return _document(text, shown, str(path.parent))
+
+
+@lru_cache(maxsize=256)
+def _document(text: str, shown: str, folder: str) -> Document:
+    root = parse(text, Mark(shown, 1, 1, folder))
+    if not isinstance(root.data, dict):
+        what = "is empty" if root.data is None else f"holds {kind(root)}"
+        raise RecipeError([Problem(Mark(shown, 1, 1), "", f"{what}: write a mapping, `key: value`")])
+    first = text.lstrip().partition("\n")[0].strip()
+    return Document(root, first.lstrip("# ") if first.startswith("#") else "")
+
+
+def parse(text: str, start: Mark, path: Where = ()) -> Value:
+    """Read YAML text. ``start`` says what it is called; an argument's values all stand at ``start`` (line 0)."""
+    builder = _Builder(start)
+    try:
+        node = YAML(typ="safe", pure=True).compose(text)
+        value = Value(None, start, start, path) if node is None else builder.value(node, path, start)
+    except RecursionError:
+        raise RecipeError([Problem(start, dotted(path), "is nested too deeply")]) from None
+    except (YAMLError, YAMLStreamError) as error:
+        raise RecipeError([_explain(error, text, start, path)]) from None
+    if builder.problems:
+        raise RecipeError(builder.problems)
+    return value
+
+
+def kind(value: Value) -> str:
+    """What a value is, in words."""
+    names = {dict: "a mapping", list: "a list", str: "a text", bool: "true or false", type(None): "nothing"}
+    return names.get(type(value.data), "a number")
+
+
+class _Builder:
+    """Makes values of the nodes of one text; an alias is the same value again."""
+
+    def __init__(self, start: Mark) -> None:
+        self.start = start
+        self.problems: list[Problem] = []
+        self.made: dict[int, Value] = {}
+        self.open: set[int] = set()
+        self.size: dict[int, int] = {}
+        self.again = 0  # values that aliases made
+
+    def value(self, node: Node, path: Where, key: Mark) -> Value:
+        mark, tag = self._mark(node), (node.tag or "").replace(_TAG, "!!")
+        if tag not in _KNOWN:
+            return self._refuse(mark, path, f"the tag {tag} means nothing here: leave it out")
+        if isinstance(node, ScalarNode):
+            return Value(_scalar(node), mark, key, path)
+        if id(node) in self.made:
+            self.again += self.size[id(node)]
+            self._refuse_many(self.again, _MOST_AGAIN, mark, path)
+            return replace(_moved(self.made[id(node)], path), key=key)
+        if id(node) in self.open:
+            return self._refuse(mark, path, "an alias inside the very value that it stands for")
+        self.open.add(id(node))
+        data = self._mapping(node, path) if isinstance(node, MappingNode) else self._list(node, path)
+        self.open.discard(id(node))
+        made = self.made[id(node)] = Value(data, mark, key, path)
+        self._weigh(node, made)
+        return made
+
+    def _mapping(self, node: MappingNode, path: Where) -> dict[str | int, Value]:
+        data: dict[str | int, Value] = {}
+        for key_node, value_node in node.value:
+            mark, key = self._mark(key_node), _key(key_node)
+            if key == "<<":
+                self._refuse(mark, path, "merge keys (<<) are not YAML 1.2: refer to values with ${…}")
+            elif key is None:
+                self._refuse(mark, path, "a key must be a name or a whole number")
+            elif key in data:
+                first = data[key].key
+                self._refuse(mark, (*path, key), f"stands twice; first in line {first.line}" if first.line else "twice")
+            else:
+                data[key] = self.value(value_node, (*path, key), mark)
+        return data
+
+    def _list(self, node: Node, path: Where) -> list[Value]:
+        return [self.value(child, (*path, i), self._mark(child)) for i, child in enumerate(node.value)]
+
+    def _weigh(self, node: Node, made: Value) -> None:
+        """Refuse a small file that aliases blow up."""
+        children = [v for pair in node.value for v in pair] if isinstance(node, MappingNode) else node.value
+        self.size[id(node)] = 1 + sum(self.size.get(id(child), 1) for child in children)
+        self._refuse_many(self.size[id(node)], _MOST, made.mark, made.path)
+
+    def _refuse_many(self, count: int, most: int, mark: Mark, path: Where) -> None:
+        if count > most:
+            raise RecipeError([Problem(mark, dotted(path), f"aliases make more than {most} values of this")])
+
+    def _mark(self, node: Node) -> Mark:
+        if not self.start.line:
+            return self.start
+        return Mark(self.start.file, node.start_mark.line + 1, node.start_mark.column + 1, self.start.folder)
+
+    def _refuse(self, mark: Mark, path: Where, message: str) -> Value:
+        self.problems.append(Problem(mark, dotted(path), message))
+        return Value(None, mark, mark, path)
+
+
+def _moved(value: Value, path: Where) -> Value:
+    """The same value at another place, and all below it."""
+    data = value.data
+    if isinstance(data, dict):
+        data = {key: _moved(child, (*path, key)) for key, child in data.items()}
+    elif isinstance(data, list):
+        data = [_moved(child, (*path, i)) for i, child in enumerate(data)]
+    return replace(value, data=data, path=path)
+
+
+_KNOWN = {f"!!{name}" for name in ("str", "int", "float", "bool", "null", "map", "seq", "timestamp", "merge", "value")}
+
+
+def _scalar(node: ScalarNode) -> Any:
+    text, tag = str(node.value), (node.tag or "").removeprefix(_TAG)
+    if tag == "null" and node.style is None:
+        return None
+    if tag == "bool" and node.style is None:
+        return text.lower() == "true"
+    return number(text) if tag in ("int", "float") and node.style is None else text
+
+
+def number(text: str) -> int | float | str:
+    """A number as YAML 1.2 writes it, or the text itself."""
+    if _INT.fullmatch(text):
+        return int(text, 0 if text[:2] in ("0o", "0x") else 10)
+    if _FLOAT.fullmatch(text):
+        return float(text)
+    bare = text.lstrip("+-").lower()
+    if bare in (".inf", ".nan"):
+        return -math.inf if text[0] == "-" and bare == ".inf" else float(bare[1:])
+    return text
+
+
+def _key(node: Node) -> str | int | None:
+    """A key as a name or a whole number; None if it is something else."""
+    if not isinstance(node, ScalarNode):
+        return None
+    key = _scalar(node)
+    return key if isinstance(key, str | int) and not isinstance(key, bool) and key != "" else None
+
+
+def _explain(error: Exception, text: str, start: Mark, path: Where) -> Problem:
+    """One located sentence for what the YAML reader could not read."""
+    at = getattr(error, "problem_mark", None)
+    line, column = (at.line, at.column) if at else _control(text)
+    problem = error.problem if isinstance(error, MarkedYAMLError) and error.problem else "a character that cannot stand"
+    lines = text.splitlines() or [""]
+    here = lines[min(line, len(lines) - 1)]
+    mark = Mark(start.file, line + 1, column + 1, start.folder) if start.line else start
+    return Problem(mark, dotted(path), _fix(problem, here, column))
+
+
+def _fix(problem: str, here: str, column: int) -> str:
+    if "\\t" in problem or "\t" in here[: column + 1]:
+        return "a tab: YAML is indented with spaces"
+    if re.search(r"[^\"']\$\{", here) and "expected" in problem:
+        return 'inside { } or [ ], quote a reference: "${…}"'
+    if re.search(r"\[[^\]]*\w\[", here) and "'['" in problem:
+        return 'inside [ ], quote a name with brackets: "psf[mask]"'
+    if "mapping values are not allowed" in problem:
+        return "a second ':' on this line, or a wrong indent: quote the text, or begin a new line"
+    if "but found another document" in problem:
+        return "a second document (---): a recipe is one"
+    return f"is not YAML: {problem}"
+
+
+def _control(text: str) -> tuple[int, int]:
+    """Line and column of the first control character."""
+    found = re.search(r"[\x00-\x08\x0b\x0c\x0e-\x1f\x7f\ud800-\udfff\ufffe\uffff]", text)
+    before = text[: found.start()] if found else ""
+    return before.count("\n"), len(before.rpartition("\n")[2])

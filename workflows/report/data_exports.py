@@ -1,0 +1,98 @@
+"""Files of ``data/``: spectral OpenEXR, RGB OpenEXR and 16-bit PNG, each kept by the key of what it holds."""
+
+from __future__ import annotations
+
+import struct
+import zlib
+from collections.abc import Callable
+from pathlib import Path
+from tempfile import TemporaryDirectory
+from typing import Any
+
+import torch
+from torch import Tensor
+
+from neusee.nodes.values import Bands, Psf
+from neusee.workflows.engine.runner import Result
+from neusee.workflows.keys.cache_key import digest
+from neusee.workflows.keys.code_digest import Code
+from neusee.workflows.report.contents import FILES
+from neusee.workflows.report.requirements import Missing
+from neusee.workflows.report.run_pictures import Job, finished, needs
+from neusee.workflows.store.derived_files import Shelf
+
+_FORM = 1  #: raised when a file is written differently
+
+
+def exports(result: Result, shelf: Shelf) -> tuple[dict[str, Path], dict[str, str]]:
+    """Every file of ``data/`` that a run can give, and why the others cannot be."""
+    code, jobs, missing = Code(result.store.code_memo), [], {}
+    for name, (form, wanted) in FILES.items():
+        try:
+            found = needs(wanted, result, code)
+        except Missing as why:
+            missing[name] = str(why)
+            continue
+        key = digest("file", form, _FORM, [[n, f.identity] for n, f in found.items()])
+        jobs.append(Job(name, Path(name).suffix, key, found, _FORMS[form]))
+    found = needs({step: step for step in result.recipe.outputs}, result, code)
+    key = digest("file", "safetensors", _FORM, [[n, f.identity] for n, f in found.items()])
+    jobs.append(Job("outputs.safetensors", ".safetensors", key, found, safetensors))
+    return finished(jobs, result, shelf, missing), missing
+
+
+def spectral(cube: Tensor | Psf, bands: Bands) -> bytes:
+    """A spectral cube as OpenEXR in the layout of Fichet et al., JCGT 2021."""
+    from neusee.nodes.scene._spectral_exr import write_spectral
+
+    values = cube.intensity if isinstance(cube, Psf) else cube
+    return _written(".exr", lambda path: write_spectral(path, values.detach().cpu().float(), bands.centres))
+
+
+def safetensors(**values: Any) -> bytes:
+    """Tensors by the name of their step, and of their field where a step gives several."""
+    from safetensors.torch import save
+
+    tensors: dict[str, Tensor] = {}
+    for name, value in values.items():
+        fields = value._asdict() if hasattr(value, "_asdict") else {"": value}
+        found = {f"{name}.{k}".rstrip("."): v for k, v in fields.items() if isinstance(v, Tensor)}
+        tensors |= {k: v.detach().cpu().clone(memory_format=torch.contiguous_format) for k, v in found.items()}
+    return save(tensors)
+
+
+def exr(image: Tensor) -> bytes:
+    """Three channels as float32 OpenEXR."""
+    import OpenEXR
+
+    pixels = {"RGB": image.detach().cpu().float().permute(1, 2, 0).contiguous().numpy()}
+    header = {"compression": OpenEXR.ZIP_COMPRESSION, "type": OpenEXR.scanlineimage}
+    return _written(".exr", lambda path: OpenEXR.File(header, pixels).write(str(path)))
+
+
+def png16(image: Tensor) -> bytes:
+    """Whole numbers in [0, 65535], (3, y, x), as a 16-bit RGB PNG, bit for bit."""
+    words = image.detach().cpu().double().round()
+    if image.ndim != 3 or image.shape[0] != 3 or float(words.min()) < 0 or float(words.max()) > 65535:
+        raise ValueError(f"16-bit PNG holds (3, y, x) in [0, 65535], not {tuple(image.shape)}")
+    height, width = image.shape[1:]
+    big = words.permute(1, 2, 0).to(torch.int32).numpy().astype(">u2").reshape(height, -1)
+    lines = b"".join(b"\0" + row.tobytes() for row in big)
+    head = struct.pack(">IIBBBBB", width, height, 16, 2, 0, 0, 0)
+    chunks = ((b"IHDR", head), (b"IDAT", zlib.compress(lines, 6)), (b"IEND", b""))
+    return b"\x89PNG\r\n\x1a\n" + b"".join(_chunk(*c) for c in chunks)
+
+
+def _chunk(name: bytes, body: bytes) -> bytes:
+    return struct.pack(">I", len(body)) + name + body + struct.pack(">I", zlib.crc32(name + body))
+
+
+def _written(suffix: str, write: Callable[[Path], Any]) -> bytes:
+    """What a library that only writes files has written."""
+    with TemporaryDirectory(prefix="neusee-") as folder:
+        path = Path(folder) / f"file{suffix}"
+        write(path)
+        return path.read_bytes()
+
+
+_FORMS: dict[str, Callable[..., bytes]] = {"spectral": spectral, "exr": exr, "png16": png16}

@@ -1,0 +1,60 @@
+"""The picture everyone looks at first: truth, plain lens, with mask, restored, error."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import Any
+
+import torch
+from torch import Tensor
+
+from neusee.workflows.report.figures.style import ORANGE, canvas, drawn, encoded, picture
+
+
+@drawn
+def overview(
+    *, truth: Tensor, plain: Tensor, mask: Tensor, restored: Tensor, spots: Mapping[str, Tensor] | None = None
+) -> Any:
+    """Truth, plain lens, with mask, restored and |error|, all by one stretch, the laser ringed."""
+    white = high(truth)
+    pictures = {"truth": truth, "plain lens": plain, "with mask": mask, "restored": restored}
+    figure, axes = canvas(13.0, 3.4, 1, 5)
+    for ax, (name, image) in zip(axes[0], pictures.items(), strict=False):
+        picture(ax, encoded(centre(image, truth) / white), name)
+        _ring(ax, spots or {}, truth)
+    error = (centre(restored, truth) - truth).abs().mean(0) / white
+    shown = picture(axes[0, 4], error.cpu().numpy(), "|restored − truth|", cmap="viridis", vmin=0.0, vmax=high(error))
+    _ring(axes[0, 4], spots or {}, truth)
+    bar = figure.colorbar(shown, ax=axes[0, 4], fraction=0.046, pad=0.03, extend="max")
+    bar.set_label("fraction of white", fontsize=9)
+    bar.ax.tick_params(labelsize=9)
+    return figure
+
+
+def high(values: Tensor) -> float:
+    """The level that only one value in 200 passes."""
+    some = values.detach().flatten()[:: max(1, values.numel() // 200_000)].float()
+    return max(float(torch.quantile(some, 0.995)), 1e-9)
+
+
+def centre(image: Tensor, like: Tensor) -> Tensor:
+    """The part of an image that ``like`` shows: both keep the axis at sample N // 2."""
+    top, left = (image.shape[d] // 2 - like.shape[d] // 2 for d in (-2, -1))
+    if top < 0 or left < 0:
+        raise ValueError(f"a picture of {tuple(image.shape)} does not cover the truth, {tuple(like.shape)}")
+    return image[..., top : top + like.shape[-2], left : left + like.shape[-1]].float()
+
+
+def _ring(ax: Any, spots: Mapping[str, Tensor], like: Tensor) -> None:
+    """A ring round every laser's brightest pixel."""
+    from matplotlib.patches import Circle
+
+    radius = max(like.shape[-1] / 14, 3.0)
+    for y, x in {_brightest(centre(s, like)) for s in spots.values()}:
+        for width, colour in ((3.0, "black"), (1.4, ORANGE)):
+            ax.add_patch(Circle((x, y), radius, fill=False, color=colour, linewidth=width))
+
+
+def _brightest(spot: Tensor) -> tuple[int, int]:
+    index = int(spot.sum(0).argmax())
+    return index // spot.shape[-1], index % spot.shape[-1]

@@ -1,0 +1,129 @@
+"""Pictures of the optics: the mask's height and phase, the spot it makes, what it buys at each wavelength."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import torch
+from torch import Tensor
+
+from neusee.nodes.values import Bands, Psf, Pupil
+from neusee.workflows.report.figures.style import (
+    BLACK,
+    BLUE,
+    GREEN,
+    VERMILION,
+    canvas,
+    drawn,
+    nanometres,
+    nearest,
+    picture,
+    wavelength_colour,
+)
+
+_SHOWN = (450e-9, 550e-9, 638e-9)
+
+
+@drawn
+def height(*, pupil: Pupil) -> Any:
+    """Height of the mask and its wrapped phase at three wavelengths, over the clear aperture."""
+    figure, axes = canvas(13.0, 3.5, 1, 4)
+    step = max(1, pupil.height.shape[-1] // 540)
+    clear = pupil.aperture[::step, ::step] > 0
+    half = float(pupil.pitch) * pupil.height.shape[-1] / 2 * 1e3
+    extent = (-half, half, -half, half)
+    metres = pupil.height[::step, ::step].double()
+    _map(figure, axes[0, 0], (metres * 1e6).where(clear, torch.nan), "height", "µm", extent, cmap="cividis")
+    for ax, wanted in zip(axes[0, 1:], _SHOWN, strict=True):
+        band = nearest(pupil.wavelengths, wanted)
+        turns = pupil.index[band] * metres / pupil.wavelengths[band]
+        title = f"phase at {nanometres(float(pupil.wavelengths[band])):.0f} nm"
+        limits = {"cmap": "twilight", "vmin": 0.0, "vmax": 1.0}
+        _map(figure, ax, torch.remainder(turns, 1.0).where(clear, torch.nan), title, "turns, wrapped", extent, **limits)
+    axes[0, 0].set_ylabel("v (mm)")
+    return figure
+
+
+def _map(figure: Any, ax: Any, values: Tensor, title: str, unit: str, extent: tuple[float, ...], **how: Any) -> None:
+    shown = ax.imshow(values.cpu().numpy(), origin="lower", extent=extent, **how)
+    ax.set_title(title)
+    ax.set_xlabel("u (mm)")
+    ax.grid(False)
+    bar = figure.colorbar(shown, ax=ax, fraction=0.046, pad=0.03)
+    bar.set_label(unit, fontsize=9)
+    bar.ax.tick_params(labelsize=9)
+
+
+@drawn
+def psf(*, plain: Psf, mask: Psf, bands: Bands, pixel_pitch: float) -> Any:
+    """Logarithm of the spread light at three wavelengths, and the energy within a radius."""
+    figure, axes = canvas(13.0, 6.6, 2, 4)
+    shown: Any = None
+    for row, (arm, each) in enumerate({"plain lens": plain, "with mask": mask}.items()):
+        for column, wanted in enumerate(_SHOWN):
+            shown = _spot(axes[row, column], each, nearest(bands.centres, wanted), bands, pixel_pitch, arm)
+        _encircled(axes[row, 3], each, bands, pixel_pitch, arm)
+    bar = figure.colorbar(shown, ax=axes[:, :3].ravel().tolist(), fraction=0.025, pad=0.01)
+    bar.set_label("log₁₀ of the pixel over the clear peak", fontsize=10)
+    bar.ax.tick_params(labelsize=9)
+    return figure
+
+
+def _spot(ax: Any, psf: Psf, band: int, bands: Bands, pitch: float, arm: str) -> Any:
+    size = min(257, *psf.intensity.shape[-2:])
+    light = _window(psf.intensity[band], size) / psf.clear_peak[band]
+    log = light.double().clamp_min(1e-30).log10()
+    shown = picture(ax, log.cpu().numpy(), "", origin="lower", cmap="viridis", vmin=-8.0, vmax=0.0)
+    ax.set_title(f"{arm}, {nanometres(float(bands.centres[band])):.0f} nm")
+    ax.set_xlabel(f"{size * pitch * 1e6:.0f} µm across")
+    return shown
+
+
+def _window(image: Tensor, size: int) -> Tensor:
+    """The middle ``size`` by ``size`` pixels, the axis kept at sample N // 2."""
+    top, left = (n // 2 - size // 2 for n in image.shape[-2:])
+    return image[top : top + size, left : left + size]
+
+
+def _encircled(ax: Any, psf: Psf, bands: Bands, pitch: float, arm: str) -> None:
+    """Share of the clear pupil's light within a radius, at three wavelengths."""
+    y, x = (torch.arange(n, dtype=torch.float64) - n // 2 for n in psf.intensity.shape[-2:])
+    radius = torch.hypot(y[:, None], x[None, :]).ceil().long().flatten()
+    for wanted in _SHOWN:
+        band = nearest(bands.centres, wanted)
+        light = psf.intensity[band].detach().double().cpu().flatten()
+        share = torch.zeros(int(radius.max()) + 1, dtype=torch.float64).index_add_(0, radius, light).cumsum(0)
+        microns = (torch.arange(len(share)) + 0.5) * pitch * 1e6
+        colour = wavelength_colour(wanted)
+        ax.semilogx(
+            microns.numpy(), share.numpy(), color=colour, label=f"{nanometres(float(bands.centres[band])):.0f} nm"
+        )
+    ax.set_ylim(0.0, 1.02)
+    ax.set_title(f"{arm}: encircled energy")
+    ax.set_xlabel("radius (µm)")
+    ax.set_ylabel("share of the pupil's light")
+    ax.legend(loc="best")
+
+
+@drawn
+def suppression(*, lsr: Tensor, bands: Bands, psf: Psf, bsr: Tensor | None = None) -> Any:
+    """Laser and background suppression against wavelength, with the floor that energy sets."""
+    figure, axes = canvas(11.0, 4.2, 1, 2)
+    pixels = psf.intensity.shape[-2] * psf.intensity.shape[-1]
+    nm, left, right = nanometres(bands.centres), axes[0, 0], axes[0, 1]
+    left.axhline(1.0, color=BLACK, linewidth=0.8, linestyle=":", label="plain lens")
+    left.semilogy(nm, lsr.cpu().numpy(), "o-", color=VERMILION, markersize=3.5, label="with mask")
+    floor = 1.0 / (pixels * psf.clear_peak.double().cpu())
+    left.semilogy(nm, floor.numpy(), "--", color=BLUE, label="energy floor")
+    left.set_title("laser suppression ratio (peak / clear peak)")
+    left.set_ylabel("LSR")
+    right.axhline(1.0, color=BLACK, linewidth=0.8, linestyle=":", label="plain lens")
+    if bsr is not None:
+        right.plot(nm, bsr.cpu().numpy(), "s-", color=GREEN, markersize=3.5, label="with mask")
+    right.set_ylim(0.0, max(1.1, 1.1 if bsr is None else 1.1 * float(bsr.max())))
+    right.set_title("background kept in the field (BSR)")
+    right.set_ylabel("BSR")
+    for ax in (left, right):
+        ax.set_xlabel("wavelength (nm)")
+        ax.legend(loc="upper center", bbox_to_anchor=(0.5, -0.17), ncols=3)
+    return figure

@@ -1,0 +1,32 @@
+"""The sensor, measured as a laboratory would: flat fields of rising light, mean against spread."""
+
+from __future__ import annotations
+
+from typing import Any
+
+from torch import Tensor
+
+from neusee.workflows.report.figures.style import BLACK, BLUE, GREEN, VERMILION, canvas, drawn
+
+
+@drawn
+def transfer(*, measured: Tensor) -> Any:
+    """The photon-transfer curve: (level, signal DN | variance DN² | predicted variance DN²), the first level dark."""
+    signal, variance, predicted = measured.detach().double().cpu().unbind(1)
+    figure, axes = canvas(6.6, 4.4)
+    ax = axes[0, 0]
+    seen = (signal > 0) & (variance > 0)
+    light, floor = signal[seen], float(predicted[0].sqrt())
+    ax.loglog(light.numpy(), variance[seen].sqrt().numpy(), "o", color=BLACK, markersize=4, label="flat fields")
+    ax.loglog(light.numpy(), predicted[seen].sqrt().numpy(), "-", color="#777777", linewidth=1.2, label="predicted")
+    shot = (predicted[seen] - predicted[0]).clamp_min(0.0).sqrt()
+    ax.loglog(light.numpy(), shot.numpy(), "--", color=BLUE, label="shot noise, slope ½")
+    ax.axhline(floor, color=GREEN, linestyle="-.", label=f"dark noise, {floor:.3g} DN, slope 0")
+    full = float(signal.max())
+    ax.axvline(full, color=VERMILION, linestyle=":", label=f"saturation, {full:,.0f} DN above dark")
+    ax.set_ylim(min(floor, float(variance[seen].sqrt().min())) / 3, 3 * float(predicted.max().sqrt()))
+    ax.set_title("photon-transfer curve of this sensor")
+    ax.set_xlabel("mean above dark (DN)")
+    ax.set_ylabel("standard deviation (DN)")
+    ax.legend(loc="upper center", bbox_to_anchor=(0.5, -0.15), ncols=2)
+    return figure

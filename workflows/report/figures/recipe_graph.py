@@ -1,0 +1,116 @@
+"""The recipe as a graph: one box a step (items of one step share a box), coloured by what became of it."""
+
+from __future__ import annotations
+
+from collections import Counter
+from collections.abc import Iterable, Mapping
+from typing import Any
+
+from neusee.workflows.graph.recipe_graph import in_order
+from neusee.workflows.report.figures.style import canvas, drawn
+
+#: fill, and the word of the legend; a mark in the box says the same without colour
+LOOKS = {
+    "run": ("#F7C9A9", "run"),
+    "cached": ("#BFDDF0", "from the cache"),
+    "left out": ("#FFFFFF", "left out: within the tolerance"),
+}
+_WIDE, _TALL = 1.75, 0.66
+
+
+@drawn
+def graph(*, sources: Mapping[str, Iterable[str]], states: Mapping[str, str]) -> Any:
+    """Steps in rows, each below what it reads; ``sources`` and ``states`` by instance, such as ``psf[mask]``."""
+    wires, looks, counts = grouped(sources, states)
+    places = layout(wires)
+    columns = max((x for x, _ in places.values()), default=0.0) + 1
+    rows = max((y for _, y in places.values()), default=0) + 1
+    figure, axes = canvas(min(max(_WIDE * columns, 6.0), 15.0), _TALL * rows + 0.7)
+    ax = axes[0, 0]
+    for name, befores in wires.items():
+        for before in befores:
+            _edge(ax, places[before], places[name])
+    for name, (x, y) in places.items():
+        _box(ax, x, y, f"{name} ×{counts[name]}" if counts[name] > 1 else name, looks[name])
+    ax.set_xlim(-0.6, columns - 0.4)
+    ax.set_ylim(rows - 0.5, -0.5)
+    ax.axis("off")
+    _legend(figure, looks.values())
+    return figure
+
+
+def grouped(
+    sources: Mapping[str, Iterable[str]], states: Mapping[str, str]
+) -> tuple[dict[str, list[str]], dict[str, str], Counter[str]]:
+    """The graph of families: ``psf[plain]`` and ``psf[mask]`` are both ``psf``; a family that ran at all, ran."""
+    family = {name: name.partition("[")[0] for name in sources}
+    wires: dict[str, list[str]] = {f: [] for f in family.values()}
+    looks: dict[str, str] = {}
+    for name, befores in sources.items():
+        mine = family[name]
+        wires[mine] += [f for f in dict.fromkeys(family[b] for b in befores) if f not in (*wires[mine], mine)]
+        state = states.get(name, "cached")
+        state = state if state in LOOKS else "cached"
+        looks[mine] = "run" if "run" in (state, looks.get(mine)) else state
+    return wires, looks, Counter(family.values())
+
+
+def layout(wires: Mapping[str, list[str]]) -> dict[str, tuple[float, int]]:
+    """Place of each family: the row is its longest way from a source, the order in a row that of what it reads."""
+    depth = _depths(wires)
+    rows: dict[int, list[str]] = {}
+    for name, row in depth.items():
+        rows.setdefault(row, []).append(name)
+    widest = max((len(r) for r in rows.values()), default=1)
+    places: dict[str, tuple[float, int]] = {}
+    for row in sorted(rows):
+        wish = {n: _mean([places[b][0] for b in wires[n] if b in places], (widest - 1) / 2) for n in rows[row]}
+        names = sorted(rows[row], key=lambda n: wish[n])
+        start = min(max(_mean(list(wish.values()), 0.0) - (len(names) - 1) / 2, 0.0), widest - len(names))
+        places |= {name: (start + i, row) for i, name in enumerate(names)}
+    return places
+
+
+def _depths(wires: Mapping[str, list[str]]) -> dict[str, int]:
+    """Longest way from a source; then each step that is read moves down to just above its first reader."""
+    order = in_order(wires, wires)
+    depth: dict[str, int] = {}
+    for name in order:
+        depth[name] = max((depth[b] + 1 for b in wires[name]), default=0)
+    first: dict[str, int] = {}
+    for name in reversed(order):
+        depth[name] = first.get(name, depth[name] + 1) - 1
+        for b in wires[name]:
+            first[b] = min(first.get(b, depth[name]), depth[name])
+    return depth
+
+
+def _mean(values: list[float], other: float) -> float:
+    return sum(values) / len(values) if values else other
+
+
+def _edge(ax: Any, start: tuple[float, int], end: tuple[float, int]) -> None:
+    from matplotlib.patches import FancyArrowPatch
+
+    bend = 0.0 if end[1] - start[1] == 1 else 0.12 if end[0] <= start[0] else -0.12
+    path: dict[str, Any] = {"connectionstyle": f"arc3,rad={bend}", "arrowstyle": "-|>", "mutation_scale": 9}
+    a, b = (start[0], start[1] + 0.27), (end[0], end[1] - 0.27)
+    ax.add_patch(FancyArrowPatch(a, b, color="#8a8a8a", linewidth=0.9, shrinkA=0, shrinkB=0, zorder=1, **path))
+
+
+def _box(ax: Any, x: float, y: float, text: str, look: str) -> None:
+    from matplotlib.patches import FancyBboxPatch
+
+    style: dict[str, Any] = {"boxstyle": "round,pad=0.0,rounding_size=0.08", "mutation_aspect": 1.6, "zorder": 2}
+    style["linestyle"] = "--" if look == "left out" else "-"
+    colour = LOOKS[look][0]
+    ax.add_patch(FancyBboxPatch((x - 0.46, y - 0.26), 0.92, 0.52, facecolor=colour, edgecolor="#444444", **style))
+    ax.text(x, y, text, ha="center", va="center", fontsize=9.5, zorder=3)
+
+
+def _legend(figure: Any, looks: Iterable[str]) -> None:
+    from matplotlib.patches import Patch
+
+    used = [k for k in LOOKS if k in set(looks)]
+    patches = [Patch(facecolor=LOOKS[k][0], edgecolor="#444444", label=LOOKS[k][1]) for k in used]
+    figure.legend(handles=patches, loc="outside upper center", ncols=len(patches), fontsize=10)

@@ -1,0 +1,103 @@
+"""Spectra of three points of the scene: what the photograph says and what was made of it."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import Any
+
+import torch
+from torch import Tensor
+
+from neusee.nodes.values import Bands
+from neusee.workflows.report.figures.style import (
+    BLACK,
+    BLUE,
+    GREEN,
+    VERMILION,
+    canvas,
+    drawn,
+    encoded,
+    nanometres,
+    picture,
+)
+
+_POINTS = ("A", "B", "C")
+_CHANNELS = ((VERMILION, "R"), (GREEN, "G"), (BLUE, "B"))
+
+
+@drawn
+def spectra(
+    *,
+    scene: Tensor,
+    radiance: Tensor,
+    bands: Bands,
+    illuminant: Tensor,
+    responses: Tensor,
+    lines: Mapping[str, Bands] | None = None,
+) -> Any:
+    """Three points of the scene: their RGB and their spectrum, the light on them and the sensor's channels."""
+    figure, axes = canvas(13.0, 4.4, 1, 3, width_ratios=(1.0, 1.35, 1.35))
+    places = _places(scene)
+    _scene(axes[0, 0], scene, places)
+    _points(axes[0, 1], scene, radiance, bands, places)
+    _channels(axes[0, 2], illuminant, responses, bands)
+    for ax in axes[0, 1:]:
+        _lasers(ax, lines or {})
+        ax.set_xlabel("wavelength (nm)")
+        ax.set_ylim(bottom=0.0)
+        ax.legend(loc="upper center", bbox_to_anchor=(0.5, -0.17), ncols=2)
+    return figure
+
+
+def _places(scene: Tensor) -> list[tuple[int, int]]:
+    """The reddest, the greenest and the bluest point that is neither dark nor clipped, away from the edge."""
+    inner = torch.nn.functional.avg_pool2d(scene[None].float(), 5, 1, 2)[0] if min(scene.shape[-2:]) >= 5 else scene
+    lit = inner.amax(0)
+    usable = (lit > 0.2 * lit.max()) & (lit < 0.9 * lit.max())
+    share = inner / inner.sum(0).clamp_min(1e-9)
+    places = []
+    for channel in range(3):
+        index = int(share[channel].where(usable, -1.0).argmax())
+        places.append((index // scene.shape[-1], index % scene.shape[-1]))
+    return places
+
+
+def _scene(ax: Any, scene: Tensor, places: list[tuple[int, int]]) -> None:
+    picture(ax, encoded(scene / scene.max().clamp_min(1e-9)), "three points of the scene")
+    box = {"boxstyle": "round,pad=0.15", "facecolor": "white", "edgecolor": "black", "linewidth": 0.8}
+    for name, (y, x) in zip(_POINTS, places, strict=True):
+        ax.plot(x, y, "o", markerfacecolor="none", markeredgecolor="white", markersize=9, markeredgewidth=2.5)
+        ax.plot(x, y, "o", markerfacecolor="none", markeredgecolor="black", markersize=9, markeredgewidth=1.0)
+        inside = -1 if x > scene.shape[-1] / 2 else 1
+        ax.annotate(
+            name, (x, y), xytext=(14 * inside, 0), textcoords="offset points", bbox=box, ha="center", va="center"
+        )
+
+
+def _points(ax: Any, scene: Tensor, radiance: Tensor, bands: Bands, places: list[tuple[int, int]]) -> None:
+    nm = nanometres(bands.centres)
+    for name, (y, x), style in zip(_POINTS, places, ("-", "--", "-."), strict=True):
+        rgb = scene[:, y, x].tolist()
+        row, column = (p * r // s for p, r, s in zip((y, x), radiance.shape[-2:], scene.shape[-2:], strict=True))
+        label = f"{name}: RGB {rgb[0]:.2f} {rgb[1]:.2f} {rgb[2]:.2f}"
+        colour = encoded(0.75 * scene[:, y : y + 1, x : x + 1] / max(*rgb, 1e-9))[0, 0]
+        ax.plot(nm, radiance[:, row, column].cpu().numpy(), style, color=colour, label=label)
+    ax.set_title("their spectra, lifted from RGB")
+    ax.set_ylabel("relative spectral radiance")
+
+
+def _channels(ax: Any, illuminant: Tensor, responses: Tensor, bands: Bands) -> None:
+    nm = nanometres(bands.centres)
+    ax.plot(nm, illuminant.cpu().numpy(), color=BLACK, linestyle="--", label="illuminant")
+    for channel, (colour, name) in zip(responses, _CHANNELS, strict=True):
+        ax.plot(nm, channel.cpu().numpy(), color=colour, label=f"channel {name}")
+    ax.set_title("illuminant and channels")
+    ax.set_ylabel("relative")
+
+
+def _lasers(ax: Any, lines: Mapping[str, Bands]) -> None:
+    """An upright line at each laser's wavelength; more than two share a label."""
+    for number, (name, line) in enumerate(lines.items()):
+        nm = float((line.centres * line.weights).sum() / line.weights.sum()) * 1e9
+        label = f"laser {name}, {nm:.0f} nm" if len(lines) < 3 else f"{len(lines)} lasers" if number == 0 else None
+        ax.axvline(nm, color="#555555", linewidth=1.2, linestyle=":", label=label)

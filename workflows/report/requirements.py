@@ -1,0 +1,91 @@
+"""Find what a picture or a file reads in a recipe: values, parameters and bound steps, each with its identity."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import Any
+
+import torch
+
+from neusee.workflows.graph.recipe_graph import Recipe, Step
+from neusee.workflows.keys.cache_key import plain
+from neusee.workflows.keys.code_digest import Code
+
+_PARAMETER = re.compile(r"(?P<step>[^.]+)\.(?P<name>\w+)")
+
+
+class Missing(LookupError):
+    """The recipe has no such step, or what it asked for does not need it."""
+
+
+@dataclass(frozen=True, slots=True)
+class Bound:
+    """A step outside the graph: its node and parameters, to be called with anything."""
+
+    step: Step
+
+    def __call__(self, *inputs: Any, rng: torch.Generator | None = None, **changes: Any) -> Any:
+        stream = {"rng": rng} if self.step.node.random else {}
+        return self.step.node(*inputs, **{**self.step.params, **changes, **stream})
+
+    @property
+    def random(self) -> bool:
+        """Whether it draws numbers."""
+        return self.step.node.random
+
+    def reference(self, *inputs: Any, **changes: Any) -> Any:
+        """The plain float64 form of the node."""
+        if self.step.node.ref is None:
+            raise Missing(f"{self.step.node.path} has no reference")
+        return self.step.node.ref(*inputs, **{**self.step.params, **changes})
+
+
+@dataclass(frozen=True, slots=True)
+class Found:
+    """One need: the steps whose values it reads, how to make the argument of them, and what identifies it."""
+
+    steps: tuple[str, ...]
+    make: Any  #: called with the values by step
+    identity: Any  #: plain JSON
+
+
+def find(need: str, recipe: Recipe, keys: Mapping[str, str], code: Code) -> Found:
+    """Resolve a need as `neusee.workflows.report.contents` writes it."""
+    if need.endswith("()"):
+        step = _step(need[:-2], recipe)
+        return Found((), lambda values: Bound(step), _identity(step, code))
+    if match := _PARAMETER.fullmatch(need):
+        value = _step(match["step"], recipe).params.get(match["name"])
+        return Found((), lambda values: value, plain(value))
+    if need.endswith("*]"):
+        return _items(need[:-2], recipe, keys)
+    _step(need, recipe)
+    return Found((need,), lambda values: values[need], _key(need, keys))
+
+
+def _step(name: str, recipe: Recipe) -> Step:
+    if name not in recipe.steps:
+        raise Missing(f"the recipe has no step {name}")
+    return recipe.steps[name]
+
+
+def _key(name: str, keys: Mapping[str, str]) -> str:
+    if name not in keys:
+        raise Missing(f"nothing that was asked for needs the step {name}")
+    return keys[name]
+
+
+def _items(prefix: str, recipe: Recipe, keys: Mapping[str, str]) -> Found:
+    """All items of a step, ``spot[mask,`` by the rest of their name."""
+    names = {n[len(prefix) : -1]: n for n in recipe.steps if n.startswith(prefix) and n in keys}
+    if not names:
+        raise Missing(f"the recipe has no step {prefix}…]")
+    identity = [[item, keys[name]] for item, name in names.items()]
+    return Found(tuple(names.values()), lambda values: {item: values[name] for item, name in names.items()}, identity)
+
+
+def _identity(step: Step, code: Code) -> Any:
+    module = step.node.fn.__module__
+    return [step.node.path, code.digest(module), [[name, plain(value)] for name, value in step.params.items()]]

@@ -1,0 +1,125 @@
+"""The numbers of a run: what the recipe promised, the result table, and every metric as a row."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from typing import Any
+
+from torch import Tensor
+
+from neusee.workflows.graph.recipe_graph import Recipe
+from neusee.workflows.report.contents import BANDS, LINES, TABLE
+
+Value = Callable[[str], Any]  #: the value of a step, read from the store when it is asked for
+_COLUMNS = ("peak/I_sat", "LSR", "BSR", "PSNR (dB)", "SSIM", "saturated px")
+_DESIGN = 550e-9
+_SMALL = 4096  #: numbers of a result that is given in full
+
+
+def expected(recipe: Recipe, value: Value) -> list[dict[str, Any]]:
+    """Every number that the recipe promises, beside what was found."""
+    rows = []
+    for e in recipe.expect:
+        found: Any = value(e.step)
+        for part in e.at:
+            found = getattr(found, part) if isinstance(part, str) and not isinstance(found, dict) else found[part]
+        number = float(found)
+        ok = abs(number - e.value) <= e.rtol * abs(e.value)
+        rows.append({"name": e.name, "step": e.step, "wanted": e.value, "found": number, "rtol": e.rtol, "ok": ok})
+    return rows
+
+
+def table(recipe: Recipe, keys: Mapping[str, str], value: Value) -> dict[str, Any]:
+    """Plain lens, with mask, restored: one row each, a cell where the recipe has the step; no rows without a cell."""
+    band, where = _band(recipe, keys, value)
+    rows = []
+    for name, cells in TABLE.items():
+        known = {column: value(step) for column, step in cells.items() if step in keys}
+        rows.append({"name": name, "cells": _cells(known, band)})
+    legend = [f"LSR at {where}; BSR is the mean over the bands."] if any(r["cells"][1] for r in rows) else []
+    rows = rows if any(any(row["cells"]) for row in rows) else []
+    return {"columns": list(_COLUMNS), "rows": rows, "legend": legend}
+
+
+def _cells(known: Mapping[str, Any], band: int) -> list[str]:
+    quality = known.get("quality")
+    numbers = {
+        "peak/I_sat": (_largest(known.get("peak/I_sat")), "{:.4g}"),
+        "LSR": (_at(known.get("LSR"), band), "{:.3g}"),
+        "BSR": (_mean(known.get("BSR")), "{:.3f}"),
+        "PSNR (dB)": (_field(quality, "psnr"), "{:.2f}"),
+        "SSIM": (_field(quality, "ssim"), "{:.3f}"),
+        "saturated px": (_sum(known.get("saturated")), "{:,.0f}"),
+    }
+    return ["" if number is None else form.format(number) for number, form in (numbers[c] for c in _COLUMNS)]
+
+
+def _band(recipe: Recipe, keys: Mapping[str, str], value: Value) -> tuple[int, str]:
+    """The scene's band nearest to the first laser, or to 550 nm where there is none."""
+    if BANDS not in keys:
+        return 0, "the first band"
+    prefix = LINES.removesuffix("*]")
+    lines = [name for name in recipe.steps if name.startswith(prefix) and name in keys]
+    wanted = _DESIGN
+    if lines:
+        line = value(lines[0])
+        wanted = float((line.centres * line.weights).sum() / line.weights.sum())
+    centres = value(BANDS).centres
+    band = int((centres - wanted).abs().argmin())
+    return band, f"{float(centres[band]) * 1e9:.0f} nm"
+
+
+def metrics(recipe: Recipe, keys: Mapping[str, str], value: Value) -> list[list[Any]]:
+    """(step, field, index, value) of every small result of a metric."""
+    rows: list[list[Any]] = []
+    for name, step in recipe.steps.items():
+        if name in keys and step.node.path.startswith("metrics."):
+            rows += numbers_of(name, value(name))
+    return rows
+
+
+def numbers_of(step: str, found: Any) -> list[list[Any]]:
+    """(step, field, index, value) of a small result; of a large one, such as a picture, nothing."""
+    rows: list[list[Any]] = []
+    for field, tensor in _fields(found):
+        if tensor.numel() <= _SMALL and not tensor.is_complex():
+            numbers = tensor.detach().double().flatten().tolist()
+            rows += [[step, field, i if len(numbers) > 1 else "", n] for i, n in enumerate(numbers)]
+    return rows
+
+
+def _fields(found: Any) -> list[tuple[str, Tensor]]:
+    if isinstance(found, Tensor):
+        return [("", found)]
+    if hasattr(found, "_asdict"):
+        return [(k, v) for k, v in found._asdict().items() if isinstance(v, Tensor)]
+    return []
+
+
+def _tensor(found: Any) -> Tensor | None:
+    fields = [] if found is None else _fields(found)
+    return fields[0][1] if fields else None
+
+
+def _largest(found: Any) -> float | None:
+    tensor = _tensor(found)
+    return None if tensor is None else float(tensor.max())
+
+
+def _mean(found: Any) -> float | None:
+    tensor = _tensor(found)
+    return None if tensor is None else float(tensor.double().mean())
+
+
+def _sum(found: Any) -> float | None:
+    tensor = _tensor(found)
+    return None if tensor is None else float(tensor.double().sum())
+
+
+def _at(found: Any, band: int) -> float | None:
+    tensor = _tensor(found)
+    return None if tensor is None else float(tensor.flatten()[min(band, tensor.numel() - 1)])
+
+
+def _field(found: Any, name: str) -> float | None:
+    return None if found is None else float(getattr(found, name))

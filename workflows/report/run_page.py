@@ -1,0 +1,246 @@
+"""What a run says of itself: the numbers, the account of every step, and the page made of them.
+
+`document` gathers everything as plain JSON, which is stored beside the pictures as
+``provenance.json``; `page` makes the page of that alone, so that it can be made again.
+"""
+
+from __future__ import annotations
+
+import base64
+import json
+import math
+import os
+import platform
+import re
+import shlex
+from collections import Counter
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import replace
+from datetime import datetime
+from importlib.metadata import PackageNotFoundError, version
+from pathlib import Path
+from typing import Any
+
+from neusee.nodes import Check
+from neusee.workflows.engine.runner import Done, Result
+from neusee.workflows.engine.step_record import facts_in
+from neusee.workflows.graph.recipe_graph import Recipe
+from neusee.workflows.recipe.distributions.nominal_values import told
+from neusee.workflows.recipe.paper_readings import in_force
+from neusee.workflows.report.contents import FIGURES
+from neusee.workflows.report.result_numbers import expected, metrics, table
+from neusee.workflows.report.run_timing import said_of, timing
+from neusee.workflows.report.run_timing import size_of as size_of
+from neusee.workflows.report.tolerance_spent import spent
+
+_TEMPLATE = Path(__file__).parent / "templates" / "run_page.html.j2"
+_LIBRARIES = ("torch", "numpy", "kornia", "colour-science", "OpenEXR", "pydantic", "safetensors")
+_UNITS = frozenset(("m", "nm", "rad", "e-", "DN", "photons", "W/m2", "dB"))
+_SAMPLING = "PSF point-sampled: a sample on the axis, at the pixel centre."
+
+
+def document(
+    result: Result, command: Sequence[str], warnings: Iterable[str], missing: Mapping[str, str]
+) -> dict[str, Any]:
+    """Everything there is to say of a run, as plain JSON."""
+    recipe, done = result.recipe, list(result.done.values())
+    found = expected(recipe, result.value)
+    steps = [_step(d, result) for d in done]
+    failed = [f"{s['step']}: {c['text']}" for s in steps for c in s["checks"] if not c["ok"]]
+    counts = Counter[str](d.state for d in done)
+    time = timing(steps, _planned(result))
+    return {
+        "recipe": recipe.name,
+        "title": recipe.title,
+        "version": _version("neusee"),
+        "command": shlex.join(command),
+        "started": datetime.now().astimezone().strftime("%Y-%m-%d %H:%M:%S %Z"),
+        "device": result.device,
+        "seconds": result.seconds,
+        "tolerance": recipe.tolerance,
+        "seed": recipe.seed,
+        "counts": said(counts),
+        "verdict": verdict(found, failed),
+        "missed": [e["name"] for e in found if not e["ok"]],
+        "failed": failed,
+        "expected": found,
+        "table": table(recipe, result.keys, result.value),
+        "metrics": metrics(recipe, result.keys, result.value),
+        "notes": [*_sampling(recipe), *recipe.notes, *warnings],
+        "posterior": told(recipe.uncertain.standings) if recipe.uncertain else [],
+        "readings": _readings(recipe),
+        "left_out": [{"step": d.step, "bound": d.bound, "why": d.why} for d in done if d.state == "left out"],
+        "spent": spent(result),
+        "absent": [{"step": step, "where": where} for step, where in recipe.absent.items()],
+        "timing": {**time, "said": said_of(time)},
+        "steps": steps,
+        "figures": _figures(missing, bool(time["ran"])),
+        "missing": [{"name": n, "title": _title(n), "why": why} for n, why in missing.items()],
+        "facts": _facts(result),
+        "inputs": _inputs(recipe),
+    }
+
+
+def page(doc: Mapping[str, Any], pictures: Mapping[str, bytes]) -> str:
+    """The page of a document and its pictures: one file, nothing to fetch."""
+    from jinja2 import Environment, StrictUndefined
+
+    environment = Environment(autoescape=True, undefined=StrictUndefined)
+    template = environment.from_string(_TEMPLATE.read_text(encoding="utf-8"))
+    inline = {name: base64.b64encode(content).decode() for name, content in pictures.items()}
+    shown = {**doc, "figures": [f for f in doc["figures"] if f["name"] in inline]}
+    return template.render(doc=shown, pictures=inline)
+
+
+def rebuild(folder: Path) -> Path:
+    """Write a run's page again from what is stored beside it."""
+    doc = json.loads((folder / "provenance.json").read_text(encoding="utf-8"))
+    pictures = {p.stem: p.read_bytes() for p in sorted((folder / "figures").glob("*.png"))}
+    target = folder / "report.html"
+    part = folder / ".report.html.part"
+    part.write_text(page(doc, pictures), encoding="utf-8")
+    part.replace(target)
+    return target
+
+
+def verdict(found: Sequence[Mapping[str, Any]], failed: Sequence[str]) -> str:
+    """One line: were the expected numbers met, and did every check hold?"""
+    met = sum(e["ok"] for e in found)
+    numbers = (
+        f"{met} of {len(found)} expected numbers within tolerance" if found else "No expected numbers in this recipe"
+    )
+    checks = "every check held" if not failed else f"{len(failed)} check{'s' * (len(failed) > 1)} to look at"
+    return f"{numbers}; {checks}."
+
+
+def said(counts: Mapping[str, int]) -> str:
+    """``12 run, 3 cached, 1 left out``; what was never looked at counts as cached."""
+    merged = Counter({"cached": counts.get("cached", 0) + counts.get("asleep", 0)})
+    merged.update({s: n for s, n in counts.items() if s not in ("cached", "asleep")})
+    return ", ".join(f"{merged[s]} {s}" for s in ("run", "cached", "left out") if merged[s]) or "nothing to do"
+
+
+def shape_of(done: Done) -> str:
+    """``31 × 512 × 512``, or nothing where it is not known."""
+    return " × ".join(map(str, done.facts.shape)) or "number" if done.facts else ""
+
+
+def _step(done: Done, result: Result) -> dict[str, Any]:
+    node = result.recipe.steps[done.step].node
+    about = result.store.about(done.key) if done.state in ("cached", "asleep") else None
+    done = _remembered(done, about) if about else done
+    return {
+        "step": done.step,
+        "node": node.path,
+        "device": done.device,
+        "state": done.state,
+        "why": done.why,
+        "seconds": done.seconds,
+        "predicted": done.predicted,
+        "began": done.began,
+        "lane": done.lane,
+        "peak": done.peak,
+        "kept": done.kept,
+        "made_in": about["seconds"] if about else done.seconds,
+        "shape": shape_of(done),
+        "unit": unit_of(node.__doc__ or ""),
+        "size": size_of(done.bytes) if done.bytes else "",
+        "bytes": done.bytes,
+        "key": done.key,
+        "bound": done.bound if done.bound is None or math.isfinite(done.bound) else None,
+        "checks": [{"text": c.text, "ok": c.ok} for c in done.checks],
+    }
+
+
+def _planned(result: Result) -> float | None:
+    """How long the plan was, where it was made of known costs and held every step that ran."""
+    ran = [done for done in result.done.values() if done.state == "run"]
+    if result.schedule is None or any(done.predicted is None for done in ran):
+        return None
+    placed = {slot.task for slot in result.schedule.slots}
+    return result.schedule.makespan if all(done.step in placed for done in ran) else None
+
+
+def _remembered(done: Done, about: Mapping[str, Any]) -> Done:
+    """A step that was not run, with what the store says of its result."""
+    checks = tuple(Check(text, ok) for text, ok in about.get("checks", ()))
+    why = f"made {about['date'][:16].replace('T', ' ')} UTC"
+    return replace(done, why=why, facts=facts_in(about), checks=checks, bytes=about["bytes"])
+
+
+def unit_of(docstring: str) -> str:
+    """The unit of the result, as a node's ``Units:`` line says it: after the word ``result``, or alone."""
+    lines = (line.strip() for line in docstring.splitlines())
+    units = next((line for line in lines if line.startswith("Units:")), "Units:").removeprefix("Units:").strip()
+    before, found, after = units.partition("result ")
+    word = re.split(r"[\s,;:]|\.(?:\s|$)", after if found else before, maxsplit=1)[0]
+    return word if word in _UNITS else ""
+
+
+def _sampling(recipe: Recipe) -> list[str]:
+    """How the PSF is sampled: the convention is part of every LSR."""
+    kinds = {step.params.get("sensor") for step in recipe.steps.values() if step.node.path == "optics.psf"}
+    return [_SAMPLING] if "point" in kinds else ["PSF integrated over each pixel."] if kinds else []
+
+
+def _readings(recipe: Recipe) -> list[dict[str, str]]:
+    values = {
+        p.removeprefix("reading."): s.value for p, s in recipe.config.settings.items() if p.startswith("reading.")
+    }
+    keep = ("name", "number", "matter", "reason")
+    rows = []
+    for row, state in in_force(values):
+        rows.append({k: str(getattr(row, k)) for k in keep} | {"value": str(values[row.name]), "state": state})
+    return rows
+
+
+def _figures(missing: Mapping[str, str], ran: bool) -> list[dict[str, str]]:
+    from neusee.workflows.report.run_pictures import GRAPH, TIMELINE
+
+    drawn = [(f.name, f.title, f.caption) for f in FIGURES if f.name not in missing] + [GRAPH] + [TIMELINE] * ran
+    return [{"name": n, "title": t, "caption": c, "file": f"figures/{n}.png"} for n, t, c in drawn]
+
+
+def _title(name: str) -> str:
+    return next((f.title for f in FIGURES if f.name == name), name)
+
+
+def _facts(result: Result) -> list[list[str]]:
+    """What made this run, by name."""
+    import torch
+
+    rows = [
+        ["neusee", _version("neusee")],
+        ["Python", platform.python_version()],
+        *[[name, _version(name)] for name in _LIBRARIES],
+        [
+            "machine",
+            f"{platform.system()} {platform.machine()}, {os.cpu_count()} cores, {torch.get_num_threads()} threads",
+        ],
+        ["device", result.device],
+        ["recipe seed", str(result.recipe.seed)],
+        ["tolerance", f"{result.recipe.tolerance:g}"],
+        ["engine", f"{result.seconds:.3f} s"],
+        ["peak memory", size_of(result.peak_memory)],
+    ]
+    return [[name, value] for name, value in rows if value]
+
+
+def _version(package: str) -> str:
+    try:
+        return version(package)
+    except PackageNotFoundError:
+        return ""
+
+
+def _inputs(recipe: Recipe) -> list[dict[str, str]]:
+    """Every file whose content decides the result."""
+    from neusee.workflows.keys.cache_key import file_digest
+
+    rows: dict[str, dict[str, str]] = {}
+    for step in recipe.steps.values():
+        for name, value in step.params.items():
+            if isinstance(value, Path):
+                path = f"{step.name}.{name}"
+                rows[path] = {"parameter": path, "file": value.name, "digest": file_digest(value)}
+    return list(rows.values())

@@ -1,0 +1,104 @@
+"""The page of a study: paragraphs, pictures and tables whose cells are coloured by what they say.
+
+One file that fetches nothing, readable in light, in dark and on paper; what a colour says stands
+as a sign in the cell too.
+"""
+
+from __future__ import annotations
+
+import base64
+import json
+import numbers
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any, Literal
+
+_TEMPLATE = Path(__file__).parent / "templates" / "study_page.html.j2"
+Mark = Literal["pass", "warn", "fail"]
+
+
+@dataclass(frozen=True)
+class Section:
+    """A heading with text, a picture and a table; a blank line in the text begins a new paragraph."""
+
+    heading: str
+    text: str
+    columns: Sequence[str] = ()
+    rows: Sequence[Sequence[Any]] = ()  #: a number is set with three digits, None as a dash
+    picture: bytes | None = None  #: PNG
+    marks: Mapping[tuple[int, int], Mark] = field(default_factory=dict)  #: (row, column), from 0
+
+
+def page(title: str, lead: str, sections: Sequence[Section], provenance: Mapping[str, Any], banner: str = "") -> str:
+    """The page: ``lead`` says the result, each section shows a part of it, ``provenance`` what made it.
+
+    ``banner`` stands above all, in red: why the result must not be used.
+    """
+    from jinja2 import Environment, StrictUndefined
+
+    environment = Environment(autoescape=True, undefined=StrictUndefined)
+    template = environment.from_string(_TEMPLATE.read_text(encoding="utf-8"))
+    return template.render(
+        title=title,
+        banner=banner,
+        lead=_paragraphs(lead),
+        sections=[_section(f"s{i}", s) for i, s in enumerate(sections)],
+        provenance=[(name, _plain(value)) for name, value in provenance.items()],
+    )
+
+
+def said(value: Any) -> str:
+    """A cell as text: three digits of a number, all of an integer, a dash where there is none."""
+    if value is None:
+        return "–"
+    if isinstance(value, bool):
+        return "yes" if value else "no"
+    if isinstance(value, numbers.Real) and not isinstance(value, numbers.Integral):
+        return f"{float(value):.3g}"
+    return str(value)
+
+
+def _section(anchor: str, section: Section) -> dict[str, Any]:
+    _refuse_stray_marks(section)
+    numeric = {i for i in range(len(section.columns)) if _holds_numbers([row[i] for row in section.rows])}
+    return {
+        "anchor": anchor,
+        "heading": section.heading,
+        "text": _paragraphs(section.text),
+        "picture": base64.b64encode(section.picture).decode() if section.picture else "",
+        "columns": section.columns,
+        "numeric": numeric,
+        "rows": [
+            [_cell(v, section.marks.get((r, c))) for c, v in enumerate(row)] for r, row in enumerate(section.rows)
+        ],
+    }
+
+
+def _refuse_stray_marks(section: Section) -> None:
+    """A mark beside the table would be a failure that nobody sees."""
+    for row, column in section.marks:
+        if not (0 <= row < len(section.rows) and 0 <= column < len(section.rows[row])):
+            raise ValueError(f"{section.heading}: a mark at ({row}, {column}), where the table has no cell")
+
+
+def _cell(value: Any, mark: Mark | None) -> dict[str, str]:
+    return {"text": said(value), "kind": " ".join(filter(None, ("n" if _is_number(value) else "", mark)))}
+
+
+def _is_number(value: Any) -> bool:
+    return isinstance(value, numbers.Real) and not isinstance(value, bool)
+
+
+def _holds_numbers(cells: Sequence[Any]) -> bool:
+    """Whether a column is of numbers, so that its head stands to the right as they do."""
+    found = [c for c in cells if c is not None]
+    return bool(found) and all(map(_is_number, found))
+
+
+def _paragraphs(text: str) -> list[str]:
+    return [" ".join(part.split()) for part in text.split("\n\n") if part.strip()]
+
+
+def _plain(value: Any) -> str:
+    return said(value) if not isinstance(value, Mapping | list | tuple) else json.dumps(value, default=str)

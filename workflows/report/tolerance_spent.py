@@ -1,0 +1,101 @@
+"""What a run spent of its tolerance: what was left out or made more cheaply, the bounds, and errors where measured."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import replace
+from typing import Any
+
+from neusee.workflows.engine.cost_model import Costs
+from neusee.workflows.engine.node_call import RunError
+from neusee.workflows.engine.placement_inputs import past_costs
+from neusee.workflows.engine.resolve_keys import resolve
+from neusee.workflows.engine.runner import Result
+from neusee.workflows.graph.recipe_graph import Recipe, needed
+from neusee.workflows.tolerance.error_norm import error_of
+
+NORM = "root mean square over the largest element"
+
+
+def spent(result: Result) -> dict[str, Any]:
+    """The tolerance of a run and what became of it, as plain JSON.
+
+    ``bounds``: of what is held to the tolerance, outputs or what feeds a step whose error nothing bounds.
+    ``measured``: by output, beside a run with ``--keep-all`` whose results this store still has.
+    """
+    costs = past_costs(result.store) if result.recipe.economies or _left_out(result) else Costs([])
+    return {
+        "tolerance": result.recipe.tolerance,
+        "norm": NORM,
+        "held": min(map(result.recipe.limit, result.proof.held), default=result.recipe.tolerance),
+        "strict": result.recipe.strict,
+        "keep_all": result.recipe.keep_all,
+        "bounds": {name: share for name, share in result.proof.held.items() if share > 0},
+        "unbounded": [name for name in result.recipe.outputs if result.proof.of(name) is None],
+        "measured": _measured(result),
+        "economies": [_economy(result, costs, e.step, e.instead, e.why) for e in result.recipe.economies],
+        "left_out": [_omission(result, costs, name) for name in _left_out(result)],
+    }
+
+
+def said_of_economies(account: Mapping[str, Any]) -> str:
+    """One line for the console: what stands in for full steps, what that may change, and what it did where known."""
+    summed = [f"{e['step']} ({_within(e['bound'])})" for e in account["economies"] if e["instead"]]
+    nothing = [f"{e['step']} (nothing)" for e in account["economies"] if not e["instead"]]
+    worst = max(account["bounds"].values(), default=0.0)
+    found = max(account["measured"].values(), default=None)
+    measured = f", measured {found:.1e}" if found is not None else ""
+    names = ", ".join([*summed, *nothing])
+    return f"spared   {names}: in all at most {worst:.1e}{measured}; tolerance {account['tolerance']:g}"
+
+
+def _within(bound: float | None) -> str:
+    return "its error is not known" if bound is None else f"at most {bound:.1e}"
+
+
+def _left_out(result: Result) -> list[str]:
+    return [name for name, done in result.done.items() if done.state == "left out"]
+
+
+def _economy(result: Result, costs: Costs, step: str, instead: str, why: str) -> dict[str, Any]:
+    done = result.done.get(instead) if instead else None
+    about = result.store.about(done.key) if done else None
+    took = done.seconds if done and done.state == "run" else about["seconds"] if about else None
+    row = {"step": step, "instead": instead, "why": why, "seconds": took, "full_seconds": _seconds(result, costs, step)}
+    checks = [check.text for check in done.checks] if done else []
+    return {**row, "bound": done.error[0] if done and done.error else None, "what": "; ".join(checks)}
+
+
+def _omission(result: Result, costs: Costs, step: str) -> dict[str, Any]:
+    done = result.done[step]
+    return {"step": step, "bound": done.bound, "why": done.why, "full_seconds": _seconds(result, costs, step)}
+
+
+def _seconds(result: Result, costs: Costs, step: str) -> float | None:
+    """What a step would have taken, as far as earlier runs tell."""
+    estimate = costs.of(result.recipe.steps[step], ["cpu"])
+    return estimate.seconds["cpu"] if estimate.known else None
+
+
+def _measured(result: Result) -> dict[str, float]:
+    """Errors of the outputs beside those of a run that left nothing out, where the store has these."""
+    recipe = result.recipe
+    if recipe.keep_all or not (recipe.economies or _left_out(result)):
+        return {}
+    full, found = _full_keys(result), {}
+    for name in recipe.outputs:
+        if name in full and full[name] != result.keys[name] and result.store.has(full[name]):
+            try:
+                found[name] = error_of(result.value(name), result.store.get(full[name]))
+            except (KeyError, ValueError):
+                continue  # removed meanwhile
+    same = {name: 0.0 for name in recipe.outputs if full.get(name) == result.keys[name]} if found else {}
+    return {name: {**same, **found}[name] for name in recipe.outputs if name in same or name in found}
+
+
+def _full_keys(result: Result) -> dict[str, str]:
+    whole: Recipe = replace(result.recipe.whole or result.recipe, keep_all=True, economies=())
+    try:
+        return resolve(whole, needed(whole, whole.outputs), result.store, result.device).keys
+    except (OSError, LookupError, RunError):
+        return {}

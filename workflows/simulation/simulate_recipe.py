@@ -1,0 +1,134 @@
+"""Run a recipe and write its folder: page, pictures, numbers, data and where every value came from."""
+
+from __future__ import annotations
+
+import json
+import warnings
+from collections.abc import Callable, Iterable, Iterator, Sequence
+from contextlib import contextmanager
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any
+
+from neusee.workflows.engine.runner import Done, Event, Result, run
+from neusee.workflows.engine.step_job import Executor
+from neusee.workflows.explain.why_rerun import explained
+from neusee.workflows.graph.recipe_graph import Recipe, needed
+from neusee.workflows.keys.cache_key import digest
+from neusee.workflows.report import run_page as report
+from neusee.workflows.report.contents import SHOWN, TABLE
+from neusee.workflows.report.data_exports import exports
+from neusee.workflows.report.run_folder import RunFolder, new_run
+from neusee.workflows.report.run_pictures import pictures, timeline
+from neusee.workflows.store.derived_files import Shelf
+from neusee.workflows.store.result_store import Store
+from neusee.workflows.tolerance.cheaper_steps import economised
+
+_TIMING = ("step", "node", "device", "lane", "state", "began", "seconds", "predicted", "peak", "bytes", "key")
+
+
+@dataclass(frozen=True)
+class Simulation:
+    """A finished run: where it lies, and everything that it says of itself."""
+
+    folder: Path
+    document: dict[str, Any]
+
+    @property
+    def page(self) -> Path:
+        """The page to open."""
+        return self.folder / "report.html"
+
+
+def wanted(recipe: Recipe) -> tuple[str, ...]:
+    """The recipe's outputs, what its expected numbers read, and what the result table shows."""
+    promised = [e.step for e in recipe.expect]
+    shown = [s for s in (*(s for row in TABLE.values() for s in row.values()), *SHOWN) if s in recipe.steps]
+    return tuple(dict.fromkeys([*recipe.outputs, *promised, *shown]))
+
+
+def simulate(
+    recipe: Recipe,
+    store: Store,
+    runs: Path,
+    command: Sequence[str],
+    device: str = "cpu",
+    watch: Callable[[Event], None] | None = None,
+    executor: Executor | None = None,
+    memory: int | None = None,
+) -> Simulation:
+    """Run ``recipe`` and write ``runs/<date>_<recipe>_<key>/``, complete or not at all."""
+    with _noted() as notes:
+        told: dict[str, Done] = {}
+        recipe = economised(recipe, wanted(recipe))
+        tell = explained(recipe, store, _both(told, watch))
+        result = run(recipe, store, wanted(recipe), tell, device, executor, memory)
+        result = replace(result, done={name: told.get(name, done) for name, done in result.done.items()})
+        with new_run(runs, recipe.name, _run_key(result)) as folder:
+            doc = _write(result, folder, command, notes)
+    return Simulation(folder.path, doc)
+
+
+def _both(told: dict[str, Done], watch: Callable[[Event], None] | None) -> Callable[[Event], None]:
+    """A watch that also remembers what it was told."""
+
+    def note(event: Event) -> None:
+        if event.done is not None:
+            told[event.step] = event.done
+        if watch is not None:
+            watch(event)
+
+    return note
+
+
+def steps_of(recipe: Recipe) -> list[str]:
+    """Every step that a run of ``recipe`` looks at, in running order."""
+    return needed(economised(recipe, wanted(recipe)), wanted(recipe))
+
+
+def _run_key(result: Result) -> str:
+    return digest([[name, result.keys[name]] for name in wanted(result.recipe)])
+
+
+def _write(result: Result, folder: RunFolder, command: Sequence[str], notes: Iterable[str]) -> dict[str, Any]:
+    shelf = Shelf(result.store)
+    drawn, missing = pictures(result, shelf)
+    files, without = exports(result, shelf)
+    doc = report.document(result, command, notes, missing)
+    doc["files"] = sorted(files)
+    doc["missing"] += [{"name": n, "title": f"data/{n}", "why": why} for n, why in without.items()]
+    shown = {name: path.read_bytes() for name, path in drawn.items()}
+    for name, path in drawn.items():
+        folder.take(f"figures/{name}.png", path)
+    if bars := timeline(result):
+        folder.write("figures/timeline.png", bars)
+        shown["timeline"] = bars
+    for name, path in files.items():
+        folder.take(f"data/{name}", path)
+    folder.write("recipe.yaml", recipe_text(result.recipe))
+    folder.write_rows("metrics.csv", ("step", "field", "index", "value"), doc["metrics"])
+    folder.write_rows("timing.csv", _TIMING, [[s[column] for column in _TIMING] for s in doc["steps"]])
+    folder.write("provenance.json", json.dumps(doc, indent=1, ensure_ascii=False, allow_nan=True))
+    folder.write("report.html", report.page(doc, shown))
+    return doc
+
+
+@contextmanager
+def _noted() -> Iterator[list[str]]:
+    """Warnings as lines of the report instead of noise between the steps."""
+    notes: list[str] = []
+
+    def note(message: Warning | str, *rest: Any, **named: Any) -> None:
+        if str(message) not in notes:
+            notes.append(str(message))
+
+    with warnings.catch_warnings():
+        warnings.showwarning = note
+        warnings.simplefilter("default")
+        yield notes
+
+
+def recipe_text(recipe: Recipe) -> str:
+    """Every final value as YAML that can be run again, with the place it comes from as a comment."""
+    head = f"# {recipe.title or recipe.name}\n# Final values; after each, where it was written.\n"
+    return head + recipe.config.to_yaml()

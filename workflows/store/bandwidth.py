@@ -1,0 +1,64 @@
+"""How fast a store reads and writes: learnt from its own transfers and remembered beside them."""
+
+from __future__ import annotations
+
+import json
+import os
+from contextlib import suppress
+from typing import Literal
+
+from neusee.workflows.store.shared_folder import Disk
+
+Way = Literal["read", "write"]
+LARGE = 1_000_000  #: bytes from which a transfer says something
+_USUAL: dict[Way, float] = {"read": 8e9, "write": 0.4e9}  #: bytes / s
+_SETUP: dict[Way, float] = {"read": 5e-5, "write": 2e-4}  #: s, whatever the size
+_LEARN = 0.3  #: weight of the newest transfer
+_NEWS = 1.25  #: factor by which a speed must differ from the remembered one to be written down
+
+
+class Speeds:
+    """Bytes a second of one store, each way."""
+
+    def __init__(self, disk: Disk) -> None:
+        self._disk = disk
+        self._path = f"{disk.folder}/speeds.json"
+        self._now: dict[Way, float] = {}
+        self._written: dict[Way, float] = {}
+
+    def seconds(self, way: Way, size: float) -> float:
+        """What moving ``size`` bytes takes."""
+        return _SETUP[way] + size / self._speed(way)
+
+    def learn(self, way: Way, size: int, seconds: float) -> None:
+        """Take a transfer into account."""
+        if size < LARGE:
+            return
+        found = size / max(seconds - _SETUP[way], 1e-6)
+        before = self._speed(way)
+        self._now[way] = before ** (1 - _LEARN) * found**_LEARN
+        written = self._written.get(way, _USUAL[way])
+        if not written / _NEWS < self._now[way] < written * _NEWS:
+            self._remember()
+
+    def _speed(self, way: Way) -> float:
+        if not self._now:
+            self._written = self._remembered()
+            self._now = {**_USUAL, **self._written}
+        return self._now[way]
+
+    def _remembered(self) -> dict[Way, float]:
+        try:
+            with open(self._path, "rb") as file:
+                found = json.load(file)
+            return {way: float(found[way]) for way in _USUAL if 1e3 < found[way] < 1e13}
+        except (OSError, ValueError, LookupError, TypeError):
+            return {}
+
+    def _remember(self) -> None:
+        self._written = dict(self._now)
+        with suppress(OSError), self._disk.temporary("speeds") as (part, file):
+            file.write(json.dumps(self._now).encode())
+            file.flush()
+            self._disk.share(part)
+            os.replace(part, self._path)

@@ -1,0 +1,176 @@
+"""What goes when a store outgrows its budget: first the values that save the fewest seconds a byte.
+
+A value counts half for every week since it was last of use, told by the newest use in the
+store and not by today's date. Pinned values stay. What goes leaves its receipt, so that
+what it was and what it cost stay known; whoever reads it at that moment keeps what is mapped.
+"""
+
+from __future__ import annotations
+
+import errno
+import os
+import re
+from collections import Counter
+from collections.abc import Callable, Collection, Iterable, Iterator
+from contextlib import suppress
+from dataclasses import dataclass
+
+from neusee.workflows.store import metadata as _sidecar
+from neusee.workflows.store.metadata import UNREADABLE, About
+from neusee.workflows.store.shared_folder import Disk
+
+LOW = 0.9  #: of the budget: what is left after it was reached
+_HALF = 7 * 86400.0  #: s
+_UNITS = {"": 1, "k": 10**3, "m": 10**6, "g": 10**9, "t": 10**12}
+_NONE = (0, 0.0)
+_FULL = (errno.ENOSPC, errno.EDQUOT, errno.EFBIG)
+_SIZE = re.compile(r"\s*(\d+(?:\.\d+)?)\s*([kmgt]?)(i?)b?\s*", re.IGNORECASE)
+
+
+@dataclass(frozen=True, slots=True)
+class Candidate:
+    """A value that may go."""
+
+    key: str
+    size: int  #: bytes that its going frees
+    seconds: float  #: what it takes to compute it, less what it takes to load it
+    used: float  #: when it was last of use, s
+
+
+def bytes_of(text: str) -> int:
+    """Bytes that ``text`` such as ``20 GB`` or ``1.5 TiB`` says, or a `ValueError`."""
+    found = _SIZE.fullmatch(text)
+    if not found or (found[3] and not found[2]):
+        raise ValueError(f"{text!r} is no size: write bytes, such as 20 GB")
+    unit = _UNITS[found[2].lower()]
+    if found[3]:
+        unit = 1024 ** list(_UNITS).index(found[2].lower())
+    return int(float(found[1]) * unit)
+
+
+def chosen(candidates: Iterable[Candidate], excess: float) -> list[Candidate]:
+    """Those that go so that at least ``excess`` bytes become free, none of them without need; the least worth first."""
+    all_ = [c for c in candidates if c.size > 0]
+    newest = max((c.used for c in all_), default=0.0)
+    all_.sort(key=lambda c: (max(c.seconds, 0.0) / c.size * 2 ** ((c.used - newest) / _HALF), c.used, c.key))
+    going, freed = [], 0
+    for candidate in all_:
+        if freed >= excess:
+            break
+        going.append(candidate)
+        freed += candidate.size
+    for candidate in reversed(list(going)):
+        if freed - candidate.size >= excess:
+            going.remove(candidate)
+            freed -= candidate.size
+    return going
+
+
+def evict(disk: Disk, found: Iterable[Candidate], excess: float, dry: bool) -> tuple[list[Candidate], list[Candidate]]:
+    """Let values go until ``excess`` bytes are free; those that went, and those that are not ours to remove."""
+    left, gone, refused = {c.key: c for c in found}, list[Candidate](), list[Candidate]()
+    while excess > 0 and (batch := chosen(left.values(), excess)):
+        for candidate in batch:
+            del left[candidate.key]
+            if dry or drop(disk, candidate.key):
+                gone.append(candidate)
+                excess -= candidate.size
+            else:
+                refused.append(candidate)
+    return gone, refused
+
+
+class Room:
+    """The bytes of a store against its budget, without counting them at each write."""
+
+    def __init__(self, disk: Disk, budget: int) -> None:
+        self._disk, self.budget = disk, budget
+        self._spare = 0.0  # bytes that may be written before they are all counted again
+
+    def excess(self, size: int) -> float:
+        """Bytes that have to go after ``size`` more; that others write more is seen after 5 % of the budget."""
+        self._spare -= size
+        if self._spare > 0:
+            return 0.0
+        found = total(self._disk)
+        self._spare = self.budget / 20
+        if found > self.budget:
+            return found - LOW * self.budget
+        self._spare = min(self._spare, self.budget - found)
+        return 0.0
+
+
+def total(disk: Disk) -> int:
+    """Bytes of all results, with the files and bands that belong to them."""
+    return sum(size for _, size, _ in files(disk))
+
+
+def candidates(disk: Disk, pinned: Collection[str], read_seconds: Callable[[float], float]) -> Iterator[Candidate]:
+    """Every value that is not pinned; a band that several values share counts in part for each."""
+    stats = {os.path.basename(path): (size, changed) for path, size, changed in files(disk)}
+    kept = {key: about for key, about in _sidecar.each(disk) if _sidecar.is_kept(about)}
+    bands = {key: set(_sidecar.bands(about)) for key, about in kept.items()}
+    shared = Counter(name for names in bands.values() for name in names)
+    for key, about in kept.items():
+        if key not in pinned and f"{key}.json" in stats:
+            size = sum(len(tensor[-1]) for tensor in about.get("tensors", ()))
+            size += sum(stats.get(name, _NONE)[0] for name in (f"{key}.safetensors", about.get("file", "")))
+            size += int(sum(stats.get(name, _NONE)[0] / shared[name] for name in bands[key]))
+            saved = float(about.get("seconds") or 0.0) - read_seconds(float(about.get("bytes") or 0))
+            yield Candidate(key, size, saved, stats[f"{key}.json"][1])
+
+
+def drop(disk: Disk, key: str) -> bool:
+    """Leave of a value the receipt alone; False where that is not allowed to us."""
+    try:
+        with disk.lock():
+            about = _sidecar.read(disk, key)
+            if _sidecar.is_kept(about):
+                _write_receipt(disk, key, about)
+                _unlink(disk, key, about)
+    except FileNotFoundError:
+        return True  # another user was first
+    except UNREADABLE:
+        return False
+    return True
+
+
+def _write_receipt(disk: Disk, key: str, about: About) -> None:
+    """On a disk without room not even that."""
+    try:
+        with disk.temporary(key) as (part, file):
+            file.write(_sidecar.seal(_sidecar.receipt(about)))
+            file.flush()
+            disk.rename(part, disk.path(key, "json"))
+    except OSError as error:
+        if error.errno not in _FULL:
+            raise
+        os.unlink(disk.path(key, "json"))
+
+
+def _unlink(disk: Disk, key: str, about: About) -> None:
+    paths = [disk.path(key, "safetensors")] if about.get("payload") else []
+    if name := about.get("file"):
+        paths.append(f"{disk.folder}/files/{key[:2]}/{os.path.basename(name)}")
+    for path in paths:
+        with suppress(FileNotFoundError):
+            os.unlink(path)
+
+
+def files(disk: Disk) -> Iterator[tuple[str, int, float]]:
+    """Path, bytes and last change of everything that counts against the budget."""
+    for base in (disk.folder, f"{disk.folder}/files", f"{disk.folder}/bands"):
+        for folder in entries(base):
+            if len(folder.name) == 2 and folder.is_dir(follow_symlinks=False):
+                for entry in entries(folder.path):
+                    with suppress(OSError):
+                        stat = entry.stat(follow_symlinks=False)
+                        yield entry.path, stat.st_size, stat.st_mtime
+
+
+def entries(folder: str) -> list[os.DirEntry[str]]:
+    try:
+        with os.scandir(folder) as found:
+            return list(found)
+    except OSError:
+        return []

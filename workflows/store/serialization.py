@@ -1,0 +1,245 @@
+"""How a result lies on disk: a layout in JSON and its tensors in one safetensors file.
+
+The file is written from the tensors' own memory and read through a memory map, so that
+neither way makes a copy. Each tensor begins at a multiple of 64 bytes, as a fresh one
+does: a kernel then takes the same path on a stored value as on a computed one. A `Stacked`
+tensor stands in no such file: its layout names one blob for each of its slices.
+"""
+
+from __future__ import annotations
+
+import base64
+import importlib
+import json
+import mmap
+from collections.abc import Callable
+from typing import IO, Any
+
+import torch
+import xxhash
+from torch import Tensor
+
+from neusee.workflows.store.band_files import Blobs, Stacked, bytes_of, dtype_of
+
+_ALIGN = 64
+_FILLER = "_"  #: begins the names of entries that only fill up to the next multiple
+_DTYPES = {
+    torch.float64: "F64",
+    torch.float32: "F32",
+    torch.float16: "F16",
+    torch.bfloat16: "BF16",
+    torch.float8_e4m3fn: "F8_E4M3",
+    torch.float8_e5m2: "F8_E5M2",
+    torch.int64: "I64",
+    torch.int32: "I32",
+    torch.int16: "I16",
+    torch.int8: "I8",
+    torch.uint64: "U64",
+    torch.uint32: "U32",
+    torch.uint16: "U16",
+    torch.uint8: "U8",
+    torch.bool: "BOOL",
+}
+_NAMES = {name: dtype for dtype, name in _DTYPES.items()}
+
+
+def each_tensor(change: Callable[[Tensor], Tensor], value: Any) -> Any:
+    """``value`` with every tensor in it changed; one that occurs twice is changed once."""
+    return change(value) if isinstance(value, Tensor) else _change(value, change, {})
+
+
+def _change(item: Any, change: Callable[[Tensor], Tensor], done: dict[int, Tensor]) -> Any:
+    """A function of the module: a nested one that calls itself would hold its tensors until a garbage collection."""
+    if isinstance(item, Tensor):
+        if id(item) not in done:
+            done[id(item)] = change(item)
+        return done[id(item)]
+    if isinstance(item, tuple):
+        items = [_change(i, change, done) for i in item]
+        return item._make(items) if hasattr(item, "_make") else tuple(items)
+    if isinstance(item, list):
+        return [_change(i, change, done) for i in item]
+    return {k: _change(v, change, done) for k, v in item.items()} if isinstance(item, dict) else item
+
+
+def tensors_in(value: Any) -> list[Tensor]:
+    """Every tensor in ``value``, once."""
+    if isinstance(value, Tensor):
+        return [value]
+    found: list[Tensor] = []
+    each_tensor(lambda t: found.append(t) or t, value)  # type: ignore[func-returns-value]
+    return found
+
+
+def settle(value: Any) -> Any:
+    """``value`` as the store would give it back: contiguous, and holding no larger memory than its own."""
+    return each_tensor(_settled, value)
+
+
+def _settled(x: Tensor) -> Tensor:
+    x = x.resolve_conj().resolve_neg().contiguous()
+    return x.clone(memory_format=torch.contiguous_format) if x.untyped_storage().nbytes() > x.nbytes else x
+
+
+class _Listed:
+    """Tensors in the order of a file; memory that is shared is listed once."""
+
+    def __init__(self) -> None:
+        self.tensors: list[Tensor] = []
+        self._known: dict[tuple[Any, ...], int] = {}
+
+    def add(self, x: Tensor) -> int:
+        same = (x.data_ptr() or id(x), x.dtype, x.shape, x.stride(), x.is_conj(), x.is_neg())
+        if same not in self._known:
+            self._known[same] = len(self.tensors)
+            self.tensors.append(x.detach())
+        return self._known[same]
+
+
+def pack(value: Any, blobs: Blobs | None = None) -> tuple[Any, list[Tensor]]:
+    """The layout of ``value`` as JSON, and its tensors; what is `Stacked` goes to ``blobs``, where there are some.
+
+    Raises `TypeError` for what cannot be stored, and `OSError` where ``blobs`` takes none.
+    """
+    listed = _Listed()
+    return _layout(value, listed, blobs), listed.tensors
+
+
+def _layout(item: Any, listed: _Listed, blobs: Blobs | None) -> dict[str, Any]:
+    if isinstance(item, Stacked):
+        return _layout(item.tensor, listed, None) if blobs is None else _stack_layout(item, blobs)
+    if isinstance(item, Tensor):
+        return {"tensor": listed.add(item)}
+    if isinstance(item, bytes):
+        return {"bytes": listed.add(torch.frombuffer(bytearray(item), dtype=torch.uint8) if item else torch.empty(0))}
+    if isinstance(item, tuple):
+        return {"class": _class_path(item), "items": [_layout(i, listed, blobs) for i in item]}
+    if isinstance(item, list):
+        return {"list": [_layout(i, listed, blobs) for i in item]}
+    if isinstance(item, dict) and all(isinstance(k, str) for k in item):
+        return {"dict": {k: _layout(v, listed, blobs) for k, v in item.items()}}
+    if item is None or isinstance(item, bool | int | float | str):
+        return {"value": item}
+    raise TypeError(f"a step must give tensors, numbers, texts, bytes or collections of these, not {type(item)}")
+
+
+def _stack_layout(item: Stacked, blobs: Blobs) -> dict[str, Any]:
+    written = blobs.write_all(item.names, item.tensor.unbind())
+    kind = str(item.tensor.dtype).removeprefix("torch.")
+    return {"stacked": {"names": item.names, "xxh3": written, "dtype": kind, "shape": list(item.tensor.shape)}}
+
+
+def unpack(layout: Any, tensors: list[Tensor], blobs: Blobs | None = None, verify: bool = True) -> Any:
+    """The value that `pack` took apart; raises `ValueError` where a band of it is lost."""
+    ((kind, body),) = ((k, v) for k, v in layout.items() if k != "items")
+    if kind == "tensor":
+        return tensors[body]
+    if kind == "stacked":
+        if blobs is None:
+            raise ValueError("its bands are stored apart, and no one says where")
+        return blobs.read(body["names"], body["shape"], dtype_of(body["dtype"]), verify, body["xxh3"])
+    if kind == "bytes":
+        return tensors[body].numpy().tobytes()
+    if kind == "class":
+        items = (unpack(i, tensors, blobs, verify) for i in layout["items"])
+        return _class(body)(*items) if body else tuple(items)
+    if kind == "list":
+        return [unpack(i, tensors, blobs, verify) for i in body]
+    return {k: unpack(v, tensors, blobs, verify) for k, v in body.items()} if kind == "dict" else body
+
+
+def blobs_in(layout: Any) -> list[str]:
+    """The names of all blobs that a layout needs."""
+    found: list[str] = []
+    todo = [layout]
+    while todo:
+        item = todo.pop()
+        if "stacked" in item:
+            found += item["stacked"]["names"]
+        todo += item.get("items", item.get("list", item.get("dict", {}).values()))
+    return found
+
+
+def _class_path(item: tuple[Any, ...]) -> str:
+    """Where a named tuple's class stands; empty for a plain tuple."""
+    kind = type(item)
+    if kind is tuple:
+        return ""
+    if not kind.__module__.startswith("neusee.nodes.") or not hasattr(item, "_fields"):
+        raise TypeError(f"{kind.__module__}.{kind.__qualname__} cannot be stored: make it a NamedTuple in neusee.nodes")
+    return f"{kind.__module__}:{kind.__qualname__}"
+
+
+def _class(path: str) -> Callable[..., Any]:
+    module, _, name = path.partition(":")
+    if not module.startswith("neusee.nodes."):
+        raise ValueError(f"{path} is no class of neusee.nodes")
+    found: Callable[..., Any] = getattr(importlib.import_module(module), name)
+    return found
+
+
+def to_text(x: Tensor) -> list[Any]:
+    """A small tensor as JSON: type, shape, bytes."""
+    return [*_kind(x), base64.b64encode(bytes_of(x)).decode()]
+
+
+def from_text(kind: str, shape: list[int], is_complex: bool, text: str) -> Tensor:
+    """The tensor that `to_text` wrote."""
+    return _tensor(bytearray(base64.b64decode(text)), 0, kind, shape, is_complex)
+
+
+def write(file: IO[bytes], tensors: list[Tensor]) -> str:
+    """Write a safetensors file; return the xxh3 of all its bytes."""
+    header: dict[str, Any] = {"__metadata__": {}}
+    end = 0
+    for i, x in enumerate(tensors):
+        kind, shape, is_complex = _kind(x)
+        header["__metadata__"][str(i)] = "complex" if is_complex else "real"
+        header[str(i)] = {"dtype": kind, "shape": shape, "data_offsets": [end, end + x.nbytes]}
+        end += x.nbytes
+        if pad := -end % _ALIGN:
+            header[f"{_FILLER}{i}"] = {"dtype": "U8", "shape": [pad], "data_offsets": [end, end + pad]}
+            end += pad
+    text = json.dumps(header, separators=(",", ":")).encode()
+    text += b" " * (-(8 + len(text)) % _ALIGN)
+    found = xxhash.xxh3_128()
+    for block in (len(text).to_bytes(8, "little"), text):
+        file.write(block)
+        found.update(block)
+    for x in tensors:
+        for part in (bytes_of(x), bytes(-x.nbytes % _ALIGN)):
+            file.write(part)
+            found.update(part)
+    return found.hexdigest()
+
+
+def read(path: str, expected: str | None) -> list[Tensor]:
+    """Tensors of a file that `write` made, mapped into memory; all its bytes have the ``expected`` xxh3, if one is."""
+    with open(path, "rb") as file:
+        data = mmap.mmap(file.fileno(), 0, access=mmap.ACCESS_COPY)
+    if expected is not None and xxhash.xxh3_128_hexdigest(data) != expected:
+        raise ValueError("its bytes are not those that were written")
+    size = int.from_bytes(data[:8], "little")
+    header = json.loads(data[8 : 8 + size])
+    tensors = []
+    for i, name in sorted((int(n), n) for n in header if n.isdigit()):
+        entry, is_complex = header[name], header["__metadata__"][str(i)] == "complex"
+        tensors.append(_tensor(data, 8 + size + entry["data_offsets"][0], entry["dtype"], entry["shape"], is_complex))
+    return tensors
+
+
+def _kind(x: Tensor) -> tuple[str, list[int], bool]:
+    real = torch.empty(0, dtype=x.dtype).real.dtype if x.is_complex() else x.dtype
+    if real not in _DTYPES:
+        raise TypeError(f"a tensor of {x.dtype} cannot be stored")
+    return _DTYPES[real], [*x.shape, 2] if x.is_complex() else list(x.shape), x.is_complex()
+
+
+def _tensor(data: Any, offset: int, kind: str, shape: list[int], is_complex: bool) -> Tensor:
+    count = 1
+    for n in shape:
+        count *= n
+    dtype = _NAMES[kind]
+    flat = torch.frombuffer(data, dtype=dtype, count=count, offset=offset) if count else torch.empty(0, dtype=dtype)
+    x = flat.reshape(shape)
+    return torch.view_as_complex(x) if is_complex else x

@@ -1,0 +1,122 @@
+"""Small results that took less to compute than a file of their own takes to write: sealed lines of one file.
+
+A line is one write. One that is torn, or not what was written, is no line; to lose one costs
+less than a millisecond. What several processes add is seen by all, for a look-up that finds
+nothing reads what has come since.
+"""
+
+from __future__ import annotations
+
+import os
+import threading
+from collections.abc import Iterator
+from contextlib import suppress
+from typing import Any
+
+from neusee.workflows.store import metadata as _sidecar
+from neusee.workflows.store.metadata import INLINE, UNREADABLE, About
+from neusee.workflows.store.shared_folder import Disk
+
+MOST = 64 << 20  #: bytes from which the older half is let go
+_HEAD = b'{"key":"'
+_KEY = slice(len(_HEAD), len(_HEAD) + 32)
+
+
+class Brief:
+    """The lines of one store."""
+
+    def __init__(self, disk: Disk) -> None:
+        self._disk, self._guard = disk, threading.Lock()
+        self._path = f"{disk.folder}/brief.jsonl"
+        self._lines: dict[str, bytes] = {}
+        self._file, self._offset = 0, 0
+
+    def find(self, key: str) -> About | None:
+        """What a line says of ``key``; None where there is none that can be trusted."""
+        if key not in self._lines:
+            self._take_in()
+        raw = self._lines.get(key)
+        if raw is None:
+            return None
+        try:
+            about = _sidecar.unseal(raw)
+            return about if about["key"] == key else None
+        except UNREADABLE:
+            return None
+
+    def put(self, key: str, value: Any, about: About) -> About:
+        """Add a value if it is small, else its receipt; gives what was written. Raises `OSError`, `TypeError`."""
+        from neusee.workflows.store import serialization as _codec
+
+        layout, tensors = _codec.pack(value)
+        size = sum(t.nbytes for t in tensors)
+        entry = {"key": key, **about, "layout": layout, "bytes": size, "payload": None, "kept": True}
+        if size <= INLINE:
+            entry["tensors"] = [_codec.to_text(t) for t in tensors]
+        else:
+            entry = _sidecar.receipt(entry)
+        self.append(entry)
+        return entry
+
+    def append(self, about: About) -> None:
+        """Add a line. Raises `OSError` where that cannot be done."""
+        raw = _sidecar.seal(about)
+        try:
+            self._write(raw, os.O_APPEND | os.O_WRONLY)
+        except FileNotFoundError:
+            self._disk.prepare()
+            self._write(raw, os.O_APPEND | os.O_WRONLY | os.O_CREAT)
+            self._disk.share(self._path)
+
+    def each(self) -> Iterator[tuple[str, About]]:
+        """Every key with what its newest line says."""
+        self._take_in()
+        for key in sorted(self._lines):
+            if (about := self.find(key)) is not None:
+                yield key, about
+
+    def compact(self) -> None:
+        """Keep the newest lines, half of what there may be; a line that comes meanwhile may be lost."""
+        self._take_in()
+        kept, size = list[bytes](), 0
+        for raw in reversed(self._lines.values()):
+            size += len(raw) + 1
+            if size > MOST // 2:
+                break
+            kept.append(raw)
+        with suppress(OSError), self._disk.temporary("brief") as (part, file):
+            file.write(b"".join(b"\n" + raw for raw in reversed(kept)))
+            file.flush()
+            self._disk.share(part)
+            os.replace(part, self._path)
+
+    def _write(self, raw: bytes, flags: int) -> None:
+        """The line begins with its end: what a killed process left of one before it stays by itself."""
+        file = os.open(self._path, flags, 0o666)
+        try:
+            if os.write(file, b"\n" + raw) != len(raw) + 1:
+                raise OSError(f"{self._path}: no room for a line")
+        finally:
+            os.close(file)
+
+    def _take_in(self) -> None:
+        """What has been added since the last time; all of it where it is another file."""
+        try:
+            stat = os.stat(self._path)
+        except OSError:
+            return
+        if (stat.st_ino, stat.st_size) == (self._file, self._offset):
+            return
+        with self._guard, suppress(OSError), open(self._path, "rb") as file:
+            if stat.st_ino != self._file or stat.st_size < self._offset:
+                self._lines, self._offset = {}, 0
+            file.seek(self._offset)
+            raw = file.read()
+            whole = raw.rfind(b"\n") if not raw.endswith(b"}") else len(raw)
+            for line in raw[:whole].split(b"\n"):
+                if line.startswith(_HEAD):
+                    self._lines.pop(line[_KEY].decode(errors="replace"), None)  # the newest last
+                    self._lines[line[_KEY].decode(errors="replace")] = line
+            self._file, self._offset = os.fstat(file.fileno()).st_ino, self._offset + max(0, whole)
+        if self._offset > MOST:
+            self.compact()

@@ -1,0 +1,191 @@
+"""The knobs of a recipe: the values that trade accuracy for time, found by what they are to their nodes.
+
+What makes bands has a ``count``, a pupil has ``samples`` and a ``pitch``, what gives a PSF has the ``shape``
+of its window, and a ``precision`` is a choice of words. Where such a value stands in the recipe, and whether something
+else hangs on it, the recipe itself says.
+"""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Iterable, Iterator, Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+from tempfile import TemporaryDirectory
+from typing import Any, Literal, get_args, get_origin
+
+from neusee.nodes.values import Bands, Psf
+from neusee.workflows.graph.recipe_graph import Recipe, Step, needed
+from neusee.workflows.recipe.loading import load
+
+_REFERENCE = re.compile(r"\$\{([\w.-]+)\}")
+_ONE_BY_ONE = ("item", "each")  #: begin what differs from item to item
+_FACTORS = (0.2, 1 / 3, 0.5, 2.0)  #: of the spaces between bands
+_FEWER = (1 / 3, 2.0)
+_SCALES = (0.5, 0.75, 0.9, 1.5, 2.0)  #: of samples, and of the side of a window
+_FEWER_SCALES = (0.75, 1.5)
+
+
+@dataclass(frozen=True)
+class Change:
+    """One setting of a knob; without overrides, the recipe's own."""
+
+    label: str
+    overrides: tuple[str, ...]
+
+
+@dataclass(frozen=True)
+class Knob:
+    """A value, or several that go together, and what they might be: the recipe's own among the rest, in order."""
+
+    name: str  #: as the recipe writes it: ``optics.bands``
+    what: str
+    changes: tuple[Change, ...]
+
+
+@dataclass(frozen=True)
+class Knobs:
+    """The knobs that a recipe has, and why others are not turned."""
+
+    found: tuple[Knob, ...]
+    without: tuple[str, ...]
+
+
+@dataclass(frozen=True)
+class _Place:
+    """Where the value of a parameter is written, and the steps of this kind that read it there."""
+
+    path: str
+    value: Any
+    steps: tuple[Step, ...]
+
+
+def knobs(recipe: Recipe, quick: bool = False) -> Knobs:
+    """The knobs of the steps that the outputs of ``recipe`` need; ``quick``: fewer settings of each."""
+    found: list[Knob] = []
+    without: list[str] = []
+    for what, turned in (
+        ("bands", _bands(recipe, quick)),
+        ("pupil samples at the same width", _samples(recipe, quick)),
+        ("window of the PSF", _windows(recipe, quick)),
+        ("precision", _precisions(recipe)),
+    ):
+        mine = [knob if isinstance(knob, str) else replace(knob, what=what) for knob in turned]
+        found += [knob for knob in mine if isinstance(knob, Knob) and len(knob.changes) > 1]
+        without += [f"{what}: {knob}" for knob in mine if isinstance(knob, str)]
+        if not mine:
+            without.append(f"{what}: this recipe has none")
+    return Knobs(tuple(found), tuple(without))
+
+
+def changed(recipe: Recipe, overrides: Sequence[str]) -> Recipe:
+    """``recipe`` with other values, checked anew; raises `RecipeError` where they cannot be."""
+    with TemporaryDirectory(prefix="neusee-") as folder:
+        path = Path(folder) / "recipe.yaml"
+        path.write_text(recipe.config.to_yaml(), encoding="utf-8")
+        found = load(path, overrides)
+    found = replace(found, name=recipe.name, title=recipe.title, seed=recipe.seed, outputs=recipe.outputs, expect=())
+    return replace(found, tolerance=recipe.tolerance, keep_all=recipe.keep_all)
+
+
+def finest(recipe: Recipe) -> Recipe:
+    """The recipe at its own sampling with nothing left out, and every step in the best precision that it has."""
+    best = [f"{place.path}={_words(place.steps[0], 'precision')[-1]}" for place in _places(recipe, "precision")]
+    return replace(changed(recipe, best) if best else recipe, keep_all=True)
+
+
+def _bands(recipe: Recipe, quick: bool) -> Iterator[Knob | str]:
+    for place in _places(recipe, "count", gives=Bands):
+        own = int(place.value)
+        counts = {1 + round((own - 1) * f) for f in (1.0, *(_FEWER if quick else _FACTORS))}
+        yield _knob(place.path, [(n, str(n), (f"{place.path}={n}",)) for n in sorted(counts)], own)
+
+
+def _samples(recipe: Recipe, quick: bool) -> Iterator[Knob | str]:
+    samples, pitches = (_places(recipe, name, beside=other) for name, other in _BOTH)
+    if len(samples) != 1 or len(pitches) != 1:
+        if samples:
+            yield f"{' and '.join(p.path for p in (*samples, *pitches))} do not go together"
+        return
+    own, pitch = int(samples[0].value), float(pitches[0].value)
+    if others := _others(recipe, "pitch", pitches[0]):
+        yield f"{', '.join(others)} would keep another pitch"
+        return
+    at, other = samples[0].path, pitches[0].path
+    sizes = sorted({max(2, round(own * f)) for f in (1.0, *(_FEWER_SCALES if quick else _SCALES))})
+    yield _knob(at, [(n, str(n), (f"{at}={n}", f"{other}={own * pitch / n!r} m")) for n in sizes], own)
+
+
+_BOTH = (("samples", "pitch"), ("pitch", "samples"))
+
+
+def _windows(recipe: Recipe, quick: bool) -> Iterator[Knob | str]:
+    for place in _places(recipe, "shape", gives=Psf):
+        if others := _others(recipe, "shape", place):
+            yield f"{place.path} is the shape of {others[0]} too"
+            continue
+        own, scales = tuple(place.value), (1.0, *(_FEWER_SCALES if quick else _SCALES))
+        sizes = sorted({tuple(max(1, round(n * f)) for n in own) for f in scales})
+        yield _knob(place.path, [(s, _size(s), (f"{place.path}={list(s)}",)) for s in sizes], own)
+
+
+def _precisions(recipe: Recipe) -> Iterator[Knob | str]:
+    """All at once: one step in double behind one in single shows nothing."""
+    if places := _places(recipe, "precision"):
+        words = _words(places[0].steps[0], "precision")
+        path = ", ".join(p.path for p in places)
+        yield _knob(path, [(w, w, tuple(f"{p.path}={w}" for p in places)) for w in words], places[0].value)
+
+
+def _knob(path: str, settings: Sequence[tuple[Any, str, tuple[str, ...]]], own: Any) -> Knob:
+    """A knob of what is at ``path``: (value, label, overrides) by setting."""
+    return Knob(path, "", tuple(Change(label, () if value == own else how) for value, label, how in settings))
+
+
+def _size(shape: Iterable[int]) -> str:
+    return "×".join(map(str, shape))
+
+
+def _words(step: Step, parameter: str) -> tuple[str, ...]:
+    """The words that a parameter may be, the coarsest first, as its node lists them."""
+    hint = step.node.hints[parameter]
+    return tuple(map(str, get_args(hint))) if get_origin(hint) is Literal else (str(step.params[parameter]),)
+
+
+def _places(recipe: Recipe, parameter: str, gives: type | None = None, beside: str = "") -> list[_Place]:
+    """Where a parameter of the steps that are needed is written, each place once; what varies by item is left away."""
+    found: dict[str, _Place] = {}
+    for name in needed(recipe, recipe.outputs):
+        step = recipe.steps[name]
+        if parameter not in step.params or (beside and beside not in step.params):
+            continue
+        if gives is not None and step.node.hints.get("return") is not gives:
+            continue
+        path = _written(recipe, step, parameter)
+        if path is not None:
+            before = found[path].steps if path in found else ()
+            found[path] = _Place(path, step.params[parameter], (*before, step))
+    return list(found.values())
+
+
+def _written(recipe: Recipe, step: Step, parameter: str) -> str | None:
+    """The path of the value that a parameter has: in a block of the recipe, or at the step itself."""
+    path = f"steps.{step.name.partition('[')[0]}.with.{parameter}"
+    while True:
+        setting = recipe.config.settings.get(path)
+        match = _REFERENCE.fullmatch(setting.value) if setting and isinstance(setting.value, str) else None
+        if match is None:
+            return path
+        path = match[1]
+        if path.partition(".")[0] in _ONE_BY_ONE:
+            return None
+
+
+def _others(recipe: Recipe, parameter: str, place: _Place) -> list[str]:
+    """Steps beside those of a place that read it too; of a pitch, that have the same from elsewhere."""
+    mine = {step.name for step in place.steps}
+    if parameter == "pitch":
+        apart = (s for s in recipe.steps.values() if parameter in s.params and s.params[parameter] == place.value)
+        return [s.name for s in apart if _written(recipe, s, parameter) != place.path]
+    others = (s for s in recipe.steps.values() if s.name not in mine)
+    return [s.name for s in others for p in s.params if _written(recipe, s, p) == place.path and p in s.param_marks]

@@ -1,0 +1,171 @@
+"""A recipe at a small size with one case in it: its steps and losses, their keys, and what each step is given."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass, field, replace
+from typing import Any
+
+import torch
+
+from neusee.nodes import Node
+from neusee.workflows.engine.node_call import RunError, call
+from neusee.workflows.graph.recipe_graph import Recipe, Step, in_order
+from neusee.workflows.keys.cache_key import Key, digest, key_of
+from neusee.workflows.keys.code_digest import Code
+from neusee.workflows.recipe.step_declarations import find_node
+from neusee.workflows.studies.stability.extreme_cases import Case, Size
+
+_COMPARES: dict[str, tuple[tuple[str, dict[str, Any]], ...]] = {  # a loss takes what the metric beside it takes
+    "metrics.lsr": (("losses.lsr", {}), ("losses.lsr", {"log": True})),
+    "metrics.bsr": (("losses.bsr", {}),),
+    "metrics.mtf": (("losses.contrast", {}), ("metrics.limits", {})),
+    "doe.fabricate": (("doe.smooth", {"feature": "400 um"}),),  # three samples of the small pupil
+    "metrics.quality": (("losses.charbonnier", {}), ("losses.fft_l1", {}), ("losses.gradient_penalty", {})),
+}
+_SMALLER = {"pixels": 256, "levels": 6, "grid": 16, "width": 4}  #: what else makes a step long
+
+
+def with_losses(recipe: Recipe) -> dict[str, Step]:
+    """Every step of the recipe, the losses of what it measures, and what else is made of the same."""
+    steps = dict(recipe.steps)
+    for name, step in recipe.steps.items():
+        for path, params in _COMPARES.get(step.node.path, ()):
+            node = find_node(path)
+            wires = {given: step.wires[own] for given, own in zip(node.inputs, step.node.inputs, strict=False)}
+            room, _, what = path.partition(".")
+            own = f"{'loss ' if room == 'losses' else ''}{what}{' log' if 'log' in params else ''} of {name}"
+            given = node.params(**params, **_grid(recipe, node, step)).model_dump()
+            steps[own] = Step(own, node, given, wires, step.mark, {})
+    return steps
+
+
+def _grid(recipe: Recipe, node: Node, step: Step) -> dict[str, Any]:
+    """The pupil's grid, for what has to know it: that of the relief."""
+    if "samples" not in node.params.model_fields:
+        return {}
+    relief = recipe.steps[step.sources[0]].params
+    lengths = {name: f"{relief[name]!r} m" for name in ("pitch", "diameter")}
+    return {"samples": relief["samples"], "aperture": relief["aperture"], **lengths}
+
+
+def smaller(steps: Mapping[str, Step], size: Size) -> dict[str, Step]:
+    """The same steps with fewer pixels, pupil samples and bands; a pupil keeps its diameter, a spot its place."""
+    sides = [side for step in steps.values() for name in ("shape",) for side in step.params.get(name) or ()]
+    part = size.pixels / max(sides, default=size.pixels)
+    return {name: replace(step, params=_smaller(step, size, part)) for name, step in steps.items()}
+
+
+def _smaller(step: Step, size: Size, part: float) -> dict[str, Any]:
+    params = dict(step.params)
+    if params.get("shape"):
+        params["shape"] = tuple(max(1, round(side * part)) for side in params["shape"])
+    if "samples" in params:
+        params["pitch"] *= params["samples"] / size.samples
+        params["samples"] = size.samples
+    elif "pitch" in params and "diameter" in params:
+        params["pitch"] = None  # of a pupil: as of its relief, see `matched`
+    if step.node.path == "spectra.bands":
+        params["count"] = size.bands
+    if params.get("angle"):
+        params["angle"] = tuple(a * min(part, 1.0) for a in params["angle"])
+    return params | {k: min(v, params[k]) for k, v in _SMALLER.items() if step.node.random and k in params}
+
+
+def matched(steps: Mapping[str, Step]) -> dict[str, Step]:
+    """Pupils sampled as the reliefs are."""
+    pitches = [s.params["pitch"] for s in steps.values() if s.params.get("pitch") and "samples" in s.params]
+    return {
+        name: replace(step, params={**step.params, "pitch": pitches[0]}) if _open(step) else step
+        for name, step in steps.items()
+    }
+
+
+def _open(step: Step) -> bool:
+    return "pitch" in step.params and step.params["pitch"] is None
+
+
+def changed(steps: Mapping[str, Step], case: Case) -> dict[str, Step]:
+    """The steps with the parameters of a case."""
+    return {name: replace(step, params=_changed(step, case)) for name, step in steps.items()}
+
+
+def _changed(step: Step, case: Case) -> dict[str, Any]:
+    params = dict(step.params)
+    for name in step.params:
+        for asked in (f"*.{name}", f"{step.node.path}.{name}"):
+            if asked in case.params and (params[name] is not None or asked[0] != "*"):
+                new = case.params[asked]
+                params[name] = new(step.params) if callable(new) else new
+    return params
+
+
+@dataclass
+class Chain:
+    """One case, under way: nothing is computed before it is asked for."""
+
+    recipe: Recipe
+    case: Case
+    steps: dict[str, Step]
+    keys: dict[str, Key] = field(default_factory=dict)
+    values: dict[str, Any] = field(default_factory=dict)
+    refused: dict[str, str] = field(default_factory=dict)  #: steps that gave no value, and why
+
+    @classmethod
+    def of(cls, recipe: Recipe, case: Case, code: Code) -> Chain:
+        """The case with the key of each step; a result that the case puts there has its own."""
+        steps = changed(matched(smaller(with_losses(recipe), case.size)), case)
+        chain = cls(recipe, case, steps)
+        for name in in_order({n: s.sources for n, s in steps.items()}, steps):
+            key, _ = key_of(steps[name], chain.keys, recipe.seed, code)
+            chain.keys[name] = digest(key, case.name) if _put(steps[name], case) else key
+        return chain
+
+    def inputs(self, name: str) -> list[Any]:
+        """What a step is given; `LookupError` where a step before it refused."""
+        return [self._gathered(self.steps[name].wires.get(i)) for i in self.steps[name].node.inputs]
+
+    def _gathered(self, wire: Any) -> Any:
+        if wire is None or isinstance(wire, str):
+            return wire and self._value(wire)
+        return [self._value(name) for name in wire]
+
+    def _value(self, wanted: str) -> Any:
+        for name in in_order({n: s.sources for n, s in self.steps.items()}, [wanted]):
+            if name not in self.values and name not in self.refused:
+                self._compute(name)
+        if wanted not in self.values:
+            raise LookupError(wanted)
+        return self.values[wanted]
+
+    def _compute(self, name: str) -> None:
+        step = self.steps[name]
+        if any(source in self.refused for source in step.sources):
+            self.refused[name] = "a step before it refused"
+            return
+        inputs = self.inputs(name)
+        try:
+            with torch.no_grad():
+                value = call(step, inputs, step.params, self.recipe.seed, "cpu")
+        except RunError as error:
+            self.refused[name] = str(error.cause)
+            if not step.node.path.startswith("spectra.lift"):
+                return
+            value = inputs[0].mean(0).expand(len(inputs[1].centres), -1, -1).clone()  # grey, so that the rest is seen
+            del self.refused[name]
+        put = _put(step, self.case)
+        self.values[name] = put(value) if put else value
+
+
+def _put(step: Step, case: Case) -> Any:
+    return next((change for path, change in case.values.items() if step.node.path.startswith(path)), None)
+
+
+def untouched(chain: Chain, usual: Chain) -> Iterator[str]:
+    """Steps of a case that are given what they are given in the usual one."""
+    if chain.case is usual.case or chain.case.inputs or chain.case.alike:
+        return
+    for name, step in chain.steps.items():
+        mine, theirs = ([c.keys[s] for s in step.sources] for c in (chain, usual))
+        if step.params == usual.steps[name].params and mine == theirs:
+            yield name

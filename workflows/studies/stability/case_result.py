@@ -1,0 +1,297 @@
+"""One cell of the grid: a step on the inputs of a case, against float64, forward and gradient.
+
+The reference is the node's own, or the same function on the same inputs in float64; random numbers are the same.
+The bound is the node's ``rtol``, over the reference's largest element; for a gradient 1e-4 of its largest, or ten
+times ``rtol`` where that is more.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import torch
+from torch import Tensor
+from torch.overrides import TorchFunctionMode
+
+from neusee.workflows.graph.recipe_graph import Step
+from neusee.workflows.keys.cache_key import stream_seed
+from neusee.workflows.report.study_page import Mark
+from neusee.workflows.store.serialization import each_tensor, tensors_in
+from neusee.workflows.studies.stability.extreme_cases import Case
+from neusee.workflows.studies.stability.stated_limits import stated_of
+from neusee.workflows.tolerance.error_norm import largest_error
+
+ROUNDING = 2.0**-23  #: a result in single precision is held to no less
+SLOPE = 1e-4  #: a gradient in single precision is held to that
+_NEAR = 0.5  #: of a bound, beyond which what holds is near it
+_STEEPER = 10.0  #: or to so many times the bound of the result, where that is more
+_LEAST = math.sqrt(torch.finfo(torch.float32).tiny)  #: below, an error counts over this: of what is denormal, a root
+_DIM = 1e-3  #: of the brightest, below which a part counts as dim
+_LIGHT = ("scene.", "spectra.", "optics.", "sensor.expose", "sensor.gather")  #: where what is dim may not drown
+_HUGE = 1e30  #: what infinity is compared with
+_HALVES = {torch.float16: 2.0**-11, torch.bfloat16: 2.0**-8}
+
+
+@dataclass(frozen=True)
+class Cell:
+    """What became of one step in one case."""
+
+    mark: Mark
+    note: str
+    error: float | None = None  #: of the result
+    bound: float | None = None
+    slope: float | None = None  #: error of the gradient
+    slope_bound: float | None = None
+
+
+class _Refused(Exception):
+    """The step itself says that it cannot use what it is given."""
+
+
+class _CountedInSingle(TorchFunctionMode):
+    """Poisson numbers as of a mean in single precision: of a mean that is another in the last digit they are others."""
+
+    def __torch_function__(self, func: Any, types: Any, args: Any = (), kwargs: Any = None) -> Any:
+        if func is torch.poisson and args[0].dtype == torch.float64:
+            return func(args[0].float(), *args[1:], **(kwargs or {})).double()
+        return func(*args, **(kwargs or {}))
+
+
+def judged(step: Step, inputs: Sequence[Any], case: Case, seed: int) -> Cell | None:
+    """Pass, warn or fail of one step; None where the case changes nothing of it."""
+    given = _given(step, inputs, case)
+    if given is None:
+        return None
+    try:
+        return _seen(step, inputs, given, case, seed) if case.expect == "seen" else _compared(step, given, case, seed)
+    except _Refused as refused:
+        return Cell("pass", f"refused: {refused}")
+    except Exception as error:
+        return Cell("fail", f"{type(error).__name__}: {str(error).splitlines()[0]}")
+
+
+def _given(step: Step, inputs: Sequence[Any], case: Case) -> list[Any] | None:
+    """The inputs with the case in them; None where it changes none."""
+    given = list(inputs)
+    if case.alike:
+        if len(given) < 2 or not all(isinstance(x, Tensor) and _is_picture(x) for x in given[:2]):
+            return None
+        given[1] = given[0].clone()
+    if case.inputs is not None:
+        if not any(map(_is_picture, tensors_in(given))):
+            return None
+        change = case.inputs
+        given = each_tensor(lambda x: change(x) if _is_picture(x) else x, given)
+    return given
+
+
+def _is_picture(x: Tensor) -> bool:
+    return (x.is_floating_point() and x.ndim >= 2 and x.dtype != torch.float64) or _is_half(x)
+
+
+def _is_half(x: Tensor) -> bool:
+    return x.dtype in _HALVES
+
+
+def _run(step: Step, fn: Any, inputs: Sequence[Any], seed: int, **params: Any) -> Any:
+    rng = {"rng": torch.Generator().manual_seed(stream_seed(seed, step.name))} if step.node.random else {}
+    return fn(*inputs, **{**step.params, **params}, **rng)
+
+
+def _as_used(step: Step, inputs: Sequence[Any], seed: int) -> Any:
+    """The step as a run takes it; what it refuses is told apart from what goes wrong here."""
+    try:
+        return _run(step, step.node.fn, inputs, seed)
+    except ValueError as error:
+        raise _Refused(str(error)) from error
+
+
+def _in_double(step: Step, inputs: Sequence[Any], seed: int) -> Any:
+    wide = each_tensor(lambda x: x.double() if x.is_floating_point() else x, list(inputs))
+    precise = {"precision": "double"} if "precision" in step.params else {}
+    with _CountedInSingle():
+        return _run(step, step.node.fn, wide, seed, **precise)
+
+
+# --- as accurate as the node says -------------------------------------------------------------------------------------
+
+
+def _compared(step: Step, inputs: list[Any], case: Case, seed: int) -> Cell:
+    with torch.no_grad():
+        value = _as_used(step, inputs, seed)
+        truth = _run(step, step.node.ref, inputs, seed) if step.node.ref else _in_double(step, inputs, seed)
+    if not _finite(value):
+        return Cell("pass", "overflows in the open, as its reference in single") if not _fits(truth) else Cell(
+            "fail", "not finite")  # fmt: skip
+    bound = max([step.node.rtol, ROUNDING, *(_HALVES.get(x.dtype, 0.0) for x in tensors_in(value))])
+    dim = case.expect == "dim part" and step.node.path.startswith(_LIGHT)
+    error = _dim_error(value, truth) if dim else _error(value, truth)
+    if isinstance(truth, Tensor) and truth.ndim == 0 and error > bound:
+        error *= _cancelled(step, inputs, truth, seed)
+    slope = _slope_error(step, inputs, seed)
+    coarse = max(
+        (_HALVES.get(x.dtype, 0.0) for x in tensors_in(inputs)), default=0.0
+    )  # a gradient has the input's type
+    return _verdict(error, bound, slope, max(SLOPE, _STEEPER * bound, 2 * coarse))
+
+
+def _verdict(error: float, bound: float, slope: float | None, steeper: float) -> Cell:
+    """Within its bound a cell passes; by less than twice, it warns."""
+    used = [error / bound] if slope is None else [error / bound, slope / steeper]
+    limit = None if slope is None else steeper
+    if not all(share <= 1.0 for share in used):  # nor is what is not a number
+        return Cell("fail", "", error, bound, slope, limit)
+    if max(used) > _NEAR:
+        return Cell("warn", "near its bound", error, bound, slope, limit)
+    return Cell("pass", "", error, bound, slope, limit)
+
+
+def _error(value: Any, truth: Any) -> float:
+    """The largest difference over the largest element."""
+    pairs = list(zip(tensors_in(value), tensors_in(truth), strict=True))
+    return max((_over(a, b, _LEAST) for a, b in pairs), default=0.0)
+
+
+def _cancelled(step: Step, inputs: list[Any], truth: Tensor, seed: int) -> float:
+    """A sum of much that cancels is as good as what it sums: |f| over sum |x df/dx|, where that is less."""
+    with torch.enable_grad():
+        slopes = _true_slopes(step, inputs, seed) or []
+    pictures = [x for x in tensors_in(inputs) if _is_picture(x)]
+    moved = sum(float((x.double() * g).abs().sum()) for x, g in zip(pictures, slopes, strict=False))
+    weight = float(_weight(truth))
+    return min(1.0, weight * abs(float(truth)) / moved) if moved > 0 else 1.0
+
+
+def _over(a: Tensor, b: Tensor, floor: float) -> float:
+    found, top = largest_error(a, b), float(b.detach().double().abs().max()) if b.numel() else 0.0
+    return found if top >= floor else found * (top or 1.0) / floor
+
+
+def _dim_error(value: Any, truth: Any) -> float:
+    """The same among the elements far below the brightest."""
+    worst = 0.0
+    for a, b in zip(tensors_in(value), tensors_in(truth), strict=True):
+        dim = b.abs() < _DIM * b.abs().max() if b.is_floating_point() and b.ndim >= 2 else None
+        if dim is not None and bool(dim.any()):
+            worst = max(worst, largest_error(a[dim], b[dim]))
+    return worst
+
+
+def _finite(value: Any) -> bool:
+    return all(bool(x.isfinite().all()) for x in tensors_in(value) if x.is_floating_point())
+
+
+def _fits(truth: Any) -> bool:
+    """Whether single precision can hold it."""
+    top = torch.finfo(torch.float32).max
+    return all(bool((x.abs() < top).all()) for x in tensors_in(truth) if x.is_floating_point())
+
+
+# --- gradients --------------------------------------------------------------------------------------------------------
+
+
+def _slope_error(step: Step, inputs: list[Any], seed: int) -> float | None:
+    """Error of the gradient of a weighted sum of the result with respect to every picture; None where none flows."""
+    with torch.enable_grad():
+        usual = _slopes(inputs, lambda given: _run(step, step.node.fn, given, seed))
+        if usual is None:
+            return None
+        truth = _true_slopes(step, inputs, seed)
+    if truth is None or not _finite(truth):
+        return math.inf
+    pictures = [x for x in tensors_in(inputs) if _is_picture(x)]
+    tops = [torch.finfo(torch.float32 if x.dtype == torch.float64 else x.dtype).max for x in pictures]
+    if any(bool((g.abs() >= top).any()) for g, top in zip(truth, tops, strict=True)):
+        return 0.0  # steeper than the picture's own type, which a gradient has, can say
+    return max(_over(a, b, _slight(x)) for a, b, x in zip(usual, truth, pictures, strict=True))
+
+
+def _slight(picture: Tensor) -> float:
+    """The gradient of a mean, or the least that its type holds in full: of less, an error counts over this."""
+    top = float(picture.detach().double().abs().max())
+    return max(1.0 / (picture.numel() * max(top, _LEAST)), torch.finfo(picture.dtype).tiny)
+
+
+def _true_slopes(step: Step, inputs: list[Any], seed: int) -> list[Tensor] | None:
+    wide = each_tensor(lambda x: x.double() if _is_picture(x) else x, inputs)
+    leaves = [id(w) for w, x in zip(tensors_in(wide), tensors_in(inputs), strict=True) if _is_picture(x)]
+    own = step.node.ref
+    found = None if own is None else _slopes(wide, lambda given: _run(step, own, given, seed), leaves)
+    return found or _slopes(wide, lambda given: _in_double(step, given, seed), leaves)
+
+
+def _slopes(inputs: list[Any], fn: Any, wanted: list[int] | None = None) -> list[Tensor] | None:
+    """Gradients with respect to the pictures, or to the tensors that are ``wanted``, by identity."""
+    leaves: list[Tensor] = []
+
+    def leaf(x: Tensor) -> Tensor:
+        if _is_picture(x) if wanted is None else id(x) in wanted:
+            leaves.append(x.detach().clone().requires_grad_())
+            return leaves[-1]
+        return x
+
+    total = _weighed(fn(each_tensor(leaf, inputs)))
+    if total is None or not leaves:
+        return None
+    grads = torch.autograd.grad(total, leaves, allow_unused=True)
+    return [torch.zeros_like(x) if g is None else g for x, g in zip(leaves, grads, strict=True)]
+
+
+def _weighed(value: Any) -> Tensor | None:
+    """Every result that has a gradient, over a power of ten near its largest, times weights that never change."""
+    parts = [(x.double() * _weight(x) / _near(x)).sum() for x in tensors_in(value) if x.requires_grad]
+    return torch.stack(parts).sum() if parts else None
+
+
+def _weight(x: Tensor) -> Tensor:
+    return torch.rand(x.shape, generator=torch.Generator().manual_seed(5), dtype=torch.float32)
+
+
+def _near(x: Tensor) -> float:
+    """A power of ten near the largest element, the same in every precision; 1 where all is slight, or one number."""
+    top = float(x.detach().double().abs().max()) if x.ndim else 0.0
+    return 10.0 ** round(math.log10(top) + 0.123) if _LEAST < top < math.inf else 1.0
+
+
+# --- numbers that are none --------------------------------------------------------------------------------------------
+
+
+def _seen(step: Step, inputs: Sequence[Any], given: list[Any], case: Case, seed: int) -> Cell:
+    """A wrong number in any picture is refused, stays to be seen, or, infinite, counts as the limit of large ones."""
+    notes, count = [], sum(_is_picture(x) for x in tensors_in(list(inputs)))
+    for i in range(count):
+        notes.append(_one_seen(step, _only(i, inputs, given), seed))
+    hidden = [note for note in notes if note.startswith("hidden")]
+    stated = stated_of(step.node, case.name)
+    if hidden and stated is None:
+        return Cell("fail", hidden[0])
+    return Cell("pass", f"as stated: {stated}" if hidden else "; ".join(dict.fromkeys(notes)))
+
+
+def _one_seen(step: Step, given: list[Any], seed: int) -> str:
+    with torch.no_grad():
+        try:
+            value = _as_used(step, given, seed)
+        except _Refused as refused:
+            return f"refused: {refused}"
+        if not _finite(value):
+            return "seen"
+        bad = next(float(x[~x.isfinite()][0]) for x in tensors_in(given) if _is_picture(x) and not _finite(x))
+        if math.isnan(bad):
+            return "hidden: a finite result of a number that is none"
+        large = each_tensor(lambda x: x.nan_to_num(posinf=_HUGE, neginf=-_HUGE), given)
+        limit = _run(step, step.node.fn, large, seed)
+        same = _finite(limit) and largest_error(value, limit) <= max(step.node.rtol, ROUNDING)
+        return "as its limit" if same else "hidden: a finite result that is no limit"
+
+
+def _only(which: int, inputs: Sequence[Any], given: Sequence[Any]) -> list[Any]:
+    """The inputs with the change in one picture alone."""
+    old = [x for x in tensors_in(list(inputs)) if _is_picture(x)]
+    new = [x for x in tensors_in(list(given)) if _is_picture(x)]
+    swap = {id(old[which]): new[which]}
+    only: list[Any] = each_tensor(lambda x: swap.get(id(x), x), list(inputs))
+    return only

@@ -1,0 +1,73 @@
+"""The grid of the stability study: a cell a colour, a sign and the number that is nearest its bound."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from typing import Any
+
+from neusee.workflows.report.figures.style import BLACK, canvas, drawn
+from neusee.workflows.studies.stability.case_result import Cell
+
+_COLOURS = {"pass": "#9AD6C1", "warn": "#F6D58A", "fail": "#F2B08A"}
+_WIDE, _TALL = 0.52, 0.23  #: inches of a cell
+_ACROSS = 22  #: nodes side by side; the others stand below
+
+Entry = tuple[str, str, str, Cell]  #: group, case, node, cell
+
+
+@drawn
+def grid_picture(entries: Sequence[Entry]) -> Any:
+    """Cases down, nodes across, the losses last."""
+    cases = list(dict.fromkeys((group, case) for group, case, _, _ in entries))
+    nodes = sorted({node for _, _, node, _ in entries}, key=lambda n: (n.startswith("losses."), n))
+    panels = max(1, -(-len(nodes) // _ACROSS))
+    across = max(1, -(-len(nodes) // panels))
+    figure, axes = canvas(2.0 + _WIDE * across, panels * (2.0 + _TALL * len(cases)), rows=panels)
+    for ax, first in zip(axes[:, 0], range(0, max(1, len(nodes)), across), strict=True):
+        _panel(ax, [e for e in entries if e[2] in nodes[first : first + across]], cases, nodes[first:], across)
+    how = "largest error over the largest element, of the result or (g) of its gradient, whichever is nearer its bound"
+    figure.supxlabel(f"{how};  ! warn, × fail;  r refused, s seen, – no number to compare", fontsize=9)
+    return figure
+
+
+def _panel(ax: Any, entries: Sequence[Entry], cases: list[tuple[str, str]], nodes: list[str], across: int) -> None:
+    for group, case, node, cell in entries:
+        column, row = nodes.index(node), cases.index((group, case))
+        ax.barh(row, 0.96, 0.92, left=column - 0.48, color=_COLOURS[cell.mark])
+        ax.text(column, row, words(cell), ha="center", va="center", color=BLACK, fontsize=9)
+    for row in range(1, len(cases)):
+        if cases[row][0] != cases[row - 1][0]:
+            ax.axhline(row - 0.5, color="#888888", linewidth=0.8)
+    ax.set_xticks(range(min(across, len(nodes))), nodes[:across], rotation=50, ha="left", rotation_mode="anchor")
+    ax.set_yticks(range(len(cases)), [case for _, case in cases])
+    ax.tick_params(length=0, top=False, bottom=False, labeltop=True, labelbottom=False, left=False)
+    ax.set_xlim(-0.5, across - 0.5)
+    ax.set_ylim(len(cases) - 0.5, -0.5)
+    ax.grid(False)
+    for spine in ax.spines.values():
+        spine.set_visible(False)
+
+
+def words(cell: Cell) -> str:
+    """What stands in a cell: a sign where it does not pass, and its number."""
+    sign = {"pass": "", "warn": "!", "fail": "×"}[cell.mark]
+    if cell.error is None:
+        short = "r" if cell.note.startswith("refused") else "s" if "seen" in cell.note else "–"
+        return sign + short
+    steep = cell.slope is not None and _share(cell.slope, cell.slope_bound) > _share(cell.error, cell.bound)
+    return f"{sign}{number(cell.slope or 0.0)}g" if steep else f"{sign}{number(cell.error)}"
+
+
+def _share(value: float, bound: float | None) -> float:
+    return value / bound if bound else 0.0
+
+
+def number(value: float) -> str:
+    """``2e-7``, in as few signs as tell the order of magnitude."""
+    if value == 0:
+        return "0"
+    if not math.isfinite(value):
+        return "inf" if value > 0 else "nan"
+    mantissa, _, exponent = f"{value:.0e}".partition("e")
+    return f"{mantissa}e{int(exponent)}"

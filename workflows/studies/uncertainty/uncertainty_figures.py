@@ -1,0 +1,144 @@
+"""Pictures of the study of uncertainty: tornado, bands, histograms, and where a picture is not sure."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+from torch import Tensor
+
+from neusee.workflows.report.figures.camera_overview import high
+from neusee.workflows.report.figures.style import BLACK, BLUE, GREEN, ORANGE, VERMILION, canvas, drawn, encoded, picture
+
+if TYPE_CHECKING:
+    from numpy.typing import NDArray
+
+    Places = NDArray[np.float64]
+
+_GREY = "#777777"
+_COLOURS = (BLUE, VERMILION, GREEN, ORANGE)
+_WIDE = 30.0  #: ratio of a curve's ends from which its axis is logarithmic
+_BINS = 24
+_SLIGHT = 1e-6  #: share of a curve's largest element: nothing is said relative to less
+_ALONG = 200  #: signals of a photon-transfer curve
+
+
+@drawn
+def tornado(swings: Mapping[str, Sequence[tuple[str, float, float]]], middles: Mapping[str, float]) -> Any:
+    """Of each number, how far an input alone moves it: (input, at its 5 %, at its 95 %), the widest on top."""
+    columns = min(2, len(swings))
+    rows = -(-len(swings) // columns)
+    most = max(map(len, swings.values()))
+    figure, axes = canvas(6.6 * columns, (0.34 * most + 1.2) * rows, rows, columns)
+    for ax, (name, bars) in zip(axes.flat, swings.items(), strict=False):
+        _bars(ax, sorted(bars, key=lambda bar: abs(bar[2] - bar[1])), middles[name])
+        ax.set_title(name)
+    for ax in list(axes.flat)[len(swings) :]:
+        ax.set_axis_off()
+    handles, labels = axes.flat[0].get_legend_handles_labels()
+    figure.legend(handles[:2], labels[:2], loc="outside lower center", ncols=2)
+    return figure
+
+
+def _bars(ax: Any, bars: Sequence[tuple[str, float, float]], middle: float) -> None:
+    low = [bar[1] - middle for bar in bars]
+    up = [bar[2] - middle for bar in bars]
+    ax.barh(range(len(bars)), low, 0.7, left=middle, color=BLUE, label="input at its 5 %")
+    ax.barh(range(len(bars)), up, 0.7, left=middle, color=ORANGE, label="input at its 95 %")
+    ax.axvline(middle, color=BLACK, linewidth=0.9)
+    ax.set_yticks(range(len(bars)), [bar[0] for bar in bars])
+    ax.ticklabel_format(axis="x", useOffset=False)
+    ax.tick_params(axis="x", rotation=20)
+    ax.grid(False, axis="y")
+
+
+@drawn
+def bands(curves: Mapping[str, tuple[Places, Mapping[str, Places]]], axis: str) -> Any:
+    """Of each family of curves (abscissa, draws by name: (draw, element)) the middle 90 %; below, over the median."""
+    figure, axes = canvas(5.6 * len(curves), 5.4, 2, len(curves), sharex="col", height_ratios=[2, 1])
+    for (ax, below), (family, (x, members)) in zip(axes.T, curves.items(), strict=True):
+        for (name, draws), colour in zip(members.items(), _COLOURS * len(members), strict=False):
+            _band(ax, below, x, draws, colour, name)
+        least, most = min(float(d.min()) for d in members.values()), max(float(d.max()) for d in members.values())
+        if least > 0 and most / least > _WIDE:
+            ax.set_yscale("log")
+        ax.set_title(f"{family}: median and middle 90 %")
+        below.set_xlabel(axis)
+        below.set_ylabel("over the\nmedian (%)")
+        ax.legend()
+    return figure
+
+
+@drawn
+def transfer(draws: Places) -> Any:
+    """The photon-transfer curve of (draw, level, signal | variance | predicted): deviation over signal, in DN."""
+    figure, axes = canvas(6.6, 5.8, 2, 1, sharex=True, height_ratios=[2, 1])
+    ax, below = axes[:, 0]
+    for column, colour, name in ((2, BLUE, "predicted"), (1, ORANGE, "flat fields")):
+        _band(ax, below, *_at_one_signal(draws, column), colour, f"{name}: middle 90 %")
+    ax.set_xscale("log")
+    ax.set_yscale("log")
+    ax.set_title("photon-transfer curve: what the draws leave open")
+    ax.set_ylabel("standard deviation (DN)")
+    below.set_xlabel("mean above dark (DN)")
+    below.set_ylabel("over the\nmedian (%)")
+    ax.legend()
+    return figure
+
+
+def _band(ax: Any, below: Any, x: Places, draws: Places, colour: str, name: str) -> None:
+    """Median and middle 90 %; below, the same over the median, where that is not next to nothing."""
+    low, middle, up = np.quantile(draws, [0.05, 0.5, 0.95], axis=0)
+    ax.fill_between(x, low, up, color=colour, alpha=0.35, linewidth=0, label=name)
+    ax.plot(x, middle, color=colour, linewidth=1.0)
+    seen = np.abs(middle) > _SLIGHT * np.abs(middle).max()
+    share = [100 * (end[seen] / middle[seen] - 1) for end in (low, up)]
+    below.fill_between(x[seen], *share, color=colour, alpha=0.35, linewidth=0.8)
+
+
+def _at_one_signal(draws: Places, column: int) -> tuple[Places, Places]:
+    """Each draw's curve at the same signals, which all draws reach: its light, and with it each level, is its own."""
+    lit = draws[:, 1:]
+    ends = float(lit[..., 0].clip(1e-9).min(1).max()), float(lit[..., 0].max(1).min())
+    signal = np.geomspace(*ends, _ALONG)
+    curves = [
+        np.interp(np.log(signal), np.log(x.clip(1e-9)), np.sqrt(y.clip(0)))
+        for x, y in lit[..., [0, column]].transpose(0, 2, 1)
+    ]
+    return signal, np.stack(curves)
+
+
+@drawn
+def histograms(draws: Mapping[str, Places], middles: Mapping[str, float]) -> Any:
+    """Every number over all draws; the line is where all inputs are at their median."""
+    columns = min(3, len(draws))
+    rows = -(-len(draws) // columns)
+    figure, axes = canvas(3.6 * columns, 2.5 * rows, rows, columns)
+    for ax, (name, values) in zip(axes.flat, draws.items(), strict=False):
+        ax.hist(values, _BINS, color=BLUE, alpha=0.8)
+        ax.axvline(middles[name], color=VERMILION, linewidth=1.2)
+        ax.set_title(name)
+        ax.ticklabel_format(axis="x", useOffset=False)
+        ax.tick_params(axis="x", rotation=20)
+        ax.grid(False)
+    for ax in list(axes.flat)[len(draws) :]:
+        ax.set_axis_off()
+    figure.supylabel("draws", fontsize=10)
+    return figure
+
+
+@drawn
+def pictures(found: Mapping[str, tuple[Tensor, Tensor]]) -> Any:
+    """Mean and standard deviation, pixel by pixel; of three channels the deviation is their mean."""
+    figure, axes = canvas(9.6, 4.2 * len(found), len(found), 2)
+    for (left, right), (name, (mean, sd)) in zip(axes, found.items(), strict=True):
+        white = high(mean.clamp_min(0))
+        three = mean.ndim == 3 and mean.shape[0] == 3
+        shown = encoded(mean / white) if three else (mean[0] if mean.ndim == 3 else mean).numpy()
+        picture(left, shown, f"{name}: mean", **({} if three else {"cmap": "gray", "vmin": 0.0, "vmax": white}))
+        spread = sd.mean(0) if sd.ndim == 3 else sd
+        image = picture(right, spread.numpy(), f"{name}: standard deviation", cmap="viridis", vmin=0, vmax=high(spread))
+        bar = figure.colorbar(image, ax=right, fraction=0.046, pad=0.03, extend="max")
+        bar.ax.tick_params(labelsize=9)
+    return figure

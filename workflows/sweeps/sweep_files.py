@@ -1,0 +1,84 @@
+"""What a sweep leaves behind: one tidy table, how to run it again, and a data set with named dimensions."""
+
+from __future__ import annotations
+
+import importlib.util
+from collections.abc import Collection, Mapping, Sequence
+from typing import TYPE_CHECKING, Any
+
+from neusee.workflows.graph.diagnostics import Mark, Problem, RecipeError
+from neusee.workflows.graph.final_values import flow
+from neusee.workflows.sweeps.sweep_table import Column, header, rows_of
+
+if TYPE_CHECKING:
+    from neusee.workflows.report.run_folder import RunFolder
+    from neusee.workflows.sweeps.sweep_points import Outcome
+
+_PACKAGES = ("xarray", "h5netcdf", "h5py")
+
+
+def require_xarray(asked_by: str) -> None:
+    """Refuse at once what could only fail after everything has run."""
+    missing = [name for name in _PACKAGES if importlib.util.find_spec(name) is None]
+    if missing:
+        told = f'needs {" and ".join(missing)}: pip install "neusee[xarray]"'
+        raise RecipeError([Problem(Mark(asked_by), "", told)])
+
+
+def write_table(folder: RunFolder, outcomes: Sequence[Outcome], columns: Sequence[Column]) -> None:
+    """``sweep.csv``: one row for each number of each point, in the order of the points."""
+    rows = (row for outcome in outcomes for row in rows_of(outcome, columns))
+    folder.write_rows("sweep.csv", header(columns), rows)
+
+
+def write_account(folder: RunFolder, title: str, account: Mapping[str, Any]) -> None:
+    """``sweep.yaml``: recipe, axes, order, versions and how to run it again."""
+    lines = [f"# {title}", *(f"{key}: {flow(value)}" for key, value in account.items())]
+    folder.write("sweep.yaml", "\n".join(lines) + "\n")
+
+
+def dataset(outcomes: Sequence[Outcome], columns: Sequence[Column], paired: bool, about: Mapping[str, str]) -> Any:
+    """An `xarray.Dataset` whose dimensions are the axes, or ``point`` where they are paired; coordinates in SI.
+
+    A result of several numbers has a dimension of its own, ``<result> index``. What failed, or
+    has not run, is nan; ``ran`` says where there are numbers.
+    """
+    import numpy
+    import xarray
+
+    shape = (len(columns[0].si),) if paired else tuple(len(c.si) for c in columns)
+    dims = ("point",) if paired else tuple(c.name for c in columns)
+    coords = {c.name: ("point" if paired else c.name, list(c.si), {"units": c.unit} if c.unit else {}) for c in columns}
+    ran, seconds = numpy.zeros(shape, bool), numpy.full(shape, numpy.nan)
+    arrays: dict[str, Any] = {}
+    taken = {"ran", "seconds", *coords}
+    long = _lengths(outcomes, taken)
+    for outcome in outcomes:
+        place = outcome.point.place[:1] if paired else outcome.point.place
+        seconds[place], ran[place] = outcome.seconds, outcome.state != "failed"
+        for step, part, index, value in outcome.numbers:
+            name = _variable(step, part, taken)
+            more = (long[name],) if name in long else ()
+            if name not in arrays:
+                arrays[name] = numpy.full((*shape, *more), numpy.nan)
+            arrays[name][(*place, index or 0) if more else place] = value
+    found = {name: ((*dims, f"{name} index") if name in long else dims, array) for name, array in arrays.items()}
+    own = {"ran": (dims, ran), "seconds": (dims, seconds, {"units": "s"})}
+    return xarray.Dataset({**found, **own}, coords, dict(about))
+
+
+def _lengths(outcomes: Sequence[Outcome], taken: Collection[str]) -> dict[str, int]:
+    """The largest number of values of every result that has several."""
+    long: dict[str, int] = {}
+    for outcome in outcomes:
+        for step, part, index, _ in outcome.numbers:
+            if index != "":
+                name = _variable(step, part, taken)
+                long[name] = max(long.get(name, 0), int(index) + 1)
+    return long
+
+
+def _variable(step: str, part: str, taken: Collection[str]) -> str:
+    """Name of a result, apart from the coordinates'."""
+    name = f"{step}.{part}".rstrip(".").replace("/", "_")
+    return f"{name} (result)" if name in taken else name

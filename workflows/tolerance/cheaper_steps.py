@@ -1,0 +1,194 @@
+"""Leave out what nobody will see: a recipe with cheaper steps where its outputs do not need the full ones.
+
+The sensor sums bands into a few channels before anything random happens. Where all that is
+asked of an image are such sums, they are convolved instead of its bands. The steps that
+stand in are added beside the full ones, and only the wires of what reads them change; so a
+value that is asked for by name is always the full one.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Collection, Iterable, Mapping, Sequence
+from dataclasses import dataclass, field, replace
+from typing import TYPE_CHECKING, Any
+
+from neusee.workflows.graph.recipe_graph import UNHEARD, Economy, Recipe, Step, Wire, in_order, needed
+from neusee.workflows.tolerance.tolerance_frontier import unheard
+from neusee.workflows.tolerance.zero_effect_steps import without_nothing
+
+if TYPE_CHECKING:
+    from neusee.nodes import Node
+
+CHANNELS = 0.25  #: share of the tolerance for the channels of one image; the level may follow a second one
+_LEAST = 2e-5  #: of a tolerance, below which sums over bands can hardly be proved: their rounding alone is 1.4e-6
+_MIXTURE = 0.1  #: share of the tolerance for a mixture, rounded down to a power of ten so that it is seldom another
+
+
+def economised(recipe: Recipe, wanted: Iterable[str], pinned: Collection[str] = ()) -> Recipe:
+    """``recipe`` with cheaper steps for what only ``wanted`` needs; as it is with ``keep_all``.
+
+    The scene of an image that follows a step in ``pinned`` stays whole: what is being learnt
+    has no mixture yet. A recipe that was economised does not change again.
+    """
+    wanted = frozenset(wanted)
+    if recipe.keep_all:
+        return recipe
+    recipe = without_nothing(recipe, needed(recipe, sorted(wanted)))
+    order = needed(recipe, sorted(wanted))
+    recipe = _limited(recipe, order)
+    images = [recipe.steps[n] for n in order if recipe.steps[n].node.collapsed is not None and n not in wanted]
+    if not images or recipe.tolerance * recipe.strict <= _LEAST:
+        return recipe
+    behind = _behind(recipe, order, pinned)
+    draft = _Draft(recipe, wanted, _readers(recipe, order))
+    for image in images:
+        if image.name not in pinned and image.wires.get("radiance") not in behind:
+            draft.collapse(image)
+    found = draft.finished()
+    return _limited(found, needed(found, sorted(wanted)))
+
+
+def _limited(recipe: Recipe, order: Sequence[str]) -> Recipe:
+    """The recipe with a limit where nodes do not tell, if its tolerance is larger."""
+    steps = unheard(recipe, order) if recipe.tolerance > UNHEARD else frozenset[str]()
+    return recipe if steps == recipe.unheard else replace(recipe, unheard=steps)
+
+
+def _behind(recipe: Recipe, order: Iterable[str], pinned: Collection[str]) -> set[str]:
+    """The pinned steps and what follows them."""
+    found = set(pinned)
+    for name in order if found else ():
+        if not found.isdisjoint(recipe.steps[name].sources):
+            found.add(name)
+    return found
+
+
+def _readers(recipe: Recipe, order: Iterable[str]) -> dict[str, list[str]]:
+    """By step, those that read it."""
+    found: dict[str, list[str]] = {}
+    for name in order:
+        for source in dict.fromkeys(recipe.steps[name].sources):
+            found.setdefault(source, []).append(name)
+    return found
+
+
+@dataclass(frozen=True)
+class Asked:
+    """What is read of an image: sums over its bands, by the channels' weights, and by the well's or not."""
+
+    bands: str
+    responses: str
+    readers: tuple[str, ...]
+    well: bool
+
+
+def asked_of(recipe: Recipe, image: str, wanted: Iterable[str]) -> Asked | None:
+    """What the steps that ``wanted`` needs read of an image; None where it is more than sums over its bands."""
+    names = _readers(recipe, needed(recipe, wanted)).get(image, [])
+    readers = [recipe.steps[name] for name in names]
+    found = _Draft(recipe, frozenset(wanted), {}).spectral(image, readers)
+    return found and Asked(*found, tuple(names), _well(readers))
+
+
+@dataclass
+class _Draft:
+    """A recipe while steps are put beside its own."""
+
+    recipe: Recipe
+    wanted: frozenset[str]
+    readers: Mapping[str, list[str]]
+    added: dict[str, Step] = field(default_factory=dict)
+    rewired: dict[str, Step] = field(default_factory=dict)
+    economies: list[Economy] = field(default_factory=list)
+
+    def collapse(self, image: Step) -> None:
+        """Put the channels of an image beside it, if all that reads it asks for sums over its bands."""
+        readers = [self.rewired.get(name, self.recipe.steps[name]) for name in self.readers.get(image.name, ())]
+        node, radiance, spectral = image.node.collapsed, image.wires.get("radiance"), self.spectral(image.name, readers)
+        if node is None or spectral is None or not isinstance(radiance, str):
+            return
+        bands, responses = spectral
+        name, within = f"{image.name}.channels", self.recipe.allowed(image.name) * CHANNELS
+        wires = {
+            "radiance": self._mixture(radiance, image),
+            "psf": image.wires.get("psf"),
+            "rows": self._rows(bands, responses, readers, image),
+        }
+        largest = any(reader.node.sums is not None for reader in readers)  # the level follows the brightest pixel
+        self._add(name, node, wires, {**image.params, "within": within, "largest": largest}, image)
+        for reader in readers:
+            changed = {i: _exchanged(wire, image.name, name) for i, wire in reader.wires.items()}
+            self.rewired[reader.name] = replace(reader, wires=changed)
+        self.economies.append(Economy(image.name, name, within, "only sums over its bands are asked for"))
+
+    def spectral(self, image: str, readers: Sequence[Step]) -> tuple[str, str] | None:
+        """The bands and responses by which all ``readers`` ask for sums over an image; None where one asks for more."""
+        found = {(r.wires.get("bands"), r.wires.get("responses")) for r in readers if "responses" in r.node.inputs}
+        if len(found) != 1 or not all(self._sums(r, image) for r in readers):
+            return None
+        bands, responses = found.pop()
+        return (bands, responses) if isinstance(bands, str) and isinstance(responses, str) else None
+
+    def finished(self) -> Recipe:
+        """The recipe with the steps that stand in."""
+        if not self.economies:
+            return self.recipe
+        steps = {**self.recipe.steps, **self.added, **self.rewired}
+        order = in_order({name: step.sources for name, step in steps.items()}, steps)
+        found = (*self.recipe.economies, *self.economies)
+        steps = {name: steps[name] for name in order}
+        return replace(self.recipe, steps=steps, economies=found, whole=self.recipe.whole or self.recipe)
+
+    def _sums(self, reader: Step, image: str) -> bool:
+        """Whether a step asks nothing of the image but sums over its bands."""
+        reads = {i for i, wire in reader.wires.items() if image == wire or (isinstance(wire, tuple) and image in wire)}
+        if not reads <= set(reader.node.channels) or (reader.node.sums and not reader.node.sums(reader.params)):
+            return False
+        return all(self._even(reader.wires.get(i)) for i in reader.node.even)
+
+    def _even(self, wire: Wire) -> bool:
+        """Whether a result is the same for every band, as its own node says."""
+        if not isinstance(wire, str):
+            return wire is None
+        step = self.recipe.steps[wire]
+        return step.node.sums is not None and step.node.sums(step.params)
+
+    def _rows(self, bands: str, responses: str, readers: list[Step], image: Step) -> str:
+        """The step that gives the weights of the bands; with the well's where a step reads bands but no responses."""
+        from neusee.nodes import spectra
+
+        well = _well(readers)
+        name, wires = f"{responses}.{'wells' if well else 'rows'}", {"bands": bands, "responses": responses}
+        return self._add(name, spectra.rows, wires, {"well": well}, image)
+
+    def _mixture(self, name: str, image: Step) -> str:
+        """The step that gives a cube as a mixture of few planes, made as far up as nodes take one."""
+        from neusee.nodes import spectra
+
+        step, new = self.recipe.steps[name], f"{name}.mixture"
+        through = next((i for i in step.node.mixtures if isinstance(step.wires.get(i), str)), None)
+        if through is not None and name not in self.wanted:
+            wires = {**step.wires, through: self._mixture(str(step.wires[through]), image)}
+            return self._add(new, step.node, wires, step.params, step)
+        within = {"within": 10.0 ** math.floor(math.log10(self.recipe.allowed(image.name) * _MIXTURE))}
+        if step.node.mixed is not None and name not in self.wanted:
+            return self._add(new, step.node.mixed, step.wires, {**step.params, **within}, step)
+        return self._add(new, spectra.compress, {"cube": name}, within, step)
+
+    def _add(self, name: str, node: Node, wires: Mapping[str, Wire], params: Mapping[str, Any], like: Step) -> str:
+        """A step that stands where ``like`` is written; gives its name."""
+        self.added[name] = Step(name, node, params, wires, like.mark, {}, like.device)
+        return name
+
+
+def _well(readers: Iterable[Step]) -> bool:
+    """Whether a step reads bands but no responses."""
+    return any("bands" in r.node.inputs and "responses" not in r.node.inputs for r in readers)
+
+
+def _exchanged(wire: Wire, old: str, new: str) -> Wire:
+    """A wire with one step in place of another."""
+    if isinstance(wire, tuple):
+        return tuple(new if name == old else name for name in wire)
+    return new if wire == old else wire

@@ -1,0 +1,57 @@
+"""The account of a tolerance: what each step that is left out may have spent of it, for all that follows."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from copy import copy
+from typing import Any
+
+from neusee.workflows.graph.recipe_graph import Recipe, Step
+from neusee.workflows.tolerance.cheaper_steps import CHANNELS
+from neusee.workflows.tolerance.skip_decision import FactsOf, Verdict, judge
+
+_NOTHING: dict[str, float] = {}
+
+
+class Ledger:
+    """Bounds by decision, summed along the graph: what is left out upstream leaves less for what follows.
+
+    Steps are brought in running order, each with `pass_on` or `verdict`.
+    """
+
+    def __init__(self, recipe: Recipe) -> None:
+        share = 1.0 - 2 * CHANNELS if any(e.within for e in recipe.economies) else 1.0
+        self._recipe, self._share = recipe, share
+        self._spent: dict[str, dict[str, float]] = {}  # by step: decision -> its bound; shared where equal
+
+    def copy(self) -> Ledger:
+        """The same account, to be carried on by itself."""
+        found = copy(self)
+        found._spent = dict(self._spent)
+        return found
+
+    def verdict(self, step: Step, params: Mapping[str, Any], facts_of: FactsOf) -> Verdict:
+        """Whether a step whose node has a bound is left out; with `Recipe.keep_all` nothing is."""
+        spent = self.pass_on(step)
+        if self._recipe.keep_all:
+            return Verdict(float("inf"), False, "everything is kept", "")
+        found = judge(step, params, facts_of, self._recipe.allowed(step.name) * self._share - sum(spent.values()))
+        if found.left_out:
+            self.leave_out(step, found.bound)
+        return found
+
+    def leave_out(self, step: Step, bound: float) -> None:
+        """Note what leaving a step out may change."""
+        if bound > 0:
+            self._spent[step.name] = {**self._spent.get(step.name, _NOTHING), step.name: bound}
+
+    def pass_on(self, step: Step) -> dict[str, float]:
+        """What was spent on the way to a step."""
+        parts = [spent for name in dict.fromkeys(step.sources) if (spent := self._spent.get(name))]
+        if not parts:
+            return _NOTHING
+        first, *others = parts
+        if any(other is not first for other in others):
+            first = {decision: bound for part in parts for decision, bound in part.items()}
+        self._spent[step.name] = first
+        return first

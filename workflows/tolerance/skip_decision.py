@@ -1,0 +1,74 @@
+"""Whether a step may be left out: its bound, from the facts of its inputs, against the recipe's tolerance."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
+from typing import Any
+
+from torch import Tensor
+
+from neusee.nodes import Facts
+from neusee.workflows.engine.node_call import RunError
+from neusee.workflows.graph.recipe_graph import Step
+
+FactsOf = Callable[[str], Facts | None]
+
+
+@dataclass(frozen=True, slots=True)
+class Verdict:
+    """What leaving a step out changes at most, and what stands in for its result."""
+
+    bound: float
+    left_out: bool
+    why: str
+    instead: str  #: the step that feeds its first input
+
+
+class _Later:
+    """Facts that are looked up, and if need be computed, only when a bound asks for one of them."""
+
+    __slots__ = ("_find", "_seen")
+
+    def __init__(self, find: Callable[[], Facts | None], seen: list[Facts]) -> None:
+        self._find, self._seen = find, seen
+
+    def __getattr__(self, name: str) -> Any:
+        facts = self._find()
+        if facts is not None:
+            self._seen.append(facts)
+        return getattr(facts, name)
+
+
+def judge(step: Step, params: Mapping[str, Any], facts_of: FactsOf, tolerance: float) -> Verdict:
+    """The verdict on a step whose node has a bound; ``facts_of`` is asked for what the bound reads and no more."""
+    node, first = step.node, step.wires.get(step.node.inputs[0])
+    if node.bound is None or not isinstance(first, str):
+        return Verdict(float("inf"), False, "nothing could stand in for it", "")
+    seen: list[Facts] = []
+    facts = [_facts(step.wires.get(name), facts_of, seen) for name in node.inputs]
+    try:
+        bound = float(node.bound(*facts, **{name: _number(value) for name, value in params.items()}))
+    except RunError:
+        raise
+    except Exception as error:
+        raise RunError(step, [], error) from error
+    if not all(f.finite for f in seen):
+        return Verdict(float("inf"), False, "its input is not finite, so nothing bounds its effect", first)
+    left_out = bound <= tolerance
+    why = (
+        f"changes at most {bound:.2g}, tolerance {tolerance:.2g}" if bound < float("inf") else "no bound on its effect"
+    )
+    return Verdict(bound, left_out, why, first)
+
+
+def _facts(wire: str | tuple[str, ...] | None, facts_of: FactsOf, seen: list[Facts]) -> Any:
+    if wire is None:
+        return None
+    if isinstance(wire, str):
+        return _Later(lambda: facts_of(wire), seen)
+    return [_facts(name, facts_of, seen) for name in wire]
+
+
+def _number(value: Any) -> Any:
+    return value.item() if isinstance(value, Tensor) and value.numel() == 1 else value

@@ -1,0 +1,33 @@
+"""Where errors are held to the tolerance: at the outputs, and before nodes that do not tell what becomes of them."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Sequence
+
+from neusee.workflows.graph.recipe_graph import Recipe, Step
+
+
+def border(recipe: Recipe, order: Iterable[str], wanted: Iterable[str]) -> list[str]:
+    """Steps that will be held to the tolerance: what may be off and is wanted, or read by a node that does not tell."""
+    off, found = set[str](), dict[str, None]()
+    for name in order:
+        step = recipe.steps[name]
+        reads = [source for source in step.sources if source in off]
+        if reads and not _tells(step):
+            found |= dict.fromkeys(reads)
+        elif reads or step.node.deviation is not None or step.node.bound is not None:
+            off.add(name)
+    return [*found, *(name for name in wanted if name in off and name not in found)]
+
+
+def unheard(recipe: Recipe, order: Sequence[str]) -> frozenset[str]:
+    """Steps of a running order whose errors reach a node that does not tell what becomes of them."""
+    found = set[str]()
+    for name in reversed(order):
+        if name in found or not _tells(recipe.steps[name]):
+            found.update(recipe.steps[name].sources)
+    return frozenset(found)
+
+
+def _tells(step: Step) -> bool:
+    return step.node.spread is not None or step.node.deviation is not None

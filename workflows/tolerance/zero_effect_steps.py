@@ -1,0 +1,76 @@
+"""Leave out what is nothing: a laser without light, ghosts of no energy, a window on which nothing lies.
+
+Found from parameters alone, before anything runs: a step whose node bounds its result by 0
+(`Node.absent`) is taken off the inputs to which it would add nothing.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterable, Mapping
+from dataclasses import replace
+from typing import Any
+
+from neusee.nodes import Facts
+from neusee.workflows.graph.recipe_graph import Economy, Recipe, Step, Wire
+
+_DARK = Facts((), "float32", 0.0, 0.0, 0.0, 0, True)  #: of a result that is 0 everywhere
+
+
+class _Unknown:
+    """Facts of what has not run: to ask for one ends the question."""
+
+    def __getattr__(self, name: str) -> Any:
+        raise LookupError(name)
+
+
+def without_nothing(recipe: Recipe, order: Iterable[str]) -> Recipe:
+    """``recipe`` whose steps do not read what is nothing; ``order``: its steps after their sources."""
+    dark: dict[str, None] = {}
+    changed: dict[str, Step] = {}
+    for name in order:
+        step = recipe.steps[name]
+        if step.node.nothing is not None and _nothing(step, dark):
+            dark.setdefault(name)
+        elif step.node.adds and not dark.keys().isdisjoint(step.sources):
+            changed[name] = replace(step, wires=without(step, dark))
+    if not changed:
+        return recipe
+    told = {e.step for e in recipe.economies}
+    why = "its parameters say that it is nothing"
+    found = tuple(Economy(name, "", 0.0, why) for name in dark if name not in told)
+    steps, whole = {**recipe.steps, **changed}, recipe.whole or recipe
+    return replace(recipe, steps=steps, economies=(*recipe.economies, *found), whole=whole)
+
+
+def _nothing(step: Step, dark: Mapping[str, None]) -> bool:
+    """Whether a step is nothing, as its parameters and what is known to be nothing tell."""
+    inputs = [_known(step.wires.get(name), dark) for name in step.node.inputs]
+    try:
+        bound = float(step.node.nothing(*inputs, **step.params)) if step.node.nothing else math.inf
+    except LookupError:
+        return False
+    return bound == 0.0
+
+
+def _known(wire: Wire, dark: Mapping[str, None]) -> Any:
+    if wire is None:
+        return None
+    if isinstance(wire, str):
+        return _DARK if wire in dark else _Unknown()
+    return [_known(name, dark) for name in wire]
+
+
+def without(step: Step, dark: Mapping[str, None]) -> dict[str, Wire]:
+    """The wires of a step less those that add nothing, and what goes with them."""
+    wires = dict(step.wires)
+    for light, *others in step.node.adds:
+        wire = wires.get(light)
+        if isinstance(wire, str) and wire in dark:
+            wires |= dict.fromkeys((light, *others))
+        elif isinstance(wire, tuple):
+            kept = [i for i, name in enumerate(wire) if name not in dark]
+            for name in (light, *others):
+                listed = wires.get(name)
+                wires[name] = tuple(listed[i] for i in kept) if isinstance(listed, tuple) else listed
+    return wires

@@ -1,0 +1,1 @@
+"""training/mask_design"""

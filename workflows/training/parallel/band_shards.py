@@ -1,0 +1,167 @@
+"""Which steps the processes of a band axis share by wavelength, and where their bands come together again.
+
+A node that declares its bands gives each of them the same bits whatever stands beside it. So each process computes
+its own bands of what works on the bands of the scene. The first step behind that reads them otherwise needs all of
+them: of the element's PSF they are gathered, of a picture they go to the process whose picture it is. Where all that
+is read of an image are sums over its bands, only the sums go.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Collection, Mapping, Sequence
+from dataclasses import dataclass, field
+from typing import Any, get_args
+
+from torch import Tensor
+
+from neusee.nodes import spectra
+from neusee.nodes.sensor._channels import summed
+from neusee.nodes.values import Bands, Channels, Mixture
+from neusee.workflows.engine.band_results import band_tensors, taken, with_band_tensors
+from neusee.workflows.engine.node_call import call
+from neusee.workflows.engine.runner import run
+from neusee.workflows.graph.recipe_graph import Recipe, Step, needed
+from neusee.workflows.store.result_store import Store
+from neusee.workflows.tolerance.cheaper_steps import Asked, asked_of
+from neusee.workflows.training.parallel.collectives import Bands as Swapped
+from neusee.workflows.training.parallel.collectives import Sum, gathered, own_bands
+from neusee.workflows.training.parallel.process_mesh import ALONE, Mesh, MeshError
+
+Port = Swapped | Sum
+
+
+@dataclass(frozen=True)
+class Shards:
+    """Steps that are shared by band, and those behind them."""
+
+    recipe: Recipe
+    mesh: Mesh = ALONE
+    count: int = 0  #: bands of the scene
+    steps: frozenset[str] = frozenset()  #: of which each process computes its own bands
+    behind: frozenset[str] = frozenset()  #: that need all bands of some of them
+    rows: Mapping[str, Tensor] = field(default_factory=dict)  #: by image that is read in sums alone: their weights
+
+    @classmethod
+    def of(
+        cls, recipe: Recipe, psf: str, wanted: Sequence[str], live: Collection[str], store: Store, mesh: Mesh
+    ) -> Shards:
+        """What of the ``live`` steps works on the same bands as the PSF; raises MeshError where that has too few."""
+        if mesh.band == 1:
+            return cls(recipe)
+        spectral = _sampled(recipe, psf)
+        count = _count(recipe, psf, spectral, store, mesh)
+        steps, behind = set[str](), set[str]()
+        for name in needed(recipe, wanted):
+            if name not in live:
+                continue
+            sources = set(recipe.steps[name].sources)
+            if not sources & behind and _by_band(recipe, name, spectral):
+                steps.add(name)
+            elif sources & (behind | steps):
+                behind.add(name)
+        summed_alone = {n: asked for n in sorted(steps) if (asked := _asked(recipe, n, wanted, behind, live))}
+        rows = {name: _rows(recipe, asked, store) for name, asked in summed_alone.items()}
+        return cls(recipe, mesh, count, frozenset(steps), frozenset(behind), rows)
+
+    @property
+    def own(self) -> list[int]:
+        """The bands of this process."""
+        return own_bands(self.mesh, self.count)
+
+    @property
+    def call(self) -> Callable[..., Any]:
+        """What computes a step: of one that is shared, the own bands."""
+        return self._call if self.steps else call
+
+    def _call(self, step: Step, inputs: Sequence[Any], params: Mapping[str, Any], seed: int, device: str) -> Any:
+        if step.name in self.steps:
+            whole = [name for name in step.node.inputs if step.wires.get(name) not in self.steps]
+            inputs = taken(step, inputs, self.own, whole)
+        return call(step, inputs, params, seed, device)
+
+    def gathered(self, name: str, value: Any) -> Any:
+        """All bands of a result of which each process has its own."""
+        axis = self.axis(name)
+        return with_band_tensors(value, [gathered(self.mesh, x, axis, self.count) for x in band_tensors(value)])
+
+    def axis(self, name: str) -> int:
+        """Where the bands of a shared step lie."""
+        bands = self.recipe.steps[name].node.bands
+        assert bands is not None
+        return bands["return"]
+
+    def sent(self, name: str, value: Any) -> list[Tensor]:
+        """What goes of a result of one picture to the process that goes on with it."""
+        if name not in self.rows:
+            return band_tensors(value)
+        part = summed(value, self.rows[name][:, self.own])
+        return [part.planes, part.flux]
+
+    def ports(self, name: str, sent: Sequence[Tensor]) -> list[Port]:
+        """How each of what is sent travels."""
+        if name in self.rows:
+            return [Sum(self.mesh), Swapped(self.mesh, -1, self.count)]
+        return [Swapped(self.mesh, self.axis(name), self.count) for _ in sent]
+
+    def received(self, name: str, like: Any, found: Sequence[Tensor]) -> Any:
+        """The result as what follows reads it."""
+        if name not in self.rows:
+            return with_band_tensors(like, found)
+        planes, flux = found
+        exact = self.rows[name].new_zeros(())
+        return Channels(planes, self.rows[name], flux, exact, largest=exact)
+
+
+def _sampled(recipe: Recipe, name: str) -> set[str]:
+    """The steps that say at which wavelengths a step works."""
+    return {n for n in needed(recipe, [name]) if recipe.steps[n].node.hints["return"] is Bands}
+
+
+def _by_band(recipe: Recipe, name: str, spectral: set[str]) -> bool:
+    """Whether a step works on each of these bands for itself."""
+    node = recipe.steps[name].node
+    return node.bands is not None and _sampled(recipe, name) == spectral and not _mixed(recipe, name)
+
+
+def _mixed(recipe: Recipe, name: str) -> bool:
+    """Whether a step gives a mixture of planes, of which no part is one band."""
+    while (kind := recipe.steps[name].node.hints["return"]) is not Mixture:
+        step = recipe.steps[name]
+        through = next((w for i in step.node.mixtures if isinstance(w := step.wires.get(i), str)), None)
+        if through is None or Mixture not in get_args(kind):
+            return False
+        name = through
+    return True
+
+
+def _count(recipe: Recipe, psf: str, spectral: set[str], store: Store, mesh: Mesh) -> int:
+    step = recipe.steps[psf]
+    if not _by_band(recipe, psf, spectral) or len(spectral) != 1:
+        raise MeshError(
+            f"{step.mark}: {psf} ({step.node.path}) couples its bands, so that --mesh {mesh} has none to share: "
+            f"write --mesh {mesh.size}x1"
+        )
+    (bands,) = spectral
+    count = len(run(recipe, store, [bands]).values[bands].centres)
+    if mesh.band > count:
+        where = recipe.steps[bands].mark
+        raise MeshError(
+            f"{where}: {bands} has {count} bands, which {mesh.band} processes cannot share: --mesh {mesh} may have "
+            f"{count} along its band axis at most"
+        )
+    return count
+
+
+def _asked(
+    recipe: Recipe, name: str, wanted: Sequence[str], behind: Collection[str], live: Collection[str]
+) -> Asked | None:
+    """The sums that are read of an image, where nothing else is and their weights are always the same."""
+    asked = None if name in wanted else asked_of(recipe, name, wanted)
+    still = asked is not None and asked.bands not in live and asked.responses not in live
+    return asked if asked is not None and still and set(behind).issuperset(asked.readers) else None
+
+
+def _rows(recipe: Recipe, asked: Asked, store: Store) -> Tensor:
+    found = run(recipe, store, [asked.bands, asked.responses]).values
+    rows: Tensor = spectra.rows(found[asked.bands], found[asked.responses], well=asked.well)
+    return rows

@@ -1,0 +1,234 @@
+"""The element, the network and its critics, and one iteration of learning them."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Iterator, Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import torch
+from torch import Tensor, nn
+from torch.optim.swa_utils import AveragedModel, get_ema_multi_avg_fn
+from torch.utils.checkpoint import checkpoint
+
+from neusee.nodes import losses
+from neusee.nodes._bicubic import resize
+from neusee.nodes.doe._learned import LEARNT
+from neusee.nodes.optics._aperture import stop
+from neusee.nodes.restore._critic import critics, passed_over, slopes
+from neusee.nodes.restore._fft_mamba import FFTMamba
+from neusee.nodes.restore._nafnet import NAFNet
+from neusee.nodes.restore._network import Restorer, parameter_groups, started
+from neusee.nodes.restore._unet import UNet
+from neusee.nodes.values import Psf
+from neusee.workflows.graph.diagnostics import nearest
+from neusee.workflows.graph.recipe_graph import Recipe, Step
+from neusee.workflows.keys.cache_key import stream_seed
+from neusee.workflows.recipe.blocks.train_block import GRID, Network, Stage, Training
+from neusee.workflows.training.parallel.process_mesh import ALONE, Mesh
+from neusee.workflows.training.parallel.shared_graph import Shared
+from neusee.workflows.training.training_pictures import Sample, Samples
+
+_STEEPEST = 10.0  #: norm of a gradient, above which it is shortened
+Losses = dict[str, float]
+
+
+class NotFinite(ArithmeticError):
+    """A loss or a gradient is not a number."""
+
+
+@dataclass
+class Scales:
+    """Pictures at two scales: the coarse one first."""
+
+    coarse: Tensor
+    fine: Tensor
+
+    def __iter__(self) -> Iterator[Tensor]:
+        yield self.coarse
+        yield self.fine
+
+    @classmethod
+    def of(cls, picture: Tensor) -> Scales:
+        """A picture (n, 3, y, x) and half of it."""
+        y, x = picture.shape[-2:]
+        return cls(resize(picture, -(-y // 2), -(-x // 2)), picture)
+
+
+class Learner:
+    """All that learns, on one device; in every process of a mesh the same."""
+
+    def __init__(self, recipe: Recipe, how: Training, device: str, designed: bool = False, mesh: Mesh = ALONE) -> None:
+        self.how, self.seed, self.device, self.mesh = how, recipe.seed, device, mesh
+        self._step = recipe.steps[how.learn] if how.learn else None
+        self.relief = nn.Module() if designed or self._step is None else self._start(self._step).to(how.dtype)
+        self.net: Restorer = started(lambda: _made(how.network), self._rng("network")).to(how.dtype)
+        self.critics = nn.ModuleList(critics(self._rng("critics"), how.critics.width)).to(how.dtype)
+        self.average = _averaged(self.net, how.average) if how.average else None
+        self.begin(Stage(iterations=0), learns=True)
+
+    def _start(self, step: Step) -> nn.Module:
+        """The relief that learns; one that was designed does not."""
+        path = step.node.path
+        if path not in LEARNT:
+            text = f"{self.how.learn} is {path}, of which nothing is learnt; {nearest(path, LEARNT)}"
+            raise ValueError(f"train: {text}; or design it without images: --stage mask")
+        return LEARNT[path](step.params, self._rng("element"))
+
+    def height(self) -> Tensor:
+        """The relief (v, u) in m; raises ValueError where none learns."""
+        if self._step is None:
+            raise ValueError("train.learn: no element learns")
+        made: Tensor = self.relief(stop(*(self._step.params[name] for name in GRID)))
+        return made
+
+    def _rng(self, *names: object) -> torch.Generator:
+        return torch.Generator(self.device).manual_seed(stream_seed(self.seed, " ".join(map(str, ("train", *names)))))
+
+    def begin(self, stage: Stage, learns: bool) -> None:
+        """Begin a stage: with new moments, at the first rate."""
+        rates, self.stage, self.learns = self.how.rates, stage, learns
+        groups = parameter_groups(self.net, rates.weights, rates.biases)
+        if learns:
+            groups += [{"params": list(self.relief.parameters()), "lr": rates.element}]
+        self.makers = torch.optim.Adam(groups, betas=self.how.betas)
+        self.judges = torch.optim.Adam(
+            parameter_groups(self.critics, rates.weights, rates.biases), betas=self.how.critics.betas
+        )
+        self._first = [[g["lr"] for g in o.param_groups] for o in (self.makers, self.judges)]
+
+    def set_rates(self, iteration: int) -> float:
+        """The rates of an iteration of the stage; by what they are multiplied."""
+        share = self.how.rates.share(iteration)
+        for optimiser, first in zip((self.makers, self.judges), self._first, strict=True):
+            for group, rate in zip(optimiser.param_groups, first, strict=True):
+                group["lr"] = max(rate * share, min(rate, self.how.rates.least))
+        return share
+
+    def parts(self) -> dict[str, Any]:
+        """All that a later iteration depends on."""
+        found = {"relief": self.relief, "net": self.net, "critics": self.critics, "makers": self.makers}
+        return {**found, "judges": self.judges, **({"average": self.average} if self.average else {})}
+
+    # --- one iteration ------------------------------------------------------------------------------------------------
+
+    def iterate(self, samples: Samples, stage: int, iteration: int) -> tuple[Losses, list[Sample]]:
+        """Look at a batch of pictures, one after another, and move a step; raises `NotFinite` before a bad one.
+
+        Of several processes each looks at its own, and all move by the sum; the pictures are those of this one.
+        """
+        self.makers.zero_grad(set_to_none=True)
+        shared = samples.begin(self.height()) if samples.shared else Shared.of({})
+        found = self._element(shared, samples) if self.learns else {}
+        batch, seen, pairs = self.stage.batch, list[Sample](), dict[int, tuple[Scales, Scales]]()
+        for i, sample in samples.batch(shared, stage, iteration * batch, batch):
+            terms, truth, estimate = self._restored(sample)
+            pairs[i] = (truth, estimate)
+            _backward([weight * term / batch for weight, term in terms.values() if weight])
+            for name, (_, term) in terms.items():
+                found[name] = found.get(name, 0.0) + float(term.detach()) / batch
+            seen.append(sample)
+        shared.back()
+        found = self.mesh.numbers(found, self._names(), self.device)
+        found["slope"] = self._move(self.makers, found, (self.net, self.relief) if self.learns else (self.net,))
+        if self.average:
+            self.average.update_parameters(self.net)
+        if self.stage.adversarial:
+            found |= self._judge(pairs, self._rng("between", stage, iteration))
+        return found, seen
+
+    def _names(self) -> list[str]:
+        """What an iteration of the stage finds, in whatever process."""
+        weights = {"BSR": self.stage.bsr, "reconstruction": self.stage.reconstruction,
+                   "adversarial": self.stage.adversarial}  # fmt: skip
+        return [*(["LSR"] if self.learns else []), "L1", *(name for name, weight in weights.items() if weight)]
+
+    def _element(self, shared: Shared, samples: Samples) -> Losses:
+        """The suppression of each band, one band at a time: what its norm needs is made again on the way back.
+
+        Each process has its own bands, or a share of all of them, so that over all processes each band counts once.
+        """
+        psf: Psf = shared.values[self.how.psf]
+        count, times = samples.counted(self.how.psf, len(psf.clear_peak))
+        with torch.no_grad():
+            peaks = psf.intensity.detach().amax((-2, -1)).double() / psf.clear_peak
+        if self.stage.lsr:
+            for one in range(len(psf.clear_peak)):
+                loss = checkpoint(self._suppression, psf.intensity, psf.clear_peak, one, use_reentrant=False)
+                (self.stage.lsr / times * loss).backward()
+        return {"LSR": float(peaks.mean()) * (len(peaks) / count) / times}
+
+    def _suppression(self, intensity: Tensor, clear: Tensor, band: int) -> Tensor:
+        one: Tensor = losses.lsr(Psf(intensity[band : band + 1], clear[band : band + 1]), log=self.how.logarithm)
+        return one
+
+    def _restored(self, sample: Sample) -> tuple[dict[str, tuple[float, Tensor]], Scales, Scales]:
+        """Each term with its weight; the truth and, cut off, the estimate."""
+        low = torch.autocast(self.device.partition(":")[0], torch.bfloat16, self.how.precision == "bfloat16")
+        picture = sample.picture if self.learns else sample.picture.detach()
+        with low:
+            coarse, fine = self.net.pyramid(picture)
+        estimate = Scales(coarse.to(self.how.dtype), fine.to(self.how.dtype))
+        truth = Scales.of(sample.truth.detach())
+        terms = {"L1": (0.0, (estimate.fine - truth.fine).abs().mean())}
+        if self.stage.bsr:
+            terms["BSR"] = (self.stage.bsr, (1.0 / sample.light.clamp_min(1e-30)).sum())
+        if self.stage.reconstruction:
+            terms["reconstruction"] = (
+                self.stage.reconstruction,
+                sum((losses.charbonnier(e, t) + losses.fft_l1(e, t) for e, t in zip(estimate, truth, strict=True)),
+                    torch.zeros((), device=fine.device)),
+            )  # fmt: skip
+        if self.stage.adversarial:
+            scores = [-critic(e).mean() for critic, e in zip(self.critics, estimate, strict=True)]
+            terms["adversarial"] = (self.stage.adversarial, sum(scores, torch.zeros((), device=fine.device)))
+        return terms, truth, Scales(estimate.coarse.detach(), estimate.fine.detach())
+
+    def _judge(self, pairs: Mapping[int, tuple[Scales, Scales]], rng: torch.Generator) -> Losses:
+        """Let the critics learn to tell truth and estimates apart; the stream is the same whoever has the pictures."""
+        self.judges.zero_grad(set_to_none=True)
+        found, batch = {"critics": 0.0, "penalty": 0.0}, self.stage.batch
+        for i in range(batch):
+            if i not in pairs:
+                for _ in self.critics:
+                    passed_over(rng, self.how.patches if self.how.patch else 1)
+                continue
+            for critic, t, e in zip(self.critics, *pairs[i], strict=True):
+                apart = (critic(e) - critic(t)).mean()
+                steep = losses.gradient_penalty(slopes(critic, t, e, rng))
+                _backward([(self.stage.adversarial * apart + self.stage.penalty * steep) / batch])
+                found["critics"] += float(apart.detach()) / batch
+                found["penalty"] += float(steep.detach()) / batch
+        found = self.mesh.numbers(found, tuple(found), self.device)
+        self._move(self.judges, found, self.critics)
+        return found
+
+    def _move(self, optimiser: torch.optim.Optimizer, found: Mapping[str, float], parts: Iterable[nn.Module]) -> float:
+        """One step against the gradient, unless it or a loss is not finite; the steepest gradient of a part.
+
+        Each part is limited by itself: the suppression pulls at the element a thousand times as hard as at a network.
+        """
+        parts = list(parts)
+        self.mesh.add_gradients(parts)
+        norm = max(float(nn.utils.clip_grad_norm_(part.parameters(), _STEEPEST)) for part in parts)
+        wrong = [name for name, x in {**found, "norm of the gradient": norm}.items() if not abs(x) < float("inf")]
+        if wrong:
+            raise NotFinite(f"not finite: {', '.join(wrong)}")
+        optimiser.step()
+        return norm
+
+
+def _backward(terms: Sequence[Tensor]) -> None:
+    if terms:
+        sum(terms[1:], terms[0]).backward()  # type: ignore[no-untyped-call]
+
+
+def _made(network: Network) -> Restorer:
+    if network.kind == "fft_mamba":
+        return FFTMamba(network.width, **network.options)
+    return UNet(network.width) if network.kind == "unet" else NAFNet(network.width)
+
+
+def _averaged(net: nn.Module, decay: float) -> AveragedModel:
+    mean = get_ema_multi_avg_fn(decay)  # type: ignore[no-untyped-call]
+    return AveragedModel(net, multi_avg_fn=mean)
