@@ -25,7 +25,7 @@ from neusee.workflows.engine.band_results import call_by_band, plain_of
 from neusee.workflows.engine.node_call import call
 from neusee.workflows.graph.diagnostics import Mark
 from neusee.workflows.graph.recipe_graph import Step
-from neusee.workflows.store import serialization as _codec
+from neusee.workflows.store import serialization
 from neusee.workflows.store.band_files import Blobs, Stacked
 
 BANDS, PARTS = 31, 8
@@ -72,20 +72,20 @@ def one_changed(inputs):
 def by_band(step, inputs, blobs, parts=1):
     """Compute what is missing, and keep it."""
     value = call_by_band(step, inputs, lambda given: call(step, given, step.params, 0, "cpu"), "code", blobs, parts)
-    _codec.pack(value, blobs)
+    serialization.pack(value, blobs)
     return plain_of(value)
 
 
 def whole(step, inputs, folder):
     """Compute all of it, and keep it in one file."""
     value = call(step, inputs, step.params, 0, "cpu")
-    write_file(folder / "payload", _codec.pack(value)[1])
+    write_file(folder / "payload", serialization.pack(value)[1])
     return value
 
 
 def write_file(path, tensors):
     with open(path, "wb") as file:
-        found = _codec.write(file, tensors)
+        found = serialization.write(file, tensors)
         file.flush()
         os.fsync(file.fileno())
     return found
@@ -171,7 +171,7 @@ def reads(size):
         names = tuple(f"{i:032x}.0" for i in range(BANDS))
         in_file = min(seconds(lambda: write_file(root / "payload", [x])) for _ in range(3))
         fresh = [Blobs(root / str(i) / "bands") for i in range(3)]
-        by_blob = min(seconds(partial(_codec.pack, Stacked(x, names), blobs)) for blobs in fresh)
+        by_blob = min(seconds(partial(serialization.pack, Stacked(x, names), blobs)) for blobs in fresh)
         blobs, xxh3 = fresh[0], write_file(root / "payload", [x])
         print(f"\n| 31 x {size} x {size} | one file, s | 31 blobs, s |\n|---|---|---|")
         print(f"| write and sync | {in_file:.3f} | {by_blob:.3f} |")
@@ -179,7 +179,7 @@ def reads(size):
             expected = xxh3 if verify else None
             pairs = [
                 (
-                    seconds(lambda e=expected: _codec.read(str(root / "payload"), e)[0].sum()),
+                    seconds(lambda e=expected: serialization.read(str(root / "payload"), e)[0].sum()),
                     seconds(lambda v=verify: blobs.read(names, x.shape, x.dtype, v).sum()),
                 )
                 for _ in range(5)

@@ -28,7 +28,7 @@ import torch
 from numpyro.infer import MCMC, NUTS
 
 from neusee.nodes.calibrate._cell import log_cell
-from neusee.workflows.calibration import emcee_sampler as calibrate
+from neusee.workflows.calibration import emcee_sampler
 from neusee.workflows.calibration.initial_guess import begin
 from neusee.workflows.calibration.log_posterior import Problem
 from neusee.workflows.calibration.posterior_mode import peak
@@ -118,11 +118,11 @@ def nuts(problem, best, draws=1000, warmup=500, chains=4):
 
 def ours(problem, best, how):
     """Draws of the first round of four ensembles of 64, and their seconds."""
-    calibrate._LONGEST, found = calibrate._FIRST, []
+    emcee_sampler._LONGEST, found = emcee_sampler._FIRST, []
     for _ in range(3):
         with tempfile.TemporaryDirectory() as folder:
             began = time.perf_counter()
-            chains = calibrate.sample(problem, best, Path(folder) / "c.h5", seed=7, how=how)
+            chains = emcee_sampler.sample(problem, best, Path(folder) / "c.h5", seed=7, how=how)
             found.append(time.perf_counter() - began)
     by_tau = chains.flat.shape[0] / chains.tau
     walkers = chains.draws.transpose(3, 0, 2, 1).reshape(chains.draws.shape[-1], -1, chains.draws.shape[1])

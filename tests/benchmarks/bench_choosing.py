@@ -21,14 +21,12 @@ from unittest import mock
 
 from neusee.nodes.optics import _channels
 from neusee.workflows import load
-from neusee.workflows.engine import execution as _under_way
-from neusee.workflows.engine import resolve_keys as _resolve
-from neusee.workflows.engine import runner as _run
+from neusee.workflows.engine import execution, resolve_keys, runner
 from neusee.workflows.store.result_store import Store
 from neusee.workflows.studies.accuracy.work_precision_points import cold
 from neusee.workflows.tolerance.error_budget import Ledger
 
-ENGINE = ((_run, "economised"), (_run, "border"), (_run, "proof"), (Ledger, "verdict"), (Ledger, "pass_on"))
+ENGINE = ((runner, "economised"), (runner, "border"), (runner, "proof"), (Ledger, "verdict"), (Ledger, "pass_on"))
 NODE = tuple((_channels, name) for name in ("passed", "with_windows", "choose", "guessed", "rounding", "_top"))
 LONG = 20.0  #: s, beyond which one run is enough
 
@@ -83,8 +81,8 @@ def clocks():
     for clock, places in ((engine, ENGINE), (node, NODE)):
         for place, name in places:
             mock.patch.object(place, name, clock.watched(getattr(place, name))).start()
-    make = _under_way.UnderWay.make
-    mock.patch.object(_under_way.UnderWay, "make", engine.left_out(make)).start()
+    make = execution.UnderWay.make
+    mock.patch.object(execution.UnderWay, "make", engine.left_out(make)).start()
     try:
         yield engine, node
     finally:
@@ -93,7 +91,7 @@ def clocks():
 
 def once(recipe, store):
     with clocks() as (engine, node):
-        result = _run.run(recipe, store)
+        result = runner.run(recipe, store)
     return result.seconds, engine.seconds, node.seconds
 
 
@@ -122,7 +120,7 @@ def line(name):
 
 
 if __name__ == "__main__":
-    assert _resolve.Ledger is Ledger is _under_way.Ledger
+    assert resolve_keys.Ledger is Ledger is execution.Ledger
     print("| recipe | run | s | engine, ms | node, ms | share |\n|---|---|---|---|---|---|")
     for name in sys.argv[1:] or ("first_light", "dirty_windshield", "paper_table1"):
         line(name)

@@ -22,7 +22,7 @@ from neusee.workflows.graph.diagnostics import Mark
 from neusee.workflows.graph.recipe_graph import Recipe, Step
 from neusee.workflows.keys.cache_key import key_of
 from neusee.workflows.keys.code_digest import Code
-from neusee.workflows.store import serialization as _codec
+from neusee.workflows.store import serialization
 from neusee.workflows.store.result_store import Store
 
 MB = 1e6
@@ -114,8 +114,8 @@ def keys(folder: Path) -> None:
 def gigabyte(folder: Path) -> None:
     """Nine results of 111 MB and a number."""
     loads: list[int] = []
-    read = _codec.read
-    _codec.read = lambda path, xxh3: loads.append(os.path.getsize(path)) or read(path, xxh3)  # type: ignore
+    read = serialization.read
+    serialization.read = lambda path, xxh3: loads.append(os.path.getsize(path)) or read(path, xxh3)  # type: ignore
     count, place = int(111e6 / 4), folder / "gigabyte"
     row("10 steps, 1 GB: cold", f"{timed(partial(new_run, chain(9, count), place)):.2f} s", "")
     for what, changed, aim in (
@@ -126,7 +126,7 @@ def gigabyte(folder: Path) -> None:
         loads.clear()
         seconds = timed(partial(new_run, chain(9, count, changed), place))
         row(f"10 steps, 1 GB: {what}", f"{seconds * 1e3:.0f} ms, {sum(loads) / MB:.0f} MB read", aim)
-    _codec.read = read
+    serialization.read = read
 
 
 def stack(folder: Path) -> None:

@@ -26,7 +26,7 @@ import torch
 from bench_engine import MB, chain, new_run, wide
 from hamilton import driver
 
-from neusee.workflows.store import serialization as _codec
+from neusee.workflows.store import serialization
 
 STEPS, LONG = 1000, 10_000
 COUNT = int(111e6 / 4)  #: numbers in one of nine arrays that make 1 GB
@@ -169,8 +169,8 @@ def bytes_read() -> int:
 def gigabyte(folder: Path) -> None:
     """Nine arrays of 111 MB and a number."""
     loads: list[int] = []
-    read = _codec.read
-    _codec.read = lambda path, *rest: loads.append(os.path.getsize(path)) or read(path, *rest)  # type: ignore
+    read = serialization.read
+    serialization.read = lambda path, *rest: loads.append(os.path.getsize(path)) or read(path, *rest)  # type: ignore
     ours, theirs, place = folder / "gigabyte", folder / "gigabyte-joblib", folder / "gigabyte-hamilton"
     for what, changed, repeat in (("cold", -1, 1), ("cached", -1, 3), ("last two changed", 8, 1)):
         graph, recipe = large_chain(9, folder, changed), chain(9, COUNT, changed)
@@ -183,7 +183,7 @@ def gigabyte(folder: Path) -> None:
                 cell.append((seconds(work), bytes_read() - before + sum(loads)))
         texts = (tuple(statistics.median(c) for c in zip(*cell, strict=True)) for cell in cells)
         row(f"10 steps, 1 GB: {what}", *(f"{t * 1e3:.0f} ms, {size / MB:.1f} MB read" for t, size in texts))
-    _codec.read = read
+    serialization.read = read
 
 
 # what is right

@@ -12,7 +12,7 @@ from statistics import median
 import emcee
 import torch
 
-from neusee.workflows.calibration import emcee_sampler as calibrate
+from neusee.workflows.calibration import emcee_sampler
 from neusee.workflows.recipe.loading import load
 from neusee.workflows.store.remote_store import open_store
 from neusee.workflows.studies.calibration.independent_draws import walked
@@ -23,7 +23,7 @@ from neusee.workflows.studies.calibration.simulated_sensors import Bench
 def main(count=1000, move="de", *overrides):
     torch.set_num_threads(1)
     if move == "snooker":  # a planted fault, which `move` refuses
-        calibrate._MOVES[move] = emcee.moves.DESnookerMove
+        emcee_sampler._MOVES[move] = emcee.moves.DESnookerMove
     bench = Bench(load("calibrate", overrides), open_store(), 128, partial(walked, how=move), move)
     found = [bench.simulation(number) for number in range(int(count))]
     print("| parameter | p | at least | coverage | bar | z mean | z sd | |\n|---|---|---|---|---|---|---|---|")

@@ -88,7 +88,7 @@ def checks(problem: Problem, peak: Peak, known: Known, chains: Chains, law: Weig
 
 
 def _of_chains(chains: Chains) -> Iterator[Check]:
-    from neusee.workflows.calibration import emcee_sampler as calibrate
+    from neusee.workflows.calibration import emcee_sampler
 
     az = arviz()
     taus = chains.steps / chains.tau
@@ -103,8 +103,8 @@ def _of_chains(chains: Chains) -> Iterator[Check]:
     low, high = _ACCEPTED
     well = low <= chains.accepted <= high
     yield Check("walkers move", f"{chains.accepted:.0%} of the steps", f"{low:.0%} to {high:.0%}", _mark(well, "warn"))
-    lost = calibrate.stranded(chains.log)  # R-hat does not see them where all ensembles have some
-    said = f"{lost} of {chains.log.shape[0] * chains.log.shape[2]} lie {calibrate.STRANDED:.0f} nats below the rest"
+    lost = emcee_sampler.stranded(chains.log)  # R-hat does not see them where all ensembles have some
+    said = f"{lost} of {chains.log.shape[0] * chains.log.shape[2]} lie {emcee_sampler.STRANDED:.0f} nats below the rest"
     yield Check("no walker is stranded", said, "none", _mark(lost == 0))
 
 

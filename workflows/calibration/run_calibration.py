@@ -65,9 +65,9 @@ def calibrate(
 
 def found(recipe: Recipe, store: Store, tell: Tell, *, walkers: int, move: str, draws: int) -> Finding:
     """The posterior with all that is known of it."""
-    from neusee.workflows.calibration import emcee_sampler as emcee_room
+    from neusee.workflows.calibration import emcee_sampler
 
-    emcee_room.move(move)  # refused before anything is computed
+    emcee_sampler.move(move)  # refused before anything is computed
     arviz()
     problem = Problem.of(recipe, store)
     top = peak(problem, begin(problem))
@@ -78,7 +78,9 @@ def found(recipe: Recipe, store: Store, tell: Tell, *, walkers: int, move: str, 
         tell(f"not told: {line}")
     key = digest("posterior", engine("calibration.emcee_sampler"), problem.key, walkers, move, recipe.seed)
     file = store.root / "posterior" / f"{key}.h5"
-    chains = emcee_room.sample(problem, top, file, seed=recipe.seed, walkers=walkers, how=move, wanted=draws, tell=tell)
+    chains = emcee_sampler.sample(
+        problem, top, file, seed=recipe.seed, walkers=walkers, how=move, wanted=draws, tell=tell
+    )
     law = weighed(problem, top, recipe.seed)
     models = spread(recipe, store, recipe.seed) if isinstance(problem.levels, Levels) else []
     return Finding(problem, top, told, chains, checks(problem, top, told, chains, law), models)

@@ -150,19 +150,19 @@ def plan(
 ) -> None:
     """Say what would run, where, for how long and with how much memory; compute nothing."""
     recipe, _ = load(words, keep_all=keep_all)
-    from neusee.workflows.explain import run_forecast as _plan
+    from neusee.workflows.explain import run_forecast
 
     check_device(device)
     if devices:
         from neusee.workflows.graph.diagnostics import RecipeError
 
         try:
-            say(_plan.simulated_lines(recipe, the_store(), devices))
+            say(run_forecast.simulated_lines(recipe, the_store(), devices))
         except RecipeError as error:
             refuse(error)
         return
     room = bytes_of(memory, "--memory") if memory else None
-    lines, refused = _plan.plan_lines(recipe, the_store(), device, room)
+    lines, refused = run_forecast.plan_lines(recipe, the_store(), device, room)
     say(lines)
     if refused:
         raise typer.Exit(FAILED)

@@ -22,17 +22,17 @@ def calibrate(
 ) -> None:
     """Find the posterior of a recipe's sensor from its levels, checked; run it again to go on."""
     recipe, command = load(words)
-    from neusee.workflows.calibration import run_calibration as _calibration
+    from neusee.workflows.calibration import run_calibration
     from neusee.workflows.engine.node_call import RunError
 
     tell = (lambda line: None) if quiet else (lambda line: say([line]))
     how = {"walkers": walkers, "move": move, "draws": draws}
     command = ["neusee", "calibrate", *command[2:], *(f"--{name} {value}" for name, value in how.items())]
     try:
-        folder = _calibration.calibrate(
+        folder = run_calibration.calibrate(
             recipe, the_store(), out, command, tell, walkers=walkers, move=move, draws=draws
         )
-    except _calibration.Refused as error:
+    except run_calibration.Refused as error:
         fail(f"refused, nothing was drawn: {error}", FAILED)
     except (RunError, ValueError, ImportError) as error:
         fail(str(error), FAILED)

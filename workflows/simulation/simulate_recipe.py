@@ -15,7 +15,7 @@ from neusee.workflows.engine.step_job import Executor
 from neusee.workflows.explain.why_rerun import explained
 from neusee.workflows.graph.recipe_graph import Recipe, needed
 from neusee.workflows.keys.cache_key import digest
-from neusee.workflows.report import run_page as report
+from neusee.workflows.report import run_page
 from neusee.workflows.report.contents import SHOWN, TABLE
 from neusee.workflows.report.data_exports import exports
 from neusee.workflows.report.run_folder import RunFolder, new_run
@@ -94,7 +94,7 @@ def _write(result: Result, folder: RunFolder, command: Sequence[str], notes: Ite
     shelf = Shelf(result.store)
     drawn, missing = pictures(result, shelf)
     files, without = exports(result, shelf)
-    doc = report.document(result, command, notes, missing)
+    doc = run_page.document(result, command, notes, missing)
     doc["files"] = sorted(files)
     doc["missing"] += [{"name": n, "title": f"data/{n}", "why": why} for n, why in without.items()]
     shown = {name: path.read_bytes() for name, path in drawn.items()}
@@ -109,7 +109,7 @@ def _write(result: Result, folder: RunFolder, command: Sequence[str], notes: Ite
     folder.write_rows("metrics.csv", ("step", "field", "index", "value"), doc["metrics"])
     folder.write_rows("timing.csv", _TIMING, [[s[column] for column in _TIMING] for s in doc["steps"]])
     folder.write("provenance.json", json.dumps(doc, indent=1, ensure_ascii=False, allow_nan=True))
-    folder.write("report.html", report.page(doc, shown))
+    folder.write("report.html", run_page.page(doc, shown))
     return doc
 
 

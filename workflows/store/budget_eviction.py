@@ -15,7 +15,7 @@ from collections.abc import Callable, Collection, Iterable, Iterator
 from contextlib import suppress
 from dataclasses import dataclass
 
-from neusee.workflows.store import metadata as _sidecar
+from neusee.workflows.store import metadata
 from neusee.workflows.store.metadata import UNREADABLE, About
 from neusee.workflows.store.shared_folder import Disk
 
@@ -108,8 +108,8 @@ def total(disk: Disk) -> int:
 def candidates(disk: Disk, pinned: Collection[str], read_seconds: Callable[[float], float]) -> Iterator[Candidate]:
     """Every value that is not pinned; a band that several values share counts in part for each."""
     stats = {os.path.basename(path): (size, changed) for path, size, changed in files(disk)}
-    kept = {key: about for key, about in _sidecar.each(disk) if _sidecar.is_kept(about)}
-    bands = {key: set(_sidecar.bands(about)) for key, about in kept.items()}
+    kept = {key: about for key, about in metadata.each(disk) if metadata.is_kept(about)}
+    bands = {key: set(metadata.bands(about)) for key, about in kept.items()}
     shared = Counter(name for names in bands.values() for name in names)
     for key, about in kept.items():
         if key not in pinned and f"{key}.json" in stats:
@@ -124,8 +124,8 @@ def drop(disk: Disk, key: str) -> bool:
     """Leave of a value the receipt alone; False where that is not allowed to us."""
     try:
         with disk.lock():
-            about = _sidecar.read(disk, key)
-            if _sidecar.is_kept(about):
+            about = metadata.read(disk, key)
+            if metadata.is_kept(about):
                 _write_receipt(disk, key, about)
                 _unlink(disk, key, about)
     except FileNotFoundError:
@@ -139,7 +139,7 @@ def _write_receipt(disk: Disk, key: str, about: About) -> None:
     """On a disk without room not even that."""
     try:
         with disk.temporary(key) as (part, file):
-            file.write(_sidecar.seal(_sidecar.receipt(about)))
+            file.write(metadata.seal(metadata.receipt(about)))
             file.flush()
             disk.rename(part, disk.path(key, "json"))
     except OSError as error:

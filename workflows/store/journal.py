@@ -16,7 +16,7 @@ from collections.abc import Callable, Collection, Iterable, Iterator
 from contextlib import suppress
 from typing import Any
 
-from neusee.workflows.store import metadata as _sidecar
+from neusee.workflows.store import metadata
 from neusee.workflows.store.shared_folder import Disk
 
 Row = dict[str, Any]
@@ -31,7 +31,7 @@ _SPARE = 20_000  #: lines that were superseded, from which the file is written a
 def row_of(key: str, about: Row) -> Row:
     """What the journal says of a result."""
     node = (about.get("origin") or {}).get("node")
-    return {"key": key, **{f: about.get(f) for f in _FIELDS}, "node": node, "kept": _sidecar.is_kept(about)}
+    return {"key": key, **{f: about.get(f) for f in _FIELDS}, "node": node, "kept": metadata.is_kept(about)}
 
 
 class Journal:
@@ -80,7 +80,7 @@ class Journal:
         found = []
         for key, about in self._each():
             at, row = known.get(key, (-1, row_of(key, about)))
-            found.append((at, {**row, "kept": _sidecar.is_kept(about)}))
+            found.append((at, {**row, "kept": metadata.is_kept(about)}))
         found.sort(key=lambda item: (item[0], str(item[1].get("date"))))
         with self._guard:
             self._replace([row for _, row in found])
@@ -132,7 +132,7 @@ class Journal:
         self._by_node[row["node"]].append(row)
 
     def _each(self) -> Iterator[tuple[str, Row]]:
-        return itertools.chain(_sidecar.each(self._disk), self._others())
+        return itertools.chain(metadata.each(self._disk), self._others())
 
     def _rebuild(self) -> None:
         rows = [row_of(key, about) for key, about in self._each()]

@@ -8,8 +8,7 @@ from contextlib import suppress
 from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
-from neusee.workflows.store import metadata as _sidecar
-from neusee.workflows.store import orphan_files as _orphans
+from neusee.workflows.store import metadata, orphan_files
 from neusee.workflows.store.budget_eviction import Candidate, candidates, evict, files, total
 from neusee.workflows.store.metadata import UNREADABLE, About, is_kept
 from neusee.workflows.store.shared_folder import Disk
@@ -41,7 +40,7 @@ class Checked:
 def gc(store: Store, budget: int | None, dry: bool) -> Swept:
     """Remove what belongs to no result, and values beyond ``budget``, where there is one."""
     before = total(store.disk)
-    orphans = dict(_orphans.sweep(store.disk, dry))
+    orphans = dict(orphan_files.sweep(store.disk, dry))
     left = sum(size for path, size, _ in files(store.disk) if path not in orphans)
     gone, refused = make_room(store, left - budget, dry) if budget is not None else ([], [])
     after = left - sum(c.size for c in gone) if dry else total(store.disk)
@@ -58,16 +57,16 @@ def make_room(store: Store, excess: float, dry: bool = False) -> tuple[list[Cand
     found = candidates(store.disk, store.pinned(), store.read_seconds)
     gone, refused = evict(store.disk, found, excess, dry)
     if gone and not dry:
-        _orphans.removed(store.disk, _orphans.bands, dry)
+        orphan_files.removed(store.disk, orphan_files.bands, dry)
     return gone, refused
 
 
 def check(store: Store) -> Iterator[Checked]:
     """Read every value and compare every checksum; what is damaged is put aside."""
-    for key in _sidecar.names(store.disk):
+    for key in metadata.names(store.disk):
         about, problem = None, ""
         try:
-            about = _sidecar.read(store.disk, key)
+            about = metadata.read(store.disk, key)
             if is_kept(about):
                 store.load(about, "always")
         except UNREADABLE as error:
@@ -102,7 +101,7 @@ def pinned(disk: Disk) -> set[str]:
 def _is_gone(disk: Disk, key: str) -> bool:
     """Whether a value went, as values may, while we were about to read it."""
     try:
-        return not is_kept(_sidecar.read(disk, key))
+        return not is_kept(metadata.read(disk, key))
     except FileNotFoundError:
         return True
     except UNREADABLE:

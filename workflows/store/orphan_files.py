@@ -11,7 +11,7 @@ import time
 from collections.abc import Callable, Iterator
 from contextlib import suppress
 
-from neusee.workflows.store import metadata as _sidecar
+from neusee.workflows.store import metadata
 from neusee.workflows.store.budget_eviction import entries
 from neusee.workflows.store.metadata import UNREADABLE
 from neusee.workflows.store.shared_folder import OLD, Disk
@@ -52,7 +52,7 @@ def _payloads(disk: Disk) -> Iterator[os.DirEntry[str]]:
         key, _, suffix = entry.name.partition(".")
         if suffix == "safetensors":
             try:
-                about = _sidecar.read(disk, key)
+                about = metadata.read(disk, key)
             except FileNotFoundError:
                 yield entry
             except UNREADABLE:
@@ -65,9 +65,9 @@ def _payloads(disk: Disk) -> Iterator[os.DirEntry[str]]:
 def bands(disk: Disk) -> Iterator[os.DirEntry[str]]:
     """Bands that no value needs; none while another user's description is not for us to read, for it may need some."""
     found, needed = list(_below(f"{disk.folder}/bands")), set[str]()
-    for key in _sidecar.names(disk) if found else ():
+    for key in metadata.names(disk) if found else ():
         try:
-            needed.update(_sidecar.bands(_sidecar.read(disk, key)))
+            needed.update(metadata.bands(metadata.read(disk, key)))
         except PermissionError:
             return
         except UNREADABLE:
@@ -79,7 +79,7 @@ def _files(disk: Disk) -> Iterator[os.DirEntry[str]]:
     """Pictures whose entry went, and halves of them."""
     for entry in _below(f"{disk.folder}/files"):
         try:
-            wanted = not entry.name.startswith(".") and _sidecar.read(disk, entry.name[:32]).get("file") == entry.name
+            wanted = not entry.name.startswith(".") and metadata.read(disk, entry.name[:32]).get("file") == entry.name
         except UNREADABLE:
             wanted = False
         if not wanted and _age(entry) > OLD:

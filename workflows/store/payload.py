@@ -29,21 +29,21 @@ def load(disk: Disk, about: About, verify: str, blobs: Blobs) -> tuple[Any, int]
 
     Raises one of `UNREADABLE` where it cannot be trusted.
     """
-    from neusee.workflows.store import serialization as _codec
+    from neusee.workflows.store import serialization
 
     payload, bands = about["payload"], about.get("bands")
     check = verify == "always" or (verify == "sampled" and _draw.random() < _SAMPLED)
-    tensors, compared = [_codec.from_text(*t) for t in about.get("tensors", ())], 0
+    tensors, compared = [serialization.from_text(*t) for t in about.get("tensors", ())], 0
     if payload:
         path = disk.path(about["key"], "safetensors")
         stamp = stamp_of(path)
         if stamp[1] != payload["size"]:
             raise ValueError(f"its payload has not the {payload['size']} bytes that were written")
         due = check or (verify == "sampled" and stamp != payload.get("stamp"))
-        tensors, compared = _codec.read(path, payload["xxh3"] if due else None), payload["size"] if due else 0
+        tensors, compared = serialization.read(path, payload["xxh3"] if due else None), payload["size"] if due else 0
     if bands and verify == "sampled" and not check:
         check = newest(disk, bands["names"]) > bands["newest"]
-    return _codec.unpack(about["layout"], tensors, blobs, check), compared
+    return serialization.unpack(about["layout"], tensors, blobs, check), compared
 
 
 def stamp_of(path: str) -> list[int]:

@@ -22,10 +22,11 @@ from typing import Any
 import xxhash
 
 from neusee.workflows.keys.cache_key import Key, digest
+from neusee.workflows.store.environment import Verify
 from neusee.workflows.store.metadata import About, is_kept, receipt, seal, unseal
 from neusee.workflows.store.payload import newest, stamp_of
 from neusee.workflows.store.remote_files import Far
-from neusee.workflows.store.result_store import Store, Verify
+from neusee.workflows.store.result_store import Store
 
 _NAME = re.compile("[0-9a-f]{32}")
 

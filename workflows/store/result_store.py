@@ -20,14 +20,10 @@ from functools import cached_property
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from neusee.workflows.store import maintenance as _upkeep
-from neusee.workflows.store import metadata as _sidecar
-from neusee.workflows.store import payload as _payload
+from neusee.workflows.store import maintenance, metadata, payload
 from neusee.workflows.store.bandwidth import Speeds
 from neusee.workflows.store.budget_eviction import LOW, Room
-from neusee.workflows.store.environment import Verify as Verify
-from neusee.workflows.store.environment import budget_bytes, verify_mode
-from neusee.workflows.store.environment import default_root as default_root
+from neusee.workflows.store.environment import Verify, budget_bytes, default_root, verify_mode
 from neusee.workflows.store.journal import Journal
 from neusee.workflows.store.lease import Lease, Leases
 from neusee.workflows.store.maintenance import Checked, Swept
@@ -71,7 +67,7 @@ class Store:
     @cached_property
     def blobs(self) -> Blobs:
         """The bands of stacks."""
-        return _payload.blobs_of(self.disk)
+        return payload.blobs_of(self.disk)
 
     def has(self, key: str) -> bool:
         """Whether there is a value; its payload is not read."""
@@ -87,7 +83,7 @@ class Store:
         about = self.brief.find(key)
         if about is None or not is_kept(about):
             try:
-                about = _sidecar.find(self.disk, key) or about
+                about = metadata.find(self.disk, key) or about
             except UNREADABLE as error:
                 self._put_aside(key, error)
         if about is not None:
@@ -120,26 +116,26 @@ class Store:
 
     def pin(self, key: str) -> None:
         """Keep a value whatever the budget. Raises `OSError` where the folder takes nothing."""
-        _upkeep.pin(self.disk, key)
+        maintenance.pin(self.disk, key)
 
     def unpin(self, key: str) -> None:
         """Let a value go again when room is needed."""
-        _upkeep.unpin(self.disk, key)
+        maintenance.unpin(self.disk, key)
 
     def pinned(self) -> set[str]:
         """The keys that are pinned."""
-        return _upkeep.pinned(self.disk)
+        return maintenance.pinned(self.disk)
 
     def gc(self, budget: int | None = None, dry: bool = False) -> Swept:
         """Remove what belongs to no result, and, beyond ``budget`` (or the store's own), what saves least a byte."""
-        swept = _upkeep.gc(self, self.budget if budget is None else budget, dry)
+        swept = maintenance.gc(self, self.budget if budget is None else budget, dry)
         if not dry:
             self._forget(swept.evicted)
         return swept
 
     def check(self) -> Iterator[Checked]:
         """Read every value, whatever ``verify`` says; what is damaged is put aside."""
-        return _upkeep.check(self)
+        return maintenance.check(self)
 
     def jot(self, key: str, value: Any, about: About) -> bool:
         """Keep a small value, of a larger one what is ``about`` it, without a file: to lose it is no loss."""
@@ -147,7 +143,7 @@ class Store:
 
     def entries(self) -> Iterator[tuple[str, About]]:
         """Every result's key and what is known of it, in the order of the keys; receipts too."""
-        for key in heapq.merge(_sidecar.names(self.disk), (key for key, _ in self.brief.each())):
+        for key in heapq.merge(metadata.names(self.disk), (key for key, _ in self.brief.each())):
             about = self.about(key)
             if about is not None:
                 yield key, about
@@ -168,21 +164,21 @@ class Store:
         """What stands beside a result now; None where somebody has removed it."""
         self._known.pop(key, None)
         try:
-            return _sidecar.read(self.disk, key)
+            return metadata.read(self.disk, key)
         except UNREADABLE:
             return None
 
     def load(self, about: About, verify: str) -> Any:
         """The value that ``about`` describes; one of `UNREADABLE` where it cannot be trusted."""
         began = time.perf_counter()
-        value, size = _payload.load(self.disk, about, verify, self.blobs)
+        value, size = payload.load(self.disk, about, verify, self.blobs)
         self._speeds.learn("read", size, time.perf_counter() - began)
         return value
 
     def _use(self, key: str) -> None:
         if key not in self._used:
             self._used.add(key)
-            _sidecar.note_use(self.disk, key)
+            metadata.note_use(self.disk, key)
 
     def _try(self, write: Callable[..., bool], key: str, *what: Any) -> bool:
         """Write; once more where what it needs was removed meanwhile."""
@@ -199,18 +195,18 @@ class Store:
             return False
 
     def _write(self, key: str, value: Any, about: About) -> bool:
-        from neusee.workflows.store import serialization as _codec
+        from neusee.workflows.store import serialization
 
         began = time.perf_counter()
-        layout, tensors = _codec.pack(value, self.blobs)
-        apart, inline = _codec.blobs_in(layout), sum(t.nbytes for t in tensors)
+        layout, tensors = serialization.pack(value, self.blobs)
+        apart, inline = serialization.blobs_in(layout), sum(t.nbytes for t in tensors)
         size = max(inline, about.get("bytes") or 0) if apart else inline
         entry = {"key": key, **about, "layout": layout, "bytes": size, "payload": None, "kept": True}
         if self._room and size > LOW * self._room.budget:
             self._write_receipt(key, entry)
             return False
         if inline <= INLINE:
-            entry["tensors"], tensors = [_codec.to_text(t) for t in tensors], []
+            entry["tensors"], tensors = [serialization.to_text(t) for t in tensors], []
         if tensors or apart:
             self._write_parts(key, entry, tensors, value if apart else None)
             self._speeds.learn("write", inline, time.perf_counter() - began)
@@ -228,31 +224,31 @@ class Store:
 
     def _write_parts(self, key: str, entry: About, tensors: list[Tensor], banded: Any) -> None:
         """What is large first, then what names it; of two processes with one key the first one's stays."""
-        from neusee.workflows.store import serialization as _codec
+        from neusee.workflows.store import serialization
 
         with self.disk.temporary(key) as (part, file):
             if tensors:
-                xxh3 = _codec.write(file, tensors)
+                xxh3 = serialization.write(file, tensors)
                 file.flush()
                 os.fsync(file.fileno())
                 entry["payload"] = {"size": file.tell(), "xxh3": xxh3}
             with self.disk.lock():
-                if key not in self._lost and _sidecar.has_value(self.disk, key):
+                if key not in self._lost and metadata.has_value(self.disk, key):
                     return
                 if banded is not None:  # bands of no value yet may have been swept
-                    names = _codec.blobs_in(_codec.pack(banded, self.blobs)[0])
-                    entry["bands"] = {"names": names, "newest": _payload.newest(self.disk, names)}
+                    names = serialization.blobs_in(serialization.pack(banded, self.blobs)[0])
+                    entry["bands"] = {"names": names, "newest": payload.newest(self.disk, names)}
                 if tensors:
                     path = self.disk.path(key, "safetensors")
                     self.disk.rename(part, path)
-                    entry["payload"]["stamp"] = _payload.stamp_of(path)
+                    entry["payload"]["stamp"] = payload.stamp_of(path)
                 self._write_about(key, entry)
 
     def _write_about(self, key: str, entry: About) -> None:
         """A torn entry fails its seal, so this small file need not wait for the disk."""
         path = self.disk.path(key, "json")
         with self.disk.temporary(key) as (part, file):
-            file.write(_sidecar.seal(entry))
+            file.write(metadata.seal(entry))
             file.flush()
             if not self.disk.link(part, path):
                 self.disk.rename(part, path)
@@ -260,10 +256,10 @@ class Store:
 
     def _write_receipt(self, key: str, about: About) -> bool:
         """What has the name already stays: it tells no less."""
-        entry = _sidecar.receipt({"key": key, **about})
+        entry = metadata.receipt({"key": key, **about})
         if self.about(key) is None:
             with self.disk.temporary(key) as (part, file):
-                file.write(_sidecar.seal(entry))
+                file.write(metadata.seal(entry))
                 file.flush()
                 if self.disk.link(part, self.disk.path(key, "json")):
                     self._known[key] = entry
@@ -273,7 +269,7 @@ class Store:
     def _make_room(self, size: int) -> None:
         """Let values go where ``size`` more bytes are too many."""
         if self._room and (excess := self._room.excess(size)) > 0:
-            gone = {candidate.key for candidate in _upkeep.make_room(self, excess)[0]}
+            gone = {candidate.key for candidate in maintenance.make_room(self, excess)[0]}
             self._forget(gone)
             self.journal.mark_evicted(gone)
 

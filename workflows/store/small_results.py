@@ -13,7 +13,7 @@ from collections.abc import Iterator
 from contextlib import suppress
 from typing import Any
 
-from neusee.workflows.store import metadata as _sidecar
+from neusee.workflows.store import metadata
 from neusee.workflows.store.metadata import INLINE, UNREADABLE, About
 from neusee.workflows.store.shared_folder import Disk
 
@@ -39,28 +39,28 @@ class Brief:
         if raw is None:
             return None
         try:
-            about = _sidecar.unseal(raw)
+            about = metadata.unseal(raw)
             return about if about["key"] == key else None
         except UNREADABLE:
             return None
 
     def put(self, key: str, value: Any, about: About) -> About:
         """Add a value if it is small, else its receipt; gives what was written. Raises `OSError`, `TypeError`."""
-        from neusee.workflows.store import serialization as _codec
+        from neusee.workflows.store import serialization
 
-        layout, tensors = _codec.pack(value)
+        layout, tensors = serialization.pack(value)
         size = sum(t.nbytes for t in tensors)
         entry = {"key": key, **about, "layout": layout, "bytes": size, "payload": None, "kept": True}
         if size <= INLINE:
-            entry["tensors"] = [_codec.to_text(t) for t in tensors]
+            entry["tensors"] = [serialization.to_text(t) for t in tensors]
         else:
-            entry = _sidecar.receipt(entry)
+            entry = metadata.receipt(entry)
         self.append(entry)
         return entry
 
     def append(self, about: About) -> None:
         """Add a line. Raises `OSError` where that cannot be done."""
-        raw = _sidecar.seal(about)
+        raw = metadata.seal(about)
         try:
             self._write(raw, os.O_APPEND | os.O_WRONLY)
         except FileNotFoundError:

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 import torch
 
-from neusee.workflows.calibration import emcee_sampler as calibrate
+from neusee.workflows.calibration import emcee_sampler
 from neusee.workflows.calibration.identifiability import known
 from neusee.workflows.calibration.initial_guess import begin
 from neusee.workflows.calibration.log_posterior import Problem
@@ -164,7 +164,9 @@ def test_the_law_is_not_fooled_by_numbers_that_do_not_scatter(fitted, tmp_path):
 
 
 def starts(problem, peak, tmp_path):
-    runs = [calibrate._begun(problem, peak, tmp_path / "none.h5", i, 1, 64, calibrate.move("de")) for i in range(4)]
+    runs = [
+        emcee_sampler._begun(problem, peak, tmp_path / "none.h5", i, 1, 64, emcee_sampler.move("de")) for i in range(4)
+    ]
     return np.concatenate([run.begin for run in runs])
 
 

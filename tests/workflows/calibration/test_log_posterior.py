@@ -8,14 +8,14 @@ import emcee
 import numpy as np
 import pytest
 
-from neusee.workflows.calibration import emcee_sampler as calibrate
+from neusee.workflows.calibration import emcee_sampler
 from neusee.workflows.calibration.calibration_page import beside
 from neusee.workflows.calibration.identifiability import known
 from neusee.workflows.calibration.initial_guess import begin
 from neusee.workflows.calibration.log_posterior import Problem
 from neusee.workflows.calibration.posterior_checks import checks, weighed
 from neusee.workflows.calibration.posterior_mode import peak
-from neusee.workflows.cli import app as cli
+from neusee.workflows.cli import app
 from neusee.workflows.recipe.loading import load
 from neusee.workflows.store.result_store import Store
 
@@ -71,9 +71,9 @@ def test_what_no_frame_tells_is_said_in_words(store):
 
 def test_the_snooker_is_refused_by_name():
     with pytest.raises(ValueError, match="18 % too narrow"):
-        calibrate.move("DESnookerMove")
+        emcee_sampler.move("DESnookerMove")
     with pytest.raises(ValueError, match="no move"):
-        calibrate.move("walk")
+        emcee_sampler.move("walk")
 
 
 class Stop(Exception):
@@ -81,8 +81,8 @@ class Stop(Exception):
 
 
 def test_what_is_stopped_goes_on_to_the_last_bit(store, tmp_path, monkeypatch):
-    monkeypatch.setattr(calibrate, "_FIRST", 20)
-    monkeypatch.setattr(calibrate, "_LONGEST", 40)
+    monkeypatch.setattr(emcee_sampler, "_FIRST", 20)
+    monkeypatch.setattr(emcee_sampler, "_LONGEST", 40)
     p = problem(store, SEEN)
     best, lines = top(p), []
 
@@ -91,15 +91,15 @@ def test_what_is_stopped_goes_on_to_the_last_bit(store, tmp_path, monkeypatch):
         if len(lines) == 2:
             raise Stop
 
-    whole = calibrate.sample(p, best, tmp_path / "whole.h5", seed=3, walkers=16)
+    whole = emcee_sampler.sample(p, best, tmp_path / "whole.h5", seed=3, walkers=16)
     with pytest.raises(Stop):
-        calibrate.sample(p, best, tmp_path / "cut.h5", seed=3, walkers=16, tell=stop)
+        emcee_sampler.sample(p, best, tmp_path / "cut.h5", seed=3, walkers=16, tell=stop)
     kept = emcee.backends.HDFBackend(str(tmp_path / "cut.h5"), name="ensemble3", read_only=True)
     assert 20 < kept.iteration < 40
-    again = calibrate.sample(p, best, tmp_path / "cut.h5", seed=3, walkers=16)
+    again = emcee_sampler.sample(p, best, tmp_path / "cut.h5", seed=3, walkers=16)
     assert np.array_equal(whole.draws, again.draws)
     assert np.array_equal(whole.log, again.log)
-    other = calibrate.sample(p, best, tmp_path / "other.h5", seed=4, walkers=16)
+    other = emcee_sampler.sample(p, best, tmp_path / "other.h5", seed=4, walkers=16)
     assert not np.array_equal(whole.draws, other.draws)
     assert not list(tmp_path.glob("*.part"))
 
@@ -107,38 +107,38 @@ def test_what_is_stopped_goes_on_to_the_last_bit(store, tmp_path, monkeypatch):
 def test_what_has_ended_draws_nothing_more(store, tmp_path, monkeypatch):
     """It ended because tau had settled since the round before, which is not seen of the last round alone."""
     for name, value in {"_FIRST": 40, "_TAUS": 0.0, "_BURN": 0.0, "_SURELY": 1e9, "_CHANGE": 0.2}.items():
-        monkeypatch.setattr(calibrate, name, value)
+        monkeypatch.setattr(emcee_sampler, name, value)
     p = problem(store, SEEN)
     best = top(p)
-    first = calibrate.sample(p, best, tmp_path / "c.h5", seed=3, walkers=16, wanted=1)
+    first = emcee_sampler.sample(p, best, tmp_path / "c.h5", seed=3, walkers=16, wanted=1)
     assert first.long
     monkeypatch.setattr(emcee.moves.DEMove, "get_proposal", None)
-    again = calibrate.sample(p, best, tmp_path / "c.h5", seed=3, walkers=16, wanted=1)
+    again = emcee_sampler.sample(p, best, tmp_path / "c.h5", seed=3, walkers=16, wanted=1)
     assert again.long
     assert again.steps == first.steps
     assert np.array_equal(again.draws, first.draws)
 
 
 def test_draws_that_cannot_be_kept_are_drawn_and_said(store, tmp_path, monkeypatch):
-    monkeypatch.setattr(calibrate, "_FIRST", 20)
-    monkeypatch.setattr(calibrate, "_LONGEST", 20)
+    monkeypatch.setattr(emcee_sampler, "_FIRST", 20)
+    monkeypatch.setattr(emcee_sampler, "_LONGEST", 20)
     (tmp_path / "file").write_text("no folder")
     p, said = problem(store, SEEN), []
     best = top(p)
-    found = calibrate.sample(p, best, tmp_path / "file" / "c.h5", seed=3, walkers=16, tell=said.append)
-    kept = calibrate.sample(p, best, tmp_path / "c.h5", seed=3, walkers=16)
+    found = emcee_sampler.sample(p, best, tmp_path / "file" / "c.h5", seed=3, walkers=16, tell=said.append)
+    kept = emcee_sampler.sample(p, best, tmp_path / "c.h5", seed=3, walkers=16)
     assert np.array_equal(found.draws, kept.draws)
     assert sum("a stop would lose these draws" in line for line in said) == 1
 
 
 def test_a_damaged_file_of_draws_is_drawn_anew(store, tmp_path, monkeypatch):
-    monkeypatch.setattr(calibrate, "_FIRST", 20)
-    monkeypatch.setattr(calibrate, "_LONGEST", 20)
+    monkeypatch.setattr(emcee_sampler, "_FIRST", 20)
+    monkeypatch.setattr(emcee_sampler, "_LONGEST", 20)
     p = problem(store, SEEN)
     best = top(p)
-    first = calibrate.sample(p, best, tmp_path / "c.h5", seed=3, walkers=16)
+    first = emcee_sampler.sample(p, best, tmp_path / "c.h5", seed=3, walkers=16)
     (tmp_path / "c.h5").write_bytes((tmp_path / "c.h5").read_bytes()[:3000])
-    assert np.array_equal(calibrate.sample(p, best, tmp_path / "c.h5", seed=3, walkers=16).draws, first.draws)
+    assert np.array_equal(emcee_sampler.sample(p, best, tmp_path / "c.h5", seed=3, walkers=16).draws, first.draws)
 
 
 @pytest.fixture(scope="module")
@@ -147,9 +147,9 @@ def drawn(store, tmp_path_factory):
     p = problem(store, SEEN)
     best = top(p)
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(calibrate, "_FIRST", 400)
-        patch.setattr(calibrate, "_LONGEST", 400)
-        chains = calibrate.sample(p, best, tmp_path_factory.mktemp("draws") / "c.h5", seed=3)
+        patch.setattr(emcee_sampler, "_FIRST", 400)
+        patch.setattr(emcee_sampler, "_LONGEST", 400)
+        chains = emcee_sampler.sample(p, best, tmp_path_factory.mktemp("draws") / "c.h5", seed=3)
     return p, best, known(p, best), replace(chains, long=True)
 
 
@@ -170,7 +170,7 @@ def test_good_draws_pass_and_each_fault_is_found(drawn):
     log = chains.log.copy()
     log[1, :, 5] -= 100.0
     lost = replace(chains, log=log)
-    assert calibrate.stranded(lost.log) == 1
+    assert emcee_sampler.stranded(lost.log) == 1
     assert marks(drawn, log=log)["no walker is stranded"] == "fail"
     assert marks(drawn, log=chains.log - 10.0)["draws reach the peak"] == "fail"
     assert marks(drawn, draws=chains.draws[:, :20])["draws are enough"] == "fail"
@@ -208,14 +208,14 @@ def here(tmp_path, monkeypatch):
 
 def said(capsys, *arguments):
     with pytest.raises(SystemExit) as ended:
-        cli.main(["calibrate", "calibrate", SMALL, *arguments])
+        app.main(["calibrate", "calibrate", SMALL, *arguments])
     return ended.value.code, capsys.readouterr()
 
 
 @pytest.mark.slow
 def test_short_chains_end_in_a_red_page_and_code_three(here, capsys, monkeypatch):
-    monkeypatch.setattr(calibrate, "_FIRST", 60)
-    monkeypatch.setattr(calibrate, "_LONGEST", 60)
+    monkeypatch.setattr(emcee_sampler, "_FIRST", 60)
+    monkeypatch.setattr(emcee_sampler, "_LONGEST", 60)
     code, printed = said(capsys, SEEN, "--walkers", "16")
     assert code == 3, printed.err
     assert "chains are long" in printed.err
@@ -235,7 +235,7 @@ def test_short_chains_end_in_a_red_page_and_code_three(here, capsys, monkeypatch
 )
 def test_mistakes_are_told_before_anything_is_drawn(here, capsys, words, code, message):
     with pytest.raises(SystemExit) as ended:
-        cli.main(["calibrate", *words])
+        app.main(["calibrate", *words])
     assert ended.value.code == code
     assert message in capsys.readouterr().err
     assert not (here / "cache" / "posterior").exists()

@@ -14,8 +14,7 @@ import torch
 from scipy.stats import binom, chi2
 
 from neusee.nodes.calibrate import Likelihood, least_squares, table
-from neusee.workflows.calibration import emcee_sampler as calibrate
-from neusee.workflows.calibration import run_calibration as _calibration
+from neusee.workflows.calibration import emcee_sampler, run_calibration
 from neusee.workflows.calibration.goodness_of_fit import fit
 from neusee.workflows.calibration.identifiability import known
 from neusee.workflows.calibration.log_posterior import Problem
@@ -151,7 +150,7 @@ def test_a_recipe_that_calibrates_nothing_says_what_is_missing(store):
 def test_emcee_draws_from_the_same_posterior(store, tmp_path):
     """Held: what frames do not tell, for a normal law is compared. Importance draws against a chain."""
     problem = Problem.of(load("calibrate_camera", ["steps.prior.with.twist=null"]), store)
-    chains = calibrate.sample(problem, peak(problem, begin(problem)), tmp_path / "chain.h5", seed=1, walkers=48)
+    chains = emcee_sampler.sample(problem, peak(problem, begin(problem)), tmp_path / "chain.h5", seed=1, walkers=48)
     assert chains.long
     rows = {row.name: row for row in spread(problem.recipe, store)}
     for name, x in zip(problem.names, chains.flat.T, strict=True):
@@ -298,10 +297,10 @@ def test_a_misfit_is_what_chance_does_not_do():
 
 @pytest.mark.slow
 def test_the_page_of_a_camera_states_what_its_models_leave_open(tmp_path, monkeypatch):
-    monkeypatch.setattr(calibrate, "_FIRST", 60)
-    monkeypatch.setattr(calibrate, "_LONGEST", 60)
+    monkeypatch.setattr(emcee_sampler, "_FIRST", 60)
+    monkeypatch.setattr(emcee_sampler, "_LONGEST", 60)
     recipe = load("calibrate_camera")
-    folder = _calibration.calibrate(recipe, Store(tmp_path / "cache"), tmp_path / "runs", walkers=32)
+    folder = run_calibration.calibrate(recipe, Store(tmp_path / "cache"), tmp_path / "runs", walkers=32)
     page, doc = (folder / "report.html").read_text(), json.loads((folder / "posterior.json").read_text())
     assert "How models of the response differ" in page
     assert "To be stated" in page

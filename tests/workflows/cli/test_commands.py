@@ -10,7 +10,7 @@ import time
 
 import pytest
 
-from neusee.workflows.cli import app as cli
+from neusee.workflows.cli import app
 
 RECIPE = """\
 # An axicon, cut off at half its height.
@@ -46,7 +46,7 @@ def neusee(here, capfd):
 
     def call(*words: str) -> tuple[int, str, str]:
         with pytest.raises(SystemExit) as end:
-            cli.main(list(words))
+            app.main(list(words))
         return (end.value.code or 0, *capfd.readouterr())
 
     return call
@@ -190,18 +190,18 @@ def test_without_a_name_the_changes_go_to_first_light(neusee):
 
 
 def test_a_failure_while_running_is_exit_code_one_and_has_no_stack(neusee, monkeypatch):
-    from neusee.workflows.engine import step_job as _work
+    from neusee.workflows.engine import step_job
 
     def burst(*args, **kwargs):
         raise MemoryError("no room for 31 bands")
 
-    monkeypatch.setattr(_work, "call", burst)
+    monkeypatch.setattr(step_job, "call", burst)
     code, _, err = neusee("run", "mine.yaml")
     assert code == 1
     assert "no room for 31 bands" in err
     assert "Traceback" not in err
     with pytest.raises(RuntimeError, match="no room"):
-        cli.main(["run", "mine.yaml", "--debug"])
+        app.main(["run", "mine.yaml", "--debug"])
 
 
 def test_plan_computes_nothing_and_knows_what_is_stored(neusee, here):

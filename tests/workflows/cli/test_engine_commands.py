@@ -4,7 +4,7 @@ import json
 
 import pytest
 
-from neusee.workflows.cli import app as cli
+from neusee.workflows.cli import app
 
 RECIPE = """
 # A target through a small sensor.
@@ -35,7 +35,7 @@ def neusee(here, capfd):
 
     def call(*words: str) -> tuple[int, str, str]:
         with pytest.raises(SystemExit) as end:
-            cli.main(list(words))
+            app.main(list(words))
         return (end.value.code or 0, *capfd.readouterr())
 
     return call

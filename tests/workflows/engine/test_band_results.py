@@ -10,12 +10,12 @@ from neusee.nodes.optics import image, psf
 from neusee.nodes.spectra import illuminate
 from neusee.nodes.values import Mixture, Psf, Pupil
 from neusee.workflows import RunError, Store, load
-from neusee.workflows.engine import band_results as _bands
+from neusee.workflows.engine import band_results
 from neusee.workflows.engine.band_results import call_by_band, plain_of
 from neusee.workflows.engine.node_call import call
 from neusee.workflows.graph.diagnostics import Mark
 from neusee.workflows.graph.recipe_graph import Step, in_order
-from neusee.workflows.store import serialization as _codec
+from neusee.workflows.store import serialization
 from neusee.workflows.store.band_files import Blobs, Stacked
 
 LENS = {"focal_length": 0.11, "pixel_pitch": 2.9e-6, "shape": (32, 64)}
@@ -25,7 +25,7 @@ BANDS = 6
 @pytest.fixture(autouse=True)
 def small(monkeypatch):
     """Small results too are kept by band."""
-    monkeypatch.setattr(_bands, "LEAST", 0)
+    monkeypatch.setattr(band_results, "LEAST", 0)
 
 
 @pytest.fixture
@@ -64,11 +64,11 @@ class Made:
         self.computed = []
         value = call_by_band(self.step, inputs, self.evaluate, self.code, Blobs(self.blobs.root), parts)
         if self.store:
-            self.layout, self.tensors = _codec.pack(value, Blobs(self.blobs.root))
+            self.layout, self.tensors = serialization.pack(value, Blobs(self.blobs.root))
         return value
 
     def evaluate(self, inputs):
-        self.computed.append(_bands.band_count(self.step, inputs))
+        self.computed.append(band_results.band_count(self.step, inputs))
         return call(self.step, inputs, self.step.params, 0, "cpu")
 
 
@@ -88,7 +88,7 @@ def test_the_first_time_all_is_computed_at_once_and_kept_by_band(blobs):
     assert made.computed == [BANDS]
     assert same(value, image(*inputs))
     assert len(files(blobs)) == len(set(value.names)) == BANDS
-    assert torch.equal(_codec.unpack(made.layout, made.tensors, Blobs(blobs.root)), image(*inputs))
+    assert torch.equal(serialization.unpack(made.layout, made.tensors, Blobs(blobs.root)), image(*inputs))
 
 
 def test_of_one_changed_band_one_is_computed_and_written(blobs):
@@ -211,7 +211,7 @@ def test_bands_that_are_not_the_first_axis_are_computed_in_parts_and_kept_whole(
 
 
 def test_a_small_result_is_kept_whole(blobs, monkeypatch):
-    monkeypatch.setattr(_bands, "LEAST", 1 << 20)
+    monkeypatch.setattr(band_results, "LEAST", 1 << 20)
     value = Made(image, blobs)(*light())
     assert isinstance(value, torch.Tensor)
     assert files(blobs) == set()
@@ -289,7 +289,7 @@ def test_a_run_shares_the_bands_that_stayed(write, tmp_path):
     expected = load(path, (moved,)).run(Store(tmp_path / "other"))
     for name, written in (("psf", 2), ("image", 1)):
         assert found.done[name].state == "run"
-        before, after = (set(_codec.blobs_in(store.about(run.keys[name])["layout"])) for run in (first, found))
+        before, after = (set(serialization.blobs_in(store.about(run.keys[name])["layout"])) for run in (first, found))
         assert len(after) == 5 * written
         assert len(after - before) == written
         assert same(found.values[name], expected.values[name])

@@ -117,13 +117,13 @@ def test_on_a_cluster_of_two_workers_and_after_one_was_killed(small, local, tmp_
 @pytest.mark.slow
 def test_a_worker_with_other_code_is_refused(small, tmp_path, monkeypatch):
     from neusee.workflows.engine.dask_executor import cluster
-    from neusee.workflows.keys import code_digest as _code
+    from neusee.workflows.keys import code_digest
 
     store = Store(tmp_path)
     with cluster("dask:1", store) as executor:
         assert threading.active_count() < 200
         time.sleep(0.1)
         with monkeypatch.context() as other:
-            other.setattr(_code.Code, "digest", lambda self, module: "0" * 32)
+            other.setattr(code_digest.Code, "digest", lambda self, module: "0" * 32)
             with pytest.raises(RunError, match="other code"):
                 run(small, store, executor=executor)

@@ -12,12 +12,12 @@ import torch
 
 from neusee.nodes import Check, node
 from neusee.nodes.values import Bands
-from neusee.workflows.engine import execution as _under_way
+from neusee.workflows.engine import execution
 from neusee.workflows.engine.node_call import RunError
 from neusee.workflows.engine.runner import run
 from neusee.workflows.graph.diagnostics import Mark
 from neusee.workflows.graph.recipe_graph import Recipe, Step
-from neusee.workflows.store import serialization as _codec
+from neusee.workflows.store import serialization
 from neusee.workflows.store.result_store import Store
 
 CALLS: list[str] = []
@@ -189,7 +189,7 @@ def test_only_what_a_change_reaches_runs_again(store):
 
 def test_a_cached_tail_reads_nothing_of_its_head(store, monkeypatch):
     run(diamond(count=BIG), store)
-    monkeypatch.setattr(_codec, "read", lambda *a: pytest.fail("a payload was read"))
+    monkeypatch.setattr(serialization, "read", lambda *a: pytest.fail("a payload was read"))
     result = run(diamond(count=BIG), again(store))
     assert result.values["top"].ndim == 0
     assert states(result)["head"] == "asleep"
@@ -197,8 +197,8 @@ def test_a_cached_tail_reads_nothing_of_its_head(store, monkeypatch):
 
 def test_an_input_is_read_once_and_only_for_a_step_that_runs(store, monkeypatch):
     run(diamond(count=BIG, outputs="top left right head"), store)
-    read, loads = _codec.read, []
-    monkeypatch.setattr(_codec, "read", lambda path, xxh3: loads.append(path) or read(path, xxh3))
+    read, loads = serialization.read, []
+    monkeypatch.setattr(serialization, "read", lambda path, xxh3: loads.append(path) or read(path, xxh3))
     run(diamond(k=5.0, count=BIG), again(store))
     assert len(loads) == len(set(loads)) == 2
 
@@ -292,7 +292,7 @@ def test_a_step_beyond_the_tolerance_runs_and_says_so(store):
 
 def test_a_verdict_on_a_cached_run_reads_no_payload(store, monkeypatch):
     first = run(ladder(1e-3, 1.0), store)
-    monkeypatch.setattr(_codec, "read", lambda *a: pytest.fail("a payload was read"))
+    monkeypatch.setattr(serialization, "read", lambda *a: pytest.fail("a payload was read"))
     with pytest.raises(pytest.fail.Exception):
         run(ladder(1e-3, 1.0), again(store))
     monkeypatch.undo()
@@ -438,7 +438,7 @@ class warnings_of:
 
 
 def test_all_of_a_store_damaged_at_once_is_computed_again(store, monkeypatch):
-    monkeypatch.setattr(_under_way, "_QUICK", 0.0)  # each has a file of its own, however quick it was
+    monkeypatch.setattr(execution, "_QUICK", 0.0)  # each has a file of its own, however quick it was
     first = run(diamond(count=BIG), store)
     for path in [*store.root.rglob("*.safetensors"), *store.root.glob("??/*.json")]:
         data = bytearray(path.read_bytes())

@@ -11,7 +11,7 @@ from pathlib import Path
 import pytest
 import torch
 
-from neusee.workflows.engine import write_behind as _later
+from neusee.workflows.engine import write_behind
 from neusee.workflows.engine.node_call import RunError
 from neusee.workflows.engine.runner import run
 from neusee.workflows.engine.write_behind import Later
@@ -33,7 +33,7 @@ class Slow(Store):
         self.seconds, self.threads, self.claims = seconds, [], []
 
     def put(self, key, value, about):
-        if about["bytes"] >= _later.LARGE:
+        if about["bytes"] >= write_behind.LARGE:
             self.threads.append(threading.current_thread().name)
             self.claims.append(Store(self.root).claim(key))
             time.sleep(self.seconds)
@@ -123,7 +123,7 @@ def test_an_error_of_the_writer_is_an_error_of_the_run(tmp_path):
 
 
 def test_no_more_waits_than_there_is_room_for(monkeypatch):
-    monkeypatch.setattr(_later, "_ROOM", 100)
+    monkeypatch.setattr(write_behind, "_ROOM", 100)
     later, gate, most = Later(), threading.Event(), []
     later.add("a", 80, lambda: gate.wait(10))
     threading.Timer(0.2, gate.set).start()

@@ -17,7 +17,7 @@ from neusee.nodes.metrics import quality
 from neusee.workflows import load
 from neusee.workflows.cli.app import app
 from neusee.workflows.engine.runner import run
-from neusee.workflows.evaluation import evaluation_points as _evaluate_points
+from neusee.workflows.evaluation import evaluation_points
 from neusee.workflows.evaluation.confidence_intervals import difference, gain, mean, table
 from neusee.workflows.evaluation.evaluation_points import Bench, Wanted
 from neusee.workflows.evaluation.evaluation_scenes import scenes
@@ -126,14 +126,14 @@ def test_what_several_points_share_is_computed_once(store, monkeypatch):
     each = pipelines(BARE)
     shown, _ = scenes(load("first_light", SMALL), store, None, 1)
     called = []
-    real = _evaluate_points.call
+    real = evaluation_points.call
 
     def counted(step, *rest):
         called.append(step.name)
         return real(step, *rest)
 
     bench = Bench(store, 24)
-    monkeypatch.setattr(_evaluate_points, "call", counted)
+    monkeypatch.setattr(evaluation_points, "call", counted)
     for strength in (1e2, 1e3):
         for pipeline in each:
             bench.values(pipeline, Wanted(shown[0], "violet", strength))

@@ -10,8 +10,7 @@ import pytest
 import neusee.nodes
 from neusee.workflows.engine.resolve_keys import resolve
 from neusee.workflows.engine.runner import run
-from neusee.workflows.explain import change_causes as _causes
-from neusee.workflows.explain import why_rerun as _why
+from neusee.workflows.explain import change_causes, why_rerun
 from neusee.workflows.explain.change_causes import Comparison, Pair
 from neusee.workflows.explain.code_changes import edits
 from neusee.workflows.explain.why_rerun import explained, why_key_lines, why_lines
@@ -449,7 +448,7 @@ def test_a_run_tells_every_step_s_own_cause(trial):
 
 def test_a_cached_run_looks_nothing_up(trial, monkeypatch):
     trial.run()
-    monkeypatch.setattr(_why, "_rows", lambda *a: pytest.fail("looked at earlier results"))
+    monkeypatch.setattr(why_rerun, "_rows", lambda *a: pytest.fail("looked at earlier results"))
     assert trial.told() == {}
 
 
@@ -492,10 +491,12 @@ def test_a_run_compares_few_results(trial, monkeypatch):
     for gain in range(12):
         trial.run(f"sensor.gain={gain}", f"sensor.read_noise={gain + 20} e-")
     seen = []
-    own = _causes.Comparison.own
-    monkeypatch.setattr(_causes.Comparison, "own", lambda self, label, *a: seen.append(label) or own(self, label, *a))
+    own = change_causes.Comparison.own
+    monkeypatch.setattr(
+        change_causes.Comparison, "own", lambda self, label, *a: seen.append(label) or own(self, label, *a)
+    )
     assert trial.told("sensor.gain=50", "sensor.read_noise=50 e-")["raw"] == "sensor.gain 11 -> 50 (argument 2)"
-    assert seen.count("raw") == _why._AT_ONCE
+    assert seen.count("raw") == why_rerun._AT_ONCE
 
 
 def test_what_went_into_a_key(trial):
@@ -552,7 +553,7 @@ def test_a_chain_of_ten_thousand_steps_is_walked_without_recursion(tmp_path, toy
     assert list(roots.found) == ["amount 1 -> 2 (default of toy.add)"]
     names = roots.chain("amount 1 -> 2 (default of toy.add)")
     assert (len(names), names[0], names[-1]) == (length, last, "s0")
-    assert _why._chain(names) == f"{last} <- s9998 <- s9997 <- s9996 <- (9995 more) <- s0"
+    assert why_rerun._chain(names) == f"{last} <- s9998 <- s9997 <- s9996 <- (9995 more) <- s0"
 
 
 def test_results_that_are_gone_are_said_to_be(tmp_path, toy):
@@ -595,4 +596,4 @@ def test_a_packaged_recipe_s_changes_are_told_in_its_own_words(tmp_path, change)
     shelf.abouts = {key: {"step": before.makers[key], "origin": origin} for key, origin in before.origins.items()}
     after = resolve(other, needed(other, [step]), shelf)
     roots = Comparison(shelf, other, after).roots(Pair(step, after.keys[step], before.keys[step]))
-    assert [f"{_why._chain(roots.chain(text))}: {text}" for text in roots.found] == [said]
+    assert [f"{why_rerun._chain(roots.chain(text))}: {text}" for text in roots.found] == [said]

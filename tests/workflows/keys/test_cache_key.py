@@ -16,7 +16,7 @@ from neusee.nodes import node
 from neusee.workflows.engine.runner import run
 from neusee.workflows.graph.diagnostics import Mark
 from neusee.workflows.graph.recipe_graph import Recipe, Step
-from neusee.workflows.keys import code_digest as _code
+from neusee.workflows.keys import code_digest
 from neusee.workflows.keys.cache_key import digest, file_digest, key_of, plain, stream_seed
 from neusee.workflows.keys.code_digest import Code
 from neusee.workflows.store.result_store import Store
@@ -172,7 +172,7 @@ def test_only_what_is_imported_counts(trial):
 
 def test_a_cached_run_parses_nothing(trial, monkeypatch):
     trial.run()
-    monkeypatch.setattr(_code, "summarise", lambda source: pytest.fail("parsed again"))
+    monkeypatch.setattr(code_digest, "summarise", lambda source: pytest.fail("parsed again"))
     assert trial.run() == (30.5, *NONE)
 
 

@@ -7,9 +7,8 @@ from pathlib import Path
 import pytest
 
 from neusee.workflows.graph.diagnostics import RecipeError
-from neusee.workflows.recipe import graph_cache as _known
-from neusee.workflows.recipe import loading as _recipe
-from neusee.workflows.recipe.text import composition as _compose
+from neusee.workflows.recipe import graph_cache, loading
+from neusee.workflows.recipe.text import composition
 
 RECIPE = """\
 sensor: {gain: 2.0, noise: 5 e-}
@@ -32,8 +31,8 @@ def forget(monkeypatch):
 
     def forget():
         for name in ("_graphs", "_written"):
-            monkeypatch.setattr(_known, name, {})
-        monkeypatch.setattr(_compose, "_known", {})
+            monkeypatch.setattr(graph_cache, name, {})
+        monkeypatch.setattr(composition, "_known", {})
 
     forget()
     return forget
@@ -86,8 +85,8 @@ def test_a_mistake_is_told_as_in_a_fresh_process(mistakes, read, forget, change)
 
 def test_the_graph_is_bound_once(read, forget, monkeypatch):
     asked = []
-    declare = _recipe.declare
-    monkeypatch.setattr(_recipe, "declare", lambda *args: asked.append(1) or declare(*args))
+    declare = loading.declare
+    monkeypatch.setattr(loading, "declare", lambda *args: asked.append(1) or declare(*args))
     for gain in range(1, 9):
         read(RECIPE, f"sensor.gain={gain}")
     assert len(asked) == 1
@@ -128,4 +127,4 @@ def test_files_are_looked_at_every_time(read, write, forget):
 def test_little_is_remembered(read, forget):
     for pitch in range(1, 60):
         read(RECIPE.replace("pitch: 3 um", f"pitch: {pitch} um"), "sensor.gain=2")
-    assert max(len(_known._graphs), len(_known._written), len(_compose._known)) <= 16
+    assert max(len(graph_cache._graphs), len(graph_cache._written), len(composition._known)) <= 16

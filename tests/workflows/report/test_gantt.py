@@ -8,7 +8,7 @@ from itertools import pairwise
 import pytest
 
 from neusee.workflows.placement.heft_and_cpop import Cluster, Device, Task, heft
-from neusee.workflows.report.figures import gantt as _timeline
+from neusee.workflows.report.figures import gantt
 from neusee.workflows.report.figures.gantt import timeline
 
 
@@ -69,7 +69,7 @@ def test_the_lanes_stand_above(drawn):
 def test_the_critical_path_is_red(drawn):
     schedule = planned(9)
     _, _, steps = drawn(schedule, [])
-    red = {t.get_text() for t in steps.get_yticklabels() if t.get_color() == _timeline.VERMILION}
+    red = {t.get_text() for t in steps.get_yticklabels() if t.get_color() == gantt.VERMILION}
     assert red == {s.task for s in schedule.critical_path()}
 
 

@@ -18,8 +18,7 @@ from neusee.nodes import Check, node
 from neusee.nodes.metrics import Quality
 from neusee.workflows import Recipe, RecipeError, Step, Store, load
 from neusee.workflows.graph.diagnostics import Mark
-from neusee.workflows.report import notebook as _notebook
-from neusee.workflows.report import result_numbers as _numbers
+from neusee.workflows.report import notebook, result_numbers
 
 CAMERA = """\
 # A camera of toys.
@@ -266,8 +265,8 @@ def test_a_recipe_runs_itself_and_gives_arrays(store):
 
 
 def test_numbers_that_numpy_has_no_type_for_become_larger():
-    assert _notebook.arrays_of([torch.ones(2, dtype=torch.bfloat16)])[0].dtype == numpy.float32
-    assert _notebook.arrays_of({"a": (torch.ones(1), None)}) == {"a": (numpy.ones(1), None)}
+    assert notebook.arrays_of([torch.ones(2, dtype=torch.bfloat16)])[0].dtype == numpy.float32
+    assert notebook.arrays_of({"a": (torch.ones(1), None)}) == {"a": (numpy.ones(1), None)}
 
 
 def test_a_number_a_band_is_a_list(store, monkeypatch):
@@ -374,19 +373,19 @@ def test_a_recipe_shows_its_changes_its_steps_and_where_values_stand(given):
 def test_pictures_weigh_less_than_a_megabyte_and_are_small(store):
     noise = torch.rand(3, 2000, 1500, generator=torch.Generator().manual_seed(1))
     for count in (1, 2, 4, 6):
-        made = _notebook._pictures({f"p{i}": noise for i in range(count)})
+        made = notebook._pictures({f"p{i}": noise for i in range(count)})
         assert len(made) == min(count, 4)
         assert sum(len(p["png"]) for p in made) < 900_000
         images = [base64.b64decode(p["png"]) for p in made]
         assert all(max(numpy.frombuffer(i[16:24], ">u4")) <= 640 for i in images)
-    grey = _notebook._pictures({"grey": torch.eye(16), "cube": torch.ones(31, 16, 16), "text": "x"})
+    grey = notebook._pictures({"grey": torch.eye(16), "cube": torch.ones(31, 16, 16), "text": "x"})
     assert [p["name"] for p in grey] == ["grey"]
 
 
 def test_the_overview_is_shown_by_one_stretch():
     white, black = torch.ones(3, 16, 16), torch.zeros(3, 20, 20)
     values = {"truth": white, "developed[plain]": black + 0.25, "developed[mask]": black, "restored": white * 2}
-    made = _notebook._pictures({**values, "raw": white})
+    made = notebook._pictures({**values, "raw": white})
     assert [p["name"] for p in made] == ["truth", "plain lens", "with mask", "restored"]
     from PIL import Image
 
@@ -396,7 +395,7 @@ def test_the_overview_is_shown_by_one_stretch():
 
 
 def test_showing_a_result_computes_nothing_that_took_long(store, monkeypatch):
-    for module in (_notebook, _numbers):
+    for module in (notebook, result_numbers):
         monkeypatch.setattr(module, "TABLE", {"row": {"peak/I_sat": "ramp"}})
     result = small().run(store, ["half"])
     known = {"peak/I_sat", "row"}

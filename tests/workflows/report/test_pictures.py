@@ -16,14 +16,15 @@ from neusee.nodes.values import Bands, Psf, Pupil
 from neusee.workflows.engine.runner import run
 from neusee.workflows.graph.diagnostics import Mark
 from neusee.workflows.graph.recipe_graph import Recipe, Step
-from neusee.workflows.report import contents as _roles
-from neusee.workflows.report import run_pictures as _figures
-from neusee.workflows.report.figures import camera_overview as _figures_pictures
-from neusee.workflows.report.figures import numerics as _figures_numerics
-from neusee.workflows.report.figures import optics as _figures_optics
-from neusee.workflows.report.figures import photon_transfer as _figures_sensor
-from neusee.workflows.report.figures import recipe_graph as _figures_graph
-from neusee.workflows.report.figures import scene_spectra as _figures_light
+from neusee.workflows.report import contents, run_pictures
+from neusee.workflows.report.figures import (
+    camera_overview,
+    numerics,
+    optics,
+    photon_transfer,
+    recipe_graph,
+    scene_spectra,
+)
 from neusee.workflows.store.derived_files import Shelf
 from neusee.workflows.store.result_store import Store
 
@@ -113,17 +114,17 @@ def drawings(light: SimpleNamespace) -> dict[str, tuple]:
     lines = {"green": Bands(*(x[1:3] for x in bands()))}
     return {
         "overview": (
-            _figures_pictures.overview,
+            camera_overview.overview,
             dict(truth=scene(), plain=scene() + 0.3, mask=scene(), restored=scene(), spots={"green": spot()}),
         ),
-        "height": (_figures_optics.height, dict(pupil=pupil(4.0))),
-        "psf": (_figures_optics.psf, dict(plain=light.plain, mask=light.mask, bands=bands(), pixel_pitch=PIXEL)),
+        "height": (optics.height, dict(pupil=pupil(4.0))),
+        "psf": (optics.psf, dict(plain=light.plain, mask=light.mask, bands=bands(), pixel_pitch=PIXEL)),
         "suppression": (
-            _figures_optics.suppression,
+            optics.suppression,
             dict(lsr=light.lsr, bands=bands(), psf=light.mask, bsr=torch.full((B,), 0.9)),
         ),
         "spectra": (
-            _figures_light.spectra,
+            scene_spectra.spectra,
             dict(
                 scene=scene(),
                 radiance=light.cube,
@@ -133,11 +134,11 @@ def drawings(light: SimpleNamespace) -> dict[str, tuple]:
                 lines=lines,
             ),
         ),
-        "sensor": (_figures_sensor.transfer, dict(measured=transfer_curve())),
-        "stability": (_figures_numerics.stability, dict(step=linear_image, psf=light.plain)),
-        "error_time": (_figures_numerics.error_time, dict(step=psf_step, pupil=pupil(4.0))),
+        "sensor": (photon_transfer.transfer, dict(measured=transfer_curve())),
+        "stability": (numerics.stability, dict(step=linear_image, psf=light.plain)),
+        "error_time": (numerics.error_time, dict(step=psf_step, pupil=pupil(4.0))),
         "graph": (
-            _figures_graph.graph,
+            recipe_graph.graph,
             dict(
                 sources={"bands": [], "psf[plain]": ["bands"], "psf[mask]": ["bands"], "image": ["psf[mask]"]},
                 states={"bands": "cached", "psf[plain]": "cached", "psf[mask]": "run", "image": "left out"},
@@ -146,7 +147,7 @@ def drawings(light: SimpleNamespace) -> dict[str, tuple]:
     }
 
 
-NAMES = [f.name for f in _roles.FIGURES] + ["graph"]
+NAMES = [f.name for f in contents.FIGURES] + ["graph"]
 
 
 @pytest.mark.parametrize("name", NAMES)
@@ -209,21 +210,21 @@ def test_axes_say_their_unit(drawings):
 
 
 def test_laser_added_as_shifted_psf_is_sound_where_a_joint_convolution_is_not(light):
-    errors = _figures_numerics.laser_trial(linear_image, light.plain)
+    errors = numerics.laser_trial(linear_image, light.plain)
     assert float(errors[0, -1]) < 1e-4
     assert float(errors[1, -1]) > 50 * float(errors[0, -1])
 
 
 def test_error_falls_with_precision():
-    rows = _figures_numerics.precision_trial(psf_step, pupil(4.0))
+    rows = numerics.precision_trial(psf_step, pupil(4.0))
     worst = {p: max(e for name, _, _, e in rows if name == p) for p in ("single", "double")}
     assert worst["double"] < worst["single"] < 1e-4
 
 
 def test_graph_places_no_two_boxes_on_one_another_and_readers_below():
     sources = {f"s{i}": [f"s{j}" for j in range(max(0, i - 3), i)] + ["root"] for i in range(45)} | {"root": []}
-    wires, _, _ = _figures_graph.grouped(sources, {})
-    places = _figures_graph.layout(wires)
+    wires, _, _ = recipe_graph.grouped(sources, {})
+    places = recipe_graph.layout(wires)
     by_row = sorted((y, x) for x, y in places.values())
     assert all(a[0] != b[0] or b[1] - a[1] >= 1 for a, b in itertools.pairwise(by_row))
     assert all(places[b][1] < places[name][1] for name, befores in wires.items() for b in befores)
@@ -231,7 +232,7 @@ def test_graph_places_no_two_boxes_on_one_another_and_readers_below():
 
 def test_graph_groups_items_and_a_family_that_ran_at_all_ran():
     sources = {"a[x]": [], "a[y]": [], "b": ["a[x]", "a[y]"]}
-    wires, looks, counts = _figures_graph.grouped(sources, {"a[x]": "cached", "a[y]": "run", "b": "asleep"})
+    wires, looks, counts = recipe_graph.grouped(sources, {"a[x]": "cached", "a[y]": "run", "b": "asleep"})
     assert wires == {"a": [], "b": ["a"]}
     assert looks == {"a": "run", "b": "cached"}
     assert counts == {"a": 2, "b": 1}
@@ -259,19 +260,19 @@ def small_recipe(level: float = 1.0) -> Recipe:
 
 def test_a_second_run_draws_nothing_and_a_changed_value_draws_again(tmp_path, monkeypatch):
     store = Store(tmp_path)
-    first, missing = _figures.pictures(run(small_recipe(), store), Shelf(store))
+    first, missing = run_pictures.pictures(run(small_recipe(), store), Shelf(store))
     assert set(first) == {"overview", "graph"}
     assert "psf" in missing["psf"]
     with monkeypatch.context() as m:
         m.setitem(sys.modules, "matplotlib", None)
         m.setitem(sys.modules, "matplotlib.figure", None)
         store = Store(tmp_path)
-        second, _ = _figures.pictures(run(small_recipe(), store), Shelf(store))
+        second, _ = run_pictures.pictures(run(small_recipe(), store), Shelf(store))
         assert second["overview"] == first["overview"]
         assert set(second) == set(first)
         with pytest.raises(ImportError):
-            _figures.pictures(run(small_recipe(0.5), Store(tmp_path)), Shelf(store))
-    third, _ = _figures.pictures(run(small_recipe(0.5), Store(tmp_path)), Shelf(store))
+            run_pictures.pictures(run(small_recipe(0.5), Store(tmp_path)), Shelf(store))
+    third, _ = run_pictures.pictures(run(small_recipe(0.5), Store(tmp_path)), Shelf(store))
     assert third["overview"] != first["overview"]
 
 
@@ -291,7 +292,7 @@ def test_every_figure_names_a_function_and_its_arguments():
     import importlib
     import inspect
 
-    for figure in _roles.FIGURES:
+    for figure in contents.FIGURES:
         module, _, name = figure.draw.partition(":")
         draw = getattr(importlib.import_module(f"neusee.workflows.{module}"), name)
         arguments = inspect.signature(draw).parameters

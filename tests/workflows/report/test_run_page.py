@@ -15,12 +15,8 @@ from neusee.nodes import Check, node
 from neusee.workflows.graph.diagnostics import Mark
 from neusee.workflows.graph.recipe_graph import Expectation, Recipe, Step
 from neusee.workflows.placement.tasks_and_devices import Schedule, Slot
-from neusee.workflows.report import result_numbers as _numbers
-from neusee.workflows.report import run_folder as _files
-from neusee.workflows.report import run_page as report
-from neusee.workflows.report import run_pictures as _figures
-from neusee.workflows.report import run_timing as _timing
-from neusee.workflows.report.figures import gantt as _timeline
+from neusee.workflows.report import result_numbers, run_folder, run_page, run_pictures, run_timing
+from neusee.workflows.report.figures import gantt
 from neusee.workflows.report.run_folder import find_run, new_run
 from neusee.workflows.simulation.simulate_recipe import simulate
 from neusee.workflows.store.result_store import Store
@@ -61,7 +57,7 @@ def test_latest_is_a_file_where_links_fail(tmp_path, monkeypatch):
     def refuse(self, *args, **kwargs):
         raise OSError("no links here")
 
-    monkeypatch.setattr(_files.Path, "symlink_to", refuse)
+    monkeypatch.setattr(run_folder.Path, "symlink_to", refuse)
     with new_run(tmp_path, "x", "0" * 8) as run:
         run.write("provenance.json", "{}")
     assert (tmp_path / "latest").read_text().strip() == run.path.name
@@ -202,12 +198,12 @@ def test_outputs_read_back_as_they_are(done):
 
 @pytest.mark.parametrize(("promised", "met"), [(6.0, True), (6.05, True), (6.1, False), (-6.0, False)])
 def test_expected_numbers_are_met_or_missed(promised, met):
-    rows = _numbers.expected(recipe(promised=promised), lambda step: torch.tensor([6.0, 12.0]))
+    rows = result_numbers.expected(recipe(promised=promised), lambda step: torch.tensor([6.0, 12.0]))
     assert [r["ok"] for r in rows] == [met]
 
 
 def test_a_number_that_is_none_is_missed():
-    rows = _numbers.expected(recipe(promised=6.0), lambda step: torch.tensor([float("nan"), 12.0]))
+    rows = result_numbers.expected(recipe(promised=6.0), lambda step: torch.tensor([float("nan"), 12.0]))
     assert not rows[0]["ok"]
 
 
@@ -223,7 +219,7 @@ def test_a_missed_number_and_a_failed_check_stand_first(tmp_path):
 def test_the_page_can_be_written_again_from_what_is_stored(done):
     before = done.page.read_bytes()
     done.page.unlink()
-    assert report.rebuild(done.folder).read_bytes() == before
+    assert run_page.rebuild(done.folder).read_bytes() == before
 
 
 def test_a_second_run_reads_the_same_numbers_and_says_where_they_come_from(done, tmp_path):
@@ -251,7 +247,7 @@ def test_a_second_run_reads_the_same_numbers_and_says_where_they_come_from(done,
     ],
 )
 def test_the_unit_of_a_result_is_read_from_the_docstring(line, unit):
-    assert report.unit_of(f"Say.\n\n    {line}\n") == unit
+    assert run_page.unit_of(f"Say.\n\n    {line}\n") == unit
 
 
 # --- time -------------------------------------------------------------------------------------------------------------
@@ -276,13 +272,13 @@ def test_time_is_added_up_with_each_key_once():
         row("e", "run", 2.0, began=0.75, kept=False),
         row("twin of e", "cached", 2.0, key="e"),
     ]
-    found = _timing.timing(rows, planned=2.5)
+    found = run_timing.timing(rows, planned=2.5)
     assert (found["ran"], found["served"], found["steps"], found["told"]) == (2, 4, 7, 1)
     assert (found["seconds"], found["span"], found["planned"]) == (3.0, 2.25, 2.5)
     assert (found["predicted"], found["actual"]) == (1.5, 1.0)
     assert (found["saved"], found["share"]) == (8.0, 8 / 11)
     assert (found["read"], found["written"]) == (400, 1000)
-    assert _timing.said_of(found) == [
+    assert run_timing.said_of(found) == [
         "2 of 7 steps ran: 3 s of computing.",
         "By earlier runs the 1 that ran before were expected to take 1.5 s; they took 1 s.",
         "The plan, with branches side by side, was 2.5 s long; it took 2.25 s.",
@@ -293,7 +289,7 @@ def test_time_is_added_up_with_each_key_once():
 
 def test_a_result_that_is_read_counts_before_the_same_one_asleep():
     rows = [row("a", "asleep", 3.0, key="k"), row("b", "cached", 3.0, key="k", bytes=70)]
-    found = _timing.timing(rows)
+    found = run_timing.timing(rows)
     assert (found["read"], found["saved"], found["share"], found["planned"]) == (70, 3.0, 1.0, None)
 
 
@@ -314,7 +310,7 @@ def test_the_plan_is_compared_where_all_that_ran_was_known(tmp_path):
 
     def planned(done, slots):
         told = replace(result, done=done, schedule=Schedule(slots, 3.0, {"cpu": 0.0}, 0.0))
-        return report.document(told, [], [], {})["timing"]["planned"]
+        return run_page.document(told, [], [], {})["timing"]["planned"]
 
     assert planned(known, slots) == 3.0
     assert planned(known, slots[:1]) is None
@@ -327,7 +323,7 @@ def test_a_page_of_before_there_was_an_account_of_time_is_still_written(done):
     del doc["timing"]
     doc["steps"] = [{k: v for k, v in s.items() if k != "predicted"} for s in doc["steps"]]
     path.write_text(json.dumps(doc))
-    assert "Time" in report.rebuild(done.folder).read_text()
+    assert "Time" in run_page.rebuild(done.folder).read_text()
 
 
 def test_the_page_shows_what_each_step_was_expected_to_take(done):
@@ -335,7 +331,7 @@ def test_the_page_shows_what_each_step_was_expected_to_take(done):
     assert text.count(" expected</span>") == sum(s["predicted"] is not None for s in done.document["steps"])
     doc = dict(done.document)
     doc["steps"] = [{**s, "predicted": 1.25} for s in doc["steps"]]
-    assert report.page(doc, {}).count("1.250 expected</span>") == 2
+    assert run_page.page(doc, {}).count("1.250 expected</span>") == 2
 
 
 def test_every_row_of_the_page_has_a_cell_for_each_column(done):
@@ -360,15 +356,15 @@ def test_only_what_was_known_is_drawn_as_the_plan(tmp_path, monkeypatch):
     }
     plan = Schedule((Slot("number", "cpu:1", 0.0, 1.0), Slot("truth", "cpu:1", 1.0, 99.0)), 99.0, {"cpu:1": 0.0}, 0.0)
     seen = {}
-    monkeypatch.setattr(_timeline, "timeline", lambda **given: seen.update(given) or b"png")
-    assert _figures.timeline(replace(result, done=told, schedule=plan)) == b"png"
+    monkeypatch.setattr(gantt, "timeline", lambda **given: seen.update(given) or b"png")
+    assert run_pictures.timeline(replace(result, done=told, schedule=plan)) == b"png"
     assert seen["rows"] == [("number", "cpu:1", 0.0, 2.0), ("truth", "cpu:1", 2.0, 1.0)]
     assert [slot.task for slot in seen["schedule"].slots] == ["number"]
     told = {name: replace(done, predicted=1.5) for name, done in told.items()}
-    _figures.timeline(replace(result, done=told, schedule=replace(plan, slots=plan.slots[:1])))
+    run_pictures.timeline(replace(result, done=told, schedule=replace(plan, slots=plan.slots[:1])))
     assert [(s.task, s.device, s.start, s.end, s.after) for s in seen["schedule"].slots] == [
         ("number", "cpu:1", 0.0, 1.5, ""),
         ("truth", "cpu:1", 1.5, 3.0, "number"),
     ]
-    _figures.timeline(replace(result, schedule=None))
+    run_pictures.timeline(replace(result, schedule=None))
     assert seen["schedule"].slots == ()

@@ -9,11 +9,11 @@ from typer.testing import CliRunner
 from neusee.workflows import load
 from neusee.workflows.cli.app import app
 from neusee.workflows.engine.runner import run
-from neusee.workflows.report import run_page as report
+from neusee.workflows.report import run_page
 from neusee.workflows.report.tolerance_spent import said_of_economies, spent
 from neusee.workflows.simulation.simulate_recipe import simulate
 from neusee.workflows.store.result_store import Store
-from neusee.workflows.tolerance import cheaper_steps as _economy
+from neusee.workflows.tolerance import cheaper_steps
 from neusee.workflows.tolerance.cheaper_steps import economised
 from neusee.workflows.tolerance.error_norm import error_of
 
@@ -125,7 +125,7 @@ def test_the_command_line_shows_what_stands_in(tmp_path, monkeypatch):
 
 def test_the_command_line_shows_a_run_that_could_not_prove_its_tolerance(tmp_path, monkeypatch):
     monkeypatch.setenv("NEUSEE_CACHE", str(tmp_path / "cache"))
-    monkeypatch.setattr(_economy, "_LEAST", 0.0)  # so fine a tolerance would not even be tried
+    monkeypatch.setattr(cheaper_steps, "_LEAST", 0.0)  # so fine a tolerance would not even be tried
     words = ["run", "first_light", *SMALL, "tolerance=1e-7", "--out", str(tmp_path / "runs")]
     done = CliRunner().invoke(app, words)
     assert done.exit_code == 0, done.output
@@ -141,4 +141,4 @@ def test_the_page_says_it(recipe, store, tmp_path):
     assert max(doc["spent"]["bounds"].values()) <= recipe.tolerance
     whole = simulate(replace(recipe, keep_all=True), store, tmp_path / "runs", ["neusee"])
     assert "every step was computed in full" in whole.page.read_text()
-    assert "measured beside --keep-all" in report.page({**doc, "spent": spent(run(recipe, store))}, {})
+    assert "measured beside --keep-all" in run_page.page({**doc, "spent": spent(run(recipe, store))}, {})

@@ -11,12 +11,11 @@ import pytest
 import torch
 
 from neusee.nodes.values import Psf
-from neusee.workflows.store import band_files as _blobs
-from neusee.workflows.store import serialization as _codec
+from neusee.workflows.store import band_files, serialization
 from neusee.workflows.store.band_files import Blobs, Damaged, Stacked, bytes_of
 
 PAGES = (4, 32, 64)  #: float32 slices of two pages
-DTYPES = [*_codec._DTYPES, torch.complex64, torch.complex128]
+DTYPES = [*serialization._DTYPES, torch.complex64, torch.complex128]
 
 
 @pytest.fixture
@@ -121,7 +120,7 @@ def test_where_nothing_can_be_mapped_it_is_copied(blobs, monkeypatch, lacking):
 
     x = stack(*PAGES)
     names = kept(blobs, x)
-    monkeypatch.setattr(_blobs, *(("_LIBC", None) if lacking == "no libc" else ("_map", refuse)))
+    monkeypatch.setattr(band_files, *(("_LIBC", None) if lacking == "no libc" else ("_map", refuse)))
     found = blobs.read(names, x.shape, x.dtype)
     assert str(blobs.root) not in maps()
     assert torch.equal(found, x)
@@ -233,11 +232,11 @@ def test_a_layout_names_its_blobs_and_gives_the_stack_back(blobs):
     names = names_of(x)
     psf = Psf(Stacked(x, tuple(names)), Stacked(peak, tuple(f"{n[:-2]}.1" for n in names)))
     value = {"psf": psf, "list": [torch.ones(3), psf.intensity], "items": "stacked"}
-    layout, tensors = _codec.pack(value, blobs)
+    layout, tensors = serialization.pack(value, blobs)
     assert [t.tolist() for t in tensors] == [[1.0, 1.0, 1.0]]
     layout = json.loads(json.dumps(layout))
-    assert set(_codec.blobs_in(layout)) == {*names, *psf.clear_peak.names}
-    found = _codec.unpack(layout, tensors, Blobs(blobs.root))
+    assert set(serialization.blobs_in(layout)) == {*names, *psf.clear_peak.names}
+    found = serialization.unpack(layout, tensors, Blobs(blobs.root))
     assert type(found["psf"]) is Psf
     assert torch.equal(found["psf"].intensity, x)
     assert torch.equal(found["psf"].clear_peak, peak)
@@ -247,25 +246,25 @@ def test_a_layout_names_its_blobs_and_gives_the_stack_back(blobs):
 
 def test_without_blobs_a_stack_is_a_tensor_like_any_other():
     x = stack(*PAGES)
-    layout, tensors = _codec.pack([Stacked(x, ("aa.0",) * 4), 3])
-    assert _codec.blobs_in(layout) == []
-    assert torch.equal(_codec.unpack(layout, tensors)[0], x)
+    layout, tensors = serialization.pack([Stacked(x, ("aa.0",) * 4), 3])
+    assert serialization.blobs_in(layout) == []
+    assert torch.equal(serialization.unpack(layout, tensors)[0], x)
 
 
 def test_a_layout_refuses_a_blob_with_another_content(blobs):
     x = stack(*PAGES)
-    layout, tensors = _codec.pack(Stacked(x, tuple(names_of(x))), blobs)
+    layout, tensors = serialization.pack(Stacked(x, tuple(names_of(x))), blobs)
     os.unlink(file_of(blobs, names_of(x)[1]))
     blobs.write(names_of(x)[1], x[1] + 1)
     with pytest.raises(ValueError, match="something else"):
-        _codec.unpack(layout, tensors, blobs)
+        serialization.unpack(layout, tensors, blobs)
 
 
 def test_a_layout_with_blobs_needs_their_folder(blobs):
     x = stack(*PAGES)
-    layout, tensors = _codec.pack(Stacked(x, tuple(names_of(x))), blobs)
+    layout, tensors = serialization.pack(Stacked(x, tuple(names_of(x))), blobs)
     with pytest.raises(ValueError, match="apart"):
-        _codec.unpack(layout, tensors)
+        serialization.unpack(layout, tensors)
 
 
 @pytest.mark.parametrize("shape", [(1, 4), (4, 1), (1, 1), (3, 4)])

@@ -11,8 +11,7 @@ import torch
 from hypothesis import given
 from hypothesis import strategies as st
 
-from neusee.workflows.store import budget_eviction as _evict
-from neusee.workflows.store import shared_folder as _disk
+from neusee.workflows.store import budget_eviction, shared_folder
 from neusee.workflows.store.band_files import Stacked
 from neusee.workflows.store.budget_eviction import Candidate, bytes_of, chosen
 from neusee.workflows.store.derived_files import Shelf
@@ -116,7 +115,7 @@ def test_a_budget_is_kept_while_writing(tmp_path):
     for i in range(40):
         assert put(store, i, seconds=float(i + 1))
         assert len(payloads(tmp_path)) <= 10
-        assert _evict.total(store.disk) <= 11 * SIZE
+        assert budget_eviction.total(store.disk) <= 11 * SIZE
     assert len(kept(tmp_path)) >= 7
     assert min(kept(tmp_path)) > 25
     for found in (store, Store(tmp_path)):
@@ -191,7 +190,7 @@ def test_a_dry_run_says_what_would_go_and_touches_nothing(tmp_path):
     assert said.orphans == done.orphans == 1
     assert abs(said.freed - done.freed) < 3000
     assert kept(tmp_path) == {3, 4}
-    assert done.left == _evict.total(store.disk)
+    assert done.left == budget_eviction.total(store.disk)
 
 
 def test_a_reader_keeps_what_it_has_mapped(tmp_path):
@@ -239,14 +238,14 @@ def test_small_values_go_too(tmp_path):
 
 def test_on_a_full_disk_not_even_receipts_are_written(tmp_path, monkeypatch):
     put(Store(tmp_path), 1)
-    rename = _disk.Disk.rename
+    rename = shared_folder.Disk.rename
 
     def full(self, part, path):
         if path.endswith(".json"):
             raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
         rename(self, part, path)
 
-    monkeypatch.setattr(_disk.Disk, "rename", full)
+    monkeypatch.setattr(shared_folder.Disk, "rename", full)
     assert Store(tmp_path).gc(budget=0).evicted == (key_of(1),)
     assert not [path for path in tmp_path.rglob("*") if key_of(1) in path.name]
 
@@ -255,14 +254,14 @@ def test_on_a_full_disk_not_even_receipts_are_written(tmp_path, monkeypatch):
 def test_what_is_not_ours_to_remove_is_passed_over(tmp_path, monkeypatch, number):
     for i in range(3):
         put(Store(tmp_path), i, seconds=float(i))
-    rename = _disk.Disk.rename
+    rename = shared_folder.Disk.rename
 
     def mine(self, part, path):
         if key_of(0) in path:
             raise OSError(number, os.strerror(number))
         rename(self, part, path)
 
-    monkeypatch.setattr(_disk.Disk, "rename", mine)
+    monkeypatch.setattr(shared_folder.Disk, "rename", mine)
     swept = Store(tmp_path).gc(budget=2 * SIZE)
     assert swept.refused == (key_of(0),)
     assert key_of(1) in swept.evicted
@@ -272,9 +271,9 @@ def test_what_is_not_ours_to_remove_is_passed_over(tmp_path, monkeypatch, number
 
 def test_a_budget_that_cannot_be_kept_is_not_counted_at_each_write(tmp_path, monkeypatch):
     store, counted = Store(tmp_path, budget=50 * SIZE), []
-    total = _evict.total
-    monkeypatch.setattr(_evict, "total", lambda disk: counted.append(1) or total(disk))
-    monkeypatch.setattr(_evict, "drop", lambda disk, key: False)
+    total = budget_eviction.total
+    monkeypatch.setattr(budget_eviction, "total", lambda disk: counted.append(1) or total(disk))
+    monkeypatch.setattr(budget_eviction, "drop", lambda disk, key: False)
     for i in range(100):
         put(store, i)
     assert len(kept(tmp_path)) == 100
@@ -344,16 +343,16 @@ def test_bands_go_with_the_last_value_that_has_them(tmp_path):
 
 
 def test_bands_that_are_swept_before_their_value_is_named_are_written_again(tmp_path, monkeypatch):
-    store, lock = Store(tmp_path), _disk.Disk.lock
+    store, lock = Store(tmp_path), shared_folder.Disk.lock
 
     def sweeping(self):
-        monkeypatch.setattr(_disk.Disk, "lock", lock)
+        monkeypatch.setattr(shared_folder.Disk, "lock", lock)
         assert bands(tmp_path) == {1, 2}
         Store(tmp_path).gc()
         assert bands(tmp_path) == set()
         return lock(self)
 
-    monkeypatch.setattr(_disk.Disk, "lock", sweeping)
+    monkeypatch.setattr(shared_folder.Disk, "lock", sweeping)
     store.put(key_of(1), banded([1, 2]), {})
     assert torch.equal(Store(tmp_path).get(key_of(1)), banded([1, 2]).tensor)
 

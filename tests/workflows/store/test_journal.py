@@ -12,7 +12,7 @@ import torch
 from hypothesis import given
 from hypothesis import strategies as st
 
-from neusee.workflows.store import journal as _journal
+from neusee.workflows.store import journal
 from neusee.workflows.store.result_store import Store
 
 
@@ -153,7 +153,7 @@ def test_a_row_knows_its_kept_value_after_compaction(tmp_path):
 
 
 def test_many_superseded_lines_go_by_themselves(tmp_path, monkeypatch):
-    monkeypatch.setattr(_journal, "_SPARE", 50)
+    monkeypatch.setattr(journal, "_SPARE", 50)
     store = Store(tmp_path)
     for i in range(60):
         store.note(key_of(i % 4), {**about(i % 4), "seconds": float(i)})
@@ -173,7 +173,7 @@ def test_where_it_cannot_be_written_it_is_still_read(tmp_path, monkeypatch, numb
     monkeypatch.setattr(os, "replace", fail)
     store = Store(tmp_path)
     assert store.journal.rows() == rows
-    monkeypatch.setattr(_journal._sidecar, "each", lambda disk: pytest.fail("all results were read twice"))
+    monkeypatch.setattr(journal.metadata, "each", lambda disk: pytest.fail("all results were read twice"))
     assert store.journal.of_step("s") == rows
 
 

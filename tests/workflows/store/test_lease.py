@@ -12,9 +12,8 @@ from concurrent.futures import ThreadPoolExecutor
 import pytest
 import torch
 
-from neusee.workflows.store import lease as _lease
-from neusee.workflows.store import process_owner as _owner
-from neusee.workflows.store import shared_folder as _disk
+from neusee.workflows.store import lease as lease_module
+from neusee.workflows.store import process_owner, shared_folder
 from neusee.workflows.store.lease import Lease
 from neusee.workflows.store.process_owner import Owner, me, owner_of
 from neusee.workflows.store.result_store import Store
@@ -110,7 +109,7 @@ def test_many_threads_one_holder(tmp_path):
 def test_of_two_who_find_that_a_holder_has_gone_one_is_first(tmp_path, monkeypatch):
     first, second = Store(tmp_path), Store(tmp_path)
     lease = first.claim(KEY)
-    monkeypatch.setattr(_lease, "_look", lambda path: None)  # as it was a moment ago
+    monkeypatch.setattr(lease_module, "_look", lambda path: None)  # as it was a moment ago
     assert second.claim(KEY) is None
     monkeypatch.undo()
     with lease:
@@ -131,7 +130,7 @@ def test_a_live_holder_elsewhere_is_waited_for_and_a_killed_one_taken_over(tmp_p
 def test_a_stopped_holder_is_taken_over_and_may_go_on(tmp_path, holder):
     process, store = holder(), Store(tmp_path)
     process.send_signal(signal.SIGSTOP)
-    while Owner(_owner.host(), process.pid, _owner._process(process.pid)[1]).state == "alive":
+    while Owner(process_owner.host(), process.pid, process_owner._process(process.pid)[1]).state == "alive":
         time.sleep(0.001)
     with store.claim(KEY):
         process.send_signal(signal.SIGCONT)
@@ -150,16 +149,16 @@ def test_what_a_killed_process_left_goes_with_the_next_write(tmp_path, holder):
 
 
 def test_a_number_that_another_process_has_now_is_no_owner(tmp_path):
-    held_by(tmp_path, f"{_owner.host()}-{os.getpid()}-1 nonce\n")
-    held_by(tmp_path, f"{_owner.host()}-1-1 nonce\n", "cd" + "0" * 30)
+    held_by(tmp_path, f"{process_owner.host()}-{os.getpid()}-1 nonce\n")
+    held_by(tmp_path, f"{process_owner.host()}-1-1 nonce\n", "cd" + "0" * 30)
     with Store(tmp_path).claim(KEY), Store(tmp_path).claim("cd" + "0" * 30):
         pass
 
 
 def test_ended_but_unburied_is_dead():
     process = subprocess.Popen([sys.executable, "-c", ""])
-    owner = Owner(_owner.host(), process.pid, _owner._process(process.pid)[1])
-    while _owner._process(process.pid)[0] != "Z":
+    owner = Owner(process_owner.host(), process.pid, process_owner._process(process.pid)[1])
+    while process_owner._process(process.pid)[0] != "Z":
         time.sleep(0.001)
     assert owner.state == "dead"
     process.wait()
@@ -171,8 +170,8 @@ class Clock:
 
     def __init__(self, monkeypatch):
         self.now = 1000.0
-        monkeypatch.setattr(_lease.time, "monotonic", lambda: self.now)
-        self.jump = lambda by: monkeypatch.setattr(_lease.time, "time", lambda: 1.9e9 + by)
+        monkeypatch.setattr(lease_module.time, "monotonic", lambda: self.now)
+        self.jump = lambda by: monkeypatch.setattr(lease_module.time, "time", lambda: 1.9e9 + by)
 
 
 @pytest.mark.parametrize("text", [FAR + " nonce\n", "", "\xff\xfe", "not-an-owner", "x" * 10_000])
@@ -180,7 +179,7 @@ def test_a_foreign_holder_is_dead_after_a_window_without_a_heartbeat(tmp_path, m
     clock, store = Clock(monkeypatch), Store(tmp_path)
     held_by(tmp_path, text)
     assert store.claim(KEY) is None
-    clock.now += _lease.WINDOW - 0.1
+    clock.now += lease_module.WINDOW - 0.1
     assert store.claim(KEY) is None
     assert Store(tmp_path).claim(KEY) is None
     clock.now += 0.2
@@ -196,8 +195,8 @@ def test_a_foreign_holder_that_beats_lives_however_the_clocks_jump(tmp_path, mon
         clock.jump(jump * (i % 2))
         os.utime(path, (1e9, 1e9))
         assert store.claim(KEY) is None
-        clock.now += _lease.WINDOW + 1
-        _lease.beat(path)
+        clock.now += lease_module.WINDOW + 1
+        lease_module.beat(path)
     assert path.read_text().startswith(FAR)
 
 
@@ -207,7 +206,7 @@ def test_no_clock_makes_our_own_files_old(tmp_path, monkeypatch, jump):
     with store.claim(KEY), store.disk.temporary(KEY) as (part, _):
         os.utime(part, (1e9, 1e9))
         os.utime(tmp_path / "tmp" / f"{KEY}.lease", (1e9, 1e9))
-        monkeypatch.setattr(_disk.time, "time", lambda: time.perf_counter() + 1.9e9 + jump)
+        monkeypatch.setattr(shared_folder.time, "time", lambda: time.perf_counter() + 1.9e9 + jump)
         other = Store(tmp_path)
         assert other.put("cd" + "0" * 30, torch.zeros(5000), {})
         assert other.gc().orphans == 0
@@ -242,7 +241,7 @@ def test_the_store_may_be_removed_under_a_run(tmp_path):
 
 
 def test_heartbeats_are_seen_while_a_lease_is_held_and_end_after_it(tmp_path, monkeypatch):
-    monkeypatch.setattr(_lease, "BEAT", 0.01)
+    monkeypatch.setattr(lease_module, "BEAT", 0.01)
     while any(t.name == "neusee-leases" for t in threading.enumerate()):
         time.sleep(0.01)  # one of an earlier test
     store = Store(tmp_path)
@@ -266,18 +265,18 @@ def test_heartbeats_are_seen_while_a_lease_is_held_and_end_after_it(tmp_path, mo
 @FORKS
 def test_two_may_clear_the_badges_away_at_once(tmp_path, monkeypatch):
     places = {str(i): str(tmp_path / str(i)) for i in range(3)}
-    monkeypatch.setattr(_lease, "_badges", dict(places))
+    monkeypatch.setattr(lease_module, "_badges", dict(places))
     removed = []
 
     def unlink(path):
         removed.append(path)
         if len(removed) == 1:
-            _lease._retire()
+            lease_module._retire()
 
-    monkeypatch.setattr(_lease.os, "unlink", unlink)
-    _lease._retire()
+    monkeypatch.setattr(lease_module.os, "unlink", unlink)
+    lease_module._retire()
     assert sorted(removed) == sorted(places.values())
-    assert _lease._badges == {}
+    assert lease_module._badges == {}
 
 
 def test_a_forked_child_holds_nothing(tmp_path):
@@ -331,8 +330,8 @@ def test_a_disk_that_fails_gives_leases_that_do_nothing(tmp_path, monkeypatch, n
 
 def test_two_who_see_the_same_dead_holder_do_not_both_take_over(tmp_path):
     one, two = Store(tmp_path), Store(tmp_path)
-    path = held_by(tmp_path, f"{_owner.host()}-{os.getpid()}-1 nonce\n")
-    found = _lease._look(path)
+    path = held_by(tmp_path, f"{process_owner.host()}-{os.getpid()}-1 nonce\n")
+    found = lease_module._look(path)
     lease = one._leases._taken_over(KEY, str(path), found)
     with pytest.raises(FileExistsError):
         two._leases._taken_over(KEY, str(path), found)

@@ -15,7 +15,7 @@ import pytest
 import torch
 from fsspec.implementations.memory import MemoryFileSystem
 
-from neusee.workflows.store import remote_files as _far
+from neusee.workflows.store import remote_files
 from neusee.workflows.store.band_files import Stacked
 from neusee.workflows.store.metadata import seal, unseal
 from neusee.workflows.store.remote_store import RemoteStore, local_layer, open_store
@@ -174,7 +174,7 @@ def test_a_listing_grows_old(bad, monkeypatch):
     one, two = bad("one"), bad("two")
     assert not two.has(KEY)
     one.put(KEY, BIG, ABOUT)
-    monkeypatch.setattr(_far, "_FRESH", 0.0)
+    monkeypatch.setattr(remote_files, "_FRESH", 0.0)
     assert two.has(KEY)
 
 
@@ -355,7 +355,7 @@ def test_a_remote_that_comes_back_is_used_again(bad, monkeypatch):
     with pytest.warns(UserWarning, match="the network is down"):
         store.put(KEY, BIG, ABOUT)
     Weather.down = False
-    monkeypatch.setattr(_far.time, "monotonic", lambda now=time.monotonic: now() + 100)
+    monkeypatch.setattr(remote_files.time, "monotonic", lambda now=time.monotonic: now() + 100)
     other = "ab" + "2" * 30
     store.put(other, BIG, ABOUT)
     assert bad("two").has(other)

@@ -19,16 +19,14 @@ from hypothesis import strategies as st
 from safetensors.torch import load_file
 
 from neusee.nodes.values import Bands, Pupil
-from neusee.workflows.store import band_files as _blobs
-from neusee.workflows.store import metadata as _sidecar
-from neusee.workflows.store import payload as _payload
-from neusee.workflows.store import serialization as _codec
+from neusee.workflows.store import band_files, metadata, serialization
+from neusee.workflows.store import payload as payload_module
 from neusee.workflows.store.result_store import INLINE, Store, default_root
 
 KEY = "ab" + "0" * 30
 SUM = xxhash.xxh3_128_hexdigest
 BIG = torch.arange(5000, dtype=torch.float32)
-DTYPES = [*_codec._DTYPES, torch.complex64, torch.complex128]
+DTYPES = [*serialization._DTYPES, torch.complex64, torch.complex128]
 
 
 def bits(x):
@@ -141,7 +139,7 @@ def test_entries_are_listed_without_reading_them(tmp_path, monkeypatch):
     keys = [f"{i:02x}" + "1" * 30 for i in (200, 3, 77)]
     for key in keys:
         store.put(key, BIG, {"step": key[:2], "seconds": 1.5})
-    monkeypatch.setattr(_codec, "read", lambda *a: pytest.fail("a payload was read"))
+    monkeypatch.setattr(serialization, "read", lambda *a: pytest.fail("a payload was read"))
     found = dict(Store(tmp_path).entries())
     assert list(found) == sorted(keys)
     assert all(about["bytes"] == BIG.nbytes and about["seconds"] == 1.5 for about in found.values())
@@ -428,7 +426,7 @@ def test_a_result_that_takes_its_name_while_one_looks_is_not_damaged(tmp_path, m
     writer, reader = Store(tmp_path), Store(tmp_path)
     looks = iter([True])
 
-    def read(disk, key, read=_sidecar.read):
+    def read(disk, key, read=metadata.read):
         if next(looks, False):
             with suppress(FileNotFoundError):
                 read(disk, key)
@@ -436,7 +434,7 @@ def test_a_result_that_takes_its_name_while_one_looks_is_not_damaged(tmp_path, m
             raise FileNotFoundError(disk.path(key, "json"))
         return read(disk, key)
 
-    monkeypatch.setattr(_sidecar, "read", read)
+    monkeypatch.setattr(metadata, "read", read)
     assert reader.has(KEY)
     same(reader.get(KEY), BIG)
     assert not (tmp_path / "bad").exists()
@@ -444,9 +442,9 @@ def test_a_result_that_takes_its_name_while_one_looks_is_not_damaged(tmp_path, m
 
 def test_entries_from_before_there_were_receipts_are_values(tmp_path):
     keep(tmp_path, BIG)
-    about = _sidecar.unseal(sidecar(tmp_path).read_bytes())
+    about = metadata.unseal(sidecar(tmp_path).read_bytes())
     del about["kept"], about["payload"]["stamp"]
-    sidecar(tmp_path).write_bytes(_sidecar.seal(about))
+    sidecar(tmp_path).write_bytes(metadata.seal(about))
     assert Store(tmp_path).has(KEY)
     for verify in ("always", "sampled", "never"):
         same(Store(tmp_path, verify=verify).get(KEY), BIG)
@@ -480,14 +478,14 @@ def quietly_flipped(root):
     """A bit that changes without the file being touched, as a disk may do it; the file's stamp is put back."""
     stamp, path = payload(root).stat(), payload(root)
     flip(path, 0.9)
-    about = _sidecar.unseal(sidecar(root).read_bytes())
+    about = metadata.unseal(sidecar(root).read_bytes())
     os.utime(path, ns=(stamp.st_atime_ns, stamp.st_mtime_ns))
-    about["payload"]["stamp"] = _payload.stamp_of(str(path))
-    sidecar(root).write_bytes(_sidecar.seal(about))
+    about["payload"]["stamp"] = payload_module.stamp_of(str(path))
+    sidecar(root).write_bytes(metadata.seal(about))
 
 
 def test_sampled_finds_what_was_written_to_at_once(tmp_path, monkeypatch):
-    monkeypatch.setattr(_payload._draw, "random", lambda: 0.999)
+    monkeypatch.setattr(payload_module._draw, "random", lambda: 0.999)
     keep(tmp_path, BIG)
     same(Store(tmp_path, verify="sampled").get(KEY), BIG)
     flip(payload(tmp_path), 0.9)
@@ -499,7 +497,7 @@ def test_sampled_finds_what_changed_by_itself_one_time_in_twenty(tmp_path, monke
     keep(tmp_path, BIG)
     quietly_flipped(tmp_path)
     draws = [(i + 0.5) / 100 for i in reversed(range(100))]
-    monkeypatch.setattr(_payload._draw, "random", lambda: draws.pop(0))
+    monkeypatch.setattr(payload_module._draw, "random", lambda: draws.pop(0))
     for _ in range(95):
         assert not torch.equal(Store(tmp_path, verify="sampled").get(KEY), BIG)
     with pytest.warns(UserWarning, match="is damaged"), pytest.raises(KeyError):
@@ -532,10 +530,10 @@ def test_never_looks_at_the_size_when_it_loads(tmp_path):
 
 
 def test_bands_apart_are_trusted_in_the_same_way(tmp_path, monkeypatch):
-    stack = _blobs.Stacked(torch.rand(3, 2000), ("a" * 32, "b" * 32, "c" * 32))
+    stack = band_files.Stacked(torch.rand(3, 2000), ("a" * 32, "b" * 32, "c" * 32))
     Store(tmp_path).put(KEY, stack, {"bytes": 24000})
     assert Store(tmp_path).about(KEY)["bytes"] == 24000
-    monkeypatch.setattr(_payload._draw, "random", lambda: 0.999)
+    monkeypatch.setattr(payload_module._draw, "random", lambda: 0.999)
     for verify in ("always", "sampled", "never"):
         same(Store(tmp_path, verify=verify).get(KEY), stack.tensor)
     band = tmp_path / "bands" / "bb" / ("b" * 32)

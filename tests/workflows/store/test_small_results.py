@@ -9,7 +9,7 @@ import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from neusee.workflows.store import small_results as _brief
+from neusee.workflows.store import small_results
 from neusee.workflows.store.result_store import INLINE, Store
 from neusee.workflows.store.shared_folder import Disk
 from neusee.workflows.store.small_results import Brief
@@ -94,7 +94,7 @@ def test_where_no_line_can_be_written_there_is_one_warning(tmp_path, monkeypatch
 
 
 def test_the_older_half_goes_when_there_is_too_much(tmp_path, monkeypatch):
-    monkeypatch.setattr(_brief, "MOST", 4000)
+    monkeypatch.setattr(small_results, "MOST", 4000)
     jotted(tmp_path, 40)
     Store(tmp_path).has(key(99))
     brief = Brief(Disk(tmp_path))

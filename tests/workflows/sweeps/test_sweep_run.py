@@ -14,7 +14,7 @@ import torch
 from neusee.workflows.engine.node_call import RunError
 from neusee.workflows.graph.diagnostics import RecipeError
 from neusee.workflows.store.result_store import Store
-from neusee.workflows.sweeps import sweep_files as _sweep_files
+from neusee.workflows.sweeps import sweep_files
 from neusee.workflows.sweeps.sweep_run import run_sweep, sweep
 
 RECIPE = """\
@@ -169,7 +169,7 @@ def test_preflight_looks_at_every_point(recipe, store, nodes):
 
 
 def test_netcdf_without_its_packages_is_refused_before_anything_runs(recipe, store, nodes, monkeypatch):
-    monkeypatch.setattr(_sweep_files, "_PACKAGES", ("xarray", "no_such_package"))
+    monkeypatch.setattr(sweep_files, "_PACKAGES", ("xarray", "no_such_package"))
     told = refused(lambda: run_sweep(recipe, WORDS, netcdf=True, store=store))
     assert told == ['--netcdf |  | needs no_such_package: pip install "neusee[xarray]"']
     assert nodes.CALLS == []

@@ -20,9 +20,9 @@ from safetensors.torch import load_file
 from neusee.nodes.doe._learned import LEARNT
 from neusee.nodes.optics._aperture import stop
 from neusee.workflows import RecipeError, Store, as_function, load
-from neusee.workflows.cli import app as cli
+from neusee.workflows.cli import app
 from neusee.workflows.recipe.blocks.train_block import GRID, MaskSettings, Rates
-from neusee.workflows.training.mask_design import design_page as _design_page
+from neusee.workflows.training.mask_design import design_page
 from neusee.workflows.training.parallel.shared_graph import Shared
 from neusee.workflows.training.photograph_folder import Photographs
 from neusee.workflows.training.run_training import frozen, train
@@ -379,11 +379,11 @@ def command(tmp_path, monkeypatch, capfd):
     """Call the command line in a folder of its own; the exit code, stdout and stderr."""
     monkeypatch.setenv("NEUSEE_CACHE", str(tmp_path / "store"))
     monkeypatch.chdir(tmp_path)
-    monkeypatch.setattr(_design_page, "pictures", lambda *_: {})  # they take longer than what is tested
+    monkeypatch.setattr(design_page, "pictures", lambda *_: {})  # they take longer than what is tested
 
     def call(*words):
         with pytest.raises(SystemExit) as end:
-            cli.main(["train", *words])
+            app.main(["train", *words])
         return (end.value.code or 0, *capfd.readouterr())
 
     return call

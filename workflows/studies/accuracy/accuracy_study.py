@@ -23,7 +23,7 @@ from neusee.workflows.keys.engine_digest import engine
 from neusee.workflows.report.run_folder import RunFolder, new_run
 from neusee.workflows.report.study_page import page
 from neusee.workflows.store.result_store import Store
-from neusee.workflows.studies.accuracy import accuracy_report as report
+from neusee.workflows.studies.accuracy import accuracy_report
 from neusee.workflows.studies.accuracy.recipe_knobs import Knobs, changed, finest, knobs
 from neusee.workflows.studies.accuracy.single_steps import StepTried, that_matter, try_step
 from neusee.workflows.studies.accuracy.work_precision_points import TIMES, Bench, Measured, Point, Trial, now
@@ -81,11 +81,11 @@ def trials(recipe: Recipe, turned: Knobs, quick: bool) -> Iterator[Trial]:
     for tolerance in asked:
         other = replace(recipe, tolerance=tolerance, keep_all=False)
         own = tolerance == recipe.tolerance and not recipe.keep_all
-        yield Trial(report.TOLERANCE, report.power(tolerance), other, value=tolerance, own=own)
-    yield Trial(report.KEEP_ALL, "", replace(recipe, keep_all=True), own=recipe.keep_all)
+        yield Trial(accuracy_report.TOLERANCE, accuracy_report.power(tolerance), other, value=tolerance, own=own)
+    yield Trial(accuracy_report.KEEP_ALL, "", replace(recipe, keep_all=True), own=recipe.keep_all)
     for knob in turned.found:
         for change in knob.changes:
-            name = f"{knob.what} ({report.short(knob.name)})"
+            name = f"{knob.what} ({accuracy_report.short(knob.name)})"
             try:
                 yield Trial(name, change.label, changed(recipe, change.overrides) if change.overrides else recipe)
             except RecipeError as error:
@@ -100,7 +100,7 @@ def _found(recipe: Recipe, bench: Bench, tell: Tell, quick: bool, until: float) 
     points = []
     for number, trial in enumerate(todo, 1):
         points.append(_left(trial) if time.monotonic() > until and _may_wait(trial, bench) else bench.point(trial))
-        tell(f"{number}/{len(todo)}  {report.told(points[-1])}")
+        tell(f"{number}/{len(todo)}  {accuracy_report.told(points[-1])}")
     for number in range(2, TIMES + 1):  # in turn, so that what else the machine does meets all points alike
         points = [bench.again(point, number) for point in points]
         tell(f"timed again: {number} of {TIMES}")
@@ -113,7 +113,7 @@ def _found(recipe: Recipe, bench: Bench, tell: Tell, quick: bool, until: float) 
 
 def _may_wait(trial: Trial, bench: Bench) -> bool:
     """Whether a trial is a knob's, and nothing is known of it yet."""
-    knob = trial.line not in (report.TOLERANCE, report.KEEP_ALL)
+    knob = trial.line not in (accuracy_report.TOLERANCE, accuracy_report.KEEP_ALL)
     return knob and trial.recipe is not None and not bench.store.has(bench.key(trial.recipe))
 
 
@@ -123,7 +123,7 @@ def _left(trial: Trial) -> Point:
 
 def _matter(recipe: Recipe, points: Sequence[Point]) -> Iterator[tuple[Recipe, str, float]]:
     """Steps that matter where everything is kept, and of the recipe as it is, those that stand in for others."""
-    whole = next((p.found.steps for p in points if p.trial.line == report.KEEP_ALL), {})
+    whole = next((p.found.steps for p in points if p.trial.line == accuracy_report.KEEP_ALL), {})
     for name, share in that_matter(recipe, whole):
         yield recipe, name, share
     own = next((p.found.steps for p in points if p.trial.own), {})
@@ -147,20 +147,20 @@ def _provenance(found: Study, bench: Bench, command: Sequence[str], quick: bool)
         "seeds": found.seeds,
         "quick": quick,
         "device": bench.device,
-        "machine": report.machine_said(),
-        "failed": report.missed(found.points),  # tolerances
+        "machine": accuracy_report.machine_said(),
+        "failed": accuracy_report.missed(found.points),  # tolerances
         "engine": engine(),
         **versions(),
     }
 
 
 def _write(found: Study, folder: RunFolder, provenance: dict[str, Any]) -> None:
-    pictures = report.pictures(found.recipe, found.points, found.steps)
+    pictures = accuracy_report.pictures(found.recipe, found.points, found.steps)
     for name, picture in pictures.items():
         folder.write(f"figures/{name}.png", picture)
-    folder.write_rows("table.csv", report.HEADER, report.table(found.points, found.steps))
+    folder.write_rows("table.csv", accuracy_report.HEADER, accuracy_report.table(found.points, found.steps))
     folder.write("recipe.yaml", found.recipe.config.to_yaml())
     folder.write("provenance.json", json.dumps(provenance, indent=1, ensure_ascii=False))
-    sections = report.sections(found.recipe, found.points, found.steps, found.without, found.seeds, pictures)
+    sections = accuracy_report.sections(found.recipe, found.points, found.steps, found.without, found.seeds, pictures)
     title = f"Accuracy of {found.recipe.name}"
-    folder.write("report.html", page(title, report.lead(found.recipe, found.points), sections, provenance))
+    folder.write("report.html", page(title, accuracy_report.lead(found.recipe, found.points), sections, provenance))

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from neusee.workflows.calibration import emcee_sampler as calibrate
+from neusee.workflows.calibration import emcee_sampler
 from neusee.workflows.calibration.ensembles import go_on
 from neusee.workflows.calibration.log_posterior import Problem
 from neusee.workflows.calibration.posterior_mode import Peak
@@ -38,12 +38,12 @@ def walked(problem: Problem, peak: Peak, seed: int, how: str = "de", count: int 
 
     It starts and walks as `calibrate.sample` does; it ends sooner, for each simulation need only give few draws.
     """
-    run = calibrate._begun(problem, peak, _NOT_KEPT, 0, seed, WALKERS, calibrate.move(how))
+    run = emcee_sampler._begun(problem, peak, _NOT_KEPT, 0, seed, WALKERS, emcee_sampler.move(how))
     steps = _FIRST
     while True:
         go_on([run], steps, problem.log_posterior)
         chain = run.backend.get_chain(discard=steps // 2)
-        tau = calibrate._tau(chain)
+        tau = emcee_sampler._tau(chain)
         apart = max(1, round(min(tau, len(chain))))
         seen = chain[::apart].reshape(-1, chain.shape[-1])
         enough = len(chain) >= _APART * tau and len(seen) >= 2 * count and _steady(chain)
@@ -52,7 +52,7 @@ def walked(problem: Problem, peak: Peak, seed: int, how: str = "de", count: int 
         steps = int(_GROWTH * steps)
     rng = np.random.default_rng([seed, 2])
     taken = seen[rng.choice(len(seen), min(count, len(seen)), replace=False)]
-    return Drawn(taken, tau, enough, calibrate.stranded(run.backend.get_log_prob(discard=steps // 2)))
+    return Drawn(taken, tau, enough, emcee_sampler.stranded(run.backend.get_log_prob(discard=steps // 2)))
 
 
 def _steady(chain: Places) -> bool:

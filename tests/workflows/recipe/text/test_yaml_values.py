@@ -10,7 +10,7 @@ from ruamel.yaml import YAML
 import neusee.recipes
 from neusee.workflows.graph.diagnostics import Mark, RecipeError
 from neusee.workflows.graph.final_values import flow
-from neusee.workflows.recipe.text import yaml_values as _yaml
+from neusee.workflows.recipe.text import yaml_values
 from neusee.workflows.recipe.text.yaml_values import parse, read
 
 TOP = Mark("f.yaml", 1, 1)
@@ -174,7 +174,7 @@ def test_twelve_files_are_read_as_fast_as_the_library_reads_them():
     files = sorted(Path(neusee.recipes.__path__[0]).rglob("*.yaml"), key=lambda p: -p.stat().st_size)[:12]
 
     def ours():
-        _yaml._document.cache_clear()
+        yaml_values._document.cache_clear()
         for path in files:
             read(path, path.name)
 

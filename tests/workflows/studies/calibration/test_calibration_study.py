@@ -13,14 +13,13 @@ from scipy.stats import binom
 from typer.testing import CliRunner
 
 from neusee.nodes.calibrate import _law
-from neusee.workflows.calibration import emcee_sampler as calibrate
+from neusee.workflows.calibration import emcee_sampler
 from neusee.workflows.calibration.initial_guess import begin
 from neusee.workflows.calibration.log_posterior import Problem
 from neusee.workflows.calibration.posterior_mode import log_law, peak
 from neusee.workflows.recipe.loading import load
 from neusee.workflows.store.result_store import Store
-from neusee.workflows.studies.calibration import calibration_study as _study_calibration
-from neusee.workflows.studies.calibration import simulated_sensors as _sbc
+from neusee.workflows.studies.calibration import calibration_study, simulated_sensors
 from neusee.workflows.studies.calibration.independent_draws import DRAWS, Drawn, walked
 from neusee.workflows.studies.calibration.prior_sensitivity import ENOUGH, sensitivity
 from neusee.workflows.studies.calibration.rank_uniformity import band, bar, verdicts
@@ -117,7 +116,7 @@ def test_walkers_pass(tmp_path):
 @pytest.mark.slow
 def test_a_move_that_is_wrong_is_found(tmp_path, monkeypatch):
     """The snooker of emcee to 3.1.6, which `calibrate` refuses: its draws are too narrow in every direction."""
-    monkeypatch.setitem(calibrate._MOVES, "snooker", DESnookerMove)
+    monkeypatch.setitem(emcee_sampler._MOVES, "snooker", DESnookerMove)
     _, found = simulated(tmp_path, 80, SEEN, partial(walked, how="snooker"), 128)
     assert len(failing(found)) >= 5
 
@@ -230,7 +229,7 @@ def test_frames_that_tell_too_little_are_told(tmp_path):
 
 @pytest.fixture
 def quick(monkeypatch):
-    monkeypatch.setattr(_study_calibration, "_WEIGHED", 100)
+    monkeypatch.setattr(calibration_study, "_WEIGHED", 100)
 
 
 def studied(tmp_path, count=20, sampler=resampled, overrides=SEEN, store="store"):
@@ -249,7 +248,7 @@ def test_a_study_has_a_page_and_goes_on(tmp_path, monkeypatch, quick):
     assert (folder / "figures" / "ranks.png").stat().st_size > 10_000
     assert len((folder / "simulations.csv").read_text().splitlines()) == 1 + 20 * 6
     again = []
-    monkeypatch.setattr(Bench, "_made", lambda self, seed: again.append(seed) or _sbc.Simulation({}))
+    monkeypatch.setattr(Bench, "_made", lambda self, seed: again.append(seed) or simulated_sensors.Simulation({}))
     second = studied(tmp_path)
     assert not again
     assert json.loads((second / "provenance.json").read_text())["verdicts"] == doc["verdicts"]
@@ -315,8 +314,8 @@ def test_the_command_ends_with_one_where_a_bar_fails(tmp_path, monkeypatch):
     from neusee.workflows.cli.app import app
 
     monkeypatch.setenv("NEUSEE_CACHE", str(tmp_path / "store"))
-    monkeypatch.setattr(_study_calibration, "PIXELS", 32)
-    monkeypatch.setattr(_study_calibration, "walked", lambda *a, **how: resampled(*a[:3]))
+    monkeypatch.setattr(calibration_study, "PIXELS", 32)
+    monkeypatch.setattr(calibration_study, "walked", lambda *a, **how: resampled(*a[:3]))
     command = ["study", "calibration", "calibrate", *SEEN, "flats.shape=[32, 32]", "--out", str(tmp_path / "runs")]
     done = CliRunner().invoke(app, [*command, "--simulations", "20"])
     assert done.exit_code == 0, done.output

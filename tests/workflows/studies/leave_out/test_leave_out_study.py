@@ -15,9 +15,7 @@ from neusee.workflows.graph.diagnostics import Mark
 from neusee.workflows.graph.recipe_graph import Recipe, Step
 from neusee.workflows.recipe.loading import load
 from neusee.workflows.store.result_store import Store
-from neusee.workflows.studies.leave_out import leave_out_study as study_leave_out
-from neusee.workflows.studies.leave_out import omission_rows as _leave_out
-from neusee.workflows.studies.leave_out import scene_costs as _content
+from neusee.workflows.studies.leave_out import leave_out_study, omission_rows, scene_costs
 from neusee.workflows.studies.leave_out.omission_rows import Bench, surely
 
 MARK = Mark("recipe.yaml", 1, 1)
@@ -105,7 +103,7 @@ def study(store, tmp_path):
 
     def study(recipe, **options):
         told = []
-        folder = study_leave_out.study(recipe, store, tmp_path / "runs", ["neusee"], told.append, **options)
+        folder = leave_out_study.study(recipe, store, tmp_path / "runs", ["neusee"], told.append, **options)
         return json.loads((folder / "provenance.json").read_text()), told, folder
 
     return study
@@ -243,7 +241,7 @@ def test_what_is_nothing_is_left_away_and_changes_nothing(study):
 
 
 def test_scenes_of_a_recipe(tmp_path):
-    scenes = _content.scenes(load("dirty_windshield", SMALL))
+    scenes = scene_costs.scenes(load("dirty_windshield", SMALL))
     assert all(isinstance(made, Recipe) for made in scenes.values()), scenes
     assert not any("laser" in name for name in scenes["no laser"].steps)
     assert not any("ghost" in name or name == "dirt" for name in scenes["clean window"].steps)
@@ -267,6 +265,6 @@ def test_a_scene_with_less_in_it_costs_less(study):
 
 def test_facts_are_read_without_the_payload(store, monkeypatch):
     bench = Bench(camera(), store)
-    monkeypatch.setattr(_leave_out.Result, "value", lambda *a: pytest.fail("a value was read"))
+    monkeypatch.setattr(omission_rows.Result, "value", lambda *a: pytest.fail("a value was read"))
     assert bench.facts("l").max == 100
     assert run(bench.full, store).keys["l"] == bench.truth.keys["l"]

@@ -14,9 +14,7 @@ from neusee.workflows.keys.code_digest import Code
 from neusee.workflows.recipe.loading import load
 from neusee.workflows.recipe.step_declarations import find_node
 from neusee.workflows.store.result_store import Store
-from neusee.workflows.studies.stability import case_result as _extremes_cell
-from neusee.workflows.studies.stability import stability_study as _study_stability
-from neusee.workflows.studies.stability import stated_limits as _extremes_limits
+from neusee.workflows.studies.stability import case_result, stability_study, stated_limits
 from neusee.workflows.studies.stability.case_recipe import Chain, untouched
 from neusee.workflows.studies.stability.case_result import judged
 from neusee.workflows.studies.stability.extreme_cases import CASES, USUAL, Case, Size
@@ -137,7 +135,7 @@ def test_the_study_writes_its_folder_and_counts_what_fails(tmp_path, monkeypatch
     assert doc["cells"] == len(rows) > 30
     assert len(told) == 2
     before = {row["step"]: row["error"] for row in rows}
-    monkeypatch.setattr(_study_stability, "judged", None)  # what is stored is not judged again
+    monkeypatch.setattr(stability_study, "judged", None)  # what is stored is not judged again
     again = study(recipe, Store(tmp_path / "store"), tmp_path / "runs", ["neusee"], told.append, cases=cases)
     with (again / "table.csv").open() as file:
         assert {row["step"]: row["error"] for row in csv.DictReader(file)} == before
@@ -152,11 +150,11 @@ def test_words_of_a_cell_say_what_does_not_pass(picture):
 
 
 def test_what_is_stated_counts_only_as_long_as_the_docstring_states_it(monkeypatch):
-    (path, case), words = next(iter(_extremes_limits._STATED.items()))
-    assert _extremes_limits.stated_of(find_node(path), case) == words
-    assert _extremes_limits.stated_of(find_node(path), "usual") is None
-    monkeypatch.setattr(_extremes_limits, "_STATED", {(path, case): "whatever it is"})
-    assert _extremes_limits.stated_of(find_node(path), case) is None
+    (path, case), words = next(iter(stated_limits._STATED.items()))
+    assert stated_limits.stated_of(find_node(path), case) == words
+    assert stated_limits.stated_of(find_node(path), "usual") is None
+    monkeypatch.setattr(stated_limits, "_STATED", {(path, case): "whatever it is"})
+    assert stated_limits.stated_of(find_node(path), case) is None
 
 
 @pytest.mark.parametrize(
@@ -173,15 +171,15 @@ def test_what_is_stated_counts_only_as_long_as_the_docstring_states_it(monkeypat
     ],
 )
 def test_what_holds_by_less_than_twice_warns(error, slope, mark):
-    cell = _extremes_cell._verdict(error, 1.0, slope, 4.0)
+    cell = case_result._verdict(error, 1.0, slope, 4.0)
     assert cell.mark == mark
     assert (cell.bound, cell.slope_bound) == (1.0, None if slope is None else 4.0)
     assert [cell.error, cell.slope] == pytest.approx([error, slope], nan_ok=True)
 
 
 def test_what_every_node_states_it_still_states():
-    for path, case in _extremes_limits._STATED:
-        assert _extremes_limits.stated_of(find_node(path), case) is not None
+    for path, case in stated_limits._STATED:
+        assert stated_limits.stated_of(find_node(path), case) is not None
 
 
 def test_poisson_numbers_are_the_same_in_both_precisions(picture):

@@ -12,8 +12,7 @@ from safetensors.torch import load_file
 from neusee.nodes.doe import half_rings
 from neusee.workflows import load
 from neusee.workflows.store.result_store import Store
-from neusee.workflows.training.mask_design import design_page as _design_page
-from neusee.workflows.training.mask_design import optimizers as _design_learn
+from neusee.workflows.training.mask_design import design_page, optimizers
 from neusee.workflows.training.mask_design.design_run import DesignError, MaskTraining, design, figures
 from neusee.workflows.training.mask_design.design_terms import Terms
 
@@ -44,7 +43,7 @@ def recipe():
 def without_pictures(request, monkeypatch):
     """Pictures take longer than what is tested; one test looks at them."""
     if "file_is_the_mask" not in request.node.name:
-        monkeypatch.setattr(_design_page, "pictures", lambda *_: {})
+        monkeypatch.setattr(design_page, "pictures", lambda *_: {})
 
 
 def loss_of(terms, height):
@@ -60,7 +59,7 @@ def read(folder):
 def test_every_kind_lowers_its_loss_on_all_bands(kind, recipe, store, tmp_path):
     given = how(kind=kind, iterations=15)
     terms = Terms(recipe, given, store)
-    before = loss_of(terms, _design_learn.shape_of(given, 0, terms.relief)(terms.stop))
+    before = loss_of(terms, optimizers.shape_of(given, 0, terms.relief)(terms.stop))
     folder = design(recipe, given, store, tmp_path, quiet)
     found = read(folder)
     assert found["loss"] < before - 0.1
@@ -121,7 +120,7 @@ def test_an_interrupted_design_goes_on_bit_for_bit(kind, values, recipe, store, 
 
 
 def test_a_damaged_state_begins_again(recipe, store, tmp_path):
-    kept = _design_learn.Kept(tmp_path / "state")
+    kept = optimizers.Kept(tmp_path / "state")
     assert kept.read() == {}
     kept.write({"a": torch.ones(3)})
     assert torch.equal(kept.read()["a"], torch.ones(3))
@@ -233,7 +232,7 @@ def test_settings_that_cannot_be_are_refused(values):
 @pytest.mark.parametrize("schedule", ["cosine", "step"])
 def test_the_rate_falls(schedule):
     given = how(schedule=schedule, iterations=50)
-    rates = [_design_learn.rate(given, number) for number in range(50)]
+    rates = [optimizers.rate(given, number) for number in range(50)]
     assert rates[0] == given.rate
     assert rates == sorted(rates, reverse=True)
     assert rates[-1] < 0.1 * rates[0]
