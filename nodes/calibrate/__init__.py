@@ -1,19 +1,19 @@
 """Calibrate: frames of flat illumination to the constants of a sensor, and to how well they are known."""
 
-from neusee.nodes.calibrate._camera import camera
-from neusee.nodes.calibrate._camera_prior import CAMERA_NAMES, CameraCoordinates, camera_prior
-from neusee.nodes.calibrate._density import density
-from neusee.nodes.calibrate._descriptor import descriptor
-from neusee.nodes.calibrate._emva import LeastSquares, least_squares
-from neusee.nodes.calibrate._frames import frames
-from neusee.nodes.calibrate._free import Prior
-from neusee.nodes.calibrate._guess import guess, guess_camera
-from neusee.nodes.calibrate._law import Likelihood
-from neusee.nodes.calibrate._prior import NAMES, Coordinates, prior
-from neusee.nodes.calibrate._reduce import levels, reduce
-from neusee.nodes.calibrate._simulated import expose
-from neusee.nodes.calibrate._sufficient import Sufficient, sufficient
-from neusee.nodes.calibrate._table import table
+from neusee.nodes.calibrate._emva_fit import LeastSquares, least_squares
+from neusee.nodes.calibrate._frames._emva_descriptor import descriptor
+from neusee.nodes.calibrate._frames._frame_statistics import levels, reduce
+from neusee.nodes.calibrate._frames._level_frames import frames
+from neusee.nodes.calibrate._frames._moment_table import table
+from neusee.nodes.calibrate._frames._simulated_frames import expose
+from neusee.nodes.calibrate._likelihood._camera_likelihood import camera
+from neusee.nodes.calibrate._likelihood._likelihood_node import density
+from neusee.nodes.calibrate._likelihood._linear_sensor import Likelihood
+from neusee.nodes.calibrate._likelihood._sufficient_statistics import Sufficient, sufficient
+from neusee.nodes.calibrate._prior._camera_prior import CAMERA_NAMES, CameraCoordinates, camera_prior
+from neusee.nodes.calibrate._prior._first_guess import guess, guess_camera
+from neusee.nodes.calibrate._prior._free_parameters import Prior
+from neusee.nodes.calibrate._prior._sensor_prior import NAMES, Coordinates, prior
 
 __all__ = [
     "CAMERA_NAMES",

@@ -1,11 +1,11 @@
 """Diffractive optical elements: height maps and materials."""
 
-from neusee.nodes.doe._fabricate import fabricate
-from neusee.nodes.doe._masks import axicon, cubic, flat, half_rings, spiral_axicon, vortex, zernike
-from neusee.nodes.doe._material import material
-from neusee.nodes.doe._pixelwise import pixelwise
-from neusee.nodes.doe._smooth import smooth
-from neusee.nodes.doe._unet import unet
+from neusee.nodes.doe._analytic_masks import axicon, cubic, flat, half_rings, spiral_axicon, vortex, zernike
+from neusee.nodes.doe._fabrication_limits import fabricate
+from neusee.nodes.doe._minimum_feature import smooth
+from neusee.nodes.doe._refractive_index import material
+from neusee.nodes.doe._sampled_height_map import pixelwise
+from neusee.nodes.doe._unet_height_map import unet
 
 __all__ = [
     "axicon",

@@ -7,9 +7,9 @@ import torch
 from pydantic import Field
 
 from neusee.nodes import Check, node
-from neusee.nodes.flare._marks import Grain, Scratch, stamp
-from neusee.nodes.optics._aperture import Aperture, Stop, grid_notes, inside, stop, stripes
-from neusee.nodes.optics._screen import factors
+from neusee.nodes.flare._grains_and_scratches import Grain, Scratch, stamp
+from neusee.nodes.optics._phase_screen import factors
+from neusee.nodes.optics._pupil_grid import Aperture, Stop, grid_notes, inside, stop, stripes
 from neusee.nodes.optics._zernike import surface
 from neusee.nodes.units import Count, Fraction, PositiveLength, Waves
 from neusee.nodes.values import Dirt

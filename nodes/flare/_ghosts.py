@@ -8,7 +8,7 @@ from pydantic import Field
 from torch import Tensor
 
 from neusee.nodes import Check, Facts, node
-from neusee.nodes._precision import single
+from neusee.nodes._half_precision import single
 from neusee.nodes.units import Fraction, PositiveLength
 from neusee.nodes.values import Bands
 

@@ -1,10 +1,10 @@
 """Losses: what learning minimises."""
 
-from neusee.nodes.losses._contrast import contrast
-from neusee.nodes.losses._mask import bsr, lsr
-from neusee.nodes.losses._penalty import gradient_penalty
-from neusee.nodes.losses._relative import mrae
-from neusee.nodes.losses._restoration import charbonnier, fft_l1
-from neusee.nodes.losses._wiener import wiener
+from neusee.nodes.losses._contrast_loss import contrast
+from neusee.nodes.losses._gradient_penalty import gradient_penalty
+from neusee.nodes.losses._mask_losses import bsr, lsr
+from neusee.nodes.losses._restoration_losses import charbonnier, fft_l1
+from neusee.nodes.losses._spectral_loss import mrae
+from neusee.nodes.losses._wiener_loss import wiener
 
 __all__ = ["bsr", "charbonnier", "contrast", "fft_l1", "gradient_penalty", "lsr", "mrae", "wiener"]

@@ -1,8 +1,8 @@
 """Metrics: what a reader of results asks for."""
 
-from neusee.nodes.metrics._contrast import Mtf, encircled, mtf
-from neusee.nodes.metrics._limits import Limits, limits
-from neusee.nodes.metrics._quality import Quality, quality
+from neusee.nodes.metrics._mask_limits import Limits, limits
+from neusee.nodes.metrics._picture_quality import Quality, quality
+from neusee.nodes.metrics._psf_contrast import Mtf, encircled, mtf
 from neusee.nodes.metrics._suppression import Peak, Saturated, bsr, lsr, peak, saturated
 
 __all__ = [

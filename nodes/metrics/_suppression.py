@@ -7,10 +7,10 @@ from pydantic import Field
 from torch import Tensor
 
 from neusee.nodes import Check, node
-from neusee.nodes._precision import single
-from neusee.nodes.metrics._limits import least_lsr
-from neusee.nodes.sensor._channels import weighted
-from neusee.nodes.sensor._digital import Bits, Gain, GainUnit, numbers_per_electron
+from neusee.nodes._half_precision import single
+from neusee.nodes.metrics._mask_limits import least_lsr
+from neusee.nodes.sensor._channel_sums import weighted
+from neusee.nodes.sensor._digitization import Bits, Gain, GainUnit, numbers_per_electron
 from neusee.nodes.sensor._saturation import Efficiency, Well, saturation
 from neusee.nodes.units import PositiveLength, Time
 from neusee.nodes.values import Bands, Channels, Psf

@@ -8,11 +8,11 @@ import torch
 from torch import Tensor
 
 from neusee.nodes import Check, node
-from neusee.nodes._precision import refuse_half, refuse_not_finite
-from neusee.nodes.optics._axis import Axis, centred
-from neusee.nodes.optics._field import View
-from neusee.nodes.optics._intensity import PupilIntensity, Sampling
-from neusee.nodes.optics._transform import Method
+from neusee.nodes._half_precision import refuse_half, refuse_not_finite
+from neusee.nodes.optics._transform._intensity import PupilIntensity, Sampling
+from neusee.nodes.optics._transform._pupil_field import View
+from neusee.nodes.optics._transform._sample_axis import Axis, centred
+from neusee.nodes.optics._transform._scaled_transform import Method
 from neusee.nodes.units import Angle, PositiveLength, Shape
 from neusee.nodes.values import Psf, Pupil
 

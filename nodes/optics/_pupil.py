@@ -7,8 +7,8 @@ import torch
 from torch import Tensor
 
 from neusee.nodes import Check, node
-from neusee.nodes._precision import refuse_half
-from neusee.nodes.optics._aperture import Aperture, Stop, axes, inside, opening, stop, stripes
+from neusee.nodes._half_precision import refuse_half
+from neusee.nodes.optics._pupil_grid import Aperture, Stop, axes, inside, opening, stop, stripes
 from neusee.nodes.optics._zernike import surface
 from neusee.nodes.units import Count, Length, PositiveLength, Waves
 from neusee.nodes.values import Bands, Dirt, Pupil

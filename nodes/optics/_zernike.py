@@ -6,7 +6,7 @@ from collections.abc import Mapping
 import torch
 from torch import Tensor
 
-from neusee.nodes.optics._aperture import Stop, axes, inside
+from neusee.nodes.optics._pupil_grid import Stop, axes, inside
 
 _ALL = slice(None)
 

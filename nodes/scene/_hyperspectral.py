@@ -8,8 +8,8 @@ import torch
 from torch import Tensor
 
 from neusee.nodes import Check, ParameterError, node
-from neusee.nodes.scene._cubes import Layout, cube_and_wavelengths, exr_size, size_and_type
-from neusee.nodes.scene._frame import enlarged, framed
+from neusee.nodes.scene._crop_to_frame import enlarged, framed
+from neusee.nodes.scene._cube_files import Layout, cube_and_wavelengths, exr_size, size_and_type
 from neusee.nodes.units import DataFile, Shape, Wavelength
 from neusee.nodes.values import Bands
 

@@ -7,7 +7,7 @@ import torch
 from torch import Tensor
 
 from neusee.nodes import Check, ParameterError, node
-from neusee.nodes.scene._frame import enlarged, framed
+from neusee.nodes.scene._crop_to_frame import enlarged, framed
 from neusee.nodes.units import DataFile, Shape
 
 _MODES = ("RGB", "L", "P", "1", "I", "I;16", "I;16B")

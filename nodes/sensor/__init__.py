@@ -1,10 +1,10 @@
 """Sensor: photons to electrons to digital numbers."""
 
-from neusee.nodes.sensor._digital import crop, digitize, full_well
+from neusee.nodes.sensor._digitization import crop, digitize, full_well
 from neusee.nodes.sensor._exposure import expose, gather, level
 from neusee.nodes.sensor._noise import dark_current, photon_noise, read_noise
+from neusee.nodes.sensor._photon_transfer import photon_transfer
 from neusee.nodes.sensor._saturation import Limits, limits, saturation
-from neusee.nodes.sensor._transfer import photon_transfer
 
 __all__ = [
     "Limits",

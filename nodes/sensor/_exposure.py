@@ -9,8 +9,8 @@ from pydantic import Field
 from torch import Tensor
 
 from neusee.nodes import Check, Deviation, Facts, node
-from neusee.nodes._precision import refuse_not_finite, single
-from neusee.nodes.sensor._channels import weighted
+from neusee.nodes._half_precision import refuse_not_finite, single
+from neusee.nodes.sensor._channel_sums import weighted
 from neusee.nodes.sensor._saturation import Efficiency, Well, photons_per_joule, saturation
 from neusee.nodes.units import PositiveLength, Time
 from neusee.nodes.values import Bands, Channels

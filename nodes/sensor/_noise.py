@@ -10,7 +10,7 @@ from pydantic import Field
 from torch import Generator, Tensor
 
 from neusee.nodes import Check, Deviation, Facts, node
-from neusee.nodes._precision import single
+from neusee.nodes._half_precision import single
 from neusee.nodes.sensor._saturation import Efficiency, Well
 from neusee.nodes.units import Electrons, Fraction
 

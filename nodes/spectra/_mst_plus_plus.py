@@ -11,7 +11,7 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor, nn
 
-from neusee.nodes._mirror import mirrored
+from neusee.nodes._mirror_padding import mirrored
 
 BANDS = 31
 

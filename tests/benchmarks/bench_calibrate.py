@@ -27,7 +27,7 @@ import numpyro
 import torch
 from numpyro.infer import MCMC, NUTS
 
-from neusee.nodes.calibrate._cell import log_cell
+from neusee.nodes.calibrate._likelihood._quantised_gaussian import log_cell
 from neusee.workflows.calibration import emcee_sampler
 from neusee.workflows.calibration.initial_guess import begin
 from neusee.workflows.calibration.log_posterior import Problem

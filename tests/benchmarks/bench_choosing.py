@@ -19,7 +19,7 @@ from functools import wraps
 from pathlib import Path
 from unittest import mock
 
-from neusee.nodes.optics import _channels
+from neusee.nodes.optics._imaging import _channel_image
 from neusee.workflows import load
 from neusee.workflows.engine import execution, resolve_keys, runner
 from neusee.workflows.store.result_store import Store
@@ -27,7 +27,7 @@ from neusee.workflows.studies.accuracy.work_precision_points import cold
 from neusee.workflows.tolerance.error_budget import Ledger
 
 ENGINE = ((runner, "economised"), (runner, "border"), (runner, "proof"), (Ledger, "verdict"), (Ledger, "pass_on"))
-NODE = tuple((_channels, name) for name in ("passed", "with_windows", "choose", "guessed", "rounding", "_top"))
+NODE = tuple((_channel_image, name) for name in ("passed", "with_windows", "choose", "guessed", "rounding", "_top"))
 LONG = 20.0  #: s, beyond which one run is enough
 
 

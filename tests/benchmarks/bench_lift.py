@@ -28,7 +28,7 @@ from neusee.nodes.spectra import (
     reflectances,
     render,
 )
-from neusee.nodes.spectra._lift import wiener
+from neusee.nodes.spectra._linear_lift import wiener
 
 SCENE = bands(start=400e-9, stop=700e-9, count=31)
 PICTURES, SIZE, LEAST = 32, (64, 64), 1e-2

@@ -13,7 +13,7 @@ import neusee.nodes
 from neusee.nodes import Node
 
 ROOT = Path(__file__).parents[2]
-ONLY_WITH = {"neusee.nodes.restore._scan_triton": "triton"}  #: what torch brings on CUDA alone; it holds no nodes
+ONLY_WITH = {"neusee.nodes.restore._scan._triton_scan": "triton"}  #: what torch brings on CUDA alone; it holds no nodes
 MODULES = [
     importlib.import_module(m.name)
     for m in pkgutil.walk_packages(neusee.nodes.__path__, "neusee.nodes.")

@@ -78,8 +78,8 @@ def crop(path: Path, shape: tuple[int, int], seed: int, index: Index) -> Tensor:
     One that is smaller is first enlarged, by the bicubic kernel in linear light, just until it covers ``shape``; what
     the kernel puts below black is black.
     """
-    from neusee.nodes._bicubic import resize
-    from neusee.nodes.scene._frame import covering
+    from neusee.nodes._bicubic_resize import resize
+    from neusee.nodes.scene._crop_to_frame import covering
 
     picture = _decoded(path)
     size = (picture.shape[-2], picture.shape[-1])
@@ -100,7 +100,7 @@ def _decoded(path: Path) -> Tensor:
 
 def crop_key(path: Path, shape: tuple[int, int], seed: int, index: Index, code: Any) -> str:
     """What decides `crop`: the file's content, the size, the draw and the code that decodes."""
-    own = [code.digest(f"neusee.nodes.{name}") for name in ("scene._photograph", "_bicubic")]
+    own = [code.digest(f"neusee.nodes.{name}") for name in ("scene._photograph", "_bicubic_resize")]
     return digest(
         "photograph", engine("training.photograph_folder"), file_digest(path), list(shape), seed, _indices(index), own
     )

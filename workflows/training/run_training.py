@@ -11,7 +11,7 @@ from typing import Any
 import torch
 
 from neusee.nodes import doe
-from neusee.nodes._weights import told
+from neusee.nodes._network_weights import told
 from neusee.workflows.engine.node_call import versions
 from neusee.workflows.graph.recipe_graph import Recipe
 from neusee.workflows.keys.cache_key import digest

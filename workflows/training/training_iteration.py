@@ -12,14 +12,14 @@ from torch.optim.swa_utils import AveragedModel, get_ema_multi_avg_fn
 from torch.utils.checkpoint import checkpoint
 
 from neusee.nodes import losses
-from neusee.nodes._bicubic import resize
-from neusee.nodes.doe._learned import LEARNT
-from neusee.nodes.optics._aperture import stop
-from neusee.nodes.restore._critic import critics, passed_over, slopes
-from neusee.nodes.restore._fft_mamba import FFTMamba
-from neusee.nodes.restore._nafnet import NAFNet
-from neusee.nodes.restore._network import Restorer, parameter_groups, started
-from neusee.nodes.restore._unet import UNet
+from neusee.nodes._bicubic_resize import resize
+from neusee.nodes.doe._parametrisations import LEARNT
+from neusee.nodes.optics._pupil_grid import stop
+from neusee.nodes.restore._networks._critic import critics, passed_over, slopes
+from neusee.nodes.restore._networks._fft_mamba import FFTMamba
+from neusee.nodes.restore._networks._nafnet import NAFNet
+from neusee.nodes.restore._networks._restorer import Restorer, parameter_groups, started
+from neusee.nodes.restore._networks._unet import UNet
 from neusee.nodes.values import Psf
 from neusee.workflows.graph.diagnostics import nearest
 from neusee.workflows.graph.recipe_graph import Recipe, Step

@@ -174,7 +174,7 @@ class Samples:
 
 
 def _resized(picture: Tensor, size: Sequence[int]) -> Tensor:
-    from neusee.nodes._bicubic import resize
+    from neusee.nodes._bicubic_resize import resize
 
     return resize(picture, *size)
 

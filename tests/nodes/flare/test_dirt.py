@@ -11,9 +11,9 @@ from torch.testing import assert_close
 
 from neusee.nodes import flare
 from neusee.nodes.flare._dirt import _dents, _grains, _scratches, _streams
-from neusee.nodes.flare._marks import Grain, Scratch, _distance, stamp
-from neusee.nodes.optics._aperture import inside, stop
-from neusee.nodes.optics._screen import screen
+from neusee.nodes.flare._grains_and_scratches import Grain, Scratch, _distance, stamp
+from neusee.nodes.optics._phase_screen import screen
+from neusee.nodes.optics._pupil_grid import inside, stop
 from neusee.nodes.optics._zernike import surface
 
 GRID = {"samples": 128, "pitch": 10e-6, "diameter": 1.28e-3}

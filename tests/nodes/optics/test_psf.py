@@ -8,8 +8,8 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from neusee.nodes.optics import psf
-from neusee.nodes.optics._field import View
-from neusee.nodes.optics._intensity import PupilIntensity, Sampling
+from neusee.nodes.optics._transform._intensity import PupilIntensity, Sampling
+from neusee.nodes.optics._transform._pupil_field import View
 from neusee.nodes.values import Pupil
 
 DIAMETER, FOCAL, PIXEL, GREEN = 2160 * 3.74e-6, 0.11, 2.9e-6, 550e-9
@@ -211,8 +211,8 @@ def test_any_shape_and_any_height_is_finite_and_right(rows, columns, y, x, scale
 @pytest.mark.parametrize("method", ["direct", "folded", "bluestein", "kaiser_bessel"])
 @pytest.mark.parametrize("kept", [True, False])
 def test_gradients_are_those_of_finite_differences(method, kept, monkeypatch):
-    from neusee.nodes.optics import _intensity
-    from neusee.nodes.optics._axis import Axis
+    from neusee.nodes.optics._transform import _intensity
+    from neusee.nodes.optics._transform._sample_axis import Axis
 
     monkeypatch.setattr(_intensity, "KEPT_FIELD_BYTES", 1 << 30 if kept else 0)
     axes = Axis(7, 5, 0.03), Axis(6, 8, 0.02)

@@ -10,9 +10,9 @@ from hypothesis import strategies as st
 from torch.testing import assert_close
 
 from neusee.nodes import doe, optics
-from neusee.nodes.optics._aperture import Stop, axes, inside, polar, stop
+from neusee.nodes.optics._phase_screen import screen
 from neusee.nodes.optics._pupil import phase_steps
-from neusee.nodes.optics._screen import screen
+from neusee.nodes.optics._pupil_grid import Stop, axes, inside, polar, stop
 from neusee.nodes.optics._zernike import combine, noll, surface
 from neusee.nodes.values import Bands, Dirt
 

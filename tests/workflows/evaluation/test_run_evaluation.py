@@ -12,7 +12,7 @@ import torch
 from PIL import Image
 from typer.testing import CliRunner
 
-from neusee.nodes._bicubic import resize
+from neusee.nodes._bicubic_resize import resize
 from neusee.nodes.metrics import quality
 from neusee.workflows import load
 from neusee.workflows.cli.app import app

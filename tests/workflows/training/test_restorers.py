@@ -7,10 +7,10 @@ import torch
 from safetensors.torch import save_file
 from torch.testing import assert_close
 
-from neusee.nodes.restore._fft_mamba import FFTMamba
-from neusee.nodes.restore._nafnet import NAFNet
-from neusee.nodes.restore._network import started
-from neusee.nodes.restore._unet import UNet
+from neusee.nodes.restore._networks._fft_mamba import FFTMamba
+from neusee.nodes.restore._networks._nafnet import NAFNet
+from neusee.nodes.restore._networks._restorer import started
+from neusee.nodes.restore._networks._unet import UNet
 from neusee.workflows import load
 from neusee.workflows.engine.runner import run
 from neusee.workflows.graph.diagnostics import RecipeError

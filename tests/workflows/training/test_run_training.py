@@ -17,8 +17,8 @@ import torch
 from PIL import Image
 from safetensors.torch import load_file
 
-from neusee.nodes.doe._learned import LEARNT
-from neusee.nodes.optics._aperture import stop
+from neusee.nodes.doe._parametrisations import LEARNT
+from neusee.nodes.optics._pupil_grid import stop
 from neusee.workflows import RecipeError, Store, as_function, load
 from neusee.workflows.cli import app
 from neusee.workflows.recipe.blocks.train_block import GRID, MaskSettings, Rates

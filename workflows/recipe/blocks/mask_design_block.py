@@ -7,9 +7,9 @@ from typing import Annotated, Any, Literal, Self
 
 from pydantic import BaseModel, ConfigDict, Field, model_validator
 
-from neusee.nodes.doe._material import Material
-from neusee.nodes.losses._contrast import Floor, Frequency
-from neusee.nodes.losses._wiener import Noise, Share
+from neusee.nodes.doe._refractive_index import Material
+from neusee.nodes.losses._contrast_loss import Floor, Frequency
+from neusee.nodes.losses._wiener_loss import Noise, Share
 from neusee.nodes.units import Count, DataFile, PositiveLength, Wavelength
 
 Weight = Annotated[float, Field(ge=0, allow_inf_nan=False)]

@@ -11,8 +11,8 @@ from torch.optim.swa_utils import AveragedModel, get_ema_multi_avg_fn
 
 from neusee.nodes import losses
 from neusee.nodes.spectra import render
-from neusee.nodes.spectra._lift import wiener
-from neusee.nodes.spectra._lift_mst import needs_bands, started, through
+from neusee.nodes.spectra._linear_lift import wiener
+from neusee.nodes.spectra._mst_lift_node import needs_bands, started, through
 from neusee.nodes.values import Bands
 from neusee.workflows.engine.differentiable_function import as_function
 from neusee.workflows.graph.diagnostics import nearest

@@ -35,7 +35,8 @@ __all__ = ["DesignError", "MaskTraining", "Weights", "design", "figures"]
 
 Tell = Callable[[str], None]
 _LEARNT_WITH = tuple(
-    f"neusee.nodes.{name}" for name in ("doe._masks", "doe._learned", "losses._contrast", "losses._mask")
+    f"neusee.nodes.{name}"
+    for name in ("doe._analytic_masks", "doe._parametrisations", "losses._contrast_loss", "losses._mask_losses")
 )
 
 

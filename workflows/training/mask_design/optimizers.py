@@ -15,10 +15,10 @@ import torch
 from torch import Tensor, nn
 
 from neusee.nodes.doe import half_rings
-from neusee.nodes.doe._learned import LEARNT, Drawn, Modes, Pixels, Rings, Written
-from neusee.nodes.doe._material import wave_height
-from neusee.nodes.doe._pixelwise import _read as read_relief
-from neusee.nodes.optics._aperture import Stop
+from neusee.nodes.doe._parametrisations import LEARNT, Drawn, Modes, Pixels, Rings, Written
+from neusee.nodes.doe._refractive_index import wave_height
+from neusee.nodes.doe._sampled_height_map import _read
+from neusee.nodes.optics._pupil_grid import Stop
 from neusee.workflows.graph.recipe_graph import Step
 from neusee.workflows.recipe.blocks.mask_design_block import DesignError, MaskTraining
 from neusee.workflows.training.mask_design.design_terms import Terms
@@ -95,7 +95,7 @@ def _start(how: MaskTraining) -> Tensor | None:
     """The relief that pixels start from."""
     if how.start is None:
         return None
-    height = read_relief(how.start, how.max_height)
+    height = _read(how.start, how.max_height)
     if float(height.max()) > how.max_height:
         deep, most = f"{float(height.max()) * 1e6:.3g} um", f"{how.max_height * 1e6:.3g} um"
         raise DesignError(f"start: {how.start.name} is {deep} deep: set max_height to more than {most}")

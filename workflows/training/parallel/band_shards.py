@@ -15,7 +15,7 @@ from typing import Any, get_args
 from torch import Tensor
 
 from neusee.nodes import spectra
-from neusee.nodes.sensor._channels import summed
+from neusee.nodes.sensor._channel_sums import summed
 from neusee.nodes.values import Bands, Channels, Mixture
 from neusee.workflows.engine.band_results import band_tensors, taken, with_band_tensors
 from neusee.workflows.engine.node_call import call

@@ -12,7 +12,7 @@ from emcee.moves import DESnookerMove
 from scipy.stats import binom
 from typer.testing import CliRunner
 
-from neusee.nodes.calibrate import _law
+from neusee.nodes.calibrate._likelihood import _linear_sensor
 from neusee.workflows.calibration import emcee_sampler
 from neusee.workflows.calibration.initial_guess import begin
 from neusee.workflows.calibration.log_posterior import Problem
@@ -66,7 +66,7 @@ def failing(simulations):
 
 def forget_the_floor(monkeypatch):
     """As if dithered numbers were rounded to the nearest: mean m and variance v + 1/12."""
-    monkeypatch.setitem(_law.ROUNDED, "dithered_floor", _law.ROUNDED["nearest"])
+    monkeypatch.setitem(_linear_sensor.ROUNDED, "dithered_floor", _linear_sensor.ROUNDED["nearest"])
 
 
 # --- the posterior is right -------------------------------------------------------------------------------------------

@@ -1,0 +1,47 @@
+"""Bicubic resampling by two small matrix products: deterministic on every device, and differentiable at will."""
+
+import functools
+
+import torch
+from torch import Tensor
+from torch.nn import functional as F
+
+from neusee.nodes._half_precision import single
+
+
+def enlarge(image: Tensor, height: int, width: int) -> Tensor:
+    """Resample (…, y, x) through its samples: smooth between them, and aliased where there are fewer."""
+    return _product(image, _through(image.shape[-2], height, image), _through(image.shape[-1], width, image))
+
+
+def resize(image: Tensor, height: int, width: int) -> Tensor:
+    """Resample (…, y, x) with Keys' kernel, as wide as the coarser of the two grids: nothing aliases.
+
+    As torch's ``interpolate(mode="bicubic", antialias=True)``, to rounding; in single precision under autocast too.
+    """
+    image = single(image)
+    rows, columns = (_keys(n, new).to(image) for n, new in zip(image.shape[-2:], (height, width), strict=True))
+    with torch.autocast(image.device.type, enabled=False):
+        return _product(image, rows, columns)
+
+
+def _product(image: Tensor, rows: Tensor, columns: Tensor) -> Tensor:
+    return rows @ image @ columns.T
+
+
+def _through(size: int, new: int, like: Tensor) -> Tensor:
+    """Matrix (new, size) of bicubic interpolation between grids of the same extent."""
+    one = torch.eye(size, dtype=like.dtype, device=like.device)[None, None]
+    return F.interpolate(one, size=(new, size), mode="bicubic", align_corners=False)[0, 0]
+
+
+@functools.lru_cache(maxsize=64)
+def _keys(size: int, new: int) -> Tensor:
+    """Matrix (new, size), float64; beyond the edge there is nothing, and what is inside has weights of sum 1."""
+    with torch.inference_mode(False):  # kept for others, who may learn
+        scale = size / new
+        centres = (torch.arange(new, dtype=torch.float64)[:, None] + 0.5) * scale
+        x = (torch.arange(size, dtype=torch.float64) + 0.5 - centres).abs() / max(scale, 1.0)
+        near, far = (1.5 * x - 2.5) * x * x + 1, ((-0.5 * x + 2.5) * x - 4) * x + 2
+        weights = near.where(x < 1, far.where(x < 2, 0.0))
+        return weights / weights.sum(1, keepdim=True)

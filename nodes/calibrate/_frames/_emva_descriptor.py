@@ -1,0 +1,150 @@
+"""A measurement as EMVA 1288 hands it on: a descriptor file and the images it names."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Annotated, Any
+
+import torch
+from pydantic import BeforeValidator
+
+from neusee.nodes import Check, ParameterError, node
+from neusee.nodes.calibrate._frames._frame_statistics import Temporal, levels, reduce
+from neusee.nodes.calibrate._frames._image_files import readable
+from neusee.nodes.calibrate._frames._level_frames import stack
+from neusee.nodes.units import IsFile
+from neusee.nodes.values import Levels
+
+_WORDS = {"b": "b EXPOSURE_NS PHOTONS", "d": "d EXPOSURE_NS [0]", "n": "n BITS WIDTH HEIGHT", "v": "v RELEASE"}
+
+
+@dataclass
+class _Level:
+    """What a descriptor says of one level."""
+
+    line: int
+    photons: float
+    exposure: float  #: s
+    images: list[tuple[int, Path]] = field(default_factory=list)  #: with the line that names it
+
+
+@dataclass
+class _Measurement:
+    bits: int = 24
+    shape: tuple[int, int] | None = None
+    levels: list[_Level] = field(default_factory=list)
+
+
+def _with_images(file: Any) -> tuple[Path, ...]:
+    """The descriptor and every image that it names, so that the content of all of them is what counts."""
+    if isinstance(file, tuple):
+        return file
+    path = Path(file)
+    if not path.is_file():
+        raise ValueError(f"no such file: {path}")
+    images = [named for level in _parsed(path).levels for named in level.images]
+    for line, image in images:
+        if not image.is_file():
+            raise ValueError(f"{path.name}:{line}: no such image: {image}: put the images beside the descriptor")
+    return (path, *(image for _, image in images))
+
+
+DescriptorFile = Annotated[tuple[Path, ...], BeforeValidator(_with_images, json_schema_input_type=str), IsFile()]
+
+
+@node(rtol=0.0)
+def descriptor(*, file: DescriptorFile, scatter: Temporal = "temporal") -> Levels:
+    """Read a measurement by its EMVA 1288 descriptor, and reduce it level by level with variances as `reduce` has them.
+
+    Shapes: -> (level,), in the order of the descriptor.
+    Units:  the descriptor's exposures ns, its photons per pixel and exposure; mean DN; variance DN2.
+    Error:  counted in whole numbers, as `reduce`. The difference of the means of a pair is part of its variance, but
+            not with `steady`.
+    Raises: ValueError, before the run where the descriptor or an image is missing or cannot be understood; for a level
+            of one image, and for images of another size or more bits than the descriptor says.
+    Source: EMVA Standard 1288, release 3.0 and 4.0 (data sets of the working group, descriptor file).
+    """
+    files = _with_images(file)
+    said = _parsed(files[0])
+    joined: Levels = levels([_reduced(files[0].name, said, level, scatter) for level in said.levels])
+    return joined
+
+
+@descriptor.preflight
+def _(*, file: Sequence[Path], **rest: object) -> list[str]:
+    try:
+        for image in file[1:]:
+            readable(image)
+    except ValueError as why:
+        raise ParameterError("file", str(why)) from None
+    return []
+
+
+@descriptor.check
+def _(result: Levels, **params: Any) -> list[Check]:
+    dark = int((result.photons == 0).sum())
+    return [Check(f"{len(result.mean)} levels, {dark} dark, {float(result.exposure.max()):.3g} s at most", dark > 0)]
+
+
+def _reduced(name: str, said: _Measurement, level: _Level, scatter: Temporal) -> Levels:
+    numbers = stack([image for _, image in level.images])
+    if said.shape and numbers.shape[1:] != said.shape:
+        raise ValueError(f"{name}:{level.line}: images of {numbers.shape[1:]} where it says {said.shape} (y, x)")
+    if int(numbers.max()) >= 2**said.bits:
+        raise ValueError(f"{name}:{level.line}: an image holds {numbers.max()} DN, more than {said.bits} bits can")
+    found: Levels = reduce(torch.from_numpy(numbers), photons=level.photons, exposure=level.exposure, scatter=scatter)
+    return found
+
+
+def _parsed(path: Path) -> _Measurement:
+    found = _Measurement()
+    for number, line in _lines(path):
+        kind, _, rest = line.partition(" ")
+        try:
+            _take(found, kind, rest.strip(), path.parent, number)
+        except ValueError as why:
+            raise ValueError(f"{path.name}:{number}: {why}") from None
+    for level in found.levels:
+        if len(level.images) < 2:
+            raise ValueError(f"{path.name}:{level.line}: {len(level.images)} image(s): a level needs two")
+    if not found.levels:
+        raise ValueError(f"{path.name}: no line 'b' or 'd', so no level: give an EMVA 1288 descriptor")
+    return found
+
+
+def _lines(path: Path) -> Iterator[tuple[int, str]]:
+    """Lines that say something, with their number."""
+    text = path.read_text(encoding="utf-8-sig", errors="replace")
+    for number, line in enumerate(text.splitlines(), 1):
+        if line.strip() and not line.lstrip().startswith("#"):
+            yield number, line.strip().replace("\t", " ")
+
+
+def _take(found: _Measurement, kind: str, rest: str, folder: Path, line: int) -> None:
+    """What one line says."""
+    if kind == "i":
+        if not found.levels:
+            raise ValueError("an image before the first level: begin a level with 'b' or 'd'")
+        found.levels[-1].images.append((line, folder / rest.replace("\\", "/")))
+        return
+    if kind not in _WORDS:
+        raise ValueError(f"cannot read {kind!r}: lines begin with v, n, b, d, i or #")
+    words = rest.split()
+    try:
+        numbers = [float(word) for word in words]
+        if kind == "n":
+            found.bits, found.shape = int(words[0]), (int(words[2]), int(words[1]))
+        elif kind != "v":
+            found.levels.append(_level(line, kind, numbers))
+    except (ValueError, IndexError):
+        raise ValueError(f"cannot read {kind} {rest!r}: write {_WORDS[kind]}") from None
+
+
+def _level(line: int, kind: str, numbers: list[float]) -> _Level:
+    """A bright level has an exposure and photons above 0; a dark one no photons, or 0."""
+    exposure, photons = (*numbers, 0.0)[:2] if kind == "d" else numbers
+    if not 0 < exposure < float("inf") or not (0 < photons < float("inf") if kind == "b" else photons == 0):
+        raise ValueError
+    return _Level(line, photons, exposure * 1e-9)

@@ -1,0 +1,54 @@
+"""The frames of one level, from files."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from neusee.nodes import Check, ParameterError, node
+from neusee.nodes.calibrate._frames._image_files import read, readable
+from neusee.nodes.units import DataFiles
+
+
+@node(rtol=0.0)
+def frames(*, files: DataFiles) -> Tensor:
+    """Read the frames of one flat illumination: PNG, TIFF, EXR, NumPy or FITS files of raw numbers.
+
+    Shapes: -> (frame, y, x) int32, all frames of one file after the other.
+    Units:  DN.
+    Error:  exact.
+    Raises: ParameterError before the run for a kind of file that is not read; ValueError for colour, for numbers that
+            are not whole, and for frames that differ in size.
+    Source: EMVA Standard 1288, release 4.0 Linear, section 6.5 (raw frames, nothing corrected).
+    """
+    return torch.from_numpy(stack(files))
+
+
+@frames.preflight
+def _(*, files: Sequence[Path]) -> list[str]:
+    try:
+        for file in files:
+            readable(file)
+    except ValueError as why:
+        raise ParameterError("files", str(why)) from None
+    return []
+
+
+@frames.check
+def _(result: Tensor, **params: Any) -> list[Check]:
+    low, high = (int(x) for x in torch.aminmax(result))
+    return [Check(f"{len(result)} frames of {result.shape[1]} x {result.shape[2]}, {low} to {high} DN")]
+
+
+def stack(files: Sequence[Path]) -> np.ndarray[Any, np.dtype[np.int32]]:
+    """The frames of all files; they must agree in size."""
+    found = [read(file) for file in files]
+    for file, each in zip(files, found, strict=True):
+        if each.shape[1:] != found[0].shape[1:]:
+            raise ValueError(f"{file} is {each.shape[1:]}, {files[0]} is {found[0].shape[1:]}: give frames of one size")
+    return np.concatenate(found)

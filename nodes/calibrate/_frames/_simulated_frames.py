@@ -1,0 +1,69 @@
+"""Frames of a flat field, by the functions that make a picture."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import torch
+from torch import Generator, Tensor
+
+from neusee.nodes import Check, node
+from neusee.nodes.calibrate._frames._frame_statistics import Photons
+from neusee.nodes.sensor._digitization import Bits, Gain, GainUnit, Rounding, digitize
+from neusee.nodes.sensor._digitization import full_well as well_of
+from neusee.nodes.sensor._noise import Distribution, Spread, dark_current, photon_noise, read_noise
+from neusee.nodes.sensor._saturation import Efficiency, Well
+from neusee.nodes.units import Count, Electrons, Fraction, Shape, Time
+
+dark_of = dark_current  # the parameter below has the same name
+
+
+@node()
+def expose(
+    *,
+    photons: Photons,
+    exposure: Time,
+    shape: Shape,
+    frames: Count = 2,
+    quantum_efficiency: Efficiency,
+    dark_current: Electrons,
+    dark_exposure: Time,
+    pedestal: Electrons,
+    sigma: Electrons,
+    full_well: Well,
+    gain: Gain,
+    gain_unit: GainUnit = "e-/DN",
+    rounding: Rounding = "nearest",
+    bits: Bits = 16,
+    distribution: Distribution = "gaussian",
+    mean_shift: Fraction = 0.0,
+    spread: Spread = 1.0,
+    rng: Generator,
+) -> Tensor:
+    """Take frames of a flat field with this sensor, by the very functions that make a picture.
+
+    Shapes: -> (frame, y, x).
+    Units:  result DN; photons per pixel and exposure; dark_current e- of one dark_exposure, in proportion to the
+            exposure; pedestal, sigma, full_well e-.
+    Error:  every pixel alike: neither non-uniformity nor drift of the lamp. That of each step of the sensor.
+    Source: NeuSee, section Sensor Image; EMVA Standard 1288, release 4.0 Linear (mathematical model).
+    """
+    flat = torch.full((frames, *shape), photons, device=rng.device)
+    e = photon_noise(
+        flat,
+        quantum_efficiency=quantum_efficiency,
+        distribution=distribution,
+        mean_shift=mean_shift,
+        spread=spread,
+        rng=rng,
+    )
+    e = dark_of(e, mean=dark_current * exposure / dark_exposure, rng=rng)
+    e = well_of(read_noise(e, pedestal=pedestal, sigma=sigma, rng=rng), capacity=full_well)
+    numbers: Tensor = digitize(e, gain=gain, gain_unit=gain_unit, rounding=rounding, bits=bits, rng=rng)
+    return numbers
+
+
+@expose.check
+def _(result: Tensor, **params: Any) -> list[Check]:
+    mean = float(result.sum(-1).sum(dtype=torch.float64)) / result.numel()
+    return [Check(f"mean {mean:.5g} DN, {float(result.min()):g} to {float(result.max()):g}")]

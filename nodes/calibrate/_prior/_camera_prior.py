@@ -1,0 +1,97 @@
+"""What was believed of a real camera before any frame was looked at, and the coordinates in which it is walked."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import ClassVar
+
+import torch
+from torch import Tensor
+
+from neusee.nodes import Check, node
+from neusee.nodes.calibrate._prior._free_parameters import Factor, Free, Positive, Prior, believed, freed
+from neusee.nodes.sensor._digitization import Gain
+from neusee.nodes.sensor._saturation import Efficiency
+from neusee.nodes.units import Electrons, Real
+
+CAMERA_NAMES = (
+    "gain",
+    "quantum_efficiency",
+    "dark_signal",
+    "dark_noise",
+    "dark_current",
+    "scatter",
+    "lamp",
+    "drift",
+    "bend",
+    "twist",
+)  #: of the parameters of `camera` that may be free
+_LINEAR = frozenset({"dark_signal", "bend", "twist"})
+
+
+@node()
+def camera_prior(
+    *,
+    gain: tuple[Gain, Factor] | None = None,
+    quantum_efficiency: tuple[Efficiency, Factor] | None = None,
+    dark_signal: tuple[Real, Positive] | None = None,
+    dark_noise: tuple[Electrons, Factor] | None = None,
+    dark_current: tuple[Electrons, Factor] | None = None,
+    scatter: tuple[Positive, Factor] | None = None,
+    lamp: tuple[Positive, Factor] | None = None,
+    drift: tuple[Positive, Factor] | None = None,
+    bend: tuple[Real, Positive] | None = None,
+    twist: tuple[Real, Positive] | None = None,
+) -> Prior:
+    """Say how well each parameter of a camera is known beforehand; what is not named is held.
+
+    Each is a median and a factor, [0.37, 2] for a half to twice as much in two cases of three; the dark signal and the
+    two terms of the response a mean and a standard deviation.
+
+    Shapes: -> (10,).
+    Units:  those of `camera`.
+    Error:  exact.
+    Raises: ValueError where nothing is free, or a width is none.
+    Source: log-normal and normal laws.
+    """
+    pairs = (gain, quantum_efficiency, dark_signal, dark_noise, dark_current, scatter, lamp, drift, bend, twist)
+    return believed(dict(zip(CAMERA_NAMES, pairs, strict=True)), _LINEAR)
+
+
+@camera_prior.check
+def _(result: Prior, **params: object) -> list[Check]:
+    free = freed(CAMERA_NAMES, result)
+    return [Check(f"{len(free)} free: {', '.join(free)}")]
+
+
+@dataclass(frozen=True)
+class CameraCoordinates(Free):
+    """The free parameters one by one: logarithms, but of those that may be none or less."""
+
+    linear: ClassVar[frozenset[str]] = _LINEAR
+
+    @classmethod
+    def of(cls, prior: Prior, nominal: Mapping[str, float], gain_unit: str) -> CameraCoordinates:
+        """``nominal``: all of `CAMERA_NAMES`, as `camera` takes them; the unit of the gain changes nothing here."""
+        free = freed(CAMERA_NAMES, prior)
+        return cls(free, prior, {name: float(nominal[name]) for name in CAMERA_NAMES if name not in free})
+
+    @property
+    def labels(self) -> tuple[str, ...]:
+        """What each coordinate is."""
+        plain = {name: name.replace("_", " ") for name in self.names}
+        return tuple(plain[name] if name in self.linear else f"ln {plain[name]}" for name in self.names)
+
+    def place(self, parameters: Mapping[str, float | Tensor]) -> Tensor:
+        """(..., free) from parameters."""
+        given = {name: torch.as_tensor(parameters[name], dtype=torch.float64) for name in self.names}
+        return torch.stack([self._walked(name, x) for name, x in given.items()], -1)
+
+    def parameters(self, place: Tensor) -> dict[str, Tensor]:
+        """The free parameters at (..., free)."""
+        return {n: x if n in self.linear else x.exp() for n, x in zip(self.names, place.unbind(-1), strict=True)}
+
+    def log_prior(self, parameters: Mapping[str, Tensor]) -> Tensor:
+        """(...) density per unit of the coordinates, but for a constant."""
+        return -0.5 * self.whitened(parameters).square().sum(-1)

@@ -1,0 +1,82 @@
+"""A first guess of a sensor's parameters, from the levels themselves."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping
+from typing import Any
+
+import torch
+
+from neusee.nodes.calibrate._emva_fit import least_squares
+from neusee.nodes.calibrate._likelihood._linear_sensor import ROUNDED
+from neusee.nodes.calibrate._likelihood._sufficient_statistics import Sufficient
+from neusee.nodes.values import Levels
+
+_ABOVE = 1.3  #: times the brightest number, where a well that nobody saw may be
+_LEAST = 1e-3  #: of a dark current or a read noise that came out as none, of what was believed
+
+
+def guess(levels: Sufficient, believed: Mapping[str, float], params: Mapping[str, Any]) -> dict[str, float]:
+    """What least squares say, and beyond them what was ``believed``; ``params`` are those of `density`.
+
+    Shapes: levels (level,); numbers by name, those of ``believed``.
+    Units:  those of `density`.
+    Error:  a start for a search, no estimate.
+    Source: EMVA Standard 1288, release 4.0 Linear, sections 6.6 to 6.8.
+    """
+    found = dict(believed)
+    numbers = params["gain_unit"] == "DN/e-"
+    lit = levels.numbers > 0
+    try:
+        fit = least_squares(Levels(*(x[lit] for x in levels[:6]), *(x[:0] for x in levels[6:])))
+    except ValueError:
+        gain = float(believed["gain"])
+        return found | {"full_well": _well(levels, found, gain if numbers else 1.0 / gain, params)}
+    gain = float(fit.gain)
+    dark = float(fit.dark_current) * params["dark_exposure"]
+    first = levels.exposure[levels.photons == 0].min()
+    ahead = float(first) / params["dark_exposure"] * (dark if dark > 0 else 0.0)
+    found |= {
+        "gain": gain if numbers else 1.0 / gain,
+        "quantum_efficiency": float(fit.efficiency),
+        "pedestal": (float(fit.dark_signal) - ROUNDED[params["rounding"]][0]) / gain - ahead,
+        "read_noise": max(float(fit.dark_noise), _LEAST * believed["read_noise"]),
+        "dark_current": dark if dark > 0 else _LEAST * believed["dark_current"],
+    }
+    return found | {"full_well": _well(levels, found, gain, params)}
+
+
+def guess_camera(levels: Levels, believed: Mapping[str, float], params: Mapping[str, Any]) -> dict[str, float]:
+    """The same of a real camera; ``params`` are those of `camera`.
+
+    Shapes: levels (level,); numbers by name, those of ``believed``.
+    Units:  those of `camera`.
+    Error:  a start for a search, no estimate.
+    Raises: ValueError as `least_squares` does.
+    Source: EMVA Standard 1288, release 4.0 Linear, sections 6.6 to 6.8.
+    """
+    fit = least_squares(levels, share=params["share"])
+    gain = float(fit.gain)
+    found = {
+        "gain": gain if params["gain_unit"] == "DN/e-" else 1.0 / gain,
+        "quantum_efficiency": float(fit.efficiency),
+        "dark_signal": float(fit.dark_signal),
+        "dark_noise": float(fit.dark_noise),
+        "dark_current": float(fit.dark_current) * params["dark_exposure"],
+    }
+    usable = {name: x for name, x in found.items() if math.isfinite(x) and (x > 0 or name == "dark_signal")}
+    return {**believed, **usable}
+
+
+def _well(levels: Sufficient, found: Mapping[str, float], gain: float, params: Mapping[str, Any]) -> float:
+    """Where numbers pile up; else above all that was seen."""
+    top, shift = 2 ** params["bits"] - 1, ROUNDED[params["rounding"]][0]
+    seen = levels.mean[levels.numbers > 0]
+    brightest = max([*seen.tolist(), *levels.cell_value.tolist()], default=0.0)
+    at = levels.cell_value >= brightest - 2
+    piled = bool(at.any()) and float(levels.cell_count[at].sum()) > 0.5 * float(levels.cell_count.max())
+    if piled and brightest < top:
+        weight = levels.cell_count[at]
+        return float((levels.cell_value[at] * weight).sum() / weight.sum() - shift) / gain
+    return max(found["full_well"], _ABOVE * min(brightest + 1, torch.inf) / gain)

@@ -1,0 +1,132 @@
+"""What was believed of a sensor before any frame was looked at, and the coordinates in which frames know it best."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import ClassVar
+
+import torch
+from torch import Tensor
+
+from neusee.nodes import Check, node
+from neusee.nodes.calibrate._prior._free_parameters import Factor, Free, Positive, Prior, believed, freed
+from neusee.nodes.sensor._digitization import Gain
+from neusee.nodes.sensor._saturation import Efficiency, Well
+from neusee.nodes.units import Electrons
+
+NAMES = (
+    "gain",
+    "pedestal",
+    "read_noise",
+    "dark_current",
+    "full_well",
+    "quantum_efficiency",
+    "spread",
+)  #: of the parameters of `density` that may be free
+_LINEAR = "pedestal"  #: the only one that may be none, or less
+
+
+@node()
+def prior(
+    *,
+    gain: tuple[Gain, Factor] | None = None,
+    pedestal: tuple[Electrons, Electrons] | None = None,
+    read_noise: tuple[Electrons, Factor] | None = None,
+    dark_current: tuple[Electrons, Factor] | None = None,
+    full_well: tuple[Well, Factor] | None = None,
+    quantum_efficiency: tuple[Efficiency, Factor] | None = None,
+    spread: tuple[Positive, Factor] | None = None,
+) -> Prior:
+    """Say how well each parameter of the sensor is known beforehand; what is not named is held.
+
+    Each is a median and a factor, [0.37, 2] for a half to twice as much in two cases of three; the pedestal a mean
+    and a standard deviation.
+
+    Shapes: -> (7,).
+    Units:  those of `density`.
+    Error:  exact.
+    Raises: ValueError where nothing is free, or a width is none.
+    Source: log-normal and normal laws.
+    """
+    given = dict(
+        zip(NAMES, (gain, pedestal, read_noise, dark_current, full_well, quantum_efficiency, spread), strict=True)
+    )
+    return believed(given, frozenset({_LINEAR}))
+
+
+@prior.check
+def _(result: Prior, **params: object) -> list[Check]:
+    free = freed(NAMES, result)
+    return [Check(f"{len(free)} free: {', '.join(free)}")]
+
+
+@dataclass(frozen=True)
+class Coordinates(Free):
+    """The free parameters as frames see them, in numbers of the converter, which do not depend on the gain.
+
+    A slope of the photon-transfer curve, an offset, a variance in the dark, a response and a saturation level are each
+    known by themselves; gain, pedestal, read noise and well only all together, correlated to 1 - 1e-3. All are
+    logarithms but the offset.
+    """
+
+    linear: ClassVar[frozenset[str]] = frozenset({_LINEAR})
+    edged: ClassVar[frozenset[str]] = frozenset({"full_well"})
+
+    inverse: bool  #: the gain is written in e-/DN
+
+    @classmethod
+    def of(cls, prior: Prior, nominal: Mapping[str, float], gain_unit: str) -> Coordinates:
+        """``nominal``: all of `NAMES`, as `density` takes them."""
+        free = freed(NAMES, prior)
+        held = {name: float(nominal[name]) for name in NAMES if name not in free}
+        return cls(free, prior, held, gain_unit == "e-/DN")
+
+    @property
+    def labels(self) -> tuple[str, ...]:
+        """What each coordinate is."""
+        of = {"gain": "ln slope of the photon-transfer curve", "pedestal": "offset, DN", "spread": "ln spread"}
+        return tuple(of.get(name, f"ln {name.replace('_', ' ')} in numbers") for name in self.names)
+
+    def place(self, parameters: Mapping[str, float | Tensor]) -> Tensor:
+        """(..., free) from parameters."""
+        full = {name: torch.as_tensor(parameters.get(name, self.held.get(name)), dtype=torch.float64) for name in NAMES}
+        slope = self._numbers(full["gain"].log())
+        return torch.stack([self._seen(name, full, slope) for name in self.names], -1)
+
+    def parameters(self, place: Tensor) -> dict[str, Tensor]:
+        """The free parameters at (..., free)."""
+        at = dict(zip(self.names, place.unbind(-1), strict=True))
+        spread = at["spread"] if "spread" in at else torch.tensor(math.log(self.held["spread"]), dtype=torch.float64)
+        if "gain" in at:
+            slope = at["gain"] - 2.0 * spread
+        else:
+            slope = self._numbers(torch.tensor(math.log(self.held["gain"]), dtype=torch.float64))
+        found = {}
+        for name, x in at.items():
+            if name == "gain":
+                found[name] = self._numbers(slope).exp()
+            elif name == _LINEAR:
+                found[name] = x * (-slope).exp()
+            else:
+                found[name] = (x if name == "spread" else x - slope).exp()
+        return found
+
+    def log_prior(self, parameters: Mapping[str, Tensor]) -> Tensor:
+        """(...) density per unit of the coordinates, but for a constant."""
+        total = -0.5 * self.whitened(parameters).square().sum(-1)
+        if _LINEAR in self.names and "gain" in self.names:
+            total = total - self._numbers(parameters["gain"].log())  # a step of the offset is less of a pedestal
+        return total
+
+    def _numbers(self, log_gain: Tensor) -> Tensor:
+        """ln of DN/e- from that of the gain as it is written, and back."""
+        return -log_gain if self.inverse else log_gain
+
+    def _seen(self, name: str, full: Mapping[str, Tensor], slope: Tensor) -> Tensor:
+        if name == "gain":
+            return slope + 2.0 * full["spread"].log()
+        if name == _LINEAR:
+            return full[name] * slope.exp()
+        return full[name].log() + (0.0 if name == "spread" else slope)

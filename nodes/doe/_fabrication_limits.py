@@ -1,0 +1,144 @@
+"""What can be made of a relief: wrapped, limited in depth, cut in steps."""
+
+import math
+from typing import Annotated
+
+import torch
+from pydantic import Field
+from torch import Tensor
+
+from neusee.nodes import Check, Facts, ParameterError, node
+from neusee.nodes._half_precision import refuse_half
+from neusee.nodes.doe._refractive_index import Material, wave_height
+from neusee.nodes.units import PositiveLength, Wavelength
+
+Levels = Annotated[int, Field(ge=2)]
+_VIOLET = 400e-9  #: m, at which a move of the relief is weighed as phase
+
+
+def _quantize(height: Tensor, step: float, levels: int, cyclic: bool) -> Tensor:
+    """Round to the nearest step; the gradient passes straight through."""
+    with torch.no_grad():
+        place = (height / step).round()
+        place = place.remainder(levels) if cyclic else place.clamp(0, levels - 1)
+        change = place * step - height
+    return height + change
+
+
+def _refuse(material: Material, wrap_at: float | None, levels: int | None, max_height: float | None) -> None:
+    if wrap_at is not None and max_height is not None and wave_height(material, wrap_at) > max_height:
+        wave = f"{wave_height(material, wrap_at) * 1e6:.3f} um"
+        text = f"{max_height * 1e6:.3g} um is less than one wave of wrap_at in {material}: needs at least {wave}"
+        raise ParameterError("max_height", text)
+    if levels is not None and wrap_at is None and max_height is None:
+        raise ParameterError("levels", f"{levels} steps of what depth? Set wrap_at or max_height")
+
+
+@node(rtol=1e-5)
+def fabricate(
+    height: Tensor,
+    *,
+    material: Material = "fused silica",
+    wrap_at: Wavelength | None = None,
+    levels: Levels | None = None,
+    max_height: PositiveLength | None = None,
+) -> Tensor:
+    """Make the relief: wrap it at one wave of ``wrap_at``, or cut it flat at ``max_height``; then quantise it.
+
+    Wrapped, ``levels`` steps divide one wave, whose top is its bottom again; limited, they run from 0 to
+    ``max_height`` inclusive. The gradient of wrapping and of the steps is 1, of what is cut off 0.
+
+    Shapes: (v, u) -> (v, u).
+    Units:  m.
+    Error:  1e-7 of the result (float32), however often it was wrapped.
+    Raises: ParameterError where one wave is deeper than ``max_height``, or levels have no depth to divide; ValueError
+            for a height in half precision.
+    Source: Swanson, MIT Lincoln Laboratory Technical Report 854 (1989), for multi-level elements.
+    """
+    _refuse(material, wrap_at, levels, max_height)
+    refuse_half(height=height)
+    if wrap_at is not None:
+        period = wave_height(material, wrap_at)
+        wrapped = height.double().remainder(period).to(height.dtype)  # the period too is rounded in float32
+        return wrapped if levels is None else _quantize(wrapped, period / levels, levels, cyclic=True)
+    if max_height is None:
+        return height
+    limited = height.clamp(0, max_height)
+    return limited if levels is None else _quantize(limited, max_height / (levels - 1), levels, cyclic=False)
+
+
+@fabricate.reference
+def _(
+    height: Tensor, *, material: Material, wrap_at: float | None, levels: int | None, max_height: float | None
+) -> Tensor:
+    """The nearest of all allowed heights, by trying each."""
+    wave = None if wrap_at is None else wave_height(material, wrap_at)
+    x = height.to(torch.float64)
+    x = x if wave is None else x - wave * (x / wave).floor()
+    x = x if max_height is None else torch.minimum(x, torch.full_like(x, max_height)).clamp(min=0)
+    top = wave or max_height
+    if levels is None or top is None:
+        return x
+    allowed = [top * k / (levels if wave else levels - 1) for k in range(levels + 1 if wave else levels)]
+    table = torch.tensor(allowed, dtype=torch.float64, device=x.device)
+    nearest = table[(x[..., None] - table).abs().argmin(-1)]
+    return nearest if wave is None else torch.where(nearest == wave, 0.0, nearest)
+
+
+@fabricate.negligible
+def _(
+    height: Facts, *, material: Material, wrap_at: float | None, levels: int | None, max_height: float | None
+) -> float:
+    """What wrapping, cutting and steps move at most, over the deepest that is known to be made; 0 where all fits.
+
+    What is small in height is not small in phase: the bound is never below the phase, in radians at 400 nm, that
+    the move turns. Wrapping turns no phase at ``wrap_at``, and counts in full all the same.
+    """
+    top = max_height if wrap_at is None else wave_height(material, wrap_at)
+    if not height.finite or top is None:
+        return 0.0 if height.finite else math.inf
+    ends = torch.tensor([height.min, height.max], dtype=getattr(torch, height.dtype))
+    moved = _moved(ends, top, levels, cyclic=wrap_at is not None)
+    if moved == 0:
+        return 0.0
+    made = fabricate(ends, material=material, wrap_at=wrap_at, levels=levels, max_height=max_height)
+    deepest, turned = float(made.abs().max()), 2 * math.pi * moved / wave_height(material, _VIOLET)
+    return max(turned, moved / deepest if deepest > 0 else math.inf)
+
+
+def _moved(ends: Tensor, top: float, levels: int | None, cyclic: bool) -> float:
+    """Bound of what any height between two ends moves, m; exact without steps."""
+    low, high = (float(end) for end in ends)
+    if not cyclic:
+        top = float(torch.tensor(top, dtype=ends.dtype))  # where it is cut
+        return max(high - top, -low, 0.0 if levels is None else top / (levels - 1) / 2)
+    waves = max(abs(math.floor(low / top)), abs(math.floor(high / top)))
+    if levels is None:
+        return top * waves
+    rounded_up = high >= top * (1 - 0.5 / levels) * (1 - 4 * torch.finfo(ends.dtype).eps)  # to a whole wave, so to 0
+    return top * (waves + rounded_up + 0.5 / levels)
+
+
+@fabricate.preflight
+def _(*, material: Material, wrap_at: float | None, levels: int | None, max_height: float | None) -> list[str]:
+    _refuse(material, wrap_at, levels, max_height)
+    if max_height is not None and wrap_at is None:
+        return [f"relief above max_height {max_height * 1e6:.3g} um is cut flat: set wrap_at to wrap it instead"]
+    return []
+
+
+@fabricate.check
+def _(
+    result: Tensor,
+    height: Tensor,
+    *,
+    material: Material,
+    wrap_at: float | None,
+    levels: int | None,
+    max_height: float | None,
+) -> list[Check]:
+    checks = [Check(f"relief {float(height.max()) * 1e6:.4g} um made {float(result.max()) * 1e6:.4g} um deep")]
+    if max_height is not None and wrap_at is None:
+        share = float((height > max_height).double().mean())
+        checks.append(Check(f"cut flat at max_height: {share:.2%} of the grid", share == 0))
+    return checks

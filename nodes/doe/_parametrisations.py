@@ -1,0 +1,185 @@
+"""Reliefs that learn: pixels, Zernike polynomials, rings and a network, each at any sampling of the pupil.
+
+A module is called with the stop and gives the height, float32 in m, counted up from 0. Nothing of it depends on the
+sampling, so that what was learnt on few samples is made on many.
+"""
+
+import math
+from collections.abc import Callable, Mapping
+from typing import Any
+
+import torch
+from torch import Tensor, nn
+
+from neusee.nodes._bicubic_resize import enlarge
+from neusee.nodes._network_weights import loaded
+from neusee.nodes.doe._analytic_masks import axicon, cubic, half_rings, spiral_axicon, vortex, zernike
+from neusee.nodes.doe._height_from_phase import relief
+from neusee.nodes.doe._minimum_feature import smooth
+from neusee.nodes.doe._refractive_index import Material
+from neusee.nodes.doe._sampled_height_map import pixelwise
+from neusee.nodes.doe._unet_height_map import HeightNet, fresh, height_of
+from neusee.nodes.optics._phase_screen import screen
+from neusee.nodes.optics._pupil_grid import Stop, axes, inside, stop
+from neusee.nodes.optics._zernike import combine
+
+Make = Callable[[Stop], Tensor]
+_END = 0.01  #: share of the depth, at its ends, that a start is kept out of: a sigmoid has no slope there
+_ROOM = 0.05  #: of a formula's depth, above and below
+
+
+class _Kept:
+    """One value per stop: what depends on the stop alone is computed once."""
+
+    def __init__(self, make: Make) -> None:
+        self._make, self._found = make, dict[Stop, Tensor]()
+
+    def __call__(self, grid: Stop) -> Tensor:
+        if grid not in self._found:
+            self._found = {grid: self._make(grid)}
+        return self._found[grid]
+
+
+class Pixels(nn.Module):
+    """A height for each of ``grid`` x ``grid`` places, a sigmoid between 0 and ``max_height``; smooth between them.
+
+    It starts from a smooth random relief with features of ``scale`` diameters, or from ``start``.
+    """
+
+    def __init__(
+        self, grid: int, max_height: float, scale: float, rng: torch.Generator, start: Tensor | None = None
+    ) -> None:
+        super().__init__()
+        self.max_height = max_height
+        if start is None:
+            logits = 1.5 * screen(stop(grid, 1.0, float(grid)), scale, rng)
+        else:
+            share = enlarge(start.double() / max_height, grid, grid)
+            logits = torch.logit(share.clamp(_END, 1 - _END))
+        self.logits = nn.Parameter(logits.to(torch.float32))
+
+    def forward(self, grid: Stop) -> Tensor:
+        """Height (v, u)."""
+        logits: Tensor = self.logits
+        if grid.samples != logits.shape[-1]:
+            logits = enlarge(logits, grid.samples, grid.samples)
+        return self.max_height * torch.sigmoid(logits)
+
+
+class Modes(nn.Module):
+    """Zernike polynomials from Noll's number 4 on, ``count`` of them; coefficients in waves, root mean square.
+
+    Piston moves nothing, and tilt only the spot. The start is a random sum, ``waves`` root mean square in all.
+    """
+
+    def __init__(self, count: int, waves: float, wavelength: float, material: Material, rng: torch.Generator) -> None:
+        super().__init__()
+        self.wavelength, self.material = wavelength, material
+        drawn = torch.randn(count, generator=rng, dtype=torch.float64)
+        self.waves = nn.Parameter((waves * drawn / drawn.norm()).to(torch.float32))
+        self._basis = _Kept(self._polynomials)
+
+    def _polynomials(self, grid: Stop) -> Tensor:
+        v, u = axes(grid, self.waves.device)
+        each = [combine({4 + k: 1.0}, v, u).expand(grid.samples, grid.samples) for k in range(len(self.waves))]
+        return torch.stack(each).where(inside(grid, v.device), 0.0).to(torch.float32)
+
+    def forward(self, grid: Stop) -> Tensor:
+        """Height (v, u)."""
+        basis = self._basis(grid)
+        phase = (2 * math.pi * self.waves) @ basis.flatten(1)
+        return relief(phase.view(grid.samples, grid.samples), grid, self.wavelength, self.material)
+
+
+class Rings(nn.Module):
+    """A slope and a step for each of ``count`` annuli of equal area, in waves at the rim; odd about the axis or not.
+
+    phi = 2 pi (a r + c), times the sign of u where it is sided. Five half-rings are among them wherever ``count``
+    is a multiple of five; the start has their slopes, alternating by fifths, with ``noise`` waves of chance on each.
+    """
+
+    def __init__(
+        self, count: int, sided: bool, noise: float, wavelength: float, material: Material, rng: torch.Generator
+    ) -> None:
+        super().__init__()
+        self.sided, self.wavelength, self.material = sided, wavelength, material
+        fifth = (torch.arange(count) * 5).div(count, rounding_mode="floor")
+        start = (12.0 + 6.0 * fifth) * (1 - 2 * (fifth % 2))
+        self.slopes = nn.Parameter(start + noise * torch.randn(count, generator=rng))
+        self.steps = nn.Parameter(torch.zeros(count))
+        self._zones = _Kept(self._zone)
+
+    def _zone(self, grid: Stop) -> Tensor:
+        v, u = axes(grid, self.slopes.device)
+        return ((v.square() + u.square()) * len(self.slopes)).floor().long().clamp(max=len(self.slopes) - 1)
+
+    def forward(self, grid: Stop) -> Tensor:
+        """Height (v, u)."""
+        v, u = axes(grid, self.slopes.device)
+        zone = self._zones(grid)
+        phase = self.slopes.double()[zone] * torch.hypot(v, u) + self.steps.double()[zone]
+        side = torch.sign(u) if self.sided else torch.ones_like(u)
+        return relief(2 * math.pi * phase * side, grid, self.wavelength, self.material)
+
+
+class Drawn(nn.Module):
+    """The network of `doe.unet`, on ``grid`` samples; from ``net``, or as it starts."""
+
+    def __init__(
+        self, width: int, grid: int, max_height: float, rng: torch.Generator, net: HeightNet | None = None
+    ) -> None:
+        super().__init__()
+        self.grid, self.max_height, self.net = grid, max_height, net or fresh(width, grid, rng)
+
+    def forward(self, grid: Stop) -> Tensor:
+        """Height (v, u)."""
+        return height_of(self.net, grid.samples, self.grid, self.max_height)
+
+
+class Written(nn.Module):
+    """A relief as a spot of ``feature`` writes it, `doe.smooth`: nothing is learnt that is too fine to be made."""
+
+    def __init__(self, shape: Make, feature: float) -> None:
+        super().__init__()
+        self.shape, self.feature = shape, feature
+
+    def forward(self, grid: Stop) -> Tensor:
+        """Height (v, u)."""
+        made: Tensor = smooth(
+            self.shape(grid), feature=self.feature, samples=grid.samples, pitch=grid.pitch, diameter=grid.diameter,
+            aperture="clipped",
+        )  # fmt: skip
+        return made
+
+
+# --- of a step --------------------------------------------------------------------------------------------------------
+
+
+def _pixels(params: Mapping[str, Any], rng: torch.Generator) -> Pixels:
+    start: Tensor = pixelwise(**params, rng=rng)
+    return Pixels(params["samples"], params["depth"], params["scale"], rng, start.to(rng.device))
+
+
+def _freed(make: Callable[..., Tensor]) -> Callable[[Mapping[str, Any], torch.Generator], Pixels]:
+    """Start as a formula has it, lifted off the ends, where a sigmoid has no slope: a piston is not seen."""
+
+    def start(params: Mapping[str, Any], rng: torch.Generator) -> Pixels:
+        height = make(**params)
+        room = _ROOM * float(height.amax())
+        return Pixels(params["samples"], float(height.amax()) + 2 * room, 1.0, rng, (height + room).to(rng.device))
+
+    return start
+
+
+def _drawn(params: Mapping[str, Any], rng: torch.Generator) -> Drawn:
+    width, grid, weights = params["width"], min(params["grid"], params["samples"]), params["weights"]
+    net = None if weights is None else loaded(lambda: HeightNet(width), weights).to(rng.device)
+    return Drawn(width, grid, params["max_height"], rng, net)
+
+
+#: by node: a relief that starts as the node draws it, from the node's own parameters; a flat one has no slope to leave
+LEARNT: dict[str, Callable[[Mapping[str, Any], torch.Generator], nn.Module]] = {
+    "doe.pixelwise": _pixels,
+    "doe.unet": _drawn,
+    **{make.path: _freed(make) for make in (half_rings, axicon, spiral_axicon, vortex, cubic, zernike)},
+}

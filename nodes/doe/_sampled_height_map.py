@@ -1,0 +1,130 @@
+"""A relief given sample by sample: from a file, or a smooth random one to start learning from."""
+
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any
+
+import torch
+from pydantic import Field
+from torch import Tensor
+
+from neusee.nodes import ParameterError, node
+from neusee.nodes.doe._height_from_phase import relief_checks
+from neusee.nodes.optics._phase_screen import screen
+from neusee.nodes.optics._pupil_grid import Aperture, grid_notes, stop
+from neusee.nodes.units import Count, DataFile, PositiveLength
+
+if TYPE_CHECKING:
+    from PIL.Image import Image
+
+_GREYS = {"L": 255, "I;16": 65535, "I;16B": 65535, "I": 65535}  #: the whitest level of each kind of grey picture
+Scale = Annotated[float, Field(gt=0, le=1)]  #: part of the pupil's diameter
+
+
+def _header(file: Path) -> tuple[int, ...]:
+    """Shape of the relief in a file, without reading it."""
+    from safetensors import SafetensorError
+
+    try:
+        return _stated(file)
+    except ParameterError:
+        raise
+    except (SafetensorError, OSError, ValueError, EOFError) as error:
+        raise ParameterError("file", f"{file.name} cannot be read as a relief: {error}") from error
+
+
+def _stated(file: Path) -> tuple[int, ...]:
+    if file.suffix == ".npy":
+        import numpy as np
+
+        return tuple(np.load(file, mmap_mode="r", allow_pickle=False).shape)
+    if file.suffix == ".safetensors":
+        from safetensors import safe_open
+
+        with safe_open(file, framework="pt") as tensors:
+            return tuple(tensors.get_slice(_name(file, list(tensors.keys()))).get_shape())
+    if file.suffix == ".png":
+        with _levels(file) as picture:
+            return picture.height, picture.width
+    raise ParameterError("file", f"{file.name}: a relief is read from .npy, .safetensors or grey .png")
+
+
+def _levels(file: Path) -> "Image":
+    """A grey picture, open."""
+    from PIL import Image
+
+    picture = Image.open(file)
+    if picture.mode not in _GREYS:
+        picture.close()
+        raise ParameterError("file", f"{file.name} is {picture.mode}, not grey: a level for each sample, 8 or 16 bit")
+    return picture
+
+
+def _name(file: Path, names: list[str]) -> str:
+    if "height" in names or len(names) == 1:
+        return "height" if "height" in names else names[0]
+    raise ParameterError("file", f"{file.name} holds {', '.join(sorted(names)) or 'nothing'}: name the relief 'height'")
+
+
+def _read(file: Path, depth: float) -> Tensor:
+    import numpy as np
+
+    if file.suffix == ".png":
+        with _levels(file) as picture:
+            levels = torch.from_numpy(np.asarray(picture, dtype=np.float64))
+            return (levels * (depth / _GREYS[picture.mode])).to(torch.float32)
+    if file.suffix == ".npy":
+        return torch.from_numpy(np.load(file, allow_pickle=False)).to(torch.float32)
+    from safetensors.torch import load_file
+
+    tensors = load_file(file)
+    return tensors[_name(file, list(tensors))].to(torch.float32)
+
+
+@node()
+def pixelwise(
+    *,
+    samples: Count,
+    pitch: PositiveLength,
+    diameter: PositiveLength,
+    aperture: Aperture = "inscribed",
+    file: DataFile | None = None,
+    depth: PositiveLength = 1.2e-6,
+    scale: Scale = 0.1,
+    rng: torch.Generator,
+) -> Tensor:
+    """Read a relief from ``file``, or draw a smooth one between 0 and ``depth`` with features of ``scale`` diameters.
+
+    The drawn one is a start for learning: a flat relief sits on a saddle where suppression has no gradient.
+
+    Shapes: -> (v, u).
+    Units:  m; of a .png, levels, of which the whitest is ``depth``.
+    Error:  exact.
+    Raises: ParameterError for a file that is no relief; ValueError where it does not fit the grid, or holds a height
+            below 0 or not finite.
+    Source: by definition.
+    """
+    if file is None:
+        noise = screen(stop(samples, pitch, diameter, aperture), scale, rng)
+        return (depth * torch.sigmoid(1.5 * noise)).to(torch.float32)
+    _fits(file, _header(file), samples)
+    height = _read(file, depth)
+    if not bool(torch.isfinite(height).all()) or float(height.min()) < 0:
+        low = float(height.min())
+        raise ValueError(f"{file.name}: lowest height {low:.3g} m; a relief is finite and counted up from 0")
+    return height
+
+
+def _fits(file: Path, shape: tuple[int, ...], samples: int) -> None:
+    if shape != (samples, samples):
+        fix = f"resample it, or set samples to {shape[-1] if shape else 1}"
+        raise ParameterError("file", f"{file.name} is {shape}, the pupil grid ({samples}, {samples}): {fix}")
+
+
+@pixelwise.preflight
+def _(*, samples: int, file: Path | None, **rest: Any) -> list[str]:
+    if file is not None:
+        _fits(file, _header(file), samples)
+    return grid_notes(samples=samples, **rest)
+
+
+pixelwise.check(relief_checks)

@@ -1,0 +1,117 @@
+"""A relief drawn by a network from the pupil coordinates alone: a smooth prior with a million numbers."""
+
+from functools import partial
+from itertools import pairwise
+from pathlib import Path
+from typing import Any
+
+import torch
+from torch import Tensor, nn
+from torch.nn import functional as F
+
+from neusee.nodes import node
+from neusee.nodes._bicubic_resize import enlarge
+from neusee.nodes._network_weights import loaded, same_layout
+from neusee.nodes.doe._height_from_phase import relief_checks
+from neusee.nodes.optics._pupil_grid import Aperture, grid_notes
+from neusee.nodes.units import Count, DataFile, PositiveLength
+
+PITCH = 15.0  #: of the first layer's sines: about four periods across the pupil at the start
+
+
+class HeightNet(nn.Module):
+    """Eight convolutions, four down and four up, from (u, v) to one logit a sample.
+
+    The first is followed by sines, so that the relief is not bound to be as smooth as its coordinates.
+    """
+
+    def __init__(self, width: int = 32) -> None:
+        super().__init__()
+        sizes = [2, width, 2 * width, 4 * width, 8 * width]
+        pairs = zip(pairwise(sizes), [1, 2, 2, 2], strict=True)
+        self.down = nn.ModuleList(nn.Conv2d(a, b, 3, stride=s) for (a, b), s in pairs)
+        self.up = nn.ModuleList(nn.Conv2d(3 * b, b, 3) for b in sizes[3:0:-1])
+        self.last = nn.Conv2d(width, 1, 3)
+
+    def forward(self, coordinates: Tensor) -> Tensor:
+        """(2, y, x) -> (y, x)."""
+        passed = [torch.sin(PITCH * self.down[0](_edged(coordinates[None])))]
+        for layer in self.down[1:]:
+            passed.append(F.silu(layer(_edged(passed[-1]))))
+        x = passed[-1]
+        for layer, skip in zip(self.up, passed[-2::-1], strict=True):
+            x = F.silu(layer(_edged(torch.cat([enlarge(x, skip.shape[-2], skip.shape[-1]), skip], dim=1))))
+        logits: Tensor = self.last(_edged(x))[0, 0]
+        return logits
+
+
+def _edged(x: Tensor) -> Tensor:
+    """Repeat the outermost rows and columns: zeros there would draw a frame around the relief."""
+    x = torch.cat([x[..., :1, :], x, x[..., -1:, :]], dim=-2)
+    return torch.cat([x[..., :1], x, x[..., -1:]], dim=-1)
+
+
+def coordinates(grid: int, device: torch.device | None = None) -> Tensor:
+    """What the network sees: u and v from -1 to 1 across the pupil grid, (2, grid, grid)."""
+    line = (torch.arange(grid, dtype=torch.float64, device=device) - (grid - 1) / 2) * (2 / grid)
+    v, u = torch.meshgrid(line, line, indexing="ij")
+    return torch.stack([u, v]).to(torch.float32)
+
+
+def height_of(net: nn.Module, samples: int, grid: int, max_height: float) -> Tensor:
+    """Relief (samples, samples) between 0 and ``max_height``, through which the network learns."""
+    like = next(net.parameters())
+    logits = net(coordinates(min(grid, samples), like.device).to(like))
+    return max_height * torch.sigmoid(enlarge(logits, samples, samples))
+
+
+def fresh(width: int, grid: int, rng: torch.Generator) -> HeightNet:
+    """Draw a network: orthogonal weights, zero biases; the last layer centred and scaled: a start far from flat."""
+    net = HeightNet(width).to(rng.device)
+    with torch.no_grad():
+        for name, parameter in net.named_parameters():
+            if name.endswith("bias"):
+                parameter.zero_()
+            else:
+                nn.init.orthogonal_(parameter, gain=2**0.5, generator=rng)
+        logits = net(coordinates(grid, rng.device))
+        spread = logits.std(correction=0).clamp(min=1e-12)
+        net.last.weight.div_(spread)
+        net.last.bias = nn.Parameter((-logits.mean() / spread)[None])
+    return net
+
+
+@node()
+def unet(
+    *,
+    samples: Count,
+    pitch: PositiveLength,
+    diameter: PositiveLength,
+    aperture: Aperture = "inscribed",
+    max_height: PositiveLength = 1.2e-6,
+    grid: Count = 270,
+    width: Count = 32,
+    weights: DataFile | None = None,
+    rng: torch.Generator,
+) -> Tensor:
+    """Draw the relief with a UNet of the pupil coordinates: max_height * sigmoid(UNet(u, v)).
+
+    Evaluated on ``grid`` samples and resampled bicubically before the sigmoid, so that it stays inside its range.
+
+    Shapes: -> (v, u).
+    Units:  m.
+    Error:  1e-6 of max_height (float32).
+    Source: "Learning to See Through Flare", "Neural Representation of the DOE"; the layer widths are ours.
+    """
+    net = fresh(width, min(grid, samples), rng) if weights is None else loaded(partial(HeightNet, width), weights)
+    return height_of(net, samples, grid, max_height).detach()
+
+
+@unet.preflight
+def _(*, width: int, weights: Path | None, **rest: Any) -> list[str]:
+    if weights is not None:
+        same_layout(partial(HeightNet, width), weights, width)
+    return grid_notes(**rest)
+
+
+unet.check(relief_checks)

@@ -1,0 +1,68 @@
+"""What a mask must not do: take the contrast from the scene while it takes the peak from the laser."""
+
+import math
+from typing import Annotated
+
+import torch
+from pydantic import Field
+from torch import Tensor
+
+from neusee.nodes import node
+from neusee.nodes._half_precision import single
+from neusee.nodes.values import Psf
+
+_DARK = 1e-30  #: share of the light that counts as none
+
+Floor = Annotated[float, Field(gt=0, le=0.1)]
+Frequency = Annotated[float, Field(gt=0, le=0.5)]  #: cycles a pixel
+
+
+@node()
+def contrast(psf: Psf, *, floor: Floor = 1e-4, up_to: Frequency | None = None) -> Tensor:
+    """Add up, over the bands, how far the contrast lies below 1: minus the mean of ln sqrt(MTF**2 + floor**2).
+
+    The mean is over the frequencies that the clear aperture passes, those of `metrics.mtf`, and the contrast is the
+    modulus of the OTF over its value at frequency 0. A mean of logarithms is the logarithm of the geometric mean: it
+    follows the median, whereas a mean of squares follows the few frequencies near 0 where contrast is plenty. A factor
+    counts alike at every contrast above ``floor``, as it does in ``losses.lsr`` with ``log``, so that a weight
+    says how many factors of suppression one of contrast is worth; below it little is won or lost, so nulls
+    of single frequencies do not rule. ``up_to`` leaves out what is finer, which a picture that is made smaller loses.
+
+    Shapes: psf.intensity (band, y, x) -> ().
+    Units:  none; 0 a band where nothing is lost, -ln(floor) where all is; up_to in cycles a pixel.
+    Error:  1e-5 in float32. What left the window is not counted, `losses.bsr` does that. A band without light (1e-30)
+            counts as contrast 0, and has no gradient.
+    Source: Goodman, Introduction to Fourier Optics, 4th ed., ch. 7 (OTF, cut-off); the mean of logarithms is ours.
+    """
+    bands = zip(single(psf.intensity), psf.clear_peak.tolist(), strict=True)
+    return torch.stack([_lost(kernel, peak, floor, up_to) for kernel, peak in bands]).sum()
+
+
+def _lost(kernel: Tensor, clear_peak: float, floor: float, up_to: float | None) -> Tensor:
+    y, x = kernel.shape
+    fy, fx = (torch.fft.fftfreq(n, dtype=torch.float64, device=kernel.device) for n in (y, x))
+    cut = min(math.sqrt(4.0 * clear_peak / math.pi), up_to or math.inf)  # cycles a pixel, of a round aperture
+    inside = torch.hypot(fy[:, None], fx[None, : x // 2 + 1]) <= cut
+    light = kernel.sum()
+    dark = light.detach() <= _DARK  # so that what is not a number is seen
+    otf = torch.fft.rfft2(kernel / light.where(~dark, 1.0))[inside]
+    square = (otf.real.square() + otf.imag.square()).where(~dark, 0.0).double()  # the floor is lost beside 1 in single
+    lost: Tensor = -0.5 * (square + floor**2).log().mean()
+    return lost.to(kernel)
+
+
+@contrast.reference
+def _(psf: Psf, *, floor: float = 1e-4, up_to: float | None = None) -> Tensor:
+    total = torch.zeros((), dtype=torch.float64)
+    for kernel, peak in zip(psf.intensity.double(), psf.clear_peak.tolist(), strict=True):
+        y, x = kernel.shape
+        otf = torch.fft.fft2(kernel)[:, : x // 2 + 1]
+        fy, fx = torch.fft.fftfreq(y, dtype=torch.float64), torch.fft.rfftfreq(x, dtype=torch.float64)
+        inside = fy[:, None].square() + fx.square() <= 4.0 * peak / math.pi
+        if up_to is not None:
+            inside &= fy[:, None].square() + fx.square() <= up_to**2
+        whole = otf[0, 0].real
+        dark = bool(whole.detach() <= _DARK)
+        passed = torch.zeros(int(inside.sum())) if dark else otf[inside].abs().square() / whole**2
+        total = total - (passed + floor**2).sqrt().log().mean()
+    return total

@@ -1,0 +1,64 @@
+"""What a mask is trained for: little laser in one place, all of the scene in the field."""
+
+from typing import Annotated
+
+import torch
+from pydantic import Field
+from torch import Tensor
+
+from neusee.nodes import node
+from neusee.nodes._half_precision import single
+from neusee.nodes.values import Psf
+
+_DARK = 1e-30  #: light, or a ratio, that stands for none
+
+
+@node()
+def lsr(psf: Psf, *, power: Annotated[float, Field(ge=8, le=64)] = 8.0, log: bool = False) -> Tensor:
+    """Add up the laser suppression over the bands, with a peak that has a gradient everywhere.
+
+    The peak of PSF / clear peak is the p-norm over pixels, which sees every bright pixel where the maximum sees one.
+    With ``log`` each band counts by its logarithm, so that 1e-3 pulls as hard as 1.
+
+    Shapes: psf.intensity (band, y, x) -> ().
+    Units:  none.
+    Error:  the p-norm of n equal pixels is n^(1/p) of their peak, never below it: 1 % at p = 8 and one bright pixel.
+            float32: 1e-5; of the logarithms 1e-6 a band, which near a ratio of 1 is more of their sum. A band without
+            light has the logarithm of 1e-30, and no gradient.
+    Source: NeuSee, section Two-Stage Training (L_DOE); p-norm for the maximum is ours.
+    """
+    ratio = single(psf.intensity) / psf.clear_peak.to(single(psf.intensity))[:, None, None]
+    top = ratio.detach().amax((-2, -1), keepdim=True)
+    dark = top <= _DARK  # so that what is not a number is seen
+    scale = top.where(~dark, 1.0)
+    sums = (ratio / scale).pow(power).sum((-2, -1)).where(~dark[:, 0, 0], 1.0)  # the root has no slope at 0
+    norm = sums.pow(1.0 / power).where(~dark[:, 0, 0], 0.0)
+    peaks = scale[:, 0, 0] * norm
+    loss: Tensor = (peaks + _DARK).log().sum() if log else peaks.sum()
+    return loss
+
+
+@lsr.reference
+def _(psf: Psf, *, power: float = 8.0, log: bool = False) -> Tensor:
+    ratio = (psf.intensity.double() / psf.clear_peak[:, None, None]).flatten(1)
+    dark = ratio.detach().amax(1, keepdim=True) <= _DARK
+    peaks = (
+        ((power * ratio.where(~dark, 1.0).clamp_min(1e-300).log()).logsumexp(1) / power).exp().where(~dark[:, 0], 0.0)
+    )
+    loss: Tensor = (peaks + _DARK).log().sum() if log else peaks.sum()
+    return loss
+
+
+@node()
+def bsr(image: Tensor, plain_image: Tensor) -> Tensor:
+    """Add up, over the bands, the scene's light through the plain lens over that through the mask.
+
+    Shapes: image and plain_image (..., band, y, x) -> ().
+    Units:  none; the number of bands where nothing is lost.
+    Error:  by energy in the field: blind to sharpness. A band without light counts as 1.
+    Source: NeuSee, section Two-Stage Training (L_DOE), as a ratio of energies.
+    """
+    kept, plain = (x.sum((-2, -1), dtype=torch.float64) for x in (image, plain_image))
+    dark = (plain <= _DARK) | (kept <= _DARK)  # so that what is not a number is seen
+    ratios: Tensor = torch.where(dark, 1.0, plain / kept.where(~dark, 1.0))
+    return ratios.sum().to(single(image).dtype)

@@ -1,0 +1,54 @@
+"""What a restoration is trained for: the right colour at every pixel and in every frequency."""
+
+from typing import Annotated
+
+import torch
+from pydantic import Field
+from torch import Tensor
+
+from neusee.nodes import node
+from neusee.nodes._half_precision import single
+
+_LEAST = 1e-30  #: of a power: the root has no slope at 0
+
+
+@node()
+def charbonnier(
+    estimate: Tensor, truth: Tensor, *, epsilon: Annotated[float, Field(gt=0, allow_inf_nan=False)] = 1e-6
+) -> Tensor:
+    """Average sqrt(difference^2 + epsilon): an absolute difference that is smooth at 0.
+
+    Shapes: estimate and truth alike -> ().
+    Units:  those of the pictures; epsilon in their square.
+    Error:  above the mean absolute difference by sqrt(epsilon) at most, 1e-3.
+    Raises: ValueError for pictures of different shape.
+    Source: NeuSee, section Two-Stage Training (L_REC), with the mean; epsilon is ours.
+    """
+    _alike(estimate, truth)
+    return ((single(estimate) - single(truth)).square() + epsilon).sqrt().mean()
+
+
+@node()
+def fft_l1(estimate: Tensor, truth: Tensor) -> Tensor:
+    """Average the absolute difference of the two spectra.
+
+    In float64: of a coefficient near 0, a transform in single precision knows neither size nor direction, and its slope
+    is its direction.
+
+    Shapes: estimate and truth (..., y, x) -> ().
+    Units:  those of the pictures: the transform is unitary, so the size of a picture does not matter.
+    Error:  that of the result's type, 1e-7 in float32; a coefficient under 1e-15 has no slope.
+    Raises: ValueError for pictures of different shape.
+    Source: NeuSee, section Two-Stage Training (L_REC), with a unitary transform and the mean.
+    """
+    _alike(estimate, truth)
+    spectrum: Tensor = torch.fft.fft2(estimate.double() - truth.double(), norm="ortho")
+    loss = (spectrum.real.square() + spectrum.imag.square() + _LEAST).sqrt().mean()
+    return loss.to(single(estimate).dtype)
+
+
+def _alike(estimate: Tensor, truth: Tensor) -> None:
+    if estimate.shape != truth.shape:
+        raise ValueError(
+            f"estimate {tuple(estimate.shape)} and truth {tuple(truth.shape)} differ: crop the truth alike"
+        )

@@ -1,0 +1,101 @@
+"""What a mask takes from the scene for good: the part of a picture that no Wiener filter brings back."""
+
+from typing import Annotated
+
+import torch
+from pydantic import Field
+from torch import Tensor
+
+from neusee.nodes import node
+from neusee.nodes._half_precision import single
+from neusee.nodes.losses._contrast_loss import Frequency
+from neusee.nodes.restore._inverse._masked_blur import variance
+from neusee.nodes.restore._inverse._wiener import effective_psf, fall, grey_shares
+from neusee.nodes.values import Bands, Psf
+
+Share = Annotated[float, Field(ge=0, le=1)]
+Noise = Annotated[float, Field(gt=0, allow_inf_nan=False)]
+
+
+@node()
+def wiener(
+    psf: Psf,
+    illuminant: Tensor,
+    responses: Tensor,
+    bands: Bands,
+    *,
+    noise: Noise = 1e-3,
+    colour: Share = 1.0,
+    up_to: Frequency | None = None,
+) -> Tensor:
+    """Take the share of a picture's variance that a Wiener filter leaves wrong: its logarithm, mean over channels.
+
+    Pictures whose power falls as that of `restore.wiener`'s prior, filtered with the PSF that a channel sees of a grey
+    scene. Wrong is, by frequency, what the noise hides, and for the share ``colour`` of the variance, which is of one
+    band alone, what that band's PSF differs from the channel's by. ``up_to`` leaves out what is finer, which a picture
+    that is made smaller loses.
+
+    Shapes: psf.intensity (band, y, x), responses (channel, band) -> ().
+    Units:  none; ``noise``: variance of a pixel's noise, of the picture's variance; up_to in cycles a pixel.
+    Error:  1e-5 in float32. Clipped pixels, the edge and that noise follows the light are not in it: a measure to
+            compare masks by, not an error to expect.
+    Raises: ValueError where bands differ.
+    Source: Wiener filter as in Goodman, Introduction to Fourier Optics, 4th ed., ch. 8; the share of one band is ours.
+    """
+    y, x = psf.intensity.shape[-2:]
+    intensity = single(psf.intensity)
+    effective = effective_psf(psf, illuminant, responses, bands).to(intensity)
+    shares = grey_shares(illuminant, responses, bands).to(intensity)
+    signal = (fall((y, x)) / noise).to(intensity)  # of a frequency's noise
+    known = signal * _counted((y, x), up_to).to(signal)
+    each, lost = torch.fft.rfft2(intensity), list[Tensor]()
+    for channel, share in zip(torch.fft.rfft2(effective), shares, strict=True):
+        passed = signal * _square(channel)
+        filtered = signal * passed / (passed + 1).square()  # of the filter, its square
+        apart = torch.tensordot(share, _square(each - channel), 1)
+        wrong = 1 / (passed + 1) + colour * filtered * apart
+        lost.append(variance(wrong * known, (y, x)) / variance(known, (y, x)))
+    result: Tensor = torch.stack(lost).clamp_min(1e-30).log().mean()
+    return result
+
+
+def _square(spectrum: Tensor) -> Tensor:
+    return spectrum.real.square() + spectrum.imag.square()
+
+
+def _counted(size: tuple[int, int], up_to: float | None) -> Tensor:
+    """Which frequencies of half a spectrum count: up to ``up_to``, and never the mean."""
+    fy, fx = torch.fft.fftfreq(size[0], dtype=torch.float64), torch.fft.rfftfreq(size[1], dtype=torch.float64)
+    square = fy[:, None].square() + fx.square()
+    inside: Tensor = (square > 0) & (square <= (1.0 if up_to is None else up_to**2))
+    return inside
+
+
+@wiener.reference
+def _(
+    psf: Psf,
+    illuminant: Tensor,
+    responses: Tensor,
+    bands: Bands,
+    *,
+    noise: float = 1e-3,
+    colour: float = 1.0,
+    up_to: float | None = None,
+) -> Tensor:
+    y, x = psf.intensity.shape[-2:]
+    fy, fx = torch.fft.fftfreq(y, dtype=torch.float64), torch.fft.fftfreq(x, dtype=torch.float64)
+    square = fy[:, None].square() + fx.square()
+    power = (square + 1 / (x * y)) ** -1.5
+    signal = power / power.mean() / noise
+    counted = (square > 0) & (square <= (up_to or 1.0) ** 2)
+    each = torch.fft.fft2(psf.intensity.double())
+    seen = responses.double() * (illuminant.double() * bands.centres)
+    logs = []
+    for share in seen / seen.sum(-1, keepdim=True):
+        channel = (share[:, None, None] * each).sum(0)
+        filtered = signal * channel.conj() / (signal * channel.abs().square() + 1)
+        wrong = signal * (1 - filtered * channel).abs().square() + filtered.abs().square()
+        for weight, band in zip(share, each, strict=True):
+            wrong = wrong + colour * weight * signal * (filtered * (band - channel)).abs().square()
+        logs.append((wrong[counted].sum() / signal[counted].sum()).clamp_min(1e-30).log())
+    return torch.stack(logs).mean()

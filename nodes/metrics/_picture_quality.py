@@ -1,0 +1,116 @@
+"""How close a restored picture is to the truth."""
+
+import math
+from typing import Annotated, Literal, NamedTuple
+
+import torch
+from pydantic import Field
+from torch import Tensor
+from torch.nn.functional import pad
+
+from neusee.nodes import Check, node
+from neusee.nodes._half_precision import single
+
+_WINDOW, _SIGMA = 11, 1.5  #: pixels, of the Gaussian of SSIM
+_C1, _C2 = 0.01**2, 0.03**2  #: of SSIM, for a white of 1
+_STRIPE, _BLOCK = 54, 54  #: rows at a time and columns at a time: 64 with the rim
+
+
+class Quality(NamedTuple):
+    """Three ways to compare two pictures, over all channels together."""
+
+    l1: Tensor  #: () float64, mean absolute difference
+    psnr: Tensor  #: () float64, dB, for a white of 1; 200 dB for equal pictures
+    ssim: Tensor  #: () float64, at most 1
+
+
+@node(rtol=1e-4)
+def quality(
+    estimate: Tensor,
+    truth: Tensor,
+    *,
+    border: Annotated[int, Field(ge=0)] = 0,
+    domain: Literal["linear", "encoded"] = "encoded",
+) -> Quality:
+    """Compare a picture with the truth: mean absolute difference, PSNR and SSIM.
+
+    Both are clipped to [0, 1], the range a display shows. `encoded` compares them as sRGB encodes them, the way
+    photographs are published and compared; `linear` compares light. SSIM is the Gaussian form (11 x 11, sigma 1.5)
+    of each RGB channel over the pixels whose window lies inside the picture.
+
+    Shapes: estimate and truth (3, y, x), linear sRGB -> three scalars, float64.
+    Units:  none; PSNR dB. ``border`` pixels at each side do not count.
+    Error:  PSNR 2e-5 dB and SSIM 1e-5 against scikit-image.
+    Raises: ValueError for pictures of different shape, or smaller than the window of SSIM.
+    Source: Wang et al., IEEE Trans. Image Process. 13, 600 (2004); sRGB as IEC 61966-2-1.
+    """
+    if estimate.shape != truth.shape:
+        raise ValueError(
+            f"estimate {tuple(estimate.shape)} and truth {tuple(truth.shape)} differ: crop the truth alike"
+        )
+    a, b = (_inside(x, border) for x in (estimate, truth))
+    if min(a.shape[-2:]) < _WINDOW:
+        raise ValueError(f"{tuple(a.shape[-2:])} pixels inside the border: SSIM needs {_WINDOW} x {_WINDOW}")
+    absolute, square, alike = _sums(a, b, domain)
+    psnr = -10.0 * (square / a.numel()).clamp_min(1e-20).log10()
+    seen = a[..., _WINDOW - 1 :, _WINDOW - 1 :].numel()
+    return Quality(absolute / a.numel(), psnr, alike / seen)
+
+
+@quality.check
+def _(result: Quality, *inputs: Tensor, **params: object) -> list[Check]:
+    l1, psnr, ssim = (float(x) for x in result)
+    return [Check(f"L1 {l1:.4f}, PSNR {psnr:.2f} dB, SSIM {ssim:.3f}", math.isfinite(psnr))]
+
+
+def _inside(picture: Tensor, border: int) -> Tensor:
+    y, x = picture.shape[-2:]
+    return single(picture)[..., border : max(y - border, border), border : max(x - border, border)]
+
+
+def _shown(picture: Tensor, domain: str) -> Tensor:
+    from kornia.color import linear_rgb_to_rgb
+
+    inside = picture.clamp(0, 1)
+    return linear_rgb_to_rgb(inside) if domain == "encoded" else inside
+
+
+def _sums(a: Tensor, b: Tensor, domain: str) -> tuple[Tensor, Tensor, Tensor]:
+    """Sums of absolute and of square differences over all pixels, and of SSIM: by stripes, which stay in cache."""
+    absolute, square, alike = (torch.zeros((), dtype=torch.float64, device=a.device) for _ in range(3))
+    rows = a.shape[-2] - _WINDOW + 1
+    for first in range(0, rows, _STRIPE):
+        last = min(first + _STRIPE, rows)
+        p, q = (_shown(x[..., first : last + _WINDOW - 1, :], domain) for x in (a, b))
+        own = None if last == rows else last - first  # the rest counts in the next stripe
+        difference = (p - q)[..., :own, :]
+        absolute = absolute + difference.abs().sum(-1).sum(dtype=torch.float64)
+        square = square + difference.square().sum(-1).sum(dtype=torch.float64)
+        alike = alike + _ssim(p, q).sum(-1).sum(dtype=torch.float64)
+    return absolute, square, alike
+
+
+def _ssim(p: Tensor, q: Tensor) -> Tensor:
+    """SSIM at the pixels whose window lies inside; the two variances are only asked for together."""
+    mean_p, mean_q, squares, product = _blurred(torch.stack([p, q, p * p + q * q, p * q]))
+    means, mean_squares = mean_p * mean_q, mean_p * mean_p + mean_q * mean_q
+    numerator = (2 * means + _C1) * (2 * (product - means) + _C2)
+    similar: Tensor = numerator / ((mean_squares + _C1) * (squares - mean_squares + _C2))
+    return similar
+
+
+def _blurred(maps: Tensor) -> Tensor:
+    """Means (..., y, x) under the window: along y, and then along x by blocks, as products with small matrices."""
+    rows, columns = (n - _WINDOW + 1 for n in maps.shape[-2:])
+    tall = _windows(rows, maps) @ maps
+    blocks = -(-columns // _BLOCK)
+    wide = pad(tall, (0, blocks * _BLOCK - columns)).unfold(-1, _BLOCK + _WINDOW - 1, _BLOCK)
+    mean = wide.flatten(0, -2) @ _windows(_BLOCK, maps).T
+    return mean.view(*tall.shape[:-1], -1)[..., :columns]
+
+
+def _windows(count: int, like: Tensor) -> Tensor:
+    """The window at so many places in a row: (count, count + window - 1)."""
+    offset = torch.arange(count + _WINDOW - 1, dtype=torch.float64) - torch.arange(count)[:, None] - _WINDOW // 2
+    weight: Tensor = torch.exp(-offset.square() / (2 * _SIGMA**2)).where(offset.abs() <= _WINDOW // 2, 0.0)
+    return (weight / weight[0].sum()).to(like)

@@ -1,0 +1,81 @@
+"""How much contrast a PSF leaves, and how far it spreads the light."""
+
+import math
+from typing import NamedTuple
+
+import torch
+from torch import Tensor
+
+from neusee.nodes import Check, node
+from neusee.nodes._half_precision import single
+from neusee.nodes.units import PositiveLength
+from neusee.nodes.values import Psf
+
+_DARK = 1e-30  #: share of the light that counts as none
+
+
+class Mtf(NamedTuple):
+    """Contrast inside the band that the clear aperture can pass."""
+
+    rms: Tensor  #: (band,) float64, root mean square
+    median: Tensor  #: (band,) float64
+    low: Tensor  #: (band,) float64, the first percentile: deep nulls show here
+
+
+@node(rtol=1e-5)
+def mtf(psf: Psf) -> Mtf:
+    """Find the contrast that is left, |OTF| over its value at frequency 0, within the band of the clear aperture.
+
+    The band ends at D / (wavelength x f), which the peak of the clear lens p0 tells: sqrt(4 p0 / pi) cycles a pixel.
+    Parseval: no mask has an rms contrast (over all frequencies that the pixels sample) above sqrt(LSR p0 / light kept).
+
+    Shapes: psf.intensity (band, y, x) -> three of (band,) float64.
+    Units:  none.
+    Error:  1e-7 in float32, and that of the window: light outside it counts as lost, frequencies are its own. The
+            cut-off holds for a round aperture and a PSF sampled at points. Without light (1e-30) it is 0. The gradient
+            is that of `rms`: a median hangs on one frequency, and of equal ones it is chance on which.
+    Source: Goodman, Introduction to Fourier Optics, 4th ed., ch. 7 (OTF as autocorrelation of the pupil).
+    """
+    rows = [_contrast(one, float(p)) for one, p in zip(psf.intensity, psf.clear_peak, strict=True)]
+    return Mtf(*(torch.stack(column) for column in zip(*rows, strict=True)))
+
+
+def _contrast(kernel: Tensor, clear_peak: float) -> tuple[Tensor, Tensor, Tensor]:
+    y, x = kernel.shape
+    fy, fx = (torch.fft.fftfreq(n, dtype=torch.float64, device=kernel.device) for n in (y, x))
+    inside = torch.hypot(fy[:, None], fx[None, : x // 2 + 1]) <= math.sqrt(4.0 * clear_peak / math.pi)
+    otf = torch.fft.rfft2(single(kernel))
+    whole = otf[0, 0].to(torch.complex128).abs()
+    dark = whole <= _DARK
+    passed = otf[inside].to(torch.complex128).abs() / whole.where(~dark, 1.0)
+    found = passed.where(~dark, 0.0).clamp_max(1.0)
+    ordered = found.detach().sort().values
+    rms: Tensor = torch.linalg.vector_norm(found) / math.sqrt(len(found))
+    return rms, ordered[(len(ordered) - 1) // 2], ordered[(len(ordered) - 1) // 100]
+
+
+@mtf.check
+def _(result: Mtf, *inputs: Psf) -> list[Check]:
+    rms, median = float(result.rms.mean()), float(result.median.mean())
+    return [Check(f"contrast rms {rms:.3g}, median {median:.3g}", bool((result.rms <= 1.0 + 1e-6).all()))]
+
+
+@node(rtol=1e-6)
+def encircled(psf: Psf, *, pixel_pitch: PositiveLength, radius: PositiveLength) -> Tensor:
+    """Add up the share of the pupil's light that falls within a radius of the axis.
+
+    Shapes: psf.intensity (band, y, x) -> (band,) float64.
+    Units:  radius m on the sensor; result a share of the light through the clear pupil.
+    Error:  whole pixels: a pixel counts where its centre lies within the radius.
+    Source: Goodman, Introduction to Fourier Optics, 4th ed.; Born and Wolf, Principles of Optics, 7th ed., ch. 8.
+    """
+    sizes = psf.intensity.shape[-2:]
+    y, x = ((torch.arange(n, device=psf.intensity.device) - n // 2) * pixel_pitch for n in sizes)
+    inside = torch.hypot(y[:, None], x[None, :]) <= radius
+    return (psf.intensity * inside).sum(-1).sum(-1, dtype=torch.float64)
+
+
+@encircled.check
+def _(result: Tensor, *inputs: Psf, **params: float) -> list[Check]:
+    low, high = float(result.min()), float(result.max())
+    return [Check(f"{low:.1%} to {high:.1%} inside", high <= 1.01)]

@@ -1,0 +1,180 @@
+"""Which planes, kernels, bands and window of the PSF are enough for a few sums over the bands of an image."""
+
+import math
+from collections.abc import Iterator
+from typing import NamedTuple
+
+import torch
+from torch import Tensor
+
+from neusee.nodes.optics._imaging._band_image import smooth
+from neusee.nodes.optics._imaging._psf_energy import Passed, by_window
+from neusee.nodes.optics._imaging._summed_convolution import Mix
+
+_SMALL = 0.05  #: of the bound goes to bands that are too weak
+_FARTHER = 6  #: planes more than are needed that are tried
+_EVERY = 8  #: one band of so many is asked first whether a smaller window may do
+
+
+class Given(NamedTuple):
+    """What is known of scene, PSF and rows before anything is convolved; on the CPU, float64."""
+
+    rows: Tensor  #: (row, band)
+    basis: Tensor  #: (band, k)
+    rest: Tensor  #: (k + 1, band) what the first planes leave of each band, in the norm that is asked for
+    most: Tensor  #: (k,) the planes, in that norm
+    gram: Tensor  #: (k, k) products of the planes
+    copies: int  #: how often a point of the scene may occur: 9 where the border reflects
+    passed: Passed
+    size: tuple[int, int]
+    reflect: bool
+
+
+class Plan(NamedTuple):
+    """What is convolved, and what that leaves away."""
+
+    planes: int
+    bands: Tensor  #: indices of those that count
+    window: tuple[int, int]
+    kernels: Tensor | None  #: (kernel, those bands); None: the PSF of each is a kernel
+    mix: Mix
+    off: Tensor  #: (row,) bound of what is left away
+    cost: float  #: s, about, on two cores
+    whole: bool  #: nothing is left away that is not zero
+
+    @property
+    def kept(self) -> list[int]:
+        """What `Channels.kept` says."""
+        count = len(self.bands) if self.kernels is None else len(self.kernels)
+        return [self.planes, count, len(self.bands), *self.window]
+
+
+class Fewer(NamedTuple):
+    """Kernels in the order of the light that they move; the wanted ones are mixed of the first few."""
+
+    kernels: Tensor  #: (q, band)
+    mixed: Tensor  #: (row x plane, q)
+    off: Tensor  #: (q - 1, row) bound of what the first 1, 2, ... leave away
+
+
+def with_windows(given: Given, intensity: Tensor, brightest: Tensor, within: float) -> Given:
+    """What smaller windows of the PSF would lose, unless a few bands alone would lose too much in any of them."""
+    few, signed = slice(_EVERY // 2, None, _EVERY), given.passed.signed
+    if len(intensity) > _EVERY:
+        some = given._replace(rows=given.rows[:, few], basis=given.basis[few], rest=given.rest[:, few])
+        if not _narrow(some._replace(passed=by_window(intensity[few], signed)), within * brightest):
+            return given
+    return given._replace(passed=by_window(intensity, signed))
+
+
+def _narrow(given: Given, limit: Tensor) -> bool:
+    """Whether the largest window but one may do for any number of planes."""
+    bands, planes = torch.arange(len(given.basis)), range(1, len(given.most) + 1)
+    return len(given.passed.windows) > 1 and any(
+        bool((given.rows.abs() @ _tail(given, bands, k, 1) <= limit).all()) for k in planes
+    )
+
+
+def choose(given: Given, brightest: Tensor, within: float) -> Plan:
+    """The cheapest plan that leaves away no more than ``within`` of the brightest pixel of each row, or the whole."""
+    bands, lost = _strong(given, brightest, within)
+    whole = min(_plans(given, bands, lost, len(given.most), 0), key=lambda plan: plan.cost)
+    best = whole._replace(whole=True)
+    if within <= 0:
+        return best
+    for k in _enough(given, bands, lost, brightest, within):
+        fewer = _fewer(given, bands, k, brightest)
+        for j in range(len(given.passed.windows)):
+            found = _plans(given, bands, lost, k, j, (within * brightest, fewer))
+            best = min([best, *found], key=lambda plan: plan.cost)
+    return best
+
+
+def _strong(given: Given, brightest: Tensor, within: float) -> tuple[Tensor, Tensor]:
+    """The bands that count, and by row what the others may add at most."""
+    may = given.rows.abs() * (given.rest[0] * given.passed.total)
+    share = torch.where(may > 0, may / brightest.clamp_min(1e-300)[:, None], 0.0).amax(0)
+    order = share.argsort()
+    weak = order[share[order].cumsum(0) <= _SMALL * max(within, 0.0)]
+    bands = torch.ones_like(share, dtype=torch.bool).index_fill_(0, weak, False)
+    if not bool(bands.any()):
+        bands[int(share.argmax())] = True
+    return bands.nonzero()[:, 0], may[:, ~bands].sum(1)
+
+
+def _enough(given: Given, bands: Tensor, lost: Tensor, brightest: Tensor, within: float) -> list[int]:
+    """Numbers of planes that are worth a try."""
+    off = lost + (given.rest[:, bands] * given.passed.total[bands]) @ given.rows[:, bands].abs().T
+    fits = [k for k in range(1, len(given.most) + 1) if bool((off[k] <= within * brightest).all())]
+    return fits[:_FARTHER]
+
+
+def _plans(
+    given: Given, bands: Tensor, lost: Tensor, k: int, j: int, within: tuple[Tensor, Fewer] | None = None
+) -> Iterator[Plan]:
+    """Ways to convolve k planes in a window: a kernel for each plane and row, fewer that these mix, or each band."""
+    rows, basis, through = given.rows[:, bands], given.basis[bands, :k], given.passed.total[bands]
+    off = lost + rows.abs() @ (given.rest[k, bands] * through) + rows.abs() @ _tail(given, bands, k, j)
+    if within is not None and not bool((off <= within[0]).all()):
+        return
+    count = len(rows)
+    u = torch.eye(count, dtype=torch.float64).repeat_interleave(k, 1)
+    x = torch.eye(k, dtype=torch.float64).repeat(count, 1)
+    sums = _sums(rows, basis)
+
+    def plan(kernels: Tensor | None, mix: Mix, off: Tensor) -> Plan:
+        window = given.passed.windows[j]
+        return Plan(k, bands, window, kernels, mix, off, _cost(given, window, k, len(bands), kernels, mix), False)
+
+    yield plan(sums, Mix(u, x, None, count), off)
+    yield plan(None, Mix(rows, basis, None), off)
+    if within is not None:
+        limit, few = within
+        for q in (few.off + off <= limit).all(1).nonzero()[:1, 0].tolist():
+            yield plan(few.kernels[: q + 1], Mix(u, x, few.mixed[:, : q + 1], count), off + few.off[q])
+
+
+def _fewer(given: Given, bands: Tensor, k: int, brightest: Tensor) -> Fewer:
+    """Singular values of the wanted sums, each by the light that it moves: that of its plane and of its band."""
+    rows, band = given.rows[:, bands], given.passed.total[bands]
+    plane = torch.where(brightest[:, None] > 0, given.most[:k] / brightest[:, None], 0.0).flatten()
+    scaled = plane[:, None] * _sums(rows, given.basis[bands, :k]) * band
+    a, s, b = torch.linalg.svd(scaled, full_matrices=False)
+    off = [(scaled - (a[:, :q] * s[:q]) @ b[:q]).abs().sum(1).reshape(len(rows), -1).sum(1) for q in range(1, len(s))]
+    kernels = torch.where(band > 0, b / band, 0.0)
+    mixed = torch.where(plane[:, None] > 0, a * s / plane[:, None], 0.0)
+    unknown = torch.where((brightest == 0) & (rows != 0).any(1), math.inf, 0.0)  # a row of no weight in the sum above
+    return Fewer(kernels, mixed, torch.stack(off) * brightest + unknown if off else brightest[None][:0])
+
+
+def _sums(rows: Tensor, basis: Tensor) -> Tensor:
+    """The weights of the bands in the kernel of each row and plane."""
+    return (rows[:, None, :] * basis.T).flatten(0, 1)
+
+
+def _tail(given: Given, bands: Tensor, k: int, j: int) -> Tensor:
+    """By band, the most that the PSF outside the window adds to a pixel: Young's inequality in three norms."""
+    basis = given.basis[bands, :k]
+    beyond, above = given.passed.beyond[j, bands], given.passed.above[j, bands]
+    top = given.rest[0, bands] + given.rest[k, bands]
+    power = ((basis @ given.gram[:k, :k]) * basis).sum(1).clamp_min(0) * given.copies
+    return torch.minimum(top * beyond, (power * beyond * above).sqrt() * (1 + 1e-6))
+
+
+def _cost(given: Given, window: tuple[int, int], k: int, bands: int, kernels: Tensor | None, mix: Mix) -> float:
+    """Seconds, about: transforms, products of spectra, sums of kernels, as they were measured on two cores."""
+    area = math.prod(transform(given, window))
+    count = bands if kernels is None else len(kernels)
+    terms = len(mix.x) if mix.x is not None else k
+    products = terms * (k + len(given.rows) + (count if mix.y is not None else 0) + 8)
+    sums = 0 if kernels is None else count * bands * math.prod(window)
+    return area * (2e-9 * (k + count + len(given.rows)) + 3e-11 * products) + 1.4e-11 * sums
+
+
+def transform(given: Given, window: tuple[int, int]) -> tuple[int, int]:
+    """Lengths of the transform: just long enough that nothing wraps into the field."""
+    if given.reflect:
+        y, x = (smooth(s + w - 1) for s, w in zip(given.size, window, strict=True))
+    else:
+        y, x = (smooth(max(s + w // 2, s + w - 1 - w // 2)) for s, w in zip(given.size, window, strict=True))
+    return y, x

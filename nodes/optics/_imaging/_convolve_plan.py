@@ -1,0 +1,95 @@
+"""Carry out a plan: borders, kernels, the convolutions, and how far their rounding may reach."""
+
+import math
+
+import torch
+from torch import Tensor
+from torch.nn.functional import pad
+
+from neusee.nodes.optics._imaging._collapsed_plan import Given, Plan, transform
+from neusee.nodes.optics._imaging._psf_energy import centred
+from neusee.nodes.optics._imaging._summed_convolution import Mix, Where, summed
+
+_SOME = 16  #: rows of the PSF summed at a time: those of 31 bands stay in the cache
+
+
+def convolved(planes: Tensor, intensity: Tensor, given: Given, plan: Plan) -> Tensor:
+    """The rows of the image: (row, y, x)."""
+    scene = bordered(planes[: plan.planes], given, plan.window)
+    return summed(scene, _kernels(intensity, plan), plan.mix, _where(given, plan.window))
+
+
+def _where(given: Given, window: tuple[int, int]) -> Where:
+    """The part of the convolution that is the image."""
+    (m, n), zero = window, (0, 0)
+    at = (m - 1, n - 1) if given.reflect else (m // 2, n // 2)
+    return Where(zero, zero, at, given.size, transform(given, window))
+
+
+def majorant(off: Tensor, intensity: Tensor, given: Given) -> Tensor:
+    """What ``off`` (y, x) in every band adds to any row at most: (y, x); one kernel for all rows."""
+    window = (intensity.shape[1], intensity.shape[2])
+    heaviest = given.rows.abs().amax(0).to(intensity)
+    kernel = _summed_bands(heaviest[None], intensity, given.passed.signed)
+    reached = summed(bordered(off[None], given, window), kernel, Mix(None, None, None), _where(given, window))
+    return reached[0].clamp_min_(0)
+
+
+def bordered(planes: Tensor, given: Given, window: tuple[int, int]) -> Tensor:
+    """The planes as they are convolved with a PSF of this size."""
+    if not given.reflect:
+        return planes
+    m, n = window
+    around = (n - 1 - n // 2, n // 2, m - 1 - m // 2, m // 2)
+    wide: Tensor = pad(planes, around, mode="reflect")
+    return wide
+
+
+def _kernels(intensity: Tensor, plan: Plan) -> Tensor:
+    stack = centred(intensity, plan.window)
+    if plan.kernels is None:
+        return stack if len(plan.bands) == len(stack) else stack[plan.bands.to(stack.device)]
+    weights = plan.kernels.new_zeros(len(plan.kernels), len(stack))
+    weights = weights.index_copy_(1, plan.bands, plan.kernels).to(stack)
+    return _summed_bands(weights, stack)
+
+
+def _summed_bands(weights: Tensor, stack: Tensor, absolute: bool = False) -> Tensor:
+    """Sums (kernel, y, x) over the bands of a stack, or of its size; where that is a copy, of some rows at a time."""
+    if stack.requires_grad or (stack.is_contiguous() and not absolute):
+        return (weights @ stack.flatten(1)).view(-1, *stack.shape[1:])
+    sums = stack.new_empty(len(weights), *stack.shape[1:])
+    for y in range(0, stack.shape[1], _SOME):
+        rows = stack[:, y : y + _SOME]
+        rows = rows.abs() if absolute else rows
+        sums[:, y : y + _SOME] = (weights @ rows.flatten(1)).view(-1, *rows.shape[1:])
+    return sums
+
+
+def guessed(planes: Tensor, given: Given) -> Tensor:
+    """About the brightest pixel of each row: a quarter of that without blur, and half of what the blur can leave."""
+    through = given.passed.total
+    room, sharp = planes.new_empty(planes[0].numel()), torch.zeros_like(given.rows[:, 0])
+    for i, weights in enumerate((given.rows * through @ given.basis).to(planes)):
+        bright = torch.mv(planes.flatten(1).T, weights, out=room)
+        sharp[i] = torch.maximum(bright.amax(), -bright.amin())
+    power = ((given.basis @ given.gram) * given.basis).sum(1).clamp_min(0) * given.copies
+    blurred = given.rows.abs() @ (power * through * given.passed.peak).sqrt()
+    return torch.minimum(sharp / 4, blurred / 2)
+
+
+def rounding(given: Given, plan: Plan, found: Tensor, eps: float) -> Tensor:
+    """By row, about the largest error of the transforms.
+
+    Their rounding is as good as white: a share eps sqrt(log2 N) / 2 of the power, spread over all N samples. Of that
+    spread eight sigma, and ten roundings of the brightest pixel for what is not spread: sums over the bands, planes and
+    rows of a PSF, of which five were found.
+    """
+    count = math.prod(transform(given, plan.window))
+    u, x, y, _ = plan.mix
+    plane = given.gram.diagonal()[: plan.planes].clamp_min(0).sqrt() * math.sqrt(given.copies)
+    kernel = (given.passed.total * given.passed.peak).sqrt()[plan.bands]
+    kernel = kernel if plan.kernels is None else plan.kernels.abs() @ kernel
+    terms = (plane if x is None else x.abs() @ plane) * (kernel if y is None else y.abs() @ kernel)
+    white = terms[None].sum(1) if u is None else u.abs() @ terms
+    return eps * (8 * math.sqrt(math.log2(count + 1)) * white / math.sqrt(count) + 10 * found)

@@ -1,0 +1,138 @@
+"""Pupil to intensity, with the gradient written by hand: little is kept, the pupil's field is computed again."""
+
+import math
+from dataclasses import dataclass
+from typing import Any
+
+import torch
+from torch import Tensor
+
+from neusee.nodes.optics._transform._pupil_field import Field, Screens, View
+from neusee.nodes.optics._transform._sample_axis import patch_of
+from neusee.nodes.optics._transform._scaled_transform import Method, propagate
+from neusee.nodes.optics._transform._workspace import Workspace, borrowed
+
+KEPT_FIELD_BYTES = 1 << 30  #: focal fields up to this size wait for the backward pass; larger ones are computed again
+
+
+@dataclass(frozen=True, slots=True)
+class Sampling:
+    """All views, the type and the method they are computed with."""
+
+    views: tuple[View, ...]
+    dtype: torch.dtype
+    method: Method = "auto"
+
+
+class PupilIntensity(torch.autograd.Function):
+    """``sum over views of weight * envelope * |U|^2``; the backward pass is the adjoint transform of g U."""
+
+    @staticmethod
+    def forward(ctx: Any, amplitude: Tensor, height: Tensor, path: Tensor, sampling: Sampling) -> Tensor:
+        screens = Screens.of(amplitude, height, path)
+        views, shape = sampling.views, (sampling.views[0].rows.n_out, sampling.views[0].columns.n_out)
+        intensity = torch.empty(views[-1].band + 1, *shape, dtype=sampling.dtype, device=height.device)
+        size = 2 * len(views) * intensity[0].nbytes
+        keep = any(ctx.needs_input_grad) and size <= KEPT_FIELD_BYTES
+        ctx.fields, done = [], -1
+        with borrowed(sampling.dtype, height.device) as work:
+            for view in views:
+                kept = torch.empty(2, *shape[::-1], dtype=sampling.dtype, device=height.device) if keep else None
+                field = Field(screens, view, sampling.dtype)
+                _power(field, intensity[view.band], view.band == done, kept, sampling.method, work)
+                ctx.fields.append(kept)
+                done = view.band
+        ctx.save_for_backward(amplitude, height, path)
+        ctx.sampling, ctx.screens = sampling, screens[3:]
+        return intensity
+
+    @staticmethod
+    def backward(ctx: Any, weight: Tensor) -> tuple[Tensor | None, ...]:
+        if torch.is_grad_enabled():
+            raise RuntimeError("the PSF has no second derivative here: differentiate without create_graph=True")
+        screens = Screens(*ctx.saved_tensors, *ctx.screens)
+        needs = zip(ctx.saved_tensors, ctx.needs_input_grad[:3], strict=True)
+        grads = [torch.zeros_like(x) if need else None for x, need in needs]
+        with borrowed(weight.dtype, weight.device) as work:
+            for view, kept in zip(ctx.sampling.views, ctx.fields, strict=True):
+                field = Field(screens, view, weight.dtype)
+                planes = kept if kept is not None else _focal(field, ctx.sampling, work)
+                _add_gradient(field, planes, weight[view.band], grads, ctx.sampling.method, work)
+        return (*grads, None)
+
+
+def _scaled(view: View, values: Tensor, rows: slice, columns: slice) -> Tensor:
+    """``values`` times what the view weighs |U|^2 with, on one patch."""
+    if view.envelope is None:
+        return values.mul_(view.weight)
+    y, x = view.envelope
+    return values.mul_(y[rows].view(*values.shape[:-1], 1)).mul_(x[columns]).mul_(view.weight)
+
+
+def _power(field: Field, out: Tensor, add: bool, kept: Tensor | None, method: Method, work: Workspace) -> None:
+    """Write, or add, the weighed |U|^2 of one view."""
+
+    def sink(rows: slice, columns: slice, patch: Tensor) -> None:
+        if kept is not None:
+            _keep(kept, rows, columns, patch)
+        power = _scaled(field.view, patch[0].square().addcmul_(patch[1], patch[1]), rows, columns)
+        into = patch_of(out, rows, columns, patch)
+        into.add_(power) if add else into.copy_(power)
+
+    propagate(field.view.rows, field.view.columns, field.rows(work), sink, work, method)
+
+
+def _keep(kept: Tensor, rows: slice, columns: slice, patch: Tensor) -> None:
+    """Store a patch transposed, which is how the fast method makes it and its adjoint wants it."""
+    patch_of(kept.transpose(1, 2), rows, columns, patch).copy_(patch)
+
+
+def _focal(field: Field, sampling: Sampling, work: Workspace) -> Tensor:
+    """The focal field once more, transposed."""
+    view = field.view
+    planes = work.take("focal", 2, view.columns.n_out, view.rows.n_out)
+
+    def sink(rows: slice, columns: slice, patch: Tensor) -> None:
+        _keep(planes, rows, columns, patch)
+
+    propagate(view.rows, view.columns, field.rows(work), sink, work, sampling.method)
+    return planes
+
+
+def _add_gradient(
+    field: Field, planes: Tensor, weight: Tensor, grads: list[Tensor | None], method: Method, work: Workspace
+) -> None:
+    """Add the gradients of ``sum(weight * scaled |U|^2)``: the adjoint of 2 weight U, against the pupil.
+
+    It runs on the transposed problem, so that the pupil's rows come back as rows.
+    """
+    view, everywhere = field.view, slice(0, planes.shape[2])
+    gain = work.take("gain", *planes.shape[1:]).copy_(weight.T)  # at once: by slabs of a power of two it is slow
+
+    def source(start: int, stop: int, out: Tensor) -> None:
+        _scaled(view, gain[start:stop].mul_(2).T, everywhere, slice(start, stop))
+        torch.mul(planes[:, start:stop], gain[start:stop], out=out)
+
+    def sink(rows: slice, columns: slice, patch: Tensor) -> None:
+        flat = work.take("flat", 2, columns.stop - columns.start, rows.stop - rows.start)
+        patch_of(flat.transpose(1, 2), slice(None), slice(None), patch).copy_(patch)
+        _chain(field, columns, rows, flat, grads, work)
+
+    propagate(view.columns.adjoint(), view.rows.adjoint(), source, sink, work, method)
+
+
+def _chain(
+    field: Field, rows: slice, columns: slice, patch: Tensor, grads: list[Tensor | None], work: Workspace
+) -> None:
+    """From the gradient with respect to the field, ``patch``, to amplitude, height and path."""
+    unit = work.take("unit", *patch.shape)
+    field.phasor(rows, columns, unit, work)
+    if grads[0] is not None:
+        grads[0][rows, columns].addcmul_(unit[0], patch[0]).addcmul_(unit[1], patch[1])
+    if grads[1] is None and grads[2] is None:
+        return
+    turning = torch.mul(unit[0], patch[1], out=work.take("turning", *patch.shape[1:]))
+    turning.addcmul_(unit[1], patch[0], value=-1).mul_(field.screens.amplitude[rows, columns])
+    for grad, turns in ((grads[1], field.view.turns_height), (grads[2], field.view.turns_path)):
+        if grad is not None:
+            grad[rows, columns].add_(turning, alpha=2 * math.pi * turns)

@@ -1,0 +1,210 @@
+"""The scaled transform by two griddings about one short FFT: exact to the kernel's chosen error.
+
+The window needs only ``alpha n_in n_out`` samples of information (800 for 2160 -> 2048 at 550 nm),
+so the pupil is gathered onto a grid 1.75 times finer than that, and the FFT is 1.75 times as long
+again, where a chirp needs n_in + n_out. All weights are real: both grids are centred by signs.
+"""
+
+import functools
+import math
+from typing import NamedTuple
+
+import torch
+from torch import Tensor
+
+from neusee.nodes.optics._transform._banded_matrix import Banded
+from neusee.nodes.optics._transform._chirp_transform import smooth
+from neusee.nodes.optics._transform._sample_axis import Axis, Sink, Source, row_chunks
+from neusee.nodes.optics._transform._workspace import Workspace
+
+
+class _Kernel(NamedTuple):
+    """Kaiser-Bessel kernel of full ``width`` samples for a grid ``oversampling`` times as fine as needed."""
+
+    width: int
+    oversampling: float
+
+    @property
+    def peak(self) -> float:
+        """Scale that keeps weights near one."""
+        return self.width * math.sinh(self.beta) / self.beta
+
+    @property
+    def beta(self) -> float:
+        return math.pi * self.width * (1 - 0.5 / self.oversampling)
+
+    def __call__(self, x: Tensor) -> Tensor:
+        root = (1 - (2 * x / self.width).square()).clamp_(min=0).sqrt_()
+        value: Tensor = torch.special.i0(root.mul_(self.beta))
+        return value
+
+    def transform(self, f: Tensor) -> Tensor:
+        root = (self.beta**2 - (math.pi * self.width * f).square()).sqrt()
+        return self.width * torch.sinh(root) / root
+
+
+_BLOCK = 16
+_WIDEST = 8  #: a grid is at least this fine, of the input, however little of it the window asks for
+_COLUMN_BLOCKS = 8
+_SINGLE, _DOUBLE = _Kernel(8, 1.75), _Kernel(18, 2.0)
+
+
+class Plan(NamedTuple):
+    """One axis: gather (n_in -> points), FFT of ``length`` about the middle, keep ``kept``, interpolate (-> n_out)."""
+
+    gather: Banded
+    spread: Banded
+    points: int
+    length: int
+    kept: int
+    sign: int
+
+    @property
+    def padded(self) -> int:
+        """Where the gathered points stand in the FFT's input."""
+        return self.length // 2 - (self.points - 1) // 2
+
+    @property
+    def cropped(self) -> int:
+        """Where the kept frequencies begin in the FFT's result."""
+        return self.length // 2 - (self.kept - 1) // 2
+
+
+@functools.lru_cache(maxsize=64)
+def plan(axis: Axis, dtype: torch.dtype, device: torch.device) -> Plan:
+    """Grids and weights of one axis; equal axes and later calls share them."""
+    kernel = _SINGLE if dtype == torch.float32 else _DOUBLE
+    pitch = min(1 / (axis.alpha * axis.n_out * kernel.oversampling), max(axis.n_in, _WIDEST) / _WIDEST)
+    points = _odd(math.ceil((axis.n_in - 1) / pitch) + kernel.width)
+    length = smooth(math.ceil(max(points, 2 * _BLOCK) * kernel.oversampling), even=True)
+    spread = _spread(axis, kernel, pitch, length)
+    while spread.n_columns + 2 * spread.margin > length:
+        length = smooth(length + length // 4, even=True)
+        spread = _spread(axis, kernel, pitch, length)
+    gather = _gather(axis, kernel, pitch, points, length).to(dtype, device)
+    kept = spread.n_columns + 2 * spread.margin
+    return Plan(gather, spread.to(dtype, device), points, length, kept, axis.sign)
+
+
+def _gather(axis: Axis, kernel: _Kernel, pitch: float, points: int, length: int) -> Banded:
+    """Field onto the grid of ``points``, divided by what the interpolation behind the FFT will multiply by."""
+    j0, l0 = (axis.n_in - 1) / 2, (points - 1) // 2
+    band = Banded(points, axis.n_in, j0 - pitch * l0, pitch, pitch * kernel.width / 2, _BLOCK)
+
+    def weigh(row: Tensor, column: Tensor) -> Tensor:
+        at = (row - l0).clamp_(max=l0)
+        scale = _alternating(at + length // 2) * (kernel.peak / kernel.transform(at / length))
+        return kernel((column - j0) / pitch - at) / kernel.peak * scale
+
+    return band.fill(weigh)
+
+
+def _spread(axis: Axis, kernel: _Kernel, pitch: float, length: int) -> Banded:
+    """The kept frequencies onto the window, divided by the transform of the kernel that gathered."""
+    k0, fine = (axis.n_out - 1) / 2, axis.alpha * pitch * length
+    kept = _odd(math.ceil((axis.n_out - 1) * fine) + kernel.width)
+    q0 = (kept - 1) // 2
+    band = Banded(axis.n_out, kept, q0 - fine * k0, fine, kernel.width / 2, 2 * _BLOCK)
+
+    def weigh(row: Tensor, column: Tensor) -> Tensor:
+        at = (row - k0).clamp_(max=k0)
+        return _alternating(column - q0) * kernel(fine * at - (column - q0)) / kernel.transform(axis.alpha * pitch * at)
+
+    return band.fill(weigh)
+
+
+def _alternating(index: Tensor) -> Tensor:
+    """(-1)^index: the middle of a grid becomes the origin of its FFT."""
+    return 1 - 2 * index.remainder(2)
+
+
+def _odd(n: int) -> int:
+    return n + 1 - n % 2
+
+
+def kaiser_bessel(rows: Axis, columns: Axis, source: Source, sink: Sink, work: Workspace) -> None:
+    """Gather, short FFT, interpolate: columns first, in chunks of rows that stay in cache."""
+    along_x, along_y = (plan(axis, work.dtype, work.device) for axis in (columns, rows))
+    half = _rows_to_frequencies(along_x, along_y.gather.margin, rows.n_in, source, work)
+    spectrum = _columns_to_frequencies(along_y, half, work)
+    _interpolate(along_x, along_y, (rows.n_out, columns.n_out), spectrum, sink, work)
+
+
+def _rows_to_frequencies(x: Plan, margin: int, n_rows: int, source: Source, work: Workspace) -> Tensor:
+    """The kept frequencies along u of every row, between ``margin`` rows of zeros."""
+    kind, wide = work.dtype.to_complex(), x.gather.n_columns
+    half = _zero_margins(work.take("half", n_rows + 2 * margin, x.kept, dtype=kind), 0, margin)
+    for start, stop in row_chunks(n_rows, wide):
+        n = stop - start
+        planes = _zero_margins(work.take("planes", 2, n, wide + 2 * x.gather.margin), 2, x.gather.margin)
+        source(start, stop, planes.narrow(2, x.gather.margin, wide))
+        blocks = work.take("blocks", x.gather.count, 2 * n, x.gather.block)
+        x.gather.right(planes.flatten(0, 1), blocks)
+        line = work.take("line", n, x.length, dtype=kind)
+        _place(blocks, line, x)
+        half[margin + start : margin + stop] = _fft(line, x.sign)[:, x.cropped : x.cropped + x.kept]
+    return half
+
+
+def _zero_margins(x: Tensor, dim: int, margin: int) -> Tensor:
+    x.narrow(dim, 0, margin).zero_()
+    x.narrow(dim, x.shape[dim] - margin, margin).zero_()
+    return x
+
+
+def _place(blocks: Tensor, line: Tensor, x: Plan) -> None:
+    """Put gathered (re, im) blocks in the middle of zeroed complex lines."""
+    count, block, n = x.gather.count, x.gather.block, line.shape[0]
+    line[:, : x.padded] = 0
+    parts = blocks.view(count, 2, n, block).permute(1, 2, 0, 3)
+    into = line[:, x.padded : x.padded + count * block]
+    torch.complex(parts[0], parts[1], out=into.view(n, count, block))
+    line[:, x.padded + x.points :] = 0
+
+
+def _columns_to_frequencies(y: Plan, half: Tensor, work: Workspace) -> Tensor:
+    """Gather along v straight into the zero-padded columns, and transform them; what returns is transposed."""
+    wide = half.shape[1]
+    columns = work.take("columns", y.length, wide, dtype=half.dtype)
+    y.gather.left(_flat(half), _flat(columns[y.padded : y.padded + y.gather.n_rows]))
+    columns[: y.padded] = 0
+    columns[y.padded + y.points :] = 0
+    spectrum = work.take("spectrum", wide, y.kept, dtype=half.dtype)
+    for start, stop in row_chunks(wide, y.length):  # small pieces: what the FFT allocates must not be large
+        lines = _fft(columns[:, start:stop].T, y.sign)
+        spectrum[start:stop] = lines[:, y.cropped : y.cropped + y.kept]
+    return spectrum
+
+
+def _interpolate(x: Plan, y: Plan, shape: tuple[int, int], spectrum: Tensor, sink: Sink, work: Workspace) -> None:
+    """Frequencies (x, y), margins included, onto the window, a few columns of it at a time."""
+    for first in range(0, x.spread.count, _COLUMN_BLOCKS):
+        part = x.spread.part(first, min(first + _COLUMN_BLOCKS, x.spread.count))
+        line = work.take("stripe", part.n_rows, spectrum.shape[1], dtype=spectrum.dtype)
+        part.left(_flat(spectrum), _flat(line))
+        planes = work.take("stripes", 2, *line.shape).copy_(torch.view_as_real(line).movedim(2, 0))
+        blocks = work.take("tiles", y.spread.count, 2 * part.n_rows, y.spread.block)
+        y.spread.right(planes.flatten(0, 1), blocks)
+        start, stop = first * part.block, min(first * part.block + part.n_rows, shape[1])
+        tiles = blocks.view(y.spread.count, 2, part.n_rows, y.spread.block).permute(1, 0, 3, 2)
+        _deliver(tiles[..., : stop - start], slice(start, stop), shape[0], sink)
+
+
+def _deliver(tiles: Tensor, columns: slice, n_rows: int, sink: Sink) -> None:
+    """Hand on whole blocks of rows, then what is left of the last."""
+    block = tiles.shape[2]
+    whole = n_rows // block
+    if whole:
+        sink(slice(0, whole * block), columns, tiles[:, :whole])
+    if whole * block < n_rows:
+        sink(slice(whole * block, n_rows), columns, tiles[:, whole, : n_rows - whole * block])
+
+
+def _flat(x: Tensor) -> Tensor:
+    """Complex (r, c) as real (r, 2 c): what a real matrix from the left may act on."""
+    return torch.view_as_real(x).flatten(1)
+
+
+def _fft(x: Tensor, sign: int) -> Tensor:
+    result: Tensor = torch.fft.fft(x, dim=1) if sign < 0 else torch.fft.ifft(x, dim=1, norm="forward")
+    return result

@@ -1,0 +1,66 @@
+"""The scaled transform as matrix products: plain, and folded at the middle of both grids."""
+
+import torch
+from torch import Tensor
+
+from neusee.nodes.optics._transform._sample_axis import Axis, Sink, Source, centred, radians, row_chunks, unit_phasor
+from neusee.nodes.optics._transform._workspace import Workspace
+
+
+def direct(rows: Axis, columns: Axis, source: Source, sink: Sink, work: Workspace) -> None:
+    """Complex matrix products with the kernel itself; nothing assumed, nothing saved."""
+    along_x, along_y = _kernel(columns, work), _kernel(rows, work)
+    half = torch.empty(rows.n_in, columns.n_out, dtype=along_x.dtype, device=work.device)
+    for start, stop in row_chunks(rows.n_in, columns.n_in):
+        planes = work.take("planes", 2, stop - start, columns.n_in)
+        source(start, stop, planes)
+        torch.mm(torch.complex(planes[0], planes[1]), along_x.T, out=half[start:stop])
+    for start, stop in row_chunks(rows.n_out, columns.n_out):
+        patch = torch.view_as_real(along_y[start:stop] @ half).movedim(2, 0)
+        sink(slice(start, stop), slice(0, columns.n_out), patch)
+
+
+def folded(rows: Axis, columns: Axis, source: Source, sink: Sink, work: Workspace) -> None:
+    """Real products of half length on the even and odd parts: a quarter of the work, and exact."""
+    turn_x, turn_y = _half_kernels(columns, work), _half_kernels(rows, work)
+    half = work.take("half", 2, rows.n_in, columns.n_out)
+    for start, stop in row_chunks(rows.n_in, columns.n_in):
+        planes = work.take("planes", 2, stop - start, columns.n_in)
+        source(start, stop, planes)
+        even, odd = _fold(planes, columns.n_in)
+        _unfold(even @ turn_x[0].T, odd @ turn_x[1].T, columns, half[:, start:stop])
+    even, odd = _fold(half.transpose(1, 2), rows.n_in)
+    for start, stop in row_chunks(columns.n_out, 4 * rows.n_out):
+        patch = work.take("patch", 2, stop - start, rows.n_out)
+        _unfold(even[:, start:stop] @ turn_y[0].T, odd[:, start:stop] @ turn_y[1].T, rows, patch)
+        sink(slice(0, rows.n_out), slice(start, stop), patch.transpose(1, 2))
+
+
+def _kernel(axis: Axis, work: Workspace) -> Tensor:
+    turns = torch.outer(centred(axis.n_out, work.device), centred(axis.n_in, work.device))
+    return unit_phasor(turns.mul_(axis.sign * axis.alpha), work.dtype)
+
+
+def _half_kernels(axis: Axis, work: Workspace) -> tuple[Tensor, Tensor]:
+    """Cosine and signed sine on the half grids j >= 0, k >= 0; a sample on the axis counts once."""
+    j, k = centred(axis.n_in, work.device)[axis.n_in // 2 :], centred(axis.n_out, work.device)[axis.n_out // 2 :]
+    angle = radians(torch.outer(k, j).mul_(axis.alpha))
+    cosine, sine = angle.cos().to(work.dtype), angle.sin().mul_(axis.sign).to(work.dtype)
+    if axis.n_in % 2:
+        cosine[:, 0] /= 2
+    return cosine, sine
+
+
+def _fold(field: Tensor, n: int) -> tuple[Tensor, Tensor]:
+    upper, lower = field[..., n // 2 :], field[..., : (n + 1) // 2].flip(-1)
+    return upper + lower, upper - lower
+
+
+def _unfold(even: Tensor, odd: Tensor, axis: Axis, out: Tensor) -> None:
+    """Write even(k) ± i odd(k) to both halves of ``out``; all are (re, im) planes."""
+    n = axis.n_out
+    low = (n + 1) // 2
+    mirrored = torch.stack((even[0] + odd[1], even[1] - odd[0]))
+    out[..., :low] = mirrored.flip(-1)
+    torch.sub(even[0], odd[1], out=out[0, ..., n // 2 :])
+    torch.add(even[1], odd[0], out=out[1, ..., n // 2 :])

@@ -1,0 +1,82 @@
+"""The field in the pupil, made patch by patch from its factors and never stored."""
+
+import math
+from dataclasses import dataclass
+from typing import NamedTuple
+
+import torch
+from torch import Tensor
+
+from neusee.nodes._half_precision import refuse_not_finite
+from neusee.nodes.optics._transform._sample_axis import Axis, Source, centred
+from neusee.nodes.optics._transform._workspace import Workspace
+
+_FEW_TURNS = 2.0  #: below, float32 holds a phase to 5e-7 rad, which is what a cast to it costs anyway
+
+
+@dataclass(frozen=True, slots=True)
+class View:
+    """One window of point samples in one band. ``|U|^2`` is weighed by ``weight`` and by ``envelope_y envelope_x``."""
+
+    band: int
+    rows: Axis
+    columns: Axis
+    turns_height: float  #: turns of phase per metre of height
+    turns_path: float  #: turns of phase per metre of path
+    tilt: tuple[float, float]  #: turns per pupil sample (v, u) that move the window onto the spot
+    weight: float
+    envelope: tuple[Tensor, Tensor] | None = None
+
+
+class Screens(NamedTuple):
+    """What all bands share, and the largest height and path, in metres."""
+
+    amplitude: Tensor
+    height: Tensor
+    path: Tensor
+    highest: float
+    longest: float
+
+    @classmethod
+    def of(cls, amplitude: Tensor, height: Tensor, path: Tensor) -> "Screens":
+        """Measure the extents once a call. Raises ValueError where one is not finite."""
+        extents = [float(torch.stack(x.detach().aminmax()).abs().max()) for x in (height, path)]
+        refuse_not_finite("no light has such a phase", height=extents[0], path=extents[1])
+        return cls(amplitude, height, path, *extents)
+
+
+class Field:
+    """The pupil of one view, row by row: amplitude * exp(2 pi i (height + path + tilt))."""
+
+    def __init__(self, screens: Screens, view: View, dtype: torch.dtype) -> None:
+        self.screens, self.view = screens, view
+        tilts = zip(screens.height.shape, view.tilt, strict=True)
+        v, u = (centred(n, screens.height.device).mul_(tilt) for n, tilt in tilts)
+        turns = screens.highest * abs(view.turns_height) + screens.longest * view.turns_path
+        self.few = dtype == torch.float32 and turns + float(v[-1].abs() + u[-1].abs()) < _FEW_TURNS
+        kind = torch.float32 if self.few else torch.float64
+        self.tilt_v, self.tilt_u = v.to(kind)[:, None], u.to(kind)
+
+    def phasor(self, rows: slice, columns: slice, planes: Tensor, work: Workspace) -> None:
+        """Write cosine and sine of one patch; turns are float64 and reduced to half a turn unless they are few."""
+        angle = work.take("angle", *planes.shape[1:])
+        turns = angle if self.few else work.take("turns", *planes.shape[1:], dtype=torch.float64)
+        unit = 2 * math.pi if self.few else 1.0
+        torch.mul(self.screens.height[rows, columns], unit * self.view.turns_height, out=turns)
+        if self.screens.longest > 0:
+            turns.add_(self.screens.path[rows, columns], alpha=unit * self.view.turns_path)
+        turns.add_(self.tilt_u[columns], alpha=unit).add_(self.tilt_v[rows], alpha=unit)
+        if not self.few:
+            torch.mul(turns.sub_(turns.round()), 2 * math.pi, out=angle)
+        torch.cos(angle, out=planes[0])
+        torch.sin(angle, out=planes[1])
+
+    def rows(self, work: Workspace) -> Source:
+        """The field as a source for a transform."""
+        everywhere = slice(0, self.screens.height.shape[1])
+
+        def fill(start: int, stop: int, planes: Tensor) -> None:
+            self.phasor(slice(start, stop), everywhere, planes, work)
+            planes.mul_(self.screens.amplitude[start:stop])
+
+        return fill

@@ -1,0 +1,68 @@
+"""Digital numbers back to electrons, and electrons to colour."""
+
+import torch
+from torch import Tensor
+
+from neusee.nodes import node
+from neusee.nodes._half_precision import single
+from neusee.nodes.metrics._suppression import clipped as at_the_end
+from neusee.nodes.sensor._digitization import Bits, Gain, GainUnit, numbers_per_electron
+from neusee.nodes.sensor._saturation import Well
+from neusee.nodes.units import Electrons
+
+
+@node()
+def electrons(
+    raw: Tensor, *, gain: Gain, gain_unit: GainUnit = "e-/DN", pedestal: Electrons, pedestal_subtracted: bool = True
+) -> Tensor:
+    """Undo the gain of the sensor, and its pedestal.
+
+    Shapes: raw (..., y, x) -> (..., y, x).
+    Units:  raw DN; result e-, negative where read noise was.
+    Error:  the rounding of the converter, 0.29 DN rms; clipped pixels stay clipped.
+    Source: NeuSee, Eq. (SensorImage), inverted.
+    """
+    return single(raw) / numbers_per_electron(gain, gain_unit) - (pedestal if pedestal_subtracted else 0.0)
+
+
+@electrons.preflight
+def _(*, pedestal: float, pedestal_subtracted: bool = True, **params: object) -> list[str]:
+    if pedestal and not pedestal_subtracted:
+        return [f"a pedestal of {pedestal:g} e- stays in the picture"]
+    return []
+
+
+@node(rtol=0.0)
+def clipped(raw: Tensor, *, full_well: Well, gain: Gain, gain_unit: GainUnit = "e-/DN", bits: Bits = 16) -> Tensor:
+    """Mark the values that say only "at least this much": at the full well, or at the end of the converter.
+
+    Shapes: raw (..., y, x) -> (..., y, x) bool.
+    Units:  raw DN.
+    Error:  a value within one DN of the full well is marked too, and so is what is not a number.
+    Source: NeuSee, Eq. (SensorImage).
+    """
+    return at_the_end(raw, full_well=full_well, gain=gain, gain_unit=gain_unit, bits=bits)
+
+
+@node()
+def colour(channels: Tensor, matrix: Tensor) -> Tensor:
+    """Turn the channels of the sensor into linear sRGB.
+
+    Shapes: channels (..., 3, y, x), matrix (3, 3) -> (..., 3, y, x).
+    Units:  channels e-; result linear sRGB, white 1; out of gamut below 0.
+    Error:  that of the matrix: no matrix is right for all spectra.
+    Raises: ValueError for other than three channels.
+    Source: Reinhard et al., High Dynamic Range Imaging, 2nd ed. (colour spaces as 3 x 3 matrices).
+    """
+    if channels.ndim < 3 or channels.shape[-3] != matrix.shape[-1]:
+        raise ValueError(f"channels {tuple(channels.shape)} do not fit a matrix {tuple(matrix.shape)}: give (3, y, x)")
+    channels = single(channels)
+    flat = matrix.to(channels) @ channels.flatten(-2)
+    return flat.reshape(*flat.shape[:-1], *channels.shape[-2:])
+
+
+@colour.reference
+def _(channels: Tensor, matrix: Tensor) -> Tensor:
+    return torch.stack(
+        [sum(m * c for m, c in zip(row, channels.double().unbind(-3), strict=True)) for row in matrix], -3
+    )

@@ -1,0 +1,134 @@
+"""Conjugate gradients towards the most likely picture, in place, with little memory and few passes over it."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+
+import torch
+from torch import Tensor
+
+from neusee.nodes.restore._inverse._lowest_frequencies import Lowest
+from neusee.nodes.restore._inverse._masked_blur import Blurred, Size, inverse_colour, mixed, weighing
+
+LOWEST = 256  #: of a picture of no more pixels a side, each step solves the lowest frequencies at once
+_PIECE = 2**18  #: numbers of a spectrum worked on at a time: what the processor's cache holds
+
+
+def descend(seen: Blurred, x: Tensor, steps: int, enough: float) -> Tensor:
+    """From `x`, which is overwritten, until the square distance left is `enough` of the posterior's, or steps end."""
+    if steps < 1:
+        return x
+    normal, inverse = _Normal(seen), _Inverse(seen)
+    left, way, change = normal.slope(x), torch.empty_like(x), torch.empty_like(x)
+    size = inverse(left, way)
+    enough = max(enough, 1e-20 * float(size))
+    for _ in range(steps):
+        if not float(size) > enough:
+            break
+        length = float(size / normal(way, change))
+        for rows in pieces(x):
+            x[:, rows].add_(way[:, rows], alpha=length)
+            left[:, rows].sub_(change[:, rows], alpha=length)
+        new = inverse(left, change)
+        way.mul_(float(new / size)).add_(change)
+        size = new
+    return x
+
+
+def pieces(spectrum: Tensor) -> Iterator[slice]:
+    """Rows of half a spectrum, a few at a time."""
+    return _few(spectrum.shape[-2], len(spectrum) * spectrum.shape[-1])
+
+
+def _few(count: int, numbers: int) -> Iterator[slice]:
+    """So many lines of so many numbers each, a few at a time."""
+    step = max(1, _PIECE // numbers)
+    return (slice(i, i + step) for i in range(0, count, step))
+
+
+def corner(spectrum: Tensor, torus: Size, pixels: Tensor) -> None:
+    """Fill pixels with the first corner of what half a spectrum (fy, fx) stands for: `irfft2` in half its time."""
+    rows, columns = pixels.shape
+    tall = spectrum.new_empty(rows, spectrum.shape[1])
+    for some in _few(spectrum.shape[1], torus[0]):
+        tall[:, some] = torch.fft.ifft(spectrum[:, some], dim=0)[:rows]
+    for some in _few(rows, torus[1]):
+        pixels[some] = torch.fft.irfft(tall[some], n=torus[1])[:, :columns]
+
+
+class _Normal:
+    """Prior and noise: the matrix whose inverse is the spread of what is likely."""
+
+    def __init__(self, seen: Blurred) -> None:
+        self.seen, self.weigh = seen, weighing(seen)
+        self.inverse = 1.0 / seen.power.clamp_min(1e-30)
+        self.plane, self.pixels = seen.picture.new_zeros(seen.torus), torch.empty_like(seen.picture)
+
+    def __call__(self, x: Tensor, result: Tensor) -> Tensor:
+        """Write its product with x, and give the inner product of the two."""
+        self._gather(self.weigh(self._blurred(x, result)), result)
+        self._finish(x, result, 1.0)
+        return inner(x, result, self.seen.torus)
+
+    def slope(self, x: Tensor) -> Tensor:
+        """How the log likelihood rises with x."""
+        result = torch.empty_like(x)
+        self._gather(self.weigh(self._blurred(x, result).neg_().add_(self.seen.picture)), result)
+        self._finish(x, result, -1.0)
+        return result if self.seen.pull is None else result.add_(self.seen.pull)
+
+    def _blurred(self, x: Tensor, room: Tensor) -> Tensor:
+        for channel, transfer in enumerate(self.seen.transfer):
+            torch.mul(transfer, x[channel], out=room[channel])
+            corner(room[channel], self.seen.torus, self.pixels[channel])
+        return self.pixels
+
+    def _gather(self, pixels: Tensor, result: Tensor) -> None:
+        """Spectra of the pixels, yet without the blur."""
+        rows, columns = pixels.shape[-2:]
+        for channel, picture in enumerate(pixels):
+            self.plane[:rows, :columns] = picture
+            torch.fft.rfft2(self.plane, out=result[channel])
+
+    def _finish(self, x: Tensor, result: Tensor, sign: float) -> None:
+        """The rest of the blur's adjoint, and the prior times x with this sign."""
+        own, shared = inverse_colour(len(x), self.seen.grey)
+        for rows in pieces(x):
+            prior = mixed(x[:, rows], own, -shared).mul_(self.inverse[rows])
+            result[:, rows].mul_(self.seen.transfer[:, rows].conj()).add_(prior, alpha=sign)
+
+
+class _Inverse:
+    """About the inverse of that: the one for a picture without edges, and the right one for the lowest frequencies."""
+
+    def __init__(self, seen: Blurred) -> None:
+        own, shared = inverse_colour(len(seen.picture), seen.grey)
+        known = (seen.weight > 0).sum((-2, -1)).clamp_min(1)
+        mean = (seen.weight.sum((-2, -1)) / known)[:, None, None]
+        self.torus = seen.torus
+        self.gain = torch.empty(seen.transfer.shape, dtype=seen.power.dtype, device=seen.power.device)
+        self.shared = torch.empty_like(seen.power)
+        for rows in pieces(self.gain):
+            inverse = 1.0 / seen.power[rows].clamp_min(1e-30)
+            through = seen.transfer[:, rows]
+            self.gain[:, rows] = 1.0 / (own * inverse + mean * (through.real.square() + through.imag.square()))
+            self.shared[rows] = shared * inverse / (1.0 - shared * inverse * self.gain[:, rows].sum(0))
+        self.lowest = Lowest(seen, self.gain) if max(seen.picture.shape[-2:]) <= LOWEST else None
+
+    def __call__(self, slope: Tensor, result: Tensor) -> Tensor:
+        """Write its product with the slope, and give the inner product of the two."""
+        for rows in pieces(slope):
+            gain = self.gain[:, rows]
+            own = torch.mul(slope[:, rows], gain, out=result[:, rows])
+            own += gain * (self.shared[rows] * own.sum(0))
+        total = inner(slope, result, self.torus)
+        return total if self.lowest is None else total + self.lowest.add(slope, result)
+
+
+def inner(a: Tensor, b: Tensor, torus: Size) -> Tensor:
+    """Inner product of pixels, given half of their spectra."""
+    whole = torch.stack([torch.vdot(p.flatten(), q.flatten()) for p, q in zip(a, b, strict=True)]).sum() * 2.0
+    for column in (0,) if torus[1] % 2 else (0, -1):
+        whole = whole - torch.linalg.vecdot(a[..., column], b[..., column]).sum()
+    total: Tensor = whole.real.double() / (torus[0] * torus[1])
+    return total

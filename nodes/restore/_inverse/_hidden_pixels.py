@@ -1,0 +1,163 @@
+"""The most likely picture behind a blur of which only some pixels are seen.
+
+Linear least squares with a Gaussian prior (Kaipio and Somersalo, Statistical and Computational Inverse Problems, 2005,
+ch. 3), with what lies beyond the edge as unknown as what lies within. Light from there mixes with all that is seen, so
+conjugate gradients get nowhere from a bad start: the problem is solved exactly on a coarse grid, each finer grid starts
+from the one before, and on the coarser ones each step solves the lowest frequencies at once.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import replace
+from typing import Any
+
+import torch
+from torch import Tensor
+from torch.autograd.function import once_differentiable
+from torch.nn.functional import avg_pool2d, pad
+
+from neusee.nodes.restore._inverse._conjugate_gradients import descend, inner, pieces
+from neusee.nodes.restore._inverse._masked_blur import Blurred, Size, mixed, narrowed, variance, widened
+
+DENSE = 40  #: a picture of no more pixels a side is solved exactly
+STEPS = 20  #: on the finest grid, at most, and four times as many on each coarser one up to
+MOST = 100
+ENOUGH = 1e-5  #: it ends where so much square distance is left per pixel seen, in the answer's own spread, as the
+#: residual tells it: 10 to 30 times too little, since it tells the slowest part too small
+CAREFUL = 8.0  #: so much less is left on each coarser grid, where steps are cheap and mend what finer ones cannot
+
+
+def torus(picture: Size, edge: Size) -> Size:
+    """A grid with `edge` of unknown pixels around the picture, that can be halved until the picture is small."""
+    whole = 2 ** _halvings(picture)
+    y, x = (whole * _smooth(-(-(n + 2 * e) // whole)) for n, e in zip(picture, edge, strict=True))
+    return y, x
+
+
+def _smooth(n: int) -> int:
+    """The next whole number with no prime factor above 7: what fast Fourier transforms like."""
+    while 210**32 % n:
+        n += 1
+    return n
+
+
+def most_likely(seen: Blurred, steps: int = STEPS, enough: float = ENOUGH) -> Tensor:
+    """Half the spectrum of the x that the picture and the prior make most likely."""
+    if not _halvings(_size(seen)):
+        return _exact(seen)
+    tensors = (seen.picture, seen.weight, seen.transfer, *seen.glare)
+    with torch.no_grad():
+        x = _nested(seen, steps, enough * float((seen.weight > 0).sum()))
+    if not (torch.is_grad_enabled() and any(t.requires_grad for t in tensors)):
+        return x
+    rest = torch.fft.irfft2(seen.slope(x), s=seen.torus)
+    pixels: Tensor = _Followed.apply(torch.fft.irfft2(x, s=seen.torus), rest, seen, steps)  # type: ignore[no-untyped-call]
+    spectrum: Tensor = torch.fft.rfft2(pixels)
+    return spectrum
+
+
+class _Followed(torch.autograd.Function):
+    """The answer, as a function of how far the slope is from zero there."""
+
+    @staticmethod
+    def forward(ctx: Any, answer: Tensor, rest: Tensor, seen: Blurred, steps: int) -> Tensor:
+        ctx.seen, ctx.steps = seen, steps
+        return answer.clone()
+
+    @staticmethod
+    @once_differentiable
+    def backward(ctx: Any, grad: Tensor) -> tuple[None, Tensor, None, None]:
+        """Solve the same problem for the gradient."""
+        pull = torch.fft.rfft2(grad)
+        seen = replace(ctx.seen, picture=torch.zeros_like(ctx.seen.picture), pull=pull)
+        enough = 1e-10 * float(inner(pull, _spread(seen, pull), seen.torus))
+        found = _nested(seen, ctx.steps, enough)
+        return None, torch.fft.irfft2(found, s=seen.torus), None, None
+
+
+def _nested(seen: Blurred, steps: int, enough: float) -> Tensor:
+    if not _halvings(_size(seen)):
+        return _exact(seen)
+    coarse = halved(seen)
+    start = widened(_nested(coarse, min(4 * steps, MOST), enough / CAREFUL), coarse.torus, seen.torus)
+    return descend(seen, start, steps, enough)
+
+
+def _size(seen: Blurred) -> Size:
+    y, x = seen.picture.shape[-2:]
+    return y, x
+
+
+def _halvings(picture: Size) -> int:
+    return max(0, math.ceil(math.log2(max(picture) / DENSE)))
+
+
+def halved(seen: Blurred) -> Blurred:
+    """The same picture on pixels twice as wide; what these cannot hold counts as noise."""
+    weight = _pooled(seen.weight)
+    picture, *glare = (_pooled(seen.weight * p) / weight.clamp_min(1e-30) for p in (seen.picture, *seen.glare))
+    size = (seen.torus[0] // 2, seen.torus[1] // 2)
+    y_mean, x_mean = (_pooling(n, seen.transfer) for n in seen.torus)
+    lost = seen.power.new_zeros(len(seen.transfer))
+    for rows in pieces(seen.transfer):
+        passed = seen.power[rows] * y_mean[rows, None].abs().square() * x_mean[: seen.transfer.shape[-1]].abs().square()
+        through = seen.transfer[:, rows]
+        lost = lost + variance((through.real.square() + through.imag.square()) * passed, seen.torus)
+    up, right = (size[0] + 1) // 2, size[1] // 2 + 1
+    y_mean = torch.cat([y_mean[:up], y_mean[len(y_mean) - size[0] + up :]])
+    transfer = narrowed(seen.transfer, size) * y_mean[:, None] * x_mean[:right]
+    power = narrowed(seen.power, size) / 4.0
+    lost = (lost - variance(transfer.abs().square() * power, size)).clamp_min(0.0)[:, None, None]
+    pull = None if seen.pull is None else narrowed(seen.pull, size)
+    return replace(
+        seen, picture=picture, weight=weight / (1.0 + weight * lost), transfer=transfer, power=power, torus=size,
+        glare=tuple(glare), pull=pull,
+    )  # fmt: skip
+
+
+def _pooled(pixels: Tensor) -> Tensor:
+    """Sums of two by two."""
+    y, x = pixels.shape[-2:]
+    return 4.0 * avg_pool2d(pad(pixels, (0, x % 2, 0, y % 2)) if x % 2 or y % 2 else pixels, 2)
+
+
+def _pooling(size: int, like: Tensor) -> Tensor:
+    """Transfer of the mean of a pixel and the next one, along an axis of so many."""
+    turns = torch.arange(size, dtype=torch.float64, device=like.device) / size
+    turns = torch.where(turns > 0.5, turns - 1.0, turns)
+    return ((1.0 + torch.exp(2j * math.pi * turns)) / 2.0).to(like)
+
+
+def _exact(seen: Blurred) -> Tensor:
+    """Solve for the weights of all seen pixels at once, in float64, by Cholesky."""
+    channels = len(seen.picture)
+    fine = replace(seen, transfer=seen.transfer.to(torch.complex128), power=seen.power.double())
+    weight = seen.weight.double().flatten()
+    root = weight.where(weight > 0, 1.0).sqrt().where(weight > 0, 0.0)  # at what is not seen the root has no slope
+    colours = torch.full((channels, channels), seen.grey, dtype=torch.float64, device=root.device).fill_diagonal_(1.0)
+    rows = [torch.cat([colours[i, j] * _covariance(fine, a * b.conj()) for j, b in enumerate(fine.transfer)], 1)
+            for i, a in enumerate(fine.transfer)]  # fmt: skip
+    matrix = root[:, None] * torch.cat(rows) * root
+    for pattern in seen.glare:
+        shape = root * pattern.double().flatten()
+        matrix = matrix + 1e8 * torch.outer(shape, shape) / shape.square().sum().clamp_min(1e-30)
+    matrix.diagonal().add_(1.0)
+    before = torch.zeros_like(fine.transfer) if seen.pull is None else _spread(fine, seen.pull.to(torch.complex128))
+    wanted = (root * (seen.picture.double() - fine.blur(before)).flatten())[:, None]
+    answer = root * torch.cholesky_solve(wanted, torch.linalg.cholesky(matrix))[:, 0]
+    return (before + _spread(fine, fine.gathered(answer.reshape(seen.picture.shape)))).to(seen.transfer)
+
+
+def _covariance(seen: Blurred, passed: Tensor) -> Tensor:
+    """Covariance of every two pixels of the picture, for a product of two transfers."""
+    lags = torch.fft.irfft2(passed * seen.power, s=seen.torus)
+    y, x = (torch.arange(n, device=lags.device) for n in seen.picture.shape[-2:])
+    down, right = (y[:, None] - y) % seen.torus[0], (x[:, None] - x) % seen.torus[1]
+    square: Tensor = lags[down[:, None, :, None], right[None, :, None, :]]
+    return square.reshape(len(y) * len(x), -1)
+
+
+def _spread(seen: Blurred, spectrum: Tensor) -> Tensor:
+    """The prior's covariance times half a spectrum."""
+    return seen.power * mixed(spectrum, 1.0 - seen.grey, seen.grey)

@@ -1,0 +1,133 @@
+"""The slowest part of a picture at once: its lowest frequencies, as a dense matrix.
+
+What lies beyond the edge and in holes is told by the rest in the lowest frequencies, where the signal is up to 1e8
+times the noise: there the inverse for a picture without edges is wrong by that factor, and this one is right.
+"""
+
+from __future__ import annotations
+
+import math
+
+import torch
+from torch import Tensor
+from torch.nn.functional import pad
+
+from neusee.nodes.restore._inverse._masked_blur import Blurred, Size, inverse_colour
+
+_LEAST = 1e-11  #: of the largest number of the matrix: what float64 cannot tell from nothing
+MODES = 1000  #: real unknowns of each of at most three channels; of more, as many as three have,
+_ROWS = 256  #: of the inverse that are read at a time
+SHARE = 24  #: and of a small torus one for so many of its points
+
+
+class Lowest:
+    """The inverse of a blur's normal matrix among its lowest frequencies, from the mean on."""
+
+    def __init__(self, seen: Blurred, gain: Tensor) -> None:
+        """`gain` (channel, fy, fx) scales the matrix: the diagonal of an inverse that is about right."""
+        self.torus = seen.torus
+        count = min(MODES, 3 * MODES // len(seen.picture), int(math.prod(seen.torus) / SHARE))
+        self.fy, self.fx = (f.to(gain.device) for f in _lowest(seen.torus, max(1, count // 2)))
+        root = gain[:, self.fy, self.fx].double().sqrt()
+        root[:, 0] *= 0.5**0.5  # the mean is its own mirror image
+        root = torch.cat([root, root[:, 1:]], 1).flatten()
+        matrix = self._matrix(seen).mul_(root[:, None]).mul_(root)
+        matrix.diagonal().add_(_LEAST * matrix.diagonal().max())
+        whiten = _inverse(torch.linalg.cholesky(matrix)).mul_(root)
+        ends = range(_ROWS, len(whiten) + _ROWS, _ROWS)  # lower triangular: the rest of these rows is 0
+        self.whiten = [whiten[end - _ROWS : end, :end].to(gain, copy=True) for end in ends]
+
+    def add(self, slope: Tensor, onto: Tensor) -> Tensor:
+        """Add the inverse times `slope` onto a spectrum; give the inner product of both, as pixels."""
+        risen = _real(slope[:, self.fy, self.fx])
+        both, rise = torch.zeros_like(risen), torch.zeros((), dtype=torch.float64, device=slope.device)
+        for some in self.whiten:  # both products while it is in cache
+            told = some @ risen[: some.shape[1]]
+            both[: some.shape[1]] += told @ some
+            rise += told.square().sum(dtype=torch.float64)
+        both = both.reshape(len(slope), -1)
+        real, imag = both[:, : len(self.fy)], pad(both[:, len(self.fy) :], (1, 0))
+        step = torch.complex(real, imag)
+        step[:, 0] *= 2.0
+        onto[:, self.fy, self.fx] += step
+        mirrored = (self.fx == 0) & (self.fy > 0)
+        onto[:, -self.fy[mirrored], 0] += step[:, mirrored].conj()
+        return rise * (2.0 / (self.torus[0] * self.torus[1]))
+
+    def _matrix(self, seen: Blurred) -> Tensor:
+        """Prior, noise and glare, for the real parts and then the imaginary ones of each channel, in float64."""
+        transfer = seen.transfer[:, self.fy, self.fx].to(torch.complex128)
+        inverse = 1.0 / seen.power[self.fy, self.fx].double().clamp_min(1e-30)
+        inverse = torch.cat([2.0 * inverse[:1], inverse[1:], inverse[1:]])
+        own, shared = inverse_colour(len(transfer), seen.grey)
+        colours = own * torch.eye(len(transfer), dtype=torch.float64, device=inverse.device) - shared
+        matrix = inverse.new_zeros(len(transfer), len(inverse), len(transfer), len(inverse))
+        matrix.diagonal(dim1=1, dim2=3).copy_(colours[..., None] * inverse)
+        for channel, through in enumerate(transfer):
+            weight = torch.fft.rfft2(seen.weight[channel].double(), s=seen.torus)
+            matrix[channel, :, channel] += self._noise(weight, through)
+        size = len(transfer) * len(inverse)
+        return self._without_glare(matrix.view(size, size), seen, transfer)
+
+    def _noise(self, weight: Tensor, through: Tensor) -> Tensor:
+        """How one channel's pixels tell its frequencies: each with each, and each with the mirror image of each."""
+        plus, minus = (self._at(weight, s) * through.conj()[:, None] for s in (-1, 1))
+        plus, minus = plus * through, minus * through.conj()
+        top = torch.cat([plus.real + minus.real, (minus.imag - plus.imag)[:, 1:]], 1)
+        bottom = torch.cat([plus.imag + minus.imag, (plus.real - minus.real)[:, 1:]], 1)
+        both: Tensor = torch.cat([top, bottom[1:]]) / (self.torus[0] * self.torus[1])
+        return both
+
+    def _at(self, spectrum: Tensor, sign: int) -> Tensor:
+        """Half a spectrum at the sum or the difference of every two frequencies."""
+        y, x = self.torus
+        fy, fx = self.fy[:, None] + sign * self.fy, (self.fx[:, None] + sign * self.fx) % x
+        far = fx > x // 2
+        values = spectrum[torch.where(far, -fy, fy) % y, torch.where(far, x - fx, fx)]
+        return torch.where(far, values.conj(), values)
+
+    def _without_glare(self, matrix: Tensor, seen: Blurred, transfer: Tensor) -> Tensor:
+        """Take away, in place, what the unknown strength of each glare hides."""
+        if not seen.glare:
+            return matrix
+        flat = torch.stack(seen.glare).double().flatten(1)
+        weighted = seen.weight.double().flatten() * flat
+        inverse = torch.linalg.pinv(weighted @ flat.T, hermitian=True) * (2.0 / (self.torus[0] * self.torus[1]))
+        shapes = weighted.reshape(-1, *seen.picture.shape)
+        spectra = (torch.fft.rfft2(shape, s=seen.torus)[:, self.fy, self.fx] for shape in shapes)
+        told = torch.stack([_real(transfer.conj() * s) for s in spectra])
+        return matrix.addmm_(told.T, inverse @ told, alpha=-1.0)
+
+
+def _inverse(lower: Tensor) -> Tensor:
+    """Inverse of a lower triangular matrix, by halves: faster than to solve for the unit matrix."""
+    inverse = torch.zeros_like(lower)
+    _invert(lower, inverse)
+    return inverse
+
+
+def _invert(lower: Tensor, inverse: Tensor) -> None:
+    half = len(lower) // 2
+    if half < 128:
+        unit = torch.eye(len(lower), dtype=lower.dtype, device=lower.device)
+        inverse.copy_(torch.linalg.solve_triangular(lower, unit, upper=False))
+        return
+    _invert(lower[:half, :half], inverse[:half, :half])
+    _invert(lower[half:, half:], inverse[half:, half:])
+    inverse[half:, :half] = (inverse[half:, half:] @ (lower[half:, :half] @ inverse[:half, :half])).neg_()
+
+
+def _real(spectrum: Tensor) -> Tensor:
+    """Real parts and imaginary ones, channel by channel; the first frequency has none of these."""
+    return torch.cat([spectrum.real, spectrum.imag[:, 1:]], 1).flatten()
+
+
+def _lowest(size: Size, count: int) -> tuple[Tensor, Tensor]:
+    """The lowest frequencies (fy, fx), one of each with its mirror image, that of no sign left out; the mean first."""
+    reach = (size[0] - 1) // 2
+    fy = torch.arange(-reach, reach + 1)[:, None]
+    fx = torch.arange((size[1] - 1) // 2 + 1)
+    squared = (fy / size[0]).square() + (fx / size[1]).square()
+    squared[:reach, 0] = torch.inf
+    order = squared.flatten().argsort(stable=True)[: min(count, squared.numel() - reach)]
+    return order // len(fx) - reach, order % len(fx)

@@ -1,0 +1,166 @@
+"""What all networks that restore have in common: two scales, any size, how they start, how they are used."""
+
+import math
+from abc import ABC, abstractmethod
+from collections.abc import Callable
+from pathlib import Path
+from typing import Annotated, Any, TypeVar
+
+import torch
+from pydantic import Field
+from torch import Tensor, nn
+from torch.nn import functional as F
+
+from neusee.nodes import Check, ParameterError
+from neusee.nodes._bicubic_resize import resize
+from neusee.nodes._half_precision import refuse_not_finite, single
+from neusee.nodes._mirror_padding import mirrored
+from neusee.nodes._network_weights import empty, loaded, same_layout
+from neusee.nodes.restore._networks._tiles import tiled
+from neusee.nodes.units import Count
+
+Net = TypeVar("Net", bound=nn.Module)
+Tile = Annotated[Count, Field(ge=32)]  #: side of a piece, pixels
+LEAK = 0.2  #: of what is negative, where a layer leaks
+LEAKY = nn.init.calculate_gain("leaky_relu", LEAK)
+LAYERS = (nn.Conv2d, nn.ConvTranspose2d, nn.Linear)
+
+
+class Restorer(nn.Module, ABC):
+    """A network from a picture to the same picture restored, (n, 3, y, x) of any size, at two scales."""
+
+    multiple: int  #: of which height and width must be, inside
+    last: nn.Conv2d  #: from which what is added to the picture comes
+
+    @abstractmethod
+    def scales(self, picture: Tensor) -> tuple[Tensor, Tensor]:
+        """Restore a picture whose size fits: the coarse estimate, of half the size, and the fine one."""
+
+    def pyramid(self, picture: Tensor) -> tuple[Tensor, Tensor]:
+        """Estimate at L = 0, half the size rounded up, and L = 1, the full size."""
+        y, x = picture.shape[-2:]
+        coarse, fine = self.scales(mirrored(picture, -y % self.multiple, -x % self.multiple))
+        return coarse[..., : -(-y // 2), : -(-x // 2)], fine[..., :y, :x]
+
+    def forward(self, picture: Tensor) -> Tensor:
+        return self.pyramid(picture)[1]
+
+
+class Flat(Restorer):
+    """A network of one scale, which gives what is to be added to the picture; its coarse estimate is the fine one's."""
+
+    @abstractmethod
+    def change(self, picture: Tensor) -> Tensor:
+        """Difference of the restored picture to this one, whose size fits."""
+
+    def scales(self, picture: Tensor) -> tuple[Tensor, Tensor]:
+        fine = picture + self.change(picture)
+        return resize(fine, picture.shape[-2] // 2, picture.shape[-1] // 2), fine
+
+
+class ChannelNorm(nn.LayerNorm):
+    """Layer norm over the channels of (n, channel, y, x), never in half precision."""
+
+    def forward(self, input: Tensor) -> Tensor:
+        return super().forward(single(input).movedim(1, -1)).movedim(-1, 1)
+
+
+class Scale(nn.Module):
+    """A factor for each channel: what a block adds is small at the start."""
+
+    def __init__(self, channels: int) -> None:
+        super().__init__()
+        self.factor = nn.Parameter(torch.empty(channels, 1, 1))
+
+    def start(self, rng: torch.Generator) -> None:
+        nn.init.constant_(self.factor, 0.1)
+
+    def forward(self, x: Tensor) -> Tensor:
+        return x * self.factor
+
+
+def started(make: Callable[[], Net], rng: torch.Generator) -> Net:
+    """Draw a network: its layers with orthogonal weights and zero biases; norms, decays and factors as these need.
+
+    Those of a network with leaky layers are larger by its `gain`, which keeps the power from layer to layer. What is
+    added to a picture is a tenth of what comes, so that the network starts as almost the picture itself.
+    """
+    net = empty(make).to_empty(device=rng.device)
+    gain = getattr(net, "gain", 1.0)
+    with torch.no_grad():
+        for part in net.modules():
+            if isinstance(part, LAYERS):
+                nn.init.orthogonal_(part.weight, gain, generator=rng)
+                if part.bias is not None:
+                    part.bias.zero_()
+            elif isinstance(part, nn.LayerNorm):
+                part.reset_parameters()
+            elif callable(start := getattr(part, "start", None)):
+                start(rng)
+        if isinstance(net, Restorer):
+            net.last.weight.mul_(0.1)
+    return net
+
+
+def parameter_groups(net: nn.Module, weights: float = 2e-4, biases: float = 4e-4) -> list[dict[str, Any]]:
+    """Two groups for an optimiser: all else, and the biases of layers; those of scans and norms are none of these."""
+    of_layers = [m.bias for m in net.modules() if isinstance(m, LAYERS) and m.bias is not None]
+    known = set(map(id, of_layers))
+    others = [p for p in net.parameters() if id(p) not in known]
+    return [{"params": others, "lr": weights}, {"params": of_layers, "lr": biases}]
+
+
+def restored(
+    picture: Tensor,
+    make: Callable[[], Restorer],
+    weights: Path | None,
+    tile: int | None = None,
+    reduce: int = 1,
+    detail: bool = False,
+) -> Tensor:
+    """The picture through the network with these weights, in single precision; gradients reach the picture alone.
+
+    ``tile``: the side of the pieces it is restored in, where it is larger. ``reduce``: by what it is made smaller
+    before, and larger again afterwards, antialiased; with ``detail`` what that loses is added as it was.
+    """
+    if picture.ndim != 3 or len(picture) != 3:
+        raise ValueError(f"a picture {tuple(picture.shape)} is no colour picture: give (3, y, x)")
+    refuse_not_finite("one of them is soon everywhere", picture=picture)
+    net = loaded(make, _needed(weights)).requires_grad_(False).eval().to(picture.device)
+    exact = torch.backends.cudnn.flags(enabled=True, benchmark=False, deterministic=True, allow_tf32=False)
+    with exact, torch.autocast(picture.device.type, enabled=False):
+        y, x = picture.shape[-2:]
+        whole = picture.float()[None]
+        seen = whole if reduce == 1 else resize(whole, -(-y // reduce), -(-x // reduce))
+        result: Tensor = net(seen) if tile is None else tiled(net, seen, tile)
+        if reduce > 1:
+            result = whole + resize(result - seen, y, x) if detail else resize(result, y, x)
+    return result[0]
+
+
+def fitting(make: Callable[[], Restorer], weights: Path | None, width: int) -> list[str]:
+    """Refuse a network without weights, and weights of another network."""
+    same_layout(make, _needed(weights), width)
+    return []
+
+
+def _needed(weights: Path | None) -> Path:
+    if weights is None:
+        text = (
+            "a network restores nothing untrained: give the .safetensors file of its weights, or choose restore: wiener"
+        )
+        raise ParameterError("weights", text)
+    return weights
+
+
+def restorer_checks(result: Tensor, picture: Tensor, **params: Any) -> list[Check]:
+    """How much the network changed, against how much there is."""
+    change = float((result - picture).square().mean(dtype=torch.float64).sqrt())
+    there = float(picture.square().mean(dtype=torch.float64).sqrt())
+    return [Check(f"changed by {change:.3g} rms, of {there:.3g}", math.isfinite(change))]
+
+
+def gated(x: Tensor) -> Tensor:
+    """One half of the channels, let through by the other."""
+    value, gate = x.chunk(2, 1)
+    return F.gelu(gate) * value

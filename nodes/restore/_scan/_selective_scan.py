@@ -1,0 +1,167 @@
+"""The selective scan: a linear recurrence whose step, input and output each position chooses for itself."""
+
+import functools
+import importlib.util
+import os
+import warnings
+from typing import Literal, get_args
+
+import torch
+from torch import Tensor
+
+from neusee.nodes.restore._scan import _cpp_scan, _torch_scan
+
+Backend = Literal["torch", "cpp", "triton", "mamba_ssm"]
+
+
+def selective_scan(
+    u: Tensor,
+    dt: Tensor,
+    A: Tensor,
+    B: Tensor,
+    C: Tensor,
+    D: Tensor | None = None,
+    *,
+    backend: Literal["auto", "torch", "cpp", "triton", "mamba_ssm"] = "auto",
+) -> Tensor:
+    """Run h_t = exp(dt_t A) h_(t-1) + dt_t B_t u_t from h = 0 and read y_t = C_t . h_t + D u_t.
+
+    ``A`` is negative and ``dt`` positive: decays are at most 1 and only ever multiplied, so that nothing overflows at
+    any length. ``backend`` "auto" is C++ on a CPU where there is a compiler, on CUDA, in float32, a Triton kernel or
+    else mamba_ssm where these are installed, and torch else; ``NEUSEE_SCAN=torch`` makes it torch everywhere.
+    Differentiable once: a gradient of its gradient is refused.
+
+    Shapes: u, dt (batch, length, d), A (d, n), B, C (batch, length, n), D (d) -> (batch, length, d).
+    Units:  none; dt in those of 1 / A.
+    Error:  float32, also from half precision and under autocast: of the largest |y|, over 65 536 steps and for
+            dt |A| from 1e-6 to 200, 2e-7 in C++ and Triton, 7e-7 in torch. float64 if any input is: 1e-12.
+    Raises: ValueError for shapes that do not fit and for a backend that these tensors, or this machine, do not have.
+    Source: Gu and Dao, Mamba: Linear-Time Sequence Modeling with Selective State Spaces, 2023, algorithm 2.
+    """
+    _check_shapes(u, dt, A, B, C, D)
+    kind = _kind(u, dt, A, B, C)
+    chosen = _auto(u, kind) if backend == "auto" else backend
+    with torch.autocast(u.device.type, enabled=False):
+        y = _run(chosen, *(x.to(kind) for x in (u, dt, A, B, C)))
+        return y if D is None else torch.addcmul(y, D.to(kind), u.to(kind))
+
+
+def reference(u: Tensor, dt: Tensor, A: Tensor, B: Tensor, C: Tensor, D: Tensor | None = None) -> Tensor:
+    """The same by the loop that defines it, in float64, to measure others by: slow, and differentiable at will.
+
+    Shapes: as `selective_scan`.
+    """
+    _check_shapes(u, dt, A, B, C, D)
+    u, dt, A, B, C = (x.double() for x in (u, dt, A, B, C))
+    h, rows = u.new_zeros(u.shape[0], *A.shape), []
+    # unbind, for a row that is indexed has a gradient as long as all rows
+    for push, step, into, out in zip((dt * u).unbind(1), dt.unbind(1), B.unbind(1), C.unbind(1), strict=True):
+        h = torch.exp(step[..., None] * A) * h + push[..., None] * into[:, None]
+        rows.append((h @ out[..., None])[..., 0])
+    y = torch.stack(rows, 1)
+    return y if D is None else y + D.double() * u
+
+
+def _check_shapes(u: Tensor, dt: Tensor, A: Tensor, B: Tensor, C: Tensor, D: Tensor | None) -> None:
+    if u.ndim != 3 or A.ndim != 2:
+        raise ValueError(f"u is (batch, length, d) and A (d, n), not {tuple(u.shape)} and {tuple(A.shape)}")
+    if not (u.numel() and A.numel()):
+        raise ValueError(f"there is nothing to scan: u is {tuple(u.shape)} and A {tuple(A.shape)}")
+    (batch, length, d), n = u.shape, A.shape[1]
+    wanted = {
+        "dt": (dt, (batch, length, d)),
+        "A": (A, (d, n)),
+        "B": (B, (batch, length, n)),
+        "C": (C, (batch, length, n)),
+    }
+    if D is not None:
+        wanted["D"] = (D, (d,))
+    for name, (x, shape) in wanted.items():
+        if tuple(x.shape) != shape:
+            raise ValueError(f"{name} is {tuple(x.shape)}; beside u {tuple(u.shape)} and A {tuple(A.shape)}: {shape}")
+        if x.device != u.device:
+            raise ValueError(f"{name} is on {x.device}, u on {u.device}")
+
+
+def _kind(*tensors: Tensor) -> torch.dtype:
+    """float64 if any is, else float32."""
+    for x in tensors:
+        if not x.is_floating_point():
+            raise ValueError(f"the selective scan is of real numbers, not of {x.dtype}")
+    return torch.float64 if any(x.dtype == torch.float64 for x in tensors) else torch.float32
+
+
+def _auto(u: Tensor, kind: torch.dtype) -> Backend:
+    named = os.environ.get("NEUSEE_SCAN") or ""
+    if named not in ("", *get_args(Backend)):
+        raise ValueError(f"NEUSEE_SCAN is {named!r}: write torch or cpp, or on CUDA triton or mamba_ssm")
+    if named == "torch":
+        return "torch"
+    if u.device.type == "cpu":
+        return "cpp" if _cpp_scan.compiled() else "torch"
+    if u.device.type == "cuda" and kind == torch.float32:
+        return _kernel(named)
+    return "torch"
+
+
+def _kernel(named: str) -> Backend:
+    """What scans on CUDA: what is named if it is installed, else what is."""
+    if named != "mamba_ssm" and importlib.util.find_spec("triton"):
+        return "triton"
+    if named != "triton" and importlib.util.find_spec("mamba_ssm"):
+        return "mamba_ssm"
+    _say_once(f"neither Triton nor mamba_ssm is here for the selective scan{named and f' ({named} is asked for)'}")
+    return "torch"
+
+
+@functools.cache
+def _say_once(why: str) -> None:
+    warnings.warn(f"{why}: torch computes it, slower", stacklevel=5)
+
+
+def _run(backend: str, u: Tensor, dt: Tensor, A: Tensor, B: Tensor, C: Tensor) -> Tensor:
+    if backend not in get_args(Backend):
+        raise ValueError(f"backend is {backend!r}: write auto, {', '.join(get_args(Backend))}")
+    if backend in ("triton", "mamba_ssm"):
+        if u.device.type != "cuda" or u.dtype != torch.float32:
+            raise ValueError(f"the backend {backend} is for float32 on CUDA, and u is {u.dtype} on {u.device}")
+        return (by_mamba if backend == "mamba_ssm" else by_triton)(u, dt, A, B, C)
+    if backend == "cpp" and u.device.type != "cpu":
+        raise ValueError(f"the backend cpp is for the CPU, and u is on {u.device}")
+    scan = _cpp_scan.Scan if backend == "cpp" and _cpp_scan.compiled() else _torch_scan.Scan
+    y: Tensor = scan.apply(u, dt, A, B, C)  # type: ignore[no-untyped-call]
+    return y
+
+
+def by_triton(*tensors: Tensor) -> Tensor:
+    """By our own kernel; a `ValueError` where Triton is not installed."""
+    if not importlib.util.find_spec("triton"):
+        raise ValueError("the backend triton is not here: it comes with torch's CUDA builds")
+    from neusee.nodes.restore._scan import _triton_scan
+
+    y: Tensor = _triton_scan.Scan.apply(*tensors)  # type: ignore[no-untyped-call]
+    return y
+
+
+class _Once(torch.autograd.Function):
+    """Its input, whose gradient must not be asked for a gradient: mamba_ssm's would be wrong without a word."""
+
+    @staticmethod
+    def forward(ctx: object, y: Tensor) -> Tensor:
+        return y.view_as(y)
+
+    @staticmethod
+    def backward(ctx: object, *seen: Tensor) -> Tensor:
+        _torch_scan.refuse_twice()
+        return seen[0]
+
+
+def by_mamba(u: Tensor, dt: Tensor, A: Tensor, B: Tensor, C: Tensor) -> Tensor:
+    """By mamba_ssm's kernel, which has the length last; a `ValueError` where it is not installed."""
+    try:
+        from mamba_ssm.ops.selective_scan_interface import selective_scan_fn
+    except ImportError as error:
+        raise ValueError(f"the backend mamba_ssm is not here: {error}") from error
+    u, dt, B, C = (x.transpose(1, 2).contiguous() for x in (u, dt, B, C))
+    y: Tensor = _Once.apply(selective_scan_fn(u, dt, A, B, C))  # type: ignore[no-untyped-call]
+    return y.transpose(1, 2)

@@ -1,0 +1,114 @@
+"""A scene-linear OpenEXR picture, with the primaries its header names."""
+
+from pathlib import Path
+from typing import Annotated, Any, Literal
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from pydantic import Field
+from torch import Tensor
+
+from neusee.nodes import Check, ParameterError, node
+from neusee.nodes.scene._crop_to_frame import enlarged, framed
+from neusee.nodes.units import DataFile, Shape
+
+White = Annotated[float, Field(gt=0, allow_inf_nan=False)]
+_REC709 = (0.64, 0.33, 0.30, 0.60, 0.15, 0.06, 0.3127, 0.3290)  #: what the format means where it names no primaries
+
+
+@node(rtol=1e-5)
+def exr(
+    *,
+    file: DataFile,
+    shape: Shape | None = None,
+    white: White | None = None,
+    negatives: Literal["clip", "keep"] = "clip",
+) -> Tensor:
+    """Read scene-linear light, from the primaries the header names to linear sRGB (Bradford where whites differ).
+
+    Shapes: -> (3, y, x) float32, the file's own size or `shape` (scaled to cover it, centre cut).
+    Units:  linear sRGB, 1 = `white` of the file's values (as they are where it is null); no upper limit.
+    Error:  half floats carry 5e-4. Negative light, of noise or of colours outside sRGB, is clipped unless kept.
+    Raises: ParameterError before the run where R, G, B and Y are all missing; ValueError on values not finite.
+    Source: OpenEXR technical introduction (chromaticities, adoptedNeutral); matrices of colour-science.
+    """
+    scene = framed(_linear(file), shape) / (white or 1.0)
+    return scene.clamp_min(0) if negatives == "clip" else scene
+
+
+@exr.preflight
+def _(*, file: Path, shape: Shape | None = None, **params: Any) -> list[str]:
+    header = _header(file)
+    names = [channel.name for channel in header["channels"]]
+    _wanted(file, names)
+    low, high = header["dataWindow"]
+    notes = [] if {"R", "G", "B"} <= set(names) else [f"{file.name}: luminance only, taken as grey"]
+    if abs(float(header.get("pixelAspectRatio", 1.0)) - 1) > 1e-3:
+        notes += [f"{file.name}: pixels are not square ({header['pixelAspectRatio']:.3f}), taken as square"]
+    return notes + enlarged((int(high[1] - low[1]) + 1, int(high[0] - low[0]) + 1), shape)
+
+
+@exr.check
+def _(result: Tensor, *, file: Path, **params: Any) -> list[Check]:
+    linear = _linear(file)
+    below, least = int((linear < 0).sum()), float(linear.min())
+    text = f"peak {float(result.max()):.4g}, mean {float(result.mean()):.3g}"
+    return [Check(text + (f"; {below} of {linear.numel()} values were negative, down to {least:.2g}" if below else ""))]
+
+
+def _header(file: Path) -> dict[str, Any]:
+    import OpenEXR
+
+    try:
+        with OpenEXR.File(str(file), header_only=True) as opened:
+            return dict(opened.header())
+    except (RuntimeError, OSError, ValueError) as why:
+        raise ParameterError(
+            "file", f"{file} cannot be read as OpenEXR ({str(why).strip()}): give an .exr file"
+        ) from None
+
+
+def _wanted(file: Path, names: list[str]) -> list[str]:
+    """Channels to read: R, G, B, or else Y alone."""
+    for wanted in (["R", "G", "B"], ["Y"]):
+        if set(wanted) <= set(names) and not {"RY", "BY"} & set(names):
+            return wanted
+    held = ", ".join(names)
+    raise ParameterError(
+        "file", f"{file} has the channels {held}, but R, G and B, or Y alone, are needed: save it as RGB"
+    )
+
+
+def _linear(file: Path) -> Tensor:
+    """Linear sRGB as the file has it, (3, y, x) float32."""
+    import OpenEXR
+
+    with OpenEXR.File(str(file), separate_channels=True) as opened:
+        header, channels = dict(opened.header()), opened.channels()
+        names = _wanted(file, list(channels))
+        pixels = np.stack([np.asarray(channels[name].pixels, dtype=np.float32) for name in names])
+    if bad := int((~np.isfinite(pixels)).sum()):
+        raise ValueError(f"{file.name} holds {bad} values that are not finite: replace them, say by the largest")
+    if names == ["Y"]:
+        return torch.from_numpy(pixels).expand(3, -1, -1).clone()
+    matrix = torch.from_numpy(_to_srgb(header)).to(torch.float32)
+    return (matrix @ torch.from_numpy(pixels).flatten(1)).reshape(pixels.shape)
+
+
+def _to_srgb(header: dict[str, Any]) -> NDArray[np.float64]:
+    """The matrix from the file's primaries to linear sRGB; its neutral goes to D65 by Bradford."""
+    import colour
+
+    values = np.asarray(header.get("chromaticities", _REC709), dtype=np.float64)
+    if np.allclose(values, _REC709, atol=1e-4) and "adoptedNeutral" not in header:
+        return np.eye(3)
+    white = values[6:]
+    neutral = np.asarray(header.get("adoptedNeutral", white), dtype=np.float64)
+    srgb = colour.RGB_COLOURSPACES["sRGB"]
+    own = colour.models.normalised_primary_matrix(values[:6].reshape(3, 2), white)
+    adapt = colour.adaptation.matrix_chromatic_adaptation_VonKries(
+        colour.xy_to_XYZ(neutral), colour.xy_to_XYZ(srgb.whitepoint), transform="Bradford"
+    )
+    matrix: NDArray[np.float64] = np.linalg.inv(srgb.matrix_RGB_to_XYZ) @ adapt @ own
+    return matrix

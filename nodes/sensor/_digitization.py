@@ -1,0 +1,157 @@
+"""Electrons to digital numbers: the full well, the converter and the window that is kept."""
+
+import math
+from typing import Annotated, Any, Literal
+
+import torch
+from pydantic import Field
+from torch import Generator, Tensor
+
+from neusee.nodes import Check, Deviation, Facts, node
+from neusee.nodes._half_precision import single
+from neusee.nodes.sensor._saturation import Well
+from neusee.nodes.units import Shape
+
+Gain = Annotated[float, Field(gt=0, allow_inf_nan=False)]
+GainUnit = Literal["e-/DN", "DN/e-"]
+Rounding = Literal["nearest", "dithered_floor"]
+Bits = Annotated[int, Field(ge=1, le=16)]
+
+
+def numbers_per_electron(gain: float, gain_unit: str) -> float:
+    """The system gain K of EMVA 1288, DN/e-, however the recipe writes it."""
+    return gain if gain_unit == "DN/e-" else 1.0 / gain
+
+
+@node(rtol=0.0)
+def full_well(electrons: Tensor, *, capacity: Well) -> Tensor:
+    """Hold no more electrons than a pixel can.
+
+    Shapes: electrons (..., y, x) -> (..., y, x).
+    Units:  e-.
+    Error:  a hard edge: neither blooming into neighbours nor a soft knee. A pedestal added before takes its share
+            of the well, as the paper prints it.
+    Source: NeuSee, Eq. (SensorImage).
+    """
+    return single(electrons).clamp_max(capacity)
+
+
+@full_well.negligible
+def _(electrons: Facts, *, capacity: float) -> float:
+    """What the brightest pixel loses, over the well or over what lies furthest below 0; exact.
+
+    The well is the number that the dtype holds, which lies beside ``capacity`` by up to half a step.
+    """
+    dtype = torch.promote_types(getattr(torch, electrons.dtype), torch.float32)
+    held = float(torch.tensor(capacity, dtype=dtype))
+    if electrons.max <= held:
+        return 0.0
+    largest = max(held, -electrons.min)
+    return (electrons.max - held) / largest if largest > 0 else math.inf
+
+
+@full_well.carries
+def _(electrons: Deviation, **params: Any) -> float:
+    return electrons.bound
+
+
+@full_well.check
+def _(result: Tensor, electrons: Tensor, *, capacity: float) -> list[Check]:
+    return [Check(f"{int(torch.count_nonzero(result >= capacity))} of {result.numel()} full")]
+
+
+@node(rtol=0.0)
+def digitize(
+    electrons: Tensor,
+    *,
+    gain: Gain,
+    gain_unit: GainUnit = "e-/DN",
+    rounding: Rounding = "nearest",
+    bits: Bits = 16,
+    rng: Generator | None = None,
+) -> Tensor:
+    """Convert electrons to whole digital numbers that a converter of so many bits can hold.
+
+    Shapes: electrons (..., y, x) -> (..., y, x), whole numbers in the dtype of the input (of half precision, float32).
+    Units:  electrons e-; gain as gain_unit says; result DN in [0, 2**bits - 1].
+    Error:  `nearest` is exact (half to even), with variance 1/12 DN2. `dithered_floor`, floor(x + U(-1/2, 1/2)) as
+            printed, lies 1/2 DN low with up to 1/6 DN2 more variance. Integral nonlinearity is left out. The
+            gradient is that of the line before rounding, and 0 where the converter clips.
+    Raises: ValueError for `dithered_floor` without rng.
+    Source: NeuSee, Eq. (SensorImage); EMVA Standard 1288, release 4.0 (quantization variance 1/12 DN2).
+    """
+    line = single(electrons) * numbers_per_electron(gain, gain_unit)
+    ideal = line.clamp(0, 2**bits - 1)
+    if rounding == "nearest":  # the sum is exact: without a gradient, the rounded number itself
+        return ideal + (ideal.round() - ideal).detach() if ideal.requires_grad else ideal.round_()
+    if rng is None:
+        raise ValueError("dithered_floor draws random numbers: give rng=torch.Generator()")
+    dither = torch.rand(line.shape, generator=rng, device=rng.device, dtype=torch.float32).to(line) - 0.5
+    whole = (line + dither).floor().clamp(0, 2**bits - 1)
+    return ideal + (whole - ideal).detach()
+
+
+@digitize.reference
+def _(
+    electrons: Tensor,
+    *,
+    gain: float,
+    gain_unit: GainUnit = "e-/DN",
+    rounding: Rounding = "nearest",
+    bits: int = 16,
+    rng: Generator | None = None,
+) -> Tensor:
+    top, slope, electrons = 2**bits - 1, numbers_per_electron(gain, gain_unit), single(electrons)
+    line = (electrons * slope).flatten().tolist()
+    if rounding == "nearest":
+        whole = [round(min(max(x, 0.0), float(top))) for x in line]
+    else:
+        dither = torch.rand(electrons.shape, generator=rng, dtype=torch.float32).flatten().tolist()
+        whole = [min(max(math.floor(x + d - 0.5), 0), top) for x, d in zip(line, dither, strict=True)]
+    return torch.tensor(whole, dtype=electrons.dtype).reshape(electrons.shape)
+
+
+@digitize.carries
+def _(electrons: Deviation, *, result: Facts, gain: float, gain_unit: GainUnit = "e-/DN", **params: Any) -> float:
+    """Of the line before rounding: whatever is near the middle between two numbers may become the next one."""
+    return electrons.bound * numbers_per_electron(gain, gain_unit)
+
+
+@digitize.preflight
+def _(*, gain: float, gain_unit: str = "e-/DN", bits: int = 16, **params: object) -> list[str]:
+    top = 2**bits - 1
+    return [f"the converter ends at {top} DN = {top / numbers_per_electron(gain, gain_unit):.0f} e-"]
+
+
+@digitize.check
+def _(result: Tensor, *inputs: Tensor, bits: int = 16, **params: Any) -> list[Check]:
+    high, low = (int(torch.count_nonzero(result == end)) / max(1, result.numel()) for end in (2**bits - 1, 0))
+    return [Check(f"{high:.2%} at the top, {low:.2%} at 0 DN", high < 0.5)]
+
+
+@node(rtol=0.0)
+def crop(image: Tensor, *, shape: Shape) -> Tensor:
+    """Keep the window of the sensor; the sample on the optical axis stays at N // 2.
+
+    Shapes: image (..., y, x) -> (..., *shape).
+    Units:  any.
+    Error:  exact.
+    Raises: ValueError for a window larger than the image.
+    Source: NeuSee, Eq. (SensorImage).
+    """
+    if any(n > m for n, m in zip(shape, image.shape[-2:], strict=True)):
+        raise ValueError(f"no window of {tuple(shape)} in an image of {tuple(image.shape[-2:])}: enlarge the scene")
+    top, left = (m // 2 - n // 2 for n, m in zip(shape, image.shape[-2:], strict=True))
+    return image[..., top : top + shape[0], left : left + shape[1]].contiguous()
+
+
+@crop.carries
+def _(image: Deviation, *, result: Facts, **params: Any) -> float:
+    """All that is off may lie in the window."""
+    before = math.prod(image.facts.shape) if image.facts else math.inf
+    return image.bound * math.sqrt(before / max(1, math.prod(result.shape)))
+
+
+@crop.negligible
+def _(image: Facts, *, shape: tuple[int, int]) -> float:
+    return 0.0 if image.shape[-2:] == tuple(shape) else math.inf

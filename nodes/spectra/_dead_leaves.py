@@ -1,0 +1,100 @@
+"""A picture of spectra: leaves that lie over one another, with edges, texture and shade."""
+
+from typing import Annotated, Any
+
+import torch
+from pydantic import Field
+from torch import Tensor
+from torch.nn import functional as F
+
+from neusee.nodes import Check, node
+from neusee.nodes.spectra._spectral_tables import daylight, light
+from neusee.nodes.units import Fraction, Shape
+from neusee.nodes.values import Bands
+
+_FINE = 2  #: samples a pixel along each axis, so that edges are mixtures
+_COARSE = 8  #: pixels between the numbers that texture and shade are drawn from
+_WARMEST, _COOLEST, _LIGHTS = 4000.0, 15000.0, 24  #: K, and how many daylights are told apart
+
+
+@node(rtol=1e-5)
+def leaves(
+    spectra: Tensor,
+    bands: Bands,
+    *,
+    shape: Shape,
+    smallest: Annotated[float, Field(ge=0.5)] = 2.0,
+    darkest: Annotated[float, Field(gt=0, le=1)] = 0.1,
+    texture: Fraction = 0.3,
+    shade: Fraction = 0.5,
+    daylights: Fraction = 0.2,
+    rng: torch.Generator,
+) -> Tensor:
+    """Lay ellipses of all sizes over one another, a spectrum each: the dead leaves that have a photograph's statistics.
+
+    Radii go from `smallest` to half the picture, their density with the inverse cube. A leaf's brightness is even in
+    its logarithm from `darkest` to 1; up to `texture` of another spectrum is mixed in, and up to `shade` of the light
+    taken off, both smooth. A share `daylights` of pictures is under another daylight, seen with the balance of D65.
+
+    Shapes: spectra (leaf, band), the first one behind all -> (band, y, x) float32.
+    Units:  `smallest` pixels; reflectance under D65, in [0, 1]: the brightest band of another daylight is kept at it.
+    Error:  edges by four samples a pixel; daylights on 24 temperatures from 4000 to 15 000 K.
+    Raises: ValueError where the bands differ.
+    Source: Lee, Mumford and Huang, Int. J. Comput. Vis. 41, 35 (2001).
+    """
+    if spectra.ndim != 2 or spectra.shape[1] != len(bands.centres):
+        raise ValueError(
+            f"spectra {tuple(spectra.shape)} are not (leaf, band) of {len(bands.centres)} bands: "
+            "give both the same `bands` step"
+        )
+    fine = (_FINE * shape[0], _FINE * shape[1])
+    top = _topmost(len(spectra), fine, _FINE * smallest, rng)
+    other = torch.randint(len(spectra), (len(spectra),), generator=rng, device=rng.device)
+    bright = darkest ** _even(rng, len(spectra))
+    mixed, dimmed = texture * _smooth(fine, rng), 1.0 - shade * _smooth(fine, rng)
+    lit = (spectra.double() * _lights(bands, daylights, rng)).float().T
+    cube = lit[:, top] * (1.0 - mixed) + lit[:, other[top]] * mixed
+    cube = cube * (bright[top] * dimmed)
+    return F.avg_pool2d(cube[None], _FINE)[0].clamp(0.0, 1.0)
+
+
+@leaves.check
+def _(result: Tensor, *inputs: Any, **params: Any) -> list[Check]:
+    low, high = float(result.min()), float(result.max())
+    return [Check(f"reflectance {low:.3g} to {high:.3g}", 0 <= low <= high <= 1)]
+
+
+def _topmost(count: int, size: tuple[int, int], smallest: float, rng: torch.Generator) -> Tensor:
+    """Which leaf is seen at each sample, (y, x)."""
+    largest = max(min(size) / 2, smallest)
+    share = _even(rng, count)
+    radius = (smallest**-2 * (1 - share) + largest**-2 * share) ** -0.5
+    long, angle = radius * (1 + _even(rng, count)), torch.pi * _even(rng, count)
+    y, x = (torch.arange(n, device=rng.device) - (n * _even(rng, count))[:, None] for n in size)
+    cos, sin = angle.cos()[:, None, None], angle.sin()[:, None, None]
+    along, across = cos * x[:, None] + sin * y[:, :, None], cos * y[:, :, None] - sin * x[:, None]
+    inside = (along / long[:, None, None]) ** 2 + (across / radius[:, None, None]) ** 2 < 1
+    number = torch.arange(count, device=rng.device)[:, None, None]
+    return (inside * number).amax(0)
+
+
+def _smooth(size: tuple[int, int], rng: torch.Generator) -> Tensor:
+    """Numbers from 0 to 1 that change slowly, (y, x)."""
+    coarse = (max(2, size[0] // (_FINE * _COARSE)), max(2, size[1] // (_FINE * _COARSE)))
+    grid = torch.rand(1, 1, *coarse, generator=rng, device=rng.device)
+    return F.interpolate(grid, size, mode="bilinear", align_corners=True)[0, 0]
+
+
+def _lights(bands: Bands, share: float, rng: torch.Generator) -> Tensor:
+    """The light of the picture over D65, at most 1: (band,) float64 on the CPU unless it is D65."""
+    other, which = torch.rand(2, generator=rng, device=rng.device).tolist()
+    centres = bands.centres
+    if other >= share:
+        return torch.ones_like(centres)
+    mired = 1 / _WARMEST + (1 / _COOLEST - 1 / _WARMEST) * int(which * _LIGHTS) / (_LIGHTS - 1)
+    ratio = daylight(1 / mired).at(centres)[0] / light("D65").at(centres)[0]
+    return (ratio / ratio.max()).to(centres)
+
+
+def _even(rng: torch.Generator, count: int) -> Tensor:
+    return torch.rand(count, generator=rng, device=rng.device)

@@ -1,0 +1,122 @@
+"""The light on the scene."""
+
+from typing import Any, Literal
+
+import torch
+from torch import Tensor
+
+from neusee.nodes import Check, ParameterError, node
+from neusee.nodes._half_precision import single
+from neusee.nodes.spectra._spectral_tables import daylight, light
+from neusee.nodes.units import Temperature
+from neusee.nodes.values import Bands, Mixture
+
+Kind = Literal[
+    "daylight", "D50", "D55", "D65", "D75", "A", "E", "FL2", "FL7", "FL11", "HP1",
+    "LED-B1", "LED-B2", "LED-B3", "LED-B4", "LED-B5", "LED-BH1", "LED-RGB1", "LED-V1", "LED-V2",
+]  # fmt: skip
+
+
+@node(rtol=1e-9)
+def illuminant(bands: Bands, *, kind: Kind = "daylight", temperature: Temperature = 6504.0) -> Tensor:
+    """Average the relative power of a CIE illuminant over each band; `temperature` is that of `daylight` alone.
+
+    Shapes: -> (band,) float64.
+    Units:  relative, mean 1 over the bands.
+    Error:  straight lines between samples 1 to 10 nm apart; 31 bands move the white of D65 by 0.2 %.
+    Raises: ParameterError before the run for daylight outside 4000 to 25 000 K; ValueError where bands leave the table.
+    Source: CIE 15:2004 (D series, A, E, FL, HP), CIE 15:2018 (LED), by way of colour-science.
+    """
+    table = daylight(temperature) if kind == "daylight" else light(kind)
+    low = float((bands.centres - bands.widths / 2).min())
+    high = float((bands.centres + bands.widths / 2).max())
+    first, last = float(table.wavelengths[0]), float(table.wavelengths[-1])
+    if low < first - 1e-12 or high > last + 1e-12:
+        raise ValueError(
+            f"bands reach from {low * 1e9:.4g} to {high * 1e9:.4g} nm, but {kind} is tabulated from "
+            f"{first * 1e9:.4g} to {last * 1e9:.4g} nm: choose bands inside it"
+        )
+    power = table.over(bands)[0]
+    if not float(power.mean()) > 0:
+        raise ValueError(f"{kind} gives no light from {low * 1e9:.4g} to {high * 1e9:.4g} nm: choose other bands")
+    return (power / power.mean()).to(bands.centres.device)
+
+
+@illuminant.preflight
+def _(*, kind: str = "daylight", temperature: float = 6504.0) -> list[str]:
+    if kind == "daylight" and not 4000 <= temperature <= 25000:
+        raise ParameterError(
+            "temperature",
+            f"CIE daylight is defined from 4000 K to 25000 K, not at {temperature:g} K: take kind A or an LED",
+        )
+    return []
+
+
+@illuminant.check
+def _(result: Tensor, bands: Bands, *, kind: str = "daylight", temperature: float = 6504.0) -> list[Check]:
+    name = f"{kind} {temperature:g} K" if kind == "daylight" else kind
+    peak = float(bands.centres[int(result.argmax())]) * 1e9
+    return [Check(f"{name}: {float(result.min()):.2f} to {float(result.max()):.2f}, brightest at {peak:.4g} nm")]
+
+
+@node(bands={"reflectance": -3, "illuminant": 0, "return": -3}, mixtures=("reflectance",))
+def illuminate(
+    reflectance: Tensor | Mixture, illuminant: Tensor, *, times: Literal["once", "twice"] = "once"
+) -> Tensor | Mixture:
+    """Multiply reflectance by the light on it: once, as light does, or twice, as the paper's chain of formulas says.
+
+    Of a cube in few planes, a `Mixture`, the planes stay and their spectra are multiplied.
+
+    Shapes: reflectance (..., band, y, x), illuminant (band,) -> (..., band, y, x).
+    Units:  relative spectral radiance, that of a white scene having mean 1 over the bands.
+    Error:  float32: 6e-8.
+    Raises: ValueError where the bands differ.
+    Source: NeuSee, T_b and the CIE formula after it; twice is contradiction C5 of its reading.
+    """
+    _same_bands(reflectance, illuminant)
+    power = illuminant if times == "once" else illuminant.square()
+    if isinstance(reflectance, Mixture):
+        basis = reflectance.basis * power.to(reflectance.basis)[:, None]
+        by = power.detach().abs().to(reflectance.rest)
+        spread = reflectance.spread * by if reflectance.spread.numel() else reflectance.spread
+        return Mixture(reflectance.planes, basis, reflectance.rest * by, spread, reflectance.off * float(by.max()))
+    reflectance = single(reflectance)
+    return reflectance * power.to(reflectance)[:, None, None]
+
+
+def _same_bands(reflectance: Tensor | Mixture, illuminant: Tensor) -> None:
+    shape = tuple(reflectance.shape) if isinstance(reflectance, Tensor) else _shape(reflectance)
+    if len(shape) < 3 or illuminant.ndim != 1 or shape[-3] != len(illuminant):
+        raise ValueError(
+            f"reflectance {shape} is not (band, y, x) of the {tuple(illuminant.shape)} bands of the "
+            "illuminant: give both the same `bands` step"
+        )
+
+
+def _shape(mixture: Mixture) -> tuple[int, ...]:
+    return len(mixture.basis), *mixture.planes.shape[1:]
+
+
+@illuminate.reference
+def _(reflectance: Tensor | Mixture, illuminant: Tensor, *, times: str = "once") -> Tensor | Mixture:
+    power = [float(p) ** (1 if times == "once" else 2) for p in illuminant]
+    if isinstance(reflectance, Mixture):
+        basis = torch.stack([row.double() * p for row, p in zip(reflectance.basis, power, strict=True)])
+        rest = torch.stack([column * p for column, p in zip(reflectance.rest.T, power, strict=True)], 1)
+        spread = [column * p for column, p in zip(reflectance.spread.T, power, strict=False)]
+        found = torch.stack(spread, 1) if spread else rest[:0, :0]
+        return Mixture(reflectance.planes.double(), basis, rest, found, reflectance.off.double() * max(power))
+    return torch.stack([reflectance[..., b, :, :].double() * p for b, p in enumerate(power)], -3)
+
+
+@illuminate.preflight
+def _(*, times: str = "once") -> list[str]:
+    return ["light falls on the scene twice, as printed: daylight is squared"] if times == "twice" else []
+
+
+@illuminate.check
+def _(result: Tensor | Mixture, *inputs: Any, **params: Any) -> list[Check]:
+    if isinstance(result, Mixture):
+        return [Check(f"{len(result.planes)} planes for {len(result.basis)} bands")]
+    low = float(result.min())
+    return [Check(f"radiance {low:.3g} to {float(result.max()):.4g}", low >= 0)]

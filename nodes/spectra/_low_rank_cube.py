@@ -1,0 +1,67 @@
+"""A cube of many bands as few planes and their spectra, with a bound of what is left away."""
+
+from typing import Annotated
+
+import torch
+from pydantic import Field
+from torch import Tensor
+
+from neusee.nodes import Check, node
+from neusee.nodes.spectra._principal_planes import Found, Source, few_planes
+from neusee.nodes.values import Mixture
+
+Share = Annotated[float, Field(ge=0, allow_inf_nan=False)]  #: of the largest element
+
+
+@node(rtol=1e-6)
+def compress(cube: Tensor, *, within: Share = 1e-6) -> Mixture:
+    """Write a cube as the fewest planes, principal components of its spectra, that come within a bound of it.
+
+    A grey scene has one plane; a linear lift of three colours has three, and hardly more where few pixels were clipped.
+
+    Shapes: cube (band, y, x) -> planes (k, y, x), basis (band, k), rest and spread (k + 1, band) float64, off (y, x).
+    Units:  planes, rest, spread and off those of the cube; the basis has none.
+    Error:  `spread[k]`, the root mean square, is at most `within` times the largest element, but not asked to be below
+            2e-7 or eight roundings of the planes. `rest[k]` and `off`, measured on every pixel in float64, are the
+            largest, of a band and of a pixel. `rest[r]` between none and all: at most five times too large as a rule.
+            The gradient holds the basis still.
+    Raises: ValueError where the cube is not (band, y, x), has no pixels or holds NaN.
+    Source: principal components, Pearson 1901; Maloney, J. Opt. Soc. Am. A 3, 1673 (1986) for spectra.
+    """
+    if cube.ndim != 3:
+        raise ValueError(f"cube {tuple(cube.shape)} must be (band, y, x): compress one scene at a time")
+    flat = cube.detach().flatten(1)
+    dtype = cube.dtype if cube.dtype == torch.float64 else torch.float32
+    source = Source(lambda pixels: flat[:, pixels].to(torch.float64, copy=True), len(flat), flat.shape[1], dtype)
+    return mixture(few_planes(source, within), cube)
+
+
+def mixture(found: Found, cube: Tensor) -> Mixture:
+    """Planes as pictures; where the cube is learnt, a product with it, so that its gradient flows."""
+    if cube.requires_grad:
+        planes = torch.tensordot(found.basis.T.to(cube), cube, 1)
+    else:
+        planes = found.planes.reshape(-1, *cube.shape[-2:])
+    return Mixture(planes, found.basis, found.rest, found.spread, found.off.reshape(cube.shape[-2:]))
+
+
+@compress.reference
+def _(cube: Tensor, *, within: float = 1e-6) -> Mixture:
+    flat = cube.double().flatten(1)
+    axes = torch.linalg.svd(flat, full_matrices=False)[0]
+    errors = [flat - axes[:, :r] @ (axes[:, :r].T @ flat) for r in range(axes.shape[1] + 1)]
+    spread = torch.stack([error.square().mean(1).sqrt() for error in errors])
+    most = within * float(flat.abs().max())
+    count = max(1, next((r for r, x in enumerate(spread) if float(x.max()) <= most), axes.shape[1]))
+    planes = (axes[:, :count].T @ flat).reshape(-1, *cube.shape[1:])
+    rest = torch.stack([error.abs().amax(1) for error in errors])
+    off = errors[count].abs().amax(0).reshape(cube.shape[1:])
+    return Mixture(planes, axes[:, :count], rest[: count + 1], spread[: count + 1], off)
+
+
+@compress.check
+def said_of_planes(result: Mixture, *inputs: object, **params: object) -> list[Check]:
+    """How many planes there are, and how far they are from the cube; of whatever gives a `Mixture`."""
+    rms, most = (float(x[-1].max()) / max(float(result.rest[0].max()), 1e-300) for x in (result.spread, result.rest))
+    few = f"{len(result.planes)} planes for {len(result.basis)} bands"
+    return [Check(f"{few}, within {rms:.2g} of the brightest, at worst {most:.2g}")]

@@ -1,0 +1,147 @@
+"""Reflectances that were measured: those of colour-science, and files of one's own."""
+
+import csv
+import functools
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any, Literal
+from zipfile import BadZipFile
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from torch import Tensor
+
+from neusee.nodes import Check, ParameterError, node
+from neusee.nodes.spectra._linear_lift import inside_charts
+from neusee.nodes.spectra._spectral_tables import Table, gamut_samples, paints
+from neusee.nodes.units import DataFiles
+from neusee.nodes.values import Bands
+
+Set = Literal["charts", "CIE 2017", "CQS"]
+_SLACK = 1e-12  #: m
+_MOST = 1.5  #: reflectance, above which a file is taken to be in percent
+_FILES = "give .csv (first column wavelength in nm), .npz (wavelengths, reflectances) or .mat (S_name, sur_name)"
+
+Numbers = NDArray[np.float64]
+
+
+@node(rtol=1e-12)
+def reflectances(
+    bands: Bands, *, sets: tuple[Set, ...] = ("charts", "CIE 2017", "CQS"), files: DataFiles | None = None
+) -> Tensor:
+    """Gather measured reflectances: sets of colour-science, and files of one's own, one spectrum after another.
+
+    `charts` are the 102 patches of `spectra.lift_lmmse`, `CIE 2017` the 99 objects of the colour fidelity index, `CQS`
+    15 saturated paints. A file is .csv (a header; first column nm, then a column each), .npz (`wavelengths` in nm and
+    `reflectances`, (spectrum, wavelength)), or a .mat of the Psychtoolbox (`S_name`: start, step, count; `sur_name`).
+
+    Shapes: -> (spectrum, band) float64.
+    Units:  reflectance, 1 = white; what leaves [0, 1] is clipped.
+    Error:  straight lines between the samples, some 1e-3 for paints at 10 nm.
+    Raises: ParameterError before the run for a file that holds no reflectances; ValueError where bands leave 380 to
+            780 nm, or a file.
+    Source: charts and NIST CQS 9.0 (Davis and Ohno 2010) by colour-science; CIE 224:2017.
+    """
+    if sets:
+        inside_charts(bands)
+    tables = [table for name in sets for table in _SETS[name]()]
+    found = [table.at(bands.centres) for table in tables]
+    found += [_inside(_read(file), bands, file).at(bands.centres) for file in files or ()]
+    return torch.cat(found).clamp(0.0, 1.0).to(bands.centres.device)
+
+
+@reflectances.preflight
+def _(*, sets: tuple[Set, ...] = ("charts",), files: tuple[Path, ...] | None = None) -> list[str]:
+    if not sets and not files:
+        raise ParameterError("files", f"neither sets nor files are given: {_FILES}")
+    for file in files or ():
+        _read(file)
+    return []
+
+
+@reflectances.check
+def _(result: Tensor, bands: Bands, **params: Any) -> list[Check]:
+    return [Check(f"{len(result)} spectra, {float(result.min()):.3g} to {float(result.max()):.3g}", len(result) > 3)]
+
+
+_SETS: dict[str, Callable[[], tuple[Table, ...]]] = {
+    "charts": paints,
+    "CIE 2017": lambda: (gamut_samples("CIE 2017"),),
+    "CQS": lambda: (gamut_samples("CQS"),),
+}
+
+
+def _inside(table: Table, bands: Bands, file: Path) -> Table:
+    low, high = float(bands.centres.min()), float(bands.centres.max())
+    first, last = float(table.wavelengths[0]), float(table.wavelengths[-1])
+    if low < first - _SLACK or high > last + _SLACK:
+        raise ValueError(
+            f"bands from {low * 1e9:.4g} to {high * 1e9:.4g} nm, but {file.name} holds {first * 1e9:.4g} to "
+            f"{last * 1e9:.4g} nm: leave the file out, or choose bands inside it"
+        )
+    return table
+
+
+# --- files ----------------------------------------------------------------------------------------------------------
+
+
+def _read(file: Path) -> Table:
+    return _known(file, file.stat().st_mtime_ns)
+
+
+@functools.lru_cache(maxsize=32)
+def _known(file: Path, stamp: int) -> Table:
+    """The table of a file; read again when the file has changed."""
+    reader = {".csv": _csv, ".npz": _npz, ".mat": _mat}.get(file.suffix.lower())
+    if reader is None:
+        raise ParameterError("files", f"{file.name} holds no reflectances: {_FILES}")
+    try:
+        wavelengths, values = reader(file)
+    except (OSError, KeyError, ValueError, TypeError, BadZipFile, UnicodeDecodeError) as error:
+        raise ParameterError("files", f"{file.name} cannot be read as reflectances ({error}): {_FILES}") from None
+    wrong = _wrong(wavelengths, values)
+    if wrong:
+        raise ParameterError("files", f"{file.name}: {wrong}")
+    return Table(torch.from_numpy(wavelengths) * 1e-9, torch.from_numpy(np.ascontiguousarray(values)))
+
+
+def _wrong(wavelengths: Numbers, values: Numbers) -> str:
+    """Why these are no reflectances, or nothing."""
+    if wavelengths.ndim != 1 or values.ndim != 2 or values.shape[1] != len(wavelengths) or values.size == 0:
+        return f"{wavelengths.shape} wavelengths and {values.shape} reflectances: write (spectrum, wavelength)"
+    if not (np.isfinite(wavelengths).all() and np.isfinite(values).all()):
+        return "not every number is finite"
+    if len(wavelengths) < 2 or not (np.diff(wavelengths) > 0).all() or wavelengths[0] < 100:
+        return "wavelengths must be two at least, rise, and be in nm"
+    if values.max() > _MOST or values.min() < -0.1:
+        return f"values from {values.min():.3g} to {values.max():.3g} are no reflectances: write 1 for white, not 100"
+    return ""
+
+
+def _csv(file: Path) -> tuple[Numbers, Numbers]:
+    with file.open(newline="", encoding="utf-8-sig") as opened:
+        rows = [row for row in csv.reader(opened) if row]
+    numbers = np.array([[float(cell) for cell in row] for row in rows[1:]], np.float64)
+    if numbers.ndim != 2 or numbers.shape[1] < 2:
+        raise ValueError("no columns of numbers below a header")
+    return numbers[:, 0].copy(), numbers[:, 1:].T
+
+
+def _npz(file: Path) -> tuple[Numbers, Numbers]:
+    with np.load(file, allow_pickle=False) as held:
+        return np.asarray(held["wavelengths"], np.float64), np.asarray(held["reflectances"], np.float64)
+
+
+def _mat(file: Path) -> tuple[Numbers, Numbers]:
+    try:
+        from scipy.io import loadmat
+    except ImportError:
+        raise ValueError(".mat files need scipy: pip install scipy") from None
+    try:
+        held = loadmat(file)
+    except Exception as why:  # scipy fails on foreign bytes in many ways
+        raise ValueError(f"no .mat file up to version 7: {why}") from None
+    name = next(name.removeprefix("sur_") for name in [*held, "sur_"] if name.startswith("sur_"))
+    start, step, count = np.asarray(held[f"S_{name}"], np.float64).ravel()
+    return start + step * np.arange(int(count)), np.asarray(held[f"sur_{name}"], np.float64).T
