@@ -3,6 +3,6 @@
 Nothing here knows of recipes, caches, devices or graphs.
 """
 
-from neusee.nodes._node import Check, Deviation, Facts, Node, ParameterError, node
+from neusee.nodes._node import Check, ErrorBound, Node, ParameterError, TensorStats, node
 
-__all__ = ["Check", "Deviation", "Facts", "Node", "ParameterError", "node"]
+__all__ = ["Check", "ErrorBound", "Node", "ParameterError", "TensorStats", "node"]

@@ -8,10 +8,12 @@ parameter named ``rng`` is filled in by the engine.
     def digitize(electrons: Tensor, *, gain: Gain, bits: Bits = 16) -> Tensor: ...
 
     @digitize.reference        # float64, slow, plainly right; a test compares to rtol
-    @digitize.negligible       # true upper bound of what skipping the step changes
-    @digitize.carries          # how far errors of the inputs can move the result
+    @digitize.skip_bound       # true upper bound of what skipping the step changes
+    @digitize.propagate_error  # how far errors of the inputs can move the result
     @digitize.preflight        # looks at the parameters before anything runs
     @digitize.check            # looks at the result: what a physicist would look at first
+
+What is attached is found under the same name in ``digitize.hooks``.
 """
 
 from __future__ import annotations
@@ -19,18 +21,14 @@ from __future__ import annotations
 import functools
 import importlib
 import inspect
-import math
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from types import MappingProxyType
 from typing import Any, Literal, TypeVar, get_type_hints
 
-import torch
 from pydantic import BaseModel, ConfigDict, create_model
-from torch import Tensor
 
-_FEW = 64  #: elements that are looked at one by one, for to call torch five times takes longer
-_PART, _ROW = 1 << 17, 1 << 10  #: elements that are looked at together, and summed in their own precision
+from neusee.nodes._error_bound import ErrorBound, TensorStats
 
 Device = Literal["any", "cpu", "gpu"]
 Fn = TypeVar("Fn", bound=Callable[..., Any])
@@ -55,80 +53,26 @@ class Check:
     ok: bool = True
 
 
-@dataclass(frozen=True, slots=True)
-class Facts:
-    """What is cheap to know of a tensor, kept beside it so that a verdict never loads it."""
+@dataclass(slots=True)
+class Hooks:
+    """What a node has beside its function; `Node` has a decorator of the same name for each."""
 
-    shape: tuple[int, ...]
-    dtype: str
-    min: float
-    max: float
-    sum: float
-    support: int  #: elements that are not zero
-    finite: bool
-
-    @classmethod
-    def of(cls, value: Any) -> Facts | None:
-        """Facts of a tensor, or of the first tensor of a named tuple; None of anything else."""
-        if isinstance(value, tuple | list) and value:
-            return cls.of(value[0])
-        if not isinstance(value, Tensor):
-            return None
-        x = value.detach()
-        shape, dtype = tuple(x.shape), str(x.dtype).removeprefix("torch.")
-        if x.numel() == 0:
-            return cls(shape, dtype, math.nan, math.nan, 0.0, 0, True)
-        x = x.abs() if x.is_complex() else x
-        few = x.reshape(-1).tolist() if x.numel() <= _FEW else []
-        if few and math.isfinite(total := float(sum(few))):
-            return cls(shape, dtype, float(min(few)), float(max(few)), total, sum(v != 0 for v in few), True)
-        low, high, total, support = _measured(x.reshape(-1))
-        finite = all(map(math.isfinite, (low, high, total)))
-        return cls(shape, dtype, low, high, total, support, finite)
-
-
-def _measured(flat: Tensor) -> tuple[float, float, float, int]:
-    """Least, greatest, sum and number of what is not zero, by parts that stay in cache: memory is read once."""
-    small = flat.dtype == torch.bool or (flat.is_floating_point() and flat.element_size() < 4)
-    found = []
-    for part in torch.split(flat, _PART):
-        part = part.float() if small else part
-        rows = part.view(-1, _ROW) if part.numel() % _ROW == 0 else part[None]
-        found.append((*torch.aminmax(part), rows.sum(1).sum(dtype=torch.float64), torch.count_nonzero(part)))
-    lows, highs, sums, counts = (torch.stack(each) for each in zip(*found, strict=True))
-    low, high, total = (float(x) for x in (lows.min(), highs.max(), sums.sum()))
-    if math.isinf(total) and math.isfinite(low) and math.isfinite(high):  # a row went beyond its own type
-        total = float(sum(part.sum(dtype=torch.float64) for part in torch.split(flat, _PART)))
-    return low, high, total, int(counts.sum())
-
-
-@dataclass(frozen=True, slots=True)
-class Deviation:
-    """How far an input may be from what it ought to be, and what is known of it."""
-
-    bound: float  #: of the root mean square of the difference, over the elements and the noise
-    facts: Facts | None = None
-    top: float | None = None  #: of how far its largest element is off, as a share of it; None where nobody tells
-
-    @property
-    def share(self) -> float:
-        """The bound as a share of the input's largest element."""
-        if self.bound == 0.0:
-            return 0.0
-        top = max(abs(self.facts.min), abs(self.facts.max)) if self.facts else 0.0
-        return self.bound / top if top > 0 else math.inf
-
-    @property
-    def largest(self) -> float:
-        """The bound on the largest element, as a share of it."""
-        return 0.0 if self.bound == 0.0 else math.inf if self.top is None else self.top
+    reference: Callable[..., Any] | None = None
+    skip_bound: Callable[..., float] | None = None
+    skip_scale: Callable[..., float] | None = None
+    zero_bound: Callable[..., float] | None = None
+    propagate_error: Callable[..., float] | None = None
+    approximation_error: Callable[[Any], tuple[float, float]] | None = None
+    band_invariant: Callable[[Mapping[str, Any]], bool] | None = None
+    preflight: Callable[..., Sequence[str]] | None = None
+    check: Callable[..., Sequence[Check]] | None = None
 
 
 class Node:
-    """A function with its typed parameters, its reference, its bound and its checks.
+    """A function with its typed parameters and its hooks: the reference, the bounds and the checks.
 
-    Cheaper forms, for `neusee.workflows` to choose from where a recipe's tolerance allows it: ``collapsed``, the node
-    that gives `Channels` instead of all bands, and ``mixed``, the one that gives a `Mixture` instead of a cube.
+    Two cheaper forms may stand in for a node where a recipe's tolerance allows it: ``channel_sum_form`` gives
+    `Channels` instead of all bands, and ``low_rank_form`` gives a `Mixture` instead of a cube.
     """
 
     def __init__(
@@ -137,26 +81,20 @@ class Node:
         device: Device = "any",
         rtol: float = 1e-5,
         bands: Mapping[str, int] | None = None,
-        channels: Sequence[str] = (),
-        even: Sequence[str] = (),
-        mixtures: Sequence[str] = (),
-        adds: Sequence[tuple[str, ...]] = (),
+        accepts_channel_sums: Sequence[str] = (),
+        needs_band_invariant: Sequence[str] = (),
+        accepts_low_rank: Sequence[str] = (),
+        additive_inputs: Sequence[tuple[str, ...]] = (),
     ) -> None:
         functools.update_wrapper(self, fn)
         self.fn, self.device, self.rtol = fn, device, rtol
-        self.channels, self.even, self.mixtures = tuple(channels), tuple(even), tuple(mixtures)
-        self.adds = tuple(adds)
-        self.collapsed: Node | None = None
-        self.mixed: Node | None = None
-        self.sums: Callable[[Mapping[str, Any]], bool] | None = None
-        self.spread: Callable[..., float] | None = None
-        self.deviation: Callable[[Any], tuple[float, float]] | None = None
-        self.nothing: Callable[..., float] | None = None
-        self.scale: Callable[..., float] | None = None
-        self.ref: Callable[..., Any] | None = None
-        self.bound: Callable[..., float] | None = None
-        self.before: Callable[..., Sequence[str]] | None = None
-        self.after: Callable[..., Sequence[Check]] | None = None
+        self.accepts_channel_sums = tuple(accepts_channel_sums)
+        self.needs_band_invariant = tuple(needs_band_invariant)
+        self.accepts_low_rank = tuple(accepts_low_rank)
+        self.additive_inputs = tuple(additive_inputs)
+        self.channel_sum_form: Node | None = None
+        self.low_rank_form: Node | None = None
+        self.hooks = Hooks()
         pars = inspect.signature(fn).parameters.values()
         data = [p for p in pars if p.kind is p.POSITIONAL_OR_KEYWORD]
         self.inputs = tuple(p.name for p in data)
@@ -205,64 +143,65 @@ class Node:
 
     def reference(self, fn: Fn) -> Fn:
         """Attach the slow float64 form: same arguments, same result within ``rtol``."""
-        self.ref = fn
+        self.hooks.reference = fn
         return fn
 
-    def negligible(self, fn: Fn) -> Fn:
-        """Attach the bound: ``(facts of each input, *, parameters) -> float``.
+    def skip_bound(self, fn: Fn) -> Fn:
+        """Attach the bound of skipping: ``(`TensorStats` of each input, *, parameters) -> float``.
 
-        It bounds ``max |with - without| / max |with|``; of a random node, the same with
-        root mean square over the noise. Skipping hands on the first input.
+        The value bounds ``max |with - without| / max |with|``; for a random node, the same ratio with the root mean
+        square over the noise. A skipped node returns its first input.
         """
-        self.bound = fn
+        self.hooks.skip_bound = fn
         return fn
 
-    def weighed(self, fn: Fn) -> Fn:
-        """Attach ``(facts of the first input, *, parameters) -> float``: what `negligible` is a share of.
+    def skip_scale(self, fn: Fn) -> Fn:
+        """Attach ``(`TensorStats` of the first input, *, parameters) -> float``: the scale of `skip_bound`.
 
-        Such as the full well, where what is above it is cut off later.
+        An example is the full well, because a later step cuts off what is above it.
         """
-        self.scale = fn
+        self.hooks.skip_scale = fn
         return fn
 
-    def absent(self, fn: Fn) -> Fn:
-        """Attach ``(facts of each input, *, parameters) -> float``: a true bound of the result's largest element.
+    def zero_bound(self, fn: Fn) -> Fn:
+        """Attach ``(`TensorStats` of each input, *, parameters) -> float``: a bound of the result's largest element.
 
-        Where that is 0, the step and what only feeds it are left out. An input that is absent is given as None.
+        Where the bound is 0, the step and the steps that only feed it are left out. An absent input is given as None.
         """
-        self.nothing = fn
+        self.hooks.zero_bound = fn
         return fn
 
-    def carries(self, fn: Fn) -> Fn:
-        """Attach ``(a `Deviation` of each input, *, result: Facts, parameters) -> float``: how far off the result is.
+    def propagate_error(self, fn: Fn) -> Fn:
+        """Attach ``(`ErrorBound` of each input, *, result: TensorStats, parameters) -> float``: the result's error.
 
-        At most, both in root mean square. A list input is a list of them, one that is absent None. Without it, nothing
-        is known behind the node, and its inputs are held to the tolerance instead.
+        Both errors are upper bounds in root mean square. A list input is a list of bounds, an absent input is None.
+        Without this hook the error behind the node is not known, and its inputs are held to the tolerance instead.
         """
-        self.spread = fn
+        self.hooks.propagate_error = fn
         return fn
 
-    def deviates(self, fn: Fn) -> Fn:
-        """Attach ``(result) -> (share, share)``: how far a cheaper form may be from the full one, over its largest.
+    def approximation_error(self, fn: Fn) -> Fn:
+        """Attach ``(result) -> (rms, peak)``: bounds of a cheaper form's error, as shares of its largest element.
 
-        In root mean square, and of the largest element alone. What its inputs lack is part of it.
+        The first is in root mean square, the second of the largest element alone. Both include the approximations
+        that the inputs carry.
         """
-        self.deviation = fn
+        self.hooks.approximation_error = fn
         return fn
 
-    def even_where(self, fn: Callable[[Mapping[str, Any]], bool]) -> Callable[[Mapping[str, Any]], bool]:
+    def band_invariant(self, fn: Callable[[Mapping[str, Any]], bool]) -> Callable[[Mapping[str, Any]], bool]:
         """Attach ``(parameters) -> bool``: whether the result is the same for every band."""
-        self.sums = fn
+        self.hooks.band_invariant = fn
         return fn
 
     def preflight(self, fn: Fn) -> Fn:
         """Attach ``(*, parameters) -> notes``; it may raise `ParameterError`."""
-        self.before = fn
+        self.hooks.preflight = fn
         return fn
 
     def check(self, fn: Fn) -> Fn:
         """Attach ``(result, *inputs, **parameters) -> checks``, run once after computing."""
-        self.after = fn
+        self.hooks.check = fn
         return fn
 
 
@@ -276,19 +215,26 @@ def node(
     rtol: float = 1e-5,
     bands: Mapping[str, int] | None = None,
     *,
-    channels: Sequence[str] = (),
-    even: Sequence[str] = (),
-    mixtures: Sequence[str] = (),
-    adds: Sequence[tuple[str, ...]] = (),
+    accepts_channel_sums: Sequence[str] = (),
+    needs_band_invariant: Sequence[str] = (),
+    accepts_low_rank: Sequence[str] = (),
+    additive_inputs: Sequence[tuple[str, ...]] = (),
 ) -> Callable[[Callable[..., Any]], Node]:
     """Make a node of a function. ``rtol`` is the agreed error against its reference.
 
-    ``bands`` gives the axis of the bands of some inputs and of the result (``return``): band i of the result depends
-    on band i of those inputs and on the whole of the others, and is the same to the last bit whatever bands stand
-    beside it. Of a named tuple, only the fields in `values.BAND_FIELDS` have that axis.
-
-    ``channels`` names the inputs that may be `Channels` instead of an image of all bands; those in ``even`` must then
-    be the same for every band. ``mixtures`` names those that may be a `Mixture` instead of a cube. ``adds`` names those
-    without which nothing changes where they are nothing, an optional input or a list; with each, what goes with it.
+    Args:
+        bands: the axis of the bands of some inputs and of the result (``return``). Band i of the result depends on
+            band i of those inputs and on the whole of the others, and is the same to the last bit whatever bands
+            stand beside it. Of a named tuple, only the fields in `values.BAND_FIELDS` have that axis.
+        accepts_channel_sums: inputs that may be `Channels` instead of an image of all bands.
+        needs_band_invariant: inputs that must then be the same for every band.
+        accepts_low_rank: inputs that may be a `Mixture` instead of a cube.
+        additive_inputs: inputs that change nothing where they are zero, an optional input or a list; each with the
+            inputs that belong to it.
     """
-    return lambda fn: Node(fn, device, rtol, bands, channels, even, mixtures, adds)
+    return lambda fn: Node(
+        fn, device, rtol, bands, accepts_channel_sums, needs_band_invariant, accepts_low_rank, additive_inputs
+    )
+
+
+__all__ = ["Check", "Device", "ErrorBound", "Hooks", "Node", "ParameterError", "TensorStats", "node"]

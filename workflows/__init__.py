@@ -14,9 +14,9 @@ from typing import TYPE_CHECKING, Any
 if TYPE_CHECKING:
     from neusee.workflows.engine.differentiable_function import as_function
     from neusee.workflows.engine.node_call import RunError
-    from neusee.workflows.engine.runner import Done, Event, Result, run
+    from neusee.workflows.engine.runner import Event, Result, StepRecord, run
     from neusee.workflows.engine.step_job import Executor
-    from neusee.workflows.graph.diagnostics import Problem, RecipeError
+    from neusee.workflows.graph.diagnostics import Diagnostic, RecipeError
     from neusee.workflows.graph.recipe_graph import Recipe, Step
     from neusee.workflows.placement.tasks_and_devices import Schedule
     from neusee.workflows.recipe.loading import load, recipes
@@ -27,11 +27,11 @@ _HOME = {
     "as_function": "engine.differentiable_function",
     "Recipe": "graph.recipe_graph",
     "Step": "graph.recipe_graph",
-    "Problem": "graph.diagnostics",
+    "Diagnostic": "graph.diagnostics",
     "RecipeError": "graph.diagnostics",
     "load": "recipe.loading",
     "recipes": "recipe.loading",
-    "Done": "engine.runner",
+    "StepRecord": "engine.runner",
     "Event": "engine.runner",
     "Result": "engine.runner",
     "run": "engine.runner",
@@ -41,16 +41,16 @@ _HOME = {
 }
 
 __all__ = [
-    "Done",
+    "Diagnostic",
     "Event",
     "Executor",
-    "Problem",
     "Recipe",
     "RecipeError",
     "Result",
     "RunError",
     "Schedule",
     "Step",
+    "StepRecord",
     "Store",
     "as_function",
     "load",

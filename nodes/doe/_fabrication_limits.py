@@ -7,7 +7,7 @@ import torch
 from pydantic import Field
 from torch import Tensor
 
-from neusee.nodes import Check, Facts, ParameterError, node
+from neusee.nodes import Check, ParameterError, TensorStats, node
 from neusee.nodes._half_precision import refuse_half
 from neusee.nodes.doe._refractive_index import Material, wave_height
 from neusee.nodes.units import PositiveLength, Wavelength
@@ -85,9 +85,9 @@ def _(
     return nearest if wave is None else torch.where(nearest == wave, 0.0, nearest)
 
 
-@fabricate.negligible
+@fabricate.skip_bound
 def _(
-    height: Facts, *, material: Material, wrap_at: float | None, levels: int | None, max_height: float | None
+    height: TensorStats, *, material: Material, wrap_at: float | None, levels: int | None, max_height: float | None
 ) -> float:
     """What wrapping, cutting and steps move at most, over the deepest that is known to be made; 0 where all fits.
 

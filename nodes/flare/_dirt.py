@@ -117,7 +117,7 @@ def _dents(rms: float, rng: torch.Generator) -> dict[int, float]:
     return dict(zip(DENT_TERMS, parts, strict=True)) if rms else {}
 
 
-@dirt.absent
+@dirt.zero_bound
 def _(*, dust: float, scratches: float, grease: float, smudges: float, dents: float, **_: Any) -> float:
     """How far the field behind the window is from that behind clear glass, at 400 nm or longer; 0 where nothing lies.
 

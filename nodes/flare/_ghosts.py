@@ -7,7 +7,7 @@ import torch
 from pydantic import Field
 from torch import Tensor
 
-from neusee.nodes import Check, Facts, node
+from neusee.nodes import Check, TensorStats, node
 from neusee.nodes._half_precision import single
 from neusee.nodes.units import Fraction, PositiveLength
 from neusee.nodes.values import Bands
@@ -120,11 +120,11 @@ def _part(numbers: Tensor, samples: int) -> slice:
     return slice(min(max(-first, 0), len(numbers)), max(samples - first, 0))
 
 
-@ghosts.absent
+@ghosts.zero_bound
 def _(
-    spot: Facts,
-    bands: Facts,
-    direction: Facts,
+    spot: TensorStats,
+    bands: TensorStats,
+    direction: TensorStats,
     *,
     focal_length: float,
     pixel_pitch: float,

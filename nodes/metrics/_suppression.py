@@ -51,7 +51,7 @@ def _(result: Tensor, *inputs: Psf) -> list[Check]:
             Check(f"evenly spread light would reach {floor:.2g}")]  # fmt: skip
 
 
-@node(rtol=1e-6, channels=("image", "plain_image"))
+@node(rtol=1e-6, accepts_channel_sums=("image", "plain_image"))
 def bsr(image: Tensor | Channels, plain_image: Tensor | Channels) -> Tensor:
     """Find the background suppression ratio: light of the scene in the field, over that of the plain lens.
 
@@ -109,7 +109,7 @@ def clipped(raw: Tensor, *, full_well: float, gain: float, gain_unit: str, bits:
     return marked
 
 
-@node(rtol=1e-6, channels=("image",), even=("level",), adds=[("spots", "lines")])
+@node(rtol=1e-6, accepts_channel_sums=("image",), needs_band_invariant=("level",), additive_inputs=[("spots", "lines")])
 def peak(
     image: Tensor | Channels,
     bands: Bands,

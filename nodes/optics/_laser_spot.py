@@ -7,7 +7,7 @@ import torch
 from pydantic import Field
 from torch import Tensor
 
-from neusee.nodes import Check, Facts, node
+from neusee.nodes import Check, TensorStats, node
 from neusee.nodes._half_precision import single
 from neusee.nodes.sensor._saturation import Efficiency, Well, saturation
 from neusee.nodes.units import PositiveLength, Time
@@ -50,10 +50,10 @@ def spot(
     return intensity * energy.to(intensity)[:, None, None]
 
 
-@spot.absent
+@spot.zero_bound
 def _(
-    psf: Facts,
-    bands: Facts,
+    psf: TensorStats,
+    bands: TensorStats,
     *,
     strength: float,
     full_well: float,

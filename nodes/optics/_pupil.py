@@ -17,7 +17,7 @@ DEFOCUS_WAVELENGTH = 550e-9  #: m; what a wave of defocus is counted in
 _ROWS = 512  #: of a pupil in which its steps are looked at, at least
 
 
-@node(adds=[("dirt",)])
+@node(additive_inputs=[("dirt",)])
 def pupil(
     height: Tensor,
     index: Tensor,

@@ -7,7 +7,7 @@ import torch
 from pydantic import Field
 from torch import Generator, Tensor
 
-from neusee.nodes import Check, Deviation, Facts, node
+from neusee.nodes import Check, ErrorBound, TensorStats, node
 from neusee.nodes._half_precision import single
 from neusee.nodes.sensor._saturation import Well
 from neusee.nodes.units import Shape
@@ -36,8 +36,8 @@ def full_well(electrons: Tensor, *, capacity: Well) -> Tensor:
     return single(electrons).clamp_max(capacity)
 
 
-@full_well.negligible
-def _(electrons: Facts, *, capacity: float) -> float:
+@full_well.skip_bound
+def _(electrons: TensorStats, *, capacity: float) -> float:
     """What the brightest pixel loses, over the well or over what lies furthest below 0; exact.
 
     The well is the number that the dtype holds, which lies beside ``capacity`` by up to half a step.
@@ -50,9 +50,9 @@ def _(electrons: Facts, *, capacity: float) -> float:
     return (electrons.max - held) / largest if largest > 0 else math.inf
 
 
-@full_well.carries
-def _(electrons: Deviation, **params: Any) -> float:
-    return electrons.bound
+@full_well.propagate_error
+def _(electrons: ErrorBound, **params: Any) -> float:
+    return electrons.rms
 
 
 @full_well.check
@@ -111,10 +111,12 @@ def _(
     return torch.tensor(whole, dtype=electrons.dtype).reshape(electrons.shape)
 
 
-@digitize.carries
-def _(electrons: Deviation, *, result: Facts, gain: float, gain_unit: GainUnit = "e-/DN", **params: Any) -> float:
+@digitize.propagate_error
+def _(
+    electrons: ErrorBound, *, result: TensorStats, gain: float, gain_unit: GainUnit = "e-/DN", **params: Any
+) -> float:
     """Of the line before rounding: whatever is near the middle between two numbers may become the next one."""
-    return electrons.bound * numbers_per_electron(gain, gain_unit)
+    return electrons.rms * numbers_per_electron(gain, gain_unit)
 
 
 @digitize.preflight
@@ -145,13 +147,13 @@ def crop(image: Tensor, *, shape: Shape) -> Tensor:
     return image[..., top : top + shape[0], left : left + shape[1]].contiguous()
 
 
-@crop.carries
-def _(image: Deviation, *, result: Facts, **params: Any) -> float:
+@crop.propagate_error
+def _(image: ErrorBound, *, result: TensorStats, **params: Any) -> float:
     """All that is off may lie in the window."""
-    before = math.prod(image.facts.shape) if image.facts else math.inf
-    return image.bound * math.sqrt(before / max(1, math.prod(result.shape)))
+    before = math.prod(image.stats.shape) if image.stats else math.inf
+    return image.rms * math.sqrt(before / max(1, math.prod(result.shape)))
 
 
-@crop.negligible
-def _(image: Facts, *, shape: tuple[int, int]) -> float:
+@crop.skip_bound
+def _(image: TensorStats, *, shape: tuple[int, int]) -> float:
     return 0.0 if image.shape[-2:] == tuple(shape) else math.inf

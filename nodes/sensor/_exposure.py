@@ -8,7 +8,7 @@ import torch
 from pydantic import Field
 from torch import Tensor
 
-from neusee.nodes import Check, Deviation, Facts, node
+from neusee.nodes import Check, ErrorBound, TensorStats, node
 from neusee.nodes._half_precision import refuse_not_finite, single
 from neusee.nodes.sensor._channel_sums import weighted
 from neusee.nodes.sensor._saturation import Efficiency, Well, photons_per_joule, saturation
@@ -18,7 +18,7 @@ from neusee.nodes.values import Bands, Channels
 Strength = Annotated[float, Field(ge=0, allow_inf_nan=False)]  #: multiple of what saturates
 
 
-@node(channels=("irradiance",), even=("level",))
+@node(accepts_channel_sums=("irradiance",), needs_band_invariant=("level",))
 def expose(
     irradiance: Tensor | Channels,
     bands: Bands,
@@ -70,8 +70,8 @@ def _(result: Tensor, *inputs: object, **params: object) -> list[Check]:
     return [Check(f"brightest {high:.4g} photons", low >= -1e-3 * high)]
 
 
-@expose.carries
-def _(irradiance: Deviation, *others: Deviation | None, result: Facts, **params: Any) -> float:
+@expose.propagate_error
+def _(irradiance: ErrorBound, *others: ErrorBound | None, result: TensorStats, **params: Any) -> float:
     """No light is negative, so that no channel loses more than the image, or the level, in parts of its largest."""
     level = others[2] if len(others) > 2 else None
     return (irradiance.share + (level.share if level else 0.0)) * result.max
@@ -92,7 +92,7 @@ def channel_weights(
     return weights if level is None else weights * level.to(weights)
 
 
-@node(channels=("plain_image",))
+@node(accepts_channel_sums=("plain_image",))
 def level(
     plain_image: Tensor | Channels,
     bands: Bands,
@@ -138,13 +138,13 @@ def level(
     return torch.where(lit, strength * top.to(peaks) / peaks.where(lit, 1.0), 0.0)
 
 
-@level.even_where
+@level.band_invariant
 def _(params: Mapping[str, Any]) -> bool:
     return bool(params.get("rule", "channel_sum") == "channel_sum")
 
 
-@level.carries
-def _(plain_image: Deviation, *others: object, result: Facts, **params: Any) -> float:
+@level.propagate_error
+def _(plain_image: ErrorBound, *others: object, result: TensorStats, **params: Any) -> float:
     """What the brightest pixel is off, the level is off the other way."""
     share = plain_image.largest
     return result.max * share / (1.0 - share) if share < 1.0 else math.inf
@@ -158,7 +158,7 @@ def _(*, strength: float, rule: str = "channel_sum", **params: object) -> list[s
     return notes + (["level per band: each band alone fills the well"] if rule == "per_band" else [])
 
 
-@node(rtol=1e-6, adds=[("lasers",), ("ghosts",)])
+@node(rtol=1e-6, additive_inputs=[("lasers",), ("ghosts",)])
 def gather(photons: Tensor, lasers: list[Tensor] | None = None, ghosts: list[Tensor] | None = None) -> Tensor:
     """Add the photons of the scene, of every laser and of every ghost: incoherent light adds.
 
@@ -179,14 +179,14 @@ def gather(photons: Tensor, lasers: list[Tensor] | None = None, ghosts: list[Ten
     return total
 
 
-@gather.carries
+@gather.propagate_error
 def _(
-    photons: Deviation,
-    lasers: list[Deviation] | None = None,
-    ghosts: list[Deviation] | None = None,
+    photons: ErrorBound,
+    lasers: list[ErrorBound] | None = None,
+    ghosts: list[ErrorBound] | None = None,
     **params: Any,
 ) -> float:
-    return math.fsum(part.bound for part in (photons, *(lasers or ()), *(ghosts or ())))
+    return math.fsum(part.rms for part in (photons, *(lasers or ()), *(ghosts or ())))
 
 
 @gather.check
@@ -195,12 +195,12 @@ def _(result: Tensor, photons: Tensor, *others: object, **params: object) -> lis
     return [Check(f"brightest pixel {high:.4g} photons, scene alone {scene:.4g}", high >= 0)]
 
 
-@expose.absent
+@expose.zero_bound
 def _(
-    irradiance: Facts,
-    bands: Facts,
-    responses: Facts,
-    level: Facts | None = None,
+    irradiance: TensorStats,
+    bands: TensorStats,
+    responses: TensorStats,
+    level: TensorStats | None = None,
     *,
     pixel_pitch: float,
     exposure: float,

@@ -9,7 +9,7 @@ import torch
 from pydantic import Field
 from torch import Generator, Tensor
 
-from neusee.nodes import Check, Deviation, Facts, node
+from neusee.nodes import Check, ErrorBound, TensorStats, node
 from neusee.nodes._half_precision import single
 from neusee.nodes.sensor._saturation import Efficiency, Well
 from neusee.nodes.units import Electrons, Fraction
@@ -69,18 +69,20 @@ def _(result: Tensor, photons: Tensor, **params: Any) -> list[Check]:
     return [Check(f"mean {mean:.4g} e-", low >= -1e-4 * max(high, 1.0))]
 
 
-@photon_noise.carries
-def _(photons: Deviation, *, result: Facts, quantum_efficiency: float, spread: float = 1.0, **params: Any) -> float:
+@photon_noise.propagate_error
+def _(
+    photons: ErrorBound, *, result: TensorStats, quantum_efficiency: float, spread: float = 1.0, **params: Any
+) -> float:
     """Of the mean, and of its root: |sqrt(a) - sqrt(b)| is at most sqrt|a - b| and |a - b| / sqrt(a).
 
     Poisson numbers of another mean are others.
     """
-    if params["distribution"] == "poisson" and photons.bound > 0:
+    if params["distribution"] == "poisson" and photons.rms > 0:
         return math.inf
-    drawn = photons.bound * (quantum_efficiency if params["drawn_in"] == "electrons" else 1.0)
+    drawn = photons.rms * (quantum_efficiency if params["drawn_in"] == "electrons" else 1.0)
     kept = params["mean_shift"] + (params["mean"] == "additive")
     electrons: float = 1.0 if params["drawn_in"] == "electrons" else quantum_efficiency
-    darkest = photons.facts.min * drawn / photons.bound if photons.facts and photons.bound > 0 else 0.0
+    darkest = photons.stats.min * drawn / photons.rms if photons.stats and photons.rms > 0 else 0.0
     root = math.sqrt(drawn) if darkest <= drawn else drawn / math.sqrt(darkest)
     total: float = electrons * (abs(kept) * drawn + spread * root)
     return total
@@ -139,19 +141,19 @@ def dark_current(electrons: Tensor, *, mean: Electrons, full_well: Well | None =
     return _by_parts(heated, single(electrons), rng)
 
 
-@dark_current.negligible
-def _(electrons: Facts, *, mean: float, full_well: float | None) -> float:
+@dark_current.skip_bound
+def _(electrons: TensorStats, *, mean: float, full_well: float | None) -> float:
     return _share(mean, math.sqrt(mean), electrons, full_well)
 
 
-@dark_current.weighed
-def _(electrons: Facts, *, full_well: float | None, **params: Any) -> float:
+@dark_current.skip_scale
+def _(electrons: TensorStats, *, full_well: float | None, **params: Any) -> float:
     return _scale(electrons, full_well)
 
 
-@dark_current.carries
-def _(electrons: Deviation, **params: Any) -> float:
-    return electrons.bound
+@dark_current.propagate_error
+def _(electrons: ErrorBound, **params: Any) -> float:
+    return electrons.rms
 
 
 @node()
@@ -172,28 +174,28 @@ def read_noise(
     return _by_parts(read, single(electrons), rng)
 
 
-@read_noise.negligible
-def _(electrons: Facts, *, pedestal: float, sigma: float, full_well: float | None) -> float:
+@read_noise.skip_bound
+def _(electrons: TensorStats, *, pedestal: float, sigma: float, full_well: float | None) -> float:
     return _share(pedestal, sigma, electrons, full_well)
 
 
-@read_noise.weighed
-def _(electrons: Facts, *, full_well: float | None, **params: Any) -> float:
+@read_noise.skip_scale
+def _(electrons: TensorStats, *, full_well: float | None, **params: Any) -> float:
     return _scale(electrons, full_well)
 
 
-@read_noise.carries
-def _(electrons: Deviation, **params: Any) -> float:
-    return electrons.bound
+@read_noise.propagate_error
+def _(electrons: ErrorBound, **params: Any) -> float:
+    return electrons.rms
 
 
-def _scale(electrons: Facts, full_well: float | None) -> float:
+def _scale(electrons: TensorStats, full_well: float | None) -> float:
     """The largest count that the well can hold."""
     largest = max(abs(electrons.max), abs(electrons.min))
     return largest if full_well is None else min(largest, full_well)
 
 
-def _share(shift: float, spread: float, electrons: Facts, full_well: float | None) -> float:
+def _share(shift: float, spread: float, electrons: TensorStats, full_well: float | None) -> float:
     """Root mean square of what is added, over the largest of the result or over the well, whichever is less.
 
     The largest is that of the brightest or of the darkest pixel, for below 0 the darkest may be it. The well alone

@@ -8,7 +8,7 @@ from pydantic import Field
 from torch import Tensor
 
 from neusee.nodes import Check, node
-from neusee.nodes.constants import LIGHT, PLANCK
+from neusee.nodes.constants import PLANCK, SPEED_OF_LIGHT
 from neusee.nodes.units import Electrons, PositiveLength, Time
 from neusee.nodes.values import Bands
 
@@ -26,7 +26,7 @@ class Limits(NamedTuple):
 
 def photons_per_joule(centres: Tensor) -> Tensor:
     """Photons of each wavelength in a joule: wavelength / (h c)."""
-    return centres.double() / (PLANCK * LIGHT)
+    return centres.double() / (PLANCK * SPEED_OF_LIGHT)
 
 
 def photons_that_fill(full_well: float, quantum_efficiency: float) -> float:

@@ -11,7 +11,7 @@ from neusee.nodes._half_precision import single
 from neusee.nodes.spectra._spectral_tables import to_srgb
 from neusee.nodes.values import Bands
 
-Deviation = Annotated[float, Field(ge=0, le=1)]
+GrainDeviation = Annotated[float, Field(ge=0, le=1)]
 
 
 @node(rtol=1e-5)
@@ -42,7 +42,7 @@ def _(result: Tensor, *inputs: Any) -> list[Check]:
 
 
 @node(rtol=1e-5)
-def grain(picture: Tensor, *, read: Deviation = 1e-3, shot: Deviation = 2e-3, rng: torch.Generator) -> Tensor:
+def grain(picture: Tensor, *, read: GrainDeviation = 1e-3, shot: GrainDeviation = 2e-3, rng: torch.Generator) -> Tensor:
     """Add the grain of a camera to a developed picture: normal, its variance rising with the light.
 
     Shapes: picture (..., y, x) -> the same.

@@ -59,7 +59,7 @@ def _(result: Tensor, bands: Bands, *, kind: str = "daylight", temperature: floa
     return [Check(f"{name}: {float(result.min()):.2f} to {float(result.max()):.2f}, brightest at {peak:.4g} nm")]
 
 
-@node(bands={"reflectance": -3, "illuminant": 0, "return": -3}, mixtures=("reflectance",))
+@node(bands={"reflectance": -3, "illuminant": 0, "return": -3}, accepts_low_rank=("reflectance",))
 def illuminate(
     reflectance: Tensor | Mixture, illuminant: Tensor, *, times: Literal["once", "twice"] = "once"
 ) -> Tensor | Mixture:

@@ -59,7 +59,7 @@ def _(rgb: Tensor, bands: Bands, *, within: float = 1e-6) -> Mixture:
 lift_mallett_mixture.check(said_of_planes)
 
 
-lift_mallett.mixed = lift_mallett_mixture
+lift_mallett.low_rank_form = lift_mallett_mixture
 
 
 @node(rtol=1e-5)
@@ -109,7 +109,7 @@ def _(rgb: Tensor, bands: Bands, *, within: float = 1e-6) -> Mixture:
 lift_lmmse_mixture.check(said_of_planes)
 
 
-lift_lmmse.mixed = lift_lmmse_mixture
+lift_lmmse.low_rank_form = lift_lmmse_mixture
 
 
 def lift_checks(result: Tensor, rgb: Tensor, bands: Bands, matrix: Tensor | None = None) -> list[Check]:
@@ -150,9 +150,9 @@ def _mixed(rgb: Tensor, matrix: Tensor, within: float) -> Mixture:
 
 def _mixed_whole(lift: Node, rgb: Tensor, bands: Bands, within: float) -> Mixture:
     """The reference of both: the cube of the other reference, and its own components."""
-    assert lift.ref is not None
-    assert compress.ref is not None
-    found: Mixture = compress.ref(lift.ref(rgb, bands), within=within)
+    assert lift.hooks.reference is not None
+    assert compress.hooks.reference is not None
+    found: Mixture = compress.hooks.reference(lift.hooks.reference(rgb, bands), within=within)
     return found
 
 

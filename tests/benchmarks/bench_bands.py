@@ -23,7 +23,7 @@ from neusee.nodes.spectra import illuminate
 from neusee.nodes.values import Psf, Pupil
 from neusee.workflows.engine.band_results import call_by_band, plain_of
 from neusee.workflows.engine.node_call import call
-from neusee.workflows.graph.diagnostics import Mark
+from neusee.workflows.graph.diagnostics import Location
 from neusee.workflows.graph.recipe_graph import Step
 from neusee.workflows.store import serialization
 from neusee.workflows.store.band_files import Blobs, Stacked
@@ -46,7 +46,7 @@ def step_of(name, size):
 
 
 def _step(node, **params):
-    return Step(node.fn.__name__, node, params, {}, Mark("bench"), {})
+    return Step(node.fn.__name__, node, params, {}, Location("bench"), {})
 
 
 def _pupil(n=2160):

@@ -30,7 +30,7 @@ from numpyro.infer import MCMC, NUTS
 from neusee.nodes.calibrate._likelihood._quantised_gaussian import log_cell
 from neusee.workflows.calibration import emcee_sampler
 from neusee.workflows.calibration.initial_guess import begin
-from neusee.workflows.calibration.log_posterior import Problem
+from neusee.workflows.calibration.log_posterior import SensorPosterior
 from neusee.workflows.calibration.posterior_mode import peak
 from neusee.workflows.engine.runner import run
 from neusee.workflows.recipe.loading import load
@@ -135,7 +135,7 @@ def main():
     numpyro.set_host_device_count(1)
     with tempfile.TemporaryDirectory() as folder:
         store = Store(Path(folder))
-        problem = Problem.of(load("calibrate"), store)
+        problem = SensorPosterior.of(load("calibrate"), store)
         best = peak(problem, begin(problem))
         places = best.draw(64, np.random.default_rng(0))
         vector = median(lambda: [problem.log_posterior(places) for _ in range(100)]) / 6400
@@ -148,7 +148,7 @@ def main():
         for name in ("de", "stretch"):
             worth, seconds, _ = ours(problem, best, name)
             print(f"| 15 | emcee, {name} | {worth:.0f} | {seconds:.2f} | {worth / seconds:.0f} |", flush=True)
-        lit = Problem.of(load("calibrate", [LIT]), store)
+        lit = SensorPosterior.of(load("calibrate", [LIT]), store)
         best = peak(lit, begin(lit))
         worth, seconds, chains = ours(lit, best, "de")
         print(f"| 14 | emcee, de | {worth:.0f} | {seconds:.2f} | {worth / seconds:.0f} |", flush=True)

@@ -1,9 +1,9 @@
 """What choosing costs, of a cold run and of a cached one: `python tests/benchmarks/bench_choosing.py [RECIPE ...]`.
 
-Choosing is all that a run with `--keep-all` does not do: the recipe made cheaper, the account of the tolerance, the
+Choosing is all that a run with `--exact` does not do: the recipe made cheaper, the account of the tolerance, the
 proof along the graph, and inside the image of few planes the search for what may be left away and the bounds. Each is
 timed where it is called; time in one that another calls counts once, and steps that it asks for do not count. Beside a
-cached run stands one with `--keep-all`, as long as that is in the store too. The runs are whole, engine and store
+cached run stands one with `--exact`, as long as that is in the store too. The runs are whole, engine and store
 included, and in one process, with the code of the nodes read before. While the store writes large results, its threads
 take the cores from whatever is computed, and the clock runs on: a cold run whose store takes nothing shows what
 choosing takes by itself, and is the shorter run to compare it with. Medians of 3, or of one where it takes long.
@@ -24,9 +24,15 @@ from neusee.workflows import load
 from neusee.workflows.engine import execution, resolve_keys, runner
 from neusee.workflows.store.result_store import Store
 from neusee.workflows.studies.accuracy.work_precision_points import cold
-from neusee.workflows.tolerance.error_budget import Ledger
+from neusee.workflows.tolerance.error_budget import ErrorBudget
 
-ENGINE = ((runner, "economised"), (runner, "border"), (runner, "proof"), (Ledger, "verdict"), (Ledger, "pass_on"))
+ENGINE = (
+    (runner, "economised"),
+    (runner, "border"),
+    (runner, "proof"),
+    (ErrorBudget, "verdict"),
+    (ErrorBudget, "pass_on"),
+)
 NODE = tuple((_channel_image, name) for name in ("passed", "with_windows", "choose", "guessed", "rounding", "_top"))
 LONG = 20.0  #: s, beyond which one run is enough
 
@@ -81,8 +87,8 @@ def clocks():
     for clock, places in ((engine, ENGINE), (node, NODE)):
         for place, name in places:
             mock.patch.object(place, name, clock.watched(getattr(place, name))).start()
-    make = execution.UnderWay.make
-    mock.patch.object(execution.UnderWay, "make", engine.left_out(make)).start()
+    make = execution.Execution.make
+    mock.patch.object(execution.Execution, "make", engine.left_out(make)).start()
     try:
         yield engine, node
     finally:
@@ -105,14 +111,14 @@ def fresh(recipe, memo, kind):
 
 def line(name):
     recipe = load(name)
-    full = replace(recipe, keep_all=True)
+    full = replace(recipe, exact=True)
     with tempfile.TemporaryDirectory() as folder:
         memo = Store(Path(folder))
         for each in (recipe, full):
             once(each, memo)
         cached, whole = ([once(each, Store(Path(folder))) for _ in range(9)] for each in (recipe, full))
         colds, unwritten = (fresh(recipe, memo, kind) for kind in (Store, Unwritten))
-    rows = {"cold": colds, "cold, nothing written": unwritten, "cached": cached, "cached, `--keep-all`": whole}
+    rows = {"cold": colds, "cold, nothing written": unwritten, "cached": cached, "cached, `--exact`": whole}
     for what, runs in rows.items():
         seconds, engine, node = (statistics.median(column) for column in zip(*runs, strict=True))
         share = (engine + node) / seconds
@@ -120,7 +126,7 @@ def line(name):
 
 
 if __name__ == "__main__":
-    assert resolve_keys.Ledger is Ledger is execution.Ledger
+    assert resolve_keys.ErrorBudget is ErrorBudget is execution.ErrorBudget
     print("| recipe | run | s | engine, ms | node, ms | share |\n|---|---|---|---|---|---|")
     for name in sys.argv[1:] or ("first_light", "dirty_windshield", "paper_table1"):
         line(name)

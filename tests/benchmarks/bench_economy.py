@@ -98,8 +98,8 @@ def planes(repeats):
             for within in (1e-6, 1e-4, 1e-2):
                 done = medians(partial(compress, cube, within=within), repeats)
                 tell(size, f"compress within {within:g}, {name}", done)
-                if lift_lmmse.mixed is not None:
-                    done = medians(partial(lift_lmmse.mixed, colours, SCENE, within=within), repeats)
+                if lift_lmmse.low_rank_form is not None:
+                    done = medians(partial(lift_lmmse.low_rank_form, colours, SCENE, within=within), repeats)
                     tell(size, f"lift to planes within {within:g}, {name}", done)
 
 

@@ -18,7 +18,7 @@ import torch
 from neusee.nodes import node
 from neusee.workflows.engine.differentiable_function import as_function
 from neusee.workflows.engine.runner import run
-from neusee.workflows.graph.diagnostics import Mark
+from neusee.workflows.graph.diagnostics import Location
 from neusee.workflows.graph.recipe_graph import Recipe, Step
 from neusee.workflows.keys.cache_key import key_of
 from neusee.workflows.keys.code_digest import Code
@@ -49,7 +49,7 @@ def recipe(outputs: tuple[str, ...], *steps: Step) -> Recipe:
 
 
 def step(name: str, what, source: str | None = None, **params) -> Step:
-    return Step(name, what, params, {"x": source} if source else {}, Mark("bench.yaml", 1, 1), {})
+    return Step(name, what, params, {"x": source} if source else {}, Location("bench.yaml", 1, 1), {})
 
 
 def chain(n: int, count: int = 4, changed: int = -1) -> Recipe:

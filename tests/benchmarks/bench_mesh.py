@@ -25,7 +25,7 @@ from mesh_processes import DO, _photographs, start
 from neusee.workflows import Store, load
 from neusee.workflows.training.parallel.process_mesh import Mesh
 from neusee.workflows.training.training_iteration import Learner
-from neusee.workflows.training.training_pictures import Samples
+from neusee.workflows.training.training_pictures import TrainingStream
 
 DOUBLE = ["train.precision=float64", "steps.psf.with.precision=double", "steps.laser_psf.with.precision=double"]
 PLAIN = ["train.network.kind=unet", "train.stages.1.batch=4"]
@@ -39,7 +39,7 @@ def timed(job: dict[str, Any], mesh: Mesh) -> None:
     how = recipe.training
     learner = Learner(recipe, how, "cpu", mesh=mesh)
     learner.begin(how.stages[1], True)
-    samples = Samples(recipe, how, _photographs(recipe, how, True), Store(Path(job["store"])), "cpu", None, mesh)
+    samples = TrainingStream(recipe, how, _photographs(recipe, how, True), Store(Path(job["store"])), "cpu", None, mesh)
     seconds = []
     for iteration in range(1 + TIMES):
         began = time.perf_counter()

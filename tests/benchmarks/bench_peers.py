@@ -236,14 +236,14 @@ from pathlib import Path
 neusee.nodes.__path__ = [*neusee.nodes.__path__, folder]
 from neusee.nodes import peer_case as case
 from neusee.workflows.graph.recipe_graph import Recipe, Step
-from neusee.workflows.graph.diagnostics import Mark
+from neusee.workflows.graph.diagnostics import Location
 from neusee.workflows.engine.runner import run
 from neusee.workflows.store.result_store import Store
 for key, value in given.items():
     if not isinstance(value, float):
         torch.save(value.state_dict() if key == "net" else value, f"{folder}/{key}.pt")
         given[key] = Path(f"{folder}/{key}.pt")
-step = Step("y", getattr(case, name), given, {}, Mark("peer.yaml", 1, 1), {})
+step = Step("y", getattr(case, name), given, {}, Location("peer.yaml", 1, 1), {})
 found = run(Recipe("peer", "", 1, 0.0, ("y",), {"y": step}), Store(Path(folder) / "ours")).values["y"]
 """,
     "joblib": """

@@ -2,7 +2,7 @@
 
 Each of COUNT (100) recipes, drawn as the tests draw them, is run as it chooses and in full; then with every
 combination of its cheaper settings (a third of the bands, three quarters of the pupil's samples, of the PSF's window,
-both with and without `--keep-all`). The error is that of both raw pictures against the full run; the cost is the
+both with and without `--exact`). The error is that of both raw pictures against the full run; the cost is the
 wall time of a whole cold run, choice, proof and second attempts included. The three cheapest settings within the
 tolerance, and the recipe as it chooses, are run three times more in turn, and their medians compared.
 
@@ -70,7 +70,7 @@ def settings(recipe):
         label = f"fewer {' and '.join(label)}" if label else "nothing changed"
         with suppress(RecipeError):
             other = changed(recipe, [word for each in words for word in each])
-            yield Setting(f"{label}, in full" if whole else label, replace(other, keep_all=whole))
+            yield Setting(f"{label}, in full" if whole else label, replace(other, exact=whole))
 
 
 def timed(recipe, memo):
@@ -88,7 +88,7 @@ def error(result, truth):
 def line(seed, memo):
     recipe, _ = random_recipes.draw(seed, outputs="[raw]")
     run(recipe, memo)  # code is read before the clock starts
-    _, truth = timed(replace(recipe, keep_all=True), memo)
+    _, truth = timed(replace(recipe, exact=True), memo)
     tried = list(settings(recipe))
     first = []
     ours, whole = tried[0], next(s for s in tried if s.label == "nothing changed, in full")
@@ -106,7 +106,7 @@ def line(seed, memo):
             setting.seconds.append(timed(setting.recipe, memo)[0])
     best = min((s for s in again if s in good), key=lambda s: s.median)
     bound, done = first[0]  # as it chooses
-    attempts = 3 if done.keep_all else 1 + (done.strict != 1.0)
+    attempts = 3 if done.exact else 1 + (done.strict != 1.0)
     seconds = (whole.median, ours.median, best.median)
     return Line(seed, recipe.tolerance, ours.error, bound, attempts, *seconds, best.label)
 

@@ -31,7 +31,7 @@ from neusee.workflows.training.checkpoint import export
 from neusee.workflows.training.photograph_folder import Photographs
 from neusee.workflows.training.run_training import frozen
 from neusee.workflows.training.training_iteration import Learner
-from neusee.workflows.training.training_pictures import Samples
+from neusee.workflows.training.training_pictures import TrainingStream
 
 SIDES, FULL = (128, 192, 256, 384, 512), (2048, 31, 8, 256)
 #: side, bands, batch, side of the network's pictures
@@ -63,7 +63,7 @@ def measured(side, bands, batch, net, stage):
         learner, store = Learner(recipe, how, "cpu"), Store(Path(folder) / "store")
         export(Path(folder), "mask", {"height": learner.height().detach()})
         still = frozen(recipe, how, Path(folder)) if stage == 2 else None
-        samples = Samples(recipe, how, Photographs((recipe.steps["scene"].params["file"],)), store, "cpu", still)
+        samples = TrainingStream(recipe, how, Photographs((recipe.steps["scene"].params["file"],)), store, "cpu", still)
         learner.begin(how.stages[stage], stage == 1)
         learner.iterate(samples, stage, 0)
         Path("/proc/self/clear_refs").write_text("5")  # the peak so far no longer counts

@@ -11,7 +11,7 @@ import pytest
 import torch
 from scipy import stats
 
-from neusee.nodes import Facts, doe, flare, optics, sensor, spectra
+from neusee.nodes import TensorStats, doe, flare, optics, sensor, spectra
 
 ROUNDING = 1e-9  #: of a bound, in float64
 SINGLE = 1e-5  #: the same, of results in float32
@@ -62,14 +62,14 @@ def dark(draw):
     electrons, mean = draw.electrons(), draw.often(0.0, draw.decades(1e-9, 1e4))
     well = draw.often(None, draw.decades(10, 1e6))
     law = stats.poisson(mean)
-    bound = sensor.dark_current.bound(Facts.of(electrons), mean=mean, full_well=well)
+    bound = sensor.dark_current.hooks.skip_bound(TensorStats.of(electrons), mean=mean, full_well=well)
     return bound, noise_change(electrons, float(law.mean()), float(law.var()), well)
 
 
 def reading(draw):
     electrons, well = draw.electrons(), draw.often(None, draw.decades(10, 1e6))
     noise = {"pedestal": draw.often(0.0, draw.decades(1e-6, 1e4)), "sigma": draw.often(0.0, draw.decades(1e-6, 1e4))}
-    bound = sensor.read_noise.bound(Facts.of(electrons), **noise, full_well=well)
+    bound = sensor.read_noise.hooks.skip_bound(TensorStats.of(electrons), **noise, full_well=well)
     return bound, noise_change(electrons, noise["pedestal"], noise["sigma"] ** 2, well)
 
 
@@ -83,7 +83,7 @@ def holding(draw):
     electrons, capacity = draw.electrons().to(dtype), draw.decades(1, 1e7)
     if draw.uniform() < 0.5:  # just above or below the well, where most that is left out lies
         electrons = electrons.clamp_max(capacity * (1 + draw.decades(1e-9, 1.0)))
-    bound = sensor.full_well.bound(Facts.of(electrons), capacity=capacity)
+    bound = sensor.full_well.hooks.skip_bound(TensorStats.of(electrons), capacity=capacity)
     return bound, largest_change(sensor.full_well(electrons, capacity=capacity), electrons)
 
 
@@ -98,7 +98,7 @@ def making(draw):
     params = {"material": material, "wrap_at": wave, "levels": levels, "max_height": deepest}
     rough = torch.rand(6, 6, generator=draw.rng, dtype=torch.float64) - draw.often(0.5, 0.0)
     height = (draw.often(0.0, draw.decades(1e-8, 1e-4)) * rough).to(dtype)
-    bound = doe.fabricate.bound(Facts.of(height), **params)
+    bound = doe.fabricate.hooks.skip_bound(TensorStats.of(height), **params)
     return bound, largest_change(doe.fabricate(height, **params), height)
 
 
@@ -106,7 +106,7 @@ def windowing(draw):
     image = draw.image(1.0, 2, 4, 4)
     shape = (int(draw.uniform(1, 5)), int(draw.uniform(1, 5)))
     same = sensor.crop(image, shape=shape).shape == image.shape
-    return sensor.crop.bound(Facts.of(image), shape=shape), 0.0 if same else math.inf
+    return sensor.crop.hooks.skip_bound(TensorStats.of(image), shape=shape), 0.0 if same else math.inf
 
 
 class Unread:
@@ -139,7 +139,7 @@ def shining(draw):
     psf = optics.psf(pupil, **camera, sensor=draw.one_of("point", "integrated"))
     power = {"strength": draw.often(0.0, draw.decades(1e-9, 1e8)), **SENSOR, "exposure": draw.decades(1e-6, 1e3)}
     found = optics.spot(psf, line, **power)
-    return optics.spot.nothing(Unread(), Facts.of(line), **power), float(found.max())
+    return optics.spot.hooks.zero_bound(Unread(), TensorStats.of(line), **power), float(found.max())
 
 
 GHOSTS = {"focal_length": 0.1, "pixel_pitch": 3e-6, "count": 8, "energy": 1e-4, "spread": 2.0, "radius": 3e-4}
@@ -158,7 +158,7 @@ def reflecting(draw):
     params = lens | kind | {"radius": draw.decades(1e-7, 3e-4)}
     found = flare.ghosts(spot, line, towards, **params, rng=draw.rng)
     assert bool(found.isfinite().all())
-    return flare.ghosts.nothing(Facts.of(spot), Unread(), Unread(), **params), float(found.max())
+    return flare.ghosts.hooks.zero_bound(TensorStats.of(spot), Unread(), Unread(), **params), float(found.max())
 
 
 def counting(draw):
@@ -168,7 +168,7 @@ def counting(draw):
     level = draw.one_of(None, torch.full((len(bands.centres),), draw.decades(1e-6, 1e6), dtype=torch.float64))
     shutter = {"pixel_pitch": draw.decades(1e-6, 1e-4), "exposure": draw.decades(1e-6, 1e3)}
     inputs = (light, bands, responses, level)
-    bound = sensor.expose.nothing(*(Facts.of(x) for x in inputs), **shutter)
+    bound = sensor.expose.hooks.zero_bound(*(TensorStats.of(x) for x in inputs), **shutter)
     return bound, float(sensor.expose(*inputs, **shutter).max())
 
 
@@ -180,7 +180,7 @@ def soiling(draw):
     dirt = flare.dirt(**grid, **marks, **film, **soft, rng=draw.rng)
     turns = dirt.path.double() / draw.uniform(400e-9, 700e-9)
     field = torch.polar(dirt.amplitude.double(), 2 * torch.pi * turns)
-    return flare.dirt.nothing(**grid, **marks, **film, **soft), float((field - 1).abs().max())
+    return flare.dirt.hooks.zero_bound(**grid, **marks, **film, **soft), float((field - 1).abs().max())
 
 
 LARGEST = {"spot": shining, "ghosts": reflecting, "expose": counting, "dirt": soiling}
@@ -212,20 +212,22 @@ def test_what_is_not_added_is_no_brighter_than_stated(name, draws):
 
 
 def test_a_laser_without_light_needs_no_other_fact():
-    nothing = Facts((3, 4, 4), "float32", 0.0, 0.0, 0.0, 0, True)
-    assert sensor.expose.nothing(nothing, Unread(), Unread(), pixel_pitch=1e-6, exposure=1.0) == 0
-    assert optics.spot.nothing(Unread(), Unread(), strength=0.0, **SENSOR) == 0
-    assert flare.ghosts.nothing(nothing, Unread(), Unread(), **GHOSTS) == 0
+    nothing = TensorStats((3, 4, 4), "float32", 0.0, 0.0, 0.0, 0, True)
+    assert sensor.expose.hooks.zero_bound(nothing, Unread(), Unread(), pixel_pitch=1e-6, exposure=1.0) == 0
+    assert optics.spot.hooks.zero_bound(Unread(), Unread(), strength=0.0, **SENSOR) == 0
+    assert flare.ghosts.hooks.zero_bound(nothing, Unread(), Unread(), **GHOSTS) == 0
 
 
 def test_noise_that_undoes_what_is_there_is_unbounded():
-    found = Facts.of(torch.full((2, 2), -5.0))
-    assert sensor.read_noise.bound(found, pedestal=5.0, sigma=0.0, full_well=None) == math.inf
+    found = TensorStats.of(torch.full((2, 2), -5.0))
+    assert sensor.read_noise.hooks.skip_bound(found, pedestal=5.0, sigma=0.0, full_well=None) == math.inf
 
 
 def test_noise_above_the_well_is_weighed_against_the_well():
-    found = Facts.of(torch.tensor([0.0, 25500.0]))
-    assert sensor.dark_current.bound(found, mean=1e4, full_well=25500.0) == pytest.approx(1e4 / 25500, rel=1e-4)
+    found = TensorStats.of(torch.tensor([0.0, 25500.0]))
+    assert sensor.dark_current.hooks.skip_bound(found, mean=1e4, full_well=25500.0) == pytest.approx(
+        1e4 / 25500, rel=1e-4
+    )
 
 
 @pytest.mark.parametrize("mean", [1e-6, 1e-3, 0.1, 30.0])
@@ -238,7 +240,7 @@ def test_the_moments_are_those_that_the_node_draws(mean):
 
 def test_a_clean_window_is_exactly_nothing_and_a_grain_may_be_all():
     clean = dict.fromkeys(("dust", "scratches", "grease", "smudges", "dents"), 0.0)
-    assert flare.dirt.nothing(**clean) == 0.0
-    assert flare.dirt.nothing(**clean | {"dust": 1.0}) >= 1.0
+    assert flare.dirt.hooks.zero_bound(**clean) == 0.0
+    assert flare.dirt.hooks.zero_bound(**clean | {"dust": 1.0}) >= 1.0
     dirt = flare.dirt(samples=16, pitch=1e-4, diameter=1e-3, rng=torch.Generator(), **clean)
     assert bool((dirt.amplitude == 1).all() and (dirt.path == 0).all())

@@ -43,7 +43,7 @@ def test_the_log_of_the_lsr_is_the_same_in_both_precisions_when_one_band_is_dark
 def test_the_reference_of_the_lsr_has_a_slope_where_some_pixels_are_black():
     psf = torch.rand(1, 5, 5, generator=torch.Generator().manual_seed(1), dtype=torch.float64)
     psf[0, :2] = 0
-    usual, truth = (slope_of(lambda x, f=f: f(psf_of(x)), psf) for f in (losses.lsr, losses.lsr.ref))
+    usual, truth = (slope_of(lambda x, f=f: f(psf_of(x)), psf) for f in (losses.lsr, losses.lsr.hooks.reference))
     torch.testing.assert_close(usual, truth)
 
 
@@ -203,7 +203,7 @@ def test_half_precision_does_not_end_the_light_at_65504():
     assert float(sensor.full_well(half, capacity=255000.0).max()) == 60000
     assert float(sensor.digitize(half, gain=2.0, gain_unit="DN/e-").max()) == 65535
     assert float(restore.electrons(half, gain=10.0, pedestal=0.0).max()) == 600000
-    reference = sensor.digitize.ref(half, gain=0.37)
+    reference = sensor.digitize.hooks.reference(half, gain=0.37)
     torch.testing.assert_close(sensor.digitize(half, gain=0.37), reference, rtol=0, atol=0)
 
 
@@ -215,7 +215,7 @@ def test_a_deep_relief_wraps_as_in_float64(levels):
     """The period in float32 is off by up to 6e-8 of itself, 83 times over in 100 um."""
     height = 100e-6 * torch.rand(64, 64, generator=torch.Generator().manual_seed(1))
     how = {"material": "fused silica", "wrap_at": 550e-9, "levels": levels, "max_height": None}
-    made, exact = doe.fabricate(height, **how), doe.fabricate.ref(height, **how)
+    made, exact = doe.fabricate(height, **how), doe.fabricate.hooks.reference(height, **how)
     wave = wave_height("fused silica", 550e-9)
     assert float((made.double() - exact).abs().max()) <= 1e-7 * wave
 
@@ -242,7 +242,7 @@ def test_a_lamp_a_million_times_as_bright_does_not_drown_the_dark(border):
     scene[0, 20, 20] = 1.0  # the other band has no lamp
     kernel = torch.rand(2, 7, 7, generator=rng).pow(8)
     psf = psf_of(kernel / kernel.sum((-2, -1), keepdim=True))
-    found, exact = optics.image(scene, psf, border=border), optics.image.ref(scene, psf, border=border)
+    found, exact = optics.image(scene, psf, border=border), optics.image.hooks.reference(scene, psf, border=border)
     dim = exact < 1e-5
     assert bool(dim[0].any())
     assert float((found - exact)[dim].abs().max()) <= 1e-5 * float(exact[dim].max())
@@ -268,7 +268,7 @@ def test_an_image_in_half_precision_is_formed_in_single(half):
 @pytest.mark.parametrize("lift", [spectra.lift_mallett, spectra.lift_lmmse])
 def test_black_has_the_slope_of_the_reference(lift):
     black = torch.zeros(3, 4, 4, dtype=torch.float64)
-    usual, truth = (slope_of(lambda x, f=f: f(x, bands_of(5)).sum(), black) for f in (lift, lift.ref))
+    usual, truth = (slope_of(lambda x, f=f: f(x, bands_of(5)).sum(), black) for f in (lift, lift.hooks.reference))
     torch.testing.assert_close(usual, truth)
 
 

@@ -57,9 +57,9 @@ def together(cube: Tensor) -> Tensor:
     return cube.mean(0)
 
 
-@together.carries
+@together.propagate_error
 def _(cube, *, result):
-    return cube.bound
+    return cube.rms
 
 
 @node()
@@ -68,14 +68,14 @@ def glow(image: Tensor, *, amount: Real) -> Tensor:
     return image * (1 + amount)
 
 
-@glow.negligible
+@glow.skip_bound
 def _(image, *, amount):
     return abs(amount)
 
 
-@glow.carries
+@glow.propagate_error
 def _(image, *, result, amount):
-    return image.bound * (1 + amount)
+    return image.rms * (1 + amount)
 
 
 @node()
@@ -84,6 +84,6 @@ def noise(image: Tensor, *, sigma: Real, rng: Generator) -> Tensor:
     return image * (1 + sigma * torch.randn((), generator=rng, dtype=torch.float64).to(image))
 
 
-@noise.carries
+@noise.propagate_error
 def _(image, *, result, sigma):
-    return image.bound * (1 + 5 * sigma)
+    return image.rms * (1 + 5 * sigma)

@@ -45,7 +45,7 @@ def mistakes(read):
     def mistakes(text, *arguments):
         with pytest.raises(RecipeError) as caught:
             read(text, *arguments)
-        return [" | ".join(filter(None, (str(p.mark), p.path, p.message))) for p in caught.value.problems]
+        return [" | ".join(filter(None, (str(p.mark), p.path, p.message))) for p in caught.value.diagnostics]
 
     return mistakes
 

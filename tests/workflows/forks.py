@@ -126,7 +126,7 @@ def once(job: dict[str, Any]) -> dict[str, Any]:
 
     import neusee.nodes
     from neusee.workflows.engine.runner import run
-    from neusee.workflows.graph.diagnostics import Mark
+    from neusee.workflows.graph.diagnostics import Location
     from neusee.workflows.graph.recipe_graph import Recipe, Step
     from neusee.workflows.store.result_store import Store
 
@@ -135,7 +135,7 @@ def once(job: dict[str, Any]) -> dict[str, Any]:
     store = Store(Path(job["store"]))
     scope = {"family": family, "store": store, "job": job}
     exec(job.get("first", ""), scope)
-    mark, steps = Mark("forks.yaml", 1, 1), {}
+    mark, steps = Location("forks.yaml", 1, 1), {}
     for name, node, params, wires in job["steps"]:
         params = {k: Path(v["file"]) if isinstance(v, dict) else v for k, v in params.items()}
         steps[name] = Step(name, getattr(family, node), params, wires, mark, {})

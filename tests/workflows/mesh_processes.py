@@ -25,7 +25,7 @@ from neusee.workflows import Store, load
 from neusee.workflows.training.parallel.process_mesh import Mesh, joined
 from neusee.workflows.training.run_training import _photographs, train
 from neusee.workflows.training.training_iteration import Learner
-from neusee.workflows.training.training_pictures import Samples
+from neusee.workflows.training.training_pictures import TrainingStream
 
 LONGEST = 120.0  #: s, after which a process counts as hanging
 
@@ -36,7 +36,7 @@ def step(job: dict[str, Any], mesh: Mesh) -> None:
     how = recipe.training
     learner = Learner(recipe, how, "cpu", mesh=mesh)
     learner.begin(how.stages[1], True)
-    samples = Samples(recipe, how, _photographs(recipe, how, True), Store(Path(job["store"])), "cpu", None, mesh)
+    samples = TrainingStream(recipe, how, _photographs(recipe, how, True), Store(Path(job["store"])), "cpu", None, mesh)
     losses, _ = learner.iterate(samples, 1, 0)
     if mesh.first:
         parts = {n: getattr(learner, n).named_parameters() for n in ("relief", "net", "critics")}
@@ -55,7 +55,7 @@ def fail(job: dict[str, Any], mesh: Mesh) -> None:
     """A training whose last process raises in its second iteration."""
     usual = Learner.iterate
 
-    def iterate(self: Learner, samples: Samples, stage: int, iteration: int) -> Any:
+    def iterate(self: Learner, samples: TrainingStream, stage: int, iteration: int) -> Any:
         if (stage, iteration, mesh.rank) == (1, 1, mesh.size - 1):
             raise ValueError("this one cannot go on")
         return usual(self, samples, stage, iteration)

@@ -13,11 +13,11 @@ from neusee.nodes.calibrate import Sufficient
 from neusee.nodes.values import Levels
 from neusee.workflows.calibration import calibration_figures as figures
 from neusee.workflows.calibration.identifiability import KINDS, Known
-from neusee.workflows.calibration.log_posterior import Problem
+from neusee.workflows.calibration.log_posterior import SensorPosterior
 from neusee.workflows.calibration.model_spread import Figure
 from neusee.workflows.calibration.model_spread import Row as Model
 from neusee.workflows.calibration.posterior_checks import Check, failed
-from neusee.workflows.calibration.posterior_mode import Peak
+from neusee.workflows.calibration.posterior_mode import LaplaceFit
 from neusee.workflows.report.study_page import Mark, Section
 
 if TYPE_CHECKING:
@@ -61,8 +61,8 @@ class Row:
 class Finding:
     """All that a calibration found."""
 
-    problem: Problem
-    peak: Peak
+    problem: SensorPosterior
+    peak: LaplaceFit
     known: Known
     chains: Chains
     checks: Sequence[Check]

@@ -16,8 +16,8 @@ import emcee
 import numpy as np
 
 from neusee.workflows.calibration.ensembles import Walk, go_on
-from neusee.workflows.calibration.log_posterior import Problem
-from neusee.workflows.calibration.posterior_mode import Peak
+from neusee.workflows.calibration.log_posterior import SensorPosterior
+from neusee.workflows.calibration.posterior_mode import LaplaceFit
 
 if TYPE_CHECKING:
     from neusee.workflows.calibration.log_posterior import Places
@@ -63,8 +63,8 @@ def move(name: str) -> Any:
 
 
 def sample(
-    problem: Problem,
-    peak: Peak,
+    problem: SensorPosterior,
+    peak: LaplaceFit,
     file: Path,
     *,
     seed: int,
@@ -104,7 +104,9 @@ def _round(iteration: int) -> tuple[int, int]:
     return before, steps
 
 
-def _begun(problem: Problem, peak: Peak, file: Path, index: int, seed: int, walkers: int, moves: Any) -> Walk:
+def _begun(
+    problem: SensorPosterior, peak: LaplaceFit, file: Path, index: int, seed: int, walkers: int, moves: Any
+) -> Walk:
     """An ensemble that starts from the normal law about the peak, or where it stopped."""
     dimensions = len(problem.names)
     backend = _read(file, index)
@@ -119,7 +121,7 @@ def _begun(problem: Problem, peak: Peak, file: Path, index: int, seed: int, walk
     return Walk(backend, moves, random, _alive(problem, peak, walkers, rng))
 
 
-def _alive(problem: Problem, peak: Peak, walkers: int, rng: np.random.Generator) -> Places:
+def _alive(problem: SensorPosterior, peak: LaplaceFit, walkers: int, rng: np.random.Generator) -> Places:
     """Starting places that the posterior knows: beside the number of a full well there is none, or next to none."""
     found = np.empty((0, len(peak.place)))
     for _ in range(50):

@@ -8,8 +8,8 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from neusee.workflows.calibration.log_posterior import Problem
-from neusee.workflows.calibration.posterior_mode import Peak
+from neusee.workflows.calibration.log_posterior import SensorPosterior
+from neusee.workflows.calibration.posterior_mode import LaplaceFit
 
 if TYPE_CHECKING:
     from neusee.workflows.calibration.log_posterior import Places
@@ -39,7 +39,7 @@ class Known:
         return tuple(name for name, kind in self.kinds.items() if kind == "estimate")
 
 
-def known(problem: Problem, peak: Peak) -> Known:
+def known(problem: SensorPosterior, peak: LaplaceFit) -> Known:
     """Singular values of what the levels tell by standard deviations of the prior, and what the small ones mean."""
     _, s, v = np.linalg.svd(peak.told)
     s = np.concatenate([s, np.zeros(len(v) - len(s))])
@@ -78,7 +78,7 @@ def _sorted_out(weak: Places) -> Sequence[Places]:
     return [*units, *v[: len(weak) - len(alone)]]
 
 
-def _limit(problem: Problem, peak: Peak, name: str) -> str:
+def _limit(problem: SensorPosterior, peak: LaplaceFit, name: str) -> str:
     """Which way the levels contradict a parameter, all others left where they are."""
     at = problem.names.index(name)
     z = np.repeat(problem.whitened(peak.place)[None], 2, 0)

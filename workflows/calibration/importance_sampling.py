@@ -6,8 +6,8 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from neusee.workflows.calibration.log_posterior import Problem
-from neusee.workflows.calibration.posterior_mode import Peak
+from neusee.workflows.calibration.log_posterior import SensorPosterior
+from neusee.workflows.calibration.posterior_mode import LaplaceFit
 
 if TYPE_CHECKING:
     from neusee.workflows.calibration.log_posterior import Places
@@ -17,7 +17,7 @@ _ROUNDS, _TAIL = 8, 6.0
 _ENOUGH, _SOFT, _LEAST = 0.3, 0.1, 0.02  #: of the draws, how many they must be worth: to end, to go on by, at all
 
 
-def drawn(problem: Problem, top: Peak, rng: np.random.Generator) -> tuple[Places, Places]:
+def drawn(problem: SensorPosterior, top: LaplaceFit, rng: np.random.Generator) -> tuple[Places, Places]:
     """Places, and the logarithm of the posterior over the law that they were drawn from.
 
     The law has wide tails, begins as that about the peak, and is fitted to the weighed draws until they agree. Raises
@@ -51,7 +51,9 @@ def weights(log: Places) -> Places:
     return found
 
 
-def _proposed(problem: Problem, centre: Places, covariance: Places, rng: np.random.Generator) -> tuple[Places, Places]:
+def _proposed(
+    problem: SensorPosterior, centre: Places, covariance: Places, rng: np.random.Generator
+) -> tuple[Places, Places]:
     """Places by Student's law, and the logarithm of the posterior over that law."""
     off = rng.standard_normal((DRAWS, len(centre))) / np.sqrt(rng.chisquare(_TAIL, (DRAWS, 1)) / _TAIL)
     places = centre + off @ np.linalg.cholesky(covariance).T

@@ -9,7 +9,7 @@ import torch
 
 from neusee.nodes.calibrate import guess, guess_camera
 from neusee.nodes.values import Levels
-from neusee.workflows.calibration.log_posterior import Problem
+from neusee.workflows.calibration.log_posterior import SensorPosterior
 
 if TYPE_CHECKING:
     from neusee.workflows.calibration.log_posterior import Places
@@ -17,7 +17,7 @@ if TYPE_CHECKING:
 _NARROWER = 0.5 ** np.arange(1, 12)
 
 
-def begin(problem: Problem) -> Places:
+def begin(problem: SensorPosterior) -> Places:
     """A place where the posterior is not none: the guess, or on the way from it to the middle of the prior.
 
     Raises ValueError where there is none on that way.

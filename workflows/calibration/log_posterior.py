@@ -32,7 +32,7 @@ _KINDS: dict[str, tuple[str, type[Coordinates] | type[CameraCoordinates]]] = {
 
 
 @dataclass(frozen=True)
-class Problem:
+class SensorPosterior:
     """A recipe's calibration: a place is a row of coordinates, one for each free parameter."""
 
     recipe: Recipe
@@ -44,7 +44,7 @@ class Problem:
     tell: Callable[[Mapping[str, Any]], dict[str, Any]]  #: also deviances and what the levels tell
 
     @classmethod
-    def of(cls, recipe: Recipe, store: Store) -> Problem:
+    def of(cls, recipe: Recipe, store: Store) -> SensorPosterior:
         """Raises ValueError for a recipe without both steps, or with two of one."""
         density, prior, kind = _pair(recipe)
         source = str(density.wires["levels"])

@@ -12,8 +12,8 @@ import numpy as np
 from neusee.workflows.calibration.goodness_of_fit import MISFIT, fit
 from neusee.workflows.calibration.identifiability import Known
 from neusee.workflows.calibration.importance_sampling import drawn, weights
-from neusee.workflows.calibration.log_posterior import Problem
-from neusee.workflows.calibration.posterior_mode import Peak
+from neusee.workflows.calibration.log_posterior import SensorPosterior
+from neusee.workflows.calibration.posterior_mode import LaplaceFit
 
 if TYPE_CHECKING:
     from neusee.workflows.calibration.emcee_sampler import Chains
@@ -72,7 +72,7 @@ def arviz() -> Any:
     return found
 
 
-def weighed(problem: Problem, peak: Peak, seed: int) -> Weighed:
+def weighed(problem: SensorPosterior, peak: LaplaceFit, seed: int) -> Weighed:
     """Importance sampling, with Pareto-smoothed weights."""
     places, log = drawn(problem, peak, np.random.default_rng(seed))
     with warnings.catch_warnings():
@@ -81,7 +81,7 @@ def weighed(problem: Problem, peak: Peak, seed: int) -> Weighed:
     return Weighed(places, weights(smooth), float(tail))
 
 
-def checks(problem: Problem, peak: Peak, known: Known, chains: Chains, law: Weighed) -> list[Check]:
+def checks(problem: SensorPosterior, peak: LaplaceFit, known: Known, chains: Chains, law: Weighed) -> list[Check]:
     """All of them; one that fails makes the posterior unfit for use."""
     found = [*_of_chains(chains), *_of_peak(problem, peak, known, chains, law), *_of_data(problem, peak, known)]
     return found
@@ -108,7 +108,7 @@ def _of_chains(chains: Chains) -> Iterator[Check]:
     yield Check("no walker is stranded", said, "none", _mark(lost == 0))
 
 
-def _of_peak(problem: Problem, peak: Peak, known: Known, chains: Chains, law: Weighed) -> Iterator[Check]:
+def _of_peak(problem: SensorPosterior, peak: LaplaceFit, known: Known, chains: Chains, law: Weighed) -> Iterator[Check]:
     yield Check(
         "the peak was found", "settled" if peak.settled else "the search stopped", "settled", _mark(peak.settled)
     )
@@ -129,7 +129,7 @@ def _of_peak(problem: Problem, peak: Peak, known: Known, chains: Chains, law: We
     yield Check("importance sampling agrees", said, bar, _mark(agrees, "fail" if law.tail < _TAIL else "warn"))
 
 
-def _of_data(problem: Problem, peak: Peak, known: Known) -> Iterator[Check]:
+def _of_data(problem: SensorPosterior, peak: LaplaceFit, known: Known) -> Iterator[Check]:
     look = problem.look(peak.place[None])
     if float(look.freedom.sum()) > len(known.estimated):
         found = fit(look, len(known.estimated))

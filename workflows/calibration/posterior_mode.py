@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from neusee.workflows.calibration.log_posterior import Problem
+from neusee.workflows.calibration.log_posterior import SensorPosterior
 
 if TYPE_CHECKING:
     from neusee.workflows.calibration.log_posterior import Places
@@ -22,7 +22,7 @@ _SHORT = 1e-7  #: the same before any deviation is known: a well is known to a p
 
 
 @dataclass(frozen=True)
-class Peak:
+class LaplaceFit:
     """A normal law about the highest place."""
 
     place: Places  #: (free,)
@@ -41,14 +41,14 @@ class Peak:
         return found
 
 
-def log_law(top: Peak, places: Places) -> Places:
+def log_law(top: LaplaceFit, places: Places) -> Places:
     """(count,) of the normal law about a peak, but for a constant."""
     off = places - top.place
     found: Places = -0.5 * np.einsum("ni,ij,nj->n", off, np.linalg.pinv(top.covariance, hermitian=True), off)
     return found
 
 
-def peak(problem: Problem, begin: Places) -> Peak:
+def peak(problem: SensorPosterior, begin: Places) -> LaplaceFit:
     """Climb from ``begin``; what no level tells stays as wide as the prior."""
     place, step_of = begin, np.full(len(begin), _SHORT)
     log = float(problem.log_posterior(place[None])[0])
@@ -72,10 +72,10 @@ def peak(problem: Problem, begin: Places) -> Peak:
     settled = bool(free @ covariance @ free < _NEXT)
     told = rows @ np.linalg.inv(prior)
     shares = np.sqrt((prior @ covariance @ prior.T).diagonal())
-    return Peak(place, log, covariance, told, shares, settled)
+    return LaplaceFit(place, log, covariance, told, shares, settled)
 
 
-def _climb(problem: Problem, place: Places, log: float, step: Places) -> tuple[Places, float, bool]:
+def _climb(problem: SensorPosterior, place: Places, log: float, step: Places) -> tuple[Places, float, bool]:
     """The best of ever shorter steps, tried at once: all coordinates, and all but one that may stand at an edge."""
     ways = np.concatenate([step[None], step * (1 - np.eye(len(step)))])
     tries = (place + ways[:, None] * 0.5 ** np.arange(24)[:, None]).reshape(-1, len(place))
@@ -96,7 +96,7 @@ def _differences(of: Callable[[Places], Places], place: Places, step: Places, si
     return slopes
 
 
-def _sides(problem: Problem, place: Places, step: Places) -> Places:
+def _sides(problem: SensorPosterior, place: Places, step: Places) -> Places:
     """(2, free) 1 where a step up, or down, is possible: beside a full well, or the end of a converter, it is not."""
     apart = np.diag(step)
     log = problem.log_posterior(np.concatenate([place[None], place + apart, place - apart]))
@@ -104,7 +104,7 @@ def _sides(problem: Problem, place: Places, step: Places) -> Places:
     return found
 
 
-def _slopes(problem: Problem, place: Places, step: Places) -> tuple[Places, Places]:
+def _slopes(problem: SensorPosterior, place: Places, step: Places) -> tuple[Places, Places]:
     """What levels and prior tell of each coordinate: Fisher's information is the product of each with itself."""
     rows = _differences(lambda p: problem.look(p).scaled.numpy(), place, step, _sides(problem, place, step))
     rounded = problem.recipe.steps[problem.step].params["rounding"] == "nearest"
@@ -115,13 +115,13 @@ def _slopes(problem: Problem, place: Places, step: Places) -> tuple[Places, Plac
     return rows, _differences(problem.whitened, place, step, np.ones((2, len(step))))
 
 
-def _gradient(problem: Problem, place: Places, step: Places) -> Places:
+def _gradient(problem: SensorPosterior, place: Places, step: Places) -> Places:
     sides = _sides(problem, place, step)
     found: Places = _differences(lambda p: problem.log_posterior(p)[:, None], place, step, sides)[0]
     return found
 
 
-def _free(problem: Problem, place: Places, step: Places, gradient: Places) -> Places:
+def _free(problem: SensorPosterior, place: Places, step: Places, gradient: Places) -> Places:
     """The slope without what leads over an edge: what lies beyond cannot be, and the highest place is there."""
     up, down = _sides(problem, place, step) == 0
     found: Places = np.where((up & (gradient > 0)) | (down & (gradient < 0)), 0.0, gradient)

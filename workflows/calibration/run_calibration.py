@@ -18,7 +18,7 @@ from neusee.nodes.values import Levels
 from neusee.workflows.calibration.calibration_page import Finding, banner, lead, sections
 from neusee.workflows.calibration.identifiability import known
 from neusee.workflows.calibration.initial_guess import begin
-from neusee.workflows.calibration.log_posterior import Problem
+from neusee.workflows.calibration.log_posterior import SensorPosterior
 from neusee.workflows.calibration.model_spread import spread
 from neusee.workflows.calibration.posterior_checks import arviz, checks, failed, weighed
 from neusee.workflows.calibration.posterior_mode import peak
@@ -29,7 +29,7 @@ from neusee.workflows.keys.engine_digest import engine
 from neusee.workflows.report.run_folder import RunFolder, new_run
 from neusee.workflows.report.study_page import page
 from neusee.workflows.store.result_store import Store
-from neusee.workflows.studies.accuracy.work_precision_points import now
+from neusee.workflows.studies.accuracy.work_precision_points import timestamp
 
 Tell = Callable[[str], None]
 _KEPT = 4000  #: draws that go into the folder
@@ -69,7 +69,7 @@ def found(recipe: Recipe, store: Store, tell: Tell, *, walkers: int, move: str, 
 
     emcee_sampler.move(move)  # refused before anything is computed
     arviz()
-    problem = Problem.of(recipe, store)
+    problem = SensorPosterior.of(recipe, store)
     top = peak(problem, begin(problem))
     told = known(problem, top)
     if told.refused:
@@ -92,7 +92,7 @@ def _document(finding: Finding, command: Sequence[str], seconds: float) -> dict[
         "study": "calibrate",
         "recipe": problem.recipe.name,
         "command": " ".join(command),
-        "date": now(),
+        "date": timestamp(),
         "seconds": seconds,
         "failed": failed(finding.checks),
         "parameters": {row.name: _plain(asdict(row)) for row in finding.rows()},

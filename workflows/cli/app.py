@@ -61,7 +61,7 @@ Device = Annotated[str, typer.Option("--device", help="Where to compute: cpu, cu
 Where = Annotated[
     str, typer.Option("--executor", help="Who computes: local, dask, dask:4 (workers), or tcp://scheduler:8786.")
 ]
-KeepAll = Annotated[bool, typer.Option("--keep-all", help="Leave nothing out: every step in full.")]
+KeepAll = Annotated[bool, typer.Option("--exact", help="Leave nothing out: every step in full.")]
 Memory = Annotated[str, typer.Option("--memory", help="What a device may use, such as 6 GB; more is refused.")]
 
 
@@ -74,11 +74,11 @@ def run(
     device: Device = "cpu",
     executor: Where = "local",
     memory: Memory = "",
-    keep_all: KeepAll = False,
+    exact: KeepAll = False,
     out: Out = Path("runs"),
 ) -> None:
     """Run a recipe, from the cache where it can, and write its report."""
-    recipe, command = load(words, keep_all=keep_all)
+    recipe, command = load(words, exact=exact)
     from neusee.workflows.report import console
 
     check_device(device)
@@ -123,9 +123,9 @@ def _simulate(
 ) -> Simulation:
     from neusee.workflows.report.console import screen
     from neusee.workflows.simulation.simulate_recipe import simulate, steps_of, wanted
-    from neusee.workflows.tolerance.cheaper_steps import economised
+    from neusee.workflows.tolerance.cheaper_steps import with_substitutions
 
-    recipe = economised(recipe, wanted(recipe))
+    recipe = with_substitutions(recipe, wanted(recipe))
     with screen(recipe, steps_of(recipe), silent) as shown:
         return simulate(recipe, store, out, command, device, shown.watch, executor, memory)
 
@@ -145,11 +145,11 @@ def plan(
     debug: Debug = False,
     device: Device = "cpu",
     memory: Memory = "",
-    keep_all: KeepAll = False,
+    exact: KeepAll = False,
     devices: Annotated[str, typer.Option("--devices", help="Machines to simulate: a YAML file, or eight_a100.")] = "",
 ) -> None:
     """Say what would run, where, for how long and with how much memory; compute nothing."""
-    recipe, _ = load(words, keep_all=keep_all)
+    recipe, _ = load(words, exact=exact)
     from neusee.workflows.explain import run_forecast
 
     check_device(device)

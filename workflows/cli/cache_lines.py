@@ -7,7 +7,7 @@ from typing import Any
 
 from neusee.workflows.report.run_timing import size_of
 from neusee.workflows.store.budget_eviction import bytes_of
-from neusee.workflows.store.derived_files import Shelf
+from neusee.workflows.store.derived_files import DerivedFiles
 from neusee.workflows.store.metadata import is_kept
 from neusee.workflows.store.result_store import Store
 
@@ -30,7 +30,7 @@ def ls_lines(store: Store) -> list[str]:
 def verify_lines(store: Store) -> tuple[list[str], int]:
     """Read every value and every picture; a line for each that is damaged, and how many they are."""
     count, size, bad = 0, 0, list[str]()
-    shelf = Shelf(store)
+    shelf = DerivedFiles(store)
     for found in store.check():
         about = found.about or {}
         problem = found.problem or _picture_problem(shelf, found.key, about)
@@ -76,7 +76,7 @@ def _named(store: Store, prefix: str, pin: bool) -> str:
     return found[0]
 
 
-def _picture_problem(shelf: Shelf, key: str, about: dict[str, Any]) -> str:
+def _picture_problem(shelf: DerivedFiles, key: str, about: dict[str, Any]) -> str:
     """What is wrong with the file that an entry stands for, which is then put aside; empty where nothing is."""
     name = about.get("file")
     if not name or not is_kept(about) or shelf.find(key, os.path.basename(name)[len(key) :]) is not None:

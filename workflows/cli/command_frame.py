@@ -47,7 +47,7 @@ def split(words: list[str] | None, before: int = 0) -> tuple[str, list[str], int
     return name, words, 1 + named + before
 
 
-def load(words: list[str] | None, before: int = 0, keep_all: bool = False) -> tuple[Recipe, list[str]]:
+def load(words: list[str] | None, before: int = 0, exact: bool = False) -> tuple[Recipe, list[str]]:
     """The recipe that the words name with its changes, and the words to run it again."""
     name, changes, first = split(words, before)
     from neusee.workflows.graph.diagnostics import RecipeError
@@ -59,14 +59,14 @@ def load(words: list[str] | None, before: int = 0, keep_all: bool = False) -> tu
         refuse(error)
     gc.freeze()
     gc.enable()
-    if keep_all:
-        return replace(recipe, keep_all=True), ["neusee", "run", name, *changes, "--keep-all"]
+    if exact:
+        return replace(recipe, exact=True), ["neusee", "run", name, *changes, "--exact"]
     return recipe, ["neusee", "run", name, *changes]
 
 
 def refuse(error: RecipeError) -> NoReturn:
     """Say every mistake of a recipe and stop."""
-    count = len(error.problems)
+    count = len(error.diagnostics)
     fail(f"{error}\n{count} problem{'s' * (count > 1)}, nothing was run")
 
 

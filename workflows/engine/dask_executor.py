@@ -19,7 +19,7 @@ import torch
 
 from neusee.workflows.engine.memory_use import there_is
 from neusee.workflows.engine.node_call import RunError
-from neusee.workflows.engine.step_job import Lane, Lost, Outcome, Work, carry_out
+from neusee.workflows.engine.step_job import InputMissing, Lane, Outcome, StepJob, carry_out
 from neusee.workflows.keys.cache_key import Key
 from neusee.workflows.keys.code_digest import Code
 from neusee.workflows.store.remote_store import open_store
@@ -42,7 +42,7 @@ class Dask:
         self.threads = torch.get_num_threads()  # sums over threads round as they do here
         self._lanes: dict[str, Lane] = {}
         self._looked = -_LOOK
-        self._running: dict[Any, tuple[Work, ...]] = {}
+        self._running: dict[Any, tuple[StepJob, ...]] = {}
         self._tries: dict[Key, int] = {}
 
     @property
@@ -52,7 +52,7 @@ class Dask:
             self._look()
         return self._lanes
 
-    def submit(self, work: Sequence[Work]) -> None:
+    def submit(self, work: Sequence[StepJob]) -> None:
         """Send one chain to the worker of its lane, or to another if that one goes."""
         self._tries[work[0].key] = self._tries.get(work[0].key, 0) + 1
         future = self.client.submit(
@@ -136,7 +136,7 @@ class _Here:
             try:
                 self.keep(key, self.store.get(key))
             except KeyError:
-                raise Lost(key) from None
+                raise InputMissing(key) from None
         self.values.move_to_end(key)
         return self.values[key]
 
@@ -159,7 +159,7 @@ def lane_here(dask_worker: Any) -> tuple[str, float]:
     return "cpu", _PLANNED * min(there_is("cpu"), allowed or float("inf"))
 
 
-def work_here(chain: tuple[Work, ...], where: str, threads: int, room: float) -> list[Outcome]:
+def work_here(chain: tuple[StepJob, ...], where: str, threads: int, room: float) -> list[Outcome]:
     """Carry out a chain; the outcomes go back without their values, ``room`` bytes of which stay here."""
     if torch.get_num_threads() != threads:
         torch.set_num_threads(threads)
@@ -175,7 +175,7 @@ def work_here(chain: tuple[Work, ...], where: str, threads: int, room: float) ->
     return [_light(outcome) for outcome in outcomes]
 
 
-def _one_here(work: Work, here: _Here) -> Outcome:
+def _one_here(work: StepJob, here: _Here) -> Outcome:
     own = here.code.digest(work.step.node.fn.__module__)
     if own != work.origin["code"]:
         text = f"a worker has other code of {work.step.node.path}: give it the version that runs here"

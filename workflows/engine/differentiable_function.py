@@ -10,15 +10,15 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from neusee.nodes import Facts
+from neusee.nodes import TensorStats
 from neusee.workflows.engine.node_call import call, place
 from neusee.workflows.engine.runner import run
 from neusee.workflows.graph.diagnostics import nearest
 from neusee.workflows.graph.recipe_graph import Recipe, Step, in_order, needed
 from neusee.workflows.store.result_store import Store
 from neusee.workflows.store.serialization import settle
-from neusee.workflows.tolerance.cheaper_steps import economised
-from neusee.workflows.tolerance.error_budget import Ledger
+from neusee.workflows.tolerance.cheaper_steps import with_substitutions
+from neusee.workflows.tolerance.error_budget import ErrorBudget
 
 Theta = Mapping[str, Any]
 
@@ -42,7 +42,7 @@ def as_function(
     """
     wanted = recipe.outputs if outputs is None else tuple(outputs)
     given, tuned = _read(recipe, free)
-    recipe = economised(recipe, wanted, given | tuned.keys())
+    recipe = with_substitutions(recipe, wanted, given | tuned.keys())
     sources = {name: () if name in given else step.sources for name, step in recipe.steps.items()}
     order = in_order(sources, wanted)
     if idle := sorted((given | tuned.keys()) - set(order)):
@@ -94,7 +94,7 @@ class _Function:
         self._caller = caller
         self.recipe, self.free, self.wanted, self.device = recipe, free, wanted, device
         self.given, self.tuned, self.live, self.fixed = given, tuned, live, fixed
-        self._facts: dict[str, Facts | None] = {}
+        self._facts: dict[str, TensorStats | None] = {}
         self._spent = _spent(recipe, fixed, left_out)
         self._last = {source: name for name in live if name not in given for source in recipe.steps[name].sources}
 
@@ -112,9 +112,9 @@ class _Function:
                     del values[source]
         return {name: values[name] for name in self.wanted}
 
-    def _evaluate(self, step: Step, values: dict[str, Any], theta: Theta, ledger: Ledger, seed: int) -> Any:
+    def _evaluate(self, step: Step, values: dict[str, Any], theta: Theta, ledger: ErrorBudget, seed: int) -> Any:
         params = {**step.params, **{p: theta[full] for p, full in self.tuned.get(step.name, {}).items()}}
-        if step.node.bound is not None:
+        if step.node.hooks.skip_bound is not None:
             with torch.no_grad():
                 verdict = ledger.verdict(step, params, lambda name: self._facts_of(name, values))
             if verdict.left_out:
@@ -127,9 +127,9 @@ class _Function:
     def _facts_of(self, name: str, values: dict[str, Any]) -> Any:
         if name not in self.fixed:
             value = values[name]
-            return _Ends(value) if isinstance(value, Tensor) and value.dtype == torch.float32 else Facts.of(value)
+            return _Ends(value) if isinstance(value, Tensor) and value.dtype == torch.float32 else TensorStats.of(value)
         if name not in self._facts:
-            self._facts[name] = Facts.of(self.fixed[name])
+            self._facts[name] = TensorStats.of(self.fixed[name])
         return self._facts[name]
 
 
@@ -161,8 +161,8 @@ class _Ends:
         return self._value.numel() == 0 or all(map(math.isfinite, self._ends))
 
     @cached_property
-    def _whole(self) -> Facts:
-        found = Facts.of(self._value)
+    def _whole(self) -> TensorStats:
+        found = TensorStats.of(self._value)
         assert found is not None
         return found
 
@@ -170,9 +170,9 @@ class _Ends:
         return getattr(self._whole, name)
 
 
-def _spent(recipe: Recipe, fixed: Mapping[str, Any], left_out: Mapping[str, float]) -> Ledger:
+def _spent(recipe: Recipe, fixed: Mapping[str, Any], left_out: Mapping[str, float]) -> ErrorBudget:
     """What the fixed steps have spent of the tolerance."""
-    ledger = Ledger(recipe)
+    ledger = ErrorBudget(recipe)
     for name in needed(recipe, fixed):
         ledger.pass_on(recipe.steps[name])
         if name in left_out:

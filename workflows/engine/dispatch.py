@@ -6,13 +6,15 @@ import time
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import replace
 
-from neusee.workflows.engine.step_job import Executor, Outcome, Work
+from neusee.workflows.engine.step_job import Executor, Outcome, StepJob
 from neusee.workflows.keys.cache_key import Key
 
 _FIRST_LOOK, _LONGEST = 0.01, 0.5  #: s between looks at work that another process holds
 
-Chain = tuple[Work, ...]  #: steps of which each feeds the next and nothing else
-Room = Callable[[Work, Sequence[Work]], bool]  #: whether there is memory for one more beside those that run
+Chain = tuple[StepJob, ...]  #: steps of which each feeds the next and nothing else
+MemoryProfile = Callable[
+    [StepJob, Sequence[StepJob]], bool
+]  #: whether there is memory for one more beside those that run
 
 
 class Loop:
@@ -22,8 +24,8 @@ class Loop:
         self,
         chains: Sequence[Chain],
         executor: Executor,
-        begin: Callable[[Work], Work],
-        room: Room,
+        begin: Callable[[StepJob], StepJob],
+        room: MemoryProfile,
     ) -> None:
         self.executor, self.begin, self.room = executor, begin, room
         self.busy: dict[str, Chain] = {}
@@ -124,7 +126,7 @@ class Loop:
             self._ready.sort(reverse=True)
 
 
-def chains_of(works: Sequence[Work], fused: bool) -> list[Chain]:
+def chains_of(works: Sequence[StepJob], fused: bool) -> list[Chain]:
     """Every step alone, or, ``fused``, with those that follow it and nothing else on the same lane."""
     if not fused:
         return [(work,) for work in works]
@@ -133,7 +135,7 @@ def chains_of(works: Sequence[Work], fused: bool) -> list[Chain]:
         for key in set(work.sources):
             readers[key] = readers.get(key, 0) + 1
     planned = {work.key for work in works}
-    chains: dict[Key, list[Work]] = {}  # by the key at their end
+    chains: dict[Key, list[StepJob]] = {}  # by the key at their end
     for work in works:
         above = [key for key in dict.fromkeys(work.sources) if key in planned]
         chain = chains.get(above[0]) if len(above) == 1 else None
@@ -146,7 +148,7 @@ def chains_of(works: Sequence[Work], fused: bool) -> list[Chain]:
     return [tuple(chain) for chain in sorted(chains.values(), key=lambda c: order[c[0].key])]
 
 
-def _moved(work: Work, lane: str, device: str) -> Work:
+def _moved(work: StepJob, lane: str, device: str) -> StepJob:
     """``work`` on another lane; what computes on the CPU beside an accelerator does so there too."""
     return replace(work, lane=lane, device=device if _kind(work.device) == _kind(device) else work.device)
 

@@ -12,28 +12,28 @@ from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import replace
 from typing import Any
 
-from neusee.nodes import Check, Facts
+from neusee.nodes import Check, TensorStats
 from neusee.workflows.engine.cost_model import Costs, Estimate
 from neusee.workflows.engine.dispatch import Loop, chains_of
-from neusee.workflows.engine.load_or_recompute import Below, to_compute_again, uses_of, worth_a_look
+from neusee.workflows.engine.load_or_recompute import Upstream, cheaper_to_recompute, uses_of, worth_solving
 from neusee.workflows.engine.local_executor import Local
 from neusee.workflows.engine.node_call import RunError, places
 from neusee.workflows.engine.placement_inputs import joined, past_costs, prepare, room_for
-from neusee.workflows.engine.step_job import Executor, Lost, Outcome, Read, Work
-from neusee.workflows.engine.step_record import Done, Event, error_in, facts_in, ran
+from neusee.workflows.engine.step_job import Executor, InputMissing, Outcome, Read, StepJob
+from neusee.workflows.engine.step_record import Event, StepRecord, error_in, facts_in, ran
 from neusee.workflows.graph.recipe_graph import Recipe, Step, Wire, in_order
 from neusee.workflows.keys.cache_key import Key, key_of
 from neusee.workflows.keys.code_digest import Code
 from neusee.workflows.placement.heft_and_cpop import Schedule, TooLarge
 from neusee.workflows.store.result_store import Store
-from neusee.workflows.tolerance.error_budget import Ledger
-from neusee.workflows.tolerance.skip_decision import Verdict
+from neusee.workflows.tolerance.error_budget import ErrorBudget
+from neusee.workflows.tolerance.skip_decision import SkipDecision
 
 _QUICK = 1e-3  #: s below which two processes may as well both compute a step
 _UNKNOWN = 100.0  #: s of a step that nobody measured, where to load is weighed against to compute
 
 
-class UnderWay:
+class Execution:
     """One run under way."""
 
     def __init__(
@@ -56,12 +56,11 @@ class UnderWay:
         self.makers: dict[Key, Step] = {}  # the first step of each key
         self.origins: dict[Key, dict[str, Any]] = {}  # what went into each key
         self.values: dict[Key, Any] = {}
-        self.facts: dict[Key, Facts | None] = {}
+        self.facts: dict[Key, TensorStats | None] = {}
         self.again: dict[Key, float] = {}  # s to have a value again that was computed here
         self.took: dict[str, float] = {}  # the longest that a step of each node took, s
-        self.verdicts: dict[str, Verdict] = {}
-        self.ledger = Ledger(recipe)
-        self.done: dict[str, Done] = {}
+        self.verdicts, self.ledger = dict[str, SkipDecision](), ErrorBudget(recipe)
+        self.done: dict[str, StepRecord] = {}
         self.receipts: dict[Key, dict[str, Any]] = {}  # what is known of values that were not kept
         self.costs: Costs | None = None
         self.schedule: Schedule | None = None
@@ -70,7 +69,7 @@ class UnderWay:
         """Give every step its key, and leave out those whose bound allows it."""
         for name in order:
             step = self.recipe.steps[name]
-            if step.node.bound is not None:
+            if step.node.hooks.skip_bound is not None:
                 verdict = self.verdicts[name] = self._judge(step)
                 if verdict.left_out:
                     self._leave_out(step, verdict)
@@ -89,16 +88,16 @@ class UnderWay:
     def make(self, targets: list[Key], keep: bool, later: Sequence[Key] = ()) -> None:
         """Hold the values of ``targets``, what ``later`` needs of those made, and with ``keep`` what no store holds."""
         while True:
-            below = Below(self.known, self.sources)
+            below = Upstream(self.known, self.sources)
             order = in_order(below, targets)
             if again := self._dear(below, targets):
-                below = Below(lambda key, again=again: key not in again and self.known(key), self.sources)  # type: ignore[misc]
+                below = Upstream(lambda key, again=again: key not in again and self.known(key), self.sources)  # type: ignore[misc]
                 order = in_order(below, targets)
             try:
                 plan = [key for key in order if key in below.missing]
                 uses = uses_of(plan, [*targets, *later], self.known, self.sources)
                 return self._execute(plan, again, targets, keep, uses)
-            except Lost:
+            except InputMissing:
                 continue
 
     def close(self) -> None:
@@ -107,27 +106,29 @@ class UnderWay:
         self.own.cancel()
         del self.own, self.executor
 
-    def account(self, order: list[str]) -> dict[str, Done]:
+    def account(self, order: list[str]) -> dict[str, StepRecord]:
         """What became of every step, in running order."""
         for name in order:
             if name in self.done:
                 continue
             key = self.keys[name]
             twin = self.done.get(self.makers[key].name)
-            if twin is None or twin.state == "asleep":
+            if twin is None or twin.state == "not needed":
                 self._finish(self.asleep(name))
             else:
                 self._finish(replace(twin, step=name, state="cached", why=f"the same as {twin.step}", seconds=0.0))
         return {name: self.done[name] for name in order}
 
-    def asleep(self, name: str) -> Done:
+    def asleep(self, name: str) -> StepRecord:
         """The account of a step that nothing has needed."""
         bound, error = self._bound(name), error_in(self.store.about(self.keys[name]))
-        return Done(name, "asleep", "nothing that ran needed it", 0.0, self.keys[name], bound=bound, error=error)
+        return StepRecord(
+            name, "not needed", "nothing that ran needed it", 0.0, self.keys[name], bound=bound, error=error
+        )
 
     def missing(self, names: Iterable[str]) -> set[Key]:
         """What would have to be computed for the values of ``names``."""
-        below = Below(self.known, self.sources)
+        below = Upstream(self.known, self.sources)
         in_order(below, [self.keys[name] for name in names])
         return set(below.missing)
 
@@ -144,7 +145,7 @@ class UnderWay:
         self.receipts[key] = about
         return False
 
-    def _dear(self, below: Below, targets: list[Key]) -> frozenset[Key]:
+    def _dear(self, below: Upstream, targets: list[Key]) -> frozenset[Key]:
         """Stored values that take longer to read than to compute again, as far as that is the cheaper way."""
 
         def compute(key: Key) -> float:
@@ -155,9 +156,9 @@ class UnderWay:
             return 0.0 if key in self.values else self._reading(key) if self.known(key) else float("inf")
 
         read = [key for key in below if key not in below.missing and key not in self.values]
-        if not any(worth_a_look(self._reading(key), compute(key)) for key in read):
+        if not any(worth_solving(self._reading(key), compute(key)) for key in read):
             return frozenset()
-        return frozenset(to_compute_again(targets, self.sources, load, compute))
+        return frozenset(cheaper_to_recompute(targets, self.sources, load, compute))
 
     def _reading(self, key: Key) -> float:
         """Seconds to read a stored value."""
@@ -206,19 +207,19 @@ class UnderWay:
             self.executor.cancel()
             raise
 
-    def _work(self, key: Key, anew: bool, target: bool) -> Work:
+    def _work(self, key: Key, anew: bool, target: bool) -> StepJob:
         step = self.makers[key]
         reads = tuple(self._read(step.wires.get(name)) for name in step.node.inputs)
         device, lanes = places(step, self.devices)[0], self.executor.lanes
         lane = next(iter(lanes)) if len(lanes) == 1 else ""
         wanted = target or step.name in self.wanted
         name, seed = self.recipe.name, self.recipe.seed
-        return Work(step, key, self.origins[key], reads, seed, name, device, lane, wanted, anew=anew)
+        return StepJob(step, key, self.origins[key], reads, seed, name, device, lane, wanted, anew=anew)
 
     def _read(self, wire: Wire) -> Read:
         return self.keys[wire] if isinstance(wire, str) else wire and tuple(self.keys[name] for name in wire)
 
-    def _begin(self, work: Work) -> Work:
+    def _begin(self, work: StepJob) -> StepJob:
         """Say that a step begins; by now it is known what its inputs would cost to have again."""
         self.watch(Event(work.step.name, None))
         below = sum(self.again[key] if key in self.again else self._reading(key) for key in set(work.sources))
@@ -230,7 +231,7 @@ class UnderWay:
         work = outcome.work
         step, key = work.step, work.key
         if outcome.lost:
-            raise Lost(*outcome.lost)
+            raise InputMissing(*outcome.lost)
         if outcome.error is not None:
             raise outcome.error if isinstance(outcome.error, RunError) else RunError(step, [], outcome.error)
         if outcome.found:
@@ -244,31 +245,31 @@ class UnderWay:
         self._finish(ran(outcome, self._why(step.name, key), self._bound(step.name), self.began, predicted))
 
     def _fetch(self, key: Key) -> Any:
-        """A value that was computed, or is stored; `Lost` where it is neither."""
+        """A value that was computed, or is stored; `InputMissing` where it is neither."""
         if key not in self.values:
             began = time.perf_counter()
             try:
                 self.values[key] = self.store.get(key)
             except KeyError:
-                raise Lost(key) from None
+                raise InputMissing(key) from None
             if self.makers[key].name not in self.done:
                 self._finish(self._cached(key, seconds=time.perf_counter() - began))
         return self.values[key]
 
-    def _cached(self, key: Key, why: str = "", seconds: float = 0.0) -> Done:
+    def _cached(self, key: Key, why: str = "", seconds: float = 0.0) -> StepRecord:
         about = self.store.about(key)
         if about is None:
-            raise Lost(key)
+            raise InputMissing(key)
         name = self.makers[key].name
         why = why or f"made {about['date']} in {about['seconds']:.3g} s"
         checks = tuple(Check(text, ok) for text, ok in about["checks"])
         facts, bound, error = facts_in(about), self._bound(name), error_in(about)
-        return Done(name, "cached", why, seconds, key, facts, checks, "cpu", about["bytes"], bound, error=error)
+        return StepRecord(name, "cached", why, seconds, key, facts, checks, "cpu", about["bytes"], bound, error=error)
 
-    def _judge(self, step: Step) -> Verdict:
+    def _judge(self, step: Step) -> SkipDecision:
         """The verdict on a step; an input runs first where the bound asks for facts that no one has yet."""
 
-        def facts_of(name: str) -> Facts | None:
+        def facts_of(name: str) -> TensorStats | None:
             key = self.keys[name]
             if key not in self.facts and self.store.about(key) is None:
                 self.make([key], keep=True)
@@ -276,14 +277,14 @@ class UnderWay:
 
         return self.ledger.verdict(step, step.params, facts_of)
 
-    def known_facts(self, name: str) -> Facts | None:
+    def known_facts(self, name: str) -> TensorStats | None:
         """Facts of a step that ran, now or before."""
         key = self.keys[name]
         return self.facts[key] if key in self.facts else facts_in(self.store.about(key))
 
-    def _leave_out(self, step: Step, verdict: Verdict) -> None:
+    def _leave_out(self, step: Step, verdict: SkipDecision) -> None:
         key = self.keys[step.name] = self.keys[verdict.instead]
-        self._finish(Done(step.name, "left out", verdict.why, 0.0, key, bound=verdict.bound))
+        self._finish(StepRecord(step.name, "left out", verdict.why, 0.0, key, bound=verdict.bound))
 
     def _why(self, name: str, key: Key) -> str:
         verdict = self.verdicts.get(name)
@@ -293,6 +294,6 @@ class UnderWay:
     def _bound(self, name: str) -> float | None:
         return self.verdicts[name].bound if name in self.verdicts else None
 
-    def _finish(self, done: Done) -> None:
+    def _finish(self, done: StepRecord) -> None:
         self.done[done.step] = done
         self.watch(Event(done.step, done))

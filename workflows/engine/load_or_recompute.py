@@ -21,7 +21,7 @@ _SCALE = 1 << 30  #: capacities are whole numbers of 31 bits
 Price = Callable[[Key], float]
 
 
-class Below(dict[Key, list[Key]]):
+class Upstream(dict[Key, list[Key]]):
     """By key the keys that it needs: its sources where it must be computed, none where its value is known."""
 
     def __init__(self, known: Callable[[Key], bool], sources: Callable[[Key], list[Key]]) -> None:
@@ -41,19 +41,19 @@ def uses_of(
     plan: Iterable[Key], targets: Sequence[Key], known: Callable[[Key], bool], sources: Callable[[Key], list[Key]]
 ) -> Counter[Key]:
     """How often ``plan``, ``targets``, and what has yet to be computed for them afterwards, take each value."""
-    below, uses = Below(known, sources), Counter(targets)
+    below, uses = Upstream(known, sources), Counter(targets)
     in_order(below, targets)
     for key in below.missing.union(plan):
         uses.update(sources(key))
     return uses
 
 
-def worth_a_look(load: float, compute: float) -> bool:
+def worth_solving(load: float, compute: float) -> bool:
     """Whether a stored value may be cheaper to compute than to load."""
     return load > compute + _GAIN
 
 
-def to_compute_again(
+def cheaper_to_recompute(
     targets: Sequence[Key], sources: Callable[[Key], Sequence[Key]], load: Price, compute: Price
 ) -> set[Key]:
     """Stored keys that are cheaper to compute than to load.

@@ -11,8 +11,8 @@ from concurrent.futures import FIRST_COMPLETED, Future, ThreadPoolExecutor, wait
 from typing import Any
 
 from neusee.workflows.engine.memory_use import pool_of, there_is
-from neusee.workflows.engine.step_job import Lane, Outcome, Work, carry_out
-from neusee.workflows.engine.write_behind import Later
+from neusee.workflows.engine.step_job import Lane, Outcome, StepJob, carry_out
+from neusee.workflows.engine.write_behind import WriteBehind
 from neusee.workflows.keys.cache_key import Key
 from neusee.workflows.store.result_store import Store
 
@@ -35,12 +35,12 @@ class Local:
     ) -> None:
         self.lanes = lanes_of(devices, memory)
         self._store, self._fetch = store, fetch
-        self._queue: deque[Work] = deque()
-        self.later = Later()
+        self._queue: deque[StepJob] = deque()
+        self.later = WriteBehind()
         self._pools: dict[str, ThreadPoolExecutor] = {}
         self._running: set[Future[Outcome]] = set()
 
-    def submit(self, work: Sequence[Work]) -> None:
+    def submit(self, work: Sequence[StepJob]) -> None:
         """Queue one step."""
         for one in work:
             if len(self.lanes) == 1:

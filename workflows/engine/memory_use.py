@@ -12,7 +12,7 @@ import torch
 _CGROUPS = ("/sys/fs/cgroup/memory.max", "/sys/fs/cgroup/memory/memory.limit_in_bytes")
 
 
-class Peak:
+class PeakMemory:
     """Bytes that a block of code took at most, beside what was there before it.
 
     Of the CPU it is the resident memory of the whole process, so that steps side by side

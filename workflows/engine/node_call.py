@@ -57,10 +57,10 @@ def call(step: Step, inputs: Sequence[Any], params: Mapping[str, Any], seed: int
 
 def examine(step: Step, value: Any, inputs: Sequence[Any]) -> tuple[Check, ...]:
     """What the node's own check says of a result; a check that fails to run is a check that failed."""
-    if step.node.after is None:
+    if step.node.hooks.check is None:
         return ()
     try:
-        return tuple(step.node.after(value, *inputs, **step.params))
+        return tuple(step.node.hooks.check(value, *inputs, **step.params))
     except Exception as error:
         return (Check(f"the check itself failed: {type(error).__name__}: {error}", False),)
 

@@ -7,10 +7,10 @@ from dataclasses import dataclass, replace
 from typing import Any
 
 from neusee.workflows.engine.cost_model import Costs, Estimate
-from neusee.workflows.engine.dispatch import Room
+from neusee.workflows.engine.dispatch import MemoryProfile
 from neusee.workflows.engine.memory_use import pool_of
 from neusee.workflows.engine.node_call import places
-from neusee.workflows.engine.step_job import Executor, Lane, Work
+from neusee.workflows.engine.step_job import Executor, Lane, StepJob
 from neusee.workflows.keys.cache_key import Key
 from neusee.workflows.placement.heft_and_cpop import Cluster, Device, Schedule, Slot, Task, heft
 from neusee.workflows.store.result_store import Store
@@ -23,13 +23,13 @@ _MOST_PARTS = 64  #: into which a step may be cut by bands; how many bands there
 class Prepared:
     """Work in the order in which it should begin, what it should take, and when it should be where."""
 
-    works: list[Work]
+    works: list[StepJob]
     expected: Mapping[Key, Estimate]
     schedule: Schedule | None
 
 
 def prepare(
-    works: Sequence[Work],
+    works: Sequence[StepJob],
     costs: Costs,
     abouts: Mapping[Key, Mapping[str, Any]],
     lanes: Mapping[str, Lane],
@@ -52,10 +52,10 @@ def prepare(
     return Prepared([_placed(planned[slot.task], slot, lanes) for slot in slots], expected, schedule)
 
 
-def room_for(expected: Mapping[Key, Estimate], executor: Executor, values: Mapping[Key, Any]) -> Room:
+def room_for(expected: Mapping[Key, Estimate], executor: Executor, values: Mapping[Key, Any]) -> MemoryProfile:
     """Whether one more step may run beside those that do, given the ``values`` that are held at that moment."""
 
-    def room(work: Work, running: Sequence[Work]) -> bool:
+    def room(work: StepJob, running: Sequence[StepJob]) -> bool:
         pool = pool_of(work.device)
         beside = [w for w in running if pool_of(w.device) == pool]
         if not beside or not executor.shares:
@@ -79,12 +79,12 @@ def joined(first: Schedule | None, then: Schedule | None) -> Schedule | None:
     return Schedule((*first.slots, *slots), by + then.makespan, peak, transferred, (*first.moves, *moves))
 
 
-def _placed(work: Work, slot: Slot, lanes: Mapping[str, Lane]) -> Work:
+def _placed(work: StepJob, slot: Slot, lanes: Mapping[str, Lane]) -> StepJob:
     device = "cpu" if _cpu_only(work) else lanes[slot.device].device
     return replace(work, lane=slot.device, device=device, parts=slot.parts)
 
 
-def _task(work: Work, estimate: Estimate, lanes: Mapping[str, Lane], names: Mapping[Key, str]) -> Task:
+def _task(work: StepJob, estimate: Estimate, lanes: Mapping[str, Lane], names: Mapping[Key, str]) -> Task:
     if _cpu_only(work):
         seconds = {name: estimate.seconds["cpu"] for name in _of_kind("cpu", lanes) or lanes}
     else:
@@ -96,7 +96,7 @@ def _task(work: Work, estimate: Estimate, lanes: Mapping[str, Lane], names: Mapp
     return Task(work.step.name, sources, seconds, estimate.bytes, estimate.work, parts)
 
 
-def _cpu_only(work: Work) -> bool:
+def _cpu_only(work: StepJob) -> bool:
     """Whether a step computes on the CPU of whatever lane it gets; the key of a random one says of what kind it is."""
     hint = work.step.device or work.step.node.device
     return hint == "cpu" or (work.step.node.random and work.device == "cpu")
@@ -107,7 +107,7 @@ def _of_kind(kind: str, lanes: Mapping[str, Lane]) -> list[str]:
 
 
 def _one_after_another(
-    works: Sequence[Work], expected: Mapping[Key, Estimate], lane: str, keep: Collection[Key]
+    works: Sequence[StepJob], expected: Mapping[Key, Estimate], lane: str, keep: Collection[Key]
 ) -> Schedule:
     """The works in their order, each result let go after its last use."""
     last = {key: work.key for work in works for key in work.sources}

@@ -6,15 +6,15 @@ from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, field
 from typing import Any
 
-from neusee.nodes import Facts
+from neusee.nodes import TensorStats
 from neusee.workflows.engine.node_call import RunError, place
 from neusee.workflows.engine.step_record import facts_in
 from neusee.workflows.graph.recipe_graph import Recipe
 from neusee.workflows.keys.cache_key import Key, key_of
 from neusee.workflows.keys.code_digest import Code
 from neusee.workflows.store.result_store import Store
-from neusee.workflows.tolerance.error_budget import Ledger
-from neusee.workflows.tolerance.skip_decision import Verdict
+from neusee.workflows.tolerance.error_budget import ErrorBudget
+from neusee.workflows.tolerance.skip_decision import SkipDecision
 
 
 @dataclass(frozen=True, slots=True)
@@ -24,7 +24,7 @@ class Resolved:
     keys: dict[str, Key] = field(default_factory=dict)
     origins: dict[Key, Mapping[str, Any]] = field(default_factory=dict)
     makers: dict[Key, str] = field(default_factory=dict)  #: the first step of each key that is not left out
-    verdicts: dict[str, Verdict | None] = field(default_factory=dict)  #: None where facts are missing that decide
+    verdicts: dict[str, SkipDecision | None] = field(default_factory=dict)  #: None where facts are missing that decide
 
     def left_out(self, name: str) -> bool | None:
         """Whether a step is left out; None where only what feeds it will tell, and it is taken to run."""
@@ -40,9 +40,9 @@ class Resolved:
 
 def resolve(recipe: Recipe, order: Iterable[str], store: Store, device: str = "cpu") -> Resolved:
     """Give each step of ``order``, in which sources come first, its key as a run on ``device`` would."""
-    found, code, ledger = Resolved(), Code(store.code_memo), Ledger(recipe)
+    found, code, ledger = Resolved(), Code(store.code_memo), ErrorBudget(recipe)
 
-    def facts_of(name: str) -> Facts | None:
+    def facts_of(name: str) -> TensorStats | None:
         known = facts_in(store.about(found.keys[name]))
         if known is None:
             raise LookupError(name)
@@ -50,7 +50,7 @@ def resolve(recipe: Recipe, order: Iterable[str], store: Store, device: str = "c
 
     for name in order:
         step = recipe.steps[name]
-        if step.node.bound is not None:
+        if step.node.hooks.skip_bound is not None:
             try:
                 found.verdicts[name] = ledger.verdict(step, step.params, facts_of)
             except RunError:

@@ -10,21 +10,21 @@ from typing import Any
 
 import torch
 
-from neusee.workflows.engine.execution import UnderWay
+from neusee.workflows.engine.execution import Execution
 from neusee.workflows.engine.node_call import to_device
 from neusee.workflows.engine.step_job import Executor
-from neusee.workflows.engine.step_record import Done, Event
+from neusee.workflows.engine.step_record import Event, StepRecord
 from neusee.workflows.graph.diagnostics import nearest
 from neusee.workflows.graph.recipe_graph import Recipe, needed
 from neusee.workflows.keys.cache_key import Key
 from neusee.workflows.placement.heft_and_cpop import Schedule
 from neusee.workflows.store.remote_store import open_store
 from neusee.workflows.store.result_store import Store
-from neusee.workflows.tolerance.cheaper_steps import economised
-from neusee.workflows.tolerance.error_propagation import Proof, Unproved, proof
+from neusee.workflows.tolerance.cheaper_steps import with_substitutions
+from neusee.workflows.tolerance.error_propagation import ErrorBounds, ToleranceNotProven, proof
 from neusee.workflows.tolerance.tolerance_frontier import border
 
-__all__ = ["Done", "Event", "Result", "run"]
+__all__ = ["Event", "Result", "StepRecord", "run"]
 
 _SAFE = 0.8  #: of what would just do, the share that a second attempt may spend
 
@@ -34,7 +34,7 @@ class Result:
     """What a run gives: the values that were asked for, and an account of every step they need."""
 
     values: dict[str, Any]
-    done: dict[str, Done]
+    done: dict[str, StepRecord]
     keys: dict[str, Key]
     seconds: float
     peak_memory: int  #: bytes, of this process so far
@@ -42,7 +42,9 @@ class Result:
     store: Store
     device: str = "cpu"
     schedule: Schedule | None = None  #: what was expected of the steps that ran
-    proof: Proof = field(default_factory=Proof)  #: what was left out, or computed more cheaply, may change at each step
+    proof: ErrorBounds = field(
+        default_factory=ErrorBounds
+    )  #: what was left out, or computed more cheaply, may change at each step
 
     def value(self, step: str) -> Any:
         """The value of any step of the recipe: from this run, from the store, or computed now."""
@@ -95,13 +97,13 @@ def run(
     for name in wanted:
         if name not in recipe.steps:
             raise ValueError(f"no step {name!r}; {nearest(name, recipe.steps)}")
-    recipe, store, watch = economised(recipe, wanted), store or open_store(), watch or (lambda event: None)
+    recipe, store, watch = with_substitutions(recipe, wanted), store or open_store(), watch or (lambda event: None)
     while True:
-        work = UnderWay(recipe, store, device.split(","), watch, wanted, executor, memory)
+        work = Execution(recipe, store, device.split(","), watch, wanted, executor, memory)
         try:
             return _attempt(work, wanted, began)
-        except Unproved as failed:
-            recipe = economised(_stricter(recipe, failed.over), wanted)
+        except ToleranceNotProven as failed:
+            recipe = with_substitutions(_stricter(recipe, failed.over), wanted)
         finally:
             work.close()
 
@@ -109,11 +111,11 @@ def run(
 def _stricter(recipe: Recipe, over: float) -> Recipe:
     """The recipe with less to spend, where it could not be proved that its tolerance held; the second time nothing."""
     strict = _SAFE / over if recipe.strict == 1.0 else 0.0
-    return replace(recipe.whole or recipe, strict=strict, keep_all=strict == 0.0)
+    return replace(recipe.unsubstituted or recipe, strict=strict, exact=strict == 0.0)
 
 
-def _attempt(work: UnderWay, wanted: tuple[str, ...], began: float) -> Result:
-    """Run; first as far as it must be known whether the tolerance holds, and raise `Unproved` where it does not."""
+def _attempt(work: Execution, wanted: tuple[str, ...], began: float) -> Result:
+    """Run the recipe, first as far as the proof of the tolerance needs; raise `ToleranceNotProven` if it fails."""
     recipe, store = work.recipe, work.store
     order = needed(recipe, wanted)
     with torch.no_grad():
@@ -123,14 +125,14 @@ def _attempt(work: UnderWay, wanted: tuple[str, ...], began: float) -> Result:
         if early := [work.keys[name] for name in first if work.keys[name] in missing]:
             work.make(early, keep=False, later=targets)
 
-        def known(name: str) -> Done:
+        def known(name: str) -> StepRecord:
             return work.done.get(name) or work.asleep(name)
 
         lead = order if first and not missing else needed(recipe, first)
         proved = proof(recipe, lead, wanted, known, work.known_facts)
         over = proved.over(recipe)
-        if over > 1.0 and not recipe.keep_all:
-            raise Unproved(over)
+        if over > 1.0 and not recipe.exact:
+            raise ToleranceNotProven(over)
         work.make(targets, keep=False)
     values = {name: to_device(work.values[work.keys[name]], work.devices[0]) for name in wanted}
     done = work.account(order)

@@ -14,11 +14,11 @@ from typing import Any, Protocol
 
 import torch
 
-from neusee.nodes import Check, Facts
+from neusee.nodes import Check, TensorStats
 from neusee.workflows.engine.band_results import call_by_band, plain_of
-from neusee.workflows.engine.memory_use import Peak
+from neusee.workflows.engine.memory_use import PeakMemory
 from neusee.workflows.engine.node_call import RunError, call, examine, versions
-from neusee.workflows.engine.write_behind import LARGE, Later
+from neusee.workflows.engine.write_behind import LARGE, WriteBehind
 from neusee.workflows.graph.recipe_graph import Step
 from neusee.workflows.keys.cache_key import Key, plain
 from neusee.workflows.store.lease import Lease
@@ -28,16 +28,16 @@ from neusee.workflows.store.serialization import pack, tensors_in
 
 Read = Key | tuple[Key, ...] | None  #: what one input reads: one value, a list of them, or nothing
 Fetch = Callable[[Key], Any]
-_FACTS = tuple(f.name for f in fields(Facts))
+_FACTS = tuple(f.name for f in fields(TensorStats))
 _WATCHED = 1 << 20  #: bytes of inputs from which the memory of a step is measured
 
 
-class Lost(Exception):
+class InputMissing(Exception):
     """A stored result turned out to be damaged or gone when it was read: plan again without it."""
 
 
 @dataclass(frozen=True, slots=True)
-class Work:
+class StepJob:
     """A step to be carried out."""
 
     step: Step
@@ -64,14 +64,14 @@ class Work:
 class Outcome:
     """What became of a piece of work."""
 
-    work: Work
+    work: StepJob
     value: Any = None  #: absent where another process computed it
-    facts: Facts | None = None
+    facts: TensorStats | None = None
     checks: tuple[Check, ...] = ()
     began: float = 0.0  #: s of the clock of `time.time`
     seconds: float = 0.0
     bytes: int = 0
-    deviation: tuple[float, float] | None = None  #: of a cheaper form, from the full one; see `Node.deviates`
+    deviation: tuple[float, float] | None = None  #: of a cheaper form: `Node.approximation_error`
     peak: int | None = None  #: bytes beside what was there before
     kept: bool = False  #: whether the store has the value
     waits: bool = False  #: it is written beside the next steps, and its lease goes with it
@@ -105,7 +105,7 @@ class Executor(Protocol):
     def shares(self) -> bool:
         """Whether values stay in this process; otherwise they travel through the store, by key."""
 
-    def submit(self, work: Sequence[Work]) -> None:
+    def submit(self, work: Sequence[StepJob]) -> None:
         """Begin with ``work``, steps of one lane of which each feeds the next."""
 
     def wait(self, seconds: float | None = None) -> list[Outcome]:
@@ -115,7 +115,7 @@ class Executor(Protocol):
         """Begin with nothing more, and wait for what is under way."""
 
 
-def carry_out(work: Work, fetch: Fetch, store: Store, later: Later | None = None) -> Outcome:
+def carry_out(work: StepJob, fetch: Fetch, store: Store, later: WriteBehind | None = None) -> Outcome:
     """Compute one step and keep what is worth keeping, perhaps ``later``; a failure is part of the outcome."""
     if work.quick:
         return _carried_out(work, fetch, store, None, Lease())
@@ -133,10 +133,10 @@ def carry_out(work: Work, fetch: Fetch, store: Store, later: Later | None = None
             lease.release()
 
 
-def _carried_out(work: Work, fetch: Fetch, store: Store, later: Later | None, lease: Lease) -> Outcome:
+def _carried_out(work: StepJob, fetch: Fetch, store: Store, later: WriteBehind | None, lease: Lease) -> Outcome:
     try:
         inputs = [_gathered(read, fetch) for read in work.reads]
-    except Lost as error:
+    except InputMissing as error:
         return Outcome(work, lost=error.args)
     try:
         return _kept(_computed(work, inputs, store), store, later, lease)
@@ -150,12 +150,12 @@ def _gathered(read: Read, fetch: Fetch) -> Any:
     return [fetch(key) for key in read]
 
 
-def _computed(work: Work, inputs: list[Any], store: Store) -> Outcome:
+def _computed(work: StepJob, inputs: list[Any], store: Store) -> Outcome:
     """The value, what is known of it, and what it cost."""
     step = work.step
     began, clock = time.time(), time.perf_counter()
     size = sum(t.nbytes for t in tensors_in(inputs))
-    with Peak(work.device, size >= _WATCHED or not inputs) as peak, torch.no_grad():
+    with PeakMemory(work.device, size >= _WATCHED or not inputs) as peak, torch.no_grad():
         if step.node.bands and (work.parts > 1 or work.device.startswith("cpu")):
             value = call_by_band(
                 step,
@@ -173,11 +173,11 @@ def _computed(work: Work, inputs: list[Any], store: Store) -> Outcome:
     if work.origin["params"] != {name: plain(param) for name, param in step.params.items()}:
         raise RunError(step, [], OSError("a file changed while it was read: run again"))
     found = sum(t.nbytes for t in tensors_in(bare))
-    deviation = step.node.deviation(bare) if step.node.deviation else None
-    return Outcome(work, value, Facts.of(bare), checks, began, seconds, found, deviation, peak.bytes)
+    deviation = step.node.hooks.approximation_error(bare) if step.node.hooks.approximation_error else None
+    return Outcome(work, value, TensorStats.of(bare), checks, began, seconds, found, deviation, peak.bytes)
 
 
-def _kept(outcome: Outcome, store: Store, later: Later | None, lease: Lease) -> Outcome:
+def _kept(outcome: Outcome, store: Store, later: WriteBehind | None, lease: Lease) -> Outcome:
     """Store the value where that pays, and in any case what is known of it."""
     work, value, about = outcome.work, outcome.value, _about(outcome)
     small = outcome.bytes <= INLINE
@@ -226,4 +226,4 @@ def _about(outcome: Outcome) -> dict[str, Any]:
     }
 
 
-__all__ = ["Executor", "Fetch", "Lane", "Lost", "Outcome", "Read", "Work", "carry_out"]
+__all__ = ["Executor", "Fetch", "InputMissing", "Lane", "Outcome", "Read", "StepJob", "carry_out"]

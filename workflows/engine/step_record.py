@@ -6,17 +6,17 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any, Literal
 
-from neusee.nodes import Check, Facts
+from neusee.nodes import Check, TensorStats
 from neusee.workflows.keys.cache_key import Key
 
 if TYPE_CHECKING:
     from neusee.workflows.engine.step_job import Outcome
 
-State = Literal["run", "cached", "left out", "asleep"]
+State = Literal["run", "cached", "left out", "not needed"]
 
 
 @dataclass(frozen=True, slots=True)
-class Done:
+class StepRecord:
     """What became of a step, and why."""
 
     step: str
@@ -24,7 +24,7 @@ class Done:
     why: str
     seconds: float
     key: Key
-    facts: Facts | None = None
+    facts: TensorStats | None = None
     checks: tuple[Check, ...] = ()
     device: str = "cpu"
     bytes: int = 0
@@ -43,16 +43,16 @@ def error_in(about: Mapping[str, Any] | None) -> tuple[float, float] | None:
     return (float(found[0]), float(found[1])) if found else None
 
 
-def facts_in(about: Mapping[str, Any] | None) -> Facts | None:
+def facts_in(about: Mapping[str, Any] | None) -> TensorStats | None:
     """What a stored result says of its facts."""
     found = (about or {}).get("facts")
-    return Facts(**{**found, "shape": tuple(found["shape"])}) if found else None
+    return TensorStats(**{**found, "shape": tuple(found["shape"])}) if found else None
 
 
-def ran(outcome: Outcome, why: str, bound: float | None, began: float, predicted: float | None) -> Done:
+def ran(outcome: Outcome, why: str, bound: float | None, began: float, predicted: float | None) -> StepRecord:
     """The account of a step that was computed in a run that ``began`` then."""
     work = outcome.work
-    return Done(
+    return StepRecord(
         work.step.name,
         "run",
         why,
@@ -77,4 +77,4 @@ class Event:
     """For a live table: ``step`` has started (``done`` is None) or has finished."""
 
     step: str
-    done: Done | None
+    done: StepRecord | None

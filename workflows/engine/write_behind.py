@@ -21,7 +21,7 @@ _ROOM = 1 << 29  #: bytes that may wait; one larger result waits alone
 _NICE = 10
 
 
-class Later:
+class WriteBehind:
     """Writes under way, one at a time."""
 
     def __init__(self) -> None:

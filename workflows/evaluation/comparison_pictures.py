@@ -12,7 +12,7 @@ from neusee.workflows.evaluation.evaluation_points import Bench, Wanted, smaller
 from neusee.workflows.evaluation.evaluation_scenes import Scene
 from neusee.workflows.evaluation.pipelines import CASES, NONE, Composed
 from neusee.workflows.keys.cache_key import digest
-from neusee.workflows.studies.accuracy.work_precision_points import now
+from neusee.workflows.studies.accuracy.work_precision_points import timestamp
 
 _SIDE = 200  #: pixels of the shorter side, as drawn
 _PLAIN = "developed[plain]"
@@ -52,7 +52,7 @@ def _pictures(bench: Bench, each: Sequence[Composed], wanted: Wanted) -> dict[st
         if not number:
             found |= {"truth": _shown(values["truth"]), "plain lens": _shown(values[_PLAIN])}
         found[pipeline.name] = _shown(values[pipeline.pipeline.picture])
-    bench.store.put(key, found, {"step": "evaluate", "seconds": 1.0, "date": now()})
+    bench.store.put(key, found, {"step": "evaluate", "seconds": 1.0, "date": timestamp()})
     return found
 
 

@@ -14,7 +14,7 @@ if TYPE_CHECKING:
 
     Numbers = NDArray[np.float64]
 
-SURE = 0.95
+CONFIDENCE = 0.95
 _AGAIN = 10_000  #: sets of scenes that are drawn anew for a ratio
 _AT_ONCE = 500  #: of them
 _FEW = 5  #: scenes from which a bootstrap of them says anything
@@ -35,7 +35,7 @@ class Interval:
         return (self.high - self.low) / 2
 
     @property
-    def sure(self) -> bool:
+    def excludes_zero(self) -> bool:
         """Whether zero lies outside."""
         return self.low > 0 or self.high < 0
 
@@ -67,7 +67,7 @@ def mean(values: Sequence[float] | Numbers) -> Interval:
         return Interval(centre, math.nan, math.nan)
     from scipy.stats import t
 
-    half = float(t.ppf((1 + SURE) / 2, len(x) - 1)) * float(x.std(ddof=1)) / math.sqrt(len(x))
+    half = float(t.ppf((1 + CONFIDENCE) / 2, len(x) - 1)) * float(x.std(ddof=1)) / math.sqrt(len(x))
     return Interval(centre, centre - half, centre + half)
 
 
@@ -89,7 +89,7 @@ def gain(values: Numbers, reference: Numbers, seed: int) -> Interval:
     for _ in range(0, _AGAIN, _AT_ONCE):
         at = rng.integers(0, len(values), (_AT_ONCE, len(values)))
         drawn.append(1.0 - values[at].mean(1) / reference[at].mean(1))
-    low, high = np.quantile(drawn, [(1 - SURE) / 2, (1 + SURE) / 2])
+    low, high = np.quantile(drawn, [(1 - CONFIDENCE) / 2, (1 + CONFIDENCE) / 2])
     return Interval(found, float(low), float(high))
 
 

@@ -132,7 +132,7 @@ def _compared(found: Evaluated) -> Section:
             continue
         less, share, small = found.against[p.name].values()
         for column, interval in ((1, less), (2, share), (3, small)):
-            if interval.sure:
+            if interval.excludes_zero:
                 marks[len(listed), column] = "pass" if interval.mean > 0 else "fail"
         listed.append((p.name, _between(less, ".4f"), _between(share, ".1%"), _between(small, ".1%")))
     columns = ("pipeline", "L1 less", "gain", "gain, small")

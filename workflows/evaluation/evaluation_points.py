@@ -23,8 +23,8 @@ from neusee.workflows.keys.code_digest import Code
 from neusee.workflows.keys.engine_digest import engine
 from neusee.workflows.recipe.distributions.uncertain_inputs import Inputs
 from neusee.workflows.store.result_store import Store
-from neusee.workflows.studies.accuracy.work_precision_points import now
-from neusee.workflows.tolerance.cheaper_steps import economised
+from neusee.workflows.studies.accuracy.work_precision_points import timestamp
+from neusee.workflows.tolerance.cheaper_steps import with_substitutions
 
 _MOVED = ("spot", "photons")  #: steps with whose results, and all that follows, another strength is another scene
 
@@ -71,7 +71,7 @@ class Bench:
         point = self._numbers(pipeline, values)
         self.seconds += (spent := time.perf_counter() - began)
         self.computed += 1
-        self.store.jot(key, point, {"step": "evaluate", "seconds": spent, "date": now()})
+        self.store.jot(key, point, {"step": "evaluate", "seconds": spent, "date": timestamp()})
         return point
 
     def values(self, pipeline: Composed, wanted: Wanted, more: Sequence[str] = ()) -> dict[str, Any]:
@@ -104,7 +104,7 @@ class Bench:
             for name, changed in params.items()
         }
         keys = self._keys(replace(recipe, steps={**recipe.steps, **steps}), wanted, outputs)
-        within = [recipe.tolerance, recipe.keep_all, self.device.partition(":")[0], self.small]
+        within = [recipe.tolerance, recipe.exact, self.device.partition(":")[0], self.small]
         own = [self._code.digest(f"neusee.nodes.{name}") for name in ("metrics._picture_quality", "_bicubic_resize")]
         return digest("evaluate", engine("evaluation.evaluation_points"), [keys[name] for name in outputs], within, own)
 
@@ -123,7 +123,7 @@ class Bench:
         name = (f"{pipeline.name} {outputs}", case)
         if name not in self._functions:
             recipe = pipeline.recipes[case]
-            whole = economised(recipe, outputs)  # as `run` would: the scene is given, and not learnt
+            whole = with_substitutions(recipe, outputs)  # as `run` would: the scene is given, and not learnt
             there = set(needed(whole, outputs))
             inputs = self._inputs(recipe, outputs)
             readers = [name for name in (inputs.readers if inputs else ()) if name.rpartition(".")[0] in there]

@@ -7,7 +7,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
-from neusee.workflows.graph.diagnostics import Problem, RecipeError, nearest
+from neusee.workflows.graph.diagnostics import Diagnostic, RecipeError, nearest
 from neusee.workflows.graph.recipe_graph import Recipe
 from neusee.workflows.recipe.loading import load
 from neusee.workflows.recipe.text.composition import groups_of, packaged
@@ -132,7 +132,7 @@ def composed(recipe: str, changes: Sequence[str], pipelines: Sequence[Pipeline],
                 _check(recipes[case], pipeline)
             found.append(Composed(pipeline, recipes))
         except RecipeError as error:
-            wrong |= dict.fromkeys(f"{pipeline.name}: {_said(problem)}" for problem in error.problems)
+            wrong |= dict.fromkeys(f"{pipeline.name}: {_said(problem)}" for problem in error.diagnostics)
         except Refused as error:
             wrong[f"{pipeline.name}: {error}"] = None
     if wrong:
@@ -140,7 +140,7 @@ def composed(recipe: str, changes: Sequence[str], pipelines: Sequence[Pipeline],
     return found
 
 
-def _said(problem: Problem) -> str:
+def _said(problem: Diagnostic) -> str:
     return " ".join(str(RecipeError([problem])).split())
 
 
@@ -184,7 +184,7 @@ def _fwhm(recipe: str, changes: Sequence[str], folder: Path) -> float:
     try:
         steps = load(recipe, changes, folder).steps
     except RecipeError as error:
-        raise Refused("\n".join(dict.fromkeys(map(_said, error.problems)))) from None
+        raise Refused("\n".join(dict.fromkeys(map(_said, error.diagnostics)))) from None
     widths = [step.params["fwhm"] for name, step in steps.items() if name.startswith("line[")]
     return float(widths[0]) if widths else 10e-9
 

@@ -31,7 +31,7 @@ from neusee.workflows.recipe.loading import load
 from neusee.workflows.report.run_folder import RunFolder, new_run
 from neusee.workflows.store.remote_store import open_store
 from neusee.workflows.store.result_store import Store
-from neusee.workflows.studies.accuracy.work_precision_points import now
+from neusee.workflows.studies.accuracy.work_precision_points import timestamp
 
 if TYPE_CHECKING:
     pass
@@ -157,7 +157,7 @@ def _document(found: Evaluated, bench: Bench, command: Sequence[str], seconds: f
         "study": "evaluate",
         "recipe": found.recipe.name,
         "command": " ".join(command),
-        "date": now(),
+        "date": timestamp(),
         "seconds": seconds,
         "scenes": [[s.number, s.name, s.case, s.seed] for s in found.scenes],
         "not read": [[str(path), reason] for path, reason in found.broken],

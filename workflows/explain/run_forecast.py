@@ -11,14 +11,14 @@ from neusee.workflows.engine.local_executor import lanes_of
 from neusee.workflows.engine.node_call import places
 from neusee.workflows.engine.placement_inputs import past_costs, prepare
 from neusee.workflows.engine.resolve_keys import resolve
-from neusee.workflows.engine.step_job import Lane, Work
+from neusee.workflows.engine.step_job import Lane, StepJob
 from neusee.workflows.graph.recipe_graph import Recipe
 from neusee.workflows.keys.cache_key import Key
 from neusee.workflows.placement.heft_and_cpop import Schedule, TooLarge
 from neusee.workflows.report.run_page import size_of
 from neusee.workflows.simulation.simulate_recipe import steps_of, wanted
 from neusee.workflows.store.result_store import Store
-from neusee.workflows.tolerance.cheaper_steps import economised
+from neusee.workflows.tolerance.cheaper_steps import with_substitutions
 
 
 @dataclass(frozen=True)
@@ -39,7 +39,7 @@ class Plan:
 
 def planned(recipe: Recipe, store: Store, lanes: Mapping[str, Lane]) -> Plan:
     """Look up what a run would compute, read and need; compute nothing."""
-    recipe = economised(recipe, wanted(recipe))
+    recipe = with_substitutions(recipe, wanted(recipe))
     order = steps_of(recipe)
     devices = [lane.device for lane in lanes.values()]
     resolved = resolve(recipe, order, store, ",".join(devices))
@@ -80,7 +80,7 @@ def simulated_lines(recipe: Recipe, store: Store, machines: str) -> list[str]:
     from neusee.workflows.explain.cluster_forecast import cluster_lines
     from neusee.workflows.placement.machine_file import read_machines
 
-    cluster, recipe = read_machines(machines), economised(recipe, wanted(recipe))
+    cluster, recipe = read_machines(machines), with_substitutions(recipe, wanted(recipe))
     costs, kinds = past_costs(store), sorted({"cpu", *(device.kind for device in cluster.devices)})
     names = steps_of(recipe)
     return cluster_lines(recipe, {name: costs.of(recipe.steps[name], kinds) for name in names}, cluster)
@@ -126,10 +126,10 @@ def _sums(plan: Plan, lanes: Mapping[str, Lane]) -> list[str]:
     return [*lines, *([f"refused: {plan.refused}"] if plan.refused else [])]
 
 
-def _work(recipe: Recipe, name: str, keys: Mapping[str, Key], devices: Sequence[str]) -> Work:
+def _work(recipe: Recipe, name: str, keys: Mapping[str, Key], devices: Sequence[str]) -> StepJob:
     step = recipe.steps[name]
     reads = tuple(tuple(keys[s] for s in ((w,) if isinstance(w, str) else w or ())) for w in step.wires.values())
-    return Work(step, keys[name], {}, reads, recipe.seed, recipe.name, places(step, devices)[0], "")
+    return StepJob(step, keys[name], {}, reads, recipe.seed, recipe.name, places(step, devices)[0], "")
 
 
 def _awake(recipe: Recipe, keys: Mapping[str, Key], store: Store) -> tuple[set[str], dict[str, int]]:

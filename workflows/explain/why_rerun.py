@@ -14,7 +14,7 @@ from neusee.workflows.graph.diagnostics import nearest
 from neusee.workflows.graph.recipe_graph import Recipe, Step, needed
 from neusee.workflows.keys.cache_key import Key
 from neusee.workflows.store.result_store import Store
-from neusee.workflows.tolerance.cheaper_steps import economised
+from neusee.workflows.tolerance.cheaper_steps import with_substitutions
 
 _CANDIDATES = 200  #: earlier results of a step that are compared, the newest ones
 _PAIRS = 20_000  #: comparisons after which no further earlier result is taken up
@@ -32,7 +32,7 @@ def why_lines(recipe: Recipe, store: Store, step: str, device: str = "cpu") -> l
     if not names:
         known = {*recipe.steps, *(name.partition("[")[0] for name in recipe.steps)}
         raise ValueError(f"no step {step!r}; {nearest(step, known)}")
-    recipe = economised(recipe, [*recipe.outputs, *names])
+    recipe = with_substitutions(recipe, [*recipe.outputs, *names])
     resolved = resolve(recipe, needed(recipe, [*recipe.outputs, *names]), store, device)
     comparison = Comparison(store, recipe, resolved)
     return [line for name in names for line in _step_lines(comparison, recipe, recipe.steps[name], resolved)]

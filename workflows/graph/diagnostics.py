@@ -8,7 +8,7 @@ from dataclasses import dataclass, field
 
 
 @dataclass(frozen=True, slots=True, order=True)
-class Mark:
+class Location:
     """A place in a file (lines and columns count from 1), or an argument such as ``argument 2`` (line 0)."""
 
     file: str  #: as the user knows it: ``first_light.yaml``, ``sensor/neusee.yaml``
@@ -21,10 +21,10 @@ class Mark:
 
 
 @dataclass(frozen=True, slots=True, order=True)
-class Problem:
+class Diagnostic:
     """One mistake: where, of what, and what to write instead."""
 
-    mark: Mark
+    mark: Location
     path: str
     message: str
 
@@ -32,15 +32,15 @@ class Problem:
 class RecipeError(ValueError):
     """A recipe cannot be run; ``str`` gives one line a problem, in the order of the files."""
 
-    def __init__(self, problems: Iterable[Problem]) -> None:
-        self.problems = tuple(sorted(set(problems)))
-        super().__init__(_table(self.problems))
+    def __init__(self, diagnostics: Iterable[Diagnostic]) -> None:
+        self.diagnostics = tuple(sorted(set(diagnostics)))
+        super().__init__(_table(self.diagnostics))
 
 
-def _table(problems: tuple[Problem, ...]) -> str:
-    where = max((len(str(p.mark)) for p in problems), default=0)
-    what = min(max((len(p.path) for p in problems), default=0), 40)
-    return "\n".join(f"{p.mark!s:<{where}}   {p.path:<{what}}   {p.message}" for p in problems)
+def _table(diagnostics: tuple[Diagnostic, ...]) -> str:
+    where = max((len(str(p.mark)) for p in diagnostics), default=0)
+    what = min(max((len(p.path) for p in diagnostics), default=0), 40)
+    return "\n".join(f"{p.mark!s:<{where}}   {p.path:<{what}}   {p.message}" for p in diagnostics)
 
 
 def nearest(name: str, among: Iterable[str]) -> str:

@@ -7,7 +7,7 @@ from dataclasses import dataclass, field, replace
 from typing import TYPE_CHECKING, Any
 
 from neusee.nodes import Node
-from neusee.workflows.graph.diagnostics import Mark
+from neusee.workflows.graph.diagnostics import Location
 from neusee.workflows.graph.final_values import Config, Setting
 
 if TYPE_CHECKING:
@@ -16,7 +16,7 @@ if TYPE_CHECKING:
     from neusee.workflows.recipe.blocks.train_lift_block import LiftTraining
     from neusee.workflows.recipe.distributions.nominal_values import Uncertain
 
-__all__ = ["Config", "Economy", "Expectation", "Recipe", "Setting", "Step", "Wire", "in_order", "needed"]
+__all__ = ["Config", "Expectation", "Recipe", "Setting", "Step", "Substitution", "Wire", "in_order", "needed"]
 
 Wire = str | tuple[str, ...] | None  #: one step, the steps of all items, or an optional input that is absent
 
@@ -29,8 +29,8 @@ class Step:
     node: Node
     params: Mapping[str, Any]  #: validated, SI, with the node's defaults
     wires: Mapping[str, Wire]  #: by input, in the node's order
-    mark: Mark
-    param_marks: Mapping[str, Mark]  #: where each value that was given stands
+    mark: Location
+    param_marks: Mapping[str, Location]  #: where each value that was given stands
     device: str = ""  #: where it asks to run: ``cpu``, ``gpu``, ``cuda:1``; empty if anywhere, and never part of a key
 
     @property
@@ -44,7 +44,7 @@ def _names(wire: Wire) -> tuple[str, ...]:
 
 
 @dataclass(frozen=True, slots=True)
-class Economy:
+class Substitution:
     """A cheaper step that stands in for a full one."""
 
     step: str  #: the full step
@@ -62,10 +62,10 @@ class Expectation:
     at: tuple[int | str, ...]  #: indices, or the name of a field of a named tuple
     value: float
     rtol: float
-    mark: Mark
+    mark: Location
 
 
-UNHEARD = 1e-3  #: what a figure of merit reads may be off by, for all of it may hang on a small difference
+METRIC_TOLERANCE = 1e-3  #: what a figure of merit reads may be off by, for all of it may hang on a small difference
 
 
 @dataclass(frozen=True, slots=True, repr=False)
@@ -82,18 +82,18 @@ class Recipe:
     config: Config = field(default_factory=Config)
     notes: tuple[str, ...] = ()
     absent: Mapping[str, str] = field(default_factory=dict)  #: step that is null -> where that is written
-    keep_all: bool = False  #: compute every step in full, whatever the tolerance allows
-    economies: tuple[Economy, ...] = ()  #: what stands in for full steps; a recipe as it is read has none
+    exact: bool = False  #: compute every step in full, whatever the tolerance allows
+    substitutions: tuple[Substitution, ...] = ()  #: what stands in for full steps; a recipe as it is read has none
     strict: float = 1.0  #: share of the tolerance that may be spent: less where a run could not prove that it held
-    whole: Recipe | None = field(default=None, compare=False)  #: the recipe without economies, where this has some
+    unsubstituted: Recipe | None = field(default=None, compare=False)  #: the recipe before substitutions, if any
     uncertain: Uncertain | None = field(default=None, compare=False)  #: what the study of uncertainty draws from
     training: Training | None = field(default=None, compare=False)  #: how it is learnt
     lifting: LiftTraining | None = field(default=None, compare=False)  #: how a lift is learnt from its pictures
     unheard: frozenset[str] = frozenset()  #: steps whose errors reach a node that does not tell what becomes of them
 
     def limit(self, step: str) -> float:
-        """What the result of a step may be off by: the tolerance, or `UNHEARD` where that is less and no node tells."""
-        return min(self.tolerance, UNHEARD) if step in self.unheard else self.tolerance
+        """Return the error allowed for a step: the tolerance, at most `METRIC_TOLERANCE` where nothing bounds it."""
+        return min(self.tolerance, METRIC_TOLERANCE) if step in self.unheard else self.tolerance
 
     def allowed(self, step: str) -> float:
         """What all that is left out or computed more cheaply, up to a step, may change of it."""

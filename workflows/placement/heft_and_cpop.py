@@ -15,7 +15,7 @@ from bisect import bisect_left
 from collections.abc import Collection, Mapping, Sequence
 from dataclasses import replace
 
-from neusee.workflows.placement.partial_schedule import Board
+from neusee.workflows.placement.partial_schedule import PartialSchedule
 from neusee.workflows.placement.task_priorities import Graph, downward, frugal, ranked, upward
 from neusee.workflows.placement.tasks_and_devices import (
     BUS,
@@ -74,13 +74,13 @@ def _best(graph: Graph, orders: Sequence[Sequence[int]], pinned: Mapping[int, in
     """The schedule of the first order, if it fits as it is; else of that order which ends first with the memory."""
     pinned = pinned or {}
     memory = {device.name: device.memory for device in graph.cluster.devices}
-    best, refused = _placed(Board(graph, bounded=False), orders[0], pinned).schedule(), list[TooLarge]()
+    best, refused = _placed(PartialSchedule(graph, bounded=False), orders[0], pinned).schedule(), list[TooLarge]()
     if all(peak <= memory[name] for name, peak in best.peak.items()):
         return best
     found: list[Schedule] = []
     for order in (*orders[1:], orders[0]):
         below = min((schedule.makespan for schedule in found), default=math.inf)
-        board = _placed(Board(graph), order, pinned, below)
+        board = _placed(PartialSchedule(graph), order, pinned, below)
         if board.refused:
             refused.append(board.too_large())
         elif len(board.placed) == len(order):
@@ -90,7 +90,9 @@ def _best(graph: Graph, orders: Sequence[Sequence[int]], pinned: Mapping[int, in
     return min(found, key=lambda schedule: schedule.makespan)
 
 
-def _placed(board: Board, order: Sequence[int], pinned: Mapping[int, int], below: float = math.inf) -> Board:
+def _placed(
+    board: PartialSchedule, order: Sequence[int], pinned: Mapping[int, int], below: float = math.inf
+) -> PartialSchedule:
     """Place tasks in an order; those of ``pinned`` on their device, if they ever fit there.
 
     A task for which there is no memory lets those go first that follow it and may give some back. It
@@ -156,7 +158,11 @@ def _alone(graph: Graph, devices: Sequence[int], *refused: TooLarge) -> Schedule
 
 def _sequence(graph: Graph, d: int, order: Sequence[int]) -> Schedule:
     """Tasks one after another on device ``d``; what is refused would run with just the memory that is named."""
-    board, name, limit = Board(graph, bounded=False), graph.cluster.devices[d].name, graph.cluster.devices[d].memory
+    board, name, limit = (
+        PartialSchedule(graph, bounded=False),
+        graph.cluster.devices[d].name,
+        graph.cluster.devices[d].memory,
+    )
     left, held, peak, at = [len(readers) for readers in graph.readers], 0.0, 0.0, 0.0
     needed, largest = 0.0, 0
     for i in order:

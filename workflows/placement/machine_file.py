@@ -25,7 +25,7 @@ from importlib.util import find_spec
 from pathlib import Path
 from typing import Any
 
-from neusee.workflows.graph.diagnostics import Mark, Problem, RecipeError, nearest
+from neusee.workflows.graph.diagnostics import Diagnostic, Location, RecipeError, nearest
 from neusee.workflows.placement.tasks_and_devices import BUS, Cluster, Device, Link
 from neusee.workflows.recipe.text.yaml_values import Value, kind, read
 
@@ -35,7 +35,7 @@ _SECONDS = {"s": 1.0, "ms": 1e-3, "us": 1e-6, "µs": 1e-6, "μs": 1e-6, "ns": 1e
 _RATES = {f"{unit}/s": scale for unit, scale in _BYTES.items() if unit in ("MB", "GB", "TB")}
 _QUANTITY = re.compile(r"((?:\d+\.?\d*|\.\d+)(?:[eE][-+]?\d+)?)\s*(.*)")
 _MOST = 4096  #: devices of one file
-_Reader = Callable[[Value, "list[Problem]"], Any]
+_Reader = Callable[[Value, "list[Diagnostic]"], Any]
 
 
 @dataclass(frozen=True)
@@ -59,13 +59,13 @@ class Machines:
 def read_machines(path: Path | str) -> Machines:
     """The machines of a file, or of an example by its name; a `RecipeError` locates every mistake at once."""
     document = read(_found(path), str(path))
-    problems: list[Problem] = []
-    root = _fields(document.root, {"devices": _groups, "links": _links, "network": _link}, ("devices",), problems)
+    diagnostics: list[Diagnostic] = []
+    root = _fields(document.root, {"devices": _groups, "links": _links, "network": _link}, ("devices",), diagnostics)
     groups, links = root.get("devices") or [], root.get("links") or {}
-    if not problems:
-        problems += _absent(document.root.items.get("links"), {group["kind"] for group in groups})
-    if problems:
-        raise RecipeError(problems)
+    if not diagnostics:
+        diagnostics += _absent(document.root.items.get("links"), {group["kind"] for group in groups})
+    if diagnostics:
+        raise RecipeError(diagnostics)
     devices = _devices(groups)
     if len(devices) > _MOST:
         raise RecipeError([_problem(document.root.items["devices"], f"are {len(devices)}; at most {_MOST} can be")])
@@ -86,7 +86,7 @@ def _found(path: Path | str) -> Path:
         return packaged[str(path)]
     if not Path(path).is_file():
         message = f"no such file, and no example of that name; {nearest(str(path), packaged)}"
-        raise RecipeError([Problem(Mark("--devices"), str(path), message)])
+        raise RecipeError([Diagnostic(Location("--devices"), str(path), message)])
     return Path(path)
 
 
@@ -106,113 +106,113 @@ def _devices(groups: list[dict[str, Any]]) -> dict[Device, dict[str, Any]]:
 # --- values ---------------------------------------------------------------------------------------------------------
 
 
-def _groups(value: Value, problems: list[Problem]) -> list[dict[str, Any]]:
+def _groups(value: Value, diagnostics: list[Diagnostic]) -> list[dict[str, Any]]:
     if not isinstance(value.data, dict) or not value.data:
-        problems.append(_problem(value, "must be a mapping of groups, such as `a100: {kind: cuda, memory: 80 GB}`"))
+        diagnostics.append(_problem(value, "must be a mapping of groups, such as `a100: {kind: cuda, memory: 80 GB}`"))
         return []
     readers = {"kind": _kind, "count": _count, "memory": _size, "speed": _speed, "node": _names}
     usual: dict[str, Any] = {"count": 1, "speed": {"default": 1.0}, "node": [""]}
-    return [usual | _fields(group, readers, ("kind", "memory"), problems) for group in value.data.values()]
+    return [usual | _fields(group, readers, ("kind", "memory"), diagnostics) for group in value.data.values()]
 
 
-def _links(value: Value, problems: list[Problem]) -> dict[tuple[str, str], Link]:
+def _links(value: Value, diagnostics: list[Diagnostic]) -> dict[tuple[str, str], Link]:
     if not isinstance(value.data, dict):
-        problems.append(_problem(value, "must be a mapping such as `cuda-cuda: {bandwidth: 300 GB/s}`"))
+        diagnostics.append(_problem(value, "must be a mapping such as `cuda-cuda: {bandwidth: 300 GB/s}`"))
         return {}
     found = {}
     for name, link in value.data.items():
         one, dash, other = str(name).partition("-")
         if not dash:
-            problems.append(_problem(link, "must name two kinds, such as cuda-cuda or cpu-cuda", link.key))
+            diagnostics.append(_problem(link, "must name two kinds, such as cuda-cuda or cpu-cuda", link.key))
         if (other, one) in found:
-            problems.append(_problem(link, f"is the same as {other}-{one}", link.key))
-        found[one, other or one] = _link(link, problems)
+            diagnostics.append(_problem(link, f"is the same as {other}-{one}", link.key))
+        found[one, other or one] = _link(link, diagnostics)
     return found
 
 
-def _link(value: Value, problems: list[Problem]) -> Link:
-    return Link(**_fields(value, {"bandwidth": _rate, "latency": _time}, ("bandwidth",), problems))
+def _link(value: Value, diagnostics: list[Diagnostic]) -> Link:
+    return Link(**_fields(value, {"bandwidth": _rate, "latency": _time}, ("bandwidth",), diagnostics))
 
 
 def _fields(
-    value: Value, readers: Mapping[str, _Reader], required: tuple[str, ...], problems: list[Problem]
+    value: Value, readers: Mapping[str, _Reader], required: tuple[str, ...], diagnostics: list[Diagnostic]
 ) -> dict[str, Any]:
     """What a mapping says, each field by its reader; what it must say and does not is a mistake."""
     if not isinstance(value.data, dict):
-        problems.append(_problem(value, f"must be a mapping of {', '.join(readers)}; it is {kind(value)}"))
+        diagnostics.append(_problem(value, f"must be a mapping of {', '.join(readers)}; it is {kind(value)}"))
         return {}
     found = {}
     for name, item in value.data.items():
         if name in readers:
-            found[name] = readers[name](item, problems)
+            found[name] = readers[name](item, diagnostics)
         else:
-            problems.append(_problem(item, f"unknown; {nearest(name, readers)}", item.key))
+            diagnostics.append(_problem(item, f"unknown; {nearest(name, readers)}", item.key))
     missing = [name for name in required if name not in value.data]
-    problems += [_problem(value, f"needs {name}", value.key) for name in missing]
+    diagnostics += [_problem(value, f"needs {name}", value.key) for name in missing]
     return found
 
 
-def _kind(value: Value, problems: list[Problem]) -> str:
+def _kind(value: Value, diagnostics: list[Diagnostic]) -> str:
     if value.data not in _KINDS:
-        problems.append(_problem(value, f"no kind of device; {nearest(str(value.data), _KINDS)}"))
+        diagnostics.append(_problem(value, f"no kind of device; {nearest(str(value.data), _KINDS)}"))
     return str(value.data)
 
 
-def _count(value: Value, problems: list[Problem]) -> int:
+def _count(value: Value, diagnostics: list[Diagnostic]) -> int:
     if isinstance(value.data, bool) or not isinstance(value.data, int) or not 1 <= value.data <= _MOST:
-        problems.append(_problem(value, f"must be a whole number from 1 to {_MOST}"))
+        diagnostics.append(_problem(value, f"must be a whole number from 1 to {_MOST}"))
         return 1
     return value.data
 
 
-def _names(value: Value, problems: list[Problem]) -> list[str]:
+def _names(value: Value, diagnostics: list[Diagnostic]) -> list[str]:
     names = value.data if isinstance(value.data, list) else [value]
     for name in names:
         if not isinstance(name.data, str) or not re.fullmatch(r"[\w.-]+", name.data):
-            problems.append(_problem(name, "must be the name of a machine, or a list of such names"))
+            diagnostics.append(_problem(name, "must be the name of a machine, or a list of such names"))
     plain = [str(name.data) for name in names]
     if len(set(plain)) < len(plain) or not plain:
-        problems.append(_problem(value, "must name one machine or more, each once"))
+        diagnostics.append(_problem(value, "must name one machine or more, each once"))
     return plain
 
 
-def _speed(value: Value, problems: list[Problem]) -> dict[str, float]:
+def _speed(value: Value, diagnostics: list[Diagnostic]) -> dict[str, float]:
     if not isinstance(value.data, dict):
-        return {"default": _factor(value, problems)}
+        return {"default": _factor(value, diagnostics)}
     families = ["default", *_families()]
-    return _fields(value, dict.fromkeys(families, _factor), ("default",), problems)
+    return _fields(value, dict.fromkeys(families, _factor), ("default",), diagnostics)
 
 
-def _factor(value: Value, problems: list[Problem]) -> float:
+def _factor(value: Value, diagnostics: list[Diagnostic]) -> float:
     good = isinstance(value.data, int | float) and not isinstance(value.data, bool)
     if not good or not 0 < value.data < math.inf:
-        problems.append(_problem(value, "must be a number above 0: how many times as fast as what was measured"))
+        diagnostics.append(_problem(value, "must be a number above 0: how many times as fast as what was measured"))
         return 1.0
     return float(value.data)
 
 
-def _size(value: Value, problems: list[Problem]) -> float:
-    return _quantity(value, _BYTES, "80 GB", problems)
+def _size(value: Value, diagnostics: list[Diagnostic]) -> float:
+    return _quantity(value, _BYTES, "80 GB", diagnostics)
 
 
-def _rate(value: Value, problems: list[Problem]) -> float:
-    return _quantity(value, _RATES, "25 GB/s", problems)
+def _rate(value: Value, diagnostics: list[Diagnostic]) -> float:
+    return _quantity(value, _RATES, "25 GB/s", diagnostics)
 
 
-def _time(value: Value, problems: list[Problem]) -> float:
-    return _quantity(value, _SECONDS, "10 us", problems)
+def _time(value: Value, diagnostics: list[Diagnostic]) -> float:
+    return _quantity(value, _SECONDS, "10 us", diagnostics)
 
 
-def _quantity(value: Value, units: Mapping[str, float], such: str, problems: list[Problem]) -> float:
+def _quantity(value: Value, units: Mapping[str, float], such: str, diagnostics: list[Diagnostic]) -> float:
     """A number and its unit; one of nothing is no quantity but for a time."""
     match = _QUANTITY.fullmatch(str(value.data).strip())
     if isinstance(value.data, bool) or match is None:
-        problems.append(_problem(value, f"must be a number and a unit, such as {such}"))
+        diagnostics.append(_problem(value, f"must be a number and a unit, such as {such}"))
     elif match[2] not in units:
         said = f"has the wrong unit {match[2]!r}" if match[2] else "needs a unit"
-        problems.append(_problem(value, f"{said}: write a number and one of {', '.join(units)}"))
+        diagnostics.append(_problem(value, f"{said}: write a number and one of {', '.join(units)}"))
     elif units is not _SECONDS and not 0 < float(match[1]) < math.inf:
-        problems.append(_problem(value, f"must be above 0, such as {such}"))
+        diagnostics.append(_problem(value, f"must be above 0, such as {such}"))
     else:
         return float(match[1]) * units[match[2]]
     return 1.0
@@ -224,7 +224,7 @@ def _families() -> list[str]:
     return [m.name for m in pkgutil.iter_modules(spec.submodule_search_locations if spec else []) if m.ispkg]
 
 
-def _absent(links: Value | None, kinds: set[str]) -> list[Problem]:
+def _absent(links: Value | None, kinds: set[str]) -> list[Diagnostic]:
     """Kinds that ``links`` names and no device is of."""
     items = links.items.items() if links else ()
     pairs = [(item, name) for pair, item in items for name in dict.fromkeys(pair.split("-"))]
@@ -232,5 +232,5 @@ def _absent(links: Value | None, kinds: set[str]) -> list[Problem]:
     return [_problem(i, f"{said} {name}; {nearest(name, kinds)}", i.key) for i, name in pairs if name not in kinds]
 
 
-def _problem(value: Value, message: str, mark: Mark | None = None) -> Problem:
-    return Problem(mark or value.mark, value.name, message)
+def _problem(value: Value, message: str, mark: Location | None = None) -> Diagnostic:
+    return Diagnostic(mark or value.mark, value.name, message)

@@ -12,7 +12,7 @@ import numpy as np
 Hold = tuple[float, float, float]  #: from, until (infinity if nobody knows yet), bytes
 
 
-class Room:
+class MemoryProfile:
     """Bytes in use as a step function of time that never rises above ``limit``.
 
     What still has readers to be placed is held for ever, and given back when the last of them has its

@@ -6,7 +6,7 @@ import math
 from bisect import bisect_left
 from collections.abc import Iterator, Sequence
 
-from neusee.workflows.placement.memory_profile import Hold, Room, stacked, without
+from neusee.workflows.placement.memory_profile import Hold, MemoryProfile, stacked, without
 from neusee.workflows.placement.task_priorities import Graph
 from neusee.workflows.placement.tasks_and_devices import Move, Schedule, Slot, TooLarge
 
@@ -14,7 +14,7 @@ Copy = tuple[float, float, float]  #: leaves its source, arrives, last use
 Of = tuple[int, float, int]  #: which task's result, how many bytes of it, on which device
 
 
-class Board:
+class PartialSchedule:
     """One schedule in the making: each task is placed after its sources, and never moves again."""
 
     def __init__(self, graph: Graph, bounded: bool = True) -> None:
@@ -26,7 +26,7 @@ class Board:
         self.gaps: list[tuple[list[float], list[float]]] = [([0.0], [math.inf]) for _ in devices]
         most = sum(graph.own) + max((graph.work(i, 1) for i in range(count)), default=0.0)
         sent = sum(max(0.0, math.ceil(s)) for t, sizes in enumerate(graph.sizes) for s in sizes if graph.tasks[t].takes)
-        self.rooms = [Room(d.memory) if bounded and d.memory < most + sent else None for d in devices]
+        self.rooms = [MemoryProfile(d.memory) if bounded and d.memory < most + sent else None for d in devices]
         self.links = [[graph.cluster.link(a.name, b.name) for b in devices] for a in devices]
         self.least = [own + graph.work(i, graph.tasks[i].parts) for i, own in enumerate(graph.own)]
         self.copies: dict[Of, list[Copy]] = {}
@@ -151,7 +151,7 @@ class Board:
         self.where[i], self.start[i], self.end[i], self.free_at[i] = d, start, end, end
         self.placed.append(i)
 
-    def _fewest(self, i: int, d: int, start: float, end: float, room: Room) -> int:
+    def _fewest(self, i: int, d: int, start: float, end: float, room: MemoryProfile) -> int:
         """The smallest number of parts with which ``i`` fits into its slot; cut into all of them, it does."""
 
         def fits(parts: int) -> bool:

@@ -4,13 +4,13 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Mapping
 
-from neusee.workflows.graph.diagnostics import Mark, Problem
+from neusee.workflows.graph.diagnostics import Diagnostic, Location
 from neusee.workflows.graph.recipe_graph import Step
 
 _MOST = 12  #: steps of a loop that a message names
 
 
-def cycles(steps: Mapping[str, Step], marks: Mapping[str, Mark]) -> Iterator[Problem]:
+def cycles(steps: Mapping[str, Step], marks: Mapping[str, Location]) -> Iterator[Diagnostic]:
     """One problem for each loop, with the lines of the steps in it."""
     seen: set[frozenset[str]] = set()
     for loop in _loops({name: [s for s in step.sources if s in steps] for name, step in steps.items()}):
@@ -22,10 +22,10 @@ def cycles(steps: Mapping[str, Step], marks: Mapping[str, Mark]) -> Iterator[Pro
         names = names[start:] + names[:start]
         few = names if len(names) <= _MOST else [*names[: _MOST - 1], f"({len(names) - _MOST} more)", names[-1]]
         where = _places([marks[name] for name in names[:_MOST]])
-        yield Problem(marks[names[0]], "steps", f"cycle: {' -> '.join([*few, names[0]])} ({where})")
+        yield Diagnostic(marks[names[0]], "steps", f"cycle: {' -> '.join([*few, names[0]])} ({where})")
 
 
-def _places(marks: list[Mark]) -> str:
+def _places(marks: list[Location]) -> str:
     if len({mark.file for mark in marks}) > 1:
         return ", ".join(f"{mark.file}:{mark.line}" for mark in marks)
     return f"line{'s' * (len(marks) > 1)} {', '.join(str(mark.line) for mark in marks)}"

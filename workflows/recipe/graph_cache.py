@@ -22,12 +22,12 @@ V = TypeVar("V")
 Names = tuple[tuple[str, tuple[str, ...] | None], ...]  #: of every block: its items, or None if it is no list of items
 
 _MOST = 16
-_graphs: dict[tuple[int, Names], KnownGraph] = {}
+_graphs: dict[tuple[int, Names], CachedGraph] = {}
 _written: dict[int, tuple[Value, Recipe]] = {}  #: id of a top mapping -> that mapping, and its recipe
 
 
 @dataclass(frozen=True, slots=True)
-class KnownGraph:
+class CachedGraph:
     """Steps and wires in which nothing was wrong."""
 
     value: Value  #: the ``steps``, held so that no other value takes its id
@@ -36,14 +36,14 @@ class KnownGraph:
     wires: Mapping[str, Mapping[str, Wire]]  #: of the bound steps whose wires are no references
 
 
-def known_graph(root: Value) -> KnownGraph | None:
+def cached_graph(root: Value) -> CachedGraph | None:
     """What is known of the graph of a recipe, if its nodes are still those of the program."""
     steps = root.items.get("steps")
     found = _graphs.get((id(steps), _names(root)))
     return found if found is not None and all(map(_current, found.steps.values())) else None
 
 
-def keep_graph(
+def cache_graph(
     root: Value, steps: dict[str, Declared], absent: dict[str, Value], wires: Mapping[str, Mapping[str, Wire]]
 ) -> None:
     """Remember a graph in which nothing is wrong, but for its references: they are followed every time."""
@@ -51,17 +51,17 @@ def keep_graph(
         return
     fixed = [name for step in steps.values() if not _refers(step.value.items.get("from")) for name in step.instances]
     value = root.items["steps"]
-    found = KnownGraph(value, steps, absent, {name: wires[name] for name in fixed})
+    found = CachedGraph(value, steps, absent, {name: wires[name] for name in fixed})
     remember(_graphs, (id(value), _names(root)), found)
 
 
-def known_recipe(root: Value) -> Recipe | None:
+def cached_recipe(root: Value) -> Recipe | None:
     """The recipe of a top mapping that was checked before."""
     found = _written.get(id(root))
-    return found[1] if found is not None and known_graph(root) is not None else None
+    return found[1] if found is not None and cached_graph(root) is not None else None
 
 
-def keep_recipe(root: Value, recipe: Recipe) -> Recipe:
+def cache_recipe(root: Value, recipe: Recipe) -> Recipe:
     """Remember the recipe of a top mapping."""
     remember(_written, id(root), (root, recipe))
     return recipe

@@ -11,7 +11,7 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
-from neusee.workflows.graph.diagnostics import Problem, RecipeError
+from neusee.workflows.graph.diagnostics import RecipeError
 from neusee.workflows.graph.final_values import Config, Setting
 from neusee.workflows.graph.recipe_graph import Expectation, Recipe, Step, Wire, kept_promises
 from neusee.workflows.recipe.blocks.train_block import KEY as TRAINING
@@ -21,7 +21,7 @@ from neusee.workflows.recipe.blocks.train_lift_block import read_lift_training
 from neusee.workflows.recipe.cycle_check import cycles
 from neusee.workflows.recipe.distributions.nominal_values import Uncertain, settle
 from neusee.workflows.recipe.global_settings import expectations, outputs_of, seed_and_tolerance
-from neusee.workflows.recipe.graph_cache import keep_graph, keep_recipe, known_graph, known_recipe
+from neusee.workflows.recipe.graph_cache import cache_graph, cache_recipe, cached_graph, cached_recipe
 from neusee.workflows.recipe.parameters import Checker
 from neusee.workflows.recipe.step_declarations import Declared, declare, device_of
 from neusee.workflows.recipe.text.composition import Composed, compose, groups_of, packaged
@@ -68,7 +68,7 @@ def load(
 def _as_written(name: str, place: Path) -> Recipe:
     """A recipe without changes; it is not checked again while its files and nodes are what they were."""
     composed = compose(name, (), place)
-    return known_recipe(composed.root) or keep_recipe(composed.root, check(composed))
+    return cached_recipe(composed.root) or cache_recipe(composed.root, check(composed))
 
 
 def check(composed: Composed) -> Recipe:
@@ -77,23 +77,23 @@ def check(composed: Composed) -> Recipe:
     composed, training = read_training(composed)
     composed, lifting = read_lift_training(composed)
     composed, uncertain = settle(composed)
-    problems = list(composed.problems)
-    root, references = composed.root, References(composed.root, problems)
-    graph = known_graph(root)
-    steps, absent = (graph.steps, graph.absent) if graph else declare(root, references, problems)
-    wiring, checker = Wiring(root, steps, absent, references, problems), Checker([])
+    diagnostics = list(composed.diagnostics)
+    root, references = composed.root, References(composed.root, diagnostics)
+    graph = cached_graph(root)
+    steps, absent = (graph.steps, graph.absent) if graph else declare(root, references, diagnostics)
+    wiring, checker = Wiring(root, steps, absent, references, diagnostics), Checker([])
     bound = {step.name: step for step in _bind(root, steps, wiring, checker, graph.wires if graph else {})}
-    problems += cycles(bound, {name: step.value.key for name, step in steps.items()})
-    seed, tolerance = seed_and_tolerance(root, references, checker.problems)
+    diagnostics += cycles(bound, {name: step.value.key for name, step in steps.items()})
+    seed, tolerance = seed_and_tolerance(root, references, checker.diagnostics)
     outputs = outputs_of(root, wiring)
     expect = expectations(root, wiring)
     references.finish()
     if not composed.whole:  # without a group, much else looks wrong that is not
-        problems = list(composed.problems)
-    if problems or checker.problems:
-        raise RecipeError([*problems, *checker.problems])
+        diagnostics = list(composed.diagnostics)
+    if diagnostics or checker.diagnostics:
+        raise RecipeError([*diagnostics, *checker.diagnostics])
     if graph is None:
-        keep_graph(root, steps, absent, {name: step.wires for name, step in bound.items()})
+        cache_graph(root, steps, absent, {name: step.wires for name, step in bound.items()})
     config = _config(root, bound, steps, checker, references.spare, uncertain)
     for block in learnt:
         config = Config({**config.settings, **dict(_settings(block, checker))})
@@ -120,7 +120,7 @@ def _bind(
             given = wiring.references.resolve(step.part("with"), scope)
             name = step.instance(items)
             wires = known[name] if name in known else wiring.wires(step, items)
-            device = device_of(step, wiring.references, scope, checker.problems)
+            device = device_of(step, wiring.references, scope, checker.diagnostics)
             if step.node is None:
                 continue
             params = checker.read(step.node, given, step.value.key)
@@ -193,4 +193,4 @@ def _titled(path: Path) -> Titled:
     return Titled(path.stem, first.lstrip("# ") if first.startswith("#") else "")
 
 
-__all__ = ["Expectation", "Problem", "Recipe", "RecipeError", "Titled", "check", "groups", "load", "recipes"]
+__all__ = ["Expectation", "Recipe", "RecipeError", "Titled", "check", "groups", "load", "recipes"]

@@ -14,7 +14,7 @@ from pydantic_core import ErrorDetails
 
 from neusee.nodes import Node, ParameterError
 from neusee.nodes.units import IsFile
-from neusee.workflows.graph.diagnostics import Mark, Problem, nearest
+from neusee.workflows.graph.diagnostics import Diagnostic, Location, nearest
 from neusee.workflows.recipe.text.references import broken
 from neusee.workflows.recipe.text.yaml_values import Value, kind
 
@@ -25,16 +25,16 @@ _LONGEST = 40  #: characters of a value that a message repeats
 class Checker:
     """Checks the parameters of one step after another and gathers what is wrong or worth a note."""
 
-    problems: list[Problem]
+    diagnostics: list[Diagnostic]
     notes: dict[str, None] = field(default_factory=dict)
     #: path of a value -> the file, or files, in full
     files: dict[tuple[str | int, ...], str | list[str]] = field(default_factory=dict)
 
-    def read(self, node: Node, given: Value, step: Mark) -> dict[str, Any] | None:
+    def read(self, node: Node, given: Value, step: Location) -> dict[str, Any] | None:
         """Validated parameters with the node's defaults, or None if there are problems."""
         if given.data is not None and not isinstance(given.data, dict):
             message = f"must be a mapping of parameters, not {kind(given)}"
-            self.problems.append(Problem(given.mark, given.name, message))
+            self.diagnostics.append(Diagnostic(given.mark, given.name, message))
             return None
         if broken(given):
             return None
@@ -43,24 +43,24 @@ class Checker:
         try:
             model = node.params.model_validate(plain)
         except ValidationError as error:
-            self.problems += _problems(error, node, values, given, step)
+            self.diagnostics += _problems(error, node, values, given, step)
             return None
         return {name: getattr(model, name) for name in node.params.model_fields}
 
     def preflight(self, node: Node, params: Mapping[str, Any], values: Mapping[str, Value], step: Value) -> None:
         """Let the node look at its parameters before anything runs."""
-        if node.before is None:
+        if node.hooks.preflight is None:
             return
         try:
-            self.notes.update(dict.fromkeys(node.before(**params)))
+            self.notes.update(dict.fromkeys(node.hooks.preflight(**params)))
         except ParameterError as error:
             value = values.get(error.parameter)
             if value is None:
-                self.problems.append(Problem(step.key, f"{step.name}.with.{error.parameter}", str(error)))
+                self.diagnostics.append(Diagnostic(step.key, f"{step.name}.with.{error.parameter}", str(error)))
             else:
-                self.problems.append(Problem(value.mark, _said(value), str(error)))
+                self.diagnostics.append(Diagnostic(value.mark, _said(value), str(error)))
         except (ValueError, OSError) as error:
-            self.problems.append(Problem(step.key, step.name, str(error)))
+            self.diagnostics.append(Diagnostic(step.key, step.name, str(error)))
 
     def _plain(self, node: Node, name: str, value: Value) -> Any:
         """A value alone; the path of a file is taken from the folder of the YAML file that names it."""
@@ -80,26 +80,26 @@ def _is_file(hint: Any) -> bool:
 
 
 def _problems(
-    error: ValidationError, node: Node, values: Mapping[str, Value], given: Value, step: Mark
-) -> Iterator[Problem]:
+    error: ValidationError, node: Node, values: Mapping[str, Value], given: Value, step: Location
+) -> Iterator[Diagnostic]:
     """One problem for each value that is wrong, unknown or missing."""
     details = error.errors(include_url=False)
     strangers = [str(e["loc"][0]) for e in details if e["type"] == "extra_forbidden"]
     meant = {nearest(name, node.params.model_fields) for name in strangers}
-    wrong: dict[tuple[Mark, str], list[str]] = {}
+    wrong: dict[tuple[Location, str], list[str]] = {}
     for e in details:
         name = str(e["loc"][0])
         if e["type"] == "extra_forbidden":
             hint = nearest(name, node.params.model_fields)
-            yield Problem(values[name].key, f"{given.name}.{name}", f"unknown to {node.path}; {hint}")
+            yield Diagnostic(values[name].key, f"{given.name}.{name}", f"unknown to {node.path}; {hint}")
         elif e["type"] == "missing" and len(e["loc"]) == 1:
             if f"did you mean {name}?" not in meant:
-                yield Problem(step, f"{given.name}.{name}", f"is missing: {node.path} needs it")
+                yield Diagnostic(step, f"{given.name}.{name}", f"is missing: {node.path} needs it")
         else:
             value = _deepest(values[name], e["loc"][1:])
             wrong.setdefault((value.mark, _said(value)), []).append(_message(e) + _in_si(e, value))
     for (mark, path), messages in wrong.items():
-        yield Problem(mark, path, ", or ".join(dict.fromkeys(messages)))
+        yield Diagnostic(mark, path, ", or ".join(dict.fromkeys(messages)))
 
 
 def _deepest(value: Value, path: tuple[int | str, ...]) -> Value:

@@ -13,7 +13,7 @@ from dataclasses import dataclass
 
 import neusee.nodes
 from neusee.nodes import Node
-from neusee.workflows.graph.diagnostics import Problem, nearest
+from neusee.workflows.graph.diagnostics import Diagnostic, nearest
 from neusee.workflows.recipe.text.references import References, Scope, broken
 from neusee.workflows.recipe.text.yaml_values import Value, kind
 
@@ -51,20 +51,22 @@ class Declared:
 
 
 def declare(
-    root: Value, references: References, problems: list[Problem]
+    root: Value, references: References, diagnostics: list[Diagnostic]
 ) -> tuple[dict[str, Declared], dict[str, Value]]:
     """The steps that can be read, and those that are null."""
     given = root.items.get("steps")
     if given is None or not isinstance(given.data, dict) or not given.data:
         mark = root.mark if given is None else given.mark
-        problems.append(Problem(mark, "steps", "a recipe needs steps, or a group that has them (`camera: neusee`)"))
+        diagnostics.append(
+            Diagnostic(mark, "steps", "a recipe needs steps, or a group that has them (`camera: neusee`)")
+        )
         return {}, {}
     absent = {str(name): value for name, value in given.data.items() if value.data is None}
     steps = {}
     nodes: dict[str, Node] = {}
     for name, value in given.data.items():
-        if value.data is not None and _well_formed(str(name), value, problems):
-            node, dims = _node(value, nodes, references, problems), _dims(value, root, problems)
+        if value.data is not None and _well_formed(str(name), value, diagnostics):
+            node, dims = _node(value, nodes, references, diagnostics), _dims(value, root, diagnostics)
             items = tuple(itertools.product(*(map(str, root.items[dim].items) for dim in dims or ())))
             steps[str(name)] = Declared(str(name), value, node, dims or (), () if dims is None else items)
         elif value.data is not None:
@@ -72,24 +74,24 @@ def declare(
     return steps, absent
 
 
-def _well_formed(name: str, value: Value, problems: list[Problem]) -> bool:
+def _well_formed(name: str, value: Value, diagnostics: list[Diagnostic]) -> bool:
     if not _NAME.fullmatch(name):
-        problems.append(Problem(value.key, value.name, "a step's name is letters, digits, _ and -"))
+        diagnostics.append(Diagnostic(value.key, value.name, "a step's name is letters, digits, _ and -"))
         return False
     if not isinstance(value.data, dict):
-        problems.append(Problem(value.mark, value.name, f"must be a mapping or null, not {kind(value)}"))
+        diagnostics.append(Diagnostic(value.mark, value.name, f"must be a mapping or null, not {kind(value)}"))
         return False
     for key, part in value.data.items():
         if key not in _KEYS:
-            problems.append(Problem(part.key, part.name, f"unknown; {nearest(str(key), _KEYS)}"))
+            diagnostics.append(Diagnostic(part.key, part.name, f"unknown; {nearest(str(key), _KEYS)}"))
     return True
 
 
-def _node(step: Value, nodes: dict[str, Node], references: References, problems: list[Problem]) -> Node | None:
+def _node(step: Value, nodes: dict[str, Node], references: References, diagnostics: list[Diagnostic]) -> Node | None:
     """The node that a step names; ``nodes`` are those found before."""
     given = step.items.get("node")
     if given is None:
-        problems.append(Problem(step.key, step.name, "has no node: write `node: family.name`"))
+        diagnostics.append(Diagnostic(step.key, step.name, "has no node: write `node: family.name`"))
         return None
     given = references.resolve(given, Scope({}, str(step.path[-1])))
     if broken(given):
@@ -99,11 +101,11 @@ def _node(step: Value, nodes: dict[str, Node], references: References, problems:
             nodes[str(given.data)] = find_node(str(given.data))
         return nodes[str(given.data)]
     except LookupError as error:
-        problems.append(Problem(given.mark, f"{step.name}.node", str(error.args[0])))
+        diagnostics.append(Diagnostic(given.mark, f"{step.name}.node", str(error.args[0])))
         return None
 
 
-def _dims(step: Value, root: Value, problems: list[Problem]) -> tuple[str, ...] | None:
+def _dims(step: Value, root: Value, diagnostics: list[Diagnostic]) -> tuple[str, ...] | None:
     """The item lists of ``each``: none, one or two; None if there is something wrong with them."""
     given = step.items.get("each")
     if given is None or given.data is None:
@@ -111,37 +113,37 @@ def _dims(step: Value, root: Value, problems: list[Problem]) -> tuple[str, ...] 
     named = list(given.items.values()) if isinstance(given.data, list) else [given]
     lists = [key for key, block in root.items.items() if key != "steps" and _is_item_list(block)]
     dims: list[str] = []
-    before = len(problems)
+    before = len(diagnostics)
     for value in named:
         block = root.items.get(value.data) if isinstance(value.data, str) else None
         if block is None or value.data not in lists:
             hint = nearest(str(value.data), map(str, lists))
-            problems.append(Problem(value.mark, given.name, f"no list of items {value.data}; {hint}"))
+            diagnostics.append(Diagnostic(value.mark, given.name, f"no list of items {value.data}; {hint}"))
         elif value.data in dims or len(dims) == 2:
-            problems.append(Problem(value.mark, given.name, "takes one list of items or two different ones"))
+            diagnostics.append(Diagnostic(value.mark, given.name, "takes one list of items or two different ones"))
         else:
             dims.append(value.data)
-            problems += [
-                Problem(item.key, item.name, "an item's name has no space, comma or bracket")
+            diagnostics += [
+                Diagnostic(item.key, item.name, "an item's name has no space, comma or bracket")
                 for key, item in block.items.items()
                 if not _ITEM.fullmatch(str(key))
             ]
-    return tuple(dims) if len(problems) == before else None
+    return tuple(dims) if len(diagnostics) == before else None
 
 
-def device_of(step: Declared, references: References, scope: Scope, problems: list[Problem]) -> str:
+def device_of(step: Declared, references: References, scope: Scope, diagnostics: list[Diagnostic]) -> str:
     """Where a copy of a step asks to run; empty where that does not matter."""
     given = references.resolve(step.part("device"), scope)
     if broken(given) or given.data in ({}, None, "any"):
         return ""
     if not isinstance(given.data, str) or not _DEVICE.fullmatch(given.data):
         hint = "write any, cpu, gpu, cuda, cuda:1 or mps"
-        problems.append(Problem(given.mark, f"{given.name} = {given.plain}", f"is no device: {hint}"))
+        diagnostics.append(Diagnostic(given.mark, f"{given.name} = {given.plain}", f"is no device: {hint}"))
         return ""
     only = step.node.device if step.node else "any"
     if only != "any" and (only == "cpu") != (given.data == "cpu"):
         message = f"{step.node and step.node.path} computes on a {only.upper()} alone"
-        problems.append(Problem(given.mark, f"{given.name} = {given.data}", message))
+        diagnostics.append(Diagnostic(given.mark, f"{given.name} = {given.data}", message))
     return given.data
 
 

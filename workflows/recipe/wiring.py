@@ -10,7 +10,7 @@ from dataclasses import dataclass
 from typing import Annotated, Any, Union, get_args, get_origin
 
 from neusee.nodes import Node
-from neusee.workflows.graph.diagnostics import Problem, nearest
+from neusee.workflows.graph.diagnostics import Diagnostic, nearest
 from neusee.workflows.graph.recipe_graph import Wire
 from neusee.workflows.recipe.step_declarations import Declared
 from neusee.workflows.recipe.text.references import BROKEN, References
@@ -27,7 +27,7 @@ class Wiring:
     steps: Mapping[str, Declared]
     absent: Mapping[str, Value]
     references: References
-    problems: list[Problem]
+    diagnostics: list[Diagnostic]
 
     def wires(self, step: Declared, items: tuple[str, ...]) -> dict[str, Wire]:
         """The wires of one copy of a step, in the order of the node's inputs."""
@@ -66,7 +66,7 @@ class Wiring:
         for name, value in given.data.items():
             if name not in node.inputs:
                 hint = nearest(str(name), node.inputs)
-                self.problems.append(Problem(value.key, value.name, f"{node.path} has no input {name}; {hint}"))
+                self.diagnostics.append(Diagnostic(value.key, value.name, f"{node.path} has no input {name}; {hint}"))
         return {str(name): value for name, value in given.data.items()}
 
     def _unwired(self, step: Declared, node: Node, name: str, given: Value) -> Wire:
@@ -76,7 +76,7 @@ class Wiring:
         if not (isinstance(given.data, dict) and _misspelt(name, node, given)):
             mark = given.mark if given.items else step.value.key
             fix = f"write from: {{{name}: STEP}}{self._makers(needs(node, name))}"
-            self.problems.append(Problem(mark, given.name, f"{node.path} needs {name}: {fix}"))
+            self.diagnostics.append(Diagnostic(mark, given.name, f"{node.path} needs {name}: {fix}"))
         return None
 
     def _wire(self, step: Declared, node: Node, items: tuple[str, ...], name: str, value: Value) -> Wire:
@@ -180,7 +180,7 @@ class Wiring:
         return f"; steps that make one: {', '.join(found[:6])}" if found else f"; no step makes {_a(needed)}"
 
     def _refuse(self, value: Value, path: str, message: str) -> tuple[str, ...] | None:
-        self.problems.append(Problem(value.mark, path, message))
+        self.diagnostics.append(Diagnostic(value.mark, path, message))
         return None
 
 

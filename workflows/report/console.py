@@ -11,7 +11,7 @@ from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Any
 
-from neusee.workflows.engine.runner import Done, Event
+from neusee.workflows.engine.runner import Event, StepRecord
 from neusee.workflows.report.run_page import shape_of, unit_of
 from neusee.workflows.report.tolerance_spent import said_of_economies
 
@@ -29,13 +29,13 @@ class Family:
     name: str
     members: list[str]
     unit: str
-    done: list[Done] = field(default_factory=list)
+    done: list[StepRecord] = field(default_factory=list)
     begun: bool = False
 
     @property
-    def awake(self) -> list[Done]:
+    def awake(self) -> list[StepRecord]:
         """The done ones that were looked at."""
-        return [d for d in self.done if d.state != "asleep"]
+        return [d for d in self.done if d.state != "not needed"]
 
     def cells(self) -> tuple[str, ...]:
         """The row of this family, by `HEADER`."""
@@ -79,7 +79,7 @@ class Plain:
         return self
 
     def __exit__(self, *error: object) -> None:
-        asleep = sum(d.state == "asleep" for f in self.families.values() for d in f.done)
+        asleep = sum(d.state == "not needed" for f in self.families.values() for d in f.done)
         if asleep:
             print(f"  {asleep} steps were not looked at: what needs them is in the cache")
 
@@ -111,7 +111,7 @@ class Live:
             cells = family.cells()
             style = {"run": "bold", "cached": "cyan", "left out": "dim"}.get(cells[2], "")
             table.add_row(*cells, style="red" if "LOOK" in cells[5] else style)
-        asleep = sum(d.state == "asleep" for f in self.families.values() for d in f.done)
+        asleep = sum(d.state == "not needed" for f in self.families.values() for d in f.done)
         if asleep:
             table.caption = f"{asleep} steps were not looked at: what needs them is in the cache"
         return table

@@ -19,12 +19,12 @@ from neusee.workflows.keys.code_digest import Code
 from neusee.workflows.report.contents import FILES
 from neusee.workflows.report.requirements import Missing
 from neusee.workflows.report.run_pictures import Job, finished, needs
-from neusee.workflows.store.derived_files import Shelf
+from neusee.workflows.store.derived_files import DerivedFiles
 
 _FORM = 1  #: raised when a file is written differently
 
 
-def exports(result: Result, shelf: Shelf) -> tuple[dict[str, Path], dict[str, str]]:
+def exports(result: Result, shelf: DerivedFiles) -> tuple[dict[str, Path], dict[str, str]]:
     """Every file of ``data/`` that a run can give, and why the others cannot be."""
     code, jobs, missing = Code(result.store.code_memo), [], {}
     for name, (form, wanted) in FILES.items():

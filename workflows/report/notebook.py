@@ -135,13 +135,13 @@ def _outputs(result: Result) -> dict[str, Any]:
 
 def _looks(value: Any) -> tuple[str, str, str]:
     """Shape, type and span of a value; of a named tuple, its small numbers by name."""
-    from neusee.nodes import Facts
+    from neusee.nodes import TensorStats
 
-    facts = Facts.of(value)
+    facts = TensorStats.of(value)
     if facts is None:
         return "", type(value).__name__, ""
     if hasattr(value, "_asdict"):
-        fields = {name: Facts.of(item) for name, item in value._asdict().items()}
+        fields = {name: TensorStats.of(item) for name, item in value._asdict().items()}
         numbers = ", ".join(f"{name} {f.max:.5g}" for name, f in fields.items() if f and not f.shape)
         return ", ".join(fields) if not numbers else "", type(value).__name__, numbers
     span = dict.fromkeys(f"{end:.5g}" for end in (facts.min, facts.max))
@@ -151,7 +151,7 @@ def _looks(value: Any) -> tuple[str, str, str]:
 def _steps(result: Result) -> dict[str, Any]:
     rows = []
     for done in result.done.values():
-        state = "cached" if done.state == "asleep" else done.state
+        state = "cached" if done.state == "not needed" else done.state
         rows.append([done.step, state, f"{done.seconds:.3f}" if done.state == "run" else "", done.why])
     return _table(f"{len(rows)} steps", ["step", "state", "seconds", "why"], rows, ["seconds"], shown=len(rows) <= 12)
 

@@ -37,9 +37,9 @@ class Bound:
 
     def reference(self, *inputs: Any, **changes: Any) -> Any:
         """The plain float64 form of the node."""
-        if self.step.node.ref is None:
+        if self.step.node.hooks.reference is None:
             raise Missing(f"{self.step.node.path} has no reference")
-        return self.step.node.ref(*inputs, **{**self.step.params, **changes})
+        return self.step.node.hooks.reference(*inputs, **{**self.step.params, **changes})
 
 
 @dataclass(frozen=True, slots=True)

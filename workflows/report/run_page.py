@@ -22,7 +22,7 @@ from pathlib import Path
 from typing import Any
 
 from neusee.nodes import Check
-from neusee.workflows.engine.runner import Done, Result
+from neusee.workflows.engine.runner import Result, StepRecord
 from neusee.workflows.engine.step_record import facts_in
 from neusee.workflows.graph.recipe_graph import Recipe
 from neusee.workflows.recipe.distributions.nominal_values import told
@@ -115,19 +115,19 @@ def verdict(found: Sequence[Mapping[str, Any]], failed: Sequence[str]) -> str:
 
 def said(counts: Mapping[str, int]) -> str:
     """``12 run, 3 cached, 1 left out``; what was never looked at counts as cached."""
-    merged = Counter({"cached": counts.get("cached", 0) + counts.get("asleep", 0)})
-    merged.update({s: n for s, n in counts.items() if s not in ("cached", "asleep")})
+    merged = Counter({"cached": counts.get("cached", 0) + counts.get("not needed", 0)})
+    merged.update({s: n for s, n in counts.items() if s not in ("cached", "not needed")})
     return ", ".join(f"{merged[s]} {s}" for s in ("run", "cached", "left out") if merged[s]) or "nothing to do"
 
 
-def shape_of(done: Done) -> str:
+def shape_of(done: StepRecord) -> str:
     """``31 × 512 × 512``, or nothing where it is not known."""
     return " × ".join(map(str, done.facts.shape)) or "number" if done.facts else ""
 
 
-def _step(done: Done, result: Result) -> dict[str, Any]:
+def _step(done: StepRecord, result: Result) -> dict[str, Any]:
     node = result.recipe.steps[done.step].node
-    about = result.store.about(done.key) if done.state in ("cached", "asleep") else None
+    about = result.store.about(done.key) if done.state in ("cached", "not needed") else None
     done = _remembered(done, about) if about else done
     return {
         "step": done.step,
@@ -161,7 +161,7 @@ def _planned(result: Result) -> float | None:
     return result.schedule.makespan if all(done.step in placed for done in ran) else None
 
 
-def _remembered(done: Done, about: Mapping[str, Any]) -> Done:
+def _remembered(done: StepRecord, about: Mapping[str, Any]) -> StepRecord:
     """A step that was not run, with what the store says of its result."""
     checks = tuple(Check(text, ok) for text, ok in about.get("checks", ()))
     why = f"made {about['date'][:16].replace('T', ' ')} UTC"

@@ -8,14 +8,14 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
-from neusee.workflows.engine.runner import Done, Result, run
+from neusee.workflows.engine.runner import Result, StepRecord, run
 from neusee.workflows.keys.cache_key import digest
 from neusee.workflows.keys.code_digest import Code
 from neusee.workflows.keys.engine_digest import engine
 from neusee.workflows.placement.tasks_and_devices import Schedule, Slot
 from neusee.workflows.report.contents import FIGURES
 from neusee.workflows.report.requirements import Found, Missing, find
-from neusee.workflows.store.derived_files import Shelf
+from neusee.workflows.store.derived_files import DerivedFiles
 
 GRAPH = (
     "graph",
@@ -40,7 +40,7 @@ class Job:
     make: Callable[..., bytes]
 
 
-def pictures(result: Result, shelf: Shelf) -> tuple[dict[str, Path], dict[str, str]]:
+def pictures(result: Result, shelf: DerivedFiles) -> tuple[dict[str, Path], dict[str, str]]:
     """Every picture that can be drawn of a run, and why the others cannot."""
     code, drawing = Code(result.store.code_memo), _drawing()
     jobs, missing = [], {}
@@ -72,7 +72,7 @@ def timeline(result: Result) -> bytes | None:
     return _function("report.figures.gantt:timeline")(schedule=replace(plan, slots=planned), rows=rows)
 
 
-def _in_turn(known: Iterable[Done]) -> tuple[Slot, ...]:
+def _in_turn(known: Iterable[StepRecord]) -> tuple[Slot, ...]:
     """What several plans placed, as one: on each lane one after another, as they ran."""
     end: dict[str, Slot] = {}
     slots = []
@@ -96,7 +96,7 @@ def needs(wanted: Mapping[str, str], result: Result, code: Code) -> dict[str, Fo
     return found
 
 
-def finished(jobs: Iterable[Job], result: Result, shelf: Shelf, missing: dict[str, str]) -> dict[str, Path]:
+def finished(jobs: Iterable[Job], result: Result, shelf: DerivedFiles, missing: dict[str, str]) -> dict[str, Path]:
     """The file of each job: kept, or made now of values that are read together."""
     jobs = list(jobs)
     done = {job.name: path for job in jobs if (path := shelf.find(job.key, job.suffix))}
@@ -130,9 +130,9 @@ def _drawing() -> str:
     return engine(*sorted({figure.draw.partition(":")[0] for figure in FIGURES}), "report.figures.recipe_graph")
 
 
-def _graph(result: Result, shelf: Shelf, drawing: str) -> Path:
+def _graph(result: Result, shelf: DerivedFiles, drawing: str) -> Path:
     """The graph with what became of each step; the one of a wholly cached run is drawn along, for the next time."""
-    states = {name: "cached" if done.state == "asleep" else str(done.state) for name, done in result.done.items()}
+    states = {name: "cached" if done.state == "not needed" else str(done.state) for name, done in result.done.items()}
     again = {name: "left out" if state == "left out" else "cached" for name, state in states.items()}
     sources = {name: list(result.recipe.steps[name].sources) for name in result.done}
     paths = []

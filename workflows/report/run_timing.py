@@ -15,13 +15,13 @@ def timing(steps: Sequence[Row], planned: float | None = None) -> dict[str, Any]
     """
     ran = [s for s in steps if s["state"] == "run"]
     own = {s["key"] for s in ran}
-    served = _once(s for s in steps if s["state"] in ("cached", "asleep") and s["key"] not in own)
+    served = _once(s for s in steps if s["state"] in ("cached", "not needed") and s["key"] not in own)
     told = [s for s in ran if s["predicted"] is not None]
     took, saved = sum(s["seconds"] for s in ran), sum(s["made_in"] for s in served)
     ends = [s["began"] + s["seconds"] for s in ran]
     return {
         "ran": len(ran),
-        "served": len([s for s in steps if s["state"] in ("cached", "asleep")]),
+        "served": len([s for s in steps if s["state"] in ("cached", "not needed")]),
         "steps": len(steps),
         "seconds": took,
         "span": max(ends) - min(s["began"] for s in ran) if ran else 0.0,

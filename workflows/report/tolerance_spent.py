@@ -21,19 +21,19 @@ def spent(result: Result) -> dict[str, Any]:
     """The tolerance of a run and what became of it, as plain JSON.
 
     ``bounds``: of what is held to the tolerance, outputs or what feeds a step whose error nothing bounds.
-    ``measured``: by output, beside a run with ``--keep-all`` whose results this store still has.
+    ``measured``: by output, beside a run with ``--exact`` whose results this store still has.
     """
-    costs = past_costs(result.store) if result.recipe.economies or _left_out(result) else Costs([])
+    costs = past_costs(result.store) if result.recipe.substitutions or _left_out(result) else Costs([])
     return {
         "tolerance": result.recipe.tolerance,
         "norm": NORM,
         "held": min(map(result.recipe.limit, result.proof.held), default=result.recipe.tolerance),
         "strict": result.recipe.strict,
-        "keep_all": result.recipe.keep_all,
+        "exact": result.recipe.exact,
         "bounds": {name: share for name, share in result.proof.held.items() if share > 0},
         "unbounded": [name for name in result.recipe.outputs if result.proof.of(name) is None],
         "measured": _measured(result),
-        "economies": [_economy(result, costs, e.step, e.instead, e.why) for e in result.recipe.economies],
+        "economies": [_economy(result, costs, e.step, e.instead, e.why) for e in result.recipe.substitutions],
         "left_out": [_omission(result, costs, name) for name in _left_out(result)],
     }
 
@@ -80,7 +80,7 @@ def _seconds(result: Result, costs: Costs, step: str) -> float | None:
 def _measured(result: Result) -> dict[str, float]:
     """Errors of the outputs beside those of a run that left nothing out, where the store has these."""
     recipe = result.recipe
-    if recipe.keep_all or not (recipe.economies or _left_out(result)):
+    if recipe.exact or not (recipe.substitutions or _left_out(result)):
         return {}
     full, found = _full_keys(result), {}
     for name in recipe.outputs:
@@ -94,7 +94,7 @@ def _measured(result: Result) -> dict[str, float]:
 
 
 def _full_keys(result: Result) -> dict[str, str]:
-    whole: Recipe = replace(result.recipe.whole or result.recipe, keep_all=True, economies=())
+    whole: Recipe = replace(result.recipe.unsubstituted or result.recipe, exact=True, substitutions=())
     try:
         return resolve(whole, needed(whole, whole.outputs), result.store, result.device).keys
     except (OSError, LookupError, RunError):

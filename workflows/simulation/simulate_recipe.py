@@ -10,7 +10,7 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
-from neusee.workflows.engine.runner import Done, Event, Result, run
+from neusee.workflows.engine.runner import Event, Result, StepRecord, run
 from neusee.workflows.engine.step_job import Executor
 from neusee.workflows.explain.why_rerun import explained
 from neusee.workflows.graph.recipe_graph import Recipe, needed
@@ -20,9 +20,9 @@ from neusee.workflows.report.contents import SHOWN, TABLE
 from neusee.workflows.report.data_exports import exports
 from neusee.workflows.report.run_folder import RunFolder, new_run
 from neusee.workflows.report.run_pictures import pictures, timeline
-from neusee.workflows.store.derived_files import Shelf
+from neusee.workflows.store.derived_files import DerivedFiles
 from neusee.workflows.store.result_store import Store
-from neusee.workflows.tolerance.cheaper_steps import economised
+from neusee.workflows.tolerance.cheaper_steps import with_substitutions
 
 _TIMING = ("step", "node", "device", "lane", "state", "began", "seconds", "predicted", "peak", "bytes", "key")
 
@@ -59,8 +59,8 @@ def simulate(
 ) -> Simulation:
     """Run ``recipe`` and write ``runs/<date>_<recipe>_<key>/``, complete or not at all."""
     with _noted() as notes:
-        told: dict[str, Done] = {}
-        recipe = economised(recipe, wanted(recipe))
+        told: dict[str, StepRecord] = {}
+        recipe = with_substitutions(recipe, wanted(recipe))
         tell = explained(recipe, store, _both(told, watch))
         result = run(recipe, store, wanted(recipe), tell, device, executor, memory)
         result = replace(result, done={name: told.get(name, done) for name, done in result.done.items()})
@@ -69,7 +69,7 @@ def simulate(
     return Simulation(folder.path, doc)
 
 
-def _both(told: dict[str, Done], watch: Callable[[Event], None] | None) -> Callable[[Event], None]:
+def _both(told: dict[str, StepRecord], watch: Callable[[Event], None] | None) -> Callable[[Event], None]:
     """A watch that also remembers what it was told."""
 
     def note(event: Event) -> None:
@@ -83,7 +83,7 @@ def _both(told: dict[str, Done], watch: Callable[[Event], None] | None) -> Calla
 
 def steps_of(recipe: Recipe) -> list[str]:
     """Every step that a run of ``recipe`` looks at, in running order."""
-    return needed(economised(recipe, wanted(recipe)), wanted(recipe))
+    return needed(with_substitutions(recipe, wanted(recipe)), wanted(recipe))
 
 
 def _run_key(result: Result) -> str:
@@ -91,7 +91,7 @@ def _run_key(result: Result) -> str:
 
 
 def _write(result: Result, folder: RunFolder, command: Sequence[str], notes: Iterable[str]) -> dict[str, Any]:
-    shelf = Shelf(result.store)
+    shelf = DerivedFiles(result.store)
     drawn, missing = pictures(result, shelf)
     files, without = exports(result, shelf)
     doc = run_page.document(result, command, notes, missing)

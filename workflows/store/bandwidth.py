@@ -9,10 +9,10 @@ from typing import Literal
 
 from neusee.workflows.store.shared_folder import Disk
 
-Way = Literal["read", "write"]
+Direction = Literal["read", "write"]
 LARGE = 1_000_000  #: bytes from which a transfer says something
-_USUAL: dict[Way, float] = {"read": 8e9, "write": 0.4e9}  #: bytes / s
-_SETUP: dict[Way, float] = {"read": 5e-5, "write": 2e-4}  #: s, whatever the size
+_USUAL: dict[Direction, float] = {"read": 8e9, "write": 0.4e9}  #: bytes / s
+_SETUP: dict[Direction, float] = {"read": 5e-5, "write": 2e-4}  #: s, whatever the size
 _LEARN = 0.3  #: weight of the newest transfer
 _NEWS = 1.25  #: factor by which a speed must differ from the remembered one to be written down
 
@@ -23,14 +23,14 @@ class Speeds:
     def __init__(self, disk: Disk) -> None:
         self._disk = disk
         self._path = f"{disk.folder}/speeds.json"
-        self._now: dict[Way, float] = {}
-        self._written: dict[Way, float] = {}
+        self._now: dict[Direction, float] = {}
+        self._written: dict[Direction, float] = {}
 
-    def seconds(self, way: Way, size: float) -> float:
+    def seconds(self, way: Direction, size: float) -> float:
         """What moving ``size`` bytes takes."""
         return _SETUP[way] + size / self._speed(way)
 
-    def learn(self, way: Way, size: int, seconds: float) -> None:
+    def learn(self, way: Direction, size: int, seconds: float) -> None:
         """Take a transfer into account."""
         if size < LARGE:
             return
@@ -41,13 +41,13 @@ class Speeds:
         if not written / _NEWS < self._now[way] < written * _NEWS:
             self._remember()
 
-    def _speed(self, way: Way) -> float:
+    def _speed(self, way: Direction) -> float:
         if not self._now:
             self._written = self._remembered()
             self._now = {**_USUAL, **self._written}
         return self._now[way]
 
-    def _remembered(self) -> dict[Way, float]:
+    def _remembered(self) -> dict[Direction, float]:
         try:
             with open(self._path, "rb") as file:
                 found = json.load(file)

@@ -16,7 +16,7 @@ from contextlib import suppress
 from dataclasses import dataclass
 
 from neusee.workflows.store import metadata
-from neusee.workflows.store.metadata import UNREADABLE, About
+from neusee.workflows.store.metadata import UNREADABLE, Metadata
 from neusee.workflows.store.shared_folder import Disk
 
 LOW = 0.9  #: of the budget: what is left after it was reached
@@ -80,7 +80,7 @@ def evict(disk: Disk, found: Iterable[Candidate], excess: float, dry: bool) -> t
     return gone, refused
 
 
-class Room:
+class CacheBudget:
     """The bytes of a store against its budget, without counting them at each write."""
 
     def __init__(self, disk: Disk, budget: int) -> None:
@@ -135,7 +135,7 @@ def drop(disk: Disk, key: str) -> bool:
     return True
 
 
-def _write_receipt(disk: Disk, key: str, about: About) -> None:
+def _write_receipt(disk: Disk, key: str, about: Metadata) -> None:
     """On a disk without room not even that."""
     try:
         with disk.temporary(key) as (part, file):
@@ -148,7 +148,7 @@ def _write_receipt(disk: Disk, key: str, about: About) -> None:
         os.unlink(disk.path(key, "json"))
 
 
-def _unlink(disk: Disk, key: str, about: About) -> None:
+def _unlink(disk: Disk, key: str, about: Metadata) -> None:
     paths = [disk.path(key, "safetensors")] if about.get("payload") else []
     if name := about.get("file"):
         paths.append(f"{disk.folder}/files/{key[:2]}/{os.path.basename(name)}")

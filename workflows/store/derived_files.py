@@ -16,7 +16,7 @@ import xxhash
 from neusee.workflows.store.result_store import Store
 
 
-class Shelf:
+class DerivedFiles:
     """Files beside a store; where its folder takes none, they live as long as this object."""
 
     def __init__(self, store: Store) -> None:

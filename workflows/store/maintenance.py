@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING
 
 from neusee.workflows.store import metadata, orphan_files
 from neusee.workflows.store.budget_eviction import Candidate, candidates, evict, files, total
-from neusee.workflows.store.metadata import UNREADABLE, About, is_kept
+from neusee.workflows.store.metadata import UNREADABLE, Metadata, is_kept
 from neusee.workflows.store.shared_folder import Disk
 
 if TYPE_CHECKING:
@@ -33,7 +33,7 @@ class Checked:
     """A result that was read as a whole."""
 
     key: str
-    about: About | None
+    about: Metadata | None
     problem: str  #: empty where it is as it was written
 
 

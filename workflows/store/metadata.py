@@ -13,7 +13,7 @@ import xxhash
 
 from neusee.workflows.store.shared_folder import Disk
 
-About = dict[str, Any]
+Metadata = dict[str, Any]
 INLINE = 4096  #: bytes of tensors up to which a result stands in its JSON
 UNREADABLE = (OSError, ValueError, LookupError, TypeError, AttributeError, ImportError)
 _OF_THE_VALUE = ("layout", "payload", "tensors", "bands")
@@ -23,22 +23,22 @@ _SEAL_SIZE = len(_SEAL) + 32 + 2
 _encode = json.JSONEncoder(separators=(",", ":")).encode
 
 
-def seal(about: About) -> bytes:
+def seal(about: Metadata) -> bytes:
     """JSON whose last field is the checksum of all before it."""
     body = _encode(about)[:-1].encode()
     return body + f'{_SEAL}{xxhash.xxh3_128_hexdigest(body)}"}}'.encode()
 
 
-def unseal(raw: bytes) -> About:
+def unseal(raw: bytes) -> Metadata:
     """What `seal` wrote, or a `ValueError`."""
     body = raw[:-_SEAL_SIZE]
     if raw[-_SEAL_SIZE:] != f'{_SEAL}{xxhash.xxh3_128_hexdigest(body)}"}}'.encode():
         raise ValueError("its description is not the one that was written")
-    about: About = json.loads(body + b"}")
+    about: Metadata = json.loads(body + b"}")
     return about
 
 
-def read(disk: Disk, key: str) -> About:
+def read(disk: Disk, key: str) -> Metadata:
     """What stands beside ``key``; one of `UNREADABLE` where nothing can be trusted."""
     with open(disk.path(key, "json"), "rb") as file:
         about = unseal(file.read())
@@ -47,7 +47,7 @@ def read(disk: Disk, key: str) -> About:
     return about
 
 
-def read_whole(disk: Disk, key: str) -> About:
+def read_whole(disk: Disk, key: str) -> Metadata:
     """What stands beside ``key``, whose payload is there and has its size; one of `UNREADABLE` otherwise."""
     about = read(disk, key)
     payload = about.get("payload")
@@ -63,7 +63,7 @@ def read_whole(disk: Disk, key: str) -> About:
     return about
 
 
-def find(disk: Disk, key: str) -> About | None:
+def find(disk: Disk, key: str) -> Metadata | None:
     """`read_whole`, or None where nothing has the name.
 
     What cannot be trusted is read again before it is said to be damaged: it may just be taking its name.
@@ -86,18 +86,18 @@ def has_value(disk: Disk, key: str) -> bool:
         return os.path.exists(disk.path(key, "json"))
 
 
-def is_kept(about: About) -> bool:
+def is_kept(about: Metadata) -> bool:
     """Whether there is a value, and not the receipt alone."""
     return bool(about.get("kept", True))
 
 
-def bands(about: About) -> list[str]:
+def bands(about: Metadata) -> list[str]:
     """The names of the bands of a value that are stored apart."""
     names: list[str] = (about.get("bands") or {}).get("names", [])
     return names
 
 
-def receipt(about: About) -> About:
+def receipt(about: Metadata) -> Metadata:
     """All that is known of a result, without its value."""
     return {k: v for k, v in about.items() if k not in _OF_THE_VALUE} | {"kept": False}
 
@@ -116,7 +116,7 @@ def names(disk: Disk) -> Iterator[str]:
         yield path.stem
 
 
-def each(disk: Disk) -> Iterator[tuple[str, About]]:
+def each(disk: Disk) -> Iterator[tuple[str, Metadata]]:
     """Every key with what stands beside it; what cannot be read is passed over."""
     for key in names(disk):
         with suppress(*UNREADABLE):

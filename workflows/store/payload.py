@@ -7,7 +7,7 @@ import random
 from collections.abc import Iterable
 from typing import TYPE_CHECKING, Any
 
-from neusee.workflows.store.metadata import About
+from neusee.workflows.store.metadata import Metadata
 from neusee.workflows.store.shared_folder import Disk
 
 if TYPE_CHECKING:
@@ -24,7 +24,7 @@ def blobs_of(disk: Disk) -> Blobs:
     return Blobs(disk.root / "bands")
 
 
-def load(disk: Disk, about: About, verify: str, blobs: Blobs) -> tuple[Any, int]:
+def load(disk: Disk, about: Metadata, verify: str, blobs: Blobs) -> tuple[Any, int]:
     """The value that ``about`` describes, and how many bytes of its payload were compared.
 
     Raises one of `UNREADABLE` where it cannot be trusted.

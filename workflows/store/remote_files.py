@@ -19,7 +19,7 @@ from typing import Any, Literal, TypeVar
 from neusee.workflows.graph.diagnostics import nearest
 
 T = TypeVar("T")
-Way = Literal["down", "up"]
+Direction = Literal["down", "up"]
 _FRESH = 20.0  #: s for which a listing is believed
 _FEW = 3  #: folders that are listed one by one; whoever asks for more is told of all of them
 _PAUSE = 60.0  #: s for which a remote that failed is left alone; twice as long each time
@@ -30,7 +30,7 @@ _RENAMES = frozenset({"file", "local", "sftp", "ssh"})  #: show a file while it 
 _NEAR = frozenset({"file", "local", "memory"})
 
 
-class Far:
+class RemoteFiles:
     """A folder at a URL, with files in ``<first two letters>/`` by name."""
 
     def __init__(self, url: str) -> None:
@@ -40,18 +40,18 @@ class Far:
         self._renames, near = bool(kinds & _RENAMES), bool(kinds & _NEAR)
         self._latency = {"down": 5e-4 if near else 0.05, "up": 5e-4 if near else 0.05}
         self._rate = {"down": 4e8 if near else 5e7, "up": 4e8 if near else 5e7}
-        self._resume: dict[Way, float] = {"down": 0.0, "up": 0.0}
-        self._pause: dict[Way, float] = {"down": _PAUSE, "up": _PAUSE}
+        self._resume: dict[Direction, float] = {"down": 0.0, "up": 0.0}
+        self._pause: dict[Direction, float] = {"down": _PAUSE, "up": _PAUSE}
         self._warned = False
         self._listed: dict[str, tuple[float, set[str]]] = {}
         self._made: set[str] = set()
         self._lock = threading.Lock()
 
-    def seconds(self, way: Way, size: float) -> float:
+    def seconds(self, way: Direction, size: float) -> float:
         """Predicted s to move ``size`` bytes and the description that names them."""
         return 2 * self._latency[way] + size / self._rate[way]
 
-    def lists(self, name: str) -> bool:
+    def exists(self, name: str) -> bool:
         """Whether there was such a file when its folder was last listed."""
         with self._lock:
             if not self._fresh(name[:2]):
@@ -171,7 +171,7 @@ class Far:
                 if time.time() - entry["mtime"] > _ORPHAN:
                     self._fs.rm_file(entry["name"])
 
-    def _try(self, way: Way, do: Callable[[], T], size: Callable[[T], int] | None = None) -> T | None:
+    def _try(self, way: Direction, do: Callable[[], T], size: Callable[[T], int] | None = None) -> T | None:
         """What ``do`` gives; None where there is no such file, and while the remote is left alone."""
         if time.monotonic() < self._resume[way]:
             return None
@@ -187,7 +187,7 @@ class Far:
             self._learn(way, size(found), time.perf_counter() - began)
         return found
 
-    def _failed(self, way: Way, error: Exception) -> None:
+    def _failed(self, way: Direction, error: Exception) -> None:
         alone = isinstance(error, PermissionError | FileNotFoundError)  # what may not be written may yet be read
         for each in (way,) if alone else ("down", "up"):
             self._resume[each] = time.monotonic() + self._pause[each]
@@ -195,7 +195,7 @@ class Far:
         what = "read" if way == "down" else "written"
         self.warn(f"{self.url} cannot be {what} ({type(error).__name__}: {error}): results are kept here alone")
 
-    def _learn(self, way: Way, size: int, seconds: float) -> None:
+    def _learn(self, way: Direction, size: int, seconds: float) -> None:
         """Move what is predicted a third of the way towards what was measured."""
         if size < _LEARN:
             self._latency[way] += (seconds - self._latency[way]) / 3

@@ -23,9 +23,9 @@ import xxhash
 
 from neusee.workflows.keys.cache_key import Key, digest
 from neusee.workflows.store.environment import Verify
-from neusee.workflows.store.metadata import About, is_kept, receipt, seal, unseal
+from neusee.workflows.store.metadata import Metadata, is_kept, receipt, seal, unseal
 from neusee.workflows.store.payload import newest, stamp_of
-from neusee.workflows.store.remote_files import Far
+from neusee.workflows.store.remote_files import RemoteFiles
 from neusee.workflows.store.result_store import Store
 
 _NAME = re.compile("[0-9a-f]{32}")
@@ -56,12 +56,12 @@ class RemoteStore(Store):
     def __init__(
         self, url: str, root: Path | str | None = None, *, verify: Verify | None = None, budget: int | None = None
     ) -> None:
-        self.url, self._far = url, Far(url)
-        self._seen: dict[Key, About] = {}  # descriptions read there
+        self.url, self._far = url, RemoteFiles(url)
+        self._seen: dict[Key, Metadata] = {}  # descriptions read there
         self._broken: set[Key] = set()  # what is there is of no use
         super().__init__(root or local_layer(url), verify=verify, budget=budget)
 
-    def about(self, key: Key) -> About | None:
+    def about(self, key: Key) -> Metadata | None:
         """What is known of a result, here or there, without reading it."""
         here = super().about(key)
         if here is not None and is_kept(here):
@@ -74,22 +74,22 @@ class RemoteStore(Store):
             self._bring(key)
         return super().get(key)
 
-    def put(self, key: Key, value: Any, about: About) -> bool:
+    def put(self, key: Key, value: Any, about: Metadata) -> bool:
         """Keep a result here and there; False where not even the local layer takes it."""
         if not super().put(key, value, about):
             return False
         self._send(key)
         return True
 
-    def note(self, key: Key, about: About) -> bool:
+    def note(self, key: Key, about: Metadata) -> bool:
         """Keep what is known of a result, here and there, without its value."""
         if not super().note(key, about):
             return False
-        if not self._far.lists(_note(key)) and not self._far.lists(f"{key}.json"):
+        if not self._far.exists(_note(key)) and not self._far.exists(f"{key}.json"):
             self._far.write(_note(key), seal(receipt({"key": key, **about})))
         return True
 
-    def entries(self) -> Iterator[tuple[Key, About]]:
+    def entries(self) -> Iterator[tuple[Key, Metadata]]:
         """Every result's key and what is known of it: those here, then those that are only there; receipts too."""
         here = set()
         for key, about in super().entries():
@@ -111,12 +111,12 @@ class RemoteStore(Store):
         here = super().about(key)
         return here is not None and is_kept(here)
 
-    def _about_there(self, key: Key, look: bool = False) -> About | None:
+    def _about_there(self, key: Key, look: bool = False) -> Metadata | None:
         """The description at the remote of a value, else of a receipt; ``look``: whatever the listing says."""
         value = f"{key}.json"
-        if key not in self._broken and (look or self._far.lists(value)) and not self._is_there(key):
+        if key not in self._broken and (look or self._far.exists(value)) and not self._is_there(key):
             self._learn(key, value)
-        if key not in self._seen and self._far.lists(_note(key)):
+        if key not in self._seen and self._far.exists(_note(key)):
             self._learn(key, _note(key))
         return self._seen.get(key)
 
@@ -151,7 +151,7 @@ class RemoteStore(Store):
             self._give_up(key)
             self._far.warn(f"{self.root} takes no copy of what is at {self.url} ({error}): set NEUSEE_CACHE_LOCAL")
 
-    def _brought(self, key: Key, about: About) -> bool:
+    def _brought(self, key: Key, about: Metadata) -> bool:
         """Whether it came, every byte compared with its checksum."""
         payload, bands = about["payload"], _bands(about["layout"])
         missing = {name: xxh3 for name, xxh3 in bands.items() if not self.blobs.has(name)}
@@ -183,7 +183,7 @@ class RemoteStore(Store):
             blob = self.blobs.about(name)
             self.blobs.read([name], (1, *blob.shape), blob.dtype, xxh3=[xxh3])
 
-    def _described(self, key: Key, about: About, part: str) -> None:
+    def _described(self, key: Key, about: Metadata, part: str) -> None:
         """Put a payload in its place and its description beside it, with the stamps that files have here."""
         about = dict(about)
         if about["payload"]:
@@ -195,7 +195,7 @@ class RemoteStore(Store):
         self._write_about(key, about)
         self._lost.discard(key)
 
-    def _fetched(self, name: str, part: str, payload: About) -> bool:
+    def _fetched(self, name: str, part: str, payload: Metadata) -> bool:
         """Whether ``name`` came; `ValueError` where it is not what was written."""
         if not self._far.fetch(name, part):
             return False
@@ -212,7 +212,7 @@ class RemoteStore(Store):
     def _send(self, key: Key) -> None:
         """What is large first, then what names it; nothing where it was evicted in between."""
         name, over = f"{key}.json", key in self._broken
-        if not over and self._far.lists(name):
+        if not over and self._far.exists(name):
             return
         try:
             raw = Path(self.disk.path(key, "json")).read_bytes()
@@ -221,13 +221,13 @@ class RemoteStore(Store):
         except (OSError, ValueError, LookupError):
             return
         with ThreadPoolExecutor(16) as pool:
-            sent = pool.map(lambda to: (not over and self._far.lists(to)) or self._far.send(files[to], to), files)
+            sent = pool.map(lambda to: (not over and self._far.exists(to)) or self._far.send(files[to], to), files)
             if not all(sent):
                 return
         if self._far.write(name, raw, over):
             self._broken.discard(key)
 
-    def _files(self, key: Key, about: About) -> dict[str, str]:
+    def _files(self, key: Key, about: Metadata) -> dict[str, str]:
         """By name at the remote the path of each file that a value needs beside its description."""
         found = {}
         if payload := about["payload"]:

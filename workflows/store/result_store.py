@@ -22,14 +22,14 @@ from typing import TYPE_CHECKING, Any
 
 from neusee.workflows.store import maintenance, metadata, payload
 from neusee.workflows.store.bandwidth import Speeds
-from neusee.workflows.store.budget_eviction import LOW, Room
+from neusee.workflows.store.budget_eviction import LOW, CacheBudget
 from neusee.workflows.store.environment import Verify, budget_bytes, default_root, verify_mode
 from neusee.workflows.store.journal import Journal
 from neusee.workflows.store.lease import Lease, Leases
 from neusee.workflows.store.maintenance import Checked, Swept
-from neusee.workflows.store.metadata import INLINE, UNREADABLE, About, is_kept
+from neusee.workflows.store.metadata import INLINE, UNREADABLE, Metadata, is_kept
 from neusee.workflows.store.shared_folder import Disk
-from neusee.workflows.store.small_results import Brief
+from neusee.workflows.store.small_results import SmallResults
 
 if TYPE_CHECKING:
     from torch import Tensor
@@ -53,13 +53,13 @@ class Store:
         self.verify = verify_mode(verify)
         self.budget = budget_bytes(budget)
         self.disk = Disk(self.root)
-        self.brief = Brief(self.disk)
+        self.brief = SmallResults(self.disk)
         self.journal = Journal(self.disk, self.brief.each)
         self.code_memo = self.root / "code.json"
         self._leases = Leases(self.disk)
-        self._room = None if self.budget is None else Room(self.disk, self.budget)
+        self._room = None if self.budget is None else CacheBudget(self.disk, self.budget)
         self._speeds = Speeds(self.disk)
-        self._known: dict[str, About] = {}
+        self._known: dict[str, Metadata] = {}
         self._lost: set[str] = set()  # damaged, and perhaps not to be moved away
         self._used: set[str] = set()
         self._warned = False
@@ -74,7 +74,7 @@ class Store:
         about = self.about(key)
         return about is not None and is_kept(about)
 
-    def about(self, key: str) -> About | None:
+    def about(self, key: str) -> Metadata | None:
         """What is known of a result, without reading it; ``kept`` in it says whether there is a value too."""
         if key in self._known and is_kept(self._known[key]):
             return self._known[key]
@@ -106,11 +106,11 @@ class Store:
                 return value
         raise KeyError(key)
 
-    def put(self, key: str, value: Any, about: About) -> bool:
+    def put(self, key: str, value: Any, about: Metadata) -> bool:
         """Keep a value with what is ``about`` it; False where the folder takes none (one warning) or the budget."""
         return self._try(self._write, key, value, about)
 
-    def note(self, key: str, about: About) -> bool:
+    def note(self, key: str, about: Metadata) -> bool:
         """Keep what is ``about`` a result without its value, unless there is a value or such a receipt already."""
         return self._try(self._write_receipt, key, about)
 
@@ -137,11 +137,11 @@ class Store:
         """Read every value, whatever ``verify`` says; what is damaged is put aside."""
         return maintenance.check(self)
 
-    def jot(self, key: str, value: Any, about: About) -> bool:
+    def jot(self, key: str, value: Any, about: Metadata) -> bool:
         """Keep a small value, of a larger one what is ``about`` it, without a file: to lose it is no loss."""
         return self._try(self._jot, key, value, about)
 
-    def entries(self) -> Iterator[tuple[str, About]]:
+    def entries(self) -> Iterator[tuple[str, Metadata]]:
         """Every result's key and what is known of it, in the order of the keys; receipts too."""
         for key in heapq.merge(metadata.names(self.disk), (key for key, _ in self.brief.each())):
             about = self.about(key)
@@ -160,7 +160,7 @@ class Store:
         """What keeping ``size`` bytes takes, as this store's own writes did."""
         return self._speeds.seconds("write", size)
 
-    def _again(self, key: str) -> About | None:
+    def _again(self, key: str) -> Metadata | None:
         """What stands beside a result now; None where somebody has removed it."""
         self._known.pop(key, None)
         try:
@@ -168,7 +168,7 @@ class Store:
         except UNREADABLE:
             return None
 
-    def load(self, about: About, verify: str) -> Any:
+    def load(self, about: Metadata, verify: str) -> Any:
         """The value that ``about`` describes; one of `UNREADABLE` where it cannot be trusted."""
         began = time.perf_counter()
         value, size = payload.load(self.disk, about, verify, self.blobs)
@@ -194,7 +194,7 @@ class Store:
             self._warned = True
             return False
 
-    def _write(self, key: str, value: Any, about: About) -> bool:
+    def _write(self, key: str, value: Any, about: Metadata) -> bool:
         from neusee.workflows.store import serialization
 
         began = time.perf_counter()
@@ -217,12 +217,12 @@ class Store:
         self._make_room(size)
         return True
 
-    def _jot(self, key: str, value: Any, about: About) -> bool:
+    def _jot(self, key: str, value: Any, about: Metadata) -> bool:
         entry = self._known[key] = self.brief.put(key, value, about)
         self.journal.append(key, entry)
         return is_kept(entry)
 
-    def _write_parts(self, key: str, entry: About, tensors: list[Tensor], banded: Any) -> None:
+    def _write_parts(self, key: str, entry: Metadata, tensors: list[Tensor], banded: Any) -> None:
         """What is large first, then what names it; of two processes with one key the first one's stays."""
         from neusee.workflows.store import serialization
 
@@ -244,7 +244,7 @@ class Store:
                     entry["payload"]["stamp"] = payload.stamp_of(path)
                 self._write_about(key, entry)
 
-    def _write_about(self, key: str, entry: About) -> None:
+    def _write_about(self, key: str, entry: Metadata) -> None:
         """A torn entry fails its seal, so this small file need not wait for the disk."""
         path = self.disk.path(key, "json")
         with self.disk.temporary(key) as (part, file):
@@ -254,7 +254,7 @@ class Store:
                 self.disk.rename(part, path)
         self._known[key] = entry
 
-    def _write_receipt(self, key: str, about: About) -> bool:
+    def _write_receipt(self, key: str, about: Metadata) -> bool:
         """What has the name already stays: it tells no less."""
         entry = metadata.receipt({"key": key, **about})
         if self.about(key) is None:

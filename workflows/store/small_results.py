@@ -14,7 +14,7 @@ from contextlib import suppress
 from typing import Any
 
 from neusee.workflows.store import metadata
-from neusee.workflows.store.metadata import INLINE, UNREADABLE, About
+from neusee.workflows.store.metadata import INLINE, UNREADABLE, Metadata
 from neusee.workflows.store.shared_folder import Disk
 
 MOST = 64 << 20  #: bytes from which the older half is let go
@@ -22,7 +22,7 @@ _HEAD = b'{"key":"'
 _KEY = slice(len(_HEAD), len(_HEAD) + 32)
 
 
-class Brief:
+class SmallResults:
     """The lines of one store."""
 
     def __init__(self, disk: Disk) -> None:
@@ -31,7 +31,7 @@ class Brief:
         self._lines: dict[str, bytes] = {}
         self._file, self._offset = 0, 0
 
-    def find(self, key: str) -> About | None:
+    def find(self, key: str) -> Metadata | None:
         """What a line says of ``key``; None where there is none that can be trusted."""
         if key not in self._lines:
             self._take_in()
@@ -44,7 +44,7 @@ class Brief:
         except UNREADABLE:
             return None
 
-    def put(self, key: str, value: Any, about: About) -> About:
+    def put(self, key: str, value: Any, about: Metadata) -> Metadata:
         """Add a value if it is small, else its receipt; gives what was written. Raises `OSError`, `TypeError`."""
         from neusee.workflows.store import serialization
 
@@ -58,7 +58,7 @@ class Brief:
         self.append(entry)
         return entry
 
-    def append(self, about: About) -> None:
+    def append(self, about: Metadata) -> None:
         """Add a line. Raises `OSError` where that cannot be done."""
         raw = metadata.seal(about)
         try:
@@ -68,7 +68,7 @@ class Brief:
             self._write(raw, os.O_APPEND | os.O_WRONLY | os.O_CREAT)
             self._disk.share(self._path)
 
-    def each(self) -> Iterator[tuple[str, About]]:
+    def each(self) -> Iterator[tuple[str, Metadata]]:
         """Every key with what its newest line says."""
         self._take_in()
         for key in sorted(self._lines):

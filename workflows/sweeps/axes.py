@@ -10,7 +10,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from neusee.workflows.graph.diagnostics import Mark, Problem, RecipeError
+from neusee.workflows.graph.diagnostics import Diagnostic, Location, RecipeError
 from neusee.workflows.graph.final_values import flow
 from neusee.workflows.recipe.text.overrides import Override, read_override
 from neusee.workflows.recipe.text.python_overrides import overrides_of
@@ -32,7 +32,7 @@ class Axis:
 
     name: str
     coordinates: tuple[Coordinate, ...]
-    mark: Mark
+    mark: Location
 
 
 Argument = Override | Axis
@@ -57,38 +57,38 @@ class Point:
 def read_words(words: Sequence[str], folder: Path, first: int = 1) -> list[Argument]:
     """Arguments of the command line, counted from ``first``; a `RecipeError` has everything that is wrong with them."""
     found: list[Argument] = []
-    problems: list[Problem] = []
+    diagnostics: list[Diagnostic] = []
     for number, word in enumerate(words, first):
         try:
-            found.append(_read_word(word, Mark(f"argument {number}", folder=str(folder))))
+            found.append(_read_word(word, Location(f"argument {number}", folder=str(folder))))
         except RecipeError as error:
-            problems += error.problems
-    if problems:
-        raise RecipeError(problems)
+            diagnostics += error.diagnostics
+    if diagnostics:
+        raise RecipeError(diagnostics)
     return found
 
 
 def read_axes(axes: Mapping[str, str | Iterable[Any]], folder: Path) -> list[Argument]:
     """Axes as Python values: a list of values, or a text as the command line would have it."""
     found: list[Argument] = []
-    problems: list[Problem] = []
+    diagnostics: list[Diagnostic] = []
     for name, values in axes.items():
-        mark = Mark(f"axis {name}", folder=str(folder))
+        mark = Location(f"axis {name}", folder=str(folder))
         try:
             found.append(_read_axis(name, values, mark, folder))
         except RecipeError as error:
-            problems += error.problems
-    if problems:
-        raise RecipeError(problems)
+            diagnostics += error.diagnostics
+    if diagnostics:
+        raise RecipeError(diagnostics)
     return found
 
 
 def points(arguments: Sequence[Argument], paired: bool = False) -> list[Point]:
     """Every combination of the axes' values, the last axis fastest; or, ``paired``, the first with the first, …"""
     axes = [argument for argument in arguments if isinstance(argument, Axis)]
-    problems = list(_wrong(axes, paired))
-    if problems:
-        raise RecipeError(problems)
+    diagnostics = list(_wrong(axes, paired))
+    if diagnostics:
+        raise RecipeError(diagnostics)
     sizes = [range(len(axis.coordinates)) for axis in axes]
     places = zip(*sizes, strict=True) if paired else itertools.product(*sizes)
     return [_point(number, place, arguments, axes) for number, place in enumerate(places, 1)]
@@ -97,7 +97,7 @@ def points(arguments: Sequence[Argument], paired: bool = False) -> list[Point]:
 # --- arguments ------------------------------------------------------------------------------------------------------
 
 
-def _read_word(word: str, mark: Mark) -> Argument:
+def _read_word(word: str, mark: Location) -> Argument:
     name, _, text = word.partition("=")
     if "=" not in word or name.startswith("~"):
         return read_override(word, mark)
@@ -105,29 +105,29 @@ def _read_word(word: str, mark: Mark) -> Argument:
         values = values_of(text)
         one = len(values) == 1 and not spans(text)
     except ValueError as error:
-        raise RecipeError([Problem(mark, word, str(error))]) from None
+        raise RecipeError([Diagnostic(mark, word, str(error))]) from None
     if one:
         return read_override(word, mark)
     if name.startswith("+"):
         fix = "an added value is the same at every point: quote a text with commas"
-        raise RecipeError([Problem(mark, word, fix)])
+        raise RecipeError([Diagnostic(mark, word, fix)])
     return _axis(name, values, mark)
 
 
-def _read_axis(name: str, values: str | Iterable[Any], mark: Mark, folder: Path) -> Axis:
+def _read_axis(name: str, values: str | Iterable[Any], mark: Location, folder: Path) -> Axis:
     if name.startswith(("+", "~")):
-        raise RecipeError([Problem(mark, name, "an axis changes a value that is there: leave out the sign")])
+        raise RecipeError([Diagnostic(mark, name, "an axis changes a value that is there: leave out the sign")])
     if isinstance(values, str):
         try:
             return _axis(name, values_of(values), mark)
         except ValueError as error:
-            raise RecipeError([Problem(mark, f"{name}={values}", str(error))]) from None
+            raise RecipeError([Diagnostic(mark, f"{name}={values}", str(error))]) from None
     listed = values.tolist() if hasattr(values, "tolist") else values
     if isinstance(listed, Mapping) or not isinstance(listed, Iterable):
-        raise RecipeError([Problem(mark, name, f"give a list of values, not {type(values).__name__}")])
+        raise RecipeError([Diagnostic(mark, name, f"give a list of values, not {type(values).__name__}")])
     found = tuple(_coordinate(name, value, folder) for value in listed)
     if not found:
-        raise RecipeError([Problem(mark, name, "has no values")])
+        raise RecipeError([Diagnostic(mark, name, "has no values")])
     return Axis(name, found, mark)
 
 
@@ -138,44 +138,44 @@ def _coordinate(name: str, value: Any, folder: Path) -> Coordinate:
     return Coordinate(plain if isinstance(plain, str) else flow(plain), plain, changes)
 
 
-def _axis(name: str, values: Sequence[str], mark: Mark) -> Axis:
-    problems: list[Problem] = []
+def _axis(name: str, values: Sequence[str], mark: Location) -> Axis:
+    diagnostics: list[Diagnostic] = []
     found: list[Coordinate] = []
     for text in values:
         try:
             change = read_override(f"{name}={text}", mark)
         except RecipeError as error:
-            problems += error.problems
+            diagnostics += error.diagnostics
             continue
         assert change.value is not None
         plain = change.value.plain
         found.append(Coordinate(plain if isinstance(plain, str) else text, plain, (change,)))
-    if problems:
-        raise RecipeError(problems)
+    if diagnostics:
+        raise RecipeError(diagnostics)
     return Axis(name, tuple(found), mark)
 
 
 # --- combinations ---------------------------------------------------------------------------------------------------
 
 
-def _wrong(axes: Sequence[Axis], paired: bool) -> Iterable[Problem]:
+def _wrong(axes: Sequence[Axis], paired: bool) -> Iterable[Diagnostic]:
     """What is wrong with the axes together."""
     if not axes:
-        yield Problem(Mark("sweep"), "", "no axis: write a=1,2,3 or a='linspace(450 nm, 650 nm, 5)'")
+        yield Diagnostic(Location("sweep"), "", "no axis: write a=1,2,3 or a='linspace(450 nm, 650 nm, 5)'")
     first: dict[str, Axis] = {}
     for axis in axes:
         if first.setdefault(axis.name, axis) is not axis:
-            yield Problem(axis.mark, axis.name, f"is an axis already ({first[axis.name].mark})")
+            yield Diagnostic(axis.mark, axis.name, f"is an axis already ({first[axis.name].mark})")
         twice = [value for value, count in Counter(c.shown for c in axis.coordinates).items() if count > 1]
         if twice:
-            yield Problem(axis.mark, axis.name, f"{twice[0]} stands twice")
+            yield Diagnostic(axis.mark, axis.name, f"{twice[0]} stands twice")
         there, here = len(axes[0].coordinates), len(axis.coordinates)
         if paired and there != here:
             told = f"has {here} values, and {axes[0].name} ({axes[0].mark}) has {there}"
-            yield Problem(axis.mark, axis.name, f"{told}: paired axes have equally many")
+            yield Diagnostic(axis.mark, axis.name, f"{told}: paired axes have equally many")
     count = 1 if paired else math.prod(len(axis.coordinates) for axis in axes)
     if count > MOST:
-        yield Problem(Mark("sweep"), "", f"{count} points: at most {MOST}")
+        yield Diagnostic(Location("sweep"), "", f"{count} points: at most {MOST}")
 
 
 def _point(number: int, place: tuple[int, ...], arguments: Sequence[Argument], axes: Sequence[Axis]) -> Point:

@@ -6,7 +6,7 @@ import importlib.util
 from collections.abc import Collection, Mapping, Sequence
 from typing import TYPE_CHECKING, Any
 
-from neusee.workflows.graph.diagnostics import Mark, Problem, RecipeError
+from neusee.workflows.graph.diagnostics import Diagnostic, Location, RecipeError
 from neusee.workflows.graph.final_values import flow
 from neusee.workflows.sweeps.sweep_table import Column, header, rows_of
 
@@ -22,7 +22,7 @@ def require_xarray(asked_by: str) -> None:
     missing = [name for name in _PACKAGES if importlib.util.find_spec(name) is None]
     if missing:
         told = f'needs {" and ".join(missing)}: pip install "neusee[xarray]"'
-        raise RecipeError([Problem(Mark(asked_by), "", told)])
+        raise RecipeError([Diagnostic(Location(asked_by), "", told)])
 
 
 def write_table(folder: RunFolder, outcomes: Sequence[Outcome], columns: Sequence[Column]) -> None:

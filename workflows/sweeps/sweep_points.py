@@ -16,7 +16,7 @@ from typing import Any, Literal
 
 from neusee.workflows.engine.node_call import RunError, place
 from neusee.workflows.engine.runner import Event, Result, run
-from neusee.workflows.graph.diagnostics import Problem, RecipeError
+from neusee.workflows.graph.diagnostics import Diagnostic, RecipeError
 from neusee.workflows.graph.recipe_graph import Recipe, needed
 from neusee.workflows.keys.cache_key import Key, key_of
 from neusee.workflows.keys.code_digest import Code
@@ -26,7 +26,7 @@ from neusee.workflows.report.result_numbers import numbers_of
 from neusee.workflows.store.result_store import Store
 from neusee.workflows.sweeps.axes import Point
 from neusee.workflows.sweeps.point_order import Job, best_order, work_left
-from neusee.workflows.tolerance.cheaper_steps import economised
+from neusee.workflows.tolerance.cheaper_steps import with_substitutions
 
 State = Literal["run", "cached", "failed"]
 OnError = Literal["continue", "stop"]
@@ -76,8 +76,8 @@ def planned(
     """Compose and check every point and put them in order; a `RecipeError` has every mistake of all of them."""
     checker = _Checker(recipe, folder, store, device)
     checked = list(checker.every(points))
-    if checker.problems or checker.first is None:
-        raise RecipeError(checker.problems)
+    if checker.diagnostics or checker.first is None:
+        raise RecipeError(checker.diagnostics)
     costs = _costs(store)
     in_turn = [checked[i] for i in best_order([c.job for c in checked], costs, paired)]
     work = work_left([c.job for c in in_turn], costs, store.has)
@@ -162,7 +162,7 @@ class _Checker:
     def __init__(self, recipe: str, folder: Path, store: Store, device: str) -> None:
         self.recipe, self.folder, self.device = recipe, folder, device
         self.code = Code(store.code_memo)
-        self.problems: list[Problem] = []
+        self.diagnostics: list[Diagnostic] = []
         self.notes: dict[str, None] = {}
         self.first: Recipe | None = None
         self._same: dict[Any, Any] = {}
@@ -174,20 +174,20 @@ class _Checker:
                 composed = compose(self.recipe, point.overrides, self.folder)
                 yield Checked(point, composed, self._job(point, check(composed)))
             except RecipeError as error:
-                self.problems += error.problems
+                self.diagnostics += error.diagnostics
         self.code.save()
 
     def _job(self, point: Point, recipe: Recipe) -> Job:
         self.first = self.first or recipe
         self.notes.update(dict.fromkeys(recipe.notes))
         keys: dict[str, Key] = {}
-        recipe = economised(recipe, recipe.outputs)
+        recipe = with_substitutions(recipe, recipe.outputs)
         for name in needed(recipe, recipe.outputs):
             step = recipe.steps[name]
             try:
                 keys[name] = self._once(key_of(step, keys, recipe.seed, self.code, place(step, self.device))[0])
             except (OSError, LookupError, TypeError) as error:
-                raise RecipeError([Problem(step.mark, name, str(error))]) from error
+                raise RecipeError([Diagnostic(step.mark, name, str(error))]) from error
         sources = tuple((name, recipe.steps[name].sources) for name in keys)
         graph = self._same.setdefault(sources, dict(sources))
         return Job(point.place, keys, graph, recipe.outputs)

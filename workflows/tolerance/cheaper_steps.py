@@ -13,7 +13,7 @@ from collections.abc import Collection, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from typing import TYPE_CHECKING, Any
 
-from neusee.workflows.graph.recipe_graph import UNHEARD, Economy, Recipe, Step, Wire, in_order, needed
+from neusee.workflows.graph.recipe_graph import METRIC_TOLERANCE, Recipe, Step, Substitution, Wire, in_order, needed
 from neusee.workflows.tolerance.tolerance_frontier import unheard
 from neusee.workflows.tolerance.zero_effect_steps import without_nothing
 
@@ -25,19 +25,19 @@ _LEAST = 2e-5  #: of a tolerance, below which sums over bands can hardly be prov
 _MIXTURE = 0.1  #: share of the tolerance for a mixture, rounded down to a power of ten so that it is seldom another
 
 
-def economised(recipe: Recipe, wanted: Iterable[str], pinned: Collection[str] = ()) -> Recipe:
-    """``recipe`` with cheaper steps for what only ``wanted`` needs; as it is with ``keep_all``.
+def with_substitutions(recipe: Recipe, wanted: Iterable[str], pinned: Collection[str] = ()) -> Recipe:
+    """``recipe`` with cheaper steps for what only ``wanted`` needs; as it is with ``exact``.
 
     The scene of an image that follows a step in ``pinned`` stays whole: what is being learnt
     has no mixture yet. A recipe that was economised does not change again.
     """
     wanted = frozenset(wanted)
-    if recipe.keep_all:
+    if recipe.exact:
         return recipe
     recipe = without_nothing(recipe, needed(recipe, sorted(wanted)))
     order = needed(recipe, sorted(wanted))
     recipe = _limited(recipe, order)
-    images = [recipe.steps[n] for n in order if recipe.steps[n].node.collapsed is not None and n not in wanted]
+    images = [recipe.steps[n] for n in order if recipe.steps[n].node.channel_sum_form is not None and n not in wanted]
     if not images or recipe.tolerance * recipe.strict <= _LEAST:
         return recipe
     behind = _behind(recipe, order, pinned)
@@ -51,7 +51,7 @@ def economised(recipe: Recipe, wanted: Iterable[str], pinned: Collection[str] = 
 
 def _limited(recipe: Recipe, order: Sequence[str]) -> Recipe:
     """The recipe with a limit where nodes do not tell, if its tolerance is larger."""
-    steps = unheard(recipe, order) if recipe.tolerance > UNHEARD else frozenset[str]()
+    steps = unheard(recipe, order) if recipe.tolerance > METRIC_TOLERANCE else frozenset[str]()
     return recipe if steps == recipe.unheard else replace(recipe, unheard=steps)
 
 
@@ -100,12 +100,16 @@ class _Draft:
     readers: Mapping[str, list[str]]
     added: dict[str, Step] = field(default_factory=dict)
     rewired: dict[str, Step] = field(default_factory=dict)
-    economies: list[Economy] = field(default_factory=list)
+    substitutions: list[Substitution] = field(default_factory=list)
 
     def collapse(self, image: Step) -> None:
         """Put the channels of an image beside it, if all that reads it asks for sums over its bands."""
         readers = [self.rewired.get(name, self.recipe.steps[name]) for name in self.readers.get(image.name, ())]
-        node, radiance, spectral = image.node.collapsed, image.wires.get("radiance"), self.spectral(image.name, readers)
+        node, radiance, spectral = (
+            image.node.channel_sum_form,
+            image.wires.get("radiance"),
+            self.spectral(image.name, readers),
+        )
         if node is None or spectral is None or not isinstance(radiance, str):
             return
         bands, responses = spectral
@@ -115,12 +119,14 @@ class _Draft:
             "psf": image.wires.get("psf"),
             "rows": self._rows(bands, responses, readers, image),
         }
-        largest = any(reader.node.sums is not None for reader in readers)  # the level follows the brightest pixel
+        largest = any(
+            reader.node.hooks.band_invariant is not None for reader in readers
+        )  # the level follows the brightest pixel
         self._add(name, node, wires, {**image.params, "within": within, "largest": largest}, image)
         for reader in readers:
             changed = {i: _exchanged(wire, image.name, name) for i, wire in reader.wires.items()}
             self.rewired[reader.name] = replace(reader, wires=changed)
-        self.economies.append(Economy(image.name, name, within, "only sums over its bands are asked for"))
+        self.substitutions.append(Substitution(image.name, name, within, "only sums over its bands are asked for"))
 
     def spectral(self, image: str, readers: Sequence[Step]) -> tuple[str, str] | None:
         """The bands and responses by which all ``readers`` ask for sums over an image; None where one asks for more."""
@@ -132,27 +138,31 @@ class _Draft:
 
     def finished(self) -> Recipe:
         """The recipe with the steps that stand in."""
-        if not self.economies:
+        if not self.substitutions:
             return self.recipe
         steps = {**self.recipe.steps, **self.added, **self.rewired}
         order = in_order({name: step.sources for name, step in steps.items()}, steps)
-        found = (*self.recipe.economies, *self.economies)
+        found = (*self.recipe.substitutions, *self.substitutions)
         steps = {name: steps[name] for name in order}
-        return replace(self.recipe, steps=steps, economies=found, whole=self.recipe.whole or self.recipe)
+        return replace(
+            self.recipe, steps=steps, substitutions=found, unsubstituted=self.recipe.unsubstituted or self.recipe
+        )
 
     def _sums(self, reader: Step, image: str) -> bool:
         """Whether a step asks nothing of the image but sums over its bands."""
         reads = {i for i, wire in reader.wires.items() if image == wire or (isinstance(wire, tuple) and image in wire)}
-        if not reads <= set(reader.node.channels) or (reader.node.sums and not reader.node.sums(reader.params)):
+        if not reads <= set(reader.node.accepts_channel_sums) or (
+            reader.node.hooks.band_invariant and not reader.node.hooks.band_invariant(reader.params)
+        ):
             return False
-        return all(self._even(reader.wires.get(i)) for i in reader.node.even)
+        return all(self._even(reader.wires.get(i)) for i in reader.node.needs_band_invariant)
 
     def _even(self, wire: Wire) -> bool:
         """Whether a result is the same for every band, as its own node says."""
         if not isinstance(wire, str):
             return wire is None
         step = self.recipe.steps[wire]
-        return step.node.sums is not None and step.node.sums(step.params)
+        return step.node.hooks.band_invariant is not None and step.node.hooks.band_invariant(step.params)
 
     def _rows(self, bands: str, responses: str, readers: list[Step], image: Step) -> str:
         """The step that gives the weights of the bands; with the well's where a step reads bands but no responses."""
@@ -167,13 +177,13 @@ class _Draft:
         from neusee.nodes import spectra
 
         step, new = self.recipe.steps[name], f"{name}.mixture"
-        through = next((i for i in step.node.mixtures if isinstance(step.wires.get(i), str)), None)
+        through = next((i for i in step.node.accepts_low_rank if isinstance(step.wires.get(i), str)), None)
         if through is not None and name not in self.wanted:
             wires = {**step.wires, through: self._mixture(str(step.wires[through]), image)}
             return self._add(new, step.node, wires, step.params, step)
         within = {"within": 10.0 ** math.floor(math.log10(self.recipe.allowed(image.name) * _MIXTURE))}
-        if step.node.mixed is not None and name not in self.wanted:
-            return self._add(new, step.node.mixed, step.wires, {**step.params, **within}, step)
+        if step.node.low_rank_form is not None and name not in self.wanted:
+            return self._add(new, step.node.low_rank_form, step.wires, {**step.params, **within}, step)
         return self._add(new, spectra.compress, {"cube": name}, within, step)
 
     def _add(self, name: str, node: Node, wires: Mapping[str, Wire], params: Mapping[str, Any], like: Step) -> str:

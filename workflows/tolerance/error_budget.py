@@ -8,33 +8,33 @@ from typing import Any
 
 from neusee.workflows.graph.recipe_graph import Recipe, Step
 from neusee.workflows.tolerance.cheaper_steps import CHANNELS
-from neusee.workflows.tolerance.skip_decision import FactsOf, Verdict, judge
+from neusee.workflows.tolerance.skip_decision import FactsOf, SkipDecision, judge
 
 _NOTHING: dict[str, float] = {}
 
 
-class Ledger:
+class ErrorBudget:
     """Bounds by decision, summed along the graph: what is left out upstream leaves less for what follows.
 
     Steps are brought in running order, each with `pass_on` or `verdict`.
     """
 
     def __init__(self, recipe: Recipe) -> None:
-        share = 1.0 - 2 * CHANNELS if any(e.within for e in recipe.economies) else 1.0
+        share = 1.0 - 2 * CHANNELS if any(e.within for e in recipe.substitutions) else 1.0
         self._recipe, self._share = recipe, share
         self._spent: dict[str, dict[str, float]] = {}  # by step: decision -> its bound; shared where equal
 
-    def copy(self) -> Ledger:
+    def copy(self) -> ErrorBudget:
         """The same account, to be carried on by itself."""
         found = copy(self)
         found._spent = dict(self._spent)
         return found
 
-    def verdict(self, step: Step, params: Mapping[str, Any], facts_of: FactsOf) -> Verdict:
-        """Whether a step whose node has a bound is left out; with `Recipe.keep_all` nothing is."""
+    def verdict(self, step: Step, params: Mapping[str, Any], facts_of: FactsOf) -> SkipDecision:
+        """Whether a step whose node has a bound is left out; with `Recipe.exact` nothing is."""
         spent = self.pass_on(step)
-        if self._recipe.keep_all:
-            return Verdict(float("inf"), False, "everything is kept", "")
+        if self._recipe.exact:
+            return SkipDecision(float("inf"), False, "everything is kept", "")
         found = judge(step, params, facts_of, self._recipe.allowed(step.name) * self._share - sum(spent.values()))
         if found.left_out:
             self.leave_out(step, found.bound)

@@ -1,6 +1,6 @@
 """What all that was left out, or computed more cheaply, may change at every step: carried along the graph by the nodes.
 
-A node says how far its result may be off where its inputs are (`Node.carries`). Where one does
+A node says how far its result may be off where its inputs are (`Node.propagate_error`). Where one does
 not, nothing is known behind it, and its inputs are what is held to the tolerance.
 """
 
@@ -10,17 +10,17 @@ import math
 from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass, field
 
-from neusee.nodes import Deviation, Facts
+from neusee.nodes import ErrorBound, TensorStats
 from neusee.workflows.engine.node_call import RunError
-from neusee.workflows.engine.step_record import Done
+from neusee.workflows.engine.step_record import StepRecord
 from neusee.workflows.graph.recipe_graph import Recipe, Step, Wire
 
-FactsOf = Callable[[str], Facts | None]
-_EXACT = Deviation(0.0)
+FactsOf = Callable[[str], TensorStats | None]
+_EXACT = ErrorBound(0.0)
 
 
 @dataclass(frozen=True, slots=True)
-class Proof:
+class ErrorBounds:
     """Bounds as shares of the largest element of each result."""
 
     shares: Mapping[str, float] = field(default_factory=dict)  #: by step; infinite where no node tells
@@ -42,7 +42,7 @@ class Proof:
         return max((share / limit if limit > 0 else math.inf for share, limit in shares), default=0.0)
 
 
-class Unproved(Exception):
+class ToleranceNotProven(Exception):
     """What was left out may have changed so many times what is allowed."""
 
     def __init__(self, over: float) -> None:
@@ -51,58 +51,62 @@ class Unproved(Exception):
 
 
 def proof(
-    recipe: Recipe, order: Iterable[str], wanted: Iterable[str], done: Callable[[str], Done], facts_of: FactsOf
-) -> Proof:
+    recipe: Recipe, order: Iterable[str], wanted: Iterable[str], done: Callable[[str], StepRecord], facts_of: FactsOf
+) -> ErrorBounds:
     """Carry the bounds of a run from step to step, in running order; nothing is computed."""
-    found: dict[str, Deviation] = {}
+    found: dict[str, ErrorBound] = {}
     held: dict[str, float] = {}
     for name in order:
         step = recipe.steps[name]
         inputs = [_gathered(step.wires.get(i), found) for i in step.node.inputs]
         own = _own(step, done(name), facts_of)
-        if own is None and not any(d.bound for part in inputs for d in _each(part)):
+        if own is None and not any(d.rms for part in inputs for d in _each(part)):
             continue  # exact, as almost every step is
         carried, facts = _carried(step, inputs, facts_of(name)), facts_of(name)
         if math.isinf(carried):
             told = {source: found[source].share for source in step.sources if source in found}
             held |= {source: share for source, share in told.items() if math.isfinite(share)}
         error = done(name).error
-        found[name] = Deviation(carried + (own or 0.0), facts, error[1] if error else None)
+        found[name] = ErrorBound(carried + (own or 0.0), facts, error[1] if error else None)
     shares = {name: deviation.share for name, deviation in found.items()}
     held |= {name: shares[name] for name in wanted if math.isfinite(shares.get(name, math.inf))}
-    return Proof(shares, held)
+    return ErrorBounds(shares, held)
 
 
-def _own(step: Step, done: Done, facts_of: FactsOf) -> float | None:
+def _own(step: Step, done: StepRecord, facts_of: FactsOf) -> float | None:
     """What a step itself adds, in the unit of its result: as a cheaper form, or by being left out."""
     share = done.bound if done.state == "left out" else done.error and done.error[0]
     facts = facts_of(done.step)
     if not share or facts is None:
         return None
     largest = max(abs(facts.min), abs(facts.max))
-    if done.state == "left out" and step.node.scale is not None:
-        largest = step.node.scale(facts, **step.params)
+    if done.state == "left out" and step.node.hooks.skip_scale is not None:
+        largest = step.node.hooks.skip_scale(facts, **step.params)
     return share * largest / max(1.0 - share, 1e-3)
 
 
-def _carried(step: Step, inputs: list[Deviation | list[Deviation] | None], result: Facts | None) -> float:
-    if not any(d.bound for part in inputs for d in _each(part)):
+def _carried(step: Step, inputs: list[ErrorBound | list[ErrorBound] | None], result: TensorStats | None) -> float:
+    if not any(d.rms for part in inputs for d in _each(part)):
         return 0.0
-    if step.node.deviation is not None:
+    if step.node.hooks.approximation_error is not None:
         return 0.0  # it tells of all that it lacks
-    if step.node.spread is None or result is None or any(math.isinf(d.bound) for part in inputs for d in _each(part)):
+    if (
+        step.node.hooks.propagate_error is None
+        or result is None
+        or any(math.isinf(d.rms) for part in inputs for d in _each(part))
+    ):
         return math.inf
     try:
-        return float(step.node.spread(*inputs, result=result, **step.params))
+        return float(step.node.hooks.propagate_error(*inputs, result=result, **step.params))
     except Exception as error:
         raise RunError(step, [], error) from error
 
 
-def _gathered(wire: Wire, found: Mapping[str, Deviation]) -> Deviation | list[Deviation] | None:
+def _gathered(wire: Wire, found: Mapping[str, ErrorBound]) -> ErrorBound | list[ErrorBound] | None:
     if wire is None or isinstance(wire, str):
         return None if wire is None else found.get(wire, _EXACT)
     return [found.get(name, _EXACT) for name in wire]
 
 
-def _each(part: Deviation | list[Deviation] | None) -> list[Deviation]:
+def _each(part: ErrorBound | list[ErrorBound] | None) -> list[ErrorBound]:
     return part if isinstance(part, list) else [part] if part else []

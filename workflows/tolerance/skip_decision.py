@@ -8,15 +8,15 @@ from typing import Any
 
 from torch import Tensor
 
-from neusee.nodes import Facts
+from neusee.nodes import TensorStats
 from neusee.workflows.engine.node_call import RunError
 from neusee.workflows.graph.recipe_graph import Step
 
-FactsOf = Callable[[str], Facts | None]
+FactsOf = Callable[[str], TensorStats | None]
 
 
 @dataclass(frozen=True, slots=True)
-class Verdict:
+class SkipDecision:
     """What leaving a step out changes at most, and what stands in for its result."""
 
     bound: float
@@ -30,7 +30,7 @@ class _Later:
 
     __slots__ = ("_find", "_seen")
 
-    def __init__(self, find: Callable[[], Facts | None], seen: list[Facts]) -> None:
+    def __init__(self, find: Callable[[], TensorStats | None], seen: list[TensorStats]) -> None:
         self._find, self._seen = find, seen
 
     def __getattr__(self, name: str) -> Any:
@@ -40,29 +40,29 @@ class _Later:
         return getattr(facts, name)
 
 
-def judge(step: Step, params: Mapping[str, Any], facts_of: FactsOf, tolerance: float) -> Verdict:
+def judge(step: Step, params: Mapping[str, Any], facts_of: FactsOf, tolerance: float) -> SkipDecision:
     """The verdict on a step whose node has a bound; ``facts_of`` is asked for what the bound reads and no more."""
     node, first = step.node, step.wires.get(step.node.inputs[0])
-    if node.bound is None or not isinstance(first, str):
-        return Verdict(float("inf"), False, "nothing could stand in for it", "")
-    seen: list[Facts] = []
+    if node.hooks.skip_bound is None or not isinstance(first, str):
+        return SkipDecision(float("inf"), False, "nothing could stand in for it", "")
+    seen: list[TensorStats] = []
     facts = [_facts(step.wires.get(name), facts_of, seen) for name in node.inputs]
     try:
-        bound = float(node.bound(*facts, **{name: _number(value) for name, value in params.items()}))
+        bound = float(node.hooks.skip_bound(*facts, **{name: _number(value) for name, value in params.items()}))
     except RunError:
         raise
     except Exception as error:
         raise RunError(step, [], error) from error
     if not all(f.finite for f in seen):
-        return Verdict(float("inf"), False, "its input is not finite, so nothing bounds its effect", first)
+        return SkipDecision(float("inf"), False, "its input is not finite, so nothing bounds its effect", first)
     left_out = bound <= tolerance
     why = (
         f"changes at most {bound:.2g}, tolerance {tolerance:.2g}" if bound < float("inf") else "no bound on its effect"
     )
-    return Verdict(bound, left_out, why, first)
+    return SkipDecision(bound, left_out, why, first)
 
 
-def _facts(wire: str | tuple[str, ...] | None, facts_of: FactsOf, seen: list[Facts]) -> Any:
+def _facts(wire: str | tuple[str, ...] | None, facts_of: FactsOf, seen: list[TensorStats]) -> Any:
     if wire is None:
         return None
     if isinstance(wire, str):

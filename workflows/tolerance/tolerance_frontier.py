@@ -15,7 +15,7 @@ def border(recipe: Recipe, order: Iterable[str], wanted: Iterable[str]) -> list[
         reads = [source for source in step.sources if source in off]
         if reads and not _tells(step):
             found |= dict.fromkeys(reads)
-        elif reads or step.node.deviation is not None or step.node.bound is not None:
+        elif reads or step.node.hooks.approximation_error is not None or step.node.hooks.skip_bound is not None:
             off.add(name)
     return [*found, *(name for name in wanted if name in off and name not in found)]
 
@@ -30,4 +30,4 @@ def unheard(recipe: Recipe, order: Sequence[str]) -> frozenset[str]:
 
 
 def _tells(step: Step) -> bool:
-    return step.node.spread is not None or step.node.deviation is not None
+    return step.node.hooks.propagate_error is not None or step.node.hooks.approximation_error is not None

@@ -11,10 +11,10 @@ from collections.abc import Iterable, Mapping
 from dataclasses import replace
 from typing import Any
 
-from neusee.nodes import Facts
-from neusee.workflows.graph.recipe_graph import Economy, Recipe, Step, Wire
+from neusee.nodes import TensorStats
+from neusee.workflows.graph.recipe_graph import Recipe, Step, Substitution, Wire
 
-_DARK = Facts((), "float32", 0.0, 0.0, 0.0, 0, True)  #: of a result that is 0 everywhere
+_DARK = TensorStats((), "float32", 0.0, 0.0, 0.0, 0, True)  #: of a result that is 0 everywhere
 
 
 class _Unknown:
@@ -30,24 +30,24 @@ def without_nothing(recipe: Recipe, order: Iterable[str]) -> Recipe:
     changed: dict[str, Step] = {}
     for name in order:
         step = recipe.steps[name]
-        if step.node.nothing is not None and _nothing(step, dark):
+        if step.node.hooks.zero_bound is not None and _nothing(step, dark):
             dark.setdefault(name)
-        elif step.node.adds and not dark.keys().isdisjoint(step.sources):
+        elif step.node.additive_inputs and not dark.keys().isdisjoint(step.sources):
             changed[name] = replace(step, wires=without(step, dark))
     if not changed:
         return recipe
-    told = {e.step for e in recipe.economies}
+    told = {e.step for e in recipe.substitutions}
     why = "its parameters say that it is nothing"
-    found = tuple(Economy(name, "", 0.0, why) for name in dark if name not in told)
-    steps, whole = {**recipe.steps, **changed}, recipe.whole or recipe
-    return replace(recipe, steps=steps, economies=(*recipe.economies, *found), whole=whole)
+    found = tuple(Substitution(name, "", 0.0, why) for name in dark if name not in told)
+    steps, whole = {**recipe.steps, **changed}, recipe.unsubstituted or recipe
+    return replace(recipe, steps=steps, substitutions=(*recipe.substitutions, *found), unsubstituted=whole)
 
 
 def _nothing(step: Step, dark: Mapping[str, None]) -> bool:
     """Whether a step is nothing, as its parameters and what is known to be nothing tell."""
     inputs = [_known(step.wires.get(name), dark) for name in step.node.inputs]
     try:
-        bound = float(step.node.nothing(*inputs, **step.params)) if step.node.nothing else math.inf
+        bound = float(step.node.hooks.zero_bound(*inputs, **step.params)) if step.node.hooks.zero_bound else math.inf
     except LookupError:
         return False
     return bound == 0.0
@@ -64,7 +64,7 @@ def _known(wire: Wire, dark: Mapping[str, None]) -> Any:
 def without(step: Step, dark: Mapping[str, None]) -> dict[str, Wire]:
     """The wires of a step less those that add nothing, and what goes with them."""
     wires = dict(step.wires)
-    for light, *others in step.node.adds:
+    for light, *others in step.node.additive_inputs:
         wire = wires.get(light)
         if isinstance(wire, str) and wire in dark:
             wires |= dict.fromkeys((light, *others))

@@ -56,8 +56,8 @@ def _wrong(path: Path) -> str:
     from neusee.nodes.scene import photograph
 
     try:
-        if photograph.before is not None:
-            photograph.before(file=path, shape=None)
+        if photograph.hooks.preflight is not None:
+            photograph.hooks.preflight(file=path, shape=None)
         with path.open("rb") as file:
             end = _ENDS[file.read(2)]
             file.seek(max(0, path.stat().st_size - _TAIL))

@@ -31,10 +31,10 @@ from neusee.workflows.training.checkpoint import (
 from neusee.workflows.training.mask_stage import MASK, design_in, designed
 from neusee.workflows.training.parallel.process_mesh import ALONE, Mesh, MeshError
 from neusee.workflows.training.photograph_folder import Photographs
-from neusee.workflows.training.tensorboard_log import Board
+from neusee.workflows.training.tensorboard_log import TensorBoardLog
 from neusee.workflows.training.training_figures import curves, strip
 from neusee.workflows.training.training_iteration import Learner, NotFinite
-from neusee.workflows.training.training_pictures import Sample, Samples
+from neusee.workflows.training.training_pictures import Sample, TrainingStream
 
 Tell = Callable[[str], None]
 Watch = Callable[[int, int, Mapping[str, float]], None]  #: stage, iterations done of it, what was found
@@ -142,7 +142,7 @@ class _Course:
         self.stage, self.iteration = 2 if self.designed else min(how.learnt), 0
         self._go_on()
         mesh.agree(f"{folder.name} in stage {self.stage} after {self.iteration} iterations")
-        self.board = Board(folder, self._behind) if how.tensorboard and mesh.first else None
+        self.board = TensorBoardLog(folder, self._behind) if how.tensorboard and mesh.first else None
 
     def _go_on(self) -> None:
         if not self.state.exists():
@@ -197,11 +197,11 @@ class _Course:
         self._keep()
         self.mesh.wait()  # for the mask that is frozen now
 
-    def _samples(self, learns: bool) -> Samples:
+    def _samples(self, learns: bool) -> TrainingStream:
         parts = self.recipe, self.how, self.photographs, self.store, self.device
-        return Samples(*parts, None if learns else frozen(self.recipe, self.how, self.folder), self.mesh)
+        return TrainingStream(*parts, None if learns else frozen(self.recipe, self.how, self.folder), self.mesh)
 
-    def _iterate(self, samples: Samples) -> None:
+    def _iterate(self, samples: TrainingStream) -> None:
         began, number = time.perf_counter(), self.iteration
         rate = self.learner.set_rates(number)
         try:

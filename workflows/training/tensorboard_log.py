@@ -9,7 +9,7 @@ from pathlib import Path
 from typing import Any
 
 
-class Board:
+class TensorBoardLog:
     """Events in ``tensorboard/`` of the folder; the second stage's follow the first's."""
 
     def __init__(self, folder: Path, first: int) -> None:

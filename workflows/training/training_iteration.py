@@ -27,7 +27,7 @@ from neusee.workflows.keys.cache_key import stream_seed
 from neusee.workflows.recipe.blocks.train_block import GRID, Network, Stage, Training
 from neusee.workflows.training.parallel.process_mesh import ALONE, Mesh
 from neusee.workflows.training.parallel.shared_graph import Shared
-from neusee.workflows.training.training_pictures import Sample, Samples
+from neusee.workflows.training.training_pictures import Sample, TrainingStream
 
 _STEEPEST = 10.0  #: norm of a gradient, above which it is shortened
 Losses = dict[str, float]
@@ -91,33 +91,33 @@ class Learner:
         groups = parameter_groups(self.net, rates.weights, rates.biases)
         if learns:
             groups += [{"params": list(self.relief.parameters()), "lr": rates.element}]
-        self.makers = torch.optim.Adam(groups, betas=self.how.betas)
-        self.judges = torch.optim.Adam(
+        self.generator_optimizer = torch.optim.Adam(groups, betas=self.how.betas)
+        self.critic_optimizer = torch.optim.Adam(
             parameter_groups(self.critics, rates.weights, rates.biases), betas=self.how.critics.betas
         )
-        self._first = [[g["lr"] for g in o.param_groups] for o in (self.makers, self.judges)]
+        self._first = [[g["lr"] for g in o.param_groups] for o in (self.generator_optimizer, self.critic_optimizer)]
 
     def set_rates(self, iteration: int) -> float:
         """The rates of an iteration of the stage; by what they are multiplied."""
         share = self.how.rates.share(iteration)
-        for optimiser, first in zip((self.makers, self.judges), self._first, strict=True):
+        for optimiser, first in zip((self.generator_optimizer, self.critic_optimizer), self._first, strict=True):
             for group, rate in zip(optimiser.param_groups, first, strict=True):
                 group["lr"] = max(rate * share, min(rate, self.how.rates.least))
         return share
 
     def parts(self) -> dict[str, Any]:
         """All that a later iteration depends on."""
-        found = {"relief": self.relief, "net": self.net, "critics": self.critics, "makers": self.makers}
-        return {**found, "judges": self.judges, **({"average": self.average} if self.average else {})}
+        found = {"relief": self.relief, "net": self.net, "critics": self.critics, "makers": self.generator_optimizer}
+        return {**found, "judges": self.critic_optimizer, **({"average": self.average} if self.average else {})}
 
     # --- one iteration ------------------------------------------------------------------------------------------------
 
-    def iterate(self, samples: Samples, stage: int, iteration: int) -> tuple[Losses, list[Sample]]:
+    def iterate(self, samples: TrainingStream, stage: int, iteration: int) -> tuple[Losses, list[Sample]]:
         """Look at a batch of pictures, one after another, and move a step; raises `NotFinite` before a bad one.
 
         Of several processes each looks at its own, and all move by the sum; the pictures are those of this one.
         """
-        self.makers.zero_grad(set_to_none=True)
+        self.generator_optimizer.zero_grad(set_to_none=True)
         shared = samples.begin(self.height()) if samples.shared else Shared.of({})
         found = self._element(shared, samples) if self.learns else {}
         batch, seen, pairs = self.stage.batch, list[Sample](), dict[int, tuple[Scales, Scales]]()
@@ -130,7 +130,9 @@ class Learner:
             seen.append(sample)
         shared.back()
         found = self.mesh.numbers(found, self._names(), self.device)
-        found["slope"] = self._move(self.makers, found, (self.net, self.relief) if self.learns else (self.net,))
+        found["slope"] = self._move(
+            self.generator_optimizer, found, (self.net, self.relief) if self.learns else (self.net,)
+        )
         if self.average:
             self.average.update_parameters(self.net)
         if self.stage.adversarial:
@@ -143,7 +145,7 @@ class Learner:
                    "adversarial": self.stage.adversarial}  # fmt: skip
         return [*(["LSR"] if self.learns else []), "L1", *(name for name, weight in weights.items() if weight)]
 
-    def _element(self, shared: Shared, samples: Samples) -> Losses:
+    def _element(self, shared: Shared, samples: TrainingStream) -> Losses:
         """The suppression of each band, one band at a time: what its norm needs is made again on the way back.
 
         Each process has its own bands, or a share of all of them, so that over all processes each band counts once.
@@ -186,7 +188,7 @@ class Learner:
 
     def _judge(self, pairs: Mapping[int, tuple[Scales, Scales]], rng: torch.Generator) -> Losses:
         """Let the critics learn to tell truth and estimates apart; the stream is the same whoever has the pictures."""
-        self.judges.zero_grad(set_to_none=True)
+        self.critic_optimizer.zero_grad(set_to_none=True)
         found, batch = {"critics": 0.0, "penalty": 0.0}, self.stage.batch
         for i in range(batch):
             if i not in pairs:
@@ -200,7 +202,7 @@ class Learner:
                 found["critics"] += float(apart.detach()) / batch
                 found["penalty"] += float(steep.detach()) / batch
         found = self.mesh.numbers(found, tuple(found), self.device)
-        self._move(self.judges, found, self.critics)
+        self._move(self.critic_optimizer, found, self.critics)
         return found
 
     def _move(self, optimiser: torch.optim.Optimizer, found: Mapping[str, float], parts: Iterable[nn.Module]) -> float:

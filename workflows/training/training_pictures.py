@@ -21,7 +21,7 @@ from neusee.workflows.graph.recipe_graph import Recipe, needed
 from neusee.workflows.recipe.blocks.train_block import Training
 from neusee.workflows.recipe.distributions.uncertain_inputs import Inputs
 from neusee.workflows.store.result_store import Store
-from neusee.workflows.tolerance.cheaper_steps import economised
+from neusee.workflows.tolerance.cheaper_steps import with_substitutions
 from neusee.workflows.training.parallel.band_shards import Shards
 from neusee.workflows.training.parallel.picture_rounds import Pictures
 from neusee.workflows.training.parallel.process_mesh import ALONE, Mesh
@@ -42,7 +42,7 @@ class Sample:
     drawn: Mapping[str, Any]  #: what it was made with
 
 
-class Samples:
+class TrainingStream:
     """Draws pictures through a recipe whose element learns, or through the same recipe ``frozen``."""
 
     def __init__(
@@ -63,7 +63,7 @@ class Samples:
         _present(recipe, (*wanted, how.scene, *([learn] if learn else [])))
         self._inputs = Inputs.of(recipe, wanted) if recipe.uncertain and recipe.uncertain.names else None
         self.shape = _frame(recipe, how.scene)
-        recipe = economised(frozen or recipe, wanted, {learn} if learn else ())
+        recipe = with_substitutions(frozen or recipe, wanted, {learn} if learn else ())
         order = needed(recipe, wanted)
         self._lasers = [f"{n}.{_LASER[1]}" for n in order if recipe.steps[n].node.path == _LASER[0]]
         readers = dict.fromkeys([*(self._inputs.readers if self._inputs else ()), *self._lasers])

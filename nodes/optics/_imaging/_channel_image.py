@@ -60,14 +60,14 @@ def image_channels(
 def _(
     radiance: Mixture, psf: Psf, rows: Tensor, *, border: Border = "zero", within: float = 0.0, largest: bool = False
 ) -> Channels:
-    assert image.ref is not None
+    assert image.hooks.reference is not None
     cube = torch.tensordot(radiance.basis.double(), radiance.planes.double(), 1)
-    bands = image.ref(cube, psf, border=border)
+    bands = image.hooks.reference(cube, psf, border=border)
     zero = torch.zeros((), dtype=torch.float64)
     return Channels(torch.tensordot(rows.double(), bands, 1), rows.double(), bands.sum((-2, -1)), zero)
 
 
-@image_channels.deviates
+@image_channels.approximation_error
 def _(result: Channels) -> tuple[float, float]:
     return float(result.bound), float(result.largest)
 
@@ -163,4 +163,4 @@ def _share(off: Tensor, found: Tensor) -> float:
     return worst
 
 
-image.collapsed = image_channels
+image.channel_sum_form = image_channels

@@ -24,7 +24,7 @@ _ROWS = 64  #: of a picture at a time, of which float64 copies stay in cache
 _LIGHT = 0.999  #: share of the light for which the unknown around the picture has room
 
 
-@node(adds=[("glare",)])
+@node(additive_inputs=[("glare",)])
 def wiener(
     electrons: Tensor,
     psf: Psf,

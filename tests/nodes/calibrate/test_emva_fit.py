@@ -144,5 +144,5 @@ def test_a_camera_without_response_is_refused():
 
 def test_the_check_doubts_an_efficiency_above_one():
     good, odd = (least_squares(synthetic(efficiency=q)) for q in (0.5, 1.5))
-    assert least_squares.after(good, synthetic())[0].ok
-    assert not least_squares.after(odd, synthetic())[0].ok
+    assert least_squares.hooks.check(good, synthetic())[0].ok
+    assert not least_squares.hooks.check(odd, synthetic())[0].ok

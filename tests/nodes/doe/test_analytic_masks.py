@@ -104,13 +104,13 @@ def test_every_reading_of_the_aperture_comes_from_one_place():
 
 def test_preflight_says_what_the_grid_does_to_the_aperture():
     paper = {"samples": 2160, "pitch": 3.74e-6, "diameter": 11e-3}
-    (note,) = doe.flat.before(**paper, aperture="inscribed")
+    (note,) = doe.flat.hooks.preflight(**paper, aperture="inscribed")
     assert note == "aperture 11.0 mm > pupil grid 8.08 mm: inscribed, a disc of 8.08 mm; see reading.aperture"
-    (note,) = doe.axicon.before(waves=3.0, **paper, aperture="stretched", wavelength=550e-9, material="PMMA")
+    (note,) = doe.axicon.hooks.preflight(waves=3.0, **paper, aperture="stretched", wavelength=550e-9, material="PMMA")
     assert "3.74 -> 5.09 um" in note
-    assert doe.flat.before(samples=2160, pitch=3.74e-6, diameter=8e-3, aperture="inscribed") == []
+    assert doe.flat.hooks.preflight(samples=2160, pitch=3.74e-6, diameter=8e-3, aperture="inscribed") == []
     with pytest.raises(ParameterError, match="no pupil sample") as caught:
-        doe.flat.before(samples=4, pitch=1e-3, diameter=1e-3, aperture="inscribed")
+        doe.flat.hooks.preflight(samples=4, pitch=1e-3, diameter=1e-3, aperture="inscribed")
     assert caught.value.parameter == "diameter"
 
 
@@ -132,10 +132,10 @@ def test_any_half_rings_are_finite_and_counted_up_from_zero(samples, slopes, sca
 
 def test_check_reports_the_depth():
     height = doe.axicon(waves=10.0, **GRID)
-    (line,) = doe.axicon.after(height, waves=10.0, **GRID)
+    (line,) = doe.axicon.hooks.check(height, waves=10.0, **GRID)
     assert line.ok
     assert f"{float(height.max()) * 1e6:.4g} um" in line.text
-    (line,) = doe.axicon.after(height - 1e-6, waves=10.0, **GRID)
+    (line,) = doe.axicon.hooks.check(height - 1e-6, waves=10.0, **GRID)
     assert not line.ok
 
 

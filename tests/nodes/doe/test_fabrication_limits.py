@@ -9,7 +9,7 @@ from hypothesis import strategies as st
 from hypothesis.extra import numpy as arrays
 from torch.testing import assert_close
 
-from neusee.nodes import Facts, ParameterError, doe
+from neusee.nodes import ParameterError, TensorStats, doe
 from neusee.nodes.doe._refractive_index import wave_height
 
 WAVE = wave_height("fused silica", 550e-9)
@@ -65,7 +65,9 @@ def test_quantising_twice_is_quantising_once(height, levels, wrapped):
 def test_agrees_with_the_reference(params):
     height = 10e-6 * torch.rand(40, 40, generator=torch.Generator().manual_seed(5))
     params = PLAIN | params
-    assert_close(doe.fabricate(height, **params).double(), doe.fabricate.ref(height, **params), rtol=0, atol=2e-12)
+    assert_close(
+        doe.fabricate(height, **params).double(), doe.fabricate.hooks.reference(height, **params), rtol=0, atol=2e-12
+    )
 
 
 def test_nothing_asked_is_nothing_done():
@@ -96,35 +98,35 @@ def test_gradient_passes_straight_through_steps_and_wraps_but_not_through_the_cu
 
 def test_preflight_refuses_what_cannot_be_made():
     with pytest.raises(ParameterError, match=r"at least 1\.196 um") as caught:
-        doe.fabricate.before(**PLAIN | {"wrap_at": 550e-9, "max_height": 1e-6})
+        doe.fabricate.hooks.preflight(**PLAIN | {"wrap_at": 550e-9, "max_height": 1e-6})
     assert caught.value.parameter == "max_height"
     with pytest.raises(ParameterError, match="Set wrap_at or max_height"):
-        doe.fabricate.before(**PLAIN | {"levels": 8})
-    (note,) = doe.fabricate.before(**PLAIN | {"max_height": 1e-6})
+        doe.fabricate.hooks.preflight(**PLAIN | {"levels": 8})
+    (note,) = doe.fabricate.hooks.preflight(**PLAIN | {"max_height": 1e-6})
     assert "cut flat" in note
-    assert doe.fabricate.before(**PLAIN | {"wrap_at": 550e-9, "max_height": 2e-6}) == []
+    assert doe.fabricate.hooks.preflight(**PLAIN | {"wrap_at": 550e-9, "max_height": 2e-6}) == []
 
 
 def test_check_says_what_was_cut():
     height = torch.tensor([[0.0, 1e-6], [3e-6, 4e-6]])
     params = PLAIN | {"max_height": 2e-6}
-    checks = doe.fabricate.after(doe.fabricate(height, **params), height, **params)
+    checks = doe.fabricate.hooks.check(doe.fabricate(height, **params), height, **params)
     assert "50.00%" in checks[-1].text
     assert not checks[-1].ok
 
 
 def test_negligible_only_where_nothing_changes():
-    facts = Facts.of(torch.tensor([[0.0, 1e-6]]))
-    assert doe.fabricate.bound(facts, **PLAIN | {"wrap_at": 550e-9}) == 0
-    assert doe.fabricate.bound(facts, **PLAIN | {"max_height": 2e-6}) == 0
-    assert doe.fabricate.bound(facts, **PLAIN | {"max_height": float(torch.tensor(1e-6))}) == 0
-    assert doe.fabricate.bound(facts, **PLAIN | {"wrap_at": 400e-9}) > 1
+    facts = TensorStats.of(torch.tensor([[0.0, 1e-6]]))
+    assert doe.fabricate.hooks.skip_bound(facts, **PLAIN | {"wrap_at": 550e-9}) == 0
+    assert doe.fabricate.hooks.skip_bound(facts, **PLAIN | {"max_height": 2e-6}) == 0
+    assert doe.fabricate.hooks.skip_bound(facts, **PLAIN | {"max_height": float(torch.tensor(1e-6))}) == 0
+    assert doe.fabricate.hooks.skip_bound(facts, **PLAIN | {"wrap_at": 400e-9}) > 1
 
 
 def test_small_in_height_is_not_small_in_phase():
-    facts = Facts.of(torch.tensor([[0.0, 0.9e-6]]))
+    facts = TensorStats.of(torch.tensor([[0.0, 0.9e-6]]))
     step = 0.5e-6 / 255 / wave_height("fused silica", 400e-9)  # half a step, waves
-    bound = doe.fabricate.bound(facts, **PLAIN | {"max_height": 1e-6, "levels": 256})
+    bound = doe.fabricate.hooks.skip_bound(facts, **PLAIN | {"max_height": 1e-6, "levels": 256})
     assert bound == pytest.approx(2 * math.pi * step, rel=1e-6)
 
 
@@ -135,7 +137,9 @@ def test_the_bound_tells_a_relief_of_just_one_wave_as_it_is_made(wavelength, dty
     for top in (wave, wave.nextafter(torch.zeros_like(wave)), wave.nextafter(torch.ones_like(wave))):
         height = torch.stack([torch.zeros_like(top), 0.5 * top, top])[None]
         changed = not torch.equal(doe.fabricate(height, **PLAIN | {"wrap_at": wavelength}), height)
-        assert (doe.fabricate.bound(Facts.of(height), **PLAIN | {"wrap_at": wavelength}) > 0) == changed
+        assert (
+            doe.fabricate.hooks.skip_bound(TensorStats.of(height), **PLAIN | {"wrap_at": wavelength}) > 0
+        ) == changed
 
 
 @pytest.mark.parametrize("params", [{"wrap_at": 550e-9, "levels": 4}, {"max_height": 2e-6, "levels": 4}])

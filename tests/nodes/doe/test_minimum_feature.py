@@ -19,7 +19,7 @@ def relief(seed=1):
 
 @pytest.mark.parametrize("feature", [0.5e-6, 4e-6, 20e-6, 1e-3])
 def test_it_agrees_with_its_reference(feature):
-    found, truth = smooth(relief(), feature=feature, **GRID), smooth.ref(relief(), feature=feature, **GRID)
+    found, truth = smooth(relief(), feature=feature, **GRID), smooth.hooks.reference(relief(), feature=feature, **GRID)
     assert float((found.double() - truth).abs().max()) <= 1e-6 * float(truth.max())
 
 
@@ -49,8 +49,8 @@ def test_what_does_not_fit_is_refused_and_a_narrow_spot_said():
         smooth(torch.zeros(3, 3), feature=4e-6, **GRID)
     with pytest.raises(ValueError, match="cannot hold a phase"):
         smooth(relief().half(), feature=4e-6, **GRID)
-    assert "1.5 samples" in smooth.before(feature=1e-6, aperture="inscribed", **GRID)[0]
-    assert smooth.before(feature=4e-6, aperture="inscribed", **GRID) == []
+    assert "1.5 samples" in smooth.hooks.preflight(feature=1e-6, aperture="inscribed", **GRID)[0]
+    assert smooth.hooks.preflight(feature=4e-6, aperture="inscribed", **GRID) == []
 
 
 # --- reliefs with numbers to learn ------------------------------------------------------------------------------------

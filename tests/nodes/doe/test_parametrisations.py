@@ -76,7 +76,7 @@ def test_pixelwise_reads_a_file(tmp_path, suffix):
     else:
         save_file({"height": torch.from_numpy(relief), "other": torch.zeros(2)}, file)
     params = GRID | {"aperture": "inscribed", "file": file, "depth": 1.2e-6, "scale": 0.1}
-    assert doe.pixelwise.before(**params) == []
+    assert doe.pixelwise.hooks.preflight(**params) == []
     assert_close(doe.pixelwise(**params, rng=seeded()), torch.from_numpy(relief), rtol=0, atol=0)
 
 
@@ -84,21 +84,21 @@ def test_pixelwise_refuses_a_file_that_does_not_fit(tmp_path):
     np.save(tmp_path / "small.npy", np.zeros((32, 32)))
     params = GRID | {"aperture": "inscribed", "depth": 1.2e-6, "scale": 0.1}
     with pytest.raises(ParameterError, match=r"\(32, 32\).*\(64, 64\).*samples to 32") as caught:
-        doe.pixelwise.before(**params, file=tmp_path / "small.npy")
+        doe.pixelwise.hooks.preflight(**params, file=tmp_path / "small.npy")
     assert caught.value.parameter == "file"
     np.save(tmp_path / "low.npy", np.full((64, 64), -1e-9))
     with pytest.raises(ValueError, match="counted up from 0"):
         doe.pixelwise(**params, file=tmp_path / "low.npy", rng=seeded())
     (tmp_path / "relief.txt").write_text("0")
     with pytest.raises(ParameterError, match=r"npy, \.safetensors or grey"):
-        doe.pixelwise.before(**params, file=tmp_path / "relief.txt")
+        doe.pixelwise.hooks.preflight(**params, file=tmp_path / "relief.txt")
     for name in ("bad.npy", "bad.safetensors"):
         (tmp_path / name).write_text("no relief")
         with pytest.raises(ParameterError, match="cannot be read"):
-            doe.pixelwise.before(**params, file=tmp_path / name)
+            doe.pixelwise.hooks.preflight(**params, file=tmp_path / name)
     save_file({"a": torch.zeros(1), "b": torch.zeros(1)}, tmp_path / "two.safetensors")
     with pytest.raises(ParameterError, match="a, b"):
-        doe.pixelwise.before(**params, file=tmp_path / "two.safetensors")
+        doe.pixelwise.hooks.preflight(**params, file=tmp_path / "two.safetensors")
 
 
 def test_unet_has_eight_convolutions_and_the_paper_inputs():
@@ -151,15 +151,15 @@ def test_unet_loads_its_own_weights_and_no_others(tmp_path):
     net = fresh(4, 32, seeded(9))
     save_file(net.state_dict(), tmp_path / "net.safetensors")
     params = GRID | {"aperture": "inscribed", "max_height": 1.2e-6, "grid": 32, "weights": tmp_path / "net.safetensors"}
-    assert doe.unet.before(**params, width=4) == []
+    assert doe.unet.hooks.preflight(**params, width=4) == []
     loaded = doe.unet(**params, width=4, rng=seeded())
     assert_close(loaded, height_of(net, 64, 32, 1.2e-6).detach(), rtol=0, atol=0)
     with pytest.raises(ParameterError, match="width 8") as caught:
-        doe.unet.before(**params, width=8)
+        doe.unet.hooks.preflight(**params, width=8)
     assert caught.value.parameter == "weights"
     (tmp_path / "text.safetensors").write_text("no")
     with pytest.raises(ParameterError, match="no safetensors file"):
-        doe.unet.before(**params | {"weights": tmp_path / "text.safetensors"}, width=4)
+        doe.unet.hooks.preflight(**params | {"weights": tmp_path / "text.safetensors"}, width=4)
 
 
 def test_pixelwise_reads_levels_of_a_grey_picture(tmp_path):
@@ -174,7 +174,9 @@ def test_pixelwise_reads_levels_of_a_grey_picture(tmp_path):
         assert_close(found.double(), wanted, rtol=1e-6, atol=0)
     for name, said in (("coloured", "not grey"), ("broken", "cannot be read")):
         with pytest.raises(ParameterError, match=said):
-            doe.pixelwise.before(**GRID, aperture="inscribed", depth=5e-6, scale=0.1, file=tmp_path / f"{name}.png")
+            doe.pixelwise.hooks.preflight(
+                **GRID, aperture="inscribed", depth=5e-6, scale=0.1, file=tmp_path / f"{name}.png"
+            )
 
 
 @pytest.mark.parametrize(("name", "params"), [("half_rings", {"waves": (9.0,)}), ("cubic", {"waves": 3.0})])

@@ -167,14 +167,14 @@ def test_dirt_scatters_the_halo_that_a_clean_pupil_has_not():
 
 def test_preflight_and_check():
     paper = {"samples": 2160, "pitch": 3.74e-6, "diameter": 11e-3, "aperture": "inscribed"}
-    (note,) = flare.dirt.before(**paper, dust=3.0)
+    (note,) = flare.dirt.hooks.preflight(**paper, dust=3.0)
     assert "inscribed" in note
     found = flare.dirt(**GRID, dents=0.4, smudges=0.3, rng=seeded())
-    light, bounds = flare.dirt.after(found, **GRID, aperture="inscribed")
+    light, bounds = flare.dirt.hooks.check(found, **GRID, aperture="inscribed")
     assert light.ok
     assert bounds.ok
     assert "by 0.401 waves" in light.text
-    assert not flare.dirt.after(found._replace(amplitude=found.amplitude + 1), **GRID, aperture="inscribed")[1].ok
+    assert not flare.dirt.hooks.check(found._replace(amplitude=found.amplitude + 1), **GRID, aperture="inscribed")[1].ok
 
 
 def test_recipe_cannot_ask_for_negative_dirt():
@@ -201,6 +201,6 @@ def test_dirt_is_made_by_stripes_that_fit_together():
     bent = 0.3 * 550e-9 * film + surface(_dents(0.5 * 550e-9, rngs[4]), grid)
     assert_close(found.path, bent.float(), rtol=1e-6, atol=1e-13)
     assert_close(found.amplitude, (1 - 0.4 * torch.sigmoid(3 * patches)).float())
-    light, _ = flare.dirt.after(found, **place, aperture="inscribed")
+    light, _ = flare.dirt.hooks.check(found, **place, aperture="inscribed")
     inner, open_ = bent.float().double(), inside(grid)
     assert f"by {float(inner[open_].std(correction=0)) / 550e-9:.3g} waves" in light.text

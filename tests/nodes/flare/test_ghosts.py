@@ -121,10 +121,10 @@ def test_bands_of_another_laser_are_refused():
 
 def test_check_reports_the_share():
     light = spot()
-    (line,) = flare.ghosts.after(ghosts(light, energy=1e-3), light, bands(), towards(0.0, 0.0), energy=1e-3)
+    (line,) = flare.ghosts.hooks.check(ghosts(light, energy=1e-3), light, bands(), towards(0.0, 0.0), energy=1e-3)
     assert line.ok
     assert "bring 0.001 of" in line.text
-    assert not flare.ghosts.after(light, light, bands(), towards(0.0, 0.0), energy=1e-3)[0].ok
+    assert not flare.ghosts.hooks.check(light, light, bands(), towards(0.0, 0.0), energy=1e-3)[0].ok
 
 
 def test_ghosts_fall_where_the_spot_is():
@@ -146,4 +146,4 @@ def test_no_ghost_is_asked_for_where_nothing_is_reflected():
 
     lens = {**LENS, "spread": 2.0, "radius": 3e-4}
     for nothing in ({"count": 0, "energy": 1e-4}, {"count": 8, "energy": 0.0}):
-        assert flare.ghosts.nothing(Unread(), Unread(), Unread(), **lens, **nothing) == 0.0
+        assert flare.ghosts.hooks.zero_bound(Unread(), Unread(), Unread(), **lens, **nothing) == 0.0

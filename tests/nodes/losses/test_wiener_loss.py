@@ -31,9 +31,11 @@ def kernels(*shape, seed=1):
 @pytest.mark.parametrize("how", [{}, {"noise": 0.1, "colour": 0.3}, {"up_to": 0.2}])
 def test_it_agrees_with_its_reference(shape, how):
     psf, *rest = given(kernels(*shape))
-    torch.testing.assert_close(wiener(psf, *rest, **how), wiener.ref(psf, *rest, **how))
+    torch.testing.assert_close(wiener(psf, *rest, **how), wiener.hooks.reference(psf, *rest, **how))
     single = psf._replace(intensity=psf.intensity.float())
-    assert float(wiener(single, *rest, **how)) == pytest.approx(float(wiener.ref(psf, *rest, **how)), abs=1e-5)
+    assert float(wiener(single, *rest, **how)) == pytest.approx(
+        float(wiener.hooks.reference(psf, *rest, **how)), abs=1e-5
+    )
 
 
 def test_a_point_leaves_what_the_noise_hides_and_no_light_leaves_nothing():
@@ -73,7 +75,7 @@ def test_bands_that_agree_leave_no_colour_wrong():
 def test_gradient():
     kernel = kernels(2, 5, 6).requires_grad_()
     assert torch.autograd.gradcheck(lambda k: wiener(*given(k)), (kernel,))
-    own, truth = (torch.autograd.grad(f(*given(kernel)), kernel)[0] for f in (wiener, wiener.ref))
+    own, truth = (torch.autograd.grad(f(*given(kernel)), kernel)[0] for f in (wiener, wiener.hooks.reference))
     torch.testing.assert_close(own, truth)
 
 

@@ -84,4 +84,4 @@ def test_what_cannot_be_compared():
 
 def test_check():
     picture = torch.rand(3, 16, 16)
-    assert quality.after(quality(picture, picture))[0].text == "L1 0.0000, PSNR 200.00 dB, SSIM 1.000"
+    assert quality.hooks.check(quality(picture, picture))[0].text == "L1 0.0000, PSNR 200.00 dB, SSIM 1.000"

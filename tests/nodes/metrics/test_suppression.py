@@ -28,10 +28,10 @@ def test_lsr_is_the_peak_over_the_clear_peak():
 
 def test_lsr_check_names_the_floor():
     psf = Psf(torch.full((1, 10, 10), 0.01), torch.tensor([0.1], dtype=torch.float64))
-    lines = lsr.after(lsr(psf), psf)
+    lines = lsr.hooks.check(lsr(psf), psf)
     assert lines[0].ok
     assert lines[1].text == "evenly spread light would reach 0.1"
-    assert not lsr.after(torch.tensor([1.2]), psf)[0].ok
+    assert not lsr.hooks.check(torch.tensor([1.2]), psf)[0].ok
 
 
 def test_bsr_is_a_ratio_of_energies():
@@ -39,7 +39,7 @@ def test_bsr_is_a_ratio_of_energies():
     plain[2] = 0.0
     found = bsr(plain * torch.tensor([0.5, 0.9, 1.0])[:, None, None], plain)
     torch.testing.assert_close(found, torch.tensor([0.5, 0.9, 1.0], dtype=torch.float64), rtol=1e-6, atol=0.0)
-    assert bsr.after(found)[0].ok
+    assert bsr.hooks.check(found)[0].ok
     with pytest.raises(ValueError, match="differ"):
         bsr(plain, plain[..., :3])
 
@@ -55,7 +55,7 @@ def test_a_full_pixel_counts_whether_well_or_converter_ends_first(gain, unit, bi
     raw = digitize(full_well(electrons, capacity=25500.0), rounding=rounding, rng=rng, **sensor)
     found = saturated(raw, full_well=25500.0, **sensor)
     assert (float(found.pixels), float(found.share)) == (2.0, 0.5)
-    assert saturated.after(found)[0].text == "2 saturated pixels, 50.00%"
+    assert saturated.hooks.check(found)[0].text == "2 saturated pixels, 50.00%"
 
 
 def test_a_pixel_with_one_full_channel_counts_once():
@@ -87,7 +87,7 @@ def test_scene_and_lasers_add():
     even = saturation(visible, **SENSOR)[:, None, None].expand(2, 4, 4).float()
     both = peak(scene, visible, factor, [even, even], [visible, visible], **SENSOR)
     assert float(both.irradiance) == pytest.approx(4.7, rel=1e-5)
-    assert peak.after(both)[0].text == "peak 4.7 I_sat"
+    assert peak.hooks.check(both)[0].text == "peak 4.7 I_sat"
 
 
 def test_every_spot_needs_its_line():
@@ -118,4 +118,8 @@ def test_peak_and_bsr_of_channels_are_those_of_all_bands():
         bsr(both[0], scene[:, :3])
     with pytest.raises(ValueError, match="lies outside its rows"):
         peak(channels(scene, rows(visible, seen)[:1]), visible, factor, **SENSOR)
-    assert (peak.channels, peak.even, bsr.channels) == (("image",), ("level",), ("image", "plain_image"))
+    assert (peak.accepts_channel_sums, peak.needs_band_invariant, bsr.accepts_channel_sums) == (
+        ("image",),
+        ("level",),
+        ("image", "plain_image"),
+    )

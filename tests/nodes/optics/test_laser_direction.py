@@ -37,15 +37,17 @@ def test_a_drawn_spot_falls_on_the_sensor(seed, share, y, x):
 
 def test_the_printed_rule_is_refused_with_its_shift():
     with pytest.raises(ParameterError, match=r"6\.67 rad would put the spot 0\.73 m off the axis") as caught:
-        optics.direction.before(angle=None, **PAPER, **RULE | {"rule": "focal_length_over_width"})
+        optics.direction.hooks.preflight(angle=None, **PAPER, **RULE | {"rule": "focal_length_over_width"})
     assert caught.value.parameter == "rule"
-    assert optics.direction.before(angle=(0.0, 0.0), **PAPER, **RULE | {"rule": "focal_length_over_width"}) == []
+    assert (
+        optics.direction.hooks.preflight(angle=(0.0, 0.0), **PAPER, **RULE | {"rule": "focal_length_over_width"}) == []
+    )
 
 
 def test_the_check_says_where_the_spot_is():
-    (line,) = optics.direction.after(torch.tensor([1e-3, 0.0]), **PAPER)
+    (line,) = optics.direction.hooks.check(torch.tensor([1e-3, 0.0]), **PAPER)
     assert "+37.9, +0.0 px" in line.text
-    (line,) = optics.direction.after(torch.tensor([0.1, 0.0]), **PAPER)
+    (line,) = optics.direction.hooks.check(torch.tensor([0.1, 0.0]), **PAPER)
     assert "beyond the sensor" in line.text
 
 

@@ -41,7 +41,7 @@ def test_an_element_that_suppresses_by_a_thousand_does_so_here():
     weak = Psf(clear_psf().intensity / 1000, CLEAR)
     found = spot(weak, LINE, strength=1e6, **SENSOR).double()
     assert float((found / saturation(LINE, **SENSOR)[:, None, None]).sum(0).max()) == pytest.approx(1e3, rel=1e-6)
-    assert spot.after(found, weak, LINE, strength=1e6, **SENSOR)[0].text == "peak 1e+03 I_sat of 1e+06"
+    assert spot.hooks.check(found, weak, LINE, strength=1e6, **SENSOR)[0].text == "peak 1e+03 I_sat of 1e+06"
 
 
 def test_no_laser_is_no_light():

@@ -179,12 +179,12 @@ CASES = [
 def test_the_node_agrees_with_its_reference(shape, params):
     pupil = make(60, (420e-9, 650e-9), height=rough, path=lambda v, u: 3e-6 * (v**2 + u**3), diameter=60 * 40e-6)
     pupil = Pupil(*(p.float() for p in pupil[:4]), *pupil[4:])
-    truth = psf.ref(pupil, shape=shape, **SENSOR, **params)
+    truth = psf.hooks.reference(pupil, shape=shape, **SENSOR, **params)
     result = psf(pupil, shape=shape, **SENSOR, **params)
     double = psf(pupil, shape=shape, precision="double", **SENSOR, **params)
     assert result.intensity.dtype == torch.float32
     assert double.intensity.dtype == truth.intensity.dtype == result.clear_peak.dtype == torch.float64
-    peak = float(psf.ref(pupil, shape=(65, 65), **SENSOR).intensity.max())
+    peak = float(psf.hooks.reference(pupil, shape=(65, 65), **SENSOR).intensity.max())
     assert float((result.intensity - truth.intensity).abs().max()) < psf.rtol * peak
     assert float((double.intensity - truth.intensity).abs().max()) < 1e-12 * peak
     torch.testing.assert_close(result.clear_peak, truth.clear_peak, rtol=1e-10, atol=0)
@@ -204,7 +204,7 @@ def test_any_shape_and_any_height_is_finite_and_right(rows, columns, y, x, scale
     ones = torch.ones(rows, columns)
     bands = torch.tensor([GREEN]).double()
     pupil = Pupil(ones, ones, height, 0 * ones, bands / GREEN * 0.46, bands, torch.tensor(1e-5).double())
-    result, truth = (f(pupil, shape=(y, x), **SENSOR).intensity for f in (psf, psf.ref))
+    result, truth = (f(pupil, shape=(y, x), **SENSOR).intensity for f in (psf, psf.hooks.reference))
     assert float((result - truth).abs().max()) <= 3e-6 * float(psf(pupil, shape=(1, 1), **SENSOR).clear_peak)
 
 
@@ -270,10 +270,10 @@ def test_parts_that_disagree_are_refused():
 
 def test_check_reads_the_energy_in_the_window():
     pupil = make(96, height=rough, diameter=96 * GREEN * FOCAL / (256 * PIXEL))
-    whole = psf.after(psf(pupil, shape=(256, 256), **SENSOR), pupil)
+    whole = psf.hooks.check(psf(pupil, shape=(256, 256), **SENSOR), pupil)
     assert [(c.text, c.ok) for c in whole] == [("energy in window 100.0 %", True)]
     result = psf(pupil, shape=(256, 256), **SENSOR)
-    assert not psf.after(result._replace(intensity=2 * result.intensity), pupil)[0].ok
+    assert not psf.hooks.check(result._replace(intensity=2 * result.intensity), pupil)[0].ok
 
 
 def test_a_direction_adds_to_the_angle():

@@ -189,7 +189,7 @@ def test_shapes_that_do_not_belong_together_are_refused():
 
 
 def check(p, **params):
-    return optics.pupil.after(p, **LENS | {"aperture": "inscribed"} | params)
+    return optics.pupil.hooks.check(p, **LENS | {"aperture": "inscribed"} | params)
 
 
 def test_check_measures_throughput_and_clipping():

@@ -46,9 +46,9 @@ def test_an_observer_that_counts_energy_is_exact():
     """With responses over wavelength, photons are tristimulus values, and a matrix can be exact."""
     found, matrix = seen(PAINTS, D65, CIE * 550e-9 / CENTRES)
     torch.testing.assert_close(found, truth(PAINTS), rtol=0.0, atol=1e-6)
-    assert colour_matrix.after(matrix, BANDS, D65, CIE * 550e-9 / CENTRES, LEVEL, quantum_efficiency=0.56, **SHUTTER)[
-        0
-    ].ok
+    assert colour_matrix.hooks.check(
+        matrix, BANDS, D65, CIE * 550e-9 / CENTRES, LEVEL, quantum_efficiency=0.56, **SHUTTER
+    )[0].ok
 
 
 def test_a_warm_lamp_is_balanced_to_daylight():

@@ -19,8 +19,8 @@ def test_undoes_the_converter_to_its_rounding(gain, unit):
 
 
 def test_a_kept_pedestal_is_said():
-    assert "390 e-" in electrons.before(gain=1.0, pedestal=390.0, pedestal_subtracted=False)[0]
-    assert electrons.before(gain=1.0, pedestal=390.0) == []
+    assert "390 e-" in electrons.hooks.preflight(gain=1.0, pedestal=390.0, pedestal_subtracted=False)[0]
+    assert electrons.hooks.preflight(gain=1.0, pedestal=390.0) == []
 
 
 @pytest.mark.parametrize(("gain", "unit"), [(0.37, "e-/DN"), (0.37, "DN/e-")])
@@ -34,7 +34,7 @@ def test_colour_is_a_matrix_at_every_pixel():
     channels, matrix = torch.rand(2, 3, 4, 5), torch.rand(3, 3, dtype=torch.float64)
     found = colour(channels, matrix)
     assert found.dtype == torch.float32
-    torch.testing.assert_close(found.double(), colour.ref(channels, matrix), rtol=1e-5, atol=1e-6)
+    torch.testing.assert_close(found.double(), colour.hooks.reference(channels, matrix), rtol=1e-5, atol=1e-6)
     assert torch.autograd.gradcheck(lambda c: colour(c, matrix), (torch.rand(3, 2, 2).double().requires_grad_(),))
     with pytest.raises(ValueError, match="do not fit"):
         colour(torch.rand(4, 2, 2), matrix)

@@ -29,7 +29,7 @@ def planes(*values, kind=np.float32):
 
 def test_without_primaries_values_are_srgb(tmp_path):
     path = saved(tmp_path, planes(0.25, 1025.0, 2.0, kind=np.float16))
-    assert exr.before(file=path) == []
+    assert exr.hooks.preflight(file=path) == []
     assert exr(file=path)[:, 0, 0].tolist() == [0.25, 1025.0, 2.0]
     assert exr(file=path, white=4.0)[:, 1, 2].tolist() == [0.0625, 256.25, 0.5]
 
@@ -73,20 +73,20 @@ def test_xyz_primaries_are_xyz(tmp_path):
 
 def test_luminance_alone_is_grey_and_said(tmp_path):
     path = saved(tmp_path, {"Y": np.array([[0.5, 2.0]], np.float32)})
-    assert "luminance" in exr.before(file=path)[0]
+    assert "luminance" in exr.hooks.preflight(file=path)[0]
     assert exr(file=path).tolist() == [[[0.5, 2.0]]] * 3
 
 
 def test_refuses_missing_channels_with_those_it_has(tmp_path):
     path = saved(tmp_path, {"R": np.ones((2, 2), np.float32), "depth": np.ones((2, 2), np.float32)})
     with pytest.raises(ParameterError, match="R, depth"):
-        exr.before(file=path)
+        exr.hooks.preflight(file=path)
 
 
 def test_refuses_what_is_no_exr(tmp_path):
     (tmp_path / "a.exr").write_text("text")
     with pytest.raises(ParameterError, match="OpenEXR"):
-        exr.before(file=tmp_path / "a.exr")
+        exr.hooks.preflight(file=tmp_path / "a.exr")
 
 
 def test_refuses_values_that_are_not_finite(tmp_path):
@@ -99,12 +99,12 @@ def test_negatives_are_clipped_and_counted_or_kept(tmp_path):
     path = saved(tmp_path, planes(-0.25, 1.0, 1.0))
     assert float(exr(file=path).min()) == 0
     assert float(exr(file=path, negatives="keep").min()) == -0.25
-    assert "6 of 18 values were negative" in exr.after(exr(file=path), file=path)[0].text
+    assert "6 of 18 values were negative" in exr.hooks.check(exr(file=path), file=path)[0].text
 
 
 def test_one_pixel_and_a_frame(tmp_path):
     path = saved(tmp_path, {c: np.full((1, 1), 7.0, np.float32) for c in "RGB"})
-    assert "enlarged 4.00" in exr.before(file=path, shape=(4, 2))[0]
+    assert "enlarged 4.00" in exr.hooks.preflight(file=path, shape=(4, 2))[0]
     assert torch.equal(exr(file=path, shape=(4, 2)), torch.full((3, 4, 2), 7.0))
 
 

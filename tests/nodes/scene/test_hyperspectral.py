@@ -65,32 +65,32 @@ def test_mat_files(tmp_path):
     cube = np.random.default_rng(2).random((4, 5, 11))
     io.savemat(tmp_path / "c.mat", {"cube": cube, "note": np.ones((2, 2))})
     ends = {"start": 400 * NM, "stop": 700 * NM}
-    assert hyperspectral.before(file=tmp_path / "c.mat", **ends) == []
+    assert hyperspectral.hooks.preflight(file=tmp_path / "c.mat", **ends) == []
     result = hyperspectral(eleven(), file=tmp_path / "c.mat", variable="cube", **ends)
     np.testing.assert_allclose(result.numpy(), np.moveaxis(cube, -1, 0), atol=1e-7)
     with pytest.raises(ParameterError, match=r"no variable 'cub'.*cube, note"):
-        hyperspectral.before(file=tmp_path / "c.mat", variable="cub", **ends)
+        hyperspectral.hooks.preflight(file=tmp_path / "c.mat", variable="cub", **ends)
     with pytest.raises(ParameterError, match="three axes"):
-        hyperspectral.before(file=tmp_path / "c.mat", variable="note", **ends)
+        hyperspectral.hooks.preflight(file=tmp_path / "c.mat", variable="note", **ends)
     io.savemat(tmp_path / "two.mat", {"a": cube, "b": cube})
     with pytest.raises(ParameterError, match="2 cubes"):
-        hyperspectral.before(file=tmp_path / "two.mat", **ends)
+        hyperspectral.hooks.preflight(file=tmp_path / "two.mat", **ends)
 
 
 def test_refusals_before_the_run(tmp_path):
     path = npy(tmp_path, np.ones((2, 2, 3)))
     with pytest.raises(ParameterError, match="400 nm") as error:
-        hyperspectral.before(file=path)
+        hyperspectral.hooks.preflight(file=path)
     assert error.value.parameter == "start"
     with pytest.raises(ParameterError):
-        hyperspectral.before(file=path, start=700 * NM, stop=400 * NM)
+        hyperspectral.hooks.preflight(file=path, start=700 * NM, stop=400 * NM)
     (tmp_path / "c.txt").write_text("1")
     (tmp_path / "bad.mat").write_text("no mat file at all, just text")
     for name, words in (("c.txt", ".mat, .npy and .exr"), ("bad.mat", "-v7")):
         with pytest.raises(ParameterError, match=words):
-            hyperspectral.before(file=tmp_path / name, start=400 * NM, stop=700 * NM)
+            hyperspectral.hooks.preflight(file=tmp_path / name, start=400 * NM, stop=700 * NM)
     with pytest.raises(ParameterError, match="complex"):
-        hyperspectral.before(file=npy(tmp_path, np.ones((2, 2, 3), complex)), start=400 * NM, stop=700 * NM)
+        hyperspectral.hooks.preflight(file=npy(tmp_path, np.ones((2, 2, 3), complex)), start=400 * NM, stop=700 * NM)
 
 
 def test_values_that_are_not_finite_are_refused(tmp_path):
@@ -134,10 +134,10 @@ def test_spectral_exr_as_a_scene(tmp_path):
     known = eleven(count=31)
     cube = torch.rand(31, 4, 5, generator=torch.Generator().manual_seed(0))
     write_spectral(tmp_path / "s.exr", cube, known.centres, kind="reflective")
-    assert hyperspectral.before(file=tmp_path / "s.exr") == []
+    assert hyperspectral.hooks.preflight(file=tmp_path / "s.exr") == []
     assert torch.equal(hyperspectral(known, file=tmp_path / "s.exr"), cube)
-    assert "enlarged" in hyperspectral.before(file=tmp_path / "s.exr", shape=(8, 8))[0]
-    assert hyperspectral.after(cube, known)[0].ok
+    assert "enlarged" in hyperspectral.hooks.preflight(file=tmp_path / "s.exr", shape=(8, 8))[0]
+    assert hyperspectral.hooks.check(cube, known)[0].ok
 
 
 def test_writing_refuses_what_does_not_fit(tmp_path):
@@ -150,6 +150,6 @@ def test_writing_refuses_what_does_not_fit(tmp_path):
 def test_reading_an_rgb_file_is_refused_with_its_channels(request):
     night = request.config.rootpath / "recipes/samples/night.exr"
     with pytest.raises(ParameterError, match="B, G, R"):
-        hyperspectral.before(file=night)
+        hyperspectral.hooks.preflight(file=night)
     with pytest.raises(ValueError, match=r"T\.550,0nm"):
         read_spectral(night)

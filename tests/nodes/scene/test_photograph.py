@@ -42,7 +42,7 @@ def test_decodes_every_8_bit_code_by_the_closed_form(tmp_path):
 
 def test_usual_form_agrees_with_reference(tmp_path):
     path = saved(tmp_path, random8(31, 23, 3))
-    usual, slow = photograph(file=path, shape=(12, 12)), photograph.ref(file=path, shape=(12, 12))
+    usual, slow = photograph(file=path, shape=(12, 12)), photograph.hooks.reference(file=path, shape=(12, 12))
     torch.testing.assert_close(usual.double(), slow, rtol=photograph.rtol, atol=1e-7)
 
 
@@ -65,7 +65,7 @@ def test_palette_is_its_colours(tmp_path):
     image = Image.fromarray(random8(6, 7, 3)).quantize(8)
     image.save(tmp_path / "p.png")
     expected = linear(np.asarray(image.convert("RGB")) / 255)
-    assert photograph.before(file=tmp_path / "p.png") == []
+    assert photograph.hooks.preflight(file=tmp_path / "p.png") == []
     np.testing.assert_allclose(photograph(file=tmp_path / "p.png").permute(1, 2, 0).numpy(), expected, atol=3e-7)
 
 
@@ -90,7 +90,7 @@ def test_turns_upright_by_exif(tmp_path, turned, bits):
         assert np.array_equal(values, upright)
     else:
         np.testing.assert_allclose(photograph(file=path).permute(1, 2, 0).numpy(), linear(upright / 255), atol=3e-7)
-        assert len(photograph.before(file=path)) == (turned != 1)
+        assert len(photograph.hooks.preflight(file=path)) == (turned != 1)
 
 
 def test_jpeg_is_read_close_to_what_was_saved(tmp_path):
@@ -102,7 +102,7 @@ def test_jpeg_is_read_close_to_what_was_saved(tmp_path):
 def test_one_pixel_is_a_picture(tmp_path):
     path = saved(tmp_path, np.full((1, 1, 3), 128, np.uint8))
     assert photograph(file=path).shape == (3, 1, 1)
-    assert photograph.before(file=path, shape=(3, 2)) != []
+    assert photograph.hooks.preflight(file=path, shape=(3, 2)) != []
     torch.testing.assert_close(photograph(file=path, shape=(3, 2)), torch.full((3, 3, 2), float(linear(128 / 255))))
 
 
@@ -141,7 +141,7 @@ def _text(folder):
 )
 def test_refuses_before_the_run_with_the_fix(tmp_path, made, words):
     with pytest.raises(ParameterError, match=words) as error:
-        photograph.before(file=made(tmp_path))
+        photograph.hooks.preflight(file=made(tmp_path))
     assert error.value.parameter == "file"
     assert "PNG" in str(error.value) or "png" in str(error.value)
 
@@ -151,8 +151,8 @@ def test_a_foreign_profile_is_named(tmp_path):
 
     lab = ImageCms.ImageCmsProfile(ImageCms.createProfile("XYZ")).tobytes()
     srgb = ImageCms.ImageCmsProfile(ImageCms.createProfile("sRGB")).tobytes()
-    assert "profile" in photograph.before(file=saved(tmp_path, random8(4, 4, 3), icc_profile=lab))[0]
-    assert photograph.before(file=saved(tmp_path, random8(4, 4, 3), icc_profile=srgb)) == []
+    assert "profile" in photograph.hooks.preflight(file=saved(tmp_path, random8(4, 4, 3), icc_profile=lab))[0]
+    assert photograph.hooks.preflight(file=saved(tmp_path, random8(4, 4, 3), icc_profile=srgb)) == []
 
 
 @settings(max_examples=40, deadline=None)
@@ -184,5 +184,5 @@ def test_frame_averages_in_linear_light(tmp_path):
 def test_the_sample_picture_is_read_as_it_is(request):
     path = request.config.rootpath / "recipes/samples/china.jpg"
     assert path.stat().st_size < 300_000
-    assert photograph.before(file=path, shape=(384, 384)) == []
+    assert photograph.hooks.preflight(file=path, shape=(384, 384)) == []
     assert 0.3 < float(photograph(file=path, shape=(384, 384)).mean()) < 0.5

@@ -62,4 +62,4 @@ def test_flat_is_flat():
 
 def test_refuses_low_above_high():
     with pytest.raises(ParameterError, match=r"0\.9.*0\.1"):
-        targets.before(kind="edge", shape=(2, 2), low=0.9, high=0.1)
+        targets.hooks.preflight(kind="edge", shape=(2, 2), low=0.9, high=0.1)

@@ -7,7 +7,7 @@ import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from neusee.nodes import Facts
+from neusee.nodes import TensorStats
 from neusee.nodes.sensor import crop, digitize, full_well
 
 
@@ -27,7 +27,7 @@ def test_digitize_agrees_with_its_reference(values, gain, unit, rounding, bits):
     electrons = torch.tensor(values)
     how = {"gain": gain, "gain_unit": unit, "rounding": rounding, "bits": bits}
     found = digitize(electrons, **how, rng=seeded())
-    assert torch.equal(found, digitize.ref(electrons, **how, rng=seeded())) or rounding == "dithered_floor"
+    assert torch.equal(found, digitize.hooks.reference(electrons, **how, rng=seeded())) or rounding == "dithered_floor"
     assert torch.equal(found, found.round())
     assert float(found.min()) >= 0
     assert float(found.max()) <= 2**bits - 1
@@ -36,14 +36,16 @@ def test_digitize_agrees_with_its_reference(values, gain, unit, rounding, bits):
 def test_dithered_floor_agrees_with_its_reference():
     electrons = torch.rand(500, dtype=torch.float64) * 100
     how = {"gain": 0.37, "rounding": "dithered_floor", "bits": 8}
-    assert torch.equal(digitize(electrons, **how, rng=seeded()), digitize.ref(electrons, **how, rng=seeded()))
+    assert torch.equal(
+        digitize(electrons, **how, rng=seeded()), digitize.hooks.reference(electrons, **how, rng=seeded())
+    )
 
 
 def test_gain_in_both_units():
     well = torch.tensor([25500.0])
     assert float(digitize(well, gain=0.37, gain_unit="DN/e-")) == 9435
     assert float(digitize(well, gain=0.37, gain_unit="e-/DN")) == 65535
-    assert "24248 e-" in digitize.before(gain=0.37, gain_unit="e-/DN", bits=16)[0]
+    assert "24248 e-" in digitize.hooks.preflight(gain=0.37, gain_unit="e-/DN", bits=16)[0]
 
 
 def test_dithered_floor_lies_half_a_number_low_and_is_noisier():
@@ -73,13 +75,13 @@ def test_gradient_is_the_line_and_nothing_where_it_clips(rounding):
 def test_the_bound_of_the_full_well_is_true(values, capacity):
     electrons = torch.tensor(values, dtype=torch.float64)
     result = full_well(electrons, capacity=capacity)
-    bound = full_well.bound(Facts.of(electrons), capacity=capacity)
+    bound = full_well.hooks.skip_bound(TensorStats.of(electrons), capacity=capacity)
     assert float((result - electrons).abs().max()) <= bound * float(result.abs().max()) * (1 + 1e-9)
     assert (bound == 0) == (max(values) <= capacity)
 
 
 def test_full_well_counts():
-    (line,) = full_well.after(torch.tensor([5.0, 9.0, 9.0]), torch.zeros(3), capacity=9.0)
+    (line,) = full_well.hooks.check(torch.tensor([5.0, 9.0, 9.0]), torch.zeros(3), capacity=9.0)
     assert line.text == "2 of 3 full"
 
 
@@ -95,9 +97,12 @@ def test_crop_keeps_the_axis(y, x, h, w):
     window = crop(image, shape=(h, w))
     assert window.shape == (2, h, w)
     assert float(window[1, h // 2, w // 2]) == 1.0
-    assert crop.bound(Facts.of(image), shape=(h, w)) == (0.0 if (h, w) == (y, x) else math.inf)
+    assert crop.hooks.skip_bound(TensorStats.of(image), shape=(h, w)) == (0.0 if (h, w) == (y, x) else math.inf)
 
 
 def test_check_of_the_converter():
-    assert not digitize.after(torch.full((4,), 255.0), torch.zeros(4), bits=8)[0].ok
-    assert digitize.after(torch.tensor([0.0, 1.0, 2.0, 255.0]), bits=8)[0].text == "25.00% at the top, 25.00% at 0 DN"
+    assert not digitize.hooks.check(torch.full((4,), 255.0), torch.zeros(4), bits=8)[0].ok
+    assert (
+        digitize.hooks.check(torch.tensor([0.0, 1.0, 2.0, 255.0]), bits=8)[0].text
+        == "25.00% at the top, 25.00% at 0 DN"
+    )

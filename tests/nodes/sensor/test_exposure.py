@@ -30,10 +30,12 @@ def test_saturating_light_of_one_wavelength_frees_a_full_well():
 def test_agrees_with_its_reference():
     found = expose(scene(4, 3), BANDS, RESPONSES, torch.rand(5), **SHUTTER)
     assert found.dtype == torch.float32
-    exact = expose.ref(scene(4, 3), BANDS, RESPONSES, torch.rand(5), **SHUTTER)
+    exact = expose.hooks.reference(scene(4, 3), BANDS, RESPONSES, torch.rand(5), **SHUTTER)
     assert found.shape == exact.shape == (3, 4, 3)
     again = expose(scene(4, 3), BANDS, RESPONSES, **SHUTTER)
-    torch.testing.assert_close(again.double(), expose.ref(scene(4, 3), BANDS, RESPONSES, **SHUTTER), rtol=1e-6, atol=0)
+    torch.testing.assert_close(
+        again.double(), expose.hooks.reference(scene(4, 3), BANDS, RESPONSES, **SHUTTER), rtol=1e-6, atol=0
+    )
 
 
 @settings(max_examples=30, deadline=None)
@@ -67,8 +69,8 @@ def test_level_per_band_lets_each_band_reach_the_strength():
     factor = level(scene(6, 6), BANDS, RESPONSES, strength=0.7, rule="per_band", **SENSOR)
     peaks = (scene(6, 6) * factor[:, None, None]).amax((-2, -1))
     torch.testing.assert_close(peaks.double(), 0.7 * saturation(BANDS, **SENSOR), rtol=1e-6, atol=0.0)
-    assert "each band alone" in level.before(strength=0.7, rule="per_band")[0]
-    assert "saturates" in level.before(strength=2.0, rule="channel_sum")[0]
+    assert "each band alone" in level.hooks.preflight(strength=0.7, rule="per_band")[0]
+    assert "saturates" in level.hooks.preflight(strength=2.0, rule="channel_sum")[0]
 
 
 @pytest.mark.parametrize("rule", ["channel_sum", "per_band"])
@@ -97,9 +99,9 @@ def test_bands_must_agree():
 
 
 def test_checks():
-    assert expose.after(torch.ones(3, 2, 2))[0].ok
-    assert not expose.after(torch.tensor([-1.0, 1.0]))[0].ok
-    assert "scene alone 1" in gather.after(torch.full((3, 1, 1), 4.0), torch.ones(3, 1, 1), [])[0].text
+    assert expose.hooks.check(torch.ones(3, 2, 2))[0].ok
+    assert not expose.hooks.check(torch.tensor([-1.0, 1.0]))[0].ok
+    assert "scene alone 1" in gather.hooks.check(torch.full((3, 1, 1), 4.0), torch.ones(3, 1, 1), [])[0].text
 
 
 def channels(light, weights):
@@ -116,7 +118,7 @@ def test_channels_give_the_photons_and_the_level_of_all_bands():
         found = [expose(x, BANDS, RESPONSES, factor, **SHUTTER) for x in (summed, light)]
         torch.testing.assert_close(*found, rtol=1e-12, atol=0)
         torch.testing.assert_close(
-            expose.ref(summed, BANDS, RESPONSES, factor, **SHUTTER), found[1], rtol=1e-12, atol=0
+            expose.hooks.reference(summed, BANDS, RESPONSES, factor, **SHUTTER), found[1], rtol=1e-12, atol=0
         )
 
 
@@ -161,7 +163,11 @@ def test_gradients_through_channels():
 
 
 def test_nodes_say_which_inputs_may_be_channels():
-    assert (expose.channels, expose.even, level.channels) == (("irradiance",), ("level",), ("plain_image",))
-    assert level.sums({"rule": "channel_sum"})
-    assert level.sums({})
-    assert not level.sums({"rule": "per_band"})
+    assert (expose.accepts_channel_sums, expose.needs_band_invariant, level.accepts_channel_sums) == (
+        ("irradiance",),
+        ("level",),
+        ("plain_image",),
+    )
+    assert level.hooks.band_invariant({"rule": "channel_sum"})
+    assert level.hooks.band_invariant({})
+    assert not level.hooks.band_invariant({"rule": "per_band"})

@@ -7,7 +7,7 @@ import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from neusee.nodes import Facts
+from neusee.nodes import TensorStats
 from neusee.nodes.sensor import dark_current, photon_noise, read_noise
 
 N = 200_000
@@ -126,33 +126,36 @@ def change(electrons, node, draws=400, **params):
 )
 def test_bounds_are_true_and_not_far(node, params, scale):
     electrons = scale * torch.rand(4, 4, dtype=torch.float64, generator=seeded(1))
-    bound, found = node.bound(Facts.of(electrons), full_well=None, **params), change(electrons, node, **params)
+    bound, found = (
+        node.hooks.skip_bound(TensorStats.of(electrons), full_well=None, **params),
+        change(electrons, node, **params),
+    )
     # The largest of 16 sampled rms values lies above the true one by a few of its own errors, 1/sqrt(2 * draws).
     assert found <= bound * (1 + 5 / math.sqrt(800) + (2.0 if params.get("mean") == 0.002 else 0.0))
     assert params.get("mean") == 0.002 or bound < 1.1 * found
 
 
 def test_bounds_of_nothing():
-    dark, any_well = Facts.of(torch.zeros(2, 2)), {"full_well": None}
-    assert dark_current.bound(dark, mean=0.0, **any_well) == 0.0
-    assert read_noise.bound(dark, pedestal=0.0, sigma=0.0, **any_well) == 0.0
-    assert dark_current.bound(dark, mean=0.1, **any_well) == 1.0
-    assert read_noise.bound(dark, pedestal=0.0, sigma=1.0, **any_well) == 1.0
+    dark, any_well = TensorStats.of(torch.zeros(2, 2)), {"full_well": None}
+    assert dark_current.hooks.skip_bound(dark, mean=0.0, **any_well) == 0.0
+    assert read_noise.hooks.skip_bound(dark, pedestal=0.0, sigma=0.0, **any_well) == 0.0
+    assert dark_current.hooks.skip_bound(dark, mean=0.1, **any_well) == 1.0
+    assert read_noise.hooks.skip_bound(dark, pedestal=0.0, sigma=1.0, **any_well) == 1.0
 
 
 def test_what_a_reader_is_told():
-    assert "literally" in photon_noise.before(mean="literal", mean_shift=0.2)[0]
-    assert photon_noise.before(mean="additive", mean_shift=0.2) == []
-    assert photon_noise.after(torch.ones(2), torch.ones(2))[0].ok
-    assert not photon_noise.after(torch.ones(2), torch.tensor([-5.0, 1.0]))[0].ok
+    assert "literally" in photon_noise.hooks.preflight(mean="literal", mean_shift=0.2)[0]
+    assert photon_noise.hooks.preflight(mean="additive", mean_shift=0.2) == []
+    assert photon_noise.hooks.check(torch.ones(2), torch.ones(2))[0].ok
+    assert not photon_noise.hooks.check(torch.ones(2), torch.tensor([-5.0, 1.0]))[0].ok
 
 
 def test_a_laser_above_the_well_hides_no_noise():
-    dazzled = Facts.of(torch.tensor([[10.0, 1e7]]))
+    dazzled = TensorStats.of(torch.tensor([[10.0, 1e7]]))
     noise = {"pedestal": 390.0, "sigma": 10.5}
-    assert read_noise.bound(dazzled, **noise, full_well=25500.0) > 0.01
-    assert read_noise.bound(dazzled, **noise, full_well=None) < 1e-4
-    dark = dark_current.bound(dazzled, mean=0.002, full_well=25500.0)
+    assert read_noise.hooks.skip_bound(dazzled, **noise, full_well=25500.0) > 0.01
+    assert read_noise.hooks.skip_bound(dazzled, **noise, full_well=None) < 1e-4
+    dark = dark_current.hooks.skip_bound(dazzled, mean=0.002, full_well=25500.0)
     assert dark == pytest.approx(math.hypot(0.002, math.sqrt(0.002)) / 25500, rel=1e-3)
 
 

@@ -56,11 +56,11 @@ def test_the_smallest_experiment(levels, pixels):
     points = curve(gain=0.37, levels=levels, pixels=pixels)
     assert points.shape == (levels, 3)
     assert torch.isfinite(points).all()
-    assert "too few" in photon_transfer.after(points, full_well=25500.0, gain=0.37)[0].text or levels > 2
+    assert "too few" in photon_transfer.hooks.check(points, full_well=25500.0, gain=0.37)[0].text or levels > 2
 
 
 def test_check_judges_the_slope():
     points = curve(gain=0.37)
-    assert photon_transfer.after(points, full_well=25500.0, gain=0.37)[0].ok
+    assert photon_transfer.hooks.check(points, full_well=25500.0, gain=0.37)[0].ok
     points[:, 1] *= 2
-    assert not photon_transfer.after(points, full_well=25500.0, gain=0.37)[0].ok
+    assert not photon_transfer.hooks.check(points, full_well=25500.0, gain=0.37)[0].ok

@@ -26,7 +26,7 @@ def test_limits_of_table_1():
     assert round(float(found.photons)) == 45536
     assert round(float(found.snr), 1) == 159.7
     assert round(float(found.dynamic_range), 1) == 67.7
-    assert limits.after(found)[0].text == "45536 photons, SNR 159.7, 67.7 dB"
+    assert limits.hooks.check(found)[0].text == "45536 photons, SNR 159.7, 67.7 dB"
 
 
 def test_a_sensor_without_read_noise_has_a_finite_range():
@@ -46,6 +46,6 @@ def test_what_would_divide_by_zero_is_refused(name, value):
 
 
 def test_check():
-    (line,) = saturation.after(saturation(BANDS, **SENSOR), BANDS, **SENSOR)
+    (line,) = saturation.hooks.check(saturation(BANDS, **SENSOR), BANDS, **SENSOR)
     assert line.ok
     assert "W/m2" in line.text

@@ -30,7 +30,7 @@ def test_one_band_is_the_middle():
 
 def test_refuses_exchanged_ends():
     with pytest.raises(ParameterError, match=r"700 nm.*400 nm"):
-        bands.before(start=700 * NM, stop=400 * NM, count=31)
+        bands.hooks.preflight(start=700 * NM, stop=400 * NM, count=31)
 
 
 def test_filters_are_the_bands_of_their_list():
@@ -38,7 +38,7 @@ def test_filters_are_the_bands_of_their_list():
     assert result.centres.tolist() == [500 * NM, 450 * NM, 633 * NM]
     assert result.widths.tolist() == [10 * NM, 25 * NM, 1 * NM]
     assert result.weights.tolist() == [1, 1, 1]
-    assert filters.after(result)[0].text == "3 filters, 450 to 633 nm"
+    assert filters.hooks.check(result)[0].text == "3 filters, 450 to 633 nm"
 
 
 def test_one_width_is_that_of_all_filters():
@@ -47,8 +47,8 @@ def test_one_width_is_that_of_all_filters():
 
 def test_refuses_widths_that_belong_to_no_filter():
     with pytest.raises(ParameterError, match="2 widths for 3 centres"):
-        filters.before(centres=(500 * NM,) * 3, widths=(10 * NM,) * 2)
-    assert filters.before(centres=(500 * NM,) * 2, widths=(10 * NM,) * 2) == []
+        filters.hooks.preflight(centres=(500 * NM,) * 3, widths=(10 * NM,) * 2)
+    assert filters.hooks.preflight(centres=(500 * NM,) * 2, widths=(10 * NM,) * 2) == []
 
 
 def test_filters_are_read_from_a_recipe():
@@ -100,8 +100,8 @@ def test_points_show_the_error_of_the_printed_grid(at, energy):
     assert float(result.weights.sum()) == pytest.approx(energy, abs=5e-4)
     rest = (result.centres / NM) % 10
     assert float(torch.minimum(rest, 10 - rest).max()) < 1e-6
-    assert not line.after(result, wavelength=at * NM)[0].ok
-    assert "5.7 %" in line.before(wavelength=at * NM, sampling="point")[0]
+    assert not line.hooks.check(result, wavelength=at * NM)[0].ok
+    assert "5.7 %" in line.hooks.preflight(wavelength=at * NM, sampling="point")[0]
 
 
 @given(at=st.floats(200, 2000), count=st.integers(1, 9))
@@ -113,6 +113,6 @@ def test_points_are_the_nearest_of_the_grid(at, count):
 
 def test_refuses_bands_below_100_nm():
     with pytest.raises(ParameterError, match="100 nm") as error:
-        line.before(wavelength=110 * NM)
+        line.hooks.preflight(wavelength=110 * NM)
     assert error.value.parameter == "fwhm"
-    assert line.before(wavelength=400 * NM) == []
+    assert line.hooks.preflight(wavelength=400 * NM) == []

@@ -49,7 +49,7 @@ def test_every_light_has_mean_one_and_no_darkness(kind):
     assert result.dtype == torch.float64
     assert float(result.mean()) == pytest.approx(1, rel=1e-12)
     assert float(result.min()) >= 0
-    assert illuminant.after(result, SCENE, kind=kind)[0].text.startswith(kind)
+    assert illuminant.hooks.check(result, SCENE, kind=kind)[0].text.startswith(kind)
 
 
 def test_lines_of_a_lamp_keep_their_energy_in_wide_bands():
@@ -61,8 +61,8 @@ def test_lines_of_a_lamp_keep_their_energy_in_wide_bands():
 @pytest.mark.parametrize("kelvin", [3999.0, 25001.0])
 def test_daylight_is_refused_outside_its_definition(kelvin):
     with pytest.raises(ParameterError, match="4000 K to 25000 K"):
-        illuminant.before(kind="daylight", temperature=kelvin)
-    assert illuminant.before(kind="A", temperature=kelvin) == []
+        illuminant.hooks.preflight(kind="daylight", temperature=kelvin)
+    assert illuminant.hooks.preflight(kind="A", temperature=kelvin) == []
 
 
 @pytest.mark.parametrize("kelvin", [4000.0, 25000.0])
@@ -94,9 +94,9 @@ def test_illuminate_once_and_twice(count, y, x, scale):
         assert result.dtype == torch.float32
         torch.testing.assert_close(result.double(), factor[:, None, None] * reflectance.double(), rtol=1e-6, atol=1e-44)
         torch.testing.assert_close(
-            result.double(), illuminate.ref(reflectance, power, times=times), rtol=1e-6, atol=1e-44
+            result.double(), illuminate.hooks.reference(reflectance, power, times=times), rtol=1e-6, atol=1e-44
         )
-    assert "squared" in illuminate.before(times="twice")[0]
+    assert "squared" in illuminate.hooks.preflight(times="twice")[0]
 
 
 def test_illuminate_learns_and_refuses_other_bands():
@@ -127,7 +127,7 @@ def test_channels_are_not_negative_and_the_largest_peaks_at_one(camera):
     assert float(result.min()) == 0
     assert float(result.max()) == pytest.approx(1, abs=0.01)
     assert float(result.max()) <= 1
-    assert responses.after(responses(SCENE, camera=camera), SCENE, camera=camera)[0].ok
+    assert responses.hooks.check(responses(SCENE, camera=camera), SCENE, camera=camera)[0].ok
 
 
 @pytest.mark.parametrize("camera", ["Nikon 5100", "Sigma SDMerill"])

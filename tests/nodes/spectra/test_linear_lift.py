@@ -40,7 +40,7 @@ def test_measured_scene_is_recovered_as_well_as_known(lift, psnr, mrae):
 @pytest.mark.parametrize("lift", LIFTS)
 def test_usual_form_agrees_with_reference(lift):
     rgb = colours().float()
-    torch.testing.assert_close(lift(rgb, SCENE).double(), lift.ref(rgb, SCENE), rtol=lift.rtol, atol=1e-6)
+    torch.testing.assert_close(lift(rgb, SCENE).double(), lift.hooks.reference(rgb, SCENE), rtol=lift.rtol, atol=1e-6)
 
 
 def test_mallett_is_the_basis_of_colour_science():
@@ -103,7 +103,7 @@ def test_gradients(lift):
 def test_check_says_what_was_clipped(lift):
     deep_blue = torch.tensor([0.0, 0.0, 1.0])[:, None, None]
     red = torch.tensor([1.0, -0.5, 0.0])[:, None, None]
-    good, bad = (lift.after(lift(c, SCENE), c, SCENE) for c in (deep_blue, red))
+    good, bad = (lift.hooks.check(lift(c, SCENE), c, SCENE) for c in (deep_blue, red))
     assert "negative" in good[1].text
     assert not bad[1].ok
 

@@ -109,7 +109,7 @@ def test_agrees_with_its_reference():
     cube = torch.tensordot(rand(9, 4, dtype=torch.float64), rand(4, 20, 21, dtype=torch.float64), 1)
     cube += 1e-5 * rand(9, 20, 21, seed=1, dtype=torch.float64)
     for within in (1e-1, 1e-3, 1e-8):
-        found, exact = compress(cube, within=within), compress.ref(cube, within=within)
+        found, exact = compress(cube, within=within), compress.hooks.reference(cube, within=within)
         assert len(found.planes) == len(exact.planes)
         assert bool((exact.rest <= found.rest * 1.05).all())
         made, wanted = (torch.tensordot(m.basis, m.planes, 1) for m in (found, exact))
@@ -145,7 +145,7 @@ def test_darkness_is_one_plane_of_nothing():
     assert len(found.planes) == 1
     assert not bool(found.planes.any())
     assert not bool(found.rest.any())
-    assert "1 planes for 5 bands" in compress.after(found)[0].text
+    assert "1 planes for 5 bands" in compress.hooks.check(found)[0].text
 
 
 @pytest.mark.parametrize("scale", [1e-300, 1e-160, 1e160, 1e300])
@@ -187,7 +187,7 @@ def test_the_gradient_of_the_planes_reaches_the_cube():
 
 def test_the_check_says_how_many():
     found = compress(rand(1, 4, 4) * rand(6, 1, 1))
-    assert compress.after(found)[0].text.startswith("1 planes for 6 bands, within ")
+    assert compress.hooks.check(found)[0].text.startswith("1 planes for 6 bands, within ")
 
 
 @settings(max_examples=20, deadline=None)
@@ -208,9 +208,9 @@ def test_light_falls_on_a_mixture_as_on_the_cube(times):
     assert isinstance(found, Mixture)
     for r in range(len(found.planes) + 1):
         assert bool((left(found, lit, r) <= found.rest[r] * (1 + 1e-9)).all())
-    for one, exact in zip(found, illuminate.ref(mixed, power, times=times), strict=True):
+    for one, exact in zip(found, illuminate.hooks.reference(mixed, power, times=times), strict=True):
         torch.testing.assert_close(one, exact)
-    assert "planes for 5 bands" in illuminate.after(found)[0].text
+    assert "planes for 5 bands" in illuminate.hooks.check(found)[0].text
 
 
 def test_a_mixture_of_other_bands_is_refused():
@@ -224,7 +224,7 @@ def test_rows_are_photons_of_each_channel_and_wells():
     assert found.shape == (4, 31)
     torch.testing.assert_close(found[:3], seen * SCENE.centres, rtol=1e-15, atol=0)
     torch.testing.assert_close(found[3], SCENE.centres, rtol=0, atol=0)
-    assert rows.after(found)[0].text == "4 rows of 31 bands, rank 4"
+    assert rows.hooks.check(found)[0].text == "4 rows of 31 bands, rank 4"
     assert torch.equal(rows(SCENE, seen, well=False), found[:3])
     with pytest.raises(ValueError, match="same `bands` step"):
         rows(Bands(*(v[:5] for v in SCENE)), seen)
@@ -242,19 +242,19 @@ def test_the_matrix_of_a_lift_is_the_basis_of_its_cube():
 @pytest.mark.parametrize("within", [1e-6, 1e-2])
 def test_a_lift_to_planes_is_the_lift_whether_clipped_or_not(lift, within):
     for colours in (rand(3, 60, 61), 0.5 + 0.01 * rand(3, 60, 61)):
-        cube, found = lift(colours, SCENE), lift.mixed(colours, SCENE, within=within)
+        cube, found = lift(colours, SCENE), lift.low_rank_form(colours, SCENE, within=within)
         lost = left(found, cube, len(found.planes))
         assert bool((lost <= found.rest[-1] + 1e-6).all())
         assert float(found.spread[-1].max()) <= within * float(cube.max())
         assert len(found.planes) == len(compress(cube, within=within).planes)
-        assert len(found.planes) == len(lift.mixed.ref(colours, SCENE, within=within).planes)
-    assert "planes for 31 bands" in lift.mixed.after(found)[0].text
+        assert len(found.planes) == len(lift.low_rank_form.hooks.reference(colours, SCENE, within=within).planes)
+    assert "planes for 31 bands" in lift.low_rank_form.hooks.check(found)[0].text
 
 
 def test_a_lift_to_planes_learns_and_refuses_what_is_no_picture():
     colours = rand(3, 2, 2, dtype=torch.float64).requires_grad_()
-    found = lift_lmmse.mixed(colours, SCENE)
+    found = lift_lmmse.low_rank_form(colours, SCENE)
     found.planes.square().sum().backward()
     assert bool((colours.grad != 0).any())
     with pytest.raises(ValueError, match="three channels"):
-        lift_lmmse.mixed(rand(4, 2, 2), SCENE)
+        lift_lmmse.low_rank_form(rand(4, 2, 2), SCENE)

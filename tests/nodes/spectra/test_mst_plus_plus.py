@@ -79,7 +79,7 @@ def test_checkpoint_loads_from_every_container(tmp_path, picture, form):
         prefix = "module." if form == "module.pth" else ""
         named = {prefix + name: tensor for name, tensor in state.items()}
         torch.save({"epoch": 7, "iter": 9, "state_dict": named, "optimizer": {"lr": 1e-4}}, path)
-    assert lift_mst_plus_plus.before(weights=path) == []
+    assert lift_mst_plus_plus.hooks.preflight(weights=path) == []
     result = lift_mst_plus_plus(picture, SCENE, weights=path, rng=generator())
     network = MSTPlusPlus().requires_grad_(False)
     network.load_state_dict(state)
@@ -105,7 +105,7 @@ def test_a_checkpoint_that_does_not_fit_is_refused_before_the_run(tmp_path):
         ("text", "no tensors"),
     ):
         with pytest.raises(ParameterError, match=words) as error:
-            lift_mst_plus_plus.before(weights=tmp_path / f"{name}.pth")
+            lift_mst_plus_plus.hooks.preflight(weights=tmp_path / f"{name}.pth")
         assert error.value.parameter == "weights"
 
 
@@ -119,18 +119,18 @@ class Trap:
 def test_a_pickle_with_code_is_not_run(tmp_path, capsys):
     torch.save({"state_dict": Trap()}, tmp_path / "trap.pth")
     with pytest.raises(ParameterError, match="safely"):
-        lift_mst_plus_plus.before(weights=tmp_path / "trap.pth")
+        lift_mst_plus_plus.hooks.preflight(weights=tmp_path / "trap.pth")
     assert "code ran" not in capsys.readouterr().out
 
 
 def test_refuses_to_run_untrained_unless_told(picture):
     with pytest.raises(ParameterError, match="untrained: allow"):
-        lift_mst_plus_plus.before()
+        lift_mst_plus_plus.hooks.preflight()
     with pytest.raises(ValueError, match="untrained: allow"):
         lift_mst_plus_plus(picture, SCENE, rng=generator())
-    assert "noise" in lift_mst_plus_plus.before(untrained="allow")[0]
+    assert "noise" in lift_mst_plus_plus.hooks.preflight(untrained="allow")[0]
     cube = lift_mst_plus_plus(picture, SCENE, untrained="allow", rng=generator())
-    assert not lift_mst_plus_plus.after(cube, picture, SCENE, untrained="allow")[-1].ok
+    assert not lift_mst_plus_plus.hooks.check(cube, picture, SCENE, untrained="allow")[-1].ok
 
 
 def test_untrained_weights_come_from_the_given_stream_alone(picture):

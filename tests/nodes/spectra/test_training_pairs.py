@@ -117,7 +117,7 @@ def test_another_daylight_moves_white_along_the_daylights():
 def test_rendering_is_the_one_that_the_lifts_undo(measured):
     cube = leaves(drawn(measured), SCENE, shape=(16, 16), rng=generator())
     colour = render(cube, SCENE)
-    torch.testing.assert_close(colour.double(), render.ref(cube, SCENE), rtol=render.rtol, atol=1e-6)
+    torch.testing.assert_close(colour.double(), render.hooks.reference(cube, SCENE), rtol=render.rtol, atol=1e-6)
     again = render(lift_lmmse(colour.double(), SCENE), SCENE)
     lit = lift_lmmse(colour.double(), SCENE).amin(0) > 0
     assert float((again - colour)[:, lit].abs().max()) < 1e-6
@@ -172,7 +172,7 @@ def test_own_files_join_the_sets(tmp_path, measured, kind):
     wavelengths = np.arange(390.0, 731.0, 10.0)
     values = [np.linspace(0.1, 0.9, len(wavelengths)), np.full(len(wavelengths), 0.5)]
     path = written(tmp_path, kind, wavelengths, values)
-    assert reflectances.before(files=(path,)) == []
+    assert reflectances.hooks.preflight(files=(path,)) == []
     found = reflectances(SCENE, files=(path,))
     assert found.shape == (len(measured) + 2, 31)
     np.testing.assert_allclose(found[-2], np.interp(np.arange(400, 701, 10), wavelengths, values[0]), atol=1e-12)
@@ -192,7 +192,7 @@ def test_own_files_join_the_sets(tmp_path, measured, kind):
 def test_a_file_that_holds_no_reflectances_is_refused_before_the_run(tmp_path, values, wavelengths, words):
     path = written(tmp_path, "csv", wavelengths, values)
     with pytest.raises(ParameterError, match=words) as error:
-        reflectances.before(files=(path,))
+        reflectances.hooks.preflight(files=(path,))
     assert error.value.parameter == "files"
 
 
@@ -203,7 +203,7 @@ def test_a_file_of_another_kind_is_refused(tmp_path, name, text):
     path = tmp_path / name
     path.write_text(text)
     with pytest.raises(ParameterError, match=r"\.npz \(wavelengths, reflectances\)"):
-        reflectances.before(files=(path,))
+        reflectances.hooks.preflight(files=(path,))
 
 
 def test_bands_beyond_a_file_and_nothing_at_all_are_refused(tmp_path):
@@ -211,9 +211,9 @@ def test_bands_beyond_a_file_and_nothing_at_all_are_refused(tmp_path):
     with pytest.raises(ValueError, match="holds 450 to 700 nm"):
         reflectances(SCENE, files=(path,))
     with pytest.raises(ParameterError, match="neither sets nor files"):
-        reflectances.before(sets=())
+        reflectances.hooks.preflight(sets=())
     with pytest.raises(ParameterError, match="exchange"):
-        metamers.before(thickness=(2.0, 1.0))
+        metamers.hooks.preflight(thickness=(2.0, 1.0))
     with pytest.raises(ValueError, match="four spectra or more of 31 bands"):
         metamers(torch.ones(3, 31), SCENE, rng=generator())
     with pytest.raises(ValueError, match=r"\(leaf, band\) of 31 bands"):
@@ -226,4 +226,4 @@ def test_bands_beyond_a_file_and_nothing_at_all_are_refused(tmp_path):
 def test_a_file_of_the_psychtoolbox():
     found = reflectances(SCENE, sets=(), files=(VRHEL,))
     assert found.shape == (170, 31)
-    assert reflectances.after(found, SCENE)[0].ok
+    assert reflectances.hooks.check(found, SCENE)[0].ok

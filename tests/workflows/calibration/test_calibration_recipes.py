@@ -143,7 +143,7 @@ def test_missing_files_are_told_with_their_place(measured):
     (measured / "mine.yaml").write_text(FILES.replace("bright/b.png", "bright/z.png"))
     with pytest.raises(RecipeError) as caught:
         load("mine.yaml", folder=measured)
-    (problem,) = caught.value.problems
+    (problem,) = caught.value.diagnostics
     assert (problem.mark.file, problem.mark.line) == ("mine.yaml", 5)
     assert "no such file" in problem.message
     assert "z.png" in problem.message

@@ -9,8 +9,8 @@ import torch
 from neusee.workflows.calibration import emcee_sampler
 from neusee.workflows.calibration.identifiability import known
 from neusee.workflows.calibration.initial_guess import begin
-from neusee.workflows.calibration.log_posterior import Problem
-from neusee.workflows.calibration.posterior_mode import Peak, log_law, peak
+from neusee.workflows.calibration.log_posterior import SensorPosterior
+from neusee.workflows.calibration.posterior_mode import LaplaceFit, log_law, peak
 from neusee.workflows.keys.cache_key import stream_seed
 from neusee.workflows.recipe.loading import load
 from neusee.workflows.store.result_store import Store
@@ -38,7 +38,7 @@ def fitted(tmp_path):
 
     def fitted(*overrides):
         recipe = load("calibrate", [*SEEN, *overrides])
-        problem = Problem.of(recipe, Store(tmp_path / "store"))
+        problem = SensorPosterior.of(recipe, Store(tmp_path / "store"))
         truth = {name: float(recipe.steps["density"].params[name]) for name in problem.names}
         highest = peak(problem, begin(problem))
         return problem, truth, highest, known(problem, highest)
@@ -253,7 +253,7 @@ def test_places_are_the_same_in_another_unit_but_for_what_an_electron_and_a_phot
     places = []
     for d in (0, decades):
         recipe = load("calibrate", [*SEEN, *scaled(10.0**d)])
-        problem = Problem.of(recipe, Store(tmp_path))
+        problem = SensorPosterior.of(recipe, Store(tmp_path))
         places.append(problem.place({name: float(recipe.steps["density"].params[name]) for name in problem.names}))
     moved = dict(zip(problem.names, places[1] - places[0], strict=True))
     step = -decades * math.log(10)
@@ -262,7 +262,7 @@ def test_places_are_the_same_in_another_unit_but_for_what_an_electron_and_a_phot
 
 def test_a_peak_is_a_normal_law():
     covariance = np.array([[1.0, 0.999], [0.999, 1.0]])
-    peak = Peak(np.zeros(2), 0.0, covariance, np.eye(2), np.ones(2), True)
+    peak = LaplaceFit(np.zeros(2), 0.0, covariance, np.eye(2), np.ones(2), True)
     drawn = peak.draw(20_000, np.random.default_rng(0))
     assert np.cov(drawn.T) == pytest.approx(covariance, abs=0.03)
     assert log_law(peak, np.array([[1.0, 1.0]]))[0] == pytest.approx(-0.5 * 2 / 1.999, rel=1e-6)

@@ -12,7 +12,7 @@ from neusee.workflows.calibration import emcee_sampler
 from neusee.workflows.calibration.calibration_page import beside
 from neusee.workflows.calibration.identifiability import known
 from neusee.workflows.calibration.initial_guess import begin
-from neusee.workflows.calibration.log_posterior import Problem
+from neusee.workflows.calibration.log_posterior import SensorPosterior
 from neusee.workflows.calibration.posterior_checks import checks, weighed
 from neusee.workflows.calibration.posterior_mode import peak
 from neusee.workflows.cli import app
@@ -29,7 +29,7 @@ def store(tmp_path_factory):
 
 
 def problem(store, *words):
-    return Problem.of(load("calibrate", [SMALL, *words]), store)
+    return SensorPosterior.of(load("calibrate", [SMALL, *words]), store)
 
 
 def top(found):

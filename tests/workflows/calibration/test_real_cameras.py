@@ -17,8 +17,8 @@ from neusee.nodes.calibrate import Likelihood, least_squares, table
 from neusee.workflows.calibration import emcee_sampler, run_calibration
 from neusee.workflows.calibration.goodness_of_fit import fit
 from neusee.workflows.calibration.identifiability import known
-from neusee.workflows.calibration.log_posterior import Problem
-from neusee.workflows.calibration.model_spread import NINETY, begin, spread
+from neusee.workflows.calibration.log_posterior import SensorPosterior
+from neusee.workflows.calibration.model_spread import Z_90, begin, spread
 from neusee.workflows.calibration.posterior_mode import peak
 from neusee.workflows.engine.runner import run
 from neusee.workflows.recipe.loading import load
@@ -95,7 +95,7 @@ def test_a_table_of_ones_own_is_taken_by_override(store, tmp_path):
 @pytest.mark.parametrize("unit", ["DN/e-", "e-/DN"])
 def test_the_peak_explains_its_levels_in_either_unit(store, unit):
     gain = 0.25 if unit == "DN/e-" else 4.0
-    problem = Problem.of(load("calibrate_camera", [f"camera.gain={gain}", f"camera.gain_unit={unit}"]), store)
+    problem = SensorPosterior.of(load("calibrate_camera", [f"camera.gain={gain}", f"camera.gain_unit={unit}"]), store)
     top = peak(problem, begin(problem))
     assert top.settled
     found = fit(problem.look(top.place[None]), len(problem.names))
@@ -124,8 +124,8 @@ def test_stated_is_the_middle_of_the_two_richest_and_half_their_distance(store):
     (gain,) = (row for row in rows if row.name == "gain")
     one, two = (np.log([m.value, m.high / m.value]) for m in gain.models[1:])
     assert math.log(gain.stated.value) == pytest.approx((one[0] + two[0]) / 2)
-    width = math.hypot(max(one[1], two[1]) / NINETY, abs(one[0] - two[0]) / 2)
-    assert math.log(gain.stated.high / gain.stated.value) == pytest.approx(NINETY * width)
+    width = math.hypot(max(one[1], two[1]) / Z_90, abs(one[0] - two[0]) / 2)
+    assert math.log(gain.stated.high / gain.stated.value) == pytest.approx(Z_90 * width)
     assert rows == spread(load("calibrate_camera"), store)  # the same draws
 
 
@@ -143,20 +143,20 @@ def test_pixels_that_are_all_alike_have_no_models_of_a_response(store):
 
 def test_a_recipe_that_calibrates_nothing_says_what_is_missing(store):
     with pytest.raises(ValueError, match=r"no step of the node calibrate\.density or calibrate\.camera, and a calib"):
-        Problem.of(load("plain_lens"), store)
+        SensorPosterior.of(load("plain_lens"), store)
 
 
 @pytest.mark.slow
 def test_emcee_draws_from_the_same_posterior(store, tmp_path):
     """Held: what frames do not tell, for a normal law is compared. Importance draws against a chain."""
-    problem = Problem.of(load("calibrate_camera", ["steps.prior.with.twist=null"]), store)
+    problem = SensorPosterior.of(load("calibrate_camera", ["steps.prior.with.twist=null"]), store)
     chains = emcee_sampler.sample(problem, peak(problem, begin(problem)), tmp_path / "chain.h5", seed=1, walkers=48)
     assert chains.long
     rows = {row.name: row for row in spread(problem.recipe, store)}
     for name, x in zip(problem.names, chains.flat.T, strict=True):
         if name in ("gain", "quantum_efficiency", "dark_noise", "lamp"):
             model = rows[name].models[-1]
-            width = math.log(model.high / model.low) / 2 / NINETY
+            width = math.log(model.high / model.low) / 2 / Z_90
             assert x.mean() == pytest.approx(math.log(model.value), abs=0.15 * width)
             assert x.std() == pytest.approx(width, rel=0.1)
 
@@ -208,7 +208,7 @@ def test_the_ccd_of_emva_is_not_linear_which_is_why_least_squares_gives_less(sto
     assert all(row.stated.low < row.stated.value < row.stated.high for row in rows.values())
     assert rows["dark_noise"].stated.high < 10.898 / 0.97
     assert rows["gain"].stated.low > 0.280769  # of a straight line, through levels where each electron gives less
-    problem = Problem.of(with_one_term(recipe), store)
+    problem = SensorPosterior.of(with_one_term(recipe), store)
     best = {name: float(x) for name, x in problem.parameters(peak(problem, begin(problem)).place).items()}
     levels = run(recipe, store).values["levels"]
     expected = least_squares(as_expected(levels, best))
@@ -265,7 +265,7 @@ def test_pixels_taken_as_alike_are_sure_of_a_wrong_gain_and_that_is_a_misfit(sto
         writer.writeheader()
         writer.writerows(row for row in rows if float(row["mean_DN"]) < 2750)  # 0.7 of saturation
     (tmp_path / "pixels.yaml").write_text(PIXELS.replace("FILE", "below.csv"))
-    problem = Problem.of(load("pixels.yaml", folder=tmp_path), store)
+    problem = SensorPosterior.of(load("pixels.yaml", folder=tmp_path), store)
     top = peak(problem, problem.place(NEAR))
     gain = float(problem.parameters(top.place)["gain"])
     error = math.sqrt(top.covariance[0, 0])  # of its logarithm

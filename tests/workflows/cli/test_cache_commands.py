@@ -4,7 +4,7 @@ import pytest
 import torch
 
 from neusee.workflows.cli import cache_lines
-from neusee.workflows.store.derived_files import Shelf
+from neusee.workflows.store.derived_files import DerivedFiles
 from neusee.workflows.store.result_store import Store
 
 KEYS = ["ab" + "0" * 30, "ab" + "1" * 30, "cd" + "0" * 30]
@@ -40,13 +40,13 @@ def test_an_empty_store_is_listed(tmp_path):
 
 
 def test_a_sound_store_is_verified(store):
-    Shelf(store).keep("ef" * 16, ".png", "picture", b"x" * 980_000)
+    DerivedFiles(store).keep("ef" * 16, ".png", "picture", b"x" * 980_000)
     assert cache_lines.verify_lines(store) == (["3 results, 1.02 MB, as written"], 0)
 
 
 @pytest.mark.parametrize("mode", ["always", "never"])
 def test_what_is_damaged_is_named_and_put_aside(store, mode):
-    picture = Shelf(store).keep("ef" * 16, ".png", "picture", b"x" * 1000)
+    picture = DerivedFiles(store).keep("ef" * 16, ".png", "picture", b"x" * 1000)
     picture.chmod(0o644)
     picture.write_bytes(b"y" * 1000)
     for key, suffix, at in ((KEYS[0], "safetensors", -1), (KEYS[2], "json", 20)):

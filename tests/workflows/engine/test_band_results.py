@@ -13,7 +13,7 @@ from neusee.workflows import RunError, Store, load
 from neusee.workflows.engine import band_results
 from neusee.workflows.engine.band_results import call_by_band, plain_of
 from neusee.workflows.engine.node_call import call
-from neusee.workflows.graph.diagnostics import Mark
+from neusee.workflows.graph.diagnostics import Location
 from neusee.workflows.graph.recipe_graph import Step, in_order
 from neusee.workflows.store import serialization
 from neusee.workflows.store.band_files import Blobs, Stacked
@@ -57,7 +57,7 @@ class Made:
     """A step by band, that counts what it computes."""
 
     def __init__(self, node, blobs, code="code", store=True, **params):
-        self.step = Step("s", node, params, {}, Mark("here.yaml"), {})
+        self.step = Step("s", node, params, {}, Location("here.yaml"), {})
         self.blobs, self.code, self.store, self.computed = blobs, code, store, []
 
     def __call__(self, *inputs, parts=1):
@@ -226,7 +226,7 @@ def test_a_node_without_bands_is_only_called(blobs):
 def test_a_scene_in_few_planes_has_no_band_to_compute_alone(blobs):
     mixed = Mixture(rand(2, 64, 64), rand(BANDS, 2, dtype=torch.float64), torch.zeros(3, BANDS, dtype=torch.float64))
     power = rand(BANDS, dtype=torch.float64)
-    step = Step("radiance", illuminate, {"times": "once"}, {}, Mark("test"), {})
+    step = Step("radiance", illuminate, {"times": "once"}, {}, Location("test"), {})
     found = call_by_band(step, [mixed, power], lambda given: illuminate(*given), "code", blobs)
     torch.testing.assert_close(found.basis, mixed.basis * power[:, None])
     assert not files(blobs)
@@ -304,4 +304,4 @@ def test_a_damaged_band_of_a_stored_result_is_mended(write, tmp_path):
     with pytest.warns(UserWarning, match="put aside"):
         again = recipe.run(Store(root))
     assert all(same(again.values[name], first.values[name]) for name in first.values)
-    assert all(done.state == "cached" for done in recipe.run(Store(root)).done.values() if done.state != "asleep")
+    assert all(done.state == "cached" for done in recipe.run(Store(root)).done.values() if done.state != "not needed")

@@ -4,7 +4,7 @@ import pytest
 
 from neusee.nodes import node
 from neusee.workflows.engine.cost_model import GUESS, Costs
-from neusee.workflows.graph.diagnostics import Mark
+from neusee.workflows.graph.diagnostics import Location
 from neusee.workflows.graph.recipe_graph import Step
 
 
@@ -14,7 +14,7 @@ def blur(x=None):
 
 
 def step(name):
-    return Step(name, blur, {}, {}, Mark("t.yaml", 1, 1), {})
+    return Step(name, blur, {}, {}, Location("t.yaml", 1, 1), {})
 
 
 def row(name, seconds, size=100, device="cpu", peak=None, node=blur.path):

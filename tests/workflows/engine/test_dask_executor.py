@@ -54,10 +54,10 @@ def agree(one, other):
 
 
 def test_work_travels_without_tensors(small):
-    from neusee.workflows.engine.step_job import Work
+    from neusee.workflows.engine.step_job import StepJob
 
     for step in small.steps.values():
-        work = Work(step, "k" * 32, {}, (), 1, "r", "cpu", "l")
+        work = StepJob(step, "k" * 32, {}, (), 1, "r", "cpu", "l")
         data = pickle.dumps(work)
         assert len(data) < 4000
         assert pickle.loads(data).step.node is step.node
@@ -80,7 +80,7 @@ def test_in_one_process(small, local, tmp_path):
         agree(there, local)
         assert {d.state for d in run(small, Store(tmp_path), executor=executor).done.values()} <= {
             "cached",
-            "asleep",
+            "not needed",
             "left out",
         }
 

@@ -7,11 +7,11 @@ import pytest
 import torch
 from torch.autograd import gradcheck
 
-from neusee.nodes import Facts, node
+from neusee.nodes import TensorStats, node
 from neusee.workflows.engine.differentiable_function import _Ends, as_function
 from neusee.workflows.engine.node_call import RunError
 from neusee.workflows.engine.runner import run
-from neusee.workflows.graph.diagnostics import Mark
+from neusee.workflows.graph.diagnostics import Location
 from neusee.workflows.graph.recipe_graph import Recipe, Step
 from neusee.workflows.store.result_store import Store
 
@@ -50,7 +50,7 @@ def noise(image, *, sigma: float = 0.1, rng: torch.Generator):
     return image + sigma * torch.randn(image.shape, generator=rng, dtype=image.dtype)
 
 
-@noise.negligible
+@noise.skip_bound
 def _(image, *, sigma):
     return sigma / image.max
 
@@ -72,7 +72,7 @@ def store(tmp_path):
 
 
 def step(name, what, wires=None, **params):
-    return Step(name, what, dict(what.params(**params)), wires or {}, Mark("test.yaml", 1, 1), {})
+    return Step(name, what, dict(what.params(**params)), wires or {}, Location("test.yaml", 1, 1), {})
 
 
 def camera(tolerance=0.0, **params):
@@ -220,7 +220,7 @@ def test_a_chain_of_ten_thousand_steps(store):
 @pytest.mark.parametrize("values", [[1.0, -2.0, 3.5], [math.nan, 1.0], [math.inf, -1.0], []])
 def test_the_ends_of_a_picture_are_those_of_its_facts(values):
     x = torch.tensor(values)
-    quick, whole = _Ends(x), Facts.of(x)
+    quick, whole = _Ends(x), TensorStats.of(x)
     for name in ("shape", "dtype", "min", "max", "finite", "sum", "support"):
         one, other = getattr(quick, name), getattr(whole, name)
         assert one == other or (one != one and other != other), name

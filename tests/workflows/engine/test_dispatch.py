@@ -4,8 +4,8 @@ import pytest
 
 from neusee.nodes import node
 from neusee.workflows.engine.dispatch import Loop, chains_of
-from neusee.workflows.engine.step_job import Lane, Outcome, Work
-from neusee.workflows.graph.diagnostics import Mark
+from neusee.workflows.engine.step_job import Lane, Outcome, StepJob
+from neusee.workflows.graph.diagnostics import Location
 from neusee.workflows.graph.recipe_graph import Step
 
 
@@ -15,8 +15,8 @@ def any_step(x=None):
 
 
 def work(key, *sources, lane="a", wanted=False):
-    step = Step(key, any_step, {}, {}, Mark("t.yaml", 1, 1), {})
-    return Work(step, key, {}, (tuple(sources),), 0, "t", "cpu", lane, wanted)
+    step = Step(key, any_step, {}, {}, Location("t.yaml", 1, 1), {})
+    return StepJob(step, key, {}, (tuple(sources),), 0, "t", "cpu", lane, wanted)
 
 
 class Fake:

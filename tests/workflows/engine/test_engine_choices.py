@@ -11,7 +11,7 @@ import torch
 from neusee.nodes import node
 from neusee.workflows.engine.node_call import RunError
 from neusee.workflows.engine.runner import run
-from neusee.workflows.graph.diagnostics import Mark
+from neusee.workflows.graph.diagnostics import Location
 from neusee.workflows.graph.recipe_graph import Recipe, Step
 from neusee.workflows.store.result_store import Store
 
@@ -73,7 +73,7 @@ def recipe(outputs, **steps):
     made = {}
     for i, (name, (what, wires, params)) in enumerate(steps.items()):
         full = {**{p.name: p.default for p in what._keyword_only}, **params}
-        made[name] = Step(name, what, full, wires, Mark("t.yaml", i + 1, 1), {})
+        made[name] = Step(name, what, full, wires, Location("t.yaml", i + 1, 1), {})
     return Recipe("t", "", 1, 0.0, tuple(outputs.split()), made)
 
 
@@ -92,7 +92,7 @@ def test_what_is_quicker_to_compute_than_to_keep_is_not_kept_but_remembered(stor
     assert not fresh.has(first.keys["a"])
     assert fresh.about(first.keys["a"])["facts"]["sum"] == BIG
     again = run(recipe("m", **CHEAP), fresh)
-    assert states(again) == {"a": "asleep", "b": "asleep", "m": "cached"}
+    assert states(again) == {"a": "not needed", "b": "not needed", "m": "cached"}
 
 
 def test_what_took_long_is_kept_and_a_change_below_it_runs_no_more_than_it_must(store):
@@ -133,14 +133,14 @@ def test_cheap_steps_after_one_another_are_kept_once_together_they_are_dear(stor
 
 
 def test_a_stored_value_is_computed_again_where_reading_takes_longer(store):
-    class Far(Store):
+    class RemoteFiles(Store):
         def read_seconds(self, size):
             return 5.0
 
     run(recipe("b m", **CHEAP), store)
     CALLS.clear()
     changed = {**CHEAP, "m": (mean, {"x": "b", "y": "b"}, {})}
-    result = run(recipe("m", **changed), Far(store.root))
+    result = run(recipe("m", **changed), RemoteFiles(store.root))
     assert result.values["m"] == 4
     assert states(result) == {"a": "run", "b": "run", "m": "run"}
     CALLS.clear()

@@ -5,7 +5,7 @@ import itertools
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from neusee.workflows.engine.load_or_recompute import to_compute_again, worth_a_look
+from neusee.workflows.engine.load_or_recompute import cheaper_to_recompute, worth_solving
 
 INF = float("inf")
 
@@ -43,7 +43,7 @@ def walked(targets, sources, load, again):
 @settings(max_examples=300, deadline=None)
 def test_the_choice_is_the_cheapest_of_all(graph):
     targets, sources, load, compute = graph
-    again = to_compute_again(targets, sources.__getitem__, load.__getitem__, compute.__getitem__)
+    again = cheaper_to_recompute(targets, sources.__getitem__, load.__getitem__, compute.__getitem__)
     ours = price(targets, sources, load, compute, walked(targets, sources, load, again))
     subsets = itertools.chain.from_iterable(itertools.combinations(sources, k) for k in range(len(sources) + 1))
     best = min(price(targets, sources, load, compute, set(s)) for s in subsets)
@@ -51,16 +51,18 @@ def test_the_choice_is_the_cheapest_of_all(graph):
 
 
 def test_what_is_not_stored_is_never_named():
-    again = to_compute_again([1], {0: (), 1: (0,)}.__getitem__, {0: INF, 1: 5.0}.__getitem__, lambda i: 1.0)
+    again = cheaper_to_recompute([1], {0: (), 1: (0,)}.__getitem__, {0: INF, 1: 5.0}.__getitem__, lambda i: 1.0)
     assert again == {1}
 
 
 def test_a_long_chain_is_no_recursion():
     n = 5000
-    found = to_compute_again([n - 1], lambda i: (i - 1,) if i else (), lambda i: 9e9 if i % 2 else INF, lambda i: 1.0)
+    found = cheaper_to_recompute(
+        [n - 1], lambda i: (i - 1,) if i else (), lambda i: 9e9 if i % 2 else INF, lambda i: 1.0
+    )
     assert found == {i for i in range(n) if i % 2}
 
 
 def test_a_millisecond_is_not_worth_a_look():
-    assert not worth_a_look(0.0015, 0.001)
-    assert worth_a_look(0.5, 0.001)
+    assert not worth_solving(0.0015, 0.001)
+    assert worth_solving(0.5, 0.001)

@@ -15,7 +15,7 @@ from neusee.nodes.values import Bands
 from neusee.workflows.engine import execution
 from neusee.workflows.engine.node_call import RunError
 from neusee.workflows.engine.runner import run
-from neusee.workflows.graph.diagnostics import Mark
+from neusee.workflows.graph.diagnostics import Location
 from neusee.workflows.graph.recipe_graph import Recipe, Step
 from neusee.workflows.store import serialization
 from neusee.workflows.store.result_store import Store
@@ -48,7 +48,7 @@ def noise(x, *, sigma: float = 1.0, rng: torch.Generator):
     return x + sigma * torch.randn(x.shape, generator=rng)
 
 
-@noise.negligible
+@noise.skip_bound
 def _(x, *, sigma):
     return sigma / x.max if sigma else 0.0
 
@@ -146,7 +146,7 @@ def recipe(outputs, tolerance=0.0, seed=7, **steps):
     """Steps, given as ``name=(node, {input: step}, {param: value})``."""
 
     def step(name, what, wires=None, params=None):
-        return Step(name, what, dict(what.params(**params or {})), wires or {}, Mark("test.yaml", 3, 5), {})
+        return Step(name, what, dict(what.params(**params or {})), wires or {}, Location("test.yaml", 3, 5), {})
 
     made = {name: step(name, *rest) for name, rest in steps.items()}
     return Recipe("test", "", seed, tolerance, tuple(outputs.split()), made)
@@ -174,7 +174,7 @@ def test_a_run_computes_in_order_and_a_second_one_reads(store):
     assert set(states(first).values()) == {"run"}
     second = run(diamond(), again(store))
     assert torch.equal(second.values["top"], first.values["top"])
-    assert states(second) == {"head": "asleep", "left": "asleep", "right": "asleep", "top": "cached"}
+    assert states(second) == {"head": "not needed", "left": "not needed", "right": "not needed", "top": "cached"}
     assert second.keys == first.keys
     assert len(CALLS) == 4
 
@@ -192,7 +192,7 @@ def test_a_cached_tail_reads_nothing_of_its_head(store, monkeypatch):
     monkeypatch.setattr(serialization, "read", lambda *a: pytest.fail("a payload was read"))
     result = run(diamond(count=BIG), again(store))
     assert result.values["top"].ndim == 0
-    assert states(result)["head"] == "asleep"
+    assert states(result)["head"] == "not needed"
 
 
 def test_an_input_is_read_once_and_only_for_a_step_that_runs(store, monkeypatch):
@@ -240,7 +240,7 @@ def test_a_cached_run_gives_the_same_bits_and_the_same_layout(store, count):
     for entry in [key for name, key in whole.keys.items() if name == "r"]:
         (store.root / entry[:2] / f"{entry}.json").unlink()
     after = run(recipe("r", **steps), again(store))
-    assert states(after) == {"s": "asleep", "n": "asleep", "t": "cached", "r": "run"}
+    assert states(after) == {"s": "not needed", "n": "not needed", "t": "cached", "r": "run"}
     assert torch.equal(after.values["r"], whole.values["r"])
     assert whole.value("t").is_contiguous()
 
@@ -298,7 +298,7 @@ def test_a_verdict_on_a_cached_run_reads_no_payload(store, monkeypatch):
     monkeypatch.undo()
     assert run(ladder(1e-3, 1.0), again(store)).keys == first.keys
     assert states(run(ladder(1e-3, 1.0), again(store))) == {
-        "s": "asleep",
+        "s": "not needed",
         "n": "left out",
         "m": "left out",
         "z": "cached",
@@ -377,7 +377,7 @@ def test_an_error_names_the_step_and_what_it_was_given(store):
     assert text.endswith("given x (40000,) float32")
     assert isinstance(caught.value.__cause__, ValueError)
     assert caught.value.step == "f"
-    assert states(run(steps, again(store), outputs=("a",))) == {"s": "asleep", "a": "cached"}
+    assert states(run(steps, again(store), outputs=("a",))) == {"s": "not needed", "a": "cached"}
 
 
 def test_an_interrupt_keeps_what_was_finished(store):
@@ -416,7 +416,10 @@ def test_damage_is_computed_again_and_never_served(store, victim, suffix, how):
         second = run(diamond(count=BIG, outputs="top left head"), again(store))
     assert all(torch.equal(second.values[name], first.values[name]) for name in first.values)
     assert states(second)[victim] == "run"
-    assert set(states(run(diamond(count=BIG, outputs="top left head"), again(store))).values()) <= {"cached", "asleep"}
+    assert set(states(run(diamond(count=BIG, outputs="top left head"), again(store))).values()) <= {
+        "cached",
+        "not needed",
+    }
 
 
 class warnings_of:

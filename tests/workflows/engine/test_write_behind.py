@@ -14,7 +14,7 @@ import torch
 from neusee.workflows.engine import write_behind
 from neusee.workflows.engine.node_call import RunError
 from neusee.workflows.engine.runner import run
-from neusee.workflows.engine.write_behind import Later
+from neusee.workflows.engine.write_behind import WriteBehind
 from neusee.workflows.store.result_store import Store
 
 SPEC = importlib.util.spec_from_file_location("engine_toys", Path(__file__).with_name("test_engine_choices.py"))
@@ -49,7 +49,7 @@ def niceness():
 
 @pytest.mark.skipif(sys.platform != "linux", reason="elsewhere priorities belong to processes, not to threads")
 def test_who_writes_yields_to_who_computes():
-    found, before, later = [], niceness(), Later()
+    found, before, later = [], niceness(), WriteBehind()
 
     def write():
         found.append(niceness())
@@ -124,7 +124,7 @@ def test_an_error_of_the_writer_is_an_error_of_the_run(tmp_path):
 
 def test_no_more_waits_than_there_is_room_for(monkeypatch):
     monkeypatch.setattr(write_behind, "_ROOM", 100)
-    later, gate, most = Later(), threading.Event(), []
+    later, gate, most = WriteBehind(), threading.Event(), []
     later.add("a", 80, lambda: gate.wait(10))
     threading.Timer(0.2, gate.set).start()
     began = time.monotonic()

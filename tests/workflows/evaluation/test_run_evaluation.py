@@ -181,7 +181,7 @@ def test_an_interval_is_that_of_students_table():
     assert found.mean == 4.5
     assert found.half == pytest.approx(2.262157 * x.std(ddof=1) / math.sqrt(10), rel=1e-6)
     assert math.isnan(mean([1.0]).half)
-    assert not mean([1.0]).sure
+    assert not mean([1.0]).excludes_zero
 
 
 def test_intervals_cover_the_truth_as_often_as_they_say():
@@ -194,7 +194,7 @@ def test_pairs_see_what_scatter_between_scenes_hides():
     rng = np.random.default_rng(1)
     reference = 1 + rng.random(30)
     values = 0.95 * reference + 1e-3 * rng.standard_normal(30)
-    assert difference(reference, values).sure
+    assert difference(reference, values).excludes_zero
     share = gain(values, reference, 7)
     assert share.mean == pytest.approx(0.05, abs=1e-3)
     assert share.half < 2e-3

@@ -9,7 +9,7 @@ import pytest
 from neusee.nodes import node
 from neusee.workflows.engine.cost_model import Estimate
 from neusee.workflows.explain.cluster_forecast import cluster_lines, simulated
-from neusee.workflows.graph.diagnostics import Mark
+from neusee.workflows.graph.diagnostics import Location
 from neusee.workflows.graph.recipe_graph import Recipe, Step
 from neusee.workflows.placement.machine_file import read_machines
 
@@ -42,7 +42,9 @@ def recipe(devices=("", "", "", "")):
     """``a`` feeds ``b`` and ``c``, which ``d`` reads."""
     wires = {"a": (), "b": ("a",), "c": ("a",), "d": ("b", "c")}
     steps = {
-        name: Step(name, change if reads else make, {}, {"x": reads} if reads else {}, Mark("r.yaml", 1, 1), {}, device)
+        name: Step(
+            name, change if reads else make, {}, {"x": reads} if reads else {}, Location("r.yaml", 1, 1), {}, device
+        )
         for (name, reads), device in zip(wires.items(), devices, strict=True)
     }
     return Recipe("r", "", 1, 0.0, ("d",), steps)
@@ -114,7 +116,7 @@ def _banded(what):
 
 def test_a_long_critical_path_loses_its_middle(machines):
     steps = {
-        f"s{i}": Step(f"s{i}", change if i else make, {}, {"x": f"s{i - 1}"} if i else {}, Mark("r.yaml", 1, 1), {})
+        f"s{i}": Step(f"s{i}", change if i else make, {}, {"x": f"s{i - 1}"} if i else {}, Location("r.yaml", 1, 1), {})
         for i in range(10_000)
     }
     long = Recipe("r", "", 1, 0.0, ("s9999",), steps)

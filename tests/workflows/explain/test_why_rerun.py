@@ -14,7 +14,7 @@ from neusee.workflows.explain import change_causes, why_rerun
 from neusee.workflows.explain.change_causes import Comparison, Pair
 from neusee.workflows.explain.code_changes import edits
 from neusee.workflows.explain.why_rerun import explained, why_key_lines, why_lines
-from neusee.workflows.graph.diagnostics import Mark
+from neusee.workflows.graph.diagnostics import Location
 from neusee.workflows.graph.recipe_graph import Recipe, Step, needed
 from neusee.workflows.keys.code_digest import Code
 from neusee.workflows.recipe.loading import load
@@ -71,7 +71,7 @@ def noise(light: Tensor, *, sigma: Electrons, rng: torch.Generator) -> Tensor:
     return light + sigma * torch.randn(light.shape, generator=rng)
 
 
-@noise.negligible
+@noise.skip_bound
 def _(light, *, sigma: float) -> float:
     return sigma / light.max
 ''',
@@ -305,7 +305,7 @@ CODE = {
     ),
     "a bound": (
         ("_light.py", "return sigma / light.max", "return 2 * sigma / light.max"),
-        "code of noise.negligible() in neusee/nodes/trial/_light.py changed",
+        "code of noise.skip_bound() in neusee/nodes/trial/_light.py changed",
     ),
     "a check": (
         ("_light.py", 'Check("even")', 'Check("flat")'),
@@ -523,7 +523,7 @@ def test_a_key_that_is_none_or_many_is_refused(trial):
 # --- long chains ----------------------------------------------------------------------------------------------------
 
 
-class Shelf:
+class DerivedFiles:
     """A store of origins alone, as deep as a test needs it."""
 
     def __init__(self, root, abouts):
@@ -535,7 +535,7 @@ class Shelf:
 
 def chain(length, first, node):
     """A chain of steps, of which the first has another parameter."""
-    mark = Mark("long.yaml", 1, 1)
+    mark = Location("long.yaml", 1, 1)
     steps = {"s0": Step("s0", node, {"amount": first}, {}, mark, {})}
     for n in range(1, length):
         steps[f"s{n}"] = Step(f"s{n}", node, {"amount": 1.0}, {"photons": f"s{n - 1}"}, mark, {})
@@ -543,7 +543,7 @@ def chain(length, first, node):
 
 
 def test_a_chain_of_ten_thousand_steps_is_walked_without_recursion(tmp_path, toy):
-    length, shelf = 10_000, Shelf(tmp_path, {})
+    length, shelf = 10_000, DerivedFiles(tmp_path, {})
     recipe = chain(length, 2.0, toy.add)
     before = resolve(chain(length, 1.0, toy.add), list(recipe.steps), shelf)
     shelf.abouts = {key: {"step": before.makers[key], "origin": before.origins[key]} for key in before.keys.values()}
@@ -557,7 +557,7 @@ def test_a_chain_of_ten_thousand_steps_is_walked_without_recursion(tmp_path, toy
 
 
 def test_results_that_are_gone_are_said_to_be(tmp_path, toy):
-    shelf = Shelf(tmp_path, {})
+    shelf = DerivedFiles(tmp_path, {})
     recipe = chain(5, 2.0, toy.add)
     before = resolve(chain(5, 1.0, toy.add), list(recipe.steps), shelf)
     key = before.keys["s4"]
@@ -589,7 +589,7 @@ PACKAGED = {
 
 @pytest.mark.parametrize("change", PACKAGED)
 def test_a_packaged_recipe_s_changes_are_told_in_its_own_words(tmp_path, change):
-    shelf, recipe, other = Shelf(tmp_path, {}), load("first_light"), load("first_light", [change], first=2)
+    shelf, recipe, other = DerivedFiles(tmp_path, {}), load("first_light"), load("first_light", [change], first=2)
     said = PACKAGED[change]
     step = said.replace(":", " ").split()[0]
     before = resolve(recipe, needed(recipe, [step]), shelf)

@@ -2,7 +2,7 @@ import time
 
 import pytest
 
-from neusee.workflows.graph.diagnostics import Mark
+from neusee.workflows.graph.diagnostics import Location
 from neusee.workflows.graph.recipe_graph import Step, in_order, needed
 from neusee.workflows.recipe.text.yaml_values import Value
 
@@ -60,7 +60,7 @@ def _chain(toy, last):
     def value(data, *path):
         items = {k: value(v, *path, k) for k, v in data.items()} if isinstance(data, dict) else data
         items = [value(v, *path, n) for n, v in enumerate(data)] if isinstance(data, list) else items
-        mark = Mark("chain.yaml", 1 + len(path), 1)
+        mark = Location("chain.yaml", 1 + len(path), 1)
         return Value(items, mark, mark, path)
 
     steps = {f"s{n}": {"node": "toy.add", "from": f"s{n - 1}"} for n in range(1, CHAIN)}
@@ -152,5 +152,5 @@ def test_only_what_the_outputs_need_is_ordered(read):
 
 
 def test_a_step_knows_its_sources():
-    step = Step("x", None, {}, {"a": "p", "b": ("q", "r"), "c": None}, Mark("f", 1, 1), {})
+    step = Step("x", None, {}, {"a": "p", "b": ("q", "r"), "c": None}, Location("f", 1, 1), {})
     assert step.sources == ("p", "q", "r")

@@ -14,14 +14,14 @@ import torch
 import neusee.nodes
 from neusee.nodes import node
 from neusee.workflows.engine.runner import run
-from neusee.workflows.graph.diagnostics import Mark
+from neusee.workflows.graph.diagnostics import Location
 from neusee.workflows.graph.recipe_graph import Recipe, Step
 from neusee.workflows.keys import code_digest
 from neusee.workflows.keys.cache_key import digest, file_digest, key_of, plain, stream_seed
 from neusee.workflows.keys.code_digest import Code
 from neusee.workflows.store.result_store import Store
 
-MARK = Mark("trial.yaml", 1, 1)
+MARK = Location("trial.yaml", 1, 1)
 LAYOUT = {
     "trial/__init__.py": "from neusee.nodes.trial._head import head\nfrom neusee.nodes.trial._tail import tail\n",
     "trial/_head.py": (
@@ -83,7 +83,7 @@ def trial(tmp_path, monkeypatch):
     forget()
 
 
-FRESH, TAIL, NONE = ("run", "run"), ("cached", "run"), ("asleep", "cached")
+FRESH, TAIL, NONE = ("run", "run"), ("cached", "run"), ("not needed", "cached")
 EDITS = {
     "nothing": (None, NONE, 30.5),
     "body of the node": (("trial/_tail.py", "x * factor", "2 * x * factor"), TAIL, 60.5),
@@ -256,8 +256,8 @@ from neusee.nodes.trial import head, tail
 from neusee.workflows.keys.code_digest import Code
 from neusee.workflows.graph.recipe_graph import Step
 from neusee.workflows.keys.cache_key import key_of
-from neusee.workflows.graph.diagnostics import Mark
-mark, code, keys = Mark("trial.yaml", 1, 1), Code(Path(sys.argv[2])), {}
+from neusee.workflows.graph.diagnostics import Location
+mark, code, keys = Location("trial.yaml", 1, 1), Code(Path(sys.argv[2])), {}
 params = {"factor": 10.0, "file": Path(sys.argv[1]) / "offset.txt"}
 for step in (Step("head", head, {"start": 2.0}, {}, mark, {}), Step("tail", tail, params, {"x": "head"}, mark, {})):
     keys[step.name] = key_of(step, keys, 1, code)[0]

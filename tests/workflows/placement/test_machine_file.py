@@ -48,7 +48,7 @@ def refused(read, tmp_path):
         with pytest.raises(RecipeError) as caught:
             read(text)
         start = len(str(tmp_path / "c.yaml:"))
-        return [f"{str(p.mark)[start:]} {p.path}: {p.message}" for p in caught.value.problems]
+        return [f"{str(p.mark)[start:]} {p.path}: {p.message}" for p in caught.value.diagnostics]
 
     return refused
 

@@ -36,7 +36,7 @@ def refused(write, tmp_path):
         write(MINE.replace(old, new) + more)
         with pytest.raises(RecipeError) as caught:
             load("mine.yaml", arguments, tmp_path)
-        return [" | ".join(filter(None, (str(p.mark), p.path, p.message))) for p in caught.value.problems]
+        return [" | ".join(filter(None, (str(p.mark), p.path, p.message))) for p in caught.value.diagnostics]
 
     return refused
 
@@ -148,8 +148,8 @@ def test_13_a_cycle(refused):
 
 def test_14_a_missing_producer(refused):
     more = "steps: {psf: {from: glass}, laser_psf: {from: psf}}\n"
-    problems = refused(more=more)
-    assert problems == [
+    diagnostics = refused(more=more)
+    assert diagnostics == [
         "mine.yaml:15:21 | steps.psf.from.pupil | no step glass; no step makes it; "
         "steps that make one: pupil[plain], pupil[mask], laser_pupil[plain,green], laser_pupil[mask,green]",
         "mine.yaml:15:47 | steps.laser_psf.from.pupil | optics.psf needs a Pupil; psf makes a Psf; "
@@ -191,14 +191,14 @@ def test_20_a_steep_element_is_legal_before_the_run(accepted):
 
 
 def test_all_at_once_and_nothing_is_run(refused):
-    problems = refused(
+    diagnostics = refused(
         "sensor.gian=3",
         "seed=x",
         more="sensor: {pixel_pitch: 2.9, bits: 0, quantum_eficiency: 1}\n",
         old="[raw]",
         new="[raw, lrs]",
     )
-    assert [p.split(" | ")[1] for p in problems] == [
+    assert [p.split(" | ")[1] for p in diagnostics] == [
         "sensor.gian=3",
         "seed = x",
         "outputs.1",

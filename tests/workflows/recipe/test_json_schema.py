@@ -4,7 +4,7 @@ from pathlib import Path
 import pytest
 
 import neusee.recipes
-from neusee.workflows.graph.diagnostics import Mark
+from neusee.workflows.graph.diagnostics import Location
 from neusee.workflows.recipe.json_schema import REFERENCE, schema
 from neusee.workflows.recipe.text.yaml_values import parse
 
@@ -57,7 +57,7 @@ def errors(of_toys):
     jsonschema = pytest.importorskip("jsonschema", reason="jsonschema is not installed")
     jsonschema.Draft202012Validator.check_schema(of_toys)
     validator = jsonschema.Draft202012Validator(of_toys)
-    return lambda text: [e.message for e in validator.iter_errors(parse(text, Mark("f.yaml", 1, 1)).plain)]
+    return lambda text: [e.message for e in validator.iter_errors(parse(text, Location("f.yaml", 1, 1)).plain)]
 
 
 def test_a_right_recipe_has_no_error(errors):

@@ -3,7 +3,7 @@ from pathlib import Path
 
 import pytest
 
-from neusee.workflows.graph.diagnostics import Mark
+from neusee.workflows.graph.diagnostics import Location
 from neusee.workflows.recipe.loading import groups, load, recipes
 from neusee.workflows.recipe.text.yaml_values import parse
 
@@ -156,14 +156,14 @@ def test_a_value_that_only_an_absent_item_needs_is_not_unknown(read):
 def _table():
     """The changes of mistakes.txt, each with the messages that it must get."""
     for block in Path(__file__).with_name("mistakes.txt").read_text(encoding="utf-8").split("\n\n")[1:]:
-        change, *problems = block.strip().split("\n")
+        change, *diagnostics = block.strip().split("\n")
         old, new = change.split(" => ")
-        yield pytest.param(old, new, [f"mine.yaml:{problem.strip()}" for problem in problems], id=change)
+        yield pytest.param(old, new, [f"mine.yaml:{problem.strip()}" for problem in diagnostics], id=change)
 
 
-@pytest.mark.parametrize(("old", "new", "problems"), [*_table()])
-def test_a_mistake_gets_its_message(mistakes, old, new, problems):
-    assert mistakes(swap(old, new)) == problems
+@pytest.mark.parametrize(("old", "new", "diagnostics"), [*_table()])
+def test_a_mistake_gets_its_message(mistakes, old, new, diagnostics):
+    assert mistakes(swap(old, new)) == diagnostics
 
 
 def test_a_node_cannot_be_any_python_function(mistakes):
@@ -232,4 +232,4 @@ def test_one_own_groups_are_listed_beside_the_packaged(write, tmp_path):
 
 
 def test_an_override_of_a_value_is_parsed_as_yaml():
-    assert parse("20 e-", Mark("argument 1")).plain == "20 e-"
+    assert parse("20 e-", Location("argument 1")).plain == "20 e-"

@@ -7,9 +7,9 @@ import io
 import pytest
 import torch
 
-from neusee.nodes import Check, Facts, node
-from neusee.workflows.engine.runner import Done, Event
-from neusee.workflows.graph.diagnostics import Mark
+from neusee.nodes import Check, TensorStats, node
+from neusee.workflows.engine.runner import Event, StepRecord
+from neusee.workflows.graph.diagnostics import Location
 from neusee.workflows.graph.recipe_graph import Recipe, Step
 from neusee.workflows.report import console as console_room
 
@@ -25,13 +25,13 @@ NAMES = ["spot[mask,green]", "spot[mask,red]", "raw"]
 
 
 def recipe() -> Recipe:
-    steps = {name: Step(name, charge, {}, {"x": None}, Mark("a.yaml", 1, 1), {}) for name in NAMES}
+    steps = {name: Step(name, charge, {}, {"x": None}, Location("a.yaml", 1, 1), {}) for name in NAMES}
     return Recipe("r", "", 1, 0.0, ("raw",), steps)
 
 
 def done(step: str, state: str, seconds: float = 0.25, ok: bool = True) -> Event:
-    facts = Facts((3, 4, 5), "float32", 0.0, 1.0, 1.0, 1, True)
-    return Event(step, Done(step, state, "", seconds, "k", facts, (Check("peak 3", ok),)))
+    facts = TensorStats((3, 4, 5), "float32", 0.0, 1.0, 1.0, 1, True)
+    return Event(step, StepRecord(step, state, "", seconds, "k", facts, (Check("peak 3", ok),)))
 
 
 def test_items_share_a_line_that_comes_when_the_last_is_done(capsys):
@@ -41,7 +41,7 @@ def test_items_share_a_line_that_comes_when_the_last_is_done(capsys):
         assert "spot" not in capsys.readouterr().out
         shown.watch(done(NAMES[1], "cached"))
         out = capsys.readouterr().out
-        shown.watch(done("raw", "asleep"))
+        shown.watch(done("raw", "not needed"))
     assert " ".join(out.split()) == "spot ×2 cpu 1 run, 1 cached 0.250 3 × 4 × 5 e- peak 3"
     rest = capsys.readouterr().out
     assert "raw" not in rest

@@ -17,7 +17,7 @@ import torch
 from neusee.nodes import Check, node
 from neusee.nodes.metrics import Quality
 from neusee.workflows import Recipe, RecipeError, Step, Store, load
-from neusee.workflows.graph.diagnostics import Mark
+from neusee.workflows.graph.diagnostics import Location
 from neusee.workflows.report import notebook, result_numbers
 
 CAMERA = """\
@@ -60,7 +60,7 @@ def refused(given):
     def refused(**values):
         with pytest.raises(RecipeError) as caught:
             given(**values)
-        return [" | ".join(filter(None, (str(p.mark), p.path, p.message))) for p in caught.value.problems]
+        return [" | ".join(filter(None, (str(p.mark), p.path, p.message))) for p in caught.value.diagnostics]
 
     return refused
 
@@ -235,7 +235,7 @@ def _(result, picture):
 
 def small(scale=1.0, samples=None) -> Recipe:
     """ramp -> half -> score, and the picture itself."""
-    at = Mark("small.yaml", 1, 1)
+    at = Location("small.yaml", 1, 1)
     steps = {
         "ramp": Step("ramp", ramp, {"scale": scale}, {}, at, {}),
         "half": Step("half", half, {}, {"picture": "ramp"}, at, {}),
@@ -277,7 +277,12 @@ def test_a_number_a_band_is_a_list(store, monkeypatch):
     lsr.fn.__module__ = "neusee.nodes.metrics"
     recipe = small()
     recipe = Recipe(
-        "small", "", 0, 0.0, ("lsr",), {**recipe.steps, "lsr": Step("lsr", lsr, {}, {"picture": "ramp"}, Mark("x"), {})}
+        "small",
+        "",
+        0,
+        0.0,
+        ("lsr",),
+        {**recipe.steps, "lsr": Step("lsr", lsr, {}, {"picture": "ramp"}, Location("x"), {})},
     )
     assert recipe.run(store).metrics()["lsr"] == pytest.approx([0, 1 / 960, 2 / 960])
 

@@ -14,7 +14,7 @@ import torch
 from neusee.nodes import node
 from neusee.nodes.values import Bands, Psf, Pupil
 from neusee.workflows.engine.runner import run
-from neusee.workflows.graph.diagnostics import Mark
+from neusee.workflows.graph.diagnostics import Location
 from neusee.workflows.graph.recipe_graph import Recipe, Step
 from neusee.workflows.report import contents, run_pictures
 from neusee.workflows.report.figures import (
@@ -25,7 +25,7 @@ from neusee.workflows.report.figures import (
     recipe_graph,
     scene_spectra,
 )
-from neusee.workflows.store.derived_files import Shelf
+from neusee.workflows.store.derived_files import DerivedFiles
 from neusee.workflows.store.result_store import Store
 
 N, B = 48, 5
@@ -232,7 +232,7 @@ def test_graph_places_no_two_boxes_on_one_another_and_readers_below():
 
 def test_graph_groups_items_and_a_family_that_ran_at_all_ran():
     sources = {"a[x]": [], "a[y]": [], "b": ["a[x]", "a[y]"]}
-    wires, looks, counts = recipe_graph.grouped(sources, {"a[x]": "cached", "a[y]": "run", "b": "asleep"})
+    wires, looks, counts = recipe_graph.grouped(sources, {"a[x]": "cached", "a[y]": "run", "b": "not needed"})
     assert wires == {"a": [], "b": ["a"]}
     assert looks == {"a": "run", "b": "cached"}
     assert counts == {"a": 2, "b": 1}
@@ -250,7 +250,7 @@ def copy_node(x: torch.Tensor) -> torch.Tensor:
 
 def small_recipe(level: float = 1.0) -> Recipe:
     def step(name, what, wires, **params):
-        return Step(name, what, params, wires, Mark("test.yaml", 1, 1), {})
+        return Step(name, what, params, wires, Location("test.yaml", 1, 1), {})
 
     copies = ("developed[plain]", "developed[mask]", "restored")
     steps = {"truth": step("truth", truth_node, {}, level=level)}
@@ -260,32 +260,32 @@ def small_recipe(level: float = 1.0) -> Recipe:
 
 def test_a_second_run_draws_nothing_and_a_changed_value_draws_again(tmp_path, monkeypatch):
     store = Store(tmp_path)
-    first, missing = run_pictures.pictures(run(small_recipe(), store), Shelf(store))
+    first, missing = run_pictures.pictures(run(small_recipe(), store), DerivedFiles(store))
     assert set(first) == {"overview", "graph"}
     assert "psf" in missing["psf"]
     with monkeypatch.context() as m:
         m.setitem(sys.modules, "matplotlib", None)
         m.setitem(sys.modules, "matplotlib.figure", None)
         store = Store(tmp_path)
-        second, _ = run_pictures.pictures(run(small_recipe(), store), Shelf(store))
+        second, _ = run_pictures.pictures(run(small_recipe(), store), DerivedFiles(store))
         assert second["overview"] == first["overview"]
         assert set(second) == set(first)
         with pytest.raises(ImportError):
-            run_pictures.pictures(run(small_recipe(0.5), Store(tmp_path)), Shelf(store))
-    third, _ = run_pictures.pictures(run(small_recipe(0.5), Store(tmp_path)), Shelf(store))
+            run_pictures.pictures(run(small_recipe(0.5), Store(tmp_path)), DerivedFiles(store))
+    third, _ = run_pictures.pictures(run(small_recipe(0.5), Store(tmp_path)), DerivedFiles(store))
     assert third["overview"] != first["overview"]
 
 
 def test_a_damaged_picture_is_drawn_again(tmp_path):
     store = Store(tmp_path)
-    shelf = Shelf(store)
+    shelf = DerivedFiles(store)
     path = shelf.keep("ab" * 16, ".png", "test", b"as it was")
     assert shelf.find("ab" * 16, ".png") == path
     path.chmod(0o644)
     path.write_bytes(b"as it is.")
     assert shelf.find("ab" * 16, ".png") is None
     path.unlink()
-    assert Shelf(Store(tmp_path)).find("ab" * 16, ".png") is None
+    assert DerivedFiles(Store(tmp_path)).find("ab" * 16, ".png") is None
 
 
 def test_every_figure_names_a_function_and_its_arguments():

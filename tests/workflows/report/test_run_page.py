@@ -12,7 +12,7 @@ import pytest
 import torch
 
 from neusee.nodes import Check, node
-from neusee.workflows.graph.diagnostics import Mark
+from neusee.workflows.graph.diagnostics import Location
 from neusee.workflows.graph.recipe_graph import Expectation, Recipe, Step
 from neusee.workflows.placement.tasks_and_devices import Schedule, Slot
 from neusee.workflows.report import result_numbers, run_folder, run_page, run_pictures, run_timing
@@ -90,7 +90,7 @@ def doubled(x: torch.Tensor) -> torch.Tensor:
 
 
 def recipe(value: float = 3.0, promised: float = 6.0) -> Recipe:
-    mark = Mark("<script>.yaml", 3, 1)
+    mark = Location("<script>.yaml", 3, 1)
     steps = {
         "number": Step("number", number, {"value": value}, {}, mark, {}),
         "truth": Step("truth", doubled, {}, {"x": "number"}, mark, {}),
@@ -227,7 +227,7 @@ def test_a_second_run_reads_the_same_numbers_and_says_where_they_come_from(done,
     assert again.document["table"] == done.document["table"]
     assert again.document["expected"] == done.document["expected"]
     steps = {s["step"]: s for s in again.document["steps"]}
-    assert (steps["truth"]["state"], steps["number"]["state"]) == ("cached", "asleep")
+    assert (steps["truth"]["state"], steps["number"]["state"]) == ("cached", "not needed")
     assert "made" in steps["number"]["why"]
     assert steps["number"]["shape"] == "2"
     assert steps["number"]["unit"] == "DN"
@@ -264,7 +264,7 @@ def row(step, state="run", seconds=0.0, began=0.0, predicted=None, key=None, **m
 
 def test_time_is_added_up_with_each_key_once():
     rows = [
-        row("a", "asleep", 3.0),
+        row("a", "not needed", 3.0),
         row("b", "cached", 5.0, bytes=400),
         row("twin of b", "cached", 5.0, key="b", bytes=400),
         row("c", "left out", 9.0),
@@ -288,7 +288,7 @@ def test_time_is_added_up_with_each_key_once():
 
 
 def test_a_result_that_is_read_counts_before_the_same_one_asleep():
-    rows = [row("a", "asleep", 3.0, key="k"), row("b", "cached", 3.0, key="k", bytes=70)]
+    rows = [row("a", "not needed", 3.0, key="k"), row("b", "cached", 3.0, key="k", bytes=70)]
     found = run_timing.timing(rows)
     assert (found["read"], found["saved"], found["share"], found["planned"]) == (70, 3.0, 1.0, None)
 

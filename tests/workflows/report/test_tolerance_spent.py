@@ -14,7 +14,7 @@ from neusee.workflows.report.tolerance_spent import said_of_economies, spent
 from neusee.workflows.simulation.simulate_recipe import simulate
 from neusee.workflows.store.result_store import Store
 from neusee.workflows.tolerance import cheaper_steps
-from neusee.workflows.tolerance.cheaper_steps import economised
+from neusee.workflows.tolerance.cheaper_steps import with_substitutions
 from neusee.workflows.tolerance.error_norm import error_of
 
 SMALL = [
@@ -40,48 +40,48 @@ def store(tmp_path):
 
 
 def test_sums_over_bands_stand_in_for_images_that_nobody_asks_for(recipe):
-    found = economised(recipe, recipe.outputs)
-    assert {e.step for e in found.economies} == {"image[plain]", "image[mask]"}
+    found = with_substitutions(recipe, recipe.outputs)
+    assert {e.step for e in found.substitutions} == {"image[plain]", "image[mask]"}
     assert found.steps["scene_photons[mask]"].wires["irradiance"] == "image[mask].channels"
     assert found.steps["image[mask]"] == recipe.steps["image[mask]"]
-    assert found.whole is recipe
-    assert economised(found, recipe.outputs) is found
+    assert found.unsubstituted is recipe
+    assert with_substitutions(found, recipe.outputs) is found
 
 
 def test_the_well_is_summed_only_where_it_is_asked_for(recipe):
     for outputs, rows in ((["raw[mask]"], "responses.rows"), (["raw[mask]", "peak[mask]"], "responses.wells")):
-        found = economised(recipe, outputs)
+        found = with_substitutions(recipe, outputs)
         assert found.steps["image[mask].channels"].wires["rows"] == rows
         assert found.steps[rows].params["well"] == (rows == "responses.wells")
 
 
 def test_an_image_that_is_asked_for_is_whole(recipe, store):
-    found = economised(recipe, [*recipe.outputs, "image[mask]"])
-    assert {e.step for e in found.economies} == {"image[plain]"}
+    found = with_substitutions(recipe, [*recipe.outputs, "image[mask]"])
+    assert {e.step for e in found.substitutions} == {"image[plain]"}
     result = run(recipe, store)
     assert result["image[mask]"].shape == (7, 64, 64)
 
 
 @pytest.mark.parametrize(
-    "change", [{"keep_all": True}, {"tolerance": 0.0}, {"tolerance": 1e-5}], ids=["keep all", "no tolerance", "fine"]
+    "change", [{"exact": True}, {"tolerance": 0.0}, {"tolerance": 1e-5}], ids=["keep all", "no tolerance", "fine"]
 )
 def test_nothing_stands_in_where_nothing_may(recipe, change):
     whole = replace(recipe, **change)
-    assert economised(whole, recipe.outputs) is whole
+    assert with_substitutions(whole, recipe.outputs) is whole
 
 
 def test_bands_that_are_levelled_one_by_one_are_not_summed():
     recipe = load("first_light", [*SMALL, "reading.level=per_band"])
-    assert economised(recipe, recipe.outputs) is recipe
+    assert with_substitutions(recipe, recipe.outputs) is recipe
 
 
 def test_a_scene_that_is_learnt_is_whole(recipe):
-    assert economised(recipe, recipe.outputs, {"scene"}) is recipe
-    assert economised(recipe, recipe.outputs, {"height"}).economies
+    assert with_substitutions(recipe, recipe.outputs, {"scene"}) is recipe
+    assert with_substitutions(recipe, recipe.outputs, {"height"}).substitutions
 
 
 def test_the_errors_are_within_their_bounds_and_these_within_the_tolerance(recipe, store):
-    result, full = run(recipe, store), run(replace(recipe, keep_all=True), store)
+    result, full = run(recipe, store), run(replace(recipe, exact=True), store)
     assert set(result.proof.held) >= {"raw[plain]", "raw[mask]"}
     assert 0 < result.proof.worst <= recipe.tolerance
     for name in ("raw[plain]", "raw[mask]"):
@@ -90,7 +90,7 @@ def test_the_errors_are_within_their_bounds_and_these_within_the_tolerance(recip
 
 def test_a_large_tolerance_spoils_no_figure_of_merit(recipe, store):
     wide = replace(recipe, tolerance=0.1)
-    result, full = run(wide, store), run(replace(recipe, keep_all=True), store)
+    result, full = run(wide, store), run(replace(recipe, exact=True), store)
     assert "read[plain]" in result.done
     assert result.done["read[plain]"].state != "left out"
     assert (spent(result)["held"], spent(full)["held"]) == (1e-3, recipe.tolerance)
@@ -104,13 +104,13 @@ def test_measured_errors_stand_where_the_full_run_is_stored(recipe, store):
     result = run(recipe, store)
     before = spent(result)
     assert before["measured"] == {}
-    full = run(replace(recipe, keep_all=True), store)
+    full = run(replace(recipe, exact=True), store)
     after = spent(result)
     assert set(after["measured"]) == set(recipe.outputs)
     assert after["measured"]["raw[mask]"] == error_of(result["raw[mask]"], full["raw[mask]"])
     assert after["economies"][0]["full_seconds"] == pytest.approx(full.done[after["economies"][0]["step"]].seconds)
     assert spent(full)["economies"] == []
-    assert spent(full)["keep_all"]
+    assert spent(full)["exact"]
     assert "measured" in said_of_economies(after)
     assert "measured" not in said_of_economies(before)
 
@@ -139,6 +139,6 @@ def test_the_page_says_it(recipe, store, tmp_path):
     assert "image[mask].channels" in page
     assert doc["spent"]["economies"][0]["bound"] <= recipe.tolerance
     assert max(doc["spent"]["bounds"].values()) <= recipe.tolerance
-    whole = simulate(replace(recipe, keep_all=True), store, tmp_path / "runs", ["neusee"])
+    whole = simulate(replace(recipe, exact=True), store, tmp_path / "runs", ["neusee"])
     assert "every step was computed in full" in whole.page.read_text()
-    assert "measured beside --keep-all" in run_page.page({**doc, "spent": spent(run(recipe, store))}, {})
+    assert "measured beside --exact" in run_page.page({**doc, "spent": spent(run(recipe, store))}, {})

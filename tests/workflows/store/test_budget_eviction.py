@@ -14,7 +14,7 @@ from hypothesis import strategies as st
 from neusee.workflows.store import budget_eviction, shared_folder
 from neusee.workflows.store.band_files import Stacked
 from neusee.workflows.store.budget_eviction import Candidate, bytes_of, chosen
-from neusee.workflows.store.derived_files import Shelf
+from neusee.workflows.store.derived_files import DerivedFiles
 from neusee.workflows.store.result_store import Store
 
 N = 5000  #: numbers in a value: 20 kB
@@ -387,7 +387,7 @@ def test_damaged_entries_go_after_a_week(tmp_path, monkeypatch):
 
 def test_pictures_go_with_their_entry_and_count(tmp_path, monkeypatch):
     store = Store(tmp_path)
-    path = Shelf(store).keep(key_of(1), ".png", "picture", b"x" * 50_000)
+    path = DerivedFiles(store).keep(key_of(1), ".png", "picture", b"x" * 50_000)
     stray = path.with_name(f"{key_of(257)}.png")
     stray.write_bytes(b"y")
     half = path.with_name(f".{key_of(257)}.77.png")

@@ -12,7 +12,7 @@ from hypothesis import strategies as st
 from neusee.workflows.store import small_results
 from neusee.workflows.store.result_store import INLINE, Store
 from neusee.workflows.store.shared_folder import Disk
-from neusee.workflows.store.small_results import Brief
+from neusee.workflows.store.small_results import SmallResults
 
 
 def key(i):
@@ -97,7 +97,7 @@ def test_the_older_half_goes_when_there_is_too_much(tmp_path, monkeypatch):
     monkeypatch.setattr(small_results, "MOST", 4000)
     jotted(tmp_path, 40)
     Store(tmp_path).has(key(99))
-    brief = Brief(Disk(tmp_path))
+    brief = SmallResults(Disk(tmp_path))
     there = [i for i in range(40) if brief.find(key(i)) is not None]
     assert there
     assert there == list(range(40 - len(there), 40))

@@ -114,7 +114,7 @@ def test_logspace_has_its_ends_and_equal_ratios(start, stop, count):
 def refused(call):
     with pytest.raises(RecipeError) as caught:
         call()
-    return [f"{p.mark} | {p.path} | {p.message}" for p in caught.value.problems]
+    return [f"{p.mark} | {p.path} | {p.message}" for p in caught.value.diagnostics]
 
 
 def test_what_is_one_value_is_the_same_at_every_point(tmp_path):

@@ -72,7 +72,7 @@ def read_table(folder):
 def refused(call):
     with pytest.raises(RecipeError) as caught:
         call()
-    return [f"{p.mark} | {p.path} | {p.message}" for p in caught.value.problems]
+    return [f"{p.mark} | {p.path} | {p.message}" for p in caught.value.diagnostics]
 
 
 # --- what it gives --------------------------------------------------------------------------------------------------

@@ -6,16 +6,16 @@ from dataclasses import replace
 import pytest
 import torch
 
-from neusee.nodes import Deviation, Facts, node
+from neusee.nodes import ErrorBound, TensorStats, node
 from neusee.workflows.engine.runner import run
-from neusee.workflows.graph.diagnostics import Mark
-from neusee.workflows.graph.recipe_graph import Economy, Recipe, Step
+from neusee.workflows.graph.diagnostics import Location
+from neusee.workflows.graph.recipe_graph import Recipe, Step, Substitution
 from neusee.workflows.store.result_store import Store
-from neusee.workflows.tolerance.error_budget import Ledger
+from neusee.workflows.tolerance.error_budget import ErrorBudget
 from neusee.workflows.tolerance.error_norm import largest_error
 from neusee.workflows.tolerance.error_propagation import proof
 
-MARK = Mark("recipe.yaml", 1, 1)
+MARK = Location("recipe.yaml", 1, 1)
 
 
 @node()
@@ -29,14 +29,14 @@ def glow(x, *, amount: float = 0.0):
     return x + amount
 
 
-@glow.negligible
+@glow.skip_bound
 def _(x, *, amount):
     return abs(amount) / (x.max + amount)
 
 
-@glow.carries
+@glow.propagate_error
 def _(x, *, result, amount):
-    return x.bound
+    return x.rms
 
 
 @node()
@@ -44,9 +44,9 @@ def power(x, *, factor: float = 1.0):
     return x * factor
 
 
-@power.carries
+@power.propagate_error
 def _(x, *, result, factor):
-    return factor * x.bound
+    return factor * x.rms
 
 
 @node()
@@ -55,9 +55,9 @@ def corner(x):
     return x[:3]
 
 
-@corner.carries
+@corner.propagate_error
 def _(x, *, result):
-    return x.bound * math.sqrt(x.facts.shape[0] / 3)
+    return x.rms * math.sqrt(x.stats.shape[0] / 3)
 
 
 @node()
@@ -65,9 +65,9 @@ def mixed(x, y=None, z=()):
     return x + (0 if y is None else y) + sum(z or ())
 
 
-@mixed.carries
+@mixed.propagate_error
 def _(x, y, z, *, result):
-    return x.bound + (y.bound if y else 0) + sum(d.bound for d in z or ())
+    return x.rms + (y.rms if y else 0) + sum(d.rms for d in z or ())
 
 
 @node()
@@ -81,7 +81,7 @@ def rough(x, *, digits: int = 2):
     return (x, torch.tensor(0.5 * 10.0**-digits / float(x.max())))
 
 
-@rough.deviates
+@rough.approximation_error
 def _(result):
     return float(result[1]), float(result[1])
 
@@ -91,7 +91,7 @@ def first(pair):
     return pair[0]
 
 
-@first.carries
+@first.propagate_error
 def _(pair, *, result):
     return pair.share * result.max
 
@@ -128,7 +128,7 @@ def states(result):
 def test_what_is_left_out_upstream_leaves_less_for_what_follows(store):
     result = run(recipe(*chain(0.6, 0.6, 0.3)), store)
     assert states(result) == ["left out", "run", "left out"]
-    assert largest_error(result["out"], run(recipe(*chain(0.6, 0.6, 0.3), keep_all=True), store)["out"]) <= 1e-2
+    assert largest_error(result["out"], run(recipe(*chain(0.6, 0.6, 0.3), exact=True), store)["out"]) <= 1e-2
 
 
 def test_branches_that_meet_add_up_and_those_that_do_not_have_each_the_whole(store):
@@ -141,22 +141,22 @@ def test_branches_that_meet_add_up_and_those_that_do_not_have_each_the_whole(sto
 
 
 def test_with_keep_all_nothing_is_left_out(store):
-    assert states(run(recipe(*chain(0.0, 0.1), keep_all=True), store)) == ["run", "run"]
+    assert states(run(recipe(*chain(0.0, 0.1), exact=True), store)) == ["run", "run"]
 
 
 def test_of_the_tolerance_of_a_recipe_with_economies_half_is_theirs():
-    facts = Facts((2,), "float32", 0.0, 100.0, 100.0, 1, True)
+    facts = TensorStats((2,), "float32", 0.0, 100.0, 100.0, 1, True)
     glowing = step("g", glow, {"amount": 0.6}, x="l")
     plain = recipe(step("l", light), glowing)
-    thrifty = replace(plain, economies=(Economy("a", "b", 1e-3, ""),))
-    assert Ledger(plain).verdict(glowing, glowing.params, lambda name: facts).left_out
-    assert not Ledger(thrifty).verdict(glowing, glowing.params, lambda name: facts).left_out
+    thrifty = replace(plain, substitutions=(Substitution("a", "b", 1e-3, ""),))
+    assert ErrorBudget(plain).verdict(glowing, glowing.params, lambda name: facts).left_out
+    assert not ErrorBudget(thrifty).verdict(glowing, glowing.params, lambda name: facts).left_out
 
 
 def test_a_long_chain_shares_one_account():
     steps = chain(0.1, *[50.0] * 2000)
-    ledger = Ledger(recipe(*steps))
-    facts = Facts((2,), "float32", 0.0, 100.0, 100.0, 1, True)
+    ledger = ErrorBudget(recipe(*steps))
+    facts = TensorStats((2,), "float32", 0.0, 100.0, 100.0, 1, True)
     for each in steps[1:-1]:
         ledger.verdict(each, each.params, lambda name: facts)
     assert len({id(spent) for spent in ledger._spent.values()}) == 1
@@ -166,7 +166,7 @@ def test_a_long_chain_shares_one_account():
 
 
 def test_an_exact_run_proves_nothing_and_asks_for_nothing(store):
-    result = run(recipe(*chain(), keep_all=True), store)
+    result = run(recipe(*chain(), exact=True), store)
     assert result.proof.shares == {}
     assert result.proof.worst == 0.0
     assert result.proof.of("out") == 0.0
@@ -174,7 +174,7 @@ def test_an_exact_run_proves_nothing_and_asks_for_nothing(store):
 
 def test_the_bound_holds_and_is_carried(store):
     steps = chain(0.5, 0.2, last=step("out", power, {"factor": 3.0}, x="g1"))
-    result, full = run(recipe(*steps), store), run(recipe(*steps, keep_all=True), store)
+    result, full = run(recipe(*steps), store), run(recipe(*steps, exact=True), store)
     measured = largest_error(result["out"], full["out"])
     assert 0 < measured <= result.proof.of("out") <= 1.1 * measured
 
@@ -185,7 +185,7 @@ def test_where_the_bound_grows_on_the_way_less_is_left_out(store):
     result = run(recipe(*steps), store)
     assert states(result) == ["run"]
     assert result.recipe.strict < 1
-    assert torch.equal(result["out"], run(recipe(*steps, keep_all=True), store)["out"])
+    assert torch.equal(result["out"], run(recipe(*steps, exact=True), store)["out"])
     again = run(recipe(*steps), store)
     assert states(again) != ["left out"]
     assert torch.equal(again["out"], result["out"])
@@ -214,7 +214,7 @@ def test_what_the_proof_made_and_the_rest_needs_is_not_made_again(store, monkeyp
 def test_where_nothing_is_allowed_a_cheaper_form_is_over(store):
     steps = [step("l", light), step("r", rough, {"digits": 0}, x="l"), step("out", first, pair="r")]
     result = run(replace(recipe(*steps), tolerance=0.0), store)
-    assert result.recipe.keep_all
+    assert result.recipe.exact
     assert result.proof.over(result.recipe) == math.inf
 
 
@@ -237,7 +237,7 @@ def test_a_cheaper_form_tells_its_own_error(store):
 def test_nothing_is_left_out_in_the_end_where_no_share_is_small_enough(store):
     steps = [step("l", light), step("r", rough, {"digits": -1}, x="l"), step("out", first, pair="r")]
     result = run(recipe(*steps), store)
-    assert result.recipe.keep_all
+    assert result.recipe.exact
     assert result.done["r"].error[0] > 1e-2
 
 
@@ -246,8 +246,8 @@ NONE = [(0.0, None, 0.0), (1.0, None, math.inf), (1.0, (0.0, 0.0), math.inf)]
 
 @pytest.mark.parametrize(("bound", "facts", "share"), NONE)
 def test_a_share_of_nothing_is_infinite(bound, facts, share):
-    known = facts and Facts((1,), "float32", *facts, 0.0, 0, True)
-    assert Deviation(bound, known).share == share
+    known = facts and TensorStats((1,), "float32", *facts, 0.0, 0, True)
+    assert ErrorBound(bound, known).share == share
 
 
 def test_lists_and_absent_inputs_are_told_apart(store):

@@ -22,7 +22,7 @@ def compared(seed, tmp_path):
     store = Store(tmp_path)
     result = run(recipe, store)
     held = [name for name in result.proof.held if name in recipe.steps]
-    return recipe, result, run(replace(recipe, keep_all=True), store, dict.fromkeys([*recipe.outputs, *held]))
+    return recipe, result, run(replace(recipe, exact=True), store, dict.fromkeys([*recipe.outputs, *held]))
 
 
 def unrounded(value, reference):

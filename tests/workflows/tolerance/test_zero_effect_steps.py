@@ -9,7 +9,7 @@ from neusee.workflows import load
 from neusee.workflows.engine.runner import run
 from neusee.workflows.graph.recipe_graph import needed
 from neusee.workflows.store.result_store import Store
-from neusee.workflows.tolerance.cheaper_steps import economised
+from neusee.workflows.tolerance.cheaper_steps import with_substitutions
 
 SMALL = [
     "optics.samples=180",
@@ -32,7 +32,7 @@ def recipe(*changes, flare="dirty_windshield"):
 
 
 def asked(found):
-    return {name.partition("[")[0] for name in needed(economised(found, found.outputs), found.outputs)}
+    return {name.partition("[")[0] for name in needed(with_substitutions(found, found.outputs), found.outputs)}
 
 
 CASES = [
@@ -59,7 +59,7 @@ def test_a_little_is_not_nothing():
 def test_the_result_is_the_same(changes, tmp_path):
     found = recipe("tolerance=0", *changes)
     spared = run(found, Store(tmp_path / "a"))
-    full = run(replace(found, keep_all=True), Store(tmp_path / "b"))
+    full = run(replace(found, exact=True), Store(tmp_path / "b"))
     assert len(spared.done) < len(full.done)
     for name in found.outputs:
         one, other = spared[name], full[name]

@@ -59,7 +59,7 @@ def test_a_recipe_names_its_network_and_the_picture_goes_through_it(name, tmp_pa
 def test_without_weights_a_recipe_is_refused_where_they_are_to_be_given(name):
     with pytest.raises(RecipeError) as caught:
         small(name)
-    (problem,) = caught.value.problems
+    (problem,) = caught.value.diagnostics
     assert str(problem.mark) == f"restore/{name}.yaml:{'3:12' if name == 'fft_mamba' else '2:20'}"
     assert problem.path == "restore.weights = None"
     assert problem.message.endswith("give the .safetensors file of its weights, or choose restore: wiener")

@@ -26,7 +26,7 @@ from neusee.workflows.training.mask_design import design_page
 from neusee.workflows.training.parallel.shared_graph import Shared
 from neusee.workflows.training.photograph_folder import Photographs
 from neusee.workflows.training.run_training import frozen, train
-from neusee.workflows.training.training_pictures import Samples
+from neusee.workflows.training.training_pictures import TrainingStream
 
 ROOT = Path(__file__).parents[3]
 TINY = [
@@ -120,7 +120,7 @@ train(recipe, Store(here / "store"), here / "runs", [], print, watch=watch)
 
 def test_a_picture_is_the_same_in_whatever_order(tmp_path, tiny):
     sources = Photographs.under(tiny.training.photographs)
-    samples = Samples(tiny, tiny.training, sources, Store(tmp_path), "cpu")
+    samples = TrainingStream(tiny, tiny.training, sources, Store(tmp_path), "cpu")
     height = LEARNT["doe.unet"](tiny.steps["height"].params, torch.Generator().manual_seed(3))(pupil(tiny))
     shared = Shared.of(samples.shared({"height": height})).values
     first = [samples(shared, 1, number) for number in (0, 1, 2)]
@@ -134,7 +134,7 @@ def test_a_picture_is_the_same_in_whatever_order(tmp_path, tiny):
 def test_the_gradient_through_the_cut_is_the_whole_one(tmp_path):
     recipe = load("train_small", [*TINY, "laser=green", "sensor.read_noise=10 e-", "tolerance=0"])
     how = recipe.training
-    samples = Samples(recipe, how, Photographs((recipe.steps["scene"].params["file"],)), Store(tmp_path), "cpu")
+    samples = TrainingStream(recipe, how, Photographs((recipe.steps["scene"].params["file"],)), Store(tmp_path), "cpu")
     relief = LEARNT["doe.unet"](recipe.steps["height"].params, torch.Generator().manual_seed(3))
     shared = Shared.of(samples.shared({"height": relief(pupil(recipe))}))
     for number in (0, 1):
@@ -166,7 +166,7 @@ def _scene(samples, number):
 
 def samples_of(recipe, folder, still=False):
     sources = Photographs.under(recipe.training.photographs)
-    return Samples(recipe, recipe.training, sources, Store(folder), "cpu", recipe if still else None)
+    return TrainingStream(recipe, recipe.training, sources, Store(folder), "cpu", recipe if still else None)
 
 
 def test_patches_are_the_same_places_of_a_picture_and_its_truth(tmp_path, photographs):
@@ -325,7 +325,7 @@ def test_photographs_are_found_and_broken_ones_said(photographs, tmp_path):
 def test_a_mistake_is_located(change, said):
     with pytest.raises(RecipeError, match=said) as caught:
         load("train_small", [change])
-    assert all("argument 1" in str(problem.mark) for problem in caught.value.problems)
+    assert all("argument 1" in str(problem.mark) for problem in caught.value.diagnostics)
 
 
 def test_options_of_one_network_are_refused_of_another():
@@ -463,7 +463,7 @@ def test_the_recommended_mask_is_that_of_trainings_that_say_nothing_of_it():
 def test_a_mistake_of_the_mask_is_located(change, said):
     with pytest.raises(RecipeError) as caught:
         load("train_small", [change])
-    (problem,) = caught.value.problems
+    (problem,) = caught.value.diagnostics
     assert re.search(said, f"{problem.path}: {problem.message}")
     if "slopes" not in change:
         assert "argument 1" in str(problem.mark)

@@ -8,7 +8,7 @@ import pytest
 from neusee.workflows import Store, load
 from neusee.workflows.training.photograph_folder import Photographs
 from neusee.workflows.training.training_iteration import Learner
-from neusee.workflows.training.training_pictures import Samples
+from neusee.workflows.training.training_pictures import TrainingStream
 
 SPEC = importlib.util.spec_from_file_location("live_bytes", Path(__file__).parents[2] / "live_bytes.py")
 live_bytes = importlib.util.module_from_spec(SPEC)
@@ -33,7 +33,7 @@ def peak(folder, bands, batch):
     photographs = Photographs((recipe.steps["scene"].params["file"],))
     with live_bytes.LiveBytes() as live:
         learner = Learner(recipe, recipe.training, "cpu")
-        samples = Samples(recipe, recipe.training, photographs, Store(folder), "cpu")
+        samples = TrainingStream(recipe, recipe.training, photographs, Store(folder), "cpu")
         learner.begin(recipe.training.stages[1], True)
         learner.iterate(samples, 1, 0)
         live.again()

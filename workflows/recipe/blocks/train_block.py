@@ -8,7 +8,7 @@ from typing import Annotated, Any, Literal
 import torch
 from pydantic import BaseModel, ConfigDict, Field, ValidationError, model_validator
 
-from neusee.workflows.graph.diagnostics import Mark, Problem, nearest
+from neusee.workflows.graph.diagnostics import Diagnostic, Location, nearest
 from neusee.workflows.recipe.blocks.mask_design_block import MaskSettings, MaskTraining, Weights
 from neusee.workflows.recipe.text.composition import Composed
 from neusee.workflows.recipe.text.yaml_values import Value
@@ -159,12 +159,12 @@ def _with_folder(composed: Composed, block: Value, found: Training) -> tuple[Com
     mark = block.items["photographs"].mark
     path = Path(mark.folder) / found.photographs.expanduser()
     if not path.is_dir():
-        problem = Problem(mark, f"{KEY}.photographs", f"{path} is no folder")
+        problem = Diagnostic(mark, f"{KEY}.photographs", f"{path} is no folder")
         return composed.with_problems([problem]), None
     return composed, found.model_copy(update={"photographs": path})
 
 
-def _problem(block: Value, error: Any) -> Problem:
+def _problem(block: Value, error: Any) -> Diagnostic:
     """Where it stands, as far as what pydantic names is there, and what to write."""
     at, path = block, [KEY]
     for key in error["loc"]:
@@ -172,13 +172,13 @@ def _problem(block: Value, error: Any) -> Problem:
         if str(key) in below:
             at = below[str(key)]
             path.append(str(key))
-    mark: Mark = at.key if error["type"] == "extra_forbidden" else at.mark
+    mark: Location = at.key if error["type"] == "extra_forbidden" else at.mark
     text = str(error["msg"])
     if error["type"] == "extra_forbidden":
         text = f"is not known here; {nearest(path[-1], _fields(error['loc'][:-1]))}"
     elif error["type"] == "missing":
         text = f"lacks {error['loc'][-1]}"
-    return Problem(mark, ".".join(path), text)
+    return Diagnostic(mark, ".".join(path), text)
 
 
 def _fields(where: tuple[int | str, ...]) -> list[str]:

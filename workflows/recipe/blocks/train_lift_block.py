@@ -7,7 +7,7 @@ from typing import Annotated, Any, Literal
 
 from pydantic import BaseModel, ConfigDict, Field, ValidationError
 
-from neusee.workflows.graph.diagnostics import Problem, nearest
+from neusee.workflows.graph.diagnostics import Diagnostic, nearest
 from neusee.workflows.recipe.text.composition import Composed
 from neusee.workflows.recipe.text.yaml_values import Value
 
@@ -56,14 +56,14 @@ def read_lift_training(composed: Composed) -> tuple[Composed, LiftTraining | Non
         return composed.with_problems(_problem(block, each) for each in error.errors()), None
 
 
-def _problem(block: Value, error: Any) -> Problem:
+def _problem(block: Value, error: Any) -> Diagnostic:
     """Where it stands, as far as what pydantic names is there, and what to write."""
     names = [str(key) for key in error["loc"]]
     below = {str(key): value for key, value in block.items.items()}
     at = below.get(names[0], block) if names else block
     path = ".".join([KEY, *names[: at is not block]])
     if error["type"] == "extra_forbidden":
-        return Problem(at.key, path, f"is not known here; {nearest(names[0], LiftTraining.model_fields)}")
+        return Diagnostic(at.key, path, f"is not known here; {nearest(names[0], LiftTraining.model_fields)}")
     if error["type"] == "missing":
-        return Problem(at.mark, path, f"lacks {names[-1]}")
-    return Problem(at.mark, path, str(error["msg"]))
+        return Diagnostic(at.mark, path, f"lacks {names[-1]}")
+    return Diagnostic(at.mark, path, str(error["msg"]))

@@ -19,7 +19,7 @@ if TYPE_CHECKING:
 
     Places = NDArray[np.float64]
 
-NINETY = 1.6448536269514722  #: standard deviations on either side that hold 90 % of a normal law
+Z_90 = 1.6448536269514722  #: standard deviations on either side that hold 90 % of a normal law
 _LEAST = 30  #: draws that can tell anything of a law
 _JITTER = 1e-10  #: added to a correlation of 1, so that its factor exists
 _FILES = "the folder of `neusee calibrate`, its posterior.json, draws in .npz or .csv, or a mean and sd in .json, .yaml"
@@ -95,7 +95,7 @@ class Joint:
         if self.draws is not None:
             low, high = np.quantile(self.draws[:, i], [0.05, 0.95])
             return float(low), float(high)
-        return float(self.mean[i] - NINETY * self.sd[i]), float(self.mean[i] + NINETY * self.sd[i])
+        return float(self.mean[i] - Z_90 * self.sd[i]), float(self.mean[i] + Z_90 * self.sd[i])
 
     def only(self, names: Sequence[str]) -> Joint:
         """Of some of the values; what is known of the rest is forgotten."""

@@ -11,7 +11,7 @@ from pathlib import Path
 from typing import Any
 
 from neusee.nodes.units import read_any
-from neusee.workflows.graph.diagnostics import Mark, Problem, nearest
+from neusee.workflows.graph.diagnostics import Diagnostic, Location, nearest
 from neusee.workflows.recipe.distributions.joint import Joint, Posterior, read_posterior, summary
 from neusee.workflows.recipe.distributions.scalar import Law, is_law, read_law, written
 from neusee.workflows.recipe.text.composition import Composed
@@ -82,25 +82,25 @@ class Uncertain:
 def settle(composed: Composed) -> tuple[Composed, Uncertain | None]:
     """The recipe with a value in the place of all that is uncertain; of one that is sure of all, itself."""
     laws, root = dict[str, Law](), composed.root
-    problems = list(composed.problems)
+    diagnostics = list(composed.diagnostics)
     for path, leaf in _laws(root):
         try:
             laws[dotted(path)] = law = read_law(leaf.data)
         except ValueError as error:
-            problems.append(Problem(leaf.mark, f"{dotted(path)} = {leaf.data}", str(error)))
+            diagnostics.append(Diagnostic(leaf.mark, f"{dotted(path)} = {leaf.data}", str(error)))
             root = put(root, path, BROKEN)
             continue
         root = put(root, path, written(law.median, law.unit))
     given = root.items.get(KEY)
-    if given is None and not laws and len(problems) == len(composed.problems):
+    if given is None and not laws and len(diagnostics) == len(composed.diagnostics):
         return composed, None
     notes = [f"{path} is {law.text}: run at {_said(law.median, law.unit)}" for path, law in laws.items()]
-    found = _Reader(replace(root, data={key: v for key, v in root.data.items() if key != KEY}), laws, problems)
+    found = _Reader(replace(root, data={key: v for key, v in root.data.items() if key != KEY}), laws, diagnostics)
     if given is not None:
         found.read(given)
-    settled = replace(composed, root=found.root, problems=tuple(problems))
+    settled = replace(composed, root=found.root, diagnostics=tuple(diagnostics))
     rest = (tuple(found.standings), (*notes, *found.notes), found.source, found.units)
-    return settled, Uncertain(replace(settled, problems=()), laws, found.joint, *rest)
+    return settled, Uncertain(replace(settled, diagnostics=()), laws, found.joint, *rest)
 
 
 def _laws(root: Value) -> Iterator[tuple[Where, Value]]:
@@ -113,7 +113,7 @@ def _laws(root: Value) -> Iterator[tuple[Where, Value]]:
         stack += [((*path, key), child) for key, child in value.items.items()]
 
 
-def put(root: Value, path: Where, data: Any, mark: Mark | None = None) -> Value:
+def put(root: Value, path: Where, data: Any, mark: Location | None = None) -> Value:
     """``root`` with another scalar at ``path``, which must be there."""
     if not path:
         return replace(root, data=data, mark=mark or root.mark)
@@ -134,8 +134,8 @@ def _at(root: Value, path: str) -> Value | None:
 class _Reader:
     """Reads ``posterior`` of a recipe, and puts what a run shall take in its place."""
 
-    def __init__(self, root: Value, laws: Mapping[str, Law], problems: list[Problem]) -> None:
-        self.root, self.laws, self.problems = root, laws, problems
+    def __init__(self, root: Value, laws: Mapping[str, Law], diagnostics: list[Diagnostic]) -> None:
+        self.root, self.laws, self.diagnostics = root, laws, diagnostics
         self.joint: Joint | None = None
         self.standings: list[Standing] = []
         self.notes: list[str] = []
@@ -211,7 +211,7 @@ class _Reader:
             if abs(told - own) > 1e-9 * own:
                 raise ValueError(f"its dark current is in {told:g} s, the recipe exposes {own:g} s")
 
-    def _apply(self, posterior: Posterior, pairs: Mapping[str, str], use: str | int, mark: Mark) -> None:
+    def _apply(self, posterior: Posterior, pairs: Mapping[str, str], use: str | int, mark: Location) -> None:
         kept = {}
         for path, name in pairs.items():
             value = _at(self.root, path)
@@ -233,7 +233,7 @@ class _Reader:
             joint = posterior.joint.only(tuple(kept.values()))
             self.joint = replace(joint, names=tuple(kept))
 
-    def _stand(self, posterior: Posterior, path: str, name: str, own: float, use: str | int, mark: Mark) -> None:
+    def _stand(self, posterior: Posterior, path: str, name: str, own: float, use: str | int, mark: Location) -> None:
         """Where the recipe's own value lies, and what a run takes in its place."""
         joint, unit, kind = posterior.joint, self.units[path], posterior.kind(name)
         i = joint.names.index(name)
@@ -254,8 +254,8 @@ class _Reader:
             law = f"{standing.mean:.6g} ± {standing.sd:.2g} {unit}".rstrip()
             self.notes.append(f"{path} = {standing.own} is far from its posterior, {law} ({self.source})")
 
-    def _fail(self, mark: Mark, path: str, message: str) -> None:
-        self.problems.append(Problem(mark, path, message))
+    def _fail(self, mark: Location, path: str, message: str) -> None:
+        self.diagnostics.append(Diagnostic(mark, path, message))
 
 
 def _flat(value: Value) -> Any:

@@ -125,7 +125,7 @@ class Inputs:
                 try:
                     self.uncertain.at({name: value})
                 except RecipeError as error:
-                    said = [replace(p, message=f"is drawn, but {p.message}") for p in error.problems]
+                    said = [replace(p, message=f"is drawn, but {p.message}") for p in error.diagnostics]
                     raise RecipeError(said) from None
 
 

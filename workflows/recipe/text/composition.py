@@ -9,7 +9,7 @@ from dataclasses import dataclass, replace
 from importlib.resources import files
 from pathlib import Path
 
-from neusee.workflows.graph.diagnostics import Mark, Problem, RecipeError, nearest
+from neusee.workflows.graph.diagnostics import Diagnostic, Location, RecipeError, nearest
 from neusee.workflows.recipe.text.overrides import Override, apply, read_override
 from neusee.workflows.recipe.text.yaml_values import Value, kind, read
 
@@ -25,16 +25,16 @@ class Composed:
     name: str
     title: str
     root: Value
-    problems: tuple[Problem, ...]
+    diagnostics: tuple[Diagnostic, ...]
     whole: bool = True  #: whether every group that is named could be read
 
     def without(self, key: str) -> Composed:
         """The same but for one block, which is read apart."""
         return replace(self, root=replace(self.root, data={k: v for k, v in self.root.data.items() if k != key}))
 
-    def with_problems(self, problems: Iterable[Problem]) -> Composed:
+    def with_problems(self, diagnostics: Iterable[Diagnostic]) -> Composed:
         """The same, with what else is wrong."""
-        return replace(self, problems=(*self.problems, *problems))
+        return replace(self, diagnostics=(*self.diagnostics, *diagnostics))
 
 
 @dataclass(frozen=True, slots=True)
@@ -43,7 +43,7 @@ class Choice:
 
     group: str
     option: str | None
-    mark: Mark
+    mark: Location
     shown: str  #: what the user wrote, for a message
 
 
@@ -60,32 +60,32 @@ def locate(recipe: str | Path, folder: Path) -> Path:
         if path.is_file():
             return path
         there = [str(p.relative_to(folder)) for p in path.parent.glob("*.yaml") if p.is_relative_to(folder)]
-        raise RecipeError([Problem(Mark("recipe"), str(recipe), f"no such file; {nearest(str(recipe), there)}")])
+        raise RecipeError([Diagnostic(Location("recipe"), str(recipe), f"no such file; {nearest(str(recipe), there)}")])
     path = packaged() / f"{recipe}.yaml"
     if _NAME.fullmatch(str(recipe)) and path.is_file():
         return path
     names = [p.stem for p in packaged().glob("*.yaml")]
-    raise RecipeError([Problem(Mark("recipe"), str(recipe), f"no such recipe; {nearest(str(recipe), names)}")])
+    raise RecipeError([Diagnostic(Location("recipe"), str(recipe), f"no such recipe; {nearest(str(recipe), names)}")])
 
 
 def compose(recipe: str | Path, arguments: Sequence[str | Override], folder: Path, first: int = 1) -> Composed:
     """Compose ``recipe``; ``arguments`` count from ``first``, and their paths are relative to ``folder``."""
     path = locate(recipe, folder)
     document = read(path, shown(path, folder))
-    problems: list[Problem] = []
+    diagnostics: list[Diagnostic] = []
     overrides: list[Override] = []
     for number, given in enumerate(arguments, first):
-        mark = Mark(f"argument {number}", folder=str(folder))
+        mark = Location(f"argument {number}", folder=str(folder))
         try:
             overrides.append(given if isinstance(given, Override) else read_override(given, mark))
         except RecipeError as error:
-            problems += error.problems
-    choices, rest = _choose(document.root, overrides, path.parent, problems)
-    options = [_option(choice, path.parent, folder, problems) for choice in choices if choice.option is not None]
+            diagnostics += error.diagnostics
+    choices, rest = _choose(document.root, overrides, path.parent, diagnostics)
+    options = [_option(choice, path.parent, folder, diagnostics) for choice in choices if choice.option is not None]
     root = _merged((*(option for option in options if option is not None), document.root))
     for override in rest:
-        root = apply(root, override, problems, [choice.group for choice in choices])
-    return Composed(path.stem, document.title, root, tuple(problems), None not in options)
+        root = apply(root, override, diagnostics, [choice.group for choice in choices])
+    return Composed(path.stem, document.title, root, tuple(diagnostics), None not in options)
 
 
 def shown(path: Path, folder: Path) -> str:
@@ -144,10 +144,10 @@ def groups_of(*folders: Path) -> dict[str, list[str]]:
 
 
 def _choose(
-    root: Value, overrides: list[Override], beside: Path, problems: list[Problem]
+    root: Value, overrides: list[Override], beside: Path, diagnostics: list[Diagnostic]
 ) -> tuple[list[Choice], list[Override]]:
     """The defaults after ``group=option``, and the overrides that are of values."""
-    choices = {choice.group: choice for choice in _defaults(root, problems)}
+    choices = {choice.group: choice for choice in _defaults(root, diagnostics)}
     groups = groups_of(beside, packaged())
     rest = []
     for o in overrides:
@@ -156,11 +156,15 @@ def _choose(
         if len(o.path) > 1 or o.value_is_collection or of_values:
             rest.append(o)
         elif o.sign == "+" and group in choices:
-            problems.append(Problem(o.mark, o.text, f"{group} is {choices[group].option} already: leave out the +"))
+            diagnostics.append(
+                Diagnostic(o.mark, o.text, f"{group} is {choices[group].option} already: leave out the +")
+            )
         elif o.sign == "" and group not in choices:
-            problems.append(Problem(o.mark, o.text, f"{group} is no group of this recipe; to add it, write +{o.text}"))
+            diagnostics.append(
+                Diagnostic(o.mark, o.text, f"{group} is no group of this recipe; to add it, write +{o.text}")
+            )
         elif o.sign == "~" and group not in choices:
-            problems.append(Problem(o.mark, o.text, f"is not among the groups; {nearest(group, choices)}"))
+            diagnostics.append(Diagnostic(o.mark, o.text, f"is not among the groups; {nearest(group, choices)}"))
         elif o.sign == "~":
             del choices[group]
         else:
@@ -169,51 +173,53 @@ def _choose(
     return list(choices.values()), rest
 
 
-def _defaults(root: Value, problems: list[Problem]) -> Iterator[Choice]:
+def _defaults(root: Value, diagnostics: list[Diagnostic]) -> Iterator[Choice]:
     """Entries of the ``defaults`` list that can be read."""
     given = root.items.get("defaults")
     if given is None:
         return
     if not isinstance(given.data, list):
-        problems.append(Problem(given.mark, "defaults", f"must be a list of `group: option`, not {kind(given)}"))
+        diagnostics.append(Diagnostic(given.mark, "defaults", f"must be a list of `group: option`, not {kind(given)}"))
         return
-    seen: dict[str, Mark] = {}
+    seen: dict[str, Location] = {}
     for entry in given.data:
         pair = list(entry.items.items()) if isinstance(entry.data, dict) else []
         if len(pair) != 1 or isinstance(pair[0][1].data, dict | list):
-            problems.append(Problem(entry.mark, entry.name, "must be one `group: option`, such as `doe: axicon`"))
+            diagnostics.append(Diagnostic(entry.mark, entry.name, "must be one `group: option`, such as `doe: axicon`"))
             continue
         group, option = str(pair[0][0]), pair[0][1]
         if group in seen:
-            problems.append(Problem(entry.mark, f"defaults.{group}", f"stands twice; first in line {seen[group].line}"))
+            diagnostics.append(
+                Diagnostic(entry.mark, f"defaults.{group}", f"stands twice; first in line {seen[group].line}")
+            )
             continue
         seen[group] = entry.mark
         yield Choice(group, None if option.data is None else str(option.data), option.mark, f"{group}: {option.data}")
 
 
-def _option(choice: Choice, beside: Path, folder: Path, problems: list[Problem]) -> Value | None:
+def _option(choice: Choice, beside: Path, folder: Path, diagnostics: list[Diagnostic]) -> Value | None:
     """The values of an option; the folder beside the recipe comes before the packaged one."""
     names = (choice.group, str(choice.option))
     for above in dict.fromkeys((beside, packaged())):
         path = above / choice.group / f"{names[1]}.yaml"
         if all(map(_NAME.fullmatch, names)) and path.is_file():
-            return _read_option(path, folder, problems)
+            return _read_option(path, folder, diagnostics)
     groups = groups_of(packaged(), beside)
     if choice.group in groups:
         message = f"no option {choice.option} in {choice.group}; {nearest(names[1], groups[choice.group])}"
     else:
         message = f"no group {choice.group}; {nearest(choice.group, groups)}"
-    problems.append(Problem(choice.mark, choice.shown, message))
+    diagnostics.append(Diagnostic(choice.mark, choice.shown, message))
     return None
 
 
-def _read_option(path: Path, folder: Path, problems: list[Problem]) -> Value | None:
+def _read_option(path: Path, folder: Path, diagnostics: list[Diagnostic]) -> Value | None:
     try:
         root = read(path, shown(path, folder)).root
     except RecipeError as error:
-        problems += error.problems
+        diagnostics += error.diagnostics
         return None
     if "defaults" in root.items:
         message = "belongs in a recipe: an option of a group cannot name other groups"
-        problems.append(Problem(root.items["defaults"].key, "defaults", message))
+        diagnostics.append(Diagnostic(root.items["defaults"].key, "defaults", message))
     return _without_defaults(root)

@@ -7,7 +7,7 @@ import re
 from collections.abc import Iterable, Iterator
 from dataclasses import dataclass, replace
 
-from neusee.workflows.graph.diagnostics import Mark, Problem, RecipeError
+from neusee.workflows.graph.diagnostics import Diagnostic, Location, RecipeError
 from neusee.workflows.recipe.text.yaml_values import Value, parse
 
 RESERVED = frozenset(
@@ -28,39 +28,39 @@ class Override:
     sign: str  #: ``""`` changes a value, ``+`` adds one, ``~`` takes one away
     path: tuple[str, ...]
     value: Value | None
-    mark: Mark
+    mark: Location
 
     @property
     def value_is_collection(self) -> bool:
         return self.value is not None and isinstance(self.value.data, dict | list)
 
 
-def read_override(text: str, mark: Mark) -> Override:
+def read_override(text: str, mark: Location) -> Override:
     """Read one argument; its value is YAML, so that ``20 e-`` stays a text."""
     match = _SYNTAX.fullmatch(text)
     if match is None:
-        raise RecipeError([Problem(mark, text, _HELP)])
+        raise RecipeError([Diagnostic(mark, text, _HELP)])
     sign, path, value = match["sign"], tuple(match["path"].split(".")), match["value"]
     if sign == "~":
         if value is not None:
-            raise RecipeError([Problem(mark, text, f"~ takes a value away and gives none: write ~{match['path']}")])
+            raise RecipeError([Diagnostic(mark, text, f"~ takes a value away and gives none: write ~{match['path']}")])
         return Override(text, sign, path, None, mark)
     if value is None:
-        raise RecipeError([Problem(mark, text, f"has no value: write {text}=VALUE")])
+        raise RecipeError([Diagnostic(mark, text, f"has no value: write {text}=VALUE")])
     if not value.strip():
-        raise RecipeError([Problem(mark, text, f"has no value: write {text}VALUE, or {text}null for none")])
+        raise RecipeError([Diagnostic(mark, text, f"has no value: write {text}VALUE, or {text}null for none")])
     try:
         return Override(text, sign, path, parse(value, mark, path), mark)
     except RecipeError as error:
-        raise RecipeError([Problem(mark, text, p.message) for p in error.problems]) from None
+        raise RecipeError([Diagnostic(mark, text, p.message) for p in error.diagnostics]) from None
 
 
-def apply(root: Value, override: Override, problems: list[Problem], groups: Iterable[str] = ()) -> Value:
+def apply(root: Value, override: Override, diagnostics: list[Diagnostic], groups: Iterable[str] = ()) -> Value:
     """``root`` with one value changed, added or taken away; a mistake leaves it as it was."""
     trail, missing = _follow(root, override.path)
     fault = _fault(root, override, trail, missing, groups)
     if fault:
-        problems.append(Problem(override.mark, override.text, fault))
+        diagnostics.append(Diagnostic(override.mark, override.text, fault))
         return root
     return _rebuild(trail, missing, override)
 
@@ -147,7 +147,7 @@ def _key(part: str | int) -> str | int:
     return int(part) if isinstance(part, str) and part.isdecimal() else part
 
 
-def _with(here: Value, key: str | int, made: Value | None, mark: Mark) -> Value:
+def _with(here: Value, key: str | int, made: Value | None, mark: Location) -> Value:
     items = {k: v for k, v in here.items.items() if made is not None or k != key}
     if made is not None:
         items[key] = made
@@ -156,7 +156,7 @@ def _with(here: Value, key: str | int, made: Value | None, mark: Mark) -> Value:
     return replace(here, data=items) if here.data is not None else Value(items, mark, here.key, here.path)
 
 
-def arguments_in(value: Value) -> Iterator[Mark]:
+def arguments_in(value: Value) -> Iterator[Location]:
     """Arguments that changed a part of a value."""
     for child in value.items.values():
         if not child.mark.line:

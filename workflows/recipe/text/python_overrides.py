@@ -12,7 +12,7 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
-from neusee.workflows.graph.diagnostics import Mark, Problem, RecipeError
+from neusee.workflows.graph.diagnostics import Diagnostic, Location, RecipeError
 from neusee.workflows.graph.final_values import flow
 from neusee.workflows.recipe.text.overrides import Override, read_override
 from neusee.workflows.recipe.text.yaml_values import Value, Where
@@ -24,26 +24,26 @@ _LONGEST = 40  #: characters of a value that a message repeats
 def overrides_of(values: Mapping[str, Any], folder: Path) -> list[Override]:
     """The changes that keyword arguments ask for; a `RecipeError` names everything that cannot stand in a recipe."""
     found: list[Override] = []
-    problems: list[Problem] = []
+    diagnostics: list[Diagnostic] = []
     for key, value in values.items():
-        mark = Mark(f"argument {key}", folder=str(folder))
+        mark = Location(f"argument {key}", folder=str(folder))
         try:
             found += _read(key, value, mark)
         except RecipeError as error:
-            problems += error.problems
-    if problems:
-        raise RecipeError(problems)
+            diagnostics += error.diagnostics
+    if diagnostics:
+        raise RecipeError(diagnostics)
     return found
 
 
-def _read(key: str, given: Any, mark: Mark) -> Iterator[Override]:
+def _read(key: str, given: Any, mark: Location) -> Iterator[Override]:
     """One keyword: its sign and path as on the command line, then each value below it."""
     if key.startswith("~") and given is not None:
-        raise RecipeError([Problem(mark, key, f"~ takes a value away and gives none: write {{{key!r}: None}}")])
+        raise RecipeError([Diagnostic(mark, key, f"~ takes a value away and gives none: write {{{key!r}: None}}")])
     try:
         named = read_override(key if key.startswith("~") else f"{key}=null", mark)
     except RecipeError as error:
-        raise RecipeError([Problem(mark, key, p.message) for p in error.problems]) from None
+        raise RecipeError([Diagnostic(mark, key, p.message) for p in error.diagnostics]) from None
     if named.sign:
         yield named if named.sign == "~" else _override(named, named.path, given)
         return
@@ -69,7 +69,7 @@ def _override(named: Override, path: tuple[str, ...], given: Any) -> Override:
     return Override(f"{named.sign}{name}={shown}", named.sign, path, value, mark)
 
 
-def _value(given: Any, mark: Mark, path: Where) -> Value:
+def _value(given: Any, mark: Location, path: Where) -> Value:
     """A Python value as the reader of a file would give it."""
     if isinstance(given, Mapping):
         data = {_key(key, mark, path): _value(item, mark, (*path, str(key))) for key, item in given.items()}
@@ -83,11 +83,11 @@ def _value(given: Any, mark: Mark, path: Where) -> Value:
     listed = given.tolist() if hasattr(given, "tolist") else given  # a number or an array of numpy or torch
     if not isinstance(listed, bool | int | float | str | list):
         message = f"a recipe holds no {type(given).__name__}: {_ALLOWED}"
-        raise RecipeError([Problem(mark, ".".join(map(str, path)), message)])
+        raise RecipeError([Diagnostic(mark, ".".join(map(str, path)), message)])
     return _value(listed, mark, path)
 
 
-def _key(key: Any, mark: Mark, path: Where) -> str | int:
+def _key(key: Any, mark: Location, path: Where) -> str | int:
     if isinstance(key, str | int) and not isinstance(key, bool) and key != "":
         return key
-    raise RecipeError([Problem(mark, ".".join(map(str, path)), f"a key is a name or a whole number, not {key!r}")])
+    raise RecipeError([Diagnostic(mark, ".".join(map(str, path)), f"a key is a name or a whole number, not {key!r}")])

@@ -9,7 +9,7 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
-from neusee.workflows.graph.diagnostics import Problem
+from neusee.workflows.graph.diagnostics import Diagnostic
 from neusee.workflows.recipe.text.composition import packaged
 from neusee.workflows.recipe.text.overrides import RESERVED
 from neusee.workflows.recipe.text.yaml_values import Value, Where, dotted
@@ -41,12 +41,12 @@ class Scope:
 class References:
     """Follows references in the values of one recipe and remembers which values were used."""
 
-    def __init__(self, root: Value, problems: list[Problem]) -> None:
-        self.root, self.problems = root, problems
+    def __init__(self, root: Value, diagnostics: list[Diagnostic]) -> None:
+        self.root, self.diagnostics = root, diagnostics
         self.used: set[Where] = set()
         self.known: dict[Where, Value] = {}
         self.open: list[Where] = []
-        self.lacking: list[tuple[Where, Problem]] = []
+        self.lacking: list[tuple[Where, Diagnostic]] = []
         self.spare: set[Where] = set()  #: values of packaged options that this recipe has no use for
 
     def resolve(self, value: Value, scope: Scope) -> Value:
@@ -115,15 +115,15 @@ class References:
         name, wanted = ".".join(parts), (*start.path, *parts)
         siblings = self.root.items[str(start.path[0])].items.values() if start.path else ()
         if any(_follow(other, parts) for other in siblings):
-            problem = Problem(start.key, start.name, f"has no {name}; steps.{scope.step} needs it")
+            problem = Diagnostic(start.key, start.name, f"has no {name}; steps.{scope.step} needs it")
         else:
             near = _nearest(wanted, {leaf.path for leaf in self.root.leaves() if leaf.path[0] not in RESERVED})
             hint = f"; did you mean {dotted(near)}?" if near else ""
-            problem = Problem(origin.mark, origin.name, f"${{{dotted(wanted)}}} is unknown{hint}")
+            problem = Diagnostic(origin.mark, origin.name, f"${{{dotted(wanted)}}} is unknown{hint}")
         self.lacking.append((wanted, problem))
 
     def _fail(self, origin: Value, message: str) -> Value:
-        self.problems.append(Problem(origin.mark, origin.name, message))
+        self.diagnostics.append(Diagnostic(origin.mark, origin.name, message))
         return replace(origin, data=BROKEN)
 
     def touch(self, value: Value, dims: Sequence[str]) -> None:
@@ -157,8 +157,8 @@ class References:
             shown = dotted(instead[-1:] if instead[:-1] == leaf.path[:-1] else instead)
             hint = f"; did you mean {shown}?" if shown else ": no step refers to it"
             asker = f" (needed at {wanted[instead].mark})" if instead in wanted else ""
-            self.problems.append(Problem(leaf.key, leaf.name, f"unknown{hint}{asker}"))
-        self.problems += [problem for path, problem in self.lacking if path not in misspelt]
+            self.diagnostics.append(Diagnostic(leaf.key, leaf.name, f"unknown{hint}{asker}"))
+        self.diagnostics += [problem for path, problem in self.lacking if path not in misspelt]
 
     def _block_leaves(self) -> Iterator[Value]:
         blocks = (block for key, block in self.root.items.items() if key not in RESERVED)

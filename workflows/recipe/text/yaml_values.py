@@ -17,7 +17,7 @@ from ruamel.yaml import YAML
 from ruamel.yaml.error import MarkedYAMLError, YAMLError, YAMLStreamError
 from ruamel.yaml.nodes import MappingNode, Node, ScalarNode
 
-from neusee.workflows.graph.diagnostics import Mark, Problem, RecipeError
+from neusee.workflows.graph.diagnostics import Diagnostic, Location, RecipeError
 
 Where = tuple[str | int, ...]  #: keys and indices from the top of a recipe
 
@@ -33,8 +33,8 @@ class Value:
     """A scalar, a list of values or a mapping of values, with the place of its key and its own."""
 
     data: Any  #: None, bool, int, float, str, list[Value] or dict[str | int, Value]
-    mark: Mark
-    key: Mark
+    mark: Location
+    key: Location
     path: Where
 
     @property
@@ -82,35 +82,35 @@ def read(path: Path, shown: str) -> Document:
         text = path.read_bytes().decode("utf-8-sig")
     except UnicodeDecodeError as error:
         before = error.object[: error.start].decode("utf-8", "replace")
-        mark = Mark(shown, before.count("\n") + 1, len(before.rpartition("\n")[2]) + 1)
-        raise RecipeError([Problem(mark, "", f"byte 0x{error.object[error.start]:02x} is not UTF-8")]) from None
+        mark = Location(shown, before.count("\n") + 1, len(before.rpartition("\n")[2]) + 1)
+        raise RecipeError([Diagnostic(mark, "", f"byte 0x{error.object[error.start]:02x} is not UTF-8")]) from None
     except OSError as error:
-        raise RecipeError([Problem(Mark(shown), "", f"cannot be read: {error.strerror}")]) from None
+        raise RecipeError([Diagnostic(Location(shown), "", f"cannot be read: {error.strerror}")]) from None
     return _document(text, shown, str(path.parent))
 
 
 @lru_cache(maxsize=256)
 def _document(text: str, shown: str, folder: str) -> Document:
-    root = parse(text, Mark(shown, 1, 1, folder))
+    root = parse(text, Location(shown, 1, 1, folder))
     if not isinstance(root.data, dict):
         what = "is empty" if root.data is None else f"holds {kind(root)}"
-        raise RecipeError([Problem(Mark(shown, 1, 1), "", f"{what}: write a mapping, `key: value`")])
+        raise RecipeError([Diagnostic(Location(shown, 1, 1), "", f"{what}: write a mapping, `key: value`")])
     first = text.lstrip().partition("\n")[0].strip()
     return Document(root, first.lstrip("# ") if first.startswith("#") else "")
 
 
-def parse(text: str, start: Mark, path: Where = ()) -> Value:
+def parse(text: str, start: Location, path: Where = ()) -> Value:
     """Read YAML text. ``start`` says what it is called; an argument's values all stand at ``start`` (line 0)."""
     builder = _Builder(start)
     try:
         node = YAML(typ="safe", pure=True).compose(text)
         value = Value(None, start, start, path) if node is None else builder.value(node, path, start)
     except RecursionError:
-        raise RecipeError([Problem(start, dotted(path), "is nested too deeply")]) from None
+        raise RecipeError([Diagnostic(start, dotted(path), "is nested too deeply")]) from None
     except (YAMLError, YAMLStreamError) as error:
         raise RecipeError([_explain(error, text, start, path)]) from None
-    if builder.problems:
-        raise RecipeError(builder.problems)
+    if builder.diagnostics:
+        raise RecipeError(builder.diagnostics)
     return value
 
 
@@ -123,15 +123,15 @@ def kind(value: Value) -> str:
 class _Builder:
     """Makes values of the nodes of one text; an alias is the same value again."""
 
-    def __init__(self, start: Mark) -> None:
+    def __init__(self, start: Location) -> None:
         self.start = start
-        self.problems: list[Problem] = []
+        self.diagnostics: list[Diagnostic] = []
         self.made: dict[int, Value] = {}
         self.open: set[int] = set()
         self.size: dict[int, int] = {}
         self.again = 0  # values that aliases made
 
-    def value(self, node: Node, path: Where, key: Mark) -> Value:
+    def value(self, node: Node, path: Where, key: Location) -> Value:
         mark, tag = self._mark(node), (node.tag or "").replace(_TAG, "!!")
         if tag not in _KNOWN:
             return self._refuse(mark, path, f"the tag {tag} means nothing here: leave it out")
@@ -174,17 +174,17 @@ class _Builder:
         self.size[id(node)] = 1 + sum(self.size.get(id(child), 1) for child in children)
         self._refuse_many(self.size[id(node)], _MOST, made.mark, made.path)
 
-    def _refuse_many(self, count: int, most: int, mark: Mark, path: Where) -> None:
+    def _refuse_many(self, count: int, most: int, mark: Location, path: Where) -> None:
         if count > most:
-            raise RecipeError([Problem(mark, dotted(path), f"aliases make more than {most} values of this")])
+            raise RecipeError([Diagnostic(mark, dotted(path), f"aliases make more than {most} values of this")])
 
-    def _mark(self, node: Node) -> Mark:
+    def _mark(self, node: Node) -> Location:
         if not self.start.line:
             return self.start
-        return Mark(self.start.file, node.start_mark.line + 1, node.start_mark.column + 1, self.start.folder)
+        return Location(self.start.file, node.start_mark.line + 1, node.start_mark.column + 1, self.start.folder)
 
-    def _refuse(self, mark: Mark, path: Where, message: str) -> Value:
-        self.problems.append(Problem(mark, dotted(path), message))
+    def _refuse(self, mark: Location, path: Where, message: str) -> Value:
+        self.diagnostics.append(Diagnostic(mark, dotted(path), message))
         return Value(None, mark, mark, path)
 
 
@@ -230,15 +230,15 @@ def _key(node: Node) -> str | int | None:
     return key if isinstance(key, str | int) and not isinstance(key, bool) and key != "" else None
 
 
-def _explain(error: Exception, text: str, start: Mark, path: Where) -> Problem:
+def _explain(error: Exception, text: str, start: Location, path: Where) -> Diagnostic:
     """One located sentence for what the YAML reader could not read."""
     at = getattr(error, "problem_mark", None)
     line, column = (at.line, at.column) if at else _control(text)
     problem = error.problem if isinstance(error, MarkedYAMLError) and error.problem else "a character that cannot stand"
     lines = text.splitlines() or [""]
     here = lines[min(line, len(lines) - 1)]
-    mark = Mark(start.file, line + 1, column + 1, start.folder) if start.line else start
-    return Problem(mark, dotted(path), _fix(problem, here, column))
+    mark = Location(start.file, line + 1, column + 1, start.folder) if start.line else start
+    return Diagnostic(mark, dotted(path), _fix(problem, here, column))
 
 
 def _fix(problem: str, here: str, column: int) -> str:

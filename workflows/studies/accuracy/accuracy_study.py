@@ -26,8 +26,8 @@ from neusee.workflows.store.result_store import Store
 from neusee.workflows.studies.accuracy import accuracy_report
 from neusee.workflows.studies.accuracy.recipe_knobs import Knobs, changed, finest, knobs
 from neusee.workflows.studies.accuracy.single_steps import StepTried, that_matter, try_step
-from neusee.workflows.studies.accuracy.work_precision_points import TIMES, Bench, Measured, Point, Trial, now
-from neusee.workflows.tolerance.cheaper_steps import economised
+from neusee.workflows.studies.accuracy.work_precision_points import TIMES, Bench, Measured, Point, Trial, timestamp
+from neusee.workflows.tolerance.cheaper_steps import with_substitutions
 
 TOLERANCES = (1e-1, 1e-2, 1e-3, 1e-4, 1e-5, 1e-6)
 _FEWER = (1e-1, 1e-2, 1e-3, 1e-4)
@@ -79,17 +79,17 @@ def trials(recipe: Recipe, turned: Knobs, quick: bool) -> Iterator[Trial]:
     """The tolerances, everything kept, and each knob in turn on the recipe as it is."""
     asked = sorted({*(_FEWER if quick else TOLERANCES), recipe.tolerance}, reverse=True)
     for tolerance in asked:
-        other = replace(recipe, tolerance=tolerance, keep_all=False)
-        own = tolerance == recipe.tolerance and not recipe.keep_all
+        other = replace(recipe, tolerance=tolerance, exact=False)
+        own = tolerance == recipe.tolerance and not recipe.exact
         yield Trial(accuracy_report.TOLERANCE, accuracy_report.power(tolerance), other, value=tolerance, own=own)
-    yield Trial(accuracy_report.KEEP_ALL, "", replace(recipe, keep_all=True), own=recipe.keep_all)
+    yield Trial(accuracy_report.KEEP_ALL, "", replace(recipe, exact=True), own=recipe.exact)
     for knob in turned.found:
         for change in knob.changes:
             name = f"{knob.what} ({accuracy_report.short(knob.name)})"
             try:
                 yield Trial(name, change.label, changed(recipe, change.overrides) if change.overrides else recipe)
             except RecipeError as error:
-                yield Trial(name, change.label, None, refused=error.problems[0].message)
+                yield Trial(name, change.label, None, refused=error.diagnostics[0].message)
 
 
 def _found(recipe: Recipe, bench: Bench, tell: Tell, quick: bool, until: float) -> Study:
@@ -127,7 +127,7 @@ def _matter(recipe: Recipe, points: Sequence[Point]) -> Iterator[tuple[Recipe, s
     for name, share in that_matter(recipe, whole):
         yield recipe, name, share
     own = next((p.found.steps for p in points if p.trial.own), {})
-    cheaper = economised(recipe, recipe.outputs)
+    cheaper = with_substitutions(recipe, recipe.outputs)
     for name, share in that_matter(cheaper, own):
         if name not in recipe.steps:
             yield cheaper, name, share
@@ -141,7 +141,7 @@ def _provenance(found: Study, bench: Bench, command: Sequence[str], quick: bool)
     return {
         "recipe": found.recipe.name,
         "command": " ".join(command),
-        "date": now(),
+        "date": timestamp(),
         "tolerance": found.recipe.tolerance,
         "seed": found.recipe.seed,
         "seeds": found.seeds,

@@ -85,13 +85,13 @@ def changed(recipe: Recipe, overrides: Sequence[str]) -> Recipe:
         path.write_text(recipe.config.to_yaml(), encoding="utf-8")
         found = load(path, overrides)
     found = replace(found, name=recipe.name, title=recipe.title, seed=recipe.seed, outputs=recipe.outputs, expect=())
-    return replace(found, tolerance=recipe.tolerance, keep_all=recipe.keep_all)
+    return replace(found, tolerance=recipe.tolerance, exact=recipe.exact)
 
 
 def finest(recipe: Recipe) -> Recipe:
     """The recipe at its own sampling with nothing left out, and every step in the best precision that it has."""
     best = [f"{place.path}={_words(place.steps[0], 'precision')[-1]}" for place in _places(recipe, "precision")]
-    return replace(changed(recipe, best) if best else recipe, keep_all=True)
+    return replace(changed(recipe, best) if best else recipe, exact=True)
 
 
 def _bands(recipe: Recipe, quick: bool) -> Iterator[Knob | str]:

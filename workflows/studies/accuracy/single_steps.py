@@ -28,7 +28,7 @@ from neusee.workflows.keys.engine_digest import engine
 from neusee.workflows.store.result_store import Store
 from neusee.workflows.store.serialization import each_tensor, tensors_in
 from neusee.workflows.studies.accuracy.smaller_inputs import Cut, cut, said
-from neusee.workflows.studies.accuracy.work_precision_points import machine, now
+from neusee.workflows.studies.accuracy.work_precision_points import machine, timestamp
 from neusee.workflows.tolerance.error_norm import error_of
 
 SHARE = 0.01  #: of the time, below which a step does not matter
@@ -89,13 +89,13 @@ def that_matter(recipe: Recipe, seconds: Mapping[str, float]) -> list[tuple[str,
 def try_step(recipe: Recipe, name: str, share: float, store: Store, patience: float) -> StepTried:
     """The forms of a step of ``recipe``, from the store or tried now; ``patience``: s that its reference may take."""
     step = recipe.steps[name]
-    if step.node.ref is None:
+    if step.node.hooks.reference is None:
         return StepTried(name, step.node.path, share, Trying(refused="its node has no reference"))
     key = _key(recipe, name, patience, store)
     if store.has(key):
         return StepTried(name, step.node.path, share, Trying(**store.get(key)))
     found = _tried(recipe, step, store, patience)
-    store.put(key, asdict(found), {"step": f"study accuracy: {name}", "seconds": patience, "date": now()})
+    store.put(key, asdict(found), {"step": f"study accuracy: {name}", "seconds": patience, "date": timestamp()})
     return StepTried(name, step.node.path, share, found)
 
 
@@ -109,7 +109,7 @@ def _key(recipe: Recipe, name: str, patience: float, store: Store) -> str:
 
 def _tried(recipe: Recipe, step: Step, store: Store, patience: float) -> Trying:
     try:
-        values = run(replace(recipe, keep_all=True), store, step.sources).values
+        values = run(replace(recipe, exact=True), store, step.sources).values
     except RunError as error:
         return Trying(refused=f"its inputs: {error.cause}")
     inputs = [_gathered(step.wires.get(name), values) for name in step.node.inputs]
@@ -131,13 +131,13 @@ def _gathered(wire: str | tuple[str, ...] | None, values: Mapping[str, Any]) -> 
 def _largest(step: Step, inputs: list[Any], seed: int, patience: float) -> tuple[Cut, Any, float] | None:
     """The largest part of the inputs on which the reference is within the patience; its result and seconds."""
     best: tuple[Cut, Any, float] | None = None
-    assert step.node.ref is not None
+    assert step.node.hooks.reference is not None
     for size in _CUTS:
         if best is not None and best[2] * _GROWTH > patience:
             break
         part = cut(step.node, inputs, size)
         try:
-            truth, seconds = _once(lambda part=part: _call(step, step.node.ref, part, seed))  # type: ignore[misc]
+            truth, seconds = _once(lambda part=part: _call(step, step.node.hooks.reference, part, seed))  # type: ignore[misc]
         except Exception:  # a part of a picture may be no input for it: a larger one may
             continue
         best = (size, truth, seconds)
@@ -171,7 +171,7 @@ def _ways(step: Step, inputs: list[Any], seed: int) -> dict[tuple[str, str], Cal
     for share in _WINDOWS if any(isinstance(x, Psf) for x in inputs) else ():
         smaller = [_inner(x, share) if isinstance(x, Psf) else x for x in inputs]
         ways["window of the PSF", f"{share:g}"] = partial(_call, step, node, smaller, seed)
-    if node.bound is not None:
+    if node.hooks.skip_bound is not None:
         ways["left out", ""] = lambda: inputs[0]
     return ways
 

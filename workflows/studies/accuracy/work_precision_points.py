@@ -28,12 +28,12 @@ from neusee.workflows.keys.cache_key import digest, key_of
 from neusee.workflows.keys.code_digest import Code
 from neusee.workflows.keys.engine_digest import engine
 from neusee.workflows.store.result_store import Store
-from neusee.workflows.tolerance.cheaper_steps import economised
+from neusee.workflows.tolerance.cheaper_steps import with_substitutions
 from neusee.workflows.tolerance.error_norm import error_of
 
 TIMES = 3  #: cold runs of a point, of which the median counts
 _QUICK = 5.0  #: s; what takes longer is run once
-_WITHIN = ("tolerance", "keep_all")  #: fields of a recipe that stand in no key
+_WITHIN = ("tolerance", "exact")  #: fields of a recipe that stand in no key
 
 
 @dataclass(frozen=True)
@@ -169,7 +169,7 @@ class Bench:
     def _warm_up(self, recipe: Recipe) -> None:
         """What a process does only once, to import libraries and to read code, is no time of the first point."""
         self.truth(0)
-        for step in economised(recipe, recipe.outputs).steps.values():
+        for step in with_substitutions(recipe, recipe.outputs).steps.values():
             self._code.digest(step.node.fn.__module__)
         self._code.save()
         if not self._warm:
@@ -218,8 +218,8 @@ def machine() -> Sequence[str]:
 
 
 def _about(seconds: Sequence[float]) -> dict[str, Any]:
-    return {"step": "study accuracy", "seconds": sum(seconds), "date": now()}
+    return {"step": "study accuracy", "seconds": sum(seconds), "date": timestamp()}
 
 
-def now() -> str:
+def timestamp() -> str:
     return datetime.now(UTC).isoformat(timespec="seconds")

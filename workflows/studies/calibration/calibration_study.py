@@ -14,7 +14,7 @@ from typing import Any
 
 from neusee.workflows.calibration.identifiability import KINDS, known
 from neusee.workflows.calibration.initial_guess import begin
-from neusee.workflows.calibration.log_posterior import Problem
+from neusee.workflows.calibration.log_posterior import SensorPosterior
 from neusee.workflows.calibration.posterior_mode import peak
 from neusee.workflows.engine.node_call import versions
 from neusee.workflows.engine.threads import one_thread
@@ -23,7 +23,7 @@ from neusee.workflows.keys.cache_key import digest
 from neusee.workflows.report.run_folder import RunFolder, new_run
 from neusee.workflows.report.study_page import Mark, Section, page
 from neusee.workflows.store.result_store import Store
-from neusee.workflows.studies.accuracy.work_precision_points import now
+from neusee.workflows.studies.accuracy.work_precision_points import timestamp
 from neusee.workflows.studies.calibration.independent_draws import DRAWS, walked
 from neusee.workflows.studies.calibration.prior_sensitivity import ENOUGH, Finding, Sensitivity, sensitivity
 from neusee.workflows.studies.calibration.rank_uniformity import Verdict, verdicts
@@ -103,7 +103,7 @@ def _simulated(bench: Bench, count: int, tell: Tell) -> Iterator[Simulation]:
 def _sensitivity(recipe: Recipe, move: str) -> tuple[Sensitivity | None, str]:
     """Of the recipe as it is, with all its pixels and with its own prior."""
     with TemporaryDirectory(prefix="neusee-") as folder:
-        problem = Problem.of(recipe, Store(folder))
+        problem = SensorPosterior.of(recipe, Store(folder))
     highest = peak(problem, begin(problem))
     told = known(problem, highest)
     if told.refused:
@@ -119,7 +119,7 @@ def _document(recipe: Recipe, command: Sequence[str], found: Found, seconds: flo
         "study": "calibration",
         "recipe": recipe.name,
         "command": " ".join(command),
-        "date": now(),
+        "date": timestamp(),
         "seconds": seconds,
         "failed": found.failed,
         "simulations": len(found.simulations),

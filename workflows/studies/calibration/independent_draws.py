@@ -10,8 +10,8 @@ import numpy as np
 
 from neusee.workflows.calibration import emcee_sampler
 from neusee.workflows.calibration.ensembles import go_on
-from neusee.workflows.calibration.log_posterior import Problem
-from neusee.workflows.calibration.posterior_mode import Peak
+from neusee.workflows.calibration.log_posterior import SensorPosterior
+from neusee.workflows.calibration.posterior_mode import LaplaceFit
 
 if TYPE_CHECKING:
     from neusee.workflows.calibration.log_posterior import Places
@@ -33,7 +33,7 @@ class Drawn:
     stranded: int = 0  #: walkers that stay where the posterior is none
 
 
-def walked(problem: Problem, peak: Peak, seed: int, how: str = "de", count: int = DRAWS) -> Drawn:
+def walked(problem: SensorPosterior, peak: LaplaceFit, seed: int, how: str = "de", count: int = DRAWS) -> Drawn:
     """``count`` draws by the move ``how``, taken at random of walkers that were looked at once each tau.
 
     It starts and walks as `calibrate.sample` does; it ends sooner, for each simulation need only give few draws.

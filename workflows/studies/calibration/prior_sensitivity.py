@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from neusee.workflows.calibration.log_posterior import Problem
+from neusee.workflows.calibration.log_posterior import SensorPosterior
 
 if TYPE_CHECKING:
     from neusee.workflows.calibration.log_posterior import Places
@@ -36,7 +36,7 @@ class Sensitivity:
     left: Mapping[str, float]  #: share of the draws that is left by weighing for that prior, as independent ones
 
 
-def sensitivity(problem: Problem, places: Places, kinds: Mapping[str, str]) -> Sensitivity:
+def sensitivity(problem: SensorPosterior, places: Places, kinds: Mapping[str, str]) -> Sensitivity:
     """Of draws (draw, free) that hardly depend on each other."""
     values = {name: x.numpy() for name, x in problem.parameters(places).items()}
     z = problem.whitened(places)

@@ -21,18 +21,18 @@ import torch
 from neusee.nodes.calibrate import NAMES, Prior, Sufficient
 from neusee.workflows.calibration.identifiability import known
 from neusee.workflows.calibration.initial_guess import begin
-from neusee.workflows.calibration.log_posterior import Problem, _the
-from neusee.workflows.calibration.posterior_mode import Peak, peak
+from neusee.workflows.calibration.log_posterior import SensorPosterior, _the
+from neusee.workflows.calibration.posterior_mode import LaplaceFit, peak
 from neusee.workflows.engine.differentiable_function import as_function
 from neusee.workflows.engine.node_call import versions
 from neusee.workflows.graph.recipe_graph import Recipe, needed
 from neusee.workflows.keys.cache_key import digest, stream_seed
 from neusee.workflows.keys.engine_digest import engine
 from neusee.workflows.store.result_store import Store
-from neusee.workflows.studies.accuracy.work_precision_points import now
+from neusee.workflows.studies.accuracy.work_precision_points import timestamp
 from neusee.workflows.studies.calibration.independent_draws import Drawn
 
-Sampler = Callable[[Problem, Peak, int], Drawn]  #: of a problem and its peak, by a seed
+Sampler = Callable[[SensorPosterior, LaplaceFit, int], Drawn]  #: of a problem and its peak, by a seed
 _EXPOSE = "calibrate.expose"
 _TAKEN = {"read_noise": "sigma"}  #: by the name in `density` that in `expose`
 #: standard deviation of each logarithm, at most, and of the pedestal in e-: a whole lifetime of sensors in one study
@@ -77,7 +77,7 @@ class Bench:
             raise ValueError(f"{recipe.name} simulates no frames: {_EXPOSE} is the step whose parameters are drawn")
         self.recipe = narrowed(recipe, {name: {"shape": (pixels, pixels)} for name in self.exposed})
         with TemporaryDirectory(prefix="neusee-") as folder:
-            self.nominal = Problem.of(self.recipe, Store(folder))
+            self.nominal = SensorPosterior.of(self.recipe, Store(folder))
             self._source = str(self.recipe.steps[self.nominal.step].wires["levels"])
             self._weigh, self._tell = self._functions(Store(folder))
 
@@ -89,7 +89,7 @@ class Bench:
         except KeyError:
             pass
         found = self._made(stream_seed(self.recipe.seed, f"calibration study {number}"))
-        self.store.jot(key, asdict(found), {"step": "study calibration", "seconds": found.seconds, "date": now()})
+        self.store.jot(key, asdict(found), {"step": "study calibration", "seconds": found.seconds, "date": timestamp()})
         return found
 
     def truth(self, seed: int) -> dict[str, float]:
@@ -97,7 +97,7 @@ class Bench:
         drawn = self.nominal.coordinates.draw(1, torch.Generator().manual_seed(seed))
         return {name: float(x) for name, x in drawn.items()}
 
-    def problem(self, truth: Mapping[str, float], seed: int) -> Problem:
+    def problem(self, truth: Mapping[str, float], seed: int) -> SensorPosterior:
         """The posterior of frames that were made by these parameters; what was seen alone is new in it."""
         levels = self._levels(truth, seed)
         weigh, tell = (partial(_given, function, {self._source: levels}) for function in (self._weigh, self._tell))
@@ -128,7 +128,7 @@ class Bench:
         return found
 
     def _functions(self, store: Store) -> tuple[Callable[[Any], Any], Callable[[Any], Any]]:
-        """As in `Problem.of`, but of levels that are given."""
+        """As in `SensorPosterior.of`, but of levels that are given."""
         step = self.recipe.steps[self.nominal.step]
         free = [self._source, *(f"{step.name}.{name}" for name in self.nominal.names)]
 
@@ -179,7 +179,7 @@ def widths(prior: Prior) -> dict[str, float]:
     return {name: width for name, width in both if np.isfinite(width)}
 
 
-def ranked(problem: Problem, truth: Mapping[str, float], drawn: Drawn) -> Simulation:
+def ranked(problem: SensorPosterior, truth: Mapping[str, float], drawn: Drawn) -> Simulation:
     """Where the truth stands among draws of each parameter."""
     values = {name: x.numpy() for name, x in problem.parameters(drawn.places).items()}
     found = Simulation(

@@ -16,7 +16,7 @@ from neusee.workflows.keys.cache_key import digest
 from neusee.workflows.report.run_folder import RunFolder, new_run
 from neusee.workflows.report.study_page import Mark, Section, page
 from neusee.workflows.store.result_store import Store
-from neusee.workflows.studies.accuracy.work_precision_points import now
+from neusee.workflows.studies.accuracy.work_precision_points import timestamp
 from neusee.workflows.studies.leave_out.omission_rows import Bench, Promise, Row
 from neusee.workflows.studies.leave_out.scene_costs import Cost, costs
 
@@ -70,7 +70,7 @@ def _document(recipe: Recipe, command: Sequence[str], found: Found, seconds: flo
         "recipe": recipe.name,
         "tolerance": recipe.tolerance,
         "command": " ".join(command),
-        "date": now(),
+        "date": timestamp(),
         "seconds": seconds,
         "failed": found.failed,
         "outputs": [asdict(promise) for promise in found.promises],
@@ -117,7 +117,7 @@ def _lead(recipe: Recipe, found: Found) -> str:
 
 def _outputs(recipe: Recipe, found: Found) -> Section:
     rows = [(p.output, p.bound, p.rms, p.largest, recipe.tolerance, _held(p.holds)) for p in found.promises]
-    text = """Each output of the recipe as it chooses, against the same with everything in full (--keep-all). The
+    text = """Each output of the recipe as it chooses, against the same with everything in full (--exact). The
         error is the root mean square of the difference over the largest element, which is what the tolerance limits;
         the proved bound is what the nodes carry on from what was left out, where they can tell."""
     columns = ("output", "proved bound", "error", "largest difference", "tolerance", "holds")

@@ -14,7 +14,7 @@ from typing import Any
 
 from torch import Tensor
 
-from neusee.nodes import Facts
+from neusee.nodes import TensorStats
 from neusee.workflows.engine.resolve_keys import resolve
 from neusee.workflows.engine.runner import Result, run
 from neusee.workflows.engine.step_record import facts_in
@@ -22,7 +22,7 @@ from neusee.workflows.graph.recipe_graph import Recipe, needed
 from neusee.workflows.keys.cache_key import Key, digest
 from neusee.workflows.keys.engine_digest import engine
 from neusee.workflows.store.result_store import Store
-from neusee.workflows.studies.accuracy.work_precision_points import now
+from neusee.workflows.studies.accuracy.work_precision_points import timestamp
 from neusee.workflows.studies.leave_out.possible_omissions import Omission, omissions
 from neusee.workflows.tolerance.error_norm import error_of, largest_error
 
@@ -63,14 +63,14 @@ class Bench:
 
     def __init__(self, recipe: Recipe, store: Store) -> None:
         self.recipe, self.store = recipe, store
-        self.full = replace(recipe, keep_all=True)
+        self.full = replace(recipe, exact=True)
         self.truth = run(self.full, store)
         self.chosen = run(recipe, store)
         self.found = list(omissions(self.full, self.chosen, self.facts))
 
-    def facts(self, step: str) -> Facts | None:
+    def facts(self, step: str) -> TensorStats | None:
         """Facts of a step in full, without reading it where they are stored."""
-        return facts_in(self.store.about(self.truth.keys[step])) or Facts.of(self.truth.value(step))
+        return facts_in(self.store.about(self.truth.keys[step])) or TensorStats.of(self.truth.value(step))
 
     def promises(self) -> list[Promise]:
         """What became of each output of the recipe as it chooses."""
@@ -78,9 +78,7 @@ class Bench:
         for name in self.recipe.outputs:
             value, reference = self.chosen.values[name], self.truth.values[name]
             rms, bound = error_of(value, reference), self.chosen.proof.of(name)
-            holds = rms <= min(
-                self.recipe.tolerance, math.inf if bound is None or self.chosen.recipe.keep_all else bound
-            )
+            holds = rms <= min(self.recipe.tolerance, math.inf if bound is None or self.chosen.recipe.exact else bound)
             found.append(Promise(name, bound, rms, largest_error(value, reference), holds))
         return found
 
@@ -90,7 +88,7 @@ class Bench:
             alone = omission.made(self.full)
             key = self._key(omission, alone)
             if not self.store.has(key):
-                about = {"step": "study leave-out", "seconds": 0.0, "date": now()}
+                about = {"step": "study leave-out", "seconds": 0.0, "date": timestamp()}
                 self.store.put(key, asdict(self._row(omission, alone)), about)
             yield Row(**self.store.get(key))
 

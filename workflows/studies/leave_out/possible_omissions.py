@@ -14,16 +14,16 @@ from typing import Literal
 
 from torch import Tensor
 
-from neusee.nodes import Facts
+from neusee.nodes import TensorStats
 from neusee.workflows.engine.node_call import RunError
 from neusee.workflows.engine.runner import Result
 from neusee.workflows.graph.recipe_graph import Recipe, Step, Wire, in_order, needed
-from neusee.workflows.tolerance.cheaper_steps import economised
+from neusee.workflows.tolerance.cheaper_steps import with_substitutions
 from neusee.workflows.tolerance.skip_decision import judge
 from neusee.workflows.tolerance.zero_effect_steps import without
 
 Kind = Literal["handed on", "not added", "stands in"]
-FactsOf = Callable[[str], Facts | None]
+FactsOf = Callable[[str], TensorStats | None]
 
 
 @dataclass(frozen=True)
@@ -79,7 +79,7 @@ def omissions(full: Recipe, chosen: Result, facts_of: FactsOf) -> Iterator[Omiss
 
 
 def _handed_on(step: Step, facts_of: FactsOf) -> Omission | None:
-    if step.node.bound is None:
+    if step.node.hooks.skip_bound is None:
         return None
     verdict = judge(step, step.params, facts_of, math.inf)
     why = f"changes at most {verdict.bound:.2g}"
@@ -88,7 +88,7 @@ def _handed_on(step: Step, facts_of: FactsOf) -> Omission | None:
 
 def _not_added(recipe: Recipe, order: list[str], name: str, facts_of: FactsOf) -> Omission | None:
     step = recipe.steps[name]
-    at = _adding(recipe, order, name) if step.node.nothing is not None else ()
+    at = _adding(recipe, order, name) if step.node.hooks.zero_bound is not None else ()
     if not at:
         return None
     largest = _largest(step, facts_of)
@@ -98,14 +98,14 @@ def _not_added(recipe: Recipe, order: list[str], name: str, facts_of: FactsOf) -
 
 def _stand_ins(full: Recipe, order: list[str], chosen: Result) -> Iterator[Omission]:
     """All images of a recipe together, for what compares two must get both in one form."""
-    sparse = economised(replace(full, keep_all=False), full.outputs)
-    exchange = {economy.step: economy.instead for economy in sparse.economies if economy.instead}
+    sparse = with_substitutions(replace(full, exact=False), full.outputs)
+    exchange = {economy.step: economy.instead for economy in sparse.substitutions if economy.instead}
     if not exchange:
         return
     beside = tuple(step for name, step in sparse.steps.items() if name not in full.steps)
     at = tuple(n for n in order if not set(exchange.values()).isdisjoint(sparse.steps[n].sources))
-    taken = {economy.step for economy in chosen.recipe.economies} >= exchange.keys()
-    why = next(economy.why for economy in sparse.economies if economy.instead)
+    taken = {economy.step for economy in chosen.recipe.substitutions} >= exchange.keys()
+    why = next(economy.why for economy in sparse.substitutions if economy.instead)
     yield Omission(", ".join(exchange), "stands in", exchange, math.nan, why, taken, at, beside)
 
 
@@ -118,20 +118,20 @@ def _adding(recipe: Recipe, order: list[str], name: str) -> tuple[str, ...]:
 def _spares(reader: Step, name: str) -> bool:
     """Whether a step reads a result only to add it."""
     read = {i for i, wire in reader.wires.items() if name == wire or (isinstance(wire, tuple) and name in wire)}
-    return read <= {light for light, *_ in reader.node.adds}
+    return read <= {light for light, *_ in reader.node.additive_inputs}
 
 
 def _largest(step: Step, facts_of: FactsOf) -> float:
     """The bound of a step's largest element, by its node, from what was computed of its inputs."""
-    assert step.node.nothing is not None
+    assert step.node.hooks.zero_bound is not None
     facts = [_facts(step.wires.get(name), facts_of) for name in step.node.inputs]
     try:
-        return float(step.node.nothing(*facts, **step.params))
+        return float(step.node.hooks.zero_bound(*facts, **step.params))
     except Exception as error:
         raise RunError(step, [], error) from error
 
 
-def _facts(wire: Wire, facts_of: FactsOf) -> Facts | list[Facts | None] | None:
+def _facts(wire: Wire, facts_of: FactsOf) -> TensorStats | list[TensorStats | None] | None:
     return [facts_of(name) for name in wire] if isinstance(wire, tuple) else wire and facts_of(wire)  # type: ignore[return-value]
 
 

@@ -18,7 +18,7 @@ from neusee.workflows.keys.code_digest import Code
 from neusee.workflows.keys.engine_digest import engine
 from neusee.workflows.store.result_store import Store
 from neusee.workflows.studies.accuracy.recipe_knobs import changed
-from neusee.workflows.studies.accuracy.work_precision_points import cold, machine, now
+from neusee.workflows.studies.accuracy.work_precision_points import cold, machine, timestamp
 
 _TIMES = 3  #: cold runs, of which the median counts
 _QUICK = 5.0  #: s; what takes longer is run once
@@ -53,7 +53,7 @@ def costs(recipe: Recipe, store: Store, tell: Callable[[str], None]) -> Iterator
                 _cold(made, store)
                 warm = True
             store.put(
-                key, asdict(_cost(scene, made, store)), {"step": "study leave-out", "seconds": 0.0, "date": now()}
+                key, asdict(_cost(scene, made, store)), {"step": "study leave-out", "seconds": 0.0, "date": timestamp()}
             )
         found = store.get(key)
         cost = Cost(**{**found, "scene": scene, "left_out": tuple(found["left_out"])})
@@ -64,14 +64,14 @@ def costs(recipe: Recipe, store: Store, tell: Callable[[str], None]) -> Iterator
 def scenes(recipe: Recipe) -> dict[str, Recipe | str]:
     """Other scenes for the same camera, as far as the recipe has what they change, and why one cannot be."""
     found: dict[str, Recipe | str] = {
-        "everything in full": replace(recipe, keep_all=True),
+        "everything in full": replace(recipe, exact=True),
         "as the recipe chooses": recipe,
     }
     for scene, overrides in _overrides(recipe).items():
         try:
             found[scene] = _changed(recipe, overrides)
         except RecipeError as error:
-            found[scene] = "; ".join(problem.message for problem in error.problems)
+            found[scene] = "; ".join(problem.message for problem in error.diagnostics)
     return found
 
 
@@ -80,8 +80,8 @@ def _changed(recipe: Recipe, overrides: Sequence[str]) -> Recipe:
     try:
         return changed(recipe, overrides)
     except RecipeError as error:
-        unread = [f"~{problem.path}" for problem in error.problems if _UNREAD in problem.message]
-        if len(unread) < len(error.problems):
+        unread = [f"~{problem.path}" for problem in error.diagnostics if _UNREAD in problem.message]
+        if len(unread) < len(error.diagnostics):
             raise
         return changed(recipe, [*overrides, *unread])
 
@@ -128,7 +128,7 @@ def _cost(scene: str, recipe: Recipe, store: Store) -> Cost:
     result = sorted(found, key=lambda r: r.seconds)[len(found) // 2]
     ran = [done.seconds for done in result.done.values() if done.state == "run"]
     left_out = [done.step for done in result.done.values() if done.state == "left out"]
-    replaced = [economy.step for economy in result.recipe.economies]
+    replaced = [economy.step for economy in result.recipe.substitutions]
     return Cost(scene, result.seconds, sum(ran), len(ran), (*left_out, *replaced))
 
 
@@ -142,5 +142,5 @@ def _key(recipe: Recipe, code: Code) -> Key:
     keys: dict[str, Key] = {}
     for name in needed(recipe, recipe.outputs):
         keys[name], _ = key_of(recipe.steps[name], keys, recipe.seed, code)
-    said = [[keys[name] for name in recipe.outputs], recipe.tolerance, recipe.keep_all]
+    said = [[keys[name] for name in recipe.outputs], recipe.tolerance, recipe.exact]
     return digest("content", said, engine("studies.leave_out.scene_costs", "engine.runner"), machine())

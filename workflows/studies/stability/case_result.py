@@ -122,7 +122,8 @@ def _in_double(step: Step, inputs: Sequence[Any], seed: int) -> Any:
 def _compared(step: Step, inputs: list[Any], case: Case, seed: int) -> Cell:
     with torch.no_grad():
         value = _as_used(step, inputs, seed)
-        truth = _run(step, step.node.ref, inputs, seed) if step.node.ref else _in_double(step, inputs, seed)
+        own = step.node.hooks.reference
+        truth = _run(step, own, inputs, seed) if own else _in_double(step, inputs, seed)
     if not _finite(value):
         return Cell("pass", "overflows in the open, as its reference in single") if not _fits(truth) else Cell(
             "fail", "not finite")  # fmt: skip
@@ -218,7 +219,7 @@ def _slight(picture: Tensor) -> float:
 def _true_slopes(step: Step, inputs: list[Any], seed: int) -> list[Tensor] | None:
     wide = each_tensor(lambda x: x.double() if _is_picture(x) else x, inputs)
     leaves = [id(w) for w, x in zip(tensors_in(wide), tensors_in(inputs), strict=True) if _is_picture(x)]
-    own = step.node.ref
+    own = step.node.hooks.reference
     found = None if own is None else _slopes(wide, lambda given: _run(step, own, given, seed), leaves)
     return found or _slopes(wide, lambda given: _in_double(step, given, seed), leaves)
 

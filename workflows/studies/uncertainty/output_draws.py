@@ -27,7 +27,7 @@ from neusee.workflows.keys.engine_digest import engine
 from neusee.workflows.recipe.distributions.uncertain_inputs import Inputs
 from neusee.workflows.report.result_numbers import numbers_of
 from neusee.workflows.store.result_store import Store
-from neusee.workflows.studies.accuracy.work_precision_points import now
+from neusee.workflows.studies.accuracy.work_precision_points import timestamp
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray
@@ -49,7 +49,7 @@ class Draws:
         self._order = needed(recipe, recipe.outputs)
         self._live = _reached(inputs, self._order)
         self.outputs = tuple(name for name in recipe.outputs if name in self._live)
-        self.still = tuple(name for name in recipe.outputs if name not in self._live)
+        self.is_constant = tuple(name for name in recipe.outputs if name not in self._live)
         self._code = Code(store.root / "code.json")
         self._fixed = self._keys({})
         self.computed = 0  #: draws that were not in the store
@@ -93,14 +93,14 @@ class Draws:
         found = {part: x for name, s in sums.items() for part, x in ((f"{name} mean", s.mean), (f"{name} sd", s.sd))}
         if found:
             seconds = time.perf_counter() - began
-            self.store.put(whole, found, {"step": "study uncertainty", "seconds": seconds, "date": now()})
+            self.store.put(whole, found, {"step": "study uncertainty", "seconds": seconds, "date": timestamp()})
         return _pairs(found)
 
     def key(self, row: Places) -> str:
         """What decides the outputs at a draw: the keys of a run with these values."""
         recipe = self.inputs.recipe
         keys = self._keys(self.inputs.theta(self._named(row)))
-        within = [recipe.tolerance, recipe.keep_all, self.device.partition(":")[0]]
+        within = [recipe.tolerance, recipe.exact, self.device.partition(":")[0]]
         return digest(
             "uncertainty draw",
             engine("studies.uncertainty.output_draws"),
@@ -133,7 +133,7 @@ class Draws:
     def _keep(self, key: str, result: Mapping[str, Any]) -> Numbers:
         numbers = quantities(result)
         shown = [name for name, value in result.items() if _is_picture(value)]
-        about = {"step": "study uncertainty", "seconds": self.seconds / max(1, self.computed), "date": now()}
+        about = {"step": "study uncertainty", "seconds": self.seconds / max(1, self.computed), "date": timestamp()}
         self.store.jot(key, {"numbers": numbers, "pictures": shown}, about)
         return numbers
 

@@ -27,7 +27,7 @@ class Scatter:
     error: float  #: relative, of the greatest standard deviation; 0 where nothing varies
 
     @property
-    def still(self) -> bool:
+    def is_constant(self) -> bool:
         """Whether the quantity does not hang on what is drawn."""
         return not float(self.sd.max()) > 0
 

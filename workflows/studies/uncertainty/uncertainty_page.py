@@ -51,7 +51,12 @@ def _curves(found: Found) -> tuple[dict[str, tuple[Places, dict[str, Places]]], 
     spectral = True
     for name, values in found.values.items():
         count = values.shape[1]
-        if count < 3 or found.scatter[name].still or _node(found, name) == _TRANSFER or not np.isfinite(values).all():
+        if (
+            count < 3
+            or found.scatter[name].is_constant
+            or _node(found, name) == _TRANSFER
+            or not np.isfinite(values).all()
+        ):
             continue
         here = wavelengths is not None and len(wavelengths) == count
         spectral &= here
@@ -184,6 +189,6 @@ def _moves(found: Found, picture: bytes | None) -> list[Section]:
 
 
 def _rest(found: Found) -> list[Section]:
-    said = [f"No input reaches {', '.join(found.still)}: these are as in a run."] if found.still else []
+    said = [f"No input reaches {', '.join(found.is_constant)}: these are as in a run."] if found.is_constant else []
     said += [f"{', '.join(found.inputs.idle)} reach no output, and were not drawn."] if found.inputs.idle else []
     return [Section("What does not vary", "\n\n".join(said))] if said else []

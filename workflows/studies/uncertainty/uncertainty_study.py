@@ -16,13 +16,13 @@ from torch import Tensor
 from neusee.workflows.engine.node_call import versions
 from neusee.workflows.graph.recipe_graph import Recipe
 from neusee.workflows.keys.cache_key import digest
-from neusee.workflows.recipe.distributions.joint import NINETY
+from neusee.workflows.recipe.distributions.joint import Z_90
 from neusee.workflows.recipe.distributions.nominal_values import told
 from neusee.workflows.recipe.distributions.uncertain_inputs import SCRAMBLES, Inputs, Points
 from neusee.workflows.report.run_folder import RunFolder, new_run
 from neusee.workflows.report.study_page import page
 from neusee.workflows.store.result_store import Store
-from neusee.workflows.studies.accuracy.work_precision_points import now
+from neusee.workflows.studies.accuracy.work_precision_points import timestamp
 from neusee.workflows.studies.uncertainty.output_draws import Draws, Numbers
 from neusee.workflows.studies.uncertainty.scatter_estimate import Scatter, scatter
 from neusee.workflows.studies.uncertainty.sobol_indices import Indices, indices, require_salib
@@ -51,7 +51,7 @@ class Found:
     swings: Mapping[str, Sequence[tuple[str, float, float]]]  #: by number: input, at its 5 %, at its 95 %
     shares: Mapping[str, Indices]  #: by number
     pictures: Mapping[str, tuple[Tensor, Tensor]]
-    still: tuple[str, ...]  #: outputs that no input reaches
+    is_constant: tuple[str, ...]  #: outputs that no input reaches
     wanted: float  #: relative error
     sequences: int  #: of Sobol's points; 0 for independent draws
 
@@ -119,7 +119,7 @@ def _points(inputs: Inputs, seed: int, most: int, points: str) -> Points:
 def _ends(inputs: Inputs) -> Places:
     """All inputs at their median, and each by itself at its 5 and its 95 %."""
     count = len(inputs.names)
-    z = np.concatenate([np.zeros((1, count)), *(np.stack([-NINETY * e, NINETY * e]) for e in np.eye(count))])
+    z = np.concatenate([np.zeros((1, count)), *(np.stack([-Z_90 * e, Z_90 * e]) for e in np.eye(count))])
     return inputs.at(z)
 
 
@@ -146,7 +146,7 @@ def _found(inputs: Inputs, draws: Draws, at: Points, tell: Tell, wanted: float, 
     middle, swings = ends[0], _swings(inputs, ends, values, scattered)
     z = at.z[:used]
     shares = {n: indices(inputs.labels, z, values[n][:, 0], inputs.recipe.seed) for n in swings}
-    rest = (pictures, draws.still, wanted, sequences)
+    rest = (pictures, draws.is_constant, wanted, sequences)
     return Found(inputs, Points(z, at.values[:used]), values, scattered, middle, swings, shares, *rest)
 
 
@@ -168,7 +168,7 @@ def _swings(
     found: dict[str, list[tuple[str, float, float]]] = {}
     for name, x in values.items():
         known = np.isfinite(x).all() and np.isfinite([end[name] for end in ends]).all()
-        if x.shape[1] > 1 or scattered[name].still or not known:
+        if x.shape[1] > 1 or scattered[name].is_constant or not known:
             continue
         if not any(_one_is_the_other(x[:, 0], values[other][:, 0]) for other in found):
             pairs = zip(ends[1::2], ends[2::2], strict=True)
@@ -193,7 +193,7 @@ def _document(found: Found, draws: Draws, command: Sequence[str], seconds: float
         "study": "uncertainty",
         "recipe": recipe.name,
         "command": " ".join(command),
-        "date": now(),
+        "date": timestamp(),
         "seconds": seconds,
         "draws": len(found.points.z),
         "points": "sobol" if found.sequences else "draws",
@@ -205,7 +205,7 @@ def _document(found: Found, draws: Draws, command: Sequence[str], seconds: float
         "inputs": _inputs(found),
         "posterior": told(found.inputs.uncertain.standings),
         "idle": list(found.inputs.idle),
-        "still": list(found.still),
+        "still": list(found.is_constant),
         "quantities": {name: _plain(found, name) for name in found.values},
         "sensitivity": {name: asdict(shares) for name, shares in found.shares.items()},
         "versions": versions(),

@@ -27,7 +27,7 @@ from neusee.workflows.report.run_folder import RunFolder, new_run
 from neusee.workflows.report.study_page import page
 from neusee.workflows.store.result_store import Store
 from neusee.workflows.studies.accuracy.recipe_knobs import changed
-from neusee.workflows.studies.accuracy.work_precision_points import now
+from neusee.workflows.studies.accuracy.work_precision_points import timestamp
 from neusee.workflows.training.mask_design.design_terms import Terms
 from neusee.workflows.training.mask_design.optimizers import Kept, Learnt, learn
 
@@ -106,7 +106,7 @@ class Made:
             "stage": "mask",
             "recipe": recipe.name,
             **({"command": " ".join(command)} if command else {}),
-            "date": now(),
+            "date": timestamp(),
             "settings": how.model_dump(mode="json"),
             "versions": versions(),
         }
@@ -128,7 +128,7 @@ def _at(recipe: Recipe, how: MaskTraining) -> Recipe:
     try:
         return changed(recipe, [f"{name}={_word(value)}" for name, value in how.at.items()])
     except RecipeError as error:
-        raise DesignError(f"at: {error.problems[0].path}: {error.problems[0].message}") from error
+        raise DesignError(f"at: {error.diagnostics[0].path}: {error.diagnostics[0].message}") from error
 
 
 def _word(value: Any) -> str:

@@ -60,7 +60,7 @@ class Terms:
 
     def __init__(self, recipe: Recipe, how: MaskTraining, store: Store | None, device: str = "cpu") -> None:
         need_steps(recipe.steps, how)
-        self.how, self.recipe = how, replace(recipe, keep_all=True)  # a bound of the relief's effect has no gradient
+        self.how, self.recipe = how, replace(recipe, exact=True)  # a bound of the relief's effect has no gradient
         self._bands = _bands_step(self.recipe, how.psf)
         self._function = as_function(
             self.recipe, how.height, self._bands, outputs=[how.psf], store=store, device=device

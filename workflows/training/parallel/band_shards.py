@@ -127,7 +127,7 @@ def _mixed(recipe: Recipe, name: str) -> bool:
     """Whether a step gives a mixture of planes, of which no part is one band."""
     while (kind := recipe.steps[name].node.hints["return"]) is not Mixture:
         step = recipe.steps[name]
-        through = next((w for i in step.node.mixtures if isinstance(w := step.wires.get(i), str)), None)
+        through = next((w for i in step.node.accepts_low_rank if isinstance(w := step.wires.get(i), str)), None)
         if through is None or Mixture not in get_args(kind):
             return False
         name = through

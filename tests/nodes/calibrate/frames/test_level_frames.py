@@ -145,17 +145,17 @@ def test_other_shapes_are_refused(tmp_path, shape):
 def test_a_kind_that_is_not_read_is_refused_before_the_run(tmp_path):
     (tmp_path / "a.raw").write_bytes(b"1")
     with pytest.raises(ParameterError, match=r"a\.raw: no frames are read from \.raw: give \.png"):
-        frames.before(files=(tmp_path / "a.raw",))
-    assert frames.before(files=(png(tmp_path / "a.png", NUMBERS),)) == []
+        frames.hooks.preflight(files=(tmp_path / "a.raw",))
+    assert frames.hooks.preflight(files=(png(tmp_path / "a.png", NUMBERS),)) == []
 
 
 def test_fits_without_astropy_says_what_to_install(tmp_path, monkeypatch):
     known = importlib.util.find_spec
     monkeypatch.setattr(importlib.util, "find_spec", lambda name, *a: None if name == "astropy" else known(name, *a))
     with pytest.raises(ParameterError, match=r"pip install 'neusee\[fits\]'"):
-        frames.before(files=(tmp_path / "a.fits",))
+        frames.hooks.preflight(files=(tmp_path / "a.fits",))
 
 
 def test_the_check_says_the_range(tmp_path):
     found = read(png(tmp_path / "a.png", NUMBERS))
-    assert frames.after(found)[0].text == "1 frames of 2 x 4, 0 to 65535 DN"
+    assert frames.hooks.check(found)[0].text == "1 frames of 2 x 4, 0 to 65535 DN"

@@ -36,14 +36,14 @@ def test_exposures_have_a_unit(file, unit, seconds):
 
 def test_a_byte_order_mark_and_other_names(file):
     file.write_text("\ufeff" + TEXT.replace("photons", "light"), encoding="utf-8")
-    assert table.before(file=file, photons="light", mean="mean", drift=None) == []
+    assert table.hooks.preflight(file=file, photons="light", mean="mean", drift=None) == []
     assert table(file=file, photons="light").photons.tolist() == [0.0, 50.5]
 
 
 @pytest.mark.parametrize("parameter", ["photons", "exposure", "pixels", "mean", "variance", "drift"])
 def test_a_missing_column_is_told_before_the_run(file, parameter):
     with pytest.raises(ParameterError, match=r"t\.csv has no column 'lost': name one of photons, exposure_s") as caught:
-        table.before(file=file, **{parameter: "lost"})
+        table.hooks.preflight(file=file, **{parameter: "lost"})
     assert caught.value.parameter == parameter
 
 
@@ -73,5 +73,5 @@ def test_what_is_no_number_is_told_with_its_place(file, old, new, message):
 
 def test_the_check_wants_a_dark(file):
     found = table(file=file)
-    assert table.after(found)[0].ok
-    assert not table.after(found._replace(photons=found.photons + 1))[0].ok
+    assert table.hooks.check(found)[0].ok
+    assert not table.hooks.check(found._replace(photons=found.photons + 1))[0].ok

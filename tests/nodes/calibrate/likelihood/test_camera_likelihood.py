@@ -196,14 +196,14 @@ def test_a_level_without_scatter_and_light_that_does_nothing_are_refused():
 
 def test_the_check_says_what_was_used():
     found = camera(around(), **SENSOR)
-    assert camera.after(found, around())[0].text.endswith("of 12 means and variances, 6 of 8 levels")
-    assert camera.after(found, around())[0].ok
-    assert camera.after(camera(around(), **SENSOR, told=False), around()) == []
+    assert camera.hooks.check(found, around())[0].text.endswith("of 12 means and variances, 6 of 8 levels")
+    assert camera.hooks.check(found, around())[0].ok
+    assert camera.hooks.check(camera(around(), **SENSOR, told=False), around()) == []
 
 
 def test_the_check_doubts_levels_that_rounding_decides():
     quiet = around()._replace(variance=torch.where(torch.arange(8) == 1, 0.2, around().variance))
-    assert [c.ok for c in camera.after(camera(quiet, **SENSOR), quiet)] == [True, False]
+    assert [c.ok for c in camera.hooks.check(camera(quiet, **SENSOR), quiet)] == [True, False]
 
 
 PRIOR = {"gain": (0.5, 2.0), "dark_signal": (50.0, 10.0), "lamp": (0.01, 3.0), "twist": (0.0, 0.05)}
@@ -242,4 +242,4 @@ def test_priors_that_are_none_are_refused():
         camera_prior()
     with pytest.raises(ValueError, match=r"dark_noise: \[0, 2\] is no law"):
         camera_prior(dark_noise=(0.0, 2.0))
-    assert camera_prior.after(camera_prior(**PRIOR))[0].text == "4 free: gain, dark_signal, lamp, twist"
+    assert camera_prior.hooks.check(camera_prior(**PRIOR))[0].text == "4 free: gain, dark_signal, lamp, twist"

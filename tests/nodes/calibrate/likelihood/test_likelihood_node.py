@@ -173,7 +173,7 @@ def test_at_any_size_of_anything_there_is_a_number_or_none(gain, noise, dark, we
 
 def test_levels_are_taken_apart_and_nothing_is_lost():
     whole = measured(frames())
-    parts, reference = sufficient(whole), sufficient.ref(whole)
+    parts, reference = sufficient(whole), sufficient.hooks.reference(whole)
     count = parts.numbers.index_add(0, parts.cell_level, parts.cell_count)
     assert torch.equal(count, whole.numbers)
     sums = (parts.numbers * parts.mean).index_add(0, parts.cell_level, parts.cell_count * parts.cell_value)

@@ -27,12 +27,12 @@ def test_agrees_with_the_direct_sum_for_any_size(y, x, m, n, border):
     scene, psf = rand(2, y, x), as_psf(rand(2, m, n))
     found = image(scene, psf, border=border)
     assert found.shape == scene.shape
-    torch.testing.assert_close(found, image.ref(scene, psf, border=border), rtol=1e-12, atol=1e-12)
+    torch.testing.assert_close(found, image.hooks.reference(scene, psf, border=border), rtol=1e-12, atol=1e-12)
 
 
 def test_single_precision_agrees_within_the_agreed_error():
     scene, kernel = rand(2, 60, 50, dtype=torch.float32), rand(2, 33, 48, dtype=torch.float32)
-    exact = image.ref(scene, as_psf(kernel))
+    exact = image.hooks.reference(scene, as_psf(kernel))
     assert image(scene, as_psf(kernel)).dtype == torch.float32
     assert float((image(scene, as_psf(kernel)) - exact).abs().max() / exact.max()) < image.rtol
 
@@ -84,10 +84,10 @@ def test_check_says_how_much_light_is_kept():
     scene = torch.zeros(1, 9, 9)
     scene[0, 4, 4] = 2.0
     psf = as_psf(torch.full((1, 3, 3), 0.1))
-    (line,) = image.after(image(scene, psf), scene, psf)
+    (line,) = image.hooks.check(image(scene, psf), scene, psf)
     assert line.ok
     assert line.text == "flux kept 90.00%"
-    assert "no light" in image.after(scene * 0, scene * 0, psf)[0].text
+    assert "no light" in image.hooks.check(scene * 0, scene * 0, psf)[0].text
 
 
 def test_smooth_sizes():

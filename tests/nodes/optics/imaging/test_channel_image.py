@@ -73,7 +73,7 @@ sizes = st.integers(1, 9)
 @given(sizes, sizes, st.integers(1, 20), st.integers(1, 20), st.integers(1, 4), st.sampled_from(["zero", "reflect"]))
 def test_agrees_with_the_bands_for_any_size(y, x, m, n, k, border):
     scene, psf, weights = mixed(rand(k, y, x) - 0.3, rand(5, k) - 0.2), as_psf(rand(5, m, n)), rand(3, 5)
-    found, exact = (f(scene, psf, weights, border=border) for f in (image_channels, image_channels.ref))
+    found, exact = (f(scene, psf, weights, border=border) for f in (image_channels, image_channels.hooks.reference))
     assert found.planes.shape == (3, y, x)
     torch.testing.assert_close(found.planes, exact.planes, rtol=1e-11, atol=1e-11)
     torch.testing.assert_close(found.flux, exact.flux, rtol=1e-11, atol=1e-11)
@@ -143,7 +143,7 @@ def top_holds(seed):
     exact = band_by_band(cube, psf, weights, border)
     assert off(found.planes, exact) <= float(found.bound), seed
     assert brightest(found.planes, exact) <= float(found.largest), seed
-    assert image_channels.deviation(found) == (float(found.bound), float(found.largest))
+    assert image_channels.hooks.approximation_error(found) == (float(found.bound), float(found.largest))
     return float(found.largest) / max(brightest(found.planes, exact), 1e-300)
 
 
@@ -192,7 +192,7 @@ def test_bands_that_no_row_sees_are_left_out():
         found = image_channels(scene, psf, weights, within=within)
         assert 31 - int(found.kept[2]) >= out
         assert off(found.planes, of_mixture(scene, psf, weights)) <= float(found.bound)
-        assert "left out" in image_channels.after(found, within=within)[0].text
+        assert "left out" in image_channels.hooks.check(found, within=within)[0].text
 
 
 def test_fewer_kernels_where_the_rows_are_alike():
@@ -216,8 +216,8 @@ def test_what_the_mixture_lacks_is_part_of_the_bound():
     found = image_channels(rough, psf, rand(2, 6), within=1e-3)
     error = off(found.planes, band_by_band(cube, psf, rand(2, 6)))
     assert 1e-3 < error <= float(found.bound)
-    assert not image_channels.after(found, within=1e-3)[0].ok
-    assert image_channels.deviation(found) == (float(found.bound), math.inf)
+    assert not image_channels.hooks.check(found, within=1e-3)[0].ok
+    assert image_channels.hooks.approximation_error(found) == (float(found.bound), math.inf)
 
 
 def test_darkness_and_rows_of_nothing_are_exact():
@@ -272,5 +272,5 @@ def test_inputs_of_other_bands_are_refused():
 
 
 def test_channels_know_what_stands_in_for_an_image():
-    assert image.collapsed is image_channels
+    assert image.channel_sum_form is image_channels
     assert Channels(rand(1, 2, 2), rand(1, 3), rand(3), rand(1)[0]).kept.shape == (5,)

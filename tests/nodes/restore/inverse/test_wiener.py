@@ -184,9 +184,9 @@ def test_a_point_for_a_psf_and_no_noise_change_nothing():
 def test_check_says_what_was_not_seen():
     electrons, clipped = torch.full((1, 4, 4), 8.0), torch.zeros(1, 4, 4, dtype=torch.bool)
     clipped[0, 0, 0] = True
-    (line,) = wiener.after(electrons, electrons, None, None, None, None, clipped)
+    (line,) = wiener.hooks.check(electrons, electrons, None, None, None, None, clipped)
     assert line.text == f"{1 / 16:.2%} not seen, mean 1.00 of the raw"
-    assert not wiener.after(electrons * math.nan, electrons, None, None, None, None, clipped)[0].ok
+    assert not wiener.hooks.check(electrons * math.nan, electrons, None, None, None, None, clipped)[0].ok
 
 
 def test_the_first_guess_of_the_glare_is_least_squares_beside_a_constant():

@@ -418,8 +418,8 @@ def test_a_file_of_weights_tells_what_its_tensors_do_not(tmp_path, option, learn
     net = begun(lambda: FFTMamba(**sizes, **{option: learnt}))
     save_file(net.state_dict(), file := tmp_path / "net.safetensors", told(net))
     with pytest.raises(ParameterError, match=f"net.safetensors.*{said}") as caught:
-        fft_mamba.before(**sizes, **usual, weights=file)
+        fft_mamba.hooks.preflight(**sizes, **usual, weights=file)
     assert caught.value.parameter == "weights"
-    assert fft_mamba.before(**sizes, **usual | {option: learnt}, weights=file) == []
+    assert fft_mamba.hooks.preflight(**sizes, **usual | {option: learnt}, weights=file) == []
     picture = torch.rand(3, 12, 16, generator=seeded())
     assert torch.equal(fft_mamba(picture, **sizes, **{option: learnt}, weights=file), net(picture[None])[0])

@@ -248,14 +248,14 @@ def test_the_node_gives_what_the_network_gives(name, saved):
     net, path = saved(name)
     picture = 3 * drawn(3, 19, 13) - 1  # beside a lamp, and out of gamut
     node = node_of(name)
-    assert node.before(**PARAMS[name], weights=path) == []
+    assert node.hooks.preflight(**PARAMS[name], weights=path) == []
     with torch.no_grad():
         wanted = net(picture[None])[0]
     found = node(picture, **PARAMS[name], weights=path)
     assert torch.equal(found, node(picture, **PARAMS[name], weights=path))
     assert_close(found, wanted, rtol=2e-6, atol=2e-6)  # weights lie elsewhere, by which some processors round
     assert not found.requires_grad
-    assert node.after(found, picture, **PARAMS[name], weights=path)[0].ok
+    assert node.hooks.check(found, picture, **PARAMS[name], weights=path)[0].ok
     _, other = saved(name, 1)
     assert float((found - node(picture, **PARAMS[name], weights=other)).abs().max()) > 1e-2
 
@@ -295,7 +295,7 @@ def test_slopes_reach_the_picture_through_the_node(name, saved):
 def test_without_weights_it_is_refused_with_what_to_give(name):
     node = node_of(name)
     with pytest.raises(ParameterError, match=r"give the \.safetensors file") as caught:
-        node.before(**PARAMS[name])
+        node.hooks.preflight(**PARAMS[name])
     assert caught.value.parameter == "weights"
     with pytest.raises(ParameterError, match=r"give the \.safetensors file"):
         node(drawn(3, 8, 8), **PARAMS[name])
@@ -306,7 +306,7 @@ def test_weights_of_another_network_are_refused_by_their_name(name, saved, tmp_p
     net, path = saved(name)
     node = node_of(name)
     with pytest.raises(ParameterError, match=r"\(width 8\) has") as caught:
-        node.before(**PARAMS[name] | {"width": 8}, weights=path)
+        node.hooks.preflight(**PARAMS[name] | {"width": 8}, weights=path)
     assert caught.value.parameter == "weights"
     state = dict(net.state_dict())
     save_file({k: v for k, v in state.items() if k != "last.bias"}, tmp_path / "less.safetensors")
@@ -320,7 +320,7 @@ def test_weights_of_another_network_are_refused_by_their_name(name, saved, tmp_p
         ("text", "text.safetensors is no safetensors file"),
     ):
         with pytest.raises(ParameterError, match=words):
-            node.before(**PARAMS[name], weights=tmp_path / f"{file}.safetensors")
+            node.hooks.preflight(**PARAMS[name], weights=tmp_path / f"{file}.safetensors")
 
 
 @pytest.mark.parametrize("wrong", [torch.rand(1, 8, 8), torch.rand(2, 3, 8, 8), torch.rand(8, 8)])

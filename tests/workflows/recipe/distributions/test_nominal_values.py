@@ -101,7 +101,7 @@ def test_a_law_that_is_none_is_refused_once_and_where_it_stands(law, message):
     with pytest.raises(RecipeError, match=message) as error:
         load("first_light", [f"sensor.read_noise={law}"])
     assert str(error.value).startswith("argument 1 ")
-    assert len(error.value.problems) == 1
+    assert len(error.value.diagnostics) == 1
 
 
 def test_a_law_of_the_wrong_unit_is_refused_by_what_reads_it():

@@ -29,14 +29,14 @@ def composed(files):
         if text is not None:
             (files / "mine.yaml").write_text(text)
         result = compose("mine.yaml", arguments, files)
-        return result.root.plain, [" | ".join((str(p.mark), p.path, p.message)) for p in result.problems]
+        return result.root.plain, [" | ".join((str(p.mark), p.path, p.message)) for p in result.diagnostics]
 
     return composed
 
 
 def test_groups_come_in_order_and_the_recipe_over_them(composed):
-    root, problems = composed()
-    assert not problems
+    root, diagnostics = composed()
+    assert not diagnostics
     assert root["lens"] == {"f": 3, "stop": 2}
     assert list(root) == ["lens", "steps", "seed", "outputs"]
 
@@ -46,15 +46,15 @@ def test_a_group_that_is_null_is_skipped(composed):
 
 
 def test_an_argument_swaps_a_group(composed):
-    root, problems = composed("lens=tele", "laser=green")
-    assert not problems
+    root, diagnostics = composed("lens=tele", "laser=green")
+    assert not diagnostics
     assert root["lens"] == {"f": 3, "stop": 8, "coat": [1, {"x": 2}]}
     assert root["lasers"] == {"green": {"wavelength": "532 nm"}}
 
 
 def test_a_group_can_be_added_and_taken_away(composed):
-    root, problems = composed("+scene=siemens", "~lens")
-    assert not problems
+    root, diagnostics = composed("+scene=siemens", "~lens")
+    assert not diagnostics
     assert set(root["scene"]) == {"shape"}  # from the packaged groups
     assert root["lens"] == {"f": 3}
 
@@ -88,8 +88,8 @@ def test_the_folder_beside_the_recipe_comes_before_the_packaged_one(composed, wr
     ],
 )
 def test_an_argument_sets_a_value(composed, argument, path, value):
-    root, problems = composed("lens=tele", argument)
-    assert not problems
+    root, diagnostics = composed("lens=tele", argument)
+    assert not diagnostics
     for key in path:
         root = root[key]
     assert root == value
@@ -97,14 +97,14 @@ def test_an_argument_sets_a_value(composed, argument, path, value):
 
 
 def test_a_parameter_of_a_step_can_be_set_though_no_one_wrote_it(composed):
-    root, problems = composed("steps.a.with.bits=12", "steps.a.each=lasers", "steps.a.with.samples=5")
-    assert not problems
+    root, diagnostics = composed("steps.a.with.bits=12", "steps.a.each=lasers", "steps.a.with.samples=5")
+    assert not diagnostics
     assert root["steps"]["a"] == {"node": "toy.height", "each": "lasers", "with": {"samples": 5, "bits": 12}}
 
 
 def test_a_value_can_be_taken_away(composed):
-    root, problems = composed("~lens.stop", "~steps.b", "~outputs.0")
-    assert not problems
+    root, diagnostics = composed("~lens.stop", "~steps.b", "~outputs.0")
+    assert not diagnostics
     assert root["lens"] == {"f": 3}
     assert list(root["steps"]) == ["a"]
     assert root["outputs"] == []
@@ -199,8 +199,8 @@ def test_an_option_names_no_other_groups(composed, write):
 def test_every_broken_file_is_reported(composed, write):
     write("a: [\n", "lens/wide.yaml")
     write("a: 1\na: 2\n", "laser/green.yaml")
-    problems = composed("laser=green", "lens.f=[")[1]
-    assert [p.partition(" ")[0] for p in problems] == ["argument", "lens/wide.yaml:2:1", "laser/green.yaml:2:1"]
+    diagnostics = composed("laser=green", "lens.f=[")[1]
+    assert [p.partition(" ")[0] for p in diagnostics] == ["argument", "lens/wide.yaml:2:1", "laser/green.yaml:2:1"]
 
 
 def test_an_unknown_recipe_gets_the_nearest(files):

@@ -8,12 +8,12 @@ from hypothesis import strategies as st
 from ruamel.yaml import YAML
 
 import neusee.recipes
-from neusee.workflows.graph.diagnostics import Mark, RecipeError
+from neusee.workflows.graph.diagnostics import Location, RecipeError
 from neusee.workflows.graph.final_values import flow
 from neusee.workflows.recipe.text import yaml_values
 from neusee.workflows.recipe.text.yaml_values import parse, read
 
-TOP = Mark("f.yaml", 1, 1)
+TOP = Location("f.yaml", 1, 1)
 
 
 def plain(text):
@@ -23,7 +23,7 @@ def plain(text):
 def refused(text):
     with pytest.raises(RecipeError) as caught:
         parse(text, TOP)
-    return "\n".join(" / ".join(filter(None, (str(p.mark), p.path, p.message))) for p in caught.value.problems)
+    return "\n".join(" / ".join(filter(None, (str(p.mark), p.path, p.message))) for p in caught.value.diagnostics)
 
 
 @pytest.mark.parametrize(

@@ -115,7 +115,7 @@ def test_a_recipe_without_a_knob_says_so(nodes, write, tmp_path):
 
 def test_the_reference_is_the_same_sampling_in_double_with_everything_kept(recipe):
     best = finest(recipe)
-    assert best.keep_all
+    assert best.exact
     assert best.steps["psf"].params["precision"] == "double"
     assert best.steps["bands"].params == recipe.steps["bands"].params
     assert (best.name, best.seed, best.outputs) == (recipe.name, recipe.seed, recipe.outputs)
@@ -181,7 +181,7 @@ def test_a_point_is_another_with_another_tolerance_recipe_seed_or_number_of_seed
     keys = {
         bench.key(recipe),
         bench.key(replace(recipe, tolerance=1e-2)),
-        bench.key(replace(recipe, keep_all=True)),
+        bench.key(replace(recipe, exact=True)),
         bench.key(replace(recipe, seed=4)),
         bench.key(changed(recipe, ["optics.bands=8"])),
         Bench(finest(recipe), store, seeds=3).key(recipe),

@@ -15,7 +15,7 @@ from typer.testing import CliRunner
 from neusee.nodes.calibrate._likelihood import _linear_sensor
 from neusee.workflows.calibration import emcee_sampler
 from neusee.workflows.calibration.initial_guess import begin
-from neusee.workflows.calibration.log_posterior import Problem
+from neusee.workflows.calibration.log_posterior import SensorPosterior
 from neusee.workflows.calibration.posterior_mode import log_law, peak
 from neusee.workflows.recipe.loading import load
 from neusee.workflows.store.result_store import Store
@@ -329,7 +329,7 @@ def test_the_command_ends_with_one_where_a_bar_fails(tmp_path, monkeypatch):
 @pytest.fixture(scope="module")
 def sensitive(tmp_path_factory):
     recipe = load("calibrate", ["flats.shape=[64, 64]"])
-    problem = Problem.of(recipe, Store(tmp_path_factory.mktemp("store")))
+    problem = SensorPosterior.of(recipe, Store(tmp_path_factory.mktemp("store")))
     return problem, {name: float(recipe.steps["density"].params[name]) for name in problem.names}
 
 
@@ -359,7 +359,7 @@ def test_weighing_anew_gives_what_a_wider_prior_gives(sensitive, tmp_path):
     kinds = dict.fromkeys(problem.names, "estimate")
     found = {f.name: f for f in sensitivity(problem, drawn_of(problem, truth), kinds).findings}["dark_current"]
     wide = ["flats.shape=[64, 64]", "steps.prior.with.dark_current=[0.002 e-, 100]"]  # 10 squared
-    other = Problem.of(load("calibrate", wide), Store(tmp_path))
+    other = SensorPosterior.of(load("calibrate", wide), Store(tmp_path))
     direct = other.parameters(drawn_of(other, truth))["dark_current"]
     moved = float(direct.mean()) - found.value
     assert abs(moved) > 2 * float(direct.std()) / 4000**0.5

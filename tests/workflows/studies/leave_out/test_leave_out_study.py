@@ -11,14 +11,14 @@ from torch import Tensor
 
 from neusee.nodes import node
 from neusee.workflows.engine.runner import run
-from neusee.workflows.graph.diagnostics import Mark
+from neusee.workflows.graph.diagnostics import Location
 from neusee.workflows.graph.recipe_graph import Recipe, Step
 from neusee.workflows.recipe.loading import load
 from neusee.workflows.store.result_store import Store
 from neusee.workflows.studies.leave_out import leave_out_study, omission_rows, scene_costs
 from neusee.workflows.studies.leave_out.omission_rows import Bench, surely
 
-MARK = Mark("recipe.yaml", 1, 1)
+MARK = Location("recipe.yaml", 1, 1)
 SMALL = (
     "scene.shape=[64, 64]",
     "sensor.shape=[48, 48]",
@@ -40,7 +40,7 @@ def glow(x: Tensor, *, amount: float = 0.0, stated: float = 1.0) -> Tensor:
     return x + amount
 
 
-@glow.negligible
+@glow.skip_bound
 def _(x, *, amount, stated):
     return stated * abs(amount) / (x.max + amount)
 
@@ -50,7 +50,7 @@ def hiss(x: Tensor, *, sigma: float, stated: float = 1.0, rng: torch.Generator) 
     return x + sigma * torch.randn(x.shape, generator=rng)
 
 
-@hiss.negligible
+@hiss.skip_bound
 def _(x, *, sigma, stated):
     return stated * sigma / math.hypot(x.max, sigma)
 
@@ -60,12 +60,12 @@ def lamp(*, power: float = 1.0) -> Tensor:
     return torch.full((1001,), power).index_fill(0, torch.tensor([3]), 0.0)
 
 
-@lamp.absent
+@lamp.zero_bound
 def _(*, power):
     return 2 * power
 
 
-@node(adds=[("lamps",)])
+@node(additive_inputs=[("lamps",)])
 def both(x: Tensor, lamps: list[Tensor]) -> Tensor:
     return x + sum(lamps)
 
@@ -166,7 +166,7 @@ def test_neighbours_that_are_both_left_out_are_put_back_one_by_one(study):
 
 
 def test_with_everything_kept_nothing_is_chosen(study):
-    doc, _, _ = study(replace(camera(), keep_all=True), contents=False)
+    doc, _, _ = study(replace(camera(), exact=True), contents=False)
     assert not any(row["taken"] for row in doc["rows"])
     assert doc["outputs"][0]["rms"] == 0
 
@@ -247,8 +247,8 @@ def test_scenes_of_a_recipe(tmp_path):
     assert not any("ghost" in name or name == "dirt" for name in scenes["clean window"].steps)
     assert scenes["one wavelength"].steps["bands"].params["count"] == 1
     assert scenes["grey scene"].steps["scene"].node.path == "scene.targets"
-    assert scenes["everything in full"].keep_all
-    assert not scenes["no laser"].keep_all
+    assert scenes["everything in full"].exact
+    assert not scenes["no laser"].exact
 
 
 @pytest.mark.slow

@@ -8,7 +8,7 @@ import pytest
 import torch
 
 from neusee.nodes import node
-from neusee.workflows.graph.diagnostics import Mark
+from neusee.workflows.graph.diagnostics import Location
 from neusee.workflows.graph.recipe_graph import Step
 from neusee.workflows.keys.code_digest import Code
 from neusee.workflows.recipe.loading import load
@@ -25,7 +25,7 @@ BY_NAME = {case.name: case for case in CASES}
 
 
 def step_of(fn, **params):
-    return Step("it", fn, params, {}, Mark("test"), {})
+    return Step("it", fn, params, {}, Location("test"), {})
 
 
 @node(rtol=1e-5)

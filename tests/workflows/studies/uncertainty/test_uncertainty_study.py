@@ -188,7 +188,7 @@ def test_the_error_of_sequences_is_what_repetitions_show():
 
 def test_what_does_not_vary_has_no_deviation_and_no_error():
     found = scatter(np.full((100, 2), 0.1 + 0.2))
-    assert found.still
+    assert found.is_constant
     assert found.error == 0.0
 
 

@@ -43,7 +43,7 @@ def whole(tmp_path_factory):
 def test_the_weights_are_those_that_the_lift_takes(whole):
     weights = whole / "mst_plus_plus.safetensors"
     assert sum(tensor.numel() for tensor in load_file(weights).values()) == 1_619_625
-    assert lift_mst_plus_plus.before(weights=weights) == []
+    assert lift_mst_plus_plus.hooks.preflight(weights=weights) == []
     scene = bands(start=400e-9, stop=700e-9, count=31)
     rgb = torch.rand(3, 12, 12, generator=torch.Generator().manual_seed(2))
     cube = lift_mst_plus_plus(rgb, scene, weights=weights, rng=torch.Generator())

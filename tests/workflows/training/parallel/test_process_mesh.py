@@ -17,7 +17,7 @@ from neusee.workflows import Store, load
 from neusee.workflows.training.parallel.band_shards import Shards
 from neusee.workflows.training.parallel.process_mesh import Mesh, MeshError, shape_of
 from neusee.workflows.training.run_training import _photographs, train
-from neusee.workflows.training.training_pictures import Samples
+from neusee.workflows.training.training_pictures import TrainingStream
 
 ROOT = Path(__file__).parents[4]
 SMALL = [
@@ -207,4 +207,4 @@ def test_a_psf_that_couples_its_bands_is_named(tmp_path):
 
 def samples(recipe, folder, mesh):
     how = recipe.training
-    return Samples(recipe, how, _photographs(recipe, how, True), Store(folder), "cpu", None, mesh)
+    return TrainingStream(recipe, how, _photographs(recipe, how, True), Store(folder), "cpu", None, mesh)
