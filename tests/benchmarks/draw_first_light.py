@@ -39,7 +39,7 @@ def compare(axis, total, centre):
         peak = float(total[arm].max())
         axis.semilogy(torch.arange(total[arm].shape[-1]) - centre, total[arm].amax(0), color=colour, lw=1.2)
         axis.axhline(peak, color=colour, lw=0.8, ls=":")
-        axis.text(-255, peak * 1.12, f"{name}: {peak:.3g}", color=colour, fontsize=9)
+        axis.text(-255, peak * 1.15, f"{name}: {peak:.3g}", color=colour, fontsize=8)
     axis.set(xlim=(-260, 260), ylim=(1, 3000))
     axis.set_title(CURVE[0], fontsize=11)
     axis.set_xlabel(CURVE[1], fontsize=9)
