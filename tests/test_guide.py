@@ -109,6 +109,11 @@ def test_every_command_line_parses_and_its_recipe_loads(words, folder, monkeypat
         composed(name, changes, read_pipelines(values["pipelines"], folder), folder)
 
 
+@pytest.mark.parametrize(("page", "least"), [("README", 11), ("commands", 20), ("own_frames", 6), ("recipes", 6)])
+def test_the_command_lines_are_found(page, least):
+    assert len(next(lines(path) for path in WRITTEN if path.stem == page)) >= least
+
+
 @pytest.mark.parametrize("words", ["runn", "study accurracy", "run --bogus", "evaluate --scenes none"])
 def test_a_wrong_command_line_does_not_parse(words):
     with pytest.raises(Exception, match=r"(?i)no such|should be a valid|is not a valid"):
