@@ -158,8 +158,8 @@ def plan(
 ) -> None:
     """Say what a run would compute, where and for how long.
 
-    Nothing is computed. Seconds, bytes to load and memory are those of earlier runs; a step that never ran shows
-    a question mark. With --devices the run is simulated on machines that you do not have: makespan, utilisation
+    Nothing is computed. Seconds, bytes and memory are those of earlier runs of the same step, even at another size;
+    a step that never ran shows a question mark. With --devices the run is simulated on machines that you do not have: makespan, utilisation
     and critical path.
     """
     recipe, _ = load(words, keep_all=keep_all)
