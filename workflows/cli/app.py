@@ -159,8 +159,8 @@ def plan(
     """Say what a run would compute, where and for how long.
 
     Nothing is computed. Seconds, bytes and memory are those of earlier runs of the same step, even at another size;
-    a step that never ran shows a question mark. With --devices the run is simulated on machines that you do not have: makespan, utilisation
-    and critical path.
+    a step that never ran shows a question mark. With --devices the run is simulated on machines that you do not
+    have: makespan, utilisation and critical path.
     """
     recipe, _ = load(words, keep_all=keep_all)
     from neusee.workflows.explain import run_forecast
