@@ -179,6 +179,17 @@ def test_the_bound_holds_and_is_carried(store):
     assert 0 < measured <= result.proof.of("out") <= 1.1 * measured
 
 
+@pytest.mark.parametrize("amount", [1.0, 50.0, 75.0])
+def test_the_bound_is_a_share_of_what_is_left_and_not_of_what_was_left_out(store, amount):
+    """A share of the full result is a greater share of the result without: 75 of 175, and 75 of 100."""
+    steps = chain(amount)
+    result = run(recipe(*steps, tolerance=0.8), store)
+    full = run(recipe(*steps, keep_all=True), store)["out"]
+    assert states(result) == ["left out"]
+    off = float((full - result["out"]).square().mean().sqrt() / result["out"].max())
+    assert result.proof.of("out") == pytest.approx(off, rel=1e-6)
+
+
 def test_where_the_bound_grows_on_the_way_less_is_left_out(store):
     """What was 0.5 % of all the light is 25 % of what the window keeps."""
     steps = chain(0.5, last=step("out", corner, x="g0"))

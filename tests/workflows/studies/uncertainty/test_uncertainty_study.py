@@ -172,6 +172,15 @@ def test_the_error_of_a_deviation_is_that_of_the_closed_form(law, kurtosis):
     assert np.median(said) == pytest.approx(shown.std() / shown.mean(), rel=0.15)
 
 
+@pytest.mark.parametrize("count", [3, 5, 64])
+def test_the_error_of_a_deviation_is_that_of_leaving_out_one_draw_after_another(count):
+    """Efron's jackknife, each deviation worked out anew."""
+    x = np.random.default_rng(2).exponential(size=count)
+    each = np.array([np.delete(x, i).std(ddof=1) for i in range(count)])
+    wanted = math.sqrt((count - 1) / count * ((each - each.mean()) ** 2).sum()) / x.std(ddof=1)
+    assert scatter(x[:, None]).error == pytest.approx(wanted, rel=1e-9)
+
+
 def test_the_error_of_sequences_is_what_repetitions_show():
     inputs = Inputs.of(small("transfer", *LAWS))
     deviations, said = [], []
