@@ -144,6 +144,14 @@ def test_with_keep_all_nothing_is_left_out(store):
     assert states(run(recipe(*chain(0.0, 0.1), keep_all=True), store)) == ["run", "run"]
 
 
+def test_what_changes_nothing_is_left_out_where_nothing_is_allowed():
+    facts = Facts((2,), "float32", 0.0, 100.0, 100.0, 1, True)
+    for amount in (0.0, 1e-300):
+        glowing = step("g", glow, {"amount": amount}, x="l")
+        ledger = Ledger(recipe(step("l", light), glowing, outputs="g", tolerance=0.0))
+        assert ledger.verdict(glowing, glowing.params, lambda name: facts).left_out == (amount == 0)
+
+
 def test_of_the_tolerance_of_a_recipe_with_economies_half_is_theirs():
     facts = Facts((2,), "float32", 0.0, 100.0, 100.0, 1, True)
     glowing = step("g", glow, {"amount": 0.6}, x="l")

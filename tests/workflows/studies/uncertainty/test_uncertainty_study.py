@@ -226,6 +226,19 @@ def test_shares_of_one_draw_that_differs_are_numbers():
     assert not found.told
 
 
+def test_a_polynomial_is_judged_by_draws_that_it_has_not_seen():
+    """As of fitting it again without each draw in turn."""
+    rng = np.random.default_rng(4)
+    z = rng.standard_normal((30, 2))
+    y = z[:, 0] + z[:, 0] * z[:, 1] + rng.standard_normal(30)
+    terms = np.stack([np.ones(30), *z.T, *(z.T**2), z[:, 0] * z[:, 1]], 1)
+    missed = []
+    for i in range(30):
+        fitted = np.linalg.lstsq(np.delete(terms, i, 0), np.delete(y, i), rcond=None)[0]
+        missed.append(y[i] - terms[i] @ fitted)
+    assert indices(["a", "b"], z, y, 1).explained == pytest.approx(1 - np.square(missed).mean() / y.var(), rel=1e-9)
+
+
 def test_a_polynomial_that_tells_nothing_is_not_believed():
     z = np.random.default_rng(1).standard_normal((400, 2))
     assert not indices(["a", "b"], z, np.sign(np.sin(9 * z[:, 0])), 1).told
