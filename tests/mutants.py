@@ -5,8 +5,8 @@ Each mutant is one fault in one file: a constant, a sign, a limit that is off by
 comparison that is turned round. Every mutant gets a temporary copy of the tree of its own, and there the tests that are
 named beside the mutant must fail. Before, the same tests must pass on a copy without any fault. Two lines are printed
 for each mutant: what became of it, and which test failed and how, for a test may fail for another reason. The exit
-status is 1 where a mutant survives, where its tests cannot be run, or where its old text does not
-stand exactly once in its file.
+status is 1 where a mutant survives, where its tests cannot be run, or where its old text does not stand exactly once in
+its file.
 """
 
 import os
@@ -316,7 +316,7 @@ def copied(to: Path) -> Path:
 
 def tested(tree: Path, tests: Sequence[str]) -> subprocess.CompletedProcess[str]:
     """Run the named tests in a copy of the tree until one fails."""
-    own = {"PYTHONPATH": str(tree / ".src"), "NEUSEE_CACHE": str(tree / "cache")}
+    own = {"PYTHONPATH": str(tree / ".src"), "NEUSEE_CACHE": str(tree / "cache"), "COLUMNS": "400"}
     return subprocess.run(
         [sys.executable, "-m", "pytest", "-x", "-q", "-n", "0", "-p", "no:cacheprovider", *tests],
         cwd=tree,
@@ -352,6 +352,9 @@ def sound(mutants: Sequence[Mutant]) -> bool:
 def main(words: Sequence[str]) -> int:
     """Try every mutant whose file contains one of the words, and return the exit status."""
     mutants = [m for m in MUTANTS if not words or any(word in m.file for word in words)]
+    if not mutants:
+        print(f"no mutant is in a file that contains {' or '.join(words)}")
+        return 1
     if not sound(mutants):
         print("these tests fail without any fault: no mutant was tried")
         return 1
