@@ -30,6 +30,9 @@ Words = Annotated[
     ),
 ]
 Debug = Annotated[bool, typer.Option("--debug", help="Show where in the code an error arose.")]
+Device = Annotated[str, typer.Option("--device", help="Where to compute: cpu, cuda, or several: cuda:0,cuda:1,cpu.")]
+KeepAll = Annotated[bool, typer.Option("--keep-all", help="Leave nothing out: every step in full.")]
+Memory = Annotated[str, typer.Option("--memory", help="What a device may use, such as 6 GB; more is refused.")]
 Out = Annotated[Path, typer.Option("--out", help="Folder in which to make the folder of results.")]
 
 

@@ -50,7 +50,7 @@ class Store:
         What stands in the JSON is always compared, and the size of every payload.
         """
         self.root = default_root() if root is None else Path(root)
-        self.verify = verify_mode(verify)
+        self.verify: Verify = verify_mode(verify)
         self.budget = budget_bytes(budget)
         self.disk = Disk(self.root)
         self.brief = Brief(self.disk)
