@@ -57,8 +57,7 @@ def train(
     device, (rank, world) = device_here(device), processes()
     check_device(device)
     quiet, who = quiet or rank > 0, f"process {rank}: " if world > 1 else ""
-    there = recipe.training.learnt if recipe.training else ()
-    stages = there if stage is Stages.BOTH else _NUMBERS[stage]
+    stages = _NUMBERS[stage] if stage is not Stages.BOTH else recipe.training.learnt if recipe.training else ()
     tell = (lambda line: None) if quiet else (lambda line: say([line]))
     told = ["neusee", "train", *command[2:], "--stage", stage.value, *(["--mesh", mesh] if mesh else [])]
     lengths = {s: recipe.training.stages[s].iterations for s in stages if s} if recipe.training else {}
