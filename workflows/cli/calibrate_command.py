@@ -23,7 +23,7 @@ def calibrate(
     """Find the posterior of a recipe's sensor from its levels, checked; run it again to go on."""
     recipe, command = load(words)
     from neusee.workflows.calibration import run_calibration
-    from neusee.workflows.engine.node_call import RunError
+    from neusee.workflows.graph.run_error import RunError
 
     tell = (lambda line: None) if quiet else (lambda line: say([line]))
     how = {"walkers": walkers, "move": move, "draws": draws}

@@ -61,8 +61,8 @@ def _given(how: dict[str, Any]) -> list[str]:
 
 def _evaluated(name: str, changes: list[str], pipelines: str, **how: Any) -> Path:
     """The folder of the evaluation, or one line of what is wrong."""
-    from neusee.workflows.engine.node_call import RunError
     from neusee.workflows.evaluation import run_evaluation as protocol
+    from neusee.workflows.graph.run_error import RunError
 
     here = Path.cwd()
     try:

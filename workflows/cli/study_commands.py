@@ -94,7 +94,7 @@ def uncertainty(
 
 def _made(kind: str, words: list[str] | None, quiet: bool, out: Path, **options: Any) -> None:
     recipe, command = load(words)
-    from neusee.workflows.engine.node_call import RunError
+    from neusee.workflows.graph.run_error import RunError
     from neusee.workflows.studies import run_study as studies
 
     given = [f"--{name}" if value is True else f"--{name} {value}" for name, value in options.items() if value]

@@ -50,7 +50,7 @@ def train(
             fail(f"{recipe.name} learns a lift, which has neither stages nor a mesh: leave --stage and --mesh out")
         check_device(device)
         return _lift(recipe, ["neusee", "train", *command[2:]], out, device, quiet)
-    from neusee.workflows.engine.node_call import RunError
+    from neusee.workflows.graph.run_error import RunError
     from neusee.workflows.training.parallel.process_mesh import MeshError, device_here, joined, processes
     from neusee.workflows.training.run_training import train as learn
 
@@ -77,7 +77,7 @@ def train(
 
 def _lift(recipe: Recipe, told: list[str], out: Path, device: str, quiet: bool) -> None:
     """Learn a lift from RGB to spectra."""
-    from neusee.workflows.engine.node_call import RunError
+    from neusee.workflows.graph.run_error import RunError
     from neusee.workflows.training.lift.lift_run import train_lift
 
     assert recipe.lifting is not None

@@ -15,13 +15,15 @@ from typing import Any
 from neusee.nodes import Check, TensorStats
 from neusee.workflows.engine.cost_model import Costs, Estimate
 from neusee.workflows.engine.dispatch import Loop, chains_of
+from neusee.workflows.engine.finished_step import error_in, facts_in, ran
 from neusee.workflows.engine.load_or_recompute import Upstream, cheaper_to_recompute, uses_of, worth_solving
 from neusee.workflows.engine.local_executor import Local
-from neusee.workflows.engine.node_call import RunError, places
+from neusee.workflows.engine.node_call import places
 from neusee.workflows.engine.placement_inputs import joined, past_costs, prepare, room_for
 from neusee.workflows.engine.step_job import Executor, InputMissing, Outcome, Read, StepJob
-from neusee.workflows.engine.step_record import Event, StepRecord, error_in, facts_in, ran
 from neusee.workflows.graph.recipe_graph import Recipe, Step, Wire, in_order
+from neusee.workflows.graph.run_error import RunError
+from neusee.workflows.graph.step_record import Event, StepRecord
 from neusee.workflows.keys.cache_key import Key, key_of
 from neusee.workflows.keys.code_digest import Code
 from neusee.workflows.placement.heft_and_cpop import Schedule, TooLarge

@@ -15,6 +15,7 @@ from neusee.nodes._bicubic_resize import resize
 from neusee.nodes.metrics import quality
 from neusee.workflows.engine.differentiable_function import as_function
 from neusee.workflows.engine.node_call import call, place
+from neusee.workflows.engine.provenance import timestamp
 from neusee.workflows.evaluation.evaluation_scenes import Scene
 from neusee.workflows.evaluation.pipelines import BEAM, NONE, Composed
 from neusee.workflows.graph.recipe_graph import Recipe, Step, needed
@@ -23,7 +24,6 @@ from neusee.workflows.keys.code_digest import Code
 from neusee.workflows.keys.engine_digest import engine
 from neusee.workflows.recipe.distributions.uncertain_inputs import Inputs
 from neusee.workflows.store.result_store import Store
-from neusee.workflows.studies.accuracy.work_precision_points import timestamp
 from neusee.workflows.tolerance.cheaper_steps import with_substitutions
 
 _MOVED = ("spot", "photons")  #: steps with whose results, and all that follows, another strength is another scene

@@ -18,7 +18,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from neusee.workflows.engine.node_call import versions
+from neusee.workflows.engine.provenance import timestamp, versions
 from neusee.workflows.evaluation.comparison_pictures import Panel, panels
 from neusee.workflows.evaluation.confidence_intervals import METRICS, Interval, Table, against, table
 from neusee.workflows.evaluation.evaluation_points import Bench, Point, Wanted
@@ -31,7 +31,6 @@ from neusee.workflows.recipe.loading import load
 from neusee.workflows.report.run_folder import RunFolder, new_run
 from neusee.workflows.store.remote_store import open_store
 from neusee.workflows.store.result_store import Store
-from neusee.workflows.studies.accuracy.work_precision_points import timestamp
 
 if TYPE_CHECKING:
     pass

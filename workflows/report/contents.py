@@ -15,6 +15,9 @@ from __future__ import annotations
 from collections.abc import Mapping
 from dataclasses import dataclass
 
+from neusee.workflows.graph.recipe_graph import Recipe, needed
+from neusee.workflows.tolerance.cheaper_steps import with_substitutions
+
 
 @dataclass(frozen=True, slots=True)
 class Figure:
@@ -140,3 +143,15 @@ FILES: Mapping[str, tuple[str, Mapping[str, str]]] = {
     "raw_mask.exr": ("exr", {"image": "raw[mask]"}),
     "restored.exr": ("exr", {"image": "restored"}),
 }
+
+
+def wanted(recipe: Recipe) -> tuple[str, ...]:
+    """Return the recipe's outputs, the steps of its expected numbers, and those that the result table shows."""
+    promised = [e.step for e in recipe.expect]
+    shown = [s for s in (*(s for row in TABLE.values() for s in row.values()), *SHOWN) if s in recipe.steps]
+    return tuple(dict.fromkeys([*recipe.outputs, *promised, *shown]))
+
+
+def steps_of(recipe: Recipe) -> list[str]:
+    """Return every step that a run of ``recipe`` looks at, in running order."""
+    return needed(with_substitutions(recipe, wanted(recipe)), wanted(recipe))

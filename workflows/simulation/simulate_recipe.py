@@ -10,13 +10,14 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
-from neusee.workflows.engine.runner import Event, Result, StepRecord, run
+from neusee.workflows.engine.runner import Result, run
 from neusee.workflows.engine.step_job import Executor
 from neusee.workflows.explain.why_rerun import explained
-from neusee.workflows.graph.recipe_graph import Recipe, needed
+from neusee.workflows.graph.recipe_graph import Recipe
+from neusee.workflows.graph.step_record import Event, StepRecord
 from neusee.workflows.keys.cache_key import digest
 from neusee.workflows.report import run_page
-from neusee.workflows.report.contents import SHOWN, TABLE
+from neusee.workflows.report.contents import wanted
 from neusee.workflows.report.data_exports import exports
 from neusee.workflows.report.run_folder import RunFolder, new_run
 from neusee.workflows.report.run_pictures import pictures, timeline
@@ -38,13 +39,6 @@ class Simulation:
     def page(self) -> Path:
         """The page to open."""
         return self.folder / "report.html"
-
-
-def wanted(recipe: Recipe) -> tuple[str, ...]:
-    """The recipe's outputs, what its expected numbers read, and what the result table shows."""
-    promised = [e.step for e in recipe.expect]
-    shown = [s for s in (*(s for row in TABLE.values() for s in row.values()), *SHOWN) if s in recipe.steps]
-    return tuple(dict.fromkeys([*recipe.outputs, *promised, *shown]))
 
 
 def simulate(
@@ -79,11 +73,6 @@ def _both(told: dict[str, StepRecord], watch: Callable[[Event], None] | None) ->
             watch(event)
 
     return note
-
-
-def steps_of(recipe: Recipe) -> list[str]:
-    """Every step that a run of ``recipe`` looks at, in running order."""
-    return needed(with_substitutions(recipe, wanted(recipe)), wanted(recipe))
 
 
 def _run_key(result: Result) -> str:

@@ -19,7 +19,7 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, Literal
 
-from neusee.workflows.engine.node_call import versions
+from neusee.workflows.engine.provenance import versions
 from neusee.workflows.keys.cache_key import digest
 from neusee.workflows.report.console import aligned
 from neusee.workflows.report.run_folder import new_run

@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Any
 from neusee.nodes import units
 
 if TYPE_CHECKING:
-    from neusee.workflows.engine.runner import Event
+    from neusee.workflows.graph.step_record import Event
     from neusee.workflows.sweeps.axes import Axis, Point
     from neusee.workflows.sweeps.sweep_points import Number, Outcome
 

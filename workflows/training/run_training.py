@@ -12,7 +12,7 @@ import torch
 
 from neusee.nodes import doe
 from neusee.nodes._network_weights import told
-from neusee.workflows.engine.node_call import versions
+from neusee.workflows.engine.provenance import versions
 from neusee.workflows.graph.recipe_graph import Recipe
 from neusee.workflows.keys.cache_key import digest
 from neusee.workflows.recipe.blocks.mask_design_block import MaskSettings

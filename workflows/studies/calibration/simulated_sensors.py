@@ -24,12 +24,11 @@ from neusee.workflows.calibration.initial_guess import begin
 from neusee.workflows.calibration.log_posterior import SensorPosterior, _the
 from neusee.workflows.calibration.posterior_mode import LaplaceFit, peak
 from neusee.workflows.engine.differentiable_function import as_function
-from neusee.workflows.engine.node_call import versions
+from neusee.workflows.engine.provenance import timestamp, versions
 from neusee.workflows.graph.recipe_graph import Recipe, needed
 from neusee.workflows.keys.cache_key import digest, stream_seed
 from neusee.workflows.keys.engine_digest import engine
 from neusee.workflows.store.result_store import Store
-from neusee.workflows.studies.accuracy.work_precision_points import timestamp
 from neusee.workflows.studies.calibration.independent_draws import Drawn
 
 Sampler = Callable[[SensorPosterior, LaplaceFit, int], Drawn]  #: of a problem and its peak, by a seed

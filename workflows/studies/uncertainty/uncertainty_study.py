@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from torch import Tensor
 
-from neusee.workflows.engine.node_call import versions
+from neusee.workflows.engine.provenance import timestamp, versions
 from neusee.workflows.graph.recipe_graph import Recipe
 from neusee.workflows.keys.cache_key import digest
 from neusee.workflows.recipe.distributions.joint import Z_90
@@ -22,7 +22,6 @@ from neusee.workflows.recipe.distributions.uncertain_inputs import SCRAMBLES, In
 from neusee.workflows.report.run_folder import RunFolder, new_run
 from neusee.workflows.report.study_page import page
 from neusee.workflows.store.result_store import Store
-from neusee.workflows.studies.accuracy.work_precision_points import timestamp
 from neusee.workflows.studies.uncertainty.output_draws import Draws, Numbers
 from neusee.workflows.studies.uncertainty.scatter_estimate import Scatter, scatter
 from neusee.workflows.studies.uncertainty.sobol_indices import Indices, indices, require_salib
