@@ -11,7 +11,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from neusee.nodes._bicubic_resize import resize
+from neusee.nodes.bicubic_resize import resize
 from neusee.nodes.metrics import quality
 from neusee.workflows.engine.differentiable_function import as_function
 from neusee.workflows.engine.node_call import call, place
@@ -105,7 +105,7 @@ class Bench:
         }
         keys = self._keys(replace(recipe, steps={**recipe.steps, **steps}), wanted, outputs)
         within = [recipe.tolerance, recipe.exact, self.device.partition(":")[0], self.small]
-        own = [self._code.digest(f"neusee.nodes.{name}") for name in ("metrics._picture_quality", "_bicubic_resize")]
+        own = [self._code.digest(used.__module__) for used in (quality, resize)]
         return digest("evaluate", engine("evaluation.evaluation_points"), [keys[name] for name in outputs], within, own)
 
     def _keys(self, recipe: Recipe, wanted: Wanted, outputs: Sequence[str]) -> dict[str, str]:
