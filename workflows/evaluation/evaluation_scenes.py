@@ -94,11 +94,9 @@ class _Source:
         if not self.paths:
             step = self.recipe.steps["scene"]
             return digest("own scene", key_of(step, {}, self.recipe.seed, code)[0])
-        own = [
-            code.digest(crop_photograph.__module__),
-            file_digest(choose_photograph(self.paths, self.recipe.seed, number)),
-        ]
-        return digest("photograph", own, list(self.shape), self.recipe.seed, number)
+        path = choose_photograph(self.paths, self.recipe.seed, number)
+        own = code.digest(crop_photograph.__module__)
+        return digest("photograph", own, file_digest(path), list(self.shape), self.recipe.seed, number)
 
 
 def scenes(
