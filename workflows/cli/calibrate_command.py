@@ -46,7 +46,7 @@ def calibrate(
 
 
 def _lines(parameters: dict[str, dict[str, object]]) -> list[str]:
-    from neusee.workflows.calibration.calibration_page import Row
+    from neusee.workflows.calibration.calibration_page import ParameterRow
 
-    rows = [Row(**{"mean": 0.0, "sd": 0.0, **row}) for row in parameters.values()]  # type: ignore[arg-type]
+    rows = [ParameterRow(**{"mean": 0.0, "sd": 0.0, **row}) for row in parameters.values()]  # type: ignore[arg-type]
     return [f"{row.name.replace('_', ' '):20s} {row.said}" for row in rows]
