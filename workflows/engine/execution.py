@@ -123,10 +123,9 @@ class Execution:
 
     def asleep(self, name: str) -> StepRecord:
         """The account of a step that nothing has needed."""
-        bound, error = self._bound(name), error_in(self.store.about(self.keys[name]))
-        return StepRecord(
-            name, "not needed", "nothing that ran needed it", 0.0, self.keys[name], bound=bound, error=error
-        )
+        key, why = self.keys[name], "nothing that ran needed it"
+        error = error_in(self.store.about(key))
+        return StepRecord(name, "not needed", why, 0.0, key, bound=self._bound(name), error=error)
 
     def missing(self, names: Iterable[str]) -> set[Key]:
         """What would have to be computed for the values of ``names``."""
@@ -230,8 +229,7 @@ class Execution:
 
     def _note(self, outcome: Outcome, expected: Estimate) -> None:
         """Take in what became of a step."""
-        work = outcome.work
-        step, key = work.step, work.key
+        work, step, key = outcome.work, outcome.work.step, outcome.work.key
         if outcome.lost:
             raise InputMissing(*outcome.lost)
         if outcome.error is not None:
