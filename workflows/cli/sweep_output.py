@@ -1,4 +1,4 @@
-"""The command ``neusee sweep``: show a sweep while it runs, write its folder and give the exit code."""
+"""A sweep as a terminal shows it: its opening, its points while they run, its folder, and the exit code."""
 
 from __future__ import annotations
 
