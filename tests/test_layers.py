@@ -27,7 +27,7 @@ FORBIDDEN_IN_NODES = {"yaml", "ruamel", "emcee", "typer", "rich", "jinja2", "log
 ROOMS = (
     "graph", "keys", "recipe.text", "recipe.blocks", "recipe.distributions", "recipe", "store", "placement",
     "tolerance", "engine", "report.figures", "report", "explain", "simulation", "sweeps", "training.parallel",
-    "training.mask_design", "training", "training.lift", "calibration", "evaluation", "studies", "studies.accuracy",
+    "training.mask_design", "training", "training.lift", "evaluation", "calibration", "studies", "studies.accuracy",
     "studies.stability", "studies.leave_out", "studies.uncertainty", "studies.calibration", "cli",
 )  # fmt: skip
 DOOR = ""  #: neusee.workflows itself, which offers names of all rooms: no room imports it
@@ -125,6 +125,8 @@ def house():
 
 def alone(file, code=""):
     """One file, with more code in it."""
+    if not code:
+        return {file: parsed(HOUSE / file)}
     source = (HOUSE / file).read_text() if (HOUSE / file).exists() else ""
     return {file: ast.parse(f"{source}\n{code}\n")}
 
