@@ -1,4 +1,4 @@
-"""What became of each step of a run: whether it ran, why, where, and what it took."""
+"""Record of each step of a run: whether the step ran, why, where, and its cost."""
 
 from __future__ import annotations
 
@@ -17,10 +17,10 @@ State = Literal["run", "cached", "left out", "not needed"]
 
 @dataclass(frozen=True, slots=True)
 class StepRecord:
-    """What became of a step, and why."""
+    """Record of a step, with the reason."""
 
     step: str
-    state: State  #: ``asleep``: nothing that ran needed it
+    state: State  #: ``not needed``: no step that ran needed this step
     why: str
     seconds: float
     key: Key
@@ -28,29 +28,29 @@ class StepRecord:
     checks: tuple[Check, ...] = ()
     device: str = "cpu"
     bytes: int = 0
-    bound: float | None = None  #: what leaving the step out may change at most
+    bound: float | None = None  #: upper bound on the change that omitting the step makes
     began: float = 0.0  #: s since the run began
-    lane: str = ""  #: which place of the executor computed it
-    peak: int | None = None  #: bytes of memory beside what was there before it ran
-    predicted: float | None = None  #: s that earlier runs made one expect
-    error: tuple[float, float] | None = None  #: of a cheaper form: rms and of the largest element, over the largest
+    lane: str = ""  #: lane of the executor that computed the step
+    peak: int | None = None  #: peak bytes of memory beside the memory in use before
+    predicted: float | None = None  #: s predicted from earlier runs
+    error: tuple[float, float] | None = None  #: of a cheaper form: rms and maximum, over the largest element
     kept: bool = True  #: whether the store has the value
 
 
 def error_in(about: Mapping[str, Any] | None) -> tuple[float, float] | None:
-    """What a stored result says of its own error."""
+    """Return the approximation error that a stored result carries, or None."""
     found = (about or {}).get("error")
     return (float(found[0]), float(found[1])) if found else None
 
 
 def facts_in(about: Mapping[str, Any] | None) -> TensorStats | None:
-    """What a stored result says of its facts."""
+    """Return the statistics that a stored result carries, or None."""
     found = (about or {}).get("facts")
     return TensorStats(**{**found, "shape": tuple(found["shape"])}) if found else None
 
 
 def ran(outcome: Outcome, why: str, bound: float | None, began: float, predicted: float | None) -> StepRecord:
-    """The account of a step that was computed in a run that ``began`` then."""
+    """Return the record of a step computed in a run that started at ``began``."""
     work = outcome.work
     return StepRecord(
         work.step.name,
@@ -74,7 +74,7 @@ def ran(outcome: Outcome, why: str, bound: float | None, began: float, predicted
 
 @dataclass(frozen=True, slots=True)
 class Event:
-    """For a live table: ``step`` has started (``done`` is None) or has finished."""
+    """Event for a live table: ``step`` has started (``done`` is None) or has finished."""
 
     step: str
     done: StepRecord | None

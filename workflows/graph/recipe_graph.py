@@ -84,20 +84,20 @@ class Recipe:
     absent: Mapping[str, str] = field(default_factory=dict)  #: step that is null -> where that is written
     exact: bool = False  #: compute every step in full, whatever the tolerance allows
     substitutions: tuple[Substitution, ...] = ()  #: what stands in for full steps; a recipe as it is read has none
-    strict: float = 1.0  #: share of the tolerance that may be spent: less where a run could not prove that it held
+    tolerance_scale: float = 1.0  #: share of the tolerance that may be spent: less where a run could not prove that it held
     unsubstituted: Recipe | None = field(default=None, compare=False)  #: the recipe before substitutions, if any
     uncertain: Uncertain | None = field(default=None, compare=False)  #: what the study of uncertainty draws from
     training: Training | None = field(default=None, compare=False)  #: how it is learnt
     lifting: LiftTraining | None = field(default=None, compare=False)  #: how a lift is learnt from its pictures
-    unheard: frozenset[str] = frozenset()  #: steps whose errors reach a node that does not tell what becomes of them
+    unbounded: frozenset[str] = frozenset()  #: steps whose errors reach a node that does not tell what becomes of them
 
     def limit(self, step: str) -> float:
         """Return the error allowed for a step: the tolerance, at most `METRIC_TOLERANCE` where nothing bounds it."""
-        return min(self.tolerance, METRIC_TOLERANCE) if step in self.unheard else self.tolerance
+        return min(self.tolerance, METRIC_TOLERANCE) if step in self.unbounded else self.tolerance
 
     def allowed(self, step: str) -> float:
         """What all that is left out or computed more cheaply, up to a step, may change of it."""
-        return self.limit(step) * self.strict
+        return self.limit(step) * self.tolerance_scale
 
     def run(
         self,

@@ -52,7 +52,7 @@ def cache_graph(
     fixed = [name for step in steps.values() if not _refers(step.value.items.get("from")) for name in step.instances]
     value = root.items["steps"]
     found = CachedGraph(value, steps, absent, {name: wires[name] for name in fixed})
-    remember(_graphs, (id(value), _names(root)), found)
+    memoise(_graphs, (id(value), _names(root)), found)
 
 
 def cached_recipe(root: Value) -> Recipe | None:
@@ -63,11 +63,11 @@ def cached_recipe(root: Value) -> Recipe | None:
 
 def cache_recipe(root: Value, recipe: Recipe) -> Recipe:
     """Remember the recipe of a top mapping."""
-    remember(_written, id(root), (root, recipe))
+    memoise(_written, id(root), (root, recipe))
     return recipe
 
 
-def remember(known: dict[K, V], name: K, value: V) -> None:
+def memoise(known: dict[K, V], name: K, value: V) -> None:
     """Keep what was made, and let the oldest go."""
     while len(known) >= _MOST:
         known.pop(next(iter(known), name), None)

@@ -14,7 +14,7 @@ from dataclasses import dataclass, field, replace
 from typing import TYPE_CHECKING, Any
 
 from neusee.workflows.graph.recipe_graph import METRIC_TOLERANCE, Recipe, Step, Substitution, Wire, in_order, needed
-from neusee.workflows.tolerance.tolerance_frontier import unheard
+from neusee.workflows.tolerance.tolerance_frontier import unbounded
 from neusee.workflows.tolerance.zero_effect_steps import without_nothing
 
 if TYPE_CHECKING:
@@ -38,7 +38,7 @@ def with_substitutions(recipe: Recipe, wanted: Iterable[str], pinned: Collection
     order = needed(recipe, sorted(wanted))
     recipe = _limited(recipe, order)
     images = [recipe.steps[n] for n in order if recipe.steps[n].node.channel_sum_form is not None and n not in wanted]
-    if not images or recipe.tolerance * recipe.strict <= _LEAST:
+    if not images or recipe.tolerance * recipe.tolerance_scale <= _LEAST:
         return recipe
     behind = _behind(recipe, order, pinned)
     draft = _Draft(recipe, wanted, _readers(recipe, order))
@@ -51,8 +51,8 @@ def with_substitutions(recipe: Recipe, wanted: Iterable[str], pinned: Collection
 
 def _limited(recipe: Recipe, order: Sequence[str]) -> Recipe:
     """The recipe with a limit where nodes do not tell, if its tolerance is larger."""
-    steps = unheard(recipe, order) if recipe.tolerance > METRIC_TOLERANCE else frozenset[str]()
-    return recipe if steps == recipe.unheard else replace(recipe, unheard=steps)
+    steps = unbounded(recipe, order) if recipe.tolerance > METRIC_TOLERANCE else frozenset[str]()
+    return recipe if steps == recipe.unbounded else replace(recipe, unbounded=steps)
 
 
 def _behind(recipe: Recipe, order: Iterable[str], pinned: Collection[str]) -> set[str]:

@@ -13,21 +13,21 @@ def border(recipe: Recipe, order: Iterable[str], wanted: Iterable[str]) -> list[
     for name in order:
         step = recipe.steps[name]
         reads = [source for source in step.sources if source in off]
-        if reads and not _tells(step):
+        if reads and not _bounds_its_error(step):
             found |= dict.fromkeys(reads)
         elif reads or step.node.hooks.approximation_error is not None or step.node.hooks.skip_bound is not None:
             off.add(name)
     return [*found, *(name for name in wanted if name in off and name not in found)]
 
 
-def unheard(recipe: Recipe, order: Sequence[str]) -> frozenset[str]:
+def unbounded(recipe: Recipe, order: Sequence[str]) -> frozenset[str]:
     """Steps of a running order whose errors reach a node that does not tell what becomes of them."""
     found = set[str]()
     for name in reversed(order):
-        if name in found or not _tells(recipe.steps[name]):
+        if name in found or not _bounds_its_error(recipe.steps[name]):
             found.update(recipe.steps[name].sources)
     return frozenset(found)
 
 
-def _tells(step: Step) -> bool:
+def _bounds_its_error(step: Step) -> bool:
     return step.node.hooks.propagate_error is not None or step.node.hooks.approximation_error is not None

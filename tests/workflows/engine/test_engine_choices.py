@@ -114,7 +114,7 @@ def test_a_value_that_was_not_kept_is_computed_again_and_says_why(store):
     first = run(recipe("m", **CHEAP), Dear(store.root))
     again = run(recipe("b", **CHEAP), Store(store.root))
     assert states(again) == {"a": "run", "b": "run"}
-    assert again.done["a"].why == "quicker to compute than to keep"
+    assert again.done["a"].why == "faster to compute than to store"
     assert again.keys["b"] == first.keys["b"]
 
 

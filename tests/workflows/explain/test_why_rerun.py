@@ -460,7 +460,7 @@ def test_a_value_that_was_not_kept_is_said_to_have_been_made(trial):
     for path in (trial.cache / key[:2]).glob(f"{key}.*"):
         path.unlink()
     (trial.cache / "brief.jsonl").unlink(missing_ok=True)
-    assert trial.store.note(key, about)
+    assert trial.store.put_receipt(key, about)
     head, *rest = trial.why("raw")
     assert head.startswith("raw (trial.add): ran 20")
     assert f"but its value was not kept, key {key[:8]}" in head
