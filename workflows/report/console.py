@@ -158,7 +158,7 @@ def families(recipe: Recipe, names: Iterable[str]) -> dict[str, Family]:
     return found
 
 
-def put_receipt(families: dict[str, Family], event: Event) -> Family:
+def note(families: dict[str, Family], event: Event) -> Family:
     """Write an event down in its family; a run that leaves out less the second time has steps again, and others."""
     short = event.step.partition("[")[0]
     family = families.setdefault(short, Family(short, [], ""))

@@ -72,7 +72,7 @@ def simulate(
 def _both(told: dict[str, StepRecord], watch: Callable[[Event], None] | None) -> Callable[[Event], None]:
     """A watch that also remembers what it was told."""
 
-    def put_receipt(event: Event) -> None:
+    def note(event: Event) -> None:
         if event.done is not None:
             told[event.step] = event.done
         if watch is not None:
@@ -118,7 +118,7 @@ def _noted() -> Iterator[list[str]]:
     """Warnings as lines of the report instead of noise between the steps."""
     notes: list[str] = []
 
-    def put_receipt(message: Warning | str, *rest: Any, **named: Any) -> None:
+    def note(message: Warning | str, *rest: Any, **named: Any) -> None:
         if str(message) not in notes:
             notes.append(str(message))
 

@@ -222,7 +222,9 @@ class RemoteStore(Store):
         except (OSError, ValueError, LookupError):
             return
         with ThreadPoolExecutor(16) as pool:
-            sent = pool.map(lambda to: (not over and self._remote.exists(to)) or self._remote.send(files[to], to), files)
+            sent = pool.map(
+                lambda to: (not over and self._remote.exists(to)) or self._remote.send(files[to], to), files
+            )
             if not all(sent):
                 return
         if self._remote.write(name, raw, over):

@@ -349,7 +349,7 @@ def test_the_account_says_what_it_cost(store):
     assert 0 < done.seconds < 5
     cached = run(diamond(count=BIG), again(store), outputs=("left",)).done["left"]
     assert (cached.bytes, cached.facts, cached.key) == (done.bytes, done.facts, done.key)
-    assert cached.why.startswith("made 20")
+    assert cached.why.startswith("computed 20")
     about = again(store).about(done.key)
     assert about["origin"]["params"] == {"k": 1.0}
     assert about["origin"]["inputs"] == [run(diamond(count=BIG), again(store)).keys["head"]]
