@@ -16,6 +16,7 @@ from pathlib import Path
 ROOT = Path(__file__).parents[1]
 DOCSTRINGS, MESSAGES, README_SENTENCES = 60, 30, 10
 _SPEAKERS = {"warn", "Diagnostic", "Check", "_fail", "_problem", "_refuse"}  #: calls whose text a user reads
+_LOCATED = {"Diagnostic", "_fail", "_problem", "_refuse"}  #: calls whose last text is the message
 _Documented = ast.Module | ast.ClassDef | ast.FunctionDef | ast.AsyncFunctionDef
 
 
@@ -37,18 +38,18 @@ def messages(tree: ast.Module) -> Iterator[str]:
     """Yield each message: the texts given to a raised exception, a warning, a diagnostic or a check."""
     for item in ast.walk(tree):
         if isinstance(item, ast.Raise) and isinstance(item.exc, ast.Call):
-            yield from _said(item.exc)
+            yield from _texts(item.exc)
         elif isinstance(item, ast.Call) and _name(item.func) in _SPEAKERS:
-            yield from _said(item)
+            yield from _texts(item)
 
 
 def _name(function: ast.expr) -> str:
     return function.attr if isinstance(function, ast.Attribute) else getattr(function, "id", "")
 
 
-def _said(call: ast.Call) -> Iterator[str]:
-    """Yield the arguments of a call that are texts of two words or more."""
-    for argument in call.args:
+def _texts(call: ast.Call) -> Iterator[str]:
+    """Yield the arguments of a call that are texts of two words or more; a diagnostic ends with its message."""
+    for argument in call.args[-1:] if _name(call.func) in _LOCATED else call.args:
         text = _text(argument)
         if len(text.split()) > 1 and re.search("[a-z]{2} ", re.sub(r"\{[^}]*\}", "", text)):
             yield text

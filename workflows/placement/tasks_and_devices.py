@@ -51,7 +51,7 @@ class Cluster:
     def __post_init__(self) -> None:
         if not self.devices or len(self._by_name) < len(self.devices):
             names = ", ".join(d.name for d in self.devices)
-            raise ValueError(f"a cluster is one device or more, each with a name of its own: {names or 'none'}")
+            raise ValueError(f"a cluster needs one device or more, with different names: {names or 'none'}")
 
     def link(self, a: str, b: str) -> Link:
         """Return the link between two devices; a device has a link of no delay to itself."""

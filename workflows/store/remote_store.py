@@ -245,7 +245,7 @@ class RemoteStore(Store):
 
     def _distrust(self, key: Key, error: Exception) -> None:
         self._give_up(key)
-        warnings.warn(f"the result {key} at {self.url} is damaged ({error}): it is not used", stacklevel=4)
+        warnings.warn(f"the result {key} at {self.url} is damaged ({error}) and is not used", stacklevel=4)
 
 
 def _receipt_name(key: Key) -> str:

@@ -148,7 +148,7 @@ class Trial:
         head, *causes, beside = self.why(step, *arguments)
         assert head.startswith(f"{step} (trial.")
         assert beside.startswith("  compared with")
-        return [line.strip() for line in causes if "only what feeds it will tell" not in line]
+        return [line.strip() for line in causes if "depending on the values of the inputs" not in line]
 
 
 def forget():

@@ -115,7 +115,7 @@ class References:
         name, wanted = ".".join(parts), (*start.path, *parts)
         siblings = self.root.items[str(start.path[0])].items.values() if start.path else ()
         if any(_follow(other, parts) for other in siblings):
-            problem = Diagnostic(start.key, start.name, f"has no {name}; steps.{scope.step} needs it")
+            problem = Diagnostic(start.key, start.name, f"has no {name}; steps.{scope.step} needs this value")
         else:
             near = _nearest(wanted, {leaf.path for leaf in self.root.leaves() if leaf.path[0] not in RESERVED})
             hint = f"; did you mean {dotted(near)}?" if near else ""

@@ -142,7 +142,7 @@ class _Builder:
             self._refuse_many(self.again, _MOST_AGAIN, mark, path)
             return replace(_moved(self.made[id(node)], path), key=key)
         if id(node) in self.open:
-            return self._refuse(mark, path, "an alias inside the value that it refers to")
+            return self._refuse(mark, path, "an alias refers to the value that contains the alias")
         self.open.add(id(node))
         data = self._mapping(node, path) if isinstance(node, MappingNode) else self._list(node, path)
         self.open.discard(id(node))

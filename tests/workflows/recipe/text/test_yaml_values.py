@@ -101,8 +101,8 @@ def test_two_duplicates_are_two_problems():
         ("? [a, b]\n: 1\n", "a key must be a name"),
         ("1.5: a\n", "a key must be a name"),
         ("a: \x01\n", "f.yaml:1:4"),
-        ("a: &x {b: *x}\n", "an alias inside the value that it refers to"),
-        ("a: &x [*x]\n", "an alias inside the value that it refers to"),
+        ("a: &x {b: *x}\n", "an alias refers to the value that contains the alias"),
+        ("a: &x [*x]\n", "an alias refers to the value that contains the alias"),
         ("a: " + "[" * 5000, "nested too deeply"),
     ],
 )
