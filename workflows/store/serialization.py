@@ -170,7 +170,7 @@ def _class_path(item: tuple[Any, ...]) -> str:
     if kind is tuple:
         return ""
     if not kind.__module__.startswith("neusee.nodes.") or not hasattr(item, "_fields"):
-        raise TypeError(f"{kind.__module__}.{kind.__qualname__} cannot be stored: make the class a NamedTuple in neusee.nodes")
+        raise TypeError(f"{kind.__module__}.{kind.__qualname__} cannot be stored: use a NamedTuple of neusee.nodes")
     return f"{kind.__module__}:{kind.__qualname__}"
 
 

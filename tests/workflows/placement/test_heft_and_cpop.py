@@ -310,9 +310,7 @@ def test_a_refusal_tells_what_one_device_alone_would_need_if_that_is_less(seed):
 
 
 def test_a_refusal_says_bytes_as_people_read_them_too():
-    with pytest.raises(
-        TooLarge, match=r"need 12,500,000,000 B \(12.5 GB\) on cpu, which has 8,000,000,000 B \(8 GB\)"
-    ):
+    with pytest.raises(TooLarge, match=r"need 12,500,000,000 B \(12.5 GB\) on cpu, which has 8,000,000,000 B \(8 GB\)"):
         heft(on(1.0, "stack", bytes=12.5e9), one(8e9))
 
 
