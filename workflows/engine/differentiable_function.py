@@ -171,7 +171,7 @@ class _Ends:
 
 
 def _spent(recipe: Recipe, fixed: Mapping[str, Any], left_out: Mapping[str, float]) -> ErrorBudget:
-    """Return the error budget after the fixed steps."""
+    """Return the error budget with the bounds of all fixed steps entered."""
     ledger = ErrorBudget(recipe)
     for name in needed(recipe, fixed):
         ledger.pass_on(recipe.steps[name])

@@ -41,7 +41,7 @@ class Local:
         self._running: set[Future[Outcome]] = set()
 
     def submit(self, work: Sequence[StepJob]) -> None:
-        """Queue one step."""
+        """Queue the steps of ``work``."""
         for one in work:
             if len(self.lanes) == 1:
                 self._queue.append(one)

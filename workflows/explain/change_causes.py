@@ -42,7 +42,7 @@ class Roots:
     above: dict[Pair, Pair | None]
 
     def chain(self, text: str) -> list[str]:
-        """Return the steps from the first one to the step with the cause."""
+        """Return the steps from the start of the comparison to the step with the cause."""
         way: list[str] = []
         pair: Pair | None = self.found[text]
         while pair is not None:
@@ -165,7 +165,7 @@ class Comparison:
         return [f"reads {label}, not {was}{self._wired(path)}"], []
 
     def _joined(self, path: tuple[str, ...], came: list[str], went: list[str]) -> list[str]:
-        """Return clauses for added and removed sources; a change of items is due to their list and not to the wire."""
+        """Return clauses for added and removed sources; only a source that is no item is located by its wire."""
         where = self._wired(path) if any("[" not in name for name in came) else ""
         texts = [f"reads {_few(came)} now{where}"] if came else []
         return [*texts, f"reads {_few(went)} no more{self._absent(went[0])}"] if went else texts

@@ -179,7 +179,7 @@ def _in_family(family: str, attribute: str, nodes: Mapping[str, Node]) -> str:
 
 
 def _elsewhere(attribute: str) -> str:
-    """Return a hint with the same name in another family."""
+    """Return a hint to the nodes of the same name in other families."""
     found = [f"{family}.{attribute}" for family in families() if attribute in nodes_of(family)]
     return f"did you mean {' or '.join(found)}?" if found else ""
 

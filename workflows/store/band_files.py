@@ -1,4 +1,4 @@
-"""Band files: one file for each slice of a stack, shared by every result that has the band, and their tensor.
+"""Band files: one file for each slice of a stack of bands, shared by every result that contains the slice.
 
 A blob holds the bytes of a slice and a trailer: type and shape, checksum and the trailer's length. The bytes begin
 at the start of the file, so that slices of whole memory pages are mapped side by side into one address range, which

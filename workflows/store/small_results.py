@@ -1,4 +1,4 @@
-"""Small results as sealed lines of one file, for results that are faster to compute than a file is to write.
+"""Small results as sealed lines of one file, for results that take less time to compute than to write to a file.
 
 A line is one write. A line that is torn or fails its checksum is ignored; the loss of a line
 costs less than a millisecond of computation. All processes see the lines of each other,
