@@ -315,7 +315,7 @@ def test_photographs_are_found_and_broken_ones_said(photographs, tmp_path):
     ("change", "said"),
     [
         ("train.stages.1.iterations=-1", "train.stages.1.iterations"),
-        ("+train.fish=1", "is not known here"),
+        ("+train.fish=1", "unknown; "),
         ("train.photographs=nowhere", "is not a folder"),
         ("train.network.kind=foo", "fft_mamba"),
         ("train.network.directions=3", "train.network.directions"),
@@ -453,10 +453,10 @@ def test_the_recommended_mask_is_that_of_trainings_that_say_nothing_of_it():
     ("change", "said"),
     [
         ("train.mask.kind=cubic", "train.mask.kind: .*five_half_rings"),
-        ("+train.mask.fish=1", "train.mask.fish: is not known here"),
+        ("+train.mask.fish=1", "train.mask.fish: unknown; "),
         ("+train.mask.weights.lsrr=1", "train.mask.weights.lsrr: unknown; .*lsr"),
         ("train.mask.max_height=3", "train.mask.max_height: .*needs a unit"),
-        ("+train.mask.slopes=[9, 3]", "train.mask: .*give the least first"),
+        ("+train.mask.slopes=[9, 3]", "train.mask: .*give the smaller slope first"),
         ("+train.mask.start=no.npy", "train.mask.start: .*no such file"),
     ],
 )
