@@ -219,7 +219,7 @@ class Comparison:
 
 
 def _few(names: list[str]) -> str:
-    """``a, b and 4 more``."""
+    """Return names as ``a, b and 4 more``."""
     rest = len(names) - _FEW
     return ", ".join(names) if rest <= 0 else f"{', '.join(names[:_FEW])} and {rest} more"
 

@@ -16,6 +16,7 @@ import warnings
 from collections.abc import Iterator
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import ExitStack
+from functools import partial
 from itertools import starmap
 from pathlib import Path
 from typing import Any
@@ -61,6 +62,9 @@ class RemoteStore(Store):
         self._seen: dict[Key, Metadata] = {}  # metadata read from the remote
         self._broken: set[Key] = set()  # keys whose remote copy is unusable
         super().__init__(root or local_layer(url), verify=verify, budget=budget)
+
+    def __reduce__(self) -> tuple[Any, ...]:
+        return partial(type(self), self.url, self.root, verify=self.verify, budget=self.budget), ()
 
     def about(self, key: Key) -> Metadata | None:
         """Return the metadata of a result from the local layer or the remote, without reading the value."""
