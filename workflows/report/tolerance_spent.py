@@ -28,7 +28,7 @@ def spent(result: Result) -> dict[str, Any]:
         "tolerance": result.recipe.tolerance,
         "norm": NORM,
         "held": min(map(result.recipe.limit, result.proof.held), default=result.recipe.tolerance),
-        "strict": result.recipe.strict,
+        "strict": result.recipe.tolerance_scale,
         "exact": result.recipe.exact,
         "bounds": {name: share for name, share in result.proof.held.items() if share > 0},
         "unbounded": [name for name in result.recipe.outputs if result.proof.of(name) is None],
