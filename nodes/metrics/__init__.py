@@ -1,4 +1,4 @@
-"""Metrics: what a reader of results asks for."""
+"""Metrics: the numbers that judge a mask, a picture and a laser spot."""
 
 from neusee.nodes.metrics._mask_limits import Limits, limits
 from neusee.nodes.metrics._picture_quality import Quality, quality
