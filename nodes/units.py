@@ -83,7 +83,7 @@ Shape = tuple[Count, Count]  #: (y, x) in pixels
 
 
 class IsFile:
-    """The mark of a file parameter: the *content* of the file decides the result, and the engine digests it."""
+    """The mark of a file parameter: the *content* of the file decides the result and enters the engine's digest."""
 
 
 def _existing(path: Path) -> Path:

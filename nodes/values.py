@@ -39,7 +39,7 @@ class Pupil(NamedTuple):
     height: Tensor  #: (v, u) height of the diffractive element, m
     path: Tensor  #: (v, u) aberrations and dirt, m of optical path
     index: Tensor  # type: ignore[assignment]  # hides tuple.index, which no caller uses
-    #: (band,) float64, refractive index of the element minus that of air
+    #: (band,) float64, refractive index of the element minus the index of air
     wavelengths: Tensor  #: (band,) float64, m
     pitch: Tensor  #: () float64, m between samples, both axes
 
@@ -68,7 +68,7 @@ class Channels(NamedTuple):
 
     planes: Tensor  #: (row, y, x)
     rows: Tensor  #: (row, band) float64
-    flux: Tensor  #: (band,) float64, sum of image[b] over its pixels
+    flux: Tensor  #: (band,) float64, sum of image[b] over all pixels
     bound: Tensor  #: () float64, upper bound of the root mean square error over max |plane|, for the worst row
     kept: Tensor = torch.zeros(5, dtype=torch.int64)  #: counts of planes, kernels, bands, PSF rows and PSF columns
     largest: Tensor = torch.tensor(

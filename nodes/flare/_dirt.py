@@ -83,7 +83,7 @@ def _uniform(rng: torch.Generator, low: float = 0.0, high: float = 1.0) -> float
 
 
 def _about(mean: float, spread: float, rng: torch.Generator) -> float:
-    """Draw a normal number and clip it at 0."""
+    """Draw a normal number, clipped at 0."""
     return max(mean + spread * float(torch.randn((), generator=rng, device=rng.device, dtype=torch.float64)), 0.0)
 
 

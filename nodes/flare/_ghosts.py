@@ -116,7 +116,7 @@ def _reach(middle: float, radius: float) -> Tensor:
 
 
 def _part(numbers: Tensor, samples: int) -> slice:
-    """Return the slice of these sample indices that lies in the window; it may be empty."""
+    """Return the slice of these sample indices that lies in the window, or an empty slice."""
     first = int(numbers[0])
     return slice(min(max(-first, 0), len(numbers)), max(samples - first, 0))
 

@@ -1,4 +1,4 @@
-"""A loss against a mask that lowers the contrast of the scene together with the peak of the laser."""
+"""The contrast loss of a mask, which keeps the contrast of the scene while another loss lowers the laser peak."""
 
 import math
 from typing import Annotated

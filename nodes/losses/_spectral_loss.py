@@ -1,4 +1,4 @@
-"""The loss of a spectral lift: the error of every band, relative to its value."""
+"""The loss of a spectral lift: the error of every band, relative to the true value."""
 
 from typing import Annotated
 

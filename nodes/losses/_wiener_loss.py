@@ -1,4 +1,4 @@
-"""The loss that a mask causes for good: the part of a picture that no Wiener filter recovers."""
+"""The permanent damage of a mask to the scene: the part of a picture that no Wiener filter recovers."""
 
 from typing import Annotated
 

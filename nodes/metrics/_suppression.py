@@ -103,7 +103,7 @@ def _(result: Saturated, *inputs: Tensor, **params: Any) -> list[Check]:
 
 
 def clipped(raw: Tensor, *, full_well: float, gain: float, gain_unit: str, bits: int) -> Tensor:
-    """Mark the values at the full well or at the largest number of the converter."""
+    """Mark the values at the full well, at the largest number of the converter, or NaN."""
     full = int(full_well * numbers_per_electron(gain, gain_unit) - 0.5)
     marked: Tensor = ~(raw < max(1, min(2**bits - 1, full)))  # NaN counts as clipped
     return marked

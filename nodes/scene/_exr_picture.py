@@ -14,7 +14,7 @@ from neusee.nodes.scene._crop_to_frame import enlarged, framed
 from neusee.nodes.units import DataFile, Shape
 
 White = Annotated[float, Field(gt=0, allow_inf_nan=False)]
-_REC709 = (0.64, 0.33, 0.30, 0.60, 0.15, 0.06, 0.3127, 0.3290)  #: primaries of a file that names none
+_REC709 = (0.64, 0.33, 0.30, 0.60, 0.15, 0.06, 0.3127, 0.3290)  #: of a file without named primaries
 
 
 @node(rtol=1e-5)

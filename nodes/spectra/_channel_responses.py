@@ -16,7 +16,7 @@ def responses(bands: Bands, *, camera: Camera = "CIE 1931") -> Tensor:
     """Average the sensitivity of each channel over each band: colour-matching functions, or a measured camera.
 
     Shapes: -> (3, band) float64.
-    Units:  relative to the largest sensitivity of any channel at any wavelength; none is negative.
+    Units:  relative to the largest sensitivity of any channel at any wavelength; no response is negative.
     Error:  linear interpolation between the samples of the table (1, 5 and 10 nm); 0 beyond the table, whose ends are
             below 6e-3 of the peak (CIE 360-830 nm, Nikon 380-780 nm, Sigma 400-680 nm; except that the blue of Sigma
             is still 0.16 at 400 nm).

@@ -12,8 +12,8 @@ def rows(bands: Bands, responses: Tensor, *, well: bool = True) -> Tensor:
     """List the weights of the bands in every sum that a sensor forms: the photons of each channel, and the well.
 
     A channel counts photons, so its weights are response times wavelength. A quantity relative to saturation is
-    weighted by the wavelength alone, because a photon of any wavelength frees one electron. `well` false leaves the
-    row of that quantity out.
+    weighted by the wavelength alone, because a photon of any wavelength frees one electron. With `well` false
+    the row of that quantity is omitted.
 
     Shapes: bands (band,), responses (channel, band) -> (channel + 1, band) float64; the last row is the well's.
     Units:  m; the node that counts photons applies the common factor.

@@ -45,7 +45,7 @@ def lift_mallett_mixture(rgb: Tensor, bands: Bands, *, within: Share = 1e-6) -> 
 
     Shapes: rgb (3, y, x) -> planes (k, y, x), basis (band, k), rest and spread (k + 1, band) float64.
     Units:  planes, rest and spread as reflectance; the basis has none.
-    Error:  that of `spectra.compress`, from the lift in float64; `lift_mallett` is within a few round-off units of it.
+    Error:  that of `spectra.compress`, from the lift in float64; `lift_mallett` differs from that lift by round-off.
     Raises: ValueError where `lift_mallett` or `spectra.compress` raises ValueError.
     Source: as `lift_mallett`.
     """
@@ -97,7 +97,7 @@ def lift_lmmse_mixture(rgb: Tensor, bands: Bands, *, within: Share = 1e-6) -> Mi
 
     Shapes: rgb (3, y, x) -> planes (k, y, x), basis (band, k), rest and spread (k + 1, band) float64.
     Units:  planes, rest and spread as reflectance; the basis has none.
-    Error:  that of `spectra.compress`, from the lift in float64; `lift_lmmse` is within a few round-off units of it.
+    Error:  that of `spectra.compress`, from the lift in float64; `lift_lmmse` differs from that lift by round-off.
     Raises: ValueError where `lift_lmmse` or `spectra.compress` raises ValueError.
     Source: as `lift_lmmse`.
     """

@@ -105,7 +105,7 @@ def histogram(frames: Tensor) -> tuple[Tensor, Tensor]:
 
 
 def _pieces(rows: Tensor) -> Iterator[Tensor]:
-    """Split ``rows`` by columns into pieces of about one block of numbers."""
+    """Split ``rows`` by columns into blocks of about `_PIECE` numbers."""
     return iter(torch.split(rows, max(1, _PIECE // len(rows)), 1))
 
 

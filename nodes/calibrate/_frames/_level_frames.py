@@ -19,7 +19,7 @@ from neusee.nodes.units import DataFiles
 def frames(*, files: DataFiles) -> Tensor:
     """Read the frames of one flat illumination: PNG, TIFF, EXR, NumPy or FITS files of raw numbers.
 
-    Shapes: -> (frame, y, x) int32, all frames of one file after the other.
+    Shapes: -> (frame, y, x) int32, the frames of all files in order.
     Units:  DN.
     Error:  exact.
     Raises: ParameterError before the run for an unknown kind of file; ValueError for colour, for numbers that are not

@@ -32,7 +32,7 @@ def table(
     """Read the moments of pairs of frames from a CSV file, one level per line, by the names of the columns.
 
     ``drift`` names the column with the difference of the two means, for a table whose variance excludes that
-    difference. Half the square of the difference is then added, because the variance of EMVA 1288 includes it.
+    difference. Half the square of the difference is then added, because the variance of EMVA 1288 includes that part.
 
     Shapes: -> (level,), in the order of the file; no histograms.
     Units:  photons per pixel and exposure; exposure in `exposure_unit`; pixels of one frame; mean DN; variance DN2.

@@ -25,7 +25,7 @@ class Prior(NamedTuple):
 
 
 def believed(given: Mapping[str, Pair | None], linear: frozenset[str]) -> Prior:
-    """Build a prior: a median and a factor, or for a linear parameter mean and standard deviation; None: held."""
+    """Build a prior from medians and factors, or means and standard deviations if linear; None holds a parameter."""
     laws = [_law(name, pair, name in linear) for name, pair in given.items()]
     if all(math.isnan(width) for _, width in laws):
         raise ValueError(f"no parameter is free: give a prior of one of {', '.join(given)}")
@@ -63,7 +63,7 @@ class Free:
         return self.from_whitened(torch.randn(count, len(self.names), generator=rng, dtype=torch.float64))
 
     def whitened(self, parameters: Mapping[str, Tensor]) -> Tensor:
-        """Return parameters as distances (..., free) from the centre of the prior, in its standard deviations."""
+        """Return parameters, (..., free), as distances from the prior's centre in standard deviations of the prior."""
         value = torch.stack([self._walked(name, parameters[name]) for name in self.names], -1)
         return (value - self._centre) / self._width
 
