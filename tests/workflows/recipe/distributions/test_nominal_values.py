@@ -89,7 +89,7 @@ def test_no_text_breaks_the_reader(text):
         ("normal(10.5 e-, 0 e-)", "greater than 0"),
         ("normal(10.5 e-, -1 e-)", "greater than 0"),
         ("normal(1e999 e-, 1 e-)", "not finite"),
-        ("normal(1 kg, 2 kg)", "no quantity"),
+        ("normal(1 kg, 2 kg)", "neither a number nor a quantity"),
         ("lognormal(10 e-, 1.1 e-)", "number without a unit"),
         ("lognormal(10 e-, 0.9)", "factor"),
         ("uniform(3 e-, 3 e-)", "first value must be smaller"),
@@ -248,7 +248,7 @@ def test_an_argument_is_stronger_than_the_posterior(calibrated):
         ({"use": True}, "write mean, nominal"),
         ({"values": {"sensor.gain": "slope"}}, "slope is not in the posterior"),
         ({"values": {"sensor.speed": "gain"}}, "no value sensor.speed"),
-        ({"values": {"sensor.camera": "gain"}}, "no number"),
+        ({"values": {"sensor.camera": "gain"}}, "neither a number nor a quantity"),
         ({"take": "mean"}, "unknown"),
     ],
 )
