@@ -98,9 +98,9 @@ def _light(amplitude: Tensor) -> float:
 def phase_steps(pupil: Pupil) -> tuple[float, float]:
     """Return the phase steps between neighbours inside the stop: median in turns, and share above one half.
 
-    Both are those of the band that has the largest. In a large pupil only every k-th row is measured, 512 rows or more.
-    A wrapped or split element has steps at its edges by design, so a few large steps mean nothing. Many large steps
-    mean that the samples cannot follow the phase.
+    Both numbers are from the band with the largest phase steps. In a large pupil only every k-th row is measured, 512
+    rows or more. A wrapped or split element has steps at its edges by design, so a few large steps mean nothing. Many
+    large steps mean that the samples cannot follow the phase.
     """
     worst = int((pupil.index / pupil.wavelengths).argmax())
     every = max(1, len(pupil.height) // _ROWS)

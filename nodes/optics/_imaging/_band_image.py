@@ -58,7 +58,7 @@ def _(result: Tensor, radiance: Tensor, psf: Psf, **params: Any) -> list[Check]:
 
 
 def _fitted(radiance: Tensor, intensity: Tensor, border: Border) -> tuple[Tensor, Tensor, Corner]:
-    """Return the scene with its border, the part of the PSF that can reach it, and the first pixel of the result."""
+    """Return the scene with its border, the part of the PSF that can reach the scene, and the result's first pixel."""
     if radiance.ndim < 3 or radiance.shape[-3] != intensity.shape[0]:
         raise ValueError(
             f"radiance {tuple(radiance.shape)} and PSF {tuple(intensity.shape)} must have the same bands: "

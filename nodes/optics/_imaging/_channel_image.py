@@ -143,8 +143,9 @@ def _top(result: Tensor, radiance: Mixture, intensity: Tensor, given: Given) -> 
     """Return the largest error of a row's brightest pixel, as a share of that pixel.
 
     All bands together form the image of the mixture's largest residual at each pixel. The true image differs from the
-    computed image by at most that image of the residual. The true brightest pixel is not below the computed one by more
-    than the residual at the computed one.
+    computed image by at most that image of the residual. The true maximum is therefore at most the maximum of computed
+    image plus residual. The true maximum is at least the computed maximum less the residual at the same pixel, and this
+    second error is never the larger one.
     """
     if not radiance.off.numel():
         return math.inf

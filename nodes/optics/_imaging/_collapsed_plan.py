@@ -112,7 +112,10 @@ def _enough(given: Given, bands: Tensor, lost: Tensor, brightest: Tensor, within
 def _plans(
     given: Given, bands: Tensor, lost: Tensor, k: int, j: int, within: tuple[Tensor, Fewer] | None = None
 ) -> Iterator[Plan]:
-    """Yield plans for k planes in a window: one kernel for each plane and row, fewer to mix, or one for each band."""
+    """Yield plans for k planes in a window.
+
+    The kernels of the three plans are one for each plane and row, one for each band, and fewer kernels to mix.
+    """
     rows, basis, through = given.rows[:, bands], given.basis[bands, :k], given.passed.total[bands]
     off = lost + rows.abs() @ (given.rest[k, bands] * through) + rows.abs() @ _tail(given, bands, k, j)
     if within is not None and not bool((off <= within[0]).all()):

@@ -27,7 +27,10 @@ def _where(given: Given, window: tuple[int, int]) -> Where:
 
 
 def majorant(off: Tensor, intensity: Tensor, given: Given) -> Tensor:
-    """Bound what ``off`` (y, x) in every band adds to any row from above: (y, x), with one kernel for all rows."""
+    """Return an upper bound (y, x) of the light that ``off`` (y, x) in every band adds to any row.
+
+    One kernel serves all rows.
+    """
     window = (intensity.shape[1], intensity.shape[2])
     heaviest = given.rows.abs().amax(0).to(intensity)
     kernel = _summed_bands(heaviest[None], intensity, given.passed.signed)
@@ -55,7 +58,10 @@ def _kernels(intensity: Tensor, plan: Plan) -> Tensor:
 
 
 def _summed_bands(weights: Tensor, stack: Tensor, absolute: bool = False) -> Tensor:
-    """Return sums (kernel, y, x) over the bands of a stack, or of its absolute value; copies are made in slabs."""
+    """Return sums (kernel, y, x) over the bands of a stack, or of its absolute value.
+
+    A stack that must be copied is copied in slabs of a few rows.
+    """
     if stack.requires_grad or (stack.is_contiguous() and not absolute):
         return (weights @ stack.flatten(1)).view(-1, *stack.shape[1:])
     sums = stack.new_empty(len(weights), *stack.shape[1:])
@@ -67,7 +73,11 @@ def _summed_bands(weights: Tensor, stack: Tensor, absolute: bool = False) -> Ten
 
 
 def guessed(planes: Tensor, given: Given) -> Tensor:
-    """Estimate each row's brightest pixel: a quarter of it without blur, at most half of its bound with blur."""
+    """Estimate the brightest pixel of each row.
+
+    The estimate is the smaller of two numbers: a quarter of the brightest pixel without blur, and half of an upper
+    bound of the brightest pixel with blur.
+    """
     through = given.passed.total
     room, sharp = planes.new_empty(planes[0].numel()), torch.zeros_like(given.rows[:, 0])
     for i, weights in enumerate((given.rows * through @ given.basis).to(planes)):
