@@ -29,9 +29,8 @@ from numpyro.infer import MCMC, NUTS
 
 from neusee.nodes.calibrate._likelihood._quantised_gaussian import log_cell
 from neusee.workflows.calibration import emcee_sampler
-from neusee.workflows.calibration.initial_guess import begin
 from neusee.workflows.calibration.log_posterior import SensorPosterior
-from neusee.workflows.calibration.posterior_mode import peak
+from neusee.workflows.calibration.posterior_mode import begin, peak
 from neusee.workflows.engine.runner import run
 from neusee.workflows.recipe.loading import load
 from neusee.workflows.store.result_store import Store

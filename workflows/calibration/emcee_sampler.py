@@ -30,7 +30,7 @@ _BESIDE = 5.0  #: nats a parameter, by which no draw from the normal law lies be
 _BURN = 10.0  #: autocorrelation times that are thrown away
 _MOVES = {"de": emcee.moves.DEMove, "stretch": emcee.moves.StretchMove}
 
-Tell = Callable[[str], None]
+Progress = Callable[[str], None]
 
 
 @dataclass(frozen=True)
@@ -71,7 +71,7 @@ def sample(
     walkers: int = 64,
     how: str = "de",
     wanted: int = 1000,
-    tell: Tell = lambda line: None,
+    progress: Progress = lambda line: None,
 ) -> Chains:
     """Draw until every chain is 50 autocorrelation times long and ``wanted`` draws are worth as many independent ones.
 
@@ -84,13 +84,15 @@ def sample(
     tau_before = max(_tau(run.backend.get_chain()[:before]) for run in runs) if before else np.inf
     while True:
         go_on(runs, steps, problem.log_posterior)
-        _keep(file, [run.backend for run in runs], tell)
+        _keep(file, [run.backend for run in runs], progress)
         tau = max(_tau(run.backend.get_chain()) for run in runs)
         change = abs(tau - tau_before) / tau
         long = steps >= (_TAUS + _BURN) * tau and (change < _CHANGE or steps >= (_SURELY + _BURN) * tau)
         found = _gathered(runs, tau, steps, long)
         worth = found.flat.shape[0] / tau
-        tell(f"{steps} steps of {ENSEMBLES} x {walkers} walkers: tau {tau:.1f}, worth {worth:.0f} independent draws")
+        progress(
+            f"{steps} steps of {ENSEMBLES} x {walkers} walkers: tau {tau:.1f}, worth {worth:.0f} independent draws"
+        )
         if (long and worth >= wanted) or steps >= _LONGEST:
             return found
         tau_before, steps = tau, int(_GROWTH * steps)
@@ -169,12 +171,12 @@ def _read(file: Path, index: int) -> Any:
     return memory
 
 
-def _keep(file: Path, backends: Sequence[Any], tell: Tell) -> None:
+def _keep(file: Path, backends: Sequence[Any], progress: Progress) -> None:
     """Write what was drawn; where that cannot be, as on a full disk, it is said, and drawing goes on."""
     try:
         _write(file, backends)
     except (OSError, RuntimeError) as error:  # h5py raises both
-        tell(f"not kept, a stop would lose these draws: {error}")
+        progress(f"not kept, a stop would lose these draws: {error}")
 
 
 def _write(file: Path, backends: Sequence[Any]) -> None:

@@ -9,9 +9,8 @@ import numpy as np
 
 from neusee.nodes.values import Levels
 from neusee.workflows.calibration.importance_sampling import drawn, weights
-from neusee.workflows.calibration.initial_guess import begin
 from neusee.workflows.calibration.log_posterior import SensorPosterior
-from neusee.workflows.calibration.posterior_mode import peak
+from neusee.workflows.calibration.posterior_mode import begin, peak
 from neusee.workflows.graph.recipe_graph import Recipe, Step
 from neusee.workflows.recipe.distributions.joint import Z_90
 from neusee.workflows.store.result_store import Store

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Any, Literal
 
 import numpy as np
 
-from neusee.workflows.calibration.goodness_of_fit import MISFIT, fit
+from neusee.nodes.calibrate import Likelihood
 from neusee.workflows.calibration.identifiability import Known
 from neusee.workflows.calibration.importance_sampling import drawn, weights
 from neusee.workflows.calibration.log_posterior import SensorPosterior
@@ -20,6 +20,7 @@ if TYPE_CHECKING:
     from neusee.workflows.calibration.log_posterior import Places
 
 Mark = Literal["pass", "warn", "fail"]
+MISFIT = 1e-3  #: probability below which chance is no excuse
 _NEVER = -1e6  #: nats, of a draw that cannot be
 _RHAT, _INDEPENDENT, _ACCEPTED = 1.01, 1000.0, (0.1, 0.7)
 _TAIL, _SD, _MEAN, _BELOW = 0.5, 0.05, 0.1, 2.0
@@ -34,6 +35,20 @@ class Check:
     found: str
     bar: str
     mark: Mark
+
+
+@dataclass(frozen=True)
+class Fit:
+    """Twice the missing log-likelihood of all levels, and how likely chance alone makes it as large."""
+
+    deviance: float
+    freedom: float  #: degrees of freedom
+    p: float
+
+    @property
+    def good(self) -> bool:
+        """No misfit."""
+        return self.p >= MISFIT
 
 
 @dataclass(frozen=True)
@@ -138,6 +153,23 @@ def _of_data(problem: SensorPosterior, peak: LaplaceFit, known: Known) -> Iterat
     count = len(known.directions)
     said = "all parameters are told" if not count else f"{count} of {len(known.strengths)} directions are not told"
     yield Check("the levels tell the parameters", said, "all, else no value is given", _mark(not count, "warn"))
+
+
+def fit(likelihood: Likelihood, free: int = 0) -> Fit:
+    """Of one sensor, of which ``free`` parameters were fitted to the same levels.
+
+    Raises ValueError for a likelihood without deviances, for many sensors at once, and where nothing is left to test.
+    """
+    from scipy.special import chdtrc
+
+    if not len(likelihood.freedom):
+        raise ValueError("this likelihood has no deviances: take one with told: true")
+    if likelihood.deviance.numel() != len(likelihood.freedom):
+        raise ValueError(f"deviances {tuple(likelihood.deviance.shape)} are not of one sensor: give one place")
+    deviance, freedom = float(likelihood.deviance.sum()), float(likelihood.freedom.sum()) - free
+    if freedom <= 0:
+        raise ValueError(f"{freedom + free:.0f} numbers are no test of {free} free parameters: give more levels")
+    return Fit(deviance, freedom, float(chdtrc(freedom, deviance)))
 
 
 def _mark(good: bool, else_: Mark = "fail") -> Mark:

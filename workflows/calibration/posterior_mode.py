@@ -7,7 +7,10 @@ from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
 import numpy as np
+import torch
 
+from neusee.nodes.calibrate import guess, guess_camera
+from neusee.nodes.values import Levels
 from neusee.workflows.calibration.log_posterior import SensorPosterior
 
 if TYPE_CHECKING:
@@ -18,6 +21,7 @@ _CLOSE = 1e-6  #: twice the nats that a step may still win
 _NEXT = 1e-3  #: the same where nothing higher is found, or an edge is near
 _STEP = 1e-3  #: of a difference, in standard deviations of that coordinate
 _EDGE = 1e3  #: nats that a step of that length never costs, but over an edge
+_NARROWER = 0.5 ** np.arange(1, 12)  #: shares of the way from the middle of the prior to the guess
 _SHORT = 1e-7  #: the same before any deviation is known: a well is known to a part in a million
 
 
@@ -45,6 +49,29 @@ def log_law(top: LaplaceFit, places: Places) -> Places:
     """(count,) of the normal law about a peak, but for a constant."""
     off = places - top.place
     found: Places = -0.5 * np.einsum("ni,ij,nj->n", off, np.linalg.pinv(top.covariance, hermitian=True), off)
+    return found
+
+
+def begin(problem: SensorPosterior) -> Places:
+    """A place where the posterior is not none: the guess, or on the way from it to the middle of the prior.
+
+    Raises ValueError where there is none on that way.
+    """
+    coordinates = problem.coordinates
+    middle = coordinates.from_whitened(torch.zeros(len(problem.names), dtype=torch.float64))
+    believed = {**coordinates.held, **{name: float(x) for name, x in middle.items()}}
+    params = problem.recipe.steps[problem.step].params
+    levels = problem.levels
+    guessed = guess_camera(levels, believed, params) if isinstance(levels, Levels) else guess(levels, believed, params)
+    first, last = (problem.place({name: x[name] for name in problem.names}) for x in (guessed, believed))
+    places = np.stack([first, *(last + (first - last) * share for share in _NARROWER), last])
+    alive = np.isfinite(problem.log_posterior(places))
+    if not alive.any():
+        raise ValueError(
+            "no sensor that was believed possible gives these numbers: compare rounding, bits and the priors with the "
+            "camera, and see what least_squares says"
+        )
+    found: Places = places[int(alive.argmax())]
     return found
 
 

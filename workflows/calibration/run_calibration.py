@@ -3,11 +3,9 @@
 from __future__ import annotations
 
 import io
-import json
 import math
-import time
 import warnings
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import asdict
 from pathlib import Path
 from typing import Any
@@ -17,21 +15,16 @@ import numpy as np
 from neusee.nodes.values import Levels
 from neusee.workflows.calibration.calibration_page import Finding, banner, lead, sections
 from neusee.workflows.calibration.identifiability import known
-from neusee.workflows.calibration.initial_guess import begin
 from neusee.workflows.calibration.log_posterior import SensorPosterior
 from neusee.workflows.calibration.model_spread import spread
 from neusee.workflows.calibration.posterior_checks import arviz, checks, failed, weighed
-from neusee.workflows.calibration.posterior_mode import peak
-from neusee.workflows.engine.node_call import versions
+from neusee.workflows.calibration.posterior_mode import begin, peak
 from neusee.workflows.graph.recipe_graph import Recipe
 from neusee.workflows.keys.cache_key import digest
 from neusee.workflows.keys.engine_digest import engine
-from neusee.workflows.report.run_folder import RunFolder, new_run
-from neusee.workflows.report.study_page import page
+from neusee.workflows.report.study_folder import Content, Progress, StudyReport, StudyRun, as_json, silent
 from neusee.workflows.store.result_store import Store
-from neusee.workflows.studies.accuracy.work_precision_points import timestamp
 
-Tell = Callable[[str], None]
 _KEPT = 4000  #: draws that go into the folder
 
 
@@ -44,7 +37,7 @@ def calibrate(
     store: Store,
     runs: Path,
     command: Sequence[str] = (),
-    tell: Tell = lambda line: None,
+    progress: Progress = silent,
     *,
     walkers: int = 64,
     move: str = "de",
@@ -55,15 +48,13 @@ def calibrate(
     Goes on where an earlier call was interrupted, and draws nothing where it was not. Raises `Refused` before anything
     is drawn where the levels tell too little, ValueError for a recipe that does not calibrate.
     """
-    began = time.perf_counter()
-    finding = found(recipe, store, tell, walkers=walkers, move=move, draws=draws)
-    doc = _document(finding, command, time.perf_counter() - began)
-    with new_run(runs, f"{recipe.name}_posterior", digest(doc["parameters"])) as folder:
-        _write(folder, finding, doc)
-    return folder.path
+    study_run = StudyRun("calibrate", recipe, command)
+    finding = found(recipe, store, progress, walkers=walkers, move=move, draws=draws)
+    document = study_run.document(_document(finding))
+    return study_run.write(runs, digest(document["parameters"]), document, _report(finding, document), "posterior")
 
 
-def found(recipe: Recipe, store: Store, tell: Tell, *, walkers: int, move: str, draws: int) -> Finding:
+def found(recipe: Recipe, store: Store, progress: Progress, *, walkers: int, move: str, draws: int) -> Finding:
     """The posterior with all that is known of it."""
     from neusee.workflows.calibration import emcee_sampler
 
@@ -75,25 +66,21 @@ def found(recipe: Recipe, store: Store, tell: Tell, *, walkers: int, move: str, 
     if told.refused:
         raise Refused(told.refused)
     for line in told.directions:
-        tell(f"not told: {line}")
+        progress(f"not told: {line}")
     key = digest("posterior", engine("calibration.emcee_sampler"), problem.key, walkers, move, recipe.seed)
     file = store.root / "posterior" / f"{key}.h5"
     chains = emcee_sampler.sample(
-        problem, top, file, seed=recipe.seed, walkers=walkers, how=move, wanted=draws, tell=tell
+        problem, top, file, seed=recipe.seed, walkers=walkers, how=move, wanted=draws, progress=progress
     )
     law = weighed(problem, top, recipe.seed)
     models = spread(recipe, store, recipe.seed) if isinstance(problem.levels, Levels) else []
     return Finding(problem, top, told, chains, checks(problem, top, told, chains, law), models)
 
 
-def _document(finding: Finding, command: Sequence[str], seconds: float) -> dict[str, Any]:
+def _document(finding: Finding) -> dict[str, Any]:
+    """Return what the folder says of the posterior, beside what every study says."""
     problem, flat = finding.problem, finding.chains.flat
     return {
-        "study": "calibrate",
-        "recipe": problem.recipe.name,
-        "command": " ".join(command),
-        "date": timestamp(),
-        "seconds": seconds,
         "failed": failed(finding.checks),
         "parameters": {row.name: _plain(asdict(row)) for row in finding.rows()},
         "gaussian": {
@@ -104,8 +91,6 @@ def _document(finding: Finding, command: Sequence[str], seconds: float) -> dict[
         "stated": {model.name: asdict(model.stated) for model in finding.models},
         "not told": list(finding.known.directions),
         "checks": [asdict(check) for check in finding.checks],
-        "versions": versions(),
-        "config": problem.recipe.config.to_yaml(),
     }
 
 
@@ -115,19 +100,16 @@ def _plain(row: Mapping[str, Any]) -> dict[str, Any]:
     return {name: None if isinstance(x, float) and not math.isfinite(x) else x for name, x in kept.items()}
 
 
-def _write(folder: RunFolder, finding: Finding, doc: Mapping[str, Any]) -> None:
-    told = {name: doc[name] for name in ("command", "date", "seconds", "versions")}
+def _report(finding: Finding, document: Mapping[str, Any]) -> StudyReport:
     parts = sections(finding)
-    for name, section in zip(("transfer", "corner", "chains"), parts[-3:], strict=True):
-        if section.picture:
-            folder.write(f"figures/{name}.png", section.picture)
-    folder.write("posterior.json", json.dumps(doc, indent=1, ensure_ascii=False))
-    folder.write("provenance.json", json.dumps(doc, indent=1, ensure_ascii=False))
-    folder.write("draws.npz", _draws(finding))
-    _inference_data(finding).to_netcdf(str(folder.path / "posterior.nc"))
-    folder.write(
-        "report.html", page(f"{finding.problem.recipe.name}: posterior", lead(finding), parts, told, banner(finding))
-    )
+    pictures = {name: part.picture for name, part in zip(("transfer", "corner", "chains"), parts[-3:], strict=True)}
+    files: dict[str, Content] = {
+        "posterior.json": as_json(document),
+        "draws.npz": _draws(finding),
+        "posterior.nc": lambda path: _inference_data(finding).to_netcdf(str(path)),
+    }
+    title = f"{finding.problem.recipe.name}: posterior"
+    return StudyReport(title, lead(finding), parts, pictures, files=files, banner=banner(finding))
 
 
 def _draws(finding: Finding) -> bytes:

@@ -25,12 +25,12 @@ def calibrate(
     from neusee.workflows.calibration import run_calibration
     from neusee.workflows.engine.node_call import RunError
 
-    tell = (lambda line: None) if quiet else (lambda line: say([line]))
+    progress = (lambda line: None) if quiet else (lambda line: say([line]))
     how = {"walkers": walkers, "move": move, "draws": draws}
     command = ["neusee", "calibrate", *command[2:], *(f"--{name} {value}" for name, value in how.items())]
     try:
         folder = run_calibration.calibrate(
-            recipe, the_store(), out, command, tell, walkers=walkers, move=move, draws=draws
+            recipe, the_store(), out, command, progress, walkers=walkers, move=move, draws=draws
         )
     except run_calibration.Refused as error:
         fail(f"refused, nothing was drawn: {error}", FAILED)

@@ -35,7 +35,7 @@ def evaluate(
     """Judge masks and restorers on many scenes and laser strengths, as the paper does; run it again to go on."""
     name, changes, _ = split(words)
     check_device(device)
-    tell = (lambda line: None) if quiet else (lambda line: say([line]))
+    progress = (lambda line: None) if quiet else (lambda line: say([line]))
     how = {"data": data, "scenes": scenes, "strengths": strengths, "small": small, "reference": reference}
     command = ["neusee", "evaluate", name, *changes, f'--pipelines "{pipelines}"', *_given(how)]
     folder = _evaluated(
@@ -49,7 +49,7 @@ def evaluate(
         reference=reference.replace(" ", ""),
         runs=out,
         command=command,
-        tell=tell,
+        progress=progress,
         device=device,
     )
     say([str(folder / "report.html")])

@@ -99,9 +99,9 @@ def _made(kind: str, words: list[str] | None, quiet: bool, out: Path, **options:
 
     given = [f"--{name}" if value is True else f"--{name} {value}" for name, value in options.items() if value]
     command = ["neusee", "study", kind, *command[2:], *given]
-    tell = (lambda line: None) if quiet else (lambda line: say([line]))
+    progress = (lambda line: None) if quiet else (lambda line: say([line]))
     try:
-        folder = studies.made(kind, recipe, the_store(), out, command, tell, **options)
+        folder = studies.made(kind, recipe, the_store(), out, command, progress, **options)
     except (RunError, ValueError, ImportError) as error:
         fail(str(error), FAILED)
     say([str(folder / "report.html")])

@@ -3,8 +3,8 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from contextlib import suppress
 from dataclasses import dataclass, replace
+from functools import partial
 
 from torch import Tensor
 
@@ -12,7 +12,7 @@ from neusee.workflows.evaluation.evaluation_points import Bench, Wanted, smaller
 from neusee.workflows.evaluation.evaluation_scenes import Scene
 from neusee.workflows.evaluation.pipelines import CASES, NONE, Composed
 from neusee.workflows.keys.cache_key import digest
-from neusee.workflows.studies.accuracy.work_precision_points import timestamp
+from neusee.workflows.store.memo import memo
 
 _SIDE = 200  #: pixels of the shorter side, as drawn
 _PLAIN = "developed[plain]"
@@ -43,16 +43,17 @@ def panels(bench: Bench, each: Sequence[Composed], scene: Scene, strengths: Sequ
 
 def _pictures(bench: Bench, each: Sequence[Composed], wanted: Wanted) -> dict[str, Tensor]:
     key = digest("evaluate pictures", _SIDE, [[p.name, bench.key(p, wanted)] for p in each])
-    with suppress(KeyError):
-        kept: dict[str, Tensor] = bench.store.get(key)
-        return kept
+    return memo(bench.store, key, dict, partial(_developed, bench, each, wanted), {"step": "evaluate"})
+
+
+def _developed(bench: Bench, each: Sequence[Composed], wanted: Wanted) -> dict[str, Tensor]:
+    """Return the truth, the picture of the plain lens and that of each pipeline, as large as they are drawn."""
     found: dict[str, Tensor] = {}
     for number, pipeline in enumerate(each):
         values = bench.values(pipeline, wanted, () if number else (_PLAIN,))
         if not number:
             found |= {"truth": _shown(values["truth"]), "plain lens": _shown(values[_PLAIN])}
         found[pipeline.name] = _shown(values[pipeline.pipeline.picture])
-    bench.store.put(key, found, {"step": "evaluate", "seconds": 1.0, "date": timestamp()})
     return found
 
 

@@ -6,6 +6,7 @@ import time
 from collections.abc import Callable, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, replace
+from functools import partial
 from typing import Any
 
 import torch
@@ -22,8 +23,8 @@ from neusee.workflows.keys.cache_key import digest, key_of
 from neusee.workflows.keys.code_digest import Code
 from neusee.workflows.keys.engine_digest import engine
 from neusee.workflows.recipe.distributions.uncertain_inputs import Inputs
+from neusee.workflows.store.memo import memo
 from neusee.workflows.store.result_store import Store
-from neusee.workflows.studies.accuracy.work_precision_points import timestamp
 from neusee.workflows.tolerance.cheaper_steps import with_substitutions
 
 _MOVED = ("spot", "photons")  #: steps with whose results, and all that follows, another strength is another scene
@@ -62,16 +63,14 @@ class Bench:
 
     def point(self, pipeline: Composed, wanted: Wanted) -> Point:
         """The numbers of a point, from the store or measured now."""
-        key = self.key(pipeline, wanted)
-        with suppress(KeyError):
-            found: Point = self.store.get(key)
-            return found
+        compute = partial(self._measure, pipeline, wanted)
+        return memo(self.store, self.key(pipeline, wanted), dict, compute, {"step": "evaluate"}, small=True)
+
+    def _measure(self, pipeline: Composed, wanted: Wanted) -> Point:
         began = time.perf_counter()
-        values = self.values(pipeline, wanted)
-        point = self._numbers(pipeline, values)
-        self.seconds += (spent := time.perf_counter() - began)
+        point = self._numbers(pipeline, self.values(pipeline, wanted))
+        self.seconds += time.perf_counter() - began
         self.computed += 1
-        self.store.jot(key, point, {"step": "evaluate", "seconds": spent, "date": timestamp()})
         return point
 
     def values(self, pipeline: Composed, wanted: Wanted, more: Sequence[str] = ()) -> dict[str, Any]:

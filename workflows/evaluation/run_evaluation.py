@@ -9,16 +9,13 @@ Points are kept in the store, so that what was stopped goes on.
 
 from __future__ import annotations
 
-import json
-import time
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 
-from neusee.workflows.engine.node_call import versions
 from neusee.workflows.evaluation.comparison_pictures import Panel, panels
 from neusee.workflows.evaluation.confidence_intervals import METRICS, Interval, Table, against, table
 from neusee.workflows.evaluation.evaluation_points import Bench, Point, Wanted
@@ -28,19 +25,14 @@ from neusee.workflows.evaluation.pipelines import NONE, Composed, Pipeline, Refu
 from neusee.workflows.graph.recipe_graph import Recipe
 from neusee.workflows.keys.cache_key import digest
 from neusee.workflows.recipe.loading import load
-from neusee.workflows.report.run_folder import RunFolder, new_run
+from neusee.workflows.report.study_folder import CsvTable, Progress, StudyReport, StudyRun, silent
 from neusee.workflows.store.remote_store import open_store
 from neusee.workflows.store.result_store import Store
-from neusee.workflows.studies.accuracy.work_precision_points import timestamp
-
-if TYPE_CHECKING:
-    pass
 
 __all__ = ["STRENGTHS", "Evaluated", "Refused", "evaluate", "read_pipelines"]
 
 STRENGTHS = (0.0, 1e1, 1e2, 1e3, 1e4, 1e5, 1e6)  #: the paper's
 SMALL = 256  #: pixels of the shorter side, at which the paper restores
-Tell = Callable[[str], None]
 
 
 @dataclass(frozen=True)
@@ -74,7 +66,7 @@ def evaluate(
     store: Store | None = None,
     runs: Path = Path("runs"),
     command: Sequence[str] = (),
-    tell: Tell = lambda line: None,
+    progress: Progress = silent,
     device: str = "cpu",
     folder: Path | None = None,
 ) -> Path:
@@ -84,14 +76,15 @@ def evaluate(
     scene. small: shorter side of the pictures that are compared a second time. reference: the pipeline that all are
     compared with, the first if none. Raises `Refused` with every mistake before anything runs.
     """
-    began, store, place = time.perf_counter(), store or open_store(), folder or Path.cwd()
+    store, place = store or open_store(), folder or Path.cwd()
     each = composed(recipe, changes, pipelines, place)
     strengths, reference = _strengths(strengths), _reference(reference, pipelines)
     base = load(recipe, changes, place)
+    study_run = StudyRun("evaluate", base, command)
     shown, broken = scenes(base, store, data, count)
-    _announce(tell, each, shown, broken, strengths)
+    _announce(progress, each, shown, broken, strengths)
     bench = Bench(store, small, device)
-    points = _points(bench, each, shown, strengths, tell)
+    points = _points(bench, each, shown, strengths, progress)
     optics = masks(each, store, device, points)
     drawn = panels(bench, each, shown[0], strengths)
     tables = {name: table(found, strengths) for name, found in points.items()}
@@ -99,10 +92,8 @@ def evaluate(
     more = {name: against(own, tables[reference], base.seed) for name, own in tables.items()}
     rest = (reference, points, tables, more, optics, drawn, list(pipelines))
     found = Evaluated(base, shown, broken, strengths, least, *rest)
-    doc = _document(found, bench, command, time.perf_counter() - began)
-    with new_run(runs, f"{base.name}_evaluate", digest(doc["summary"])) as made:
-        _write(made, found, doc)
-    return made.path
+    document = study_run.document(_document(found, bench))
+    return study_run.write(runs, digest(document["summary"]), document, _report(found))
 
 
 def _strengths(strengths: Sequence[float]) -> tuple[float, ...]:
@@ -119,17 +110,23 @@ def _reference(reference: str, pipelines: Sequence[Pipeline]) -> str:
 
 
 def _announce(
-    tell: Tell, each: Sequence[Composed], shown: Sequence[Scene], broken: Sequence[Any], strengths: Sequence[float]
+    progress: Progress,
+    each: Sequence[Composed],
+    shown: Sequence[Scene],
+    broken: Sequence[Any],
+    strengths: Sequence[float],
 ) -> None:
-    tell(f"{len(shown)} scenes, {len(strengths)} strengths, {len(each)} pipelines: {', '.join(p.name for p in each)}")
+    progress(
+        f"{len(shown)} scenes, {len(strengths)} strengths, {len(each)} pipelines: {', '.join(p.name for p in each)}"
+    )
     for path, reason in broken[:5]:
-        tell(f"not read: {path.name}: {reason}")
+        progress(f"not read: {path.name}: {reason}")
     if len(broken) > 5:
-        tell(f"not read: {len(broken) - 5} more")
+        progress(f"not read: {len(broken) - 5} more")
 
 
 def _points(
-    bench: Bench, each: Sequence[Composed], shown: Sequence[Scene], strengths: Sequence[float], tell: Tell
+    bench: Bench, each: Sequence[Composed], shown: Sequence[Scene], strengths: Sequence[float], progress: Progress
 ) -> dict[str, list[dict[float, Point]]]:
     """Every point; the scenes of one laser after another, for they have its optics in common."""
     found: dict[str, list[dict[float, Point]]] = {p.name: [{} for _ in shown] for p in each}
@@ -143,22 +140,18 @@ def _points(
                 found[pipeline.name][scene.number][strength] = bench.point(
                     pipeline, Wanted(alone, scene.case, strength)
                 )
-        tell(f"scene {done} of {len(shown)} ({scene.case}, {scene.name}): {bench.computed} points computed")
+        progress(f"scene {done} of {len(shown)} ({scene.case}, {scene.name}): {bench.computed} points computed")
     return found
 
 
 # --- the folder -------------------------------------------------------------------------------------------------------
 
 
-def _document(found: Evaluated, bench: Bench, command: Sequence[str], seconds: float) -> dict[str, Any]:
+def _document(found: Evaluated, bench: Bench) -> dict[str, Any]:
+    """Return what the folder says of the evaluation, beside what every study says."""
     from neusee.workflows.evaluation.evaluation_page import summary
 
     return {
-        "study": "evaluate",
-        "recipe": found.recipe.name,
-        "command": " ".join(command),
-        "date": timestamp(),
-        "seconds": seconds,
         "scenes": [[s.number, s.name, s.case, s.seed] for s in found.scenes],
         "not read": [[str(path), reason] for path, reason in found.broken],
         "strengths": list(found.strengths),
@@ -167,25 +160,21 @@ def _document(found: Evaluated, bench: Bench, command: Sequence[str], seconds: f
         "computed": bench.computed,
         "seconds a point": bench.seconds / bench.computed if bench.computed else None,
         "summary": summary(found),
-        "versions": versions(),
-        "config": found.recipe.config.to_yaml(),
     }
 
 
-def _write(folder: RunFolder, found: Evaluated, doc: dict[str, Any]) -> None:
+def _report(found: Evaluated) -> StudyReport:
     from neusee.workflows.evaluation.evaluation_page import COLUMNS, drawn, lead, rows, sections
-    from neusee.workflows.report.study_page import page
 
     pictures = drawn(found)
-    for name, content in pictures.items():
-        folder.write(f"figures/{name}.png", content)
-    folder.write("provenance.json", json.dumps(doc, indent=1, ensure_ascii=False))
-    folder.write_rows("points.csv", ("pipeline", "mask", "restorer", *_POINT, *METRICS), _point_rows(found))
-    folder.write_rows("table.csv", COLUMNS, rows(found))
-    folder.write_rows("suppression.csv", ("mask", "wavelength (nm)", "lsr", "bsr", "floor"), _curve_rows(found))
-    told = ("command", "date", "seconds", "computed", "seconds a point", "reference", "versions")
-    said = {name: doc[name] for name in told}
-    folder.write("report.html", page(f"{found.recipe.name}: evaluated", lead(found), sections(found, pictures), said))
+    tables: dict[str, CsvTable] = {
+        "points.csv": (("pipeline", "mask", "restorer", *_POINT, *METRICS), _point_rows(found)),
+        "table.csv": (COLUMNS, rows(found)),
+        "suppression.csv": (("mask", "wavelength (nm)", "lsr", "bsr", "floor"), _curve_rows(found)),
+    }
+    shown = ("command", "date", "seconds", "computed", "seconds a point", "reference", "versions")
+    title = f"{found.recipe.name}: evaluated"
+    return StudyReport(title, lead(found), sections(found, pictures), pictures, tables, shown=shown)
 
 
 _POINT = ("scene", "photograph", "laser", "strength")

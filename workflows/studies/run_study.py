@@ -55,7 +55,7 @@ def made(
     store: Store | None = None,
     runs: Path = Path("runs"),
     command: Sequence[str] = (),
-    tell: Callable[[str], None] = lambda line: None,
+    progress: Callable[[str], None] = lambda line: None,
     **options: Any,
 ) -> Path:
     """Make one of `KINDS` and give its folder.
@@ -65,7 +65,7 @@ def made(
     """
     room = kind.replace("-", "_")
     module = import_module(f"neusee.workflows.studies.{room}.{room}_study")
-    folder: Path = module.study(recipe, store or open_store(), runs, list(command), tell, **options)
+    folder: Path = module.study(recipe, store or open_store(), runs, list(command), progress, **options)
     return folder
 
 

@@ -8,9 +8,8 @@ import torch
 
 from neusee.workflows.calibration import emcee_sampler
 from neusee.workflows.calibration.identifiability import known
-from neusee.workflows.calibration.initial_guess import begin
 from neusee.workflows.calibration.log_posterior import SensorPosterior
-from neusee.workflows.calibration.posterior_mode import LaplaceFit, log_law, peak
+from neusee.workflows.calibration.posterior_mode import LaplaceFit, begin, log_law, peak
 from neusee.workflows.keys.cache_key import stream_seed
 from neusee.workflows.recipe.loading import load
 from neusee.workflows.store.result_store import Store

@@ -11,10 +11,9 @@ import pytest
 from neusee.workflows.calibration import emcee_sampler
 from neusee.workflows.calibration.calibration_page import beside
 from neusee.workflows.calibration.identifiability import known
-from neusee.workflows.calibration.initial_guess import begin
 from neusee.workflows.calibration.log_posterior import SensorPosterior
 from neusee.workflows.calibration.posterior_checks import checks, weighed
-from neusee.workflows.calibration.posterior_mode import peak
+from neusee.workflows.calibration.posterior_mode import begin, peak
 from neusee.workflows.cli import app
 from neusee.workflows.recipe.loading import load
 from neusee.workflows.store.result_store import Store
@@ -93,7 +92,7 @@ def test_what_is_stopped_goes_on_to_the_last_bit(store, tmp_path, monkeypatch):
 
     whole = emcee_sampler.sample(p, best, tmp_path / "whole.h5", seed=3, walkers=16)
     with pytest.raises(Stop):
-        emcee_sampler.sample(p, best, tmp_path / "cut.h5", seed=3, walkers=16, tell=stop)
+        emcee_sampler.sample(p, best, tmp_path / "cut.h5", seed=3, walkers=16, progress=stop)
     kept = emcee.backends.HDFBackend(str(tmp_path / "cut.h5"), name="ensemble3", read_only=True)
     assert 20 < kept.iteration < 40
     again = emcee_sampler.sample(p, best, tmp_path / "cut.h5", seed=3, walkers=16)
@@ -125,7 +124,7 @@ def test_draws_that_cannot_be_kept_are_drawn_and_said(store, tmp_path, monkeypat
     (tmp_path / "file").write_text("no folder")
     p, said = problem(store, SEEN), []
     best = top(p)
-    found = emcee_sampler.sample(p, best, tmp_path / "file" / "c.h5", seed=3, walkers=16, tell=said.append)
+    found = emcee_sampler.sample(p, best, tmp_path / "file" / "c.h5", seed=3, walkers=16, progress=said.append)
     kept = emcee_sampler.sample(p, best, tmp_path / "c.h5", seed=3, walkers=16)
     assert np.array_equal(found.draws, kept.draws)
     assert sum("a stop would lose these draws" in line for line in said) == 1

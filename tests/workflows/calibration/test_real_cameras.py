@@ -15,10 +15,10 @@ from scipy.stats import binom, chi2
 
 from neusee.nodes.calibrate import Likelihood, least_squares, table
 from neusee.workflows.calibration import emcee_sampler, run_calibration
-from neusee.workflows.calibration.goodness_of_fit import fit
 from neusee.workflows.calibration.identifiability import known
 from neusee.workflows.calibration.log_posterior import SensorPosterior
 from neusee.workflows.calibration.model_spread import Z_90, begin, spread
+from neusee.workflows.calibration.posterior_checks import fit
 from neusee.workflows.calibration.posterior_mode import peak
 from neusee.workflows.engine.runner import run
 from neusee.workflows.recipe.loading import load

@@ -294,7 +294,7 @@ def test_an_evaluation_writes_its_folder_and_goes_on_where_it_was_stopped(tmp_pa
     with pytest.raises(KeyboardInterrupt):
         evaluate("first_light", asked, SMALL, runs=tmp_path, **how)
     lines = []
-    folder = evaluate("first_light", asked, SMALL, runs=tmp_path, tell=lines.append, **how)
+    folder = evaluate("first_light", asked, SMALL, runs=tmp_path, progress=lines.append, **how)
     doc = json.loads((folder / "provenance.json").read_text())
     count = 2 * (5 * 2 + 1)  # of the scene without a laser there is one strength
     assert doc["computed"] == count - 8

@@ -7,33 +7,29 @@ turned one at a time. What is measured is kept: a study that was stopped goes on
 
 from __future__ import annotations
 
-import json
 import math
 import time
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
-from neusee.workflows.engine.node_call import versions
 from neusee.workflows.graph.diagnostics import RecipeError
 from neusee.workflows.graph.recipe_graph import Recipe
 from neusee.workflows.keys.cache_key import digest
 from neusee.workflows.keys.engine_digest import engine
-from neusee.workflows.report.run_folder import RunFolder, new_run
-from neusee.workflows.report.study_page import page
+from neusee.workflows.recipe.changed_recipe import changed
+from neusee.workflows.report.study_folder import Progress, StudyReport, StudyRun
 from neusee.workflows.store.result_store import Store
 from neusee.workflows.studies.accuracy import accuracy_report
-from neusee.workflows.studies.accuracy.recipe_knobs import Knobs, changed, finest, knobs
+from neusee.workflows.studies.accuracy.recipe_knobs import Knobs, finest, knobs
 from neusee.workflows.studies.accuracy.single_steps import StepTried, that_matter, try_step
-from neusee.workflows.studies.accuracy.work_precision_points import TIMES, Bench, Measured, Point, Trial, timestamp
+from neusee.workflows.studies.accuracy.work_precision_points import TIMES, Bench, Measured, Point, Trial
 from neusee.workflows.tolerance.cheaper_steps import with_substitutions
 
 TOLERANCES = (1e-1, 1e-2, 1e-3, 1e-4, 1e-5, 1e-6)
 _FEWER = (1e-1, 1e-2, 1e-3, 1e-4)
 _PATIENCE, _LITTLE = 4.0, 1.0  #: s that the reference of a step may take
-
-Tell = Callable[[str], None]
 
 
 @dataclass(frozen=True)
@@ -52,7 +48,7 @@ def study(
     store: Store,
     runs: Path,
     command: Sequence[str],
-    tell: Tell,
+    progress: Progress,
     *,
     seeds: int = 3,
     quick: bool = False,
@@ -67,12 +63,12 @@ def study(
     """
     if seeds < 1:
         raise ValueError(f"seeds={seeds}: a study needs one at least")
+    study_run = StudyRun("accuracy", recipe, command)
     bench = Bench(finest(recipe), store, seeds, device)
-    found = _found(recipe, bench, tell, quick, math.inf if budget is None else time.monotonic() + budget)
+    found = _found(recipe, bench, progress, quick, math.inf if budget is None else time.monotonic() + budget)
     key = digest("accuracy", bench.key(recipe), [_named(p) for p in found.points], quick)
-    with new_run(runs, f"{recipe.name}_accuracy", key) as folder:
-        _write(found, folder, _provenance(found, bench, command, quick))
-    return folder.path
+    document = study_run.document(_document(found, bench, quick))
+    return study_run.write(runs, key, document, _report(found, document))
 
 
 def trials(recipe: Recipe, turned: Knobs, quick: bool) -> Iterator[Trial]:
@@ -92,22 +88,22 @@ def trials(recipe: Recipe, turned: Knobs, quick: bool) -> Iterator[Trial]:
                 yield Trial(name, change.label, None, refused=error.diagnostics[0].message)
 
 
-def _found(recipe: Recipe, bench: Bench, tell: Tell, quick: bool, until: float) -> Study:
+def _found(recipe: Recipe, bench: Bench, progress: Progress, quick: bool, until: float) -> Study:
     turned = knobs(recipe, quick)
     todo = list(trials(recipe, turned, quick))
-    tell(f"{len(todo)} points, {bench.seeds} seed{'s' * (bench.seeds > 1)}; the reference first")
+    progress(f"{len(todo)} points, {bench.seeds} seed{'s' * (bench.seeds > 1)}; the reference first")
     bench.truth(0)
     points = []
     for number, trial in enumerate(todo, 1):
         points.append(_left(trial) if time.monotonic() > until and _may_wait(trial, bench) else bench.point(trial))
-        tell(f"{number}/{len(todo)}  {accuracy_report.told(points[-1])}")
+        progress(f"{number}/{len(todo)}  {accuracy_report.told(points[-1])}")
     for number in range(2, TIMES + 1):  # in turn, so that what else the machine does meets all points alike
         points = [bench.again(point, number) for point in points]
-        tell(f"timed again: {number} of {TIMES}")
+        progress(f"timed again: {number} of {TIMES}")
     steps = []
     for stage, name, share in _matter(recipe, points):
         steps.append(try_step(stage, name, share, bench.store, _LITTLE if quick else _PATIENCE))
-        tell(f"step {name}: {steps[-1].found.refused or f'{len(steps[-1].forms)} forms'}")
+        progress(f"step {name}: {steps[-1].found.refused or f'{len(steps[-1].forms)} forms'}")
     return Study(recipe, tuple(points), tuple(steps), turned.without, bench.seeds)
 
 
@@ -137,11 +133,9 @@ def _named(point: Point) -> list[Any]:
     return [point.trial.line, point.trial.label]
 
 
-def _provenance(found: Study, bench: Bench, command: Sequence[str], quick: bool) -> dict[str, Any]:
+def _document(found: Study, bench: Bench, quick: bool) -> dict[str, Any]:
+    """Return what the folder says of the study, beside what every study says."""
     return {
-        "recipe": found.recipe.name,
-        "command": " ".join(command),
-        "date": timestamp(),
         "tolerance": found.recipe.tolerance,
         "seed": found.recipe.seed,
         "seeds": found.seeds,
@@ -150,17 +144,19 @@ def _provenance(found: Study, bench: Bench, command: Sequence[str], quick: bool)
         "machine": accuracy_report.machine_said(),
         "failed": accuracy_report.missed(found.points),  # tolerances
         "engine": engine(),
-        **versions(),
     }
 
 
-def _write(found: Study, folder: RunFolder, provenance: dict[str, Any]) -> None:
+def _report(found: Study, document: Mapping[str, Any]) -> StudyReport:
     pictures = accuracy_report.pictures(found.recipe, found.points, found.steps)
-    for name, picture in pictures.items():
-        folder.write(f"figures/{name}.png", picture)
-    folder.write_rows("table.csv", accuracy_report.HEADER, accuracy_report.table(found.points, found.steps))
-    folder.write("recipe.yaml", found.recipe.config.to_yaml())
-    folder.write("provenance.json", json.dumps(provenance, indent=1, ensure_ascii=False))
     sections = accuracy_report.sections(found.recipe, found.points, found.steps, found.without, found.seeds, pictures)
-    title = f"Accuracy of {found.recipe.name}"
-    folder.write("report.html", page(title, accuracy_report.lead(found.recipe, found.points), sections, provenance))
+    table = (accuracy_report.HEADER, accuracy_report.table(found.points, found.steps))
+    return StudyReport(
+        f"Accuracy of {found.recipe.name}",
+        accuracy_report.lead(found.recipe, found.points),
+        sections,
+        pictures,
+        tables={"table.csv": table},
+        files={"recipe.yaml": found.recipe.config.to_yaml()},
+        shown=[name for name in document if name != "config"],
+    )

@@ -17,20 +17,23 @@ from statistics import median
 from typing import Any, Literal, get_args, get_origin
 
 import torch
+from torch import Tensor
 
-from neusee.nodes.values import Channels, Mixture, Psf
+from neusee.nodes import Node
+from neusee.nodes.values import BAND_FIELDS, Channels, Mixture, Psf
 from neusee.workflows.engine.node_call import RunError
+from neusee.workflows.engine.provenance import machine
 from neusee.workflows.engine.runner import run
 from neusee.workflows.graph.recipe_graph import Recipe, Step, needed
 from neusee.workflows.keys.cache_key import digest, key_of, stream_seed
 from neusee.workflows.keys.code_digest import Code
 from neusee.workflows.keys.engine_digest import engine
+from neusee.workflows.store.memo import memo
 from neusee.workflows.store.result_store import Store
 from neusee.workflows.store.serialization import each_tensor, tensors_in
-from neusee.workflows.studies.accuracy.smaller_inputs import Cut, cut, said
-from neusee.workflows.studies.accuracy.work_precision_points import machine, timestamp
 from neusee.workflows.tolerance.error_norm import error_of
 
+Cut = tuple[int, int]  #: the longest side, and the most bands; 0 for all
 SHARE = 0.01  #: of the time, below which a step does not matter
 _ITEM = re.compile(r"\[.*?\]")
 _CUTS: Sequence[Cut] = ((32, 2), (64, 2), (128, 3), (256, 3), (512, 3), (1024, 3), (0, 3), (0, 0))
@@ -91,11 +94,8 @@ def try_step(recipe: Recipe, name: str, share: float, store: Store, patience: fl
     step = recipe.steps[name]
     if step.node.hooks.reference is None:
         return StepTried(name, step.node.path, share, Trying(refused="its node has no reference"))
-    key = _key(recipe, name, patience, store)
-    if store.has(key):
-        return StepTried(name, step.node.path, share, Trying(**store.get(key)))
-    found = _tried(recipe, step, store, patience)
-    store.put(key, asdict(found), {"step": f"study accuracy: {name}", "seconds": patience, "date": timestamp()})
+    key, about = _key(recipe, name, patience, store), {"step": f"study accuracy: {name}"}
+    found = memo(store, key, Trying, lambda: _tried(recipe, step, store, patience), about)
     return StepTried(name, step.node.path, share, found)
 
 
@@ -121,7 +121,7 @@ def _tried(recipe: Recipe, step: Step, store: Store, patience: float) -> Trying:
         part = cut(step.node, inputs, size)
         forms = [asdict(form) for form in _forms(step, part, truth, recipe.seed)]
     whole = all(a.shape == b.shape for a, b in zip(tensors_in(inputs), tensors_in(part), strict=True))
-    return Trying(forms, seconds, "" if whole else said(step.node, size))
+    return Trying(forms, seconds, "" if whole else _words_of(step.node, size))
 
 
 def _gathered(wire: str | tuple[str, ...] | None, values: Mapping[str, Any]) -> Any:
@@ -217,3 +217,43 @@ def _timed(way: Callable[[], Any]) -> tuple[Any, float]:
     while len(times) < _TIMES and sum(times) < _LONG_ENOUGH:
         times.append(_once(way)[1])
     return value, median(times)
+
+
+# --- smaller inputs, on which the slow reference can be afforded ------------------------------------------------------
+
+
+def cut(node: Node, inputs: list[Any], size: Cut) -> list[Any]:
+    """``inputs`` with no picture wider than ``size`` and no more bands, where the node says which axis these are."""
+    side, bands = size
+    found = []
+    for name, value in zip(node.inputs, inputs, strict=True):
+        axis = (node.bands or {}).get(name)
+        fewer = value if axis is None or not bands else _fewer(value, axis, bands)
+        found.append(each_tensor(lambda x: _middle(x, side), fewer) if side else fewer)
+    return found
+
+
+def _words_of(node: Node, size: Cut) -> str:
+    """The cut in words; empty of none."""
+    side, bands = size
+    fewer = bands and (node.bands or {}).keys() - {"return"}
+    parts = [f"the middle {side} × {side}"] * bool(side) + [f"{bands} bands"] * bool(fewer)
+    return " and ".join(parts)
+
+
+def _middle(x: Tensor, side: int) -> Tensor:
+    for axis in (-2, -1) if x.ndim >= 2 and min(x.shape[-2:]) > side else ():
+        x = x.narrow(axis, x.shape[axis] // 2 - side // 2, side)
+    return x
+
+
+def _fewer(value: Any, axis: int, bands: int) -> Any:
+    """Bands spread over all that there are."""
+    if isinstance(value, Tensor):
+        count = value.shape[axis]
+        if count <= bands:
+            return value
+        places = value.new_tensor([round((i + 0.5) * count / bands - 0.5) for i in range(bands)]).long()
+        return value.index_select(axis, places)
+    fields = BAND_FIELDS.get(type(value), ())
+    return value._replace(**{name: _fewer(getattr(value, name), axis, bands) for name in fields}) if fields else value

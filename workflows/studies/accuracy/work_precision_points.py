@@ -8,32 +8,28 @@ that was stopped goes on from there.
 from __future__ import annotations
 
 import os
-import platform
-import shutil
-from collections.abc import Iterator, Mapping, Sequence
-from contextlib import contextmanager
-from dataclasses import asdict, dataclass, field, replace
-from datetime import UTC, datetime
-from pathlib import Path
+from collections.abc import Mapping
+from dataclasses import dataclass, field, replace
 from statistics import median
-from tempfile import TemporaryDirectory
 from typing import Any
 
-import torch
-
-from neusee.workflows.engine.node_call import RunError, versions
+from neusee.workflows.engine.node_call import RunError
+from neusee.workflows.engine.provenance import machine
 from neusee.workflows.engine.runner import Event, run
 from neusee.workflows.graph.recipe_graph import Recipe, needed
 from neusee.workflows.keys.cache_key import digest, key_of
 from neusee.workflows.keys.code_digest import Code
 from neusee.workflows.keys.engine_digest import engine
+from neusee.workflows.store.memo import memo
 from neusee.workflows.store.result_store import Store
+from neusee.workflows.studies.cold_run import cold
 from neusee.workflows.tolerance.cheaper_steps import with_substitutions
 from neusee.workflows.tolerance.error_norm import error_of
 
 TIMES = 3  #: cold runs of a point, of which the median counts
 _QUICK = 5.0  #: s; what takes longer is run once
 _WITHIN = ("tolerance", "exact")  #: fields of a recipe that stand in no key
+_ABOUT = {"step": "study accuracy"}
 
 
 @dataclass(frozen=True)
@@ -107,27 +103,22 @@ class Bench:
         """The point of a trial, from the store or measured now."""
         if trial.recipe is None:
             return Point(trial, Measured(refused=trial.refused))
-        key = self.key(trial.recipe)
-        if self.store.has(key):
-            return Point(trial, Measured(**self.store.get(key)))
-        found = self._measure(trial.recipe)
-        self.store.put(key, asdict(found), _about(found.seconds))
-        return Point(trial, found)
+        recipe = trial.recipe
+        return Point(trial, memo(self.store, self.key(recipe), Measured, lambda: self._measure(recipe), _ABOUT))
 
     def again(self, point: Point, number: int) -> Point:
         """The point with one more cold run, if it is a quick one; ``number`` tells its runs apart."""
         recipe, seconds = point.trial.recipe, point.found.seconds
         if recipe is None or not seconds or seconds[0] >= _QUICK:
             return point
-        key = digest(self.key(recipe), number)
-        if self.store.has(key):
-            one = [float(s) for s in self.store.get(key)]
-        else:
-            self._warm_up(recipe)
-            with cold(self.store) as store:
-                one = [run(recipe, store, device=self.device).seconds]
-            self.store.put(key, one, _about(one))
+        one = memo(self.store, digest(self.key(recipe), number), list, lambda: [self._time(recipe)], _ABOUT)
         return Point(point.trial, replace(point.found, seconds=[*seconds, *one]))
+
+    def _time(self, recipe: Recipe) -> float:
+        """Return the seconds of a cold run."""
+        self._warm_up(recipe)
+        with cold(self.store) as store:
+            return run(recipe, store, device=self.device).seconds
 
     def key(self, recipe: Recipe) -> str:
         """What decides a point: both recipes with their code and files, the engine, the seeds and the machine."""
@@ -198,28 +189,6 @@ def compared(values: Mapping[str, Any], truth: Mapping[str, Any]) -> dict[str, l
     return found
 
 
-@contextmanager
-def cold(store: Store) -> Iterator[Store]:
-    """An empty store for as long as it is used; that code was read before is no work of this run."""
-    with TemporaryDirectory(prefix="neusee-") as folder:
-        if os.path.isfile(store.code_memo):
-            shutil.copyfile(store.code_memo, Path(folder) / store.code_memo.name)
-        yield Store(folder)
-
-
 def draws(recipe: Recipe) -> bool:
     """Whether anything that the outputs need is random."""
     return any(recipe.steps[name].node.random for name in needed(recipe, recipe.outputs))
-
-
-def machine() -> Sequence[str]:
-    """Where a time was measured; on another machine it is another."""
-    return [platform.node(), platform.machine(), str(torch.get_num_threads()), *versions().values()]
-
-
-def _about(seconds: Sequence[float]) -> dict[str, Any]:
-    return {"step": "study accuracy", "seconds": sum(seconds), "date": timestamp()}
-
-
-def timestamp() -> str:
-    return datetime.now(UTC).isoformat(timespec="seconds")

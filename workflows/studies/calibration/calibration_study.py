@@ -2,10 +2,8 @@
 
 from __future__ import annotations
 
-import json
-import time
 from collections import Counter
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import asdict, dataclass
 from functools import partial
 from pathlib import Path
@@ -13,23 +11,19 @@ from tempfile import TemporaryDirectory
 from typing import Any
 
 from neusee.workflows.calibration.identifiability import KINDS, known
-from neusee.workflows.calibration.initial_guess import begin
 from neusee.workflows.calibration.log_posterior import SensorPosterior
-from neusee.workflows.calibration.posterior_mode import peak
-from neusee.workflows.engine.node_call import versions
+from neusee.workflows.calibration.posterior_mode import begin, peak
 from neusee.workflows.engine.threads import one_thread
 from neusee.workflows.graph.recipe_graph import Recipe
 from neusee.workflows.keys.cache_key import digest
-from neusee.workflows.report.run_folder import RunFolder, new_run
-from neusee.workflows.report.study_page import Mark, Section, page
+from neusee.workflows.report.study_folder import CsvTable, Progress, StudyReport, StudyRun
+from neusee.workflows.report.study_page import Mark, Section
 from neusee.workflows.store.result_store import Store
-from neusee.workflows.studies.accuracy.work_precision_points import timestamp
 from neusee.workflows.studies.calibration.independent_draws import DRAWS, walked
 from neusee.workflows.studies.calibration.prior_sensitivity import ENOUGH, Finding, Sensitivity, sensitivity
-from neusee.workflows.studies.calibration.rank_uniformity import Verdict, verdicts
+from neusee.workflows.studies.calibration.rank_uniformity import Verdict, ranks, verdicts
 from neusee.workflows.studies.calibration.simulated_sensors import Bench, Sampler, Simulation, widths
 
-Tell = Callable[[str], None]
 PIXELS = 128
 _EVERY = 20  #: simulations by line
 _WEIGHED = 1000  #: draws for the sensitivity
@@ -71,33 +65,31 @@ def study(
     store: Store,
     runs: Path,
     command: Sequence[str],
-    tell: Tell,
+    progress: Progress,
     simulations: int = 200,
     move: str = "de",
     pixels: int = PIXELS,
     sampler: Sampler | None = None,
 ) -> Path:
     """Simulate, fit and rank so many times; ``sampler`` in place of walkers that move by ``move``."""
-    began = time.perf_counter()
+    study_run = StudyRun("calibration", recipe, command)
     with one_thread():
         bench = Bench(recipe, store, pixels, sampler or partial(walked, how=move), move)
-        made = list(_simulated(bench, simulations, tell))
+        made = list(_simulated(bench, simulations, progress))
         weighed, untold = _sensitivity(recipe, move)
     found = Found(made, verdicts(made), widths(bench.nominal.coordinates.prior), weighed, untold)
-    doc = _document(recipe, command, found, time.perf_counter() - began)
-    with new_run(runs, f"{recipe.name}_calibration", digest(doc["verdicts"])) as folder:
-        _write(folder, recipe, found, doc, pixels)
-    return folder.path
+    document = study_run.document(_document(found))
+    return study_run.write(runs, digest(document["verdicts"]), document, _report(recipe, found, pixels))
 
 
-def _simulated(bench: Bench, count: int, tell: Tell) -> Iterator[Simulation]:
+def _simulated(bench: Bench, count: int, progress: Progress) -> Iterator[Simulation]:
     for number in range(count):
         found = bench.simulation(number)
         if found.refused:
-            tell(f"simulation {number}: {found.refused}")
+            progress(f"simulation {number}: {found.refused}")
         yield found
         if (number + 1) % _EVERY == 0 or number + 1 == count:
-            tell(f"{number + 1} of {count} simulations")
+            progress(f"{number + 1} of {count} simulations")
 
 
 def _sensitivity(recipe: Recipe, move: str) -> tuple[Sensitivity | None, str]:
@@ -114,38 +106,29 @@ def _sensitivity(recipe: Recipe, move: str) -> tuple[Sensitivity | None, str]:
     return sensitivity(problem, drawn.places, told.kinds), ""
 
 
-def _document(recipe: Recipe, command: Sequence[str], found: Found, seconds: float) -> dict[str, Any]:
+def _document(found: Found) -> dict[str, Any]:
+    """Return what the folder says of the study, beside what every study says."""
     return {
-        "study": "calibration",
-        "recipe": recipe.name,
-        "command": " ".join(command),
-        "date": timestamp(),
-        "seconds": seconds,
         "failed": found.failed,
         "simulations": len(found.simulations),
         "refused": list(found.refused),
         "verdicts": [asdict(v) for v in found.verdicts],
         "widths": dict(found.widths),
         "sensitivity": asdict(found.sensitivity) if found.sensitivity else found.untold,
-        "versions": versions(),
-        "config": recipe.config.to_yaml(),
     }
 
 
 # --- the page ---------------------------------------------------------------------------------------------------------
 
 
-def _write(folder: RunFolder, recipe: Recipe, found: Found, doc: Mapping[str, Any], pixels: int) -> None:
-    from neusee.workflows.studies.calibration.rank_figures import ranks
-
+def _report(recipe: Recipe, found: Found, pixels: int) -> StudyReport:
     picture = ranks(found.verdicts)
-    folder.write("figures/ranks.png", picture)
-    folder.write_rows("table.csv", _COLUMNS, map(_line, found.verdicts))
-    folder.write_rows("simulations.csv", ("parameter", "truth", "rank", "inside", "z", "told"), _each(found))
-    folder.write("provenance.json", json.dumps(doc, indent=1, ensure_ascii=False))
     sections = [_ranks(found, picture, pixels), _intervals(found), _weighed(found), *_refusals(found)]
-    told = {name: doc[name] for name in ("command", "date", "seconds", "versions")}
-    folder.write("report.html", page(f"{recipe.name}: is the posterior right?", _lead(found), sections, told))
+    tables: dict[str, CsvTable] = {
+        "table.csv": (_COLUMNS, map(_line, found.verdicts)),
+        "simulations.csv": (("parameter", "truth", "rank", "inside", "z", "told"), _each(found)),
+    }
+    return StudyReport(f"{recipe.name}: is the posterior right?", _lead(found), sections, {"ranks": picture}, tables)
 
 
 def _line(v: Verdict) -> Sequence[Any]:

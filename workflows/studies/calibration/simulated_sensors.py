@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import time
 from collections.abc import Callable, Mapping
-from dataclasses import asdict, dataclass, field, replace
+from dataclasses import dataclass, field, replace
 from functools import partial
 from importlib.metadata import version
 from tempfile import TemporaryDirectory
@@ -20,16 +20,15 @@ import torch
 
 from neusee.nodes.calibrate import NAMES, Prior, Sufficient
 from neusee.workflows.calibration.identifiability import known
-from neusee.workflows.calibration.initial_guess import begin
 from neusee.workflows.calibration.log_posterior import SensorPosterior, _the
-from neusee.workflows.calibration.posterior_mode import LaplaceFit, peak
+from neusee.workflows.calibration.posterior_mode import LaplaceFit, begin, peak
 from neusee.workflows.engine.differentiable_function import as_function
-from neusee.workflows.engine.node_call import versions
+from neusee.workflows.engine.provenance import versions
 from neusee.workflows.graph.recipe_graph import Recipe, needed
 from neusee.workflows.keys.cache_key import digest, stream_seed
 from neusee.workflows.keys.engine_digest import engine
+from neusee.workflows.store.memo import memo
 from neusee.workflows.store.result_store import Store
-from neusee.workflows.studies.accuracy.work_precision_points import timestamp
 from neusee.workflows.studies.calibration.independent_draws import Drawn
 
 Sampler = Callable[[SensorPosterior, LaplaceFit, int], Drawn]  #: of a problem and its peak, by a seed
@@ -84,13 +83,8 @@ class Bench:
     def simulation(self, number: int) -> Simulation:
         """The simulation of that number, from the store or made now."""
         key = digest("calibration study", self._says(), number)
-        try:
-            return Simulation(**self.store.get(key))
-        except KeyError:
-            pass
-        found = self._made(stream_seed(self.recipe.seed, f"calibration study {number}"))
-        self.store.jot(key, asdict(found), {"step": "study calibration", "seconds": found.seconds, "date": timestamp()})
-        return found
+        seed = stream_seed(self.recipe.seed, f"calibration study {number}")
+        return memo(self.store, key, Simulation, lambda: self._made(seed), {"step": "study calibration"}, small=True)
 
     def truth(self, seed: int) -> dict[str, float]:
         """Parameters from the prior."""

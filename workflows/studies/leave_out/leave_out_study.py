@@ -2,25 +2,22 @@
 
 from __future__ import annotations
 
-import json
 import math
-import time
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
 
-from neusee.workflows.engine.node_call import versions
 from neusee.workflows.graph.recipe_graph import Recipe
 from neusee.workflows.keys.cache_key import digest
-from neusee.workflows.report.run_folder import RunFolder, new_run
-from neusee.workflows.report.study_page import Mark, Section, page
+from neusee.workflows.report.figures.style import BLUE, canvas, drawn
+from neusee.workflows.report.study_folder import SHOWN, CsvTable, Progress, StudyReport, StudyRun
+from neusee.workflows.report.study_page import Mark, Section
 from neusee.workflows.store.result_store import Store
-from neusee.workflows.studies.accuracy.work_precision_points import timestamp
 from neusee.workflows.studies.leave_out.omission_rows import Bench, Promise, Row
 from neusee.workflows.studies.leave_out.scene_costs import Cost, costs
 
-Tell = Callable[[str], None]
+_WAITING = "#9DB8CC"  #: the colour of seconds that the engine takes beside the steps
 _COLUMNS = ("what", "name", "kind", "chosen", "bound", "rms", "largest", "outputs", "put back", "seconds", "holds")
 _HOW = {
     "handed on": "left out",
@@ -43,56 +40,50 @@ class Found:
         return sum(not holds for holds in (*(p.holds for p in self.promises), *(r.holds for r in self.rows)))
 
 
-def study(recipe: Recipe, store: Store, runs: Path, command: Sequence[str], tell: Tell, contents: bool = True) -> Path:
+def study(
+    recipe: Recipe, store: Store, runs: Path, command: Sequence[str], progress: Progress, contents: bool = True
+) -> Path:
     """Measure every omission of ``recipe``; with ``contents``, also what simpler scenes cost."""
-    began = time.perf_counter()
+    study_run = StudyRun("leave-out", recipe, command)
     bench = Bench(recipe, store)
     promises, rows = bench.promises(), []
     for promise in promises:
-        tell(f"{promise.output}: error {promise.rms:.2g}, tolerance {recipe.tolerance:.2g}{_said(promise.holds)}")
+        progress(f"{promise.output}: error {promise.rms:.2g}, tolerance {recipe.tolerance:.2g}{_said(promise.holds)}")
     for row in bench.rows():
         rows.append(row)
-        tell(f"{row.name} {row.kind}: {row.rms:.2g}, stated at most {row.bound:.2g}{_said(row.holds)}")
-    found = Found(promises, rows, list(costs(recipe, store, tell)) if contents else [])
-    doc = _document(recipe, command, found, time.perf_counter() - began)
-    with new_run(runs, f"{recipe.name}_leave_out", digest(doc["rows"])) as folder:
-        _write(folder, recipe, found, doc)
-    return folder.path
+        progress(f"{row.name} {row.kind}: {row.rms:.2g}, stated at most {row.bound:.2g}{_said(row.holds)}")
+    found = Found(promises, rows, list(costs(recipe, store, progress)) if contents else [])
+    document = study_run.document(_document(recipe, found))
+    return study_run.write(runs, digest(document["rows"]), document, _report(recipe, found))
 
 
 def _said(holds: bool) -> str:
     return "" if holds else ": does not hold"
 
 
-def _document(recipe: Recipe, command: Sequence[str], found: Found, seconds: float) -> dict[str, Any]:
+def _document(recipe: Recipe, found: Found) -> dict[str, Any]:
+    """Return what the folder says of the study, beside what every study says."""
     return {
-        "study": "leave-out",
-        "recipe": recipe.name,
         "tolerance": recipe.tolerance,
-        "command": " ".join(command),
-        "date": timestamp(),
-        "seconds": seconds,
         "failed": found.failed,
         "outputs": [asdict(promise) for promise in found.promises],
         "rows": [asdict(row) for row in found.rows],
         "costs": [asdict(cost) for cost in found.costs],
-        "versions": versions(),
-        "config": recipe.config.to_yaml(),
     }
 
 
-def _write(folder: RunFolder, recipe: Recipe, found: Found, doc: Mapping[str, Any]) -> None:
-    folder.write_rows("table.csv", _COLUMNS, [*map(_output_line, found.promises), *map(_line, found.rows)])
-    scenes = [(c.scene, c.seconds, c.computing, c.steps, "; ".join(c.left_out), c.refused) for c in found.costs]
-    if scenes:
-        folder.write_rows("costs.csv", ("scene", "seconds", "computing", "steps", "left out", "refused"), scenes)
-    folder.write("provenance.json", json.dumps(doc, indent=1, ensure_ascii=False))
-    sections = [_outputs(recipe, found), _omissions(found), *([_scenes(found)] if found.costs else [])]
-    for section in sections:
-        if section.picture:
-            folder.write("figures/content.png", section.picture)
-    told = {name: doc[name] for name in ("command", "date", "seconds", "tolerance", "versions")}
-    folder.write("report.html", page(f"{recipe.name}: what is left out", _lead(recipe, found), sections, told))
+def _report(recipe: Recipe, found: Found) -> StudyReport:
+    tables: dict[str, CsvTable] = {
+        "table.csv": (_COLUMNS, [*map(_output_line, found.promises), *map(_line, found.rows)])
+    }
+    sections, picture = [_outputs(recipe, found), _omissions(found)], None
+    if found.costs:
+        scenes = [(c.scene, c.seconds, c.computing, c.steps, "; ".join(c.left_out), c.refused) for c in found.costs]
+        tables["costs.csv"] = (("scene", "seconds", "computing", "steps", "left out", "refused"), scenes)
+        sections.append(_scenes(found))
+        picture = sections[-1].picture
+    title, shown = f"{recipe.name}: what is left out", (*SHOWN, "tolerance")
+    return StudyReport(title, _lead(recipe, found), sections, {"content": picture}, tables, shown=shown)
 
 
 def _output_line(p: Promise) -> Sequence[Any]:
@@ -155,10 +146,28 @@ def _scenes(found: Found) -> Section:
         for c in found.costs
     ]
     columns = ("scene", "seconds", "share of full", "steps", "left out or made cheaper")
-    drawn = [c for c in found.costs if math.isfinite(c.seconds)]
-    from neusee.workflows.studies.leave_out.scene_cost_figures import bars
+    timed = [c for c in found.costs if math.isfinite(c.seconds)]
+    return Section("Cost follows content", text, columns, rows, _bars(timed) if timed else None)
 
-    return Section("Cost follows content", text, columns, rows, bars(drawn) if drawn else None)
+
+@drawn
+def _bars(costs: Sequence[Cost]) -> Any:
+    """Seconds of each scene: in its steps, and in the engine beside them."""
+    figure, axes = canvas(8.0, 0.42 * len(costs) + 1.0)
+    ax = axes[0, 0]
+    names = [cost.scene for cost in costs]
+    inside = [min(cost.computing, cost.seconds) for cost in costs]
+    ax.barh(names, inside, color=BLUE, label="in the steps")
+    beside = [cost.seconds - part for cost, part in zip(costs, inside, strict=True)]
+    ax.barh(names, beside, left=inside, color=_WAITING, label="reading, keeping, choosing")
+    for row, cost in enumerate(costs):
+        ax.annotate(f" {cost.seconds:.3g} s", (cost.seconds, row), va="center", fontsize=9)
+    ax.invert_yaxis()
+    ax.grid(False, axis="y")
+    ax.set_xlabel("seconds, from an empty store")
+    ax.set_xlim(0, 1.15 * max(cost.seconds for cost in costs))
+    ax.legend(loc="lower right")
+    return figure
 
 
 def _listed(cost: Cost) -> str:

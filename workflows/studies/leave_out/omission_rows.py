@@ -9,7 +9,8 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterable, Iterator, Sequence
-from dataclasses import asdict, dataclass, replace
+from dataclasses import dataclass, replace
+from functools import partial
 from typing import Any
 
 from torch import Tensor
@@ -21,12 +22,13 @@ from neusee.workflows.engine.step_record import facts_in
 from neusee.workflows.graph.recipe_graph import Recipe, needed
 from neusee.workflows.keys.cache_key import Key, digest
 from neusee.workflows.keys.engine_digest import engine
+from neusee.workflows.store.memo import memo
 from neusee.workflows.store.result_store import Store
-from neusee.workflows.studies.accuracy.work_precision_points import timestamp
 from neusee.workflows.studies.leave_out.possible_omissions import Omission, omissions
 from neusee.workflows.tolerance.error_norm import error_of, largest_error
 
 _SURE = 4.0  #: standard errors that a mean over pixels may lie beside that over the noise
+_ABOUT = {"step": "study leave-out"}
 _ROUNDING = 2e-7  #: of a sum in float32, as a share of its largest element
 
 
@@ -86,11 +88,7 @@ class Bench:
         """A row for each omission, from the store where it was measured before."""
         for omission in self.found:
             alone = omission.made(self.full)
-            key = self._key(omission, alone)
-            if not self.store.has(key):
-                about = {"step": "study leave-out", "seconds": 0.0, "date": timestamp()}
-                self.store.put(key, asdict(self._row(omission, alone)), about)
-            yield Row(**self.store.get(key))
+            yield memo(self.store, self._key(omission, alone), Row, partial(self._row, omission, alone), _ABOUT)
 
     def _row(self, omission: Omission, alone: Recipe) -> Row:
         seen = run(alone, self.store, tuple(omission.value_of(name) for name in omission.at))

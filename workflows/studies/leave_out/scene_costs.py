@@ -7,18 +7,20 @@ in one process; what a process does only once is done before.
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from dataclasses import asdict, dataclass, replace
+from dataclasses import dataclass, replace
 
 from neusee.workflows.engine.node_call import RunError
+from neusee.workflows.engine.provenance import machine
 from neusee.workflows.engine.runner import Result, run
 from neusee.workflows.graph.diagnostics import RecipeError
 from neusee.workflows.graph.recipe_graph import Recipe, needed
 from neusee.workflows.keys.cache_key import Key, digest, key_of
 from neusee.workflows.keys.code_digest import Code
 from neusee.workflows.keys.engine_digest import engine
+from neusee.workflows.recipe.changed_recipe import changed
+from neusee.workflows.store.memo import memo
 from neusee.workflows.store.result_store import Store
-from neusee.workflows.studies.accuracy.recipe_knobs import changed
-from neusee.workflows.studies.accuracy.work_precision_points import cold, machine, timestamp
+from neusee.workflows.studies.cold_run import cold
 
 _TIMES = 3  #: cold runs, of which the median counts
 _QUICK = 5.0  #: s; what takes longer is run once
@@ -40,24 +42,21 @@ class Cost:
     refused: str = ""
 
 
-def costs(recipe: Recipe, store: Store, tell: Callable[[str], None]) -> Iterator[Cost]:
+def costs(recipe: Recipe, store: Store, progress: Callable[[str], None]) -> Iterator[Cost]:
     """The cost of each scene that ``recipe`` can be changed to; what was timed on this machine is not timed again."""
-    code, warm = Code(store.code_memo), False
+    code, warm = Code(store.code_memo), list[Result]()
     for scene, made in scenes(recipe).items():
         if isinstance(made, str):
             yield Cost(scene, float("nan"), 0.0, 0, (), made)
             continue
-        key = _key(made, code)
-        if not store.has(key):
-            if not warm:
-                _cold(made, store)
-                warm = True
-            store.put(
-                key, asdict(_cost(scene, made, store)), {"step": "study leave-out", "seconds": 0.0, "date": timestamp()}
-            )
-        found = store.get(key)
-        cost = Cost(**{**found, "scene": scene, "left_out": tuple(found["left_out"])})
-        tell(f"{scene}: {cost.seconds:.3g} s" if not cost.refused else f"{scene}: {cost.refused}")
+
+        def compute(scene: str = scene, made: Recipe = made) -> Cost:
+            if not warm:  # libraries are imported and code is read by the first run of a process
+                warm.append(_cold(made, store))
+            return _cost(scene, made, store)
+
+        cost = replace(memo(store, _key(made, code), Cost, compute, {"step": "study leave-out"}), scene=scene)
+        progress(f"{scene}: {cost.seconds:.3g} s" if not cost.refused else f"{scene}: {cost.refused}")
         yield cost
 
 

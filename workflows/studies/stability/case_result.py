@@ -20,8 +20,7 @@ from neusee.workflows.graph.recipe_graph import Step
 from neusee.workflows.keys.cache_key import stream_seed
 from neusee.workflows.report.study_page import Mark
 from neusee.workflows.store.serialization import each_tensor, tensors_in
-from neusee.workflows.studies.stability.extreme_cases import Case
-from neusee.workflows.studies.stability.stated_limits import stated_of
+from neusee.workflows.studies.stability.extreme_cases import Case, stated_of
 from neusee.workflows.tolerance.error_norm import largest_error
 
 ROUNDING = 2.0**-23  #: a result in single precision is held to no less

@@ -14,6 +14,7 @@ from typing import Any, Literal
 import torch
 from torch import Tensor
 
+from neusee.nodes import Node
 from neusee.nodes.optics._laser_direction import field_of_view
 from neusee.nodes.sensor._saturation import photons_that_fill
 from neusee.nodes.values import Pupil
@@ -44,6 +45,23 @@ class Case:
     alike: bool = False  #: a step that compares two pictures is given the same twice
     size: Size = field(default_factory=Size)
     expect: Expect = "accurate"
+
+
+#: by node and case, the words of its docstring that say what becomes of NaN where the result cannot show it
+_STATED = {
+    ("restore.clipped", "NaN"): "so is what is not a number",
+    ("metrics.saturated", "NaN"): "so does one that is not a number",
+}
+
+
+def stated_of(node: Node, case: str) -> str | None:
+    """What a node says that it makes of a number that is none, where its result cannot show it."""
+    words = _STATED.get((node.path, case))
+    return words if words is not None and _says(node, words) else None
+
+
+def _says(node: Node, words: str) -> bool:
+    return words in " ".join((node.__doc__ or "").split())
 
 
 def middle(value: float) -> Callable[[Tensor], Tensor]:

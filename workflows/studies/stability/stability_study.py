@@ -3,30 +3,28 @@
 from __future__ import annotations
 
 import itertools
-import json
-import time
 import warnings
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import asdict, dataclass
-from datetime import UTC, datetime
+from functools import partial
 from pathlib import Path
 from typing import Any
 
-from neusee.workflows.engine.node_call import versions
+from neusee.workflows.engine.provenance import versions
 from neusee.workflows.engine.threads import one_thread
 from neusee.workflows.graph.recipe_graph import Recipe
-from neusee.workflows.keys.cache_key import Key, digest
+from neusee.workflows.keys.cache_key import digest
 from neusee.workflows.keys.code_digest import Code
 from neusee.workflows.keys.engine_digest import engine
-from neusee.workflows.report.run_folder import RunFolder, new_run
-from neusee.workflows.report.study_page import Mark, Section, page
+from neusee.workflows.report.study_folder import Progress, StudyReport, StudyRun
+from neusee.workflows.report.study_page import Mark, Section
+from neusee.workflows.store.memo import memo
 from neusee.workflows.store.result_store import Store
 from neusee.workflows.studies.stability.case_recipe import Chain, untouched
 from neusee.workflows.studies.stability.case_result import Cell, judged
 from neusee.workflows.studies.stability.extreme_cases import CASES, USUAL, Case
 from neusee.workflows.studies.stability.stability_figures import grid_picture
 
-Tell = Callable[[str], None]
 _COLUMNS = ("case", "step", "node", "mark", "error", "bound", "gradient error", "gradient bound", "note")
 _HOW = """Each step is given what the recipe gives it, at a small size, with one thing changed: a parameter of the
 recipe, the result of one of its steps, or the pictures that the step itself is given. Its result is compared with the
@@ -62,20 +60,18 @@ def study(
     store: Store,
     runs: Path,
     command: Sequence[str],
-    tell: Tell,
+    progress: Progress,
     cases: Sequence[Case] = CASES,
 ) -> Path:
     """Judge every step of ``recipe``, and its losses, in every case; cells that are stored are not judged again."""
-    began = time.perf_counter()
+    study_run = StudyRun("stability", recipe, command)
     with one_thread():
-        rows = list(_rows(recipe, store, cases, tell))
-    doc = _document(recipe, rows, command, time.perf_counter() - began)
-    with new_run(runs, f"{recipe.name}_stability", digest([repr(_line(row)) for row in rows])) as folder:
-        _write(folder, recipe, rows, doc)
-    return folder.path
+        rows = list(_rows(recipe, store, cases, progress))
+    document = study_run.document(_document(rows))
+    return study_run.write(runs, digest([repr(_line(row)) for row in rows]), document, _report(recipe, rows, document))
 
 
-def _rows(recipe: Recipe, store: Store, cases: Sequence[Case], tell: Tell) -> Iterator[Row]:
+def _rows(recipe: Recipe, store: Store, cases: Sequence[Case], progress: Progress) -> Iterator[Row]:
     code = Code(store.code_memo)
     own = engine("studies.stability.extreme_cases", "studies.stability.case_result")
     usual = Chain.of(recipe, USUAL, code)
@@ -84,7 +80,7 @@ def _rows(recipe: Recipe, store: Store, cases: Sequence[Case], tell: Tell) -> It
         found = list(_row(chain, set(untouched(chain, usual)), store, own))
         yield from found
         bad = sum(row.cell.mark == "fail" for row in found)
-        tell(f"[{number}/{len(cases)}] {case.name}: {len(found)} steps, {bad} fail")
+        progress(f"[{number}/{len(cases)}] {case.name}: {len(found)} steps, {bad} fail")
     code.save()
 
 
@@ -93,74 +89,48 @@ def _row(chain: Chain, same: set[str], store: Store, own: str) -> Iterator[Row]:
         if name in same:
             continue
         key = digest("stability", own, chain.case.name, chain.keys[name], [chain.keys[s] for s in step.sources])
-        known = _stored(store, key)
-        if known is None:
-            known = _judged(chain, name, store, key)
-        if known:
-            yield Row(chain.case, name, step.node.path, Cell(**known))
+        about = {"step": f"stability of {name}: {chain.case.name}", "recipe": chain.recipe.name, "versions": versions()}
+        cell = memo(store, key, dict, partial(_judged, chain, name), about, small=True)
+        if cell:
+            yield Row(chain.case, name, step.node.path, Cell(**cell))
 
 
-def _stored(store: Store, key: Key) -> dict[str, Any] | None:
-    """The fields of a cell, none where there is none to be had; None where it was never judged."""
-    try:
-        found: dict[str, Any] = store.get(key)
-    except KeyError:
-        return None
-    return found
-
-
-def _judged(chain: Chain, name: str, store: Store, key: Key) -> dict[str, Any]:
-    """The same, judged now and kept; none where a step before this one refused or the case changes nothing of it."""
-    step, began = chain.steps[name], time.perf_counter()
+def _judged(chain: Chain, name: str) -> dict[str, Any]:
+    """Return the fields of a cell; none where a step before this one refused or the case changes nothing of it."""
     try:
         inputs = chain.inputs(name)
         with warnings.catch_warnings():
             warnings.simplefilter("ignore")
-            cell = judged(step, inputs, chain.case, chain.recipe.seed)
+            cell = judged(chain.steps[name], inputs, chain.case, chain.recipe.seed)
     except LookupError:
-        cell = None
-    fields = {} if cell is None else asdict(cell)
-    store.jot(key, fields, _about(chain, name, time.perf_counter() - began))
-    return fields
-
-
-def _about(chain: Chain, name: str, seconds: float) -> dict[str, Any]:
-    date = datetime.now(UTC).isoformat(timespec="seconds")
-    return {"step": f"stability of {name}: {chain.case.name}", "recipe": chain.recipe.name, "seconds": seconds,
-            "versions": versions(), "date": date}  # fmt: skip
+        return {}
+    return {} if cell is None else asdict(cell)
 
 
 # --- the folder -------------------------------------------------------------------------------------------------------
 
 
-def _document(recipe: Recipe, rows: Sequence[Row], command: Sequence[str], seconds: float) -> dict[str, Any]:
+def _document(rows: Sequence[Row]) -> dict[str, Any]:
+    """Return what the folder says of the study, beside what every study says."""
     count = {mark: sum(row.cell.mark == mark for row in rows) for mark in ("pass", "warn", "fail")}
-    return {
-        "study": "stability",
-        "recipe": recipe.name,
-        "command": " ".join(command),
-        "date": datetime.now(UTC).isoformat(timespec="seconds"),
-        "cells": len(rows),
-        "passed": count["pass"],
-        "warned": count["warn"],
-        "failed": count["fail"],
-        "seconds": round(seconds, 2),
-        "versions": versions(),
-    }
+    return {"cells": len(rows), "passed": count["pass"], "warned": count["warn"], "failed": count["fail"]}
 
 
-def _write(folder: RunFolder, recipe: Recipe, rows: Sequence[Row], doc: dict[str, Any]) -> None:
+def _report(recipe: Recipe, rows: Sequence[Row], document: Mapping[str, Any]) -> StudyReport:
     worst = _worst(rows)
     picture = grid_picture([(row.case.group, row.case.name, row.node, row.cell) for row in worst])
-    folder.write("figures/stability.png", picture)
-    folder.write_rows("table.csv", _COLUMNS, map(_line, rows))
-    folder.write("provenance.json", json.dumps(doc, indent=1, ensure_ascii=False))
     lead = (
-        f"{doc['cells']} cells, {len({r.case.name for r in rows})} cases by {len({r.node for r in rows})} nodes: "
-        f"{doc['failed']} fail, {doc['warned']} warn, {doc['passed']} pass."
+        f"{document['cells']} cells, {len({r.case.name for r in rows})} cases by {len({r.node for r in rows})} nodes: "
+        f"{document['failed']} fail, {document['warned']} warn, {document['passed']} pass."
     )
-    sections = [Section("How to read it", _HOW, picture=picture), *_tables(rows)]
-    folder.write("report.html", page(f"Stability of {recipe.name}", lead, sections, doc))
+    return StudyReport(
+        f"Stability of {recipe.name}",
+        lead,
+        [Section("How to read it", _HOW, picture=picture), *_tables(rows)],
+        {"stability": picture},
+        tables={"table.csv": (_COLUMNS, map(_line, rows))},
+        shown=[name for name in document if name != "config"],
+    )
 
 
 def _worst(rows: Sequence[Row]) -> list[Row]:

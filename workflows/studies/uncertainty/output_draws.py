@@ -19,6 +19,7 @@ from torch import Tensor
 
 from neusee.workflows.engine.differentiable_function import as_function
 from neusee.workflows.engine.node_call import place
+from neusee.workflows.engine.provenance import timestamp
 from neusee.workflows.engine.threads import one_thread
 from neusee.workflows.graph.recipe_graph import needed
 from neusee.workflows.keys.cache_key import digest, key_of
@@ -26,8 +27,8 @@ from neusee.workflows.keys.code_digest import Code
 from neusee.workflows.keys.engine_digest import engine
 from neusee.workflows.recipe.distributions.uncertain_inputs import Inputs
 from neusee.workflows.report.result_numbers import numbers_of
+from neusee.workflows.store.memo import memo
 from neusee.workflows.store.result_store import Store
-from neusee.workflows.studies.accuracy.work_precision_points import timestamp
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray
@@ -36,6 +37,7 @@ if TYPE_CHECKING:
 
 Numbers = dict[str, list[float]]  #: by quantity, such as ``restored_quality.psnr``, its elements
 _ARENAS, _MAPPED, _TRIM = -8, -4, -1  #: M_ARENA_MAX, M_MMAP_MAX and M_TRIM_THRESHOLD of glibc's mallopt
+_ABOUT = {"step": "study uncertainty"}
 _NARROW = 8  #: columns that a table has at most; what has more of both is a picture
 
 
@@ -82,19 +84,17 @@ class Draws:
         whole = digest("uncertainty pictures", keys)
         if (first := self._kept(keys[0])) is not None and not first["pictures"]:
             return {}
-        with suppress(KeyError):
-            return _pairs(self.store.get(whole))
-        began, sums = time.perf_counter(), dict[str, _Sum]()
+        return _pairs(memo(self.store, whole, dict, lambda: self._sums(keys, values), _ABOUT))
+
+    def _sums(self, keys: Sequence[str], values: Places) -> dict[str, Tensor]:
+        """Return mean and standard deviation of every picture over the draws, by name."""
+        sums = dict[str, _Sum]()
         for key, result in zip(keys, self._results(list(values)), strict=True):
             self._keep(key, result)
             for name, value in result.items():
                 if _is_picture(value):
                     sums.setdefault(name, _Sum()).add(value)
-        found = {part: x for name, s in sums.items() for part, x in ((f"{name} mean", s.mean), (f"{name} sd", s.sd))}
-        if found:
-            seconds = time.perf_counter() - began
-            self.store.put(whole, found, {"step": "study uncertainty", "seconds": seconds, "date": timestamp()})
-        return _pairs(found)
+        return {part: x for name, s in sums.items() for part, x in ((f"{name} mean", s.mean), (f"{name} sd", s.sd))}
 
     def key(self, row: Places) -> str:
         """What decides the outputs at a draw: the keys of a run with these values."""
@@ -133,7 +133,7 @@ class Draws:
     def _keep(self, key: str, result: Mapping[str, Any]) -> Numbers:
         numbers = quantities(result)
         shown = [name for name, value in result.items() if _is_picture(value)]
-        about = {"step": "study uncertainty", "seconds": self.seconds / max(1, self.computed), "date": timestamp()}
+        about = {**_ABOUT, "seconds": self.seconds / max(1, self.computed), "date": timestamp()}
         self.store.jot(key, {"numbers": numbers, "pictures": shown}, about)
         return numbers
 

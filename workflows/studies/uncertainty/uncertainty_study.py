@@ -3,9 +3,7 @@
 from __future__ import annotations
 
 import io
-import json
-import time
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -13,16 +11,13 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from torch import Tensor
 
-from neusee.workflows.engine.node_call import versions
 from neusee.workflows.graph.recipe_graph import Recipe
 from neusee.workflows.keys.cache_key import digest
 from neusee.workflows.recipe.distributions.joint import Z_90
 from neusee.workflows.recipe.distributions.nominal_values import told
 from neusee.workflows.recipe.distributions.uncertain_inputs import SCRAMBLES, Inputs, Points
-from neusee.workflows.report.run_folder import RunFolder, new_run
-from neusee.workflows.report.study_page import page
+from neusee.workflows.report.study_folder import Content, Progress, StudyReport, StudyRun
 from neusee.workflows.store.result_store import Store
-from neusee.workflows.studies.accuracy.work_precision_points import timestamp
 from neusee.workflows.studies.uncertainty.output_draws import Draws, Numbers
 from neusee.workflows.studies.uncertainty.scatter_estimate import Scatter, scatter
 from neusee.workflows.studies.uncertainty.sobol_indices import Indices, indices, require_salib
@@ -32,7 +27,6 @@ if TYPE_CHECKING:
 
     Places = NDArray[np.float64]
 
-Tell = Callable[[str], None]
 LEAST = 64  #: draws before any stop
 _ROUND = 16  #: independent draws by round
 PICTURED = 32  #: draws that pictures are made of: a deviation to 13 %
@@ -86,7 +80,7 @@ def study(
     store: Store,
     runs: Path,
     command: Sequence[str],
-    tell: Tell,
+    progress: Progress,
     error: float = 0.05,
     most: int = 1000,
     points: str = "draws",
@@ -97,17 +91,15 @@ def study(
 
     ``workers`` draws are made at once, on the CPU one a core where it is 0; on another ``device`` one after another.
     """
-    began = time.perf_counter()
+    study_run = StudyRun("uncertainty", recipe, command)
     require_salib()
     inputs = Inputs.of(recipe)
     at = _points(inputs, recipe.seed, most, points)
     inputs.checked(np.concatenate([at.values, _ends(inputs)]))
     draws = Draws(inputs, store, device, workers)
-    found = _found(inputs, draws, at, tell, error, SCRAMBLES if points == "sobol" else 0)
-    doc = _document(found, draws, command, time.perf_counter() - began)
-    with new_run(runs, f"{recipe.name}_uncertainty", digest(doc["quantities"])) as folder:
-        _write(folder, found, doc)
-    return folder.path
+    found = _found(inputs, draws, at, progress, error, SCRAMBLES if points == "sobol" else 0)
+    document = study_run.document(_document(found, draws))
+    return study_run.write(runs, digest(document["quantities"]), document, _report(found))
 
 
 def _points(inputs: Inputs, seed: int, most: int, points: str) -> Points:
@@ -123,11 +115,11 @@ def _ends(inputs: Inputs) -> Places:
     return inputs.at(z)
 
 
-def _found(inputs: Inputs, draws: Draws, at: Points, tell: Tell, wanted: float, sequences: int) -> Found:
+def _found(inputs: Inputs, draws: Draws, at: Points, progress: Progress, wanted: float, sequences: int) -> Found:
     names = ", ".join(inputs.names)
-    tell(f"{len(inputs.names)} inputs: {names}; {len(draws.outputs)} outputs hang on them")
+    progress(f"{len(inputs.names)} inputs: {names}; {len(draws.outputs)} outputs hang on them")
     seconds = draws.ready()
-    tell(f"what they do not reach: {seconds:.1f} s")
+    progress(f"what they do not reach: {seconds:.1f} s")
     pictures = draws.pictures(at.values[: min(PICTURED, len(at.values))])
     ends = draws.numbers(_ends(inputs))
     if not ends[0]:
@@ -140,7 +132,7 @@ def _found(inputs: Inputs, draws: Draws, at: Points, tell: Tell, wanted: float, 
         values = {name: np.array([n[name] for n in numbers]) for name in ends[0]}
         scattered = {name: scatter(x, sequences) for name, x in values.items()}
         worst, error = _worst(scattered)
-        tell(f"{used} draws: every standard deviation to {error:.1%} ({worst})")
+        progress(f"{used} draws: every standard deviation to {error:.1%} ({worst})")
         if error <= wanted:
             break
     middle, swings = ends[0], _swings(inputs, ends, values, scattered)
@@ -186,15 +178,10 @@ def _one_is_the_other(x: Places, y: Places) -> bool:
 # --- the folder -------------------------------------------------------------------------------------------------------
 
 
-def _document(found: Found, draws: Draws, command: Sequence[str], seconds: float) -> dict[str, Any]:
-    recipe = found.inputs.recipe
+def _document(found: Found, draws: Draws) -> dict[str, Any]:
+    """Return what the folder says of the study, beside what every study says."""
     computed, spent = draws.computed, draws.seconds
     return {
-        "study": "uncertainty",
-        "recipe": recipe.name,
-        "command": " ".join(command),
-        "date": timestamp(),
-        "seconds": seconds,
         "draws": len(found.points.z),
         "points": "sobol" if found.sequences else "draws",
         "computed": computed,
@@ -208,8 +195,6 @@ def _document(found: Found, draws: Draws, command: Sequence[str], seconds: float
         "still": list(found.is_constant),
         "quantities": {name: _plain(found, name) for name in found.values},
         "sensitivity": {name: asdict(shares) for name, shares in found.shares.items()},
-        "versions": versions(),
-        "config": recipe.config.to_yaml(),
     }
 
 
@@ -233,23 +218,23 @@ def _plain(found: Found, name: str) -> dict[str, Any]:
     return {"error": s.error, "middle": list(found.middle[name]), **{k: x.tolist() for k, x in arrays.items()}}
 
 
-def _write(folder: RunFolder, found: Found, doc: Mapping[str, Any]) -> None:
+def _report(found: Found) -> StudyReport:
     from neusee.workflows.studies.uncertainty.uncertainty_page import drawn, lead, sections
 
-    shown = drawn(found)
-    for name, content in shown.items():
-        folder.write(f"figures/{name}.png", content)
-    folder.write("provenance.json", json.dumps(doc, indent=1, ensure_ascii=False))
-    folder.write_rows("table.csv", _COLUMNS, _rows(found))
-    folder.write("draws.npz", _arrays(found))
+    pictures = drawn(found)
+    files: dict[str, Content] = {"draws.npz": _arrays(found)}
     if found.pictures:
-        folder.write("pictures.npz", _packed({f"{n} {part}": x.numpy() for n, both in found.pictures.items()
-                                              for part, x in zip(("mean", "sd"), both, strict=True)}))  # fmt: skip
-    said = {
-        name: doc[name] for name in ("command", "date", "seconds", "draws", "computed", "seconds a draw", "versions")
-    }
-    title = f"{found.inputs.recipe.name}: what it is worth"
-    folder.write("report.html", page(title, lead(found), sections(found, shown), said))
+        files["pictures.npz"] = _packed({f"{n} {part}": x.numpy() for n, both in found.pictures.items()
+                                         for part, x in zip(("mean", "sd"), both, strict=True)})  # fmt: skip
+    return StudyReport(
+        f"{found.inputs.recipe.name}: what it is worth",
+        lead(found),
+        sections(found, pictures),
+        pictures,
+        tables={"table.csv": (_COLUMNS, _rows(found))},
+        files=files,
+        shown=("command", "date", "seconds", "draws", "computed", "seconds a draw", "versions"),
+    )
 
 
 def _rows(found: Found) -> list[Sequence[Any]]:

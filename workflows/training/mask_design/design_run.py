@@ -16,18 +16,17 @@ import torch
 from torch import Tensor
 
 from neusee.nodes import metrics
-from neusee.workflows.engine.node_call import versions
+from neusee.workflows.engine.provenance import timestamp, versions
 from neusee.workflows.graph.diagnostics import RecipeError
 from neusee.workflows.graph.recipe_graph import Recipe, needed
 from neusee.workflows.keys.cache_key import digest, file_digest
 from neusee.workflows.keys.code_digest import Code
 from neusee.workflows.keys.engine_digest import engine
 from neusee.workflows.recipe.blocks.mask_design_block import DesignError, MaskTraining, Weights, need_steps, state_file
+from neusee.workflows.recipe.changed_recipe import changed
 from neusee.workflows.report.run_folder import RunFolder, new_run
 from neusee.workflows.report.study_page import page
 from neusee.workflows.store.result_store import Store
-from neusee.workflows.studies.accuracy.recipe_knobs import changed
-from neusee.workflows.studies.accuracy.work_precision_points import timestamp
 from neusee.workflows.training.mask_design.design_terms import Terms
 from neusee.workflows.training.mask_design.optimizers import Kept, Learnt, learn
 

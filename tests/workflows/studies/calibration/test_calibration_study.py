@@ -14,9 +14,8 @@ from typer.testing import CliRunner
 
 from neusee.nodes.calibrate._likelihood import _linear_sensor
 from neusee.workflows.calibration import emcee_sampler
-from neusee.workflows.calibration.initial_guess import begin
 from neusee.workflows.calibration.log_posterior import SensorPosterior
-from neusee.workflows.calibration.posterior_mode import log_law, peak
+from neusee.workflows.calibration.posterior_mode import begin, log_law, peak
 from neusee.workflows.recipe.loading import load
 from neusee.workflows.store.result_store import Store
 from neusee.workflows.studies.calibration import calibration_study, simulated_sensors

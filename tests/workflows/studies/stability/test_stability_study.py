@@ -14,7 +14,7 @@ from neusee.workflows.keys.code_digest import Code
 from neusee.workflows.recipe.loading import load
 from neusee.workflows.recipe.step_declarations import find_node
 from neusee.workflows.store.result_store import Store
-from neusee.workflows.studies.stability import case_result, stability_study, stated_limits
+from neusee.workflows.studies.stability import case_result, extreme_cases, stability_study
 from neusee.workflows.studies.stability.case_recipe import Chain, untouched
 from neusee.workflows.studies.stability.case_result import judged
 from neusee.workflows.studies.stability.extreme_cases import CASES, USUAL, Case, Size
@@ -150,11 +150,11 @@ def test_words_of_a_cell_say_what_does_not_pass(picture):
 
 
 def test_what_is_stated_counts_only_as_long_as_the_docstring_states_it(monkeypatch):
-    (path, case), words = next(iter(stated_limits._STATED.items()))
-    assert stated_limits.stated_of(find_node(path), case) == words
-    assert stated_limits.stated_of(find_node(path), "usual") is None
-    monkeypatch.setattr(stated_limits, "_STATED", {(path, case): "whatever it is"})
-    assert stated_limits.stated_of(find_node(path), case) is None
+    (path, case), words = next(iter(extreme_cases._STATED.items()))
+    assert extreme_cases.stated_of(find_node(path), case) == words
+    assert extreme_cases.stated_of(find_node(path), "usual") is None
+    monkeypatch.setattr(extreme_cases, "_STATED", {(path, case): "whatever it is"})
+    assert extreme_cases.stated_of(find_node(path), case) is None
 
 
 @pytest.mark.parametrize(
@@ -178,8 +178,8 @@ def test_what_holds_by_less_than_twice_warns(error, slope, mark):
 
 
 def test_what_every_node_states_it_still_states():
-    for path, case in stated_limits._STATED:
-        assert stated_limits.stated_of(find_node(path), case) is not None
+    for path, case in extreme_cases._STATED:
+        assert extreme_cases.stated_of(find_node(path), case) is not None
 
 
 def test_poisson_numbers_are_the_same_in_both_precisions(picture):
