@@ -32,7 +32,7 @@ def calibrate(
         folder = run_calibration.calibrate(
             recipe, the_store(), out, command, progress, walkers=walkers, move=move, draws=draws
         )
-    except run_calibration.Refused as error:
+    except run_calibration.CalibrationRefused as error:
         fail(f"refused, nothing was drawn: {error}", FAILED)
     except (RunError, ValueError, ImportError) as error:
         fail(str(error), FAILED)
@@ -46,7 +46,7 @@ def calibrate(
 
 
 def _lines(parameters: dict[str, dict[str, object]]) -> list[str]:
-    from neusee.workflows.calibration.calibration_page import Row
+    from neusee.workflows.calibration.calibration_page import ParameterEstimate
 
-    rows = [Row(**{"mean": 0.0, "sd": 0.0, **row}) for row in parameters.values()]  # type: ignore[arg-type]
-    return [f"{row.name.replace('_', ' '):20s} {row.said}" for row in rows]
+    rows = [ParameterEstimate(**{"mean": 0.0, "sd": 0.0, **row}) for row in parameters.values()]  # type: ignore[arg-type]
+    return [f"{row.name.replace('_', ' '):20s} {row.text}" for row in rows]

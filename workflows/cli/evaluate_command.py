@@ -38,7 +38,7 @@ def evaluate(
     progress = (lambda line: None) if quiet else (lambda line: say([line]))
     how = {"data": data, "scenes": scenes, "strengths": strengths, "small": small, "reference": reference}
     command = ["neusee", "evaluate", name, *changes, f'--pipelines "{pipelines}"', *_given(how)]
-    folder = _evaluated(
+    folder = _evaluate(
         name,
         changes,
         pipelines,
@@ -59,7 +59,7 @@ def _given(how: dict[str, Any]) -> list[str]:
     return [f"--{key} {value}" for key, value in how.items() if value]
 
 
-def _evaluated(name: str, changes: list[str], pipelines: str, **how: Any) -> Path:
+def _evaluate(name: str, changes: list[str], pipelines: str, **how: Any) -> Path:
     """The folder of the evaluation, or one line of what is wrong."""
     from neusee.workflows.engine.node_call import RunError
     from neusee.workflows.evaluation import run_evaluation as protocol
@@ -68,7 +68,7 @@ def _evaluated(name: str, changes: list[str], pipelines: str, **how: Any) -> Pat
     try:
         read = protocol.read_pipelines(pipelines, here)
         return protocol.evaluate(name, read, changes, store=the_store(), folder=here, **how)
-    except protocol.Refused as error:
+    except protocol.EvaluationRefused as error:
         fail(str(error))
     except RunError as error:
         fail(str(error), FAILED)

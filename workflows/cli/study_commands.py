@@ -44,19 +44,19 @@ def accuracy(
     out: Out = Path("runs"),
 ) -> None:
     """Draw error against run time, of the whole recipe and of each step, over tolerances and knobs."""
-    _made("accuracy", words, quiet, out, seeds=seeds, quick=quick)
+    _run("accuracy", words, quiet, out, seeds=seeds, quick=quick)
 
 
 @study.command()
 def stability(words: Words = None, quiet: Quiet = False, debug: Debug = False, out: Out = Path("runs")) -> None:
     """Run stiff and extreme cases against float64, forward and gradient; fail where one does not hold."""
-    _made("stability", words, quiet, out)
+    _run("stability", words, quiet, out)
 
 
 @study.command("leave-out")
 def leave_out(words: Words = None, quiet: Quiet = False, debug: Debug = False, out: Out = Path("runs")) -> None:
     """Compute each omission in full beside it; fail where one changes more than was said."""
-    _made("leave-out", words, quiet, out)
+    _run("leave-out", words, quiet, out)
 
 
 @study.command()
@@ -69,7 +69,7 @@ def calibration(
     out: Out = Path("runs"),
 ) -> None:
     """Simulate sensors, calibrate each, rank the truth among the draws; fail where ranks or coverage are not right."""
-    _made("calibration", words, quiet, out, simulations=simulations, move=move.value)
+    _run("calibration", words, quiet, out, simulations=simulations, move=move.value)
 
 
 @study.command()
@@ -89,10 +89,10 @@ def uncertainty(
     """Draw what is uncertain (laws such as "normal(1 e-, 0.1 e-)", a posterior); show how the outputs scatter."""
     check_device(device)
     how = {"error": error, "most": most, "points": points.value, "workers": workers, "device": device}
-    _made("uncertainty", words, quiet, out, **how)
+    _run("uncertainty", words, quiet, out, **how)
 
 
-def _made(kind: str, words: list[str] | None, quiet: bool, out: Path, **options: Any) -> None:
+def _run(kind: str, words: list[str] | None, quiet: bool, out: Path, **options: Any) -> None:
     recipe, command = load(words)
     from neusee.workflows.engine.node_call import RunError
     from neusee.workflows.studies import run_study as studies
@@ -101,9 +101,9 @@ def _made(kind: str, words: list[str] | None, quiet: bool, out: Path, **options:
     command = ["neusee", "study", kind, *command[2:], *given]
     progress = (lambda line: None) if quiet else (lambda line: say([line]))
     try:
-        folder = studies.made(kind, recipe, the_store(), out, command, progress, **options)
+        folder = studies.run_study(kind, recipe, the_store(), out, command, progress, **options)
     except (RunError, ValueError, ImportError) as error:
         fail(str(error), FAILED)
     say([str(folder / "report.html")])
-    if count := studies.failed(folder):
+    if count := studies.count_failures(folder):
         fail(f"{count} do not hold: see {folder / 'report.html'}", FAILED)

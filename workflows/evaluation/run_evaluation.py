@@ -1,10 +1,10 @@
-"""Judge masks and restorers as the paper does: many scenes, many strengths, every pipeline on the very same ones.
+"""The paper's evaluation of masks and restorers: every pipeline on the same scenes and laser strengths.
 
     evaluate("first_light", read_pipelines("flat+none, five_half_rings+wiener", Path()), data=Path("photographs"))
 
-Each point, of a scene, a laser's strength and a pipeline, is a run of the recipe that the pipeline makes, to the last
-bit; but what a run would compute again and more strictly, because it could not prove its tolerance, is computed once.
-Points are kept in the store, so that what was stopped goes on.
+Each point, of a scene, a laser's strength and a pipeline, has the numbers of a run of the pipeline's recipe, to the
+last bit. A run that cannot prove its tolerance computes again more strictly; a point is computed once. The store keeps
+all points, so that an interrupted evaluation goes on.
 """
 
 from __future__ import annotations
@@ -17,11 +17,18 @@ from typing import Any
 import numpy as np
 
 from neusee.workflows.evaluation.comparison_pictures import Panel, panels
-from neusee.workflows.evaluation.confidence_intervals import METRICS, Interval, Table, against, table
-from neusee.workflows.evaluation.evaluation_points import Bench, Point, Wanted
+from neusee.workflows.evaluation.confidence_intervals import METRICS, Interval, MetricTable, compare_with, metric_table
+from neusee.workflows.evaluation.evaluation_points import EvaluationPoints, PointNumbers, PointRequest
 from neusee.workflows.evaluation.evaluation_scenes import Scene, scenes
-from neusee.workflows.evaluation.mask_optics import Mask, masks
-from neusee.workflows.evaluation.pipelines import NONE, Composed, Pipeline, Refused, composed, read_pipelines
+from neusee.workflows.evaluation.mask_optics import MaskOptics, masks
+from neusee.workflows.evaluation.pipelines import (
+    NONE,
+    EvaluationRefused,
+    Pipeline,
+    PipelineRecipes,
+    compose_pipelines,
+    read_pipelines,
+)
 from neusee.workflows.graph.recipe_graph import Recipe
 from neusee.workflows.keys.cache_key import digest
 from neusee.workflows.recipe.loading import load
@@ -29,14 +36,14 @@ from neusee.workflows.report.study_folder import CsvTable, Progress, StudyReport
 from neusee.workflows.store.remote_store import open_store
 from neusee.workflows.store.result_store import Store
 
-__all__ = ["STRENGTHS", "Evaluated", "Refused", "evaluate", "read_pipelines"]
+__all__ = ["STRENGTHS", "EvaluationRefused", "EvaluationResult", "evaluate", "read_pipelines"]
 
 STRENGTHS = (0.0, 1e1, 1e2, 1e3, 1e4, 1e5, 1e6)  #: the paper's
 SMALL = 256  #: pixels of the shorter side, at which the paper restores
 
 
 @dataclass(frozen=True)
-class Evaluated:
+class EvaluationResult:
     """All that was measured."""
 
     recipe: Recipe
@@ -44,11 +51,11 @@ class Evaluated:
     broken: Sequence[tuple[Path, str]]
     strengths: tuple[float, ...]
     small: int  #: pixels of the shorter side of the small pictures
-    reference: str  #: the pipeline that others are compared with
-    points: dict[str, list[dict[float, Point]]]  #: by pipeline, and scene by scene
-    tables: dict[str, Table]  #: by pipeline
-    against: dict[str, dict[str, Interval]]  #: by pipeline, what the reference's L1 is more
-    masks: dict[str, Mask]  #: by mask
+    reference: str  #: the pipeline to compare with
+    points: dict[str, list[dict[float, PointNumbers]]]  #: by pipeline, and scene by scene
+    tables: dict[str, MetricTable]  #: by pipeline
+    against: dict[str, dict[str, Interval]]  #: gains over the reference, by pipeline
+    masks: dict[str, MaskOptics]  #: by mask
     panels: Sequence[Panel]
     pipelines: Sequence[Pipeline]
 
@@ -70,48 +77,49 @@ def evaluate(
     device: str = "cpu",
     folder: Path | None = None,
 ) -> Path:
-    """Measure every pipeline over ``count`` scenes and all ``strengths``; give the folder of the results.
+    """Measure every pipeline over ``count`` scenes and all ``strengths``; return the folder of the results.
 
-    Args: recipe, changes: the camera, as `load` takes them. data: a folder of photographs; without, the recipe's own
-    scene. small: shorter side of the pictures that are compared a second time. reference: the pipeline that all are
-    compared with, the first if none. Raises `Refused` with every mistake before anything runs.
+    Args: recipe, changes: the camera, as `load` takes them. data: a folder of photographs; without one, the recipe's
+    own scene. small: shorter side of the reduced pictures that are compared too. reference: the pipeline to compare
+    with, the first one by default. progress: receives a line for each scene. Raises: `EvaluationRefused` with every
+    mistake before anything runs.
     """
     store, place = store or open_store(), folder or Path.cwd()
-    each = composed(recipe, changes, pipelines, place)
+    each = compose_pipelines(recipe, changes, pipelines, place)
     strengths, reference = _strengths(strengths), _reference(reference, pipelines)
     base = load(recipe, changes, place)
     study_run = StudyRun("evaluate", base, command)
     shown, broken = scenes(base, store, data, count)
     _announce(progress, each, shown, broken, strengths)
-    bench = Bench(store, small, device)
+    bench = EvaluationPoints(store, small, device)
     points = _points(bench, each, shown, strengths, progress)
     optics = masks(each, store, device, points)
     drawn = panels(bench, each, shown[0], strengths)
-    tables = {name: table(found, strengths) for name, found in points.items()}
+    tables = {name: metric_table(found, strengths) for name, found in points.items()}
     least = min(small, *(base.steps["truth"].params["shape"])) if "truth" in base.steps else small
-    more = {name: against(own, tables[reference], base.seed) for name, own in tables.items()}
+    more = {name: compare_with(own, tables[reference], base.seed) for name, own in tables.items()}
     rest = (reference, points, tables, more, optics, drawn, list(pipelines))
-    found = Evaluated(base, shown, broken, strengths, least, *rest)
+    found = EvaluationResult(base, shown, broken, strengths, least, *rest)
     document = study_run.document(_document(found, bench))
     return study_run.write(runs, digest(document["summary"]), document, _report(found))
 
 
 def _strengths(strengths: Sequence[float]) -> tuple[float, ...]:
     if not strengths or min(strengths) < 0 or not all(map(np.isfinite, strengths)):
-        raise Refused("--strengths: write multiples of saturation from 0, such as 0,1e1,1e3,1e6")
+        raise EvaluationRefused("--strengths: write multiples of saturation from 0, such as 0,1e1,1e3,1e6")
     return tuple(sorted(set(map(float, strengths))))
 
 
 def _reference(reference: str, pipelines: Sequence[Pipeline]) -> str:
     names = [pipeline.name for pipeline in pipelines]
     if reference and reference not in names:
-        raise Refused(f"--reference {reference}: is none of the pipelines {', '.join(names)}")
+        raise EvaluationRefused(f"--reference {reference}: is not one of the pipelines {', '.join(names)}")
     return reference or names[0]
 
 
 def _announce(
     progress: Progress,
-    each: Sequence[Composed],
+    each: Sequence[PipelineRecipes],
     shown: Sequence[Scene],
     broken: Sequence[Any],
     strengths: Sequence[float],
@@ -126,19 +134,23 @@ def _announce(
 
 
 def _points(
-    bench: Bench, each: Sequence[Composed], shown: Sequence[Scene], strengths: Sequence[float], progress: Progress
-) -> dict[str, list[dict[float, Point]]]:
-    """Every point; the scenes of one laser after another, for they have its optics in common."""
-    found: dict[str, list[dict[float, Point]]] = {p.name: [{} for _ in shown] for p in each}
+    bench: EvaluationPoints,
+    each: Sequence[PipelineRecipes],
+    shown: Sequence[Scene],
+    strengths: Sequence[float],
+    progress: Progress,
+) -> dict[str, list[dict[float, PointNumbers]]]:
+    """Return every point, with the scenes of one laser after another because they share its optics."""
+    found: dict[str, list[dict[float, PointNumbers]]] = {p.name: [{} for _ in shown] for p in each}
     before, order = "", [scene.case for scene in shown]
     for done, scene in enumerate(sorted(shown, key=lambda scene: order.index(scene.case)), 1):
         if before not in ("", scene.case):
             bench.forget()
-        before, alone = scene.case, replace(scene)  # its picture goes with it
+        before, alone = scene.case, replace(scene)  # a copy, so that the picture is released with it
         for strength in strengths if scene.case != NONE else (0.0,):
             for pipeline in each:
                 found[pipeline.name][scene.number][strength] = bench.point(
-                    pipeline, Wanted(alone, scene.case, strength)
+                    pipeline, PointRequest(alone, scene.case, strength)
                 )
         progress(f"scene {done} of {len(shown)} ({scene.case}, {scene.name}): {bench.computed} points computed")
     return found
@@ -147,7 +159,7 @@ def _points(
 # --- the folder -------------------------------------------------------------------------------------------------------
 
 
-def _document(found: Evaluated, bench: Bench) -> dict[str, Any]:
+def _document(found: EvaluationResult, bench: EvaluationPoints) -> dict[str, Any]:
     """Return what the folder says of the evaluation, beside what every study says."""
     from neusee.workflows.evaluation.evaluation_page import summary
 
@@ -163,10 +175,10 @@ def _document(found: Evaluated, bench: Bench) -> dict[str, Any]:
     }
 
 
-def _report(found: Evaluated) -> StudyReport:
-    from neusee.workflows.evaluation.evaluation_page import COLUMNS, drawn, lead, rows, sections
+def _report(found: EvaluationResult) -> StudyReport:
+    from neusee.workflows.evaluation.evaluation_page import COLUMNS, draw_pictures, lead, rows, sections
 
-    pictures = drawn(found)
+    pictures = draw_pictures(found)
     tables: dict[str, CsvTable] = {
         "points.csv": (("pipeline", "mask", "restorer", *_POINT, *METRICS), _point_rows(found)),
         "table.csv": (COLUMNS, rows(found)),
@@ -180,7 +192,7 @@ def _report(found: Evaluated) -> StudyReport:
 _POINT = ("scene", "photograph", "laser", "strength")
 
 
-def _point_rows(found: Evaluated) -> list[Sequence[Any]]:
+def _point_rows(found: EvaluationResult) -> list[Sequence[Any]]:
     return [
         (p.name, p.front, p.back, s.number, s.name, s.case, f"{k:g}", *(point[metric] for metric in METRICS))
         for p in found.pipelines
@@ -189,7 +201,7 @@ def _point_rows(found: Evaluated) -> list[Sequence[Any]]:
     ]
 
 
-def _curve_rows(found: Evaluated) -> list[Sequence[Any]]:
+def _curve_rows(found: EvaluationResult) -> list[Sequence[Any]]:
     return [
         (name, f"{x:.6g}", *row)
         for name, mask in found.masks.items()

@@ -15,9 +15,7 @@ from neusee.workflows.store.result_store import Store
 T = TypeVar("T")
 
 
-def memo(
-    store: Store, key: str, kind: Callable[..., T], compute: Callable[[], T], about: Metadata, *, small: bool = False
-) -> T:
+def memo(store: Store, key: str, kind: type[T], compute: Callable[[], T], about: Metadata, *, small: bool = False) -> T:
     """Return the value that ``store`` keeps under ``key``; where it keeps none, compute the value and keep it.
 
     Args: kind: the type of the value. A dataclass is kept as the dict of its fields. about: what the metadata says of
@@ -34,5 +32,6 @@ def memo(
     return value
 
 
-def _restored(kind: Callable[..., T], kept: Any) -> T:
-    return kind(**kept) if is_dataclass(kind) else kind(kept)
+def _restored(kind: type[T], kept: Any) -> T:
+    make: Callable[..., T] = kind
+    return make(**kept) if is_dataclass(kind) else make(kept)

@@ -13,7 +13,7 @@ from neusee.nodes.units import read_any
 if TYPE_CHECKING:
     from numpy.typing import NDArray
 
-    Places = NDArray[np.float64]
+    FloatArray = NDArray[np.float64]
 
 #: by kind, what its two arguments are
 KINDS = {
@@ -36,7 +36,7 @@ class Law:
     second: float
     unit: str  #: SI unit of a draw; empty for a number without one
 
-    def at(self, z: Places) -> Places:
+    def at(self, z: FloatArray) -> FloatArray:
         """The value that lies where ``z`` lies in the standard normal law."""
         from scipy.special import ndtr
 

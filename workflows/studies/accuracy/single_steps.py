@@ -2,7 +2,7 @@
 
 Every step that takes more than a hundredth of the time and whose node has a reference is tried on its own
 inputs. Where the reference would take too long on them, all forms are tried on the middle of the
-pictures and on fewer bands, and that is said.
+pictures and on fewer bands, and the page says so.
 """
 
 from __future__ import annotations
@@ -55,31 +55,31 @@ class Form:
 
 
 @dataclass(frozen=True)
-class Trying:
-    """What was found of a step; plain values, so that it can be kept."""
+class StepMeasurement:
+    """The forms of a step with their errors and times; plain values, so that the store can keep them."""
 
     forms: list[dict[str, Any]] = field(default_factory=list)
     reference: float = 0.0  #: s
-    cut: str = ""  #: what it was tried on; empty: on all
+    cut_inputs: str = ""  #: what it was tried on; empty: on all
     refused: str = ""
 
 
 @dataclass(frozen=True)
 class StepTried:
-    """A step that matters, or why it was not tried."""
+    """A step that matters, and its measurement or the reason why it was not tried."""
 
     step: str  #: the slowest of its items
     node: str
     share: float  #: of the time, with all its items
-    found: Trying
+    found: StepMeasurement
 
     @property
     def forms(self) -> list[Form]:
         return [Form(**form) for form in self.found.forms]
 
 
-def that_matter(recipe: Recipe, seconds: Mapping[str, float]) -> list[tuple[str, float]]:
-    """The slowest item of each step that takes more than `SHARE` of the time, with the share of all its items."""
+def steps_that_matter(recipe: Recipe, seconds: Mapping[str, float]) -> list[tuple[str, float]]:
+    """Return the slowest item of each step that takes more than `SHARE` of the time, and the share of all its items."""
     items: dict[str, list[str]] = defaultdict(list)
     for name in seconds:
         if name in recipe.steps:
@@ -90,12 +90,15 @@ def that_matter(recipe: Recipe, seconds: Mapping[str, float]) -> list[tuple[str,
 
 
 def try_step(recipe: Recipe, name: str, share: float, store: Store, patience: float) -> StepTried:
-    """The forms of a step of ``recipe``, from the store or tried now; ``patience``: s that its reference may take."""
+    """Return the forms of a step of ``recipe``, from the store or tried now.
+
+    ``patience`` is the longest time in seconds that the reference of the step may take.
+    """
     step = recipe.steps[name]
     if step.node.hooks.reference is None:
-        return StepTried(name, step.node.path, share, Trying(refused="its node has no reference"))
+        return StepTried(name, step.node.path, share, StepMeasurement(refused="its node has no reference"))
     key, about = _key(recipe, name, patience, store), {"step": f"study accuracy: {name}"}
-    found = memo(store, key, Trying, lambda: _tried(recipe, step, store, patience), about)
+    found = memo(store, key, StepMeasurement, lambda: _tried(recipe, step, store, patience), about)
     return StepTried(name, step.node.path, share, found)
 
 
@@ -107,21 +110,21 @@ def _key(recipe: Recipe, name: str, patience: float, store: Store) -> str:
     return digest("accuracy of a step", keys[name], patience, engine("studies.accuracy.single_steps"), machine())
 
 
-def _tried(recipe: Recipe, step: Step, store: Store, patience: float) -> Trying:
+def _tried(recipe: Recipe, step: Step, store: Store, patience: float) -> StepMeasurement:
     try:
         values = run(replace(recipe, exact=True), store, step.sources).values
     except RunError as error:
-        return Trying(refused=f"its inputs: {error.cause}")
+        return StepMeasurement(refused=f"its inputs: {error.cause}")
     inputs = [_gathered(step.wires.get(name), values) for name in step.node.inputs]
     with torch.no_grad():
         afforded = _largest(step, inputs, recipe.seed, patience)
         if afforded is None:
-            return Trying(refused="its reference runs neither on its inputs in time nor on a part of them")
+            return StepMeasurement(refused="its reference runs neither on its inputs in time nor on a part of them")
         size, truth, seconds = afforded
-        part = cut(step.node, inputs, size)
+        part = cut_inputs(step.node, inputs, size)
         forms = [asdict(form) for form in _forms(step, part, truth, recipe.seed)]
     whole = all(a.shape == b.shape for a, b in zip(tensors_in(inputs), tensors_in(part), strict=True))
-    return Trying(forms, seconds, "" if whole else _words_of(step.node, size))
+    return StepMeasurement(forms, seconds, "" if whole else _words_of(step.node, size))
 
 
 def _gathered(wire: str | tuple[str, ...] | None, values: Mapping[str, Any]) -> Any:
@@ -129,13 +132,13 @@ def _gathered(wire: str | tuple[str, ...] | None, values: Mapping[str, Any]) -> 
 
 
 def _largest(step: Step, inputs: list[Any], seed: int, patience: float) -> tuple[Cut, Any, float] | None:
-    """The largest part of the inputs on which the reference is within the patience; its result and seconds."""
+    """Return the largest part of the inputs on which the reference is within the patience, its result and seconds."""
     best: tuple[Cut, Any, float] | None = None
     assert step.node.hooks.reference is not None
     for size in _CUTS:
         if best is not None and best[2] * _GROWTH > patience:
             break
-        part = cut(step.node, inputs, size)
+        part = cut_inputs(step.node, inputs, size)
         try:
             truth, seconds = _once(lambda part=part: _call(step, step.node.hooks.reference, part, seed))  # type: ignore[misc]
         except Exception:  # a part of a picture may be no input for it: a larger one may
@@ -145,7 +148,7 @@ def _largest(step: Step, inputs: list[Any], seed: int, patience: float) -> tuple
 
 
 def _forms(step: Step, inputs: list[Any], truth: Any, seed: int) -> Iterator[Form]:
-    """The result of every way to compute the step, as far as it can be compared with the reference's."""
+    """Yield every way to compute the step whose result can be compared with that of the reference."""
     for (line, label), way in _ways(step, inputs, seed).items():
         try:
             value, seconds = _timed(way)
@@ -155,7 +158,7 @@ def _forms(step: Step, inputs: list[Any], truth: Any, seed: int) -> Iterator[For
 
 
 def _ways(step: Step, inputs: list[Any], seed: int) -> dict[tuple[str, str], Callable[[], Any]]:
-    """As it is used, in each other precision, allowance and window that it has, and left out."""
+    """Return calls of the step: as used, in each other precision, allowance and window, and left out."""
     node = step.node
     ways: dict[tuple[str, str], Callable[[], Any]] = {(USED, ""): lambda: _call(step, node, inputs, seed)}
     for word in _others(step, "precision"):
@@ -177,7 +180,7 @@ def _ways(step: Step, inputs: list[Any], seed: int) -> dict[tuple[str, str], Cal
 
 
 def _inner(psf: Psf, share: float) -> Psf:
-    """The middle of a PSF; its centre stays at N // 2."""
+    """Return the middle of a PSF; its centre stays at N // 2."""
     x = psf.intensity
     for axis in (-2, -1):
         size = x.shape[axis]
@@ -187,7 +190,7 @@ def _inner(psf: Psf, share: float) -> Psf:
 
 
 def _meant(value: Any) -> Any:
-    """What counts of a result: of a mixture the cube that it stands for, of channels the sums alone."""
+    """Return the values to compare: the cube of a mixture, the sums of channels."""
     if isinstance(value, Mixture):
         return torch.einsum("bk,kyx->byx", value.basis.to(value.planes), value.planes)
     return (value.planes, value.flux) if isinstance(value, Channels) else value
@@ -211,7 +214,7 @@ def _once(way: Callable[[], Any]) -> tuple[Any, float]:
 
 
 def _timed(way: Callable[[], Any]) -> tuple[Any, float]:
-    """The result, and the median of some calls after the first, which finds its tables."""
+    """Return the result, and the median time of some calls after the first one, which computes tables."""
     value, seconds = _once(way)
     times = [] if seconds < _LONG_ENOUGH else [seconds]
     while len(times) < _TIMES and sum(times) < _LONG_ENOUGH:
@@ -222,8 +225,8 @@ def _timed(way: Callable[[], Any]) -> tuple[Any, float]:
 # --- smaller inputs, on which the slow reference can be afforded ------------------------------------------------------
 
 
-def cut(node: Node, inputs: list[Any], size: Cut) -> list[Any]:
-    """``inputs`` with no picture wider than ``size`` and no more bands, where the node says which axis these are."""
+def cut_inputs(node: Node, inputs: list[Any], size: Cut) -> list[Any]:
+    """Return ``inputs`` with no picture wider and no more bands than ``size``, where the node names the band axis."""
     side, bands = size
     found = []
     for name, value in zip(node.inputs, inputs, strict=True):
@@ -234,7 +237,7 @@ def cut(node: Node, inputs: list[Any], size: Cut) -> list[Any]:
 
 
 def _words_of(node: Node, size: Cut) -> str:
-    """The cut in words; empty of none."""
+    """Return the cut in words; an empty text where nothing is cut."""
     side, bands = size
     fewer = bands and (node.bands or {}).keys() - {"return"}
     parts = [f"the middle {side} × {side}"] * bool(side) + [f"{bands} bands"] * bool(fewer)
@@ -248,7 +251,7 @@ def _middle(x: Tensor, side: int) -> Tensor:
 
 
 def _fewer(value: Any, axis: int, bands: int) -> Any:
-    """Bands spread over all that there are."""
+    """Return bands that are spread evenly over all bands."""
     if isinstance(value, Tensor):
         count = value.shape[axis]
         if count <= bands:

@@ -14,8 +14,8 @@ from neusee.workflows.report.figures.style import BLUE, canvas, drawn
 from neusee.workflows.report.study_folder import SHOWN, CsvTable, Progress, StudyReport, StudyRun
 from neusee.workflows.report.study_page import Mark, Section
 from neusee.workflows.store.result_store import Store
-from neusee.workflows.studies.leave_out.omission_rows import Bench, Promise, Row
-from neusee.workflows.studies.leave_out.scene_costs import Cost, costs
+from neusee.workflows.studies.leave_out.omission_rows import OmissionComparison, OmissionRow, OutputError
+from neusee.workflows.studies.leave_out.scene_costs import SceneCost, measure_scenes
 
 _WAITING = "#9DB8CC"  #: the colour of seconds that the engine takes beside the steps
 _COLUMNS = ("what", "name", "kind", "chosen", "bound", "rms", "largest", "outputs", "put back", "seconds", "holds")
@@ -27,17 +27,17 @@ _HOW = {
 
 
 @dataclass(frozen=True)
-class Found:
+class LeaveOutResult:
     """All that the study measured."""
 
-    promises: Sequence[Promise]
-    rows: Sequence[Row]
-    costs: Sequence[Cost]
+    output_errors: Sequence[OutputError]
+    rows: Sequence[OmissionRow]
+    costs: Sequence[SceneCost]
 
     @property
     def failed(self) -> int:
-        """Bounds and outputs that do not hold."""
-        return sum(not holds for holds in (*(p.holds for p in self.promises), *(r.holds for r in self.rows)))
+        """Return how many bounds and outputs do not hold."""
+        return sum(not holds for holds in (*(p.holds for p in self.output_errors), *(r.holds for r in self.rows)))
 
 
 def study(
@@ -45,14 +45,14 @@ def study(
 ) -> Path:
     """Measure every omission of ``recipe``; with ``contents``, also what simpler scenes cost."""
     study_run = StudyRun("leave-out", recipe, command)
-    bench = Bench(recipe, store)
-    promises, rows = bench.promises(), []
-    for promise in promises:
+    comparison = OmissionComparison(recipe, store)
+    output_errors, rows = comparison.output_errors(), []
+    for promise in output_errors:
         progress(f"{promise.output}: error {promise.rms:.2g}, tolerance {recipe.tolerance:.2g}{_said(promise.holds)}")
-    for row in bench.rows():
+    for row in comparison.rows():
         rows.append(row)
         progress(f"{row.name} {row.kind}: {row.rms:.2g}, stated at most {row.bound:.2g}{_said(row.holds)}")
-    found = Found(promises, rows, list(costs(recipe, store, progress)) if contents else [])
+    found = LeaveOutResult(output_errors, rows, list(measure_scenes(recipe, store, progress)) if contents else [])
     document = study_run.document(_document(recipe, found))
     return study_run.write(runs, digest(document["rows"]), document, _report(recipe, found))
 
@@ -61,20 +61,20 @@ def _said(holds: bool) -> str:
     return "" if holds else ": does not hold"
 
 
-def _document(recipe: Recipe, found: Found) -> dict[str, Any]:
+def _document(recipe: Recipe, found: LeaveOutResult) -> dict[str, Any]:
     """Return what the folder says of the study, beside what every study says."""
     return {
         "tolerance": recipe.tolerance,
         "failed": found.failed,
-        "outputs": [asdict(promise) for promise in found.promises],
+        "outputs": [asdict(promise) for promise in found.output_errors],
         "rows": [asdict(row) for row in found.rows],
         "costs": [asdict(cost) for cost in found.costs],
     }
 
 
-def _report(recipe: Recipe, found: Found) -> StudyReport:
+def _report(recipe: Recipe, found: LeaveOutResult) -> StudyReport:
     tables: dict[str, CsvTable] = {
-        "table.csv": (_COLUMNS, [*map(_output_line, found.promises), *map(_line, found.rows)])
+        "table.csv": (_COLUMNS, [*map(_output_line, found.output_errors), *map(_line, found.rows)])
     }
     sections, picture = [_outputs(recipe, found), _omissions(found)], None
     if found.costs:
@@ -86,18 +86,18 @@ def _report(recipe: Recipe, found: Found) -> StudyReport:
     return StudyReport(title, _lead(recipe, found), sections, {"content": picture}, tables, shown=shown)
 
 
-def _output_line(p: Promise) -> Sequence[Any]:
+def _output_line(p: OutputError) -> Sequence[Any]:
     return "output", p.output, "", "", p.bound, p.rms, p.largest, "", "", "", p.holds
 
 
-def _line(r: Row) -> Sequence[Any]:
+def _line(r: OmissionRow) -> Sequence[Any]:
     worst = max(r.outputs.values(), default=0.0)
     return "omission", r.name, r.kind, r.taken, r.bound, r.rms, r.largest, worst, r.back, r.seconds, r.holds
 
 
-def _lead(recipe: Recipe, found: Found) -> str:
+def _lead(recipe: Recipe, found: LeaveOutResult) -> str:
     chosen = [row for row in found.rows if row.taken]
-    worst = max((p.rms for p in found.promises), default=0.0)
+    worst = max((p.rms for p in found.output_errors), default=0.0)
     held = "All bounds hold" if not found.failed else f"{found.failed} bounds do not hold"
     return (
         f"{held}. Of {len(found.rows)} steps that could be left out or made cheaper with a known bound, the recipe "
@@ -106,40 +106,40 @@ def _lead(recipe: Recipe, found: Found) -> str:
     )
 
 
-def _outputs(recipe: Recipe, found: Found) -> Section:
-    rows = [(p.output, p.bound, p.rms, p.largest, recipe.tolerance, _held(p.holds)) for p in found.promises]
+def _outputs(recipe: Recipe, found: LeaveOutResult) -> Section:
+    rows = [(p.output, p.bound, p.rms, p.largest, recipe.tolerance, _held(p.holds)) for p in found.output_errors]
     text = """Each output of the recipe as it chooses, against the same with everything in full (--exact). The
-        error is the root mean square of the difference over the largest element, which is what the tolerance limits;
-        the proved bound is what the nodes carry on from what was left out, where they can tell."""
+        error is the root mean square of the difference over the largest element, which the tolerance limits. The
+        proved bound is what the nodes propagate from the omissions, where they have a bound."""
     columns = ("output", "proved bound", "error", "largest difference", "tolerance", "holds")
-    return Section("The outputs", text, columns, rows, marks=_marks([p.holds for p in found.promises], 5))
+    return Section("The outputs", text, columns, rows, marks=_marks([p.holds for p in found.output_errors], 5))
 
 
-def _omissions(found: Found) -> Section:
-    text = """Each omission alone, everything else in full. A step that is left out hands its input on; light that is
-        not added stays away; of an image that is summed, only the sums over bands that its readers ask for are
-        convolved. The stated bound and the change are shares of the largest element of the step's full result; of what
-        is not added, of what it would be added to; of what is summed, of the steps that read it. For noise and for sums
-        the bound limits the root mean square, where one draw of the noise may lie four standard errors beside the mean;
-        for all else it limits the largest difference.
+def _omissions(found: LeaveOutResult) -> Section:
+    text = """Each omission alone, with everything else in full. A step that is left out passes its input on. Light
+        may be not added. For a summed image, only the sums over bands that its readers need are convolved. The stated
+        bound and the change are shares of the largest element: of the step's full result; for light that is not added,
+        of the sum; for a summed image, of the steps that read it. For noise and for sums the bound limits the root mean
+        square, and one draw of the noise may differ by four standard errors; for all others it limits the largest
+        difference.
 
         Outputs: the error of the worst output by this omission alone. Put back: the change of the worst output when the
-        recipe as it chooses computes this one in full after all. Saved: what its steps took, in seconds. A bound that
-        the tolerance does not allow is tested all the same."""
+        recipe as it chooses computes this one step in full. Saved: the seconds of its steps. A bound that the tolerance
+        does not allow is tested too."""
     columns = ("step", "how", "chosen", "bound", "error", "largest", "outputs", "put back", "saved s", "holds")
     rows = [(*_told(r), _held(r.holds)) for r in found.rows]
     marks = _marks([r.holds for r in found.rows], len(columns) - 1)
     return Section("Each omission", text, columns, rows, marks=marks)
 
 
-def _told(r: Row) -> Sequence[Any]:
+def _told(r: OmissionRow) -> Sequence[Any]:
     worst = max(r.outputs.values(), default=0.0)
     return r.name, _HOW[r.kind], r.taken, r.bound, r.rms, r.largest, worst, r.back, r.seconds
 
 
-def _scenes(found: Found) -> Section:
-    text = """What the engine takes from an empty store, in one process: the median of up to three runs. The first row
-        computes everything in full; each of the others may leave out what its scene does not need."""
+def _scenes(found: LeaveOutResult) -> Section:
+    text = """The run time from an empty store, in one process: the median of up to three runs. The first row
+        computes everything in full; the others may leave out what their scene does not need."""
     full = found.costs[0].seconds
     rows = [
         (c.scene, None if c.refused else c.seconds, None if c.refused else c.seconds / full, c.steps, _listed(c))
@@ -151,8 +151,8 @@ def _scenes(found: Found) -> Section:
 
 
 @drawn
-def _bars(costs: Sequence[Cost]) -> Any:
-    """Seconds of each scene: in its steps, and in the engine beside them."""
+def _bars(costs: Sequence[SceneCost]) -> Any:
+    """Draw the seconds of each scene: in its steps, and in the engine beside them."""
     figure, axes = canvas(8.0, 0.42 * len(costs) + 1.0)
     ax = axes[0, 0]
     names = [cost.scene for cost in costs]
@@ -170,7 +170,7 @@ def _bars(costs: Sequence[Cost]) -> Any:
     return figure
 
 
-def _listed(cost: Cost) -> str:
+def _listed(cost: SceneCost) -> str:
     return cost.refused or ", ".join(cost.left_out) or "nothing"
 
 

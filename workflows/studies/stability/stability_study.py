@@ -1,4 +1,4 @@
-"""Is every step sound at the extremes: the grid of cases and steps, each cell a stated bound and a number."""
+"""The study of stability: a grid of extreme cases and steps, each cell with a bound and a measured error."""
 
 from __future__ import annotations
 
@@ -20,27 +20,27 @@ from neusee.workflows.report.study_folder import Progress, StudyReport, StudyRun
 from neusee.workflows.report.study_page import Mark, Section
 from neusee.workflows.store.memo import memo
 from neusee.workflows.store.result_store import Store
-from neusee.workflows.studies.stability.case_recipe import Chain, untouched
-from neusee.workflows.studies.stability.case_result import Cell, judged
+from neusee.workflows.studies.stability.case_recipe import CaseRecipe, unchanged_steps
+from neusee.workflows.studies.stability.case_result import Cell, judge_step
 from neusee.workflows.studies.stability.extreme_cases import CASES, USUAL, Case
 from neusee.workflows.studies.stability.stability_figures import grid_picture
 
 _COLUMNS = ("case", "step", "node", "mark", "error", "bound", "gradient error", "gradient bound", "note")
-_HOW = """Each step is given what the recipe gives it, at a small size, with one thing changed: a parameter of the
-recipe, the result of one of its steps, or the pictures that the step itself is given. Its result is compared with the
+_HOW = """Each step has the inputs of the recipe, at a small size, with one change: a parameter of the recipe, the
+result of one of its steps, or the pictures among the inputs of the step. Its result is compared with the
 node's own reference, or with the same function on the same inputs in float64; the number is the largest difference over
 the largest element, and the bound is the node's rtol (no less than 1.2e-7, what single precision can hold).
 
 The second number is that of the gradient of a weighted sum of the result with respect to every picture, over its
-largest element; the bound is 1e-4, or ten times the node's rtol where that is more. What holds by less than twice is
-marked as a warning: another machine's rounding may take it over. A number that is none, or infinite,
-must be refused with a reason, stay to be seen in the result, or count as the limit of large numbers. One that refuses
-passes where its error says what is wrong. Empty: the step is given what it is given in the usual case, or nothing."""
+largest element; the bound is 1e-4, or ten times the node's rtol where that is more. A cell
+above half of its bound has a warning: the rounding of another machine may take it over. NaN or infinity must be refused
+with a reason, show in the result, or give the limit of large numbers. A step that refuses its inputs passes if its
+error names the cause. Empty: the step has the inputs of the usual case, or none."""
 
 
 @dataclass(frozen=True)
-class Row:
-    """One cell with where it stands."""
+class GridCell:
+    """One cell with its case, step and node."""
 
     case: Case
     step: str
@@ -49,7 +49,7 @@ class Row:
 
     @property
     def severity(self) -> tuple[int, float]:
-        """The worst cell of several steps of one node is the one shown."""
+        """Return the order by which the worst cell of several steps of one node is chosen."""
         shares = [e / b for e, b in ((self.cell.error, self.cell.bound), (self.cell.slope, self.cell.slope_bound))
                   if e is not None and b]  # fmt: skip
         return ("pass", "warn", "fail").index(self.cell.mark), max(shares, default=-1.0)
@@ -63,7 +63,7 @@ def study(
     progress: Progress,
     cases: Sequence[Case] = CASES,
 ) -> Path:
-    """Judge every step of ``recipe``, and its losses, in every case; cells that are stored are not judged again."""
+    """Judge every step of ``recipe``, and its losses, in every case; read the cells that the store has."""
     study_run = StudyRun("stability", recipe, command)
     with one_thread():
         rows = list(_rows(recipe, store, cases, progress))
@@ -71,20 +71,20 @@ def study(
     return study_run.write(runs, digest([repr(_line(row)) for row in rows]), document, _report(recipe, rows, document))
 
 
-def _rows(recipe: Recipe, store: Store, cases: Sequence[Case], progress: Progress) -> Iterator[Row]:
+def _rows(recipe: Recipe, store: Store, cases: Sequence[Case], progress: Progress) -> Iterator[GridCell]:
     code = Code(store.code_memo)
     own = engine("studies.stability.extreme_cases", "studies.stability.case_result")
-    usual = Chain.of(recipe, USUAL, code)
+    usual = CaseRecipe.of(recipe, USUAL, code)
     for number, case in enumerate(cases, 1):
-        chain = usual if case is USUAL else Chain.of(recipe, case, code)
-        found = list(_row(chain, set(untouched(chain, usual)), store, own))
+        chain = usual if case is USUAL else CaseRecipe.of(recipe, case, code)
+        found = list(_row(chain, set(unchanged_steps(chain, usual)), store, own))
         yield from found
         bad = sum(row.cell.mark == "fail" for row in found)
         progress(f"[{number}/{len(cases)}] {case.name}: {len(found)} steps, {bad} fail")
     code.save()
 
 
-def _row(chain: Chain, same: set[str], store: Store, own: str) -> Iterator[Row]:
+def _row(chain: CaseRecipe, same: set[str], store: Store, own: str) -> Iterator[GridCell]:
     for name, step in chain.steps.items():
         if name in same:
             continue
@@ -92,16 +92,16 @@ def _row(chain: Chain, same: set[str], store: Store, own: str) -> Iterator[Row]:
         about = {"step": f"stability of {name}: {chain.case.name}", "recipe": chain.recipe.name, "versions": versions()}
         cell = memo(store, key, dict, partial(_judged, chain, name), about, small=True)
         if cell:
-            yield Row(chain.case, name, step.node.path, Cell(**cell))
+            yield GridCell(chain.case, name, step.node.path, Cell(**cell))
 
 
-def _judged(chain: Chain, name: str) -> dict[str, Any]:
-    """Return the fields of a cell; none where a step before this one refused or the case changes nothing of it."""
+def _judged(chain: CaseRecipe, name: str) -> dict[str, Any]:
+    """Return the fields of a cell; none where an earlier step refused or the case changes nothing of the step."""
     try:
         inputs = chain.inputs(name)
         with warnings.catch_warnings():
             warnings.simplefilter("ignore")
-            cell = judged(chain.steps[name], inputs, chain.case, chain.recipe.seed)
+            cell = judge_step(chain.steps[name], inputs, chain.case, chain.recipe.seed)
     except LookupError:
         return {}
     return {} if cell is None else asdict(cell)
@@ -110,13 +110,13 @@ def _judged(chain: Chain, name: str) -> dict[str, Any]:
 # --- the folder -------------------------------------------------------------------------------------------------------
 
 
-def _document(rows: Sequence[Row]) -> dict[str, Any]:
+def _document(rows: Sequence[GridCell]) -> dict[str, Any]:
     """Return what the folder says of the study, beside what every study says."""
     count = {mark: sum(row.cell.mark == mark for row in rows) for mark in ("pass", "warn", "fail")}
     return {"cells": len(rows), "passed": count["pass"], "warned": count["warn"], "failed": count["fail"]}
 
 
-def _report(recipe: Recipe, rows: Sequence[Row], document: Mapping[str, Any]) -> StudyReport:
+def _report(recipe: Recipe, rows: Sequence[GridCell], document: Mapping[str, Any]) -> StudyReport:
     worst = _worst(rows)
     picture = grid_picture([(row.case.group, row.case.name, row.node, row.cell) for row in worst])
     lead = (
@@ -133,14 +133,14 @@ def _report(recipe: Recipe, rows: Sequence[Row], document: Mapping[str, Any]) ->
     )
 
 
-def _worst(rows: Sequence[Row]) -> list[Row]:
-    """One row for each case and node."""
+def _worst(rows: Sequence[GridCell]) -> list[GridCell]:
+    """Return the worst row for each case and node."""
     ordered = sorted(rows, key=lambda r: (CASES.index(r.case) if r.case in CASES else 0, r.node))
     groups = itertools.groupby(ordered, key=lambda r: (r.case.name, r.node))
     return [max(group, key=lambda r: r.severity) for _, group in groups]
 
 
-def _tables(rows: Sequence[Row]) -> Iterator[Section]:
+def _tables(rows: Sequence[GridCell]) -> Iterator[Section]:
     told: tuple[tuple[Mark, str, str], ...] = (
         ("fail", "What fails", "Nothing."),
         ("warn", "What holds by less than twice", "Nothing."),
@@ -155,6 +155,6 @@ def _tables(rows: Sequence[Row]) -> Iterator[Section]:
     yield Section("The cases", "", ("case", "group", "what"), [(c.name, c.group, c.what) for c in cases])
 
 
-def _line(row: Row) -> tuple[Any, ...]:
+def _line(row: GridCell) -> tuple[Any, ...]:
     c = row.cell
     return row.case.name, row.step, row.node, c.mark, c.error, c.bound, c.slope, c.slope_bound, c.note

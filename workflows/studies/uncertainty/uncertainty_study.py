@@ -1,4 +1,4 @@
-"""The study of uncertainty: what a recipe's outputs are worth, its values being known only so well."""
+"""The study of uncertainty: how far a recipe's outputs scatter when its uncertain values do."""
 
 from __future__ import annotations
 
@@ -15,17 +15,17 @@ from neusee.workflows.graph.recipe_graph import Recipe
 from neusee.workflows.keys.cache_key import digest
 from neusee.workflows.recipe.distributions.joint import Z_90
 from neusee.workflows.recipe.distributions.nominal_values import told
-from neusee.workflows.recipe.distributions.uncertain_inputs import SCRAMBLES, Inputs, Points
+from neusee.workflows.recipe.distributions.uncertain_inputs import SCRAMBLES, InputDraws, Inputs
 from neusee.workflows.report.study_folder import Content, Progress, StudyReport, StudyRun
 from neusee.workflows.store.result_store import Store
-from neusee.workflows.studies.uncertainty.output_draws import Draws, Numbers
+from neusee.workflows.studies.uncertainty.output_draws import Numbers, OutputDraws
 from neusee.workflows.studies.uncertainty.scatter_estimate import Scatter, scatter
-from neusee.workflows.studies.uncertainty.sobol_indices import Indices, indices, require_salib
+from neusee.workflows.studies.uncertainty.sobol_indices import SobolIndices, indices, require_salib
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray
 
-    Places = NDArray[np.float64]
+    FloatArray = NDArray[np.float64]
 
 LEAST = 64  #: draws before any stop
 _ROUND = 16  #: independent draws by round
@@ -34,16 +34,16 @@ _COLUMNS = ("quantity", "element", "at the medians", "mean", "sd", "5 %", "95 %"
 
 
 @dataclass(frozen=True)
-class Found:
+class UncertaintyResult:
     """All that the study measured."""
 
     inputs: Inputs
-    points: Points  #: those that were used
-    values: Mapping[str, Places]  #: by quantity (draw, element)
+    points: InputDraws  #: those that were used
+    values: Mapping[str, FloatArray]  #: by quantity (draw, element)
     scatter: Mapping[str, Scatter]
     middle: Mapping[str, Sequence[float]]  #: every input at its median
     swings: Mapping[str, Sequence[tuple[str, float, float]]]  #: by number: input, at its 5 %, at its 95 %
-    shares: Mapping[str, Indices]  #: by number
+    shares: Mapping[str, SobolIndices]  #: by number
     pictures: Mapping[str, tuple[Tensor, Tensor]]
     is_constant: tuple[str, ...]  #: outputs that no input reaches
     wanted: float  #: relative error
@@ -51,27 +51,27 @@ class Found:
 
     @property
     def error(self) -> float:
-        """The greatest relative error of a standard deviation."""
+        """Return the greatest relative error of a standard deviation."""
         return _worst(self.scatter)[1]
 
     @property
     def worst(self) -> str:
-        """The quantity that has it."""
+        """Return the quantity whose standard deviation has the greatest relative error."""
         return _worst(self.scatter)[0]
 
     @property
     def strange(self) -> list[str]:
-        """Quantities that are not finite in some draw."""
+        """Return the quantities that are not finite in some draw."""
         return [name for name, x in self.values.items() if not np.isfinite(x).all()]
 
     @property
     def failed(self) -> int:
-        """Bars that do not hold: the error that was asked for, and that all is finite."""
+        """Return how many bars do not hold: the error that was asked for, and that every quantity is finite."""
         return len(self.strange) + (not self.error <= self.wanted)
 
     @property
     def numbers(self) -> list[str]:
-        """Quantities of one element that vary, without those that are another one in another unit."""
+        """Return the quantities of one element that vary, each once where two differ only by their unit."""
         return list(self.swings)
 
 
@@ -89,41 +89,44 @@ def study(
 ) -> Path:
     """Draw until every standard deviation is known to a relative ``error``, or ``most`` draws are made.
 
-    ``workers`` draws are made at once, on the CPU one a core where it is 0; on another ``device`` one after another.
+    ``workers`` draws are made at once; 0 means one for each core of the CPU. Another ``device`` makes one after
+    another.
     """
     study_run = StudyRun("uncertainty", recipe, command)
     require_salib()
     inputs = Inputs.of(recipe)
     at = _points(inputs, recipe.seed, most, points)
     inputs.checked(np.concatenate([at.values, _ends(inputs)]))
-    draws = Draws(inputs, store, device, workers)
+    draws = OutputDraws(inputs, store, device, workers)
     found = _found(inputs, draws, at, progress, error, SCRAMBLES if points == "sobol" else 0)
     document = study_run.document(_document(found, draws))
     return study_run.write(runs, digest(document["quantities"]), document, _report(found))
 
 
-def _points(inputs: Inputs, seed: int, most: int, points: str) -> Points:
+def _points(inputs: Inputs, seed: int, most: int, points: str) -> InputDraws:
     if points == "sobol":
         return inputs.sobol(SCRAMBLES * 2 ** int(np.log2(max(most, LEAST) / SCRAMBLES)), seed)
     return inputs.independent(most if inputs.most is None else min(most, inputs.most), seed)
 
 
-def _ends(inputs: Inputs) -> Places:
-    """All inputs at their median, and each by itself at its 5 and its 95 %."""
+def _ends(inputs: Inputs) -> FloatArray:
+    """Return all inputs at their median, and each one by itself at its 5 % and at its 95 %."""
     count = len(inputs.names)
     z = np.concatenate([np.zeros((1, count)), *(np.stack([-Z_90 * e, Z_90 * e]) for e in np.eye(count))])
     return inputs.at(z)
 
 
-def _found(inputs: Inputs, draws: Draws, at: Points, progress: Progress, wanted: float, sequences: int) -> Found:
+def _found(
+    inputs: Inputs, draws: OutputDraws, at: InputDraws, progress: Progress, wanted: float, sequences: int
+) -> UncertaintyResult:
     names = ", ".join(inputs.names)
-    progress(f"{len(inputs.names)} inputs: {names}; {len(draws.outputs)} outputs hang on them")
+    progress(f"{len(inputs.names)} inputs: {names}; {len(draws.outputs)} outputs depend on them")
     seconds = draws.ready()
-    progress(f"what they do not reach: {seconds:.1f} s")
+    progress(f"steps that no input reaches: {seconds:.1f} s")
     pictures = draws.pictures(at.values[: min(PICTURED, len(at.values))])
     ends = draws.numbers(_ends(inputs))
     if not ends[0]:
-        raise ValueError("the outputs are pictures alone: ask for a number too, such as saturated or restored_quality")
+        raise ValueError("the outputs are pictures only: ask for a number too, such as saturated or restored_quality")
     numbers: list[Numbers] = []
     used = 0
     while used < len(at.values):
@@ -139,23 +142,23 @@ def _found(inputs: Inputs, draws: Draws, at: Points, progress: Progress, wanted:
     z = at.z[:used]
     shares = {n: indices(inputs.labels, z, values[n][:, 0], inputs.recipe.seed) for n in swings}
     rest = (pictures, draws.is_constant, wanted, sequences)
-    return Found(inputs, Points(z, at.values[:used]), values, scattered, middle, swings, shares, *rest)
+    return UncertaintyResult(inputs, InputDraws(z, at.values[:used]), values, scattered, middle, swings, shares, *rest)
 
 
 def _next(used: int, most: int, sequences: int) -> int:
-    """Sobol's points are even after powers of two alone."""
+    """Return the next number of draws; points of Sobol are even only after a power of two."""
     more = max(LEAST, 2 * used) if sequences else max(LEAST, used + _ROUND)
     return min(more, most)
 
 
 def _worst(found: Mapping[str, Scatter]) -> tuple[str, float]:
-    """The quantity whose standard deviation is known worst, and its relative error."""
+    """Return the quantity whose standard deviation is known worst, and its relative error."""
     name = max(found, key=lambda each: found[each].error)
     return name, found[name].error
 
 
 def _swings(
-    inputs: Inputs, ends: Sequence[Numbers], values: Mapping[str, Places], scattered: Mapping[str, Scatter]
+    inputs: Inputs, ends: Sequence[Numbers], values: Mapping[str, FloatArray], scattered: Mapping[str, Scatter]
 ) -> dict[str, list[tuple[str, float, float]]]:
     found: dict[str, list[tuple[str, float, float]]] = {}
     for name, x in values.items():
@@ -169,8 +172,8 @@ def _swings(
     return found
 
 
-def _one_is_the_other(x: Places, y: Places) -> bool:
-    """Whether two numbers are proportional in every draw, such as pixels and their share of all."""
+def _one_is_the_other(x: FloatArray, y: FloatArray) -> bool:
+    """Return True if two numbers are proportional in every draw, such as pixels and their share of all."""
     at = int(np.abs(y).argmax())
     return y[at] != 0 and bool(np.allclose(x * y[at], y * x[at], rtol=1e-9, atol=0.0))
 
@@ -178,7 +181,7 @@ def _one_is_the_other(x: Places, y: Places) -> bool:
 # --- the folder -------------------------------------------------------------------------------------------------------
 
 
-def _document(found: Found, draws: Draws) -> dict[str, Any]:
+def _document(found: UncertaintyResult, draws: OutputDraws) -> dict[str, Any]:
     """Return what the folder says of the study, beside what every study says."""
     computed, spent = draws.computed, draws.seconds
     return {
@@ -198,7 +201,7 @@ def _document(found: Found, draws: Draws) -> dict[str, Any]:
     }
 
 
-def _inputs(found: Found) -> list[dict[str, Any]]:
+def _inputs(found: UncertaintyResult) -> list[dict[str, Any]]:
     inputs, values = found.inputs, found.points.values
     return [
         {
@@ -212,22 +215,22 @@ def _inputs(found: Found) -> list[dict[str, Any]]:
     ]
 
 
-def _plain(found: Found, name: str) -> dict[str, Any]:
+def _plain(found: UncertaintyResult, name: str) -> dict[str, Any]:
     s = found.scatter[name]
     arrays = {"mean": s.mean, "sd": s.sd, "low": s.low, "high": s.high}
     return {"error": s.error, "middle": list(found.middle[name]), **{k: x.tolist() for k, x in arrays.items()}}
 
 
-def _report(found: Found) -> StudyReport:
-    from neusee.workflows.studies.uncertainty.uncertainty_page import drawn, lead, sections
+def _report(found: UncertaintyResult) -> StudyReport:
+    from neusee.workflows.studies.uncertainty.uncertainty_page import draw_pictures, lead, sections
 
-    pictures = drawn(found)
+    pictures = draw_pictures(found)
     files: dict[str, Content] = {"draws.npz": _arrays(found)}
     if found.pictures:
         files["pictures.npz"] = _packed({f"{n} {part}": x.numpy() for n, both in found.pictures.items()
                                          for part, x in zip(("mean", "sd"), both, strict=True)})  # fmt: skip
     return StudyReport(
-        f"{found.inputs.recipe.name}: what it is worth",
+        f"{found.inputs.recipe.name}: how certain it is",
         lead(found),
         sections(found, pictures),
         pictures,
@@ -237,7 +240,7 @@ def _report(found: Found) -> StudyReport:
     )
 
 
-def _rows(found: Found) -> list[Sequence[Any]]:
+def _rows(found: UncertaintyResult) -> list[Sequence[Any]]:
     rows: list[Sequence[Any]] = []
     for name, s in found.scatter.items():
         columns = zip(found.middle[name], s.mean, s.sd, s.low, s.high, strict=True)
@@ -245,8 +248,8 @@ def _rows(found: Found) -> list[Sequence[Any]]:
     return rows
 
 
-def _arrays(found: Found) -> bytes:
-    """Inputs and quantities by name, draw by draw."""
+def _arrays(found: UncertaintyResult) -> bytes:
+    """Return inputs and quantities by name, draw by draw, as the bytes of an npz file."""
     columns = dict(zip(found.inputs.names, found.points.values.T, strict=True))
     return _packed({**columns, **found.values})
 
