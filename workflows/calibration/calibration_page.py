@@ -134,7 +134,7 @@ def _stated(result: CalibrationResult) -> str:
 def sections(result: CalibrationResult) -> list[Section]:
     """Return the parts of the page: parameters, checks, what is not identifiable, and the pictures."""
     models = (_models,) if result.models else ()
-    return [part(result) for part in (_parameters, *models, _checks, _untold, _curve, _corner, _chains)]
+    return [part(result) for part in (_parameters, *models, _checks, _not_determined, _curve, _corner, _chains)]
 
 
 def _parameters(result: CalibrationResult) -> Section:
@@ -142,7 +142,7 @@ def _parameters(result: CalibrationResult) -> Section:
         limit, which depends on the prior. The last columns show where the recipe's own value lies among the draws, and
         the width of the posterior over that of the prior."""
     columns = ("parameter", "posterior", "5 %", "95 %", "unit", "recipe", "draws below it", "width / prior")
-    rows = [_told(r) for r in result.rows()]
+    rows = [_cells(r) for r in result.rows()]
     marks: dict[tuple[int, int], Mark] = {
         (i, 6): "pass" if 0.005 <= r.share <= 0.995 else "warn"
         for i, r in enumerate(result.rows())
@@ -151,7 +151,7 @@ def _parameters(result: CalibrationResult) -> Section:
     return Section("The sensor", text, columns, rows, marks=marks)
 
 
-def _told(r: ParameterEstimate) -> Sequence[Any]:
+def _cells(r: ParameterEstimate) -> Sequence[Any]:
     numbers = (f"{x:.6g}" for x in (r.low, r.high))
     return r.name.replace("_", " "), r.text, *numbers, r.unit, f"{r.nominal:.6g}", r.share, r.narrower
 
@@ -182,7 +182,7 @@ def _checks(result: CalibrationResult) -> Section:
     return Section("Checks", text, ("check", "found", "bar", "holds"), rows, marks=marks)
 
 
-def _untold(result: CalibrationResult) -> Section:
+def _not_determined(result: CalibrationResult) -> Section:
     text = """Singular values of the slopes of the levels per standard deviation of the prior, before anything is
         drawn. In a direction below 3 the prior constrains the parameters more than the frames do."""
     said = list(result.identifiability.directions)

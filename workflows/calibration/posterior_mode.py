@@ -39,9 +39,8 @@ class LaplaceFit:
     def draw(self, count: int, rng: np.random.Generator) -> FloatArray:
         """Return samples (count, free) of the normal distribution."""
         values, vectors = np.linalg.eigh(self.covariance)
-        found: FloatArray = (
-            self.theta + (rng.standard_normal((count, len(self.theta))) * np.sqrt(values.clip(0))) @ vectors.T
-        )
+        normal = rng.standard_normal((count, len(self.theta)))
+        found: FloatArray = self.theta + (normal * np.sqrt(values.clip(0))) @ vectors.T
         return found
 
 

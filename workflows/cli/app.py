@@ -6,133 +6,81 @@ Nothing heavy is imported before a command asks for it: ``neusee --help`` never 
 from __future__ import annotations
 
 import gc
+import inspect
+import os
 import sys
+from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
+from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
+from neusee import __version__
 from neusee.workflows.cli.cache_commands import cache
 from neusee.workflows.cli.calibrate_command import calibrate
 from neusee.workflows.cli.command_frame import (
     BAD,
     DONE,
     FAILED,
-    MISSED,
     Debug,
-    Out,
+    Device,
+    Exact,
+    Memory,
     Words,
     bytes_of,
     check_device,
-    executor_of,
     fail,
     load,
     refuse,
     say,
-    split,
     the_store,
 )
 from neusee.workflows.cli.evaluate_command import evaluate
 from neusee.workflows.cli.list_commands import nodes, recipes, schema
+from neusee.workflows.cli.run_command import run
 from neusee.workflows.cli.study_commands import study
+from neusee.workflows.cli.sweep_command import sweep
 from neusee.workflows.cli.train_command import train
 
 if TYPE_CHECKING:
-    from neusee.workflows.engine.step_job import Executor
-    from neusee.workflows.graph.recipe_graph import Recipe
-    from neusee.workflows.simulation.simulate_recipe import Simulation
-    from neusee.workflows.store.result_store import Store
+    from typer.models import CommandInfo
 
-app = typer.Typer(
-    name="neusee",
-    help="What a laser does to a camera: its light, its glass and its sensor, as recipes. "
-    "`neusee run` is the place to start.",
-    add_completion=False,
-    no_args_is_help=True,
-    rich_markup_mode=None,
-    pretty_exceptions_enable=False,
-)
-app.add_typer(cache, name="cache")
-app.add_typer(study, name="study")
-for command in (calibrate, evaluate, train, recipes, nodes, schema):
-    app.command()(command)
-
-Device = Annotated[str, typer.Option("--device", help="Where to compute: cpu, cuda, or several: cuda:0,cuda:1,cpu.")]
-Where = Annotated[
-    str, typer.Option("--executor", help="Who computes: local, dask, dask:4 (workers), or tcp://scheduler:8786.")
-]
-KeepAll = Annotated[bool, typer.Option("--exact", help="Leave nothing out: every step in full.")]
-Memory = Annotated[str, typer.Option("--memory", help="What a device may use, such as 6 GB; more is refused.")]
+_HOW: Mapping[str, Any] = {
+    "name": "neusee",
+    "help": "Simulate what a laser does to a camera: its light, its glass and its sensor, as recipes. "
+    "Start with `neusee run`. Each command explains itself: `neusee run --help`.",
+    "epilog": "Exit codes: 0 done; 1 failed while running; 2 mistake in the recipe or the arguments; "
+    "3 expected numbers missed, a check of a calibration failed, or damaged results found.",
+    "context_settings": {"help_option_names": ["-h", "--help"]},
+    "no_args_is_help": True,
+    "rich_markup_mode": None,
+    "pretty_exceptions_enable": False,
+}
+app = typer.Typer(**_HOW)
+app.command()(run)
 
 
-@app.command()
-def run(
-    words: Words = None,
-    as_json: Annotated[bool, typer.Option("--json", help="One JSON document on stdout.")] = False,
-    quiet: Annotated[bool, typer.Option("--quiet", help="The report's path alone.")] = False,
-    debug: Debug = False,
-    device: Device = "cpu",
-    executor: Where = "local",
-    memory: Memory = "",
-    exact: KeepAll = False,
-    out: Out = Path("runs"),
+def _say_version(wanted: bool) -> None:
+    if wanted:
+        say([f"neusee {__version__}"])
+        raise typer.Exit(DONE)
+
+
+@app.callback()
+def _options(
+    version: Annotated[
+        bool, typer.Option("--version", help="Show the version and exit.", callback=_say_version, is_eager=True)
+    ] = False,
 ) -> None:
-    """Run a recipe, from the cache where it can, and write its report."""
-    recipe, command = load(words, exact=exact)
-    from neusee.workflows.report import console
-
-    check_device(device)
-    room = bytes_of(memory, "--memory") if memory else None
-    if not (as_json or quiet):
-        say(console.opening(recipe, " ".join(command[1:])))
-    store = the_store()
-    if room is not None:
-        _refuse_too_large(recipe, store, device, room)
-    with executor_of(executor, store) as carries_out:
-        done = _simulate(recipe, store, command, device, out, as_json or quiet, carries_out, room)
-    if as_json:
-        import json
-
-        say([json.dumps({"report": str(done.page), **done.document}, ensure_ascii=False)])
-    elif quiet:
-        say([str(done.page)])
-    else:
-        say(console.closing(done.document, str(done.page), console.next_commands(recipe)))
-    if done.document["missed"]:
-        raise typer.Exit(MISSED)
-
-
-def _refuse_too_large(recipe: Recipe, store: Store, device: str, memory: int) -> None:
-    """Stop before anything runs where, as far as earlier runs tell, the memory cannot do."""
-    from neusee.workflows.engine.local_executor import lanes_of
-    from neusee.workflows.explain.run_forecast import planned
-
-    if refused := planned(recipe, store, lanes_of(device.split(","), memory)).refused:
-        fail(f"--memory: {refused}")
-
-
-def _simulate(
-    recipe: Recipe,
-    store: Store,
-    command: list[str],
-    device: str,
-    out: Path,
-    silent: bool,
-    executor: Executor | None,
-    memory: int | None,
-) -> Simulation:
-    from neusee.workflows.report.console import screen
-    from neusee.workflows.simulation.simulate_recipe import simulate, steps_of, wanted
-    from neusee.workflows.tolerance.cheaper_steps import with_substitutions
-
-    recipe = with_substitutions(recipe, wanted(recipe))
-    with screen(recipe, steps_of(recipe), silent) as shown:
-        return simulate(recipe, store, out, command, device, shown.watch, executor, memory)
+    pass
 
 
 @app.command()
 def validate(words: Words = None, debug: Debug = False) -> None:
-    """Check a recipe: every mistake at once, and nothing is run."""
+    """Check a recipe without running it.
+
+    All mistakes are listed at once, each with its file, line and column and the nearest known name.
+    """
     recipe, command = load(words)
     from neusee.workflows.report.console import opening
 
@@ -145,10 +93,17 @@ def plan(
     debug: Debug = False,
     device: Device = "cpu",
     memory: Memory = "",
-    exact: KeepAll = False,
-    devices: Annotated[str, typer.Option("--devices", help="Machines to simulate: a YAML file, or eight_a100.")] = "",
+    exact: Exact = False,
+    devices: Annotated[
+        str, typer.Option("--devices", help="Simulate these machines: a YAML file, or the example eight_a100.")
+    ] = "",
 ) -> None:
-    """Say what would run, where, for how long and with how much memory; compute nothing."""
+    """Say what a run would compute, where and for how long.
+
+    Nothing is computed. Seconds, bytes and memory are those of earlier runs of the same step, even at another size;
+    a step that never ran shows a question mark. With --devices the run is simulated on machines that you do not
+    have: makespan, utilisation and critical path.
+    """
     recipe, _ = load(words, exact=exact)
     from neusee.workflows.explain import run_forecast
 
@@ -175,7 +130,11 @@ def why(
     debug: Debug = False,
     device: Device = "cpu",
 ) -> None:
-    """Say what makes a step other than its nearest earlier result: which value, where, or whose code."""
+    """Say why a step differs from its nearest earlier result.
+
+    The answer names the value that changed and where it was written, such as
+    `sensor.read_noise 10.5 -> 20 e- (argument 2)`, or the code that changed.
+    """
     recipe, _ = load(words, before=1)
     from neusee.workflows.explain.why_rerun import why_lines
 
@@ -186,46 +145,11 @@ def why(
 
 
 @app.command()
-def sweep(
-    words: Words = None,
-    paired: Annotated[bool, typer.Option("--zip", help="Pair the axes' values instead of combining them.")] = False,
-    on_error: Annotated[str, typer.Option("--on-error", help="stop, or continue with the next point.")] = "stop",
-    netcdf: Annotated[bool, typer.Option("--netcdf", help="Write sweep.nc too (needs neusee[xarray]).")] = False,
-    quiet: Annotated[bool, typer.Option("--quiet", help="The table's path alone.")] = False,
-    debug: Debug = False,
-    device: Device = "cpu",
-    out: Out = Path("runs"),
-) -> None:
-    """Run a recipe over values: a=1,2,3 b='linspace(450 nm, 650 nm, 5)'; run it again to go on."""
-    name, words, first = split(words)
-    if on_error not in ("stop", "continue"):
-        fail(f"--on-error {on_error}: write stop or continue")
-    check_device(device)
-    from neusee.workflows.graph.diagnostics import RecipeError
-    from neusee.workflows.sweeps.sweep_run import run_sweep
-
-    try:
-        code = run_sweep(
-            name,
-            words,
-            first=first,
-            zip=paired,
-            on_error="continue" if on_error == "continue" else "stop",
-            netcdf=netcdf,
-            device=device,
-            out=out,
-            store=the_store(),
-            quiet=quiet,
-        )
-    except RecipeError as error:
-        refuse(error)
-    if code:
-        raise typer.Exit(code)
-
-
-@app.command()
 def config(words: Words = None, debug: Debug = False) -> None:
-    """Print every final value and where it comes from."""
+    """Print every final value and where it comes from.
+
+    The output is YAML: a recipe that can be run.
+    """
     recipe, _ = load(words)
     from neusee.workflows.simulation.simulate_recipe import recipe_text
 
@@ -235,10 +159,10 @@ def config(words: Words = None, debug: Debug = False) -> None:
 @app.command()
 def report(
     folder: Annotated[str, typer.Argument(metavar="RUN_FOLDER", help="A run's folder, or `latest`.")] = "latest",
-    out: Annotated[Path, typer.Option("--out", help="Where the run's folders lie.")] = Path("runs"),
+    out: Annotated[Path, typer.Option("--out", help="Folder that holds the folders of runs.")] = Path("runs"),
     debug: Debug = False,
 ) -> None:
-    """Write a run's page again from what is stored."""
+    """Write the page of a run again from stored results."""
     from neusee.workflows.report.run_folder import find_run
     from neusee.workflows.report.run_page import rebuild
 
@@ -248,12 +172,49 @@ def report(
         fail(str(error))
 
 
+for command in (sweep, train, calibrate, evaluate, recipes, nodes, schema):
+    app.command()(command)
+app.add_typer(study, name="study")
+app.add_typer(cache, name="cache")
+
+
+def _asked(arguments: Sequence[str]) -> typer.Typer:
+    """Return the program with the options of the command that ``arguments`` name, and the help alone of all others.
+
+    To read the options of every command takes a fifth of the start. A shell that completes a word needs all of them.
+    """
+    if any(name.endswith("_COMPLETE") for name in os.environ):
+        return app
+    name = next((word for word in arguments if not word.startswith("-")), "")
+    light = typer.Typer(**_HOW)
+    light.callback()(_options)
+    for known in app.registered_commands:
+        if _name(known) == name:
+            light.registered_commands.append(known)
+        else:
+            light.command(_name(known), help=inspect.getdoc(known.callback))(_not_asked)
+    for group in app.registered_groups:
+        if group.name == name:
+            light.registered_groups.append(group)
+        elif group.typer_instance is not None:
+            light.command(group.name, help=group.typer_instance.info.help)(_not_asked)
+    return light
+
+
+def _name(command: CommandInfo) -> str:
+    return str(command.name or getattr(command.callback, "__name__", ""))
+
+
+def _not_asked() -> None:
+    pass
+
+
 def main(arguments: list[str] | None = None) -> None:
     """Entry point: every error is one line and an exit code, unless ``--debug`` asks for the stack."""
     arguments = sys.argv[1:] if arguments is None else arguments
     gc.disable()  # what is imported stays: to look for garbage in it costs a tenth of the start
     try:
-        sys.exit(app(arguments, standalone_mode=False) or DONE)
+        sys.exit(_asked(arguments)(arguments, standalone_mode=False, prog_name="neusee") or DONE)
     except BrokenPipeError:
         sys.stderr.close()
         sys.exit(DONE)

@@ -25,24 +25,29 @@ class Stages(StrEnum):
     MASK = "mask"
 
 
-_STAGES = "1: element and network; 2: network; both; mask: element without images, then 2."
+_STAGES = "1: mask and network; 2: network alone; both: 1, then 2; mask: mask alone, without images."
+_MESH = "DATAxBAND processes of torchrun: 4x2, four groups that share the bands by two; else all share the data."
 _NUMBERS = {Stages.FIRST: (1,), Stages.SECOND: (2,), Stages.BOTH: (1, 2), Stages.MASK: (0,)}  #: of `train`
 
 
 def train(
     words: Words = None,
     stage: Annotated[Stages, typer.Option("--stage", help=_STAGES)] = Stages.BOTH,
-    device: Annotated[str, typer.Option("--device", help="Where to learn: cpu or cuda.")] = "cpu",
-    mesh: Annotated[
-        str, typer.Option("--mesh", help="DATAxBAND processes, as torchrun starts them: 4x2; else all share the data.")
-    ] = "",
-    quiet: Annotated[bool, typer.Option("--quiet", help="The folder alone.")] = False,
+    device: Annotated[str, typer.Option("--device", help="Where to train: cpu or cuda.")] = "cpu",
+    mesh: Annotated[str, typer.Option("--mesh", help=_MESH)] = "",
+    quiet: Annotated[bool, typer.Option("--quiet", help="Print only the path of the folder.")] = False,
     debug: Debug = False,
     out: Out = Path("runs"),
 ) -> None:
-    """Learn a recipe's element and restoration; run it again to go on where it was stopped.
+    """Train a recipe's mask and the network that restores.
 
-    With --stage mask the element is designed without images, as train.mask says; --stage 2 then goes on from it.
+    Pictures come from the folder `train.photographs`; the paper trains in two stages. With --stage mask the mask is
+    designed without images, as `train.mask` says; --stage 2 then trains the network behind that mask. The recipe
+    `train_lift` trains a network from RGB to spectra instead. Without a name the recipe is train_small. Run the same
+    command again to continue a training that was stopped.
+
+    Several processes share one training: torchrun --nproc-per-node 8 --no-python neusee train RECIPE --device cuda
+    --mesh 4x2.
     """
     recipe, command = load(words or ["train_small"])
     if recipe.lifting is not None:
@@ -50,21 +55,21 @@ def train(
             fail(f"{recipe.name} learns a lift, which has neither stages nor a mesh: leave --stage and --mesh out")
         check_device(device)
         return _lift(recipe, ["neusee", "train", *command[2:]], out, device, quiet)
+    from neusee.workflows.api import verbs
     from neusee.workflows.engine.node_call import RunError
     from neusee.workflows.training.parallel.process_mesh import MeshError, device_here, joined, processes
-    from neusee.workflows.training.run_training import train as learn
 
     device, (rank, world) = device_here(device), processes()
     check_device(device)
     quiet, who = quiet or rank > 0, f"process {rank}: " if world > 1 else ""
-    there = recipe.training.learnt if recipe.training else ()
-    stages = there if stage is Stages.BOTH else _NUMBERS[stage]
+    stages = _NUMBERS[stage] if stage is not Stages.BOTH else recipe.training.learnt if recipe.training else ()
     tell = (lambda line: None) if quiet else (lambda line: say([line]))
     told = ["neusee", "train", *command[2:], "--stage", stage.value, *(["--mesh", mesh] if mesh else [])]
     lengths = {s: recipe.training.stages[s].iterations for s in stages if s} if recipe.training else {}
     try:
         with joined(mesh, device) as processes_here, _bar(quiet, lengths) as bar:
-            folder = learn(recipe, the_store(), out, told, tell, stages, device, bar.watch, processes_here)
+            folder = verbs.train(recipe, store=the_store(), device=device, out=out, progress=tell, command=told,
+                                 stages=stages, watch=bar.watch, mesh=processes_here)  # fmt: skip
     except MeshError as error:
         fail(f"{who}{error}")
     except (RunError, ValueError, ArithmeticError) as error:
@@ -77,14 +82,15 @@ def train(
 
 def _lift(recipe: Recipe, told: list[str], out: Path, device: str, quiet: bool) -> None:
     """Learn a lift from RGB to spectra."""
+    from neusee.workflows.api import verbs
     from neusee.workflows.engine.node_call import RunError
-    from neusee.workflows.training.lift.lift_run import train_lift
 
     assert recipe.lifting is not None
     tell = (lambda line: None) if quiet else (lambda line: say([line]))
     try:
         with _bar(quiet, {1: recipe.lifting.iterations}) as bar:
-            folder = train_lift(recipe, the_store(), out, told, tell, device, lambda n, found: bar.watch(1, n, found))
+            folder = verbs.train(recipe, store=the_store(), device=device, out=out, progress=tell, command=told,
+                                 watch=bar.watch)  # fmt: skip
     except (RunError, ValueError, ArithmeticError) as error:
         fail(str(error), FAILED)
     if not quiet:

@@ -45,20 +45,20 @@ def panels(
 
 def _pictures(bench: EvaluationPoints, each: Sequence[PipelineRecipes], wanted: PointRequest) -> dict[str, Tensor]:
     key = digest("evaluate pictures", _SIDE, [[p.name, bench.key(p, wanted)] for p in each])
-    return memo(bench.store, key, dict, partial(_developed, bench, each, wanted), {"step": "evaluate"})
+    return memo(bench.store, key, dict, partial(_develop, bench, each, wanted), {"step": "evaluate"})
 
 
-def _developed(bench: EvaluationPoints, each: Sequence[PipelineRecipes], wanted: PointRequest) -> dict[str, Tensor]:
+def _develop(bench: EvaluationPoints, each: Sequence[PipelineRecipes], wanted: PointRequest) -> dict[str, Tensor]:
     """Return the truth, the picture of the plain lens and that of each pipeline, as large as they are drawn."""
     found: dict[str, Tensor] = {}
     for number, pipeline in enumerate(each):
         values = bench.values(pipeline, wanted, () if number else (_PLAIN,))
         if not number:
-            found |= {"truth": _shown(values["truth"]), "plain lens": _shown(values[_PLAIN])}
-        found[pipeline.name] = _shown(values[pipeline.pipeline.picture])
+            found |= {"truth": _shrink(values["truth"]), "plain lens": _shrink(values[_PLAIN])}
+        found[pipeline.name] = _shrink(values[pipeline.pipeline.picture])
     return found
 
 
-def _shown(picture: Tensor) -> Tensor:
+def _shrink(picture: Tensor) -> Tensor:
     side = min(_SIDE, *picture.shape[-2:])
     return reduced(picture.detach().cpu().float(), side).contiguous()

@@ -59,7 +59,7 @@ def rows(found: EvaluationResult) -> list[Sequence[Any]]:
 def lead(found: EvaluationResult) -> str:
     """Return the result in a few sentences."""
     best = min(found.pipelines, key=lambda p: float(found.tables[p.name].scenes("l1").mean()))
-    said = _said(mean(found.tables[best.name].scenes("l1")), "l1")
+    said = _with_interval(mean(found.tables[best.name].scenes("l1")), "l1")
     strengths = ", ".join("none" if k == 0 else f"{k:g}".replace("e+0", "e") for k in found.strengths)
     enough = len(found.scenes) >= len(CASES)
     few = "" if enough else f" These are too few scenes for all {len(CASES)} cases of the protocol."
@@ -94,10 +94,10 @@ def _crossed(found: EvaluationResult) -> Section:
 
 
 def _cell(found: EvaluationResult, name: str | None) -> str | None:
-    return _said(mean(found.tables[name].scenes("l1")), "l1") if name else None
+    return _with_interval(mean(found.tables[name].scenes("l1")), "l1") if name else None
 
 
-def _said(x: Interval, metric: str) -> str:
+def _with_interval(x: Interval, metric: str) -> str:
     how = _DIGITS.get(metric.partition(" ")[0], ".3g")
     return (
         f"{x.mean:{how}}"
@@ -114,7 +114,7 @@ def _numbers(found: EvaluationResult) -> Section:
     metrics = [metric for metric in METRICS if metric != "peak"]
     columns = ("pipeline", *(re.sub("l1|psnr|ssim", lambda found: found[0].upper(), metric) for metric in metrics))
     listed = [
-        (p.name, *(_said(mean(found.tables[p.name].scenes(metric)), metric) for metric in metrics))
+        (p.name, *(_with_interval(mean(found.tables[p.name].scenes(metric)), metric) for metric in metrics))
         for p in found.pipelines
     ]
     return Section("All numbers", text, columns, listed)

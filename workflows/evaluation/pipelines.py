@@ -11,6 +11,7 @@ from neusee.workflows.graph.diagnostics import Diagnostic, RecipeError, nearest
 from neusee.workflows.graph.recipe_graph import Recipe
 from neusee.workflows.recipe.loading import load
 from neusee.workflows.recipe.text.composition import groups_of, packaged
+from neusee.workflows.recipe.text.overrides import Override
 
 NONE = "none"  #: of restorers: the raw picture, developed; of cases: no laser
 BEAM = "beam"  #: the laser's name in every recipe of an evaluation
@@ -88,7 +89,7 @@ class PipelineRecipes:
 class _Recipes(dict[str, Recipe]):
     """The recipe of each case, read when it is first asked for; the recipes differ in one wavelength."""
 
-    def __init__(self, recipe: str, words: Sequence[str], fwhm: float, folder: Path) -> None:
+    def __init__(self, recipe: str, words: Sequence[str | Override], fwhm: float, folder: Path) -> None:
         super().__init__()
         self._how = recipe, words, fwhm, folder
 
@@ -120,7 +121,7 @@ def read_pipelines(text: str, folder: Path) -> list[Pipeline]:
 
 
 def compose_pipelines(
-    recipe: str, changes: Sequence[str], pipelines: Sequence[Pipeline], folder: Path
+    recipe: str, changes: Sequence[str | Override], pipelines: Sequence[Pipeline], folder: Path
 ) -> list[PipelineRecipes]:
     """Return every pipeline with its recipes; raise `EvaluationRefused` with the mistakes of all of them."""
     fwhm = _fwhm(recipe, changes, folder)
@@ -134,7 +135,7 @@ def compose_pipelines(
                 _check(recipes[case], pipeline)
             found.append(PipelineRecipes(pipeline, recipes))
         except RecipeError as error:
-            wrong |= dict.fromkeys(f"{pipeline.name}: {_said(problem)}" for problem in error.diagnostics)
+            wrong |= dict.fromkeys(f"{pipeline.name}: {_one_line(problem)}" for problem in error.diagnostics)
         except EvaluationRefused as error:
             wrong[f"{pipeline.name}: {error}"] = None
     if wrong:
@@ -142,7 +143,7 @@ def compose_pipelines(
     return found
 
 
-def _said(problem: Diagnostic) -> str:
+def _one_line(problem: Diagnostic) -> str:
     return " ".join(str(RecipeError([problem])).split())
 
 
@@ -184,12 +185,12 @@ def _laser(metres: float | None, fwhm: float) -> str:
     return f"lasers={{{BEAM}: {{{line}, strength: 1, angle: null}}}}"
 
 
-def _fwhm(recipe: str, changes: Sequence[str], folder: Path) -> float:
+def _fwhm(recipe: str, changes: Sequence[str | Override], folder: Path) -> float:
     """Return the width of the recipe's own first line; 10 nm where the recipe has no laser."""
     try:
         steps = load(recipe, changes, folder).steps
     except RecipeError as error:
-        raise EvaluationRefused("\n".join(dict.fromkeys(map(_said, error.diagnostics)))) from None
+        raise EvaluationRefused("\n".join(dict.fromkeys(map(_one_line, error.diagnostics)))) from None
     widths = [step.params["fwhm"] for name, step in steps.items() if name.startswith("line[")]
     return float(widths[0]) if widths else 10e-9
 

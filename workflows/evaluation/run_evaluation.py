@@ -32,6 +32,7 @@ from neusee.workflows.evaluation.pipelines import (
 from neusee.workflows.graph.recipe_graph import Recipe
 from neusee.workflows.keys.cache_key import digest
 from neusee.workflows.recipe.loading import load
+from neusee.workflows.recipe.text.overrides import Override
 from neusee.workflows.report.study_folder import CsvTable, Progress, StudyReport, StudyRun, silent
 from neusee.workflows.store.remote_store import open_store
 from neusee.workflows.store.result_store import Store
@@ -63,7 +64,7 @@ class EvaluationResult:
 def evaluate(
     recipe: str,
     pipelines: Sequence[Pipeline],
-    changes: Sequence[str] = (),
+    changes: Sequence[str | Override] = (),
     *,
     data: Path | None = None,
     count: int = 20,

@@ -71,8 +71,8 @@ def study(
         raise ValueError(f"seeds={seeds}: a study needs one at least")
     study_run = StudyRun("accuracy", recipe, command)
     cache = PointCache(finest(recipe), store, seeds, device)
-    found = _found(recipe, cache, progress, quick, math.inf if budget is None else time.monotonic() + budget)
-    key = digest("accuracy", cache.key(recipe), [_named(p) for p in found.points], quick)
+    found = _measure(recipe, cache, progress, quick, math.inf if budget is None else time.monotonic() + budget)
+    key = digest("accuracy", cache.key(recipe), [_line_and_label(p) for p in found.points], quick)
     document = study_run.document(_document(found, cache, quick))
     return study_run.write(runs, key, document, _report(found, document))
 
@@ -94,14 +94,14 @@ def trials(recipe: Recipe, turned: Knobs, quick: bool) -> Iterator[Trial]:
                 yield Trial(name, change.label, None, refused=error.diagnostics[0].message)
 
 
-def _found(recipe: Recipe, cache: PointCache, progress: Progress, quick: bool, until: float) -> AccuracyResult:
+def _measure(recipe: Recipe, cache: PointCache, progress: Progress, quick: bool, until: float) -> AccuracyResult:
     turned = knobs(recipe, quick)
     todo = list(trials(recipe, turned, quick))
     progress(f"{len(todo)} points, {cache.seeds} seed{'s' * (cache.seeds > 1)}; the reference first")
     cache.truth(0)
     points = []
     for number, trial in enumerate(todo, 1):
-        points.append(_left(trial) if time.monotonic() > until and _may_wait(trial, cache) else cache.point(trial))
+        points.append(_leave(trial) if time.monotonic() > until and _may_wait(trial, cache) else cache.point(trial))
         progress(f"{number}/{len(todo)}  {accuracy_report.summary_line(points[-1])}")
     for number in range(2, TIMES + 1):  # in turn, so that other work of the machine disturbs all points alike
         points = [cache.time_again(point, number) for point in points]
@@ -119,7 +119,7 @@ def _may_wait(trial: Trial, cache: PointCache) -> bool:
     return knob and trial.recipe is not None and not cache.store.has(cache.key(trial.recipe))
 
 
-def _left(trial: Trial) -> WorkPrecisionPoint:
+def _leave(trial: Trial) -> WorkPrecisionPoint:
     return WorkPrecisionPoint(trial, PointMeasurement(refused="left for another time: run the study again to go on"))
 
 
@@ -135,7 +135,7 @@ def _matter(recipe: Recipe, points: Sequence[WorkPrecisionPoint]) -> Iterator[tu
             yield cheaper, name, share
 
 
-def _named(point: WorkPrecisionPoint) -> list[Any]:
+def _line_and_label(point: WorkPrecisionPoint) -> list[Any]:
     return [point.trial.line, point.trial.label]
 
 

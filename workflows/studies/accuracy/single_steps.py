@@ -98,7 +98,7 @@ def try_step(recipe: Recipe, name: str, share: float, store: Store, patience: fl
     if step.node.hooks.reference is None:
         return StepTried(name, step.node.path, share, StepMeasurement(refused="its node has no reference"))
     key, about = _key(recipe, name, patience, store), {"step": f"study accuracy: {name}"}
-    found = memo(store, key, StepMeasurement, lambda: _tried(recipe, step, store, patience), about)
+    found = memo(store, key, StepMeasurement, lambda: _try_forms(recipe, step, store, patience), about)
     return StepTried(name, step.node.path, share, found)
 
 
@@ -110,7 +110,7 @@ def _key(recipe: Recipe, name: str, patience: float, store: Store) -> str:
     return digest("accuracy of a step", keys[name], patience, engine("studies.accuracy.single_steps"), machine())
 
 
-def _tried(recipe: Recipe, step: Step, store: Store, patience: float) -> StepMeasurement:
+def _try_forms(recipe: Recipe, step: Step, store: Store, patience: float) -> StepMeasurement:
     try:
         values = run(replace(recipe, exact=True), store, step.sources).values
     except RunError as error:
@@ -140,7 +140,7 @@ def _largest(step: Step, inputs: list[Any], seed: int, patience: float) -> tuple
             break
         part = cut_inputs(step.node, inputs, size)
         try:
-            truth, seconds = _once(lambda part=part: _call(step, step.node.hooks.reference, part, seed))  # type: ignore[misc]
+            truth, seconds = _time_once(lambda part=part: _call(step, step.node.hooks.reference, part, seed))  # type: ignore[misc]
         except Exception:  # a part of a picture may be no input for it: a larger one may
             continue
         best = (size, truth, seconds)
@@ -151,8 +151,8 @@ def _forms(step: Step, inputs: list[Any], truth: Any, seed: int) -> Iterator[For
     """Yield every way to compute the step whose result can be compared with that of the reference."""
     for (line, label), way in _ways(step, inputs, seed).items():
         try:
-            value, seconds = _timed(way)
-            yield Form(line, label, error_of(_meant(value), _meant(truth)), seconds)
+            value, seconds = _median_time(way)
+            yield Form(line, label, error_of(_compared_value(value), _compared_value(truth)), seconds)
         except (ValueError, RuntimeError):  # another shape, or a dtype that the form does not take
             continue
 
@@ -189,7 +189,7 @@ def _inner(psf: Psf, share: float) -> Psf:
     return psf._replace(intensity=x)
 
 
-def _meant(value: Any) -> Any:
+def _compared_value(value: Any) -> Any:
     """Return the values to compare: the cube of a mixture, the sums of channels."""
     if isinstance(value, Mixture):
         return torch.einsum("bk,kyx->byx", value.basis.to(value.planes), value.planes)
@@ -207,18 +207,18 @@ def _call(step: Step, form: Any, inputs: list[Any], seed: int, **other: Any) -> 
     return form(*inputs, **{**step.params, **other}, **rng)
 
 
-def _once(way: Callable[[], Any]) -> tuple[Any, float]:
+def _time_once(way: Callable[[], Any]) -> tuple[Any, float]:
     began = time.perf_counter()
     value = way()
     return value, time.perf_counter() - began
 
 
-def _timed(way: Callable[[], Any]) -> tuple[Any, float]:
+def _median_time(way: Callable[[], Any]) -> tuple[Any, float]:
     """Return the result, and the median time of some calls after the first one, which computes tables."""
-    value, seconds = _once(way)
+    value, seconds = _time_once(way)
     times = [] if seconds < _LONG_ENOUGH else [seconds]
     while len(times) < _TIMES and sum(times) < _LONG_ENOUGH:
-        times.append(_once(way)[1])
+        times.append(_time_once(way)[1])
     return value, median(times)
 
 

@@ -89,7 +89,7 @@ def study(
     study_run = StudyRun("calibration", recipe, command)
     with one_thread():
         simulator = SensorSimulator(recipe, store, pixels, sampler or partial(walk_draws, how=move), move)
-        made = list(_simulated(simulator, simulations, progress))
+        made = list(_simulate_all(simulator, simulations, progress))
         weighed, untold = _sensitivity(recipe, move)
     found = CalibrationStudyResult(
         made, rank_tests(made), prior_widths(simulator.nominal.coordinates.prior), weighed, untold
@@ -98,7 +98,7 @@ def study(
     return study_run.write(runs, digest(document["verdicts"]), document, _report(recipe, found, pixels))
 
 
-def _simulated(simulator: SensorSimulator, count: int, progress: Progress) -> Iterator[SensorSimulation]:
+def _simulate_all(simulator: SensorSimulator, count: int, progress: Progress) -> Iterator[SensorSimulation]:
     for number in range(count):
         found = simulator.simulation(number)
         if found.refused:
@@ -193,13 +193,13 @@ def _intervals(found: CalibrationStudyResult) -> Section:
     rows, marks = [], dict[tuple[int, int], Mark]()
     for i, v in enumerate(found.rank_tests):
         bar = f"{v.bar[0]:.3f} to {v.bar[1]:.3f}"
-        rows.append((_plain(v.name), v.p, v.least_p, v.coverage, bar, v.z_mean, v.z_sd, _told(found, v.name)))
+        rows.append((_plain(v.name), v.p, v.least_p, v.coverage, bar, v.z_mean, v.z_sd, _count_kinds(found, v.name)))
         marks[i, 1] = "pass" if v.uniform else "fail"
         marks[i, 3] = "pass" if v.covered else "fail"
     return Section("Coverage", text, columns, rows, marks=marks)
 
 
-def _told(found: CalibrationStudyResult, name: str) -> str:
+def _count_kinds(found: CalibrationStudyResult, name: str) -> str:
     count = Counter(s.kinds[name] for s in found.simulations if not s.refused)
     return ", ".join(f"{n} {KINDS[kind] or 'estimated'}" for kind, n in count.most_common())
 
@@ -215,7 +215,7 @@ def _weighed(found: CalibrationStudyResult) -> Section:
         Below {ENOUGH:g} reweighting is unreliable, and there is a dash: the prior of that parameter constrains it about
         as much as the frames do, or more."""
     columns = ("parameter", "from these frames", "value", "sd", *(f"{_plain(name)} x 2" for name in names))
-    rows = [_finding(f) for f in found.sensitivity.findings]
+    rows = [_sensitivity_row(f) for f in found.sensitivity.findings]
     left: list[Any] = ["draws left", "", None, None, *(found.sensitivity.left[name] for name in names)]
     marks: dict[tuple[int, int], Mark] = {
         (len(rows), 4 + i): "warn" for i, name in enumerate(names) if found.sensitivity.left[name] < ENOUGH
@@ -223,7 +223,7 @@ def _weighed(found: CalibrationStudyResult) -> Section:
     return Section(heading, text, columns, [*rows, left], marks=marks)
 
 
-def _finding(f: ParameterSensitivity) -> list[Any]:
+def _sensitivity_row(f: ParameterSensitivity) -> list[Any]:
     moved = [None if x is None else (x - f.value) / f.sd for x in f.doubled.values()]
     return [_plain(f.name), KINDS[f.kind] or "estimate", f.value, f.sd, *moved]
 

@@ -44,12 +44,12 @@ def sensitivity(problem: SensorPosterior, samples: FloatArray, kinds: Mapping[st
     left = {name: float(1.0 / (w @ w) / len(w)) for name, w in weights.items()}
     even = np.full(len(samples), 1.0 / len(samples))
 
-    def found(name: str) -> ParameterSensitivity:
+    def of(name: str) -> ParameterSensitivity:
         x, kind = values[name], kinds[name]
         again = {by: _value(x, w, kind) if left[by] >= ENOUGH else None for by, w in weights.items()}
         return ParameterSensitivity(name, kind, _value(x, even, kind), float(x.std(ddof=1)), again)
 
-    return Sensitivity([found(name) for name in problem.names], left)
+    return Sensitivity([of(name) for name in problem.names], left)
 
 
 def _weights(z: FloatArray) -> FloatArray:

@@ -48,16 +48,18 @@ def study(
     comparison = OmissionComparison(recipe, store)
     output_errors, rows = comparison.output_errors(), []
     for promise in output_errors:
-        progress(f"{promise.output}: error {promise.rms:.2g}, tolerance {recipe.tolerance:.2g}{_said(promise.holds)}")
+        progress(
+            f"{promise.output}: error {promise.rms:.2g}, tolerance {recipe.tolerance:.2g}{_failure_note(promise.holds)}"
+        )
     for row in comparison.rows():
         rows.append(row)
-        progress(f"{row.name} {row.kind}: {row.rms:.2g}, stated at most {row.bound:.2g}{_said(row.holds)}")
+        progress(f"{row.name} {row.kind}: {row.rms:.2g}, stated at most {row.bound:.2g}{_failure_note(row.holds)}")
     found = LeaveOutResult(output_errors, rows, list(measure_scenes(recipe, store, progress)) if contents else [])
     document = study_run.document(_document(recipe, found))
     return study_run.write(runs, digest(document["rows"]), document, _report(recipe, found))
 
 
-def _said(holds: bool) -> str:
+def _failure_note(holds: bool) -> str:
     return "" if holds else ": does not hold"
 
 
@@ -127,12 +129,12 @@ def _omissions(found: LeaveOutResult) -> Section:
         recipe as it chooses computes this one step in full. Saved: the seconds of its steps. A bound that the tolerance
         does not allow is tested too."""
     columns = ("step", "how", "chosen", "bound", "error", "largest", "outputs", "put back", "saved s", "holds")
-    rows = [(*_told(r), _held(r.holds)) for r in found.rows]
+    rows = [(*_cells(r), _held(r.holds)) for r in found.rows]
     marks = _marks([r.holds for r in found.rows], len(columns) - 1)
     return Section("Each omission", text, columns, rows, marks=marks)
 
 
-def _told(r: OmissionRow) -> Sequence[Any]:
+def _cells(r: OmissionRow) -> Sequence[Any]:
     worst = max(r.outputs.values(), default=0.0)
     return r.name, _HOW[r.kind], r.taken, r.bound, r.rms, r.largest, worst, r.back, r.seconds
 

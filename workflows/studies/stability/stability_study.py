@@ -90,12 +90,12 @@ def _row(chain: CaseRecipe, same: set[str], store: Store, own: str) -> Iterator[
             continue
         key = digest("stability", own, chain.case.name, chain.keys[name], [chain.keys[s] for s in step.sources])
         about = {"step": f"stability of {name}: {chain.case.name}", "recipe": chain.recipe.name, "versions": versions()}
-        cell = memo(store, key, dict, partial(_judged, chain, name), about, small=True)
+        cell = memo(store, key, dict, partial(_judge, chain, name), about, small=True)
         if cell:
             yield GridCell(chain.case, name, step.node.path, Cell(**cell))
 
 
-def _judged(chain: CaseRecipe, name: str) -> dict[str, Any]:
+def _judge(chain: CaseRecipe, name: str) -> dict[str, Any]:
     """Return the fields of a cell; none where an earlier step refused or the case changes nothing of the step."""
     try:
         inputs = chain.inputs(name)

@@ -98,7 +98,7 @@ def study(
     at = _points(inputs, recipe.seed, most, points)
     inputs.checked(np.concatenate([at.values, _ends(inputs)]))
     draws = OutputDraws(inputs, store, device, workers)
-    found = _found(inputs, draws, at, progress, error, SCRAMBLES if points == "sobol" else 0)
+    found = _measure(inputs, draws, at, progress, error, SCRAMBLES if points == "sobol" else 0)
     document = study_run.document(_document(found, draws))
     return study_run.write(runs, digest(document["quantities"]), document, _report(found))
 
@@ -116,7 +116,7 @@ def _ends(inputs: Inputs) -> FloatArray:
     return inputs.at(z)
 
 
-def _found(
+def _measure(
     inputs: Inputs, draws: OutputDraws, at: InputDraws, progress: Progress, wanted: float, sequences: int
 ) -> UncertaintyResult:
     names = ", ".join(inputs.names)
