@@ -114,7 +114,7 @@ def _strengths(strengths: Sequence[float]) -> tuple[float, ...]:
 def _reference(reference: str, pipelines: Sequence[Pipeline]) -> str:
     names = [pipeline.name for pipeline in pipelines]
     if reference and reference not in names:
-        raise EvaluationRefused(f"--reference {reference}: is not one of the pipelines {', '.join(names)}")
+        raise EvaluationRefused(f"--reference {reference}: is none of the pipelines {', '.join(names)}")
     return reference or names[0]
 
 
