@@ -24,8 +24,8 @@ from neusee.workflows.store.remote_store import open_store
 if TYPE_CHECKING:
     from neusee.workflows.engine.runner import Result
     from neusee.workflows.engine.step_job import Executor
-    from neusee.workflows.engine.step_record import Event
     from neusee.workflows.evaluation.pipelines import Pipeline
+    from neusee.workflows.graph.step_record import Event
     from neusee.workflows.store.result_store import Store
     from neusee.workflows.sweeps.sweep_run import Sweep
     from neusee.workflows.training.parallel.process_mesh import Mesh
@@ -208,7 +208,7 @@ def study(
 
     if kind not in run_study.KINDS:
         raise ValueError(f"no study {kind!r}: there are {', '.join(run_study.KINDS)}")
-    return run_study.run_study(kind, _read(recipe, changes), store, Path(out), command, progress, **options)
+    return run_study.study_recipe(kind, _read(recipe, changes), store, Path(out), command, progress, **options)
 
 
 def _read(recipe: Recipe | Named, changes: Changes) -> Recipe:

@@ -31,7 +31,7 @@ def calibrate(
     recipe, command = load(words)
     from neusee.workflows.api import verbs
     from neusee.workflows.calibration.run_calibration import CalibrationRefused
-    from neusee.workflows.engine.node_call import RunError
+    from neusee.workflows.graph.run_error import RunError
 
     progress = (lambda line: None) if quiet else (lambda line: say([line]))
     how = {"walkers": walkers, "move": move, "draws": draws}

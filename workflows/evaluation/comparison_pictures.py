@@ -12,7 +12,7 @@ from neusee.workflows.evaluation.evaluation_points import EvaluationPoints, Poin
 from neusee.workflows.evaluation.evaluation_scenes import Scene
 from neusee.workflows.evaluation.pipelines import CASES, NONE, PipelineRecipes
 from neusee.workflows.keys.cache_key import digest
-from neusee.workflows.store.memo import memo
+from neusee.workflows.store.memo import compute_once
 
 _SIDE = 200  #: pixels of the shorter side, as drawn
 _PLAIN = "developed[plain]"
@@ -45,7 +45,7 @@ def panels(
 
 def _pictures(bench: EvaluationPoints, each: Sequence[PipelineRecipes], wanted: PointRequest) -> dict[str, Tensor]:
     key = digest("evaluate pictures", _SIDE, [[p.name, bench.key(p, wanted)] for p in each])
-    return memo(bench.store, key, dict, partial(_develop, bench, each, wanted), {"step": "evaluate"})
+    return compute_once(bench.store, key, dict, partial(_develop, bench, each, wanted), {"step": "evaluate"})
 
 
 def _develop(bench: EvaluationPoints, each: Sequence[PipelineRecipes], wanted: PointRequest) -> dict[str, Tensor]:

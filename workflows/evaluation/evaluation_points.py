@@ -12,7 +12,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from neusee.nodes._bicubic_resize import resize
+from neusee.nodes.bicubic_resize import resize
 from neusee.nodes.metrics import quality
 from neusee.workflows.engine.differentiable_function import as_function
 from neusee.workflows.engine.node_call import call, place
@@ -23,7 +23,7 @@ from neusee.workflows.keys.cache_key import digest, key_of
 from neusee.workflows.keys.code_digest import Code
 from neusee.workflows.keys.engine_digest import engine
 from neusee.workflows.recipe.distributions.uncertain_inputs import Inputs
-from neusee.workflows.store.memo import memo
+from neusee.workflows.store.memo import compute_once
 from neusee.workflows.store.result_store import Store
 from neusee.workflows.tolerance.cheaper_steps import with_substitutions
 
@@ -64,7 +64,7 @@ class EvaluationPoints:
     def point(self, pipeline: PipelineRecipes, wanted: PointRequest) -> PointNumbers:
         """Return the numbers of a point, from the store or measured now."""
         compute = partial(self._measure, pipeline, wanted)
-        return memo(self.store, self.key(pipeline, wanted), dict, compute, {"step": "evaluate"}, small=True)
+        return compute_once(self.store, self.key(pipeline, wanted), dict, compute, {"step": "evaluate"}, small=True)
 
     def _measure(self, pipeline: PipelineRecipes, wanted: PointRequest) -> PointNumbers:
         began = time.perf_counter()
@@ -104,7 +104,7 @@ class EvaluationPoints:
         }
         keys = self._keys(replace(recipe, steps={**recipe.steps, **steps}), wanted, outputs)
         within = [recipe.tolerance, recipe.exact, self.device.partition(":")[0], self.small]
-        own = [self._code.digest(f"neusee.nodes.{name}") for name in ("metrics._picture_quality", "_bicubic_resize")]
+        own = [self._code.digest(used.__module__) for used in (quality, resize)]
         return digest("evaluate", engine("evaluation.evaluation_points"), [keys[name] for name in outputs], within, own)
 
     def _keys(self, recipe: Recipe, wanted: PointRequest, outputs: Sequence[str]) -> dict[str, str]:

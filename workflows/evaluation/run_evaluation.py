@@ -10,17 +10,18 @@ all points, so that an interrupted evaluation goes on.
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
-from neusee.workflows.evaluation.comparison_pictures import Panel, panels
-from neusee.workflows.evaluation.confidence_intervals import METRICS, Interval, MetricTable, compare_with, metric_table
+from neusee.workflows.evaluation.comparison_pictures import panels
+from neusee.workflows.evaluation.confidence_intervals import METRICS, compare_with, metric_table
 from neusee.workflows.evaluation.evaluation_points import EvaluationPoints, PointNumbers, PointRequest
+from neusee.workflows.evaluation.evaluation_result import EvaluationResult
 from neusee.workflows.evaluation.evaluation_scenes import Scene, scenes
-from neusee.workflows.evaluation.mask_optics import MaskOptics, masks
+from neusee.workflows.evaluation.mask_optics import masks
 from neusee.workflows.evaluation.pipelines import (
     NONE,
     EvaluationRefused,
@@ -29,7 +30,6 @@ from neusee.workflows.evaluation.pipelines import (
     compose_pipelines,
     read_pipelines,
 )
-from neusee.workflows.graph.recipe_graph import Recipe
 from neusee.workflows.keys.cache_key import digest
 from neusee.workflows.recipe.loading import load
 from neusee.workflows.recipe.text.overrides import Override
@@ -41,24 +41,6 @@ __all__ = ["STRENGTHS", "EvaluationRefused", "EvaluationResult", "evaluate", "re
 
 STRENGTHS = (0.0, 1e1, 1e2, 1e3, 1e4, 1e5, 1e6)  #: the paper's
 SMALL = 256  #: pixels of the shorter side, at which the paper restores
-
-
-@dataclass(frozen=True)
-class EvaluationResult:
-    """All that was measured."""
-
-    recipe: Recipe
-    scenes: Sequence[Scene]
-    broken: Sequence[tuple[Path, str]]
-    strengths: tuple[float, ...]
-    small: int  #: pixels of the shorter side of the small pictures
-    reference: str  #: the pipeline to compare with
-    points: dict[str, list[dict[float, PointNumbers]]]  #: by pipeline, and scene by scene
-    tables: dict[str, MetricTable]  #: by pipeline
-    against: dict[str, dict[str, Interval]]  #: gains over the reference, by pipeline
-    masks: dict[str, MaskOptics]  #: by mask
-    panels: Sequence[Panel]
-    pipelines: Sequence[Pipeline]
 
 
 def evaluate(

@@ -15,19 +15,21 @@ from neusee.workflows.store.result_store import Store
 T = TypeVar("T")
 
 
-def memo(store: Store, key: str, kind: type[T], compute: Callable[[], T], about: Metadata, *, small: bool = False) -> T:
+def compute_once(
+    store: Store, key: str, kind: type[T], compute: Callable[[], T], about: Metadata, *, small: bool = False
+) -> T:
     """Return the value that ``store`` keeps under ``key``; where it keeps none, compute the value and keep it.
 
     Args: kind: the type of the value. A dataclass is kept as the dict of its fields. about: what the metadata says of
     the value, beside the date and the seconds that ``compute`` took. small: whether to keep the value without a file of
-    its own, as `Store.jot` does.
+    its own, as `Store.put_small` does.
     """
     with suppress(KeyError):
         return _restored(kind, store.get(key))
     began = time.perf_counter()
     value = compute()
     spent: Metadata = {"seconds": time.perf_counter() - began, "date": datetime.now(UTC).isoformat(timespec="seconds")}
-    keep = store.jot if small else store.put
+    keep = store.put_small if small else store.put
     keep(key, asdict(value) if is_dataclass(value) and not isinstance(value, type) else value, spent | about)
     return value
 

@@ -1,10 +1,10 @@
 """Studies of a recipe: how accurate its numbers are, where it breaks, and what it need not compute.
 
-    study.accuracy(load("first_light"))     error against run time, over tolerances and knobs
-    study.stability(load("first_light"))    stiff and extreme cases against float64
-    study.leave_out(load("first_light"))    each omission beside the full computation
-    study.calibration(load("calibrate"))    whether the posterior of a sensor is right, by simulations
-    study.uncertainty(load("first_light", ["sensor.read_noise=normal(10.5 e-, 0.5 e-)"]))    how far outputs scatter
+    study_recipe("accuracy", load("first_light"))       error against run time, over tolerances and knobs
+    study_recipe("stability", load("first_light"))      stiff and extreme cases against float64
+    study_recipe("leave-out", load("first_light"))      each omission beside the full computation
+    study_recipe("calibration", load("calibrate"))      whether the posterior of a sensor is right, by simulations
+    study_recipe("uncertainty", load("first_light", ["sensor.read_noise=normal(10.5 e-, 0.5 e-)"]))  how outputs scatter
 
 Each writes a folder with a page, a table and pictures, and goes on where it was interrupted.
 """
@@ -24,32 +24,7 @@ from neusee.workflows.store.result_store import Store
 KINDS = ("accuracy", "stability", "leave-out", "calibration", "uncertainty")
 
 
-def accuracy(recipe: Recipe, **how: Any) -> Path:
-    """Measure error against run time of the recipe and of its steps; see `run_study`."""
-    return run_study("accuracy", recipe, **how)
-
-
-def stability(recipe: Recipe, **how: Any) -> Path:
-    """Compare stiff and extreme cases, forward and gradient, with float64; see `run_study`."""
-    return run_study("stability", recipe, **how)
-
-
-def leave_out(recipe: Recipe, **how: Any) -> Path:
-    """Run with and without each omission, and check its bound; see `run_study`."""
-    return run_study("leave-out", recipe, **how)
-
-
-def calibration(recipe: Recipe, **how: Any) -> Path:
-    """Rank the truth among draws from the posterior of simulated frames; see `run_study`."""
-    return run_study("calibration", recipe, **how)
-
-
-def uncertainty(recipe: Recipe, **how: Any) -> Path:
-    """Measure how outputs scatter over draws of the uncertain values of the recipe; see `run_study`."""
-    return run_study("uncertainty", recipe, **how)
-
-
-def run_study(
+def study_recipe(
     kind: str,
     recipe: Recipe,
     store: Store | None = None,

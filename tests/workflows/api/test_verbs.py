@@ -107,7 +107,7 @@ def test_calibrate_study_and_train_hand_their_options_to_their_rooms(monkeypatch
         return called
 
     monkeypatch.setattr(run_calibration, "calibrate", room("calibrate"))
-    monkeypatch.setattr(run_study, "run_study", room("study"))
+    monkeypatch.setattr(run_study, "study_recipe", room("study"))
     monkeypatch.setattr(run_training, "train", room("train"))
     monkeypatch.setattr(lift_run, "train_lift", room("lift"))
     recipe, progress, watch = neusee.load("train_small"), print, lambda *found: None

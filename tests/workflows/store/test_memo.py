@@ -4,7 +4,7 @@ from dataclasses import dataclass, field
 
 import pytest
 
-from neusee.workflows.store.memo import memo
+from neusee.workflows.store.memo import compute_once
 from neusee.workflows.store.result_store import Store
 
 ABOUT = {"step": "a study"}
@@ -32,7 +32,7 @@ def test_a_value_is_computed_once_and_comes_back_as_it_was(tmp_path, kind, value
         return value
 
     for _ in range(2):
-        found = memo(Store(tmp_path), "0" * 32, kind, compute, ABOUT, small=small)
+        found = compute_once(Store(tmp_path), "0" * 32, kind, compute, ABOUT, small=small)
         assert found == value
         assert type(found) is kind
     assert len(calls) == 1
@@ -40,21 +40,21 @@ def test_a_value_is_computed_once_and_comes_back_as_it_was(tmp_path, kind, value
 
 def test_the_metadata_say_what_it_is_when_it_was_made_and_how_long_it_took(tmp_path):
     store = Store(tmp_path)
-    memo(store, "0" * 32, Measured, lambda: FOUND, ABOUT)
+    compute_once(store, "0" * 32, Measured, lambda: FOUND, ABOUT)
     about = store.about("0" * 32)
     assert about["step"] == "a study"
     assert 0 <= about["seconds"] < 10
     assert about["date"].endswith("+00:00")
-    memo(store, "1" * 32, Measured, lambda: FOUND, {**ABOUT, "seconds": 7.0})
+    compute_once(store, "1" * 32, Measured, lambda: FOUND, {**ABOUT, "seconds": 7.0})
     assert store.about("1" * 32)["seconds"] == 7.0
 
 
 def test_a_damaged_value_is_computed_again(tmp_path):
-    memo(Store(tmp_path), "0" * 32, dict, lambda: {"first": 1}, ABOUT)
+    compute_once(Store(tmp_path), "0" * 32, dict, lambda: {"first": 1}, ABOUT)
     (file,) = tmp_path.glob(f"*/{'0' * 32}.json")
     file.write_bytes(file.read_bytes().replace(b"first", b"worst"))
     with pytest.warns(UserWarning, match="damaged"):
-        assert memo(Store(tmp_path), "0" * 32, dict, lambda: {"second": 2}, ABOUT) == {"second": 2}
+        assert compute_once(Store(tmp_path), "0" * 32, dict, lambda: {"second": 2}, ABOUT) == {"second": 2}
 
 
 def test_what_fails_is_not_kept(tmp_path):
@@ -64,5 +64,5 @@ def test_what_fails_is_not_kept(tmp_path):
         raise KeyError("no such step")
 
     with pytest.raises(KeyError, match="no such step"):
-        memo(store, "0" * 32, dict, fail, ABOUT)
+        compute_once(store, "0" * 32, dict, fail, ABOUT)
     assert not store.has("0" * 32)

@@ -21,14 +21,14 @@ from torch import Tensor
 
 from neusee.nodes import Node
 from neusee.nodes.values import BAND_FIELDS, Channels, Mixture, Psf
-from neusee.workflows.engine.node_call import RunError
 from neusee.workflows.engine.provenance import machine
 from neusee.workflows.engine.runner import run
 from neusee.workflows.graph.recipe_graph import Recipe, Step, needed
+from neusee.workflows.graph.run_error import RunError
 from neusee.workflows.keys.cache_key import digest, key_of, stream_seed
 from neusee.workflows.keys.code_digest import Code
 from neusee.workflows.keys.engine_digest import engine
-from neusee.workflows.store.memo import memo
+from neusee.workflows.store.memo import compute_once
 from neusee.workflows.store.result_store import Store
 from neusee.workflows.store.serialization import each_tensor, tensors_in
 from neusee.workflows.tolerance.error_norm import error_of
@@ -98,7 +98,7 @@ def try_step(recipe: Recipe, name: str, share: float, store: Store, patience: fl
     if step.node.hooks.reference is None:
         return StepTried(name, step.node.path, share, StepMeasurement(refused="its node has no reference"))
     key, about = _key(recipe, name, patience, store), {"step": f"study accuracy: {name}"}
-    found = memo(store, key, StepMeasurement, lambda: _try_forms(recipe, step, store, patience), about)
+    found = compute_once(store, key, StepMeasurement, lambda: _try_forms(recipe, step, store, patience), about)
     return StepTried(name, step.node.path, share, found)
 
 

@@ -11,14 +11,15 @@ from dataclasses import dataclass, field, replace
 from statistics import median
 from typing import Any
 
-from neusee.workflows.engine.node_call import RunError
 from neusee.workflows.engine.provenance import machine
-from neusee.workflows.engine.runner import Event, run
+from neusee.workflows.engine.runner import run
 from neusee.workflows.graph.recipe_graph import Recipe, needed
+from neusee.workflows.graph.run_error import RunError
+from neusee.workflows.graph.step_record import Event
 from neusee.workflows.keys.cache_key import digest, key_of
 from neusee.workflows.keys.code_digest import Code
 from neusee.workflows.keys.engine_digest import engine
-from neusee.workflows.store.memo import memo
+from neusee.workflows.store.memo import compute_once
 from neusee.workflows.store.result_store import Store
 from neusee.workflows.studies.cold_run import cold
 from neusee.workflows.tolerance.cheaper_steps import with_substitutions
@@ -103,7 +104,7 @@ class PointCache:
             return WorkPrecisionPoint(trial, PointMeasurement(refused=trial.refused))
         recipe = trial.recipe
         return WorkPrecisionPoint(
-            trial, memo(self.store, self.key(recipe), PointMeasurement, lambda: self._measure(recipe), _ABOUT)
+            trial, compute_once(self.store, self.key(recipe), PointMeasurement, lambda: self._measure(recipe), _ABOUT)
         )
 
     def time_again(self, point: WorkPrecisionPoint, number: int) -> WorkPrecisionPoint:
@@ -111,7 +112,7 @@ class PointCache:
         recipe, seconds = point.trial.recipe, point.found.seconds
         if recipe is None or not seconds or seconds[0] >= _QUICK:
             return point
-        one = memo(self.store, digest(self.key(recipe), number), list, lambda: [self._time(recipe)], _ABOUT)
+        one = compute_once(self.store, digest(self.key(recipe), number), list, lambda: [self._time(recipe)], _ABOUT)
         return WorkPrecisionPoint(point.trial, replace(point.found, seconds=[*seconds, *one]))
 
     def _time(self, recipe: Recipe) -> float:

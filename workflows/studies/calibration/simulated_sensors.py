@@ -27,7 +27,7 @@ from neusee.workflows.engine.provenance import versions
 from neusee.workflows.graph.recipe_graph import Recipe, needed
 from neusee.workflows.keys.cache_key import digest, stream_seed
 from neusee.workflows.keys.engine_digest import engine
-from neusee.workflows.store.memo import memo
+from neusee.workflows.store.memo import compute_once
 from neusee.workflows.store.result_store import Store
 from neusee.workflows.studies.calibration.independent_draws import PosteriorDraws
 
@@ -86,7 +86,7 @@ class SensorSimulator:
         """Return the simulation of that number, from the store or computed now."""
         key = digest("calibration study", self._says(), number)
         seed = stream_seed(self.recipe.seed, f"calibration study {number}")
-        return memo(
+        return compute_once(
             self.store, key, SensorSimulation, lambda: self._simulate(seed), {"step": "study calibration"}, small=True
         )
 

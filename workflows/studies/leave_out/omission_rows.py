@@ -16,13 +16,13 @@ from typing import Any
 from torch import Tensor
 
 from neusee.nodes import TensorStats
+from neusee.workflows.engine.finished_step import facts_in
 from neusee.workflows.engine.resolve_keys import resolve
 from neusee.workflows.engine.runner import Result, run
-from neusee.workflows.engine.step_record import facts_in
 from neusee.workflows.graph.recipe_graph import Recipe, needed
 from neusee.workflows.keys.cache_key import Key, digest
 from neusee.workflows.keys.engine_digest import engine
-from neusee.workflows.store.memo import memo
+from neusee.workflows.store.memo import compute_once
 from neusee.workflows.store.result_store import Store
 from neusee.workflows.studies.leave_out.possible_omissions import Omission, omissions
 from neusee.workflows.tolerance.error_norm import error_of, largest_error
@@ -88,7 +88,9 @@ class OmissionComparison:
         """Yield a row for each omission, from the store or measured now."""
         for omission in self.found:
             alone = omission.applied_to(self.full)
-            yield memo(self.store, self._key(omission, alone), OmissionRow, partial(self._row, omission, alone), _ABOUT)
+            yield compute_once(
+                self.store, self._key(omission, alone), OmissionRow, partial(self._row, omission, alone), _ABOUT
+            )
 
     def _row(self, omission: Omission, alone: Recipe) -> OmissionRow:
         seen = run(alone, self.store, tuple(omission.value_of(name) for name in omission.at))

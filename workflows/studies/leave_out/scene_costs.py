@@ -9,23 +9,23 @@ from __future__ import annotations
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 
-from neusee.workflows.engine.node_call import RunError
 from neusee.workflows.engine.provenance import machine
 from neusee.workflows.engine.runner import Result, run
 from neusee.workflows.graph.diagnostics import RecipeError
 from neusee.workflows.graph.recipe_graph import Recipe, needed
+from neusee.workflows.graph.run_error import RunError
 from neusee.workflows.keys.cache_key import Key, digest, key_of
 from neusee.workflows.keys.code_digest import Code
 from neusee.workflows.keys.engine_digest import engine
 from neusee.workflows.recipe.changed_recipe import changed
-from neusee.workflows.store.memo import memo
+from neusee.workflows.store.memo import compute_once
 from neusee.workflows.store.result_store import Store
 from neusee.workflows.studies.cold_run import cold
 
 _TIMES = 3  #: cold runs, of which the median counts
 _QUICK = 5.0  #: s; what takes longer is run once
 _WINDOW = ("flare.dirt", "flare.ghosts")
-_UNREAD = "no step refers to it"
+_UNREAD = "no step refers to this value"
 _LIFT = "steps.cube={node: spectra.lift_mallett, from: {rgb: scene, bands: bands}}"  #: of as few bands as one
 _GREY = "steps.scene={node: scene.targets, with: {kind: siemens, shape: '${scene.shape}'}}"
 
@@ -55,7 +55,9 @@ def measure_scenes(recipe: Recipe, store: Store, progress: Callable[[str], None]
                 warm.append(_cold(made, store))
             return _cost(scene, made, store)
 
-        cost = replace(memo(store, _key(made, code), SceneCost, compute, {"step": "study leave-out"}), scene=scene)
+        cost = replace(
+            compute_once(store, _key(made, code), SceneCost, compute, {"step": "study leave-out"}), scene=scene
+        )
         progress(f"{scene}: {cost.seconds:.3g} s" if not cost.refused else f"{scene}: {cost.refused}")
         yield cost
 

@@ -15,8 +15,8 @@ import torch
 from torch import Tensor
 
 from neusee.nodes import Node
-from neusee.nodes.optics._laser_direction import field_of_view
-from neusee.nodes.sensor._saturation import photons_that_fill
+from neusee.nodes.optics import field_of_view
+from neusee.nodes.sensor import photons_that_fill
 from neusee.nodes.values import Pupil
 
 Params = Mapping[str, Any]

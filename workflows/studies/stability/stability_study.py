@@ -18,7 +18,7 @@ from neusee.workflows.keys.code_digest import Code
 from neusee.workflows.keys.engine_digest import engine
 from neusee.workflows.report.study_folder import Progress, StudyReport, StudyRun
 from neusee.workflows.report.study_page import Mark, Section
-from neusee.workflows.store.memo import memo
+from neusee.workflows.store.memo import compute_once
 from neusee.workflows.store.result_store import Store
 from neusee.workflows.studies.stability.case_recipe import CaseRecipe, unchanged_steps
 from neusee.workflows.studies.stability.case_result import Cell, judge_step
@@ -90,7 +90,7 @@ def _row(chain: CaseRecipe, same: set[str], store: Store, own: str) -> Iterator[
             continue
         key = digest("stability", own, chain.case.name, chain.keys[name], [chain.keys[s] for s in step.sources])
         about = {"step": f"stability of {name}: {chain.case.name}", "recipe": chain.recipe.name, "versions": versions()}
-        cell = memo(store, key, dict, partial(_judge, chain, name), about, small=True)
+        cell = compute_once(store, key, dict, partial(_judge, chain, name), about, small=True)
         if cell:
             yield GridCell(chain.case, name, step.node.path, Cell(**cell))
 

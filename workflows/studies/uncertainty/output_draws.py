@@ -27,7 +27,7 @@ from neusee.workflows.keys.code_digest import Code
 from neusee.workflows.keys.engine_digest import engine
 from neusee.workflows.recipe.distributions.uncertain_inputs import Inputs
 from neusee.workflows.report.result_numbers import numbers_of
-from neusee.workflows.store.memo import memo
+from neusee.workflows.store.memo import compute_once
 from neusee.workflows.store.result_store import Store
 
 if TYPE_CHECKING:
@@ -84,7 +84,7 @@ class OutputDraws:
         whole = digest("uncertainty pictures", keys)
         if (first := self._kept(keys[0])) is not None and not first["pictures"]:
             return {}
-        return _pairs(memo(self.store, whole, dict, lambda: self._sums(keys, values), _ABOUT))
+        return _pairs(compute_once(self.store, whole, dict, lambda: self._sums(keys, values), _ABOUT))
 
     def _sums(self, keys: Sequence[str], values: FloatArray) -> dict[str, Tensor]:
         """Return mean and standard deviation of every picture over the draws, by name."""
@@ -134,7 +134,7 @@ class OutputDraws:
         numbers = quantities(result)
         shown = [name for name, value in result.items() if _is_picture(value)]
         about = {**_ABOUT, "seconds": self.seconds / max(1, self.computed), "date": timestamp()}
-        self.store.jot(key, {"numbers": numbers, "pictures": shown}, about)
+        self.store.put_small(key, {"numbers": numbers, "pictures": shown}, about)
         return numbers
 
     def _results(self, rows: Sequence[FloatArray]) -> Iterator[dict[str, Any]]:

@@ -16,7 +16,7 @@ from neusee.workflows.studies.uncertainty.sobol_indices import EXPLAINED
 if TYPE_CHECKING:
     from numpy.typing import NDArray
 
-    from neusee.workflows.studies.uncertainty.uncertainty_study import UncertaintyResult
+    from neusee.workflows.studies.uncertainty.uncertainty_result import UncertaintyResult
 
     FloatArray = NDArray[np.float64]
 

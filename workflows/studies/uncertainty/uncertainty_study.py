@@ -4,12 +4,11 @@ from __future__ import annotations
 
 import io
 from collections.abc import Mapping, Sequence
-from dataclasses import asdict, dataclass
+from dataclasses import asdict
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
-from torch import Tensor
 
 from neusee.workflows.graph.recipe_graph import Recipe
 from neusee.workflows.keys.cache_key import digest
@@ -19,8 +18,9 @@ from neusee.workflows.recipe.distributions.uncertain_inputs import SCRAMBLES, In
 from neusee.workflows.report.study_folder import Content, Progress, StudyReport, StudyRun
 from neusee.workflows.store.result_store import Store
 from neusee.workflows.studies.uncertainty.output_draws import Numbers, OutputDraws
-from neusee.workflows.studies.uncertainty.scatter_estimate import Scatter, scatter
-from neusee.workflows.studies.uncertainty.sobol_indices import SobolIndices, indices, require_salib
+from neusee.workflows.studies.uncertainty.scatter_estimate import Scatter, scatter, worst_known
+from neusee.workflows.studies.uncertainty.sobol_indices import indices, require_salib
+from neusee.workflows.studies.uncertainty.uncertainty_result import UncertaintyResult
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray
@@ -31,48 +31,6 @@ LEAST = 64  #: draws before any stop
 _ROUND = 16  #: independent draws by round
 PICTURED = 32  #: draws that pictures are made of: a deviation to 13 %
 _COLUMNS = ("quantity", "element", "at the medians", "mean", "sd", "5 %", "95 %")
-
-
-@dataclass(frozen=True)
-class UncertaintyResult:
-    """All that the study measured."""
-
-    inputs: Inputs
-    points: InputDraws  #: those that were used
-    values: Mapping[str, FloatArray]  #: by quantity (draw, element)
-    scatter: Mapping[str, Scatter]
-    middle: Mapping[str, Sequence[float]]  #: every input at its median
-    swings: Mapping[str, Sequence[tuple[str, float, float]]]  #: by number: input, at its 5 %, at its 95 %
-    shares: Mapping[str, SobolIndices]  #: by number
-    pictures: Mapping[str, tuple[Tensor, Tensor]]
-    is_constant: tuple[str, ...]  #: outputs that no input reaches
-    wanted: float  #: relative error
-    sequences: int  #: of Sobol's points; 0 for independent draws
-
-    @property
-    def error(self) -> float:
-        """Return the greatest relative error of a standard deviation."""
-        return _worst(self.scatter)[1]
-
-    @property
-    def worst(self) -> str:
-        """Return the quantity whose standard deviation has the greatest relative error."""
-        return _worst(self.scatter)[0]
-
-    @property
-    def strange(self) -> list[str]:
-        """Return the quantities that are not finite in some draw."""
-        return [name for name, x in self.values.items() if not np.isfinite(x).all()]
-
-    @property
-    def failed(self) -> int:
-        """Return how many bars do not hold: the error that was asked for, and that every quantity is finite."""
-        return len(self.strange) + (not self.error <= self.wanted)
-
-    @property
-    def numbers(self) -> list[str]:
-        """Return the quantities of one element that vary, each once where two differ only by their unit."""
-        return list(self.swings)
 
 
 def study(
@@ -134,7 +92,7 @@ def _measure(
         numbers += draws.numbers(at.values[len(numbers) : used])
         values = {name: np.array([n[name] for n in numbers]) for name in ends[0]}
         scattered = {name: scatter(x, sequences) for name, x in values.items()}
-        worst, error = _worst(scattered)
+        worst, error = worst_known(scattered)
         progress(f"{used} draws: every standard deviation to {error:.1%} ({worst})")
         if error <= wanted:
             break
@@ -149,12 +107,6 @@ def _next(used: int, most: int, sequences: int) -> int:
     """Return the next number of draws; points of Sobol are even only after a power of two."""
     more = max(LEAST, 2 * used) if sequences else max(LEAST, used + _ROUND)
     return min(more, most)
-
-
-def _worst(found: Mapping[str, Scatter]) -> tuple[str, float]:
-    """Return the quantity whose standard deviation is known worst, and its relative error."""
-    name = max(found, key=lambda each: found[each].error)
-    return name, found[name].error
 
 
 def _swings(

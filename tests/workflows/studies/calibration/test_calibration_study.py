@@ -28,7 +28,7 @@ from neusee.workflows.studies.calibration.simulated_sensors import (
     rank_truth,
     with_narrow_prior,
 )
-from neusee.workflows.studies.run_study import count_failures, run_study
+from neusee.workflows.studies.run_study import count_failures, study_recipe
 
 pytestmark = pytest.mark.usefixtures("one_thread")
 
@@ -251,7 +251,7 @@ def quick(monkeypatch):
 
 
 def studied(tmp_path, count=20, sampler=resampled, overrides=SEEN, store="store"):
-    return run_study("calibration", load("calibrate", ["flats.shape=[32, 32]", *overrides]), Store(tmp_path / store),
+    return study_recipe("calibration", load("calibrate", ["flats.shape=[32, 32]", *overrides]), Store(tmp_path / store),
                 tmp_path / "runs", simulations=count, pixels=32, sampler=sampler)  # fmt: skip
 
 

@@ -17,7 +17,7 @@ from neusee.workflows.graph.recipe_graph import needed
 from neusee.workflows.recipe.distributions.uncertain_inputs import SCRAMBLES, Inputs
 from neusee.workflows.simulation.simulate_recipe import simulate
 from neusee.workflows.store.result_store import Store
-from neusee.workflows.studies.run_study import count_failures, run_study
+from neusee.workflows.studies.run_study import count_failures, study_recipe
 from neusee.workflows.studies.uncertainty.output_draws import OutputDraws, quantities
 from neusee.workflows.studies.uncertainty.scatter_estimate import scatter
 from neusee.workflows.studies.uncertainty.sobol_indices import indices
@@ -65,14 +65,14 @@ def test_what_reaches_no_output_is_not_drawn():
 
 
 def test_a_recipe_that_is_sure_of_all_has_nothing_to_draw():
-    with pytest.raises(ValueError, match="nothing is uncertain: write a law"):
+    with pytest.raises(ValueError, match="no value is uncertain: write a distribution"):
         Inputs.of(small("raw"))
 
 
 def test_a_draw_beyond_a_limit_is_refused_before_anything_runs(tmp_path):
     recipe = small("transfer", "sensor.read_noise=normal(1 e-, 1 e-)")
     with pytest.raises(ValueError, match=r"argument 9 +sensor\.read_noise = -.* e- +is drawn, but must be greater"):
-        run_study("uncertainty", recipe, Store(tmp_path / "store"), tmp_path / "runs")
+        study_recipe("uncertainty", recipe, Store(tmp_path / "store"), tmp_path / "runs")
     assert not (tmp_path / "runs").exists()
 
 
@@ -249,7 +249,7 @@ def test_a_polynomial_that_tells_nothing_is_not_believed():
 
 def test_deviations_are_those_of_the_closed_form(tmp_path, store):
     """Dark noise K**2 (sigma**2 + dark) + 1/12 with sigma of 10.5 ± 0.5: variance K**4 (4 m**2 s**2 + 2 s**4)."""
-    folder = run_study("uncertainty", load("first_light", NOISE), store, tmp_path, most=400)
+    folder = study_recipe("uncertainty", load("first_light", NOISE), store, tmp_path, most=400)
     doc = json.loads((folder / "provenance.json").read_text())
     floor = 2  # the dark level's prediction
     found, error = doc["quantities"]["transfer"]["sd"][floor], doc["quantities"]["transfer"]["error"]
@@ -261,7 +261,9 @@ def test_deviations_are_those_of_the_closed_form(tmp_path, store):
 
 
 def test_points_of_sobol_find_the_same_with_fewer(tmp_path, store):
-    folder = run_study("uncertainty", load("first_light", NOISE), store, tmp_path, most=512, points="sobol", error=0.02)
+    folder = study_recipe(
+        "uncertainty", load("first_light", NOISE), store, tmp_path, most=512, points="sobol", error=0.02
+    )
     doc = json.loads((folder / "provenance.json").read_text())
     wanted = math.sqrt(4 * 10.5**2 * 0.5**2 + 2 * 0.5**4) / 0.37**2
     assert doc["quantities"]["transfer"]["sd"][2] == pytest.approx(wanted, rel=0.06)
@@ -270,7 +272,7 @@ def test_points_of_sobol_find_the_same_with_fewer(tmp_path, store):
 
 def test_what_was_stopped_goes_on_with_the_same(tmp_path, store, monkeypatch):
     recipe = small("developed_quality, saturated, raw", *LAWS)
-    whole = run_study("uncertainty", recipe, Store(tmp_path / "whole"), tmp_path / "a", most=80)
+    whole = study_recipe("uncertainty", recipe, Store(tmp_path / "whole"), tmp_path / "a", most=80)
     real, calls = OutputDraws._result, []
 
     def stops(self, row):
@@ -281,13 +283,13 @@ def test_what_was_stopped_goes_on_with_the_same(tmp_path, store, monkeypatch):
 
     monkeypatch.setattr(OutputDraws, "_result", stops)
     with pytest.raises(KeyboardInterrupt):
-        run_study("uncertainty", recipe, Store(tmp_path / "store"), tmp_path / "b", most=80)
+        study_recipe("uncertainty", recipe, Store(tmp_path / "store"), tmp_path / "b", most=80)
     monkeypatch.setattr(OutputDraws, "_result", real)
-    again = run_study("uncertainty", recipe, Store(tmp_path / "store"), tmp_path / "b", most=80)
+    again = study_recipe("uncertainty", recipe, Store(tmp_path / "store"), tmp_path / "b", most=80)
     one, other = (json.loads((folder / "provenance.json").read_text()) for folder in (whole, again))
     assert one["quantities"] == other["quantities"]
     assert 0 < other["computed"] < one["computed"] - 60
-    last = run_study("uncertainty", recipe, Store(tmp_path / "store"), tmp_path / "c", most=80)
+    last = study_recipe("uncertainty", recipe, Store(tmp_path / "store"), tmp_path / "c", most=80)
     assert json.loads((last / "provenance.json").read_text())["computed"] == 0
     with np.load(again / "pictures.npz") as a, np.load(last / "pictures.npz") as b:
         assert all((a[name] == b[name]).all() for name in a)
@@ -324,7 +326,7 @@ def test_an_option_that_cannot_be_is_refused(option, said):
 
 def test_pictures_alone_are_no_numbers(tmp_path, store):
     with pytest.raises(ValueError, match="pictures only"):
-        run_study("uncertainty", small("raw", *LAWS), store, tmp_path)
+        study_recipe("uncertainty", small("raw", *LAWS), store, tmp_path)
 
 
 def test_a_run_with_a_posterior_says_where_the_recipe_lies(tmp_path, store):
@@ -347,7 +349,7 @@ def test_what_is_not_finite_fails_and_is_said(tmp_path, store, monkeypatch):
         return [{**numbers, "developed_quality[mask].psnr": [math.nan]} for numbers in found]
 
     monkeypatch.setattr(OutputDraws, "numbers", broken)
-    folder = run_study("uncertainty", small("developed_quality", *LAWS), store, tmp_path, most=64, error=1.0)
+    folder = study_recipe("uncertainty", small("developed_quality", *LAWS), store, tmp_path, most=64, error=1.0)
     assert count_failures(folder) == 1
     assert "Not finite in some draw: developed_quality[mask].psnr" in (folder / "report.html").read_text()
     table = (folder / "table.csv").read_text()

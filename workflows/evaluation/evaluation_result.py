@@ -1,0 +1,33 @@
+"""The result of an evaluation: what was measured of every pipeline, scene by scene, and the tables over them."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+from neusee.workflows.evaluation.comparison_pictures import Panel
+from neusee.workflows.evaluation.confidence_intervals import Interval, MetricTable
+from neusee.workflows.evaluation.evaluation_points import PointNumbers
+from neusee.workflows.evaluation.evaluation_scenes import Scene
+from neusee.workflows.evaluation.mask_optics import MaskOptics
+from neusee.workflows.evaluation.pipelines import Pipeline
+from neusee.workflows.graph.recipe_graph import Recipe
+
+
+@dataclass(frozen=True)
+class EvaluationResult:
+    """All that was measured."""
+
+    recipe: Recipe
+    scenes: Sequence[Scene]
+    broken: Sequence[tuple[Path, str]]
+    strengths: tuple[float, ...]
+    small: int  #: pixels of the shorter side of the small pictures
+    reference: str  #: the pipeline to compare with
+    points: dict[str, list[dict[float, PointNumbers]]]  #: by pipeline, and scene by scene
+    tables: dict[str, MetricTable]  #: by pipeline
+    against: dict[str, dict[str, Interval]]  #: gains over the reference, by pipeline
+    masks: dict[str, MaskOptics]  #: by mask
+    panels: Sequence[Panel]
+    pipelines: Sequence[Pipeline]
