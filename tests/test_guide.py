@@ -18,7 +18,7 @@ from typer.main import get_command
 from neusee.nodes.restore._networks._nafnet import NAFNet
 from neusee.workflows.cli import app, catalogue
 from neusee.workflows.cli.command_frame import split
-from neusee.workflows.evaluation.pipelines import composed, read_pipelines
+from neusee.workflows.evaluation.pipelines import compose_pipelines, read_pipelines
 from neusee.workflows.placement.machine_file import read_machines
 from neusee.workflows.recipe.loading import load
 from neusee.workflows.sweeps.axes import points, read_words
@@ -106,7 +106,7 @@ def test_every_command_line_parses_and_its_recipe_loads(words, folder, monkeypat
     if command == "train":
         assert recipe.training or recipe.lifting
     if command == "evaluate":
-        composed(name, changes, read_pipelines(values["pipelines"], folder), folder)
+        compose_pipelines(name, changes, read_pipelines(values["pipelines"], folder), folder)
 
 
 @pytest.mark.parametrize(("page", "least"), [("README", 11), ("commands", 20), ("own_frames", 6), ("recipes", 6)])

@@ -72,7 +72,6 @@ MEASURED = {
     "centres",
 }  #: fields of neusee.nodes.values that formulas of optics are made of
 
-TWICE = {("studies", "Bench"), ("studies", "Found"), ("studies", "Row")}  #: public classes, until they are renamed
 MOST_LINES = 5000  #: of a room with its inner rooms
 
 # --- what a file says -------------------------------------------------------------------------------------------------
@@ -283,9 +282,7 @@ def classes(files):
         for item in tree.body
         if isinstance(item, ast.ClassDef) and not item.name.startswith("_")
     )
-    yield from (
-        f"{room}: {name} is {n} classes" for (room, name), n in found.items() if n > 1 and (room, name) not in TWICE
-    )
+    yield from (f"{room}: {name} is {n} classes" for (room, name), n in found.items() if n > 1)
 
 
 def names(files):
@@ -404,13 +401,6 @@ def test_every_exception_is_needed():
     assert {(outer(a), outer(b)) for a, b, _, _ in found if {outer(a), outer(b)} <= set(COMMANDS)} >= set(ACROSS)
     assert {line.partition(":")[0] for line in dynamic(house(), allowed=())} == set(DYNAMIC)
     assert {line.partition(":")[0] for line in formulas(house(), allowed=())} == set(PI)
-
-
-@pytest.mark.parametrize("name", sorted(TWICE), ids=" ".join)
-def test_a_name_that_may_be_twice_is(name):
-    room, wanted = name
-    found = [f for f, tree in house().items() if f.startswith(f"{room}/") and wanted in defined(tree)]
-    assert len(found) > 1, f"{wanted} is one class of {room} now: take it from the set"
 
 
 # --- planted offences -------------------------------------------------------------------------------------------------

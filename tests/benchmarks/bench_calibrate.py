@@ -29,9 +29,8 @@ from numpyro.infer import MCMC, NUTS
 
 from neusee.nodes.calibrate._likelihood._quantised_gaussian import log_cell
 from neusee.workflows.calibration import emcee_sampler
-from neusee.workflows.calibration.initial_guess import begin
 from neusee.workflows.calibration.log_posterior import SensorPosterior
-from neusee.workflows.calibration.posterior_mode import peak
+from neusee.workflows.calibration.posterior_mode import find_mode, initial_theta
 from neusee.workflows.engine.runner import run
 from neusee.workflows.recipe.loading import load
 from neusee.workflows.store.result_store import Store
@@ -77,7 +76,7 @@ def nuts(problem, best, draws=1000, warmup=500, chains=4):
     photons, exposure, n, mean, variance, nu = (jnp.asarray(x.numpy()) for x in levels[:6])
     prior = [jnp.asarray(x[problem.coordinates.prior.width.isfinite()].numpy()) for x in problem.coordinates.prior]
     values, vectors = np.linalg.eigh(best.covariance)
-    root, middle = jnp.asarray(vectors * np.sqrt(values)), jnp.asarray(best.place)
+    root, middle = jnp.asarray(vectors * np.sqrt(values)), jnp.asarray(best.theta)
 
     def log(z):
         a, b, s, d, w, q = middle + root @ z
@@ -89,8 +88,8 @@ def nuts(problem, best, draws=1000, warmup=500, chains=4):
         below = jnp.sum(n * jax.scipy.special.log_ndtr((jnp.exp(w) - m) / jnp.sqrt(v)))
         return told + below - 0.5 * jnp.sum(((theta - prior[0]) / prior[1]) ** 2) - a
 
-    at = jnp.zeros(len(best.place))
-    ours = problem.log_posterior(np.stack([best.place, best.place + 0.01 * best.covariance.diagonal() ** 0.5]))
+    at = jnp.zeros(len(best.theta))
+    ours = problem.log_posterior(np.stack([best.theta, best.theta + 0.01 * best.covariance.diagonal() ** 0.5]))
     step = jnp.linalg.solve(root, jnp.asarray(0.01 * best.covariance.diagonal() ** 0.5))
     assert abs(float(log(step) - log(at)) - (ours[1] - ours[0])) < 1e-6, "not the same posterior"
 
@@ -103,17 +102,17 @@ def nuts(problem, best, draws=1000, warmup=500, chains=4):
             chain_method="vectorized", progress_bar=False,
         )  # fmt: skip
         began = time.perf_counter()
-        sampler.run(jax.random.PRNGKey(1), init_params=jnp.zeros((chains, len(best.place))))
-        places = np.asarray(sampler.get_samples(group_by_chain=True)) @ np.asarray(root).T + best.place
-        return sampler, places, time.perf_counter() - began
+        sampler.run(jax.random.PRNGKey(1), init_params=jnp.zeros((chains, len(best.theta))))
+        samples = np.asarray(sampler.get_samples(group_by_chain=True)) @ np.asarray(root).T + best.theta
+        return sampler, samples, time.perf_counter() - began
 
-    sampler, places, first = drawn()
+    sampler, samples, first = drawn()
     began = time.perf_counter()
-    sampler.run(jax.random.PRNGKey(2), init_params=jnp.zeros((chains, len(best.place))))
+    sampler.run(jax.random.PRNGKey(2), init_params=jnp.zeros((chains, len(best.theta))))
     np.asarray(sampler.get_samples())
     again = time.perf_counter() - began
-    worth = min(float(arviz.ess(places[..., i])) for i in range(places.shape[-1]))
-    return worth, first, again, places
+    worth = min(float(arviz.ess(samples[..., i])) for i in range(samples.shape[-1]))
+    return worth, first, again, samples
 
 
 def ours(problem, best, how):
@@ -136,10 +135,10 @@ def main():
     with tempfile.TemporaryDirectory() as folder:
         store = Store(Path(folder))
         problem = SensorPosterior.of(load("calibrate"), store)
-        best = peak(problem, begin(problem))
-        places = best.draw(64, np.random.default_rng(0))
-        vector = median(lambda: [problem.log_posterior(places) for _ in range(100)]) / 6400
-        pixel, count = by_pixel(problem, store, problem.parameters(best.place))
+        best = find_mode(problem, initial_theta(problem))
+        samples = best.draw(64, np.random.default_rng(0))
+        vector = median(lambda: [problem.log_posterior(samples) for _ in range(100)]) / 6400
+        pixel, count = by_pixel(problem, store, problem.parameters(best.theta))
         print(
             f"likelihood of a sensor, 64 at once: {1e6 * vector:.1f} us; of {count} pixels one by one: {pixel:.3f} s,"
         )
@@ -149,7 +148,7 @@ def main():
             worth, seconds, _ = ours(problem, best, name)
             print(f"| 15 | emcee, {name} | {worth:.0f} | {seconds:.2f} | {worth / seconds:.0f} |", flush=True)
         lit = SensorPosterior.of(load("calibrate", [LIT]), store)
-        best = peak(lit, begin(lit))
+        best = find_mode(lit, initial_theta(lit))
         worth, seconds, chains = ours(lit, best, "de")
         print(f"| 14 | emcee, de | {worth:.0f} | {seconds:.2f} | {worth / seconds:.0f} |", flush=True)
         worth, first, again, other = nuts(lit, best)

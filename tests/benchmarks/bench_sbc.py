@@ -15,19 +15,19 @@ import torch
 from neusee.workflows.calibration import emcee_sampler
 from neusee.workflows.recipe.loading import load
 from neusee.workflows.store.remote_store import open_store
-from neusee.workflows.studies.calibration.independent_draws import walked
-from neusee.workflows.studies.calibration.rank_uniformity import verdicts
-from neusee.workflows.studies.calibration.simulated_sensors import Bench
+from neusee.workflows.studies.calibration.independent_draws import walk_draws
+from neusee.workflows.studies.calibration.rank_uniformity import rank_tests
+from neusee.workflows.studies.calibration.simulated_sensors import SensorSimulator
 
 
 def main(count=1000, move="de", *overrides):
     torch.set_num_threads(1)
     if move == "snooker":  # a planted fault, which `move` refuses
         emcee_sampler._MOVES[move] = emcee.moves.DESnookerMove
-    bench = Bench(load("calibrate", overrides), open_store(), 128, partial(walked, how=move), move)
-    found = [bench.simulation(number) for number in range(int(count))]
+    simulator = SensorSimulator(load("calibrate", overrides), open_store(), 128, partial(walk_draws, how=move), move)
+    found = [simulator.simulation(number) for number in range(int(count))]
     print("| parameter | p | at least | coverage | bar | z mean | z sd | |\n|---|---|---|---|---|---|---|---|")
-    for v in verdicts(found):
+    for v in rank_tests(found):
         held = "fails" if v.failed else "holds"
         print(
             f"| {v.name} | {v.p:.3f} | {v.least_p:.4f} | {v.coverage:.3f} | {v.bar[0]:.3f} to {v.bar[1]:.3f} "

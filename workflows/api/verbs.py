@@ -3,7 +3,7 @@
 ``changes`` are those of a recipe that is given by name or file: a mapping as `load` takes it
 (``{"doe": "axicon", "sensor": {"read_noise": "20 e-"}}``), or arguments as on the command line
 (``["doe=axicon"]``). ``store`` is where results are kept: ``$NEUSEE_CACHE``, or the usual
-folder, if None. ``out`` is the folder in which a folder of results is made. ``tell`` is given
+folder, if None. ``out`` is the folder in which a folder of results is made. ``progress`` is given
 one line for each thing that is done, and ``command`` is what the page says to run it again.
 """
 
@@ -32,7 +32,7 @@ if TYPE_CHECKING:
 
 Named = str | os.PathLike[str]  #: a packaged recipe's name, or a file
 Changes = Mapping[str, Any] | Sequence[str]
-Tell = Callable[[str], None]
+Progress = Callable[[str], None]
 Kind = Literal["accuracy", "stability", "leave-out", "calibration", "uncertainty"]
 
 __all__ = ["calibrate", "evaluate", "run", "study", "sweep", "train"]
@@ -91,7 +91,7 @@ def train(
     store: Store | None = None,
     device: str = "cpu",
     out: Named = "runs",
-    tell: Tell = _silent,
+    progress: Progress = _silent,
     command: Sequence[str] = (),
     stages: Sequence[int] | None = None,
     watch: Callable[[int, int, Mapping[str, float]], None] | None = None,
@@ -109,12 +109,12 @@ def train(
     if found.lifting is not None:
         from neusee.workflows.training.lift.lift_run import train_lift
 
-        return train_lift(found, store, place, command, tell, device, watch and partial(watch, 1))
+        return train_lift(found, store, place, command, progress, device, watch and partial(watch, 1))
     from neusee.workflows.training.parallel.process_mesh import ALONE
     from neusee.workflows.training.run_training import train as learn
 
     numbers = stages if stages is not None else found.training.learnt if found.training else ()
-    return learn(found, store, place, command, tell, tuple(numbers), device, watch, mesh or ALONE)
+    return learn(found, store, place, command, progress, tuple(numbers), device, watch, mesh or ALONE)
 
 
 def evaluate(
@@ -125,7 +125,7 @@ def evaluate(
     store: Store | None = None,
     device: str = "cpu",
     out: Named = "runs",
-    tell: Tell = _silent,
+    progress: Progress = _silent,
     command: Sequence[str] = (),
     data: Named | None = None,
     scenes: int = 20,
@@ -138,7 +138,7 @@ def evaluate(
     Args: pipelines: ``"flat+none, five_half_rings+wiener"``. data: a folder of photographs; the recipe's own scene if
     None. scenes: how many. strengths: of the laser, multiples of saturation; those of the paper if None. small: shorter
     side, in pixels, of the pictures that are compared a second time. reference: the pipeline to compare with.
-    Raises: `Refused` with every mistake before anything runs, `RunError` where a step fails.
+    Raises: `EvaluationRefused` with every mistake before anything runs, `RunError` where a step fails.
     """
     from neusee.workflows.evaluation import run_evaluation as protocol
 
@@ -156,7 +156,7 @@ def evaluate(
         store=store,
         runs=Path(out),
         command=command,
-        tell=tell,
+        progress=progress,
         device=device,
         folder=here,
     )
@@ -168,7 +168,7 @@ def calibrate(
     changes: Changes = (),
     store: Store | None = None,
     out: Named = "runs",
-    tell: Tell = _silent,
+    progress: Progress = _silent,
     command: Sequence[str] = (),
     walkers: int = 64,
     move: str = "de",
@@ -178,13 +178,13 @@ def calibrate(
 
     Args: walkers: of each of the four ensembles. move: how walkers move, ``"de"`` or ``"stretch"``. draws: how many
     independent ones there are at least.
-    Raises: `Refused` where the levels tell too little, ValueError for a recipe that does not calibrate.
+    Raises: `CalibrationRefused` where the levels tell too little, ValueError for a recipe that does not calibrate.
     """
     from neusee.workflows.calibration.run_calibration import calibrate as found
 
     place = Path(out)
     read = _read(recipe, changes)
-    return found(read, store or open_store(), place, command, tell, walkers=walkers, move=move, draws=draws)
+    return found(read, store or open_store(), place, command, progress, walkers=walkers, move=move, draws=draws)
 
 
 def study(
@@ -194,7 +194,7 @@ def study(
     changes: Changes = (),
     store: Store | None = None,
     out: Named = "runs",
-    tell: Tell = _silent,
+    progress: Progress = _silent,
     command: Sequence[str] = (),
     **options: Any,
 ) -> Path:
@@ -208,7 +208,7 @@ def study(
 
     if kind not in run_study.KINDS:
         raise ValueError(f"no study {kind!r}: there are {', '.join(run_study.KINDS)}")
-    return run_study.made(kind, _read(recipe, changes), store, Path(out), command, tell, **options)
+    return run_study.study_recipe(kind, _read(recipe, changes), store, Path(out), command, progress, **options)
 
 
 def _read(recipe: Recipe | Named, changes: Changes) -> Recipe:

@@ -13,7 +13,7 @@ from neusee.workflows.report.figures.style import BLACK, BLUE, ORANGE, VERMILION
 if TYPE_CHECKING:
     from numpy.typing import NDArray
 
-    from neusee.workflows.calibration.log_posterior import Places
+    from neusee.workflows.calibration.log_posterior import FloatArray
 
 _BAND = (5.0, 50.0, 95.0)  #: percentiles
 _POINTS = 1500  #: of a chain that are drawn
@@ -21,8 +21,8 @@ _LEAST = 0.1  #: DN2, where a level without any scatter is drawn
 
 
 @drawn
-def transfer(measured: Places, predicted: Places, whole: NDArray[np.bool_]) -> Any:
-    """Variance against mean, and how far each level lies from what the posterior predicts.
+def transfer(measured: FloatArray, predicted: FloatArray, whole: NDArray[np.bool_]) -> Any:
+    """Draw variance against mean, and how far each level lies from what the posterior predicts.
 
     ``measured`` (3, level): mean, variance, degrees of freedom; ``predicted`` (2, draw, level): mean and variance, with
     the chance of another such measurement; ``whole`` (level,): not cut off by an end.
@@ -51,8 +51,8 @@ def transfer(measured: Places, predicted: Places, whole: NDArray[np.bool_]) -> A
 
 
 @drawn
-def corners(draws: Places, names: Sequence[str], nominal: Sequence[float]) -> Any:
-    """Every pair of parameters; orange: what the recipe says."""
+def corners(draws: FloatArray, names: Sequence[str], nominal: Sequence[float]) -> Any:
+    """Draw every pair of parameters; the recipe's own values are orange."""
     import corner
     from matplotlib.backends.backend_agg import FigureCanvasAgg
     from matplotlib.figure import Figure
@@ -68,8 +68,8 @@ def corners(draws: Places, names: Sequence[str], nominal: Sequence[float]) -> An
 
 
 @drawn
-def traces(draws: Places, labels: Sequence[str]) -> Any:
-    """Each coordinate by step: the median and the middle 90 % of the walkers of each ensemble."""
+def traces(draws: FloatArray, labels: Sequence[str]) -> Any:
+    """Draw each coordinate by step: the median and the middle 90 % of the walkers of each ensemble."""
     count = len(labels)
     figure, axes = canvas(9.0, 1.35 * count + 0.5, count, 1, sharex=True)
     every = max(1, draws.shape[1] // _POINTS)

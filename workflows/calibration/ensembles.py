@@ -1,7 +1,7 @@
-"""Ensembles that walk in step: each by emcee's moves and its own random stream, and all weighed in one call.
+"""Ensembles that walk in step: each by emcee's moves and its own random stream, and all evaluated in one call.
 
-It is draw for draw the walk of emcee's `EnsembleSampler`, which weighs an ensemble by itself and looks at its walkers
-one by one: a likelihood of few numbers takes as long for one ensemble as for four, and less than that loop.
+The draws are exactly those of emcee's `EnsembleSampler`. That class evaluates each ensemble by itself and loops over
+its walkers. A likelihood of few numbers takes as long for one ensemble as for four, and less than that loop.
 """
 
 from __future__ import annotations
@@ -13,34 +13,36 @@ import emcee
 import numpy as np
 
 if TYPE_CHECKING:
-    from neusee.workflows.calibration.log_posterior import Places
+    from neusee.workflows.calibration.log_posterior import FloatArray
 
-Weigh = Callable[["Places"], "Places"]  #: of (walker, free) the log density of each, never not a number
+Weigh = Callable[["FloatArray"], "FloatArray"]  #: the log density of each walker of (walker, free), never NaN
 
 
 class Walk:
     """One ensemble."""
 
-    def __init__(self, backend: Any, move: Any, random: np.random.RandomState, begin: Places | None) -> None:
-        self.backend = backend  #: emcee's, in memory: all steps that were walked
+    def __init__(
+        self, backend: Any, move: Any, random: np.random.RandomState, initial_theta: FloatArray | None
+    ) -> None:
+        self.backend = backend  #: emcee's, in memory: all steps so far
         self.move, self.random = move, random
-        self.begin = begin  #: (walker, free) before the first step; None where there were some
+        self.initial_theta = initial_theta  #: (walker, free) before the first step; None after it
 
     @property
     def iteration(self) -> int:
-        """Steps that were walked."""
+        """Return the number of steps so far."""
         return int(self.backend.iteration)
 
     def prepare(self, steps: int, weigh: Weigh) -> None:
-        """Make room for so many steps more, and stand where the last one ended."""
-        if self.begin is not None and self.iteration == 0:
-            self._state = emcee.State(self.begin.copy(), log_prob=weigh(self.begin))
+        """Reserve memory for ``steps`` more steps, and start from the last one."""
+        if self.initial_theta is not None and self.iteration == 0:
+            self._state = emcee.State(self.initial_theta.copy(), log_prob=weigh(self.initial_theta))
         else:
             self._state = emcee.State(self.backend.get_last_sample(), copy=True)
         self.backend.grow(steps, None)
 
     def begin_step(self) -> None:
-        """Split the walkers: each part is proposed places from the others."""
+        """Split the walkers into parts: the proposals of each part come from the other parts."""
         self.random.random_sample()  # by which emcee draws one of several moves
         self.move.setup(self._state.coords)
         self._part = np.arange(len(self._state.coords)) % self.move.nsplits
@@ -48,34 +50,34 @@ class Walk:
             self.random.shuffle(self._part)
         self._accepted = np.zeros(len(self._part), dtype=bool)
 
-    def propose(self, part: int) -> Places:
-        """(walker, free) where those of one part may go."""
+    def propose(self, part: int) -> FloatArray:
+        """Return the proposals (walker, free) of one part."""
         sets = [self._state.coords[self._part == other] for other in range(self.move.nsplits)]
         others = sets[:part] + sets[part + 1 :]
-        self._places, self._factors = self.move.get_proposal(sets[part], others, self.random)
-        found: Places = self._places
+        self._proposed, self._factors = self.move.get_proposal(sets[part], others, self.random)
+        found: FloatArray = self._proposed
         return found
 
-    def decide(self, part: int, log: Places) -> None:
-        """Go there, or stay."""
+    def decide(self, part: int, log: FloatArray) -> None:
+        """Accept or reject the proposals of one part."""
         own = np.flatnonzero(self._part == part)
         gain = self._factors + log - self._state.log_prob[own]
         goes = gain > np.log(self.random.rand(len(own)))
         at = own[goes]
-        self._state.coords[at], self._state.log_prob[at] = self._places[goes], log[goes]
+        self._state.coords[at], self._state.log_prob[at] = self._proposed[goes], log[goes]
         self._accepted[at] = True
 
     def end_step(self) -> None:
-        """Keep it."""
+        """Keep the step."""
         self.backend.save_step(self._state, self._accepted)
 
     def rest(self) -> None:
-        """Keep where the stream stands, which only what goes on asks for."""
+        """Keep the state of the random stream, which a continued chain needs."""
         self.backend.random_state = self.random.get_state()
 
 
-def go_on(walks: Sequence[Walk], steps: int, weigh: Weigh) -> None:
-    """Walk by one move until so many steps are there, those that are behind first."""
+def walk_until(walks: Sequence[Walk], steps: int, weigh: Weigh) -> None:
+    """Walk until every ensemble has ``steps`` steps, those that are behind first."""
     while (now := min(walk.iteration for walk in walks)) < steps:
         behind = [walk for walk in walks if walk.iteration == now]
         until = min([steps, *(walk.iteration for walk in walks if walk.iteration > now)])

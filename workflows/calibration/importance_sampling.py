@@ -1,4 +1,4 @@
-"""Draws of a posterior without a chain: importance sampling from a law that is fitted until it agrees."""
+"""Samples of a posterior without a chain: importance sampling from a density that is fitted until both agree."""
 
 from __future__ import annotations
 
@@ -10,57 +10,59 @@ from neusee.workflows.calibration.log_posterior import SensorPosterior
 from neusee.workflows.calibration.posterior_mode import LaplaceFit
 
 if TYPE_CHECKING:
-    from neusee.workflows.calibration.log_posterior import Places
+    from neusee.workflows.calibration.log_posterior import FloatArray
 
 DRAWS = 4000
 _ROUNDS, _TAIL = 8, 6.0
-_ENOUGH, _SOFT, _LEAST = 0.3, 0.1, 0.02  #: of the draws, how many they must be worth: to end, to go on by, at all
+_ENOUGH, _SOFT, _LEAST = 0.3, 0.1, 0.02  #: effective sample fractions: to end, to fit the next density to, at least
 
 
-def drawn(problem: SensorPosterior, top: LaplaceFit, rng: np.random.Generator) -> tuple[Places, Places]:
-    """Places, and the logarithm of the posterior over the law that they were drawn from.
+def draw_samples(problem: SensorPosterior, mode: LaplaceFit, rng: np.random.Generator) -> tuple[FloatArray, FloatArray]:
+    """Return samples, and the logarithm of the posterior over the density that they were drawn from.
 
-    The law has wide tails, begins as that about the peak, and is fitted to the weighed draws until they agree. Raises
-    ValueError where they never do.
+    The density has wide tails, starts as that about the mode, and is fitted to the weighted samples until both agree.
+    Raises: `ValueError` where they never do.
     """
-    centre, covariance = top.place, top.covariance
+    centre, covariance = mode.theta, mode.covariance
     found, best = (np.empty((0, len(centre))), np.empty(0)), 0.0
     for _ in range(_ROUNDS):
-        places, log = _proposed(problem, centre, covariance, rng)
-        worth = _worth(weights(log))
-        if worth > best:
-            found, best = (places, log), worth
+        samples, log = _proposed(problem, centre, covariance, rng)
+        fraction = _effective_sample_fraction(weights(log))
+        if fraction > best:
+            found, best = (samples, log), fraction
         if best >= _ENOUGH:
             break
-        while _worth(soft := weights(log)) < _SOFT:  # few draws would make the next law too narrow
+        while (
+            _effective_sample_fraction(soft := weights(log)) < _SOFT
+        ):  # few samples would make the next density too narrow
             log = 0.5 * log
-        centre = soft @ places
-        covariance = (places - centre).T @ (soft[:, None] * (places - centre))
+        centre = soft @ samples
+        covariance = (samples - centre).T @ (soft[:, None] * (samples - centre))
     if best < _LEAST:
         raise ValueError(
-            f"{DRAWS} draws of {', '.join(problem.names)} are worth {best * DRAWS:.0f}: what levels do not tell is "
-            "better held"
+            f"{DRAWS} draws of {', '.join(problem.names)} have an effective sample size of {best * DRAWS:.0f}: "
+            "hold the parameters that the levels do not determine"
         )
     return found
 
 
-def weights(log: Places) -> Places:
-    """Shares that sum to one."""
+def weights(log: FloatArray) -> FloatArray:
+    """Return shares that sum to one."""
     share = np.exp(log - log.max())
-    found: Places = share / share.sum()
+    found: FloatArray = share / share.sum()
     return found
 
 
 def _proposed(
-    problem: SensorPosterior, centre: Places, covariance: Places, rng: np.random.Generator
-) -> tuple[Places, Places]:
-    """Places by Student's law, and the logarithm of the posterior over that law."""
+    problem: SensorPosterior, centre: FloatArray, covariance: FloatArray, rng: np.random.Generator
+) -> tuple[FloatArray, FloatArray]:
+    """Return samples of Student's t, and the logarithm of the posterior over the density of Student's t."""
     off = rng.standard_normal((DRAWS, len(centre))) / np.sqrt(rng.chisquare(_TAIL, (DRAWS, 1)) / _TAIL)
-    places = centre + off @ np.linalg.cholesky(covariance).T
-    log: Places = problem.log_posterior(places) + 0.5 * (_TAIL + len(centre)) * np.log1p((off**2).sum(1) / _TAIL)
-    return places, log
+    samples = centre + off @ np.linalg.cholesky(covariance).T
+    log: FloatArray = problem.log_posterior(samples) + 0.5 * (_TAIL + len(centre)) * np.log1p((off**2).sum(1) / _TAIL)
+    return samples, log
 
 
-def _worth(weight: Places) -> float:
-    """As how many independent draws, as a share of all."""
+def _effective_sample_fraction(weight: FloatArray) -> float:
+    """Return the effective sample size as a share of all samples."""
     return float(1.0 / (weight**2).sum() / len(weight))

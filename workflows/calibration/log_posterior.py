@@ -1,4 +1,4 @@
-"""The posterior of a recipe's sensor as a function: what is free, where, and how likely."""
+"""The posterior of a recipe's sensor as a function of its free parameters."""
 
 from __future__ import annotations
 
@@ -22,9 +22,9 @@ from neusee.workflows.store.result_store import Store
 if TYPE_CHECKING:
     from numpy.typing import NDArray
 
-    Places = NDArray[np.float64]
+    FloatArray = NDArray[np.float64]
 
-#: by the node that weighs levels, the node that says what is free, and how that is walked
+#: by the node of the likelihood, the node of the prior and the class of the coordinates
 _KINDS: dict[str, tuple[str, type[Coordinates] | type[CameraCoordinates]]] = {
     "calibrate.density": ("calibrate.prior", Coordinates),
     "calibrate.camera": ("calibrate.camera_prior", CameraCoordinates),
@@ -33,19 +33,19 @@ _KINDS: dict[str, tuple[str, type[Coordinates] | type[CameraCoordinates]]] = {
 
 @dataclass(frozen=True)
 class SensorPosterior:
-    """A recipe's calibration: a place is a row of coordinates, one for each free parameter."""
+    """The posterior of a recipe's sensor; theta is a row of coordinates, one for each free parameter."""
 
     recipe: Recipe
-    step: str  #: that weighs the levels
-    key: str  #: of what decides it
+    step: str  #: the step of the likelihood
+    key: str  #: of everything that decides the posterior
     coordinates: Coordinates | CameraCoordinates
     levels: Sufficient | Levels
     weigh: Callable[[Mapping[str, Any]], dict[str, Any]]
-    tell: Callable[[Mapping[str, Any]], dict[str, Any]]  #: also deviances and what the levels tell
+    weigh_in_full: Callable[[Mapping[str, Any]], dict[str, Any]]  #: with deviances and slopes too
 
     @classmethod
     def of(cls, recipe: Recipe, store: Store) -> SensorPosterior:
-        """Raises ValueError for a recipe without both steps, or with two of one."""
+        """Read a recipe; raise `ValueError` for a recipe without both steps, or with two of one."""
         density, prior, kind = _pair(recipe)
         source = str(density.wires["levels"])
         done = run(recipe, store, (density.name, prior.name, source))
@@ -62,35 +62,35 @@ class SensorPosterior:
 
     @property
     def names(self) -> tuple[str, ...]:
-        """The free parameters."""
+        """Return the names of the free parameters."""
         return self.coordinates.names
 
-    def parameters(self, places: Places) -> dict[str, Tensor]:
-        """Of places (..., free) the parameters, each (...)."""
-        return self.coordinates.parameters(torch.from_numpy(np.ascontiguousarray(places)))
+    def parameters(self, samples: FloatArray) -> dict[str, Tensor]:
+        """Return the parameters, each (...), of samples (..., free)."""
+        return self.coordinates.parameters(torch.from_numpy(np.ascontiguousarray(samples)))
 
-    def place(self, parameters: Mapping[str, float | Tensor]) -> Places:
-        """(..., free) from parameters."""
-        found: Places = self.coordinates.place(parameters).numpy()
+    def theta(self, parameters: Mapping[str, float | Tensor]) -> FloatArray:
+        """Return coordinates (..., free) of parameters."""
+        found: FloatArray = self.coordinates.place(parameters).numpy()
         return found
 
-    def look(self, places: Places) -> Likelihood:
-        """How likely the levels are at places (walker, free)."""
+    def likelihood(self, samples: FloatArray) -> Likelihood:
+        """Return the likelihood of the levels at samples (walker, free)."""
         with torch.no_grad(), one_thread():
-            found: Likelihood = self.tell(self._named(self.parameters(places)))[self.step]
+            found: Likelihood = self.weigh_in_full(self._named(self.parameters(samples)))[self.step]
         return found
 
-    def log_posterior(self, places: Places) -> Places:
-        """(walker,) log density per unit of the coordinates, but for a constant; minus infinity where there is none."""
+    def log_posterior(self, samples: FloatArray) -> FloatArray:
+        """Return the log density (walker,) by the coordinates, up to a constant; minus infinity where it is zero."""
         with torch.no_grad(), one_thread():
-            parameters = self.parameters(places)
+            parameters = self.parameters(samples)
             total = self.weigh(self._named(parameters))[self.step].log + self.coordinates.log_prior(parameters)
-        found: Places = total.nan_to_num(nan=-torch.inf, posinf=-torch.inf, neginf=-torch.inf).numpy()
+        found: FloatArray = total.nan_to_num(nan=-torch.inf, posinf=-torch.inf, neginf=-torch.inf).numpy()
         return found
 
-    def whitened(self, places: Places) -> Places:
-        """(..., free) in standard deviations of the prior."""
-        found: Places = self.coordinates.whitened(self.parameters(places)).numpy()
+    def whitened(self, samples: FloatArray) -> FloatArray:
+        """Return samples (..., free) in standard deviations of the prior."""
+        found: FloatArray = self.coordinates.whitened(self.parameters(samples)).numpy()
         return found
 
     def _named(self, parameters: Mapping[str, Tensor]) -> dict[str, Tensor]:
@@ -98,13 +98,13 @@ class SensorPosterior:
 
 
 def _pair(recipe: Recipe) -> tuple[Step, Step, type[Coordinates] | type[CameraCoordinates]]:
-    """The step that weighs, the one that says what is free, and how that is walked."""
-    weighing = the_step(recipe, *_KINDS)
+    """Return the step that weighs the levels, the step of the prior, and the class of the coordinates."""
+    weighing = only_step(recipe, *_KINDS)
     prior, kind = _KINDS[weighing.node.path]
-    return weighing, the_step(recipe, prior), kind
+    return weighing, only_step(recipe, prior), kind
 
 
-def the_step(recipe: Recipe, *paths: str) -> Step:
+def only_step(recipe: Recipe, *paths: str) -> Step:
     found = [step for step in recipe.steps.values() if step.node.path in paths]
     if len(found) != 1:
         has = "no step" if not found else f"{len(found)} steps"

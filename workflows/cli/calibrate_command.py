@@ -30,17 +30,24 @@ def calibrate(
     """
     recipe, command = load(words)
     from neusee.workflows.api import verbs
-    from neusee.workflows.calibration.run_calibration import Refused
+    from neusee.workflows.calibration.run_calibration import CalibrationRefused
     from neusee.workflows.graph.run_error import RunError
 
-    tell = (lambda line: None) if quiet else (lambda line: say([line]))
+    progress = (lambda line: None) if quiet else (lambda line: say([line]))
     how = {"walkers": walkers, "move": move, "draws": draws}
     command = ["neusee", "calibrate", *command[2:], *(f"--{name} {value}" for name, value in how.items())]
     try:
         folder = verbs.calibrate(
-            recipe, store=the_store(), out=out, command=command, tell=tell, walkers=walkers, move=move, draws=draws
+            recipe,
+            store=the_store(),
+            out=out,
+            command=command,
+            progress=progress,
+            walkers=walkers,
+            move=move,
+            draws=draws,
         )
-    except Refused as error:
+    except CalibrationRefused as error:
         fail(f"refused, nothing was drawn: {error}", FAILED)
     except (RunError, ValueError, ImportError) as error:
         fail(str(error), FAILED)
@@ -54,7 +61,7 @@ def calibrate(
 
 
 def _lines(parameters: dict[str, dict[str, object]]) -> list[str]:
-    from neusee.workflows.calibration.calibration_page import ParameterRow
+    from neusee.workflows.calibration.calibration_page import ParameterEstimate
 
-    rows = [ParameterRow(**{"mean": 0.0, "sd": 0.0, **row}) for row in parameters.values()]  # type: ignore[arg-type]
-    return [f"{row.name.replace('_', ' '):20s} {row.said}" for row in rows]
+    rows = [ParameterEstimate(**{"mean": 0.0, "sd": 0.0, **row}) for row in parameters.values()]  # type: ignore[arg-type]
+    return [f"{row.name.replace('_', ' '):20s} {row.text}" for row in rows]

@@ -41,10 +41,10 @@ def evaluate(
     """
     name, changes, _ = split(words)
     check_device(device)
-    tell = (lambda line: None) if quiet else (lambda line: say([line]))
+    progress = (lambda line: None) if quiet else (lambda line: say([line]))
     how = {"data": data, "scenes": scenes, "strengths": strengths, "small": small, "reference": reference}
     command = ["neusee", "evaluate", name, *changes, f'--pipelines "{pipelines}"', *_given(how)]
-    folder = _evaluated(
+    folder = _evaluate(
         name,
         changes,
         pipelines,
@@ -55,7 +55,7 @@ def evaluate(
         reference=reference.replace(" ", ""),
         out=out,
         command=command,
-        tell=tell,
+        progress=progress,
         device=device,
     )
     say([str(folder / "report.html")])
@@ -65,15 +65,15 @@ def _given(how: dict[str, Any]) -> list[str]:
     return [f"--{key} {value}" for key, value in how.items() if value]
 
 
-def _evaluated(name: str, changes: list[str], pipelines: str, **how: Any) -> Path:
-    """The folder of the evaluation, or one line of what is wrong."""
+def _evaluate(name: str, changes: list[str], pipelines: str, **how: Any) -> Path:
+    """Return the folder of the evaluation, or end with one line for each mistake."""
     from neusee.workflows.api import verbs
-    from neusee.workflows.evaluation.pipelines import Refused
+    from neusee.workflows.evaluation.pipelines import EvaluationRefused
     from neusee.workflows.graph.run_error import RunError
 
     try:
         return verbs.evaluate(name, pipelines=pipelines, changes=changes, store=the_store(), **how)
-    except Refused as error:
+    except EvaluationRefused as error:
         fail(str(error))
     except RunError as error:
         fail(str(error), FAILED)

@@ -51,7 +51,7 @@ def accuracy(
     For the whole recipe and for each step, over tolerances and settings of accuracy; the page names the cheapest
     setting for each error.
     """
-    _made("accuracy", words, quiet, out, seeds=seeds, quick=quick)
+    _run("accuracy", words, quiet, out, seeds=seeds, quick=quick)
 
 
 @study.command()
@@ -61,7 +61,7 @@ def stability(words: Words = None, quiet: Quiet = False, debug: Debug = False, o
     Values and gradients are compared: each case passes, warns or fails with its number. The exit code is 1 where
     one fails.
     """
-    _made("stability", words, quiet, out)
+    _run("stability", words, quiet, out)
 
 
 @study.command("leave-out")
@@ -71,7 +71,7 @@ def leave_out(words: Words = None, quiet: Quiet = False, debug: Debug = False, o
     Each omitted step is computed in full as well. The page has the stated bound, the measured change and the
     seconds saved, and what simpler scenes cost. The exit code is 1 where a change exceeds its bound.
     """
-    _made("leave-out", words, quiet, out)
+    _run("leave-out", words, quiet, out)
 
 
 @study.command()
@@ -91,7 +91,7 @@ def calibration(
     posterior (simulation-based calibration, SBC). The page also has what doubling the width of each prior moves.
     The exit code is 1 where ranks or coverage are wrong.
     """
-    _made("calibration", words, quiet, out, simulations=simulations, move=move.value)
+    _run("calibration", words, quiet, out, simulations=simulations, move=move.value)
 
 
 @study.command()
@@ -121,22 +121,24 @@ def uncertainty(
     """
     check_device(device)
     how = {"error": error, "most": most, "points": points.value, "workers": workers, "device": device}
-    _made("uncertainty", words, quiet, out, **how)
+    _run("uncertainty", words, quiet, out, **how)
 
 
-def _made(kind: Kind, words: list[str] | None, quiet: bool, out: Path, **options: Any) -> None:
+def _run(kind: Kind, words: list[str] | None, quiet: bool, out: Path, **options: Any) -> None:
     recipe, command = load(words)
     from neusee.workflows.api import verbs
     from neusee.workflows.graph.run_error import RunError
-    from neusee.workflows.studies.run_study import failed
+    from neusee.workflows.studies.run_study import count_failures
 
     given = [f"--{name}" if value is True else f"--{name} {value}" for name, value in options.items() if value]
     command = ["neusee", "study", kind, *command[2:], *given]
-    tell = (lambda line: None) if quiet else (lambda line: say([line]))
+    progress = (lambda line: None) if quiet else (lambda line: say([line]))
     try:
-        folder = verbs.study(recipe, kind=kind, store=the_store(), out=out, command=command, tell=tell, **options)
+        folder = verbs.study(
+            recipe, kind=kind, store=the_store(), out=out, command=command, progress=progress, **options
+        )
     except (RunError, ValueError, ImportError) as error:
         fail(str(error), FAILED)
     say([str(folder / "report.html")])
-    if count := failed(folder):
+    if count := count_failures(folder):
         fail(f"{count} do not hold: see {folder / 'report.html'}", FAILED)

@@ -68,7 +68,7 @@ def train(
     lengths = {s: recipe.training.stages[s].iterations for s in stages if s} if recipe.training else {}
     try:
         with joined(mesh, device) as processes_here, _bar(quiet, lengths) as bar:
-            folder = verbs.train(recipe, store=the_store(), device=device, out=out, tell=tell, command=told,
+            folder = verbs.train(recipe, store=the_store(), device=device, out=out, progress=tell, command=told,
                                  stages=stages, watch=bar.watch, mesh=processes_here)  # fmt: skip
     except MeshError as error:
         fail(f"{who}{error}")
@@ -89,7 +89,7 @@ def _lift(recipe: Recipe, told: list[str], out: Path, device: str, quiet: bool) 
     tell = (lambda line: None) if quiet else (lambda line: say([line]))
     try:
         with _bar(quiet, {1: recipe.lifting.iterations}) as bar:
-            folder = verbs.train(recipe, store=the_store(), device=device, out=out, tell=tell, command=told,
+            folder = verbs.train(recipe, store=the_store(), device=device, out=out, progress=tell, command=told,
                                  watch=bar.watch)  # fmt: skip
     except (RunError, ValueError, ArithmeticError) as error:
         fail(str(error), FAILED)

@@ -1,4 +1,4 @@
-"""What points say together: means over scenes, differences from a reference scene by scene, each with its interval."""
+"""Confidence intervals over scenes: of means, and of differences from a reference scene by scene."""
 
 from __future__ import annotations
 
@@ -15,15 +15,15 @@ if TYPE_CHECKING:
     Numbers = NDArray[np.float64]
 
 CONFIDENCE = 0.95
-_AGAIN = 10_000  #: sets of scenes that are drawn anew for a ratio
-_AT_ONCE = 500  #: of them
-_FEW = 5  #: scenes from which a bootstrap of them says anything
+_AGAIN = 10_000  #: bootstrap sets of scenes for a ratio
+_AT_ONCE = 500  #: sets in memory at once
+_FEW = 5  #: least scenes for a bootstrap
 METRICS = ("l1", "psnr", "ssim", "l1 small", "psnr small", "ssim small", "saturated", "peak", "damaged")
 
 
 @dataclass(frozen=True)
 class Interval:
-    """A mean and its 95 % confidence interval; of one scene, or too few, the interval is unknown (not a number)."""
+    """A mean and its 95 % confidence interval; the limits are NaN where there is one scene, or too few."""
 
     mean: float
     low: float
@@ -31,36 +31,36 @@ class Interval:
 
     @property
     def half(self) -> float:
-        """Half the width."""
+        """Return half the width."""
         return (self.high - self.low) / 2
 
     @property
     def excludes_zero(self) -> bool:
-        """Whether zero lies outside."""
+        """Return True if zero lies outside."""
         return self.low > 0 or self.high < 0
 
 
 @dataclass(frozen=True)
-class Table:
-    """All points of one pipeline: by metric (scene, strength), not a number where a scene has no laser to vary."""
+class MetricTable:
+    """All points of one pipeline: (scene, strength) by metric, NaN where a scene has no laser to vary."""
 
     strengths: tuple[float, ...]
     values: Mapping[str, Numbers]
 
     def scenes(self, metric: str) -> Numbers:
-        """Of each scene its mean over strengths."""
+        """Return the mean over strengths of each scene."""
         found: Numbers = np.nanmean(self.values[metric], axis=1)
         return found
 
     def at(self, metric: str, strength: int) -> Numbers:
-        """Of each scene that has it, the value at one strength."""
+        """Return the value at one strength of each scene that has one."""
         column = self.values[metric][:, strength]
         found: Numbers = column[~np.isnan(column)]
         return found
 
 
 def mean(values: Sequence[float] | Numbers) -> Interval:
-    """Student's t over scenes."""
+    """Return the mean over scenes with the interval of Student's t."""
     x = np.asarray(values, dtype=np.float64)
     centre = float(x.mean()) if len(x) else math.nan
     if len(x) < 2:
@@ -72,14 +72,14 @@ def mean(values: Sequence[float] | Numbers) -> Interval:
 
 
 def difference(values: Numbers, reference: Numbers) -> Interval:
-    """Student's t of the differences scene by scene."""
+    """Return the mean of the differences scene by scene with the interval of Student's t."""
     return mean(values - reference)
 
 
 def gain(values: Numbers, reference: Numbers, seed: int) -> Interval:
-    """By which share of the reference's mean a metric is lower, such as L1 by 10.1 %.
+    """Return by which share of the reference's mean a metric is lower, such as L1 by 10.1 %.
 
-    The interval is the bootstrap's: the same scenes of both are drawn again, by a seed of its own.
+    The interval is that of the bootstrap: it draws the same scenes of both again, with a seed of its own.
     """
     found = 1.0 - float(values.mean()) / float(reference.mean())
     if len(values) < _FEW:
@@ -93,8 +93,8 @@ def gain(values: Numbers, reference: Numbers, seed: int) -> Interval:
     return Interval(found, float(low), float(high))
 
 
-def against(values: Table, reference: Table, seed: int) -> dict[str, Interval]:
-    """How much lower the L1 of a pipeline is than the reference's: as it is, as a share, and of the small pictures."""
+def compare_with(values: MetricTable, reference: MetricTable, seed: int) -> dict[str, Interval]:
+    """Return how much lower a pipeline's L1 is than the reference's: as it is, as a share, and of small pictures."""
     own, other = values.scenes("l1"), reference.scenes("l1")
     return {
         "l1 less": difference(other, own),
@@ -103,10 +103,10 @@ def against(values: Table, reference: Table, seed: int) -> dict[str, Interval]:
     }
 
 
-def table(points: Sequence[Mapping[float, Mapping[str, float]]], strengths: Sequence[float]) -> Table:
-    """Points by scene and strength as arrays."""
+def metric_table(points: Sequence[Mapping[float, Mapping[str, float]]], strengths: Sequence[float]) -> MetricTable:
+    """Return points by scene and strength as arrays."""
     each = {
         metric: np.array([[point.get(k, {}).get(metric, math.nan) for k in strengths] for point in points])
         for metric in METRICS
     }
-    return Table(tuple(strengths), each)
+    return MetricTable(tuple(strengths), each)

@@ -9,7 +9,7 @@ import numpy as np
 import torch
 
 from neusee.nodes.metrics import most_contrast
-from neusee.workflows.evaluation.confidence_intervals import Table, mean
+from neusee.workflows.evaluation.confidence_intervals import MetricTable, mean
 from neusee.workflows.report.figures.camera_overview import high
 from neusee.workflows.report.figures.style import BLACK, BLUE, GREEN, ORANGE, VERMILION, canvas, drawn, encoded, picture
 
@@ -17,7 +17,7 @@ if TYPE_CHECKING:
     from numpy.typing import NDArray
 
     from neusee.workflows.evaluation.comparison_pictures import Panel
-    from neusee.workflows.evaluation.mask_optics import Mask
+    from neusee.workflows.evaluation.mask_optics import MaskOptics
 
     Numbers = NDArray[np.float64]
 
@@ -28,7 +28,7 @@ _LETTERS = 16  #: of a row's name before it is broken
 
 
 def _looks(names: Sequence[str]) -> dict[str, dict[str, Any]]:
-    """A colour and a dash for each name, the same in every figure."""
+    """Return a colour and a dash for each name, the same in every figure."""
     count = len(_COLOURS)
     return {
         name: {"color": _COLOURS[i % count], "linestyle": _STYLES[i // count % len(_STYLES)]}
@@ -38,7 +38,7 @@ def _looks(names: Sequence[str]) -> dict[str, dict[str, Any]]:
 
 @drawn
 def cases(panels: Sequence[Panel]) -> Any:
-    """Truth, plain lens and every pipeline (rows) behind each laser and behind none, all by one stretch."""
+    """Draw truth, plain lens and every pipeline (rows) behind each laser and behind none, all scaled alike."""
     rows = list(panels[0].pictures)
     white = high(panels[0].pictures["truth"])
     figure, axes = canvas(1.95 * len(panels) + 0.6, 2.0 * len(rows) + 0.3, len(rows), len(panels))
@@ -59,13 +59,13 @@ def _power(strength: float) -> str:
 
 
 def _broken(name: str) -> str:
-    """A long name on several lines."""
+    """Return a long name on several lines."""
     return name if len(name) <= _LETTERS else name.replace("+", "\n+ ").replace("@", "\n@ ")
 
 
 @drawn
-def strengths(tables: Mapping[str, Table], small: int) -> Any:
-    """L1 over the laser's strength: mean over scenes and its 95 % interval, at full size and reduced."""
+def strengths(tables: Mapping[str, MetricTable], small: int) -> Any:
+    """Draw L1 over the laser's strength: mean over scenes and its 95 % interval, at full size and reduced."""
     figure, axes = canvas(11.0, 4.2, 1, 2, sharex=True)
     looks = _looks(list(tables))
     whole = ((axes[0, 0], "l1", "full size"), (axes[0, 1], "l1 small", f"shorter side {small} pixels"))
@@ -81,7 +81,7 @@ def strengths(tables: Mapping[str, Table], small: int) -> Any:
     return figure
 
 
-def _line(ax: Any, table: Table, metric: str, look: Mapping[str, Any], name: str) -> None:
+def _line(ax: Any, table: MetricTable, metric: str, look: Mapping[str, Any], name: str) -> None:
     found = [mean(table.at(metric, i)) for i in range(len(table.strengths))]
     at = _places(table.strengths)
     ax.plot(at, [x.mean for x in found], marker="o", markersize=4, linewidth=1.4, label=name, **look)
@@ -90,7 +90,7 @@ def _line(ax: Any, table: Table, metric: str, look: Mapping[str, Any], name: str
 
 
 def _places(values: Sequence[float]) -> list[float]:
-    """Decades; no laser stands one step before the weakest."""
+    """Return the decades of strengths; no laser stands one step before the weakest."""
     logs = [float(np.log10(k)) for k in values if k > 0]
     return [float(np.log10(k)) if k > 0 else (min(logs) - 1 if logs else 0.0) for k in values]
 
@@ -101,8 +101,8 @@ def _axis(ax: Any, values: Sequence[float]) -> None:
 
 
 @drawn
-def curves(masks: Mapping[str, Mask]) -> Any:
-    """LSR and BSR of every mask at each wavelength."""
+def curves(masks: Mapping[str, MaskOptics]) -> Any:
+    """Draw LSR and BSR of every mask at each wavelength."""
     figure, axes = canvas(11.0, 4.2, 1, 2, sharex=True)
     looks = _looks(list(masks))
     left, right = axes[0]
@@ -124,8 +124,8 @@ def curves(masks: Mapping[str, Mask]) -> Any:
 
 
 @drawn
-def plane(masks: Mapping[str, Mask]) -> Any:
-    """Mean LSR against the contrast that is left, with what no mask passes."""
+def plane(masks: Mapping[str, MaskOptics]) -> Any:
+    """Draw mean LSR against the contrast that is left, and the region that no mask reaches."""
     figure, axes = canvas(8.4, 5.2)
     ax = axes[0, 0]
     floor = float(np.mean([mask.floor.mean() for mask in masks.values()]))

@@ -1,4 +1,4 @@
-"""An evaluation on paper."""
+"""The page of an evaluation."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from neusee.workflows.evaluation.pipelines import CASES
 from neusee.workflows.report.study_page import Mark, Section
 
 if TYPE_CHECKING:
-    from neusee.workflows.evaluation.evaluation_result import Evaluated
+    from neusee.workflows.evaluation.evaluation_result import EvaluationResult
 
 _EACH = ("mean", "low", "high")
 COLUMNS = ("pipeline", "mask", "restorer", "scenes", *(f"{m} {e}" for m in METRICS for e in _EACH),
@@ -23,8 +23,8 @@ _COARSE = 1.05  #: the band of the aperture is a disc, counted by the grid of fr
 _DIGITS = {"psnr": ".2f", "l1": ".4f", "ssim": ".3f", "saturated": ".0f", "damaged": ".2f"}
 
 
-def drawn(found: Evaluated) -> dict[str, bytes]:
-    """The pictures, by name."""
+def draw_pictures(found: EvaluationResult) -> dict[str, bytes]:
+    """Return the pictures, by name."""
     return {
         "cases": figures.cases(found.panels),
         "strengths": figures.strengths(found.tables, found.small),
@@ -33,8 +33,8 @@ def drawn(found: Evaluated) -> dict[str, bytes]:
     }
 
 
-def summary(found: Evaluated) -> dict[str, Any]:
-    """By pipeline: every metric's mean over scenes with its interval, and what the reference's L1 is more."""
+def summary(found: EvaluationResult) -> dict[str, Any]:
+    """Return for each pipeline the mean of every metric with its interval, and the gain over the reference."""
     return {
         p.name: {
             "mask": p.front,
@@ -46,8 +46,8 @@ def summary(found: Evaluated) -> dict[str, Any]:
     }
 
 
-def rows(found: Evaluated) -> list[Sequence[Any]]:
-    """The same as a table."""
+def rows(found: EvaluationResult) -> list[Sequence[Any]]:
+    """Return the rows of the table: for each pipeline the numbers of `summary`."""
     listed: list[Sequence[Any]] = []
     for p in found.pipelines:
         each = [mean(found.tables[p.name].scenes(metric)) for metric in METRICS] + list(found.against[p.name].values())
@@ -56,10 +56,10 @@ def rows(found: Evaluated) -> list[Sequence[Any]]:
     return listed
 
 
-def lead(found: Evaluated) -> str:
-    """What came out."""
+def lead(found: EvaluationResult) -> str:
+    """Return the result in a few sentences."""
     best = min(found.pipelines, key=lambda p: float(found.tables[p.name].scenes("l1").mean()))
-    said = _said(mean(found.tables[best.name].scenes("l1")), "l1")
+    said = _with_interval(mean(found.tables[best.name].scenes("l1")), "l1")
     strengths = ", ".join("none" if k == 0 else f"{k:g}".replace("e+0", "e") for k in found.strengths)
     enough = len(found.scenes) >= len(CASES)
     few = "" if enough else f" These are too few scenes for all {len(CASES)} cases of the protocol."
@@ -71,8 +71,8 @@ def lead(found: Evaluated) -> str:
         {few}{drawn}"""
 
 
-def sections(found: Evaluated, shown: Mapping[str, bytes]) -> list[Section]:
-    """Mask by restorer, all numbers, against the reference, over strength, the cases, the masks, the data."""
+def sections(found: EvaluationResult, shown: Mapping[str, bytes]) -> list[Section]:
+    """Return the parts of the page, from mask by restorer to the scenes."""
     parts = [_crossed(found), _numbers(found), _compared(found)]
     text = """Mean over scenes and its 95 % interval. A scene without a laser counts at no strength but none, so
         that the scenes of the other points have a laser each."""
@@ -83,7 +83,7 @@ def sections(found: Evaluated, shown: Mapping[str, bytes]) -> list[Section]:
     return [*parts, _suppression(found, shown["curves"]), _plane(found, shown["plane"]), *_data(found)]
 
 
-def _crossed(found: Evaluated) -> Section:
+def _crossed(found: EvaluationResult) -> Section:
     masks = list(dict.fromkeys(p.front for p in found.pipelines))
     restorers = list(dict.fromkeys(p.back for p in found.pipelines))
     each = {(p.front, p.back): p.name for p in found.pipelines}
@@ -93,11 +93,11 @@ def _crossed(found: Evaluated) -> Section:
     return Section("Mask by restorer", text, ("mask", *restorers), listed)
 
 
-def _cell(found: Evaluated, name: str | None) -> str | None:
-    return _said(mean(found.tables[name].scenes("l1")), "l1") if name else None
+def _cell(found: EvaluationResult, name: str | None) -> str | None:
+    return _with_interval(mean(found.tables[name].scenes("l1")), "l1") if name else None
 
 
-def _said(x: Interval, metric: str) -> str:
+def _with_interval(x: Interval, metric: str) -> str:
     how = _DIGITS.get(metric.partition(" ")[0], ".3g")
     return (
         f"{x.mean:{how}}"
@@ -106,7 +106,7 @@ def _said(x: Interval, metric: str) -> str:
     )
 
 
-def _numbers(found: Evaluated) -> Section:
+def _numbers(found: EvaluationResult) -> Section:
     text = f"""Mean and 95 % interval over scenes. Small: the picture that a display shows, reduced to {found.small}
         pixels of its shorter side in linear light, antialiased. Saturated: pixels of the raw picture. Damaged:
         share of the points whose brightest pixel passes the damage threshold of the sensor. PSNR is a mean of
@@ -114,13 +114,13 @@ def _numbers(found: Evaluated) -> Section:
     metrics = [metric for metric in METRICS if metric != "peak"]
     columns = ("pipeline", *(re.sub("l1|psnr|ssim", lambda found: found[0].upper(), metric) for metric in metrics))
     listed = [
-        (p.name, *(_said(mean(found.tables[p.name].scenes(metric)), metric) for metric in metrics))
+        (p.name, *(_with_interval(mean(found.tables[p.name].scenes(metric)), metric) for metric in metrics))
         for p in found.pipelines
     ]
     return Section("All numbers", text, columns, listed)
 
 
-def _compared(found: Evaluated) -> Section:
+def _compared(found: EvaluationResult) -> Section:
     text = f"""Against {found.reference}, scene by scene. L1 less: how much lower the L1 is (Student's t of the
         differences). Gain: the same as a share of the reference's mean L1, its interval from scenes drawn again
         (10 000 times, both pipelines on the same; of fewer than five scenes none is given). Marked where zero lies
@@ -143,7 +143,7 @@ def _between(x: Interval, how: str) -> str:
     return f"{x.mean:{how}}" if math.isnan(x.low) else f"{x.mean:{how}} ({x.low:{how}} to {x.high:{how}})"
 
 
-def _suppression(found: Evaluated, picture: bytes) -> Section:
+def _suppression(found: EvaluationResult, picture: bytes) -> Section:
     own = next(p.front for p in found.pipelines if p.name == found.reference)
     text = f"""LSR: the brightest pixel of a laser behind the mask over that behind the clear lens; BSR: light of
         the scene in the field over that of the plain lens, mean over scenes. Energy floor: the LSR of light that is
@@ -159,7 +159,7 @@ def _suppression(found: Evaluated, picture: bytes) -> Section:
     return Section("Suppression by wavelength", text, columns, listed, picture)
 
 
-def _plane(found: Evaluated, picture: bytes) -> Section:
+def _plane(found: EvaluationResult, picture: bytes) -> Section:
     text = """Means over wavelengths, contrast within the band that the clear aperture passes. A low peak costs
         contrast: by Parseval the rms over all sampled frequencies is at most sqrt(LSR p0), p0 the share of light in
         the brightest pixel of the clear lens, and within the band, a share 4 p0 of them, at most sqrt(LSR) / 2; the
@@ -178,7 +178,7 @@ def _mark(held: bool) -> Mark:
     return "pass" if held else "fail"
 
 
-def _data(found: Evaluated) -> list[Section]:
+def _data(found: EvaluationResult) -> list[Section]:
     text = """Scenes in the order of their numbers; each is a part of a photograph that the recipe's seed decides,
         and has its own seed, of the laser's direction and of the noise, the same behind every pipeline. A run of
         the recipe with that seed and scene gives the same numbers."""

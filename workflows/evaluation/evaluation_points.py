@@ -1,4 +1,4 @@
-"""Points of an evaluation: a scene, a laser of some strength, a pipeline; what is stored is not computed again."""
+"""Points of an evaluation: the numbers of a scene, a laser of some strength and a pipeline, each computed once."""
 
 from __future__ import annotations
 
@@ -6,6 +6,7 @@ import time
 from collections.abc import Callable, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, replace
+from functools import partial
 from typing import Any
 
 import torch
@@ -15,25 +16,25 @@ from neusee.nodes.bicubic_resize import resize
 from neusee.nodes.metrics import quality
 from neusee.workflows.engine.differentiable_function import as_function
 from neusee.workflows.engine.node_call import call, place
-from neusee.workflows.engine.provenance import timestamp
 from neusee.workflows.evaluation.evaluation_scenes import Scene
-from neusee.workflows.evaluation.pipelines import BEAM, NONE, Composed
+from neusee.workflows.evaluation.pipelines import BEAM, NONE, PipelineRecipes
 from neusee.workflows.graph.recipe_graph import Recipe, Step, needed
 from neusee.workflows.keys.cache_key import digest, key_of
 from neusee.workflows.keys.code_digest import Code
 from neusee.workflows.keys.engine_digest import engine
 from neusee.workflows.recipe.distributions.uncertain_inputs import Inputs
+from neusee.workflows.store.memo import compute_once
 from neusee.workflows.store.result_store import Store
 from neusee.workflows.tolerance.cheaper_steps import with_substitutions
 
-_MOVED = ("spot", "photons")  #: steps with whose results, and all that follows, another strength is another scene
+_MOVED = ("spot", "photons")  #: first steps that depend on the strength of the laser
 
-Point = dict[str, Any]  #: numbers by name; ``bsr`` is a list
+PointNumbers = dict[str, Any]  #: numbers by name; ``bsr`` is a list
 
 
 @dataclass(frozen=True)
-class Wanted:
-    """A point that is asked for."""
+class PointRequest:
+    """A point to evaluate."""
 
     scene: Scene
     case: str
@@ -41,12 +42,12 @@ class Wanted:
 
     @property
     def lit(self) -> str:
-        """The case whose recipe is run: a laser without light is none."""
+        """Return the case whose recipe is run: a laser without light counts as no laser."""
         return self.case if self.strength > 0 else NONE
 
 
-class Bench:
-    """Computes points one after another, and what several share only once."""
+class EvaluationPoints:
+    """Points of an evaluation; results that several points share are computed once."""
 
     def __init__(self, store: Store, small: int, device: str = "cpu") -> None:
         self.store, self.small, self.device = store, small, device
@@ -56,26 +57,24 @@ class Bench:
         self._functions: dict[tuple[str, str], Any] = {}
         self._drawn: dict[
             Any, tuple[Recipe, Inputs | None]
-        ] = {}  #: the recipe is kept, so that no other gets its identity
-        self._fixed: dict[str, Any] = {}  #: by key: what no scene reaches, one copy for all functions
-        self._kept = _Kept()
+        ] = {}  #: with the recipe, so that no other recipe gets its identity
+        self._fixed: dict[str, Any] = {}  #: results that no scene reaches, by key: one copy for all functions
+        self._kept = _SharedResults()
 
-    def point(self, pipeline: Composed, wanted: Wanted) -> Point:
-        """The numbers of a point, from the store or measured now."""
-        key = self.key(pipeline, wanted)
-        with suppress(KeyError):
-            found: Point = self.store.get(key)
-            return found
+    def point(self, pipeline: PipelineRecipes, wanted: PointRequest) -> PointNumbers:
+        """Return the numbers of a point, from the store or measured now."""
+        compute = partial(self._measure, pipeline, wanted)
+        return compute_once(self.store, self.key(pipeline, wanted), dict, compute, {"step": "evaluate"}, small=True)
+
+    def _measure(self, pipeline: PipelineRecipes, wanted: PointRequest) -> PointNumbers:
         began = time.perf_counter()
-        values = self.values(pipeline, wanted)
-        point = self._numbers(pipeline, values)
-        self.seconds += (spent := time.perf_counter() - began)
+        point = self._numbers(pipeline, self.values(pipeline, wanted))
+        self.seconds += time.perf_counter() - began
         self.computed += 1
-        self.store.put_small(key, point, {"step": "evaluate", "seconds": spent, "date": timestamp()})
         return point
 
-    def values(self, pipeline: Composed, wanted: Wanted, more: Sequence[str] = ()) -> dict[str, Any]:
-        """The outputs of a run with this scene and laser, and ``more``."""
+    def values(self, pipeline: PipelineRecipes, wanted: PointRequest, more: Sequence[str] = ()) -> dict[str, Any]:
+        """Return the outputs of a run with this scene and laser, and the steps ``more``."""
         outputs = (*pipeline.pipeline.outputs, *more)
         function = self._function(pipeline, wanted.lit, outputs)
         self._kept.turn(wanted)
@@ -86,14 +85,14 @@ class Bench:
         return found
 
     def forget(self) -> None:
-        """Let go of what belongs to one laser."""
+        """Release the results of one laser."""
         self._functions = {name: f for name, f in self._functions.items() if name[1] == NONE}
         used = {id(value) for f in self._functions.values() for value in f.fixed.values()}
         self._fixed = {key: value for key, value in self._fixed.items() if id(value) in used}
         self._kept.clear()
 
-    def key(self, pipeline: Composed, wanted: Wanted) -> str:
-        """What decides a point: the keys of a run with its values, and how its pictures are compared."""
+    def key(self, pipeline: PipelineRecipes, wanted: PointRequest) -> str:
+        """Return what decides a point: the keys of a run with its values, and how its pictures are compared."""
         recipe, outputs = pipeline.recipes[wanted.lit], pipeline.pipeline.outputs
         params: dict[str, dict[str, Any]] = {}
         for name, value in self._changed(recipe, wanted, outputs).items():
@@ -108,8 +107,11 @@ class Bench:
         own = [self._code.digest(used.__module__) for used in (quality, resize)]
         return digest("evaluate", engine("evaluation.evaluation_points"), [keys[name] for name in outputs], within, own)
 
-    def _keys(self, recipe: Recipe, wanted: Wanted, outputs: Sequence[str]) -> dict[str, str]:
-        """By step. Noise is that of the scene; what no scene reaches, such as a mask that is drawn, is the recipe's."""
+    def _keys(self, recipe: Recipe, wanted: PointRequest, outputs: Sequence[str]) -> dict[str, str]:
+        """Return the key of each step.
+
+        Noise depends on the scene. What no scene reaches, such as a mask that is drawn, depends on the recipe only.
+        """
         keys = {"scene": wanted.scene.key(self._code)}
         live = _reached(recipe, ("scene",))
         for name in needed(recipe, outputs):
@@ -119,11 +121,11 @@ class Bench:
                 keys[name], _ = key_of(step, keys, seed, self._code, place(step, self.device))
         return keys
 
-    def _function(self, pipeline: Composed, case: str, outputs: tuple[str, ...]) -> Any:
+    def _function(self, pipeline: PipelineRecipes, case: str, outputs: tuple[str, ...]) -> Any:
         name = (f"{pipeline.name} {outputs}", case)
         if name not in self._functions:
             recipe = pipeline.recipes[case]
-            whole = with_substitutions(recipe, outputs)  # as `run` would: the scene is given, and not learnt
+            whole = with_substitutions(recipe, outputs)  # as in `run`, but the scene is an argument
             there = set(needed(whole, outputs))
             inputs = self._inputs(recipe, outputs)
             readers = [name for name in (inputs.readers if inputs else ()) if name.rpartition(".")[0] in there]
@@ -136,14 +138,14 @@ class Bench:
             self._functions[name] = found
         return self._functions[name]
 
-    def _changed(self, recipe: Recipe, wanted: Wanted, outputs: Sequence[str]) -> dict[str, Any]:
-        """The parameters that are other than the recipe's: drawn for the scene, and the laser's of the point."""
+    def _changed(self, recipe: Recipe, wanted: PointRequest, outputs: Sequence[str]) -> dict[str, Any]:
+        """Return the parameters that differ from the recipe's: those drawn for the scene, and the laser's."""
         inputs = self._inputs(recipe, outputs)
-        drawn = inputs.theta(wanted.scene.drawn(inputs)) if inputs else {}
+        drawn = inputs.theta(wanted.scene.draw(inputs)) if inputs else {}
         return drawn | _moved(recipe, wanted, outputs)
 
     def _inputs(self, recipe: Recipe, outputs: Sequence[str]) -> Inputs | None:
-        """What the recipe draws from a law, where an output hangs on it."""
+        """Return the uncertain inputs of the recipe; None where no output depends on any."""
         if recipe.uncertain is None or not recipe.uncertain.names:
             return None
         key = (id(recipe), tuple(outputs))
@@ -154,7 +156,7 @@ class Bench:
         return self._drawn[key][1]
 
     def _share(self, function: Any, recipe: Recipe) -> None:
-        """Let functions hold one copy of what they have in common, so that what follows from it is common too."""
+        """Make functions hold one copy of the results that they share, so that later results are shared too."""
         keys: dict[str, str] = {}
         for name in needed(recipe, function.fixed):
             step = recipe.steps[name]
@@ -162,14 +164,14 @@ class Bench:
         for name, value in function.fixed.items():
             function.fixed[name] = self._fixed.setdefault(keys[name], value)
 
-    def _numbers(self, pipeline: Composed, values: Mapping[str, Any]) -> Point:
+    def _numbers(self, pipeline: PipelineRecipes, values: Mapping[str, Any]) -> PointNumbers:
         line = pipeline.pipeline
         picture, truth = values[line.picture], values["truth"]
         whole = values[line.quality]
         small = whole
         if min(truth.shape[-2:]) > self.small:
             domain = pipeline.recipes[NONE].steps[line.quality].params["domain"]
-            small = quality(*(smaller(x, self.small) for x in (picture, truth)), domain=domain)
+            small = quality(*(reduced(x, self.small) for x in (picture, truth)), domain=domain)
         peak, saturated = values["peak[mask]"], values["saturated[mask]"]
         return {
             **{name: float(value) for name, value in whole._asdict().items()},
@@ -181,16 +183,16 @@ class Bench:
         }
 
 
-def _moved(recipe: Recipe, wanted: Wanted, outputs: Sequence[str]) -> dict[str, Any]:
-    """The parameters that a point changes: the laser's direction and strength, where there is one."""
+def _moved(recipe: Recipe, wanted: PointRequest, outputs: Sequence[str]) -> dict[str, Any]:
+    """Return the parameters that a point changes: the laser's direction and strength, where there is a laser."""
     if wanted.lit == NONE:
         return {}
     strengths = {f"{spot}.strength": wanted.strength for spot in _spots(recipe, outputs)}
     return {f"direction[{BEAM}].angle": wanted.scene.angle(recipe), **strengths}
 
 
-class _Kept:
-    """Results that the next point needs again: of a scene until the next one, of a strength until the next one."""
+class _SharedResults:
+    """Results that the next point needs again: those of a scene, and those of a strength."""
 
     def __init__(self) -> None:
         self._of_scene: dict[Any, tuple[Any, Any]] = {}
@@ -200,12 +202,12 @@ class _Kept:
         self._seed = 0
 
     def clear(self) -> None:
-        """Let go of all."""
+        """Release all results."""
         self._of_scene.clear()
         self._of_strength.clear()
 
-    def turn(self, wanted: Wanted) -> None:
-        """Go to a point; what belongs to another scene, case or strength is let go."""
+    def turn(self, wanted: PointRequest) -> None:
+        """Go to a point, and release the results of any other scene, case or strength."""
         scene = (wanted.scene.number, wanted.scene.seed, wanted.case)
         if scene != self._scene:
             self._of_scene.clear()
@@ -214,13 +216,16 @@ class _Kept:
         self._scene, self._strength, self._seed = scene, wanted.strength, wanted.scene.seed
 
     def caller(self, moved: set[str]) -> Callable[..., Any]:
-        """A step's result, from before where the very same inputs went into the same step; ``moved``: by a strength."""
+        """Return a function that calls a step, or returns its result for the very same inputs.
+
+        ``moved`` names the steps that depend on the strength of the laser.
+        """
 
         def asked(step: Step, inputs: Sequence[Any], params: Mapping[str, Any], seed: int, device: str) -> Any:
             kept = self._of_strength if step.name in moved else self._of_scene
             own = (step.name, self._seed) if step.node.random else ()
             key = (own, step.node.path, repr(sorted(params.items())), device, *_identities(inputs))
-            if key not in kept:  # the inputs are kept too, so that no other object gets their identity
+            if key not in kept:  # kept with its inputs, so that no other object gets their identity
                 kept[key] = (inputs, call(step, inputs, params, self._seed, device))
             return kept[key][1]
 
@@ -243,8 +248,8 @@ def _reached(recipe: Recipe, roots: Sequence[str]) -> set[str]:
     return found
 
 
-def smaller(picture: Tensor, side: int) -> Tensor:
-    """What a display shows of a picture, its shorter side reduced to so many pixels, antialiased, in linear light."""
+def reduced(picture: Tensor, side: int) -> Tensor:
+    """Return a picture as a display shows it, its shorter side ``side`` pixels, antialiased, in linear light."""
     y, x = picture.shape[-2:]
     scale = side / min(y, x)
     return resize(picture.clamp(0, 1), round(y * scale), round(x * scale))

@@ -7,16 +7,16 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from neusee.workflows.evaluation.comparison_pictures import Panel
-from neusee.workflows.evaluation.confidence_intervals import Interval, Table
-from neusee.workflows.evaluation.evaluation_points import Point
+from neusee.workflows.evaluation.confidence_intervals import Interval, MetricTable
+from neusee.workflows.evaluation.evaluation_points import PointNumbers
 from neusee.workflows.evaluation.evaluation_scenes import Scene
-from neusee.workflows.evaluation.mask_optics import Mask
+from neusee.workflows.evaluation.mask_optics import MaskOptics
 from neusee.workflows.evaluation.pipelines import Pipeline
 from neusee.workflows.graph.recipe_graph import Recipe
 
 
 @dataclass(frozen=True)
-class Evaluated:
+class EvaluationResult:
     """All that was measured."""
 
     recipe: Recipe
@@ -24,10 +24,10 @@ class Evaluated:
     broken: Sequence[tuple[Path, str]]
     strengths: tuple[float, ...]
     small: int  #: pixels of the shorter side of the small pictures
-    reference: str  #: the pipeline that others are compared with
-    points: dict[str, list[dict[float, Point]]]  #: by pipeline, and scene by scene
-    tables: dict[str, Table]  #: by pipeline
-    against: dict[str, dict[str, Interval]]  #: by pipeline, what the reference's L1 is more
-    masks: dict[str, Mask]  #: by mask
+    reference: str  #: the pipeline to compare with
+    points: dict[str, list[dict[float, PointNumbers]]]  #: by pipeline, and scene by scene
+    tables: dict[str, MetricTable]  #: by pipeline
+    against: dict[str, dict[str, Interval]]  #: gains over the reference, by pipeline
+    masks: dict[str, MaskOptics]  #: by mask
     panels: Sequence[Panel]
     pipelines: Sequence[Pipeline]

@@ -13,7 +13,7 @@ from neusee.nodes import ParameterError
 from neusee.nodes.scene import choose_photograph, crop_photograph, list_photographs
 from neusee.workflows.engine.node_call import call
 from neusee.workflows.engine.runner import run
-from neusee.workflows.evaluation.pipelines import BEAM, CASES, NONE, Refused
+from neusee.workflows.evaluation.pipelines import BEAM, CASES, NONE, EvaluationRefused
 from neusee.workflows.graph.recipe_graph import Recipe
 from neusee.workflows.keys.cache_key import digest, file_digest, key_of, stream_seed
 from neusee.workflows.keys.code_digest import Code
@@ -25,7 +25,7 @@ _PHOTOGRAPH = "scene.photograph"
 
 @dataclass(frozen=True)
 class Scene:
-    """One scene; what it holds is read when it is first needed."""
+    """One scene; its picture is read when it is first needed."""
 
     number: int
     seed: int  #: of noise and direction: those of a run of the recipe with this seed
@@ -34,27 +34,27 @@ class Scene:
 
     @property
     def name(self) -> str:
-        """The photograph, from the folder that was given."""
+        """Return the path of the photograph within its folder."""
         return self.source.name(self.number)
 
     @cached_property
     def picture(self) -> Tensor:
-        """Linear sRGB (3, y, x)."""
+        """Return the picture in linear sRGB (3, y, x)."""
         return self.source.picture(self.number)
 
     def key(self, code: Code) -> str:
-        """What decides the picture."""
+        """Return what decides the picture."""
         return self.source.key(self.number, code)
 
-    def drawn(self, inputs: Inputs) -> dict[str, float]:
-        """What the recipe has a law for, in SI: the same whatever the mask, the restorer and the laser."""
+    def draw(self, inputs: Inputs) -> dict[str, float]:
+        """Return a draw of each uncertain value, in SI: the same for every mask, restorer and laser."""
         import numpy as np
 
         z = [np.random.default_rng([self.seed, stream_seed(0, name)]).standard_normal() for name in inputs.names]
         return dict(zip(inputs.names, map(float, inputs.at(np.array([z]))[0]), strict=True))
 
     def angle(self, recipe: Recipe) -> tuple[float, float]:
-        """Direction cosines (y, x) of the laser, drawn as the paper draws them."""
+        """Return direction cosines (y, x) of the laser, drawn as the paper draws them."""
         step = recipe.steps[f"direction[{BEAM}]"]
         drawn = call(step, [], step.params, self.seed, "cpu")
         return float(drawn[0]), float(drawn[1])
@@ -62,7 +62,7 @@ class Scene:
 
 @dataclass(frozen=True)
 class _Source:
-    """Where pictures come from: photographs, or the one scene of the recipe."""
+    """The source of pictures: photographs, or the one scene of the recipe."""
 
     recipe: Recipe
     store: Store
@@ -83,7 +83,7 @@ class _Source:
         try:
             return crop_photograph(path, self.shape, self.recipe.seed, number)
         except (ParameterError, OSError, ValueError, SyntaxError) as error:
-            raise Refused(f"{path}: {error}: take it away; all other points are kept") from error
+            raise EvaluationRefused(f"{path}: {error}: remove this file; all other points are kept") from error
 
     @cached_property
     def _own(self) -> Tensor:
@@ -102,34 +102,34 @@ class _Source:
 def scenes(
     recipe: Recipe, store: Store, root: Path | None, count: int, cases: Sequence[str] = tuple(CASES)
 ) -> tuple[list[Scene], list[tuple[Path, str]]]:
-    """So many scenes, the cases in turn, and the photographs that cannot be read."""
+    """Return ``count`` scenes, the cases in turn, and the photographs that cannot be read."""
     broken: list[tuple[Path, str]] = []
     own = recipe.steps["scene"]
     shape = _shape(recipe)
     paths: Sequence[Path] = [own.params["file"]] if own.node.path == _PHOTOGRAPH else []
     if root is not None:
         if not root.is_dir():
-            raise Refused(f"--data {root}: no such folder")
+            raise EvaluationRefused(f"--data {root}: no such folder")
         paths, broken = list_photographs(root)
         if not paths:
             said = f"; {broken[0][0].name}: {broken[0][1]}" if broken else ""
-            raise Refused(f"--data {root}: no photograph that can be read, PNG or JPEG{said}")
+            raise EvaluationRefused(f"--data {root}: no photograph that can be read, PNG or JPEG{said}")
     source = _Source(recipe, store, root, paths, shape)
     return [Scene(i, recipe.seed + i, cases[i % len(cases)], source) for i in range(count)], broken
 
 
 def _shape(recipe: Recipe) -> tuple[int, int]:
-    """The size of the scene that a recipe asks for, as its step says."""
+    """Return the size of the scene, as the step of the recipe states it."""
     shape = recipe.steps["scene"].params.get("shape")
     if shape is None and recipe.steps["scene"].node.path == _PHOTOGRAPH:
-        raise Refused("scene.shape: say the size that is cut of every photograph, such as [768, 768]")
+        raise EvaluationRefused("scene.shape: give the size to crop from every photograph, such as [768, 768]")
     if shape is None:
-        raise Refused("the recipe's scene has no shape: write one, such as scene.shape=[768, 768]")
+        raise EvaluationRefused("the recipe's scene has no shape: write one, such as scene.shape=[768, 768]")
     return int(shape[0]), int(shape[1])
 
 
 def with_case(scene: Scene, case: str) -> Scene:
-    """The same scene and direction behind another laser."""
+    """Return the same scene and direction behind another laser."""
     return replace(scene, case=case)
 
 

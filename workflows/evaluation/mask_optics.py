@@ -1,4 +1,4 @@
-"""What a mask does by itself: suppression at each wavelength, the contrast it leaves, and what none could do better."""
+"""The optics of a mask alone: suppression at each wavelength, the contrast that is left, and the limits of both."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ import numpy as np
 from neusee.nodes import metrics
 from neusee.nodes.metrics import least_lsr, most_unsuppressed
 from neusee.workflows.engine.runner import run
-from neusee.workflows.evaluation.pipelines import NONE, Composed
+from neusee.workflows.evaluation.pipelines import NONE, PipelineRecipes
 from neusee.workflows.store.result_store import Store
 
 if TYPE_CHECKING:
@@ -21,8 +21,8 @@ if TYPE_CHECKING:
 
 
 @dataclass(frozen=True)
-class Mask:
-    """By band."""
+class MaskOptics:
+    """Suppression and contrast of a mask, by band."""
 
     wavelengths: Numbers  #: nm
     lsr: Numbers
@@ -35,10 +35,10 @@ class Mask:
 
 
 def masks(
-    each: Sequence[Composed], store: Store, device: str, points: Mapping[str, Sequence[Mapping[float, Any]]]
-) -> dict[str, Mask]:
-    """Every mask once, in the order of the pipelines."""
-    found: dict[str, Mask] = {}
+    each: Sequence[PipelineRecipes], store: Store, device: str, points: Mapping[str, Sequence[Mapping[float, Any]]]
+) -> dict[str, MaskOptics]:
+    """Return the optics of every mask once, in the order of the pipelines."""
+    found: dict[str, MaskOptics] = {}
     for pipeline in each:
         if pipeline.pipeline.front not in found:
             bsr = [point["bsr"] for at in points[pipeline.name] for point in list(at.values())[:1]]
@@ -46,10 +46,10 @@ def masks(
     return found
 
 
-def _mask(pipeline: Composed, store: Store, device: str, bsr: Numbers) -> Mask:
+def _mask(pipeline: PipelineRecipes, store: Store, device: str, bsr: Numbers) -> MaskOptics:
     wanted = ("bands", "lsr[mask]", "mtf[mask]", "psf[mask]")
     values = run(pipeline.recipes[NONE], store, wanted, device=device).values
     bands, lsr, mtf, psf = (values[name] for name in wanted)
     each = (lsr, mtf.median, mtf.rms, least_lsr(psf), metrics.limits(psf).passed, most_unsuppressed(psf))
     suppression, *rest = (x.double().cpu().numpy() for x in each)
-    return Mask(bands.centres.double().cpu().numpy() * 1e9, suppression, bsr, *rest)
+    return MaskOptics(bands.centres.double().cpu().numpy() * 1e9, suppression, bsr, *rest)

@@ -1,4 +1,4 @@
-"""What is compared: a mask and a restorer each, as the recipe that they make with each laser."""
+"""The pipelines of an evaluation: a mask and a restorer each, with one recipe for each laser."""
 
 from __future__ import annotations
 
@@ -15,9 +15,9 @@ from neusee.workflows.recipe.text.overrides import Override
 
 NONE = "none"  #: of restorers: the raw picture, developed; of cases: no laser
 BEAM = "beam"  #: the laser's name in every recipe of an evaluation
-FILES = ("file", "weights")  #: by which of these an option takes a file
+FILES = ("file", "weights")  #: parameters by which an option may take a file
 
-#: the paper's cases, and where it names a colour alone, a wavelength (m) of a common laser
+#: the paper's cases; where the paper names only a colour, the wavelength (m) of a common laser
 CASES: dict[str, float | None] = {
     "violet": 405e-9,
     "blue": 450e-9,
@@ -30,13 +30,13 @@ _PIPELINE = re.compile(r"(?P<mask>[\w-]+)(?:@(?P<relief>[^+]+))?\+(?P<restorer>[
 _HOW = "write MASK+RESTORER, such as flat+none, five_half_rings+wiener or pixelwise@mask.npy+nafnet@net.safetensors"
 
 
-class Refused(ValueError):
-    """Mistakes in what is asked for; nothing was run."""
+class EvaluationRefused(ValueError):
+    """Mistakes in the arguments of an evaluation; nothing was run."""
 
 
 @dataclass(frozen=True)
 class Pipeline:
-    """A mask in front of the lens and what restores its picture."""
+    """A mask in front of the lens and the restorer of its picture."""
 
     mask: str  #: an option of `doe`
     restorer: str  #: an option of `restore`, or none
@@ -45,37 +45,37 @@ class Pipeline:
 
     @property
     def name(self) -> str:
-        """As it was asked for, files by their names."""
+        """Return the pipeline as it was asked for, files by their names."""
         return f"{self.front}+{self.back}"
 
     @property
     def front(self) -> str:
-        """The mask with its file."""
+        """Return the mask with its file."""
         return self.mask + (f"@{self.relief.name}" if self.relief else "")
 
     @property
     def back(self) -> str:
-        """The restorer with its file."""
+        """Return the restorer with its file."""
         return self.restorer + (f"@{self.weights.name}" if self.weights else "")
 
     @property
     def picture(self) -> str:
-        """The step whose picture is judged."""
+        """Return the step whose picture is judged."""
         return "developed[mask]" if self.restorer == NONE else "restored"
 
     @property
     def quality(self) -> str:
-        """The step that judges it."""
+        """Return the step that judges the picture."""
         return "developed_quality[mask]" if self.restorer == NONE else "restored_quality"
 
     @property
     def outputs(self) -> tuple[str, ...]:
-        """What an evaluation asks of a run."""
+        """Return the steps that an evaluation needs of a run."""
         return (self.picture, "truth", self.quality, "saturated[mask]", "peak[mask]", "bsr[mask]")
 
 
 @dataclass(frozen=True)
-class Composed:
+class PipelineRecipes:
     """A pipeline with its recipe for each case."""
 
     pipeline: Pipeline
@@ -87,7 +87,7 @@ class Composed:
 
 
 class _Recipes(dict[str, Recipe]):
-    """The recipe of each case, read when it is first asked for: they differ in one wavelength."""
+    """The recipe of each case, read when it is first asked for; the recipes differ in one wavelength."""
 
     def __init__(self, recipe: str, words: Sequence[str | Override], fwhm: float, folder: Path) -> None:
         super().__init__()
@@ -100,7 +100,7 @@ class _Recipes(dict[str, Recipe]):
 
 
 def read_pipelines(text: str, folder: Path) -> list[Pipeline]:
-    """``flat+none, five_half_rings+wiener``; raises `Refused` with everything that is wrong."""
+    """Read text such as ``flat+none, five_half_rings+wiener``; raise `EvaluationRefused` with every mistake."""
     found: list[Pipeline] = []
     wrong: list[str] = []
     for word in filter(None, (part.strip() for part in text.split(","))):
@@ -116,16 +116,16 @@ def read_pipelines(text: str, folder: Path) -> list[Pipeline]:
     if not found and not wrong:
         wrong = [f"no pipeline: {_HOW}"]
     if wrong:
-        raise Refused("\n".join(wrong))
+        raise EvaluationRefused("\n".join(wrong))
     return found
 
 
-def composed(
+def compose_pipelines(
     recipe: str, changes: Sequence[str | Override], pipelines: Sequence[Pipeline], folder: Path
-) -> list[Composed]:
-    """Every pipeline with its recipes; raises `Refused` with the mistakes of all of them."""
+) -> list[PipelineRecipes]:
+    """Return every pipeline with its recipes; raise `EvaluationRefused` with the mistakes of all of them."""
     fwhm = _fwhm(recipe, changes, folder)
-    found: list[Composed] = []
+    found: list[PipelineRecipes] = []
     wrong: dict[str, None] = {}
     for pipeline in pipelines:
         try:
@@ -133,22 +133,22 @@ def composed(
             recipes = _Recipes(recipe, words, fwhm, folder)
             for case in (NONE, next(iter(CASES))):
                 _check(recipes[case], pipeline)
-            found.append(Composed(pipeline, recipes))
+            found.append(PipelineRecipes(pipeline, recipes))
         except RecipeError as error:
-            wrong |= dict.fromkeys(f"{pipeline.name}: {_said(problem)}" for problem in error.diagnostics)
-        except Refused as error:
+            wrong |= dict.fromkeys(f"{pipeline.name}: {_one_line(problem)}" for problem in error.diagnostics)
+        except EvaluationRefused as error:
             wrong[f"{pipeline.name}: {error}"] = None
     if wrong:
-        raise Refused("\n".join(wrong))
+        raise EvaluationRefused("\n".join(wrong))
     return found
 
 
-def _said(problem: Diagnostic) -> str:
+def _one_line(problem: Diagnostic) -> str:
     return " ".join(str(RecipeError([problem])).split())
 
 
 def _words(pipeline: Pipeline) -> list[str]:
-    """The changes of the recipe that make it this pipeline."""
+    """Return the changes of the recipe that make it this pipeline."""
     words = [f"doe={pipeline.mask}"]
     if pipeline.relief:
         words.append(f"doe.{_takes('doe', pipeline.mask)}={pipeline.relief.absolute()}")
@@ -160,22 +160,25 @@ def _words(pipeline: Pipeline) -> list[str]:
 
 
 def _takes(group: str, option: str) -> str:
-    """By which parameter an option of a group takes a file."""
+    """Return the parameter by which an option of a group takes a file."""
     options = groups_of(packaged()).get(group, [])
     path = packaged() / group / f"{option}.yaml"
     if option == NONE or (option in options and not path.is_file()):
-        raise Refused(f"{option} takes no file")
+        raise EvaluationRefused(f"{option} takes no file")
     if not path.is_file():
-        raise Refused(f"no option {option} in {group}; {nearest(option, options)}")
+        raise EvaluationRefused(f"no option {option} in {group}; {nearest(option, options)}")
     text = path.read_text(encoding="utf-8")
     for name in FILES:
         if re.search(rf"\b{name}: null", text):
             return name
-    raise Refused(f"{option} takes no file")
+    raise EvaluationRefused(f"{option} takes no file")
 
 
 def _laser(metres: float | None, fwhm: float) -> str:
-    """The lasers of a case, as an argument: a strength of 1 stands for all, and a direction is drawn for each scene."""
+    """Return the lasers of a case as an argument.
+
+    The strength of 1 stands for all strengths, and a direction is drawn for each scene.
+    """
     if metres is None:
         return "lasers={}"
     line = f"wavelength: {metres * 1e9:g} nm, fwhm: {fwhm * 1e9:g} nm"
@@ -183,11 +186,11 @@ def _laser(metres: float | None, fwhm: float) -> str:
 
 
 def _fwhm(recipe: str, changes: Sequence[str | Override], folder: Path) -> float:
-    """The width of the recipe's own first line, 10 nm where it has no laser."""
+    """Return the width of the recipe's own first line; 10 nm where the recipe has no laser."""
     try:
         steps = load(recipe, changes, folder).steps
     except RecipeError as error:
-        raise Refused("\n".join(dict.fromkeys(map(_said, error.diagnostics)))) from None
+        raise EvaluationRefused("\n".join(dict.fromkeys(map(_one_line, error.diagnostics)))) from None
     widths = [step.params["fwhm"] for name, step in steps.items() if name.startswith("line[")]
     return float(widths[0]) if widths else 10e-9
 
@@ -195,4 +198,4 @@ def _fwhm(recipe: str, changes: Sequence[str | Override], folder: Path) -> float
 def _check(recipe: Recipe, pipeline: Pipeline) -> None:
     lacking = [name for name in ("scene", *pipeline.outputs, "lsr[mask]", "mtf[mask]") if name not in recipe.steps]
     if lacking:
-        raise Refused(f"an evaluation needs the steps {', '.join(lacking)}, which {recipe.name} has not")
+        raise EvaluationRefused(f"an evaluation needs the steps {', '.join(lacking)}, which {recipe.name} lacks")

@@ -2,5 +2,5 @@
 
 Studies of a recipe, each with a page, a table and pictures, and what they share.
 A kind of study has its own room, which imports no other kind.
-Offers: `run_study.made`, `run_study.failed`, `cold_run.cold`.
+Offers: `run_study.study_recipe`, `run_study.count_failures`, `cold_run.cold`.
 """

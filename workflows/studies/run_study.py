@@ -1,10 +1,10 @@
-"""Studies of a recipe: what its numbers are worth, where it breaks, and what it need not compute.
+"""Studies of a recipe: how accurate its numbers are, where it breaks, and what it need not compute.
 
-    made("accuracy", load("first_light"))       error against run time, over tolerances and knobs
-    made("stability", load("first_light"))      stiff and extreme cases against float64
-    made("leave-out", load("first_light"))      each omission beside the full computation
-    made("calibration", load("calibrate"))      whether the posterior of a sensor is right, by simulations
-    made("uncertainty", load("first_light", ["sensor.read_noise=normal(10.5 e-, 0.5 e-)"]))  what outputs are worth
+    study_recipe("accuracy", load("first_light"))       error against run time, over tolerances and knobs
+    study_recipe("stability", load("first_light"))      stiff and extreme cases against float64
+    study_recipe("leave-out", load("first_light"))      each omission beside the full computation
+    study_recipe("calibration", load("calibrate"))      whether the posterior of a sensor is right, by simulations
+    study_recipe("uncertainty", load("first_light", ["sensor.read_noise=normal(10.5 e-, 0.5 e-)"]))  how outputs scatter
 
 Each writes a folder with a page, a table and pictures, and goes on where it was interrupted.
 """
@@ -24,27 +24,27 @@ from neusee.workflows.store.result_store import Store
 KINDS = ("accuracy", "stability", "leave-out", "calibration", "uncertainty")
 
 
-def made(
+def study_recipe(
     kind: str,
     recipe: Recipe,
     store: Store | None = None,
     runs: Path = Path("runs"),
     command: Sequence[str] = (),
-    tell: Callable[[str], None] = lambda line: None,
+    progress: Callable[[str], None] = lambda line: None,
     **options: Any,
 ) -> Path:
-    """Make one of `KINDS` and give its folder.
+    """Run the study of one of `KINDS` and return its folder.
 
-    Args: store: where its points are kept, so that it goes on where it was interrupted. runs: where
-    the folder is made. tell: is given a line for each point that is done. options: of the kind of study.
+    Args: store: where the study keeps its points, so that an interrupted study goes on. runs: where the folder is made.
+    progress: receives a line for each point that is done. options: of the kind of study.
     """
     room = kind.replace("-", "_")
     module = import_module(f"neusee.workflows.studies.{room}.{room}_study")
-    folder: Path = module.study(recipe, store or open_store(), runs, list(command), tell, **options)
+    folder: Path = module.study(recipe, store or open_store(), runs, list(command), progress, **options)
     return folder
 
 
-def failed(folder: Path) -> int:
-    """How many cells, bounds or bars of a finished study do not hold."""
+def count_failures(folder: Path) -> int:
+    """Return how many cells, bounds or bars of a finished study do not hold."""
     found: dict[str, Any] = json.loads((folder / "provenance.json").read_text())
     return int(found.get("failed", 0))

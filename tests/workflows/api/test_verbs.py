@@ -40,7 +40,7 @@ def test_a_recipe_comes_first_and_all_else_by_name(verb):
     assert {"changes", "store"} <= {p.name for p in rest}
 
 
-@pytest.mark.parametrize("name", ["device", "out", "tell", "command", "changes", "store"])
+@pytest.mark.parametrize("name", ["device", "out", "progress", "command", "changes", "store"])
 def test_an_option_is_the_same_in_every_verb_that_has_it(name):
     every = [inspect.signature(getattr(neusee, verb)).parameters.get(name) for verb in VERBS]
     assert len({str(option) for option in every if option is not None}) == 1
@@ -89,7 +89,7 @@ def test_sweep_takes_changes_as_values_and_as_words():
 def test_evaluate_takes_pipelines_as_a_text():
     told = []
     folder = neusee.evaluate(
-        "first_light", pipelines="flat+none", changes=SMALL, scenes=1, strengths=[0, 10], small=11, tell=told.append
+        "first_light", pipelines="flat+none", changes=SMALL, scenes=1, strengths=[0, 10], small=11, progress=told.append
     )
     assert folder.parent == Path("runs")
     assert json.loads((folder / "provenance.json").read_text())["strengths"] == [0.0, 10.0]
@@ -107,17 +107,17 @@ def test_calibrate_study_and_train_hand_their_options_to_their_rooms(monkeypatch
         return called
 
     monkeypatch.setattr(run_calibration, "calibrate", room("calibrate"))
-    monkeypatch.setattr(run_study, "made", room("study"))
+    monkeypatch.setattr(run_study, "study_recipe", room("study"))
     monkeypatch.setattr(run_training, "train", room("train"))
     monkeypatch.setattr(lift_run, "train_lift", room("lift"))
-    recipe, tell, watch = neusee.load("train_small"), print, lambda *found: None
+    recipe, progress, watch = neusee.load("train_small"), print, lambda *found: None
     store = neusee.Store("there")
-    assert neusee.calibrate(recipe, store=store, out="o", tell=tell, draws=200) == Path("made/calibrate")
-    assert asked["calibrate"] == ((recipe, store, Path("o"), (), tell), {"walkers": 64, "move": "de", "draws": 200})
-    assert neusee.study(recipe, kind="leave-out", store=store, out="o", tell=tell) == Path("made/study")
-    assert asked["study"] == (("leave-out", recipe, store, Path("o"), (), tell), {})
-    assert neusee.train(recipe, store=store, out="o", tell=tell, watch=watch) == Path("made/train")
-    assert asked["train"][0][:5] == (recipe, store, Path("o"), (), tell)
+    assert neusee.calibrate(recipe, store=store, out="o", progress=progress, draws=200) == Path("made/calibrate")
+    assert asked["calibrate"] == ((recipe, store, Path("o"), (), progress), {"walkers": 64, "move": "de", "draws": 200})
+    assert neusee.study(recipe, kind="leave-out", store=store, out="o", progress=progress) == Path("made/study")
+    assert asked["study"] == (("leave-out", recipe, store, Path("o"), (), progress), {})
+    assert neusee.train(recipe, store=store, out="o", progress=progress, watch=watch) == Path("made/train")
+    assert asked["train"][0][:5] == (recipe, store, Path("o"), (), progress)
     assert asked["train"][0][5:8] == (tuple(recipe.training.learnt), "cpu", watch)
     losses = []
     lift = neusee.load("train_lift")

@@ -4,7 +4,7 @@ import emcee
 import numpy as np
 import pytest
 
-from neusee.workflows.calibration.ensembles import Walk, go_on
+from neusee.workflows.calibration.ensembles import Walk, walk_until
 
 WALKERS, FREE = 16, 3
 MOVES = {
@@ -14,10 +14,10 @@ MOVES = {
 }
 
 
-def weigh(places):
+def weigh(samples):
     """A bent law with an edge, weighed by walker: of each the same bits, whoever is beside it."""
-    found = [-0.5 * (x[0] ** 2 + 4.0 * (x[1] - x[0] ** 2) ** 2 + abs(x[2])) for x in places]
-    return np.array([log if x[2] > -1.0 else -np.inf for x, log in zip(places, found, strict=True)])
+    found = [-0.5 * (x[0] ** 2 + 4.0 * (x[1] - x[0] ** 2) ** 2 + abs(x[2])) for x in samples]
+    return np.array([log if x[2] > -1.0 else -np.inf for x, log in zip(samples, found, strict=True)])
 
 
 def start(seed):
@@ -49,7 +49,7 @@ def assert_same(found, expected):
 @pytest.mark.parametrize("name", MOVES)
 def test_each_walks_as_emcee_walks_it_alone(name):
     walks = [begun(seed, MOVES[name]()) for seed in range(3)]
-    go_on(walks, 60, weigh)
+    walk_until(walks, 60, weigh)
     for seed, walk in enumerate(walks):
         assert_same(walk.backend, by_emcee(seed, MOVES[name](), 60))
         assert 0 < walk.backend.accepted.sum() < 60 * WALKERS
@@ -58,26 +58,26 @@ def test_each_walks_as_emcee_walks_it_alone(name):
 def test_all_are_weighed_in_one_call():
     counted = []
 
-    def counting(places):
-        counted.append(len(places))
-        return weigh(places)
+    def counting(samples):
+        counted.append(len(samples))
+        return weigh(samples)
 
-    go_on([begun(seed, emcee.moves.DEMove()) for seed in range(4)], 5, counting)
+    walk_until([begun(seed, emcee.moves.DEMove()) for seed in range(4)], 5, counting)
     assert counted == [WALKERS] * 4 + [4 * WALKERS // 2] * 10
 
 
 def test_what_goes_on_is_what_never_stopped():
     walk = begun(0, emcee.moves.DEMove())
     for steps in (1, 20, 20, 10, 50):  # fewer than there are: nothing is walked
-        go_on([walk], steps, weigh)
+        walk_until([walk], steps, weigh)
     assert_same(walk.backend, by_emcee(0, emcee.moves.DEMove(), 50))
 
 
 def test_those_behind_walk_first():
     walks = [begun(seed, emcee.moves.DEMove()) for seed in range(4)]
-    go_on(walks[1:2], 40, weigh)
-    go_on(walks[2:3], 90, weigh)
-    go_on(walks, 60, weigh)
+    walk_until(walks[1:2], 40, weigh)
+    walk_until(walks[2:3], 90, weigh)
+    walk_until(walks, 60, weigh)
     assert [walk.iteration for walk in walks] == [60, 60, 90, 60]
     for seed, walk in enumerate(walks):
         assert_same(walk.backend, by_emcee(seed, emcee.moves.DEMove(), walk.iteration))

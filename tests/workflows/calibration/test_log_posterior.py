@@ -9,12 +9,11 @@ import numpy as np
 import pytest
 
 from neusee.workflows.calibration import emcee_sampler
-from neusee.workflows.calibration.calibration_page import beside
-from neusee.workflows.calibration.identifiability import known
-from neusee.workflows.calibration.initial_guess import begin
+from neusee.workflows.calibration.calibration_page import with_uncertainty
+from neusee.workflows.calibration.identifiability import identify
 from neusee.workflows.calibration.log_posterior import SensorPosterior
-from neusee.workflows.calibration.posterior_checks import checks, weighed
-from neusee.workflows.calibration.posterior_mode import peak
+from neusee.workflows.calibration.posterior_checks import checks, importance_samples
+from neusee.workflows.calibration.posterior_mode import find_mode, initial_theta
 from neusee.workflows.cli import app
 from neusee.workflows.recipe.loading import load
 from neusee.workflows.store.result_store import Store
@@ -32,41 +31,41 @@ def problem(store, *words):
     return SensorPosterior.of(load("calibrate", [SMALL, *words]), store)
 
 
-def top(found):
-    return peak(found, begin(found))
+def mode(found):
+    return find_mode(found, initial_theta(found))
 
 
 @pytest.mark.parametrize("words", [(), (SEEN,), ("reading=as_printed",), (SEEN, "sensor.read_noise=2 e-")])
 def test_the_peak_is_where_the_frames_were_made(store, words):
     p = problem(store, *words)
-    best, params = top(p), p.recipe.steps[p.step].params
+    best, params = mode(p), p.recipe.steps[p.step].params
     assert best.settled
-    truth = p.place({name: params[name] for name in p.names})
+    truth = p.theta({name: params[name] for name in p.names})
     sd = np.sqrt(best.covariance.diagonal())
-    told = [i for i, name in enumerate(p.names) if known(p, best).kinds[name] == "estimate"]
+    told = [i for i, name in enumerate(p.names) if identify(p, best).kinds[name] == "estimate"]
     assert len(told) >= 4
-    assert np.all(np.abs(best.place - truth)[told] < 5 * np.maximum(sd, 1e-12)[told])
+    assert np.all(np.abs(best.theta - truth)[told] < 5 * np.maximum(sd, 1e-12)[told])
     assert best.log >= float(p.log_posterior(truth[None])[0])
 
 
 @pytest.mark.slow
 def test_the_width_at_the_peak_is_that_of_the_posterior(store):
     p = problem(store, "reading=as_printed")
-    law = weighed(p, top(p), 1)
+    law = importance_samples(p, mode(p), 1)
     assert law.tail < 0.7
-    np.testing.assert_allclose(np.sqrt(top(p).covariance.diagonal()), law.sd(), rtol=0.15)
+    np.testing.assert_allclose(np.sqrt(mode(p).covariance.diagonal()), law.sd(), rtol=0.15)
 
 
 def test_what_no_frame_tells_is_said_in_words(store):
     p = problem(store)
-    told = known(p, top(p))
+    told = identify(p, mode(p))
     assert told.kinds["full_well"] == "lower"
     well = "full well: only a lower limit: no frame is saturated by the well"
     dark = "dark current: only an upper limit: no dark was exposed for long enough"  # for so few pixels
     assert sorted(told.directions) == [dark, well]
     assert told.estimated == ("gain", "pedestal", "read_noise", "quantum_efficiency")
     seen = problem(store, SEEN)
-    assert list(known(seen, top(seen)).directions) == [dark]
+    assert list(identify(seen, mode(seen)).directions) == [dark]
 
 
 def test_the_snooker_is_refused_by_name():
@@ -84,7 +83,7 @@ def test_what_is_stopped_goes_on_to_the_last_bit(store, tmp_path, monkeypatch):
     monkeypatch.setattr(emcee_sampler, "_FIRST", 20)
     monkeypatch.setattr(emcee_sampler, "_LONGEST", 40)
     p = problem(store, SEEN)
-    best, lines = top(p), []
+    best, lines = mode(p), []
 
     def stop(line):
         lines.append(line)
@@ -93,7 +92,7 @@ def test_what_is_stopped_goes_on_to_the_last_bit(store, tmp_path, monkeypatch):
 
     whole = emcee_sampler.sample(p, best, tmp_path / "whole.h5", seed=3, walkers=16)
     with pytest.raises(Stop):
-        emcee_sampler.sample(p, best, tmp_path / "cut.h5", seed=3, walkers=16, tell=stop)
+        emcee_sampler.sample(p, best, tmp_path / "cut.h5", seed=3, walkers=16, progress=stop)
     kept = emcee.backends.HDFBackend(str(tmp_path / "cut.h5"), name="ensemble3", read_only=True)
     assert 20 < kept.iteration < 40
     again = emcee_sampler.sample(p, best, tmp_path / "cut.h5", seed=3, walkers=16)
@@ -109,7 +108,7 @@ def test_what_has_ended_draws_nothing_more(store, tmp_path, monkeypatch):
     for name, value in {"_FIRST": 40, "_TAUS": 0.0, "_BURN": 0.0, "_SURELY": 1e9, "_CHANGE": 0.2}.items():
         monkeypatch.setattr(emcee_sampler, name, value)
     p = problem(store, SEEN)
-    best = top(p)
+    best = mode(p)
     first = emcee_sampler.sample(p, best, tmp_path / "c.h5", seed=3, walkers=16, wanted=1)
     assert first.long
     monkeypatch.setattr(emcee.moves.DEMove, "get_proposal", None)
@@ -124,18 +123,18 @@ def test_draws_that_cannot_be_kept_are_drawn_and_said(store, tmp_path, monkeypat
     monkeypatch.setattr(emcee_sampler, "_LONGEST", 20)
     (tmp_path / "file").write_text("no folder")
     p, said = problem(store, SEEN), []
-    best = top(p)
-    found = emcee_sampler.sample(p, best, tmp_path / "file" / "c.h5", seed=3, walkers=16, tell=said.append)
+    best = mode(p)
+    found = emcee_sampler.sample(p, best, tmp_path / "file" / "c.h5", seed=3, walkers=16, progress=said.append)
     kept = emcee_sampler.sample(p, best, tmp_path / "c.h5", seed=3, walkers=16)
     assert np.array_equal(found.draws, kept.draws)
-    assert sum("a stop would lose these draws" in line for line in said) == 1
+    assert sum("a stop would lose them" in line for line in said) == 1
 
 
 def test_a_damaged_file_of_draws_is_drawn_anew(store, tmp_path, monkeypatch):
     monkeypatch.setattr(emcee_sampler, "_FIRST", 20)
     monkeypatch.setattr(emcee_sampler, "_LONGEST", 20)
     p = problem(store, SEEN)
-    best = top(p)
+    best = mode(p)
     first = emcee_sampler.sample(p, best, tmp_path / "c.h5", seed=3, walkers=16)
     (tmp_path / "c.h5").write_bytes((tmp_path / "c.h5").read_bytes()[:3000])
     assert np.array_equal(emcee_sampler.sample(p, best, tmp_path / "c.h5", seed=3, walkers=16).draws, first.draws)
@@ -145,17 +144,17 @@ def test_a_damaged_file_of_draws_is_drawn_anew(store, tmp_path, monkeypatch):
 def drawn(store, tmp_path_factory):
     """Enough draws for checks, not for a result."""
     p = problem(store, SEEN)
-    best = top(p)
+    best = mode(p)
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(emcee_sampler, "_FIRST", 400)
         patch.setattr(emcee_sampler, "_LONGEST", 400)
         chains = emcee_sampler.sample(p, best, tmp_path_factory.mktemp("draws") / "c.h5", seed=3)
-    return p, best, known(p, best), replace(chains, long=True)
+    return p, best, identify(p, best), replace(chains, long=True)
 
 
 def marks(drawn, **changes):
     p, best, told, chains = drawn
-    found = checks(p, best, told, replace(chains, **changes), weighed(p, best, 1))
+    found = checks(p, best, told, replace(chains, **changes), importance_samples(p, best, 1))
     return {check.name: check.mark for check in found}
 
 
@@ -172,7 +171,7 @@ def test_good_draws_pass_and_each_fault_is_found(drawn):
     lost = replace(chains, log=log)
     assert emcee_sampler.stranded(lost.log) == 1
     assert marks(drawn, log=log)["no walker is stranded"] == "fail"
-    assert marks(drawn, log=chains.log - 10.0)["draws reach the peak"] == "fail"
+    assert marks(drawn, log=chains.log - 10.0)["draws reach the mode"] == "fail"
     assert marks(drawn, draws=chains.draws[:, :20])["draws are enough"] == "fail"
     narrow = chains.flat.mean(0) + 0.8 * (chains.draws - chains.flat.mean(0))
     assert marks(drawn, draws=narrow)["importance sampling agrees"] in ("fail", "warn")
@@ -180,7 +179,7 @@ def test_good_draws_pass_and_each_fault_is_found(drawn):
 
 def test_draws_too_narrow_fail_where_importance_sampling_can_tell(drawn, monkeypatch):
     p, best, told, chains = drawn
-    law = replace(weighed(p, best, 1), tail=0.2)
+    law = replace(importance_samples(p, best, 1), tail=0.2)
     narrow = replace(chains, draws=chains.flat.mean(0) + 0.8 * (chains.draws - chains.flat.mean(0)))
     found = {check.name: check.mark for check in checks(p, best, told, narrow, law)}
     assert found["importance sampling agrees"] == "fail"
@@ -196,7 +195,7 @@ def test_draws_too_narrow_fail_where_importance_sampling_can_tell(drawn, monkeyp
     ],
 )
 def test_digits_stand_beside_their_deviation(mean, sd, said):
-    assert beside(mean, sd) == said
+    assert with_uncertainty(mean, sd) == said
 
 
 @pytest.fixture

@@ -15,11 +15,11 @@ from scipy.stats import binom, chi2
 
 from neusee.nodes.calibrate import Likelihood, least_squares, table
 from neusee.workflows.calibration import emcee_sampler, run_calibration
-from neusee.workflows.calibration.goodness_of_fit import fit
-from neusee.workflows.calibration.identifiability import known
+from neusee.workflows.calibration.identifiability import identify
 from neusee.workflows.calibration.log_posterior import SensorPosterior
-from neusee.workflows.calibration.model_spread import Z_90, begin, spread
-from neusee.workflows.calibration.posterior_mode import peak
+from neusee.workflows.calibration.model_spread import Z_90, compare_models, initial_theta
+from neusee.workflows.calibration.posterior_checks import goodness_of_fit
+from neusee.workflows.calibration.posterior_mode import find_mode
 from neusee.workflows.engine.runner import run
 from neusee.workflows.recipe.loading import load
 from neusee.workflows.store.result_store import Store
@@ -51,7 +51,7 @@ def of(file, *more):
 
 def stated(recipe, store):
     """Also printed, for whoever wants to see them: pytest -s."""
-    rows = {row.name: row for row in spread(recipe, store)}
+    rows = {row.name: row for row in compare_models(recipe, store)}
     for name in cameras.TRUTH:
         figures = (*rows[name].models, rows[name].stated)
         print(name, *(f"{f.value:.5g} [{f.low:.5g}, {f.high:.5g}]" for f in figures), sep=" | ")
@@ -96,49 +96,51 @@ def test_a_table_of_ones_own_is_taken_by_override(store, tmp_path):
 def test_the_peak_explains_its_levels_in_either_unit(store, unit):
     gain = 0.25 if unit == "DN/e-" else 4.0
     problem = SensorPosterior.of(load("calibrate_camera", [f"camera.gain={gain}", f"camera.gain_unit={unit}"]), store)
-    top = peak(problem, begin(problem))
-    assert top.settled
-    found = fit(problem.look(top.place[None]), len(problem.names))
+    mode = find_mode(problem, initial_theta(problem))
+    assert mode.settled
+    found = goodness_of_fit(problem.likelihood(mode.theta[None]), len(problem.names))
     assert found.good
     assert found.p > 0.01
     at = problem.names.index("gain")
-    assert float(problem.parameters(top.place)["gain"]) == pytest.approx(gain, rel=0.02)
-    assert top.shares[at] < 0.01
-    assert known(problem, top).kinds["gain"] == "estimate"
-    assert not known(problem, top).refused
+    assert float(problem.parameters(mode.theta)["gain"]) == pytest.approx(gain, rel=0.02)
+    assert mode.shares[at] < 0.01
+    assert identify(problem, mode).kinds["gain"] == "estimate"
+    assert not identify(problem, mode).refused
 
 
 def test_fewer_models_where_fewer_terms_are_free(store):
     recipe = load("calibrate_camera", ["steps.prior.with.twist=null"])
-    rows = {row.name: row for row in spread(recipe, store)}
+    rows = {row.name: row for row in compare_models(recipe, store)}
     assert len(rows["gain"].models) == 2
     alone = load("calibrate_camera", ["steps.prior.with.twist=null", "steps.prior.with.bend=null"])
-    (model,) = (row.models for row in spread(alone, store) if row.name == "gain")
+    (model,) = (row.models for row in compare_models(alone, store) if row.name == "gain")
     assert model[0].value == pytest.approx(rows["gain"].models[0].value, rel=1e-3)
-    (row,) = (row for row in spread(alone, store) if row.name == "gain")
+    (row,) = (row for row in compare_models(alone, store) if row.name == "gain")
     assert row.stated == row.models[0]
 
 
 def test_stated_is_the_middle_of_the_two_richest_and_half_their_distance(store):
-    rows = spread(load("calibrate_camera"), store)
+    rows = compare_models(load("calibrate_camera"), store)
     (gain,) = (row for row in rows if row.name == "gain")
     one, two = (np.log([m.value, m.high / m.value]) for m in gain.models[1:])
     assert math.log(gain.stated.value) == pytest.approx((one[0] + two[0]) / 2)
     width = math.hypot(max(one[1], two[1]) / Z_90, abs(one[0] - two[0]) / 2)
     assert math.log(gain.stated.high / gain.stated.value) == pytest.approx(Z_90 * width)
-    assert rows == spread(load("calibrate_camera"), store)  # the same draws
+    assert rows == compare_models(load("calibrate_camera"), store)  # the same draws
 
 
 def test_too_few_levels_are_refused_with_what_would_do(store, tmp_path):
     file = cameras.tabled(1, tmp_path / "few.csv", pixels=100_000, lit=4)
-    with pytest.raises(ValueError, match=r"3 lit levels tell no response of 2 terms .* give 4 or more .* hold twist$"):
-        spread(of(file), store)
-    assert len(spread(of(file, "steps.prior.with.twist=null"), store)[0].models) == 2
+    with pytest.raises(
+        ValueError, match=r"3 lit levels do not separate a response of 2 terms .* give 4 or more .* hold twist$"
+    ):
+        compare_models(of(file), store)
+    assert len(compare_models(of(file, "steps.prior.with.twist=null"), store)[0].models) == 2
 
 
 def test_pixels_that_are_all_alike_have_no_models_of_a_response(store):
     with pytest.raises(ValueError, match="calibrate weighs pixels that are all alike"):
-        spread(load("calibrate", ["flats.shape=[32, 32]"]), store)
+        compare_models(load("calibrate", ["flats.shape=[32, 32]"]), store)
 
 
 def test_a_recipe_that_calibrates_nothing_says_what_is_missing(store):
@@ -150,9 +152,11 @@ def test_a_recipe_that_calibrates_nothing_says_what_is_missing(store):
 def test_emcee_draws_from_the_same_posterior(store, tmp_path):
     """Held: what frames do not tell, for a normal law is compared. Importance draws against a chain."""
     problem = SensorPosterior.of(load("calibrate_camera", ["steps.prior.with.twist=null"]), store)
-    chains = emcee_sampler.sample(problem, peak(problem, begin(problem)), tmp_path / "chain.h5", seed=1, walkers=48)
+    chains = emcee_sampler.sample(
+        problem, find_mode(problem, initial_theta(problem)), tmp_path / "chain.h5", seed=1, walkers=48
+    )
     assert chains.long
-    rows = {row.name: row for row in spread(problem.recipe, store)}
+    rows = {row.name: row for row in compare_models(problem.recipe, store)}
     for name, x in zip(problem.names, chains.flat.T, strict=True):
         if name in ("gain", "quantum_efficiency", "dark_noise", "lamp"):
             model = rows[name].models[-1]
@@ -163,7 +167,7 @@ def test_emcee_draws_from_the_same_posterior(store, tmp_path):
 
 def covered(recipes, store):
     """By parameter, how many stated intervals hold the truth."""
-    rows = [{row.name: row for row in spread(recipe, store)} for recipe in recipes]
+    rows = [{row.name: row for row in compare_models(recipe, store)} for recipe in recipes]
     return {name: sum(row[name].stated.holds(truth) for row in rows) for name, truth in cameras.TRUTH.items()}
 
 
@@ -187,7 +191,7 @@ def test_a_model_that_is_wrong_does_not_make_the_statement_wrong(store, tmp_path
     held = covered(recipes, store)
     print(held)
     assert min(held.values()) >= binom.ppf(1e-3, 24, 0.9)
-    alone = [row.models[2].holds(0.25) for r in recipes for row in spread(r, store) if row.name == "gain"]
+    alone = [row.models[2].holds(0.25) for r in recipes for row in compare_models(r, store) if row.name == "gain"]
     assert sum(alone) < binom.ppf(1e-3, 24, 0.9)
 
 
@@ -209,7 +213,7 @@ def test_the_ccd_of_emva_is_not_linear_which_is_why_least_squares_gives_less(sto
     assert rows["dark_noise"].stated.high < 10.898 / 0.97
     assert rows["gain"].stated.low > 0.280769  # of a straight line, through levels where each electron gives less
     problem = SensorPosterior.of(with_one_term(recipe), store)
-    best = {name: float(x) for name, x in problem.parameters(peak(problem, begin(problem)).place).items()}
+    best = {name: float(x) for name, x in problem.parameters(find_mode(problem, initial_theta(problem)).theta).items()}
     levels = run(recipe, store).values["levels"]
     expected = least_squares(as_expected(levels, best))
     assert float(expected.gain) == pytest.approx(float(least_squares(levels).gain), rel=5e-3)
@@ -266,13 +270,13 @@ def test_pixels_taken_as_alike_are_sure_of_a_wrong_gain_and_that_is_a_misfit(sto
         writer.writerows(row for row in rows if float(row["mean_DN"]) < 2750)  # 0.7 of saturation
     (tmp_path / "pixels.yaml").write_text(PIXELS.replace("FILE", "below.csv"))
     problem = SensorPosterior.of(load("pixels.yaml", folder=tmp_path), store)
-    top = peak(problem, problem.place(NEAR))
-    gain = float(problem.parameters(top.place)["gain"])
-    error = math.sqrt(top.covariance[0, 0])  # of its logarithm
+    mode = find_mode(problem, problem.theta(NEAR))
+    gain = float(problem.parameters(mode.theta)["gain"])
+    error = math.sqrt(mode.covariance[0, 0])  # of its logarithm
     print(f"pixels alike: K {gain:.5g} +- {100 * error:.2g} %")
     assert error < 0.002
     assert abs(math.log(gain / 0.280769)) > 10 * error
-    found = fit(problem.look(top.place[None]), 5)
+    found = goodness_of_fit(problem.likelihood(mode.theta[None]), 5)
     assert found.deviance / found.freedom > 100
     assert not found.good
 
@@ -282,17 +286,17 @@ def test_a_misfit_is_what_chance_does_not_do():
         told = (torch.tensor([deviance]), torch.full((4,), 2.0))
         return Likelihood(torch.zeros(1), *told, *(torch.zeros(1, 0) for _ in range(3)))
 
-    found = fit(told([1.0, 2.0, 3.0, 4.0]))
+    found = goodness_of_fit(told([1.0, 2.0, 3.0, 4.0]))
     assert (found.deviance, found.freedom) == (10.0, 8.0)
     assert found.p == pytest.approx(chi2.sf(10.0, 8), rel=1e-12)
-    assert fit(told([1.0, 2.0, 3.0, 4.0]), 3).p == pytest.approx(chi2.sf(10.0, 5), rel=1e-12)
-    assert not fit(told([10.0, 10.0, 3.0, 4.0])).good
-    with pytest.raises(ValueError, match="8 numbers are no test of 8 free"):
-        fit(told([1.0] * 4), 8)
+    assert goodness_of_fit(told([1.0, 2.0, 3.0, 4.0]), 3).p == pytest.approx(chi2.sf(10.0, 5), rel=1e-12)
+    assert not goodness_of_fit(told([10.0, 10.0, 3.0, 4.0])).good
+    with pytest.raises(ValueError, match="8 numbers cannot test 8 free"):
+        goodness_of_fit(told([1.0] * 4), 8)
     with pytest.raises(ValueError, match="told: true"):
-        fit(Likelihood(torch.zeros(1), *(torch.zeros(0) for _ in range(5))))
+        goodness_of_fit(Likelihood(torch.zeros(1), *(torch.zeros(0) for _ in range(5))))
     with pytest.raises(ValueError, match="not of one sensor"):
-        fit(told([1.0] * 4)._replace(deviance=torch.ones(2, 4)))
+        goodness_of_fit(told([1.0] * 4)._replace(deviance=torch.ones(2, 4)))
 
 
 @pytest.mark.slow
@@ -304,6 +308,6 @@ def test_the_page_of_a_camera_states_what_its_models_leave_open(tmp_path, monkey
     page, doc = (folder / "report.html").read_text(), json.loads((folder / "posterior.json").read_text())
     assert "How models of the response differ" in page
     assert "To be stated" in page
-    rows = {row.name: row.stated for row in spread(recipe, Store(tmp_path / "cache"), recipe.seed)}
+    rows = {row.name: row.stated for row in compare_models(recipe, Store(tmp_path / "cache"), recipe.seed)}
     assert doc["stated"]["gain"]["low"] == pytest.approx(rows["gain"].low, rel=1e-12)
     assert doc["stated"]["gain"]["low"] < 0.25 < doc["stated"]["gain"]["high"]

@@ -18,10 +18,10 @@ from neusee.workflows import load
 from neusee.workflows.cli.app import app
 from neusee.workflows.engine.runner import run
 from neusee.workflows.evaluation import evaluation_points
-from neusee.workflows.evaluation.confidence_intervals import difference, gain, mean, table
-from neusee.workflows.evaluation.evaluation_points import Bench, Wanted
+from neusee.workflows.evaluation.confidence_intervals import difference, gain, mean, metric_table
+from neusee.workflows.evaluation.evaluation_points import EvaluationPoints, PointRequest
 from neusee.workflows.evaluation.evaluation_scenes import scenes
-from neusee.workflows.evaluation.pipelines import CASES, Refused, composed, read_pipelines
+from neusee.workflows.evaluation.pipelines import CASES, EvaluationRefused, compose_pipelines, read_pipelines
 from neusee.workflows.evaluation.run_evaluation import evaluate
 from neusee.workflows.recipe.distributions.uncertain_inputs import Inputs
 from neusee.workflows.store.result_store import Store
@@ -51,7 +51,7 @@ def photographs(tmp_path_factory):
 
 
 def pipelines(text, *more):
-    return composed("first_light", [*SMALL, *more], read_pipelines(text, HERE), HERE)
+    return compose_pipelines("first_light", [*SMALL, *more], read_pipelines(text, HERE), HERE)
 
 
 def by_hand(tmp_path, scene, pipeline, strength, more=()):
@@ -80,7 +80,7 @@ def test_a_point_is_a_run_with_its_values_to_the_last_bit(tmp_path, store, name,
     (pipeline,) = pipelines(name)
     shown, _ = scenes(load("first_light", SMALL), store, tmp_path, 2)
     scene = shown[1]
-    found = Bench(store, 16).point(pipeline, Wanted(scene, scene.case, strength))
+    found = EvaluationPoints(store, 16).point(pipeline, PointRequest(scene, scene.case, strength))
     wanted = by_hand(tmp_path, scene, pipeline, strength)
     step = pipeline.pipeline
     assert {k: found[k] for k in ("l1", "psnr", "ssim")} == {
@@ -103,23 +103,25 @@ def test_what_a_recipe_has_laws_for_is_drawn_for_each_scene(tmp_path, store):
     }
     each = pipelines(BARE, *(f"{name}={law}" for name, law in laws.items()))
     shown, _ = scenes(load("first_light", SMALL), store, tmp_path, 2)
-    bench, seen = Bench(store, 16), list[dict[str, float]]()
+    bench, seen = EvaluationPoints(store, 16), list[dict[str, float]]()
     for scene in shown:
         for pipeline in each:
             recipe = pipeline.recipes[scene.case]
-            seen.append(scene.drawn(Inputs.of(recipe, pipeline.pipeline.outputs)))
+            seen.append(scene.draw(Inputs.of(recipe, pipeline.pipeline.outputs)))
             units = {
                 name: f"{value!r} e-" if name == "sensor.pedestal" else repr(value) for name, value in seen[-1].items()
             }
             wanted = by_hand(tmp_path, scene, pipeline, 1e4, [f"{name}={text}" for name, text in units.items()])
-            found = bench.point(pipeline, Wanted(scene, scene.case, 1e4))
+            found = bench.point(pipeline, PointRequest(scene, scene.case, 1e4))
             assert found["l1"] == float(wanted[pipeline.pipeline.quality].l1)
             assert found["peak"] == float(wanted["peak[mask]"].irradiance)
     assert seen[0] == seen[1] != seen[2] == seen[3]
     assert seen[0].keys() == laws.keys()
     assert 0 < seen[0]["sensor.c1"] < 0.25
     (plain, _), (still, _) = each, pipelines(BARE)
-    assert bench.key(plain, Wanted(shown[0], "none", 0.0)) != bench.key(still, Wanted(shown[0], "none", 0.0))
+    assert bench.key(plain, PointRequest(shown[0], "none", 0.0)) != bench.key(
+        still, PointRequest(shown[0], "none", 0.0)
+    )
 
 
 def test_what_several_points_share_is_computed_once(store, monkeypatch):
@@ -132,11 +134,11 @@ def test_what_several_points_share_is_computed_once(store, monkeypatch):
         called.append(step.name)
         return real(step, *rest)
 
-    bench = Bench(store, 24)
+    bench = EvaluationPoints(store, 24)
     monkeypatch.setattr(evaluation_points, "call", counted)
     for strength in (1e2, 1e3):
         for pipeline in each:
-            bench.values(pipeline, Wanted(shown[0], "violet", strength))
+            bench.values(pipeline, PointRequest(shown[0], "violet", strength))
     assert called.count("image[plain].channels") == called.count("level") == 1
     assert called.count("laser_psf[mask,beam]") == called.count("image[mask].channels") == 2  # one a mask
     assert called.count("spot[mask,beam]") == called.count("raw[mask]") == 4
@@ -157,15 +159,15 @@ def test_a_key_hangs_on_all_that_decides_a_point(store, photographs):
     ):
         (pipeline,) = pipelines("flat+none", *more)
         shown, _ = scenes(load("first_light", [*SMALL, *more]), store, photographs, 2)
-        keys.add(Bench(store, small).key(pipeline, Wanted(shown[number], case, strength)))
+        keys.add(EvaluationPoints(store, small).key(pipeline, PointRequest(shown[number], case, strength)))
     assert len(keys) == 9
 
 
 def test_the_same_point_of_another_order_is_the_same(store, tmp_path):
     each = pipelines("five_half_rings+none")
     shown, _ = scenes(load("first_light", SMALL), store, None, 3)
-    wanted = [Wanted(scene, scene.case, 1e4) for scene in shown]
-    one, other = Bench(Store(tmp_path / "one"), 24), Bench(Store(tmp_path / "other"), 24)
+    wanted = [PointRequest(scene, scene.case, 1e4) for scene in shown]
+    one, other = EvaluationPoints(Store(tmp_path / "one"), 24), EvaluationPoints(Store(tmp_path / "other"), 24)
     ahead = [one.point(each[0], w) for w in wanted]
     back = [other.point(each[0], w) for w in reversed(wanted)]
     assert ahead == back[::-1]
@@ -213,7 +215,9 @@ def test_a_scene_without_a_laser_counts_at_no_strength_but_none():
     point = dict.fromkeys(
         ("l1", "psnr", "ssim", "l1 small", "psnr small", "ssim small", "saturated", "peak", "damaged")
     )
-    found = table([{0.0: {**point, "l1": 1.0}, 10.0: {**point, "l1": 3.0}}, {0.0: {**point, "l1": 5.0}}], (0.0, 10.0))
+    found = metric_table(
+        [{0.0: {**point, "l1": 1.0}, 10.0: {**point, "l1": 3.0}}, {0.0: {**point, "l1": 5.0}}], (0.0, 10.0)
+    )
     assert found.scenes("l1").tolist() == [2.0, 5.0]
     assert found.at("l1", 1).tolist() == [3.0]
 
@@ -222,7 +226,7 @@ def test_a_scene_without_a_laser_counts_at_no_strength_but_none():
 
 
 def test_every_mistake_is_said_before_anything_runs(tmp_path):
-    with pytest.raises(Refused) as error:
+    with pytest.raises(EvaluationRefused) as error:
         read_pipelines("flat, flat+none, flat+none, pixelwise@gone.npy+wiener", tmp_path)
     said = str(error.value).splitlines()
     assert len(said) == 3
@@ -232,8 +236,8 @@ def test_every_mistake_is_said_before_anything_runs(tmp_path):
     (tmp_path / "net.safetensors").write_bytes(b"nothing")
     words = "falt+none, flat+wener, flat+nafnet@net.safetensors, flat+unet, flat@net.safetensors+none"
     asked = read_pipelines(words, tmp_path)
-    with pytest.raises(Refused) as error:
-        composed("first_light", SMALL, asked, tmp_path)
+    with pytest.raises(EvaluationRefused) as error:
+        compose_pipelines("first_light", SMALL, asked, tmp_path)
     said = str(error.value)
     for part in (
         "falt+none: argument 7 doe=falt no option falt",
@@ -251,8 +255,8 @@ def test_weights_of_another_network_are_refused(tmp_path):
     from safetensors.torch import save_file
 
     save_file({"first.weight": torch.zeros(3)}, tmp_path / "net.safetensors")
-    with pytest.raises(Refused, match=r"flat\+nafnet@net.safetensors: .*this network \(width 16\) has"):
-        composed("first_light", SMALL, read_pipelines("flat+nafnet@net.safetensors", tmp_path), tmp_path)
+    with pytest.raises(EvaluationRefused, match=r"flat\+nafnet@net.safetensors: .*this network \(width 16\) has"):
+        compose_pipelines("first_light", SMALL, read_pipelines("flat+nafnet@net.safetensors", tmp_path), tmp_path)
 
 
 @pytest.mark.parametrize(
@@ -282,7 +286,7 @@ def test_an_argument_that_cannot_be_ends_with_one_line(tmp_path, monkeypatch, op
 def test_an_evaluation_writes_its_folder_and_goes_on_where_it_was_stopped(tmp_path, store, photographs, monkeypatch):
     how = {"data": photographs, "count": 6, "strengths": (0, 1e4), "small": 16, "store": store}
     asked = read_pipelines(BARE, HERE)
-    real, seen = Bench._numbers, []
+    real, seen = EvaluationPoints._numbers, []
 
     def stops(self, pipeline, values):
         seen.append(pipeline.name)
@@ -290,11 +294,11 @@ def test_an_evaluation_writes_its_folder_and_goes_on_where_it_was_stopped(tmp_pa
             raise KeyboardInterrupt
         return real(self, pipeline, values)
 
-    monkeypatch.setattr(Bench, "_numbers", stops)
+    monkeypatch.setattr(EvaluationPoints, "_numbers", stops)
     with pytest.raises(KeyboardInterrupt):
         evaluate("first_light", asked, SMALL, runs=tmp_path, **how)
     lines = []
-    folder = evaluate("first_light", asked, SMALL, runs=tmp_path, tell=lines.append, **how)
+    folder = evaluate("first_light", asked, SMALL, runs=tmp_path, progress=lines.append, **how)
     doc = json.loads((folder / "provenance.json").read_text())
     count = 2 * (5 * 2 + 1)  # of the scene without a laser there is one strength
     assert doc["computed"] == count - 8

@@ -17,7 +17,7 @@ from neusee.nodes.units import read_any
 if TYPE_CHECKING:
     from numpy.typing import NDArray
 
-    Places = NDArray[np.float64]
+    FloatArray = NDArray[np.float64]
 
 Z_90 = 1.6448536269514722  #: standard deviations on either side that contain 90 % of a normal distribution
 _LEAST = 30  #: smallest number of draws from which a distribution is estimated
@@ -35,13 +35,13 @@ class Joint:
     """
 
     names: tuple[str, ...]
-    mean: Places  #: (name,)
-    sd: Places  #: (name,)
-    factor: Places  #: (name, name), lower
-    draws: Places | None = None  #: (draw, name)
+    mean: FloatArray  #: (name,)
+    sd: FloatArray  #: (name,)
+    factor: FloatArray  #: (name, name), lower
+    draws: FloatArray | None = None  #: (draw, name)
 
     @classmethod
-    def of_draws(cls, names: Sequence[str], draws: Places) -> Joint:
+    def of_draws(cls, names: Sequence[str], draws: FloatArray) -> Joint:
         """Return the joint distribution of draws; raise ValueError for too few, non-finite or constant draws."""
         if len(draws) < _LEAST:
             raise ValueError(f"{len(draws)} draws are too few: give {_LEAST} or more")
@@ -53,7 +53,7 @@ class Joint:
         return cls(tuple(names), draws.mean(0), draws.std(0, ddof=1), _factor(correlation), draws)
 
     @classmethod
-    def of_normal(cls, names: Sequence[str], mean: Places, sd: Places, correlation: Places) -> Joint:
+    def of_normal(cls, names: Sequence[str], mean: FloatArray, sd: FloatArray, correlation: FloatArray) -> Joint:
         """Return a normal joint distribution; raise ValueError for an invalid correlation or standard deviation."""
         count = len(names)
         if correlation.shape != (count, count) or not np.allclose(correlation, correlation.T):
@@ -64,7 +64,7 @@ class Joint:
             raise ValueError("the correlation must have ones on its diagonal and no negative eigenvalue")
         return cls(tuple(names), mean, sd, _factor(correlation))
 
-    def at(self, z: Places) -> Places:
+    def at(self, z: FloatArray) -> FloatArray:
         """Return (…, name) values at (…, name) standard normal numbers."""
         score = z @ self.factor.T
         if self.draws is None:
@@ -75,7 +75,7 @@ class Joint:
         columns = [np.interp(ndtr(score[..., i]), share, np.sort(x)) for i, x in enumerate(self.draws.T)]
         return np.stack(columns, -1)
 
-    def numbers(self) -> Places:
+    def numbers(self) -> FloatArray:
         """Return (draw, name) standard normal numbers that reproduce the draws."""
         assert self.draws is not None
         return np.asarray(np.linalg.solve(self.factor, _scores(self.draws).T).T, np.float64)
@@ -107,7 +107,7 @@ class Joint:
         return Joint.of_normal(names, self.mean[at], self.sd[at], (whole / scale / scale[:, None])[np.ix_(at, at)])
 
 
-def _scores(draws: Places) -> Places:
+def _scores(draws: FloatArray) -> FloatArray:
     """Return (draw, name) normal scores of the ranks; equal draws share one rank."""
     from scipy.special import ndtri
     from scipy.stats import rankdata
@@ -115,7 +115,7 @@ def _scores(draws: Places) -> Places:
     return np.asarray(ndtri(rankdata(draws, axis=0) / (len(draws) + 1)), np.float64)
 
 
-def _factor(correlation: Places) -> Places:
+def _factor(correlation: FloatArray) -> FloatArray:
     return np.asarray(np.linalg.cholesky(correlation + _JITTER * np.eye(len(correlation))), np.float64)
 
 
@@ -174,14 +174,14 @@ def _document(path: Path) -> Posterior:
     return Posterior(joint, kinds, units)
 
 
-def _drawn(columns: Mapping[str, Places]) -> Joint:
+def _drawn(columns: Mapping[str, FloatArray]) -> Joint:
     lengths = {len(x) for x in columns.values()}
     if len(lengths) != 1:
         raise ValueError("the values have different numbers of draws" if lengths else "the file contains no draws")
     return Joint.of_draws(tuple(columns), np.stack(list(columns.values()), 1))
 
 
-def _arrays(path: Path) -> dict[str, Places]:
+def _arrays(path: Path) -> dict[str, FloatArray]:
     with path.open("rb") as file:
         if file.read(2) != b"PK":
             raise ValueError(f"{path.name} cannot be read: the file is not in .npz format")
@@ -189,7 +189,7 @@ def _arrays(path: Path) -> dict[str, Places]:
         return {name: np.asarray(found[name], np.float64).reshape(-1) for name in found}
 
 
-def _columns(path: Path) -> dict[str, Places]:
+def _columns(path: Path) -> dict[str, FloatArray]:
     with path.open(newline="", encoding="utf-8") as file:
         header, *rows = list(csv.reader(file)) or [[]]
     if short := [n for n, row in enumerate(rows, 2) if len(row) != len(header)]:
@@ -222,7 +222,7 @@ def summary(given: Mapping[str, Any]) -> Joint:
     return Joint.of_normal(names, mean, sd, correlation)
 
 
-def _matrix(given: Any) -> Places:
+def _matrix(given: Any) -> FloatArray:
     try:
         return np.array(given, np.float64)
     except (TypeError, ValueError):

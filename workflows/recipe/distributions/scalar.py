@@ -13,7 +13,7 @@ from neusee.nodes.units import read_any
 if TYPE_CHECKING:
     from numpy.typing import NDArray
 
-    Places = NDArray[np.float64]
+    FloatArray = NDArray[np.float64]
 
 #: by kind, the meaning of its two arguments
 KINDS = {
@@ -36,7 +36,7 @@ class Law:
     second: float
     unit: str  #: SI unit of a draw; empty for a number without a unit
 
-    def at(self, z: Places) -> Places:
+    def at(self, z: FloatArray) -> FloatArray:
         """Return the value at the quantile of ``z`` in the standard normal distribution."""
         from scipy.special import ndtr
 

@@ -15,7 +15,7 @@ from neusee.workflows.recipe.distributions.nominal_values import Uncertain
 if TYPE_CHECKING:
     from numpy.typing import NDArray
 
-    Places = NDArray[np.float64]
+    FloatArray = NDArray[np.float64]
 
 SCRAMBLES = 8  #: independent scramblings of Sobol's points, whose differences give the error
 _PROBE = 0.3  #: standard deviations from the median at which a value is traced to the parameters
@@ -26,11 +26,11 @@ Index = tuple[int | str, ...]
 
 
 @dataclass(frozen=True)
-class Points:
+class InputDraws:
     """Draws of all inputs."""
 
-    z: Places  #: (draw, input) independent standard normal numbers
-    values: Places  #: (draw, input) in SI
+    z: FloatArray  #: (draw, input) independent standard normal numbers
+    values: FloatArray  #: (draw, input) in SI
 
 
 @dataclass(frozen=True)
@@ -89,24 +89,24 @@ class Inputs:
             found[reader] = value
         return found
 
-    def at(self, z: Places) -> Places:
+    def at(self, z: FloatArray) -> FloatArray:
         """Return (draw, input) values at standard normal numbers."""
         columns = [law.at(z[:, i]) for i, law in enumerate(self.uncertain.laws.values())]
         joint = self.uncertain.joint
         return np.stack([*columns, *(joint.at(z[:, len(columns) :]).T if joint else ())], 1)
 
-    def independent(self, count: int, seed: int) -> Points:
+    def independent(self, count: int, seed: int) -> InputDraws:
         """Return independent draws; a larger count begins with the same draws."""
         z = np.random.default_rng([seed, 1]).standard_normal((count, len(self.names)))
         values, joint = self.at(z), self.uncertain.joint
         if joint is None or joint.draws is None:
-            return Points(z, values)
+            return InputDraws(z, values)
         rows = np.random.default_rng([seed, 2]).permutation(len(joint.draws))[:count]
         first = len(self.uncertain.laws)
         z = np.concatenate([z[: len(rows), :first], joint.numbers()[rows]], 1)
-        return Points(z, np.concatenate([values[: len(rows), :first], joint.draws[rows]], 1))
+        return InputDraws(z, np.concatenate([values[: len(rows), :first], joint.draws[rows]], 1))
 
-    def sobol(self, count: int, seed: int) -> Points:
+    def sobol(self, count: int, seed: int) -> InputDraws:
         """Return points of `SCRAMBLES` scrambled Sobol sequences in turn: point i belongs to sequence i % SCRAMBLES."""
         from scipy.special import ndtri
         from scipy.stats import qmc
@@ -116,9 +116,9 @@ class Inputs:
         sequences = [qmc.Sobol(len(self.names), seed=rng).random_base2((each - 1).bit_length()) for rng in streams]
         u = np.stack([s[:each] for s in sequences], 1).reshape(-1, len(self.names))[:count]
         z = np.asarray(ndtri(u.clip(_EDGE, 1 - _EDGE)), np.float64)
-        return Points(z, self.at(z))
+        return InputDraws(z, self.at(z))
 
-    def checked(self, values: Places) -> None:
+    def checked(self, values: FloatArray) -> None:
         """Check the least and the greatest value of each input before a run; raise `RecipeError`."""
         for name, column in zip(self.names, values.T, strict=True):
             for value in (float(column.min()), float(column.max())):
@@ -182,11 +182,11 @@ def _label(uncertain: Uncertain, name: str) -> str:
     if joint is None or name not in joint.names:
         return name
     i = joint.names.index(name)
-    whole: Places = joint.factor @ joint.factor.T
+    whole: FloatArray = joint.factor @ joint.factor.T
     if _tied(whole[i, :i]):
         return f"rest of {name}"
     return f"{name} and what goes with it" if _tied(whole[i, i + 1 :]) else name
 
 
-def _tied(correlations: Sequence[float] | Places) -> bool:
+def _tied(correlations: Sequence[float] | FloatArray) -> bool:
     return bool((np.abs(correlations) > _TIED).any())

@@ -42,15 +42,17 @@ class Line:
 
 
 @drawn
-def work_precision(lines: Sequence[Line], front: Sequence[tuple[float, float]], tolerance: float, title: str) -> Any:
-    """Error against run time, log-log: a line for each knob, the Pareto line, the recipe's own point in a ring."""
+def work_precision(
+    lines: Sequence[Line], pareto_front: Sequence[tuple[float, float]], tolerance: float, title: str
+) -> Any:
+    """Draw error against run time on logarithmic axes: a line for each knob, the Pareto line, the recipe in a ring."""
     figure, axes = canvas(10.0, 7.0)
     ax = axes[0, 0]
     styles = {line.name: (_COLOURS[i % 8], _MARKS[i % 8]) for i, line in enumerate(lines)}
     _diagram(ax, lines, styles, EXACT, tolerance)
     _ring(ax, [d for line in lines for d in line.dots if d.own])
-    if front:
-        x, y = zip(*front, strict=True)
+    if pareto_front:
+        x, y = zip(*pareto_front, strict=True)
         how = {"color": BLACK, "linewidth": 5.0, "alpha": 0.16, "zorder": 0}
         ax.step(x, [max(e, EXACT) for e in y], where="post", label="Pareto line", **how)
     ax.axhline(tolerance, color=VERMILION, linestyle="--", linewidth=1.2, label="tolerance of the recipe")
@@ -64,7 +66,7 @@ def work_precision(lines: Sequence[Line], front: Sequence[tuple[float, float]], 
 
 @drawn
 def steps(diagrams: Sequence[tuple[str, Sequence[Line], float]]) -> Any:
-    """The same of each step, in ms: its forms against its reference, whose time is the dotted line."""
+    """Draw error against run time in ms for each step: its forms, and the time of its reference as a dotted line."""
     columns = min(3, len(diagrams))
     rows = -(-len(diagrams) // columns)
     figure, axes = canvas(3.9 * columns + 0.4, 3.5 * rows + 0.7, rows, columns)
@@ -89,7 +91,7 @@ def steps(diagrams: Sequence[tuple[str, Sequence[Line], float]]) -> Any:
 
 @drawn
 def promises(asked: Sequence[float], measured: Mapping[str, Sequence[float]], proved: Sequence[float | None]) -> Any:
-    """What each tolerance gave, output by output, and what was proved, against what was asked."""
+    """Draw the measured error of each output, and the proved bound, against the tolerance that was asked for."""
     figure, axes = canvas(8.4, 5.0)
     ax = axes[0, 0]
     ax.loglog(asked, asked, color=BLACK, linewidth=1.2, label="as asked")
@@ -110,7 +112,7 @@ def promises(asked: Sequence[float], measured: Mapping[str, Sequence[float]], pr
 
 
 def _diagram(ax: Any, lines: Sequence[Line], styles: Styles, exact: float, *also: float | None) -> None:
-    """Lines and marks; ``also``: an error and a time that must be in the picture too, where there are such."""
+    """Draw lines and marks; ``also`` is an error and a time that the axes must include, where there are such."""
     ax.set_xscale("log")
     ax.set_yscale("log")
     dots = [d for line in lines for d in line.dots]
@@ -127,7 +129,7 @@ def _diagram(ax: Any, lines: Sequence[Line], styles: Styles, exact: float, *also
 
 
 def _room(values: Sequence[float], least: float, margin: float) -> tuple[float, float]:
-    """Limits that hold the values with a margin, and are at least a factor of ``least`` apart."""
+    """Return limits that hold the values with a margin and are at least a factor of ``least`` apart."""
     low, high = min(values) / margin, max(values) * margin
     wider = math.sqrt(max(1.0, least / (high / low)))
     return low / wider, high * wider
@@ -151,7 +153,7 @@ def _ring(ax: Any, own: Sequence[Dot]) -> None:
 
 
 def _tick_seconds(ax: Any) -> None:
-    """Ticks at 1, 2 and 5 of each decade, as plain numbers; at the decades alone where there are many."""
+    """Set ticks at 1, 2 and 5 of each decade, as plain numbers; at the decades alone where there are many."""
     from matplotlib.ticker import FuncFormatter, LogLocator, NullFormatter
 
     low, high = ax.get_xlim()
@@ -162,7 +164,7 @@ def _tick_seconds(ax: Any) -> None:
 
 
 def _say_exact(ax: Any, errors: Iterable[float], exact: float) -> None:
-    """A line where what is below any error that counts is drawn."""
+    """Draw a line at the level where points stand whose error is too small for the axis."""
     if any(e < exact for e in errors):
         ax.axhline(exact, color=_GREY, linewidth=0.8, linestyle=":")
         at = ax.get_yaxis_transform()
@@ -170,7 +172,7 @@ def _say_exact(ax: Any, errors: Iterable[float], exact: float) -> None:
 
 
 def _place_labels(figure: Any, shown: Sequence[tuple[Any, Sequence[Line], Styles, float]]) -> None:
-    """Each label at the first place beside its point where it covers no other; none where there is no such place."""
+    """Put each label at the first position beside its point where it covers no other; else leave the label out."""
     figure.canvas.draw()
     for ax, lines, styles, exact in shown:
         dots = [(d, styles[line.name][0]) for line in lines for d in line.dots]
@@ -207,7 +209,7 @@ def _label(figure: Any, ax: Any, dot: Dot, colour: str, taken: list[Any]) -> Non
 
 
 def _around(point: Any) -> Any:
-    """What a mark covers, in pixels."""
+    """Return the box of pixels that a mark covers."""
     from matplotlib.transforms import Bbox
 
     return Bbox.from_bounds(point[0] - 6, point[1] - 6, 12, 12)

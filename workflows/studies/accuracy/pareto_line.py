@@ -1,4 +1,4 @@
-"""Which points are worth their time: the Pareto line, and the engine's choice against the cheapest that does."""
+"""The Pareto line of points, and the engine's choice against the cheapest point that holds a tolerance."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ from typing import Protocol, TypeVar
 
 
 class Priced(Protocol):
-    """Something with a price and an error."""
+    """A thing with a price and an error."""
 
     @property
     def seconds(self) -> float: ...
@@ -22,7 +22,7 @@ P = TypeVar("P", bound=Priced)
 
 
 @dataclass(frozen=True)
-class Choice:
+class ToleranceChoice:
     """The engine's choice for a tolerance, and the cheapest point that holds it."""
 
     tolerance: float
@@ -31,17 +31,17 @@ class Choice:
 
     @property
     def held(self) -> bool:
-        """Whether what was chosen is within the tolerance."""
+        """Return True if the error of the chosen point is within the tolerance."""
         return self.chosen.most <= self.tolerance
 
     @property
     def ratio(self) -> float | None:
-        """What the choice costs over what the cheapest costs."""
+        """Return the run time of the chosen point over that of the cheapest point."""
         return None if self.cheapest is None else self.chosen.seconds / self.cheapest.seconds
 
 
-def front(points: Iterable[P]) -> list[P]:
-    """The points that none other beats in both time and error, the quickest first."""
+def pareto_front(points: Iterable[P]) -> list[P]:
+    """Return the points that no other point beats in both time and error, the quickest first."""
     line: list[P] = []
     for point in sorted(points, key=lambda p: (p.seconds, p.most)):
         if not line or point.most < line[-1].most:
@@ -50,11 +50,11 @@ def front(points: Iterable[P]) -> list[P]:
 
 
 def cheapest(points: Iterable[P], tolerance: float) -> P | None:
-    """The quickest point with no error above ``tolerance``."""
+    """Return the quickest point with no error above ``tolerance``."""
     return min((p for p in points if p.most <= tolerance), key=lambda p: p.seconds, default=None)
 
 
-def median_ratio(choices: Iterable[Choice]) -> float | None:
-    """Of the choices that some point holds, the median price over the cheapest."""
+def median_ratio(choices: Iterable[ToleranceChoice]) -> float | None:
+    """Return the median ratio of the choices whose tolerance some point holds."""
     ratios = [c.ratio for c in choices if c.ratio is not None]
     return median(ratios) if ratios else None

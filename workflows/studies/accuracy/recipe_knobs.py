@@ -1,8 +1,8 @@
-"""The knobs of a recipe: the values that trade accuracy for time, found by what they are to their nodes.
+"""The knobs of a recipe: the values that trade accuracy for time, found by their role in the nodes.
 
-What makes bands has a ``count``, a pupil has ``samples`` and a ``pitch``, what gives a PSF has the ``shape``
-of its window, and a ``precision`` is a choice of words. Where such a value stands in the recipe, and whether something
-else hangs on it, the recipe itself says.
+A node that makes bands has a ``count``, a pupil has ``samples`` and a ``pitch``, a node that gives a PSF has the
+``shape`` of its window, and a ``precision`` is a choice of words. The recipe shows where such a value is written and
+which other steps depend on the value.
 """
 
 from __future__ import annotations
@@ -26,7 +26,7 @@ _FEWER_SCALES = (0.75, 1.5)
 
 @dataclass(frozen=True)
 class Change:
-    """One setting of a knob; without overrides, the recipe's own."""
+    """One setting of a knob; without overrides, the recipe's own setting."""
 
     label: str
     overrides: tuple[str, ...]
@@ -34,7 +34,7 @@ class Change:
 
 @dataclass(frozen=True)
 class Knob:
-    """A value, or several that go together, and what they might be: the recipe's own among the rest, in order."""
+    """A value, or several values that change together, and the settings to try, in order, with the recipe's own."""
 
     name: str  #: as the recipe writes it: ``optics.bands``
     what: str
@@ -43,7 +43,7 @@ class Knob:
 
 @dataclass(frozen=True)
 class Knobs:
-    """The knobs that a recipe has, and why others are not turned."""
+    """The knobs that a recipe has, and the reasons why others are not turned."""
 
     found: tuple[Knob, ...]
     without: tuple[str, ...]
@@ -51,7 +51,7 @@ class Knobs:
 
 @dataclass(frozen=True)
 class _Place:
-    """Where the value of a parameter is written, and the steps of this kind that read it there."""
+    """The path at which the value of a parameter is written, and the steps that read the value there."""
 
     path: str
     value: Any
@@ -59,7 +59,7 @@ class _Place:
 
 
 def knobs(recipe: Recipe, quick: bool = False) -> Knobs:
-    """The knobs of the steps that the outputs of ``recipe`` need; ``quick``: fewer settings of each."""
+    """Return the knobs of the steps that the outputs of ``recipe`` need; ``quick``: with fewer settings of each."""
     found: list[Knob] = []
     without: list[str] = []
     for what, turned in (
@@ -77,7 +77,7 @@ def knobs(recipe: Recipe, quick: bool = False) -> Knobs:
 
 
 def finest(recipe: Recipe) -> Recipe:
-    """The recipe at its own sampling with nothing left out, and every step in the best precision that it has."""
+    """Return the recipe at its own sampling, with nothing left out and every step in its best precision."""
     best = [f"{place.path}={_words(place.steps[0], 'precision')[-1]}" for place in _places(recipe, "precision")]
     return replace(changed(recipe, best) if best else recipe, exact=True)
 
@@ -118,7 +118,7 @@ def _windows(recipe: Recipe, quick: bool) -> Iterator[Knob | str]:
 
 
 def _precisions(recipe: Recipe) -> Iterator[Knob | str]:
-    """All at once: one step in double behind one in single shows nothing."""
+    """Yield one knob for the precision of all steps: one step in double after one in single shows nothing."""
     if places := _places(recipe, "precision"):
         words = _words(places[0].steps[0], "precision")
         path = ", ".join(p.path for p in places)
@@ -126,7 +126,7 @@ def _precisions(recipe: Recipe) -> Iterator[Knob | str]:
 
 
 def _knob(path: str, settings: Sequence[tuple[Any, str, tuple[str, ...]]], own: Any) -> Knob:
-    """A knob of what is at ``path``: (value, label, overrides) by setting."""
+    """Return a knob of the value at ``path`` from the value, label and overrides of each setting."""
     return Knob(path, "", tuple(Change(label, () if value == own else how) for value, label, how in settings))
 
 
@@ -135,13 +135,13 @@ def _size(shape: Iterable[int]) -> str:
 
 
 def _words(step: Step, parameter: str) -> tuple[str, ...]:
-    """The words that a parameter may be, the coarsest first, as its node lists them."""
+    """Return the words that a parameter may be, the coarsest first, as its node lists them."""
     hint = step.node.hints[parameter]
     return tuple(map(str, get_args(hint))) if get_origin(hint) is Literal else (str(step.params[parameter]),)
 
 
 def _places(recipe: Recipe, parameter: str, gives: type | None = None, beside: str = "") -> list[_Place]:
-    """Where a parameter of the steps that are needed is written, each place once; what varies by item is left away."""
+    """Return where a parameter of the needed steps is written, each path once, without values that vary by item."""
     found: dict[str, _Place] = {}
     for name in needed(recipe, recipe.outputs):
         step = recipe.steps[name]
@@ -157,7 +157,7 @@ def _places(recipe: Recipe, parameter: str, gives: type | None = None, beside: s
 
 
 def _written(recipe: Recipe, step: Step, parameter: str) -> str | None:
-    """The path of the value that a parameter has: in a block of the recipe, or at the step itself."""
+    """Return the path of the value that a parameter has: in a block of the recipe, or at the step itself."""
     path = f"steps.{step.name.partition('[')[0]}.with.{parameter}"
     while True:
         setting = recipe.config.settings.get(path)
@@ -170,7 +170,7 @@ def _written(recipe: Recipe, step: Step, parameter: str) -> str | None:
 
 
 def _others(recipe: Recipe, parameter: str, place: _Place) -> list[str]:
-    """Steps beside those of a place that read it too; of a pitch, that have the same from elsewhere."""
+    """Return other steps that read the value of a place; for a pitch, steps with the same pitch from elsewhere."""
     mine = {step.name for step in place.steps}
     if parameter == "pitch":
         apart = (s for s in recipe.steps.values() if parameter in s.params and s.params[parameter] == place.value)

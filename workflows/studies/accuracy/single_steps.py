@@ -2,7 +2,7 @@
 
 Every step that takes more than a hundredth of the time and whose node has a reference is tried on its own
 inputs. Where the reference would take too long on them, all forms are tried on the middle of the
-pictures and on fewer bands, and that is said.
+pictures and on fewer bands, and the page says so.
 """
 
 from __future__ import annotations
@@ -17,20 +17,23 @@ from statistics import median
 from typing import Any, Literal, get_args, get_origin
 
 import torch
+from torch import Tensor
 
-from neusee.nodes.values import Channels, Mixture, Psf
-from neusee.workflows.engine.provenance import machine, timestamp
+from neusee.nodes import Node
+from neusee.nodes.values import BAND_FIELDS, Channels, Mixture, Psf
+from neusee.workflows.engine.provenance import machine
 from neusee.workflows.engine.runner import run
 from neusee.workflows.graph.recipe_graph import Recipe, Step, needed
 from neusee.workflows.graph.run_error import RunError
 from neusee.workflows.keys.cache_key import digest, key_of, stream_seed
 from neusee.workflows.keys.code_digest import Code
 from neusee.workflows.keys.engine_digest import engine
+from neusee.workflows.store.memo import compute_once
 from neusee.workflows.store.result_store import Store
 from neusee.workflows.store.serialization import each_tensor, tensors_in
-from neusee.workflows.studies.accuracy.smaller_inputs import Cut, cut, said
 from neusee.workflows.tolerance.error_norm import error_of
 
+Cut = tuple[int, int]  #: the longest side, and the most bands; 0 for all
 SHARE = 0.01  #: of the time, below which a step does not matter
 _ITEM = re.compile(r"\[.*?\]")
 _CUTS: Sequence[Cut] = ((32, 2), (64, 2), (128, 3), (256, 3), (512, 3), (1024, 3), (0, 3), (0, 0))
@@ -52,31 +55,31 @@ class Form:
 
 
 @dataclass(frozen=True)
-class Trying:
-    """What was found of a step; plain values, so that it can be kept."""
+class StepMeasurement:
+    """The forms of a step with their errors and times; plain values, so that the store can keep them."""
 
     forms: list[dict[str, Any]] = field(default_factory=list)
     reference: float = 0.0  #: s
-    cut: str = ""  #: what it was tried on; empty: on all
+    cut_inputs: str = ""  #: what it was tried on; empty: on all
     refused: str = ""
 
 
 @dataclass(frozen=True)
 class StepTried:
-    """A step that matters, or why it was not tried."""
+    """A step that matters, and its measurement or the reason why it was not tried."""
 
     step: str  #: the slowest of its items
     node: str
     share: float  #: of the time, with all its items
-    found: Trying
+    found: StepMeasurement
 
     @property
     def forms(self) -> list[Form]:
         return [Form(**form) for form in self.found.forms]
 
 
-def that_matter(recipe: Recipe, seconds: Mapping[str, float]) -> list[tuple[str, float]]:
-    """The slowest item of each step that takes more than `SHARE` of the time, with the share of all its items."""
+def steps_that_matter(recipe: Recipe, seconds: Mapping[str, float]) -> list[tuple[str, float]]:
+    """Return the slowest item of each step that takes more than `SHARE` of the time, and the share of all its items."""
     items: dict[str, list[str]] = defaultdict(list)
     for name in seconds:
         if name in recipe.steps:
@@ -87,15 +90,15 @@ def that_matter(recipe: Recipe, seconds: Mapping[str, float]) -> list[tuple[str,
 
 
 def try_step(recipe: Recipe, name: str, share: float, store: Store, patience: float) -> StepTried:
-    """The forms of a step of ``recipe``, from the store or tried now; ``patience``: s that its reference may take."""
+    """Return the forms of a step of ``recipe``, from the store or tried now.
+
+    ``patience`` is the longest time in seconds that the reference of the step may take.
+    """
     step = recipe.steps[name]
     if step.node.hooks.reference is None:
-        return StepTried(name, step.node.path, share, Trying(refused="its node has no reference"))
-    key = _key(recipe, name, patience, store)
-    if store.has(key):
-        return StepTried(name, step.node.path, share, Trying(**store.get(key)))
-    found = _tried(recipe, step, store, patience)
-    store.put(key, asdict(found), {"step": f"study accuracy: {name}", "seconds": patience, "date": timestamp()})
+        return StepTried(name, step.node.path, share, StepMeasurement(refused="its node has no reference"))
+    key, about = _key(recipe, name, patience, store), {"step": f"study accuracy: {name}"}
+    found = compute_once(store, key, StepMeasurement, lambda: _try_forms(recipe, step, store, patience), about)
     return StepTried(name, step.node.path, share, found)
 
 
@@ -107,21 +110,21 @@ def _key(recipe: Recipe, name: str, patience: float, store: Store) -> str:
     return digest("accuracy of a step", keys[name], patience, engine("studies.accuracy.single_steps"), machine())
 
 
-def _tried(recipe: Recipe, step: Step, store: Store, patience: float) -> Trying:
+def _try_forms(recipe: Recipe, step: Step, store: Store, patience: float) -> StepMeasurement:
     try:
         values = run(replace(recipe, exact=True), store, step.sources).values
     except RunError as error:
-        return Trying(refused=f"its inputs: {error.cause}")
+        return StepMeasurement(refused=f"its inputs: {error.cause}")
     inputs = [_gathered(step.wires.get(name), values) for name in step.node.inputs]
     with torch.no_grad():
         afforded = _largest(step, inputs, recipe.seed, patience)
         if afforded is None:
-            return Trying(refused="its reference runs neither on its inputs in time nor on a part of them")
+            return StepMeasurement(refused="its reference runs neither on its inputs in time nor on a part of them")
         size, truth, seconds = afforded
-        part = cut(step.node, inputs, size)
+        part = cut_inputs(step.node, inputs, size)
         forms = [asdict(form) for form in _forms(step, part, truth, recipe.seed)]
     whole = all(a.shape == b.shape for a, b in zip(tensors_in(inputs), tensors_in(part), strict=True))
-    return Trying(forms, seconds, "" if whole else said(step.node, size))
+    return StepMeasurement(forms, seconds, "" if whole else _words_of(step.node, size))
 
 
 def _gathered(wire: str | tuple[str, ...] | None, values: Mapping[str, Any]) -> Any:
@@ -129,15 +132,15 @@ def _gathered(wire: str | tuple[str, ...] | None, values: Mapping[str, Any]) -> 
 
 
 def _largest(step: Step, inputs: list[Any], seed: int, patience: float) -> tuple[Cut, Any, float] | None:
-    """The largest part of the inputs on which the reference is within the patience; its result and seconds."""
+    """Return the largest part of the inputs on which the reference is within the patience, its result and seconds."""
     best: tuple[Cut, Any, float] | None = None
     assert step.node.hooks.reference is not None
     for size in _CUTS:
         if best is not None and best[2] * _GROWTH > patience:
             break
-        part = cut(step.node, inputs, size)
+        part = cut_inputs(step.node, inputs, size)
         try:
-            truth, seconds = _once(lambda part=part: _call(step, step.node.hooks.reference, part, seed))  # type: ignore[misc]
+            truth, seconds = _time_once(lambda part=part: _call(step, step.node.hooks.reference, part, seed))  # type: ignore[misc]
         except Exception:  # a part of a picture may be no input for it: a larger one may
             continue
         best = (size, truth, seconds)
@@ -145,17 +148,17 @@ def _largest(step: Step, inputs: list[Any], seed: int, patience: float) -> tuple
 
 
 def _forms(step: Step, inputs: list[Any], truth: Any, seed: int) -> Iterator[Form]:
-    """The result of every way to compute the step, as far as it can be compared with the reference's."""
+    """Yield every way to compute the step whose result can be compared with that of the reference."""
     for (line, label), way in _ways(step, inputs, seed).items():
         try:
-            value, seconds = _timed(way)
-            yield Form(line, label, error_of(_meant(value), _meant(truth)), seconds)
+            value, seconds = _median_time(way)
+            yield Form(line, label, error_of(_compared_value(value), _compared_value(truth)), seconds)
         except (ValueError, RuntimeError):  # another shape, or a dtype that the form does not take
             continue
 
 
 def _ways(step: Step, inputs: list[Any], seed: int) -> dict[tuple[str, str], Callable[[], Any]]:
-    """As it is used, in each other precision, allowance and window that it has, and left out."""
+    """Return calls of the step: as used, in each other precision, allowance and window, and left out."""
     node = step.node
     ways: dict[tuple[str, str], Callable[[], Any]] = {(USED, ""): lambda: _call(step, node, inputs, seed)}
     for word in _others(step, "precision"):
@@ -177,7 +180,7 @@ def _ways(step: Step, inputs: list[Any], seed: int) -> dict[tuple[str, str], Cal
 
 
 def _inner(psf: Psf, share: float) -> Psf:
-    """The middle of a PSF; its centre stays at N // 2."""
+    """Return the middle of a PSF; its centre stays at N // 2."""
     x = psf.intensity
     for axis in (-2, -1):
         size = x.shape[axis]
@@ -186,8 +189,8 @@ def _inner(psf: Psf, share: float) -> Psf:
     return psf._replace(intensity=x)
 
 
-def _meant(value: Any) -> Any:
-    """What counts of a result: of a mixture the cube that it stands for, of channels the sums alone."""
+def _compared_value(value: Any) -> Any:
+    """Return the values to compare: the cube of a mixture, the sums of channels."""
     if isinstance(value, Mixture):
         return torch.einsum("bk,kyx->byx", value.basis.to(value.planes), value.planes)
     return (value.planes, value.flux) if isinstance(value, Channels) else value
@@ -204,16 +207,56 @@ def _call(step: Step, form: Any, inputs: list[Any], seed: int, **other: Any) -> 
     return form(*inputs, **{**step.params, **other}, **rng)
 
 
-def _once(way: Callable[[], Any]) -> tuple[Any, float]:
+def _time_once(way: Callable[[], Any]) -> tuple[Any, float]:
     began = time.perf_counter()
     value = way()
     return value, time.perf_counter() - began
 
 
-def _timed(way: Callable[[], Any]) -> tuple[Any, float]:
-    """The result, and the median of some calls after the first, which finds its tables."""
-    value, seconds = _once(way)
+def _median_time(way: Callable[[], Any]) -> tuple[Any, float]:
+    """Return the result, and the median time of some calls after the first one, which computes tables."""
+    value, seconds = _time_once(way)
     times = [] if seconds < _LONG_ENOUGH else [seconds]
     while len(times) < _TIMES and sum(times) < _LONG_ENOUGH:
-        times.append(_once(way)[1])
+        times.append(_time_once(way)[1])
     return value, median(times)
+
+
+# --- smaller inputs, on which the slow reference can be afforded ------------------------------------------------------
+
+
+def cut_inputs(node: Node, inputs: list[Any], size: Cut) -> list[Any]:
+    """Return ``inputs`` with no picture wider and no more bands than ``size``, where the node names the band axis."""
+    side, bands = size
+    found = []
+    for name, value in zip(node.inputs, inputs, strict=True):
+        axis = (node.bands or {}).get(name)
+        fewer = value if axis is None or not bands else _fewer(value, axis, bands)
+        found.append(each_tensor(lambda x: _middle(x, side), fewer) if side else fewer)
+    return found
+
+
+def _words_of(node: Node, size: Cut) -> str:
+    """Return the cut in words; an empty text where nothing is cut."""
+    side, bands = size
+    fewer = bands and (node.bands or {}).keys() - {"return"}
+    parts = [f"the middle {side} × {side}"] * bool(side) + [f"{bands} bands"] * bool(fewer)
+    return " and ".join(parts)
+
+
+def _middle(x: Tensor, side: int) -> Tensor:
+    for axis in (-2, -1) if x.ndim >= 2 and min(x.shape[-2:]) > side else ():
+        x = x.narrow(axis, x.shape[axis] // 2 - side // 2, side)
+    return x
+
+
+def _fewer(value: Any, axis: int, bands: int) -> Any:
+    """Return bands that are spread evenly over all bands."""
+    if isinstance(value, Tensor):
+        count = value.shape[axis]
+        if count <= bands:
+            return value
+        places = value.new_tensor([round((i + 0.5) * count / bands - 0.5) for i in range(bands)]).long()
+        return value.index_select(axis, places)
+    fields = BAND_FIELDS.get(type(value), ())
+    return value._replace(**{name: _fewer(getattr(value, name), axis, bands) for name in fields}) if fields else value

@@ -1,30 +1,34 @@
-"""Whether ranks are uniform and intervals hold what they say, and what chance alone would still do."""
+"""Tests of a posterior: whether ranks are uniform and intervals cover the truth, beyond what chance explains."""
 
 from __future__ import annotations
 
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 
+from neusee.workflows.report.figures.style import BLUE, VERMILION, canvas, drawn
 from neusee.workflows.studies.calibration.independent_draws import DRAWS
-from neusee.workflows.studies.calibration.simulated_sensors import Simulation
+from neusee.workflows.studies.calibration.simulated_sensors import SensorSimulation
 
 BINS, SHARE = 10, 0.9
-_CHANCE = 0.01  #: of a false alarm by the ranks, over all parameters together
-_CERTAIN = 0.999  #: of one parameter's coverage, that a right posterior keeps to its bar
+_CHANCE = 0.01  #: probability of a false alarm by the ranks, over all parameters together
+_DRAWN = 0.99  #: share of the bins of uniform ranks that lie in the band
+_GREY = "#777777"
+_CERTAIN = 0.999  #: probability that the coverage of a right posterior is within its limits
 #: exact but for the last digit; of 1000 it is .868 to .930
 _ROUNDED = {200: (0.825, 0.960), 1000: (0.870, 0.930)}
 
 
 @dataclass(frozen=True)
-class Verdict:
-    """What all simulations together say of one parameter."""
+class RankTest:
+    """The ranks and the coverage of one parameter over all simulations."""
 
     name: str
     counts: tuple[int, ...]  #: ranks by bin
-    p: float  #: of ranks no less uneven, were they uniform
+    p: float  #: probability that uniform ranks are as uneven as these
     least_p: float
     coverage: float  #: share of the simulations whose central 90 % hold the truth
     bar: tuple[float, float]  #: that it must lie in
@@ -44,42 +48,70 @@ class Verdict:
         return (not self.uniform) + (not self.covered)
 
 
-def verdicts(simulations: Sequence[Simulation]) -> list[Verdict]:
-    """One a parameter, of the simulations that gave a posterior."""
+def rank_tests(simulations: Sequence[SensorSimulation]) -> list[RankTest]:
+    """Return one test for each parameter, from the simulations that gave a posterior."""
     sound = [s for s in simulations if not s.refused]
     if not sound:
         raise ValueError(f"no simulation has a posterior; the first: {simulations[0].refused}")
     return [_verdict(name, sound, len(sound[0].rank)) for name in sound[0].rank]
 
 
-def _verdict(name: str, sound: Sequence[Simulation], parameters: int) -> Verdict:
+def _verdict(name: str, sound: Sequence[SensorSimulation], parameters: int) -> RankTest:
     from scipy.stats import chisquare
 
     counts, _ = np.histogram([s.rank[name] for s in sound], BINS, (-0.5, DRAWS + 0.5))
     z = np.array([s.z[name] for s in sound])
-    return Verdict(
+    return RankTest(
         name,
         tuple(counts.tolist()),
         float(chisquare(counts).pvalue),
         _CHANCE / parameters,
         float(np.mean([s.inside[name] for s in sound])),
-        bar(len(sound)),
+        coverage_limits(len(sound)),
         float(z.mean()),
         float(z.std(ddof=1)) if len(z) > 1 else math.nan,
     )
 
 
-def bar(count: int) -> tuple[float, float]:
-    """Between what the coverage of ``count`` simulations must lie: in 999 of 1000 cases it does."""
+def coverage_limits(count: int) -> tuple[float, float]:
+    """Return the limits of the coverage of ``count`` simulations; a right posterior keeps to them in 999 of 1000."""
     if count in _ROUNDED:
         return _ROUNDED[count]
-    low, high = band(count, SHARE, _CERTAIN)
+    low, high = chance_band(count, SHARE, _CERTAIN)
     return low / count, high / count
 
 
-def band(count: int, share: float, certain: float) -> tuple[float, float]:
-    """Between how many of ``count`` a share lies by chance."""
+def chance_band(count: int, share: float, certain: float) -> tuple[float, float]:
+    """Return the limits between which a share of ``count`` lies by chance."""
     from scipy.stats import binom
 
     low, high = binom.interval(certain, count, share)
     return float(low), float(high)
+
+
+@drawn
+def ranks(rank_tests: Sequence[RankTest]) -> Any:
+    """Draw a histogram for each parameter; the band holds 99 of 100 bins of uniform ranks."""
+    columns = min(3, len(rank_tests))
+    rows = -(-len(rank_tests) // columns)
+    figure, axes = canvas(3.4 * columns, 2.4 * rows + 0.4, rows, columns, sharex=True)
+    for ax, verdict in zip(axes.flat, rank_tests, strict=False):
+        _histogram(ax, verdict)
+    for ax in list(axes.flat)[len(rank_tests) :]:
+        ax.set_axis_off()
+    figure.supxlabel(f"draws below the truth, of {DRAWS}", fontsize=10)
+    figure.supylabel("simulations", fontsize=10)
+    return figure
+
+
+def _histogram(ax: Any, verdict: RankTest) -> None:
+    total, width = sum(verdict.counts), (DRAWS + 1) / BINS
+    low, high = chance_band(total, 1.0 / BINS, _DRAWN)
+    ax.axhspan(low, high, color="#cccccc", alpha=0.6, linewidth=0)
+    ax.axhline(total / BINS, color=_GREY, linewidth=0.8)
+    colour = BLUE if verdict.uniform else VERMILION
+    ax.bar([(i + 0.5) * width for i in range(BINS)], verdict.counts, 0.92 * width, color=colour, alpha=0.85)
+    ax.set_title(f"{verdict.name.replace('_', ' ')}: p = {verdict.p:.2g}")
+    ax.set_ylim(0, 1.15 * max(high, *verdict.counts))
+    ax.grid(False, axis="x")
+    ax.set_axisbelow(True)

@@ -1,8 +1,8 @@
-"""What a recipe need not compute, one by one: each as a change of the recipe that does everything in full.
+"""The possible omissions of a recipe: each as a change of the recipe that computes everything in full.
 
 There are three kinds. A step whose node bounds what it changes is left out, and its first input handed on. Light or
-dirt whose largest element is bounded is not added. Sums over bands stand in for an image of all bands. Whether the
-engine chose so is one thing; each can be tried alone.
+dirt whose largest element is bounded is not added. Sums over bands stand in for an image of all bands. Each
+omission can be tried alone, whether the engine chose it or not.
 """
 
 from __future__ import annotations
@@ -28,7 +28,7 @@ FactsOf = Callable[[str], TensorStats | None]
 
 @dataclass(frozen=True)
 class Omission:
-    """Steps that may be left out, or replaced by cheaper ones."""
+    """Steps that can be left out, or replaced by cheaper steps."""
 
     name: str
     kind: Kind
@@ -39,8 +39,8 @@ class Omission:
     at: tuple[str, ...]  #: where the change is looked at: the step itself, or what reads it
     beside: tuple[Step, ...] = ()  #: steps that stand in and are not in the recipe
 
-    def made(self, recipe: Recipe) -> Recipe:
-        """``recipe`` with this; everything else as it is there."""
+    def applied_to(self, recipe: Recipe) -> Recipe:
+        """Return ``recipe`` with this omission; everything else stays as it is there."""
         readers = set(recipe.steps) if self.kind != "stands in" else set(self.at)
         steps = {**recipe.steps, **{step.name: step for step in self.beside}}
         for name in readers & recipe.steps.keys():
@@ -50,7 +50,7 @@ class Omission:
         return replace(recipe, steps={name: steps[name] for name in order}, outputs=outputs)
 
     def value_of(self, step: str) -> str:
-        """The step that gives the value of ``step`` in a recipe that was made so."""
+        """Return the step that gives the value of ``step`` in a recipe with this omission."""
         return self.exchange.get(step, step) if self.kind == "handed on" else step
 
     def _wires(self, reader: Step) -> Mapping[str, Wire]:
@@ -66,7 +66,7 @@ def _exchanged(wire: Wire, exchange: Mapping[str, str]) -> Wire:
 
 
 def omissions(full: Recipe, chosen: Result, facts_of: FactsOf) -> Iterator[Omission]:
-    """All that the outputs of ``full`` could do without, as far as a bound says what that changes."""
+    """Yield every omission of ``full`` whose effect has a bound."""
     order = needed(full, full.outputs)
     yield from _stand_ins(full, order, chosen)
     for name in order:
@@ -97,7 +97,7 @@ def _not_added(recipe: Recipe, order: list[str], name: str, facts_of: FactsOf) -
 
 
 def _stand_ins(full: Recipe, order: list[str], chosen: Result) -> Iterator[Omission]:
-    """All images of a recipe together, for what compares two must get both in one form."""
+    """Yield one omission for all images of a recipe: a step that compares two images must get both in one form."""
     sparse = with_substitutions(replace(full, exact=False), full.outputs)
     exchange = {economy.step: economy.instead for economy in sparse.substitutions if economy.instead}
     if not exchange:
@@ -110,19 +110,19 @@ def _stand_ins(full: Recipe, order: list[str], chosen: Result) -> Iterator[Omiss
 
 
 def _adding(recipe: Recipe, order: list[str], name: str) -> tuple[str, ...]:
-    """The steps that a result is added to, if every reader can do without it."""
+    """Return the steps that add a result, if every reader only adds it; else nothing."""
     readers = [recipe.steps[n] for n in order if name in recipe.steps[n].sources]
     return tuple(reader.name for reader in readers) if all(_spares(reader, name) for reader in readers) else ()
 
 
 def _spares(reader: Step, name: str) -> bool:
-    """Whether a step reads a result only to add it."""
+    """Return True if a step reads a result only to add the result to something."""
     read = {i for i, wire in reader.wires.items() if name == wire or (isinstance(wire, tuple) and name in wire)}
     return read <= {light for light, *_ in reader.node.additive_inputs}
 
 
 def _largest(step: Step, facts_of: FactsOf) -> float:
-    """The bound of a step's largest element, by its node, from what was computed of its inputs."""
+    """Return the node's bound of the largest element of a step, from the statistics of its inputs."""
     assert step.node.hooks.zero_bound is not None
     facts = [_facts(step.wires.get(name), facts_of) for name in step.node.inputs]
     try:
@@ -136,7 +136,7 @@ def _facts(wire: Wire, facts_of: FactsOf) -> TensorStats | list[TensorStats | No
 
 
 def _share(largest: float, recipe: Recipe, at: tuple[str, ...], facts_of: FactsOf) -> float:
-    """The bound over the largest element of what it is added to; of what is not a plain tensor, only 0 is told."""
+    """Return the bound over the largest element of the sum; infinity where the sum is no tensor, 0 for no light."""
     if largest == 0:
         return 0.0
     if any(recipe.steps[name].node.hints.get("return") is not Tensor for name in at):

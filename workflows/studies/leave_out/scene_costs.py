@@ -1,15 +1,15 @@
-"""What simpler scenes cost: the recipe without its laser, in one colour, behind a clean window, each from nothing.
+"""The cost of simpler scenes: the recipe without its laser, in one colour, behind a clean window.
 
-Cost follows content where what is not in the scene is not computed. Each is run in a store of its own that is empty,
-in one process; what a process does only once is done before.
+Cost follows content where the engine does not compute what the scene lacks. Each scene is run in one process from an
+empty store, after a run that does what a process does only once.
 """
 
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from dataclasses import asdict, dataclass, replace
+from dataclasses import dataclass, replace
 
-from neusee.workflows.engine.provenance import machine, timestamp
+from neusee.workflows.engine.provenance import machine
 from neusee.workflows.engine.runner import Result, run
 from neusee.workflows.graph.diagnostics import RecipeError
 from neusee.workflows.graph.recipe_graph import Recipe, needed
@@ -18,20 +18,21 @@ from neusee.workflows.keys.cache_key import Key, digest, key_of
 from neusee.workflows.keys.code_digest import Code
 from neusee.workflows.keys.engine_digest import engine
 from neusee.workflows.recipe.changed_recipe import changed
+from neusee.workflows.store.memo import compute_once
 from neusee.workflows.store.result_store import Store
 from neusee.workflows.studies.cold_run import cold
 
 _TIMES = 3  #: cold runs, of which the median counts
 _QUICK = 5.0  #: s; what takes longer is run once
 _WINDOW = ("flare.dirt", "flare.ghosts")
-_UNREAD = "no step refers to it"
+_UNREAD = "no step refers to this value"
 _LIFT = "steps.cube={node: spectra.lift_mallett, from: {rgb: scene, bands: bands}}"  #: of as few bands as one
 _GREY = "steps.scene={node: scene.targets, with: {kind: siemens, shape: '${scene.shape}'}}"
 
 
 @dataclass(frozen=True)
-class Cost:
-    """What one scene took."""
+class SceneCost:
+    """The time that one scene took."""
 
     scene: str
     seconds: float  #: median of the engine's cold runs; nan where it could not be run
@@ -41,29 +42,28 @@ class Cost:
     refused: str = ""
 
 
-def costs(recipe: Recipe, store: Store, tell: Callable[[str], None]) -> Iterator[Cost]:
-    """The cost of each scene that ``recipe`` can be changed to; what was timed on this machine is not timed again."""
-    code, warm = Code(store.code_memo), False
+def measure_scenes(recipe: Recipe, store: Store, progress: Callable[[str], None]) -> Iterator[SceneCost]:
+    """Yield the cost of each scene that ``recipe`` can be changed to, from the store or measured on this machine."""
+    code, warm = Code(store.code_memo), list[Result]()
     for scene, made in scenes(recipe).items():
         if isinstance(made, str):
-            yield Cost(scene, float("nan"), 0.0, 0, (), made)
+            yield SceneCost(scene, float("nan"), 0.0, 0, (), made)
             continue
-        key = _key(made, code)
-        if not store.has(key):
-            if not warm:
-                _cold(made, store)
-                warm = True
-            store.put(
-                key, asdict(_cost(scene, made, store)), {"step": "study leave-out", "seconds": 0.0, "date": timestamp()}
-            )
-        found = store.get(key)
-        cost = Cost(**{**found, "scene": scene, "left_out": tuple(found["left_out"])})
-        tell(f"{scene}: {cost.seconds:.3g} s" if not cost.refused else f"{scene}: {cost.refused}")
+
+        def compute(scene: str = scene, made: Recipe = made) -> SceneCost:
+            if not warm:  # libraries are imported and code is read by the first run of a process
+                warm.append(_cold(made, store))
+            return _cost(scene, made, store)
+
+        cost = replace(
+            compute_once(store, _key(made, code), SceneCost, compute, {"step": "study leave-out"}), scene=scene
+        )
+        progress(f"{scene}: {cost.seconds:.3g} s" if not cost.refused else f"{scene}: {cost.refused}")
         yield cost
 
 
 def scenes(recipe: Recipe) -> dict[str, Recipe | str]:
-    """Other scenes for the same camera, as far as the recipe has what they change, and why one cannot be."""
+    """Return other scenes for the same camera, or the reason why a scene is not possible."""
     found: dict[str, Recipe | str] = {
         "everything in full": replace(recipe, exact=True),
         "as the recipe chooses": recipe,
@@ -77,7 +77,7 @@ def scenes(recipe: Recipe) -> dict[str, Recipe | str]:
 
 
 def _changed(recipe: Recipe, overrides: Sequence[str]) -> Recipe:
-    """``recipe`` with other values, and without those that no step refers to any more."""
+    """Return ``recipe`` with other values, and without the values that no step refers to any more."""
     try:
         return changed(recipe, overrides)
     except RecipeError as error:
@@ -103,7 +103,7 @@ def _overrides(recipe: Recipe) -> Mapping[str, Sequence[str]]:
 
 
 def _behind_the_window(recipe: Recipe) -> Iterator[str]:
-    """What lies on the window, what it reflects, and what only makes photons of that."""
+    """Return the steps of light on the window or reflected by it, and the steps that only make photons of it."""
     window = {name for name, step in recipe.steps.items() if step.node.path in _WINDOW}
     for name, step in recipe.steps.items():
         needs = {w for i, w in step.wires.items() if isinstance(w, str) and i not in step.node.optional}
@@ -119,18 +119,18 @@ def _bands(recipe: Recipe, start: str, stop: str, count: int) -> list[str]:
     return [f"{name}={value}" for name, value in zip(names, (start, stop, count), strict=True)]
 
 
-def _cost(scene: str, recipe: Recipe, store: Store) -> Cost:
+def _cost(scene: str, recipe: Recipe, store: Store) -> SceneCost:
     found: list[Result] = []
     try:
         while not found or (max(r.seconds for r in found) < _QUICK and len(found) < _TIMES):
             found.append(_cold(recipe, store))
     except RunError as error:
-        return Cost(scene, float("nan"), 0.0, 0, (), f"{error.step}: {error.cause}")
+        return SceneCost(scene, float("nan"), 0.0, 0, (), f"{error.step}: {error.cause}")
     result = sorted(found, key=lambda r: r.seconds)[len(found) // 2]
     ran = [done.seconds for done in result.done.values() if done.state == "run"]
     left_out = [done.step for done in result.done.values() if done.state == "left out"]
     replaced = [economy.step for economy in result.recipe.substitutions]
-    return Cost(scene, result.seconds, sum(ran), len(ran), (*left_out, *replaced))
+    return SceneCost(scene, result.seconds, sum(ran), len(ran), (*left_out, *replaced))
 
 
 def _cold(recipe: Recipe, store: Store) -> Result:
@@ -139,7 +139,7 @@ def _cold(recipe: Recipe, store: Store) -> Result:
 
 
 def _key(recipe: Recipe, code: Code) -> Key:
-    """What decides a time: all that the outputs need, what may be left out, the engine and the machine."""
+    """Return what decides a time: all that the outputs need, what may be left out, the engine and the machine."""
     keys: dict[str, Key] = {}
     for name in needed(recipe, recipe.outputs):
         keys[name], _ = key_of(recipe.steps[name], keys, recipe.seed, code)

@@ -28,7 +28,7 @@ _SMALLER = {"pixels": 256, "levels": 6, "grid": 16, "width": 4}  #: what else ma
 
 
 def with_losses(recipe: Recipe) -> dict[str, Step]:
-    """Every step of the recipe, the losses of what it measures, and what else is made of the same."""
+    """Return every step of the recipe, the losses of what it measures, and other steps that take the same inputs."""
     steps = dict(recipe.steps)
     for name, step in recipe.steps.items():
         for path, params in _COMPARES.get(step.node.path, ()):
@@ -42,7 +42,7 @@ def with_losses(recipe: Recipe) -> dict[str, Step]:
 
 
 def _grid(recipe: Recipe, node: Node, step: Step) -> dict[str, Any]:
-    """The pupil's grid, for what has to know it: that of the relief."""
+    """Return the grid of the pupil, that of the mask, for a node that has to know the grid."""
     if "samples" not in node.params.model_fields:
         return {}
     relief = recipe.steps[step.sources[0]].params
@@ -50,8 +50,8 @@ def _grid(recipe: Recipe, node: Node, step: Step) -> dict[str, Any]:
     return {"samples": relief["samples"], "aperture": relief["aperture"], **lengths}
 
 
-def smaller(steps: Mapping[str, Step], size: Size) -> dict[str, Step]:
-    """The same steps with fewer pixels, pupil samples and bands; a pupil keeps its diameter, a spot its place."""
+def with_size(steps: Mapping[str, Step], size: Size) -> dict[str, Step]:
+    """Return the steps with fewer pixels, pupil samples and bands; a pupil keeps its diameter, a spot its place."""
     sides = [side for step in steps.values() for name in ("shape",) for side in step.params.get(name) or ()]
     part = size.pixels / max(sides, default=size.pixels)
     return {name: replace(step, params=_smaller(step, size, part)) for name, step in steps.items()}
@@ -65,7 +65,7 @@ def _smaller(step: Step, size: Size, part: float) -> dict[str, Any]:
         params["pitch"] *= params["samples"] / size.samples
         params["samples"] = size.samples
     elif "pitch" in params and "diameter" in params:
-        params["pitch"] = None  # of a pupil: as of its relief, see `matched`
+        params["pitch"] = None  # of a pupil: as of its relief, see `with_matched_pupils`
     if step.node.path == "spectra.bands":
         params["count"] = size.bands
     if params.get("angle"):
@@ -73,8 +73,8 @@ def _smaller(step: Step, size: Size, part: float) -> dict[str, Any]:
     return params | {k: min(v, params[k]) for k, v in _SMALLER.items() if step.node.random and k in params}
 
 
-def matched(steps: Mapping[str, Step]) -> dict[str, Step]:
-    """Pupils sampled as the reliefs are."""
+def with_matched_pupils(steps: Mapping[str, Step]) -> dict[str, Step]:
+    """Return the steps with pupils sampled as the masks are."""
     pitches = [s.params["pitch"] for s in steps.values() if s.params.get("pitch") and "samples" in s.params]
     return {
         name: replace(step, params={**step.params, "pitch": pitches[0]}) if _open(step) else step
@@ -86,8 +86,8 @@ def _open(step: Step) -> bool:
     return "pitch" in step.params and step.params["pitch"] is None
 
 
-def changed(steps: Mapping[str, Step], case: Case) -> dict[str, Step]:
-    """The steps with the parameters of a case."""
+def with_parameters(steps: Mapping[str, Step], case: Case) -> dict[str, Step]:
+    """Return the steps with the parameters of a case."""
     return {name: replace(step, params=_changed(step, case)) for name, step in steps.items()}
 
 
@@ -102,20 +102,20 @@ def _changed(step: Step, case: Case) -> dict[str, Any]:
 
 
 @dataclass
-class Chain:
-    """One case, under way: nothing is computed before it is asked for."""
+class CaseRecipe:
+    """The recipe of one case; a value is computed when it is first asked for."""
 
     recipe: Recipe
     case: Case
     steps: dict[str, Step]
     keys: dict[str, Key] = field(default_factory=dict)
     values: dict[str, Any] = field(default_factory=dict)
-    refused: dict[str, str] = field(default_factory=dict)  #: steps that gave no value, and why
+    refused: dict[str, str] = field(default_factory=dict)  #: why a step gave no value, by step
 
     @classmethod
-    def of(cls, recipe: Recipe, case: Case, code: Code) -> Chain:
-        """The case with the key of each step; a result that the case puts there has its own."""
-        steps = changed(matched(smaller(with_losses(recipe), case.size)), case)
+    def of(cls, recipe: Recipe, case: Case, code: Code) -> CaseRecipe:
+        """Return the case with the key of each step; a result that the case replaces has a key of its own."""
+        steps = with_parameters(with_matched_pupils(with_size(with_losses(recipe), case.size)), case)
         chain = cls(recipe, case, steps)
         for name in in_order({n: s.sources for n, s in steps.items()}, steps):
             key, _ = key_of(steps[name], chain.keys, recipe.seed, code)
@@ -123,7 +123,7 @@ class Chain:
         return chain
 
     def inputs(self, name: str) -> list[Any]:
-        """What a step is given; `LookupError` where a step before it refused."""
+        """Return the inputs of a step; raise `LookupError` where an earlier step refused its inputs."""
         return [self._gathered(self.steps[name].wires.get(i)) for i in self.steps[name].node.inputs]
 
     def _gathered(self, wire: Any) -> Any:
@@ -162,8 +162,8 @@ def _put(step: Step, case: Case) -> Any:
     return next((change for path, change in case.values.items() if step.node.path.startswith(path)), None)
 
 
-def untouched(chain: Chain, usual: Chain) -> Iterator[str]:
-    """Steps of a case that are given what they are given in the usual one."""
+def unchanged_steps(chain: CaseRecipe, usual: CaseRecipe) -> Iterator[str]:
+    """Yield the steps of a case whose inputs and parameters are those of the usual case."""
     if chain.case is usual.case or chain.case.inputs or chain.case.alike:
         return
     for name, step in chain.steps.items():

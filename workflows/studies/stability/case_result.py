@@ -20,24 +20,23 @@ from neusee.workflows.graph.recipe_graph import Step
 from neusee.workflows.keys.cache_key import stream_seed
 from neusee.workflows.report.study_page import Mark
 from neusee.workflows.store.serialization import each_tensor, tensors_in
-from neusee.workflows.studies.stability.extreme_cases import Case
-from neusee.workflows.studies.stability.stated_limits import stated_of
+from neusee.workflows.studies.stability.extreme_cases import Case, stated_words
 from neusee.workflows.tolerance.error_norm import largest_error
 
-ROUNDING = 2.0**-23  #: a result in single precision is held to no less
-SLOPE = 1e-4  #: a gradient in single precision is held to that
-_NEAR = 0.5  #: of a bound, beyond which what holds is near it
-_STEEPER = 10.0  #: or to so many times the bound of the result, where that is more
-_LEAST = math.sqrt(torch.finfo(torch.float32).tiny)  #: below, an error counts over this: of what is denormal, a root
-_DIM = 1e-3  #: of the brightest, below which a part counts as dim
-_LIGHT = ("scene.", "spectra.", "optics.", "sensor.expose", "sensor.gather")  #: where what is dim may not drown
+ROUNDING = 2.0**-23  #: the least bound of a result in single precision
+SLOPE = 1e-4  #: the least bound of a gradient in single precision
+_NEAR = 0.5  #: share of a bound above which a cell warns
+_STEEPER = 10.0  #: the bound of a gradient over that of the result
+_LEAST = math.sqrt(torch.finfo(torch.float32).tiny)  #: the least scale of an error, a root above denormal numbers
+_DIM = 1e-3  #: share of the brightest element below which an element is dim
+_LIGHT = ("scene.", "spectra.", "optics.", "sensor.expose", "sensor.gather")  #: nodes that must keep dim parts
 _HUGE = 1e30  #: what infinity is compared with
 _HALVES = {torch.float16: 2.0**-11, torch.bfloat16: 2.0**-8}
 
 
 @dataclass(frozen=True)
 class Cell:
-    """What became of one step in one case."""
+    """The result of one step in one case."""
 
     mark: Mark
     note: str
@@ -48,11 +47,11 @@ class Cell:
 
 
 class _Refused(Exception):
-    """The step itself says that it cannot use what it is given."""
+    """A step's own error for inputs that it cannot use."""
 
 
 class _CountedInSingle(TorchFunctionMode):
-    """Poisson numbers as of a mean in single precision: of a mean that is another in the last digit they are others."""
+    """Poisson counts of the mean rounded to single precision: a mean with another last digit gives other counts."""
 
     def __torch_function__(self, func: Any, types: Any, args: Any = (), kwargs: Any = None) -> Any:
         if func is torch.poisson and args[0].dtype == torch.float64:
@@ -60,8 +59,8 @@ class _CountedInSingle(TorchFunctionMode):
         return func(*args, **(kwargs or {}))
 
 
-def judged(step: Step, inputs: Sequence[Any], case: Case, seed: int) -> Cell | None:
-    """Pass, warn or fail of one step; None where the case changes nothing of it."""
+def judge_step(step: Step, inputs: Sequence[Any], case: Case, seed: int) -> Cell | None:
+    """Return whether a step passes, warns or fails; None where the case changes nothing of the step."""
     given = _given(step, inputs, case)
     if given is None:
         return None
@@ -74,7 +73,7 @@ def judged(step: Step, inputs: Sequence[Any], case: Case, seed: int) -> Cell | N
 
 
 def _given(step: Step, inputs: Sequence[Any], case: Case) -> list[Any] | None:
-    """The inputs with the case in them; None where it changes none."""
+    """Return the inputs with the change of the case; None where the case changes none."""
     given = list(inputs)
     if case.alike:
         if len(given) < 2 or not all(isinstance(x, Tensor) and _is_picture(x) for x in given[:2]):
@@ -102,7 +101,7 @@ def _run(step: Step, fn: Any, inputs: Sequence[Any], seed: int, **params: Any) -
 
 
 def _as_used(step: Step, inputs: Sequence[Any], seed: int) -> Any:
-    """The step as a run takes it; what it refuses is told apart from what goes wrong here."""
+    """Return the result of the step as a run computes it; raise `_Refused` for the step's own `ValueError`."""
     try:
         return _run(step, step.node.fn, inputs, seed)
     except ValueError as error:
@@ -140,10 +139,10 @@ def _compared(step: Step, inputs: list[Any], case: Case, seed: int) -> Cell:
 
 
 def _verdict(error: float, bound: float, slope: float | None, steeper: float) -> Cell:
-    """Within its bound a cell passes; by less than twice, it warns."""
+    """Return a cell that passes within its bound, warns above half of the bound, and fails beyond."""
     used = [error / bound] if slope is None else [error / bound, slope / steeper]
     limit = None if slope is None else steeper
-    if not all(share <= 1.0 for share in used):  # nor is what is not a number
+    if not all(share <= 1.0 for share in used):  # NaN is not within its bound
         return Cell("fail", "", error, bound, slope, limit)
     if max(used) > _NEAR:
         return Cell("warn", "near its bound", error, bound, slope, limit)
@@ -151,13 +150,13 @@ def _verdict(error: float, bound: float, slope: float | None, steeper: float) ->
 
 
 def _error(value: Any, truth: Any) -> float:
-    """The largest difference over the largest element."""
+    """Return the largest difference over the largest element."""
     pairs = list(zip(tensors_in(value), tensors_in(truth), strict=True))
     return max((_over(a, b, _LEAST) for a, b in pairs), default=0.0)
 
 
 def _cancelled(step: Step, inputs: list[Any], truth: Tensor, seed: int) -> float:
-    """A sum of much that cancels is as good as what it sums: |f| over sum |x df/dx|, where that is less."""
+    """Return by how much a sum of terms that cancel is less exact: |f| over sum |x df/dx|, at most 1."""
     with torch.enable_grad():
         slopes = _true_slopes(step, inputs, seed) or []
     pictures = [x for x in tensors_in(inputs) if _is_picture(x)]
@@ -172,7 +171,7 @@ def _over(a: Tensor, b: Tensor, floor: float) -> float:
 
 
 def _dim_error(value: Any, truth: Any) -> float:
-    """The same among the elements far below the brightest."""
+    """Return the largest relative difference among the elements far below the brightest."""
     worst = 0.0
     for a, b in zip(tensors_in(value), tensors_in(truth), strict=True):
         dim = b.abs() < _DIM * b.abs().max() if b.is_floating_point() and b.ndim >= 2 else None
@@ -186,7 +185,7 @@ def _finite(value: Any) -> bool:
 
 
 def _fits(truth: Any) -> bool:
-    """Whether single precision can hold it."""
+    """Return True if single precision can hold every element."""
     top = torch.finfo(torch.float32).max
     return all(bool((x.abs() < top).all()) for x in tensors_in(truth) if x.is_floating_point())
 
@@ -195,7 +194,10 @@ def _fits(truth: Any) -> bool:
 
 
 def _slope_error(step: Step, inputs: list[Any], seed: int) -> float | None:
-    """Error of the gradient of a weighted sum of the result with respect to every picture; None where none flows."""
+    """Return the error of the gradient of a weighted sum of the result with respect to every picture.
+
+    Return None where no gradient flows.
+    """
     with torch.enable_grad():
         usual = _slopes(inputs, lambda given: _run(step, step.node.fn, given, seed))
         if usual is None:
@@ -206,12 +208,12 @@ def _slope_error(step: Step, inputs: list[Any], seed: int) -> float | None:
     pictures = [x for x in tensors_in(inputs) if _is_picture(x)]
     tops = [torch.finfo(torch.float32 if x.dtype == torch.float64 else x.dtype).max for x in pictures]
     if any(bool((g.abs() >= top).any()) for g, top in zip(truth, tops, strict=True)):
-        return 0.0  # steeper than the picture's own type, which a gradient has, can say
+        return 0.0  # steeper than the type of the picture, which is that of its gradient, can hold
     return max(_over(a, b, _slight(x)) for a, b, x in zip(usual, truth, pictures, strict=True))
 
 
 def _slight(picture: Tensor) -> float:
-    """The gradient of a mean, or the least that its type holds in full: of less, an error counts over this."""
+    """Return the floor of a gradient: that of a mean, or the least number that the type holds in full precision."""
     top = float(picture.detach().double().abs().max())
     return max(1.0 / (picture.numel() * max(top, _LEAST)), torch.finfo(picture.dtype).tiny)
 
@@ -225,7 +227,7 @@ def _true_slopes(step: Step, inputs: list[Any], seed: int) -> list[Tensor] | Non
 
 
 def _slopes(inputs: list[Any], fn: Any, wanted: list[int] | None = None) -> list[Tensor] | None:
-    """Gradients with respect to the pictures, or to the tensors that are ``wanted``, by identity."""
+    """Return gradients with respect to the pictures, or to the tensors whose identities are ``wanted``."""
     leaves: list[Tensor] = []
 
     def leaf(x: Tensor) -> Tensor:
@@ -242,7 +244,7 @@ def _slopes(inputs: list[Any], fn: Any, wanted: list[int] | None = None) -> list
 
 
 def _weighed(value: Any) -> Tensor | None:
-    """Every result that has a gradient, over a power of ten near its largest, times weights that never change."""
+    """Return the sum of every result with a gradient, over a power of ten near its largest, times fixed weights."""
     parts = [(x.double() * _weight(x) / _near(x)).sum() for x in tensors_in(value) if x.requires_grad]
     return torch.stack(parts).sum() if parts else None
 
@@ -252,21 +254,21 @@ def _weight(x: Tensor) -> Tensor:
 
 
 def _near(x: Tensor) -> float:
-    """A power of ten near the largest element, the same in every precision; 1 where all is slight, or one number."""
+    """Return a power of ten near the largest element, the same in every precision; 1 for a scalar or tiny elements."""
     top = float(x.detach().double().abs().max()) if x.ndim else 0.0
     return 10.0 ** round(math.log10(top) + 0.123) if _LEAST < top < math.inf else 1.0
 
 
-# --- numbers that are none --------------------------------------------------------------------------------------------
+# --- NaN and infinity ------------------------------------------------------------------------------------------------
 
 
 def _seen(step: Step, inputs: Sequence[Any], given: list[Any], case: Case, seed: int) -> Cell:
-    """A wrong number in any picture is refused, stays to be seen, or, infinite, counts as the limit of large ones."""
+    """Judge whether NaN or infinity in a picture is refused, shows in the result, or gives the limit of large ones."""
     notes, count = [], sum(_is_picture(x) for x in tensors_in(list(inputs)))
     for i in range(count):
         notes.append(_one_seen(step, _only(i, inputs, given), seed))
     hidden = [note for note in notes if note.startswith("hidden")]
-    stated = stated_of(step.node, case.name)
+    stated = stated_words(step.node, case.name)
     if hidden and stated is None:
         return Cell("fail", hidden[0])
     return Cell("pass", f"as stated: {stated}" if hidden else "; ".join(dict.fromkeys(notes)))
@@ -282,7 +284,7 @@ def _one_seen(step: Step, given: list[Any], seed: int) -> str:
             return "seen"
         bad = next(float(x[~x.isfinite()][0]) for x in tensors_in(given) if _is_picture(x) and not _finite(x))
         if math.isnan(bad):
-            return "hidden: a finite result of a number that is none"
+            return "hidden: a finite result of NaN"
         large = each_tensor(lambda x: x.nan_to_num(posinf=_HUGE, neginf=-_HUGE), given)
         limit = _run(step, step.node.fn, large, seed)
         same = _finite(limit) and largest_error(value, limit) <= max(step.node.rtol, ROUNDING)
@@ -290,7 +292,7 @@ def _one_seen(step: Step, given: list[Any], seed: int) -> str:
 
 
 def _only(which: int, inputs: Sequence[Any], given: Sequence[Any]) -> list[Any]:
-    """The inputs with the change in one picture alone."""
+    """Return the inputs with the change in one picture only."""
     old = [x for x in tensors_in(list(inputs)) if _is_picture(x)]
     new = [x for x in tensors_in(list(given)) if _is_picture(x)]
     swap = {id(old[which]): new[which]}

@@ -1,8 +1,8 @@
 """The catalogue of stiff and extreme cases: what is changed of a recipe, or of what each of its steps is given.
 
 A case changes parameters by ``node.parameter`` (``*.exposure`` of every node), results by the path of the node
-that made them, or, step by step, the inputs. What a node should make of them is not said here: the node's own
-reference and its own documented error are (`_extremes_cell`).
+that made them, or, step by step, the inputs. The expected result is not written here: it is that of the node's own
+reference, within the node's own documented error (`case_result`).
 """
 
 from __future__ import annotations
@@ -14,6 +14,7 @@ from typing import Any, Literal
 import torch
 from torch import Tensor
 
+from neusee.nodes import Node
 from neusee.nodes.optics import field_of_view
 from neusee.nodes.sensor import photons_that_fill
 from neusee.nodes.values import Pupil
@@ -24,7 +25,7 @@ Expect = Literal["accurate", "dim part", "seen"]
 
 @dataclass(frozen=True)
 class Size:
-    """How large the small recipe is."""
+    """The size of the small recipe."""
 
     pixels: int = 24  #: side of the scene; the rest in proportion
     samples: int = 64  #: side of the pupil
@@ -46,8 +47,25 @@ class Case:
     expect: Expect = "accurate"
 
 
+#: by node and case, the words of its docstring that say what becomes of NaN where the result cannot show it
+_STATED = {
+    ("restore.clipped", "NaN"): "so is what is not a number",
+    ("metrics.saturated", "NaN"): "so does one that is not a number",
+}
+
+
+def stated_words(node: Node, case: str) -> str | None:
+    """Return the words with which a node says what becomes of NaN; None where its docstring has no such words."""
+    words = _STATED.get((node.path, case))
+    return words if words is not None and _says(node, words) else None
+
+
+def _says(node: Node, words: str) -> bool:
+    return words in " ".join((node.__doc__ or "").split())
+
+
 def middle(value: float) -> Callable[[Tensor], Tensor]:
-    """A picture with one element changed, the one in the middle."""
+    """Return a function that changes the element in the middle of a picture."""
 
     def change(x: Tensor) -> Tensor:
         changed = x.clone()
@@ -66,7 +84,7 @@ def _peak_of(top: float) -> Callable[[Tensor], Tensor]:
 
 
 def _lamp(scene: Tensor) -> Tensor:
-    """The scene a million times darker than one lamp in it."""
+    """Return the scene a million times darker than one lamp in it."""
     return middle(1.0)(scene * (1e-6 / scene.max()))
 
 
@@ -79,7 +97,7 @@ def _noise(depth: float) -> Callable[[Tensor], Tensor]:
 
 
 def _steps(height: Tensor) -> Tensor:
-    """0.9 of a wave at 550 nm up and down from sample to sample, in fused silica: every step is aliased."""
+    """Return a height of 0.9 waves at 550 nm in fused silica on every second sample: every step is aliased."""
     v, u = (torch.arange(n) for n in height.shape)
     return ((v[:, None] + u) % 2 * 1.076e-6).to(height.dtype)
 
@@ -93,7 +111,7 @@ def _closed(pupil: Pupil) -> Pupil:
 
 
 def _off_axis(share: float) -> Callable[[Params], tuple[float, float]]:
-    """Where a spot lies that many sides of the sensor from its middle along x."""
+    """Return a function for the direction whose spot lies ``share`` sides of the sensor from its middle along x."""
     return lambda p: (0.0, share * field_of_view(p["focal_length"], p["pixel_pitch"], p["shape"])[1])
 
 

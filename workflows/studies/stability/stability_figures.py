@@ -1,4 +1,4 @@
-"""The grid of the stability study: a cell a colour, a sign and the number that is nearest its bound."""
+"""The grid of the stability study: each cell has a colour, a sign and the number that is nearest its bound."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ Entry = tuple[str, str, str, Cell]  #: group, case, node, cell
 
 @drawn
 def grid_picture(entries: Sequence[Entry]) -> Any:
-    """Cases down, nodes across, the losses last."""
+    """Draw the grid: cases down, nodes across, the losses last."""
     cases = list(dict.fromkeys((group, case) for group, case, _, _ in entries))
     nodes = sorted({node for _, _, node, _ in entries}, key=lambda n: (n.startswith("losses."), n))
     panels = max(1, -(-len(nodes) // _ACROSS))
@@ -35,7 +35,7 @@ def _panel(ax: Any, entries: Sequence[Entry], cases: list[tuple[str, str]], node
     for group, case, node, cell in entries:
         column, row = nodes.index(node), cases.index((group, case))
         ax.barh(row, 0.96, 0.92, left=column - 0.48, color=_COLOURS[cell.mark])
-        ax.text(column, row, words(cell), ha="center", va="center", color=BLACK, fontsize=9)
+        ax.text(column, row, cell_text(cell), ha="center", va="center", color=BLACK, fontsize=9)
     for row in range(1, len(cases)):
         if cases[row][0] != cases[row - 1][0]:
             ax.axhline(row - 0.5, color="#888888", linewidth=0.8)
@@ -49,22 +49,22 @@ def _panel(ax: Any, entries: Sequence[Entry], cases: list[tuple[str, str]], node
         spine.set_visible(False)
 
 
-def words(cell: Cell) -> str:
-    """What stands in a cell: a sign where it does not pass, and its number."""
+def cell_text(cell: Cell) -> str:
+    """Return the text of a cell: a sign where the cell does not pass, and its number."""
     sign = {"pass": "", "warn": "!", "fail": "×"}[cell.mark]
     if cell.error is None:
         short = "r" if cell.note.startswith("refused") else "s" if "seen" in cell.note else "–"
         return sign + short
     steep = cell.slope is not None and _share(cell.slope, cell.slope_bound) > _share(cell.error, cell.bound)
-    return f"{sign}{number(cell.slope or 0.0)}g" if steep else f"{sign}{number(cell.error)}"
+    return f"{sign}{short_number(cell.slope or 0.0)}g" if steep else f"{sign}{short_number(cell.error)}"
 
 
 def _share(value: float, bound: float | None) -> float:
     return value / bound if bound else 0.0
 
 
-def number(value: float) -> str:
-    """``2e-7``, in as few signs as tell the order of magnitude."""
+def short_number(value: float) -> str:
+    """Return a number such as ``2e-7`` in as few characters as show the order of magnitude."""
     if value == 0:
         return "0"
     if not math.isfinite(value):

@@ -1,4 +1,4 @@
-"""Outputs of a recipe at one draw of its inputs after another: only what they reach, several draws at once."""
+"""Outputs of a recipe at draws of its inputs: only the steps that an input reaches, several draws at once."""
 
 from __future__ import annotations
 
@@ -27,20 +27,22 @@ from neusee.workflows.keys.code_digest import Code
 from neusee.workflows.keys.engine_digest import engine
 from neusee.workflows.recipe.distributions.uncertain_inputs import Inputs
 from neusee.workflows.report.result_numbers import numbers_of
+from neusee.workflows.store.memo import compute_once
 from neusee.workflows.store.result_store import Store
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray
 
-    Places = NDArray[np.float64]
+    FloatArray = NDArray[np.float64]
 
 Numbers = dict[str, list[float]]  #: by quantity, such as ``restored_quality.psnr``, its elements
 _ARENAS, _MAPPED, _TRIM = -8, -4, -1  #: M_ARENA_MAX, M_MMAP_MAX and M_TRIM_THRESHOLD of glibc's mallopt
+_ABOUT = {"step": "study uncertainty"}
 _NARROW = 8  #: columns that a table has at most; what has more of both is a picture
 
 
-class Draws:
-    """Computes outputs at draws and keeps their numbers in the store, draw by draw."""
+class OutputDraws:
+    """Outputs at draws of the inputs; the store keeps their numbers, draw by draw."""
 
     def __init__(self, inputs: Inputs, store: Store, device: str = "cpu", workers: int = 0) -> None:
         self.inputs, self.store, self.device = inputs, store, device
@@ -57,18 +59,18 @@ class Draws:
 
     @cached_property
     def _function(self) -> Any:
-        """What the inputs do not reach is computed here, once."""
+        """Return the recipe as a function of the inputs; this computes once what no input reaches."""
         free = tuple(self.inputs.readers)
         return as_function(self.inputs.recipe, *free, outputs=self.outputs, store=self.store, device=self.device)
 
     def ready(self) -> float:
-        """Compute what no input reaches; the seconds it took."""
+        """Compute what no input reaches; return the seconds that this took."""
         began = time.perf_counter()
         _ = self._function
         return time.perf_counter() - began
 
-    def numbers(self, values: Places) -> list[Numbers]:
-        """All numbers of the outputs at each draw (draw, input); what is stored is not computed again."""
+    def numbers(self, values: FloatArray) -> list[Numbers]:
+        """Return all numbers of the outputs at each draw (draw, input), from the store or computed now."""
         keys = [self.key(row) for row in values]
         found = [kept and kept["numbers"] for kept in map(self._kept, keys)]
         lacking = [i for i, numbers in enumerate(found) if numbers is None]
@@ -76,28 +78,26 @@ class Draws:
             found[i] = self._keep(keys[i], result)
         return [numbers for numbers in found if numbers is not None]
 
-    def pictures(self, values: Places) -> dict[str, tuple[Tensor, Tensor]]:
-        """Mean and standard deviation of every output that is a picture, pixel by pixel; its numbers are kept too."""
+    def pictures(self, values: FloatArray) -> dict[str, tuple[Tensor, Tensor]]:
+        """Return mean and standard deviation of every output that is a picture, by pixel; keep the numbers too."""
         keys = [self.key(row) for row in values]
         whole = digest("uncertainty pictures", keys)
         if (first := self._kept(keys[0])) is not None and not first["pictures"]:
             return {}
-        with suppress(KeyError):
-            return _pairs(self.store.get(whole))
-        began, sums = time.perf_counter(), dict[str, _Sum]()
+        return _pairs(compute_once(self.store, whole, dict, lambda: self._sums(keys, values), _ABOUT))
+
+    def _sums(self, keys: Sequence[str], values: FloatArray) -> dict[str, Tensor]:
+        """Return mean and standard deviation of every picture over the draws, by name."""
+        sums = dict[str, _Sum]()
         for key, result in zip(keys, self._results(list(values)), strict=True):
             self._keep(key, result)
             for name, value in result.items():
                 if _is_picture(value):
                     sums.setdefault(name, _Sum()).add(value)
-        found = {part: x for name, s in sums.items() for part, x in ((f"{name} mean", s.mean), (f"{name} sd", s.sd))}
-        if found:
-            seconds = time.perf_counter() - began
-            self.store.put(whole, found, {"step": "study uncertainty", "seconds": seconds, "date": timestamp()})
-        return _pairs(found)
+        return {part: x for name, s in sums.items() for part, x in ((f"{name} mean", s.mean), (f"{name} sd", s.sd))}
 
-    def key(self, row: Places) -> str:
-        """What decides the outputs at a draw: the keys of a run with these values."""
+    def key(self, row: FloatArray) -> str:
+        """Return what decides the outputs at a draw: the keys of a run with these values."""
         recipe = self.inputs.recipe
         keys = self._keys(self.inputs.theta(self._named(row)))
         within = [recipe.tolerance, recipe.exact, self.device.partition(":")[0]]
@@ -109,7 +109,7 @@ class Draws:
         )
 
     def _keys(self, theta: Mapping[str, Any]) -> dict[str, str]:
-        """By step; without ``theta``, of those alone that no input reaches."""
+        """Return the key of each step; without ``theta``, only of the steps that no input reaches."""
         recipe, keys = self.inputs.recipe, dict(self._fixed) if theta else {}
         by_step: dict[str, dict[str, Any]] = {}
         for reader, value in theta.items():
@@ -133,12 +133,12 @@ class Draws:
     def _keep(self, key: str, result: Mapping[str, Any]) -> Numbers:
         numbers = quantities(result)
         shown = [name for name, value in result.items() if _is_picture(value)]
-        about = {"step": "study uncertainty", "seconds": self.seconds / max(1, self.computed), "date": timestamp()}
+        about = {**_ABOUT, "seconds": self.seconds / max(1, self.computed), "date": timestamp()}
         self.store.put_small(key, {"numbers": numbers, "pictures": shown}, about)
         return numbers
 
-    def _results(self, rows: Sequence[Places]) -> Iterator[dict[str, Any]]:
-        """Outputs at each draw, in order: as many at once as there are cores, each on one thread."""
+    def _results(self, rows: Sequence[FloatArray]) -> Iterator[dict[str, Any]]:
+        """Yield the outputs at each draw, in order: as many at once as there are cores, each on one thread."""
         if not rows:
             return
         self.ready()
@@ -152,7 +152,7 @@ class Draws:
                     yield result
                     began = time.perf_counter()
 
-    def _result(self, row: Places) -> dict[str, Any]:
+    def _result(self, row: FloatArray) -> dict[str, Any]:
         values = self._named(row)
         try:
             with torch.no_grad():
@@ -162,12 +162,12 @@ class Draws:
             raise ValueError(f"at {at}: {error}") from error
         return found
 
-    def _named(self, row: Places) -> dict[str, float]:
+    def _named(self, row: FloatArray) -> dict[str, float]:
         return dict(zip(self.inputs.names, map(float, row), strict=True))
 
 
 def quantities(result: Mapping[str, Any]) -> Numbers:
-    """Every small result by the name of its step and field."""
+    """Return every small result by the name of its step and field."""
     found: Numbers = {}
     for step, value in result.items():
         for _, field, _, number in () if _is_picture(value) else numbers_of(step, value):
@@ -216,9 +216,9 @@ class _Sum:
 
 @cache
 def _keep_memory() -> None:
-    """Let the process keep the memory of a draw for the next: to ask the system anew takes longer than to compute.
+    """Let the process keep the memory of a draw for the next one; asking the system again takes longer than computing.
 
-    Of glibc alone, and from now on.
+    This works with glibc only, and lasts for the rest of the process.
     """
     if sys.platform.startswith("linux"):
         with suppress(OSError, AttributeError):

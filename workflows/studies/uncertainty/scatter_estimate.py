@@ -1,4 +1,4 @@
-"""How much numbers scatter over draws, and how well that is known."""
+"""The scatter of numbers over draws, and the standard error of that scatter."""
 
 from __future__ import annotations
 
@@ -12,29 +12,32 @@ import numpy as np
 if TYPE_CHECKING:
     from numpy.typing import NDArray
 
-    Places = NDArray[np.float64]
+    FloatArray = NDArray[np.float64]
 
 _STILL = 1e-12  #: of the largest value: what varies by no more does not vary
 
 
 @dataclass(frozen=True)
 class Scatter:
-    """Of one quantity, element by element."""
+    """The scatter of one quantity, element by element."""
 
-    mean: Places
-    sd: Places
-    low: Places  #: 5 %
-    high: Places  #: 95 %
+    mean: FloatArray
+    sd: FloatArray
+    low: FloatArray  #: 5 %
+    high: FloatArray  #: 95 %
     error: float  #: relative, of the greatest standard deviation; 0 where nothing varies
 
     @property
     def is_constant(self) -> bool:
-        """Whether the quantity does not hang on what is drawn."""
+        """Return True if the quantity does not depend on the draws."""
         return not float(self.sd.max()) > 0
 
 
-def scatter(values: Places, sequences: int = 0) -> Scatter:
-    """Of (draw, element); with ``sequences``, draw i belongs to the scrambled sequence i % sequences."""
+def scatter(values: FloatArray, sequences: int = 0) -> Scatter:
+    """Return the scatter of values (draw, element).
+
+    With ``sequences``, draw i belongs to the scrambled sequence i % sequences.
+    """
     with np.errstate(invalid="ignore"):  # what is infinite in a draw has no deviation
         mean, sd = values.mean(0), values.std(0, ddof=1)
         low, high = np.quantile(values, [0.05, 0.95], axis=0)
@@ -44,8 +47,8 @@ def scatter(values: Places, sequences: int = 0) -> Scatter:
     return Scatter(mean, sd, low, high, error)
 
 
-def _jackknife(x: Places) -> float:
-    """Relative standard error of the standard deviation of independent draws, by leaving out one after another."""
+def _jackknife(x: FloatArray) -> float:
+    """Return the relative standard error of the standard deviation of independent draws, by the jackknife."""
     n = len(x)
     apart = (x - x.mean()) ** 2
     without = np.sqrt((apart.sum() - apart * n / (n - 1)).clip(0.0) / (n - 2))
@@ -53,8 +56,8 @@ def _jackknife(x: Places) -> float:
     return error / float(x.std(ddof=1))
 
 
-def _of_sequences(x: Places, count: int) -> float:
-    """The same from how sequences that know nothing of each other differ in their mean square about the common mean."""
+def _of_sequences(x: FloatArray, count: int) -> float:
+    """Return the relative standard error from how the mean squares of independent sequences differ."""
     squares = (x - x.mean()) ** 2
     each = np.array([squares[i::count].mean() for i in range(count)])
     return float(each.std(ddof=1) / math.sqrt(count) / each.mean() / 2)

@@ -1,4 +1,4 @@
-"""Which input makes a number scatter: variance-based indices by SALib, of inputs that know nothing of each other."""
+"""The share of each input in the scatter of a number: variance-based indices by SALib, for independent inputs."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ import numpy as np
 if TYPE_CHECKING:
     from numpy.typing import NDArray
 
-    Places = NDArray[np.float64]
+    FloatArray = NDArray[np.float64]
 
 EXPLAINED = 0.9  #: share of the variance that the polynomial must tell of draws that it has not seen
 _SALTELLI = 1024  #: points of the polynomial by input
@@ -21,7 +21,7 @@ _BY_TERM = 3  #: draws that a term of the polynomial asks for
 
 
 @dataclass(frozen=True)
-class Indices:
+class SobolIndices:
     """Shares of a variance, by input."""
 
     first: Sequence[float]  #: what the input does by itself, from the draws
@@ -31,24 +31,24 @@ class Indices:
     explained: float  #: share of the variance that the polynomial tells of draws that it has not seen
 
     @property
-    def told(self) -> bool:
-        """Whether the polynomial is good enough for its indices to mean anything."""
+    def explains_enough(self) -> bool:
+        """Return True if the polynomial explains enough of the variance for its indices to mean anything."""
         return self.explained >= EXPLAINED
 
 
 def require_salib() -> None:
-    """Raise ImportError that says how to get it."""
+    """Raise `ImportError` with the command that installs SALib, where SALib is missing."""
     try:
         import SALib  # noqa: F401
     except ImportError:
         raise ImportError("the study of uncertainty needs SALib: pip install 'neusee[uncertainty]'") from None
 
 
-def indices(names: Sequence[str], z: Places, y: Places, seed: int) -> Indices:
-    """Of a number ``y`` (draw,) by standard normal inputs ``z`` (draw, input), which draws hold together.
+def indices(names: Sequence[str], z: FloatArray, y: FloatArray, seed: int) -> SobolIndices:
+    """Return the shares of the variance of a number ``y`` (draw,) by standard normal inputs ``z`` (draw, input).
 
-    First-order indices are those of RBD-FAST, from the draws alone; total ones those of Saltelli's points (Sobol,
-    Jansen) on a polynomial of second order that was fitted to the draws.
+    First-order indices are those of RBD-FAST, from the draws only; total ones those of Saltelli's points (Sobol,
+    Jansen) on a polynomial of second order that is fitted to the draws.
     """
     from SALib.analyze import rbd_fast, sobol
     from SALib.sample import sobol as points
@@ -62,18 +62,18 @@ def indices(names: Sequence[str], z: Places, y: Places, seed: int) -> Indices:
     }
     fitted, explained = _fit(z, y)
     with warnings.catch_warnings():
-        warnings.simplefilter("ignore")  # of pandas and of indices of next to nothing
+        warnings.simplefilter("ignore")  # pandas warns, and so do indices next to nothing
         first = rbd_fast.analyze(problem, z, y, seed=seed)
         at = points.sample(problem, _SALTELLI, calc_second_order=False, seed=seed)
         total = sobol.analyze(problem, _terms(at, len(fitted)) @ fitted, calc_second_order=False, seed=seed)
     found = (first["S1"], first["S1_conf"], total["ST"], total["ST_conf"])
-    # a share that resampling knows nothing of is known to 1: few draws alone vary
+    # a share without an error by resampling gets an error of 1
     alone, alone_error, whole, whole_error = ([float(x) for x in np.nan_to_num(v, nan=1.0)] for v in found)
-    return Indices(alone, alone_error, whole, whole_error, explained)
+    return SobolIndices(alone, alone_error, whole, whole_error, explained)
 
 
-def _fit(z: Places, y: Places) -> tuple[Places, float]:
-    """Coefficients, and 1 - PRESS over the variance: what each draw's neighbours tell of it."""
+def _fit(z: FloatArray, y: FloatArray) -> tuple[FloatArray, float]:
+    """Return the coefficients, and the share of the variance that the polynomial predicts of draws left out (PRESS)."""
     many = _count(z.shape[1], 2)
     terms = _terms(z, many if many * _BY_TERM <= len(z) else _count(z.shape[1], 1))
     fitted = np.asarray(np.linalg.lstsq(terms, y, rcond=None)[0], np.float64)
@@ -86,8 +86,8 @@ def _count(inputs: int, order: int) -> int:
     return 1 + inputs + (inputs * (inputs + 1) // 2 if order == 2 else 0)
 
 
-def _terms(z: Places, count: int) -> Places:
-    """One, each input and, where ``count`` has room for them, products of two: Hermite's polynomials."""
+def _terms(z: FloatArray, count: int) -> FloatArray:
+    """Return Hermite's polynomials: one, each input, and products of two inputs where ``count`` has room for them."""
     columns = [np.ones(len(z)), *z.T]
     if count > len(columns):
         pairs = combinations_with_replacement(range(z.shape[1]), 2)

@@ -1,4 +1,4 @@
-"""Pictures of the study of uncertainty: tornado, bands, histograms, and where a picture is not sure."""
+"""Pictures of the study of uncertainty: tornado, bands, histograms, and the uncertain parts of a picture."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from neusee.workflows.report.figures.style import BLACK, BLUE, GREEN, ORANGE, VE
 if TYPE_CHECKING:
     from numpy.typing import NDArray
 
-    Places = NDArray[np.float64]
+    FloatArray = NDArray[np.float64]
 
 _GREY = "#777777"
 _COLOURS = (BLUE, VERMILION, GREEN, ORANGE)
@@ -26,7 +26,7 @@ _ALONG = 200  #: signals of a photon-transfer curve
 
 @drawn
 def tornado(swings: Mapping[str, Sequence[tuple[str, float, float]]], middles: Mapping[str, float]) -> Any:
-    """Of each number, how far an input alone moves it: (input, at its 5 %, at its 95 %), the widest on top."""
+    """Draw for each number how far an input alone moves it: (input, at its 5 %, at its 95 %), the widest on top."""
     columns = min(2, len(swings))
     rows = -(-len(swings) // columns)
     most = max(map(len, swings.values()))
@@ -54,8 +54,11 @@ def _bars(ax: Any, bars: Sequence[tuple[str, float, float]], middle: float) -> N
 
 
 @drawn
-def bands(curves: Mapping[str, tuple[Places, Mapping[str, Places]]], axis: str) -> Any:
-    """Of each family of curves (abscissa, draws by name: (draw, element)) the middle 90 %; below, over the median."""
+def bands(curves: Mapping[str, tuple[FloatArray, Mapping[str, FloatArray]]], axis: str) -> Any:
+    """Draw the middle 90 % of each family of curves; below, the same over the median.
+
+    A family is the abscissa and the draws (draw, element) by name.
+    """
     figure, axes = canvas(5.6 * len(curves), 5.4, 2, len(curves), sharex="col", height_ratios=[2, 1])
     for (ax, below), (family, (x, members)) in zip(axes.T, curves.items(), strict=True):
         for (name, draws), colour in zip(members.items(), _COLOURS * len(members), strict=False):
@@ -71,8 +74,8 @@ def bands(curves: Mapping[str, tuple[Places, Mapping[str, Places]]], axis: str) 
 
 
 @drawn
-def transfer(draws: Places) -> Any:
-    """The photon-transfer curve of (draw, level, signal | variance | predicted): deviation over signal, in DN."""
+def transfer(draws: FloatArray) -> Any:
+    """Draw the photon-transfer curve of (draw, level, signal | variance | predicted): deviation over signal, in DN."""
     figure, axes = canvas(6.6, 5.8, 2, 1, sharex=True, height_ratios=[2, 1])
     ax, below = axes[:, 0]
     for column, colour, name in ((2, BLUE, "predicted"), (1, ORANGE, "flat fields")):
@@ -87,8 +90,8 @@ def transfer(draws: Places) -> Any:
     return figure
 
 
-def _band(ax: Any, below: Any, x: Places, draws: Places, colour: str, name: str) -> None:
-    """Median and middle 90 %; below, the same over the median, where that is not next to nothing."""
+def _band(ax: Any, below: Any, x: FloatArray, draws: FloatArray, colour: str, name: str) -> None:
+    """Draw median and middle 90 %; below, the same over the median, where the median is not next to nothing."""
     low, middle, up = np.quantile(draws, [0.05, 0.5, 0.95], axis=0)
     ax.fill_between(x, low, up, color=colour, alpha=0.35, linewidth=0, label=name)
     ax.plot(x, middle, color=colour, linewidth=1.0)
@@ -97,8 +100,8 @@ def _band(ax: Any, below: Any, x: Places, draws: Places, colour: str, name: str)
     below.fill_between(x[seen], *share, color=colour, alpha=0.35, linewidth=0.8)
 
 
-def _at_one_signal(draws: Places, column: int) -> tuple[Places, Places]:
-    """Each draw's curve at the same signals, which all draws reach: its light, and with it each level, is its own."""
+def _at_one_signal(draws: FloatArray, column: int) -> tuple[FloatArray, FloatArray]:
+    """Return each draw's curve at the same signals, which all draws reach; the levels of each draw differ."""
     lit = draws[:, 1:]
     ends = float(lit[..., 0].clip(1e-9).min(1).max()), float(lit[..., 0].max(1).min())
     signal = np.geomspace(*ends, _ALONG)
@@ -110,8 +113,8 @@ def _at_one_signal(draws: Places, column: int) -> tuple[Places, Places]:
 
 
 @drawn
-def histograms(draws: Mapping[str, Places], middles: Mapping[str, float]) -> Any:
-    """Every number over all draws; the line is where all inputs are at their median."""
+def histograms(draws: Mapping[str, FloatArray], middles: Mapping[str, float]) -> Any:
+    """Draw every number over all draws; the line is the number with all inputs at their median."""
     columns = min(3, len(draws))
     rows = -(-len(draws) // columns)
     figure, axes = canvas(3.6 * columns, 2.5 * rows, rows, columns)
@@ -130,7 +133,7 @@ def histograms(draws: Mapping[str, Places], middles: Mapping[str, float]) -> Any
 
 @drawn
 def pictures(found: Mapping[str, tuple[Tensor, Tensor]]) -> Any:
-    """Mean and standard deviation, pixel by pixel; of three channels the deviation is their mean."""
+    """Draw mean and standard deviation, pixel by pixel; for three channels the mean of the three deviations."""
     figure, axes = canvas(9.6, 4.2 * len(found), len(found), 2)
     for (left, right), (name, (mean, sd)) in zip(axes, found.items(), strict=True):
         white = high(mean.clamp_min(0))

@@ -1,4 +1,4 @@
-"""The study of uncertainty on paper."""
+"""The page of the study of uncertainty."""
 
 from __future__ import annotations
 
@@ -16,9 +16,9 @@ from neusee.workflows.studies.uncertainty.sobol_indices import EXPLAINED
 if TYPE_CHECKING:
     from numpy.typing import NDArray
 
-    from neusee.workflows.studies.uncertainty.uncertainty_result import Found
+    from neusee.workflows.studies.uncertainty.uncertainty_result import UncertaintyResult
 
-    Places = NDArray[np.float64]
+    FloatArray = NDArray[np.float64]
 
 _MOST = 12  #: numbers that are drawn
 _LITTLE = 0.01  #: share of a variance that is not worth a row
@@ -26,8 +26,8 @@ _TRANSFER = "sensor.photon_transfer"
 _NOT_TOLD = {"upper": "only an upper limit", "lower": "only a lower limit", "none": "nothing"}
 
 
-def drawn(found: Found) -> dict[str, bytes]:
-    """The pictures, by name."""
+def draw_pictures(found: UncertaintyResult) -> dict[str, bytes]:
+    """Return the pictures, by name."""
     shown = {}
     numbers = found.numbers[:_MOST]
     if numbers:
@@ -44,10 +44,10 @@ def drawn(found: Found) -> dict[str, bytes]:
     return shown
 
 
-def _curves(found: Found) -> tuple[dict[str, tuple[Places, dict[str, Places]]], str] | None:
-    """Families of curves, such as that of both arms, by the name of their step."""
+def _curves(found: UncertaintyResult) -> tuple[dict[str, tuple[FloatArray, dict[str, FloatArray]]], str] | None:
+    """Return families of curves, such as that of both arms, by the name of their step."""
     wavelengths = _wavelengths(found)
-    curves: dict[str, tuple[Places, dict[str, Places]]] = {}
+    curves: dict[str, tuple[FloatArray, dict[str, FloatArray]]] = {}
     spectral = True
     for name, values in found.values.items():
         count = values.shape[1]
@@ -66,22 +66,22 @@ def _curves(found: Found) -> tuple[dict[str, tuple[Places, dict[str, Places]]], 
     return (curves, "wavelength (nm)" if spectral else "element") if curves else None
 
 
-def _wavelengths(found: Found) -> Places | None:
+def _wavelengths(found: UncertaintyResult) -> FloatArray | None:
     recipe = found.inputs.recipe
     if BANDS not in recipe.steps:
         return None
-    centres: Places = run(recipe, None, [BANDS])[BANDS].centres.double().numpy()
+    centres: FloatArray = run(recipe, None, [BANDS])[BANDS].centres.double().numpy()
     return centres * 1e9
 
 
-def _node(found: Found, quantity: str) -> str:
+def _node(found: UncertaintyResult, quantity: str) -> str:
     steps = found.inputs.recipe.steps
     name = quantity if quantity in steps else quantity.rpartition(".")[0]
     return steps[name].node.path if name in steps else ""
 
 
-def lead(found: Found) -> str:
-    """What came out."""
+def lead(found: UncertaintyResult) -> str:
+    """Return the result in a few sentences."""
     count, kind = len(found.points.z), "points of Sobol" if found.sequences else "independent draws"
     held = f"every standard deviation is known to {found.error:.1%}"
     if found.error > found.wanted:
@@ -93,34 +93,34 @@ def lead(found: Found) -> str:
     return f"{count} {kind} of {', '.join(found.inputs.names)}: {held}.{strange}\n\n{'; '.join(values)}."
 
 
-def _beside(found: Found, name: str) -> str:
+def _beside(found: UncertaintyResult, name: str) -> str:
     s = found.scatter[name]
     return f"{float(s.mean[0]):.5g} ± {float(s.sd[0]):.2g}"
 
 
-def sections(found: Found, shown: Mapping[str, bytes]) -> list[Section]:
-    """Inputs, numbers, what moves them, curves, pictures, and what does not hang on any."""
+def sections(found: UncertaintyResult, shown: Mapping[str, bytes]) -> list[Section]:
+    """Return the parts of the page: inputs, numbers, what moves them, curves, pictures, and what is constant."""
     parts = [_inputs(found), *_posterior(found), _numbers(found, shown.get("numbers"))]
     parts += _moves(found, shown.get("tornado"))
     if "bands" in shown:
         text = "The middle 90 % of the draws, element by element."
         parts.append(Section("Curves", text, picture=shown["bands"]))
     if "transfer" in shown:
-        text = """What a laboratory would measure of the sensors that were drawn, by the steps that make the picture.
-            The prediction has no chance of its own; flat fields have that of their pixels, for each draw has its own
-            light."""
+        text = """The curves that a laboratory would measure of the drawn sensors, by the steps that make the picture.
+            The prediction has no noise of its own. Flat fields have the noise of their pixels, because each draw has
+            its own light."""
         parts.append(Section("Photon-transfer curve", text, picture=shown["transfer"]))
     if "pictures" in shown:
         text = """Mean and standard deviation of each pixel over the first 32 draws, the deviation known to 13 %. The
-            noise is the same in all draws: what is seen is what the inputs leave open; pictures.npz has the numbers."""
+            noise is the same in all draws, so only the inputs matter; pictures.npz has the numbers."""
         parts.append(Section("Pictures", text, picture=shown["pictures"]))
     return [*parts, *_rest(found)]
 
 
-def _inputs(found: Found) -> Section:
-    text = """What was drawn, in SI. Of values that are known together the first moves with all that goes with it, and
-        each further one by what is left of it: these are independent, and so are all others. The same noise is drawn
-        every time, so that only the inputs make a difference."""
+def _inputs(found: UncertaintyResult) -> Section:
+    text = """The drawn values, in SI. In a joint distribution the first value moves together with the others as far as
+        they correlate, and each further one by what is left of it, so that all inputs are independent. The same noise
+        is drawn every time, so that only the inputs make a difference."""
     rows = []
     for name, label, x in zip(found.inputs.names, found.inputs.labels, found.points.values.T, strict=True):
         law = found.inputs.uncertain.said(name)
@@ -128,12 +128,12 @@ def _inputs(found: Found) -> Section:
     return Section("Inputs", text, ("value", "drawn as", "law", "mean", "sd"), rows)
 
 
-def _posterior(found: Found) -> list[Section]:
+def _posterior(found: UncertaintyResult) -> list[Section]:
     standings = [s for s in found.inputs.uncertain.standings if s.path in found.inputs.names]
     if not standings:
         return []
-    text = """Where the recipe's own value lies. What its frames tell only as a limit, or not at all, is drawn from what
-        is mostly the prior of the calibration."""
+    text = """Where the recipe's own value lies in the posterior. A value that the frames only limit, or do not
+        determine, is drawn mostly from the prior of the calibration."""
     rows, marks = [], dict[tuple[int, int], Mark]()
     for i, s in enumerate(standings):
         rows.append((s.path, s.own, f"{s.mean:.6g}", s.sd, s.below, _NOT_TOLD.get(s.kind, "estimate")))
@@ -145,8 +145,8 @@ def _posterior(found: Found) -> list[Section]:
     return [Section("The recipe beside its posterior", text, columns, rows, marks=marks)]
 
 
-def _numbers(found: Found, picture: bytes | None) -> Section:
-    text = f"""Error: of the standard deviation, relative, {_how(found)}. Of a curve: its element that scatters most."""
+def _numbers(found: UncertaintyResult, picture: bytes | None) -> Section:
+    text = f"""Error: of the standard deviation, relative, {_how(found)}. Of a curve, the worst element."""
     columns = ("quantity", "at the medians", "mean", "sd", "error", "5 %", "95 %")
     rows, marks = list[Sequence[Any]](), dict[tuple[int, int], Mark]()
     for name, s in found.scatter.items():
@@ -158,13 +158,13 @@ def _numbers(found: Found, picture: bytes | None) -> Section:
     return Section("Numbers", text, columns, rows, picture, marks)
 
 
-def _how(found: Found) -> str:
+def _how(found: UncertaintyResult) -> str:
     if found.sequences:
         return f"by how {found.sequences} scrambled sequences differ"
     return "by the jackknife"
 
 
-def _moves(found: Found, picture: bytes | None) -> list[Section]:
+def _moves(found: UncertaintyResult, picture: bytes | None) -> list[Section]:
     if picture is None:
         return []
     text = f"""Each input by itself at its 5 and its 95 %, all others at their median. The table: shares of the variance
@@ -179,16 +179,16 @@ def _moves(found: Found, picture: bytes | None) -> list[Section]:
         before = len(rows)
         each = zip(found.inputs.labels, shares.first, shares.first_error, shares.total, shares.total_error, strict=True)
         for label, first, about, total, beside in each:
-            share, error = (total, beside) if shares.told else (first, about)
+            share, error = (total, beside) if shares.explains_enough else (first, about)
             if share > max(_LITTLE, error / 2):
-                both = (total, beside) if shares.told else (None, None)
+                both = (total, beside) if shares.explains_enough else (None, None)
                 rows.append((name, label, first, about, *both, shares.explained))
-        if len(rows) > before and not shares.told:
+        if len(rows) > before and not shares.explains_enough:
             marks[before, 6] = "warn"
     return [Section("What moves them", text, columns, rows, picture, marks)]
 
 
-def _rest(found: Found) -> list[Section]:
+def _rest(found: UncertaintyResult) -> list[Section]:
     said = [f"No input reaches {', '.join(found.is_constant)}: these are as in a run."] if found.is_constant else []
     said += [f"{', '.join(found.inputs.idle)} reach no output, and were not drawn."] if found.inputs.idle else []
     return [Section("What does not vary", "\n\n".join(said))] if said else []

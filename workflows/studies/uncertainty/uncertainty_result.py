@@ -9,27 +9,27 @@ from typing import TYPE_CHECKING
 import numpy as np
 from torch import Tensor
 
-from neusee.workflows.recipe.distributions.uncertain_inputs import Inputs, Points
+from neusee.workflows.recipe.distributions.uncertain_inputs import InputDraws, Inputs
 from neusee.workflows.studies.uncertainty.scatter_estimate import Scatter, worst_known
-from neusee.workflows.studies.uncertainty.sobol_indices import Indices
+from neusee.workflows.studies.uncertainty.sobol_indices import SobolIndices
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray
 
-    Places = NDArray[np.float64]
+    FloatArray = NDArray[np.float64]
 
 
 @dataclass(frozen=True)
-class Found:
+class UncertaintyResult:
     """All that the study measured."""
 
     inputs: Inputs
-    points: Points  #: those that were used
-    values: Mapping[str, Places]  #: by quantity (draw, element)
+    points: InputDraws  #: those that were used
+    values: Mapping[str, FloatArray]  #: by quantity (draw, element)
     scatter: Mapping[str, Scatter]
     middle: Mapping[str, Sequence[float]]  #: every input at its median
     swings: Mapping[str, Sequence[tuple[str, float, float]]]  #: by number: input, at its 5 %, at its 95 %
-    shares: Mapping[str, Indices]  #: by number
+    shares: Mapping[str, SobolIndices]  #: by number
     pictures: Mapping[str, tuple[Tensor, Tensor]]
     is_constant: tuple[str, ...]  #: outputs that no input reaches
     wanted: float  #: relative error
@@ -37,25 +37,25 @@ class Found:
 
     @property
     def error(self) -> float:
-        """The greatest relative error of a standard deviation."""
+        """Return the greatest relative error of a standard deviation."""
         return worst_known(self.scatter)[1]
 
     @property
     def worst(self) -> str:
-        """The quantity that has it."""
+        """Return the quantity whose standard deviation has the greatest relative error."""
         return worst_known(self.scatter)[0]
 
     @property
     def strange(self) -> list[str]:
-        """Quantities that are not finite in some draw."""
+        """Return the quantities that are not finite in some draw."""
         return [name for name, x in self.values.items() if not np.isfinite(x).all()]
 
     @property
     def failed(self) -> int:
-        """Bars that do not hold: the error that was asked for, and that all is finite."""
+        """Return how many bars do not hold: the error that was asked for, and that every quantity is finite."""
         return len(self.strange) + (not self.error <= self.wanted)
 
     @property
     def numbers(self) -> list[str]:
-        """Quantities of one element that vary, without those that are another one in another unit."""
+        """Return the quantities of one element that vary, each once where two differ only by their unit."""
         return list(self.swings)

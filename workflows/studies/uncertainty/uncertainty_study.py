@@ -1,37 +1,32 @@
-"""The study of uncertainty: what a recipe's outputs are worth, its values being known only so well."""
+"""The study of uncertainty: how far a recipe's outputs scatter when its uncertain values do."""
 
 from __future__ import annotations
 
 import io
-import json
-import time
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import asdict
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from neusee.workflows.engine.provenance import timestamp, versions
 from neusee.workflows.graph.recipe_graph import Recipe
 from neusee.workflows.keys.cache_key import digest
 from neusee.workflows.recipe.distributions.joint import Z_90
 from neusee.workflows.recipe.distributions.nominal_values import told
-from neusee.workflows.recipe.distributions.uncertain_inputs import SCRAMBLES, Inputs, Points
-from neusee.workflows.report.run_folder import RunFolder, new_run
-from neusee.workflows.report.study_page import page
+from neusee.workflows.recipe.distributions.uncertain_inputs import SCRAMBLES, InputDraws, Inputs
+from neusee.workflows.report.study_folder import Content, Progress, StudyReport, StudyRun
 from neusee.workflows.store.result_store import Store
-from neusee.workflows.studies.uncertainty.output_draws import Draws, Numbers
+from neusee.workflows.studies.uncertainty.output_draws import Numbers, OutputDraws
 from neusee.workflows.studies.uncertainty.scatter_estimate import Scatter, scatter, worst_known
 from neusee.workflows.studies.uncertainty.sobol_indices import indices, require_salib
-from neusee.workflows.studies.uncertainty.uncertainty_result import Found
+from neusee.workflows.studies.uncertainty.uncertainty_result import UncertaintyResult
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray
 
-    Places = NDArray[np.float64]
+    FloatArray = NDArray[np.float64]
 
-Tell = Callable[[str], None]
 LEAST = 64  #: draws before any stop
 _ROUND = 16  #: independent draws by round
 PICTURED = 32  #: draws that pictures are made of: a deviation to 13 %
@@ -43,7 +38,7 @@ def study(
     store: Store,
     runs: Path,
     command: Sequence[str],
-    tell: Tell,
+    progress: Progress,
     error: float = 0.05,
     most: int = 1000,
     points: str = "draws",
@@ -52,43 +47,44 @@ def study(
 ) -> Path:
     """Draw until every standard deviation is known to a relative ``error``, or ``most`` draws are made.
 
-    ``workers`` draws are made at once, on the CPU one a core where it is 0; on another ``device`` one after another.
+    ``workers`` draws are made at once; 0 means one for each core of the CPU. Another ``device`` makes one after
+    another.
     """
-    began = time.perf_counter()
+    study_run = StudyRun("uncertainty", recipe, command)
     require_salib()
     inputs = Inputs.of(recipe)
     at = _points(inputs, recipe.seed, most, points)
     inputs.checked(np.concatenate([at.values, _ends(inputs)]))
-    draws = Draws(inputs, store, device, workers)
-    found = _found(inputs, draws, at, tell, error, SCRAMBLES if points == "sobol" else 0)
-    doc = _document(found, draws, command, time.perf_counter() - began)
-    with new_run(runs, f"{recipe.name}_uncertainty", digest(doc["quantities"])) as folder:
-        _write(folder, found, doc)
-    return folder.path
+    draws = OutputDraws(inputs, store, device, workers)
+    found = _measure(inputs, draws, at, progress, error, SCRAMBLES if points == "sobol" else 0)
+    document = study_run.document(_document(found, draws))
+    return study_run.write(runs, digest(document["quantities"]), document, _report(found))
 
 
-def _points(inputs: Inputs, seed: int, most: int, points: str) -> Points:
+def _points(inputs: Inputs, seed: int, most: int, points: str) -> InputDraws:
     if points == "sobol":
         return inputs.sobol(SCRAMBLES * 2 ** int(np.log2(max(most, LEAST) / SCRAMBLES)), seed)
     return inputs.independent(most if inputs.most is None else min(most, inputs.most), seed)
 
 
-def _ends(inputs: Inputs) -> Places:
-    """All inputs at their median, and each by itself at its 5 and its 95 %."""
+def _ends(inputs: Inputs) -> FloatArray:
+    """Return all inputs at their median, and each one by itself at its 5 % and at its 95 %."""
     count = len(inputs.names)
     z = np.concatenate([np.zeros((1, count)), *(np.stack([-Z_90 * e, Z_90 * e]) for e in np.eye(count))])
     return inputs.at(z)
 
 
-def _found(inputs: Inputs, draws: Draws, at: Points, tell: Tell, wanted: float, sequences: int) -> Found:
+def _measure(
+    inputs: Inputs, draws: OutputDraws, at: InputDraws, progress: Progress, wanted: float, sequences: int
+) -> UncertaintyResult:
     names = ", ".join(inputs.names)
-    tell(f"{len(inputs.names)} inputs: {names}; {len(draws.outputs)} outputs hang on them")
+    progress(f"{len(inputs.names)} inputs: {names}; {len(draws.outputs)} outputs depend on them")
     seconds = draws.ready()
-    tell(f"what they do not reach: {seconds:.1f} s")
+    progress(f"steps that no input reaches: {seconds:.1f} s")
     pictures = draws.pictures(at.values[: min(PICTURED, len(at.values))])
     ends = draws.numbers(_ends(inputs))
     if not ends[0]:
-        raise ValueError("the outputs are pictures alone: ask for a number too, such as saturated or restored_quality")
+        raise ValueError("the outputs are pictures only: ask for a number too, such as saturated or restored_quality")
     numbers: list[Numbers] = []
     used = 0
     while used < len(at.values):
@@ -97,24 +93,24 @@ def _found(inputs: Inputs, draws: Draws, at: Points, tell: Tell, wanted: float, 
         values = {name: np.array([n[name] for n in numbers]) for name in ends[0]}
         scattered = {name: scatter(x, sequences) for name, x in values.items()}
         worst, error = worst_known(scattered)
-        tell(f"{used} draws: every standard deviation to {error:.1%} ({worst})")
+        progress(f"{used} draws: every standard deviation to {error:.1%} ({worst})")
         if error <= wanted:
             break
     middle, swings = ends[0], _swings(inputs, ends, values, scattered)
     z = at.z[:used]
     shares = {n: indices(inputs.labels, z, values[n][:, 0], inputs.recipe.seed) for n in swings}
     rest = (pictures, draws.is_constant, wanted, sequences)
-    return Found(inputs, Points(z, at.values[:used]), values, scattered, middle, swings, shares, *rest)
+    return UncertaintyResult(inputs, InputDraws(z, at.values[:used]), values, scattered, middle, swings, shares, *rest)
 
 
 def _next(used: int, most: int, sequences: int) -> int:
-    """Sobol's points are even after powers of two alone."""
+    """Return the next number of draws; points of Sobol are even only after a power of two."""
     more = max(LEAST, 2 * used) if sequences else max(LEAST, used + _ROUND)
     return min(more, most)
 
 
 def _swings(
-    inputs: Inputs, ends: Sequence[Numbers], values: Mapping[str, Places], scattered: Mapping[str, Scatter]
+    inputs: Inputs, ends: Sequence[Numbers], values: Mapping[str, FloatArray], scattered: Mapping[str, Scatter]
 ) -> dict[str, list[tuple[str, float, float]]]:
     found: dict[str, list[tuple[str, float, float]]] = {}
     for name, x in values.items():
@@ -128,8 +124,8 @@ def _swings(
     return found
 
 
-def _one_is_the_other(x: Places, y: Places) -> bool:
-    """Whether two numbers are proportional in every draw, such as pixels and their share of all."""
+def _one_is_the_other(x: FloatArray, y: FloatArray) -> bool:
+    """Return True if two numbers are proportional in every draw, such as pixels and their share of all."""
     at = int(np.abs(y).argmax())
     return y[at] != 0 and bool(np.allclose(x * y[at], y * x[at], rtol=1e-9, atol=0.0))
 
@@ -137,15 +133,10 @@ def _one_is_the_other(x: Places, y: Places) -> bool:
 # --- the folder -------------------------------------------------------------------------------------------------------
 
 
-def _document(found: Found, draws: Draws, command: Sequence[str], seconds: float) -> dict[str, Any]:
-    recipe = found.inputs.recipe
+def _document(found: UncertaintyResult, draws: OutputDraws) -> dict[str, Any]:
+    """Return what the folder says of the study, beside what every study says."""
     computed, spent = draws.computed, draws.seconds
     return {
-        "study": "uncertainty",
-        "recipe": recipe.name,
-        "command": " ".join(command),
-        "date": timestamp(),
-        "seconds": seconds,
         "draws": len(found.points.z),
         "points": "sobol" if found.sequences else "draws",
         "computed": computed,
@@ -159,12 +150,10 @@ def _document(found: Found, draws: Draws, command: Sequence[str], seconds: float
         "still": list(found.is_constant),
         "quantities": {name: _plain(found, name) for name in found.values},
         "sensitivity": {name: asdict(shares) for name, shares in found.shares.items()},
-        "versions": versions(),
-        "config": recipe.config.to_yaml(),
     }
 
 
-def _inputs(found: Found) -> list[dict[str, Any]]:
+def _inputs(found: UncertaintyResult) -> list[dict[str, Any]]:
     inputs, values = found.inputs, found.points.values
     return [
         {
@@ -178,32 +167,32 @@ def _inputs(found: Found) -> list[dict[str, Any]]:
     ]
 
 
-def _plain(found: Found, name: str) -> dict[str, Any]:
+def _plain(found: UncertaintyResult, name: str) -> dict[str, Any]:
     s = found.scatter[name]
     arrays = {"mean": s.mean, "sd": s.sd, "low": s.low, "high": s.high}
     return {"error": s.error, "middle": list(found.middle[name]), **{k: x.tolist() for k, x in arrays.items()}}
 
 
-def _write(folder: RunFolder, found: Found, doc: Mapping[str, Any]) -> None:
-    from neusee.workflows.studies.uncertainty.uncertainty_page import drawn, lead, sections
+def _report(found: UncertaintyResult) -> StudyReport:
+    from neusee.workflows.studies.uncertainty.uncertainty_page import draw_pictures, lead, sections
 
-    shown = drawn(found)
-    for name, content in shown.items():
-        folder.write(f"figures/{name}.png", content)
-    folder.write("provenance.json", json.dumps(doc, indent=1, ensure_ascii=False))
-    folder.write_rows("table.csv", _COLUMNS, _rows(found))
-    folder.write("draws.npz", _arrays(found))
+    pictures = draw_pictures(found)
+    files: dict[str, Content] = {"draws.npz": _arrays(found)}
     if found.pictures:
-        folder.write("pictures.npz", _packed({f"{n} {part}": x.numpy() for n, both in found.pictures.items()
-                                              for part, x in zip(("mean", "sd"), both, strict=True)}))  # fmt: skip
-    said = {
-        name: doc[name] for name in ("command", "date", "seconds", "draws", "computed", "seconds a draw", "versions")
-    }
-    title = f"{found.inputs.recipe.name}: what it is worth"
-    folder.write("report.html", page(title, lead(found), sections(found, shown), said))
+        files["pictures.npz"] = _packed({f"{n} {part}": x.numpy() for n, both in found.pictures.items()
+                                         for part, x in zip(("mean", "sd"), both, strict=True)})  # fmt: skip
+    return StudyReport(
+        f"{found.inputs.recipe.name}: how certain it is",
+        lead(found),
+        sections(found, pictures),
+        pictures,
+        tables={"table.csv": (_COLUMNS, _rows(found))},
+        files=files,
+        shown=("command", "date", "seconds", "draws", "computed", "seconds a draw", "versions"),
+    )
 
 
-def _rows(found: Found) -> list[Sequence[Any]]:
+def _rows(found: UncertaintyResult) -> list[Sequence[Any]]:
     rows: list[Sequence[Any]] = []
     for name, s in found.scatter.items():
         columns = zip(found.middle[name], s.mean, s.sd, s.low, s.high, strict=True)
@@ -211,8 +200,8 @@ def _rows(found: Found) -> list[Sequence[Any]]:
     return rows
 
 
-def _arrays(found: Found) -> bytes:
-    """Inputs and quantities by name, draw by draw."""
+def _arrays(found: UncertaintyResult) -> bytes:
+    """Return inputs and quantities by name, draw by draw, as the bytes of an npz file."""
     columns = dict(zip(found.inputs.names, found.points.values.T, strict=True))
     return _packed({**columns, **found.values})
 

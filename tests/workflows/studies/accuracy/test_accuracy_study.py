@@ -15,14 +15,13 @@ from neusee.workflows import load
 from neusee.workflows.recipe.changed_recipe import changed
 from neusee.workflows.store.result_store import Store
 from neusee.workflows.studies.accuracy.accuracy_figures import EXACT, Dot, Line, steps, work_precision
-from neusee.workflows.studies.accuracy.accuracy_report import lead, missed
+from neusee.workflows.studies.accuracy.accuracy_report import count_missed, lead
 from neusee.workflows.studies.accuracy.accuracy_study import study, trials
-from neusee.workflows.studies.accuracy.pareto_line import Choice, cheapest, front, median_ratio
+from neusee.workflows.studies.accuracy.pareto_line import ToleranceChoice, cheapest, median_ratio, pareto_front
 from neusee.workflows.studies.accuracy.recipe_knobs import finest, knobs
-from neusee.workflows.studies.accuracy.single_steps import that_matter, try_step
-from neusee.workflows.studies.accuracy.smaller_inputs import cut
-from neusee.workflows.studies.accuracy.work_precision_points import TIMES, Bench, Point, Trial
-from neusee.workflows.studies.run_study import failed
+from neusee.workflows.studies.accuracy.single_steps import cut_inputs, steps_that_matter, try_step
+from neusee.workflows.studies.accuracy.work_precision_points import TIMES, PointCache, Trial, WorkPrecisionPoint
+from neusee.workflows.studies.run_study import count_failures
 
 RECIPE = """\
 # A camera whose errors are known
@@ -126,18 +125,18 @@ def test_the_reference_is_the_same_sampling_in_double_with_everything_kept(recip
 
 
 def test_errors_are_the_closed_forms(recipe, store):
-    bench = Bench(finest(recipe), store, seeds=1)
-    coarse = bench.point(Trial("bands", "3", changed(recipe, ["optics.bands=3"])))
+    cache = PointCache(finest(recipe), store, seeds=1)
+    coarse = cache.point(Trial("bands", "3", changed(recipe, ["optics.bands=3"])))
     assert coarse.found.errors["raw"][0] == pytest.approx(1 - quadrature(3) / quadrature(9), rel=1e-4)
     assert "cube" not in coarse.found.errors  # of another shape
-    single = bench.point(Trial("own", "", recipe))
+    single = cache.point(Trial("own", "", recipe))
     assert 1e-9 < single.error < 1e-7  # a third in float32
-    assert bench.point(Trial("best", "", finest(recipe))).error == 0
+    assert cache.point(Trial("best", "", finest(recipe))).error == 0
 
 
 def test_a_tolerance_leaves_out_what_it_may_and_the_error_shows_it(recipe, store):
-    bench = Bench(finest(recipe), store, seeds=2)
-    loose = bench.point(Trial("tolerance", "1e-1", replace(recipe, tolerance=1e-1)))
+    cache = PointCache(finest(recipe), store, seeds=2)
+    loose = cache.point(Trial("tolerance", "1e-1", replace(recipe, tolerance=1e-1)))
     assert "lit" not in loose.found.steps
     for error in loose.found.errors["raw"]:
         assert error == pytest.approx(5e-3 / (1 + 5e-3), rel=1e-4)
@@ -145,51 +144,51 @@ def test_a_tolerance_leaves_out_what_it_may_and_the_error_shows_it(recipe, store
 
 
 def test_seeds_draw_other_noise_and_only_that_runs_again(nodes, recipe, store):
-    bench = Bench(finest(recipe), store, seeds=3)
-    bench.truth(0)
+    cache = PointCache(finest(recipe), store, seeds=3)
+    cache.truth(0)
     nodes.CALLS.clear()
-    point = bench.point(Trial("own", "", recipe))
+    point = cache.point(Trial("own", "", recipe))
     assert len(point.by_seed) == 3
-    truths = [bench.truth(seed)["raw"][0, 0].item() for seed in range(3)]
+    truths = [cache.truth(seed)["raw"][0, 0].item() for seed in range(3)]
     assert len(set(truths)) == 3
     assert nodes.CALLS.count("bands 9") == 1  # not again for the other seeds
-    assert bench.point(Trial("own", "", recipe)) == point
+    assert cache.point(Trial("own", "", recipe)) == point
 
 
 def test_a_quick_point_is_timed_again_each_time_once(nodes, recipe, store):
-    bench = Bench(finest(recipe), store, seeds=1)
-    point = bench.point(Trial("own", "", recipe))
+    cache = PointCache(finest(recipe), store, seeds=1)
+    point = cache.point(Trial("own", "", recipe))
     nodes.CALLS.clear()
-    third = bench.again(bench.again(point, 2), 3)
+    third = cache.time_again(cache.time_again(point, 2), 3)
     assert nodes.CALLS.count("bands 9") == 2
     assert len(set(third.found.seconds)) == 3
     assert third.seconds == sorted(third.found.seconds)[1]
-    assert bench.again(bench.again(point, 2), 3) == third
+    assert cache.time_again(cache.time_again(point, 2), 3) == third
     assert nodes.CALLS.count("bands 9") == 2
-    slow = Point(point.trial, replace(point.found, seconds=[9.0]))
-    assert bench.again(slow, 2) == slow
+    slow = WorkPrecisionPoint(point.trial, replace(point.found, seconds=[9.0]))
+    assert cache.time_again(slow, 2) == slow
 
 
 def test_what_cannot_run_is_a_point_that_says_why(recipe, store):
-    bench = Bench(finest(recipe), store, seeds=1)
-    point = bench.point(Trial("samples", "4", changed(recipe, ["optics.samples=4", "optics.pitch=2 mm"])))
+    cache = PointCache(finest(recipe), store, seeds=1)
+    point = cache.point(Trial("samples", "4", changed(recipe, ["optics.samples=4", "optics.pitch=2 mm"])))
     assert point.found.refused == "pupil: 4 samples are too few"
     assert not point.sound
 
 
 def test_a_point_is_another_with_another_tolerance_recipe_seed_or_number_of_seeds(recipe, store):
-    bench = Bench(finest(recipe), store, seeds=2)
+    cache = PointCache(finest(recipe), store, seeds=2)
     keys = {
-        bench.key(recipe),
-        bench.key(replace(recipe, tolerance=1e-2)),
-        bench.key(replace(recipe, exact=True)),
-        bench.key(replace(recipe, seed=4)),
-        bench.key(changed(recipe, ["optics.bands=8"])),
-        Bench(finest(recipe), store, seeds=3).key(recipe),
-        Bench(recipe, store, seeds=2).key(recipe),
+        cache.key(recipe),
+        cache.key(replace(recipe, tolerance=1e-2)),
+        cache.key(replace(recipe, exact=True)),
+        cache.key(replace(recipe, seed=4)),
+        cache.key(changed(recipe, ["optics.bands=8"])),
+        PointCache(finest(recipe), store, seeds=3).key(recipe),
+        PointCache(recipe, store, seeds=2).key(recipe),
     }
     assert len(keys) == 7
-    assert bench.key(recipe) == Bench(finest(recipe), store, seeds=2).key(recipe)
+    assert cache.key(recipe) == PointCache(finest(recipe), store, seeds=2).key(recipe)
 
 
 # --- the Pareto line --------------------------------------------------------------------------------------------------
@@ -203,16 +202,16 @@ class Spot:
 
 def test_the_pareto_line_has_what_no_other_point_beats():
     points = [Spot(1, 1e-1), Spot(2, 1e-3), Spot(2, 1e-2), Spot(3, 5e-3), Spot(4, 1e-3), Spot(5, 1e-6)]
-    assert front(points) == [Spot(1, 1e-1), Spot(2, 1e-3), Spot(5, 1e-6)]
+    assert pareto_front(points) == [Spot(1, 1e-1), Spot(2, 1e-3), Spot(5, 1e-6)]
     assert cheapest(points, 1e-2) == Spot(2, 1e-3)
     assert cheapest(points, 1e-7) is None
 
 
 def test_a_choice_is_weighed_against_the_cheapest_that_holds():
     made = [
-        Choice(1e-2, Spot(4, 1e-3), Spot(2, 1e-2)),
-        Choice(1e-3, Spot(3, 2e-3), Spot(3, 1e-3)),
-        Choice(1e-9, Spot(1, 1), None),
+        ToleranceChoice(1e-2, Spot(4, 1e-3), Spot(2, 1e-2)),
+        ToleranceChoice(1e-3, Spot(3, 2e-3), Spot(3, 1e-3)),
+        ToleranceChoice(1e-9, Spot(1, 1), None),
     ]
     assert [c.held for c in made] == [True, False, False]
     assert [c.ratio for c in made] == [2.0, 1.0, None]
@@ -224,7 +223,7 @@ def test_a_choice_is_weighed_against_the_cheapest_that_holds():
 
 def test_steps_that_matter_are_the_slowest_items(recipe):
     seconds = {"cube": 6.0, "image": 3.98, "psf": 0.02, "elsewhere": 5.0}
-    assert that_matter(recipe, seconds) == [("cube", pytest.approx(0.4)), ("image", pytest.approx(3.98 / 15))]
+    assert steps_that_matter(recipe, seconds) == [("cube", pytest.approx(0.4)), ("image", pytest.approx(3.98 / 15))]
 
 
 def test_a_step_is_tried_in_its_forms_against_its_reference(nodes, recipe, store):
@@ -234,7 +233,7 @@ def test_a_step_is_tried_in_its_forms_against_its_reference(nodes, recipe, store
     assert errors["precision", "double"] == 0
     assert ("window of the PSF", "0.5") not in errors  # its result has another shape
     assert all(form.seconds >= 0.01 for form in found.forms)
-    assert found.found.cut == ""
+    assert found.found.cut_inputs == ""
     nodes.CALLS.clear()
     assert try_step(recipe, "cube", 0.5, store, patience=10.0) == found
     assert nodes.CALLS == []
@@ -247,11 +246,11 @@ def test_a_step_without_a_reference_says_so(recipe, store):
 def test_a_part_of_the_inputs_is_their_middle_and_bands_from_all_over(nodes):
     cube = torch.arange(9.0)[:, None, None] * 100 + torch.arange(6.0)[:, None] * 10 + torch.arange(8.0)
     psf = nodes.Psf(cube, torch.arange(9.0))
-    (part,) = cut(nodes.weighed, [psf], (4, 3))
+    (part,) = cut_inputs(nodes.weighed, [psf], (4, 3))
     assert part.intensity.shape == (3, 4, 4)
     assert part.clear_peak.tolist() == [1.0, 4.0, 7.0]
     assert part.intensity[0, 2, 2] == 100 + 30 + 4  # the sample at N // 2 stays there
-    assert cut(nodes.weighed, [psf], (0, 0))[0].intensity.shape == (9, 6, 8)
+    assert cut_inputs(nodes.weighed, [psf], (0, 0))[0].intensity.shape == (9, 6, 8)
 
 
 # --- the whole --------------------------------------------------------------------------------------------------------
@@ -286,7 +285,7 @@ def _look_at(folder):
     assert {p.name for p in folder.iterdir()} == names
     assert {p.stem for p in (folder / "figures").iterdir()} == {"work_precision", "promises", "steps"}
     assert json.loads((folder / "provenance.json").read_text())["command"] == "neusee study"
-    assert failed(folder) == 0
+    assert count_failures(folder) == 0
     rows = rows_of(folder)
     asked = [r for r in rows if r["line"] == "tolerance" and r["output"] == "raw"]
     assert [r["setting"] for r in asked] == ["1e-1", "1e-2", "1e-3", "1e-4"]
@@ -308,17 +307,17 @@ def test_what_the_budget_leaves_is_said_and_measured_the_next_time(nodes, recipe
 
 
 def test_a_tolerance_finer_than_the_arithmetic_is_told_from_one_that_was_missed(recipe, store):
-    bench = Bench(finest(recipe), store, seeds=1)
+    cache = PointCache(finest(recipe), store, seeds=1)
     points = [
-        bench.point(t) for t in trials(recipe, knobs(recipe, True), True) if t.line in ("tolerance", "everything kept")
+        cache.point(t) for t in trials(recipe, knobs(recipe, True), True) if t.line in ("tolerance", "everything kept")
     ]
-    fine = bench.point(Trial("tolerance", "1e-9", replace(recipe, tolerance=1e-9), value=1e-9))
+    fine = cache.point(Trial("tolerance", "1e-9", replace(recipe, tolerance=1e-9), value=1e-9))
     assert fine.most > 1e-9  # a third in float32
     said = lead(recipe, [*points, fine])
     assert "4 of 5 tolerances were held. 1 cannot be told: everything kept is off by " in said
-    off = Point(replace(fine.trial, value=1e-9), replace(fine.found, errors={"raw": [1e-3]}))
+    off = WorkPrecisionPoint(replace(fine.trial, value=1e-9), replace(fine.found, errors={"raw": [1e-3]}))
     assert "cannot be told" not in lead(recipe, [*points, off])
-    assert (missed([*points, fine]), missed([*points, off])) == (0, 1)
+    assert (count_missed([*points, fine]), count_missed([*points, off])) == (0, 1)
 
 
 def test_a_study_without_seeds_is_refused(recipe, store, tmp_path):

@@ -14,17 +14,21 @@ from typer.testing import CliRunner
 
 from neusee.nodes.calibrate._likelihood import _linear_sensor
 from neusee.workflows.calibration import emcee_sampler
-from neusee.workflows.calibration.initial_guess import begin
 from neusee.workflows.calibration.log_posterior import SensorPosterior
-from neusee.workflows.calibration.posterior_mode import log_law, peak
+from neusee.workflows.calibration.posterior_mode import find_mode, initial_theta, log_density
 from neusee.workflows.recipe.loading import load
 from neusee.workflows.store.result_store import Store
 from neusee.workflows.studies.calibration import calibration_study, simulated_sensors
-from neusee.workflows.studies.calibration.independent_draws import DRAWS, Drawn, walked
+from neusee.workflows.studies.calibration.independent_draws import DRAWS, PosteriorDraws, walk_draws
 from neusee.workflows.studies.calibration.prior_sensitivity import ENOUGH, sensitivity
-from neusee.workflows.studies.calibration.rank_uniformity import band, bar, verdicts
-from neusee.workflows.studies.calibration.simulated_sensors import Bench, Simulation, narrowed, ranked
-from neusee.workflows.studies.run_study import failed, made
+from neusee.workflows.studies.calibration.rank_uniformity import chance_band, coverage_limits, rank_tests
+from neusee.workflows.studies.calibration.simulated_sensors import (
+    SensorSimulation,
+    SensorSimulator,
+    rank_truth,
+    with_narrow_prior,
+)
+from neusee.workflows.studies.run_study import count_failures, study_recipe
 
 pytestmark = pytest.mark.usefixtures("one_thread")
 
@@ -35,7 +39,7 @@ PIXELS = 64
 COUNT = 10_000  #: draws that are weighed
 
 
-def resampled(problem, peak, seed):
+def resampled(problem, mode, seed):
     """Draws about the peak, taken by what the posterior says of them: independent, and no walk.
 
     The law is a quarter wider than the posterior, in the full well, which has edges, half. As right as that is wide
@@ -43,25 +47,25 @@ def resampled(problem, peak, seed):
     """
     rng = np.random.default_rng(seed)
     at = problem.names.index("full_well") if "full_well" in problem.names else None
-    wider = np.where(np.arange(len(peak.place)) == at, 1.5, 1.25)
-    covariance = peak.covariance * wider * wider[:, None]
-    law = replace(peak, covariance=covariance)
+    wider = np.where(np.arange(len(mode.theta)) == at, 1.5, 1.25)
+    covariance = mode.covariance * wider * wider[:, None]
+    law = replace(mode, covariance=covariance)
     drawn = law.draw(COUNT, rng)
-    log = problem.log_posterior(drawn) - log_law(law, drawn)
+    log = problem.log_posterior(drawn) - log_density(law, drawn)
     weights = np.exp(log - log.max())
     weights /= weights.sum()
     if 1 / (weights @ weights) < 2 * DRAWS:
         raise ValueError(f"only {1 / (weights @ weights):.0f} of {COUNT} draws are left")
-    return Drawn(drawn[rng.choice(COUNT, DRAWS, replace=False, p=weights)])
+    return PosteriorDraws(drawn[rng.choice(COUNT, DRAWS, replace=False, p=weights)])
 
 
 def simulated(tmp_path, count, overrides, sampler=resampled, pixels=PIXELS):
-    bench = Bench(load("calibrate", overrides), Store(tmp_path / "store"), pixels, sampler, "test")
-    return bench, [bench.simulation(i) for i in range(count)]
+    simulator = SensorSimulator(load("calibrate", overrides), Store(tmp_path / "store"), pixels, sampler, "test")
+    return simulator, [simulator.simulation(i) for i in range(count)]
 
 
 def failing(simulations):
-    return {v.name for v in verdicts(simulations) if v.failed}
+    return {v.name for v in rank_tests(simulations) if v.failed}
 
 
 def forget_the_floor(monkeypatch):
@@ -83,7 +87,7 @@ def test_a_forgotten_floor_is_found(tmp_path, monkeypatch):
     forget_the_floor(monkeypatch)
     _, found = simulated(tmp_path, 60, [*DITHERED, *OPEN], pixels=128)
     assert {"pedestal", "read_noise"} <= failing(found)
-    z = {v.name: v.z_mean for v in verdicts(found)}
+    z = {v.name: v.z_mean for v in rank_tests(found)}
     assert z["pedestal"] < -0.7  # half a number too low
     assert z["read_noise"] > 0.7  # a twelfth of a number squared too much
 
@@ -107,7 +111,7 @@ def test_a_well_beyond_the_converter_ranks_uniformly(tmp_path):
 
 @pytest.mark.slow
 def test_walkers_pass(tmp_path):
-    _, found = simulated(tmp_path, 200, SEEN, walked, 128)
+    _, found = simulated(tmp_path, 200, SEEN, walk_draws, 128)
     assert not [s.refused for s in found if s.refused]
     assert not any(s.stranded or not s.independent for s in found)
     assert not failing(found)
@@ -117,13 +121,13 @@ def test_walkers_pass(tmp_path):
 def test_a_move_that_is_wrong_is_found(tmp_path, monkeypatch):
     """The snooker of emcee to 3.1.6, which `calibrate` refuses: its draws are too narrow in every direction."""
     monkeypatch.setitem(emcee_sampler._MOVES, "snooker", DESnookerMove)
-    _, found = simulated(tmp_path, 80, SEEN, partial(walked, how="snooker"), 128)
+    _, found = simulated(tmp_path, 80, SEEN, partial(walk_draws, how="snooker"), 128)
     assert len(failing(found)) >= 5
 
 
 @pytest.mark.slow
 def test_walkers_pass_where_the_well_is_beyond_the_converter(tmp_path):
-    _, found = simulated(tmp_path, 40, [], walked, 128)
+    _, found = simulated(tmp_path, 40, [], walk_draws, 128)
     assert not [s.refused for s in found if s.refused]
     assert not any(s.stranded or not s.independent for s in found)
     assert not failing(found)
@@ -138,7 +142,7 @@ def test_many_parameters_together_raise_no_more_false_alarms_than_one():
     for _ in range(studies):
         ranks = rng.integers(0, DRAWS + 1, (200, len(names))).tolist()
         same = dict.fromkeys(names, True), dict.fromkeys(names, 0.0)
-        found = verdicts([Simulation({}, dict(zip(names, row, strict=True)), *same) for row in ranks])
+        found = rank_tests([SensorSimulation({}, dict(zip(names, row, strict=True)), *same) for row in ranks])
         alarms += not all(verdict.uniform for verdict in found)
     assert alarms <= binom.ppf(0.999, studies, 0.01)
 
@@ -150,7 +154,7 @@ def uniform(count, width=1.0, shift=0.0, seed=0):
     for _ in range(count):
         truth, x = rng.normal(), shift + width * rng.normal(size=DRAWS)
         rank, z = int((x < truth).sum()), float((x.mean() - truth) / x.std())
-        found.append(Simulation({"a": truth}, {"a": rank}, {"a": 5 <= rank < 95}, {"a": z}))
+        found.append(SensorSimulation({"a": truth}, {"a": rank}, {"a": 5 <= rank < 95}, {"a": z}))
     return found
 
 
@@ -162,26 +166,26 @@ def test_bars_let_right_draws_pass(count):
 @pytest.mark.parametrize(("count", "width", "shift"), [(200, 0.7, 0), (200, 1.5, 0), (200, 1, 0.5), (1000, 0.82, 0)])
 def test_bars_find_draws_that_are_too_narrow_too_wide_or_beside(count, width, shift):
     for seed in range(5):
-        (verdict,) = verdicts(uniform(count, width, shift, seed))
+        (verdict,) = rank_tests(uniform(count, width, shift, seed))
         assert verdict.failed
 
 
 def test_bars_are_those_of_chance():
-    assert bar(200) == (0.825, 0.960)
-    assert bar(1000) == (0.870, 0.930)
-    assert bar(500) == pytest.approx((0.854, 0.942))
+    assert coverage_limits(200) == (0.825, 0.960)
+    assert coverage_limits(1000) == (0.870, 0.930)
+    assert coverage_limits(500) == pytest.approx((0.854, 0.942))
     for count in (200, 1000):
-        low, high = (round(end * count) for end in bar(count))
+        low, high = (round(end * count) for end in coverage_limits(count))
         assert binom.cdf(high, count, 0.9) - binom.cdf(low - 1, count, 0.9) > 0.998
-    assert band(200, 0.1, 0.99) == (10, 32)
+    assert chance_band(200, 0.1, 0.99) == (10, 32)
 
 
 def test_ranks_count_from_none_to_all(tmp_path):
-    bench = Bench(load("calibrate", SEEN), Store(tmp_path), 16, resampled, "test")
-    truth = bench.truth(3)
+    simulator = SensorSimulator(load("calibrate", SEEN), Store(tmp_path), 16, resampled, "test")
+    truth = simulator.truth(3)
     other = {name: x * torch.linspace(0.5, 1.0, DRAWS, dtype=torch.float64) for name, x in truth.items()}
-    found = ranked(bench.nominal, truth, Drawn(bench.nominal.place(other)))
-    assert set(found.rank) == set(bench.nominal.names)
+    found = rank_truth(simulator.nominal, truth, PosteriorDraws(simulator.nominal.theta(other)))
+    assert set(found.rank) == set(simulator.nominal.names)
     assert all(DRAWS - 1 <= rank <= DRAWS for rank in found.rank.values())
     assert not any(found.inside.values())
     assert all(z < -1 for z in found.z.values())
@@ -189,32 +193,35 @@ def test_ranks_count_from_none_to_all(tmp_path):
 
 def test_without_any_posterior_there_is_no_verdict():
     with pytest.raises(ValueError, match="no simulation has a posterior; the first: too dark"):
-        verdicts([Simulation({"a": 1.0}, refused="too dark")])
+        rank_tests([SensorSimulation({"a": 1.0}, refused="too dark")])
 
 
 # --- simulations ------------------------------------------------------------------------------------------------------
 
 
 def test_a_simulation_is_by_the_parameters_that_were_drawn(tmp_path):
-    bench = Bench(load("calibrate", SEEN), Store(tmp_path), 128, resampled, "test")
-    truth = bench.truth(5)
-    levels = bench.problem(truth, 5).levels
+    simulator = SensorSimulator(load("calibrate", SEEN), Store(tmp_path), 128, resampled, "test")
+    truth = simulator.truth(5)
+    levels = simulator.problem(truth, 5).levels
     assert truth["gain"] != pytest.approx(0.37, rel=1e-3)
     flat = truth["gain"] * (truth["pedestal"] + truth["quantum_efficiency"] * 9820)
     assert float(levels.mean[11]) == pytest.approx(flat, rel=1e-3)
     dark = truth["gain"] * truth["read_noise"]
     assert float(levels.variance[0]) ** 0.5 == pytest.approx(math.hypot(dark, 12**-0.5), rel=0.02)
     assert float(levels.cell_value[-1]) == round(truth["gain"] * truth["full_well"])
-    assert not torch.equal(bench.problem(truth, 6).levels.mean, levels.mean)
-    same = bench.problem(truth, 5)
-    place = bench.nominal.place(truth)[None]
-    assert same.log_posterior(place) == pytest.approx(bench.problem(truth, 5).log_posterior(place), abs=0)
-    assert float(same.look(place).log) > float(bench.nominal.look(place).log.nan_to_num(neginf=-1e30)) + 1e4
+    assert not torch.equal(simulator.problem(truth, 6).levels.mean, levels.mean)
+    same = simulator.problem(truth, 5)
+    place = simulator.nominal.theta(truth)[None]
+    assert same.log_posterior(place) == pytest.approx(simulator.problem(truth, 5).log_posterior(place), abs=0)
+    assert (
+        float(same.likelihood(place).log)
+        > float(simulator.nominal.likelihood(place).log.nan_to_num(neginf=-1e30)) + 1e4
+    )
 
 
 def test_the_prior_is_no_wider_than_is_sensible():
     recipe = load("calibrate", ["steps.prior.with.gain=[0.37, 1.01]"])
-    found = narrowed(recipe, {}).steps["prior"].params
+    found = with_narrow_prior(recipe, {}).steps["prior"].params
     assert found["gain"] == (0.37, 1.01)
     assert found["pedestal"] == (390, 20)
     assert found["dark_current"][1] == pytest.approx(math.exp(0.5))
@@ -224,15 +231,15 @@ def test_the_prior_is_no_wider_than_is_sensible():
 def test_what_simulates_nothing_cannot_be_studied(tmp_path):
     recipe = load("first_light")
     with pytest.raises(ValueError, match="simulates no frames"):
-        Bench(recipe, Store(tmp_path), 16, resampled, "test")
+        SensorSimulator(recipe, Store(tmp_path), 16, resampled, "test")
 
 
 def test_frames_that_tell_too_little_are_told(tmp_path):
     levels = {path.split(".")[1] for path in load("calibrate").config.settings if path.startswith("levels.")}
     other = "+levels.fuller={photons: 200000, exposure: 0.1 s}"
     overrides = [*SEEN, other, *(f"~levels.{name}" for name in sorted(levels - {"full"}))]
-    with pytest.raises(ValueError, match="of 6 parameters cannot be told"):
-        verdicts(simulated(tmp_path, 2, overrides)[1])
+    with pytest.raises(ValueError, match="of 6 parameters cannot be determined"):
+        rank_tests(simulated(tmp_path, 2, overrides)[1])
 
 
 # --- the study --------------------------------------------------------------------------------------------------------
@@ -244,14 +251,14 @@ def quick(monkeypatch):
 
 
 def studied(tmp_path, count=20, sampler=resampled, overrides=SEEN, store="store"):
-    return made("calibration", load("calibrate", ["flats.shape=[32, 32]", *overrides]), Store(tmp_path / store),
+    return study_recipe("calibration", load("calibrate", ["flats.shape=[32, 32]", *overrides]), Store(tmp_path / store),
                 tmp_path / "runs", simulations=count, pixels=32, sampler=sampler)  # fmt: skip
 
 
 def test_a_study_has_a_page_and_goes_on(tmp_path, monkeypatch, quick):
     folder = studied(tmp_path)
     page, doc = (folder / "report.html").read_text(), json.loads((folder / "provenance.json").read_text())
-    assert failed(folder) == doc["failed"] == 0
+    assert count_failures(folder) == doc["failed"] == 0
     assert {v["name"] for v in doc["verdicts"]} == set(doc["widths"])
     assert doc["widths"]["gain"] == pytest.approx(0.1)
     assert all(text in page for text in ("Ranks of the truth", "Coverage", "What the prior does", "All bars hold"))
@@ -259,7 +266,9 @@ def test_a_study_has_a_page_and_goes_on(tmp_path, monkeypatch, quick):
     assert (folder / "figures" / "ranks.png").stat().st_size > 10_000
     assert len((folder / "simulations.csv").read_text().splitlines()) == 1 + 20 * 6
     again = []
-    monkeypatch.setattr(Bench, "_made", lambda self, seed: again.append(seed) or simulated_sensors.Simulation({}))
+    monkeypatch.setattr(
+        SensorSimulator, "_simulate", lambda self, seed: again.append(seed) or simulated_sensors.SensorSimulation({})
+    )
     second = studied(tmp_path)
     assert not again
     assert json.loads((second / "provenance.json").read_text())["verdicts"] == doc["verdicts"]
@@ -267,7 +276,7 @@ def test_a_study_has_a_page_and_goes_on(tmp_path, monkeypatch, quick):
 
 def test_a_study_that_was_stopped_goes_on_with_the_same(tmp_path, monkeypatch):
     whole = [s.rank for s in simulated(tmp_path / "whole", 6, SEEN, pixels=32)[1]]
-    real, done = Bench._made, []
+    real, done = SensorSimulator._simulate, []
 
     def stops(self, seed):
         if len(done) == 4:
@@ -275,10 +284,10 @@ def test_a_study_that_was_stopped_goes_on_with_the_same(tmp_path, monkeypatch):
         done.append(seed)
         return real(self, seed)
 
-    monkeypatch.setattr(Bench, "_made", stops)
+    monkeypatch.setattr(SensorSimulator, "_simulate", stops)
     with pytest.raises(KeyboardInterrupt):
         simulated(tmp_path, 6, SEEN, pixels=32)
-    monkeypatch.setattr(Bench, "_made", lambda self, seed: done.append(seed) or real(self, seed))
+    monkeypatch.setattr(SensorSimulator, "_simulate", lambda self, seed: done.append(seed) or real(self, seed))
     assert [s.rank for s in simulated(tmp_path, 6, SEEN, pixels=32)[1]] == whole
     assert len(done) == len(set(done)) == 6
 
@@ -286,23 +295,23 @@ def test_a_study_that_was_stopped_goes_on_with_the_same(tmp_path, monkeypatch):
 def test_another_prior_size_or_sampler_is_another_study(tmp_path, monkeypatch):
     simulated(tmp_path, 1, SEEN, pixels=32)
     made = []
-    real = Bench._made
-    monkeypatch.setattr(Bench, "_made", lambda self, seed: made.append(seed) or real(self, seed))
+    real = SensorSimulator._simulate
+    monkeypatch.setattr(SensorSimulator, "_simulate", lambda self, seed: made.append(seed) or real(self, seed))
     simulated(tmp_path, 1, SEEN, pixels=33)
     simulated(tmp_path, 1, [*SEEN, "steps.prior.with.gain=[0.37, 1.05]"], pixels=32)
     assert len(made) == 2
-    Bench(load("calibrate", SEEN), Store(tmp_path / "store"), 32, resampled, "other").simulation(0)
+    SensorSimulator(load("calibrate", SEEN), Store(tmp_path / "store"), 32, resampled, "other").simulation(0)
     assert len(made) == 3
 
 
 @pytest.mark.slow
 def test_a_study_fails_where_draws_are_too_narrow(tmp_path, quick):
-    def narrow(problem, peak, seed):
-        drawn = resampled(problem, peak, seed)
-        return Drawn(peak.place + 0.5 * (drawn.places - peak.place))
+    def narrow(problem, mode, seed):
+        drawn = resampled(problem, mode, seed)
+        return PosteriorDraws(mode.theta + 0.5 * (drawn.samples - mode.theta))
 
     folder = studied(tmp_path, 40, narrow)
-    assert failed(folder) >= 6
+    assert count_failures(folder) >= 6
     assert "bars do not hold" in (folder / "report.html").read_text()
     assert 'class="n fail"' in (folder / "report.html").read_text()
 
@@ -312,12 +321,12 @@ def test_a_study_fails_where_draws_are_too_narrow(tmp_path, quick):
 def test_a_study_fails_where_one_chain_is_bad(tmp_path, fault, quick):
     first = []
 
-    def once(problem, peak, seed):
-        drawn = resampled(problem, peak, seed)
+    def once(problem, mode, seed):
+        drawn = resampled(problem, mode, seed)
         first.append(seed)
-        return Drawn(drawn.places, **fault) if len(first) == 1 else drawn
+        return PosteriorDraws(drawn.samples, **fault) if len(first) == 1 else drawn
 
-    assert failed(studied(tmp_path, sampler=once)) == 1
+    assert count_failures(studied(tmp_path, sampler=once)) == 1
 
 
 @pytest.mark.slow
@@ -326,7 +335,7 @@ def test_the_command_ends_with_one_where_a_bar_fails(tmp_path, monkeypatch):
 
     monkeypatch.setenv("NEUSEE_CACHE", str(tmp_path / "store"))
     monkeypatch.setattr(calibration_study, "PIXELS", 32)
-    monkeypatch.setattr(calibration_study, "walked", lambda *a, **how: resampled(*a[:3]))
+    monkeypatch.setattr(calibration_study, "walk_draws", lambda *a, **how: resampled(*a[:3]))
     command = ["study", "calibration", "calibrate", *SEEN, "flats.shape=[32, 32]", "--out", str(tmp_path / "runs")]
     done = CliRunner().invoke(app, [*command, "--simulations", "20"])
     assert done.exit_code == 0, done.output
@@ -345,10 +354,10 @@ def sensitive(tmp_path_factory):
 
 
 def drawn_of(problem, truth, count=4000):
-    highest = peak(problem, begin(problem))
+    mode = find_mode(problem, initial_theta(problem))
     rng = np.random.default_rng(0)
-    drawn = highest.draw(4 * count, rng)
-    log = problem.log_posterior(drawn) - log_law(highest, drawn)
+    drawn = mode.draw(4 * count, rng)
+    log = problem.log_posterior(drawn) - log_density(mode, drawn)
     weights = np.exp(log - log.max())
     return drawn[rng.choice(len(drawn), count, p=weights / weights.sum())]
 

@@ -16,7 +16,7 @@ from neusee.workflows.graph.recipe_graph import Recipe, Step
 from neusee.workflows.recipe.loading import load
 from neusee.workflows.store.result_store import Store
 from neusee.workflows.studies.leave_out import leave_out_study, omission_rows, scene_costs
-from neusee.workflows.studies.leave_out.omission_rows import Bench, surely
+from neusee.workflows.studies.leave_out.omission_rows import OmissionComparison, least_error
 
 MARK = Location("recipe.yaml", 1, 1)
 SMALL = (
@@ -173,7 +173,7 @@ def test_with_everything_kept_nothing_is_chosen(study):
 
 def test_a_second_study_measures_nothing_again(study, monkeypatch):
     first, _, _ = study(camera(), contents=False)
-    monkeypatch.setattr(Bench, "_row", lambda *a: pytest.fail("measured again"))
+    monkeypatch.setattr(OmissionComparison, "_row", lambda *a: pytest.fail("measured again"))
     second, _, folder = study(camera(), contents=False)
     assert second["rows"] == first["rows"]
     with (folder / "table.csv").open() as file:
@@ -182,7 +182,7 @@ def test_a_second_study_measures_nothing_again(study, monkeypatch):
 
 
 def test_a_study_that_was_stopped_goes_on(study, store, monkeypatch):
-    real, done = Bench._row, []
+    real, done = OmissionComparison._row, []
 
     def stops(self, omission, alone):
         if len(done) == 2:
@@ -190,11 +190,11 @@ def test_a_study_that_was_stopped_goes_on(study, store, monkeypatch):
         done.append(omission.name)
         return real(self, omission, alone)
 
-    monkeypatch.setattr(Bench, "_row", stops)
+    monkeypatch.setattr(OmissionComparison, "_row", stops)
     with pytest.raises(KeyboardInterrupt):
         study(camera(), contents=False)
     again = []
-    monkeypatch.setattr(Bench, "_row", lambda self, o, alone: again.append(o.name) or real(self, o, alone))
+    monkeypatch.setattr(OmissionComparison, "_row", lambda self, o, alone: again.append(o.name) or real(self, o, alone))
     study(camera(), contents=False)
     assert set(again).isdisjoint(done)
     assert len(done) + len(again) == 4
@@ -206,13 +206,13 @@ def test_one_draw_of_noise_does_not_break_a_true_bound():
         rng = torch.Generator().manual_seed(seed)
         dark = torch.poisson(torch.full((100, 100), 3e-4), generator=rng)
         scene = torch.full((100, 100), 1000.0)
-        assert surely(scene, scene + dark) <= math.sqrt(3e-4) / 1000
+        assert least_error(scene, scene + dark) <= math.sqrt(3e-4) / 1000
     loud = scene + torch.randn(scene.shape, generator=rng)
-    assert surely(scene, loud) > 0.9 / 1000
+    assert least_error(scene, loud) > 0.9 / 1000
 
 
 def test_a_single_pixel_tells_nothing_of_its_noise():
-    assert surely(torch.tensor([100.0]), torch.tensor([103.0])) == 0
+    assert least_error(torch.tensor([100.0]), torch.tensor([103.0])) == 0
 
 
 def test_the_camera_holds_what_it_states(study):
@@ -264,7 +264,7 @@ def test_a_scene_with_less_in_it_costs_less(study):
 
 
 def test_facts_are_read_without_the_payload(store, monkeypatch):
-    bench = Bench(camera(), store)
+    comparison = OmissionComparison(camera(), store)
     monkeypatch.setattr(omission_rows.Result, "value", lambda *a: pytest.fail("a value was read"))
-    assert bench.facts("l").max == 100
-    assert run(bench.full, store).keys["l"] == bench.truth.keys["l"]
+    assert comparison.facts("l").max == 100
+    assert run(comparison.full, store).keys["l"] == comparison.truth.keys["l"]

@@ -14,11 +14,11 @@ from neusee.workflows.keys.code_digest import Code
 from neusee.workflows.recipe.loading import load
 from neusee.workflows.recipe.step_declarations import find_node
 from neusee.workflows.store.result_store import Store
-from neusee.workflows.studies.stability import case_result, stability_study, stated_limits
-from neusee.workflows.studies.stability.case_recipe import Chain, untouched
-from neusee.workflows.studies.stability.case_result import judged
+from neusee.workflows.studies.stability import case_result, extreme_cases, stability_study
+from neusee.workflows.studies.stability.case_recipe import CaseRecipe, unchanged_steps
+from neusee.workflows.studies.stability.case_result import judge_step
 from neusee.workflows.studies.stability.extreme_cases import CASES, USUAL, Case, Size
-from neusee.workflows.studies.stability.stability_figures import number, words
+from neusee.workflows.studies.stability.stability_figures import cell_text, short_number
 from neusee.workflows.studies.stability.stability_study import study
 
 BY_NAME = {case.name: case for case in CASES}
@@ -66,7 +66,7 @@ def picture():
 
 
 def test_a_step_within_its_bound_passes_with_both_numbers(picture):
-    cell = judged(step_of(doubled), [picture], USUAL, 0)
+    cell = judge_step(step_of(doubled), [picture], USUAL, 0)
     assert cell.mark == "pass"
     assert 0 <= cell.error <= cell.bound == 1e-5
     assert 0 <= cell.slope <= cell.slope_bound
@@ -77,12 +77,12 @@ def test_a_step_within_its_bound_passes_with_both_numbers(picture):
     [(cancelling, "usual"), (rooted, "usual"), (hiding, "NaN"), (breaking, "usual"), (breaking, "NaN")],
 )
 def test_what_is_wrong_fails(fn, case, picture):
-    assert judged(step_of(fn), [picture], BY_NAME[case], 0).mark == "fail"
+    assert judge_step(step_of(fn), [picture], BY_NAME[case], 0).mark == "fail"
 
 
 @pytest.mark.parametrize(("fn", "case"), [(refusing, "NaN"), (doubled, "NaN"), (doubled, "Inf"), (doubled, "float16")])
 def test_what_is_refused_seen_or_of_its_precision_passes(fn, case, picture):
-    assert judged(step_of(fn), [picture], BY_NAME[case], 0).mark == "pass"
+    assert judge_step(step_of(fn), [picture], BY_NAME[case], 0).mark == "pass"
 
 
 def test_a_number_that_is_none_is_tried_in_each_picture_alone(picture):
@@ -90,12 +90,12 @@ def test_a_number_that_is_none_is_tried_in_each_picture_alone(picture):
     def blind(x: torch.Tensor, y: torch.Tensor) -> torch.Tensor:
         return x + torch.where(y > 2, y, 0.0)
 
-    assert judged(step_of(blind), [picture, picture + 0], BY_NAME["NaN"], 0).mark == "fail"
+    assert judge_step(step_of(blind), [picture, picture + 0], BY_NAME["NaN"], 0).mark == "fail"
 
 
 def test_a_case_that_changes_nothing_of_a_step_has_no_cell(picture):
-    assert judged(step_of(doubled), [], BY_NAME["NaN"], 0) is None
-    assert judged(step_of(doubled), [picture], BY_NAME["alike"], 0) is None
+    assert judge_step(step_of(doubled), [], BY_NAME["NaN"], 0) is None
+    assert judge_step(step_of(doubled), [picture], BY_NAME["alike"], 0) is None
 
 
 def test_names_and_groups_of_the_catalogue_are_in_order():
@@ -106,12 +106,12 @@ def test_names_and_groups_of_the_catalogue_are_in_order():
 
 def test_small_chains_keep_the_pupil_and_know_what_a_case_touches(tmp_path):
     recipe, code = load("first_light", []), Code(tmp_path / "code.json")
-    usual = Chain.of(recipe, USUAL, code)
+    usual = CaseRecipe.of(recipe, USUAL, code)
     pupil = usual.steps["pupil[mask]"].params
     whole = recipe.steps["flat"].params
     assert pupil["pitch"] * USUAL.size.samples == pytest.approx(whole["pitch"] * whole["samples"])
-    dim = Chain.of(recipe, BY_NAME["exposure 1 us"], code)
-    same = set(untouched(dim, usual))
+    dim = CaseRecipe.of(recipe, BY_NAME["exposure 1 us"], code)
+    same = set(unchanged_steps(dim, usual))
     assert {"psf[mask]", "image[mask]"} <= same
     assert not {"scene_photons[mask]", "spot[mask,green]", "charge[mask]"} & same
 
@@ -135,26 +135,26 @@ def test_the_study_writes_its_folder_and_counts_what_fails(tmp_path, monkeypatch
     assert doc["cells"] == len(rows) > 30
     assert len(told) == 2
     before = {row["step"]: row["error"] for row in rows}
-    monkeypatch.setattr(stability_study, "judged", None)  # what is stored is not judged again
+    monkeypatch.setattr(stability_study, "judge_step", None)  # what is stored is not judged again
     again = study(recipe, Store(tmp_path / "store"), tmp_path / "runs", ["neusee"], told.append, cases=cases)
     with (again / "table.csv").open() as file:
         assert {row["step"]: row["error"] for row in csv.DictReader(file)} == before
 
 
 def test_words_of_a_cell_say_what_does_not_pass(picture):
-    cell = judged(step_of(cancelling), [picture], USUAL, 0)
-    assert words(cell).startswith("×")
-    assert number(2.34e-7) == "2e-7"
-    assert number(0.0) == "0"
-    assert number(float("inf")) == "inf"
+    cell = judge_step(step_of(cancelling), [picture], USUAL, 0)
+    assert cell_text(cell).startswith("×")
+    assert short_number(2.34e-7) == "2e-7"
+    assert short_number(0.0) == "0"
+    assert short_number(float("inf")) == "inf"
 
 
 def test_what_is_stated_counts_only_as_long_as_the_docstring_states_it(monkeypatch):
-    (path, case), words = next(iter(stated_limits._STATED.items()))
-    assert stated_limits.stated_of(find_node(path), case) == words
-    assert stated_limits.stated_of(find_node(path), "usual") is None
-    monkeypatch.setattr(stated_limits, "_STATED", {(path, case): "whatever it is"})
-    assert stated_limits.stated_of(find_node(path), case) is None
+    (path, case), words = next(iter(extreme_cases._STATED.items()))
+    assert extreme_cases.stated_words(find_node(path), case) == words
+    assert extreme_cases.stated_words(find_node(path), "usual") is None
+    monkeypatch.setattr(extreme_cases, "_STATED", {(path, case): "whatever it is"})
+    assert extreme_cases.stated_words(find_node(path), case) is None
 
 
 @pytest.mark.parametrize(
@@ -178,8 +178,8 @@ def test_what_holds_by_less_than_twice_warns(error, slope, mark):
 
 
 def test_what_every_node_states_it_still_states():
-    for path, case in stated_limits._STATED:
-        assert stated_limits.stated_of(find_node(path), case) is not None
+    for path, case in extreme_cases._STATED:
+        assert extreme_cases.stated_words(find_node(path), case) is not None
 
 
 def test_poisson_numbers_are_the_same_in_both_precisions(picture):
@@ -187,7 +187,7 @@ def test_poisson_numbers_are_the_same_in_both_precisions(picture):
     def counted(x: torch.Tensor, *, rng: torch.Generator) -> torch.Tensor:
         return torch.poisson(100.1 * x, generator=rng)
 
-    assert judged(step_of(counted), [picture], USUAL, 0).mark == "pass"
+    assert judge_step(step_of(counted), [picture], USUAL, 0).mark == "pass"
 
 
 def test_an_error_of_the_study_itself_is_no_refusal(monkeypatch, picture):
@@ -195,7 +195,7 @@ def test_an_error_of_the_study_itself_is_no_refusal(monkeypatch, picture):
         raise ValueError("zip() argument 2 is shorter than argument 1")
 
     monkeypatch.setattr("neusee.workflows.studies.stability.case_result._error", wrong)
-    assert judged(step_of(doubled), [picture], USUAL, 0).mark == "fail"
+    assert judge_step(step_of(doubled), [picture], USUAL, 0).mark == "fail"
 
 
 def test_a_picture_that_two_inputs_share_counts_once(picture):
@@ -204,7 +204,7 @@ def test_a_picture_that_two_inputs_share_counts_once(picture):
         return x * 2 + y
 
     for case in ("usual", "alike", "negative"):
-        cell = judged(step_of(added), [picture, picture], BY_NAME[case], 0)
+        cell = judge_step(step_of(added), [picture, picture], BY_NAME[case], 0)
         assert cell.mark == "pass"
         assert cell.slope is not None
 
@@ -214,4 +214,4 @@ def test_a_slope_beyond_the_type_of_its_picture_is_no_fault_of_the_step(picture)
     def steep(x: torch.Tensor) -> torch.Tensor:
         return 1 + 1e7 * (x.float() - x.float().detach()) if x.dtype != torch.float64 else 1 + 1e7 * (x - x.detach())
 
-    assert judged(step_of(steep), [picture], BY_NAME["float16"], 0).mark == "pass"
+    assert judge_step(step_of(steep), [picture], BY_NAME["float16"], 0).mark == "pass"

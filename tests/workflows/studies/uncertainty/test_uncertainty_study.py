@@ -17,8 +17,8 @@ from neusee.workflows.graph.recipe_graph import needed
 from neusee.workflows.recipe.distributions.uncertain_inputs import SCRAMBLES, Inputs
 from neusee.workflows.simulation.simulate_recipe import simulate
 from neusee.workflows.store.result_store import Store
-from neusee.workflows.studies.run_study import failed, made
-from neusee.workflows.studies.uncertainty.output_draws import Draws, quantities
+from neusee.workflows.studies.run_study import count_failures, study_recipe
+from neusee.workflows.studies.uncertainty.output_draws import OutputDraws, quantities
 from neusee.workflows.studies.uncertainty.scatter_estimate import scatter
 from neusee.workflows.studies.uncertainty.sobol_indices import indices
 
@@ -72,7 +72,7 @@ def test_a_recipe_that_is_sure_of_all_has_nothing_to_draw():
 def test_a_draw_beyond_a_limit_is_refused_before_anything_runs(tmp_path):
     recipe = small("transfer", "sensor.read_noise=normal(1 e-, 1 e-)")
     with pytest.raises(ValueError, match=r"argument 9 +sensor\.read_noise = -.* e- +is drawn, but must be greater"):
-        made("uncertainty", recipe, Store(tmp_path / "store"), tmp_path / "runs")
+        study_recipe("uncertainty", recipe, Store(tmp_path / "store"), tmp_path / "runs")
     assert not (tmp_path / "runs").exists()
 
 
@@ -122,7 +122,7 @@ def test_joint_draws_are_taken_whole(tmp_path):
 def test_a_draw_is_a_run_with_its_values_to_the_last_bit(store):
     recipe = small("raw, saturated, developed_quality, transfer", *LAWS)
     inputs = Inputs.of(recipe)
-    draws = Draws(inputs, store)
+    draws = OutputDraws(inputs, store)
     row = inputs.independent(3, 1).values[2]
     found = draws.numbers(row[None])[0]
     said = inputs.uncertain.at(dict(zip(inputs.names, map(float, row), strict=True)))
@@ -133,24 +133,24 @@ def test_a_draw_is_a_run_with_its_values_to_the_last_bit(store):
 def test_draws_at_once_are_those_one_after_another(store, tmp_path):
     inputs = Inputs.of(small("developed_quality, transfer, lsr", *LAWS, "optics.defocus=normal(0.3 waves, 0.1 waves)"))
     values = inputs.independent(6, 1).values
-    one = Draws(inputs, Store(tmp_path / "one"), workers=1).numbers(values)
-    assert Draws(inputs, Store(tmp_path / "many"), workers=3).numbers(values) == one
+    one = OutputDraws(inputs, Store(tmp_path / "one"), workers=1).numbers(values)
+    assert OutputDraws(inputs, Store(tmp_path / "many"), workers=3).numbers(values) == one
 
 
 def test_a_key_hangs_on_all_that_decides_a_draw(tmp_path):
     recipe = small("transfer", *LAWS)
     inputs = Inputs.of(recipe)
     row = inputs.independent(1, 1).values[0]
-    keys = {Draws(inputs, Store(tmp_path)).key(row), Draws(inputs, Store(tmp_path)).key(row * (1 + 1e-15))}
+    keys = {OutputDraws(inputs, Store(tmp_path)).key(row), OutputDraws(inputs, Store(tmp_path)).key(row * (1 + 1e-15))}
     for other in (small("transfer", *LAWS, "sensor.bits=12"), small("transfer", *LAWS, "seed=8")):
-        keys.add(Draws(Inputs.of(other), Store(tmp_path)).key(row))
+        keys.add(OutputDraws(Inputs.of(other), Store(tmp_path)).key(row))
     assert len(keys) == 4
 
 
 def test_pictures_have_the_mean_and_deviation_of_all_draws(store):
     inputs = Inputs.of(small("raw", *LAWS))
     values = inputs.independent(5, 1).values
-    mean, sd = Draws(inputs, store).pictures(values)["raw[mask]"]
+    mean, sd = OutputDraws(inputs, store).pictures(values)["raw[mask]"]
     names = inputs.names
     each = [run(inputs.uncertain.at(dict(zip(names, map(float, v), strict=True))), store)["raw[mask]"] for v in values]
     whole = torch.stack(each).double()
@@ -213,7 +213,7 @@ def test_shares_of_a_variance_are_those_of_the_closed_form():
     a, b, c, _ = z.T
     found = indices(["a", "b", "c", "d"], z, 3 * a + 2 * b + 2 * a * b + c**2 / 2, 1)
     whole = 9 + 4 + 4 + 0.5
-    assert found.told
+    assert found.explains_enough
     assert found.total == pytest.approx([13 / whole, 8 / whole, 0.5 / whole, 0.0], abs=0.03)
     assert found.first == pytest.approx([9 / whole, 4 / whole, 0.5 / whole, 0.0], abs=0.08)
 
@@ -223,7 +223,7 @@ def test_shares_of_one_draw_that_differs_are_numbers():
     y[0] = 4.0
     found = indices(["a"], z, y, 1)
     assert np.isfinite([*found.first, *found.first_error, *found.total, *found.total_error]).all()
-    assert not found.told
+    assert not found.explains_enough
 
 
 def test_a_polynomial_is_judged_by_draws_that_it_has_not_seen():
@@ -241,7 +241,7 @@ def test_a_polynomial_is_judged_by_draws_that_it_has_not_seen():
 
 def test_a_polynomial_that_tells_nothing_is_not_believed():
     z = np.random.default_rng(1).standard_normal((400, 2))
-    assert not indices(["a", "b"], z, np.sign(np.sin(9 * z[:, 0])), 1).told
+    assert not indices(["a", "b"], z, np.sign(np.sin(9 * z[:, 0])), 1).explains_enough
 
 
 # --- the study --------------------------------------------------------------------------------------------------------
@@ -249,19 +249,21 @@ def test_a_polynomial_that_tells_nothing_is_not_believed():
 
 def test_deviations_are_those_of_the_closed_form(tmp_path, store):
     """Dark noise K**2 (sigma**2 + dark) + 1/12 with sigma of 10.5 ± 0.5: variance K**4 (4 m**2 s**2 + 2 s**4)."""
-    folder = made("uncertainty", load("first_light", NOISE), store, tmp_path, most=400)
+    folder = study_recipe("uncertainty", load("first_light", NOISE), store, tmp_path, most=400)
     doc = json.loads((folder / "provenance.json").read_text())
     floor = 2  # the dark level's prediction
     found, error = doc["quantities"]["transfer"]["sd"][floor], doc["quantities"]["transfer"]["error"]
     wanted = math.sqrt(4 * 10.5**2 * 0.5**2 + 2 * 0.5**4) / 0.37**2
     assert abs(found / wanted - 1) < 3 * error
     assert error <= 0.05
-    assert doc["failed"] == failed(folder) == 0
+    assert doc["failed"] == count_failures(folder) == 0
     assert doc["still"] == ["lsr[plain]", "lsr[mask]"]
 
 
 def test_points_of_sobol_find_the_same_with_fewer(tmp_path, store):
-    folder = made("uncertainty", load("first_light", NOISE), store, tmp_path, most=512, points="sobol", error=0.02)
+    folder = study_recipe(
+        "uncertainty", load("first_light", NOISE), store, tmp_path, most=512, points="sobol", error=0.02
+    )
     doc = json.loads((folder / "provenance.json").read_text())
     wanted = math.sqrt(4 * 10.5**2 * 0.5**2 + 2 * 0.5**4) / 0.37**2
     assert doc["quantities"]["transfer"]["sd"][2] == pytest.approx(wanted, rel=0.06)
@@ -270,8 +272,8 @@ def test_points_of_sobol_find_the_same_with_fewer(tmp_path, store):
 
 def test_what_was_stopped_goes_on_with_the_same(tmp_path, store, monkeypatch):
     recipe = small("developed_quality, saturated, raw", *LAWS)
-    whole = made("uncertainty", recipe, Store(tmp_path / "whole"), tmp_path / "a", most=80)
-    real, calls = Draws._result, []
+    whole = study_recipe("uncertainty", recipe, Store(tmp_path / "whole"), tmp_path / "a", most=80)
+    real, calls = OutputDraws._result, []
 
     def stops(self, row):
         calls.append(row)
@@ -279,15 +281,15 @@ def test_what_was_stopped_goes_on_with_the_same(tmp_path, store, monkeypatch):
             raise KeyboardInterrupt
         return real(self, row)
 
-    monkeypatch.setattr(Draws, "_result", stops)
+    monkeypatch.setattr(OutputDraws, "_result", stops)
     with pytest.raises(KeyboardInterrupt):
-        made("uncertainty", recipe, Store(tmp_path / "store"), tmp_path / "b", most=80)
-    monkeypatch.setattr(Draws, "_result", real)
-    again = made("uncertainty", recipe, Store(tmp_path / "store"), tmp_path / "b", most=80)
+        study_recipe("uncertainty", recipe, Store(tmp_path / "store"), tmp_path / "b", most=80)
+    monkeypatch.setattr(OutputDraws, "_result", real)
+    again = study_recipe("uncertainty", recipe, Store(tmp_path / "store"), tmp_path / "b", most=80)
     one, other = (json.loads((folder / "provenance.json").read_text()) for folder in (whole, again))
     assert one["quantities"] == other["quantities"]
     assert 0 < other["computed"] < one["computed"] - 60
-    last = made("uncertainty", recipe, Store(tmp_path / "store"), tmp_path / "c", most=80)
+    last = study_recipe("uncertainty", recipe, Store(tmp_path / "store"), tmp_path / "c", most=80)
     assert json.loads((last / "provenance.json").read_text())["computed"] == 0
     with np.load(again / "pictures.npz") as a, np.load(last / "pictures.npz") as b:
         assert all((a[name] == b[name]).all() for name in a)
@@ -323,8 +325,8 @@ def test_an_option_that_cannot_be_is_refused(option, said):
 
 
 def test_pictures_alone_are_no_numbers(tmp_path, store):
-    with pytest.raises(ValueError, match="pictures alone"):
-        made("uncertainty", small("raw", *LAWS), store, tmp_path)
+    with pytest.raises(ValueError, match="pictures only"):
+        study_recipe("uncertainty", small("raw", *LAWS), store, tmp_path)
 
 
 def test_a_run_with_a_posterior_says_where_the_recipe_lies(tmp_path, store):
@@ -340,15 +342,15 @@ def test_a_run_with_a_posterior_says_where_the_recipe_lies(tmp_path, store):
 
 
 def test_what_is_not_finite_fails_and_is_said(tmp_path, store, monkeypatch):
-    real = Draws.numbers
+    real = OutputDraws.numbers
 
     def broken(self, values):
         found = real(self, values)
         return [{**numbers, "developed_quality[mask].psnr": [math.nan]} for numbers in found]
 
-    monkeypatch.setattr(Draws, "numbers", broken)
-    folder = made("uncertainty", small("developed_quality", *LAWS), store, tmp_path, most=64, error=1.0)
-    assert failed(folder) == 1
+    monkeypatch.setattr(OutputDraws, "numbers", broken)
+    folder = study_recipe("uncertainty", small("developed_quality", *LAWS), store, tmp_path, most=64, error=1.0)
+    assert count_failures(folder) == 1
     assert "Not finite in some draw: developed_quality[mask].psnr" in (folder / "report.html").read_text()
     table = (folder / "table.csv").read_text()
     assert "developed_quality[mask].psnr,,nan,nan" in table

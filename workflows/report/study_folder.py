@@ -1,0 +1,89 @@
+"""The folder of a study: what a study, a calibration and an evaluation write alike.
+
+run = StudyRun("stability", recipe, command)            # starts the clock
+document = run.document({"failed": 3})                  # what provenance.json holds
+report = StudyReport("Stability of it", lead, sections) # the page, its pictures and its tables
+folder = run.write(runs, key, document, report)
+"""
+
+from __future__ import annotations
+
+import json
+import time
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+from neusee.workflows.engine.provenance import timestamp, versions
+from neusee.workflows.graph.recipe_graph import Recipe
+from neusee.workflows.report.run_folder import RunFolder, new_run
+from neusee.workflows.report.study_page import Section, page
+
+Progress = Callable[[str], None]  #: takes one line for each part of a study that is done
+CsvTable = tuple[Sequence[str], Iterable[Sequence[Any]]]  #: the names of the columns, and the rows
+Content = str | bytes | Callable[[Path], Any]  #: of a file, or what writes the file at a path
+SHOWN = ("command", "date", "seconds", "versions")  #: what the page of a study shows of its document
+
+
+def silent(line: str) -> None:
+    """Ignore a line of progress."""
+
+
+@dataclass(frozen=True)
+class StudyReport:
+    """What a study writes beside its document: the parts of its page, pictures, tables and other files by name."""
+
+    title: str
+    lead: str
+    sections: Sequence[Section]
+    pictures: Mapping[str, bytes | None] = field(default_factory=dict)  #: by name, without folder and suffix
+    tables: Mapping[str, CsvTable] = field(default_factory=dict)  #: by file name
+    files: Mapping[str, Content] = field(default_factory=dict)  #: by file name
+    shown: Sequence[str] = SHOWN  #: the values of the document that the page shows
+    banner: str = ""  #: why the result must not be used
+
+    def write(self, folder: RunFolder, document: Mapping[str, Any]) -> None:
+        """Write the page, its pictures, tables and files, and ``document`` as ``provenance.json``."""
+        for name, picture in self.pictures.items():
+            if picture:
+                folder.write(f"figures/{name}.png", picture)
+        for name, (header, rows) in self.tables.items():
+            folder.write_rows(name, header, rows)
+        for name, content in self.files.items():
+            content(folder.path / name) if callable(content) else folder.write(name, content)
+        folder.write("provenance.json", as_json(document))
+        shown = {name: document[name] for name in self.shown}
+        folder.write("report.html", page(self.title, self.lead, self.sections, shown, self.banner))
+
+
+class StudyRun:
+    """A study under way: the clock runs from the moment that it is made."""
+
+    def __init__(self, kind: str, recipe: Recipe, command: Sequence[str]) -> None:
+        self.kind, self.recipe, self.command = kind, recipe, command
+        self._began = time.perf_counter()
+
+    def document(self, content: Mapping[str, Any]) -> dict[str, Any]:
+        """Return what ``provenance.json`` holds: the command, date and seconds, then ``content``, then the recipe."""
+        return {
+            "study": self.kind,
+            "recipe": self.recipe.name,
+            "command": " ".join(self.command),
+            "date": timestamp(),
+            "seconds": time.perf_counter() - self._began,
+            **content,
+            "versions": versions(),
+            "config": self.recipe.config.to_yaml(),
+        }
+
+    def write(self, runs: Path, key: str, document: Mapping[str, Any], report: StudyReport, name: str = "") -> Path:
+        """Write ``runs/<date>_<recipe>_<name>_<key>`` and return it; ``name`` is the kind of study by default."""
+        with new_run(runs, f"{self.recipe.name}_{name or self.kind.replace('-', '_')}", key) as folder:
+            report.write(folder, document)
+        return folder.path
+
+
+def as_json(document: Mapping[str, Any]) -> str:
+    """Return a document as indented JSON."""
+    return json.dumps(document, indent=1, ensure_ascii=False)
