@@ -22,11 +22,11 @@ from neusee.workflows.cli.command_frame import (
     Debug,
     Out,
     Words,
-    bytes_of,
     check_device,
     executor_of,
     fail,
     load,
+    parse_memory,
     refuse,
     say,
     split,
@@ -82,7 +82,7 @@ def run(
     from neusee.workflows.report import console
 
     check_device(device)
-    room = bytes_of(memory, "--memory") if memory else None
+    room = parse_memory(memory, "--memory") if memory else None
     if not (as_json or quiet):
         say(console.opening(recipe, " ".join(command[1:])))
     store = the_store()
@@ -161,7 +161,7 @@ def plan(
         except RecipeError as error:
             refuse(error)
         return
-    room = bytes_of(memory, "--memory") if memory else None
+    room = parse_memory(memory, "--memory") if memory else None
     lines, refused = run_forecast.plan_lines(recipe, the_store(), device, room)
     say(lines)
     if refused:

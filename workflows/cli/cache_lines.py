@@ -5,8 +5,8 @@ from __future__ import annotations
 import os
 from typing import Any
 
-from neusee.workflows.report.run_timing import size_of
-from neusee.workflows.store.budget_eviction import bytes_of
+from neusee.workflows.report.text_table import columns
+from neusee.workflows.store.byte_sizes import format_size, parse_size
 from neusee.workflows.store.derived_files import DerivedFiles
 from neusee.workflows.store.metadata import is_kept
 from neusee.workflows.store.result_store import Store
@@ -18,13 +18,13 @@ def ls_lines(store: Store) -> list[str]:
     pins = store.pinned()
     rows = [_row(key, about, key in pins) for key, about in found]
     kept = [about for _, about in found if is_kept(about)]
-    last = f"{_count(len(kept), 'result')}, {size_of(sum(map(_size, kept)))}, in {store.root}"
+    last = f"{_count(len(kept), 'result')}, {format_size(sum(map(_size, kept)))}, in {store.root}"
     if len(kept) < len(found):
         last += f"; of {_count(len(found) - len(kept), 'more result')} the receipt alone"
     if store.budget is not None:
-        last += f"; the budget is {size_of(store.budget)}"
+        last += f"; the budget is {format_size(store.budget)}"
     head = ["date", "bytes", "seconds", "step", "recipe", "key", ""]
-    return [*(_columns([head, *rows]) if rows else []), last]
+    return [*(columns([head, *rows]) if rows else []), last]
 
 
 def verify_lines(store: Store) -> tuple[list[str], int]:
@@ -38,7 +38,7 @@ def verify_lines(store: Store) -> tuple[list[str], int]:
             bad.append(f"{found.key}  {about.get('step') or '?'}  {problem}")
         elif is_kept(about):
             count, size = count + 1, size + _size(about)
-    last = f"{_count(count, 'result')}, {size_of(size)}, as written"
+    last = f"{_count(count, 'result')}, {format_size(size)}, as written"
     if bad:
         last += f"; {len(bad)} damaged, put aside in {store.root / 'bad'}: a next run computes what it needs of them"
     return [*bad, last], len(bad)
@@ -47,12 +47,13 @@ def verify_lines(store: Store) -> tuple[list[str], int]:
 def gc_lines(store: Store, budget: str | None = None, dry: bool = False) -> list[str]:
     """Remove what belongs to no result, and values beyond ``budget``, such as ``20 GB``. Raises `ValueError`."""
     abouts = dict(store.entries())
-    swept = store.gc(None if budget is None else bytes_of(budget), dry)
+    swept = store.gc(None if budget is None else parse_size(budget), dry)
     rows = [[*_row(key, abouts[key], False)[1:4], key[:8]] for key in swept.evicted if key in abouts]
     went = f"{_count(len(swept.evicted), 'value')} and {_count(swept.orphans, 'file')} that belonged to no result"
-    last = f"{went} {'would go' if dry else 'went'}: {size_of(swept.freed)}; {size_of(swept.left)} stay in {store.root}"
+    freed, left = format_size(swept.freed), format_size(swept.left)
+    last = f"{went} {'would go' if dry else 'went'}: {freed}; {left} stay in {store.root}"
     refused = f"{_count(len(swept.refused), 'value')} of other users could not be removed"
-    return [*(_columns(rows) if rows else []), *([refused] if swept.refused else []), last]
+    return [*(columns(rows) if rows else []), *([refused] if swept.refused else []), last]
 
 
 def pin_lines(store: Store, prefix: str, pin: bool = True) -> list[str]:
@@ -89,7 +90,7 @@ def _picture_problem(shelf: DerivedFiles, key: str, about: dict[str, Any]) -> st
 def _row(key: str, about: dict[str, Any], pinned: bool) -> list[str]:
     took, date = f"{about.get('seconds') or 0.0:.3f}", str(about.get("date") or "")[:19].replace("T", " ")
     mark = "pinned" if pinned else "" if is_kept(about) else "receipt"
-    return [date, size_of(_size(about)), took, about.get("step") or "", about.get("recipe") or "", key[:8], mark]
+    return [date, format_size(_size(about)), took, about.get("step") or "", about.get("recipe") or "", key[:8], mark]
 
 
 def _size(about: dict[str, Any]) -> int:
@@ -100,9 +101,3 @@ def _size(about: dict[str, Any]) -> int:
 
 def _count(count: int, what: str) -> str:
     return f"{count} {what}{'s' * (count != 1)}"
-
-
-def _columns(rows: list[list[str]]) -> list[str]:
-    """Left-aligned columns."""
-    widths = [max(len(row[i]) for row in rows) for i in range(len(rows[0]))]
-    return ["  ".join(f"{cell:<{wide}}" for cell, wide in zip(row, widths, strict=True)).rstrip() for row in rows]

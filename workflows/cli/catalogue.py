@@ -15,6 +15,7 @@ from neusee.workflows.graph.diagnostics import nearest
 from neusee.workflows.recipe.loading import groups, recipes
 from neusee.workflows.recipe.paper_readings import READINGS
 from neusee.workflows.recipe.step_declarations import all_nodes
+from neusee.workflows.report.text_table import columns
 
 _FOLDER = Path(neusee.recipes.__file__).parent
 _KINDS = (
@@ -46,9 +47,7 @@ _SAID = {
 def recipe_lines() -> list[str]:
     """Each recipe with its first line, then the groups that it may choose from."""
     found = recipes()
-    wide = max((len(r.name) for r in found), default=0)
-    lines = [f"{r.name:<{wide}}  {r.title}" for r in found]
-    lines += ["", "groups, as in `neusee run laser=six`"]
+    lines = [*columns([[r.name, r.title] for r in found]), "", "groups, as in `neusee run laser=six`"]
     return [*lines, *(f"  {name}: {', '.join(o.name for o in options)}" for name, options in groups().items())]
 
 
@@ -86,9 +85,8 @@ def _parameters(node: Node) -> list[str]:
     rows = []
     for name, field in node.params.model_fields.items():
         default = "required" if field.is_required() else f"default {_default(field.default)}"
-        rows.append((name, _kind(node.hints[name]), default))
-    wide = max((len(name) for name, _, _ in rows), default=0)
-    return [f"  {name:<{wide}}  {kind}; {default}" for name, kind, default in rows]
+        rows.append([f"  {name}", f"{_kind(node.hints[name])}; {default}"])
+    return columns(rows)
 
 
 def _default(value: Any) -> str:

@@ -109,12 +109,12 @@ def the_store() -> Store:
         fail(f"NEUSEE_CACHE: {error}")
 
 
-def bytes_of(text: str, option: str) -> int:
-    """``6 GB`` as bytes; anything else is refused, with what may be written."""
-    from neusee.workflows.store.budget_eviction import bytes_of as read
+def parse_memory(text: str, option: str) -> int:
+    """Return the bytes that a text such as ``6 GB`` names; stop with a message for any other text."""
+    from neusee.workflows.store.byte_sizes import parse_size
 
     try:
-        return read(text)
+        return parse_size(text)
     except ValueError as error:
         fail(f"{option}: {error}")
 

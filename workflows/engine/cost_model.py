@@ -8,6 +8,7 @@ from statistics import median
 from typing import Any
 
 from neusee.workflows.graph.recipe_graph import Step
+from neusee.workflows.keys.cache_key import device_kind
 
 GUESS = 0.01  #: s of a step of which nothing is known
 _FASTER = 10.0  #: how many times as fast another kind of device is taken to be until both were measured
@@ -75,4 +76,4 @@ class Costs:
 
 
 def _kind(row: Row) -> str:
-    return str(row.get("device") or "cpu").partition(":")[0]
+    return device_kind(str(row.get("device") or "cpu"))

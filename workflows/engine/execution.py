@@ -22,7 +22,7 @@ from neusee.workflows.engine.placement_inputs import joined, past_costs, prepare
 from neusee.workflows.engine.step_job import Executor, InputMissing, Outcome, Read, StepJob
 from neusee.workflows.engine.step_record import Event, StepRecord, error_in, facts_in, ran
 from neusee.workflows.graph.recipe_graph import Recipe, Step, Wire, in_order
-from neusee.workflows.keys.cache_key import Key, key_of
+from neusee.workflows.keys.cache_key import Key, device_kind, key_of
 from neusee.workflows.keys.code_digest import Code
 from neusee.workflows.placement.heft_and_cpop import Schedule, TooLarge
 from neusee.workflows.store.result_store import Store
@@ -241,7 +241,7 @@ class Execution:
         path = step.node.path
         self.took[path] = max(outcome.seconds, self.took.get(path, 0.0))
         self.again[key] = self.store.read_seconds(outcome.bytes) if outcome.kept else outcome.seconds + work.below
-        predicted = expected.seconds[work.device.partition(":")[0]] if expected.known else None
+        predicted = expected.seconds[device_kind(work.device)] if expected.known else None
         self._finish(ran(outcome, self._why(step.name, key), self._bound(step.name), self.began, predicted))
 
     def _fetch(self, key: Key) -> Any:

@@ -13,6 +13,7 @@ from typing import TYPE_CHECKING, Any
 
 from neusee.workflows.engine.runner import Event, StepRecord
 from neusee.workflows.report.run_page import shape_of, unit_of
+from neusee.workflows.report.text_table import columns, indented
 from neusee.workflows.report.tolerance_spent import said_of_economies
 
 if TYPE_CHECKING:
@@ -186,7 +187,7 @@ def closing(doc: Mapping[str, Any], path: str, again: Sequence[str]) -> list[str
     lines = [said_of_economies(doc["spent"])] if doc["spent"]["economies"] else []
     lines += [said_of_left_out(doc)] if doc["left_out"] else []
     rows = [[row["name"], *row["cells"]] for row in doc["table"]["rows"]]
-    lines += ["", *aligned([["", *doc["table"]["columns"]], *rows])] if rows else []
+    lines += ["", *indented([["", *doc["table"]["columns"]], *rows])] if rows else []
     lines += [f"  {line}" for line in doc["table"]["legend"]]
     lines += ["", f"{doc['verdict']}  ({doc['counts']}, {doc['seconds']:.2f} s)"]
     for e in doc["expected"]:
@@ -218,20 +219,7 @@ def next_commands(recipe: Recipe) -> list[str]:
         ("neusee recipes", "what else there is", True),
     ]
     shown = [(command, why) for command, why, fits in tries if fits][:3]
-    wide = max(len(command) for command, _ in shown)
-    return [f"{command:<{wide}}   # {why}" for command, why in shown]
-
-
-def aligned(rows: Sequence[Sequence[str]], right: bool = True) -> list[str]:
-    """Rows as lines of equal columns; the first column is text, the others numbers."""
-    widths = [max(len(row[i]) for row in rows) for i in range(len(rows[0]))]
-    lines = []
-    for row in rows:
-        cells = [
-            f"{(c or '–') if i and right else c:{'>' if i and right else '<'}{widths[i]}}" for i, c in enumerate(row)
-        ]
-        lines.append("  " + "   ".join(cells).rstrip())
-    return lines
+    return columns([[command, f"# {why}"] for command, why in shown], gap="   ")
 
 
 def _line(cells: Sequence[str], wide: int) -> str:

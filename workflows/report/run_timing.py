@@ -5,6 +5,8 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from typing import Any
 
+from neusee.workflows.store.byte_sizes import format_size
+
 Row = Mapping[str, Any]  #: a step as the report says it
 
 
@@ -60,18 +62,9 @@ def said_of(found: Mapping[str, Any]) -> list[str]:
     if found["served"]:
         share = f"{100 * found['share']:.3g} % of all computing"
         lines.append(f"The cache served {found['served']} steps and saved {_seconds(found['saved'])}, {share}.")
-    lines.append(f"Read from the cache: {size_of(found['read'])}; written to it: {size_of(found['written'])}.")
+    lines.append(f"Read from the cache: {format_size(found['read'])}; written to it: {format_size(found['written'])}.")
     return lines
 
 
 def _seconds(value: float) -> str:
     return f"{value:.3g} s" if value < 100 else f"{value:.0f} s"
-
-
-def size_of(count: float) -> str:
-    """Bytes as people read them."""
-    for unit in ("B", "kB", "MB", "GB"):
-        if count < 1000 or unit == "GB":
-            return f"{count:.3g} {unit}"
-        count /= 1000
-    raise AssertionError

@@ -21,8 +21,8 @@ from typing import Any, Literal
 
 from neusee.workflows.engine.node_call import versions
 from neusee.workflows.keys.cache_key import digest
-from neusee.workflows.report.console import aligned
 from neusee.workflows.report.run_folder import new_run
+from neusee.workflows.report.text_table import indented
 from neusee.workflows.store.remote_store import open_store
 from neusee.workflows.store.result_store import Store
 from neusee.workflows.sweeps.axes import Argument, Axis, points, read_axes, read_words
@@ -61,7 +61,7 @@ class Sweep:
 
     def table(self) -> str:
         """One line a point, for reading."""
-        return "\n".join(aligned(wide(self.outcomes, self.columns)))
+        return "\n".join(indented(wide(self.outcomes, self.columns)))
 
     def to_xarray(self) -> Any:
         """An `xarray.Dataset` with the axes as dimensions and coordinates in SI; nan where a point failed.

@@ -23,7 +23,7 @@ from neusee.nodes.restore._networks._unet import UNet
 from neusee.nodes.values import Psf
 from neusee.workflows.graph.diagnostics import nearest
 from neusee.workflows.graph.recipe_graph import Recipe, Step
-from neusee.workflows.keys.cache_key import stream_seed
+from neusee.workflows.keys.cache_key import device_kind, stream_seed
 from neusee.workflows.recipe.blocks.train_block import GRID, Network, Stage, Training
 from neusee.workflows.training.parallel.process_mesh import ALONE, Mesh
 from neusee.workflows.training.parallel.shared_graph import Shared
@@ -166,7 +166,7 @@ class Learner:
 
     def _restored(self, sample: Sample) -> tuple[dict[str, tuple[float, Tensor]], Scales, Scales]:
         """Each term with its weight; the truth and, cut off, the estimate."""
-        low = torch.autocast(self.device.partition(":")[0], torch.bfloat16, self.how.precision == "bfloat16")
+        low = torch.autocast(device_kind(self.device), torch.bfloat16, self.how.precision == "bfloat16")
         picture = sample.picture if self.learns else sample.picture.detach()
         with low:
             coarse, fine = self.net.pyramid(picture)
