@@ -27,7 +27,7 @@ sys.path.insert(0, str(Path(__file__).parents[1]))
 from live_bytes import LiveBytes
 
 from neusee.workflows import Store, load
-from neusee.workflows.training.checkpoint import export
+from neusee.workflows.training.loop.checkpoint import export
 from neusee.workflows.training.photograph_folder import Photographs
 from neusee.workflows.training.run_training import frozen
 from neusee.workflows.training.training_iteration import Learner

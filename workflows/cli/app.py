@@ -121,12 +121,13 @@ def _simulate(
     executor: Executor | None,
     memory: int | None,
 ) -> Simulation:
-    from neusee.workflows.report.console import screen
+    from neusee.workflows.report.console import RunTable
+    from neusee.workflows.report.progress_table import mode_for
     from neusee.workflows.simulation.simulate_recipe import simulate, steps_of, wanted
     from neusee.workflows.tolerance.cheaper_steps import with_substitutions
 
     recipe = with_substitutions(recipe, wanted(recipe))
-    with screen(recipe, steps_of(recipe), silent) as shown:
+    with RunTable(recipe, steps_of(recipe), mode_for(silent)) as shown:
         return simulate(recipe, store, out, command, device, shown.watch, executor, memory)
 
 

@@ -6,12 +6,12 @@ nothing needed are one line together.
 
 from __future__ import annotations
 
-import sys
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Any
 
 from neusee.workflows.engine.runner import Event, StepRecord
+from neusee.workflows.report.progress_table import Mode, ProgressTable
 from neusee.workflows.report.run_page import shape_of, unit_of
 from neusee.workflows.report.text_table import columns, indented
 from neusee.workflows.report.tolerance_spent import said_of_economies
@@ -20,7 +20,7 @@ if TYPE_CHECKING:
     from neusee.workflows.graph.recipe_graph import Recipe
 
 HEADER = ("step", "where", "state", "seconds", "output", "check")
-_WIDTHS = (0, 5, 10, 9, 28, 0)
+_WIDTHS = (5, 10, 9, 28, 0)  #: of the columns after the first
 
 
 @dataclass
@@ -68,85 +68,38 @@ class Family:
         return ", ".join(f"{states.count(s)} {s}" for s in dict.fromkeys(states))
 
 
-class Plain:
-    """One line a step, printed when its last item is done."""
+class RunTable(ProgressTable):
+    """The steps of a run: as plain lines, a step is printed when its last item is done."""
 
-    def __init__(self, recipe: Recipe, names: Iterable[str]) -> None:
+    header, numbers = HEADER, ("seconds",)
+
+    def __init__(self, recipe: Recipe, names: Iterable[str], mode: Mode) -> None:
+        super().__init__(mode)
         self.families = families(recipe, names)
-        self.wide = max((len(f.cells()[0]) for f in self.families.values()), default=0)
-
-    def __enter__(self) -> Plain:
-        print(_line(HEADER, self.wide))
-        return self
+        self.widths = (max((len(f.cells()[0]) for f in self.families.values()), default=0), *_WIDTHS)
 
     def __exit__(self, *error: object) -> None:
-        asleep = sum(d.state == "not needed" for f in self.families.values() for d in f.done)
-        if asleep:
-            print(f"  {asleep} steps were not looked at: what needs them is in the cache")
+        super().__exit__(*error)
+        if self.mode == "plain" and self.caption():
+            print(f"  {self.caption()}")
 
     def watch(self, event: Event) -> None:
         """Take one event of the engine."""
         family = note(self.families, event)
         if event.done is not None and family.awake and len(family.done) == len(family.members):
-            print(_line(family.cells(), self.wide))
+            self.show_row(family.cells())
 
+    def live_rows(self) -> Iterator[tuple[tuple[str, ...], str]]:
+        """Return the steps that have begun."""
+        for family in self.families.values():
+            if family.begun or family.awake:
+                cells = family.cells()
+                yield cells, "failed" if "LOOK" in cells[5] else cells[2]
 
-class Live:
-    """A table that fills as the steps are done."""
-
-    def __init__(self, recipe: Recipe, names: Iterable[str]) -> None:
-        from rich.live import Live as RichLive
-
-        self.families = families(recipe, names)
-        self.live = RichLive(self, refresh_per_second=8, vertical_overflow="visible")
-
-    def __rich__(self) -> Any:
-        from rich import box
-        from rich.table import Table
-
-        rows = [f for f in self.families.values() if f.begun or f.awake]
-        table = Table(box=box.SIMPLE_HEAD, pad_edge=False, header_style="bold")
-        for name in HEADER:
-            table.add_column(name, justify="right" if name == "seconds" else "left", overflow="fold")
-        for family in rows:
-            cells = family.cells()
-            style = {"run": "bold", "cached": "cyan", "left out": "dim"}.get(cells[2], "")
-            table.add_row(*cells, style="red" if "LOOK" in cells[5] else style)
+    def caption(self) -> str:
+        """Return how many steps were not needed."""
         asleep = sum(d.state == "not needed" for f in self.families.values() for d in f.done)
-        if asleep:
-            table.caption = f"{asleep} steps were not looked at: what needs them is in the cache"
-        return table
-
-    def __enter__(self) -> Live:
-        self.live.start()
-        return self
-
-    def __exit__(self, *error: object) -> None:
-        self.live.stop()
-
-    def watch(self, event: Event) -> None:
-        """Take one event of the engine."""
-        note(self.families, event)
-
-
-class Silent:
-    """Nothing at all: for ``--json`` and ``--quiet``."""
-
-    def __enter__(self) -> Silent:
-        return self
-
-    def __exit__(self, *error: object) -> None:
-        return None
-
-    def watch(self, event: Event) -> None:
-        """Take one event of the engine."""
-
-
-def screen(recipe: Recipe, names: Iterable[str], silent: bool) -> Plain | Live | Silent:
-    """The display that fits where the output goes."""
-    if silent:
-        return Silent()
-    return Live(recipe, names) if sys.stdout.isatty() else Plain(recipe, names)
+        return f"{asleep} steps were not looked at: what needs them is in the cache" if asleep else ""
 
 
 def families(recipe: Recipe, names: Iterable[str]) -> dict[str, Family]:
@@ -220,12 +173,3 @@ def next_commands(recipe: Recipe) -> list[str]:
     ]
     shown = [(command, why) for command, why, fits in tries if fits][:3]
     return columns([[command, f"# {why}"] for command, why in shown], gap="   ")
-
-
-def _line(cells: Sequence[str], wide: int) -> str:
-    """One plain line; the columns keep their places while the cells fit."""
-    widths = (wide, *_WIDTHS[1:])
-    padded = [
-        f"{c:>{w}}" if name == "seconds" else f"{c:<{w}}" for c, w, name in zip(cells, widths, HEADER, strict=True)
-    ]
-    return "  " + "  ".join(padded).rstrip()

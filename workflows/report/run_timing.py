@@ -7,10 +7,10 @@ from typing import Any
 
 from neusee.workflows.store.byte_sizes import format_size
 
-Row = Mapping[str, Any]  #: a step as the report says it
+StepRow = Mapping[str, Any]  #: a step as the report says it
 
 
-def timing(steps: Sequence[Row], planned: float | None = None) -> dict[str, Any]:
+def timing(steps: Sequence[StepRow], planned: float | None = None) -> dict[str, Any]:
     """Seconds predicted and taken, what was served instead of computed, and what went through the disk.
 
     A key that several steps share is counted once. ``planned`` is the length of the schedule, where one was made.
@@ -38,9 +38,9 @@ def timing(steps: Sequence[Row], planned: float | None = None) -> dict[str, Any]
     }
 
 
-def _once(steps: Any) -> list[Row]:
+def _once(steps: Any) -> list[StepRow]:
     """The first step of each key; one that was read counts before one that was not looked at."""
-    found: dict[str, Row] = {}
+    found: dict[str, StepRow] = {}
     for step in steps:
         if step["key"] not in found or step["state"] == "cached":
             found[step["key"]] = step

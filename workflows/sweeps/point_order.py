@@ -17,7 +17,7 @@ from neusee.workflows.keys.cache_key import Key
 
 
 @dataclass(frozen=True, slots=True)
-class Job:
+class PointJob:
     """What one point asks of the engine."""
 
     place: tuple[int, ...]  #: index along every axis
@@ -51,7 +51,7 @@ def filled(costs: Mapping[str, float], steps: Iterable[str]) -> dict[str, float]
     return {step: costs.get(step, usual) for step in steps}
 
 
-def best_order(jobs: Sequence[Job], costs: Mapping[str, float], paired: bool = False) -> list[int]:
+def best_order(jobs: Sequence[PointJob], costs: Mapping[str, float], paired: bool = False) -> list[int]:
     """Indices of ``jobs`` so that expensive shared steps run once although little is held.
 
     Args: jobs: one a point, in the order of the product of the axes, the last fastest.
@@ -71,7 +71,7 @@ def best_order(jobs: Sequence[Job], costs: Mapping[str, float], paired: bool = F
     return [index[place] for place in _there_and_back(sizes, slowest_first)]
 
 
-def sharing(jobs: Sequence[Job], costs: Mapping[str, float]) -> Sharing:
+def sharing(jobs: Sequence[PointJob], costs: Mapping[str, float]) -> Sharing:
     """How many different results there are of every step, and what that saves."""
     weights = filled(costs, {step for job in jobs for step in job.keys})
     found: dict[str, set[Key]] = defaultdict(set)
@@ -87,7 +87,7 @@ def sharing(jobs: Sequence[Job], costs: Mapping[str, float]) -> Sharing:
     return Sharing(len(jobs), distinct, steps, len(cost), alone, sum(cost.values()))
 
 
-def work_left(jobs: Iterable[Job], costs: Mapping[str, float], stored: Callable[[Key], bool]) -> list[float]:
+def work_left(jobs: Iterable[PointJob], costs: Mapping[str, float], stored: Callable[[Key], bool]) -> list[float]:
     """Work of each job in turn, when what is stored, or made by a job before, is not made again."""
     made: set[Key] = set()
     found = []
@@ -108,7 +108,7 @@ def work_left(jobs: Iterable[Job], costs: Mapping[str, float], stored: Callable[
 class _Missing(dict[str, tuple[str, ...]]):
     """By step the steps that it asks for: its sources where it is missing, none where it is known."""
 
-    def __init__(self, job: Job, known: Callable[[Key], bool]) -> None:
+    def __init__(self, job: PointJob, known: Callable[[Key], bool]) -> None:
         self.job, self.known, self.names = job, known, set[str]()
 
     def __missing__(self, name: str) -> tuple[str, ...]:
@@ -119,7 +119,7 @@ class _Missing(dict[str, tuple[str, ...]]):
         return self[name]
 
 
-def _reach(jobs: Sequence[Job], weights: Mapping[str, float], sizes: Sequence[int], axis: int) -> float:
+def _reach(jobs: Sequence[PointJob], weights: Mapping[str, float], sizes: Sequence[int], axis: int) -> float:
     """Mean work that one move along an axis makes anew."""
     stride = 1
     for size in sizes[axis + 1 :]:
@@ -145,7 +145,7 @@ def _there_and_back(sizes: Sequence[int], slowest_first: Sequence[int]) -> list[
     return [tuple(row) for row in rows]
 
 
-def _grouped(jobs: Sequence[Job], weights: Mapping[str, float]) -> list[int]:
+def _grouped(jobs: Sequence[PointJob], weights: Mapping[str, float]) -> list[int]:
     """Points with the same costly results beside each other, else in their own order."""
     first: dict[str, dict[Key, int]] = defaultdict(dict)
     for i, job in enumerate(jobs):

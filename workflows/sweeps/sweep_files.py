@@ -8,11 +8,11 @@ from typing import TYPE_CHECKING, Any
 
 from neusee.workflows.graph.diagnostics import Diagnostic, Location, RecipeError
 from neusee.workflows.graph.final_values import flow
-from neusee.workflows.sweeps.sweep_table import Column, header, rows_of
+from neusee.workflows.sweeps.sweep_table import AxisColumn, header, rows_of
 
 if TYPE_CHECKING:
     from neusee.workflows.report.run_folder import RunFolder
-    from neusee.workflows.sweeps.sweep_points import Outcome
+    from neusee.workflows.sweeps.sweep_points import PointOutcome
 
 _PACKAGES = ("xarray", "h5netcdf", "h5py")
 
@@ -25,7 +25,7 @@ def require_xarray(asked_by: str) -> None:
         raise RecipeError([Diagnostic(Location(asked_by), "", told)])
 
 
-def write_table(folder: RunFolder, outcomes: Sequence[Outcome], columns: Sequence[Column]) -> None:
+def write_table(folder: RunFolder, outcomes: Sequence[PointOutcome], columns: Sequence[AxisColumn]) -> None:
     """``sweep.csv``: one row for each number of each point, in the order of the points."""
     rows = (row for outcome in outcomes for row in rows_of(outcome, columns))
     folder.write_rows("sweep.csv", header(columns), rows)
@@ -37,7 +37,9 @@ def write_account(folder: RunFolder, title: str, account: Mapping[str, Any]) -> 
     folder.write("sweep.yaml", "\n".join(lines) + "\n")
 
 
-def dataset(outcomes: Sequence[Outcome], columns: Sequence[Column], paired: bool, about: Mapping[str, str]) -> Any:
+def dataset(
+    outcomes: Sequence[PointOutcome], columns: Sequence[AxisColumn], paired: bool, about: Mapping[str, str]
+) -> Any:
     """An `xarray.Dataset` whose dimensions are the axes, or ``point`` where they are paired; coordinates in SI.
 
     A result of several numbers has a dimension of its own, ``<result> index``. What failed, or
@@ -67,7 +69,7 @@ def dataset(outcomes: Sequence[Outcome], columns: Sequence[Column], paired: bool
     return xarray.Dataset({**found, **own}, coords, dict(about))
 
 
-def _lengths(outcomes: Sequence[Outcome], taken: Collection[str]) -> dict[str, int]:
+def _lengths(outcomes: Sequence[PointOutcome], taken: Collection[str]) -> dict[str, int]:
     """The largest number of values of every result that has several."""
     long: dict[str, int] = {}
     for outcome in outcomes:

@@ -25,54 +25,54 @@ from neusee.workflows.recipe.text.composition import Composed, compose
 from neusee.workflows.report.result_numbers import numbers_of
 from neusee.workflows.store.result_store import Store
 from neusee.workflows.sweeps.axes import Point
-from neusee.workflows.sweeps.point_order import Job, best_order, work_left
+from neusee.workflows.sweeps.point_order import PointJob, best_order, work_left
 from neusee.workflows.tolerance.cheaper_steps import with_substitutions
 
-State = Literal["run", "cached", "failed"]
+PointState = Literal["run", "cached", "failed"]
 OnError = Literal["continue", "stop"]
-Number = tuple[str, str, int | str, float]  #: step, field, index (empty of a single number), value
+ResultNumber = tuple[str, str, int | str, float]  #: step, field, index (empty of a single number), value
 
 
 @dataclass(frozen=True, slots=True)
-class Checked:
+class CheckedPoint:
     """A point in which nothing is wrong, and what it asks of the engine."""
 
     point: Point
     composed: Composed
-    job: Job
+    job: PointJob
 
 
 @dataclass(frozen=True, slots=True)
-class Outcome:
+class PointOutcome:
     """What became of a point."""
 
     point: Point
-    state: State  #: ``cached``: no step had to run
+    state: PointState  #: ``cached``: no step had to run
     seconds: float
-    numbers: tuple[Number, ...] = ()
+    numbers: tuple[ResultNumber, ...] = ()
     step: str = ""  #: the one that failed
     message: str = ""  #: why it failed, with the place where the step is written
     left: float = 0.0  #: seconds that the points after it will take, as the ones before it took
 
 
 @dataclass(frozen=True)
-class Plan:
+class SweepPlan:
     """The points in the order in which they run."""
 
     recipe: Recipe  #: of the first point
-    checked: tuple[Checked, ...]
+    checked: tuple[CheckedPoint, ...]
     costs: dict[str, float]  #: seconds by step, of those that ran before
     work: tuple[float, ...]  #: of every point in turn that is not stored: seconds, or steps where none ran before
     notes: tuple[str, ...]
 
     @property
-    def jobs(self) -> list[Job]:
+    def jobs(self) -> list[PointJob]:
         return [checked.job for checked in self.checked]
 
 
 def planned(
     recipe: str, points: Sequence[Point], folder: Path, store: Store, paired: bool = False, device: str = "cpu"
-) -> Plan:
+) -> SweepPlan:
     """Compose and check every point and put them in order; a `RecipeError` has every mistake of all of them."""
     checker = _Checker(recipe, folder, store, device)
     checked = list(checker.every(points))
@@ -81,17 +81,17 @@ def planned(
     costs = _costs(store)
     in_turn = [checked[i] for i in best_order([c.job for c in checked], costs, paired)]
     work = work_left([c.job for c in in_turn], costs, store.has)
-    return Plan(checker.first, tuple(in_turn), costs, tuple(work), tuple(checker.notes))
+    return SweepPlan(checker.first, tuple(in_turn), costs, tuple(work), tuple(checker.notes))
 
 
 def outcomes(
-    plan: Plan,
+    plan: SweepPlan,
     store: Store,
     on_error: OnError = "stop",
     device: str = "cpu",
     started: Callable[[Point], None] = lambda point: None,
     watch: Callable[[Event], None] | None = None,
-) -> Generator[Outcome, None, None]:
+) -> Generator[PointOutcome, None, None]:
     """Run the points in turn and say at once what became of each.
 
     With ``on_error="stop"`` the error of the first point that fails is raised after its outcome was given.
@@ -114,17 +114,17 @@ def outcomes(
                 raise failure
             failure = None  # it holds the values that the failed step was given
         elif result is not None:
-            state: State = "run" if any(d.state == "run" for d in result.done.values()) else "cached"
-            yield Outcome(checked.point, state, seconds, numbers, left=left)
+            state: PointState = "run" if any(d.state == "run" for d in result.done.values()) else "cached"
+            yield PointOutcome(checked.point, state, seconds, numbers, left=left)
 
 
-def _failed(point: Point, error: Exception, seconds: float, left: float) -> Outcome:
+def _failed(point: Point, error: Exception, seconds: float, left: float) -> PointOutcome:
     step = error.step if isinstance(error, RunError) else ""
     message = str(error) if isinstance(error, RunError | RecipeError) else f"{type(error).__name__}: {error}"
-    return Outcome(point, "failed", seconds, step=step, message=message, left=left)
+    return PointOutcome(point, "failed", seconds, step=step, message=message, left=left)
 
 
-def _numbers(result: Result) -> tuple[Number, ...]:
+def _numbers(result: Result) -> tuple[ResultNumber, ...]:
     """Every small output, number by number."""
     rows = (row for step, value in result.values.items() for row in numbers_of(step, value))
     return tuple((step, field, index, number) for step, field, index, number in rows)
@@ -167,17 +167,17 @@ class _Checker:
         self.first: Recipe | None = None
         self._same: dict[Any, Any] = {}
 
-    def every(self, points: Sequence[Point]) -> Iterator[Checked]:
+    def every(self, points: Sequence[Point]) -> Iterator[CheckedPoint]:
         """The points that are right; what is wrong with the others is in ``problems``."""
         for point in points:
             try:
                 composed = compose(self.recipe, point.overrides, self.folder)
-                yield Checked(point, composed, self._job(point, check(composed)))
+                yield CheckedPoint(point, composed, self._job(point, check(composed)))
             except RecipeError as error:
                 self.diagnostics += error.diagnostics
         self.code.save()
 
-    def _job(self, point: Point, recipe: Recipe) -> Job:
+    def _job(self, point: Point, recipe: Recipe) -> PointJob:
         self.first = self.first or recipe
         self.notes.update(dict.fromkeys(recipe.notes))
         keys: dict[str, Key] = {}
@@ -190,7 +190,7 @@ class _Checker:
                 raise RecipeError([Diagnostic(step.mark, name, str(error))]) from error
         sources = tuple((name, recipe.steps[name].sources) for name in keys)
         graph = self._same.setdefault(sources, dict(sources))
-        return Job(point.place, keys, graph, recipe.outputs)
+        return PointJob(point.place, keys, graph, recipe.outputs)
 
     def _once(self, key: Key) -> Key:
         """The same text for the same key: a thousand points share most of theirs."""

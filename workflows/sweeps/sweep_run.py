@@ -21,6 +21,7 @@ from typing import Any, Literal
 
 from neusee.workflows.engine.node_call import versions
 from neusee.workflows.keys.cache_key import digest
+from neusee.workflows.report.progress_table import mode_for
 from neusee.workflows.report.run_folder import new_run
 from neusee.workflows.report.text_table import indented
 from neusee.workflows.store.remote_store import open_store
@@ -28,11 +29,11 @@ from neusee.workflows.store.result_store import Store
 from neusee.workflows.sweeps.axes import Argument, Axis, points, read_axes, read_words
 from neusee.workflows.sweeps.point_order import Sharing, sharing
 from neusee.workflows.sweeps.sweep_files import dataset, require_xarray, write_account, write_table
-from neusee.workflows.sweeps.sweep_points import OnError, Outcome, Plan, outcomes, planned
-from neusee.workflows.sweeps.sweep_table import Column, column, header, lasts, rows_of, screen, wide
+from neusee.workflows.sweeps.sweep_points import OnError, PointOutcome, SweepPlan, outcomes, planned
+from neusee.workflows.sweeps.sweep_table import AxisColumn, SweepTable, column, header, lasts, rows_of, wide
 
 DONE, FAILED, INTERRUPTED = 0, 1, 130
-State = Literal["complete", "stopped", "interrupted"]
+SweepState = Literal["complete", "stopped", "interrupted"]
 
 
 @dataclass(frozen=True)
@@ -41,15 +42,15 @@ class Sweep:
 
     recipe: str
     title: str
-    columns: tuple[Column, ...] = field(repr=False)
-    outcomes: tuple[Outcome, ...] = field(repr=False)
+    columns: tuple[AxisColumn, ...] = field(repr=False)
+    outcomes: tuple[PointOutcome, ...] = field(repr=False)
     points: int
     sharing: Sharing = field(repr=False)
     paired: bool = False
-    state: State = "complete"
+    state: SweepState = "complete"
 
     @property
-    def failed(self) -> tuple[Outcome, ...]:
+    def failed(self) -> tuple[PointOutcome, ...]:
         """The points that failed."""
         return tuple(outcome for outcome in self.outcomes if outcome.state == "failed")
 
@@ -154,10 +155,10 @@ class _Sweeping:
         self.fixed = [argument.text for argument in arguments if not isinstance(argument, Axis)]
         self.columns = tuple(map(column, self.axes))
         self.store, self.paired, self.device = store, paired, device
-        self.plan: Plan = planned(recipe, points(arguments, paired), folder, store, paired, device)
+        self.plan: SweepPlan = planned(recipe, points(arguments, paired), folder, store, paired, device)
         self.sharing = sharing(self.plan.jobs, self.plan.costs)
 
-    def sweep(self, found: Sequence[Outcome], state: State) -> Sweep:
+    def sweep(self, found: Sequence[PointOutcome], state: SweepState) -> Sweep:
         recipe, in_turn = self.plan.recipe, sorted(found, key=lambda outcome: outcome.point.number)
         count = len(self.plan.checked)
         return Sweep(recipe.name, recipe.title, self.columns, tuple(in_turn), count, self.sharing, self.paired, state)
@@ -178,9 +179,9 @@ def _sized(axis: Axis) -> str:
     return f"{axis.name}: {len(axis.coordinates)}"
 
 
-def _shown(work: _Sweeping, on_error: OnError, quiet: bool) -> tuple[list[Outcome], State, Exception | None]:
+def _shown(work: _Sweeping, on_error: OnError, quiet: bool) -> tuple[list[PointOutcome], SweepState, Exception | None]:
     """Run the points on the screen that fits; Ctrl-C and a failure end the sweep, and keep what there is."""
-    shown = screen(work.columns, len(work.plan.checked), quiet)
+    shown = SweepTable(work.columns, len(work.plan.checked), mode_for(quiet))
     try:
         with (
             shown,

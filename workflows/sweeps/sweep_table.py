@@ -2,17 +2,17 @@
 
 from __future__ import annotations
 
-import sys
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 
 from neusee.nodes import units
+from neusee.workflows.report.progress_table import Mode, ProgressTable
 
 if TYPE_CHECKING:
     from neusee.workflows.engine.runner import Event
     from neusee.workflows.sweeps.axes import Axis, Point
-    from neusee.workflows.sweeps.sweep_points import Number, Outcome
+    from neusee.workflows.sweeps.sweep_points import PointOutcome, ResultNumber
 
 AFTER = ("status", "step", "field", "index", "value", "seconds", "cached", "message")  #: columns after the axes
 _NUMBERS = 4  #: columns of numbers that a screen shows
@@ -20,7 +20,7 @@ _LAST = 25  #: points that a live table shows
 
 
 @dataclass(frozen=True, slots=True)
-class Column:
+class AxisColumn:
     """An axis as a column: with its unit in the header where all its values have one."""
 
     name: str
@@ -30,7 +30,7 @@ class Column:
     unit: str  #: of ``si``; empty for pure numbers and for words
 
 
-def column(axis: Axis) -> Column:
+def column(axis: Axis) -> AxisColumn:
     """Numbers in the unit that they are written in, or in SI if they are written in several; words as they are."""
     values = [c.value for c in axis.coordinates]
     found = [q for q in map(_quantity, values) if q is not None]
@@ -38,11 +38,11 @@ def column(axis: Axis) -> Column:
     if len(found) == len(values) and len({q.si_unit for q in found}) == 1:
         si, unit, written = tuple(q.si for q in found), found[0].si_unit, {q.unit for q in found}
         cells = tuple(q.number for q in found) if len(written) == 1 else si
-        return Column(axis.name, f"{header} ({found[0].unit if len(written) == 1 else unit})", cells, si, unit)
+        return AxisColumn(axis.name, f"{header} ({found[0].unit if len(written) == 1 else unit})", cells, si, unit)
     if all(isinstance(v, int | float) and not isinstance(v, bool) for v in values):
-        return Column(axis.name, header, tuple(values), tuple(map(float, values)), "")
+        return AxisColumn(axis.name, header, tuple(values), tuple(map(float, values)), "")
     words = tuple(c.shown for c in axis.coordinates)
-    return Column(axis.name, header, words, words, "")
+    return AxisColumn(axis.name, header, words, words, "")
 
 
 @dataclass(frozen=True, slots=True)
@@ -64,11 +64,11 @@ def _quantity(value: Any) -> _Quantity | None:
 # --- rows -----------------------------------------------------------------------------------------------------------
 
 
-def header(columns: Sequence[Column]) -> list[str]:
+def header(columns: Sequence[AxisColumn]) -> list[str]:
     return ["point", *(c.header for c in columns), *AFTER]
 
 
-def rows_of(outcome: Outcome, columns: Sequence[Column]) -> Iterator[list[Any]]:
+def rows_of(outcome: PointOutcome, columns: Sequence[AxisColumn]) -> Iterator[list[Any]]:
     """One row for each number of a point; one for a point that failed or has no numbers."""
     where = [outcome.point.number, *_cells(outcome.point, columns)]
     status = "failed" if outcome.state == "failed" else "ok"
@@ -77,7 +77,7 @@ def rows_of(outcome: Outcome, columns: Sequence[Column]) -> Iterator[list[Any]]:
         yield [*where, status, *number, *last]
 
 
-def headline(numbers: Sequence[Number]) -> dict[str, str]:
+def headline(numbers: Sequence[ResultNumber]) -> dict[str, str]:
     """Every result in a word: a number alone, or the least and the largest of several; single numbers first."""
     found: dict[str, list[float]] = {}
     for step, part, _, value in numbers:
@@ -86,7 +86,7 @@ def headline(numbers: Sequence[Number]) -> dict[str, str]:
     return dict(sorted(said.items(), key=lambda item: len(found[item[0]]) > 1))
 
 
-def wide(outcomes: Sequence[Outcome], columns: Sequence[Column]) -> list[list[str]]:
+def wide(outcomes: Sequence[PointOutcome], columns: Sequence[AxisColumn]) -> list[list[str]]:
     """One row a point below a row of headers: its place, its results, its state and its seconds."""
     results = [headline(outcome.numbers) for outcome in outcomes]
     names = list(dict.fromkeys(name for result in results for name in result))
@@ -98,7 +98,7 @@ def wide(outcomes: Sequence[Outcome], columns: Sequence[Column]) -> list[list[st
     return rows
 
 
-def _cells(point: Point, columns: Sequence[Column]) -> list[Any]:
+def _cells(point: Point, columns: Sequence[AxisColumn]) -> list[Any]:
     return [c.cells[i] for c, i in zip(columns, point.place, strict=True)]
 
 
@@ -121,110 +121,57 @@ def lasts(seconds: float) -> str:
 # --- on the screen --------------------------------------------------------------------------------------------------
 
 
-@dataclass
-class Silent:
-    """Shows nothing."""
+class SweepTable(ProgressTable):
+    """The points of a sweep, one row for each that ended."""
 
-    columns: Sequence[Column]
-    points: int
-    outcomes: list[Outcome] = field(default_factory=list)
-    running: Point | None = None
-    step: str = ""
-
-    def __enter__(self) -> Silent:
-        return self
-
-    def __exit__(self, *error: object) -> None:
-        return None
+    def __init__(self, columns: Sequence[AxisColumn], points: int, mode: Mode) -> None:
+        super().__init__(mode)
+        self.columns, self.points = columns, points
+        self.outcomes: list[PointOutcome] = []
+        self.running: Point | None = None
+        self.step = ""
+        self.lines = list[list[str]]()
+        self.header = ["done", "point", *(c.header for c in columns), "state", "seconds", "left", "results"]
+        widest = [max(map(len, (c.header, *map(_text, c.cells)))) for c in columns]
+        count = len(str(points))
+        self.widths = [max(4, 2 * count + 1), max(5, count), *widest, 6, 8, 12, 0]
 
     def started(self, point: Point) -> None:
-        """A point begins."""
+        """Note that a point begins."""
         self.running, self.step = point, ""
 
     def watch(self, event: Event) -> None:
-        """A step of it begins or ended."""
+        """Note that a step of the point begins or ended."""
         self.step = event.step if event.done is None else ""
 
-    def finished(self, outcome: Outcome) -> None:
-        """A point ended."""
+    def finished(self, outcome: PointOutcome) -> None:
+        """Note what became of a point, and show its row."""
         self.outcomes.append(outcome)
         self.running = None
+        self.lines.append(self.cells(outcome))
+        self.show_row(self.lines[-1])
+        if outcome.state == "failed":
+            lines = [f"  {line}" for line in outcome.message.splitlines()]
+            self.show_error(lines, f"point {outcome.point.number}: {outcome.point.shown}\n{outcome.message}")
 
-    def cells(self, outcome: Outcome) -> list[str]:
-        """One row: which of how many, the values, state, seconds, the first numbers, and the time that is left."""
+    def cells(self, outcome: PointOutcome) -> list[str]:
+        """Return one row: which of how many, the values, state, seconds, the time that is left, the first numbers."""
         values = map(_text, _cells(outcome.point, self.columns))
         numbers = list(headline(outcome.numbers).items())[:_NUMBERS]
-        said = "  ".join(f"{name} {value}" for name, value in numbers)
+        results = "  ".join(f"{name} {value}" for name, value in numbers)
         where, left = f"{len(self.outcomes)}/{self.points}", lasts(outcome.left) if outcome.left else ""
-        return [where, str(outcome.point.number), *values, outcome.state, f"{outcome.seconds:.3f}", left, said]
+        return [where, str(outcome.point.number), *values, outcome.state, f"{outcome.seconds:.3f}", left, results]
 
-    @property
-    def headers(self) -> list[str]:
-        return ["done", "point", *(c.header for c in self.columns), "state", "seconds", "left", "results"]
-
-
-class Plain(Silent):
-    """One line a point."""
-
-    def __enter__(self) -> Plain:
-        widest = [max(map(len, (c.header, *map(_text, c.cells)))) for c in self.columns]
-        count = len(str(self.points))
-        self.widths = [max(4, 2 * count + 1), max(5, count), *widest, 6, 8, 12, 0]
-        self._say(self.headers)
-        return self
-
-    def finished(self, outcome: Outcome) -> None:
-        super().finished(outcome)
-        self._say(self.cells(outcome))
-        if outcome.state == "failed":
-            print(*(f"  {line}" for line in outcome.message.splitlines()), sep="\n", flush=True)
-
-    def _say(self, cells: Sequence[str]) -> None:
-        line = "  ".join(f"{cell:<{width}}" for cell, width in zip(cells, self.widths, strict=True))
-        print(f"  {line}".rstrip(), flush=True)
-
-
-class Live(Silent):
-    """A table that fills; failures stay above it."""
-
-    def __enter__(self) -> Live:
-        from rich.live import Live as RichLive
-
-        self.lines = list[list[str]]()
-        self.live = RichLive(self, refresh_per_second=8, vertical_overflow="visible")
-        self.live.start()
-        return self
-
-    def __exit__(self, *error: object) -> None:
-        self.live.stop()
-
-    def finished(self, outcome: Outcome) -> None:
-        super().finished(outcome)
-        self.lines.append(self.cells(outcome))
-        if outcome.state == "failed":
-            told = f"point {outcome.point.number}: {outcome.point.shown}\n{outcome.message}"
-            self.live.console.print(told, style="red", markup=False, highlight=False)
-
-    def __rich__(self) -> Any:
-        from rich import box
-        from rich.table import Table
-
-        table = Table(box=box.SIMPLE_HEAD, pad_edge=False, header_style="bold")
-        for name in self.headers:
-            table.add_column(name, overflow="fold")
+    def live_rows(self) -> Iterator[tuple[list[str], str]]:
+        """Return the last points."""
         state = len(self.columns) + 2
-        for line in self.lines[-_LAST:]:
-            table.add_row(*line, style={"run": "bold", "cached": "cyan", "failed": "red"}[line[state]])
-        if self.running is not None:
-            left = self.outcomes[-1].left if self.outcomes else 0.0
-            about = [f"about {lasts(left)} left"] if left else []
-            now = [f"point {len(self.outcomes) + 1} of {self.points}: {self.running.shown}", *filter(None, [self.step])]
-            table.caption = "; ".join(now + about)
-        return table
+        yield from ((line, line[state]) for line in self.lines[-_LAST:])
 
-
-def screen(columns: Sequence[Column], points: int, silent: bool) -> Silent:
-    """The display that fits where the output goes."""
-    if silent:
-        return Silent(columns, points)
-    return Live(columns, points) if sys.stdout.isatty() else Plain(columns, points)
+    def caption(self) -> str:
+        """Return which point runs, its step, and the time that is left."""
+        if self.running is None:
+            return ""
+        left = self.outcomes[-1].left if self.outcomes else 0.0
+        about = f"about {lasts(left)} left" if left else ""
+        point = f"point {len(self.outcomes) + 1} of {self.points}: {self.running.shown}"
+        return "; ".join(filter(None, (point, self.step, about)))

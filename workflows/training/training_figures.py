@@ -9,7 +9,7 @@ import torch
 from torch import Tensor
 
 from neusee.workflows.report.figures.style import BLUE, VERMILION, canvas, drawn
-from neusee.workflows.training.checkpoint import columns
+from neusee.workflows.training.loop.checkpoint import loss_curve
 
 _SHOWN = ("LSR", "BSR", "L1", "reconstruction", "adversarial", "critics", "penalty", "rate")
 _GAP = 4  #: pixels between pictures
@@ -23,7 +23,7 @@ def curves(rows: Sequence[Mapping[str, str]]) -> Any:
     first = 1 + max((int(r["iteration"]) for r in rows if r["stage"] == "1"), default=-1)
     for ax, name in zip(axes.flat, names, strict=False):
         for stage, colour in ((1, BLUE), (2, VERMILION)):
-            at, values = columns(rows, stage, name)
+            at, values = loss_curve(rows, stage, name)
             at = [i + first * (stage == 2) for i in at]
             ax.plot(at, values, color=colour, alpha=0.25, linewidth=0.7)
             ax.plot(at, middle(values), color=colour, linewidth=1.5, label=f"stage {stage}")

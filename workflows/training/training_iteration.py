@@ -8,7 +8,6 @@ from typing import Any
 
 import torch
 from torch import Tensor, nn
-from torch.optim.swa_utils import AveragedModel, get_ema_multi_avg_fn
 from torch.utils.checkpoint import checkpoint
 
 from neusee.nodes import losses
@@ -25,16 +24,10 @@ from neusee.workflows.graph.diagnostics import nearest
 from neusee.workflows.graph.recipe_graph import Recipe, Step
 from neusee.workflows.keys.cache_key import device_kind, stream_seed
 from neusee.workflows.recipe.blocks.train_block import GRID, Network, Stage, Training
+from neusee.workflows.training.loop.resumable_loop import STEEPEST, Losses, averaged, require_finite
 from neusee.workflows.training.parallel.process_mesh import ALONE, Mesh
 from neusee.workflows.training.parallel.shared_graph import Shared
 from neusee.workflows.training.training_pictures import Sample, TrainingStream
-
-_STEEPEST = 10.0  #: norm of a gradient, above which it is shortened
-Losses = dict[str, float]
-
-
-class NotFinite(ArithmeticError):
-    """A loss or a gradient is not a number."""
 
 
 @dataclass
@@ -58,20 +51,22 @@ class Scales:
 class Learner:
     """All that learns, on one device; in every process of a mesh the same."""
 
-    def __init__(self, recipe: Recipe, how: Training, device: str, designed: bool = False, mesh: Mesh = ALONE) -> None:
-        self.how, self.seed, self.device, self.mesh = how, recipe.seed, device, mesh
-        self._step = recipe.steps[how.learn] if how.learn else None
-        self.relief = nn.Module() if designed or self._step is None else self._start(self._step).to(how.dtype)
-        self.net: Restorer = started(lambda: _made(how.network), self._rng("network")).to(how.dtype)
-        self.critics = nn.ModuleList(critics(self._rng("critics"), how.critics.width)).to(how.dtype)
-        self.average = _averaged(self.net, how.average) if how.average else None
+    def __init__(
+        self, recipe: Recipe, settings: Training, device: str, designed: bool = False, mesh: Mesh = ALONE
+    ) -> None:
+        self.settings, self.seed, self.device, self.mesh = settings, recipe.seed, device, mesh
+        self._step = recipe.steps[settings.learn] if settings.learn else None
+        self.relief = nn.Module() if designed or self._step is None else self._start(self._step).to(settings.dtype)
+        self.net: Restorer = started(lambda: _made(settings.network), self._rng("network")).to(settings.dtype)
+        self.critics = nn.ModuleList(critics(self._rng("critics"), settings.critics.width)).to(settings.dtype)
+        self.average = averaged(self.net, settings.average)
         self.begin(Stage(iterations=0), learns=True)
 
     def _start(self, step: Step) -> nn.Module:
         """The relief that learns; one that was designed does not."""
         path = step.node.path
         if path not in LEARNT:
-            text = f"{self.how.learn} is {path}, of which nothing is learnt; {nearest(path, LEARNT)}"
+            text = f"{self.settings.learn} is {path}, of which nothing is learnt; {nearest(path, LEARNT)}"
             raise ValueError(f"train: {text}; or design it without images: --stage mask")
         return LEARNT[path](step.params, self._rng("element"))
 
@@ -87,22 +82,22 @@ class Learner:
 
     def begin(self, stage: Stage, learns: bool) -> None:
         """Begin a stage: with new moments, at the first rate."""
-        rates, self.stage, self.learns = self.how.rates, stage, learns
+        rates, self.stage, self.learns = self.settings.rates, stage, learns
         groups = parameter_groups(self.net, rates.weights, rates.biases)
         if learns:
             groups += [{"params": list(self.relief.parameters()), "lr": rates.element}]
-        self.generator_optimizer = torch.optim.Adam(groups, betas=self.how.betas)
+        self.generator_optimizer = torch.optim.Adam(groups, betas=self.settings.betas)
         self.critic_optimizer = torch.optim.Adam(
-            parameter_groups(self.critics, rates.weights, rates.biases), betas=self.how.critics.betas
+            parameter_groups(self.critics, rates.weights, rates.biases), betas=self.settings.critics.betas
         )
         self._first = [[g["lr"] for g in o.param_groups] for o in (self.generator_optimizer, self.critic_optimizer)]
 
     def set_rates(self, iteration: int) -> float:
         """The rates of an iteration of the stage; by what they are multiplied."""
-        share = self.how.rates.share(iteration)
+        share = self.settings.rates.share(iteration)
         for optimiser, first in zip((self.generator_optimizer, self.critic_optimizer), self._first, strict=True):
             for group, rate in zip(optimiser.param_groups, first, strict=True):
-                group["lr"] = max(rate * share, min(rate, self.how.rates.least))
+                group["lr"] = max(rate * share, min(rate, self.settings.rates.least))
         return share
 
     def parts(self) -> dict[str, Any]:
@@ -150,8 +145,8 @@ class Learner:
 
         Each process has its own bands, or a share of all of them, so that over all processes each band counts once.
         """
-        psf: Psf = shared.values[self.how.psf]
-        count, times = samples.counted(self.how.psf, len(psf.clear_peak))
+        psf: Psf = shared.values[self.settings.psf]
+        count, times = samples.counted(self.settings.psf, len(psf.clear_peak))
         with torch.no_grad():
             peaks = psf.intensity.detach().amax((-2, -1)).double() / psf.clear_peak
         if self.stage.lsr:
@@ -161,16 +156,16 @@ class Learner:
         return {"LSR": float(peaks.mean()) * (len(peaks) / count) / times}
 
     def _suppression(self, intensity: Tensor, clear: Tensor, band: int) -> Tensor:
-        one: Tensor = losses.lsr(Psf(intensity[band : band + 1], clear[band : band + 1]), log=self.how.logarithm)
+        one: Tensor = losses.lsr(Psf(intensity[band : band + 1], clear[band : band + 1]), log=self.settings.logarithm)
         return one
 
     def _restored(self, sample: Sample) -> tuple[dict[str, tuple[float, Tensor]], Scales, Scales]:
         """Each term with its weight; the truth and, cut off, the estimate."""
-        low = torch.autocast(device_kind(self.device), torch.bfloat16, self.how.precision == "bfloat16")
+        low = torch.autocast(device_kind(self.device), torch.bfloat16, self.settings.precision == "bfloat16")
         picture = sample.picture if self.learns else sample.picture.detach()
         with low:
             coarse, fine = self.net.pyramid(picture)
-        estimate = Scales(coarse.to(self.how.dtype), fine.to(self.how.dtype))
+        estimate = Scales(coarse.to(self.settings.dtype), fine.to(self.settings.dtype))
         truth = Scales.of(sample.truth.detach())
         terms = {"L1": (0.0, (estimate.fine - truth.fine).abs().mean())}
         if self.stage.bsr:
@@ -193,7 +188,7 @@ class Learner:
         for i in range(batch):
             if i not in pairs:
                 for _ in self.critics:
-                    passed_over(rng, self.how.patches if self.how.patch else 1)
+                    passed_over(rng, self.settings.patches if self.settings.patch else 1)
                 continue
             for critic, t, e in zip(self.critics, *pairs[i], strict=True):
                 apart = (critic(e) - critic(t)).mean()
@@ -212,10 +207,8 @@ class Learner:
         """
         parts = list(parts)
         self.mesh.add_gradients(parts)
-        norm = max(float(nn.utils.clip_grad_norm_(part.parameters(), _STEEPEST)) for part in parts)
-        wrong = [name for name, x in {**found, "norm of the gradient": norm}.items() if not abs(x) < float("inf")]
-        if wrong:
-            raise NotFinite(f"not finite: {', '.join(wrong)}")
+        norm = max(float(nn.utils.clip_grad_norm_(part.parameters(), STEEPEST)) for part in parts)
+        require_finite({**found, "norm of the gradient": norm})
         optimiser.step()
         return norm
 
@@ -229,8 +222,3 @@ def _made(network: Network) -> Restorer:
     if network.kind == "fft_mamba":
         return FFTMamba(network.width, **network.options)
     return UNet(network.width) if network.kind == "unet" else NAFNet(network.width)
-
-
-def _averaged(net: nn.Module, decay: float) -> AveragedModel:
-    mean = get_ema_multi_avg_fn(decay)  # type: ignore[no-untyped-call]
-    return AveragedModel(net, multi_avg_fn=mean)

@@ -48,42 +48,45 @@ class TrainingStream:
     def __init__(
         self,
         recipe: Recipe,
-        how: Training,
+        settings: Training,
         photographs: Photographs,
         store: Store,
         device: str,
         frozen: Recipe | None = None,
         mesh: Mesh = ALONE,
     ) -> None:
-        learn = None if frozen else how.learn
-        self.how, self.photographs, self.device, self.seed, self.mesh = how, photographs, device, recipe.seed, mesh
-        self._pool = how.pool if frozen else None
+        learn = None if frozen else settings.learn
+        self.settings, self.photographs, self.device = settings, photographs, device
+        self.seed, self.mesh = recipe.seed, mesh
+        self._pool = settings.pool if frozen else None
         self._kept: dict[tuple[int, int], Sample] = {}
-        wanted = (how.picture, how.truth, how.light, how.psf)
-        _present(recipe, (*wanted, how.scene, *([learn] if learn else [])))
+        wanted = (settings.picture, settings.truth, settings.light, settings.psf)
+        _present(recipe, (*wanted, settings.scene, *([learn] if learn else [])))
         self._inputs = Inputs.of(recipe, wanted) if recipe.uncertain and recipe.uncertain.names else None
-        self.shape = _frame(recipe, how.scene)
+        self.shape = _frame(recipe, settings.scene)
         recipe = with_substitutions(frozen or recipe, wanted, {learn} if learn else ())
         order = needed(recipe, wanted)
         self._lasers = [f"{n}.{_LASER[1]}" for n in order if recipe.steps[n].node.path == _LASER[0]]
         readers = dict.fromkeys([*(self._inputs.readers if self._inputs else ()), *self._lasers])
         self._readers = {name: _given(recipe, name) for name in readers}
-        fixed = set(needed(recipe, [how.psf]))  # a window that is dirty stays as it is
+        fixed = set(needed(recipe, [settings.psf]))  # a window that is dirty stays as it is
         noise = {name for name in order if recipe.steps[name].node.random and name not in fixed}
-        drawn = _behind(recipe, order, noise | {how.scene, *(name.rpartition(".")[0] for name in readers)})
+        drawn = _behind(recipe, order, noise | {settings.scene, *(name.rpartition(".")[0] for name in readers)})
         learnt = _behind(recipe, order, {learn} if learn else set())
-        if how.psf in drawn:
-            raise ValueError(f"{how.psf} is drawn anew with each picture: its suppression cannot be learnt from")
-        self.shards = Shards.of(recipe, how.psf, wanted, drawn | learnt, store, mesh)
+        if settings.psf in drawn:
+            raise ValueError(f"{settings.psf} is drawn anew with each picture: its suppression cannot be learnt from")
+        self.shards = Shards.of(recipe, settings.psf, wanted, drawn | learnt, store, mesh)
         drawn |= self.shards.behind
-        self._divide(recipe, learn, noise, drawn, _border(recipe, order, learnt - drawn, drawn, how.psf), store)
+        self._divide(recipe, learn, noise, drawn, _border(recipe, order, learnt - drawn, drawn, settings.psf), store)
 
     def _divide(
         self, recipe: Recipe, learn: str | None, noise: set[str], drawn: set[str], border: list[str], store: Store
     ) -> None:
         """What follows the element alone and ends at ``border``, and what is computed for each picture."""
         ways: dict[str, Any] = {"store": store, "device": self.device}
-        within, outputs = [*border, self.how.scene, *self._readers], [self.how.picture, self.how.truth, self.how.light]
+        settings = self.settings
+        within = [*border, settings.scene, *self._readers]
+        outputs = [settings.picture, settings.truth, settings.light]
         shared = {**ways, "caller": self.shards.call}
         self.shared = as_function(recipe, learn, outputs=border, **shared) if learn else None
         read = {source for reader in drawn - self.shards.steps for source in recipe.steps[reader].sources}
@@ -92,7 +95,7 @@ class TrainingStream:
 
     def begin(self, height: Tensor) -> Shared:
         """What follows the element alone, for all pictures of an iteration."""
-        made = self.shared({str(self.how.learn): height}) if self.shared else {}
+        made = self.shared({str(self.settings.learn): height}) if self.shared else {}
         return Shared.of(made, self.shards, self._whole)
 
     def counted(self, name: str, here: int) -> tuple[int, int]:
@@ -144,32 +147,31 @@ class TrainingStream:
             values = self._inputs.at(rng.standard_normal((1, len(self._inputs.names))))[0]
             drawn = dict(zip(self._inputs.names, map(float, values), strict=True))
             theta |= self._inputs.theta(drawn)
-        if rng.random() < self.how.laser_free:
+        if rng.random() < self.settings.laser_free:
             theta |= dict.fromkeys(self._lasers, 0.0)
             drawn["laser"] = "none"
         scene = self.photographs.crop(self.shape, self.seed, (stage, number))
-        theta |= {self.how.scene: scene.to(self.device, self.how.dtype)}
+        theta |= {self.settings.scene: scene.to(self.device, self.settings.dtype)}
         noise = int(rng.integers(_SEEDS))
         return theta, noise, {**drawn, "noise": noise, "number": number}
 
     def _sample(self, found: Mapping[str, Any], drawn: Mapping[str, Any]) -> Sample:
-        picture, truth = (found[name].to(self.how.dtype) for name in (self.how.picture, self.how.truth))
-        if self.how.size is not None:
-            picture, truth = _resized(picture, self.how.size), _resized(truth, self.how.size)
+        picture, truth = (found[name].to(self.settings.dtype) for name in (self.settings.picture, self.settings.truth))
+        if self.settings.size is not None:
+            picture, truth = _resized(picture, self.settings.size), _resized(truth, self.settings.size)
         picture, truth = self._patches(torch.stack([picture, truth]), drawn["noise"])
-        return Sample(picture, truth, found[self.how.light], drawn)
+        return Sample(picture, truth, found[self.settings.light], drawn)
 
     def _patches(self, both: Tensor, seed: int) -> Tensor:
         """(2, 3, y, x) -> (2, n, 3, y, x): the same places of a picture and of its truth, or all of it."""
-        if self.how.patch is None:
+        if self.settings.patch is None:
             return both[:, None]
-        size, patch = (both.shape[-2], both.shape[-1]), self.how.patch
+        size, patch = (both.shape[-2], both.shape[-1]), self.settings.patch
         if any(have < want for have, want in zip(size, patch, strict=True)):
             raise ValueError(f"train.patch: {list(patch)} is larger than the picture, {list(size)}")
         rng = np.random.default_rng((seed, 2))
-        places = [
-            [int(rng.integers(h - w + 1)) for h, w in zip(size, patch, strict=True)] for _ in range(self.how.patches)
-        ]
+        count = self.settings.patches
+        places = [[int(rng.integers(h - w + 1)) for h, w in zip(size, patch, strict=True)] for _ in range(count)]
         return torch.stack([both[..., y : y + patch[0], x : x + patch[1]] for y, x in places], 1)
 
 

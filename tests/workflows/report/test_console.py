@@ -12,6 +12,7 @@ from neusee.workflows.engine.runner import Event, StepRecord
 from neusee.workflows.graph.diagnostics import Location
 from neusee.workflows.graph.recipe_graph import Recipe, Step
 from neusee.workflows.report import console as console_room
+from neusee.workflows.report.progress_table import mode_for
 
 
 @node()
@@ -35,7 +36,7 @@ def done(step: str, state: str, seconds: float = 0.25, ok: bool = True) -> Event
 
 
 def test_items_share_a_line_that_comes_when_the_last_is_done(capsys):
-    with console_room.Plain(recipe(), NAMES) as shown:
+    with console_room.RunTable(recipe(), NAMES, "plain") as shown:
         shown.watch(Event(NAMES[0], None))
         shown.watch(done(NAMES[0], "run"))
         assert "spot" not in capsys.readouterr().out
@@ -49,7 +50,7 @@ def test_items_share_a_line_that_comes_when_the_last_is_done(capsys):
 
 
 def test_a_check_that_does_not_hold_is_shown_of_all_items(capsys):
-    with console_room.Plain(recipe(), NAMES) as shown:
+    with console_room.RunTable(recipe(), NAMES, "plain") as shown:
         shown.watch(done(NAMES[0], "run"))
         shown.watch(done(NAMES[1], "run", ok=False))
     assert "LOOK: peak 3" in capsys.readouterr().out
@@ -59,7 +60,7 @@ def test_a_check_that_does_not_hold_is_shown_of_all_items(capsys):
 def test_the_live_table_shows_what_has_begun(width):
     from rich.console import Console
 
-    shown = console_room.Live(recipe(), NAMES)
+    shown = console_room.RunTable(recipe(), NAMES, "live")
     out = io.StringIO()
     console = Console(file=out, width=width)
     shown.watch(Event("raw", None))
@@ -73,7 +74,7 @@ def test_the_live_table_shows_what_has_begun(width):
 
 
 def test_nothing_is_printed_where_silence_was_asked_for(capsys):
-    with console_room.screen(recipe(), NAMES, silent=True) as shown:
+    with console_room.RunTable(recipe(), NAMES, mode_for(silent=True)) as shown:
         shown.watch(done("raw", "run"))
     assert capsys.readouterr().out == ""
 

@@ -7,7 +7,6 @@ from typing import Any
 
 import torch
 from torch import Tensor, nn
-from torch.optim.swa_utils import AveragedModel, get_ema_multi_avg_fn
 
 from neusee.nodes import losses
 from neusee.nodes.spectra import render
@@ -20,30 +19,28 @@ from neusee.workflows.graph.recipe_graph import Recipe, needed
 from neusee.workflows.keys.cache_key import stream_seed
 from neusee.workflows.recipe.blocks.train_lift_block import LiftTraining
 from neusee.workflows.store.result_store import Store
-from neusee.workflows.training.training_iteration import NotFinite
-
-_STEEPEST = 10.0  #: norm of a gradient, above which it is shortened
-Losses = dict[str, float]
+from neusee.workflows.training.loop.resumable_loop import STEEPEST, Losses, averaged, require_finite
 
 
 class Pairs:
     """Pictures (3, y, x) with their spectra (31, y, x): the same for the same number, in whatever order."""
 
-    def __init__(self, recipe: Recipe, how: LiftTraining, store: Store, device: str) -> None:
-        for name in (how.measured, how.picture, how.cube):
+    def __init__(self, recipe: Recipe, settings: LiftTraining, store: Store, device: str) -> None:
+        for name in (settings.measured, settings.picture, settings.cube):
             if name not in recipe.steps:
                 raise ValueError(f"train_lift: the recipe has no step {name}; {nearest(name, recipe.steps)}")
-        wires = recipe.steps[how.measured].wires
+        wires = recipe.steps[settings.measured].wires
         if not isinstance(wires.get("bands"), str):
-            raise ValueError(f"train_lift.measured: {how.measured} takes no bands: name a spectra.reflectances step")
-        self._names, self._seed = (how.picture, how.cube), recipe.seed
+            name = settings.measured
+            raise ValueError(f"train_lift.measured: {name} takes no bands: name a spectra.reflectances step")
+        self._names, self._seed = (settings.picture, settings.cube), recipe.seed
         bands = str(wires["bands"])
         random = {name for name in needed(recipe, self._names) if recipe.steps[name].node.random}
         if not random:
-            raise ValueError(f"train_lift: {how.picture} is always the same: draw it by spectra.leaves")
-        known = recipe.run(store, [bands, how.measured], device=device)
+            raise ValueError(f"train_lift: {settings.picture} is always the same: draw it by spectra.leaves")
+        known = recipe.run(store, [bands, settings.measured], device=device)
         self.bands: Bands = known[bands]
-        self.measured: Tensor = known[how.measured]
+        self.measured: Tensor = known[settings.measured]
         needs_bands(self.bands)
         self._draw = as_function(recipe, outputs=self._names, store=store, device=device, redraw=random)
 
@@ -62,13 +59,13 @@ class Pairs:
 class LiftLearner:
     """The network, its optimiser and its average."""
 
-    def __init__(self, how: LiftTraining, pairs: Pairs, seed: int, device: str) -> None:
-        self.how, self.pairs = how, pairs
+    def __init__(self, settings: LiftTraining, pairs: Pairs, seed: int, device: str) -> None:
+        self.settings, self.pairs = settings, pairs
         rng = torch.Generator(device).manual_seed(stream_seed(seed, "train lift network"))
         self.linear = wiener(pairs.measured.cpu(), pairs.bands.centres.cpu()).to(device, torch.float32)
-        self.net = started(rng, self.linear if how.start == "linear" else None)
-        self.optimiser = torch.optim.Adam(self.net.parameters(), lr=how.rate, betas=how.betas)
-        self.average = _averaged(self.net, how.average) if how.average else None
+        self.net = started(rng, self.linear if settings.start == "linear" else None)
+        self.optimiser = torch.optim.Adam(self.net.parameters(), lr=settings.rate, betas=settings.betas)
+        self.average = averaged(self.net, settings.ema_decay)
 
     def parts(self) -> dict[str, Any]:
         """All that a later iteration depends on."""
@@ -77,19 +74,17 @@ class LiftLearner:
 
     def iterate(self, iteration: int) -> Losses:
         """Look at a batch and move a step; raises `NotFinite` before a bad one."""
-        batch, rate = self.how.batch, self.how.rate_at(iteration)
+        batch, rate = self.settings.batch, self.settings.rate_at(iteration)
         for group in self.optimiser.param_groups:
             group["lr"] = rate
         self.optimiser.zero_grad(set_to_none=True)
         picture, cube = self.pairs.batch(range(iteration * batch, (iteration + 1) * batch))
         estimate = through(self.net, picture)
-        loss = losses.mrae(estimate, cube, floor=self.how.floor)
+        loss = losses.mrae(estimate, cube, floor=self.settings.floor)
         loss.backward()
-        slope = float(nn.utils.clip_grad_norm_(self.net.parameters(), _STEEPEST))
+        slope = float(nn.utils.clip_grad_norm_(self.net.parameters(), STEEPEST))
         found = {"MRAE": float(loss.detach()), **_rmse(estimate.detach(), cube), "slope": slope, "rate": rate}
-        wrong = [name for name, x in found.items() if not abs(x) < float("inf")]
-        if wrong:
-            raise NotFinite(f"not finite: {', '.join(wrong)}")
+        require_finite(found)
         self.optimiser.step()
         if self.average:
             self.average.update_parameters(self.net)
@@ -100,26 +95,21 @@ class LiftLearner:
         return self.average.module if self.average else self.net
 
     @torch.no_grad()
-    def judged(self) -> dict[str, Losses]:
+    def validate(self) -> dict[str, Losses]:
         """The network and the linear estimate of the same reflectances, on pictures that nobody learnt from."""
-        sums: dict[str, Losses] = {}
-        for number in range(self.how.judge):
+        sums, count = dict[str, Losses](), self.settings.validation_batches
+        for number in range(count):
             picture, cube = self.pairs("judge", number)
             for name, estimate in self.estimates(picture).items():
-                found = {"MRAE": float(losses.mrae(estimate, cube, floor=self.how.floor)), **_rmse(estimate, cube),
+                found = {"MRAE": float(losses.mrae(estimate, cube, floor=self.settings.floor)), **_rmse(estimate, cube),
                          "colour": _rmse(render(estimate, self.pairs.bands), picture)["RMSE"]}  # fmt: skip
-                sums[name] = {key: sums.get(name, {}).get(key, 0.0) + x / self.how.judge for key, x in found.items()}
+                sums[name] = {key: sums.get(name, {}).get(key, 0.0) + x / count for key, x in found.items()}
         return sums
 
     def estimates(self, picture: Tensor) -> dict[str, Tensor]:
         """Spectra of a picture by the network, and linearly."""
         linear = torch.einsum("bc,cyx->byx", self.linear, picture)
         return {"mst_plus_plus": through(self.best(), picture[None])[0].clamp_min(0), "linear": linear.clamp_min(0)}
-
-
-def _averaged(net: nn.Module, decay: float) -> AveragedModel:
-    mean = get_ema_multi_avg_fn(decay)  # type: ignore[no-untyped-call]
-    return AveragedModel(net, multi_avg_fn=mean)
 
 
 def _rmse(estimate: Tensor, truth: Tensor) -> Losses:

@@ -11,16 +11,16 @@ from neusee.workflows.report.figures import optics
 from neusee.workflows.report.figures.style import canvas, drawn
 from neusee.workflows.report.study_page import Section
 from neusee.workflows.training.mask_design.design_terms import Fabrication, Terms
-from neusee.workflows.training.mask_design.optimizers import Learnt
+from neusee.workflows.training.mask_design.optimizers import LearntMask
 
 _COLUMNS = ("nm", "LSR", "even light", "BSR", "median MTF", "at most", "rms MTF", "at most")
 _NAMES = ("lsr", "energy_floor", "bsr", "median_mtf", "median_mtf_bound", "rms_mtf", "rms_mtf_bound")
 
 
-def pictures(terms: Terms, height: Tensor, learnt: Learnt) -> dict[str, bytes]:
+def pictures(terms: Terms, height: Tensor, learnt: LearntMask) -> dict[str, bytes]:
     """Relief, PSF, suppression by wavelength and the way of the loss, as PNG."""
     pupil, psf, plain = terms.pupil(height), terms.psf(height), terms.plain()
-    pitch = terms.recipe.steps[terms.how.psf].params["pixel_pitch"]
+    pitch = terms.recipe.steps[terms.settings.psf].params["pixel_pitch"]
     lsr = psf.intensity.amax((-2, -1)).double() / psf.clear_peak
     shown = {
         "relief": optics.height(pupil=pupil),

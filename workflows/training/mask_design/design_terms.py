@@ -31,12 +31,12 @@ class Fabrication:
     values: Mapping[str, Any]
 
     @classmethod
-    def of(cls, recipe: Recipe, how: MaskTraining) -> Fabrication:
+    def of(cls, recipe: Recipe, settings: MaskTraining) -> Fabrication:
         """The limits of the recipe's `doe.fabricate` between relief and PSF, and the least feature."""
-        steps = [recipe.steps[name] for name in needed(recipe, [how.psf])]
+        steps = [recipe.steps[name] for name in needed(recipe, [settings.psf])]
         made = [step.params for step in steps if step.node.path == "doe.fabricate"]
         limits = {name: made[0][name] if made else None for name in ("levels", "max_height", "wrap_at")}
-        return cls({**limits, "feature": how.feature})
+        return cls({**limits, "feature": settings.feature})
 
     def rows(self) -> list[tuple[str, str]]:
         """Each limit in words."""
@@ -58,36 +58,37 @@ def _limit(name: str, value: Any) -> str:
 class Terms:
     """The loss of a relief and its parts, on all bands of a recipe or some of them."""
 
-    def __init__(self, recipe: Recipe, how: MaskTraining, store: Store | None, device: str = "cpu") -> None:
-        need_steps(recipe.steps, how)
-        self.how, self.recipe = how, replace(recipe, exact=True)  # a bound of the relief's effect has no gradient
-        self._bands = _bands_step(self.recipe, how.psf)
+    def __init__(self, recipe: Recipe, settings: MaskTraining, store: Store | None, device: str = "cpu") -> None:
+        need_steps(recipe.steps, settings)
+        self.settings = settings
+        self.recipe = replace(recipe, exact=True)  # a bound of the mask's effect has no gradient
+        self._bands = _bands_step(self.recipe, settings.psf)
         self._function = as_function(
-            self.recipe, how.height, self._bands, outputs=[how.psf], store=store, device=device
+            self.recipe, settings.height, self._bands, outputs=[settings.psf], store=store, device=device
         )
-        seen = [how.illuminant, how.responses] if how.weights.wiener else []
-        done = run(self.recipe, store, [self._bands, how.plain, *seen], device=device)
+        seen = [settings.illuminant, settings.responses] if settings.weights.wiener else []
+        done = run(self.recipe, store, [self._bands, settings.plain, *seen], device=device)
         self._seen: list[Tensor] = [done[name] for name in seen]
         self.bands: Bands = done[self._bands]
-        self._plain: Psf = done[how.plain]
+        self._plain: Psf = done[settings.plain]
         self.device = self._plain.intensity.device
 
     @property
     def fabrication(self) -> Fabrication:
         """What the relief is designed for."""
-        return Fabrication.of(self.recipe, self.how)
+        return Fabrication.of(self.recipe, self.settings)
 
     @property
     def relief(self) -> Step:
         """The step that is replaced."""
-        return self.recipe.steps[self.how.height]
+        return self.recipe.steps[self.settings.height]
 
     @cached_property
     def stop(self) -> Stop:
         """The pupil's grid, as the step that is replaced has it."""
         params = self.relief.params
         if missing := [name for name in ("samples", "pitch", "diameter", "aperture") if name not in params]:
-            raise DesignError(f"height: {self.how.height} has no {missing[0]}: take a recipe whose mask is a doe")
+            raise DesignError(f"height: {self.settings.height} has no {missing[0]}: take a recipe whose mask is a doe")
         return stop(*(params[name] for name in ("samples", "pitch", "diameter", "aperture")))
 
     @property
@@ -98,16 +99,16 @@ class Terms:
     def psf(self, height: Tensor, chosen: Sequence[int] | None = None) -> Psf:
         """The PSF behind a relief, of some bands or all."""
         bands = self.bands if chosen is None else _some(self.bands, chosen)
-        found: Psf = self._function({self.how.height: height, self._bands: bands})[self.how.psf]
+        found: Psf = self._function({self.settings.height: height, self._bands: bands})[self.settings.psf]
         return found
 
     def pupil(self, height: Tensor) -> Pupil:
         """The pupil that a relief makes."""
-        name = self.recipe.steps[self.how.psf].wires.get("pupil")
+        name = self.recipe.steps[self.settings.psf].wires.get("pupil")
         if not isinstance(name, str):
-            raise DesignError(f"psf: {self.how.psf} has no pupil: name a step of optics.psf")
-        function = as_function(self.recipe, self.how.height, outputs=[name], device=str(self.device))
-        found: Pupil = function({self.how.height: height})[name]
+            raise DesignError(f"psf: {self.settings.psf} has no pupil: name a step of optics.psf")
+        function = as_function(self.recipe, self.settings.height, outputs=[name], device=str(self.device))
+        found: Pupil = function({self.settings.height: height})[name]
         return found
 
     def plain(self, chosen: Sequence[int] | None = None) -> Psf:
@@ -116,14 +117,15 @@ class Terms:
 
     def parts(self, height: Tensor, chosen: Sequence[int] | None = None) -> dict[str, Tensor]:
         """Each term that counts, by name, as a mean over the bands."""
-        psf, plain, weights, how = self.psf(height, chosen), self.plain(chosen), self.how.weights, self.how
+        psf, plain, settings = self.psf(height, chosen), self.plain(chosen), self.settings
+        weights = settings.weights
         found = {}
         if weights.lsr:
             found["lsr"] = self._suppression(psf)
         if weights.bsr:
             found["bsr"] = losses.bsr(psf.intensity, plain.intensity)
         if weights.contrast:
-            found["contrast"] = losses.contrast(psf, floor=how.floor, up_to=how.up_to)
+            found["contrast"] = losses.contrast(psf, floor=settings.floor, up_to=settings.up_to)
         found = {name: term / len(psf.intensity) for name, term in found.items()}
         if weights.wiener:  # of channels, each of which sees all bands
             found["wiener"] = self._left_wrong(psf, chosen)
@@ -131,39 +133,39 @@ class Terms:
 
     def _suppression(self, psf: Psf) -> Tensor:
         """The sum over bands, no less than what is enough of each in the mean."""
-        how, count = self.how, len(psf.intensity)
-        found: Tensor = losses.lsr(psf, power=how.power, log=how.log)
-        if how.enough is None:
+        settings, count = self.settings, len(psf.intensity)
+        found: Tensor = losses.lsr(psf, power=settings.power, log=settings.log)
+        if settings.enough is None:
             return found
-        return found.clamp_min(count * (math.log(how.enough) if how.log else how.enough))
+        return found.clamp_min(count * (math.log(settings.enough) if settings.log else settings.enough))
 
     def _left_wrong(self, psf: Psf, chosen: Sequence[int] | None) -> Tensor:
         bands = self.bands if chosen is None else _some(self.bands, chosen)
         light, responses = self._seen
         if chosen is not None:
             light, responses = light[..., list(chosen)], responses[..., list(chosen)]
-        how = self.how
+        settings = self.settings
         found: Tensor = losses.wiener(
-            psf, light, responses, bands, noise=how.noise_share, colour=how.colour, up_to=how.up_to
+            psf, light, responses, bands, noise=settings.noise_share, colour=settings.colour, up_to=settings.up_to
         )
         return found
 
     def total(self, parts: dict[str, Tensor]) -> Tensor:
         """The weighted sum."""
-        return torch.stack([getattr(self.how.weights, name) * term for name, term in parts.items()]).sum()
+        return torch.stack([getattr(self.settings.weights, name) * term for name, term in parts.items()]).sum()
 
     def drawn(self, number: int) -> list[int] | None:
         """The bands of an iteration: one of each stretch of the spectrum, by chance, so that in time all are seen."""
-        wanted = self.how.bands
+        wanted = self.settings.bands
         if wanted is None or wanted >= self.count:
             return None
-        rng = torch.Generator().manual_seed(self.how.seed * _PRIME + number)
+        rng = torch.Generator().manual_seed(self.settings.seed * _PRIME + number)
         places = (torch.arange(wanted) + torch.rand(wanted, generator=rng)) * (self.count / wanted)
         return [min(int(place), self.count - 1) for place in places]
 
     def even(self) -> list[int] | None:
         """The same bands every time, from the first to the last."""
-        wanted = self.how.bands
+        wanted = self.settings.bands
         if wanted is None or wanted >= self.count:
             return None
         return [round(float(place)) for place in torch.linspace(0, self.count - 1, wanted)]

@@ -13,12 +13,10 @@ from typing import Any
 import torch
 from torch import nn
 
-_EDITION = 1
-COLUMNS = ("stage", "iteration", "LSR", "BSR", "L1", "reconstruction", "adversarial", "critics", "penalty", "slope",
-           "rate", "seconds")  # fmt: skip
+_FORMAT = 1  #: of a state; a state of another format is refused
 
 
-def replaced(path: Path, data: bytes) -> None:
+def write_whole(path: Path, data: bytes) -> None:
     """Write a file whole or not at all."""
     part = path.with_name(f".{path.name}.{os.getpid()}.part")
     try:
@@ -32,34 +30,43 @@ def replaced(path: Path, data: bytes) -> None:
         raise
 
 
-def packed(parts: Mapping[str, Any], **about: Any) -> bytes:
-    """Weights, moments and place of all parts."""
-    memory = io.BytesIO()
-    torch.save({"edition": _EDITION, **about, "parts": {name: x.state_dict() for name, x in parts.items()}}, memory)
-    return memory.getvalue()
+class StateFile:
+    """The state of unfinished work: one file, always whole: a killed process leaves the old one or the new."""
 
+    def __init__(self, path: Path) -> None:
+        self.path = path
 
-def unpacked(path: Path, device: str) -> dict[str, Any]:
-    """Read a state; raises ValueError for what is none."""
-    try:
-        found: dict[str, Any] = torch.load(path, map_location=device, weights_only=True)
-        if found["edition"] != _EDITION:
-            raise ValueError(f"edition {found['edition']}, not {_EDITION}")
-    except (RuntimeError, KeyError, EOFError, OSError, ValueError, TypeError) as error:
-        raise ValueError(f"{path} cannot be gone on from ({error}): remove its folder to begin anew") from error
-    return found
+    def write(self, state: Mapping[str, Any]) -> None:
+        """Replace the file."""
+        self.path.parent.mkdir(parents=True, exist_ok=True)
+        memory = io.BytesIO()
+        torch.save({"edition": _FORMAT, **state}, memory)
+        write_whole(self.path, memory.getvalue())
 
+    def read(self, device: str = "cpu", strict: bool = True) -> dict[str, Any]:
+        """Return the state, or an empty one where there is no file.
 
-def restore(parts: Mapping[str, Any], found: Mapping[str, Any]) -> None:
-    """Put a state back into its parts."""
-    for name, part in parts.items():
-        part.load_state_dict(found["parts"][name])
+        Raises ValueError for a file that cannot be read; without ``strict`` such a file counts as absent.
+        """
+        if not self.path.exists():
+            return {}
+        try:
+            found: dict[str, Any] = torch.load(self.path, map_location=device, weights_only=True)
+            if found.get("edition", _FORMAT) != _FORMAT:
+                raise ValueError(f"edition {found['edition']}, not {_FORMAT}")
+        except (RuntimeError, KeyError, EOFError, OSError, ValueError, TypeError, AttributeError) as error:
+            if not strict:
+                return {}
+            raise ValueError(
+                f"{self.path} cannot be gone on from ({error}): remove its folder to begin anew"
+            ) from error
+        return found
 
 
 class Rows:
     """``losses.csv``: a row for each iteration; those after the state that is gone on from are cut off."""
 
-    def __init__(self, path: Path, columns: Sequence[str] = COLUMNS) -> None:
+    def __init__(self, path: Path, columns: Sequence[str]) -> None:
         self._path, self._columns = path, columns
         self.rows: list[dict[str, str]] = []
         self._kept = 0
@@ -86,7 +93,7 @@ class Rows:
             writer.writeheader()
         writer.writerows(self.rows[self._kept :])
         if self._kept == 0:
-            replaced(self._path, text.getvalue().encode())
+            write_whole(self._path, text.getvalue().encode())
         else:
             with self._path.open("ab") as file:
                 file.write(text.getvalue().encode())
@@ -110,7 +117,7 @@ def export(
 
     path = folder / f"{name}.safetensors"
     whole = {key: x.detach().cpu().contiguous() for key, x in tensors.items()}
-    replaced(path, save(whole, dict(about) if about else None))
+    write_whole(path, save(whole, dict(about) if about else None))
     return path
 
 
@@ -122,10 +129,10 @@ def weights_of(net: nn.Module) -> dict[str, torch.Tensor]:
 
 def write_json(path: Path, document: Mapping[str, Any]) -> None:
     """Write a document whole or not at all."""
-    replaced(path, (json.dumps(document, indent=1, ensure_ascii=False) + "\n").encode())
+    write_whole(path, (json.dumps(document, indent=1, ensure_ascii=False) + "\n").encode())
 
 
-def columns(rows: Sequence[Mapping[str, str]], stage: int, name: str) -> tuple[list[int], list[float]]:
-    """Iterations of a stage and what a column has there."""
+def loss_curve(rows: Sequence[Mapping[str, str]], stage: int, name: str) -> tuple[list[int], list[float]]:
+    """Return the iterations of a stage that have a value in a column, and these values."""
     pairs = [(int(r["iteration"]), float(r[name])) for r in rows if int(r["stage"]) == stage and r[name]]
     return [i for i, _ in pairs], [x for _, x in pairs]
