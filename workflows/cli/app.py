@@ -1,6 +1,6 @@
 """The command line: few commands, the same words everywhere, one line for each mistake.
 
-Nothing heavy is imported before a command asks for it: ``neusee --help`` never sees torch.
+A command imports what it needs when it runs: ``neusee --help`` never imports torch.
 """
 
 from __future__ import annotations
@@ -14,6 +14,7 @@ import typer
 
 from neusee.workflows.cli.cache_commands import cache
 from neusee.workflows.cli.calibrate_command import calibrate
+from neusee.workflows.cli.catalogue import nodes, recipes, schema
 from neusee.workflows.cli.command_frame import (
     BAD,
     DONE,
@@ -33,7 +34,6 @@ from neusee.workflows.cli.command_frame import (
     the_store,
 )
 from neusee.workflows.cli.evaluate_command import evaluate
-from neusee.workflows.cli.list_commands import nodes, recipes, schema
 from neusee.workflows.cli.study_commands import study
 from neusee.workflows.cli.train_command import train
 
@@ -103,7 +103,7 @@ def run(
 
 
 def _refuse_too_large(recipe: Recipe, store: Store, device: str, memory: int) -> None:
-    """Stop before anything runs where, as far as earlier runs tell, the memory cannot do."""
+    """Exit before anything runs if the memory is too small, by the sizes of earlier runs."""
     from neusee.workflows.engine.local_executor import lanes_of
     from neusee.workflows.explain.run_forecast import planned
 
@@ -121,8 +121,7 @@ def _simulate(
     executor: Executor | None,
     memory: int | None,
 ) -> Simulation:
-    from neusee.workflows.report.console import RunTable
-    from neusee.workflows.report.progress_table import mode_for
+    from neusee.workflows.report.console import RunTable, mode_for
     from neusee.workflows.simulation.simulate_recipe import simulate, steps_of, wanted
     from neusee.workflows.tolerance.cheaper_steps import with_substitutions
 
@@ -202,8 +201,8 @@ def sweep(
     if on_error not in ("stop", "continue"):
         fail(f"--on-error {on_error}: write stop or continue")
     check_device(device)
+    from neusee.workflows.cli.sweep_command import run_sweep
     from neusee.workflows.graph.diagnostics import RecipeError
-    from neusee.workflows.sweeps.sweep_run import run_sweep
 
     try:
         code = run_sweep(
@@ -250,7 +249,7 @@ def report(
 
 
 def main(arguments: list[str] | None = None) -> None:
-    """Entry point: every error is one line and an exit code, unless ``--debug`` asks for the stack."""
+    """Run the command line; an error is one line and an exit code, unless ``--debug`` asks for the traceback."""
     arguments = sys.argv[1:] if arguments is None else arguments
     gc.disable()  # what is imported stays: to look for garbage in it costs a tenth of the start
     try:
@@ -268,7 +267,7 @@ def main(arguments: list[str] | None = None) -> None:
 
 
 def _explained(error: Exception) -> int:
-    """Print an error as one line; a mistake in the arguments and a failure while running differ in their code."""
+    """Print an error as one line and return its exit code, which tells a wrong argument from a failed run."""
     message = getattr(error, "format_message", None)
     if message is not None:
         print(f"{message()} (try `neusee --help`)", file=sys.stderr)

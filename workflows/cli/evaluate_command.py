@@ -1,4 +1,4 @@
-"""``neusee evaluate``: masks and restorers on the same scenes and lasers, with confidence intervals."""
+"""The command ``neusee evaluate``: compare masks and restorers on the same scenes and lasers."""
 
 from __future__ import annotations
 
@@ -60,7 +60,7 @@ def _given(how: dict[str, Any]) -> list[str]:
 
 
 def _evaluated(name: str, changes: list[str], pipelines: str, **how: Any) -> Path:
-    """The folder of the evaluation, or one line of what is wrong."""
+    """Return the folder of the evaluation, or exit with one line about a mistake."""
     from neusee.workflows.engine.node_call import RunError
     from neusee.workflows.evaluation import run_evaluation as protocol
 

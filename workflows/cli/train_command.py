@@ -1,4 +1,4 @@
-"""``neusee train``: learn the element and the restoration of a recipe."""
+"""The command ``neusee train``: learn the mask and the restoration of a recipe."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ if TYPE_CHECKING:
 
 
 class Stages(StrEnum):
-    """What is learnt."""
+    """The stages that are learnt."""
 
     FIRST = "1"
     SECOND = "2"
@@ -25,7 +25,7 @@ class Stages(StrEnum):
     MASK = "mask"
 
 
-_STAGES = "1: element and network; 2: network; both; mask: element without images, then 2."
+_STAGES = "1: mask and network; 2: network; both; mask: the mask without images, before 2."
 _NUMBERS = {Stages.FIRST: (1,), Stages.SECOND: (2,), Stages.BOTH: (1, 2), Stages.MASK: (0,)}  #: of `train`
 
 
@@ -40,9 +40,9 @@ def train(
     debug: Debug = False,
     out: Out = Path("runs"),
 ) -> None:
-    """Learn a recipe's element and restoration; run it again to go on where it was stopped.
+    """Learn the mask and the restoration of a recipe; the same command goes on with a stopped training.
 
-    With --stage mask the element is designed without images, as train.mask says; --stage 2 then goes on from it.
+    With --stage mask the mask is designed without images, as train.mask says; --stage 2 goes on from that mask.
     """
     recipe, command = load(words or ["train_small"])
     if recipe.lifting is not None:
@@ -59,12 +59,12 @@ def train(
     quiet, who = quiet or rank > 0, f"process {rank}: " if world > 1 else ""
     there = recipe.training.learnt if recipe.training else ()
     stages = there if stage is Stages.BOTH else _NUMBERS[stage]
-    tell = (lambda line: None) if quiet else (lambda line: say([line]))
-    told = ["neusee", "train", *command[2:], "--stage", stage.value, *(["--mesh", mesh] if mesh else [])]
+    progress = (lambda line: None) if quiet else (lambda line: say([line]))
+    again = ["neusee", "train", *command[2:], "--stage", stage.value, *(["--mesh", mesh] if mesh else [])]
     lengths = {s: recipe.training.stages[s].iterations for s in stages if s} if recipe.training else {}
     try:
-        with joined(mesh, device) as processes_here, _bar(quiet, lengths) as bar:
-            folder = learn(recipe, the_store(), out, told, tell, stages, device, bar.watch, processes_here)
+        with joined(mesh, device) as processes_here, _LossBar(quiet, lengths) as bar:
+            folder = learn(recipe, the_store(), out, again, progress, stages, device, bar.watch, processes_here)
     except MeshError as error:
         fail(f"{who}{error}")
     except (RunError, ValueError, ArithmeticError) as error:
@@ -75,16 +75,18 @@ def train(
         say([str(folder)])
 
 
-def _lift(recipe: Recipe, told: list[str], out: Path, device: str, quiet: bool) -> None:
+def _lift(recipe: Recipe, again: list[str], out: Path, device: str, quiet: bool) -> None:
     """Learn a lift from RGB to spectra."""
     from neusee.workflows.engine.node_call import RunError
     from neusee.workflows.training.lift.lift_run import train_lift
 
     assert recipe.lifting is not None
-    tell = (lambda line: None) if quiet else (lambda line: say([line]))
+    progress = (lambda line: None) if quiet else (lambda line: say([line]))
     try:
-        with _bar(quiet, {1: recipe.lifting.iterations}) as bar:
-            folder = train_lift(recipe, the_store(), out, told, tell, device, lambda n, found: bar.watch(1, n, found))
+        with _LossBar(quiet, {1: recipe.lifting.iterations}) as bar:
+            folder = train_lift(
+                recipe, the_store(), out, again, progress, device, lambda n, found: bar.watch(1, n, found)
+            )
     except (RunError, ValueError, ArithmeticError) as error:
         fail(str(error), FAILED)
     if not quiet:
@@ -96,14 +98,14 @@ def _lift(recipe: Recipe, told: list[str], out: Path, device: str, quiet: bool) 
 
 def _next(folder: Path, stage: Stages) -> list[str]:
     if stage is Stages.MASK:
-        return [f"element: {folder / 'mask.safetensors'}", f"report:  {folder / 'report.html'}"]
+        return [f"mask:    {folder / 'mask.safetensors'}", f"report:  {folder / 'report.html'}"]
     mask, network = folder / "mask.safetensors", folder / "network.safetensors"
-    element = [f"element: {mask}"] if mask.is_file() else []
-    return [*element, f"network: {network}", f"curves:  {folder / 'curves.png'}"]
+    lines = [f"mask:    {mask}"] if mask.is_file() else []
+    return [*lines, f"network: {network}", f"curves:  {folder / 'curves.png'}"]
 
 
-class _bar:
-    """The losses on the way, where somebody looks."""
+class _LossBar:
+    """A progress bar with the losses, on a terminal."""
 
     def __init__(self, quiet: bool, lengths: Mapping[int, int]) -> None:
         from rich.console import Console
@@ -115,7 +117,7 @@ class _bar:
                                disable=quiet or not console.is_terminal)  # fmt: skip
         self._tasks = {s: self._shown.add_task(f"stage {s}", total=n, losses="") for s, n in lengths.items()}
 
-    def __enter__(self) -> _bar:
+    def __enter__(self) -> _LossBar:
         self._shown.start()
         return self
 
@@ -123,8 +125,8 @@ class _bar:
         self._shown.stop()
 
     def watch(self, stage: int, done: int, found: Mapping[str, float]) -> None:
-        """An iteration was done."""
-        said = " ".join(
+        """Show the losses of an iteration."""
+        losses = " ".join(
             f"{name} {found[name]:.3g}" for name in ("LSR", "L1", "critics", "MRAE", "RMSE") if name in found
         )
-        self._shown.update(self._tasks[stage], completed=done, losses=said)
+        self._shown.update(self._tasks[stage], completed=done, losses=losses)

@@ -14,7 +14,7 @@ import time
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 
@@ -32,9 +32,6 @@ from neusee.workflows.report.run_folder import RunFolder, new_run
 from neusee.workflows.store.remote_store import open_store
 from neusee.workflows.store.result_store import Store
 from neusee.workflows.studies.accuracy.work_precision_points import timestamp
-
-if TYPE_CHECKING:
-    pass
 
 __all__ = ["STRENGTHS", "Evaluated", "Refused", "evaluate", "read_pipelines"]
 

@@ -89,11 +89,11 @@ class Recipe:
     uncertain: Uncertain | None = field(default=None, compare=False)  #: what the study of uncertainty draws from
     training: Training | None = field(default=None, compare=False)  #: how it is learnt
     lifting: LiftTraining | None = field(default=None, compare=False)  #: how a lift is learnt from its pictures
-    unheard: frozenset[str] = frozenset()  #: steps whose errors reach a node that does not tell what becomes of them
+    unbounded: frozenset[str] = frozenset()  #: steps whose errors reach a node that does not bound its error
 
     def limit(self, step: str) -> float:
         """Return the error allowed for a step: the tolerance, at most `METRIC_TOLERANCE` where nothing bounds it."""
-        return min(self.tolerance, METRIC_TOLERANCE) if step in self.unheard else self.tolerance
+        return min(self.tolerance, METRIC_TOLERANCE) if step in self.unbounded else self.tolerance
 
     def allowed(self, step: str) -> float:
         """What all that is left out or computed more cheaply, up to a step, may change of it."""

@@ -1,7 +1,7 @@
-"""The points of a sweep, checked and then run one after another on one store.
+"""The points of a sweep: checked, and then run one after another on one store.
 
-Every point is composed and checked before the first one runs. A point keeps its composed values,
-which share almost everything with the other points; its steps are bound again when it runs.
+Every point is composed and checked before the first point runs. A point keeps its composed values, which it shares
+almost entirely with the other points; its steps are bound again when it runs.
 """
 
 from __future__ import annotations
@@ -35,7 +35,7 @@ ResultNumber = tuple[str, str, int | str, float]  #: step, field, index (empty o
 
 @dataclass(frozen=True, slots=True)
 class CheckedPoint:
-    """A point in which nothing is wrong, and what it asks of the engine."""
+    """A point without mistakes, and the steps that it needs."""
 
     point: Point
     composed: Composed
@@ -44,25 +44,25 @@ class CheckedPoint:
 
 @dataclass(frozen=True, slots=True)
 class PointOutcome:
-    """What became of a point."""
+    """The outcome of a point."""
 
     point: Point
     state: PointState  #: ``cached``: no step had to run
     seconds: float
     numbers: tuple[ResultNumber, ...] = ()
-    step: str = ""  #: the one that failed
+    step: str = ""  #: the step that failed
     message: str = ""  #: why it failed, with the place where the step is written
     left: float = 0.0  #: seconds that the points after it will take, as the ones before it took
 
 
 @dataclass(frozen=True)
 class SweepPlan:
-    """The points in the order in which they run."""
+    """The checked points in the order in which they run."""
 
     recipe: Recipe  #: of the first point
     checked: tuple[CheckedPoint, ...]
-    costs: dict[str, float]  #: seconds by step, of those that ran before
-    work: tuple[float, ...]  #: of every point in turn that is not stored: seconds, or steps where none ran before
+    costs: dict[str, float]  #: seconds by step, of steps that ran before
+    work: tuple[float, ...]  #: of each point, without stored results: seconds, or steps where none ran before
     notes: tuple[str, ...]
 
     @property
@@ -70,10 +70,10 @@ class SweepPlan:
         return [checked.job for checked in self.checked]
 
 
-def planned(
+def plan_sweep(
     recipe: str, points: Sequence[Point], folder: Path, store: Store, paired: bool = False, device: str = "cpu"
 ) -> SweepPlan:
-    """Compose and check every point and put them in order; a `RecipeError` has every mistake of all of them."""
+    """Compose, check and order the points; raise `RecipeError` with every mistake of every point."""
     checker = _Checker(recipe, folder, store, device)
     checked = list(checker.every(points))
     if checker.diagnostics or checker.first is None:
@@ -92,9 +92,9 @@ def outcomes(
     started: Callable[[Point], None] = lambda point: None,
     watch: Callable[[Event], None] | None = None,
 ) -> Generator[PointOutcome, None, None]:
-    """Run the points in turn and say at once what became of each.
+    """Run the points in turn, and yield the outcome of each.
 
-    With ``on_error="stop"`` the error of the first point that fails is raised after its outcome was given.
+    With ``on_error="stop"`` the error of the first point that fails is raised after its outcome.
     """
     clock = _Clock(plan.work)
     for checked in plan.checked:
@@ -125,13 +125,13 @@ def _failed(point: Point, error: Exception, seconds: float, left: float) -> Poin
 
 
 def _numbers(result: Result) -> tuple[ResultNumber, ...]:
-    """Every small output, number by number."""
+    """Return every small output, number by number."""
     rows = (row for step, value in result.values.items() for row in numbers_of(step, value))
     return tuple((step, field, index, number) for step, field, index, number in rows)
 
 
 def _costs(store: Store) -> dict[str, float]:
-    """Median seconds of every step that this store has results of."""
+    """Return the median seconds of every step that has results in the store."""
     found: dict[str, list[float]] = defaultdict(list)
     for row in store.journal.rows():
         if row["step"] and row["seconds"] is not None:
@@ -140,7 +140,7 @@ def _costs(store: Store) -> dict[str, float]:
 
 
 class _Clock:
-    """Predicts how long the rest takes, from the work that is done and the work that is left."""
+    """A prediction of the remaining seconds, from the work so far and the work that is left."""
 
     def __init__(self, work: Sequence[float]) -> None:
         least = sum(work) / 100 / len(work) or 1.0  # reading a point's numbers is work too
@@ -149,7 +149,7 @@ class _Clock:
         self.done = self.seconds = 0.0
 
     def left(self, seconds: float) -> float:
-        """Seconds for the points to come, after one that took ``seconds``."""
+        """Return the seconds that the remaining points will take, after a point that took ``seconds``."""
         one = self.work[0]
         del self.work[0]
         self.todo, self.done, self.seconds = self.todo - one, self.done + one, self.seconds + seconds
@@ -157,7 +157,7 @@ class _Clock:
 
 
 class _Checker:
-    """Looks at one point after another."""
+    """The check of one point after another."""
 
     def __init__(self, recipe: str, folder: Path, store: Store, device: str) -> None:
         self.recipe, self.folder, self.device = recipe, folder, device
@@ -168,7 +168,7 @@ class _Checker:
         self._same: dict[Any, Any] = {}
 
     def every(self, points: Sequence[Point]) -> Iterator[CheckedPoint]:
-        """The points that are right; what is wrong with the others is in ``problems``."""
+        """Yield the points without mistakes; the mistakes of the others are in ``diagnostics``."""
         for point in points:
             try:
                 composed = compose(self.recipe, point.overrides, self.folder)
@@ -193,5 +193,5 @@ class _Checker:
         return PointJob(point.place, keys, graph, recipe.outputs)
 
     def _once(self, key: Key) -> Key:
-        """The same text for the same key: a thousand points share most of theirs."""
+        """Return one text object for equal keys, for points share most of their keys."""
         return str(self._same.setdefault(key, key))

@@ -1,13 +1,13 @@
-"""What all that was left out, or computed more cheaply, may change at every step: carried along the graph by the nodes.
+"""Bounds of the errors of every step, carried along the graph by the nodes, and where they are held to the tolerance.
 
-A node says how far its result may be off where its inputs are (`Node.propagate_error`). Where one does
-not, nothing is known behind it, and its inputs are what is held to the tolerance.
+A node with the hook `propagate_error` bounds the error of its result by the errors of its inputs. A node without the
+hook ends the bounds: its inputs are held to the tolerance, as the outputs of the recipe are.
 """
 
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
 
 from neusee.nodes import ErrorBound, TensorStats
@@ -48,6 +48,35 @@ class ToleranceNotProven(Exception):
     def __init__(self, over: float) -> None:
         super().__init__(f"changes at most {over:.2g} times what the tolerance allows")
         self.over = over
+
+
+def tolerance_frontier(recipe: Recipe, order: Iterable[str], wanted: Iterable[str]) -> list[str]:
+    """Return the steps whose errors are held to the tolerance.
+
+    They may be off, and are wanted or read by a node that does not bound its error.
+    """
+    off, found = set[str](), dict[str, None]()
+    for name in order:
+        step = recipe.steps[name]
+        reads = [source for source in step.sources if source in off]
+        if reads and not _bounds_its_error(step):
+            found |= dict.fromkeys(reads)
+        elif reads or step.node.hooks.approximation_error is not None or step.node.hooks.skip_bound is not None:
+            off.add(name)
+    return [*found, *(name for name in wanted if name in off and name not in found)]
+
+
+def unbounded_steps(recipe: Recipe, order: Sequence[str]) -> frozenset[str]:
+    """Return the steps of a running order whose errors reach a node that does not bound its error."""
+    found = set[str]()
+    for name in reversed(order):
+        if name in found or not _bounds_its_error(recipe.steps[name]):
+            found.update(recipe.steps[name].sources)
+    return frozenset(found)
+
+
+def _bounds_its_error(step: Step) -> bool:
+    return step.node.hooks.propagate_error is not None or step.node.hooks.approximation_error is not None
 
 
 def proof(

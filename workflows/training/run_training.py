@@ -1,4 +1,4 @@
-"""Learn an element and the restoration behind it, in stages: resumed to the last bit, one folder."""
+"""The training of a mask and of the restoration behind it, in stages, in one folder."""
 
 from __future__ import annotations
 
@@ -42,20 +42,20 @@ def train(
     watch: Watch | None = None,
     mesh: Mesh = ALONE,
 ) -> Path:
-    """Learn through the stages, or go on where an earlier call of the same was stopped; the folder.
+    """Learn through the stages and return the folder; a stopped training goes on where it stopped.
 
-    Stage 0 designs the element without images, in place of stage 1.
+    Stage 0 designs the mask without images, in place of stage 1.
 
-    Of the processes of a mesh each calls this, with the same arguments and a folder that all of them see; the first
-    alone writes, and an error in one ends them all. The mesh decides no number but by rounding.
+    Every process of a mesh calls this function with the same arguments and a folder that all processes see; only the
+    first process writes, and an error in one process ends all of them. The mesh changes results by rounding alone.
 
-    Raises ValueError for a recipe that says not how, a folder without photographs, a second stage before there is an
-    element, a first one where that was designed, or a mesh that does not fit; ArithmeticError where a loss is no
-    number, with all that led to it beside the state.
+    Raises ValueError for a recipe without the block ``train``, a folder without photographs, a second stage before
+    there is a mask, a first stage after the mask was designed, or a mesh that does not fit; ArithmeticError where a
+    loss is NaN or infinite, with the weights and pictures that led to the loss in a file.
     """
     settings = recipe.training
     if settings is None:
-        raise ValueError(f"{recipe.name} says not how it is learnt: add `train: recommended` to its defaults")
+        raise ValueError(f"{recipe.name} has no block train: add `train: recommended` to its defaults")
     with_pictures = [number for number in stages if number != MASK]
     if MASK in stages and mesh.size > 1:
         raise MeshError("--stage mask is designed by one process: start it without torchrun")
@@ -78,7 +78,7 @@ def train(
 
 
 def _require_equal_shares(recipe: Recipe, settings: Training, mesh: Mesh) -> None:
-    """Refuse a batch of which the processes of the data axis cannot have equal shares."""
+    """Raise `MeshError` for a batch that the processes of the data axis cannot share equally."""
     for number, stage in settings.stages.items():
         if stage.batch % mesh.data:
             path = f"{KEY}.stages.{number}.batch"
@@ -163,7 +163,7 @@ class _TrainingLoop(ResumableLoop):
 
     @property
     def _behind(self) -> int:
-        """Iterations of all stages that are done."""
+        """Return the iterations of all stages so far."""
         return self.iteration + sum(s.iterations for number, s in self.settings.stages.items() if number < self.stage)
 
     @property
@@ -222,7 +222,7 @@ class _TrainingLoop(ResumableLoop):
 
     @property
     def _mask(self) -> str:
-        """Where the mask comes from."""
+        """Return where the mask comes from."""
         if self.settings.learn is None:
             return "the recipe's own"
         return "designed without images" if self.designed else "learnt in stage 1"
@@ -244,7 +244,7 @@ class _TrainingLoop(ResumableLoop):
 
 
 def frozen(recipe: Recipe, settings: Training, folder: Path) -> Recipe:
-    """The recipe with the element that was learnt in place of the one that learns: a step like any other."""
+    """Return the recipe with the mask that was learnt in place of the step that learns."""
     if settings.learn is None:
         return recipe
     file = folder / "mask.safetensors"

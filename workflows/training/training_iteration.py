@@ -1,4 +1,4 @@
-"""The element, the network and its critics, and one iteration of learning them."""
+"""The mask, the network and its critics, and one iteration of learning them."""
 
 from __future__ import annotations
 
@@ -32,7 +32,7 @@ from neusee.workflows.training.training_pictures import Sample, TrainingStream
 
 @dataclass
 class Scales:
-    """Pictures at two scales: the coarse one first."""
+    """Pictures at two scales, the coarse scale first."""
 
     coarse: Tensor
     fine: Tensor
@@ -43,13 +43,13 @@ class Scales:
 
     @classmethod
     def of(cls, picture: Tensor) -> Scales:
-        """A picture (n, 3, y, x) and half of it."""
+        """Return a picture (n, 3, y, x) with its half-size version."""
         y, x = picture.shape[-2:]
         return cls(resize(picture, -(-y // 2), -(-x // 2)), picture)
 
 
 class Learner:
-    """All that learns, on one device; in every process of a mesh the same."""
+    """Everything that learns, on one device; equal in every process of a mesh."""
 
     def __init__(
         self, recipe: Recipe, settings: Training, device: str, designed: bool = False, mesh: Mesh = ALONE
@@ -57,13 +57,13 @@ class Learner:
         self.settings, self.seed, self.device, self.mesh = settings, recipe.seed, device, mesh
         self._step = recipe.steps[settings.learn] if settings.learn else None
         self.relief = nn.Module() if designed or self._step is None else self._start(self._step).to(settings.dtype)
-        self.net: Restorer = started(lambda: _made(settings.network), self._rng("network")).to(settings.dtype)
+        self.net: Restorer = started(lambda: _network_of(settings.network), self._rng("network")).to(settings.dtype)
         self.critics = nn.ModuleList(critics(self._rng("critics"), settings.critics.width)).to(settings.dtype)
         self.average = averaged(self.net, settings.average)
         self.begin(Stage(iterations=0), learns=True)
 
     def _start(self, step: Step) -> nn.Module:
-        """The relief that learns; one that was designed does not."""
+        """Return the parameters of the mask that learns."""
         path = step.node.path
         if path not in LEARNT:
             text = f"{self.settings.learn} is {path}, of which nothing is learnt; {nearest(path, LEARNT)}"
@@ -71,9 +71,9 @@ class Learner:
         return LEARNT[path](step.params, self._rng("element"))
 
     def height(self) -> Tensor:
-        """The relief (v, u) in m; raises ValueError where none learns."""
+        """Return the height map (v, u) in m; raise ValueError where no mask learns."""
         if self._step is None:
-            raise ValueError("train.learn: no element learns")
+            raise ValueError("train.learn: no mask learns")
         made: Tensor = self.relief(stop(*(self._step.params[name] for name in GRID)))
         return made
 
@@ -81,7 +81,7 @@ class Learner:
         return torch.Generator(self.device).manual_seed(stream_seed(self.seed, " ".join(map(str, ("train", *names)))))
 
     def begin(self, stage: Stage, learns: bool) -> None:
-        """Begin a stage: with new moments, at the first rate."""
+        """Begin a stage with new moments and the first learning rates."""
         rates, self.stage, self.learns = self.settings.rates, stage, learns
         groups = parameter_groups(self.net, rates.weights, rates.biases)
         if learns:
@@ -93,7 +93,7 @@ class Learner:
         self._first = [[g["lr"] for g in o.param_groups] for o in (self.generator_optimizer, self.critic_optimizer)]
 
     def set_rates(self, iteration: int) -> float:
-        """The rates of an iteration of the stage; by what they are multiplied."""
+        """Set the learning rates of an iteration of the stage, and return their factor on the first rates."""
         share = self.settings.rates.share(iteration)
         for optimiser, first in zip((self.generator_optimizer, self.critic_optimizer), self._first, strict=True):
             for group, rate in zip(optimiser.param_groups, first, strict=True):
@@ -101,23 +101,24 @@ class Learner:
         return share
 
     def parts(self) -> dict[str, Any]:
-        """All that a later iteration depends on."""
+        """Return everything on which a later iteration depends."""
         found = {"relief": self.relief, "net": self.net, "critics": self.critics, "makers": self.generator_optimizer}
         return {**found, "judges": self.critic_optimizer, **({"average": self.average} if self.average else {})}
 
     # --- one iteration ------------------------------------------------------------------------------------------------
 
     def iterate(self, samples: TrainingStream, stage: int, iteration: int) -> tuple[Losses, list[Sample]]:
-        """Look at a batch of pictures, one after another, and move a step; raises `NotFinite` before a bad one.
+        """Learn from a batch of pictures, one after another; raise `NotFinite` before a bad step.
 
-        Of several processes each looks at its own, and all move by the sum; the pictures are those of this one.
+        Returns the losses of the batch, and the pictures of this process. Of several processes each has pictures of
+        its own, and all of them step by the sum of the gradients.
         """
         self.generator_optimizer.zero_grad(set_to_none=True)
         shared = samples.begin(self.height()) if samples.shared else Shared.of({})
-        found = self._element(shared, samples) if self.learns else {}
+        found = self._mask_suppression(shared, samples) if self.learns else {}
         batch, seen, pairs = self.stage.batch, list[Sample](), dict[int, tuple[Scales, Scales]]()
         for i, sample in samples.batch(shared, stage, iteration * batch, batch):
-            terms, truth, estimate = self._restored(sample)
+            terms, truth, estimate = self._restoration_terms(sample)
             pairs[i] = (truth, estimate)
             _backward([weight * term / batch for weight, term in terms.values() if weight])
             for name, (_, term) in terms.items():
@@ -131,19 +132,19 @@ class Learner:
         if self.average:
             self.average.update_parameters(self.net)
         if self.stage.adversarial:
-            found |= self._judge(pairs, self._rng("between", stage, iteration))
+            found |= self._train_critics(pairs, self._rng("between", stage, iteration))
         return found, seen
 
     def _names(self) -> list[str]:
-        """What an iteration of the stage finds, in whatever process."""
+        """Return the names of the losses of the stage, the same in every process."""
         weights = {"BSR": self.stage.bsr, "reconstruction": self.stage.reconstruction,
                    "adversarial": self.stage.adversarial}  # fmt: skip
         return [*(["LSR"] if self.learns else []), "L1", *(name for name, weight in weights.items() if weight)]
 
-    def _element(self, shared: Shared, samples: TrainingStream) -> Losses:
-        """The suppression of each band, one band at a time: what its norm needs is made again on the way back.
+    def _mask_suppression(self, shared: Shared, samples: TrainingStream) -> Losses:
+        """Differentiate the suppression of each band, one band at a time, so that the norm of one band is held at once.
 
-        Each process has its own bands, or a share of all of them, so that over all processes each band counts once.
+        Each process has bands of its own, or a share of all bands, so that each band counts once over all processes.
         """
         psf: Psf = shared.values[self.settings.psf]
         count, times = samples.counted(self.settings.psf, len(psf.clear_peak))
@@ -159,8 +160,8 @@ class Learner:
         one: Tensor = losses.lsr(Psf(intensity[band : band + 1], clear[band : band + 1]), log=self.settings.logarithm)
         return one
 
-    def _restored(self, sample: Sample) -> tuple[dict[str, tuple[float, Tensor]], Scales, Scales]:
-        """Each term with its weight; the truth and, cut off, the estimate."""
+    def _restoration_terms(self, sample: Sample) -> tuple[dict[str, tuple[float, Tensor]], Scales, Scales]:
+        """Return each term with its weight, the truth, and the detached estimate."""
         low = torch.autocast(device_kind(self.device), torch.bfloat16, self.settings.precision == "bfloat16")
         picture = sample.picture if self.learns else sample.picture.detach()
         with low:
@@ -181,8 +182,8 @@ class Learner:
             terms["adversarial"] = (self.stage.adversarial, sum(scores, torch.zeros((), device=fine.device)))
         return terms, truth, Scales(estimate.coarse.detach(), estimate.fine.detach())
 
-    def _judge(self, pairs: Mapping[int, tuple[Scales, Scales]], rng: torch.Generator) -> Losses:
-        """Let the critics learn to tell truth and estimates apart; the stream is the same whoever has the pictures."""
+    def _train_critics(self, pairs: Mapping[int, tuple[Scales, Scales]], rng: torch.Generator) -> Losses:
+        """Let the critics learn to tell truth from estimates; the random stream does not depend on the process."""
         self.critic_optimizer.zero_grad(set_to_none=True)
         found, batch = {"critics": 0.0, "penalty": 0.0}, self.stage.batch
         for i in range(batch):
@@ -201,9 +202,10 @@ class Learner:
         return found
 
     def _move(self, optimiser: torch.optim.Optimizer, found: Mapping[str, float], parts: Iterable[nn.Module]) -> float:
-        """One step against the gradient, unless it or a loss is not finite; the steepest gradient of a part.
+        """Step against the gradient, and return the largest norm of a part; raise `NotFinite` before a bad step.
 
-        Each part is limited by itself: the suppression pulls at the element a thousand times as hard as at a network.
+        The gradient of each part is clipped separately: the suppression acts on the mask a thousand times as strongly
+        as on a network.
         """
         parts = list(parts)
         self.mesh.add_gradients(parts)
@@ -218,7 +220,7 @@ def _backward(terms: Sequence[Tensor]) -> None:
         sum(terms[1:], terms[0]).backward()  # type: ignore[no-untyped-call]
 
 
-def _made(network: Network) -> Restorer:
+def _network_of(network: Network) -> Restorer:
     if network.kind == "fft_mamba":
         return FFTMamba(network.width, **network.options)
     return UNet(network.width) if network.kind == "unet" else NAFNet(network.width)

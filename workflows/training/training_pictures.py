@@ -1,9 +1,9 @@
-"""What a recipe is learnt from: pictures by number, each with its own scene, laser, sensor and noise.
+"""The pictures from which a recipe learns: by number, each with its own scene, laser, sensor and noise.
 
-A recipe falls into three: what neither learns nor is drawn is computed once; what follows the element alone is
-computed once an iteration; what follows a scene, a draw or a random step is computed for each picture. Between the
-second and the third the gradient waits until all pictures are done, so that no more than one of them is held. Of
-several processes each has its own pictures, and along a band axis its own bands of what is shared.
+The steps of a recipe fall into three parts. Steps that neither learn nor are drawn are computed once. Steps that
+depend on the mask alone are computed once an iteration. Steps that follow a scene, a draw or a random step are computed
+for each picture. Between the second and the third part the gradient waits until all pictures are done, so that one
+picture is held at a time. Of several processes each has its own pictures, and along a band axis its own bands.
 """
 
 from __future__ import annotations
@@ -34,16 +34,16 @@ _SEEDS = 2**31
 
 @dataclass(frozen=True)
 class Sample:
-    """One picture, or patches of it."""
+    """One picture, or patches of the picture."""
 
-    picture: Tensor  #: (n, 3, y, x) what the camera gives, developed
+    picture: Tensor  #: (n, 3, y, x), of the camera, developed
     truth: Tensor  #: (n, 3, y, x)
-    light: Tensor  #: (band,) share of the scene's light that the element keeps
-    drawn: Mapping[str, Any]  #: what it was made with
+    light: Tensor  #: (band,), the share of the scene's light that the mask keeps
+    drawn: Mapping[str, Any]  #: the values that were drawn for it
 
 
 class TrainingStream:
-    """Draws pictures through a recipe whose element learns, or through the same recipe ``frozen``."""
+    """The stream of pictures of a recipe whose mask learns, or of the same recipe ``frozen``."""
 
     def __init__(
         self,
@@ -74,15 +74,16 @@ class TrainingStream:
         drawn = _behind(recipe, order, noise | {settings.scene, *(name.rpartition(".")[0] for name in readers)})
         learnt = _behind(recipe, order, {learn} if learn else set())
         if settings.psf in drawn:
-            raise ValueError(f"{settings.psf} is drawn anew with each picture: its suppression cannot be learnt from")
+            raise ValueError(f"{settings.psf} changes with each picture: learn its suppression from a PSF that stays")
         self.shards = Shards.of(recipe, settings.psf, wanted, drawn | learnt, store, mesh)
         drawn |= self.shards.behind
-        self._divide(recipe, learn, noise, drawn, _border(recipe, order, learnt - drawn, drawn, settings.psf), store)
+        border = _read_by_pictures(recipe, order, learnt - drawn, drawn, settings.psf)
+        self._divide(recipe, learn, noise, drawn, border, store)
 
     def _divide(
         self, recipe: Recipe, learn: str | None, noise: set[str], drawn: set[str], border: list[str], store: Store
     ) -> None:
-        """What follows the element alone and ends at ``border``, and what is computed for each picture."""
+        """Divide the recipe: steps up to ``border`` that depend on the mask alone, and steps of each picture."""
         ways: dict[str, Any] = {"store": store, "device": self.device}
         settings = self.settings
         within = [*border, settings.scene, *self._readers]
@@ -94,19 +95,19 @@ class TrainingStream:
         self._each = Pictures(recipe, within, outputs, noise, self.shards, ways)
 
     def begin(self, height: Tensor) -> Shared:
-        """What follows the element alone, for all pictures of an iteration."""
+        """Compute what depends on the mask alone, for all pictures of an iteration."""
         made = self.shared({str(self.settings.learn): height}) if self.shared else {}
         return Shared.of(made, self.shards, self._whole)
 
     def counted(self, name: str, here: int) -> tuple[int, int]:
-        """Of ``here`` bands of a result: how many there are in all, and how many processes have each."""
+        """Return the bands of a result in all processes, and the number of processes that have each band."""
         by_band = name in self.shards.steps
         return (self.shards.count, self.mesh.data) if by_band else (here, self.mesh.size)
 
     def batch(self, shared: Shared, stage: int, first: int, count: int) -> Iterator[tuple[int, Sample]]:
-        """This process's pictures of ``count`` from number ``first`` on, each with its place among them.
+        """Return this process's pictures among ``count`` from number ``first`` on, each with its place.
 
-        To be gone through to the end, for what comes behind a picture goes back to all that had a share in it.
+        The caller reads every picture, for the gradients of a picture return to all processes that had a share.
         """
         group = range(self.mesh.row, count, self.mesh.data)
         for begin in range(0, len(group), self.mesh.band):
@@ -127,7 +128,7 @@ class TrainingStream:
                     yield mine, self._sample(found, begun[mine][2])
 
     def __call__(self, shared: Mapping[str, Any], stage: int, number: int) -> Sample:
-        """The picture of this number: the same whoever asks, and in whatever order."""
+        """Return the picture of a number, which depends neither on the order nor on the process."""
         if self._pool is None:
             return self._alone(shared, stage, number)
         number %= self._pool
@@ -140,7 +141,7 @@ class TrainingStream:
         return self._sample(self._each.alone({**shared, **theta}, noise), drawn)
 
     def _drawn(self, stage: int, number: int) -> tuple[dict[str, Any], int, dict[str, Any]]:
-        """What a picture is made of, the seed of its noise, and all that was drawn."""
+        """Return the inputs of a picture, the seed of its noise, and all values that were drawn."""
         rng = np.random.default_rng((self.seed, stage, number, 1))
         theta, drawn = dict(self._readers), dict[str, Any]()
         if self._inputs is not None:
@@ -163,7 +164,7 @@ class TrainingStream:
         return Sample(picture, truth, found[self.settings.light], drawn)
 
     def _patches(self, both: Tensor, seed: int) -> Tensor:
-        """(2, 3, y, x) -> (2, n, 3, y, x): the same places of a picture and of its truth, or all of it."""
+        """Cut patches at the same places of a picture and its truth: (2, 3, y, x) -> (2, n, 3, y, x)."""
         if self.settings.patch is None:
             return both[:, None]
         size, patch = (both.shape[-2], both.shape[-1]), self.settings.patch
@@ -192,7 +193,7 @@ def _present(recipe: Recipe, names: Sequence[str]) -> None:
 def _frame(recipe: Recipe, scene: str) -> tuple[int, int]:
     shape = recipe.steps[scene].params.get("shape")
     if shape is None:
-        raise ValueError(f"train: {scene} has no shape: say how large a piece of a photograph shall be")
+        raise ValueError(f"train: {scene} has no shape: give the size of the piece of a photograph")
     return shape[0], shape[1]
 
 
@@ -201,14 +202,14 @@ def _given(recipe: Recipe, name: str) -> Any:
     return recipe.steps[step].params[param]
 
 
-def _border(recipe: Recipe, order: Sequence[str], made: set[str], drawn: set[str], psf: str) -> list[str]:
-    """What of ``made`` a picture reads, and the PSF."""
+def _read_by_pictures(recipe: Recipe, order: Sequence[str], made: set[str], drawn: set[str], psf: str) -> list[str]:
+    """Return the steps of ``made`` that a picture reads, and the PSF."""
     read = {source for reader in drawn for source in recipe.steps[reader].sources}
     return [name for name in order if name in made and (name == psf or name in read)]
 
 
 def _behind(recipe: Recipe, order: Sequence[str], first: set[str]) -> set[str]:
-    """``first`` and the steps that follow."""
+    """Return the steps ``first`` and the steps that follow them."""
     found = set(first)
     for name in order:
         if not found.isdisjoint(recipe.steps[name].sources):

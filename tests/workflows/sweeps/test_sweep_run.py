@@ -11,11 +11,12 @@ from pathlib import Path
 import pytest
 import torch
 
+from neusee.workflows.cli.sweep_command import run_sweep
 from neusee.workflows.engine.node_call import RunError
 from neusee.workflows.graph.diagnostics import RecipeError
 from neusee.workflows.store.result_store import Store
 from neusee.workflows.sweeps import sweep_files
-from neusee.workflows.sweeps.sweep_run import run_sweep, sweep
+from neusee.workflows.sweeps.sweep_run import sweep
 
 RECIPE = """\
 # A camera of three steps
@@ -379,9 +380,9 @@ def test_fifty_sweeps_leave_nothing_behind(recipe, tmp_path):
 
 def test_points_share_their_composed_values(recipe, store):
     from neusee.workflows.sweeps.axes import points, read_axes
-    from neusee.workflows.sweeps.sweep_points import planned
+    from neusee.workflows.sweeps.sweep_points import plan_sweep
 
-    found = planned(
+    found = plan_sweep(
         recipe,
         points(read_axes({"sensor.read_noise": [f"{n} e-" for n in range(9)]}, Path())),
         Path().absolute(),

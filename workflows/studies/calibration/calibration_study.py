@@ -16,8 +16,8 @@ from neusee.workflows.calibration.identifiability import KINDS, known
 from neusee.workflows.calibration.initial_guess import begin
 from neusee.workflows.calibration.log_posterior import SensorPosterior
 from neusee.workflows.calibration.posterior_mode import peak
+from neusee.workflows.engine.local_executor import one_thread
 from neusee.workflows.engine.node_call import versions
-from neusee.workflows.engine.threads import one_thread
 from neusee.workflows.graph.recipe_graph import Recipe
 from neusee.workflows.keys.cache_key import digest
 from neusee.workflows.report.run_folder import RunFolder, new_run

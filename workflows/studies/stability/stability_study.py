@@ -12,8 +12,8 @@ from datetime import UTC, datetime
 from pathlib import Path
 from typing import Any
 
+from neusee.workflows.engine.local_executor import one_thread
 from neusee.workflows.engine.node_call import versions
-from neusee.workflows.engine.threads import one_thread
 from neusee.workflows.graph.recipe_graph import Recipe
 from neusee.workflows.keys.cache_key import Key, digest
 from neusee.workflows.keys.code_digest import Code

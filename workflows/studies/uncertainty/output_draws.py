@@ -18,8 +18,8 @@ import torch
 from torch import Tensor
 
 from neusee.workflows.engine.differentiable_function import as_function
+from neusee.workflows.engine.local_executor import one_thread
 from neusee.workflows.engine.node_call import place
-from neusee.workflows.engine.threads import one_thread
 from neusee.workflows.graph.recipe_graph import needed
 from neusee.workflows.keys.cache_key import device_kind, digest, key_of
 from neusee.workflows.keys.code_digest import Code

@@ -1,4 +1,4 @@
-"""Pictures with known spectra, drawn through a recipe by their number, and the network that learns from them."""
+"""The network of a lift, one iteration of learning it, and the numbered pictures with known spectra."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ from neusee.workflows.training.loop.resumable_loop import STEEPEST, Losses, aver
 
 
 class Pairs:
-    """Pictures (3, y, x) with their spectra (31, y, x): the same for the same number, in whatever order."""
+    """Pictures (3, y, x) with their spectra (31, y, x); a number always gives the same pair."""
 
     def __init__(self, recipe: Recipe, settings: LiftTraining, store: Store, device: str) -> None:
         for name in (settings.measured, settings.picture, settings.cube):
@@ -37,7 +37,7 @@ class Pairs:
         bands = str(wires["bands"])
         random = {name for name in needed(recipe, self._names) if recipe.steps[name].node.random}
         if not random:
-            raise ValueError(f"train_lift: {settings.picture} is always the same: draw it by spectra.leaves")
+            raise ValueError(f"train_lift: {settings.picture} never changes: draw the picture by spectra.leaves")
         known = recipe.run(store, [bands, settings.measured], device=device)
         self.bands: Bands = known[bands]
         self.measured: Tensor = known[settings.measured]
@@ -45,19 +45,19 @@ class Pairs:
         self._draw = as_function(recipe, outputs=self._names, store=store, device=device, redraw=random)
 
     def __call__(self, *number: object) -> tuple[Tensor, Tensor]:
-        """The picture of this number, and its spectra."""
+        """Return the picture of a number, and its spectra."""
         found = self._draw({}, seed=stream_seed(self._seed, " ".join(map(str, ("lift", *number)))))
         picture, cube = (found[name] for name in self._names)
         return picture.float(), cube.float()
 
     def batch(self, numbers: Sequence[int]) -> tuple[Tensor, Tensor]:
-        """Several, one over another."""
+        """Return the stacked pictures and spectra of several numbers."""
         pictures, cubes = zip(*map(self, numbers), strict=True)
         return torch.stack(pictures), torch.stack(cubes)
 
 
 class LiftLearner:
-    """The network, its optimiser and its average."""
+    """The network, its optimiser and the moving average of its weights."""
 
     def __init__(self, settings: LiftTraining, pairs: Pairs, seed: int, device: str) -> None:
         self.settings, self.pairs = settings, pairs
@@ -68,12 +68,12 @@ class LiftLearner:
         self.average = averaged(self.net, settings.ema_decay)
 
     def parts(self) -> dict[str, Any]:
-        """All that a later iteration depends on."""
+        """Return everything on which a later iteration depends."""
         found = {"net": self.net, "optimiser": self.optimiser}
         return {**found, **({"average": self.average} if self.average else {})}
 
     def iterate(self, iteration: int) -> Losses:
-        """Look at a batch and move a step; raises `NotFinite` before a bad one."""
+        """Learn from a batch and return its losses; raise `NotFinite` before a bad step."""
         batch, rate = self.settings.batch, self.settings.rate_at(iteration)
         for group in self.optimiser.param_groups:
             group["lr"] = rate
@@ -91,12 +91,12 @@ class LiftLearner:
         return found
 
     def best(self) -> nn.Module:
-        """The network to use: the average, where there is one."""
+        """Return the network to use: the average, where there is one."""
         return self.average.module if self.average else self.net
 
     @torch.no_grad()
     def validate(self) -> dict[str, Losses]:
-        """The network and the linear estimate of the same reflectances, on pictures that nobody learnt from."""
+        """Return the mean errors of the network and of the linear estimate, on pictures that were not learnt from."""
         sums, count = dict[str, Losses](), self.settings.validation_batches
         for number in range(count):
             picture, cube = self.pairs("judge", number)
@@ -107,7 +107,7 @@ class LiftLearner:
         return sums
 
     def estimates(self, picture: Tensor) -> dict[str, Tensor]:
-        """Spectra of a picture by the network, and linearly."""
+        """Return the spectra of a picture by the network, and by the linear estimate."""
         linear = torch.einsum("bc,cyx->byx", self.linear, picture)
         return {"mst_plus_plus": through(self.best(), picture[None])[0].clamp_min(0), "linear": linear.clamp_min(0)}
 

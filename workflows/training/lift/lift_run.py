@@ -1,4 +1,4 @@
-"""Learn a lift from RGB to spectra: one state to go on from, a row for each iteration, weights that `lift` takes."""
+"""The training of a lift from RGB to spectra, from the settings of a recipe to weights that `lift` reads."""
 
 from __future__ import annotations
 
@@ -33,16 +33,16 @@ def train_lift(
     device: str = "cpu",
     watch: LiftWatch | None = None,
 ) -> Path:
-    """Learn MST++ as a recipe's ``train_lift`` says, or go on where the same was stopped; the folder.
+    """Learn MST++ as the block ``train_lift`` of a recipe says, and return the folder; a stopped training goes on.
 
-    ``mst_plus_plus.safetensors`` is what `spectra.lift_mst_plus_plus` takes as its weights.
+    ``mst_plus_plus.safetensors`` holds the weights for `spectra.lift_mst_plus_plus`.
 
-    Raises ValueError for a recipe that says not how, or lacks the steps; ArithmeticError where a loss is no number,
-    with all that led to it beside the state.
+    Raises ValueError for a recipe without the block or its steps; ArithmeticError where a loss is NaN or infinite, with
+    the weights and pictures that led to the loss in a file.
     """
     settings = recipe.lifting
     if settings is None:
-        raise ValueError(f"{recipe.name} says not how a lift is learnt: begin with the recipe train_lift")
+        raise ValueError(f"{recipe.name} has no block train_lift: begin with the recipe train_lift")
     pairs = Pairs(recipe, settings, store, device)
     folder = runs / f"{recipe.name}_{_key(recipe, settings)}"
     folder.mkdir(parents=True, exist_ok=True)

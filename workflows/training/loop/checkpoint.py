@@ -1,4 +1,4 @@
-"""What a training leaves on disk: one state to go on from, a row for each iteration, and what was learnt."""
+"""The files of a training: a state from which it goes on, a row for each iteration, and what was learnt."""
 
 from __future__ import annotations
 
@@ -64,7 +64,7 @@ class StateFile:
 
 
 class Rows:
-    """``losses.csv``: a row for each iteration; those after the state that is gone on from are cut off."""
+    """The table ``losses.csv``, a row for each iteration; a training that goes on cuts rows after its state off."""
 
     def __init__(self, path: Path, columns: Sequence[str]) -> None:
         self._path, self._columns = path, columns
@@ -72,7 +72,7 @@ class Rows:
         self._kept = 0
 
     def cut(self, stage: int, iteration: int, write: bool = True) -> None:
-        """Keep what came before an iteration of a stage."""
+        """Keep the rows before an iteration of a stage."""
         if self._path.exists():
             with self._path.open(newline="", encoding="utf-8") as file:
                 self.rows = [row for row in csv.DictReader(file) if _place(row) < (stage, iteration)]
@@ -81,12 +81,12 @@ class Rows:
             self.keep()
 
     def add(self, stage: int, iteration: int, found: Mapping[str, float]) -> None:
-        """Note an iteration; it is on disk with the next `keep`."""
+        """Add the row of an iteration, which the next `keep` writes to disk."""
         row = {"stage": stage, "iteration": iteration, **{name: f"{x:.6g}" for name, x in found.items()}}
         self.rows.append({name: str(row.get(name, "")) for name in self._columns})
 
     def keep(self) -> None:
-        """Write what is new; at first all of it, whole or not at all."""
+        """Append the new rows; the first call writes all rows, whole or not at all."""
         text = io.StringIO(newline="")
         writer = csv.DictWriter(text, self._columns)
         if self._kept == 0:
@@ -106,13 +106,13 @@ def _place(row: Mapping[str, str | None]) -> tuple[int, int]:
             raise ValueError("not all of its columns")
         return int(row.get("stage") or 0), int(row["iteration"] or 0)
     except (ValueError, TypeError, KeyError):
-        return (1 << 62, 0)  # half a row of a process that was killed
+        return (1 << 62, 0)  # half a row, of a process that was killed
 
 
 def export(
     folder: Path, name: str, tensors: Mapping[str, torch.Tensor], about: Mapping[str, str] | None = None
 ) -> Path:
-    """Tensors as a safetensors file, with what is told about them, whole or not at all."""
+    """Write tensors with their metadata as a safetensors file, whole or not at all, and return its path."""
     from safetensors.torch import save
 
     path = folder / f"{name}.safetensors"
@@ -122,7 +122,7 @@ def export(
 
 
 def weights_of(net: nn.Module) -> dict[str, torch.Tensor]:
-    """The weights of a network; of an average, those that it averages."""
+    """Return the weights of a network, or of the network inside an average."""
     inner = net.module if isinstance(net, torch.optim.swa_utils.AveragedModel) else net
     return dict(inner.state_dict())
 

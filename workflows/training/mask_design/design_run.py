@@ -1,7 +1,7 @@
-"""Design a mask without images: little laser in one place, the light in the field, and what contrast that leaves.
+"""The design of a mask without images: it spreads the laser, keeps the light in the field, and keeps contrast.
 
-A relief is learnt through the recipe's own graph on the terms of the mask alone, and then judged by the same figures
-as any other mask, on every band and at the full sampling of the recipe.
+The height map is learnt through the graph of the recipe on the terms of the mask alone. Then it is judged by the same
+figures as any other mask, on every band and at the full sampling of the recipe.
 """
 
 from __future__ import annotations
@@ -46,13 +46,13 @@ _LEARNT_WITH = tuple(
 def design(
     recipe: Recipe, settings: MaskTraining, store: Store | None, out: Path, progress: Progress, *, device: str = "cpu"
 ) -> Path:
-    """Learn a mask and write ``out/<date>_<recipe>_mask_<key>/``; gives the folder.
+    """Learn a mask, write ``out/<date>_<recipe>_mask_<key>/`` and return this folder.
 
-    ``mask.safetensors`` holds the relief as `doe.pixelwise` reads it, ``history.csv`` the terms at each iteration,
-    ``mask.json`` the figures, ``provenance.json`` the settings. What is unfinished is kept beside the folder, and
-    goes on where the same is asked for again.
+    ``mask.safetensors`` holds the height map for `doe.pixelwise`, ``history.csv`` the terms at each iteration,
+    ``mask.json`` the figures, ``provenance.json`` the settings. The state of an unfinished design lies beside the
+    folder; the same call goes on from there.
 
-    Raises: `DesignError` where the recipe has no such steps, or a loss that is not finite.
+    Raises: `DesignError` for a recipe without the steps, or a loss that is NaN or infinite.
     """
     need_steps(recipe.steps, settings)
     key = _key(recipe, settings, store)
@@ -96,7 +96,7 @@ def design_in(
 
 @dataclass(frozen=True)
 class DesignedMask:
-    """A designed relief, at the sampling of its recipe, and what it does."""
+    """A designed height map at the sampling of its recipe, with its figures."""
 
     terms: Terms
     learnt: LearntMask
@@ -113,10 +113,10 @@ class DesignedMask:
         progress: Progress,
         device: str = "cpu",
     ) -> DesignedMask:
-        """Learn it, or go on from what is kept, and judge it; raises `DesignError` as `design` does."""
+        """Learn a mask, or go on from its state, and judge it; raise `DesignError` as `design` does."""
         learning = Terms(_at(recipe, settings), settings, store, device)
         full = Terms(recipe, settings, store, device) if settings.at else learning
-        progress(f"to be made: {full.fabrication}")
+        progress(f"fabrication: {full.fabrication}")
         learnt = learn(learning, kept, progress)
         with torch.no_grad():
             height = learnt.height(full.stop).detach().to("cpu", torch.float32).contiguous()
@@ -125,7 +125,7 @@ class DesignedMask:
         return cls(full, learnt, height, found)
 
     def write(self, folder: RunFolder, command: Sequence[str] = ()) -> None:
-        """Write relief, curve, page and settings; ``mask.json`` at last, so that where it is all of it is."""
+        """Write mask, curves, page and settings; ``mask.json`` comes last and marks a complete design."""
         from safetensors.torch import save
 
         learnt, recipe, settings = self.learnt, self.terms.recipe, self.terms.settings
@@ -161,7 +161,7 @@ class DesignedMask:
 
 
 def _at(recipe: Recipe, settings: MaskTraining) -> Recipe:
-    """The recipe as it is learnt on."""
+    """Return the recipe with the values that hold while the mask is learnt."""
     if not settings.at:
         return recipe
     try:
@@ -175,7 +175,7 @@ def _word(value: Any) -> str:
 
 
 def _key(recipe: Recipe, settings: MaskTraining, store: Store | None) -> str:
-    """What decides the bits of a mask: the recipe, the settings, and the code of nodes and design."""
+    """Return a digest of all that decides the bits of a mask: recipe, settings, code of nodes and design."""
     code = Code((store or Store()).code_memo)
     steps = [recipe.steps[name] for name in needed(recipe, [settings.psf, settings.plain])]
     nodes = sorted({step.node.fn.__module__ for step in steps} | set(_LEARNT_WITH))
@@ -192,7 +192,7 @@ def _key(recipe: Recipe, settings: MaskTraining, store: Store | None) -> str:
 
 
 def mask_figures(terms: Terms, height: Tensor) -> dict[str, Any]:
-    """LSR, BSR and contrast of a relief by band, their means, and the bounds that hold for them."""
+    """Return LSR, BSR and contrast of a mask by band, their means, and the bounds that hold for them."""
     with torch.no_grad():
         psf, plain = terms.psf(height), terms.plain()
         lsr, bsr = metrics.lsr(psf), metrics.bsr(psf.intensity, plain.intensity)
@@ -208,7 +208,7 @@ def mask_figures(terms: Terms, height: Tensor) -> dict[str, Any]:
 
 
 def summary_line(found: Mapping[str, Any]) -> str:
-    """The figures in one line."""
+    """Return the figures in one line."""
     mean = found["mean"]
     return (
         f"mean LSR {mean['lsr']:.3g} (even light {mean['energy_floor']:.2g}), BSR {mean['bsr']:.3f}, "
