@@ -83,10 +83,8 @@ def _lift(recipe: Recipe, again: list[str], out: Path, device: str, quiet: bool)
     assert recipe.lifting is not None
     progress = (lambda line: None) if quiet else (lambda line: say([line]))
     try:
-        with _LossBar(quiet, {1: recipe.lifting.iterations}) as bar:
-            folder = train_lift(
-                recipe, the_store(), out, again, progress, device, lambda n, found: bar.watch(1, n, found)
-            )
+        with _LossBar(quiet, {0: recipe.lifting.iterations}) as bar:
+            folder = train_lift(recipe, the_store(), out, again, progress, device, bar.watch)
     except (RunError, ValueError, ArithmeticError) as error:
         fail(str(error), FAILED)
     if not quiet:
@@ -115,7 +113,9 @@ class _LossBar:
         console = Console(stderr=True)
         self._shown = Progress(*columns, TextColumn("{task.fields[losses]}"), console=console,
                                disable=quiet or not console.is_terminal)  # fmt: skip
-        self._tasks = {s: self._shown.add_task(f"stage {s}", total=n, losses="") for s, n in lengths.items()}
+        self._tasks = {
+            s: self._shown.add_task(f"stage {s}" if s else "lift", total=n, losses="") for s, n in lengths.items()
+        }
 
     def __enter__(self) -> _LossBar:
         self._shown.start()

@@ -2,10 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
-from typing import Any
 
 import torch
 
@@ -17,7 +16,7 @@ from neusee.workflows.recipe.blocks.mask_design_block import MaskSettings
 from neusee.workflows.recipe.blocks.train_block import GRID, KEY, Stage, Training
 from neusee.workflows.store.result_store import Store
 from neusee.workflows.training.loop.checkpoint import export, weights_of
-from neusee.workflows.training.loop.resumable_loop import Losses, Progress, ResumableLoop
+from neusee.workflows.training.loop.resumable_loop import Losses, Progress, ResumableLoop, Watch
 from neusee.workflows.training.mask_design.design_run import MASK, design_in, designed
 from neusee.workflows.training.parallel.process_mesh import ALONE, Mesh, MeshError
 from neusee.workflows.training.photograph_folder import Photographs
@@ -26,7 +25,6 @@ from neusee.workflows.training.training_figures import curves, strip
 from neusee.workflows.training.training_iteration import Learner
 from neusee.workflows.training.training_pictures import TrainingStream
 
-Watch = Callable[[int, int, Mapping[str, float]], None]  #: takes the stage, its iterations so far, and the losses
 _COLUMNS = ("stage", "iteration", "LSR", "BSR", "L1", "reconstruction", "adversarial", "critics", "penalty", "slope",
             "rate", "seconds")  # fmt: skip
 
@@ -108,38 +106,21 @@ def _key(recipe: Recipe, settings: Training, photographs: Photographs) -> str:
     return digest("training", values, block, [path.name for path in photographs.paths])[:8]
 
 
-class _TrainingLoop(ResumableLoop):
+class _TrainingLoop(ResumableLoop[Learner]):
     """One training in stages."""
 
     def __init__(
-        self,
-        recipe: Recipe,
-        settings: Training,
-        photographs: Photographs,
-        store: Store,
-        folder: Path,
-        progress: Progress,
-        device: str,
-        watch: Watch | None,
-        mesh: Mesh,
-    ) -> None:
-        super().__init__(folder, settings, _COLUMNS, progress, device, mesh.first)
-        self.recipe, self.settings, self.photographs, self.store = recipe, settings, photographs, store
-        self.watch, self.mesh = watch, mesh
+        self, recipe: Recipe, settings: Training, photographs: Photographs, store: Store, folder: Path,
+        progress: Progress, device: str, watch: Watch | None, mesh: Mesh,
+    ) -> None:  # fmt: skip
         self.designed = designed(folder)
-        self.learner = Learner(recipe, settings, device, self.designed, mesh)
-        self.stage = 2 if self.designed else min(settings.learnt)
+        learner = Learner(recipe, settings, device, self.designed, mesh)
+        super().__init__(folder, settings, learner, _COLUMNS, progress, device, watch, mesh.first)
+        self.recipe, self.settings, self.photographs, self.store = recipe, settings, photographs, store
+        self.mesh, self.stage = mesh, 2 if self.designed else min(settings.learnt)
         self.resume()
         mesh.agree(f"{folder.name} in stage {self.stage} after {self.iteration} iterations")
         self.board = TensorBoardLog(folder, self._behind) if settings.tensorboard and mesh.first else None
-
-    def parts(self) -> dict[str, Any]:
-        """Return the networks, the mask and their optimisers."""
-        return self.learner.parts()
-
-    def batch(self) -> int:
-        """Return the pictures of an iteration."""
-        return self.settings.stages[self.stage].batch
 
     def begin_stage(self) -> None:
         """Give the optimisers of the stage fresh moments; after the last stage nothing learns."""
@@ -176,7 +157,7 @@ class _TrainingLoop(ResumableLoop):
         fixed = None if learns else frozen(self.recipe, self.settings, self.folder)
         parts = self.recipe, self.settings, self.photographs, self.store, self.device
         self.samples = TrainingStream(*parts, fixed, self.mesh)
-        self.run(self._length)
+        self.run(self._length, self.settings.stages[self.stage].batch)
         if self.writes:
             self._export(learns)
         self.stage, self.iteration = self.stage + 1, 0
@@ -190,15 +171,14 @@ class _TrainingLoop(ResumableLoop):
         losses, self.seen = self.learner.iterate(self.samples, self.stage, self.iteration)
         return losses | {"rate": rate}
 
-    def report(self, losses: Losses) -> None:
-        """Pass the losses on to TensorBoard and to whoever watches."""
+    def note(self, losses: Losses) -> None:
+        """Pass the losses on to TensorBoard and to the caller."""
         if self.board is not None:
             self.board.row(self._behind - 1, losses)
-        if self.watch is not None:
-            self.watch(self.stage, self.iteration, losses)
+        super().note(losses)
 
     def keep(self) -> None:
-        """Write rows, state and what TensorBoard shows."""
+        """Write rows, state and TensorBoard's events."""
         if self.board is not None:
             self.board.keep()
         super().keep()

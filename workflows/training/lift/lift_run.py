@@ -2,9 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Sequence
 from pathlib import Path
-from typing import Any
 
 import torch
 
@@ -15,9 +14,8 @@ from neusee.workflows.store.result_store import Store
 from neusee.workflows.training.lift.lift_figures import lift_curves, lifted_spectra
 from neusee.workflows.training.lift.lift_iteration import LiftLearner, Pairs
 from neusee.workflows.training.loop.checkpoint import export, weights_of
-from neusee.workflows.training.loop.resumable_loop import DOCUMENT, Losses, Progress, ResumableLoop
+from neusee.workflows.training.loop.resumable_loop import DOCUMENT, Losses, Progress, ResumableLoop, Watch
 
-LiftWatch = Callable[[int, Mapping[str, float]], None]  #: takes the iterations so far, and the losses
 _COLUMNS = ("iteration", "MRAE", "RMSE", "slope", "rate", "seconds")
 _NETWORK = "mst_plus_plus"
 #: in the names of folders, so that trainings of version 0.1 go on
@@ -31,7 +29,7 @@ def train_lift(
     command: Sequence[str],
     progress: Progress,
     device: str = "cpu",
-    watch: LiftWatch | None = None,
+    watch: Watch | None = None,
 ) -> Path:
     """Learn MST++ as the block ``train_lift`` of a recipe says, and return the folder; a stopped training goes on.
 
@@ -65,39 +63,23 @@ def _key(recipe: Recipe, settings: LiftTraining) -> str:
     return digest("lift", recipe.seed, steps, {_OLD_NAMES.get(name, name): value for name, value in block.items()})[:8]
 
 
-class _LiftLoop(ResumableLoop):
+class _LiftLoop(ResumableLoop[LiftLearner]):
     """One training of a lift, without stages."""
 
     def __init__(
-        self,
-        settings: LiftTraining,
-        learner: LiftLearner,
-        folder: Path,
-        progress: Progress,
-        device: str,
-        watch: LiftWatch | None,
-    ) -> None:
-        super().__init__(folder, settings, _COLUMNS, progress, device)
-        self.settings, self.learner, self.watch = settings, learner, watch
+        self, settings: LiftTraining, learner: LiftLearner, folder: Path, progress: Progress, device: str,
+        watch: Watch | None,
+    ) -> None:  # fmt: skip
+        super().__init__(folder, settings, learner, _COLUMNS, progress, device, watch)
+        self.settings = settings
         self.resume()
-
-    def parts(self) -> dict[str, Any]:
-        """Return the network, its optimiser and its average."""
-        return self.learner.parts()
-
-    def batch(self) -> int:
-        """Return the pictures of an iteration."""
-        return self.settings.batch
-
-    def begin_stage(self) -> None:
-        """Leave the parts as they are: there is one stage."""
 
     def run_to_end(self, recipe: Recipe, command: Sequence[str]) -> None:
         """Learn to the last iteration and write what was learnt; leave a finished training as it is."""
         if self.iteration == self.settings.iterations and (self.folder / DOCUMENT).is_file():
             return
         if self.iteration < self.settings.iterations:
-            self.run(self.settings.iterations)
+            self.run(self.settings.iterations, self.settings.batch)
             self.keep()
         export(self.folder, _NETWORK, weights_of(self.learner.best()))
         self.close(
@@ -112,11 +94,6 @@ class _LiftLoop(ResumableLoop):
     def iterate(self) -> Losses:
         """Learn from a batch of pictures."""
         return self.learner.iterate(self.iteration)
-
-    def report(self, losses: Losses) -> None:
-        """Pass the losses on to whoever watches."""
-        if self.watch is not None:
-            self.watch(self.iteration, losses)
 
     @torch.no_grad()
     def show(self) -> None:

@@ -6,16 +6,19 @@ import time
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
-from typing import Any, Protocol
+from typing import Any, Generic, Protocol, TypeVar
 
 from torch import nn
 from torch.optim.swa_utils import AveragedModel, get_ema_multi_avg_fn
 
 from neusee.workflows.engine.node_call import versions
+from neusee.workflows.recipe.blocks.train_block import Training
+from neusee.workflows.recipe.blocks.train_lift_block import LiftTraining
 from neusee.workflows.training.loop.checkpoint import Rows, StateFile, write_json, write_whole
 
 Losses = dict[str, float]
 Progress = Callable[[str], None]  #: takes one line about what a training does
+Watch = Callable[[int, int, Mapping[str, float]], None]  #: takes the stage, its iterations so far, and the losses
 DOCUMENT = "training.json"  #: the file that a training writes last
 STEEPEST = 10.0  #: the norm above which a gradient is shortened
 
@@ -24,41 +27,30 @@ class NotFinite(ArithmeticError):
     """A loss or a gradient that is NaN or infinite."""
 
 
-class Pace(Protocol):
-    """Settings that every training has."""
+class Learns(Protocol):
+    """Networks, parameters and their optimisers."""
 
-    @property
-    def keep(self) -> int:
-        """Iterations from one state on disk to the next."""
-
-    @property
-    def show(self) -> int:
-        """Iterations from one picture to the next."""
+    def parts(self) -> dict[str, Any]:
+        """Return everything on which a later iteration depends."""
 
 
-class ResumableLoop(ABC):
+L = TypeVar("L", bound=Learns)
+
+
+class ResumableLoop(ABC, Generic[L]):
     """A training in a folder: its state, a row for each iteration, pictures on the way, and a document at the end.
 
-    Only the loop with ``writes`` writes files: of several processes, one.
+    Of several processes one ``writes`` files. A training without stages stays in stage 0.
     """
 
     def __init__(
-        self, folder: Path, pace: Pace, columns: Sequence[str], progress: Progress, device: str, writes: bool = True
-    ) -> None:
-        self.folder, self.pace, self.progress, self.device, self.writes = folder, pace, progress, device, writes
-        self.rows = Rows(folder / "losses.csv", columns)
-        self.state = StateFile(folder / "state.pt")
-        self.stage, self.iteration = 0, 0  # a training without stages stays in stage 0
-
-    # --- what each training does in its own way -----------------------------------------------------------------------
-
-    @abstractmethod
-    def parts(self) -> Mapping[str, Any]:
-        """Return everything on which a later iteration depends."""
-
-    @abstractmethod
-    def batch(self) -> int:
-        """Return the number of pictures in an iteration of the present stage."""
+        self, folder: Path, settings: Training | LiftTraining, learner: L, columns: Sequence[str],
+        progress: Progress, device: str, watch: Watch | None, writes: bool = True,
+    ) -> None:  # fmt: skip
+        self.folder, self.learner, self.progress, self.device = folder, learner, progress, device
+        self.keep_every, self.show_every, self.watch, self.writes = settings.keep, settings.show, watch, writes
+        self.rows, self.state = Rows(folder / "losses.csv", columns), StateFile(folder / "state.pt")
+        self.stage, self.iteration, self.batch = 0, 0, 1
 
     @abstractmethod
     def iterate(self) -> Losses:
@@ -68,15 +60,8 @@ class ResumableLoop(ABC):
     def show(self) -> None:
         """Write a picture of the present state of learning."""
 
-    @abstractmethod
-    def report(self, losses: Losses) -> None:
-        """Pass on the losses of the iteration that has just ended."""
-
-    @abstractmethod
     def begin_stage(self) -> None:
-        """Prepare the parts for the present stage, before a state is put back into them."""
-
-    # --- what all trainings do in the same way ------------------------------------------------------------------------
+        """Prepare the learner for the present stage."""
 
     def resume(self) -> None:
         """Begin at the first iteration, or go on from the state that an earlier process left."""
@@ -84,23 +69,29 @@ class ResumableLoop(ABC):
         self.stage, self.iteration = found.get("stage", self.stage), found.get("iteration", 0)
         self.begin_stage()
         if found:
-            for name, part in self.parts().items():
+            for name, part in self.learner.parts().items():
                 part.load_state_dict(found["parts"][name])
             self.rows.cut(self.stage, self.iteration, self.writes)
             self.progress(f"goes on {f'in stage {self.stage} ' if self.stage else ''}after {self.iteration} iterations")
 
-    def run(self, iterations: int) -> None:
+    def run(self, iterations: int, batch: int) -> None:
         """Iterate to the end of the present stage; the caller keeps the state that follows the last iteration."""
+        self.batch = batch
         while self.iteration < iterations:
             losses = self._timed()
             self.rows.add(self.stage, self.iteration, losses)
             self.iteration += 1
             ended = self.iteration == iterations
-            if self.writes and (ended or self.iteration % self.pace.show == 0):
+            if self.writes and (ended or self.iteration % self.show_every == 0):
                 self.show()
-            self.report(losses)
-            if not ended and self.iteration % self.pace.keep == 0:
+            self.note(losses)
+            if not ended and self.iteration % self.keep_every == 0:
                 self.keep()
+
+    def note(self, losses: Losses) -> None:
+        """Pass on the losses of the iteration that has just ended."""
+        if self.watch is not None:
+            self.watch(self.stage, self.iteration, losses)
 
     def keep(self) -> None:
         """Write the rows and then the state: surplus rows are cut off later, lacking rows would be lost."""
@@ -129,14 +120,14 @@ class ResumableLoop(ABC):
         return losses | {"seconds": time.perf_counter() - began}
 
     def _packed(self, **about: Any) -> dict[str, Any]:
-        parts = {name: part.state_dict() for name, part in self.parts().items()}
+        parts = {name: part.state_dict() for name, part in self.learner.parts().items()}
         return {"stage": self.stage, "iteration": self.iteration, **about, "parts": parts}
 
     def _dumped(self, error: NotFinite) -> ArithmeticError:
         """Return the error to raise, after the weights and the numbers of the pictures that led to it are written."""
         place = [self.stage, self.iteration] if self.stage else [self.iteration]
         dump = StateFile(self.folder / f"not_finite_{'_'.join(map(str, place))}.pt")
-        first, count = self.iteration * self.batch(), self.batch()
+        first, count = self.iteration * self.batch, self.batch
         if self.writes:
             dump.write(self._packed(pictures=list(range(first, first + count))))
             self.rows.keep()

@@ -72,7 +72,7 @@ def designed(folder: Path) -> bool:
 def design_in(
     folder: Path,
     recipe: Recipe,
-    settings: Training,
+    training: Training,
     store: Store,
     command: Sequence[str],
     progress: Progress,
@@ -82,7 +82,7 @@ def design_in(
 
     Raises `DesignError` as `design` does; ValueError where stage 1 has begun to learn another mask, or no mask learns.
     """
-    if settings.learn is None:
+    if training.learn is None:
         raise ValueError("train.learn: name the step of the mask that is designed")
     if designed(folder):
         progress("the mask is designed")
@@ -90,7 +90,7 @@ def design_in(
     if (folder / "state.pt").exists():
         raise ValueError(f"stage 1 has begun in {folder}: remove that folder, or change a value of train.mask")
     kept = StateFile(folder / "mask.state")
-    DesignedMask.of(recipe, settings.design, store, kept, progress, device).write(RunFolder(folder), command)
+    DesignedMask.of(recipe, training.design, store, kept, progress, device).write(RunFolder(folder), command)
     kept.path.unlink(missing_ok=True)
 
 

@@ -64,7 +64,7 @@ def same(again, whole):
 
 
 def test_a_training_that_is_stopped_goes_on_to_the_same_weights(tmp_path, whole):
-    def watch(done, found):
+    def watch(stage, done, found):
         if done == 3:
             raise KeyboardInterrupt
 
@@ -82,7 +82,7 @@ import os, signal
 from pathlib import Path
 from neusee.workflows import Store, load
 from neusee.workflows.training.lift.lift_run import train_lift
-def watch(done, found):
+def watch(stage, done, found):
     if done == 3:
         os.kill(os.getpid(), signal.SIGKILL)
 here = Path({str(tmp_path)!r})
