@@ -6,6 +6,7 @@ import importlib
 import inspect
 import re
 from collections.abc import Iterator
+from importlib.resources import files
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, get_args
 
@@ -32,15 +33,19 @@ _UNITS_IN_WORDS = {
 
 
 def recipes() -> None:
-    """List the recipes, each with what it shows."""
+    """List the recipes and the groups that they choose from."""
     say(recipe_lines())
 
 
 def nodes(
-    name: Annotated[str | None, typer.Argument(help="One node, such as optics.psf, or `reading`.")] = None,
+    name: Annotated[str | None, typer.Argument(help="One node, such as optics.psf; `reading`, or `glossary`.")] = None,
     debug: Debug = False,
 ) -> None:
-    """List what a step can compute, or explain one node."""
+    """List the nodes, or explain one of them.
+
+    For one node: its physics, source, error, inputs and parameters, and the recipes that use it. `reading` lists how
+    the paper is read where it contradicts itself. `glossary` lists the terms of the field, one a line.
+    """
     try:
         say(node_lines(name) if name else nodes_lines())
     except LookupError as error:
@@ -48,7 +53,7 @@ def nodes(
 
 
 def schema() -> None:
-    """Print the JSON schema of recipes, for editors."""
+    """Print the JSON schema of recipes for editors."""
     import json
 
     from neusee.workflows.recipe import json_schema
@@ -84,11 +89,13 @@ def nodes_lines() -> list[str]:
 
 
 def node_lines(name: str) -> list[str]:
-    """Return the physics of a node, its inputs, its parameters and the recipes that use it; or all readings."""
+    """Return the lines on one node: its physics, its inputs and parameters, where it is used; or readings, or terms."""
     from neusee.workflows.graph.diagnostics import nearest
     from neusee.workflows.recipe.paper_readings import READINGS
     from neusee.workflows.recipe.step_declarations import all_nodes
 
+    if name == "glossary":
+        return glossary_lines()
     if name == "reading":
         return [line for row in READINGS for line in (*_reading(row.name), "")]
     found = dict(all_nodes())
@@ -102,6 +109,12 @@ def node_lines(name: str) -> list[str]:
     for reading in readings:
         lines += ["", *_reading(reading)]
     return [*lines, "", f"written in  {', '.join(dict.fromkeys(where for where, _ in uses)) or 'no recipe'}"]
+
+
+def glossary_lines() -> list[str]:
+    """Return the terms of the packaged glossary, one a line, without the marks of Markdown."""
+    text = (files("neusee.recipes") / "guide" / "glossary.md").read_text(encoding="utf-8")
+    return [re.sub(r"[*`]", "", line[2:]) for line in text.splitlines() if line.startswith("- **")]
 
 
 def _parameters(node: Node) -> list[str]:

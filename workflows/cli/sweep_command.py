@@ -1,121 +1,55 @@
-"""The command ``neusee sweep``: show a sweep while it runs, write its folder, and give the exit code."""
+"""``neusee sweep``: a recipe at several values of its parameters."""
 
 from __future__ import annotations
 
-import shlex
-import sys
-import time
-from collections.abc import Iterator, Sequence
-from contextlib import closing
 from pathlib import Path
+from typing import Annotated
 
-from neusee.workflows.cli.sweep_screen import SweepTable
-from neusee.workflows.report.console import mode_for
-from neusee.workflows.store.remote_store import open_store
-from neusee.workflows.store.result_store import Store
-from neusee.workflows.sweeps.axes import Axis, read_words
-from neusee.workflows.sweeps.sweep_files import require_xarray
-from neusee.workflows.sweeps.sweep_points import OnError, PointOutcome, outcomes
-from neusee.workflows.sweeps.sweep_run import Sweep, Sweeping, SweepState, counted, write_sweep
-from neusee.workflows.sweeps.sweep_table import lasts
+import typer
 
-DONE, FAILED, INTERRUPTED = 0, 1, 130
+from neusee.workflows.cli.command_frame import Debug, Device, Out, Words, check_device, fail, refuse, split, the_store
 
 
-def run_sweep(
-    recipe: str,
-    words: Sequence[str],
-    *,
-    first: int = 2,
-    zip: bool = False,
-    on_error: OnError = "stop",
-    netcdf: bool = False,
-    device: str = "cpu",
-    out: Path = Path("runs"),
-    store: Store | None = None,
-    quiet: bool = False,
-) -> int:
-    """Run, show and write a sweep to ``out/sweeps/<date>_<recipe>_<key>/``; return the exit code of the command.
+def sweep(
+    words: Words = None,
+    paired: Annotated[
+        bool, typer.Option("--zip", help="Pair the values of the axes instead of combining them.")
+    ] = False,
+    on_error: Annotated[
+        str, typer.Option("--on-error", help="After a failed point: stop, or continue with the next.")
+    ] = "stop",
+    netcdf: Annotated[bool, typer.Option("--netcdf", help="Write sweep.nc too (needs neusee[xarray]).")] = False,
+    quiet: Annotated[bool, typer.Option("--quiet", help="Print only the path of the table.")] = False,
+    debug: Debug = False,
+    device: Device = "cpu",
+    out: Out = Path("runs"),
+) -> None:
+    """Run a recipe at several values of its parameters.
 
-    ``words`` are the changes and axes, counted from ``first``. Raises: RecipeError with every
-    mistake of every point, before anything runs.
+    Write values as a=1,2,3 or b='linspace(450 nm, 650 nm, 5)'. All combinations run unless --zip pairs them.
+    Run the same command again to continue a sweep that was stopped.
     """
-    if netcdf:
-        require_xarray("--netcdf")
-    began, place = time.perf_counter(), Path().absolute()
-    work = Sweeping(recipe, read_words(words, place, first), place, store or open_store(), zip, device)
-    again = _command(recipe, words, zip, on_error, netcdf, device, out)
-    if not quiet:
-        print(*_opening(work), sep="\n", flush=True)
-    found, state, error = _run_points(work, on_error, quiet)
-    if error is not None and not (on_error == "stop" and found and found[-1].state == "failed"):
-        raise error
-    result = work.sweep(found, state)
-    path = write_sweep(work, result, again, out, netcdf, time.perf_counter() - began)
-    if quiet:
-        print(*_failures(result), sep="\n", end="\n" if result.failed else "", file=sys.stderr)
-        print(path / "sweep.csv", flush=True)
-    else:
-        print(*_closing(result, path, again, time.perf_counter() - began), sep="\n", flush=True)
-    return INTERRUPTED if state == "interrupted" else FAILED if result.failed else DONE
+    name, words, first = split(words)
+    if on_error not in ("stop", "continue"):
+        fail(f"--on-error {on_error}: write stop or continue")
+    check_device(device)
+    from neusee.workflows.cli.sweep_screen import run_sweep
+    from neusee.workflows.graph.diagnostics import RecipeError
 
-
-def _opening(work: Sweeping) -> Iterator[str]:
-    """Return the lines before anything runs."""
-    recipe, sizes = work.plan.recipe, f" {'+' if work.paired else '×'} ".join(map(_sized, work.axes))
-    shared = work.sharing
-    yield f"neusee sweep: {recipe.title or recipe.name}"
-    yield f"checked  {shared.points} points ({sizes}), {shared.steps} steps: all right"
-    yield f"shared   {shared.made} different results: {100 * shared.saved:.0f} % less work than point by point"
-    if work.plan.costs and any(work.plan.work):
-        yield f"time     about {lasts(sum(work.plan.work))}, as earlier runs took"
-    yield from (f"note     {line}" for line in work.plan.notes)
-
-
-def _sized(axis: Axis) -> str:
-    return f"{axis.name}: {len(axis.coordinates)}"
-
-
-def _run_points(
-    work: Sweeping, on_error: OnError, quiet: bool
-) -> tuple[list[PointOutcome], SweepState, Exception | None]:
-    """Run the points and show them; Ctrl-C and a failure end the sweep, and the outcomes so far are kept."""
-    shown = SweepTable(work.columns, len(work.plan.checked), mode_for(quiet))
     try:
-        with (
-            shown,
-            closing(outcomes(work.plan, work.store, on_error, work.device, shown.started, shown.watch)) as running,
-        ):
-            for outcome in running:
-                shown.finished(outcome)
-    except KeyboardInterrupt:
-        return shown.outcomes, "interrupted", None
-    except Exception as error:
-        return shown.outcomes, "stopped", error
-    return shown.outcomes, "complete", None
-
-
-def _command(
-    recipe: str, words: Sequence[str], paired: bool, on_error: str, netcdf: bool, device: str, out: Path
-) -> list[str]:
-    """Return the words of the command that runs a sweep again."""
-    options = ["--zip"] * paired + ["--netcdf"] * netcdf
-    options += ["--on-error", on_error] if on_error != "stop" else []
-    options += ["--device", device] if device != "cpu" else []
-    options += ["--out", str(out)] if out != Path("runs") else []
-    return ["neusee", "sweep", recipe, *words, *options]
-
-
-def _closing(result: Sweep, path: Path, again: Sequence[str], seconds: float) -> Iterator[str]:
-    """Return the lines after the last point."""
-    yield ""
-    yield f"{counted(result)}  ({lasts(seconds)})"
-    yield from (f"  {line}" for line in _failures(result))
-    yield f"table    {path / 'sweep.csv'}"
-    if result.state != "complete":
-        yield f"partial: what is done is kept; to go on: {shlex.join(again)}"
-
-
-def _failures(result: Sweep) -> Iterator[str]:
-    for outcome in result.failed:
-        yield f"failed: point {outcome.point.number}, {outcome.point.shown}: {outcome.message.splitlines()[0]}"
+        code = run_sweep(
+            name,
+            words,
+            first=first,
+            zip=paired,
+            on_error="continue" if on_error == "continue" else "stop",
+            netcdf=netcdf,
+            device=device,
+            out=out,
+            store=the_store(),
+            quiet=quiet,
+        )
+    except RecipeError as error:
+        refuse(error)
+    if code:
+        raise typer.Exit(code)

@@ -11,7 +11,7 @@ from pathlib import Path
 import pytest
 import torch
 
-from neusee.workflows.cli.sweep_command import run_sweep
+from neusee.workflows.cli.sweep_screen import run_sweep
 from neusee.workflows.engine.node_call import RunError
 from neusee.workflows.graph.diagnostics import RecipeError
 from neusee.workflows.store.result_store import Store
