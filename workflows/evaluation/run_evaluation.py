@@ -28,6 +28,7 @@ from neusee.workflows.evaluation.pipelines import NONE, Composed, Pipeline, Refu
 from neusee.workflows.graph.recipe_graph import Recipe
 from neusee.workflows.keys.cache_key import digest
 from neusee.workflows.recipe.loading import load
+from neusee.workflows.recipe.text.overrides import Override
 from neusee.workflows.report.run_folder import RunFolder, new_run
 from neusee.workflows.store.remote_store import open_store
 from neusee.workflows.store.result_store import Store
@@ -61,7 +62,7 @@ class Evaluated:
 def evaluate(
     recipe: str,
     pipelines: Sequence[Pipeline],
-    changes: Sequence[str] = (),
+    changes: Sequence[str | Override] = (),
     *,
     data: Path | None = None,
     count: int = 20,
