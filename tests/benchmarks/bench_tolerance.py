@@ -24,12 +24,13 @@ import torch
 sys.path.insert(0, str(Path(__file__).parents[1] / "workflows"))
 import random_recipes
 
-from neusee.workflows.engine.node_call import RunError
 from neusee.workflows.engine.runner import run
 from neusee.workflows.graph.diagnostics import RecipeError
+from neusee.workflows.graph.run_error import RunError
+from neusee.workflows.recipe.changed_recipe import changed
 from neusee.workflows.store.result_store import Store
-from neusee.workflows.studies.accuracy.recipe_knobs import changed, knobs
-from neusee.workflows.studies.accuracy.work_precision_points import cold
+from neusee.workflows.studies.accuracy.recipe_knobs import knobs
+from neusee.workflows.studies.cold_run import cold
 from neusee.workflows.tolerance.error_norm import error_of
 
 OUTPUTS = ("raw[plain]", "raw[mask]")
@@ -106,7 +107,7 @@ def line(seed, memo):
             setting.seconds.append(timed(setting.recipe, memo)[0])
     best = min((s for s in again if s in good), key=lambda s: s.median)
     bound, done = first[0]  # as it chooses
-    attempts = 3 if done.exact else 1 + (done.strict != 1.0)
+    attempts = 3 if done.exact else 1 + (done.tolerance_scale != 1.0)
     seconds = (whole.median, ours.median, best.median)
     return Line(seed, recipe.tolerance, ours.error, bound, attempts, *seconds, best.label)
 

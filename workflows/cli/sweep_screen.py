@@ -20,7 +20,7 @@ from neusee.workflows.sweeps.sweep_run import Sweep, Sweeping, SweepState, count
 from neusee.workflows.sweeps.sweep_table import AxisColumn, cell_text, headline, lasts, point_cells
 
 if TYPE_CHECKING:
-    from neusee.workflows.engine.runner import Event
+    from neusee.workflows.graph.step_record import Event
     from neusee.workflows.sweeps.axes import Point
 
 _NUMBERS = 4  #: columns of numbers on the screen

@@ -1,4 +1,4 @@
-"""What a run would do, without doing it: hits, bytes, seconds, memory and place, from what earlier runs left behind."""
+"""Forecast of a run: cache hits, bytes, seconds, memory and devices, from the records of earlier runs."""
 
 from __future__ import annotations
 
@@ -15,8 +15,8 @@ from neusee.workflows.engine.step_job import Lane, StepJob
 from neusee.workflows.graph.recipe_graph import Recipe
 from neusee.workflows.keys.cache_key import Key, device_kind
 from neusee.workflows.placement.heft_and_cpop import Schedule, TooLarge
+from neusee.workflows.report.contents import steps_of, wanted
 from neusee.workflows.report.text_table import columns
-from neusee.workflows.simulation.simulate_recipe import steps_of, wanted
 from neusee.workflows.store.byte_sizes import format_size
 from neusee.workflows.store.result_store import Store
 from neusee.workflows.tolerance.cheaper_steps import with_substitutions
@@ -24,22 +24,22 @@ from neusee.workflows.tolerance.cheaper_steps import with_substitutions
 
 @dataclass(frozen=True)
 class Plan:
-    """What would become of every step."""
+    """Forecast for every step of a recipe."""
 
     recipe: Recipe
     order: list[str]
     keys: dict[str, Key]
-    left_out: dict[str, bool | None]  #: None where only what feeds a step will tell
+    left_out: dict[str, bool | None]  #: None where only the inputs of a step can decide
     awake: set[str]  #: steps that would run
-    loaded: dict[str, int]  #: stored steps that these would read, and their bytes
-    expected: Mapping[str, Estimate]  #: by step, of those that would run
+    loaded: dict[str, int]  #: stored steps that would be read, with their bytes
+    expected: Mapping[str, Estimate]  #: by step, for the steps that would run
     lanes: Mapping[str, str]  #: by step
     schedule: Schedule | None
-    refused: str = ""  #: why there is not memory enough
+    refused: str = ""  #: why the memory is too small
 
 
 def planned(recipe: Recipe, store: Store, lanes: Mapping[str, Lane]) -> Plan:
-    """Look up what a run would compute, read and need; compute nothing."""
+    """Return what a run would compute, read and need, without computing anything."""
     recipe = with_substitutions(recipe, wanted(recipe))
     order = steps_of(recipe)
     devices = [lane.device for lane in lanes.values()]
@@ -65,9 +65,9 @@ def planned(recipe: Recipe, store: Store, lanes: Mapping[str, Lane]) -> Plan:
 
 
 def plan_lines(recipe: Recipe, store: Store, device: str = "cpu", memory: int | None = None) -> tuple[list[str], bool]:
-    """One line a step: stored or to be run, where, its seconds, bytes and memory as far as they are known; the sums.
+    """Return one line for each step (state, device, seconds, bytes, memory), the sums, and whether memory is short.
 
-    With it, whether the run would be refused for want of memory.
+    A run that is short of memory would be refused.
     """
     lanes = lanes_of(device.split(","), memory)
     plan = planned(recipe, store, lanes)
@@ -77,7 +77,7 @@ def plan_lines(recipe: Recipe, store: Store, device: str = "cpu", memory: int | 
 
 
 def simulated_lines(recipe: Recipe, store: Store, machines: str) -> list[str]:
-    """What the whole recipe would take on the machines of a YAML file, with nothing stored."""
+    """Return the forecast of the whole recipe on the machines of a YAML file, with an empty store."""
     from neusee.workflows.explain.cluster_forecast import cluster_lines
     from neusee.workflows.placement.machine_file import read_machines
 
@@ -106,12 +106,12 @@ def _row(name: str, plan: Plan, store: Store) -> list[str]:
 
 
 def _sums(plan: Plan, lanes: Mapping[str, Lane]) -> list[str]:
-    """What all of it takes, and what is not known yet."""
+    """Return lines with the sums over all steps, and with the steps whose state is not known yet."""
     ran, new = len(plan.expected), sum(e.bytes for e in plan.expected.values())
     guesses = sum(not e.known for e in plan.expected.values())
     lines = []
     if unsure := [name for name, known in plan.left_out.items() if known is None]:
-        lines.append(f"left out or not, only what feeds it will tell: {', '.join(unsure)}")
+        lines.append(f"left out or not, depending on the values of the inputs: {', '.join(unsure)}")
     took = f"about {plan.schedule.makespan:.3g} s" if plan.schedule else "no schedule"
     guessed = f", {guesses} of them never measured" if guesses else ""
     read = format_size(sum(plan.loaded.values()))
@@ -134,7 +134,7 @@ def _work(recipe: Recipe, name: str, keys: Mapping[str, Key], devices: Sequence[
 
 
 def _awake(recipe: Recipe, keys: Mapping[str, Key], store: Store) -> tuple[set[str], dict[str, int]]:
-    """Steps that a run would compute, walking back from what is wanted, and what it would read on the way."""
+    """Return the steps that a run would compute, and the stored steps that it would read, with their bytes."""
     found, loaded, todo = set[str](), dict[str, int](), [*wanted(recipe)]
     while todo:
         name = todo.pop()

@@ -7,11 +7,11 @@ from dataclasses import replace
 from typing import Any
 
 from neusee.workflows.engine.cost_model import Costs
-from neusee.workflows.engine.node_call import RunError
 from neusee.workflows.engine.placement_inputs import past_costs
 from neusee.workflows.engine.resolve_keys import resolve
 from neusee.workflows.engine.runner import Result
 from neusee.workflows.graph.recipe_graph import Recipe, needed
+from neusee.workflows.graph.run_error import RunError
 from neusee.workflows.tolerance.error_norm import error_of
 
 NORM = "root mean square over the largest element"
@@ -28,7 +28,7 @@ def spent(result: Result) -> dict[str, Any]:
         "tolerance": result.recipe.tolerance,
         "norm": NORM,
         "held": min(map(result.recipe.limit, result.proof.held), default=result.recipe.tolerance),
-        "strict": result.recipe.strict,
+        "strict": result.recipe.tolerance_scale,
         "exact": result.recipe.exact,
         "bounds": {name: share for name, share in result.proof.held.items() if share > 0},
         "unbounded": [name for name in result.recipe.outputs if result.proof.of(name) is None],

@@ -13,7 +13,7 @@ def parse_size(text: str) -> int:
     """Return the bytes that a text such as ``20 GB`` or ``1.5 TiB`` names; raise `ValueError` for any other text."""
     found = _SIZE.fullmatch(text)
     if not found:
-        raise ValueError(f"{text!r} is no size: write bytes, such as 20 GB")
+        raise ValueError(f"{text!r} is not a size: write a number of bytes, such as 20 GB")
     unit = found[2].lower().removesuffix("b") + "b"
     return int(float(found[1]) * _ANY_CASE[unit])
 

@@ -16,7 +16,7 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, Literal
 
-from neusee.workflows.engine.node_call import versions
+from neusee.workflows.engine.provenance import versions
 from neusee.workflows.keys.cache_key import digest
 from neusee.workflows.recipe.text.overrides import Override
 from neusee.workflows.report.run_folder import new_run
@@ -123,7 +123,7 @@ class Sweeping:
 
 
 def write_sweep(work: Sweeping, result: Sweep, again: Sequence[str], out: Path, netcdf: bool, seconds: float) -> Path:
-    """Write the folder of a sweep and return it; an incomplete sweep has ``partial`` in the name of its folder."""
+    """Write the folder of a sweep and return its path. A sweep that did not end has ``partial`` in its name."""
     name = f"{result.recipe}{'' if result.state == 'complete' else '_partial'}"
     key = digest([checked.job.keys[name] for checked in work.plan.checked for name in checked.job.outputs])
     with new_run(out / "sweeps", name, key) as folder:

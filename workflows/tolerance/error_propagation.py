@@ -1,7 +1,7 @@
-"""Bounds of the errors of every step, carried along the graph by the nodes, and where they are held to the tolerance.
+"""Error propagation: upper bounds on the effect of omitted and approximated steps, from node to node.
 
-A node with the hook `propagate_error` bounds the error of its result by the errors of its inputs. A node without the
-hook ends the bounds: its inputs are held to the tolerance, as the outputs of the recipe are.
+A node computes the error of its result from the errors of its inputs (`Node.propagate_error`).
+Behind a node without this hook nothing is known, and its inputs are held to the tolerance instead.
 """
 
 from __future__ import annotations
@@ -11,9 +11,9 @@ from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
 
 from neusee.nodes import ErrorBound, TensorStats
-from neusee.workflows.engine.node_call import RunError
-from neusee.workflows.engine.step_record import StepRecord
 from neusee.workflows.graph.recipe_graph import Recipe, Step, Wire
+from neusee.workflows.graph.run_error import RunError
+from neusee.workflows.graph.step_record import StepRecord
 
 FactsOf = Callable[[str], TensorStats | None]
 _EXACT = ErrorBound(0.0)
@@ -21,40 +21,37 @@ _EXACT = ErrorBound(0.0)
 
 @dataclass(frozen=True, slots=True)
 class ErrorBounds:
-    """Bounds as shares of the largest element of each result."""
+    """Upper bounds, each relative to the largest element of a result."""
 
-    shares: Mapping[str, float] = field(default_factory=dict)  #: by step; infinite where no node tells
-    held: Mapping[str, float] = field(default_factory=dict)  #: of outputs, or what feeds a node that does not tell
+    shares: Mapping[str, float] = field(default_factory=dict)  #: by step; infinite where a node gives no bound
+    held: Mapping[str, float] = field(default_factory=dict)  #: of outputs, and of what feeds nodes without bounds
 
     def of(self, step: str) -> float | None:
-        """The bound of a step; None where nothing is known of it."""
+        """Return the bound of a step; None where no bound is known."""
         share = self.shares.get(step, 0.0)
         return share if math.isfinite(share) else None
 
     @property
     def worst(self) -> float:
-        """The greatest bound of what is held to the tolerance."""
+        """Return the greatest bound among the steps held to the tolerance."""
         return max(self.held.values(), default=0.0)
 
     def over(self, recipe: Recipe) -> float:
-        """The greatest bound over what it is held to; infinite where nothing is allowed."""
+        """Return the greatest ratio of a bound to its limit; infinite where the limit is 0."""
         shares = [(share, recipe.limit(name)) for name, share in self.held.items() if share > 0]
         return max((share / limit if limit > 0 else math.inf for share, limit in shares), default=0.0)
 
 
 class ToleranceNotProven(Exception):
-    """What was left out may have changed so many times what is allowed."""
+    """Error of a run whose bounds exceed the tolerance ``over`` times."""
 
     def __init__(self, over: float) -> None:
-        super().__init__(f"changes at most {over:.2g} times what the tolerance allows")
+        super().__init__(f"the error bound is {over:.2g} times the tolerance")
         self.over = over
 
 
 def tolerance_frontier(recipe: Recipe, order: Iterable[str], wanted: Iterable[str]) -> list[str]:
-    """Return the steps whose errors are held to the tolerance.
-
-    They may be off, and are wanted or read by a node that does not bound its error.
-    """
+    """Return the steps held to the tolerance: inexact ones that are wanted or feed a node without an error bound."""
     off, found = set[str](), dict[str, None]()
     for name in order:
         step = recipe.steps[name]
@@ -67,7 +64,7 @@ def tolerance_frontier(recipe: Recipe, order: Iterable[str], wanted: Iterable[st
 
 
 def unbounded_steps(recipe: Recipe, order: Sequence[str]) -> frozenset[str]:
-    """Return the steps of a running order whose errors reach a node that does not bound its error."""
+    """Return the steps whose errors reach a node that does not bound its error."""
     found = set[str]()
     for name in reversed(order):
         if name in found or not _bounds_its_error(recipe.steps[name]):
@@ -82,7 +79,7 @@ def _bounds_its_error(step: Step) -> bool:
 def proof(
     recipe: Recipe, order: Iterable[str], wanted: Iterable[str], done: Callable[[str], StepRecord], facts_of: FactsOf
 ) -> ErrorBounds:
-    """Carry the bounds of a run from step to step, in running order; nothing is computed."""
+    """Return the bounds of a run, carried from step to step in running order; nothing is computed."""
     found: dict[str, ErrorBound] = {}
     held: dict[str, float] = {}
     for name in order:
@@ -90,7 +87,7 @@ def proof(
         inputs = [_gathered(step.wires.get(i), found) for i in step.node.inputs]
         own = _own(step, done(name), facts_of)
         if own is None and not any(d.rms for part in inputs for d in _each(part)):
-            continue  # exact, as almost every step is
+            continue  # exact, like almost every step
         carried, facts = _carried(step, inputs, facts_of(name)), facts_of(name)
         if math.isinf(carried):
             told = {source: found[source].share for source in step.sources if source in found}
@@ -103,7 +100,7 @@ def proof(
 
 
 def _own(step: Step, done: StepRecord, facts_of: FactsOf) -> float | None:
-    """What a step itself adds, in the unit of its result: as a cheaper form, or by being left out."""
+    """Return the error that a step itself adds, in the unit of its result: by approximation or by omission."""
     share = done.bound if done.state == "left out" else done.error and done.error[0]
     facts = facts_of(done.step)
     if not share or facts is None:
@@ -118,7 +115,7 @@ def _carried(step: Step, inputs: list[ErrorBound | list[ErrorBound] | None], res
     if not any(d.rms for part in inputs for d in _each(part)):
         return 0.0
     if step.node.hooks.approximation_error is not None:
-        return 0.0  # it tells of all that it lacks
+        return 0.0  # the hook covers all errors of the result
     if (
         step.node.hooks.propagate_error is None
         or result is None

@@ -9,7 +9,8 @@ from pathlib import Path
 import torch
 
 from neusee.nodes import doe
-from neusee.nodes._network_weights import told
+from neusee.nodes.network_weights import file_metadata
+from neusee.nodes.scene import Photographs
 from neusee.workflows.graph.recipe_graph import Recipe
 from neusee.workflows.keys.cache_key import digest
 from neusee.workflows.recipe.blocks.mask_design_block import MaskSettings
@@ -19,7 +20,6 @@ from neusee.workflows.training.loop.checkpoint import export, weights_of
 from neusee.workflows.training.loop.resumable_loop import Losses, Progress, ResumableLoop, Watch
 from neusee.workflows.training.mask_design.design_run import MASK, design_in, designed
 from neusee.workflows.training.parallel.process_mesh import ALONE, Mesh, MeshError
-from neusee.workflows.training.photograph_folder import Photographs
 from neusee.workflows.training.tensorboard_log import TensorBoardLog
 from neusee.workflows.training.training_figures import curves, strip
 from neusee.workflows.training.training_iteration import Learner
@@ -198,7 +198,7 @@ class _TrainingLoop(ResumableLoop[Learner]):
             with torch.no_grad():
                 export(self.folder, "mask", {"height": self.learner.height()})
         net = self.learner.average or self.learner.net
-        export(self.folder, "network", weights_of(net), told(self.learner.net))
+        export(self.folder, "network", weights_of(net), file_metadata(self.learner.net))
 
     @property
     def _mask(self) -> str:

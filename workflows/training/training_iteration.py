@@ -10,15 +10,21 @@ import torch
 from torch import Tensor, nn
 from torch.utils.checkpoint import checkpoint
 
-from neusee.nodes import losses
-from neusee.nodes._bicubic_resize import resize
-from neusee.nodes.doe._parametrisations import LEARNT
-from neusee.nodes.optics._pupil_grid import stop
-from neusee.nodes.restore._networks._critic import critics, passed_over, slopes
-from neusee.nodes.restore._networks._fft_mamba import FFTMamba
-from neusee.nodes.restore._networks._nafnet import NAFNet
-from neusee.nodes.restore._networks._restorer import Restorer, parameter_groups, started
-from neusee.nodes.restore._networks._unet import UNet
+from neusee.nodes import losses, metrics
+from neusee.nodes.bicubic_resize import resize
+from neusee.nodes.doe import PARAMETRISATIONS
+from neusee.nodes.optics import stop
+from neusee.nodes.restore import (
+    FFTMamba,
+    NAFNet,
+    Restorer,
+    UNet,
+    critic_slopes,
+    critics,
+    parameter_groups,
+    skip_critic_draws,
+    start_network,
+)
 from neusee.nodes.values import Psf
 from neusee.workflows.graph.diagnostics import nearest
 from neusee.workflows.graph.recipe_graph import Recipe, Step
@@ -57,7 +63,8 @@ class Learner:
         self.settings, self.seed, self.device, self.mesh = settings, recipe.seed, device, mesh
         self._step = recipe.steps[settings.learn] if settings.learn else None
         self.relief = nn.Module() if designed or self._step is None else self._start(self._step).to(settings.dtype)
-        self.net: Restorer = started(lambda: _network_of(settings.network), self._rng("network")).to(settings.dtype)
+        net = start_network(lambda: _network_of(settings.network), self._rng("network"))
+        self.net: Restorer = net.to(settings.dtype)
         self.critics = nn.ModuleList(critics(self._rng("critics"), settings.critics.width)).to(settings.dtype)
         self.average = averaged(self.net, settings.average)
         self.begin(Stage(iterations=0), learns=True)
@@ -65,10 +72,10 @@ class Learner:
     def _start(self, step: Step) -> nn.Module:
         """Return the parameters of the mask that learns."""
         path = step.node.path
-        if path not in LEARNT:
-            text = f"{self.settings.learn} is {path}, of which nothing is learnt; {nearest(path, LEARNT)}"
+        if path not in PARAMETRISATIONS:
+            text = f"{self.settings.learn} is {path}, of which nothing is learnt; {nearest(path, PARAMETRISATIONS)}"
             raise ValueError(f"train: {text}; or design it without images: --stage mask")
-        return LEARNT[path](step.params, self._rng("element"))
+        return PARAMETRISATIONS[path](step.params, self._rng("element"))
 
     def height(self) -> Tensor:
         """Return the height map (v, u) in m; raise ValueError where no mask learns."""
@@ -149,7 +156,7 @@ class Learner:
         psf: Psf = shared.values[self.settings.psf]
         count, times = samples.counted(self.settings.psf, len(psf.clear_peak))
         with torch.no_grad():
-            peaks = psf.intensity.detach().amax((-2, -1)).double() / psf.clear_peak
+            peaks: Tensor = metrics.lsr(psf)
         if self.stage.lsr:
             for one in range(len(psf.clear_peak)):
                 loss = checkpoint(self._suppression, psf.intensity, psf.clear_peak, one, use_reentrant=False)
@@ -189,11 +196,11 @@ class Learner:
         for i in range(batch):
             if i not in pairs:
                 for _ in self.critics:
-                    passed_over(rng, self.settings.patches if self.settings.patch else 1)
+                    skip_critic_draws(rng, self.settings.patches if self.settings.patch else 1)
                 continue
             for critic, t, e in zip(self.critics, *pairs[i], strict=True):
                 apart = (critic(e) - critic(t)).mean()
-                steep = losses.gradient_penalty(slopes(critic, t, e, rng))
+                steep = losses.gradient_penalty(critic_slopes(critic, t, e, rng))
                 _backward([(self.stage.adversarial * apart + self.stage.penalty * steep) / batch])
                 found["critics"] += float(apart.detach()) / batch
                 found["penalty"] += float(steep.detach()) / batch

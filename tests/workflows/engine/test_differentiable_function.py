@@ -9,10 +9,10 @@ from torch.autograd import gradcheck
 
 from neusee.nodes import TensorStats, node
 from neusee.workflows.engine.differentiable_function import _Ends, as_function
-from neusee.workflows.engine.node_call import RunError
 from neusee.workflows.engine.runner import run
 from neusee.workflows.graph.diagnostics import Location
 from neusee.workflows.graph.recipe_graph import Recipe, Step
+from neusee.workflows.graph.run_error import RunError
 from neusee.workflows.recipe.loading import load
 from neusee.workflows.store.result_store import Store
 
@@ -199,14 +199,14 @@ def test_a_wrong_name_is_refused_with_the_nearest(store, free, message):
 
 @pytest.mark.parametrize("theta", [{}, {"height": 1.0, "scene": 1.0}, {"scene": 1.0}])
 def test_theta_must_be_what_was_asked_for(store, theta):
-    with pytest.raises(ValueError, match="give exactly height"):
+    with pytest.raises(ValueError, match="give values for exactly height"):
         as_function(camera(), "height", store=store)(theta)
 
 
 def test_an_error_names_the_step(store):
     function = as_function(camera(), "height", store=store)
     with pytest.raises(
-        RunError, match=r"image\[a\] .*RuntimeError(?s:.*)given scene \(64,\) float64, psf \(63,\) float64"
+        RunError, match=r"image\[a\] .*RuntimeError(?s:.*)inputs: scene \(64,\) float64, psf \(63,\) float64"
     ):
         function({"height": torch.ones(63, dtype=torch.float64)})
 

@@ -12,8 +12,8 @@ import pytest
 import torch
 
 from neusee.workflows.cli.sweep_screen import run_sweep
-from neusee.workflows.engine.node_call import RunError
 from neusee.workflows.graph.diagnostics import RecipeError
+from neusee.workflows.graph.run_error import RunError
 from neusee.workflows.store.result_store import Store
 from neusee.workflows.sweeps import sweep_files
 from neusee.workflows.sweeps.sweep_run import sweep

@@ -17,14 +17,14 @@ import torch
 from PIL import Image
 from safetensors.torch import load_file
 
-from neusee.nodes.doe._parametrisations import LEARNT
+from neusee.nodes.doe._parametrisations import PARAMETRISATIONS
 from neusee.nodes.optics._pupil_grid import stop
+from neusee.nodes.scene import Photographs
 from neusee.workflows import RecipeError, Store, as_function, load
 from neusee.workflows.cli import app
 from neusee.workflows.recipe.blocks.train_block import GRID, MaskSettings, Rates
 from neusee.workflows.training.mask_design import design_page
 from neusee.workflows.training.parallel.shared_graph import Shared
-from neusee.workflows.training.photograph_folder import Photographs
 from neusee.workflows.training.run_training import frozen, train
 from neusee.workflows.training.training_pictures import TrainingStream
 
@@ -121,7 +121,7 @@ train(recipe, Store(here / "store"), here / "runs", [], print, watch=watch)
 def test_a_picture_is_the_same_in_whatever_order(tmp_path, tiny):
     sources = Photographs.under(tiny.training.photographs)
     samples = TrainingStream(tiny, tiny.training, sources, Store(tmp_path), "cpu")
-    height = LEARNT["doe.unet"](tiny.steps["height"].params, torch.Generator().manual_seed(3))(pupil(tiny))
+    height = PARAMETRISATIONS["doe.unet"](tiny.steps["height"].params, torch.Generator().manual_seed(3))(pupil(tiny))
     shared = Shared.of(samples.shared({"height": height})).values
     first = [samples(shared, 1, number) for number in (0, 1, 2)]
     again = [samples(shared, 1, number) for number in (2, 0, 1)]
@@ -135,7 +135,7 @@ def test_the_gradient_through_the_cut_is_the_whole_one(tmp_path):
     recipe = load("train_small", [*TINY, "laser=green", "sensor.read_noise=10 e-", "tolerance=0"])
     how = recipe.training
     samples = TrainingStream(recipe, how, Photographs((recipe.steps["scene"].params["file"],)), Store(tmp_path), "cpu")
-    relief = LEARNT["doe.unet"](recipe.steps["height"].params, torch.Generator().manual_seed(3))
+    relief = PARAMETRISATIONS["doe.unet"](recipe.steps["height"].params, torch.Generator().manual_seed(3))
     shared = Shared.of(samples.shared({"height": relief(pupil(recipe))}))
     for number in (0, 1):
         sample = samples(shared.values, 1, number)
@@ -315,8 +315,8 @@ def test_photographs_are_found_and_broken_ones_said(photographs, tmp_path):
     ("change", "said"),
     [
         ("train.stages.1.iterations=-1", "train.stages.1.iterations"),
-        ("+train.fish=1", "is not known here"),
-        ("train.photographs=nowhere", "is no folder"),
+        ("+train.fish=1", "unknown; "),
+        ("train.photographs=nowhere", "is not a folder"),
         ("train.network.kind=foo", "fft_mamba"),
         ("train.network.directions=3", "train.network.directions"),
         ("train.network.frequency=phase", "amp_phase"),
@@ -329,7 +329,7 @@ def test_a_mistake_is_located(change, said):
 
 
 def test_options_of_one_network_are_refused_of_another():
-    with pytest.raises(RecipeError, match="directions, pyramid: of fft_mamba alone, not of unet"):
+    with pytest.raises(RecipeError, match="directions, pyramid: only fft_mamba has this option, not unet"):
         load("train_small", ["train.network.kind=unet", "train.network.pyramid=true", "train.network.directions=4"])
 
 
@@ -453,10 +453,10 @@ def test_the_recommended_mask_is_that_of_trainings_that_say_nothing_of_it():
     ("change", "said"),
     [
         ("train.mask.kind=cubic", "train.mask.kind: .*five_half_rings"),
-        ("+train.mask.fish=1", "train.mask.fish: is not known here"),
-        ("+train.mask.weights.lsrr=1", "train.mask.weights.lsrr: is not known here; .*lsr"),
+        ("+train.mask.fish=1", "train.mask.fish: unknown; "),
+        ("+train.mask.weights.lsrr=1", "train.mask.weights.lsrr: unknown; .*lsr"),
         ("train.mask.max_height=3", "train.mask.max_height: .*needs a unit"),
-        ("+train.mask.slopes=[9, 3]", "train.mask: .*give the least first"),
+        ("+train.mask.slopes=[9, 3]", "train.mask: .*give the smaller slope first"),
         ("+train.mask.start=no.npy", "train.mask.start: .*no such file"),
     ],
 )

@@ -1,4 +1,4 @@
-"""The settings of a lift from RGB to spectra that is learnt: the ``train_lift`` block of a recipe."""
+"""Lift training block of a recipe: the settings under ``train_lift`` for a lift from RGB to spectra."""
 
 from __future__ import annotations
 
@@ -12,14 +12,14 @@ from neusee.workflows.recipe.blocks.mask_design_block import half_cosine
 from neusee.workflows.recipe.text.composition import Composed
 from neusee.workflows.recipe.text.yaml_values import Value
 
-KEY = "train_lift"  #: of a recipe
+KEY = "train_lift"  #: key of the block in a recipe
 
 Beta = Annotated[float, Field(ge=0, lt=1)]
 Number = Annotated[int, Field(ge=1)]
 
 
 class LiftTraining(BaseModel):
-    """A recipe's ``train_lift`` block."""
+    """Settings of a recipe's ``train_lift`` block."""
 
     model_config = ConfigDict(extra="forbid", frozen=True)
 
@@ -40,13 +40,13 @@ class LiftTraining(BaseModel):
     show: Number = 1000
 
     def rate_at(self, iteration: int) -> float:
-        """Return the learning rate of an iteration, from 0: it rises evenly, and falls as half a cosine."""
+        """Return the rate of an iteration from 0: linear warm-up, then half a cosine from `rate` to `min_rate`."""
         least, rising = min(self.min_rate, self.rate), min(1.0, (iteration + 1) / max(self.warmup, 1))
         return rising * (least + (self.rate - least) * half_cosine(math.pi * iteration / self.iterations))
 
 
 def read_lift_training(composed: Composed) -> tuple[Composed, LiftTraining | None]:
-    """Return the recipe without its ``train_lift`` block, and the block; each mistake becomes a diagnostic."""
+    """Return the recipe without its ``train_lift`` block, and the block; mistakes become diagnostics of the recipe."""
     block = composed.root.items.get(KEY)
     if block is None:
         return composed, None
@@ -58,13 +58,13 @@ def read_lift_training(composed: Composed) -> tuple[Composed, LiftTraining | Non
 
 
 def _problem(block: Value, error: Any) -> Diagnostic:
-    """Return the place of a mistake that pydantic found, and what to write there."""
+    """Return a diagnostic at the innermost location that pydantic names, with the fix."""
     names = [str(key) for key in error["loc"]]
     below = {str(key): value for key, value in block.items.items()}
     at = below.get(names[0], block) if names else block
     path = ".".join([KEY, *names[: at is not block]])
     if error["type"] == "extra_forbidden":
-        return Diagnostic(at.key, path, f"is not known here; {nearest(names[0], LiftTraining.model_fields)}")
+        return Diagnostic(at.key, path, f"unknown; {nearest(names[0], LiftTraining.model_fields)}")
     if error["type"] == "missing":
-        return Diagnostic(at.mark, path, f"lacks {names[-1]}")
+        return Diagnostic(at.mark, path, f"needs {names[-1]}")
     return Diagnostic(at.mark, path, str(error["msg"]))

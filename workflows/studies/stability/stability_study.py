@@ -13,7 +13,7 @@ from pathlib import Path
 from typing import Any
 
 from neusee.workflows.engine.local_executor import one_thread
-from neusee.workflows.engine.node_call import versions
+from neusee.workflows.engine.provenance import versions
 from neusee.workflows.graph.recipe_graph import Recipe
 from neusee.workflows.keys.cache_key import Key, digest
 from neusee.workflows.keys.code_digest import Code
@@ -120,7 +120,7 @@ def _judged(chain: Chain, name: str, store: Store, key: Key) -> dict[str, Any]:
     except LookupError:
         cell = None
     fields = {} if cell is None else asdict(cell)
-    store.jot(key, fields, _about(chain, name, time.perf_counter() - began))
+    store.put_small(key, fields, _about(chain, name, time.perf_counter() - began))
     return fields
 
 

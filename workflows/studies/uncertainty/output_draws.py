@@ -20,6 +20,7 @@ from torch import Tensor
 from neusee.workflows.engine.differentiable_function import as_function
 from neusee.workflows.engine.local_executor import one_thread
 from neusee.workflows.engine.node_call import place
+from neusee.workflows.engine.provenance import timestamp
 from neusee.workflows.graph.recipe_graph import needed
 from neusee.workflows.keys.cache_key import device_kind, digest, key_of
 from neusee.workflows.keys.code_digest import Code
@@ -27,7 +28,6 @@ from neusee.workflows.keys.engine_digest import engine
 from neusee.workflows.recipe.distributions.uncertain_inputs import Inputs
 from neusee.workflows.report.result_numbers import numbers_of
 from neusee.workflows.store.result_store import Store
-from neusee.workflows.studies.accuracy.work_precision_points import timestamp
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray
@@ -134,7 +134,7 @@ class Draws:
         numbers = quantities(result)
         shown = [name for name, value in result.items() if _is_picture(value)]
         about = {"step": "study uncertainty", "seconds": self.seconds / max(1, self.computed), "date": timestamp()}
-        self.store.jot(key, {"numbers": numbers, "pictures": shown}, about)
+        self.store.put_small(key, {"numbers": numbers, "pictures": shown}, about)
         return numbers
 
     def _results(self, rows: Sequence[Places]) -> Iterator[dict[str, Any]]:

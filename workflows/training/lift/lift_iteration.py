@@ -9,9 +9,7 @@ import torch
 from torch import Tensor, nn
 
 from neusee.nodes import losses
-from neusee.nodes.spectra import render
-from neusee.nodes.spectra._linear_lift import wiener
-from neusee.nodes.spectra._mst_lift_node import needs_bands, started, through
+from neusee.nodes.spectra import lift_matrix, lift_pictures, need_mst_plus_plus_bands, render, start_mst_plus_plus
 from neusee.nodes.values import Bands
 from neusee.workflows.engine.differentiable_function import as_function
 from neusee.workflows.graph.diagnostics import nearest
@@ -41,7 +39,7 @@ class Pairs:
         known = recipe.run(store, [bands, settings.measured], device=device)
         self.bands: Bands = known[bands]
         self.measured: Tensor = known[settings.measured]
-        needs_bands(self.bands)
+        need_mst_plus_plus_bands(self.bands)
         self._draw = as_function(recipe, outputs=self._names, store=store, device=device, redraw=random)
 
     def __call__(self, *number: object) -> tuple[Tensor, Tensor]:
@@ -62,8 +60,8 @@ class LiftLearner:
     def __init__(self, settings: LiftTraining, pairs: Pairs, seed: int, device: str) -> None:
         self.settings, self.pairs = settings, pairs
         rng = torch.Generator(device).manual_seed(stream_seed(seed, "train lift network"))
-        self.linear = wiener(pairs.measured.cpu(), pairs.bands.centres.cpu()).to(device, torch.float32)
-        self.net = started(rng, self.linear if settings.start == "linear" else None)
+        self.linear = lift_matrix(pairs.measured.cpu(), pairs.bands.centres.cpu()).to(device, torch.float32)
+        self.net = start_mst_plus_plus(rng, self.linear if settings.start == "linear" else None)
         self.optimiser = torch.optim.Adam(self.net.parameters(), lr=settings.rate, betas=settings.betas)
         self.average = averaged(self.net, settings.ema_decay)
 
@@ -79,7 +77,7 @@ class LiftLearner:
             group["lr"] = rate
         self.optimiser.zero_grad(set_to_none=True)
         picture, cube = self.pairs.batch(range(iteration * batch, (iteration + 1) * batch))
-        estimate = through(self.net, picture)
+        estimate = lift_pictures(self.net, picture)
         loss = losses.mrae(estimate, cube, floor=self.settings.floor)
         loss.backward()
         slope = float(nn.utils.clip_grad_norm_(self.net.parameters(), STEEPEST))
@@ -109,7 +107,10 @@ class LiftLearner:
     def estimates(self, picture: Tensor) -> dict[str, Tensor]:
         """Return the spectra of a picture by the network, and by the linear estimate."""
         linear = torch.einsum("bc,cyx->byx", self.linear, picture)
-        return {"mst_plus_plus": through(self.best(), picture[None])[0].clamp_min(0), "linear": linear.clamp_min(0)}
+        return {
+            "mst_plus_plus": lift_pictures(self.best(), picture[None])[0].clamp_min(0),
+            "linear": linear.clamp_min(0),
+        }
 
 
 def _rmse(estimate: Tensor, truth: Tensor) -> Losses:

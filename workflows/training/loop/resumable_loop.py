@@ -11,7 +11,7 @@ from typing import Any, Generic, Protocol, TypeVar
 from torch import nn
 from torch.optim.swa_utils import AveragedModel, get_ema_multi_avg_fn
 
-from neusee.workflows.engine.node_call import versions
+from neusee.workflows.engine.provenance import versions
 from neusee.workflows.recipe.blocks.train_block import Training
 from neusee.workflows.recipe.blocks.train_lift_block import LiftTraining
 from neusee.workflows.training.loop.checkpoint import Rows, StateFile, write_json, write_whole

@@ -10,11 +10,18 @@ from typing import Any
 import torch
 from torch import Tensor, nn
 
-from neusee.nodes.doe import half_rings
-from neusee.nodes.doe._parametrisations import LEARNT, Drawn, Modes, Pixels, Rings, Written
-from neusee.nodes.doe._refractive_index import wave_height
-from neusee.nodes.doe._sampled_height_map import _read
-from neusee.nodes.optics._pupil_grid import Stop
+from neusee.nodes.doe import (
+    PARAMETRISATIONS,
+    Drawn,
+    Modes,
+    Pixels,
+    Rings,
+    Written,
+    half_rings,
+    read_height_map,
+    wave_height,
+)
+from neusee.nodes.optics import Stop
 from neusee.workflows.graph.recipe_graph import Step
 from neusee.workflows.recipe.blocks.mask_design_block import DesignError, MaskTraining, half_cosine
 from neusee.workflows.training.loop.checkpoint import StateFile
@@ -52,9 +59,9 @@ def shape_of(settings: MaskTraining, start: int, step: Step) -> nn.Module:
 
 def _free(settings: MaskTraining, rng: torch.Generator, step: Step) -> nn.Module:
     if settings.kind == "element":
-        if step.node.path not in LEARNT:
+        if step.node.path not in PARAMETRISATIONS:
             raise DesignError(f"kind: {step.name} is {step.node.path}, whose samples are not learnt")
-        return LEARNT[step.node.path](step.params, rng)
+        return PARAMETRISATIONS[step.node.path](step.params, rng)
     if settings.kind == "pixelwise":
         return Pixels(settings.grid, settings.max_height, settings.scale, rng, _start(settings))
     if settings.kind == "zernike":
@@ -68,7 +75,7 @@ def _start(settings: MaskTraining) -> Tensor | None:
     """Return the height map from which pixels start."""
     if settings.start is None:
         return None
-    height = _read(settings.start, settings.max_height)
+    height = read_height_map(settings.start, settings.max_height)
     if float(height.max()) > settings.max_height:
         deep, most = f"{float(height.max()) * 1e6:.3g} um", f"{settings.max_height * 1e6:.3g} um"
         raise DesignError(f"start: {settings.start.name} is {deep} deep: set max_height to more than {most}")

@@ -15,7 +15,7 @@ from typing import Any, get_args
 from torch import Tensor
 
 from neusee.nodes import spectra
-from neusee.nodes.sensor._channel_sums import summed
+from neusee.nodes.sensor import channel_sums
 from neusee.nodes.values import Bands, Channels, Mixture
 from neusee.workflows.engine.band_results import band_tensors, taken, with_band_tensors
 from neusee.workflows.engine.node_call import call
@@ -94,7 +94,7 @@ class Shards:
         """Return the tensors of one picture's result that are sent to the process that owns the picture."""
         if name not in self.rows:
             return band_tensors(value)
-        part = summed(value, self.rows[name][:, self.own])
+        part = channel_sums(value, self.rows[name][:, self.own])
         return [part.planes, part.flux]
 
     def ports(self, name: str, sent: Sequence[Tensor]) -> list[Port]:

@@ -1,0 +1,41 @@
+"""Error of a failed step."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Any
+
+from torch import Tensor
+
+from neusee.workflows.graph.recipe_graph import Step
+
+
+class RunError(RuntimeError):
+    """Error of a failed step: names the step, its node, its place in the recipe, its inputs and the cause."""
+
+    def __init__(self, step: Step, inputs: Sequence[Any], cause: BaseException) -> None:
+        self.step, self.cause = step.name, cause
+        given = ", ".join(f"{name} {_shape(value)}" for name, value in zip(step.node.inputs, inputs, strict=False))
+        super().__init__(
+            f"{step.mark}   {step.name} ({step.node.path}): {type(cause).__name__}: {cause}"
+            + (f"\n  inputs: {given}" if given else "")
+        )
+
+    def __reduce__(self) -> tuple[Any, ...]:
+        return _remade, (self.step, str(self), repr(self.cause))
+
+
+def _remade(step: str, text: str, cause: str) -> RunError:
+    """Return the unpickled error in another process: its text, without the traceback of the cause."""
+    error = RunError.__new__(RunError, text)
+    RuntimeError.__init__(error, text)
+    error.step, error.cause = step, RuntimeError(cause)
+    return error
+
+
+def _shape(value: Any) -> str:
+    if isinstance(value, Tensor):
+        return f"{tuple(value.shape)} {str(value.dtype).removeprefix('torch.')}"
+    if isinstance(value, list | tuple):
+        return f"{type(value).__name__}[{', '.join(_shape(v) for v in value)}]"
+    return "absent" if value is None else type(value).__name__
