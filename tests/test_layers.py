@@ -26,9 +26,10 @@ FORBIDDEN_IN_NODES = {"yaml", "ruamel", "emcee", "typer", "rich", "jinja2", "log
 #: The rooms in order: a file imports its own room and earlier ones.
 ROOMS = (
     "graph", "keys", "recipe.text", "recipe.blocks", "recipe.distributions", "recipe", "store", "placement",
-    "tolerance", "engine", "report.figures", "report", "explain", "simulation", "sweeps", "training.parallel",
-    "training.mask_design", "training", "training.lift", "evaluation", "calibration", "studies", "studies.accuracy",
-    "studies.stability", "studies.leave_out", "studies.uncertainty", "studies.calibration", "api", "cli",
+    "tolerance", "engine", "report.figures", "report", "explain", "simulation", "sweeps", "training.loop",
+    "training.parallel", "training.mask_design", "training", "training.lift", "evaluation", "calibration", "studies",
+    "studies.accuracy", "studies.stability", "studies.leave_out", "studies.uncertainty", "studies.calibration", "api",
+    "cli",
 )  # fmt: skip
 DOOR = ""  #: neusee.workflows itself, which offers names of all rooms: no room imports it
 

@@ -25,7 +25,7 @@ from safetensors.torch import load_file
 from neusee.nodes import doe, losses, metrics
 from neusee.workflows import load
 from neusee.workflows.store.result_store import Store
-from neusee.workflows.training.mask_design.design_run import MaskTraining, design, figures
+from neusee.workflows.training.mask_design.design_run import MaskTraining, design, mask_figures
 from neusee.workflows.training.mask_design.design_terms import Terms
 
 AT = {"optics.samples": 270, "optics.pitch": "29.92 um", "optics.window": [504, 504]}
@@ -166,7 +166,7 @@ def formulas(folder: Path) -> None:
     """Judge the masks of a formula."""
     terms = Terms(load("first_light"), MaskTraining(), Store(folder / "cache"))
     for name, height in known(*terms.stop).items():
-        (folder / f"{name}.json").write_text(json.dumps(figures(terms, height) | {"seconds": 0.0}))
+        (folder / f"{name}.json").write_text(json.dumps(mask_figures(terms, height) | {"seconds": 0.0}))
 
 
 def filtered(folder: Path) -> None:
@@ -196,7 +196,7 @@ def grid(terms: Terms) -> dict[str, Any]:
 def _as(terms: Terms, colour: float) -> Terms:
     """The same terms with another share of what is of one band."""
     other = copy.copy(terms)
-    other.how = terms.how.model_copy(update={"colour": colour})
+    other.settings = terms.settings.model_copy(update={"colour": colour})
     return other
 
 

@@ -53,7 +53,7 @@ def mistakes(read):
 @pytest.fixture
 def one_thread():
     """What is computed is over before a second thread is awake."""
-    from neusee.workflows.engine.threads import one_thread
+    from neusee.workflows.engine.local_executor import one_thread
 
     with one_thread():
         yield

@@ -11,7 +11,6 @@ from __future__ import annotations
 
 import os
 from collections.abc import Callable, Iterable, Mapping, Sequence
-from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal
 
@@ -100,7 +99,8 @@ def train(
     """Learn the mask and the restoration of a recipe, or its lift, and return the folder; go on where one was stopped.
 
     Args: stages: 1 learns mask and network, 2 the network, 0 designs the mask without pictures; all that the recipe
-    names if None. watch: is given the stage, its iterations so far and the losses. mesh: the processes of `torchrun`.
+    names if None. watch: is given the stage (0 of a lift), its iterations so far and the losses. mesh: the processes of
+    `torchrun`.
     Raises: ValueError for a recipe that cannot be learnt, `DesignError` or `MeshError` among them; `NotFinite` where a
     loss is NaN or infinite.
     """
@@ -109,7 +109,7 @@ def train(
     if found.lifting is not None:
         from neusee.workflows.training.lift.lift_run import train_lift
 
-        return train_lift(found, store, place, command, progress, device, watch and partial(watch, 1))
+        return train_lift(found, store, place, command, progress, device, watch)
     from neusee.workflows.training.parallel.process_mesh import ALONE
     from neusee.workflows.training.run_training import train as learn
 

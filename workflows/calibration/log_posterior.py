@@ -13,8 +13,8 @@ from torch import Tensor
 from neusee.nodes.calibrate import CameraCoordinates, Coordinates, Likelihood, Sufficient
 from neusee.nodes.values import Levels
 from neusee.workflows.engine.differentiable_function import as_function
+from neusee.workflows.engine.local_executor import one_thread
 from neusee.workflows.engine.runner import run
-from neusee.workflows.engine.threads import one_thread
 from neusee.workflows.graph.recipe_graph import Recipe, Step
 from neusee.workflows.keys.cache_key import digest
 from neusee.workflows.store.result_store import Store

@@ -2,5 +2,5 @@
 
 Commands and options, their messages, and the exit codes.
 Nothing here computes: a command calls the room that does. This room alone imports typer and ends the program.
-Offers: `app.app`, `app.main`, `command_frame.fail`, `sweep_output.run_sweep`.
+Offers: `app.app`, `app.main`, `command_frame.fail`, `sweep_screen.run_sweep`.
 """

@@ -1,6 +1,6 @@
 """The command line: few commands, the same words everywhere, one line for each mistake.
 
-Nothing heavy is imported before a command asks for it: ``neusee --help`` never sees torch.
+A command imports what it needs when it runs: ``neusee --help`` never imports torch.
 """
 
 from __future__ import annotations
@@ -18,6 +18,7 @@ import typer
 from neusee import __version__
 from neusee.workflows.cli.cache_commands import cache
 from neusee.workflows.cli.calibrate_command import calibrate
+from neusee.workflows.cli.catalogue import nodes, recipes, schema
 from neusee.workflows.cli.command_frame import (
     BAD,
     DONE,
@@ -27,16 +28,15 @@ from neusee.workflows.cli.command_frame import (
     Exact,
     Memory,
     Words,
-    bytes_of,
     check_device,
     fail,
     load,
+    parse_memory,
     refuse,
     say,
     the_store,
 )
 from neusee.workflows.cli.evaluate_command import evaluate
-from neusee.workflows.cli.list_commands import nodes, recipes, schema
 from neusee.workflows.cli.run_command import run
 from neusee.workflows.cli.study_commands import study
 from neusee.workflows.cli.sweep_command import sweep
@@ -116,7 +116,7 @@ def plan(
         except RecipeError as error:
             refuse(error)
         return
-    room = bytes_of(memory, "--memory") if memory else None
+    room = parse_memory(memory, "--memory") if memory else None
     lines, refused = run_forecast.plan_lines(recipe, the_store(), device, room)
     say(lines)
     if refused:
@@ -210,7 +210,7 @@ def _not_asked() -> None:
 
 
 def main(arguments: list[str] | None = None) -> None:
-    """Entry point: every error is one line and an exit code, unless ``--debug`` asks for the stack."""
+    """Run the command line; an error is one line and an exit code, unless ``--debug`` asks for the traceback."""
     arguments = sys.argv[1:] if arguments is None else arguments
     gc.disable()  # what is imported stays: to look for garbage in it costs a tenth of the start
     try:
@@ -228,7 +228,7 @@ def main(arguments: list[str] | None = None) -> None:
 
 
 def _explained(error: Exception) -> int:
-    """Print an error as one line; a mistake in the arguments and a failure while running differ in their code."""
+    """Print an error as one line and return its exit code, which tells a wrong argument from a failed run."""
     message = getattr(error, "format_message", None)
     if message is not None:
         print(f"{message()} (try `neusee --help`)", file=sys.stderr)

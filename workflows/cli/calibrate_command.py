@@ -1,4 +1,4 @@
-"""``neusee calibrate``: what calibration frames tell of a sensor."""
+"""The command ``neusee calibrate``: the posterior of a sensor from its calibration frames."""
 
 from __future__ import annotations
 

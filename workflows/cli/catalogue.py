@@ -1,4 +1,4 @@
-"""What there is to use: recipes, nodes with their parameters, readings, and the JSON schema of it all."""
+"""The commands that list what there is, and their lines: recipes, nodes with their parameters, the JSON schema."""
 
 from __future__ import annotations
 
@@ -8,29 +8,17 @@ import re
 from collections.abc import Iterator
 from importlib.resources import files
 from pathlib import Path
-from typing import Any, get_args
+from typing import TYPE_CHECKING, Annotated, Any, get_args
 
-import neusee.recipes
-from neusee.nodes import Node, units
-from neusee.workflows.graph.diagnostics import nearest
-from neusee.workflows.recipe.loading import groups, recipes
-from neusee.workflows.recipe.paper_readings import READINGS
-from neusee.workflows.recipe.step_declarations import all_nodes
+import typer
 
-_FOLDER = Path(neusee.recipes.__file__).parent
-_KINDS = (
-    "PositiveLength",
-    "Length",
-    "Wavelength",
-    "Time",
-    "Angle",
-    "Temperature",
-    "Electrons",
-    "Waves",
-    "DataFile",
-    "DataFiles",
-)
-_SAID = {
+from neusee.workflows.cli.command_frame import Debug, fail, say
+from neusee.workflows.report.text_table import columns
+
+if TYPE_CHECKING:
+    from neusee.nodes import Node
+
+_UNITS_IN_WORDS = {
     "PositiveLength": "length > 0, such as 2.9 um",
     "Length": "length, such as 50 nm",
     "Wavelength": "wavelength from 100 nm to 20 um, such as 550 nm",
@@ -44,21 +32,55 @@ _SAID = {
 }
 
 
+def recipes() -> None:
+    """List the recipes and the groups that they choose from."""
+    say(recipe_lines())
+
+
+def nodes(
+    name: Annotated[str | None, typer.Argument(help="One node, such as optics.psf; `reading`, or `glossary`.")] = None,
+    debug: Debug = False,
+) -> None:
+    """List the nodes, or explain one of them.
+
+    For one node: its physics, source, error, inputs and parameters, and the recipes that use it. `reading` lists how
+    the paper is read where it contradicts itself. `glossary` lists the terms of the field, one a line.
+    """
+    try:
+        say(node_lines(name) if name else nodes_lines())
+    except LookupError as error:
+        fail(str(error.args[0]))
+
+
+def schema() -> None:
+    """Print the JSON schema of recipes for editors."""
+    import json
+
+    from neusee.workflows.recipe import json_schema
+
+    say([json.dumps(json_schema.schema(), indent=1)])
+
+
+# --- what the commands print ------------------------------------------------------------------------------------------
+
+
 def recipe_lines() -> list[str]:
-    """Each recipe with its first line, then the groups that it may choose from."""
-    found = recipes()
-    wide = max((len(r.name) for r in found), default=0)
-    lines = [f"{r.name:<{wide}}  {r.title}" for r in found]
-    lines += ["", "groups, as in `neusee run laser=six`"]
-    return [*lines, *(f"  {name}: {', '.join(o.name for o in options)}" for name, options in groups().items())]
+    """Return a line for each recipe with its title, then the groups of options."""
+    from neusee.workflows.recipe import loading
+
+    found = loading.recipes()
+    lines = [*columns([[r.name, r.title] for r in found]), "", "groups, as in `neusee run laser=six`"]
+    return [*lines, *(f"  {name}: {', '.join(o.name for o in options)}" for name, options in loading.groups().items())]
 
 
 def nodes_lines() -> list[str]:
-    """Every node by family, with the first sentence of what it does."""
-    nodes = dict(all_nodes())
-    wide = max(map(len, nodes), default=0)
+    """Return a line for each node by family, with the first sentence of its docstring."""
+    from neusee.workflows.recipe.step_declarations import all_nodes
+
+    found = dict(all_nodes())
+    wide = max(map(len, found), default=0)
     lines: list[str] = []
-    for path, node in nodes.items():
+    for path, node in found.items():
         family = path.partition(".")[0]
         if not any(line.startswith(f"{family}.") for line in lines):
             lines += ["", _first(importlib.import_module(f"neusee.nodes.{family}").__doc__)]
@@ -68,14 +90,18 @@ def nodes_lines() -> list[str]:
 
 def node_lines(name: str) -> list[str]:
     """Return the lines on one node: its physics, its inputs and parameters, where it is used; or readings, or terms."""
+    from neusee.workflows.graph.diagnostics import nearest
+    from neusee.workflows.recipe.paper_readings import READINGS
+    from neusee.workflows.recipe.step_declarations import all_nodes
+
     if name == "glossary":
         return glossary_lines()
     if name == "reading":
         return [line for row in READINGS for line in (*_reading(row.name), "")]
-    nodes = dict(all_nodes())
-    if name not in nodes:
-        raise LookupError(f"no node {name}: {nearest(name, nodes)}")
-    node, uses = nodes[name], list(_uses(name))
+    found = dict(all_nodes())
+    if name not in found:
+        raise LookupError(f"no node {name}: {nearest(name, found)}")
+    node, uses = found[name], list(_uses(name))
     lines = [name, "", *inspect.cleandoc(node.__doc__ or "").splitlines(), "", "inputs"]
     lines += [f"  {i}{' (optional)' if i in node.optional else ''}" for i in node.inputs] or ["  none"]
     lines += ["", "parameters", *(_parameters(node) or ["  none"])]
@@ -95,9 +121,8 @@ def _parameters(node: Node) -> list[str]:
     rows = []
     for name, field in node.params.model_fields.items():
         default = "required" if field.is_required() else f"default {_default(field.default)}"
-        rows.append((name, _kind(node.hints[name]), default))
-    wide = max((len(name) for name, _, _ in rows), default=0)
-    return [f"  {name:<{wide}}  {kind}; {default}" for name, kind, default in rows]
+        rows.append([f"  {name}", f"{_kind(node.hints[name])}; {default}"])
+    return columns(rows)
 
 
 def _default(value: Any) -> str:
@@ -105,12 +130,14 @@ def _default(value: Any) -> str:
 
 
 def _kind(hint: Any) -> str:
-    """A type as a user writes it: the unit, the words that are allowed, or a number and its range."""
-    for name in _KINDS:
+    """Return a type as a user writes it: the unit, the words that are allowed, or a number and its range."""
+    from neusee.nodes import units
+
+    for name in _UNITS_IN_WORDS:
         if hint == getattr(units, name):
-            return _SAID[name]
+            return _UNITS_IN_WORDS[name]
     if any(isinstance(extra, units.IsFile) for extra in getattr(hint, "__metadata__", ())):
-        return _SAID["DataFile"]  # and what it names
+        return _UNITS_IN_WORDS["DataFile"]  # and what it names
     arguments = get_args(hint)
     if arguments and all(isinstance(a, str) for a in arguments):
         return " | ".join(arguments)
@@ -142,17 +169,20 @@ def _composed(hint: Any, arguments: tuple[Any, ...]) -> str:
 
 
 def _uses(name: str) -> Iterator[tuple[str, Any]]:
-    """Recipe files with a step of this node, and that step."""
+    """Return the recipe files that have a step of this node, each with the step."""
     from ruamel.yaml import YAML
 
-    for path in sorted(_FOLDER.rglob("*.yaml")):
+    import neusee.recipes
+
+    folder = Path(neusee.recipes.__file__).parent
+    for path in sorted(folder.rglob("*.yaml")):
         text = path.read_text(encoding="utf-8")
         if name not in text:
             continue
         steps = (YAML(typ="safe").load(text) or {}).get("steps") or {}
         for step in steps.values():
             if isinstance(step, dict) and step.get("node") == name:
-                yield str(path.relative_to(_FOLDER)), step
+                yield str(path.relative_to(folder)), step
 
 
 def _readings_of(step: Any) -> Iterator[tuple[str, str]]:
@@ -162,7 +192,9 @@ def _readings_of(step: Any) -> Iterator[tuple[str, str]]:
 
 
 def _reading(name: str) -> list[str]:
-    """One contradiction of the paper: what it says, the two readings, and which packaged group chooses which."""
+    """Return the lines of a contradiction of the paper: its text, the two readings, and the groups that choose them."""
+    from neusee.workflows.recipe.paper_readings import READINGS
+
     row = next((r for r in READINGS if r.name == name), None)
     if row is None:
         return [f"reading.{name}"]
@@ -174,5 +206,5 @@ def _reading(name: str) -> list[str]:
 
 
 def _first(text: str | None) -> str:
-    """The first sentence."""
+    """Return the first sentence of a text."""
     return inspect.cleandoc(text or "").partition("\n\n")[0].replace("\n", " ").partition(". ")[0].rstrip(".")

@@ -1,4 +1,4 @@
-"""What every command does with its words: read the recipe they name, refuse what cannot be, print, stop."""
+"""The frame of every command: read the recipe from the words, refuse mistakes, print, exit."""
 
 from __future__ import annotations
 
@@ -39,7 +39,7 @@ Out = Annotated[Path, typer.Option("--out", help="Folder in which to make the fo
 
 
 def split(words: list[str] | None, before: int = 0) -> tuple[str, list[str], int]:
-    """The recipe that the words name (`first_light` if none does), its changes, and the number of the first of these.
+    """Return the name of the recipe, by default `first_light`, its changes, and the number of the first change.
 
     ``before``: how many arguments stand before the words.
     """
@@ -53,7 +53,7 @@ def split(words: list[str] | None, before: int = 0) -> tuple[str, list[str], int
 
 
 def load(words: list[str] | None, before: int = 0, exact: bool = False) -> tuple[Recipe, list[str]]:
-    """The recipe that the words name with its changes, and the words to run it again."""
+    """Return the recipe that the words name, with its changes, and the words of the command."""
     name, changes, first = split(words, before)
     from neusee.workflows.graph.diagnostics import RecipeError
     from neusee.workflows.recipe.loading import load as read
@@ -70,18 +70,18 @@ def load(words: list[str] | None, before: int = 0, exact: bool = False) -> tuple
 
 
 def refuse(error: RecipeError) -> NoReturn:
-    """Say every mistake of a recipe and stop."""
+    """Print every mistake of a recipe and exit."""
     count = len(error.diagnostics)
     fail(f"{error}\n{count} problem{'s' * (count > 1)}, nothing was run")
 
 
 def check_device(device: str) -> None:
-    """Refuse what is no device, or is not here; several are separated by commas."""
+    """Refuse a device that does not exist on this machine; several devices are separated by commas."""
     import torch
 
     names = device.split(",")
     if len(set(names)) < len(names):
-        fail(f"--device {device}: names one device twice")
+        fail(f"--device {device}: names a device twice")
     for name in names:
         try:
             torch.empty(0, device=name)
@@ -99,13 +99,13 @@ def say(lines: list[str]) -> None:
 
 
 def fail(message: str, code: int = BAD) -> NoReturn:
-    """Say on stderr what is wrong and stop."""
+    """Print a message to stderr and exit."""
     print(message, file=sys.stderr)
     raise typer.Exit(code)
 
 
 def the_store() -> Store:
-    """The store that ``$NEUSEE_CACHE`` names, or the usual one."""
+    """Open the store that ``$NEUSEE_CACHE`` names, or the default store."""
     from neusee.workflows.store.remote_store import open_store
 
     try:
@@ -114,19 +114,19 @@ def the_store() -> Store:
         fail(f"NEUSEE_CACHE: {error}")
 
 
-def bytes_of(text: str, option: str) -> int:
-    """``6 GB`` as bytes; anything else is refused, with what may be written."""
-    from neusee.workflows.store.budget_eviction import bytes_of as read
+def parse_memory(text: str, option: str) -> int:
+    """Return the bytes that a text such as ``6 GB`` names; stop with a message for any other text."""
+    from neusee.workflows.store.byte_sizes import parse_size
 
     try:
-        return read(text)
+        return parse_size(text)
     except ValueError as error:
         fail(f"{option}: {error}")
 
 
 @contextmanager
 def executor_of(where: str, store: Store) -> Iterator[Executor | None]:
-    """Who computes: this process (None), or a cluster for as long as the command runs."""
+    """Yield None for this process, or a cluster for the length of the command."""
     if where == "local":
         yield None
         return

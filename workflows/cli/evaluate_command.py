@@ -1,4 +1,4 @@
-"""``neusee evaluate``: masks and restorers on the same scenes and lasers, with confidence intervals."""
+"""The command ``neusee evaluate``: compare masks and restorers on the same scenes and lasers."""
 
 from __future__ import annotations
 

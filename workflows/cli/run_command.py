@@ -15,11 +15,11 @@ from neusee.workflows.cli.command_frame import (
     Memory,
     Out,
     Words,
-    bytes_of,
     check_device,
     executor_of,
     fail,
     load,
+    parse_memory,
     say,
     the_store,
 )
@@ -55,7 +55,7 @@ def run(
     from neusee.workflows.report import console
 
     check_device(device)
-    room = bytes_of(memory, "--memory") if memory else None
+    room = parse_memory(memory, "--memory") if memory else None
     if not (as_json or quiet):
         say(console.opening(recipe, " ".join(command[1:])))
     store = the_store()
@@ -94,11 +94,11 @@ def _simulate(
     executor: Executor | None,
     memory: int | None,
 ) -> Simulation:
-    from neusee.workflows.report.console import screen
+    from neusee.workflows.report.console import RunTable, mode_for
     from neusee.workflows.report.contents import steps_of, wanted
     from neusee.workflows.simulation.simulate_recipe import simulate
     from neusee.workflows.tolerance.cheaper_steps import with_substitutions
 
     recipe = with_substitutions(recipe, wanted(recipe))
-    with screen(recipe, steps_of(recipe), silent) as shown:
+    with RunTable(recipe, steps_of(recipe), mode_for(silent)) as shown:
         return simulate(recipe, store, out, command, device, shown.watch, executor, memory)

@@ -1,4 +1,4 @@
-"""``neusee study``: error against run time, extreme cases, what is left out, posteriors and what they leave open."""
+"""The commands ``neusee study``: accuracy, stability, leave-out, calibration and uncertainty."""
 
 from __future__ import annotations
 
@@ -21,14 +21,14 @@ study = typer.Typer(
 
 
 class Move(StrEnum):
-    """The moves of `calibrate`."""
+    """The moves of the walkers of `calibrate`."""
 
     DE = "de"
     STRETCH = "stretch"
 
 
 class Points(StrEnum):
-    """How inputs are drawn."""
+    """The ways to draw uncertain inputs."""
 
     DRAWS = "draws"
     SOBOL = "sobol"

@@ -1,127 +1,183 @@
-"""What a terminal shows while a sweep runs: a table that fills, one line a point, or nothing."""
+"""A sweep on the screen: its table while it runs, the lines before and after, and the exit code."""
 
 from __future__ import annotations
 
+import shlex
 import sys
-from collections.abc import Sequence
-from dataclasses import dataclass, field
-from typing import TYPE_CHECKING, Any
+import time
+from collections.abc import Iterator, Sequence
+from contextlib import closing
+from pathlib import Path
+from typing import TYPE_CHECKING
 
-from neusee.workflows.sweeps.sweep_table import Column, cell_text, headline, lasts, point_cells
+from neusee.workflows.report.console import Mode, ProgressTable, mode_for
+from neusee.workflows.store.remote_store import open_store
+from neusee.workflows.store.result_store import Store
+from neusee.workflows.sweeps.axes import Axis, read_words
+from neusee.workflows.sweeps.sweep_files import require_xarray
+from neusee.workflows.sweeps.sweep_points import OnError, PointOutcome, outcomes
+from neusee.workflows.sweeps.sweep_run import Sweep, Sweeping, SweepState, counted, write_sweep
+from neusee.workflows.sweeps.sweep_table import AxisColumn, cell_text, headline, lasts, point_cells
 
 if TYPE_CHECKING:
     from neusee.workflows.graph.step_record import Event
     from neusee.workflows.sweeps.axes import Point
-    from neusee.workflows.sweeps.sweep_points import Outcome
 
-_NUMBERS = 4  #: columns of numbers that a screen shows
-_LAST = 25  #: points that a live table shows
+_NUMBERS = 4  #: columns of numbers on the screen
+_LAST = 25  #: points in a live table
+DONE, FAILED, INTERRUPTED = 0, 1, 130
 
 
-@dataclass
-class Silent:
-    """Shows nothing."""
+def run_sweep(
+    recipe: str,
+    words: Sequence[str],
+    *,
+    first: int = 2,
+    zip: bool = False,
+    on_error: OnError = "stop",
+    netcdf: bool = False,
+    device: str = "cpu",
+    out: Path = Path("runs"),
+    store: Store | None = None,
+    quiet: bool = False,
+) -> int:
+    """Run, show and write a sweep to ``out/sweeps/<date>_<recipe>_<key>/``; return the exit code of the command.
 
-    columns: Sequence[Column]
-    points: int
-    outcomes: list[Outcome] = field(default_factory=list)
-    running: Point | None = None
-    step: str = ""
+    ``words`` are the changes and axes, counted from ``first``. Raises: RecipeError with every
+    mistake of every point, before anything runs.
+    """
+    if netcdf:
+        require_xarray("--netcdf")
+    began, place = time.perf_counter(), Path().absolute()
+    work = Sweeping(recipe, read_words(words, place, first), place, store or open_store(), zip, device)
+    again = _command(recipe, words, zip, on_error, netcdf, device, out)
+    if not quiet:
+        print(*_opening(work), sep="\n", flush=True)
+    found, state, error = _run_points(work, on_error, quiet)
+    if error is not None and not (on_error == "stop" and found and found[-1].state == "failed"):
+        raise error
+    result = work.sweep(found, state)
+    path = write_sweep(work, result, again, out, netcdf, time.perf_counter() - began)
+    if quiet:
+        print(*_failures(result), sep="\n", end="\n" if result.failed else "", file=sys.stderr)
+        print(path / "sweep.csv", flush=True)
+    else:
+        print(*_closing(result, path, again, time.perf_counter() - began), sep="\n", flush=True)
+    return INTERRUPTED if state == "interrupted" else FAILED if result.failed else DONE
 
-    def __enter__(self) -> Silent:
-        return self
 
-    def __exit__(self, *error: object) -> None:
-        return None
+def _opening(work: Sweeping) -> Iterator[str]:
+    """Return the lines before anything runs."""
+    recipe, sizes = work.plan.recipe, f" {'+' if work.paired else '×'} ".join(map(_sized, work.axes))
+    shared = work.sharing
+    yield f"neusee sweep: {recipe.title or recipe.name}"
+    yield f"checked  {shared.points} points ({sizes}), {shared.steps} steps: all right"
+    yield f"shared   {shared.made} different results: {100 * shared.saved:.0f} % less work than point by point"
+    if work.plan.costs and any(work.plan.work):
+        yield f"time     about {lasts(sum(work.plan.work))}, as earlier runs took"
+    yield from (f"note     {line}" for line in work.plan.notes)
+
+
+def _sized(axis: Axis) -> str:
+    return f"{axis.name}: {len(axis.coordinates)}"
+
+
+def _run_points(
+    work: Sweeping, on_error: OnError, quiet: bool
+) -> tuple[list[PointOutcome], SweepState, Exception | None]:
+    """Run the points and show them; Ctrl-C and a failure end the sweep, and the outcomes so far are kept."""
+    shown = SweepTable(work.columns, len(work.plan.checked), mode_for(quiet))
+    try:
+        with (
+            shown,
+            closing(outcomes(work.plan, work.store, on_error, work.device, shown.started, shown.watch)) as running,
+        ):
+            for outcome in running:
+                shown.finished(outcome)
+    except KeyboardInterrupt:
+        return shown.outcomes, "interrupted", None
+    except Exception as error:
+        return shown.outcomes, "stopped", error
+    return shown.outcomes, "complete", None
+
+
+def _command(
+    recipe: str, words: Sequence[str], paired: bool, on_error: str, netcdf: bool, device: str, out: Path
+) -> list[str]:
+    """Return the words of the command that runs a sweep again."""
+    options = ["--zip"] * paired + ["--netcdf"] * netcdf
+    options += ["--on-error", on_error] if on_error != "stop" else []
+    options += ["--device", device] if device != "cpu" else []
+    options += ["--out", str(out)] if out != Path("runs") else []
+    return ["neusee", "sweep", recipe, *words, *options]
+
+
+def _closing(result: Sweep, path: Path, again: Sequence[str], seconds: float) -> Iterator[str]:
+    """Return the lines after the last point."""
+    yield ""
+    yield f"{counted(result)}  ({lasts(seconds)})"
+    yield from (f"  {line}" for line in _failures(result))
+    yield f"table    {path / 'sweep.csv'}"
+    if result.state != "complete":
+        yield f"partial: what is done is kept; to go on: {shlex.join(again)}"
+
+
+def _failures(result: Sweep) -> Iterator[str]:
+    for outcome in result.failed:
+        yield f"failed: point {outcome.point.number}, {outcome.point.shown}: {outcome.message.splitlines()[0]}"
+
+
+class SweepTable(ProgressTable):
+    """The points of a sweep, one row for each that ended."""
+
+    def __init__(self, columns: Sequence[AxisColumn], points: int, mode: Mode) -> None:
+        super().__init__(mode)
+        self.columns, self.points = columns, points
+        self.outcomes: list[PointOutcome] = []
+        self.running: Point | None = None
+        self.step = ""
+        self.lines = list[list[str]]()
+        self.header = ["done", "point", *(c.header for c in columns), "state", "seconds", "left", "results"]
+        widest = [max(map(len, (c.header, *map(cell_text, c.cells)))) for c in columns]
+        count = len(str(points))
+        self.widths = [max(4, 2 * count + 1), max(5, count), *widest, 6, 8, 12, 0]
 
     def started(self, point: Point) -> None:
-        """A point begins."""
+        """Note that a point begins."""
         self.running, self.step = point, ""
 
     def watch(self, event: Event) -> None:
-        """A step of it begins or ended."""
+        """Note that a step of the point begins or ended."""
         self.step = event.step if event.done is None else ""
 
-    def finished(self, outcome: Outcome) -> None:
-        """A point ended."""
+    def finished(self, outcome: PointOutcome) -> None:
+        """Note what became of a point, and show its row."""
         self.outcomes.append(outcome)
         self.running = None
+        self.lines.append(self.cells(outcome))
+        self.show_row(self.lines[-1])
+        if outcome.state == "failed":
+            lines = [f"  {line}" for line in outcome.message.splitlines()]
+            self.show_error(lines, f"point {outcome.point.number}: {outcome.point.shown}\n{outcome.message}")
 
-    def cells(self, outcome: Outcome) -> list[str]:
-        """One row: which of how many, the values, state, seconds, the first numbers, and the time that is left."""
+    def cells(self, outcome: PointOutcome) -> list[str]:
+        """Return one row: which of how many, the values, state, seconds, the time that is left, the first numbers."""
         values = map(cell_text, point_cells(outcome.point, self.columns))
         numbers = list(headline(outcome.numbers).items())[:_NUMBERS]
-        said = "  ".join(f"{name} {value}" for name, value in numbers)
+        results = "  ".join(f"{name} {value}" for name, value in numbers)
         where, left = f"{len(self.outcomes)}/{self.points}", lasts(outcome.left) if outcome.left else ""
-        return [where, str(outcome.point.number), *values, outcome.state, f"{outcome.seconds:.3f}", left, said]
+        return [where, str(outcome.point.number), *values, outcome.state, f"{outcome.seconds:.3f}", left, results]
 
-    @property
-    def headers(self) -> list[str]:
-        return ["done", "point", *(c.header for c in self.columns), "state", "seconds", "left", "results"]
-
-
-class Plain(Silent):
-    """One line a point."""
-
-    def __enter__(self) -> Plain:
-        widest = [max(map(len, (c.header, *map(cell_text, c.cells)))) for c in self.columns]
-        count = len(str(self.points))
-        self.widths = [max(4, 2 * count + 1), max(5, count), *widest, 6, 8, 12, 0]
-        self._say(self.headers)
-        return self
-
-    def finished(self, outcome: Outcome) -> None:
-        super().finished(outcome)
-        self._say(self.cells(outcome))
-        if outcome.state == "failed":
-            print(*(f"  {line}" for line in outcome.message.splitlines()), sep="\n", flush=True)
-
-    def _say(self, cells: Sequence[str]) -> None:
-        line = "  ".join(f"{cell:<{width}}" for cell, width in zip(cells, self.widths, strict=True))
-        print(f"  {line}".rstrip(), flush=True)
-
-
-class Live(Silent):
-    """A table that fills; failures stay above it."""
-
-    def __enter__(self) -> Live:
-        from rich.live import Live as RichLive
-
-        self.lines = list[list[str]]()
-        self.live = RichLive(self, refresh_per_second=8, vertical_overflow="visible")
-        self.live.start()
-        return self
-
-    def __exit__(self, *error: object) -> None:
-        self.live.stop()
-
-    def finished(self, outcome: Outcome) -> None:
-        super().finished(outcome)
-        self.lines.append(self.cells(outcome))
-        if outcome.state == "failed":
-            told = f"point {outcome.point.number}: {outcome.point.shown}\n{outcome.message}"
-            self.live.console.print(told, style="red", markup=False, highlight=False)
-
-    def __rich__(self) -> Any:
-        from rich import box
-        from rich.table import Table
-
-        table = Table(box=box.SIMPLE_HEAD, pad_edge=False, header_style="bold")
-        for name in self.headers:
-            table.add_column(name, overflow="fold")
+    def live_rows(self) -> Iterator[tuple[list[str], str]]:
+        """Return the last points."""
         state = len(self.columns) + 2
-        for line in self.lines[-_LAST:]:
-            table.add_row(*line, style={"run": "bold", "cached": "cyan", "failed": "red"}[line[state]])
-        if self.running is not None:
-            left = self.outcomes[-1].left if self.outcomes else 0.0
-            about = [f"about {lasts(left)} left"] if left else []
-            now = [f"point {len(self.outcomes) + 1} of {self.points}: {self.running.shown}", *filter(None, [self.step])]
-            table.caption = "; ".join(now + about)
-        return table
+        yield from ((line, line[state]) for line in self.lines[-_LAST:])
 
-
-def screen(columns: Sequence[Column], points: int, silent: bool) -> Silent:
-    """The display that fits where the output goes."""
-    if silent:
-        return Silent(columns, points)
-    return Live(columns, points) if sys.stdout.isatty() else Plain(columns, points)
+    def caption(self) -> str:
+        """Return which point runs, its step, and the time that is left."""
+        if self.running is None:
+            return ""
+        left = self.outcomes[-1].left if self.outcomes else 0.0
+        about = f"about {lasts(left)} left" if left else ""
+        point = f"point {len(self.outcomes) + 1} of {self.points}: {self.running.shown}"
+        return "; ".join(filter(None, (point, self.step, about)))

@@ -1,4 +1,4 @@
-"""``neusee train``: learn the element and the restoration of a recipe."""
+"""The command ``neusee train``: learn the mask and the restoration of a recipe."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ if TYPE_CHECKING:
 
 
 class Stages(StrEnum):
-    """What is learnt."""
+    """The stages that are learnt."""
 
     FIRST = "1"
     SECOND = "2"
@@ -63,12 +63,12 @@ def train(
     check_device(device)
     quiet, who = quiet or rank > 0, f"process {rank}: " if world > 1 else ""
     stages = _NUMBERS[stage] if stage is not Stages.BOTH else recipe.training.learnt if recipe.training else ()
-    tell = (lambda line: None) if quiet else (lambda line: say([line]))
-    told = ["neusee", "train", *command[2:], "--stage", stage.value, *(["--mesh", mesh] if mesh else [])]
+    progress = (lambda line: None) if quiet else (lambda line: say([line]))
+    again = ["neusee", "train", *command[2:], "--stage", stage.value, *(["--mesh", mesh] if mesh else [])]
     lengths = {s: recipe.training.stages[s].iterations for s in stages if s} if recipe.training else {}
     try:
-        with joined(mesh, device) as processes_here, _bar(quiet, lengths) as bar:
-            folder = verbs.train(recipe, store=the_store(), device=device, out=out, progress=tell, command=told,
+        with joined(mesh, device) as processes_here, _LossBar(quiet, lengths) as bar:
+            folder = verbs.train(recipe, store=the_store(), device=device, out=out, progress=progress, command=again,
                                  stages=stages, watch=bar.watch, mesh=processes_here)  # fmt: skip
     except MeshError as error:
         fail(f"{who}{error}")
@@ -80,16 +80,16 @@ def train(
         say([str(folder)])
 
 
-def _lift(recipe: Recipe, told: list[str], out: Path, device: str, quiet: bool) -> None:
+def _lift(recipe: Recipe, again: list[str], out: Path, device: str, quiet: bool) -> None:
     """Learn a lift from RGB to spectra."""
     from neusee.workflows.api import verbs
     from neusee.workflows.graph.run_error import RunError
 
     assert recipe.lifting is not None
-    tell = (lambda line: None) if quiet else (lambda line: say([line]))
+    progress = (lambda line: None) if quiet else (lambda line: say([line]))
     try:
-        with _bar(quiet, {1: recipe.lifting.iterations}) as bar:
-            folder = verbs.train(recipe, store=the_store(), device=device, out=out, progress=tell, command=told,
+        with _LossBar(quiet, {0: recipe.lifting.iterations}) as bar:
+            folder = verbs.train(recipe, store=the_store(), device=device, out=out, progress=progress, command=again,
                                  watch=bar.watch)  # fmt: skip
     except (RunError, ValueError, ArithmeticError) as error:
         fail(str(error), FAILED)
@@ -102,14 +102,14 @@ def _lift(recipe: Recipe, told: list[str], out: Path, device: str, quiet: bool) 
 
 def _next(folder: Path, stage: Stages) -> list[str]:
     if stage is Stages.MASK:
-        return [f"element: {folder / 'mask.safetensors'}", f"report:  {folder / 'report.html'}"]
+        return [f"mask:    {folder / 'mask.safetensors'}", f"report:  {folder / 'report.html'}"]
     mask, network = folder / "mask.safetensors", folder / "network.safetensors"
-    element = [f"element: {mask}"] if mask.is_file() else []
-    return [*element, f"network: {network}", f"curves:  {folder / 'curves.png'}"]
+    lines = [f"mask:    {mask}"] if mask.is_file() else []
+    return [*lines, f"network: {network}", f"curves:  {folder / 'curves.png'}"]
 
 
-class _bar:
-    """The losses on the way, where somebody looks."""
+class _LossBar:
+    """A progress bar with the losses, on a terminal."""
 
     def __init__(self, quiet: bool, lengths: Mapping[int, int]) -> None:
         from rich.console import Console
@@ -119,9 +119,11 @@ class _bar:
         console = Console(stderr=True)
         self._shown = Progress(*columns, TextColumn("{task.fields[losses]}"), console=console,
                                disable=quiet or not console.is_terminal)  # fmt: skip
-        self._tasks = {s: self._shown.add_task(f"stage {s}", total=n, losses="") for s, n in lengths.items()}
+        self._tasks = {
+            s: self._shown.add_task(f"stage {s}" if s else "lift", total=n, losses="") for s, n in lengths.items()
+        }
 
-    def __enter__(self) -> _bar:
+    def __enter__(self) -> _LossBar:
         self._shown.start()
         return self
 
@@ -129,8 +131,8 @@ class _bar:
         self._shown.stop()
 
     def watch(self, stage: int, done: int, found: Mapping[str, float]) -> None:
-        """An iteration was done."""
-        said = " ".join(
+        """Show the losses of an iteration."""
+        losses = " ".join(
             f"{name} {found[name]:.3g}" for name in ("LSR", "L1", "critics", "MRAE", "RMSE") if name in found
         )
-        self._shown.update(self._tasks[stage], completed=done, losses=said)
+        self._shown.update(self._tasks[stage], completed=done, losses=losses)

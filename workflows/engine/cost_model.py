@@ -8,6 +8,7 @@ from statistics import median
 from typing import Any
 
 from neusee.workflows.graph.recipe_graph import Step
+from neusee.workflows.keys.cache_key import device_kind
 
 GUESS = 0.01  #: s for a step without any measurement
 _FASTER = 10.0  #: speed ratio of another kind of device to the CPU, until both are measured
@@ -75,4 +76,4 @@ class Costs:
 
 
 def _kind(row: Row) -> str:
-    return str(row.get("device") or "cpu").partition(":")[0]
+    return device_kind(str(row.get("device") or "cpu"))

@@ -7,7 +7,7 @@ from collections.abc import Callable, Iterator, Sequence
 from dataclasses import replace
 
 from neusee.workflows.engine.step_job import Executor, Outcome, StepJob
-from neusee.workflows.keys.cache_key import Key
+from neusee.workflows.keys.cache_key import Key, device_kind
 
 _FIRST_LOOK, _LONGEST = 0.01, 0.5  #: s between looks at work that another process holds
 
@@ -79,7 +79,7 @@ class Loop:
         for place in range(len(self._ready) - 1, -1, -1):
             chain = self._chains[self._ready[place]]
             own = chain[0].lane
-            moved = (own in self.busy or own not in there) and _kind(chain[0].device) == _kind(device)
+            moved = (own in self.busy or own not in there) and device_kind(chain[0].device) == device_kind(device)
             if (own == lane or moved) and (not running or self.room(chain[0], running)):
                 return place
         return None
@@ -150,8 +150,4 @@ def chains_of(works: Sequence[StepJob], fused: bool) -> list[Chain]:
 
 def _moved(work: StepJob, lane: str, device: str) -> StepJob:
     """Return ``work`` on another lane; a step that computes on the CPU of an accelerator's lane still does so there."""
-    return replace(work, lane=lane, device=device if _kind(work.device) == _kind(device) else work.device)
-
-
-def _kind(device: str) -> str:
-    return device.partition(":")[0]
+    return replace(work, lane=lane, device=device if device_kind(work.device) == device_kind(device) else work.device)

@@ -24,7 +24,7 @@ from neusee.workflows.engine.step_job import Executor, InputMissing, Outcome, Re
 from neusee.workflows.graph.recipe_graph import Recipe, Step, Wire, in_order
 from neusee.workflows.graph.run_error import RunError
 from neusee.workflows.graph.step_record import Event, StepRecord
-from neusee.workflows.keys.cache_key import Key, key_of
+from neusee.workflows.keys.cache_key import Key, device_kind, key_of
 from neusee.workflows.keys.code_digest import Code
 from neusee.workflows.placement.heft_and_cpop import Schedule, TooLarge
 from neusee.workflows.store.result_store import Store
@@ -242,7 +242,7 @@ class Execution:
         self.took[path] = max(outcome.seconds, self.took.get(path, 0.0))
         computing = outcome.seconds + work.refetch_seconds
         self.again[key] = self.store.read_seconds(outcome.bytes) if outcome.kept else computing
-        predicted = expected.seconds[work.device.partition(":")[0]] if expected.known else None
+        predicted = expected.seconds[device_kind(work.device)] if expected.known else None
         self._finish(ran(outcome, self._why(step.name, key), self._bound(step.name), self.began, predicted))
 
     def _fetch(self, key: Key) -> Any:

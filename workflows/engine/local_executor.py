@@ -6,9 +6,12 @@
 from __future__ import annotations
 
 from collections import deque
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import FIRST_COMPLETED, Future, ThreadPoolExecutor, wait
+from contextlib import contextmanager
 from typing import Any
+
+import torch
 
 from neusee.workflows.engine.memory_use import pool_of, there_is
 from neusee.workflows.engine.step_job import Lane, Outcome, StepJob, carry_out
@@ -69,3 +72,14 @@ class Local:
         if lane not in self._pools:
             self._pools[lane] = ThreadPoolExecutor(1, f"neusee {lane}")
         return self._pools[lane]
+
+
+@contextmanager
+def one_thread() -> Iterator[None]:
+    """Run a block of code on one thread of torch: small work ends before other threads wake up."""
+    before = torch.get_num_threads()
+    torch.set_num_threads(1)
+    try:
+        yield
+    finally:
+        torch.set_num_threads(before)

@@ -10,7 +10,7 @@ import torch
 from neusee.nodes import Check
 from neusee.workflows.graph.recipe_graph import Step
 from neusee.workflows.graph.run_error import RunError
-from neusee.workflows.keys.cache_key import stream_seed
+from neusee.workflows.keys.cache_key import device_kind, stream_seed
 from neusee.workflows.store.serialization import each_tensor, settle, tensors_in
 
 
@@ -54,17 +54,13 @@ def places(step: Step, devices: Sequence[str]) -> tuple[str, ...]:
     if hint == "cpu":
         return ("cpu",)
     fits = [d for d in devices if _fits(d, hint)] or list(devices)
-    return tuple(d for d in fits if not step.node.random or _kind(d) == _kind(fits[0]))
+    return tuple(d for d in fits if not step.node.random or device_kind(d) == device_kind(fits[0]))
 
 
 def _fits(device: str, hint: str) -> bool:
     if hint in ("any", ""):
         return True
-    return _kind(device) != "cpu" if hint == "gpu" else device == hint or _kind(device) == hint
-
-
-def _kind(device: str) -> str:
-    return device.partition(":")[0]
+    return device_kind(device) != "cpu" if hint == "gpu" else device == hint or device_kind(device) == hint
 
 
 def to_device(value: Any, device: str) -> Any:

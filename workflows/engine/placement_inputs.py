@@ -11,7 +11,7 @@ from neusee.workflows.engine.dispatch import MemoryProfile
 from neusee.workflows.engine.memory_use import pool_of
 from neusee.workflows.engine.node_call import places
 from neusee.workflows.engine.step_job import Executor, Lane, StepJob
-from neusee.workflows.keys.cache_key import Key
+from neusee.workflows.keys.cache_key import Key, device_kind
 from neusee.workflows.placement.heft_and_cpop import Cluster, Device, Schedule, Slot, Task, heft
 from neusee.workflows.store.result_store import Store
 from neusee.workflows.store.serialization import tensors_in
@@ -118,13 +118,9 @@ def _one_after_another(
         most = max(most, held + cost.work)
         ended = {key for key in (*work.sources, work.key) if last.get(key, work.key) == work.key and key not in keep}
         held -= sum(expected[key].bytes for key in ended if key in expected)
-        slots.append(Slot(work.step.name, lane, now, now + cost.seconds[_kind(work.device)], 1))
+        slots.append(Slot(work.step.name, lane, now, now + cost.seconds[device_kind(work.device)], 1))
         now = slots[-1].end
     return Schedule(tuple(slots), now, {lane: most}, 0.0)
-
-
-def _kind(device: str) -> str:
-    return device.partition(":")[0]
 
 
 def past_costs(store: Store) -> Costs:

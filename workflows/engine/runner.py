@@ -20,8 +20,7 @@ from neusee.workflows.placement.heft_and_cpop import Schedule
 from neusee.workflows.store.remote_store import open_store
 from neusee.workflows.store.result_store import Store
 from neusee.workflows.tolerance.cheaper_steps import with_substitutions
-from neusee.workflows.tolerance.error_propagation import ErrorBounds, ToleranceNotProven, proof
-from neusee.workflows.tolerance.tolerance_frontier import border
+from neusee.workflows.tolerance.error_propagation import ErrorBounds, ToleranceNotProven, proof, tolerance_frontier
 
 __all__ = ["Event", "Result", "StepRecord", "run"]
 
@@ -122,7 +121,7 @@ def _attempt(work: Execution, wanted: tuple[str, ...], began: float) -> Result:
     order = needed(recipe, wanted)
     with torch.no_grad():
         work.resolve(order)
-        first = border(recipe, order, wanted)
+        first = tolerance_frontier(recipe, order, wanted)
         missing, targets = work.missing(wanted) if first else set(), [work.keys[name] for name in wanted]
         if early := [work.keys[name] for name in first if work.keys[name] in missing]:
             work.make(early, keep=False, later=targets)

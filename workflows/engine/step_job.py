@@ -22,7 +22,7 @@ from neusee.workflows.engine.provenance import versions
 from neusee.workflows.engine.write_behind import LARGE, WriteBehind
 from neusee.workflows.graph.recipe_graph import Step
 from neusee.workflows.graph.run_error import RunError
-from neusee.workflows.keys.cache_key import Key, plain
+from neusee.workflows.keys.cache_key import Key, device_kind, plain
 from neusee.workflows.store.lease import Lease
 from neusee.workflows.store.metadata import INLINE
 from neusee.workflows.store.result_store import Store
@@ -93,7 +93,7 @@ class Lane:
     @property
     def kind(self) -> str:
         """Return ``cpu`` or ``cuda``, without the number."""
-        return self.device.partition(":")[0]
+        return device_kind(self.device)
 
 
 class Executor(Protocol):

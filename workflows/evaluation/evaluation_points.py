@@ -19,7 +19,7 @@ from neusee.workflows.engine.node_call import call, place
 from neusee.workflows.evaluation.evaluation_scenes import Scene
 from neusee.workflows.evaluation.pipelines import BEAM, NONE, PipelineRecipes
 from neusee.workflows.graph.recipe_graph import Recipe, Step, needed
-from neusee.workflows.keys.cache_key import digest, key_of
+from neusee.workflows.keys.cache_key import device_kind, digest, key_of
 from neusee.workflows.keys.code_digest import Code
 from neusee.workflows.keys.engine_digest import engine
 from neusee.workflows.recipe.distributions.uncertain_inputs import Inputs
@@ -103,7 +103,7 @@ class EvaluationPoints:
             for name, changed in params.items()
         }
         keys = self._keys(replace(recipe, steps={**recipe.steps, **steps}), wanted, outputs)
-        within = [recipe.tolerance, recipe.exact, self.device.partition(":")[0], self.small]
+        within = [recipe.tolerance, recipe.exact, device_kind(self.device), self.small]
         own = [self._code.digest(used.__module__) for used in (quality, resize)]
         return digest("evaluate", engine("evaluation.evaluation_points"), [keys[name] for name in outputs], within, own)
 

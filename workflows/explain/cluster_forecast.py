@@ -2,13 +2,14 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from typing import Protocol
 
 from neusee.workflows.graph.recipe_graph import Recipe, Step
 from neusee.workflows.placement.heft_and_cpop import Device, Schedule, Slot, Task, TooLarge, heft
 from neusee.workflows.placement.machine_file import Machines
-from neusee.workflows.report.run_timing import size_of
+from neusee.workflows.report.text_table import columns
+from neusee.workflows.store.byte_sizes import format_size
 
 _MOST_PARTS = 64  #: upper bound on the parts of a step cut by bands; the number of bands is known when the step runs
 _SHOWN = 24  #: steps of the critical path
@@ -40,7 +41,7 @@ def cluster_lines(recipe: Recipe, estimates: Mapping[str, Cost], machines: Machi
     except TooLarge as error:
         return [head, f"refused: {error}", *_guesses(estimates)]
     faster = f": {alone / schedule.makespan:.3g} times as long" if schedule.makespan else ""
-    sent = f"{_size(schedule.transferred)} in {_count(len(schedule.moves), 'copy', 'copies')}"
+    sent = f"{format_size(schedule.transferred)} in {_count(len(schedule.moves), 'copy', 'copies')}"
     return [
         head,
         "",
@@ -91,11 +92,10 @@ def _devices(schedule: Schedule, machines: Machines) -> list[str]:
         steps[slot.device] += 1
     rows = [["device", "busy", "steps", "memory", "of"]]
     for d in machines.devices:
-        rows.append(
-            [d.name, f"{shares[d.name]:.0%}", str(steps[d.name]), _size(schedule.peak[d.name]), _size(d.memory)]
-        )
+        held, memory = format_size(schedule.peak[d.name]), format_size(d.memory)
+        rows.append([d.name, f"{shares[d.name]:.0%}", str(steps[d.name]), held, memory])
     mean = sum(shares.values()) / len(shares)
-    return [*_columns(rows, ">"), f"the devices are busy {mean:.0%} of the time on average"]
+    return [*columns(rows, ">"), f"the devices are busy {mean:.0%} of the time on average"]
 
 
 def _path(schedule: Schedule) -> list[str]:
@@ -111,7 +111,7 @@ def _path(schedule: Schedule) -> list[str]:
     if len(path) > _SHOWN:
         half = _SHOWN // 2
         rows = [*rows[: half + 1], [f"… {len(path) - _SHOWN} more …", "", "", ""], *rows[-half:]]
-    return [*_columns(rows), f"{_count(len(path), 'step')} on it, {_time(busy)}{share}"]
+    return [*columns(rows), f"{_count(len(path), 'step')} on it, {_time(busy)}{share}"]
 
 
 def _row(slot: Slot) -> list[str]:
@@ -135,16 +135,5 @@ def _time(seconds: float) -> str:
     return f"{seconds:.3g} s" if seconds >= 1 or seconds == 0 else f"{seconds * 1e3:.3g} ms"
 
 
-def _size(count: float) -> str:
-    return size_of(count) if count < 1e12 else f"{count / 1e12:.3g} TB"
-
-
 def _count(number: int, one: str, many: str = "") -> str:
     return f"{number} {one if number == 1 else many or one + 's'}"
-
-
-def _columns(rows: Sequence[Sequence[str]], numbers: str = "<") -> list[str]:
-    """Return aligned columns, the first one to the left."""
-    widths = [max(len(row[i]) for row in rows) for i in range(len(rows[0]))]
-    form = [f"<{widths[0]}", *(f"{numbers}{wide}" for wide in widths[1:])]
-    return ["  ".join(f"{cell:{how}}" for cell, how in zip(row, form, strict=True)).rstrip() for row in rows]

@@ -13,10 +13,11 @@ from neusee.workflows.engine.placement_inputs import past_costs, prepare
 from neusee.workflows.engine.resolve_keys import resolve
 from neusee.workflows.engine.step_job import Lane, StepJob
 from neusee.workflows.graph.recipe_graph import Recipe
-from neusee.workflows.keys.cache_key import Key
+from neusee.workflows.keys.cache_key import Key, device_kind
 from neusee.workflows.placement.heft_and_cpop import Schedule, TooLarge
 from neusee.workflows.report.contents import steps_of, wanted
-from neusee.workflows.report.run_page import size_of
+from neusee.workflows.report.text_table import columns
+from neusee.workflows.store.byte_sizes import format_size
 from neusee.workflows.store.result_store import Store
 from neusee.workflows.tolerance.cheaper_steps import with_substitutions
 
@@ -72,7 +73,7 @@ def plan_lines(recipe: Recipe, store: Store, device: str = "cpu", memory: int | 
     plan = planned(recipe, store, lanes)
     rows = [_row(name, plan, store) for name in plan.order]
     head = ["step", "node", "state", "where", "seconds", "bytes", "memory", "reads"]
-    return [*_columns([head, *rows]), *_sums(plan, lanes)], bool(plan.refused)
+    return [*columns([head, *rows]), *_sums(plan, lanes)], bool(plan.refused)
 
 
 def simulated_lines(recipe: Recipe, store: Store, machines: str) -> list[str]:
@@ -94,13 +95,13 @@ def _row(name: str, plan: Plan, store: Store) -> list[str]:
     if name in plan.expected:
         cost = plan.expected[name]
         where = plan.lanes.get(name, "?")
-        seconds = cost.seconds.get(where.partition(":")[0], cost.seconds["cpu"])
+        seconds = cost.seconds.get(device_kind(where), cost.seconds["cpu"])
         if cost.known:
-            memory = size_of(int(cost.bytes + cost.work))
-            return [name, step.node.path, "run", where, f"{seconds:.3f} s", size_of(int(cost.bytes)), memory, reads]
+            memory = format_size(int(cost.bytes + cost.work))
+            return [name, step.node.path, "run", where, f"{seconds:.3f} s", format_size(int(cost.bytes)), memory, reads]
         return [name, step.node.path, "run", where, "?", "?", "?", reads]
     state = "stored" if store.has(plan.keys[name]) else "run" if name in plan.awake else "not needed"
-    known = [f"{about['seconds']:.3f} s", size_of(about["bytes"])] if about else ["", ""]
+    known = [f"{about['seconds']:.3f} s", format_size(about["bytes"])] if about else ["", ""]
     return [name, step.node.path, state, "", *known, "", reads]
 
 
@@ -113,14 +114,14 @@ def _sums(plan: Plan, lanes: Mapping[str, Lane]) -> list[str]:
         lines.append(f"left out or not, depending on the values of the inputs: {', '.join(unsure)}")
     took = f"about {plan.schedule.makespan:.3g} s" if plan.schedule else "no schedule"
     guessed = f", {guesses} of them never measured" if guesses else ""
-    read = size_of(sum(plan.loaded.values()))
+    read = format_size(sum(plan.loaded.values()))
     lines.append(
-        f"{ran} of {len(plan.order)} steps would run{guessed}: {took}, {size_of(int(new))} new, {read} to load"
+        f"{ran} of {len(plan.order)} steps would run{guessed}: {took}, {format_size(int(new))} new, {read} to load"
     )
     if plan.schedule:
         peaks = {name: plan.schedule.peak.get(name, 0.0) for name in lanes}
         lines += [
-            f"memory  {name}: {size_of(int(peak))} at most, of {size_of(int(lanes[name].memory))}"
+            f"memory  {name}: {format_size(int(peak))} at most, of {format_size(int(lanes[name].memory))}"
             for name, peak in peaks.items()
         ]
     return [*lines, *([f"refused: {plan.refused}"] if plan.refused else [])]
@@ -146,9 +147,3 @@ def _awake(recipe: Recipe, keys: Mapping[str, Key], store: Store) -> tuple[set[s
             found.add(name)
             todo += recipe.steps[name].sources
     return found, loaded
-
-
-def _columns(rows: list[list[str]]) -> list[str]:
-    """Return left-aligned columns."""
-    widths = [max(len(row[i]) for row in rows) for i in range(len(rows[0]))]
-    return ["  ".join(f"{cell:<{wide}}" for cell, wide in zip(row, widths, strict=True)).rstrip() for row in rows]

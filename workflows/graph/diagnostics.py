@@ -6,6 +6,8 @@ import difflib
 from collections.abc import Iterable
 from dataclasses import dataclass, field
 
+UNREAD = "unread"  #: code of a value to which no step refers
+
 
 @dataclass(frozen=True, slots=True, order=True)
 class Location:
@@ -27,6 +29,7 @@ class Diagnostic:
     mark: Location
     path: str
     message: str
+    code: str = field(default="", compare=False)  #: names the kind of a mistake for programs, such as `UNREAD`
 
 
 class RecipeError(ValueError):

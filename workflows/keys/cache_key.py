@@ -45,13 +45,18 @@ def key_of(
         "inputs": [_input(step.wires.get(name), keys) for name in node.inputs],
     }
     if node.random:
-        recipe["stream"] = [seed, step.name, device.partition(":")[0]]
+        recipe["stream"] = [seed, step.name, device_kind(device)]
     return digest(recipe), recipe
 
 
 def stream_seed(seed: int, step: str) -> int:
     """Return the seed of a step's random stream, which depends on the recipe's seed and the step's name only."""
     return int(digest(seed, step)[:15], 16)
+
+
+def device_kind(device: str) -> str:
+    """Return the kind of a device: ``cuda`` of ``cuda:1``."""
+    return device.partition(":")[0]
 
 
 def _input(wire: str | tuple[str, ...] | None, keys: Mapping[str, Key]) -> Any:

@@ -28,11 +28,11 @@ from typing import Any
 from neusee.workflows.graph.diagnostics import Diagnostic, Location, RecipeError, nearest
 from neusee.workflows.placement.tasks_and_devices import BUS, Cluster, Device, Link
 from neusee.workflows.recipe.text.yaml_values import Value, kind, read
+from neusee.workflows.store.byte_sizes import UNITS
 
 _KINDS = ("cpu", "cuda", "mps")
-_BYTES = {"B": 1.0, "kB": 1e3, "MB": 1e6, "GB": 1e9, "TB": 1e12, "MiB": 2.0**20, "GiB": 2.0**30, "TiB": 2.0**40}
 _SECONDS = {"s": 1.0, "ms": 1e-3, "us": 1e-6, "µs": 1e-6, "μs": 1e-6, "ns": 1e-9}
-_RATES = {f"{unit}/s": scale for unit, scale in _BYTES.items() if unit in ("MB", "GB", "TB")}
+_RATES = {f"{unit}/s": scale for unit, scale in UNITS.items() if unit in ("MB", "GB", "TB")}
 _QUANTITY = re.compile(r"((?:\d+\.?\d*|\.\d+)(?:[eE][-+]?\d+)?)\s*(.*)")
 _MOST = 4096  #: limit on the devices of one file
 _Reader = Callable[[Value, "list[Diagnostic]"], Any]
@@ -192,7 +192,7 @@ def _factor(value: Value, diagnostics: list[Diagnostic]) -> float:
 
 
 def _size(value: Value, diagnostics: list[Diagnostic]) -> float:
-    return _quantity(value, _BYTES, "80 GB", diagnostics)
+    return _quantity(value, UNITS, "80 GB", diagnostics)
 
 
 def _rate(value: Value, diagnostics: list[Diagnostic]) -> float:

@@ -18,7 +18,6 @@ from neusee.workflows.recipe.blocks.train_block import KEY as TRAINING
 from neusee.workflows.recipe.blocks.train_block import read_training
 from neusee.workflows.recipe.blocks.train_lift_block import KEY as LIFTING
 from neusee.workflows.recipe.blocks.train_lift_block import read_lift_training
-from neusee.workflows.recipe.cycle_check import cycles
 from neusee.workflows.recipe.distributions.nominal_values import Uncertain, settle
 from neusee.workflows.recipe.global_settings import expectations, outputs_of, seed_and_tolerance
 from neusee.workflows.recipe.graph_cache import cache_graph, cache_recipe, cached_graph, cached_recipe
@@ -29,7 +28,7 @@ from neusee.workflows.recipe.text.overrides import Override, arguments_in
 from neusee.workflows.recipe.text.python_overrides import overrides_of
 from neusee.workflows.recipe.text.references import References
 from neusee.workflows.recipe.text.yaml_values import Value, Where
-from neusee.workflows.recipe.wiring import Wiring
+from neusee.workflows.recipe.wiring import Wiring, cycles
 
 
 @dataclass(frozen=True, slots=True)

@@ -5,17 +5,18 @@ from __future__ import annotations
 import itertools
 import re
 import types
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Annotated, Any, Union, get_args, get_origin
 
 from neusee.nodes import Node
-from neusee.workflows.graph.diagnostics import Diagnostic, nearest
-from neusee.workflows.graph.recipe_graph import Wire
+from neusee.workflows.graph.diagnostics import Diagnostic, Location, nearest
+from neusee.workflows.graph.recipe_graph import Step, Wire
 from neusee.workflows.recipe.step_declarations import Declared
 from neusee.workflows.recipe.text.references import BROKEN, References
 from neusee.workflows.recipe.text.yaml_values import Value, kind
 
+_NAMED = 12  #: steps of a cycle that a message names
 _WIRE = re.compile(r"\s*([^\[\]\s]+)\s*(?:\[([^\[\]]*)\])?\s*")
 
 
@@ -227,3 +228,45 @@ def _kinds(hint: Any) -> list[type]:
 
 def _a(kinds: Sequence[type]) -> str:
     return "a " + " or ".join(dict.fromkeys(k.__name__ for k in kinds))
+
+
+# --- cycles -----------------------------------------------------------------------------------------------------------
+
+
+def cycles(steps: Mapping[str, Step], marks: Mapping[str, Location]) -> Iterator[Diagnostic]:
+    """Yield one diagnostic for each cycle, with the lines of its steps."""
+    seen: set[frozenset[str]] = set()
+    for loop in _loops({name: [s for s in step.sources if s in steps] for name, step in steps.items()}):
+        names = list(dict.fromkeys(name.partition("[")[0] for name in loop))
+        if frozenset(names) in seen:
+            continue
+        seen.add(frozenset(names))
+        start = min(range(len(names)), key=lambda n: marks[names[n]])
+        names = names[start:] + names[:start]
+        few = names if len(names) <= _NAMED else [*names[: _NAMED - 1], f"({len(names) - _NAMED} more)", names[-1]]
+        where = _lines_of([marks[name] for name in names[:_NAMED]])
+        yield Diagnostic(marks[names[0]], "steps", f"cycle: {' -> '.join([*few, names[0]])} ({where})")
+
+
+def _lines_of(marks: list[Location]) -> str:
+    if len({mark.file for mark in marks}) > 1:
+        return ", ".join(f"{mark.file}:{mark.line}" for mark in marks)
+    return f"line{'s' * (len(marks) > 1)} {', '.join(str(mark.line) for mark in marks)}"
+
+
+def _loops(sources: Mapping[str, list[str]]) -> Iterator[list[str]]:
+    """Yield each cycle that a walk from sink to source closes, in the direction of the data; without recursion."""
+    done: set[str] = set()
+    for root in sources:
+        path: dict[str, Iterator[str]] = {} if root in done else {root: iter(sources[root])}
+        while path:
+            name = next(reversed(path))
+            source = next(path[name], None)
+            if source is None:
+                done.add(name)
+                path.popitem()
+            elif source in path:
+                names = list(path)
+                yield names[names.index(source) :][::-1]
+            elif source not in done:
+                path[source] = iter(sources[source])

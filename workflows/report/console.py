@@ -1,30 +1,35 @@
-"""What a run prints: a live table on a terminal, plain lines elsewhere, then the numbers.
+"""The lines of a run on the screen: a live table on a terminal, plain lines elsewhere, then the numbers.
 
-Items of one step, such as ``spot[mask,green]`` and its like, share a line, and steps that
-nothing needed are one line together.
+Items of one step, such as ``spot[mask,green]``, share a line. Steps that were not needed share one line too.
 """
 
 from __future__ import annotations
 
 import sys
-from collections.abc import Iterable, Mapping, Sequence
+from abc import ABC, abstractmethod
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, Literal, Self
 
 from neusee.workflows.graph.step_record import Event, StepRecord
 from neusee.workflows.report.run_page import shape_of, unit_of
+from neusee.workflows.report.text_table import columns, indented
 from neusee.workflows.report.tolerance_spent import said_of_economies
 
 if TYPE_CHECKING:
     from neusee.workflows.graph.recipe_graph import Recipe
 
+Mode = Literal["silent", "plain", "live"]
+_STYLES = {"run": "bold", "cached": "cyan", "left out": "dim", "failed": "red"}  #: by state
+
+
 HEADER = ("step", "where", "state", "seconds", "output", "check")
-_WIDTHS = (0, 5, 10, 9, 28, 0)
+_WIDTHS = (5, 10, 9, 28, 0)  #: of the columns after the first
 
 
 @dataclass
 class Family:
-    """The items of one step: how many there are, and those that are done."""
+    """The items of one step, and the records of those that are done."""
 
     name: str
     members: list[str]
@@ -34,25 +39,25 @@ class Family:
 
     @property
     def awake(self) -> list[StepRecord]:
-        """The done ones that were looked at."""
+        """Return the records of the items that were needed."""
         return [d for d in self.done if d.state != "not needed"]
 
     def cells(self) -> tuple[str, ...]:
-        """The row of this family, by `HEADER`."""
+        """Return the row of these items, by `HEADER`."""
         done, many = self.awake, len(self.members) > 1
         name = f"{self.name} ×{len(self.members)}" if many else self.members[0]
         if not done:
             return (name, "", "…" if self.begun else "", "", "", "")
         ran = sum(d.seconds for d in done if d.state == "run")
         last = max(done, key=lambda d: (d.facts is not None, self.members.index(d.step)))
-        told = next((d for d in done if any(not c.ok for c in d.checks)), last)
+        shown = next((d for d in done if any(not c.ok for c in d.checks)), last)
         shape = shape_of(last)
-        check = "; ".join(("" if c.ok else "LOOK: ") + c.text for c in told.checks)
+        check = "; ".join(("" if c.ok else "LOOK: ") + c.text for c in shown.checks)
         why = next((d.why for d in done if d.state in ("run", "left out") and d.why), "")
         check = f"{check}  ({why})" if check and why else check or why
         return (
             name,
-            told.device,
+            shown.device,
             self.state(),
             f"{ran:.3f}" if ran else "",
             f"{shape} {self.unit}".strip() if shape else "",
@@ -60,96 +65,112 @@ class Family:
         )
 
     def state(self) -> str:
-        """``run``, ``cached``, ``left out``, or how many of each."""
+        """Return ``run``, ``cached`` or ``left out``, or the number of each."""
         states = [d.state for d in self.awake]
         if len(set(states)) == 1:
             return states[0]
         return ", ".join(f"{states.count(s)} {s}" for s in dict.fromkeys(states))
 
 
-class Plain:
-    """One line a step, printed when its last item is done."""
+def mode_for(silent: bool) -> Mode:
+    """Return how a table is shown: live only where the output goes to a terminal."""
+    return "silent" if silent else "live" if sys.stdout.isatty() else "plain"
 
-    def __init__(self, recipe: Recipe, names: Iterable[str]) -> None:
-        self.families = families(recipe, names)
-        self.wide = max((len(f.cells()[0]) for f in self.families.values()), default=0)
 
-    def __enter__(self) -> Plain:
-        print(_line(HEADER, self.wide))
+class ProgressTable(ABC):
+    """A table on the screen for as long as its ``with`` block lasts."""
+
+    header: Sequence[str]
+    widths: Sequence[int]  #: least widths of the columns of plain lines
+    numbers: Sequence[str] = ()  #: columns that are aligned right
+
+    def __init__(self, mode: Mode) -> None:
+        self.mode = mode
+
+    @abstractmethod
+    def live_rows(self) -> Iterable[tuple[Sequence[str], str]]:
+        """Return the rows of a live table, each with its state."""
+
+    @abstractmethod
+    def caption(self) -> str:
+        """Return the line below a live table."""
+
+    def __enter__(self) -> Self:
+        if self.mode == "live":
+            from rich.live import Live
+
+            self._live = Live(self, refresh_per_second=8, vertical_overflow="visible")
+            self._live.start()
+        self.show_row(self.header)
         return self
 
     def __exit__(self, *error: object) -> None:
-        asleep = sum(d.state == "not needed" for f in self.families.values() for d in f.done)
-        if asleep:
-            print(f"  {asleep} steps were not looked at: what needs them is in the cache")
+        if self.mode == "live":
+            self._live.stop()
 
-    def watch(self, event: Event) -> None:
-        """Take one event of the engine."""
-        family = note(self.families, event)
-        if event.done is not None and family.awake and len(family.done) == len(family.members):
-            print(_line(family.cells(), self.wide))
+    def show_row(self, cells: Sequence[str]) -> None:
+        """Print a row that will not change; a live table shows its rows by itself."""
+        if self.mode != "plain":
+            return
+        columns = zip(self.header, cells, self.widths, strict=True)
+        padded = [f"{cell:{'>' if name in self.numbers else '<'}{width}}" for name, cell, width in columns]
+        print("  " + "  ".join(padded).rstrip(), flush=True)
 
-
-class Live:
-    """A table that fills as the steps are done."""
-
-    def __init__(self, recipe: Recipe, names: Iterable[str]) -> None:
-        from rich.live import Live as RichLive
-
-        self.families = families(recipe, names)
-        self.live = RichLive(self, refresh_per_second=8, vertical_overflow="visible")
+    def show_error(self, plain: Iterable[str], live: str) -> None:
+        """Print what went wrong: lines below the last plain row, or a text above a live table."""
+        if self.mode == "plain":
+            print(*plain, sep="\n", flush=True)
+        elif self.mode == "live":
+            self._live.console.print(live, style="red", markup=False, highlight=False)
 
     def __rich__(self) -> Any:
         from rich import box
         from rich.table import Table
 
-        rows = [f for f in self.families.values() if f.begun or f.awake]
-        table = Table(box=box.SIMPLE_HEAD, pad_edge=False, header_style="bold")
-        for name in HEADER:
-            table.add_column(name, justify="right" if name == "seconds" else "left", overflow="fold")
-        for family in rows:
-            cells = family.cells()
-            style = {"run": "bold", "cached": "cyan", "left out": "dim"}.get(cells[2], "")
-            table.add_row(*cells, style="red" if "LOOK" in cells[5] else style)
-        asleep = sum(d.state == "not needed" for f in self.families.values() for d in f.done)
-        if asleep:
-            table.caption = f"{asleep} steps were not looked at: what needs them is in the cache"
+        table = Table(box=box.SIMPLE_HEAD, pad_edge=False, header_style="bold", caption=self.caption() or None)
+        for name in self.header:
+            table.add_column(name, justify="right" if name in self.numbers else "left", overflow="fold")
+        for cells, state in self.live_rows():
+            table.add_row(*cells, style=_STYLES.get(state, ""))
         return table
 
-    def __enter__(self) -> Live:
-        self.live.start()
-        return self
+
+class RunTable(ProgressTable):
+    """The steps of a run: as plain lines, a step is printed when its last item is done."""
+
+    header, numbers = HEADER, ("seconds",)
+
+    def __init__(self, recipe: Recipe, names: Iterable[str], mode: Mode) -> None:
+        super().__init__(mode)
+        self.families = families(recipe, names)
+        self.widths = (max((len(f.cells()[0]) for f in self.families.values()), default=0), *_WIDTHS)
 
     def __exit__(self, *error: object) -> None:
-        self.live.stop()
+        super().__exit__(*error)
+        if self.mode == "plain" and self.caption():
+            print(f"  {self.caption()}")
 
     def watch(self, event: Event) -> None:
         """Take one event of the engine."""
-        note(self.families, event)
+        family = note(self.families, event)
+        if event.done is not None and family.awake and len(family.done) == len(family.members):
+            self.show_row(family.cells())
 
+    def live_rows(self) -> Iterator[tuple[tuple[str, ...], str]]:
+        """Return the steps that have begun."""
+        for family in self.families.values():
+            if family.begun or family.awake:
+                cells = family.cells()
+                yield cells, "failed" if "LOOK" in cells[5] else cells[2]
 
-class Silent:
-    """Nothing at all: for ``--json`` and ``--quiet``."""
-
-    def __enter__(self) -> Silent:
-        return self
-
-    def __exit__(self, *error: object) -> None:
-        return None
-
-    def watch(self, event: Event) -> None:
-        """Take one event of the engine."""
-
-
-def screen(recipe: Recipe, names: Iterable[str], silent: bool) -> Plain | Live | Silent:
-    """The display that fits where the output goes."""
-    if silent:
-        return Silent()
-    return Live(recipe, names) if sys.stdout.isatty() else Plain(recipe, names)
+    def caption(self) -> str:
+        """Return how many steps were not needed."""
+        asleep = sum(d.state == "not needed" for f in self.families.values() for d in f.done)
+        return f"{asleep} steps were not needed: the results that need them are in the cache" if asleep else ""
 
 
 def families(recipe: Recipe, names: Iterable[str]) -> dict[str, Family]:
-    """Steps by the name before their bracket, in running order."""
+    """Group steps by the name before the bracket, in running order."""
     found: dict[str, Family] = {}
     for name in names:
         short = name.partition("[")[0]
@@ -159,7 +180,7 @@ def families(recipe: Recipe, names: Iterable[str]) -> dict[str, Family]:
 
 
 def note(families: dict[str, Family], event: Event) -> Family:
-    """Write an event down in its family; a run that leaves out less the second time has steps again, and others."""
+    """Add an event to the items of its step; a second attempt of a run repeats steps, and adds others."""
     short = event.step.partition("[")[0]
     family = families.setdefault(short, Family(short, [], ""))
     if event.step not in family.members:
@@ -172,7 +193,7 @@ def note(families: dict[str, Family], event: Event) -> Family:
 
 
 def opening(recipe: Recipe, command: str) -> list[str]:
-    """The lines before anything runs: what was checked, and what there is to say of it."""
+    """Return the lines before anything runs: what was checked, and notes."""
     values = sum(len(step.params) for step in recipe.steps.values())
     nodes = len({step.node.path for step in recipe.steps.values()})
     lines = [f"neusee {command}: {recipe.title or recipe.name}"]
@@ -182,11 +203,11 @@ def opening(recipe: Recipe, command: str) -> list[str]:
 
 
 def closing(doc: Mapping[str, Any], path: str, again: Sequence[str]) -> list[str]:
-    """The lines after everything ran: what was left out, the table, the verdict, where the page is, what to try."""
+    """Return the lines after the run: what was left out, the table, the verdict, the page, and commands to try."""
     lines = [said_of_economies(doc["spent"])] if doc["spent"]["economies"] else []
-    lines += [said_of_left_out(doc)] if doc["left_out"] else []
+    lines += [left_out_line(doc)] if doc["left_out"] else []
     rows = [[row["name"], *row["cells"]] for row in doc["table"]["rows"]]
-    lines += ["", *aligned([["", *doc["table"]["columns"]], *rows])] if rows else []
+    lines += ["", *indented([["", *doc["table"]["columns"]], *rows])] if rows else []
     lines += [f"  {line}" for line in doc["table"]["legend"]]
     lines += ["", f"{doc['verdict']}  ({doc['counts']}, {doc['seconds']:.2f} s)"]
     for e in doc["expected"]:
@@ -197,8 +218,8 @@ def closing(doc: Mapping[str, Any], path: str, again: Sequence[str]) -> list[str
     return [*lines, f"report   {path}", "", "next", *[f"  {line}" for line in again]]
 
 
-def said_of_left_out(doc: Mapping[str, Any]) -> str:
-    """One line that names what was left out and what that may change."""
+def left_out_line(doc: Mapping[str, Any]) -> str:
+    """Return one line that names the steps that were left out, and the bounds of their effect."""
     named: dict[str, float] = {}
     for row in doc["left_out"]:
         short = row["step"].partition("[")[0]
@@ -208,7 +229,7 @@ def said_of_left_out(doc: Mapping[str, Any]) -> str:
 
 
 def next_commands(recipe: Recipe) -> list[str]:
-    """Three commands that work on this recipe."""
+    """Return three commands that work on this recipe."""
     has, name = recipe.config.settings, recipe.name
     tries = [
         (f'neusee run {name} sensor.read_noise="20 e-"', "only what follows is run", "sensor.read_noise" in has),
@@ -218,26 +239,4 @@ def next_commands(recipe: Recipe) -> list[str]:
         ("neusee recipes", "what else there is", True),
     ]
     shown = [(command, why) for command, why, fits in tries if fits][:3]
-    wide = max(len(command) for command, _ in shown)
-    return [f"{command:<{wide}}   # {why}" for command, why in shown]
-
-
-def aligned(rows: Sequence[Sequence[str]], right: bool = True) -> list[str]:
-    """Rows as lines of equal columns; the first column is text, the others numbers."""
-    widths = [max(len(row[i]) for row in rows) for i in range(len(rows[0]))]
-    lines = []
-    for row in rows:
-        cells = [
-            f"{(c or '–') if i and right else c:{'>' if i and right else '<'}{widths[i]}}" for i, c in enumerate(row)
-        ]
-        lines.append("  " + "   ".join(cells).rstrip())
-    return lines
-
-
-def _line(cells: Sequence[str], wide: int) -> str:
-    """One plain line; the columns keep their places while the cells fit."""
-    widths = (wide, *_WIDTHS[1:])
-    padded = [
-        f"{c:>{w}}" if name == "seconds" else f"{c:<{w}}" for c, w, name in zip(cells, widths, HEADER, strict=True)
-    ]
-    return "  " + "  ".join(padded).rstrip()
+    return columns([[command, f"# {why}"] for command, why in shown], gap="   ")

@@ -31,8 +31,8 @@ from neusee.workflows.recipe.paper_readings import in_force
 from neusee.workflows.report.contents import FIGURES
 from neusee.workflows.report.result_numbers import expected, metrics, table
 from neusee.workflows.report.run_timing import said_of, timing
-from neusee.workflows.report.run_timing import size_of as size_of
 from neusee.workflows.report.tolerance_spent import spent
+from neusee.workflows.store.byte_sizes import format_size
 
 _TEMPLATE = Path(__file__).parent / "templates" / "run_page.html.j2"
 _LIBRARIES = ("torch", "numpy", "kornia", "colour-science", "OpenEXR", "pydantic", "safetensors")
@@ -145,7 +145,7 @@ def _step(done: StepRecord, result: Result) -> dict[str, Any]:
         "made_in": about["seconds"] if about else done.seconds,
         "shape": shape_of(done),
         "unit": unit_of(node.__doc__ or ""),
-        "size": size_of(done.bytes) if done.bytes else "",
+        "size": format_size(done.bytes) if done.bytes else "",
         "bytes": done.bytes,
         "key": done.key,
         "bound": done.bound if done.bound is None or math.isfinite(done.bound) else None,
@@ -222,7 +222,7 @@ def _facts(result: Result) -> list[list[str]]:
         ["recipe seed", str(result.recipe.seed)],
         ["tolerance", f"{result.recipe.tolerance:g}"],
         ["engine", f"{result.seconds:.3f} s"],
-        ["peak memory", size_of(result.peak_memory)],
+        ["peak memory", format_size(result.peak_memory)],
     ]
     return [[name, value] for name, value in rows if value]
 

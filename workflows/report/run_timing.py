@@ -5,10 +5,12 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from typing import Any
 
-Row = Mapping[str, Any]  #: a step as the report says it
+from neusee.workflows.store.byte_sizes import format_size
+
+StepRow = Mapping[str, Any]  #: a step as the report says it
 
 
-def timing(steps: Sequence[Row], planned: float | None = None) -> dict[str, Any]:
+def timing(steps: Sequence[StepRow], planned: float | None = None) -> dict[str, Any]:
     """Return predicted and actual seconds, the seconds that the cache saved, and the bytes read and written.
 
     A key that several steps share counts once. ``planned`` is the planned duration of the run in s, or None.
@@ -36,9 +38,9 @@ def timing(steps: Sequence[Row], planned: float | None = None) -> dict[str, Any]
     }
 
 
-def _once(steps: Any) -> list[Row]:
+def _once(steps: Any) -> list[StepRow]:
     """Return one step for each key: the step that was read from the cache, or else the first step with this key."""
-    found: dict[str, Row] = {}
+    found: dict[str, StepRow] = {}
     for step in steps:
         if step["key"] not in found or step["state"] == "cached":
             found[step["key"]] = step
@@ -60,18 +62,9 @@ def said_of(found: Mapping[str, Any]) -> list[str]:
     if found["served"]:
         share = f"{100 * found['share']:.3g} % of all computing time"
         lines.append(f"The cache served {found['served']} steps and saved {_seconds(found['saved'])}, {share}.")
-    lines.append(f"Read from the cache: {size_of(found['read'])}; written to it: {size_of(found['written'])}.")
+    lines.append(f"Read from the cache: {format_size(found['read'])}; written to it: {format_size(found['written'])}.")
     return lines
 
 
 def _seconds(value: float) -> str:
     return f"{value:.3g} s" if value < 100 else f"{value:.0f} s"
-
-
-def size_of(count: float) -> str:
-    """Bytes as people read them."""
-    for unit in ("B", "kB", "MB", "GB"):
-        if count < 1000 or unit == "GB":
-            return f"{count:.3g} {unit}"
-        count /= 1000
-    raise AssertionError

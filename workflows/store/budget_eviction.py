@@ -9,7 +9,6 @@ from __future__ import annotations
 
 import errno
 import os
-import re
 from collections import Counter
 from collections.abc import Callable, Collection, Iterable, Iterator
 from contextlib import suppress
@@ -21,10 +20,8 @@ from neusee.workflows.store.shared_folder import Disk
 
 LOW = 0.9  #: fraction of the budget that remains after an eviction
 _HALF = 7 * 86400.0  #: s in which the weight of an unused value halves
-_UNITS = {"": 1, "k": 10**3, "m": 10**6, "g": 10**9, "t": 10**12}
 _NONE = (0, 0.0)
 _FULL = (errno.ENOSPC, errno.EDQUOT, errno.EFBIG)
-_SIZE = re.compile(r"\s*(\d+(?:\.\d+)?)\s*([kmgt]?)(i?)b?\s*", re.IGNORECASE)
 
 
 @dataclass(frozen=True, slots=True)
@@ -35,17 +32,6 @@ class Candidate:
     size: int  #: bytes that the eviction frees
     seconds: float  #: s for computing the value, less the s for loading it
     used: float  #: time of the last use, s
-
-
-def bytes_of(text: str) -> int:
-    """Return the bytes that ``text`` such as ``20 GB`` or ``1.5 TiB`` states; raise `ValueError` for another text."""
-    found = _SIZE.fullmatch(text)
-    if not found or (found[3] and not found[2]):
-        raise ValueError(f"{text!r} is not a size: write a number of bytes, such as 20 GB")
-    unit = _UNITS[found[2].lower()]
-    if found[3]:
-        unit = 1024 ** list(_UNITS).index(found[2].lower())
-    return int(float(found[1]) * unit)
 
 
 def chosen(candidates: Iterable[Candidate], excess: float) -> list[Candidate]:

@@ -6,7 +6,7 @@ import os
 from pathlib import Path
 from typing import Literal, cast, get_args
 
-from neusee.workflows.store.budget_eviction import bytes_of
+from neusee.workflows.store.byte_sizes import parse_size
 
 Verify = Literal["always", "sampled", "never"]
 
@@ -43,6 +43,6 @@ def budget_bytes(wanted: int | None) -> int | None:
     if wanted is not None or not named:
         return wanted
     try:
-        return bytes_of(named)
+        return parse_size(named)
     except ValueError as error:
         raise ValueError(f"NEUSEE_CACHE_BUDGET: {error}") from None

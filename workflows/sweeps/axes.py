@@ -1,4 +1,4 @@
-"""The points of a sweep, in Hydra's manner: ``a=1,2,3`` and ``b='range(0, 10, 2)'``, their product or their pairs."""
+"""The axes of a sweep, written as in Hydra: ``a=1,2,3`` and ``b='range(0, 10, 2)'``, and their points."""
 
 from __future__ import annotations
 
@@ -21,14 +21,14 @@ from neusee.workflows.sweeps.value_ranges import MOST, spans, values_of
 class Coordinate:
     """One value of an axis."""
 
-    shown: str  #: as one would write it
+    shown: str  #: as a user writes it
     value: Any  #: as YAML reads it
     overrides: tuple[Override, ...]
 
 
 @dataclass(frozen=True, slots=True)
 class Axis:
-    """A parameter, or a group, with the values that it takes."""
+    """A parameter, or a group, with its values."""
 
     name: str
     coordinates: tuple[Coordinate, ...]
@@ -50,12 +50,12 @@ class Point:
 
     @property
     def shown(self) -> str:
-        """``sensor.read_noise=5 e-, doe=axicon``."""
+        """Return the point as text: ``sensor.read_noise=5 e-, doe=axicon``."""
         return ", ".join(f"{name}={c.shown}" for name, c in zip(self.axes, self.coordinates, strict=True))
 
 
 def read_words(words: Sequence[str | Override], folder: Path, first: int = 1) -> list[Argument]:
-    """Arguments of the command line, counted from ``first``; a `RecipeError` has everything that is wrong with them."""
+    """Read arguments of the command line, counted from ``first``; raise `RecipeError` with every mistake in them."""
     found: list[Argument] = []
     diagnostics: list[Diagnostic] = []
     for number, word in enumerate(words, first):
@@ -69,7 +69,7 @@ def read_words(words: Sequence[str | Override], folder: Path, first: int = 1) ->
 
 
 def read_axes(axes: Mapping[str, str | Iterable[Any]], folder: Path) -> list[Argument]:
-    """Axes as Python values: a list of values, or a text as the command line would have it."""
+    """Read axes from Python values: a list of values, or a text as on the command line."""
     found: list[Argument] = []
     diagnostics: list[Diagnostic] = []
     for name, values in axes.items():
@@ -84,7 +84,7 @@ def read_axes(axes: Mapping[str, str | Iterable[Any]], folder: Path) -> list[Arg
 
 
 def points(arguments: Sequence[Argument], paired: bool = False) -> list[Point]:
-    """Every combination of the axes' values, the last axis fastest; or, ``paired``, the first with the first, …"""
+    """Return every combination of values, the last axis fastest; ``paired``: the first values, the second values, …"""
     axes = [argument for argument in arguments if isinstance(argument, Axis)]
     diagnostics = list(_wrong(axes, paired))
     if diagnostics:
@@ -161,7 +161,7 @@ def _axis(name: str, values: Sequence[str], mark: Location) -> Axis:
 
 
 def _wrong(axes: Sequence[Axis], paired: bool) -> Iterable[Diagnostic]:
-    """What is wrong with the axes together."""
+    """Return the mistakes of all axes together."""
     if not axes:
         yield Diagnostic(Location("sweep"), "", "no axis: write a=1,2,3 or a='linspace(450 nm, 650 nm, 5)'")
     first: dict[str, Axis] = {}
@@ -170,11 +170,11 @@ def _wrong(axes: Sequence[Axis], paired: bool) -> Iterable[Diagnostic]:
             yield Diagnostic(axis.mark, axis.name, f"is an axis already ({first[axis.name].mark})")
         twice = [value for value, count in Counter(c.shown for c in axis.coordinates).items() if count > 1]
         if twice:
-            yield Diagnostic(axis.mark, axis.name, f"{twice[0]} stands twice")
+            yield Diagnostic(axis.mark, axis.name, f"{twice[0]} appears twice")
         there, here = len(axes[0].coordinates), len(axis.coordinates)
         if paired and there != here:
-            told = f"has {here} values, and {axes[0].name} ({axes[0].mark}) has {there}"
-            yield Diagnostic(axis.mark, axis.name, f"{told}: paired axes have equally many")
+            text = f"has {here} values, and {axes[0].name} ({axes[0].mark}) has {there}"
+            yield Diagnostic(axis.mark, axis.name, f"{text}: paired axes have equally many values")
     count = 1 if paired else math.prod(len(axis.coordinates) for axis in axes)
     if count > MOST:
         yield Diagnostic(Location("sweep"), "", f"{count} points: at most {MOST}")

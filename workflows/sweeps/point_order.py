@@ -1,8 +1,8 @@
-"""In which order the points of a sweep run, how much they share, and how much work each has left.
+"""The order in which the points of a sweep run, the results that they share, and the work that each has left.
 
-What two points have in common is a step with the same key. Points that share much stand
-beside each other, so that what is costly is made once, used at once and let go: an axis that
-reaches costly steps varies slowly, and from one point to the next only one axis changes.
+Two points share a step if its key is the same. Points that share much run one after another, so that a costly result
+is made once, used at once and dropped: an axis that reaches costly steps varies slowly, and from one point to the next
+only one axis changes.
 """
 
 from __future__ import annotations
@@ -17,18 +17,18 @@ from neusee.workflows.keys.cache_key import Key
 
 
 @dataclass(frozen=True, slots=True)
-class Job:
-    """What one point asks of the engine."""
+class PointJob:
+    """The steps that one point needs."""
 
     place: tuple[int, ...]  #: index along every axis
-    keys: Mapping[str, Key]  #: of every step that its outputs need
+    keys: Mapping[str, Key]  #: of every step that the outputs need
     sources: Mapping[str, tuple[str, ...]]  #: by step, the steps that feed it
     outputs: tuple[str, ...]
 
 
 @dataclass(frozen=True, slots=True)
 class Sharing:
-    """How much the points of a sweep have in common."""
+    """The results that the points of a sweep share."""
 
     points: int
     distinct: Mapping[str, int]  #: different results by step
@@ -39,27 +39,26 @@ class Sharing:
 
     @property
     def saved(self) -> float:
-        """Share of the work that need not be done, in [0, 1]."""
+        """Return the share of the work that sharing saves, in [0, 1]."""
         return 1 - self.together / self.alone if self.alone else 0.0
 
 
 def filled(costs: Mapping[str, float], steps: Iterable[str]) -> dict[str, float]:
-    """A cost for every step: what is known, else the median of what is known, else 1."""
+    """Return a cost for every step: its known cost, else the median of known costs, else 1."""
     steps = list(steps)
     known = [costs[step] for step in steps if step in costs]
     usual = median(known) if known else 1.0
     return {step: costs.get(step, usual) for step in steps}
 
 
-def best_order(jobs: Sequence[Job], costs: Mapping[str, float], paired: bool = False) -> list[int]:
-    """Indices of ``jobs`` so that expensive shared steps run once although little is held.
+def best_order(jobs: Sequence[PointJob], costs: Mapping[str, float], paired: bool = False) -> list[int]:
+    """Return an order of ``jobs``, as indices, in which costly shared steps run once although little is held.
 
-    Args: jobs: one a point, in the order of the product of the axes, the last fastest.
-    costs: seconds by step, or nothing. paired: the axes run together, as one.
+    Args: jobs: one for each point, in the order of the product of the axes, the last axis fastest.
+    costs: seconds by step, or nothing. paired: the axes vary together, as one axis.
 
-    For a product whose axes each reach a fixed set of steps, no order changes less work from
-    point to point: every change costs at least its cheapest axis, and a cheaper axis is used
-    as often as a path through the points can use it.
+    For a product whose axes each reach a fixed set of steps, no order changes less work from point to point: every
+    change costs at least its cheapest axis, and a cheaper axis is used as often as a path through the points can.
     """
     weights = filled(costs, {step for job in jobs for step in job.keys})
     if paired:
@@ -71,8 +70,8 @@ def best_order(jobs: Sequence[Job], costs: Mapping[str, float], paired: bool = F
     return [index[place] for place in _there_and_back(sizes, slowest_first)]
 
 
-def sharing(jobs: Sequence[Job], costs: Mapping[str, float]) -> Sharing:
-    """How many different results there are of every step, and what that saves."""
+def sharing(jobs: Sequence[PointJob], costs: Mapping[str, float]) -> Sharing:
+    """Count the different results of every step, and the work that sharing saves."""
     weights = filled(costs, {step for job in jobs for step in job.keys})
     found: dict[str, set[Key]] = defaultdict(set)
     cost: dict[Key, float] = {}
@@ -87,8 +86,8 @@ def sharing(jobs: Sequence[Job], costs: Mapping[str, float]) -> Sharing:
     return Sharing(len(jobs), distinct, steps, len(cost), alone, sum(cost.values()))
 
 
-def work_left(jobs: Iterable[Job], costs: Mapping[str, float], stored: Callable[[Key], bool]) -> list[float]:
-    """Work of each job in turn, when what is stored, or made by a job before, is not made again."""
+def work_left(jobs: Iterable[PointJob], costs: Mapping[str, float], stored: Callable[[Key], bool]) -> list[float]:
+    """Return the work of each job in turn; a result that is stored, or made by an earlier job, costs nothing."""
     made: set[Key] = set()
     found = []
 
@@ -106,9 +105,9 @@ def work_left(jobs: Iterable[Job], costs: Mapping[str, float], stored: Callable[
 
 
 class _Missing(dict[str, tuple[str, ...]]):
-    """By step the steps that it asks for: its sources where it is missing, none where it is known."""
+    """The steps that each step asks for: its sources where its result is missing, none where the result is known."""
 
-    def __init__(self, job: Job, known: Callable[[Key], bool]) -> None:
+    def __init__(self, job: PointJob, known: Callable[[Key], bool]) -> None:
         self.job, self.known, self.names = job, known, set[str]()
 
     def __missing__(self, name: str) -> tuple[str, ...]:
@@ -119,8 +118,8 @@ class _Missing(dict[str, tuple[str, ...]]):
         return self[name]
 
 
-def _reach(jobs: Sequence[Job], weights: Mapping[str, float], sizes: Sequence[int], axis: int) -> float:
-    """Mean work that one move along an axis makes anew."""
+def _reach(jobs: Sequence[PointJob], weights: Mapping[str, float], sizes: Sequence[int], axis: int) -> float:
+    """Return the mean work of one move along an axis."""
     stride = 1
     for size in sizes[axis + 1 :]:
         stride *= size
@@ -134,7 +133,7 @@ def _reach(jobs: Sequence[Job], weights: Mapping[str, float], sizes: Sequence[in
 
 
 def _there_and_back(sizes: Sequence[int], slowest_first: Sequence[int]) -> list[tuple[int, ...]]:
-    """Every place, each differing from the one before along one axis by one."""
+    """Return every place, each one step along one axis away from the place before."""
     rows: list[list[int]] = [[0] * len(sizes)]
     for axis in slowest_first:
         grown = []
@@ -145,8 +144,8 @@ def _there_and_back(sizes: Sequence[int], slowest_first: Sequence[int]) -> list[
     return [tuple(row) for row in rows]
 
 
-def _grouped(jobs: Sequence[Job], weights: Mapping[str, float]) -> list[int]:
-    """Points with the same costly results beside each other, else in their own order."""
+def _grouped(jobs: Sequence[PointJob], weights: Mapping[str, float]) -> list[int]:
+    """Order points so that equal costly results come one after another, and otherwise as given."""
     first: dict[str, dict[Key, int]] = defaultdict(dict)
     for i, job in enumerate(jobs):
         for step, key in job.keys.items():

@@ -1,4 +1,4 @@
-"""What a sweep leaves behind: one tidy table, how to run it again, and a data set with named dimensions."""
+"""The files of a sweep: a tidy table, an account with the command, and a data set with named dimensions."""
 
 from __future__ import annotations
 
@@ -8,40 +8,42 @@ from typing import TYPE_CHECKING, Any
 
 from neusee.workflows.graph.diagnostics import Diagnostic, Location, RecipeError
 from neusee.workflows.graph.final_values import flow
-from neusee.workflows.sweeps.sweep_table import Column, header, rows_of
+from neusee.workflows.sweeps.sweep_table import AxisColumn, header, rows_of
 
 if TYPE_CHECKING:
     from neusee.workflows.report.run_folder import RunFolder
-    from neusee.workflows.sweeps.sweep_points import Outcome
+    from neusee.workflows.sweeps.sweep_points import PointOutcome
 
 _PACKAGES = ("xarray", "h5netcdf", "h5py")
 
 
 def require_xarray(asked_by: str) -> None:
-    """Refuse at once what could only fail after everything has run."""
+    """Raise `RecipeError` before anything runs where xarray or its writers are not installed."""
     missing = [name for name in _PACKAGES if importlib.util.find_spec(name) is None]
     if missing:
-        told = f'needs {" and ".join(missing)}: pip install "neusee[xarray]"'
-        raise RecipeError([Diagnostic(Location(asked_by), "", told)])
+        text = f'needs {" and ".join(missing)}: pip install "neusee[xarray]"'
+        raise RecipeError([Diagnostic(Location(asked_by), "", text)])
 
 
-def write_table(folder: RunFolder, outcomes: Sequence[Outcome], columns: Sequence[Column]) -> None:
-    """``sweep.csv``: one row for each number of each point, in the order of the points."""
+def write_table(folder: RunFolder, outcomes: Sequence[PointOutcome], columns: Sequence[AxisColumn]) -> None:
+    """Write ``sweep.csv``: one row for each number of each point, in the order of the points."""
     rows = (row for outcome in outcomes for row in rows_of(outcome, columns))
     folder.write_rows("sweep.csv", header(columns), rows)
 
 
 def write_account(folder: RunFolder, title: str, account: Mapping[str, Any]) -> None:
-    """``sweep.yaml``: recipe, axes, order, versions and how to run it again."""
+    """Write ``sweep.yaml``: recipe, axes, order, versions and the command."""
     lines = [f"# {title}", *(f"{key}: {flow(value)}" for key, value in account.items())]
     folder.write("sweep.yaml", "\n".join(lines) + "\n")
 
 
-def dataset(outcomes: Sequence[Outcome], columns: Sequence[Column], paired: bool, about: Mapping[str, str]) -> Any:
-    """An `xarray.Dataset` whose dimensions are the axes, or ``point`` where they are paired; coordinates in SI.
+def dataset(
+    outcomes: Sequence[PointOutcome], columns: Sequence[AxisColumn], paired: bool, about: Mapping[str, str]
+) -> Any:
+    """Return an `xarray.Dataset` whose dimensions are the axes, or ``point`` for paired axes; coordinates are in SI.
 
-    A result of several numbers has a dimension of its own, ``<result> index``. What failed, or
-    has not run, is nan; ``ran`` says where there are numbers.
+    A result of several numbers has a dimension of its own, ``<result> index``. A point that failed, or did not run,
+    is NaN; ``ran`` is true where there are numbers.
     """
     import numpy
     import xarray
@@ -67,8 +69,8 @@ def dataset(outcomes: Sequence[Outcome], columns: Sequence[Column], paired: bool
     return xarray.Dataset({**found, **own}, coords, dict(about))
 
 
-def _lengths(outcomes: Sequence[Outcome], taken: Collection[str]) -> dict[str, int]:
-    """The largest number of values of every result that has several."""
+def _lengths(outcomes: Sequence[PointOutcome], taken: Collection[str]) -> dict[str, int]:
+    """Return the largest number of values of every result that has several."""
     long: dict[str, int] = {}
     for outcome in outcomes:
         for step, part, index, _ in outcome.numbers:
@@ -79,6 +81,6 @@ def _lengths(outcomes: Sequence[Outcome], taken: Collection[str]) -> dict[str, i
 
 
 def _variable(step: str, part: str, taken: Collection[str]) -> str:
-    """Name of a result, apart from the coordinates'."""
+    """Return the name of a result, distinct from those of the coordinates."""
     name = f"{step}.{part}".rstrip(".").replace("/", "_")
     return f"{name} (result)" if name in taken else name

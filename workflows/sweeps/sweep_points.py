@@ -1,7 +1,7 @@
-"""The points of a sweep, checked and then run one after another on one store.
+"""The points of a sweep: checked, and then run one after another on one store.
 
-Every point is composed and checked before the first one runs. A point keeps its composed values,
-which share almost everything with the other points; its steps are bound again when it runs.
+Every point is composed and checked before the first point runs. A point keeps its composed values, which it shares
+almost entirely with the other points; its steps are bound again when it runs.
 """
 
 from __future__ import annotations
@@ -27,55 +27,55 @@ from neusee.workflows.recipe.text.composition import Composed, compose
 from neusee.workflows.report.result_numbers import numbers_of
 from neusee.workflows.store.result_store import Store
 from neusee.workflows.sweeps.axes import Point
-from neusee.workflows.sweeps.point_order import Job, best_order, work_left
+from neusee.workflows.sweeps.point_order import PointJob, best_order, work_left
 from neusee.workflows.tolerance.cheaper_steps import with_substitutions
 
-State = Literal["run", "cached", "failed"]
+PointState = Literal["run", "cached", "failed"]
 OnError = Literal["continue", "stop"]
-Number = tuple[str, str, int | str, float]  #: step, field, index (empty of a single number), value
+ResultNumber = tuple[str, str, int | str, float]  #: step, field, index (empty of a single number), value
 
 
 @dataclass(frozen=True, slots=True)
-class Checked:
-    """A point in which nothing is wrong, and what it asks of the engine."""
+class CheckedPoint:
+    """A point without mistakes, and the steps that it needs."""
 
     point: Point
     composed: Composed
-    job: Job
+    job: PointJob
 
 
 @dataclass(frozen=True, slots=True)
-class Outcome:
-    """What became of a point."""
+class PointOutcome:
+    """The outcome of a point."""
 
     point: Point
-    state: State  #: ``cached``: no step had to run
+    state: PointState  #: ``cached``: no step had to run
     seconds: float
-    numbers: tuple[Number, ...] = ()
-    step: str = ""  #: the one that failed
+    numbers: tuple[ResultNumber, ...] = ()
+    step: str = ""  #: the step that failed
     message: str = ""  #: why it failed, with the place where the step is written
     left: float = 0.0  #: seconds that the points after it will take, as the ones before it took
 
 
 @dataclass(frozen=True)
-class Plan:
-    """The points in the order in which they run."""
+class SweepPlan:
+    """The checked points in the order in which they run."""
 
     recipe: Recipe  #: of the first point
-    checked: tuple[Checked, ...]
-    costs: dict[str, float]  #: seconds by step, of those that ran before
-    work: tuple[float, ...]  #: of every point in turn that is not stored: seconds, or steps where none ran before
+    checked: tuple[CheckedPoint, ...]
+    costs: dict[str, float]  #: seconds by step, of steps that ran before
+    work: tuple[float, ...]  #: of each point, without stored results: seconds, or steps where none ran before
     notes: tuple[str, ...]
 
     @property
-    def jobs(self) -> list[Job]:
+    def jobs(self) -> list[PointJob]:
         return [checked.job for checked in self.checked]
 
 
-def planned(
+def plan_sweep(
     recipe: str, points: Sequence[Point], folder: Path, store: Store, paired: bool = False, device: str = "cpu"
-) -> Plan:
-    """Compose and check every point and put them in order; a `RecipeError` has every mistake of all of them."""
+) -> SweepPlan:
+    """Compose, check and order the points; raise `RecipeError` with every mistake of every point."""
     checker = _Checker(recipe, folder, store, device)
     checked = list(checker.every(points))
     if checker.diagnostics or checker.first is None:
@@ -83,20 +83,20 @@ def planned(
     costs = _costs(store)
     in_turn = [checked[i] for i in best_order([c.job for c in checked], costs, paired)]
     work = work_left([c.job for c in in_turn], costs, store.has)
-    return Plan(checker.first, tuple(in_turn), costs, tuple(work), tuple(checker.notes))
+    return SweepPlan(checker.first, tuple(in_turn), costs, tuple(work), tuple(checker.notes))
 
 
 def outcomes(
-    plan: Plan,
+    plan: SweepPlan,
     store: Store,
     on_error: OnError = "stop",
     device: str = "cpu",
     started: Callable[[Point], None] = lambda point: None,
     watch: Callable[[Event], None] | None = None,
-) -> Generator[Outcome, None, None]:
-    """Run the points in turn and say at once what became of each.
+) -> Generator[PointOutcome, None, None]:
+    """Run the points in turn, and yield the outcome of each.
 
-    With ``on_error="stop"`` the error of the first point that fails is raised after its outcome was given.
+    With ``on_error="stop"`` the error of the first point that fails is raised after its outcome.
     """
     clock = _Clock(plan.work)
     for checked in plan.checked:
@@ -116,24 +116,24 @@ def outcomes(
                 raise failure
             failure = None  # it holds the values that the failed step was given
         elif result is not None:
-            state: State = "run" if any(d.state == "run" for d in result.done.values()) else "cached"
-            yield Outcome(checked.point, state, seconds, numbers, left=left)
+            state: PointState = "run" if any(d.state == "run" for d in result.done.values()) else "cached"
+            yield PointOutcome(checked.point, state, seconds, numbers, left=left)
 
 
-def _failed(point: Point, error: Exception, seconds: float, left: float) -> Outcome:
+def _failed(point: Point, error: Exception, seconds: float, left: float) -> PointOutcome:
     step = error.step if isinstance(error, RunError) else ""
     message = str(error) if isinstance(error, RunError | RecipeError) else f"{type(error).__name__}: {error}"
-    return Outcome(point, "failed", seconds, step=step, message=message, left=left)
+    return PointOutcome(point, "failed", seconds, step=step, message=message, left=left)
 
 
-def _numbers(result: Result) -> tuple[Number, ...]:
-    """Every small output, number by number."""
+def _numbers(result: Result) -> tuple[ResultNumber, ...]:
+    """Return every small output, number by number."""
     rows = (row for step, value in result.values.items() for row in numbers_of(step, value))
     return tuple((step, field, index, number) for step, field, index, number in rows)
 
 
 def _costs(store: Store) -> dict[str, float]:
-    """Median seconds of every step that this store has results of."""
+    """Return the median seconds of every step that has results in the store."""
     found: dict[str, list[float]] = defaultdict(list)
     for row in store.journal.rows():
         if row["step"] and row["seconds"] is not None:
@@ -142,7 +142,7 @@ def _costs(store: Store) -> dict[str, float]:
 
 
 class _Clock:
-    """Predicts how long the rest takes, from the work that is done and the work that is left."""
+    """A prediction of the remaining seconds, from the work so far and the work that is left."""
 
     def __init__(self, work: Sequence[float]) -> None:
         least = sum(work) / 100 / len(work) or 1.0  # reading a point's numbers is work too
@@ -151,7 +151,7 @@ class _Clock:
         self.done = self.seconds = 0.0
 
     def left(self, seconds: float) -> float:
-        """Seconds for the points to come, after one that took ``seconds``."""
+        """Return the seconds that the remaining points will take, after a point that took ``seconds``."""
         one = self.work[0]
         del self.work[0]
         self.todo, self.done, self.seconds = self.todo - one, self.done + one, self.seconds + seconds
@@ -159,7 +159,7 @@ class _Clock:
 
 
 class _Checker:
-    """Looks at one point after another."""
+    """The check of one point after another."""
 
     def __init__(self, recipe: str, folder: Path, store: Store, device: str) -> None:
         self.recipe, self.folder, self.device = recipe, folder, device
@@ -169,17 +169,17 @@ class _Checker:
         self.first: Recipe | None = None
         self._same: dict[Any, Any] = {}
 
-    def every(self, points: Sequence[Point]) -> Iterator[Checked]:
-        """The points that are right; what is wrong with the others is in ``problems``."""
+    def every(self, points: Sequence[Point]) -> Iterator[CheckedPoint]:
+        """Yield the points without mistakes; the mistakes of the others are in ``diagnostics``."""
         for point in points:
             try:
                 composed = compose(self.recipe, point.overrides, self.folder)
-                yield Checked(point, composed, self._job(point, check(composed)))
+                yield CheckedPoint(point, composed, self._job(point, check(composed)))
             except RecipeError as error:
                 self.diagnostics += error.diagnostics
         self.code.save()
 
-    def _job(self, point: Point, recipe: Recipe) -> Job:
+    def _job(self, point: Point, recipe: Recipe) -> PointJob:
         self.first = self.first or recipe
         self.notes.update(dict.fromkeys(recipe.notes))
         keys: dict[str, Key] = {}
@@ -192,8 +192,8 @@ class _Checker:
                 raise RecipeError([Diagnostic(step.mark, name, str(error))]) from error
         sources = tuple((name, recipe.steps[name].sources) for name in keys)
         graph = self._same.setdefault(sources, dict(sources))
-        return Job(point.place, keys, graph, recipe.outputs)
+        return PointJob(point.place, keys, graph, recipe.outputs)
 
     def _once(self, key: Key) -> Key:
-        """The same text for the same key: a thousand points share most of theirs."""
+        """Return one text object for equal keys, for points share most of their keys."""
         return str(self._same.setdefault(key, key))

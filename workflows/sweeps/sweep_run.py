@@ -1,9 +1,9 @@
-"""Run a recipe over every combination of some of its values, and gather the numbers in one table.
+"""A recipe over every combination of some of its values, with all numbers in one table.
 
     sweep("first_light", {"sensor.read_noise": ["5 e-", "10 e-"], "doe": ["axicon", "vortex"]})
 
-Results lie in the store by what they are made of, so that a sweep that was stopped goes on when it
-is run again, and what two points share is made once.
+Results lie in the store by key: a stopped sweep goes on when the same sweep runs again, and results that points share
+are made once.
 """
 
 from __future__ import annotations
@@ -19,49 +19,49 @@ from typing import Any, Literal
 from neusee.workflows.engine.provenance import versions
 from neusee.workflows.keys.cache_key import digest
 from neusee.workflows.recipe.text.overrides import Override
-from neusee.workflows.report.console import aligned
 from neusee.workflows.report.run_folder import new_run
+from neusee.workflows.report.text_table import indented
 from neusee.workflows.store.remote_store import open_store
 from neusee.workflows.store.result_store import Store
 from neusee.workflows.sweeps.axes import Argument, Axis, points, read_axes, read_words
 from neusee.workflows.sweeps.point_order import Sharing, sharing
 from neusee.workflows.sweeps.sweep_files import dataset, require_xarray, write_account, write_table
-from neusee.workflows.sweeps.sweep_points import OnError, Outcome, Plan, outcomes, planned
-from neusee.workflows.sweeps.sweep_table import Column, column, header, rows_of, wide
+from neusee.workflows.sweeps.sweep_points import OnError, PointOutcome, SweepPlan, outcomes, plan_sweep
+from neusee.workflows.sweeps.sweep_table import AxisColumn, column, header, rows_of, wide
 
-State = Literal["complete", "stopped", "interrupted"]
+SweepState = Literal["complete", "stopped", "interrupted"]
 
 
 @dataclass(frozen=True)
 class Sweep:
-    """What a sweep gave: the points that ran, in the order of the axes, the last axis fastest."""
+    """The result of a sweep: the points that ran, in the order of the axes, the last axis fastest."""
 
     recipe: str
     title: str
-    columns: tuple[Column, ...] = field(repr=False)
-    outcomes: tuple[Outcome, ...] = field(repr=False)
+    columns: tuple[AxisColumn, ...] = field(repr=False)
+    outcomes: tuple[PointOutcome, ...] = field(repr=False)
     points: int
     sharing: Sharing = field(repr=False)
     paired: bool = False
-    state: State = "complete"
+    state: SweepState = "complete"
 
     @property
-    def failed(self) -> tuple[Outcome, ...]:
-        """The points that failed."""
+    def failed(self) -> tuple[PointOutcome, ...]:
+        """Return the points that failed."""
         return tuple(outcome for outcome in self.outcomes if outcome.state == "failed")
 
     @property
     def rows(self) -> list[dict[str, Any]]:
-        """The tidy table: a row for each number of each point."""
+        """Return the tidy table: a row for each number of each point."""
         names = header(self.columns)
         return [dict(zip(names, row, strict=True)) for o in self.outcomes for row in rows_of(o, self.columns)]
 
     def table(self) -> str:
-        """One line a point, for reading."""
-        return "\n".join(aligned(wide(self.outcomes, self.columns)))
+        """Return a table with one line for each point."""
+        return "\n".join(indented(wide(self.outcomes, self.columns)))
 
     def to_xarray(self) -> Any:
-        """An `xarray.Dataset` with the axes as dimensions and coordinates in SI; nan where a point failed.
+        """Return an `xarray.Dataset` with the axes as dimensions and coordinates in SI; NaN where a point failed.
 
         Raises: RecipeError where xarray is not installed.
         """
@@ -73,8 +73,8 @@ class Sweep:
         names, *rows = wide(self.outcomes, self.columns)
         head = "".join(f"<th>{html.escape(name)}</th>" for name in names)
         body = "".join("<tr>" + "".join(f"<td>{html.escape(c)}</td>" for c in row) + "</tr>" for row in rows)
-        said = html.escape(f"{self.title or self.recipe}: {counted(self)}")
-        return f"<p>{said}</p><table><thead><tr>{head}</tr></thead><tbody>{body}</tbody></table>"
+        summary = html.escape(f"{self.title or self.recipe}: {counted(self)}")
+        return f"<p>{summary}</p><table><thead><tr>{head}</tr></thead><tbody>{body}</tbody></table>"
 
 
 def sweep(
@@ -113,10 +113,10 @@ class Sweeping:
         self.fixed = [argument.text for argument in arguments if not isinstance(argument, Axis)]
         self.columns = tuple(map(column, self.axes))
         self.store, self.paired, self.device = store, paired, device
-        self.plan: Plan = planned(recipe, points(arguments, paired), folder, store, paired, device)
+        self.plan: SweepPlan = plan_sweep(recipe, points(arguments, paired), folder, store, paired, device)
         self.sharing = sharing(self.plan.jobs, self.plan.costs)
 
-    def sweep(self, found: Sequence[Outcome], state: State) -> Sweep:
+    def sweep(self, found: Sequence[PointOutcome], state: SweepState) -> Sweep:
         recipe, in_turn = self.plan.recipe, sorted(found, key=lambda outcome: outcome.point.number)
         count = len(self.plan.checked)
         return Sweep(recipe.name, recipe.title, self.columns, tuple(in_turn), count, self.sharing, self.paired, state)
@@ -155,7 +155,7 @@ def _account(work: Sweeping, result: Sweep, again: Sequence[str], seconds: float
 
 
 def counted(result: Sweep) -> str:
-    """``12 points: 8 run, 3 cached, 1 failed``."""
+    """Return a text such as ``12 points: 8 run, 3 cached, 1 failed``."""
     states = [outcome.state for outcome in result.outcomes]
     parts = [f"{states.count(state)} {state}" for state in ("run", "cached", "failed") if state in states]
     rest = result.points - len(states)

@@ -10,14 +10,14 @@ from neusee.nodes import units
 
 if TYPE_CHECKING:
     from neusee.workflows.sweeps.axes import Axis, Point
-    from neusee.workflows.sweeps.sweep_points import Number, Outcome
+    from neusee.workflows.sweeps.sweep_points import PointOutcome, ResultNumber
 
 AFTER = ("status", "step", "field", "index", "value", "seconds", "cached", "message")  #: columns after the axes
 
 
 @dataclass(frozen=True, slots=True)
-class Column:
-    """An axis as a column: with its unit in the header where all its values have one."""
+class AxisColumn:
+    """An axis as a column, with its unit in the header where all values have one unit."""
 
     name: str
     header: str
@@ -26,19 +26,19 @@ class Column:
     unit: str  #: of ``si``; empty for pure numbers and for words
 
 
-def column(axis: Axis) -> Column:
-    """Numbers in the unit that they are written in, or in SI if they are written in several; words as they are."""
+def column(axis: Axis) -> AxisColumn:
+    """Return an axis as a column: numbers in their unit, or in SI if they have several units; words as they are."""
     values = [c.value for c in axis.coordinates]
     found = [q for q in map(_quantity, values) if q is not None]
     header = f"{axis.name} (axis)" if axis.name in ("point", *AFTER) else axis.name
     if len(found) == len(values) and len({q.si_unit for q in found}) == 1:
         si, unit, written = tuple(q.si for q in found), found[0].si_unit, {q.unit for q in found}
         cells = tuple(q.number for q in found) if len(written) == 1 else si
-        return Column(axis.name, f"{header} ({found[0].unit if len(written) == 1 else unit})", cells, si, unit)
+        return AxisColumn(axis.name, f"{header} ({found[0].unit if len(written) == 1 else unit})", cells, si, unit)
     if all(isinstance(v, int | float) and not isinstance(v, bool) for v in values):
-        return Column(axis.name, header, tuple(values), tuple(map(float, values)), "")
+        return AxisColumn(axis.name, header, tuple(values), tuple(map(float, values)), "")
     words = tuple(c.shown for c in axis.coordinates)
-    return Column(axis.name, header, words, words, "")
+    return AxisColumn(axis.name, header, words, words, "")
 
 
 @dataclass(frozen=True, slots=True)
@@ -60,12 +60,13 @@ def _quantity(value: Any) -> _Quantity | None:
 # --- rows -----------------------------------------------------------------------------------------------------------
 
 
-def header(columns: Sequence[Column]) -> list[str]:
+def header(columns: Sequence[AxisColumn]) -> list[str]:
+    """Return the names of all columns of ``sweep.csv``."""
     return ["point", *(c.header for c in columns), *AFTER]
 
 
-def rows_of(outcome: Outcome, columns: Sequence[Column]) -> Iterator[list[Any]]:
-    """One row for each number of a point; one for a point that failed or has no numbers."""
+def rows_of(outcome: PointOutcome, columns: Sequence[AxisColumn]) -> Iterator[list[Any]]:
+    """Yield one row for each number of a point; one row for a point that failed or has no numbers."""
     where = [outcome.point.number, *point_cells(outcome.point, columns)]
     status = "failed" if outcome.state == "failed" else "ok"
     last = [round(outcome.seconds, 6), outcome.state == "cached", outcome.message]
@@ -73,17 +74,17 @@ def rows_of(outcome: Outcome, columns: Sequence[Column]) -> Iterator[list[Any]]:
         yield [*where, status, *number, *last]
 
 
-def headline(numbers: Sequence[Number]) -> dict[str, str]:
-    """Every result in a word: a number alone, or the least and the largest of several; single numbers first."""
+def headline(numbers: Sequence[ResultNumber]) -> dict[str, str]:
+    """Return a text for every result: a single number, or the least and the largest; single numbers come first."""
     found: dict[str, list[float]] = {}
     for step, part, _, value in numbers:
         found.setdefault(f"{step}.{part}".rstrip("."), []).append(value)
-    said = {name: _said(values) for name, values in found.items()}
-    return dict(sorted(said.items(), key=lambda item: len(found[item[0]]) > 1))
+    texts = {name: _range_of(values) for name, values in found.items()}
+    return dict(sorted(texts.items(), key=lambda item: len(found[item[0]]) > 1))
 
 
-def wide(outcomes: Sequence[Outcome], columns: Sequence[Column]) -> list[list[str]]:
-    """One row a point below a row of headers: its place, its results, its state and its seconds."""
+def wide(outcomes: Sequence[PointOutcome], columns: Sequence[AxisColumn]) -> list[list[str]]:
+    """Return a header and one row for each point: its place, its results, its state and its seconds."""
     results = [headline(outcome.numbers) for outcome in outcomes]
     names = list(dict.fromkeys(name for result in results for name in result))
     rows = [["point", *(c.header for c in columns), *names, "state", "seconds"]]
@@ -94,12 +95,12 @@ def wide(outcomes: Sequence[Outcome], columns: Sequence[Column]) -> list[list[st
     return rows
 
 
-def point_cells(point: Point, columns: Sequence[Column]) -> list[Any]:
+def point_cells(point: Point, columns: Sequence[AxisColumn]) -> list[Any]:
     """Return the values of a point on the axes."""
     return [c.cells[i] for c, i in zip(columns, point.place, strict=True)]
 
 
-def _said(values: Sequence[float]) -> str:
+def _range_of(values: Sequence[float]) -> str:
     return f"{values[0]:.4g}" if len(values) == 1 else f"{min(values):.3g} … {max(values):.3g}"
 
 
@@ -109,7 +110,7 @@ def cell_text(cell: Any) -> str:
 
 
 def lasts(seconds: float) -> str:
-    """``3 h 05 min``, ``2 min 10 s``, ``4 s``."""
+    """Return a duration such as ``3 h 05 min``, ``2 min 10 s`` or ``4 s``."""
     whole = round(seconds)
     if whole >= 3600:
         return f"{whole // 3600} h {whole % 3600 // 60:02} min"

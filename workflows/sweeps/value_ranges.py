@@ -1,7 +1,7 @@
-"""The values that a text lists or spans: ``1,2,3``, ``range(0, 10, 2)``, ``linspace(450 nm, 650 nm, 5)``.
+"""The values of a text that is a list or a range: ``1,2,3``, ``range(0, 10, 2)``, ``linspace(450 nm, 650 nm, 5)``.
 
-Commas in quotes or brackets do not split, so that ``[1, 2]`` is one value. Numbers of a range
-are worked out exactly: ``range(0, 1, 0.1)`` has 0.3 in it and not 0.30000000000000004.
+Commas in quotes or brackets do not split, so that ``[1, 2]`` is one value. Numbers of a range are computed exactly:
+``range(0, 1, 0.1)`` has the value 0.3, not 0.30000000000000004.
 """
 
 from __future__ import annotations
@@ -24,7 +24,7 @@ _EXACT = 10**15  #: whole numbers below are written without a point
 
 
 def split(text: str) -> list[str]:
-    """The parts between the commas that stand in no quotes and in no brackets; `ValueError` if one is left open."""
+    """Return the parts between commas outside of quotes and brackets; raise `ValueError` for a bracket left open."""
     parts, waiting = [""], list[str]()
     for token in _TOKEN.findall(text):
         if token == "," and not waiting:
@@ -41,7 +41,7 @@ def split(text: str) -> list[str]:
 
 
 def values_of(text: str) -> list[str]:
-    """The values that a text lists or spans, each as YAML; `ValueError` with the fix where it does neither."""
+    """Return the values of a text, each as YAML; raise `ValueError` with the fix for a wrong list or range."""
     parts = split(text)
     if len(parts) > 1 and not all(part.strip() for part in parts):
         raise ValueError("a value is missing beside a comma")
@@ -49,12 +49,12 @@ def values_of(text: str) -> list[str]:
 
 
 def spans(text: str) -> bool:
-    """Whether a text is a range."""
+    """Return True if a text is a range."""
     return _function(text) is not None
 
 
 def _spanned(text: str) -> list[str]:
-    """The values of one part: those of its range, or itself."""
+    """Return the values of one part: the values of a range, or the part itself."""
     function = _function(text)
     if function is None:
         return [text.strip()]
@@ -66,7 +66,7 @@ def _spanned(text: str) -> list[str]:
 
 
 def _function(text: str) -> tuple[str, str] | None:
-    """Name and arguments of a range; `ValueError` with the nearest name for one that is misspelt."""
+    """Return the name and the arguments of a range; raise `ValueError` with the nearest name for a misspelt range."""
     match = _CALL.fullmatch(text)
     if match is None or match[1] in _FUNCTIONS:
         return match and (match[1], match[2])
@@ -95,7 +95,7 @@ def _linspace(arguments: list[str]) -> list[str]:
 
 
 def _logspace(arguments: list[str]) -> list[str]:
-    """Equal ratios from the first end to the second."""
+    """Return values in equal ratios from the first end to the second."""
     (start, stop), unit, count = _ends(arguments, "logspace(1e2, 1e6, 5)")
     if start <= 0 or stop <= 0:
         raise ValueError("both ends must be positive: they are the first and the last value")
@@ -115,12 +115,12 @@ _FUNCTIONS: dict[str, Callable[[list[str]], list[str]]] = {
 
 
 def _ends(arguments: list[str], example: str) -> tuple[list[Fraction], str, int]:
-    """First value, last value, their unit, and how many there are."""
+    """Return the first and the last value, their unit, and the number of values."""
     if len(arguments) != 3:
         raise ValueError(f"takes first, last and how many: {example}")
     numbers, unit = _numbers(arguments[:2])
     if not re.fullmatch(r"\+?\d{1,9}", arguments[2]):
-        raise ValueError(f"how many is a whole number from 1, not {arguments[2] or 'nothing'}")
+        raise ValueError(f"the number of values is a whole number from 1, not {arguments[2] or 'nothing'}")
     return numbers, unit, _count(int(arguments[2]))
 
 
@@ -133,7 +133,7 @@ def _count(count: int) -> int:
 
 
 def _numbers(texts: list[str]) -> tuple[list[Fraction], str]:
-    """Numbers, exactly as they are written, and the one unit that they have."""
+    """Return the numbers exactly as they are written, and their one unit."""
     found = [_NUMBER.fullmatch(text) for text in texts]
     for text, match in zip(texts, found, strict=True):
         if match is None or not math.isfinite(float(match[1])):

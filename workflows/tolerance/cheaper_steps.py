@@ -14,7 +14,7 @@ from dataclasses import dataclass, field, replace
 from typing import TYPE_CHECKING, Any
 
 from neusee.workflows.graph.recipe_graph import METRIC_TOLERANCE, Recipe, Step, Substitution, Wire, in_order, needed
-from neusee.workflows.tolerance.tolerance_frontier import unbounded
+from neusee.workflows.tolerance.error_propagation import unbounded_steps
 from neusee.workflows.tolerance.zero_effect_steps import without_nothing
 
 if TYPE_CHECKING:
@@ -51,7 +51,7 @@ def with_substitutions(recipe: Recipe, wanted: Iterable[str], pinned: Collection
 
 def _limited(recipe: Recipe, order: Sequence[str]) -> Recipe:
     """Return the recipe with its unbounded steps noted, if its tolerance exceeds `METRIC_TOLERANCE`."""
-    steps = unbounded(recipe, order) if recipe.tolerance > METRIC_TOLERANCE else frozenset[str]()
+    steps = unbounded_steps(recipe, order) if recipe.tolerance > METRIC_TOLERANCE else frozenset[str]()
     return recipe if steps == recipe.unbounded else replace(recipe, unbounded=steps)
 
 

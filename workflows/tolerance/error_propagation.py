@@ -7,7 +7,7 @@ Behind a node without this hook nothing is known, and its inputs are held to the
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
 
 from neusee.nodes import ErrorBound, TensorStats
@@ -48,6 +48,32 @@ class ToleranceNotProven(Exception):
     def __init__(self, over: float) -> None:
         super().__init__(f"the error bound is {over:.2g} times the tolerance")
         self.over = over
+
+
+def tolerance_frontier(recipe: Recipe, order: Iterable[str], wanted: Iterable[str]) -> list[str]:
+    """Return the steps held to the tolerance: inexact ones that are wanted or feed a node without an error bound."""
+    off, found = set[str](), dict[str, None]()
+    for name in order:
+        step = recipe.steps[name]
+        reads = [source for source in step.sources if source in off]
+        if reads and not _bounds_its_error(step):
+            found |= dict.fromkeys(reads)
+        elif reads or step.node.hooks.approximation_error is not None or step.node.hooks.skip_bound is not None:
+            off.add(name)
+    return [*found, *(name for name in wanted if name in off and name not in found)]
+
+
+def unbounded_steps(recipe: Recipe, order: Sequence[str]) -> frozenset[str]:
+    """Return the steps whose errors reach a node that does not bound its error."""
+    found = set[str]()
+    for name in reversed(order):
+        if name in found or not _bounds_its_error(recipe.steps[name]):
+            found.update(recipe.steps[name].sources)
+    return frozenset(found)
+
+
+def _bounds_its_error(step: Step) -> bool:
+    return step.node.hooks.propagate_error is not None or step.node.hooks.approximation_error is not None
 
 
 def proof(

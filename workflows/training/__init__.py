@@ -2,5 +2,5 @@
 
 Training pictures through the graph of a recipe, the iterations and stages, the state that is kept, and the figures.
 Settings are read in `recipe.blocks`; networks and losses are nodes.
-Offers: `run_training.train`, `training_iteration.NotFinite`, `training_pictures.TrainingStream`.
+Offers: `run_training.train`, `training_iteration.Learner`, `training_pictures.TrainingStream`.
 """

@@ -1,4 +1,4 @@
-"""A training in TensorBoard, beside its table: the losses over the iterations, and the pictures."""
+"""The TensorBoard log of a training: the losses over the iterations, and the pictures."""
 
 from __future__ import annotations
 
@@ -10,10 +10,10 @@ from typing import Any
 
 
 class TensorBoardLog:
-    """Events in ``tensorboard/`` of the folder; the second stage's follow the first's."""
+    """Events in the folder ``tensorboard/``; the second stage follows the first."""
 
     def __init__(self, folder: Path, first: int) -> None:
-        """From iteration ``first`` of both stages on; what an earlier process wrote of it and after is not shown.
+        """Begin at iteration ``first`` of all stages; later events of an earlier process are not shown.
 
         Raises ValueError where TensorBoard is not installed.
         """
@@ -25,12 +25,12 @@ class TensorBoardLog:
         self._writer: Any = there.SummaryWriter(str(folder / "tensorboard"), purge_step=first)
 
     def row(self, iteration: int, found: Mapping[str, float]) -> None:
-        """Note what an iteration found."""
+        """Log the losses of an iteration."""
         for name, value in found.items():
             self._writer.add_scalar(name, value, iteration)
 
     def picture(self, iteration: int, stage: int, shown: bytes) -> None:
-        """Note a picture, a PNG."""
+        """Log a picture, given as a PNG."""
         import numpy as np
         from PIL import Image
 
@@ -38,9 +38,9 @@ class TensorBoardLog:
             self._writer.add_image(f"stage {stage}", np.asarray(image), iteration, dataformats="HWC")
 
     def keep(self) -> None:
-        """Have on disk what was noted."""
+        """Write the log to disk."""
         self._writer.flush()
 
     def close(self) -> None:
-        """End the file."""
+        """Close the file."""
         self._writer.close()

@@ -1,4 +1,4 @@
-"""Pictures of a training: curves of its losses, and what the network makes of a picture."""
+"""Figures of a training: the curves of its losses, and pictures before and after the network."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ import torch
 from torch import Tensor
 
 from neusee.workflows.report.figures.style import BLUE, VERMILION, canvas, drawn
-from neusee.workflows.training.checkpoint import columns
+from neusee.workflows.training.loop.checkpoint import loss_curve
 
 _SHOWN = ("LSR", "BSR", "L1", "reconstruction", "adversarial", "critics", "penalty", "rate")
 _GAP = 4  #: pixels between pictures
@@ -17,16 +17,16 @@ _GAP = 4  #: pixels between pictures
 
 @drawn
 def curves(rows: Sequence[Mapping[str, str]]) -> Any:
-    """Each loss over the iterations, the second stage after the first; pale: single iterations, full: their middle."""
+    """Draw each loss over the iterations, the second stage after the first: pale as it is, full as a running median."""
     names = [name for name in _SHOWN if any(row[name] for row in rows)]
     figure, axes = canvas(11.0, 2.4 * -(-len(names) // 2), -(-len(names) // 2), 2)
     first = 1 + max((int(r["iteration"]) for r in rows if r["stage"] == "1"), default=-1)
     for ax, name in zip(axes.flat, names, strict=False):
         for stage, colour in ((1, BLUE), (2, VERMILION)):
-            at, values = columns(rows, stage, name)
+            at, values = loss_curve(rows, stage, name)
             at = [i + first * (stage == 2) for i in at]
             ax.plot(at, values, color=colour, alpha=0.25, linewidth=0.7)
-            ax.plot(at, middle(values), color=colour, linewidth=1.5, label=f"stage {stage}")
+            ax.plot(at, running_median(values), color=colour, linewidth=1.5, label=f"stage {stage}")
         if name in ("LSR", "L1", "reconstruction", "rate"):
             ax.set_yscale("log", nonpositive="mask")
         ax.set_title(name)
@@ -37,8 +37,8 @@ def curves(rows: Sequence[Mapping[str, str]]) -> Any:
     return figure
 
 
-def middle(values: Sequence[float]) -> list[float]:
-    """The median of about a twentieth of the course around each value."""
+def running_median(values: Sequence[float]) -> list[float]:
+    """Return the running median, over about a twentieth of the values."""
     import statistics
 
     half = max(1, len(values) // 40)
@@ -46,7 +46,7 @@ def middle(values: Sequence[float]) -> list[float]:
 
 
 def strip(pictures: Sequence[Tensor]) -> bytes:
-    """Linear pictures (3, y, x) side by side as an sRGB PNG."""
+    """Return linear pictures (3, y, x) side by side as an sRGB PNG."""
     import io
 
     from kornia.color import linear_rgb_to_rgb

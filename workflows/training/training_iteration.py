@@ -1,4 +1,4 @@
-"""The element, the network and its critics, and one iteration of learning them."""
+"""The mask, the network and its critics, and one iteration of learning them."""
 
 from __future__ import annotations
 
@@ -8,7 +8,6 @@ from typing import Any
 
 import torch
 from torch import Tensor, nn
-from torch.optim.swa_utils import AveragedModel, get_ema_multi_avg_fn
 from torch.utils.checkpoint import checkpoint
 
 from neusee.nodes import losses, metrics
@@ -29,23 +28,17 @@ from neusee.nodes.restore import (
 from neusee.nodes.values import Psf
 from neusee.workflows.graph.diagnostics import nearest
 from neusee.workflows.graph.recipe_graph import Recipe, Step
-from neusee.workflows.keys.cache_key import stream_seed
+from neusee.workflows.keys.cache_key import device_kind, stream_seed
 from neusee.workflows.recipe.blocks.train_block import GRID, Network, Stage, Training
+from neusee.workflows.training.loop.resumable_loop import STEEPEST, Losses, averaged, require_finite
 from neusee.workflows.training.parallel.process_mesh import ALONE, Mesh
 from neusee.workflows.training.parallel.shared_graph import Shared
 from neusee.workflows.training.training_pictures import Sample, TrainingStream
 
-_STEEPEST = 10.0  #: norm of a gradient, above which it is shortened
-Losses = dict[str, float]
-
-
-class NotFinite(ArithmeticError):
-    """A loss or a gradient is not a number."""
-
 
 @dataclass
 class Scales:
-    """Pictures at two scales: the coarse one first."""
+    """Pictures at two scales, the coarse scale first."""
 
     coarse: Tensor
     fine: Tensor
@@ -56,35 +49,38 @@ class Scales:
 
     @classmethod
     def of(cls, picture: Tensor) -> Scales:
-        """A picture (n, 3, y, x) and half of it."""
+        """Return a picture (n, 3, y, x) with its half-size version."""
         y, x = picture.shape[-2:]
         return cls(resize(picture, -(-y // 2), -(-x // 2)), picture)
 
 
 class Learner:
-    """All that learns, on one device; in every process of a mesh the same."""
+    """Everything that learns, on one device; equal in every process of a mesh."""
 
-    def __init__(self, recipe: Recipe, how: Training, device: str, designed: bool = False, mesh: Mesh = ALONE) -> None:
-        self.how, self.seed, self.device, self.mesh = how, recipe.seed, device, mesh
-        self._step = recipe.steps[how.learn] if how.learn else None
-        self.relief = nn.Module() if designed or self._step is None else self._start(self._step).to(how.dtype)
-        self.net: Restorer = start_network(lambda: _made(how.network), self._rng("network")).to(how.dtype)
-        self.critics = nn.ModuleList(critics(self._rng("critics"), how.critics.width)).to(how.dtype)
-        self.average = _averaged(self.net, how.average) if how.average else None
+    def __init__(
+        self, recipe: Recipe, settings: Training, device: str, designed: bool = False, mesh: Mesh = ALONE
+    ) -> None:
+        self.settings, self.seed, self.device, self.mesh = settings, recipe.seed, device, mesh
+        self._step = recipe.steps[settings.learn] if settings.learn else None
+        self.relief = nn.Module() if designed or self._step is None else self._start(self._step).to(settings.dtype)
+        net = start_network(lambda: _network_of(settings.network), self._rng("network"))
+        self.net: Restorer = net.to(settings.dtype)
+        self.critics = nn.ModuleList(critics(self._rng("critics"), settings.critics.width)).to(settings.dtype)
+        self.average = averaged(self.net, settings.average)
         self.begin(Stage(iterations=0), learns=True)
 
     def _start(self, step: Step) -> nn.Module:
-        """The relief that learns; one that was designed does not."""
+        """Return the parameters of the mask that learns."""
         path = step.node.path
         if path not in PARAMETRISATIONS:
-            text = f"{self.how.learn} is {path}, of which nothing is learnt; {nearest(path, PARAMETRISATIONS)}"
+            text = f"{self.settings.learn} is {path}, of which nothing is learnt; {nearest(path, PARAMETRISATIONS)}"
             raise ValueError(f"train: {text}; or design it without images: --stage mask")
         return PARAMETRISATIONS[path](step.params, self._rng("element"))
 
     def height(self) -> Tensor:
-        """The relief (v, u) in m; raises ValueError where none learns."""
+        """Return the height map (v, u) in m; raise ValueError where no mask learns."""
         if self._step is None:
-            raise ValueError("train.learn: no element learns")
+            raise ValueError("train.learn: no mask learns")
         made: Tensor = self.relief(stop(*(self._step.params[name] for name in GRID)))
         return made
 
@@ -92,43 +88,44 @@ class Learner:
         return torch.Generator(self.device).manual_seed(stream_seed(self.seed, " ".join(map(str, ("train", *names)))))
 
     def begin(self, stage: Stage, learns: bool) -> None:
-        """Begin a stage: with new moments, at the first rate."""
-        rates, self.stage, self.learns = self.how.rates, stage, learns
+        """Begin a stage with new moments and the first learning rates."""
+        rates, self.stage, self.learns = self.settings.rates, stage, learns
         groups = parameter_groups(self.net, rates.weights, rates.biases)
         if learns:
             groups += [{"params": list(self.relief.parameters()), "lr": rates.element}]
-        self.generator_optimizer = torch.optim.Adam(groups, betas=self.how.betas)
+        self.generator_optimizer = torch.optim.Adam(groups, betas=self.settings.betas)
         self.critic_optimizer = torch.optim.Adam(
-            parameter_groups(self.critics, rates.weights, rates.biases), betas=self.how.critics.betas
+            parameter_groups(self.critics, rates.weights, rates.biases), betas=self.settings.critics.betas
         )
         self._first = [[g["lr"] for g in o.param_groups] for o in (self.generator_optimizer, self.critic_optimizer)]
 
     def set_rates(self, iteration: int) -> float:
-        """The rates of an iteration of the stage; by what they are multiplied."""
-        share = self.how.rates.share(iteration)
+        """Set the learning rates of an iteration of the stage, and return their factor on the first rates."""
+        share = self.settings.rates.share(iteration)
         for optimiser, first in zip((self.generator_optimizer, self.critic_optimizer), self._first, strict=True):
             for group, rate in zip(optimiser.param_groups, first, strict=True):
-                group["lr"] = max(rate * share, min(rate, self.how.rates.least))
+                group["lr"] = max(rate * share, min(rate, self.settings.rates.least))
         return share
 
     def parts(self) -> dict[str, Any]:
-        """All that a later iteration depends on."""
+        """Return everything on which a later iteration depends."""
         found = {"relief": self.relief, "net": self.net, "critics": self.critics, "makers": self.generator_optimizer}
         return {**found, "judges": self.critic_optimizer, **({"average": self.average} if self.average else {})}
 
     # --- one iteration ------------------------------------------------------------------------------------------------
 
     def iterate(self, samples: TrainingStream, stage: int, iteration: int) -> tuple[Losses, list[Sample]]:
-        """Look at a batch of pictures, one after another, and move a step; raises `NotFinite` before a bad one.
+        """Learn from a batch of pictures, one after another; raise `NotFinite` before a bad step.
 
-        Of several processes each looks at its own, and all move by the sum; the pictures are those of this one.
+        Returns the losses of the batch, and the pictures of this process. Of several processes each has pictures of
+        its own, and all of them step by the sum of the gradients.
         """
         self.generator_optimizer.zero_grad(set_to_none=True)
         shared = samples.begin(self.height()) if samples.shared else Shared.of({})
-        found = self._element(shared, samples) if self.learns else {}
+        found = self._mask_suppression(shared, samples) if self.learns else {}
         batch, seen, pairs = self.stage.batch, list[Sample](), dict[int, tuple[Scales, Scales]]()
         for i, sample in samples.batch(shared, stage, iteration * batch, batch):
-            terms, truth, estimate = self._restored(sample)
+            terms, truth, estimate = self._restoration_terms(sample)
             pairs[i] = (truth, estimate)
             _backward([weight * term / batch for weight, term in terms.values() if weight])
             for name, (_, term) in terms.items():
@@ -142,22 +139,22 @@ class Learner:
         if self.average:
             self.average.update_parameters(self.net)
         if self.stage.adversarial:
-            found |= self._judge(pairs, self._rng("between", stage, iteration))
+            found |= self._train_critics(pairs, self._rng("between", stage, iteration))
         return found, seen
 
     def _names(self) -> list[str]:
-        """What an iteration of the stage finds, in whatever process."""
+        """Return the names of the losses of the stage, the same in every process."""
         weights = {"BSR": self.stage.bsr, "reconstruction": self.stage.reconstruction,
                    "adversarial": self.stage.adversarial}  # fmt: skip
         return [*(["LSR"] if self.learns else []), "L1", *(name for name, weight in weights.items() if weight)]
 
-    def _element(self, shared: Shared, samples: TrainingStream) -> Losses:
-        """The suppression of each band, one band at a time: what its norm needs is made again on the way back.
+    def _mask_suppression(self, shared: Shared, samples: TrainingStream) -> Losses:
+        """Differentiate the suppression of each band, one band at a time, so that the norm of one band is held at once.
 
-        Each process has its own bands, or a share of all of them, so that over all processes each band counts once.
+        Each process has bands of its own, or a share of all bands, so that each band counts once over all processes.
         """
-        psf: Psf = shared.values[self.how.psf]
-        count, times = samples.counted(self.how.psf, len(psf.clear_peak))
+        psf: Psf = shared.values[self.settings.psf]
+        count, times = samples.counted(self.settings.psf, len(psf.clear_peak))
         with torch.no_grad():
             peaks: Tensor = metrics.lsr(psf)
         if self.stage.lsr:
@@ -167,16 +164,16 @@ class Learner:
         return {"LSR": float(peaks.mean()) * (len(peaks) / count) / times}
 
     def _suppression(self, intensity: Tensor, clear: Tensor, band: int) -> Tensor:
-        one: Tensor = losses.lsr(Psf(intensity[band : band + 1], clear[band : band + 1]), log=self.how.logarithm)
+        one: Tensor = losses.lsr(Psf(intensity[band : band + 1], clear[band : band + 1]), log=self.settings.logarithm)
         return one
 
-    def _restored(self, sample: Sample) -> tuple[dict[str, tuple[float, Tensor]], Scales, Scales]:
-        """Each term with its weight; the truth and, cut off, the estimate."""
-        low = torch.autocast(self.device.partition(":")[0], torch.bfloat16, self.how.precision == "bfloat16")
+    def _restoration_terms(self, sample: Sample) -> tuple[dict[str, tuple[float, Tensor]], Scales, Scales]:
+        """Return each term with its weight, the truth, and the detached estimate."""
+        low = torch.autocast(device_kind(self.device), torch.bfloat16, self.settings.precision == "bfloat16")
         picture = sample.picture if self.learns else sample.picture.detach()
         with low:
             coarse, fine = self.net.pyramid(picture)
-        estimate = Scales(coarse.to(self.how.dtype), fine.to(self.how.dtype))
+        estimate = Scales(coarse.to(self.settings.dtype), fine.to(self.settings.dtype))
         truth = Scales.of(sample.truth.detach())
         terms = {"L1": (0.0, (estimate.fine - truth.fine).abs().mean())}
         if self.stage.bsr:
@@ -192,14 +189,14 @@ class Learner:
             terms["adversarial"] = (self.stage.adversarial, sum(scores, torch.zeros((), device=fine.device)))
         return terms, truth, Scales(estimate.coarse.detach(), estimate.fine.detach())
 
-    def _judge(self, pairs: Mapping[int, tuple[Scales, Scales]], rng: torch.Generator) -> Losses:
-        """Let the critics learn to tell truth and estimates apart; the stream is the same whoever has the pictures."""
+    def _train_critics(self, pairs: Mapping[int, tuple[Scales, Scales]], rng: torch.Generator) -> Losses:
+        """Let the critics learn to tell truth from estimates; the random stream does not depend on the process."""
         self.critic_optimizer.zero_grad(set_to_none=True)
         found, batch = {"critics": 0.0, "penalty": 0.0}, self.stage.batch
         for i in range(batch):
             if i not in pairs:
                 for _ in self.critics:
-                    skip_critic_draws(rng, self.how.patches if self.how.patch else 1)
+                    skip_critic_draws(rng, self.settings.patches if self.settings.patch else 1)
                 continue
             for critic, t, e in zip(self.critics, *pairs[i], strict=True):
                 apart = (critic(e) - critic(t)).mean()
@@ -212,16 +209,15 @@ class Learner:
         return found
 
     def _move(self, optimiser: torch.optim.Optimizer, found: Mapping[str, float], parts: Iterable[nn.Module]) -> float:
-        """One step against the gradient, unless it or a loss is not finite; the steepest gradient of a part.
+        """Step against the gradient, and return the largest norm of a part; raise `NotFinite` before a bad step.
 
-        Each part is limited by itself: the suppression pulls at the element a thousand times as hard as at a network.
+        The gradient of each part is clipped separately: the suppression acts on the mask a thousand times as strongly
+        as on a network.
         """
         parts = list(parts)
         self.mesh.add_gradients(parts)
-        norm = max(float(nn.utils.clip_grad_norm_(part.parameters(), _STEEPEST)) for part in parts)
-        wrong = [name for name, x in {**found, "norm of the gradient": norm}.items() if not abs(x) < float("inf")]
-        if wrong:
-            raise NotFinite(f"not finite: {', '.join(wrong)}")
+        norm = max(float(nn.utils.clip_grad_norm_(part.parameters(), STEEPEST)) for part in parts)
+        require_finite({**found, "norm of the gradient": norm})
         optimiser.step()
         return norm
 
@@ -231,12 +227,7 @@ def _backward(terms: Sequence[Tensor]) -> None:
         sum(terms[1:], terms[0]).backward()  # type: ignore[no-untyped-call]
 
 
-def _made(network: Network) -> Restorer:
+def _network_of(network: Network) -> Restorer:
     if network.kind == "fft_mamba":
         return FFTMamba(network.width, **network.options)
     return UNet(network.width) if network.kind == "unet" else NAFNet(network.width)
-
-
-def _averaged(net: nn.Module, decay: float) -> AveragedModel:
-    mean = get_ema_multi_avg_fn(decay)  # type: ignore[no-untyped-call]
-    return AveragedModel(net, multi_avg_fn=mean)

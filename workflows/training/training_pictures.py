@@ -1,9 +1,9 @@
-"""What a recipe is learnt from: pictures by number, each with its own scene, laser, sensor and noise.
+"""The pictures from which a recipe learns: by number, each with its own scene, laser, sensor and noise.
 
-A recipe falls into three: what neither learns nor is drawn is computed once; what follows the element alone is
-computed once an iteration; what follows a scene, a draw or a random step is computed for each picture. Between the
-second and the third the gradient waits until all pictures are done, so that no more than one of them is held. Of
-several processes each has its own pictures, and along a band axis its own bands of what is shared.
+The steps of a recipe fall into three parts. Steps that neither learn nor are drawn are computed once. Steps that
+depend on the mask alone are computed once an iteration. Steps that follow a scene, a draw or a random step are computed
+for each picture. Between the second and the third part the gradient waits until all pictures are done, so that one
+picture is held at a time. Of several processes each has its own pictures, and along a band axis its own bands.
 """
 
 from __future__ import annotations
@@ -34,56 +34,60 @@ _SEEDS = 2**31
 
 @dataclass(frozen=True)
 class Sample:
-    """One picture, or patches of it."""
+    """One picture, or patches of the picture."""
 
-    picture: Tensor  #: (n, 3, y, x) what the camera gives, developed
+    picture: Tensor  #: (n, 3, y, x), of the camera, developed
     truth: Tensor  #: (n, 3, y, x)
-    light: Tensor  #: (band,) share of the scene's light that the element keeps
-    drawn: Mapping[str, Any]  #: what it was made with
+    light: Tensor  #: (band,), the share of the scene's light that the mask keeps
+    drawn: Mapping[str, Any]  #: the values that were drawn for it
 
 
 class TrainingStream:
-    """Draws pictures through a recipe whose element learns, or through the same recipe ``frozen``."""
+    """The stream of pictures of a recipe whose mask learns, or of the same recipe ``frozen``."""
 
     def __init__(
         self,
         recipe: Recipe,
-        how: Training,
+        settings: Training,
         photographs: Photographs,
         store: Store,
         device: str,
         frozen: Recipe | None = None,
         mesh: Mesh = ALONE,
     ) -> None:
-        learn = None if frozen else how.learn
-        self.how, self.photographs, self.device, self.seed, self.mesh = how, photographs, device, recipe.seed, mesh
-        self._pool = how.pool if frozen else None
+        learn = None if frozen else settings.learn
+        self.settings, self.photographs, self.device = settings, photographs, device
+        self.seed, self.mesh = recipe.seed, mesh
+        self._pool = settings.pool if frozen else None
         self._kept: dict[tuple[int, int], Sample] = {}
-        wanted = (how.picture, how.truth, how.light, how.psf)
-        _present(recipe, (*wanted, how.scene, *([learn] if learn else [])))
+        wanted = (settings.picture, settings.truth, settings.light, settings.psf)
+        _present(recipe, (*wanted, settings.scene, *([learn] if learn else [])))
         self._inputs = Inputs.of(recipe, wanted) if recipe.uncertain and recipe.uncertain.names else None
-        self.shape = _frame(recipe, how.scene)
+        self.shape = _frame(recipe, settings.scene)
         recipe = with_substitutions(frozen or recipe, wanted, {learn} if learn else ())
         order = needed(recipe, wanted)
         self._lasers = [f"{n}.{_LASER[1]}" for n in order if recipe.steps[n].node.path == _LASER[0]]
         readers = dict.fromkeys([*(self._inputs.readers if self._inputs else ()), *self._lasers])
         self._readers = {name: _given(recipe, name) for name in readers}
-        fixed = set(needed(recipe, [how.psf]))  # a window that is dirty stays as it is
+        fixed = set(needed(recipe, [settings.psf]))  # a window that is dirty stays as it is
         noise = {name for name in order if recipe.steps[name].node.random and name not in fixed}
-        drawn = _behind(recipe, order, noise | {how.scene, *(name.rpartition(".")[0] for name in readers)})
+        drawn = _behind(recipe, order, noise | {settings.scene, *(name.rpartition(".")[0] for name in readers)})
         learnt = _behind(recipe, order, {learn} if learn else set())
-        if how.psf in drawn:
-            raise ValueError(f"{how.psf} is drawn anew with each picture: its suppression cannot be learnt from")
-        self.shards = Shards.of(recipe, how.psf, wanted, drawn | learnt, store, mesh)
+        if settings.psf in drawn:
+            raise ValueError(f"{settings.psf} changes with each picture: learn its suppression from a PSF that stays")
+        self.shards = Shards.of(recipe, settings.psf, wanted, drawn | learnt, store, mesh)
         drawn |= self.shards.behind
-        self._divide(recipe, learn, noise, drawn, _border(recipe, order, learnt - drawn, drawn, how.psf), store)
+        border = _read_by_pictures(recipe, order, learnt - drawn, drawn, settings.psf)
+        self._divide(recipe, learn, noise, drawn, border, store)
 
     def _divide(
         self, recipe: Recipe, learn: str | None, noise: set[str], drawn: set[str], border: list[str], store: Store
     ) -> None:
-        """What follows the element alone and ends at ``border``, and what is computed for each picture."""
+        """Divide the recipe: steps up to ``border`` that depend on the mask alone, and steps of each picture."""
         ways: dict[str, Any] = {"store": store, "device": self.device}
-        within, outputs = [*border, self.how.scene, *self._readers], [self.how.picture, self.how.truth, self.how.light]
+        settings = self.settings
+        within = [*border, settings.scene, *self._readers]
+        outputs = [settings.picture, settings.truth, settings.light]
         shared = {**ways, "caller": self.shards.call}
         self.shared = as_function(recipe, learn, outputs=border, **shared) if learn else None
         read = {source for reader in drawn - self.shards.steps for source in recipe.steps[reader].sources}
@@ -91,19 +95,19 @@ class TrainingStream:
         self._each = Pictures(recipe, within, outputs, noise, self.shards, ways)
 
     def begin(self, height: Tensor) -> Shared:
-        """What follows the element alone, for all pictures of an iteration."""
-        made = self.shared({str(self.how.learn): height}) if self.shared else {}
+        """Compute what depends on the mask alone, for all pictures of an iteration."""
+        made = self.shared({str(self.settings.learn): height}) if self.shared else {}
         return Shared.of(made, self.shards, self._whole)
 
     def counted(self, name: str, here: int) -> tuple[int, int]:
-        """Of ``here`` bands of a result: how many there are in all, and how many processes have each."""
+        """Return the bands of a result in all processes, and the number of processes that have each band."""
         by_band = name in self.shards.steps
         return (self.shards.count, self.mesh.data) if by_band else (here, self.mesh.size)
 
     def batch(self, shared: Shared, stage: int, first: int, count: int) -> Iterator[tuple[int, Sample]]:
-        """This process's pictures of ``count`` from number ``first`` on, each with its place among them.
+        """Return this process's pictures among ``count`` from number ``first`` on, each with its place.
 
-        To be gone through to the end, for what comes behind a picture goes back to all that had a share in it.
+        The caller reads every picture, for the gradients of a picture return to all processes that had a share.
         """
         group = range(self.mesh.row, count, self.mesh.data)
         for begin in range(0, len(group), self.mesh.band):
@@ -124,7 +128,7 @@ class TrainingStream:
                     yield mine, self._sample(found, begun[mine][2])
 
     def __call__(self, shared: Mapping[str, Any], stage: int, number: int) -> Sample:
-        """The picture of this number: the same whoever asks, and in whatever order."""
+        """Return the picture of a number, which depends neither on the order nor on the process."""
         if self._pool is None:
             return self._alone(shared, stage, number)
         number %= self._pool
@@ -137,39 +141,38 @@ class TrainingStream:
         return self._sample(self._each.alone({**shared, **theta}, noise), drawn)
 
     def _drawn(self, stage: int, number: int) -> tuple[dict[str, Any], int, dict[str, Any]]:
-        """What a picture is made of, the seed of its noise, and all that was drawn."""
+        """Return the inputs of a picture, the seed of its noise, and all values that were drawn."""
         rng = np.random.default_rng((self.seed, stage, number, 1))
         theta, drawn = dict(self._readers), dict[str, Any]()
         if self._inputs is not None:
             values = self._inputs.at(rng.standard_normal((1, len(self._inputs.names))))[0]
             drawn = dict(zip(self._inputs.names, map(float, values), strict=True))
             theta |= self._inputs.theta(drawn)
-        if rng.random() < self.how.laser_free:
+        if rng.random() < self.settings.laser_free:
             theta |= dict.fromkeys(self._lasers, 0.0)
             drawn["laser"] = "none"
         scene = self.photographs.crop(self.shape, self.seed, (stage, number))
-        theta |= {self.how.scene: scene.to(self.device, self.how.dtype)}
+        theta |= {self.settings.scene: scene.to(self.device, self.settings.dtype)}
         noise = int(rng.integers(_SEEDS))
         return theta, noise, {**drawn, "noise": noise, "number": number}
 
     def _sample(self, found: Mapping[str, Any], drawn: Mapping[str, Any]) -> Sample:
-        picture, truth = (found[name].to(self.how.dtype) for name in (self.how.picture, self.how.truth))
-        if self.how.size is not None:
-            picture, truth = _resized(picture, self.how.size), _resized(truth, self.how.size)
+        picture, truth = (found[name].to(self.settings.dtype) for name in (self.settings.picture, self.settings.truth))
+        if self.settings.size is not None:
+            picture, truth = _resized(picture, self.settings.size), _resized(truth, self.settings.size)
         picture, truth = self._patches(torch.stack([picture, truth]), drawn["noise"])
-        return Sample(picture, truth, found[self.how.light], drawn)
+        return Sample(picture, truth, found[self.settings.light], drawn)
 
     def _patches(self, both: Tensor, seed: int) -> Tensor:
-        """(2, 3, y, x) -> (2, n, 3, y, x): the same places of a picture and of its truth, or all of it."""
-        if self.how.patch is None:
+        """Cut patches at the same places of a picture and its truth: (2, 3, y, x) -> (2, n, 3, y, x)."""
+        if self.settings.patch is None:
             return both[:, None]
-        size, patch = (both.shape[-2], both.shape[-1]), self.how.patch
+        size, patch = (both.shape[-2], both.shape[-1]), self.settings.patch
         if any(have < want for have, want in zip(size, patch, strict=True)):
             raise ValueError(f"train.patch: {list(patch)} is larger than the picture, {list(size)}")
         rng = np.random.default_rng((seed, 2))
-        places = [
-            [int(rng.integers(h - w + 1)) for h, w in zip(size, patch, strict=True)] for _ in range(self.how.patches)
-        ]
+        count = self.settings.patches
+        places = [[int(rng.integers(h - w + 1)) for h, w in zip(size, patch, strict=True)] for _ in range(count)]
         return torch.stack([both[..., y : y + patch[0], x : x + patch[1]] for y, x in places], 1)
 
 
@@ -190,7 +193,7 @@ def _present(recipe: Recipe, names: Sequence[str]) -> None:
 def _frame(recipe: Recipe, scene: str) -> tuple[int, int]:
     shape = recipe.steps[scene].params.get("shape")
     if shape is None:
-        raise ValueError(f"train: {scene} has no shape: say how large a piece of a photograph shall be")
+        raise ValueError(f"train: {scene} has no shape: give the size of the piece of a photograph")
     return shape[0], shape[1]
 
 
@@ -199,14 +202,14 @@ def _given(recipe: Recipe, name: str) -> Any:
     return recipe.steps[step].params[param]
 
 
-def _border(recipe: Recipe, order: Sequence[str], made: set[str], drawn: set[str], psf: str) -> list[str]:
-    """What of ``made`` a picture reads, and the PSF."""
+def _read_by_pictures(recipe: Recipe, order: Sequence[str], made: set[str], drawn: set[str], psf: str) -> list[str]:
+    """Return the steps of ``made`` that a picture reads, and the PSF."""
     read = {source for reader in drawn for source in recipe.steps[reader].sources}
     return [name for name in order if name in made and (name == psf or name in read)]
 
 
 def _behind(recipe: Recipe, order: Sequence[str], first: set[str]) -> set[str]:
-    """``first`` and the steps that follow."""
+    """Return the steps ``first`` and the steps that follow them."""
     found = set(first)
     for name in order:
         if not found.isdisjoint(recipe.steps[name].sources):

@@ -122,8 +122,8 @@ def test_calibrate_study_and_train_hand_their_options_to_their_rooms(monkeypatch
     losses = []
     lift = neusee.load("train_lift")
     assert neusee.train(lift, store=store, watch=lambda *found: losses.append(found)) == Path("made/lift")
-    asked["lift"][0][-1](7, {"MRAE": 0.5})
-    assert losses == [(1, 7, {"MRAE": 0.5})]
+    asked["lift"][0][-1](0, 7, {"MRAE": 0.5})
+    assert losses == [(0, 7, {"MRAE": 0.5})]
 
 
 def test_an_unknown_kind_of_study_is_refused_with_those_there_are():

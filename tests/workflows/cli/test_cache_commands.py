@@ -3,7 +3,7 @@
 import pytest
 import torch
 
-from neusee.workflows.cli import cache_lines
+from neusee.workflows.cli import cache_commands
 from neusee.workflows.store.derived_files import DerivedFiles
 from neusee.workflows.store.result_store import Store
 
@@ -24,7 +24,7 @@ def store(tmp_path):
 
 def test_results_are_listed_the_newest_last(store):
     store.pin(KEYS[0])
-    assert cache_lines.ls_lines(store) == [
+    assert cache_commands.ls_lines(store) == [
         "date                 bytes  seconds  step  recipe  key",
         "2026-01-01 00:00:00  20 kB  0.500    s0    r       ab000000  pinned",
         "2026-01-02 00:00:00  20 kB  1.500    s1    r       ab111111",
@@ -34,14 +34,14 @@ def test_results_are_listed_the_newest_last(store):
 
 
 def test_an_empty_store_is_listed(tmp_path):
-    assert cache_lines.ls_lines(Store(tmp_path / "none", budget=10**9)) == [
+    assert cache_commands.ls_lines(Store(tmp_path / "none", budget=10**9)) == [
         f"0 results, 0 B, in {tmp_path / 'none'}; the budget is 1 GB"
     ]
 
 
 def test_a_sound_store_is_verified(store):
     DerivedFiles(store).keep("ef" * 16, ".png", "picture", b"x" * 980_000)
-    assert cache_lines.verify_lines(store) == (["3 results, 1.02 MB, as written"], 0)
+    assert cache_commands.verify_lines(store) == (["3 results, 1.02 MB, as written"], 0)
 
 
 @pytest.mark.parametrize("mode", ["always", "never"])
@@ -54,7 +54,7 @@ def test_what_is_damaged_is_named_and_put_aside(store, mode):
         data = bytearray(path.read_bytes())
         data[at] ^= 1
         path.write_bytes(data)
-    lines, bad = cache_lines.verify_lines(Store(store.root, verify=mode))
+    lines, bad = cache_commands.verify_lines(Store(store.root, verify=mode))
     assert bad == 3
     assert lines[:3] == [
         f"{KEYS[0]}  s0  checksum mismatch: the stored bytes have changed since they were written",
@@ -63,33 +63,33 @@ def test_what_is_damaged_is_named_and_put_aside(store, mode):
     ]
     assert lines[3].startswith("1 result, 20 kB, as written; 3 damaged, put aside in ")
     assert {path.stem for path in (store.root / "bad").iterdir()} == {KEYS[0], KEYS[2], "ef" * 16}
-    assert cache_lines.verify_lines(Store(store.root)) == (["1 result, 20 kB, as written"], 0)
+    assert cache_commands.verify_lines(Store(store.root)) == (["1 result, 20 kB, as written"], 0)
 
 
 def test_room_is_made(store):
-    dry = cache_lines.gc_lines(store, "30 kB", dry=True)
+    dry = cache_commands.gc_lines(store, "30 kB", dry=True)
     assert dry[0] == "20 kB  0.500  s0  ab000000"
     assert dry[1].startswith("1 value and 0 files that belonged to no result would go: 2")
     assert store.has(KEYS[0])
-    done = cache_lines.gc_lines(store, "30 kB")
+    done = cache_commands.gc_lines(store, "30 kB")
     assert done[0] == dry[0]
     assert done[1].startswith("1 value and 0 files that belonged to no result went: 2")
     assert done[1].endswith(f" stay in {store.root}")
     assert not store.has(KEYS[0])
     assert store.has(KEYS[1])
-    assert cache_lines.gc_lines(store)[0].startswith("0 values and 0 files")
+    assert cache_commands.gc_lines(store)[0].startswith("0 values and 0 files")
     with pytest.raises(ValueError, match="'a lot' is not a size"):
-        cache_lines.gc_lines(store, "a lot")
+        cache_commands.gc_lines(store, "a lot")
 
 
 def test_a_value_is_pinned_by_the_beginning_of_its_key(store):
-    assert cache_lines.pin_lines(store, "AB0") == [f"pinned: {KEYS[0]}  s0"]
+    assert cache_commands.pin_lines(store, "AB0") == [f"pinned: {KEYS[0]}  s0"]
     assert store.pinned() == {KEYS[0]}
     with pytest.raises(ValueError, match="'ab' names no single value: these begin so: ab0000000000, ab1111111111"):
-        cache_lines.pin_lines(store, "ab")
+        cache_commands.pin_lines(store, "ab")
     with pytest.raises(ValueError, match="'cd' names no single value: no value begins so"):
-        cache_lines.pin_lines(store, "cd")
+        cache_commands.pin_lines(store, "cd")
     with pytest.raises(ValueError, match="'ab1' names no single pinned value"):
-        cache_lines.pin_lines(store, "ab1", pin=False)
-    assert cache_lines.pin_lines(store, "ab0", pin=False) == [f"no longer pinned: {KEYS[0]}  s0"]
+        cache_commands.pin_lines(store, "ab1", pin=False)
+    assert cache_commands.pin_lines(store, "ab0", pin=False) == [f"no longer pinned: {KEYS[0]}  s0"]
     assert store.pinned() == set()

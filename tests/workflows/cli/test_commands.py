@@ -94,7 +94,7 @@ def test_a_second_run_is_cached_and_says_what_slept(neusee):
     neusee("run", "mine.yaml")
     _, out, _ = neusee("run", "mine.yaml")
     assert "cached" in next(line for line in out.splitlines() if line.startswith("  made"))
-    assert "1 steps were not looked at" in out
+    assert "1 steps were not needed" in out
     assert "2 cached" in out
 
 

@@ -86,7 +86,7 @@ def test_a_damaged_result_fails_the_verification(neusee, here):
         (("cache", "pin", "zzz"), "zzz"),
         (("cache", "why", "zzz"), "zzz"),
         (("run", "mine.yaml", "--executor", "ray"), "--executor ray: write local, dask"),
-        (("run", "mine.yaml", "--device", "cpu,cpu"), "names one device twice"),
+        (("run", "mine.yaml", "--device", "cpu,cpu"), "names a device twice"),
         (("run", "mine.yaml", "--device", "gpu"), "--device gpu"),
         (("run", "mine.yaml", "--memory", "lots"), "--memory"),
         (("sweep", "mine.yaml", "sensor.gain=0.5,0.6", "--on-error", "ignore"), "--on-error ignore"),

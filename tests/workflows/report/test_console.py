@@ -35,7 +35,7 @@ def done(step: str, state: str, seconds: float = 0.25, ok: bool = True) -> Event
 
 
 def test_items_share_a_line_that_comes_when_the_last_is_done(capsys):
-    with console_room.Plain(recipe(), NAMES) as shown:
+    with console_room.RunTable(recipe(), NAMES, "plain") as shown:
         shown.watch(Event(NAMES[0], None))
         shown.watch(done(NAMES[0], "run"))
         assert "spot" not in capsys.readouterr().out
@@ -45,11 +45,11 @@ def test_items_share_a_line_that_comes_when_the_last_is_done(capsys):
     assert " ".join(out.split()) == "spot ×2 cpu 1 run, 1 cached 0.250 3 × 4 × 5 e- peak 3"
     rest = capsys.readouterr().out
     assert "raw" not in rest
-    assert "1 steps were not looked at" in rest
+    assert "1 steps were not needed" in rest
 
 
 def test_a_check_that_does_not_hold_is_shown_of_all_items(capsys):
-    with console_room.Plain(recipe(), NAMES) as shown:
+    with console_room.RunTable(recipe(), NAMES, "plain") as shown:
         shown.watch(done(NAMES[0], "run"))
         shown.watch(done(NAMES[1], "run", ok=False))
     assert "LOOK: peak 3" in capsys.readouterr().out
@@ -59,7 +59,7 @@ def test_a_check_that_does_not_hold_is_shown_of_all_items(capsys):
 def test_the_live_table_shows_what_has_begun(width):
     from rich.console import Console
 
-    shown = console_room.Live(recipe(), NAMES)
+    shown = console_room.RunTable(recipe(), NAMES, "live")
     out = io.StringIO()
     console = Console(file=out, width=width)
     shown.watch(Event("raw", None))
@@ -73,12 +73,12 @@ def test_the_live_table_shows_what_has_begun(width):
 
 
 def test_nothing_is_printed_where_silence_was_asked_for(capsys):
-    with console_room.screen(recipe(), NAMES, silent=True) as shown:
+    with console_room.RunTable(recipe(), NAMES, console_room.mode_for(silent=True)) as shown:
         shown.watch(done("raw", "run"))
     assert capsys.readouterr().out == ""
 
 
 def test_left_out_steps_are_named_once_with_the_largest_bound():
     rows = [{"step": f"dark[{i}]", "bound": b} for i, b in (("a", 1e-5), ("b", 3e-5))]
-    line = console_room.said_of_left_out({"left_out": rows, "tolerance": 1e-3})
+    line = console_room.left_out_line({"left_out": rows, "tolerance": 1e-3})
     assert line == "left out dark (at most 3.0e-05); tolerance 0.001"

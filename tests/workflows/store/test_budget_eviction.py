@@ -13,7 +13,8 @@ from hypothesis import strategies as st
 
 from neusee.workflows.store import budget_eviction, shared_folder
 from neusee.workflows.store.band_files import Stacked
-from neusee.workflows.store.budget_eviction import Candidate, bytes_of, chosen
+from neusee.workflows.store.budget_eviction import Candidate, chosen
+from neusee.workflows.store.byte_sizes import parse_size
 from neusee.workflows.store.derived_files import DerivedFiles
 from neusee.workflows.store.result_store import Store
 
@@ -58,7 +59,7 @@ def payloads(root):
     ],
 )
 def test_sizes_are_read_as_people_write_them(text, size, monkeypatch, tmp_path):
-    assert bytes_of(text) == size
+    assert parse_size(text) == size
     monkeypatch.setenv("NEUSEE_CACHE_BUDGET", text)
     assert Store(tmp_path).budget == size
     assert Store(tmp_path, budget=7).budget == 7

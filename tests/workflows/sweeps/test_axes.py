@@ -66,7 +66,7 @@ def test_values_as_they_are_written(text, values):
         ("linspace(1 nm, 2 um, 3)", "linspace: write every number in one unit, not in nm, um"),
         ("linspace(1, 2 um, 3)", "linspace: write every number in one unit, not in none, um"),
         ("linspace(1, 2)", "linspace: takes first, last and how many"),
-        ("linspace(1, 2, 2.5)", "linspace: how many is a whole number from 1, not 2.5"),
+        ("linspace(1, 2, 2.5)", "linspace: the number of values is a whole number from 1, not 2.5"),
         ("linspace(1, 2, 0)", "linspace: is empty"),
         ("logspace(0, 1, 3)", "logspace: both ends must be positive"),
         ("linspce(1, 2, 3)", "no range linspce; did you mean linspace?"),
@@ -138,7 +138,7 @@ def test_paired_axes_run_together(tmp_path):
 
 def test_paired_axes_of_unequal_length_name_both(tmp_path):
     arguments = read_words(["a=1,2", "b=range(3)"], tmp_path, first=2)
-    told = "argument 3 | b | has 3 values, and a (argument 2) has 2: paired axes have equally many"
+    told = "argument 3 | b | has 3 values, and a (argument 2) has 2: paired axes have equally many values"
     assert refused(lambda: points(arguments, paired=True)) == [told]
 
 
@@ -152,7 +152,7 @@ def test_every_wrong_argument_is_named_at_once(tmp_path):
     [
         (["a=1"], "sweep |  | no axis: write a=1,2,3 or a='linspace(450 nm, 650 nm, 5)'"),
         (["a=1,2", "a=3,4"], "argument 2 | a | is an axis already (argument 1)"),
-        (["a=1,2,1"], "argument 1 | a | 1 stands twice"),
+        (["a=1,2,1"], "argument 1 | a | 1 appears twice"),
         (["a=range(1000)", "b=range(1000)"], "sweep |  | 1000000 points: at most 100000"),
     ],
 )

@@ -5,7 +5,7 @@ import random
 
 import pytest
 
-from neusee.workflows.sweeps.point_order import Job, best_order, filled, sharing, work_left
+from neusee.workflows.sweeps.point_order import PointJob, best_order, filled, sharing, work_left
 
 REACH = {"pupil": "a", "psf": "ab", "scene": "b", "sensor": "abc", "noise": "c", "fixed": ""}
 CHAIN = {
@@ -27,7 +27,7 @@ def jobs_of(sizes, reach=REACH):
         keys = {
             step: f"{step}:" + ",".join(f"{n}{value[n]}" for n in names if n in axes) for step, axes in reach.items()
         }
-        found.append(Job(place, keys, CHAIN, ("noise",)))
+        found.append(PointJob(place, keys, CHAIN, ("noise",)))
     return found
 
 
@@ -77,7 +77,7 @@ def test_without_costs_the_axis_that_reaches_more_steps_varies_slowest():
 
 def test_paired_points_with_the_same_costly_result_stand_together():
     keys = [("x", 1), ("y", 2), ("x", 3), ("y", 4)]
-    jobs = [Job((i, i), {"pupil": p, "noise": f"n{n}"}, {}, ("noise",)) for i, (p, n) in enumerate(keys)]
+    jobs = [PointJob((i, i), {"pupil": p, "noise": f"n{n}"}, {}, ("noise",)) for i, (p, n) in enumerate(keys)]
     assert best_order(jobs, {"pupil": 5.0, "noise": 9.0}, paired=True) == [0, 2, 1, 3]
 
 
@@ -106,5 +106,7 @@ def test_work_left_stops_at_what_is_stored_and_at_what_a_point_before_made():
 def test_a_chain_of_ten_thousand_steps_is_walked():
     names = [f"s{i}" for i in range(10_000)]
     sources = {name: (before,) for before, name in itertools.pairwise(names)} | {"s0": ()}
-    jobs = [Job((i,), {n: n if n != names[-1] else f"last{i}" for n in names}, sources, (names[-1],)) for i in (0, 1)]
+    jobs = [
+        PointJob((i,), {n: n if n != names[-1] else f"last{i}" for n in names}, sources, (names[-1],)) for i in (0, 1)
+    ]
     assert work_left(jobs, {}, lambda key: False) == [10_000.0, 1.0]

@@ -11,7 +11,7 @@ from pathlib import Path
 import pytest
 import torch
 
-from neusee.workflows.cli.sweep_output import run_sweep
+from neusee.workflows.cli.sweep_screen import run_sweep
 from neusee.workflows.graph.diagnostics import RecipeError
 from neusee.workflows.graph.run_error import RunError
 from neusee.workflows.store.result_store import Store
@@ -380,9 +380,9 @@ def test_fifty_sweeps_leave_nothing_behind(recipe, tmp_path):
 
 def test_points_share_their_composed_values(recipe, store):
     from neusee.workflows.sweeps.axes import points, read_axes
-    from neusee.workflows.sweeps.sweep_points import planned
+    from neusee.workflows.sweeps.sweep_points import plan_sweep
 
-    found = planned(
+    found = plan_sweep(
         recipe,
         points(read_axes({"sensor.read_noise": [f"{n} e-" for n in range(9)]}, Path())),
         Path().absolute(),

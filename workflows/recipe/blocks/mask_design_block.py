@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from pathlib import Path
 from typing import Annotated, Any, Literal, Self
 
@@ -14,6 +15,11 @@ from neusee.nodes.units import Count, DataFile, PositiveLength, Wavelength
 Weight = Annotated[float, Field(ge=0, allow_inf_nan=False)]
 Kind = Literal["pixelwise", "element", "zernike", "rings", "unet", "five_half_rings"]
 _RATE = {"pixelwise": 0.05, "element": 4e-3, "zernike": 0.1, "rings": 0.1, "unet": 2e-3, "five_half_rings": 1.0}
+
+
+def half_cosine(angle: float) -> float:
+    """Return the factor of a learning rate that falls from 1 at an angle of 0 to 0 at an angle of pi."""
+    return 0.5 * (1 + math.cos(angle))
 
 
 class Weights(BaseModel):

@@ -8,6 +8,7 @@ from typing import Annotated, Any, Literal
 from pydantic import BaseModel, ConfigDict, Field, ValidationError
 
 from neusee.workflows.graph.diagnostics import Diagnostic, nearest
+from neusee.workflows.recipe.blocks.mask_design_block import half_cosine
 from neusee.workflows.recipe.text.composition import Composed
 from neusee.workflows.recipe.text.yaml_values import Value
 
@@ -29,19 +30,19 @@ class LiftTraining(BaseModel):
     iterations: Number
     batch: Number = 4
     rate: Annotated[float, Field(gt=0, allow_inf_nan=False)] = 4e-4
-    least: Annotated[float, Field(ge=0, allow_inf_nan=False)] = 1e-6
+    min_rate: Annotated[float, Field(ge=0, allow_inf_nan=False)] = 1e-6
     betas: tuple[Beta, Beta] = (0.9, 0.999)
-    warm: Annotated[int, Field(ge=0)] = 200
+    warmup: Annotated[int, Field(ge=0)] = 200  #: iterations in which the rate rises evenly
     floor: Annotated[float, Field(gt=0, le=1)] = 0.02
-    average: Beta = 0.998
-    judge: Number = 32
+    ema_decay: Beta = 0.998  #: of the moving average of the weights; 0: no average
+    validation_batches: Number = 32  #: pictures on which the network is judged at the end
     keep: Number = 100
     show: Number = 1000
 
     def rate_at(self, iteration: int) -> float:
-        """Return the rate of an iteration from 0: linear warm-up, then half a cosine from `rate` to `least`."""
-        least, rising = min(self.least, self.rate), min(1.0, (iteration + 1) / max(self.warm, 1))
-        return rising * (least + (self.rate - least) * 0.5 * (1 + math.cos(math.pi * iteration / self.iterations)))
+        """Return the rate of an iteration from 0: linear warm-up, then half a cosine from `rate` to `min_rate`."""
+        least, rising = min(self.min_rate, self.rate), min(1.0, (iteration + 1) / max(self.warmup, 1))
+        return rising * (least + (self.rate - least) * half_cosine(math.pi * iteration / self.iterations))
 
 
 def read_lift_training(composed: Composed) -> tuple[Composed, LiftTraining | None]:

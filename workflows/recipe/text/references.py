@@ -9,7 +9,7 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
-from neusee.workflows.graph.diagnostics import Diagnostic
+from neusee.workflows.graph.diagnostics import UNREAD, Diagnostic
 from neusee.workflows.recipe.text.composition import packaged
 from neusee.workflows.recipe.text.overrides import RESERVED
 from neusee.workflows.recipe.text.yaml_values import Value, Where, dotted
@@ -157,7 +157,8 @@ class References:
             shown = dotted(instead[-1:] if instead[:-1] == leaf.path[:-1] else instead)
             hint = f"; did you mean {shown}?" if shown else ": no step refers to this value"
             asker = f" (needed at {wanted[instead].mark})" if instead in wanted else ""
-            self.diagnostics.append(Diagnostic(leaf.key, leaf.name, f"unknown{hint}{asker}"))
+            code = "" if shown else UNREAD
+            self.diagnostics.append(Diagnostic(leaf.key, leaf.name, f"unknown{hint}{asker}", code))
         self.diagnostics += [problem for path, problem in self.lacking if path not in misspelt]
 
     def _block_leaves(self) -> Iterator[Value]:

@@ -13,7 +13,7 @@ from typing import Any
 from neusee.workflows.calibration.identifiability import KINDS, identify
 from neusee.workflows.calibration.log_posterior import SensorPosterior
 from neusee.workflows.calibration.posterior_mode import find_mode, initial_theta
-from neusee.workflows.engine.threads import one_thread
+from neusee.workflows.engine.local_executor import one_thread
 from neusee.workflows.graph.recipe_graph import Recipe
 from neusee.workflows.keys.cache_key import digest
 from neusee.workflows.report.study_folder import CsvTable, Progress, StudyReport, StudyRun

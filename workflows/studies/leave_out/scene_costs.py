@@ -11,7 +11,7 @@ from dataclasses import dataclass, replace
 
 from neusee.workflows.engine.provenance import machine
 from neusee.workflows.engine.runner import Result, run
-from neusee.workflows.graph.diagnostics import RecipeError
+from neusee.workflows.graph.diagnostics import UNREAD, RecipeError
 from neusee.workflows.graph.recipe_graph import Recipe, needed
 from neusee.workflows.graph.run_error import RunError
 from neusee.workflows.keys.cache_key import Key, digest, key_of
@@ -25,7 +25,6 @@ from neusee.workflows.studies.cold_run import cold
 _TIMES = 3  #: cold runs, of which the median counts
 _QUICK = 5.0  #: s; what takes longer is run once
 _WINDOW = ("flare.dirt", "flare.ghosts")
-_UNREAD = "no step refers to this value"
 _LIFT = "steps.cube={node: spectra.lift_mallett, from: {rgb: scene, bands: bands}}"  #: of as few bands as one
 _GREY = "steps.scene={node: scene.targets, with: {kind: siemens, shape: '${scene.shape}'}}"
 
@@ -81,7 +80,7 @@ def _changed(recipe: Recipe, overrides: Sequence[str]) -> Recipe:
     try:
         return changed(recipe, overrides)
     except RecipeError as error:
-        unread = [f"~{problem.path}" for problem in error.diagnostics if _UNREAD in problem.message]
+        unread = [f"~{problem.path}" for problem in error.diagnostics if problem.code == UNREAD]
         if len(unread) < len(error.diagnostics):
             raise
         return changed(recipe, [*overrides, *unread])

@@ -10,8 +10,8 @@ from functools import partial
 from pathlib import Path
 from typing import Any
 
+from neusee.workflows.engine.local_executor import one_thread
 from neusee.workflows.engine.provenance import versions
-from neusee.workflows.engine.threads import one_thread
 from neusee.workflows.graph.recipe_graph import Recipe
 from neusee.workflows.keys.cache_key import digest
 from neusee.workflows.keys.code_digest import Code

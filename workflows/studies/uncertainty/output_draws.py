@@ -18,11 +18,11 @@ import torch
 from torch import Tensor
 
 from neusee.workflows.engine.differentiable_function import as_function
+from neusee.workflows.engine.local_executor import one_thread
 from neusee.workflows.engine.node_call import place
 from neusee.workflows.engine.provenance import timestamp
-from neusee.workflows.engine.threads import one_thread
 from neusee.workflows.graph.recipe_graph import needed
-from neusee.workflows.keys.cache_key import digest, key_of
+from neusee.workflows.keys.cache_key import device_kind, digest, key_of
 from neusee.workflows.keys.code_digest import Code
 from neusee.workflows.keys.engine_digest import engine
 from neusee.workflows.recipe.distributions.uncertain_inputs import Inputs
@@ -100,7 +100,7 @@ class OutputDraws:
         """Return what decides the outputs at a draw: the keys of a run with these values."""
         recipe = self.inputs.recipe
         keys = self._keys(self.inputs.theta(self._named(row)))
-        within = [recipe.tolerance, recipe.exact, self.device.partition(":")[0]]
+        within = [recipe.tolerance, recipe.exact, device_kind(self.device)]
         return digest(
             "uncertainty draw",
             engine("studies.uncertainty.output_draws"),

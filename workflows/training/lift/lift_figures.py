@@ -1,4 +1,4 @@
-"""Pictures of a lift that learns: its errors, and spectra beside the truth."""
+"""Figures of a lift that learns: the curves of its errors, and spectra beside the truth."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ from typing import Any
 from torch import Tensor
 
 from neusee.workflows.report.figures.style import BLACK, BLUE, ORANGE, canvas, drawn, encoded, picture
-from neusee.workflows.training.training_figures import middle
+from neusee.workflows.training.training_figures import running_median
 
 _SHOWN = ("MRAE", "RMSE", "rate")
 _COLOURS = {"mst_plus_plus": BLUE, "linear": ORANGE}
@@ -16,12 +16,12 @@ _COLOURS = {"mst_plus_plus": BLUE, "linear": ORANGE}
 
 @drawn
 def lift_curves(rows: Sequence[Mapping[str, str]]) -> Any:
-    """Each error over the iterations; pale: single iterations, full: their middle."""
+    """Draw each error over the iterations: pale as it is, full as a running median."""
     figure, axes = canvas(11.0, 3.0, 1, len(_SHOWN))
     for ax, name in zip(axes.flat, _SHOWN, strict=True):
         values = [float(row[name]) for row in rows]
         ax.plot(values, color=BLUE, alpha=0.25, linewidth=0.7)
-        ax.plot(middle(values), color=BLUE, linewidth=1.5)
+        ax.plot(running_median(values), color=BLUE, linewidth=1.5)
         ax.set_yscale("log", nonpositive="mask")
         ax.set_title(name)
     figure.supxlabel("iteration")
@@ -30,7 +30,7 @@ def lift_curves(rows: Sequence[Mapping[str, str]]) -> Any:
 
 @drawn
 def lifted_spectra(shown: Tensor, truth: Tensor, estimates: Mapping[str, Tensor], centres: Tensor) -> Any:
-    """A picture, and at five of its pixels the true spectrum (black) and the estimates."""
+    """Draw a picture, and at five of its pixels the true spectrum (black) and the estimates."""
     figure, axes = canvas(13.0, 2.6, 1, 6)
     y, x = shown.shape[-2:]
     at = [(y * (2 * i + 1) // 10, x * (2 * ((3 * i) % 5) + 1) // 10) for i in range(5)]

@@ -1,4 +1,4 @@
-"""Pictures with known spectra, drawn through a recipe by their number, and the network that learns from them."""
+"""The network of a lift, one iteration of learning it, and the numbered pictures with known spectra."""
 
 from __future__ import annotations
 
@@ -7,7 +7,6 @@ from typing import Any
 
 import torch
 from torch import Tensor, nn
-from torch.optim.swa_utils import AveragedModel, get_ema_multi_avg_fn
 
 from neusee.nodes import losses
 from neusee.nodes.spectra import lift_matrix, lift_pictures, need_mst_plus_plus_bands, render, start_mst_plus_plus
@@ -18,109 +17,100 @@ from neusee.workflows.graph.recipe_graph import Recipe, needed
 from neusee.workflows.keys.cache_key import stream_seed
 from neusee.workflows.recipe.blocks.train_lift_block import LiftTraining
 from neusee.workflows.store.result_store import Store
-from neusee.workflows.training.training_iteration import NotFinite
-
-_STEEPEST = 10.0  #: norm of a gradient, above which it is shortened
-Losses = dict[str, float]
+from neusee.workflows.training.loop.resumable_loop import STEEPEST, Losses, averaged, require_finite
 
 
 class Pairs:
-    """Pictures (3, y, x) with their spectra (31, y, x): the same for the same number, in whatever order."""
+    """Pictures (3, y, x) with their spectra (31, y, x); a number always gives the same pair."""
 
-    def __init__(self, recipe: Recipe, how: LiftTraining, store: Store, device: str) -> None:
-        for name in (how.measured, how.picture, how.cube):
+    def __init__(self, recipe: Recipe, settings: LiftTraining, store: Store, device: str) -> None:
+        for name in (settings.measured, settings.picture, settings.cube):
             if name not in recipe.steps:
                 raise ValueError(f"train_lift: the recipe has no step {name}; {nearest(name, recipe.steps)}")
-        wires = recipe.steps[how.measured].wires
+        wires = recipe.steps[settings.measured].wires
         if not isinstance(wires.get("bands"), str):
-            raise ValueError(f"train_lift.measured: {how.measured} takes no bands: name a spectra.reflectances step")
-        self._names, self._seed = (how.picture, how.cube), recipe.seed
+            name = settings.measured
+            raise ValueError(f"train_lift.measured: {name} takes no bands: name a spectra.reflectances step")
+        self._names, self._seed = (settings.picture, settings.cube), recipe.seed
         bands = str(wires["bands"])
         random = {name for name in needed(recipe, self._names) if recipe.steps[name].node.random}
         if not random:
-            raise ValueError(f"train_lift: {how.picture} is always the same: draw it by spectra.leaves")
-        known = recipe.run(store, [bands, how.measured], device=device)
+            raise ValueError(f"train_lift: {settings.picture} never changes: draw the picture by spectra.leaves")
+        known = recipe.run(store, [bands, settings.measured], device=device)
         self.bands: Bands = known[bands]
-        self.measured: Tensor = known[how.measured]
+        self.measured: Tensor = known[settings.measured]
         need_mst_plus_plus_bands(self.bands)
         self._draw = as_function(recipe, outputs=self._names, store=store, device=device, redraw=random)
 
     def __call__(self, *number: object) -> tuple[Tensor, Tensor]:
-        """The picture of this number, and its spectra."""
+        """Return the picture of a number, and its spectra."""
         found = self._draw({}, seed=stream_seed(self._seed, " ".join(map(str, ("lift", *number)))))
         picture, cube = (found[name] for name in self._names)
         return picture.float(), cube.float()
 
     def batch(self, numbers: Sequence[int]) -> tuple[Tensor, Tensor]:
-        """Several, one over another."""
+        """Return the stacked pictures and spectra of several numbers."""
         pictures, cubes = zip(*map(self, numbers), strict=True)
         return torch.stack(pictures), torch.stack(cubes)
 
 
 class LiftLearner:
-    """The network, its optimiser and its average."""
+    """The network, its optimiser and the moving average of its weights."""
 
-    def __init__(self, how: LiftTraining, pairs: Pairs, seed: int, device: str) -> None:
-        self.how, self.pairs = how, pairs
+    def __init__(self, settings: LiftTraining, pairs: Pairs, seed: int, device: str) -> None:
+        self.settings, self.pairs = settings, pairs
         rng = torch.Generator(device).manual_seed(stream_seed(seed, "train lift network"))
         self.linear = lift_matrix(pairs.measured.cpu(), pairs.bands.centres.cpu()).to(device, torch.float32)
-        self.net = start_mst_plus_plus(rng, self.linear if how.start == "linear" else None)
-        self.optimiser = torch.optim.Adam(self.net.parameters(), lr=how.rate, betas=how.betas)
-        self.average = _averaged(self.net, how.average) if how.average else None
+        self.net = start_mst_plus_plus(rng, self.linear if settings.start == "linear" else None)
+        self.optimiser = torch.optim.Adam(self.net.parameters(), lr=settings.rate, betas=settings.betas)
+        self.average = averaged(self.net, settings.ema_decay)
 
     def parts(self) -> dict[str, Any]:
-        """All that a later iteration depends on."""
+        """Return everything on which a later iteration depends."""
         found = {"net": self.net, "optimiser": self.optimiser}
         return {**found, **({"average": self.average} if self.average else {})}
 
     def iterate(self, iteration: int) -> Losses:
-        """Look at a batch and move a step; raises `NotFinite` before a bad one."""
-        batch, rate = self.how.batch, self.how.rate_at(iteration)
+        """Learn from a batch and return its losses; raise `NotFinite` before a bad step."""
+        batch, rate = self.settings.batch, self.settings.rate_at(iteration)
         for group in self.optimiser.param_groups:
             group["lr"] = rate
         self.optimiser.zero_grad(set_to_none=True)
         picture, cube = self.pairs.batch(range(iteration * batch, (iteration + 1) * batch))
         estimate = lift_pictures(self.net, picture)
-        loss = losses.mrae(estimate, cube, floor=self.how.floor)
+        loss = losses.mrae(estimate, cube, floor=self.settings.floor)
         loss.backward()
-        slope = float(nn.utils.clip_grad_norm_(self.net.parameters(), _STEEPEST))
+        slope = float(nn.utils.clip_grad_norm_(self.net.parameters(), STEEPEST))
         found = {"MRAE": float(loss.detach()), **_rmse(estimate.detach(), cube), "slope": slope, "rate": rate}
-        wrong = [name for name, x in found.items() if not abs(x) < float("inf")]
-        if wrong:
-            raise NotFinite(f"not finite: {', '.join(wrong)}")
+        require_finite(found)
         self.optimiser.step()
         if self.average:
             self.average.update_parameters(self.net)
         return found
 
     def best(self) -> nn.Module:
-        """The network to use: the average, where there is one."""
+        """Return the network to use: the average, where there is one."""
         return self.average.module if self.average else self.net
 
     @torch.no_grad()
-    def judged(self) -> dict[str, Losses]:
-        """The network and the linear estimate of the same reflectances, on pictures that nobody learnt from."""
-        sums: dict[str, Losses] = {}
-        for number in range(self.how.judge):
+    def validate(self) -> dict[str, Losses]:
+        """Return the mean errors of the network and of the linear estimate, on pictures that were not learnt from."""
+        sums, count = dict[str, Losses](), self.settings.validation_batches
+        for number in range(count):
             picture, cube = self.pairs("judge", number)
             for name, estimate in self.estimates(picture).items():
-                found = {"MRAE": float(losses.mrae(estimate, cube, floor=self.how.floor)), **_rmse(estimate, cube),
+                found = {"MRAE": float(losses.mrae(estimate, cube, floor=self.settings.floor)), **_rmse(estimate, cube),
                          "colour": _rmse(render(estimate, self.pairs.bands), picture)["RMSE"]}  # fmt: skip
-                sums[name] = {key: sums.get(name, {}).get(key, 0.0) + x / self.how.judge for key, x in found.items()}
+                sums[name] = {key: sums.get(name, {}).get(key, 0.0) + x / count for key, x in found.items()}
         return sums
 
     def estimates(self, picture: Tensor) -> dict[str, Tensor]:
-        """Spectra of a picture by the network, and linearly."""
+        """Return the spectra of a picture by the network, and by the linear estimate."""
         linear = torch.einsum("bc,cyx->byx", self.linear, picture)
         return {
             "mst_plus_plus": lift_pictures(self.best(), picture[None])[0].clamp_min(0),
             "linear": linear.clamp_min(0),
         }
-
-
-def _averaged(net: nn.Module, decay: float) -> AveragedModel:
-    mean = get_ema_multi_avg_fn(decay)  # type: ignore[no-untyped-call]
-    return AveragedModel(net, multi_avg_fn=mean)
 
 
 def _rmse(estimate: Tensor, truth: Tensor) -> Losses:

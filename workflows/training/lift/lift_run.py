@@ -1,38 +1,25 @@
-"""Learn a lift from RGB to spectra: one state to go on from, a row for each iteration, weights that `lift` takes."""
+"""The training of a lift from RGB to spectra, from the settings of a recipe to weights that `lift` reads."""
 
 from __future__ import annotations
 
-import time
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Sequence
 from pathlib import Path
-from typing import Any
 
 import torch
 
-from neusee.workflows.engine.provenance import versions
 from neusee.workflows.graph.recipe_graph import Recipe, needed
 from neusee.workflows.keys.cache_key import digest, plain
 from neusee.workflows.recipe.blocks.train_lift_block import LiftTraining
 from neusee.workflows.store.result_store import Store
-from neusee.workflows.training.checkpoint import (
-    Rows,
-    export,
-    packed,
-    replaced,
-    restore,
-    unpacked,
-    weights_of,
-    write_json,
-)
 from neusee.workflows.training.lift.lift_figures import lift_curves, lifted_spectra
 from neusee.workflows.training.lift.lift_iteration import LiftLearner, Pairs
-from neusee.workflows.training.training_iteration import NotFinite
+from neusee.workflows.training.loop.checkpoint import export, weights_of
+from neusee.workflows.training.loop.resumable_loop import DOCUMENT, Losses, Progress, ResumableLoop, Watch
 
-Tell = Callable[[str], None]
-Watch = Callable[[int, Mapping[str, float]], None]  #: iterations done, what was found
 _COLUMNS = ("iteration", "MRAE", "RMSE", "slope", "rate", "seconds")
 _NETWORK = "mst_plus_plus"
-_ABOUT = "training.json"  #: what is written last
+#: in the names of folders, so that trainings of version 0.1 go on
+_OLD_NAMES = {"min_rate": "least", "warmup": "warm", "ema_decay": "average", "validation_batches": "judge"}
 
 
 def train_lift(
@@ -40,109 +27,79 @@ def train_lift(
     store: Store,
     runs: Path,
     command: Sequence[str],
-    tell: Tell,
+    progress: Progress,
     device: str = "cpu",
     watch: Watch | None = None,
 ) -> Path:
-    """Learn MST++ as a recipe's ``train_lift`` says, or go on where the same was stopped; the folder.
+    """Learn MST++ as the block ``train_lift`` of a recipe says, and return the folder; a stopped training goes on.
 
-    ``mst_plus_plus.safetensors`` is what `spectra.lift_mst_plus_plus` takes as its weights.
+    ``mst_plus_plus.safetensors`` holds the weights for `spectra.lift_mst_plus_plus`.
 
-    Raises ValueError for a recipe that says not how, or lacks the steps; ArithmeticError where a loss is no number,
-    with all that led to it beside the state.
+    Raises ValueError for a recipe without the block or its steps; ArithmeticError where a loss is NaN or infinite, with
+    the weights and pictures that led to the loss in a file.
     """
-    how = recipe.lifting
-    if how is None:
-        raise ValueError(f"{recipe.name} says not how a lift is learnt: begin with the recipe train_lift")
-    pairs = Pairs(recipe, how, store, device)
-    folder = runs / f"{recipe.name}_{_name(recipe, how)}"
+    settings = recipe.lifting
+    if settings is None:
+        raise ValueError(f"{recipe.name} has no block train_lift: begin with the recipe train_lift")
+    pairs = Pairs(recipe, settings, store, device)
+    folder = runs / f"{recipe.name}_{_key(recipe, settings)}"
     folder.mkdir(parents=True, exist_ok=True)
-    _Course(how, LiftLearner(how, pairs, recipe.seed, device), folder, tell, device, watch).through(recipe, command)
+    learner = LiftLearner(settings, pairs, recipe.seed, device)
+    _LiftLoop(settings, learner, folder, progress, device, watch).run_to_end(recipe, command)
     return folder
 
 
-def _name(recipe: Recipe, how: LiftTraining) -> str:
-    """What decides a training, but for how often it is kept and shown, and on how much it is judged."""
+def _key(recipe: Recipe, settings: LiftTraining) -> str:
+    """Return a digest of all that decides a training; how often it is kept and shown decides nothing."""
     steps = {
         name: [
             recipe.steps[name].node.path,
             {key: plain(value) for key, value in recipe.steps[name].params.items()},
             {key: plain(wire) for key, wire in recipe.steps[name].wires.items()},
         ]
-        for name in needed(recipe, [how.measured, how.picture, how.cube])
+        for name in needed(recipe, [settings.measured, settings.picture, settings.cube])
     }
-    said = how.model_copy(update={"keep": 1, "show": 1, "judge": 1}).model_dump(mode="json")
-    return digest("lift", recipe.seed, steps, said)[:8]
+    block = settings.model_copy(update={"keep": 1, "show": 1, "validation_batches": 1}).model_dump(mode="json")
+    return digest("lift", recipe.seed, steps, {_OLD_NAMES.get(name, name): value for name, value in block.items()})[:8]
 
 
-class _Course:
-    """One training: where it stands, and how it goes on."""
+class _LiftLoop(ResumableLoop[LiftLearner]):
+    """One training of a lift, without stages."""
 
     def __init__(
-        self, how: LiftTraining, learner: LiftLearner, folder: Path, tell: Tell, device: str, watch: Watch | None
-    ) -> None:
-        self.how, self.learner, self.folder, self.watch = how, learner, folder, watch
-        self.rows = Rows(folder / "losses.csv", _COLUMNS)
-        self.state, self.iteration = folder / "state.pt", 0
-        if self.state.exists():
-            found = unpacked(self.state, device)
-            self.iteration = found["iteration"]
-            restore(learner.parts(), found)
-            self.rows.cut(0, self.iteration)
-            tell(f"goes on after {self.iteration} iterations")
+        self, settings: LiftTraining, learner: LiftLearner, folder: Path, progress: Progress, device: str,
+        watch: Watch | None,
+    ) -> None:  # fmt: skip
+        super().__init__(folder, settings, learner, _COLUMNS, progress, device, watch)
+        self.settings = settings
+        self.resume()
 
-    def through(self, recipe: Recipe, command: Sequence[str]) -> None:
-        """To the end, and what comes out of it; what is finished stays as it is."""
-        if self.iteration == self.how.iterations and (self.folder / _ABOUT).is_file():
+    def run_to_end(self, recipe: Recipe, command: Sequence[str]) -> None:
+        """Learn to the last iteration and write what was learnt; leave a finished training as it is."""
+        if self.iteration == self.settings.iterations and (self.folder / DOCUMENT).is_file():
             return
-        while self.iteration < self.how.iterations:
-            self._iterate()
-            if self.iteration % self.how.show == 0 and self.iteration < self.how.iterations:
-                self._show()
-            if self.iteration % self.how.keep == 0 or self.iteration == self.how.iterations:
-                self._keep()
+        if self.iteration < self.settings.iterations:
+            self.run(self.settings.iterations, self.settings.batch)
+            self.keep()
         export(self.folder, _NETWORK, weights_of(self.learner.best()))
-        self._show()
-        self._close(recipe, command)
+        self.close(
+            lift_curves(self.rows.rows),
+            recipe.name,
+            command,
+            train_lift=self.settings.model_dump(mode="json"),
+            reflectances=len(self.learner.pairs.measured),
+            judged=self.learner.validate(),
+        )
 
-    def _iterate(self) -> None:
-        began = time.perf_counter()
-        try:
-            found = self.learner.iterate(self.iteration)
-        except NotFinite as error:
-            raise self._dumped(error) from error
-        self.rows.add(0, self.iteration, found | {"seconds": time.perf_counter() - began})
-        self.iteration += 1
-        if self.watch is not None:
-            self.watch(self.iteration, found)
-
-    def _dumped(self, error: NotFinite) -> ArithmeticError:
-        path = self.folder / f"not_finite_{self.iteration}.pt"
-        replaced(path, packed(self.learner.parts(), iteration=self.iteration))
-        self.rows.keep()
-        return ArithmeticError(f"iteration {self.iteration}: {error}; weights of that moment: {path}")
-
-    def _keep(self) -> None:
-        """First the rows, then the state: rows that are too many are cut off, lacking ones would be lost."""
-        self.rows.keep()
-        replaced(self.state, packed(self.learner.parts(), iteration=self.iteration))
+    def iterate(self) -> Losses:
+        """Learn from a batch of pictures."""
+        return self.learner.iterate(self.iteration)
 
     @torch.no_grad()
-    def _show(self) -> None:
+    def show(self) -> None:
+        """Write a picture with its spectra: the truth and the estimates."""
         picture, cube = self.learner.pairs("show", 0)
-        shown = lifted_spectra(picture, cube, self.learner.estimates(picture), self.learner.pairs.bands.centres)
-        (self.folder / "pictures").mkdir(exist_ok=True)
-        replaced(self.folder / "pictures" / f"{self.iteration:06d}.png", shown)
-
-    def _close(self, recipe: Recipe, command: Sequence[str]) -> None:
-        replaced(self.folder / "curves.png", lift_curves(self.rows.rows))
-        document: dict[str, Any] = {
-            "command": list(command),
-            "recipe": recipe.name,
-            "train_lift": self.how.model_dump(mode="json"),
-            "reflectances": len(self.learner.pairs.measured),
-            "judged": self.learner.judged(),
-            "seconds": sum(float(row["seconds"]) for row in self.rows.rows),
-            "versions": versions(),
-        }
-        write_json(self.folder / _ABOUT, document)
+        centres = self.learner.pairs.bands.centres
+        self.write_picture(
+            f"{self.iteration:06d}", lifted_spectra(picture, cube, self.learner.estimates(picture), centres)
+        )

@@ -1,4 +1,4 @@
-"""The page of a designed mask: what it is, what it does at each wavelength, what bounds it, how it was learnt."""
+"""The page of a designed mask: its height, its figures at each wavelength with their bounds, and how it was learnt."""
 
 from __future__ import annotations
 
@@ -12,16 +12,16 @@ from neusee.workflows.report.figures import optics
 from neusee.workflows.report.figures.style import canvas, drawn
 from neusee.workflows.report.study_page import Section
 from neusee.workflows.training.mask_design.design_terms import Fabrication, Terms
-from neusee.workflows.training.mask_design.optimizers import Learnt
+from neusee.workflows.training.mask_design.optimizers import LearntMask
 
 _COLUMNS = ("nm", "LSR", "even light", "BSR", "median MTF", "at most", "rms MTF", "at most")
 _NAMES = ("lsr", "energy_floor", "bsr", "median_mtf", "median_mtf_bound", "rms_mtf", "rms_mtf_bound")
 
 
-def pictures(terms: Terms, height: Tensor, learnt: Learnt) -> dict[str, bytes]:
-    """Relief, PSF, suppression by wavelength and the way of the loss, as PNG."""
+def pictures(terms: Terms, height: Tensor, learnt: LearntMask) -> dict[str, bytes]:
+    """Draw height map, PSF, suppression by wavelength and the losses, as PNG."""
     pupil, psf, plain = terms.pupil(height), terms.psf(height), terms.plain()
-    pitch = terms.recipe.steps[terms.how.psf].params["pixel_pitch"]
+    pitch = terms.recipe.steps[terms.settings.psf].params["pixel_pitch"]
     shown = {
         "relief": optics.height(pupil=pupil),
         "psf": optics.psf(plain=plain, mask=psf, bands=terms.bands, pixel_pitch=pitch),
@@ -32,7 +32,7 @@ def pictures(terms: Terms, height: Tensor, learnt: Learnt) -> dict[str, bytes]:
 
 @drawn
 def history(rows: Sequence[Mapping[str, float]]) -> Any:
-    """The loss and its terms, iteration by iteration, one line a start."""
+    """Draw the loss and its terms over the iterations, one line for each start."""
     names = [name for name in dict.fromkeys(n for row in rows for n in row) if name not in ("start", "iteration")]
     figure, axes = canvas(3.6 * len(names), 3.2, 1, len(names))
     for ax, name in zip(axes[0], names, strict=True):
@@ -44,18 +44,18 @@ def history(rows: Sequence[Mapping[str, float]]) -> Any:
     return figure
 
 
-def sections(found: Mapping[str, Any], made: Fabrication, shown: Mapping[str, bytes]) -> list[Section]:
-    """What the page says."""
+def sections(found: Mapping[str, Any], limits: Fabrication, shown: Mapping[str, bytes]) -> list[Section]:
+    """Return the sections of the page."""
     bands = found["bands"]
     columns = [[1e9 * value for value in bands["wavelength"]], *(bands[name] for name in _NAMES)]
     bounds = (
-        "Light that stays in the field shines somewhere: spread evenly over the window it would reach `even light`. "
-        "And the sum of the squares of a PSF is that of its contrast, so that a low peak leaves little contrast: "
-        "no PSF with this peak has more than `at most`."
+        "Light that stays in the field lands somewhere: spread evenly over the window it gives `even light`. "
+        "The sum of the squares of a PSF equals that of its contrast, so that a low peak leaves little contrast: "
+        "no PSF with this peak has more contrast than `at most`."
     )
     parts = [
-        Section("Relief", "Height, and the phase that it is at three wavelengths.", picture=shown.get("relief")),
-        Section("To be made", f"{made}.", ("limit", "value"), [(name, text) for name, text in made.rows()]),
+        Section("Mask", "Its height map, and its phase at three wavelengths.", picture=shown.get("relief")),
+        Section("Fabrication", f"{limits}.", ("limit", "value"), [(name, text) for name, text in limits.rows()]),
         Section("Light", "The spread light beside the plain lens's.", picture=shown.get("psf")),
         Section("Suppression", "", picture=shown.get("suppression")),
         Section("By wavelength", bounds, _COLUMNS, list(zip(*columns, strict=True))),

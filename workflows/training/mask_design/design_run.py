@@ -1,13 +1,13 @@
-"""Design a mask without images: little laser in one place, the light in the field, and what contrast that leaves.
+"""The design of a mask without images: it spreads the laser, keeps the light in the field, and keeps contrast.
 
-A relief is learnt through the recipe's own graph on the terms of the mask alone, and then judged by the same figures
-as any other mask, on every band and at the full sampling of the recipe.
+The height map is learnt through the graph of the recipe on the terms of the mask alone. Then it is judged by the same
+figures as any other mask, on every band and at the full sampling of the recipe.
 """
 
 from __future__ import annotations
 
 import json
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -24,89 +24,128 @@ from neusee.workflows.keys.cache_key import digest, file_digest
 from neusee.workflows.keys.code_digest import Code
 from neusee.workflows.keys.engine_digest import engine
 from neusee.workflows.recipe.blocks.mask_design_block import DesignError, MaskTraining, Weights, need_steps, state_file
+from neusee.workflows.recipe.blocks.train_block import Training
 from neusee.workflows.recipe.changed_recipe import changed
 from neusee.workflows.report.run_folder import RunFolder, new_run
 from neusee.workflows.report.study_page import page
 from neusee.workflows.store.result_store import Store
+from neusee.workflows.training.loop.checkpoint import StateFile
+from neusee.workflows.training.loop.resumable_loop import Progress
 from neusee.workflows.training.mask_design.design_terms import Terms
-from neusee.workflows.training.mask_design.optimizers import Kept, Learnt, learn
+from neusee.workflows.training.mask_design.optimizers import LearntMask, learn
 
-__all__ = ["DesignError", "MaskTraining", "Weights", "design", "figures"]
+__all__ = ["DesignError", "MaskTraining", "Weights", "design", "mask_figures"]
 
-Tell = Callable[[str], None]
+MASK = 0  #: the number of this stage in a training: it comes before the first
 _LEARNT_WITH = {
     used.__module__ for used in (half_rings, PARAMETRISATIONS["doe.pixelwise"], losses.contrast, losses.lsr)
 }
 
 
 def design(
-    recipe: Recipe, how: MaskTraining, store: Store | None, out: Path, tell: Tell, *, device: str = "cpu"
+    recipe: Recipe, settings: MaskTraining, store: Store | None, out: Path, progress: Progress, *, device: str = "cpu"
 ) -> Path:
-    """Learn a mask and write ``out/<date>_<recipe>_mask_<key>/``; gives the folder.
+    """Learn a mask, write ``out/<date>_<recipe>_mask_<key>/`` and return this folder.
 
-    ``mask.safetensors`` holds the relief as `doe.pixelwise` reads it, ``history.csv`` the terms at each iteration,
-    ``mask.json`` the figures, ``provenance.json`` the settings. What is unfinished is kept beside the folder, and
-    goes on where the same is asked for again.
+    ``mask.safetensors`` holds the height map for `doe.pixelwise`, ``history.csv`` the terms at each iteration,
+    ``mask.json`` the figures, ``provenance.json`` the settings. The state of an unfinished design lies beside the
+    folder; the same call goes on from there.
 
-    Raises: `DesignError` where the recipe has no such steps, or a loss that is not finite.
+    Raises: `DesignError` for a recipe without the steps, or a loss that is NaN or infinite.
     """
-    need_steps(recipe.steps, how)
-    key = _key(recipe, how, store)
-    kept = Kept(state_file(out, recipe.name, key))
-    made = Made.of(recipe, how, store, kept, tell, device)
+    need_steps(recipe.steps, settings)
+    key = _key(recipe, settings, store)
+    kept = StateFile(state_file(out, recipe.name, key))
+    made = DesignedMask.of(recipe, settings, store, kept, progress, device)
     with new_run(out, f"{recipe.name}_mask", key) as folder:
         made.write(folder)
     kept.path.unlink(missing_ok=True)
     return folder.path
 
 
+def designed(folder: Path) -> bool:
+    """Return True if the mask of a training in a folder was designed without images; its document is written last."""
+    return (folder / "mask.json").is_file()
+
+
+def design_in(
+    folder: Path,
+    recipe: Recipe,
+    training: Training,
+    store: Store,
+    command: Sequence[str],
+    progress: Progress,
+    device: str,
+) -> None:
+    """Design the mask in the folder of a training, which goes on from there, or go on where that was stopped.
+
+    Raises `DesignError` as `design` does; ValueError where stage 1 has begun to learn another mask, or no mask learns.
+    """
+    if training.learn is None:
+        raise ValueError("train.learn: name the step of the mask that is designed")
+    if designed(folder):
+        progress("the mask is designed")
+        return
+    if (folder / "state.pt").exists():
+        raise ValueError(f"stage 1 has begun in {folder}: remove that folder, or change a value of train.mask")
+    kept = StateFile(folder / "mask.state")
+    DesignedMask.of(recipe, training.design, store, kept, progress, device).write(RunFolder(folder), command)
+    kept.path.unlink(missing_ok=True)
+
+
 @dataclass(frozen=True)
-class Made:
-    """A designed relief, at the sampling of its recipe, and what it does."""
+class DesignedMask:
+    """A designed height map at the sampling of its recipe, with its figures."""
 
     terms: Terms
-    learnt: Learnt
+    learnt: LearntMask
     height: Tensor
     found: Mapping[str, Any]
 
     @classmethod
     def of(
-        cls, recipe: Recipe, how: MaskTraining, store: Store | None, kept: Kept, tell: Tell, device: str = "cpu"
-    ) -> Made:
-        """Learn it, or go on from what is kept, and judge it; raises `DesignError` as `design` does."""
-        learning = Terms(_at(recipe, how), how, store, device)
-        full = Terms(recipe, how, store, device) if how.at else learning
-        tell(f"to be made: {full.fabrication}")
-        learnt = learn(learning, how, kept, tell)
+        cls,
+        recipe: Recipe,
+        settings: MaskTraining,
+        store: Store | None,
+        kept: StateFile,
+        progress: Progress,
+        device: str = "cpu",
+    ) -> DesignedMask:
+        """Learn a mask, or go on from its state, and judge it; raise `DesignError` as `design` does."""
+        learning = Terms(_at(recipe, settings), settings, store, device)
+        full = Terms(recipe, settings, store, device) if settings.at else learning
+        progress(f"fabrication: {full.fabrication}")
+        learnt = learn(learning, kept, progress)
         with torch.no_grad():
             height = learnt.height(full.stop).detach().to("cpu", torch.float32).contiguous()
-            found = figures(full, height.to(full.device))
-        tell(said(found))
+            found = mask_figures(full, height.to(full.device))
+        progress(summary_line(found))
         return cls(full, learnt, height, found)
 
     def write(self, folder: RunFolder, command: Sequence[str] = ()) -> None:
-        """Write relief, curve, page and settings; ``mask.json`` at last, so that where it is all of it is."""
+        """Write mask, curves, page and settings; ``mask.json`` comes last and marks a complete design."""
         from safetensors.torch import save
 
-        learnt, recipe, how = self.learnt, self.terms.recipe, self.terms.how
+        learnt, recipe, settings = self.learnt, self.terms.recipe, self.terms.settings
         folder.write("mask.safetensors", save({"height": self.height}))
         header = list(dict.fromkeys(name for row in learnt.history for name in row))
         folder.write_rows("history.csv", header, [[row.get(name, "") for name in header] for row in learnt.history])
         self._page(folder, command)
         made = {"fabrication": self.terms.fabrication.values, "numbers": learnt.numbers}
-        doc = {"recipe": recipe.name, "kind": how.kind, "loss": learnt.loss, **self.found, **made}
+        doc = {"recipe": recipe.name, "kind": settings.kind, "loss": learnt.loss, **self.found, **made}
         folder.write("mask.json", json.dumps(doc, indent=1))
 
     def _page(self, folder: RunFolder, command: Sequence[str]) -> None:
         from neusee.workflows.training.mask_design.design_page import pictures, sections
 
-        recipe, how = self.terms.recipe, self.terms.how
+        recipe, settings = self.terms.recipe, self.terms.settings
         provenance = {
             "stage": "mask",
             "recipe": recipe.name,
             **({"command": " ".join(command)} if command else {}),
             "date": timestamp(),
-            "settings": how.model_dump(mode="json"),
+            "settings": settings.model_dump(mode="json"),
             "versions": versions(),
         }
         written = provenance | {"config": recipe.config.to_yaml()}
@@ -115,17 +154,17 @@ class Made:
             shown = pictures(self.terms, self.height.to(self.terms.device), self.learnt)
         for name, picture in shown.items():
             folder.write(f"figures/{name}.png", picture)
-        title, intro = f"{recipe.name}: a mask designed without images", f"{how.kind}: {said(self.found)}."
+        title, intro = f"{recipe.name}: a mask designed without images", f"{settings.kind}: {summary_line(self.found)}."
         body = sections(self.found, self.terms.fabrication, shown)
         folder.write("report.html", page(title, intro, body, provenance))
 
 
-def _at(recipe: Recipe, how: MaskTraining) -> Recipe:
-    """The recipe as it is learnt on."""
-    if not how.at:
+def _at(recipe: Recipe, settings: MaskTraining) -> Recipe:
+    """Return the recipe with the values that hold while the mask is learnt."""
+    if not settings.at:
         return recipe
     try:
-        return changed(recipe, [f"{name}={_word(value)}" for name, value in how.at.items()])
+        return changed(recipe, [f"{name}={_word(value)}" for name, value in settings.at.items()])
     except RecipeError as error:
         raise DesignError(f"at: {error.diagnostics[0].path}: {error.diagnostics[0].message}") from error
 
@@ -134,25 +173,25 @@ def _word(value: Any) -> str:
     return json.dumps(value) if isinstance(value, list | tuple | dict) else str(value)
 
 
-def _key(recipe: Recipe, how: MaskTraining, store: Store | None) -> str:
-    """What decides the bits of a mask: the recipe, the settings, and the code of nodes and design."""
+def _key(recipe: Recipe, settings: MaskTraining, store: Store | None) -> str:
+    """Return a digest of all that decides the bits of a mask: recipe, settings, code of nodes and design."""
     code = Code((store or Store()).code_memo)
-    steps = [recipe.steps[name] for name in needed(recipe, [how.psf, how.plain])]
+    steps = [recipe.steps[name] for name in needed(recipe, [settings.psf, settings.plain])]
     nodes = sorted({step.node.fn.__module__ for step in steps} | _LEARNT_WITH)
-    settings = how.model_dump(mode="json", exclude={"save_every", "start"})
-    settings["start"] = how.start and file_digest(how.start)
+    block = settings.model_dump(mode="json", exclude={"save_every", "start"})
+    block["start"] = settings.start and file_digest(settings.start)
     return digest(
         "mask",
         recipe.config.to_yaml(),
         recipe.seed,
-        settings,
+        block,
         [code.digest(node) for node in nodes],
         engine("training.mask_design.design_run"),
     )
 
 
-def figures(terms: Terms, height: Tensor) -> dict[str, Any]:
-    """LSR, BSR and contrast of a relief by band, their means, and the bounds that hold for them."""
+def mask_figures(terms: Terms, height: Tensor) -> dict[str, Any]:
+    """Return LSR, BSR and contrast of a mask by band, their means, and the bounds that hold for them."""
     with torch.no_grad():
         psf, plain = terms.psf(height), terms.plain()
         lsr, bsr = metrics.lsr(psf), metrics.bsr(psf.intensity, plain.intensity)
@@ -167,8 +206,8 @@ def figures(terms: Terms, height: Tensor) -> dict[str, Any]:
     return {"mean": means, "bands": plain_values, "depth": float(height.amax() - height.amin())}
 
 
-def said(found: Mapping[str, Any]) -> str:
-    """The figures in one line."""
+def summary_line(found: Mapping[str, Any]) -> str:
+    """Return the figures in one line."""
     mean = found["mean"]
     return (
         f"mean LSR {mean['lsr']:.3g} (even light {mean['energy_floor']:.2g}), BSR {mean['bsr']:.3f}, "

@@ -1,9 +1,9 @@
-"""Which steps the processes of a band axis share by wavelength, and where their bands come together again.
+"""Which steps the processes of a band axis share by wavelength, and where the bands come together again.
 
-A node that declares its bands gives each of them the same bits whatever stands beside it. So each process computes
-its own bands of what works on the bands of the scene. The first step behind that reads them otherwise needs all of
-them: of the element's PSF they are gathered, of a picture they go to the process whose picture it is. Where all that
-is read of an image are sums over its bands, only the sums go.
+A node that declares its bands gives each band the same bits, whatever other bands are computed with it. So each
+process computes its own bands of every step that works on the bands of the scene. The first later step that does not
+work band by band needs all bands: those of the mask's PSF are gathered by every process, those of a picture are sent
+to the process that owns the picture. Where only sums over the bands of an image are read, only the sums are sent.
 """
 
 from __future__ import annotations
@@ -32,20 +32,20 @@ Port = Swapped | Sum
 
 @dataclass(frozen=True)
 class Shards:
-    """Steps that are shared by band, and those behind them."""
+    """The steps that are shared by band, and the steps that follow them."""
 
     recipe: Recipe
     mesh: Mesh = ALONE
     count: int = 0  #: bands of the scene
-    steps: frozenset[str] = frozenset()  #: of which each process computes its own bands
-    behind: frozenset[str] = frozenset()  #: that need all bands of some of them
-    rows: Mapping[str, Tensor] = field(default_factory=dict)  #: by image that is read in sums alone: their weights
+    steps: frozenset[str] = frozenset()  #: those of which each process computes its own bands
+    behind: frozenset[str] = frozenset()  #: those that need all bands of a shared step
+    rows: Mapping[str, Tensor] = field(default_factory=dict)  #: weights of sums, by image of which only sums are read
 
     @classmethod
     def of(
         cls, recipe: Recipe, psf: str, wanted: Sequence[str], live: Collection[str], store: Store, mesh: Mesh
     ) -> Shards:
-        """What of the ``live`` steps works on the same bands as the PSF; raises MeshError where that has too few."""
+        """Find the ``live`` steps that work on the bands of the PSF; raise MeshError for too few bands."""
         if mesh.band == 1:
             return cls(recipe)
         spectral = _sampled(recipe, psf)
@@ -65,12 +65,12 @@ class Shards:
 
     @property
     def own(self) -> list[int]:
-        """The bands of this process."""
+        """Return the bands of this process."""
         return own_bands(self.mesh, self.count)
 
     @property
     def call(self) -> Callable[..., Any]:
-        """What computes a step: of one that is shared, the own bands."""
+        """Return the function that computes a step; of shared steps it computes the bands of this process."""
         return self._call if self.steps else call
 
     def _call(self, step: Step, inputs: Sequence[Any], params: Mapping[str, Any], seed: int, device: str) -> Any:
@@ -80,31 +80,31 @@ class Shards:
         return call(step, inputs, params, seed, device)
 
     def gathered(self, name: str, value: Any) -> Any:
-        """All bands of a result of which each process has its own."""
+        """Gather all bands of a result of which each process has its own bands."""
         axis = self.axis(name)
         return with_band_tensors(value, [gathered(self.mesh, x, axis, self.count) for x in band_tensors(value)])
 
     def axis(self, name: str) -> int:
-        """Where the bands of a shared step lie."""
+        """Return the axis along which the bands of a shared step lie."""
         bands = self.recipe.steps[name].node.bands
         assert bands is not None
         return bands["return"]
 
     def sent(self, name: str, value: Any) -> list[Tensor]:
-        """What goes of a result of one picture to the process that goes on with it."""
+        """Return the tensors of one picture's result that are sent to the process that owns the picture."""
         if name not in self.rows:
             return band_tensors(value)
         part = channel_sums(value, self.rows[name][:, self.own])
         return [part.planes, part.flux]
 
     def ports(self, name: str, sent: Sequence[Tensor]) -> list[Port]:
-        """How each of what is sent travels."""
+        """Return the port through which each of these tensors is sent."""
         if name in self.rows:
             return [Sum(self.mesh), Swapped(self.mesh, -1, self.count)]
         return [Swapped(self.mesh, self.axis(name), self.count) for _ in sent]
 
     def received(self, name: str, like: Any, found: Sequence[Tensor]) -> Any:
-        """The result as what follows reads it."""
+        """Return the result in the form that later steps read."""
         if name not in self.rows:
             return with_band_tensors(like, found)
         planes, flux = found
@@ -113,18 +113,18 @@ class Shards:
 
 
 def _sampled(recipe: Recipe, name: str) -> set[str]:
-    """The steps that say at which wavelengths a step works."""
+    """Return the steps that give the wavelengths of a step."""
     return {n for n in needed(recipe, [name]) if recipe.steps[n].node.hints["return"] is Bands}
 
 
 def _by_band(recipe: Recipe, name: str, spectral: set[str]) -> bool:
-    """Whether a step works on each of these bands for itself."""
+    """Return True if a step works on each of these bands separately."""
     node = recipe.steps[name].node
     return node.bands is not None and _sampled(recipe, name) == spectral and not _mixed(recipe, name)
 
 
 def _mixed(recipe: Recipe, name: str) -> bool:
-    """Whether a step gives a mixture of planes, of which no part is one band."""
+    """Return True if a step gives a mixture of planes, none of which is a single band."""
     while (kind := recipe.steps[name].node.hints["return"]) is not Mixture:
         step = recipe.steps[name]
         through = next((w for i in step.node.accepts_low_rank if isinstance(w := step.wires.get(i), str)), None)
@@ -155,7 +155,7 @@ def _count(recipe: Recipe, psf: str, spectral: set[str], store: Store, mesh: Mes
 def _asked(
     recipe: Recipe, name: str, wanted: Sequence[str], behind: Collection[str], live: Collection[str]
 ) -> Asked | None:
-    """The sums that are read of an image, where nothing else is and their weights are always the same."""
+    """Return the sums that are read of an image; None if anything else is read, or if their weights change."""
     asked = None if name in wanted else asked_of(recipe, name, wanted)
     still = asked is not None and asked.bands not in live and asked.responses not in live
     return asked if asked is not None and still and set(behind).issuperset(asked.readers) else None

@@ -1,7 +1,7 @@
-"""Pictures of processes that share their bands: each begins all of a round, and goes on with its own.
+"""Pictures of processes that share bands: each process begins every picture of a round, and finishes its own.
 
-Every process computes its bands of every picture of the round. Then bands, or sums over them, go to the process whose
-picture it is, which does all that follows by itself; on the way back each gradient goes to those that had a share.
+Every process computes its bands of every picture of the round. Then the bands, or sums over them, are sent to the
+process that owns the picture, and this process computes all later steps. Gradients return to all processes.
 """
 
 from __future__ import annotations
@@ -20,7 +20,7 @@ from neusee.workflows.training.parallel.shared_graph import Shared
 
 
 class Pictures:
-    """The part of a recipe that is computed for each picture, in one piece or cut where bands come together."""
+    """The part of a recipe that is computed for each picture: in one piece, or cut where bands come together."""
 
     def __init__(
         self,
@@ -44,21 +44,21 @@ class Pictures:
             self._start = as_function(recipe, *first, outputs=self._cut, redraw=redraw, **ways)
 
     def alone(self, theta: Theta, seed: int) -> dict[str, Any]:
-        """A picture of this process alone."""
+        """Compute a picture without other processes."""
         return self._end(_only(theta, self._end.free), seed)
 
     @property
     def by_band(self) -> bool:
-        """Whether processes that share bands begin each other's pictures."""
+        """Return True if processes that share bands begin each other's pictures."""
         return self._start is not None
 
     @contextmanager
     def together(
         self, shared: Shared, drawn: Mapping[int, tuple[Theta, int]], mine: int | None
     ) -> Iterator[dict[str, Any]]:
-        """Begin all pictures of a round, and go on with ``mine``; a process without one only begins those of others.
+        """Begin all pictures of a round and finish picture ``mine``; None: begin the pictures of others only.
 
-        What was found of the gradient when the block ends goes back to where the bands came from.
+        When the block ends, the gradients return to the processes that sent the bands.
         """
         if self._start is None:
             yield self._finished(shared, drawn, mine, {})
@@ -79,10 +79,10 @@ class Pictures:
 
 
 class _Cut:
-    """Where the pictures of a round change hands."""
+    """The point at which the pictures of a round are sent to their processes."""
 
     def __init__(self, begun: Sequence[Mapping[str, Any]], names: Sequence[str], shards: Shards) -> None:
-        self._sent: list[list[Tensor]] = []  #: by what is sent, of each picture
+        self._sent: list[list[Tensor]] = []  #: the tensors that are sent, each for all pictures
         self._ports: list[Port] = []
         self._leaves: list[Tensor] = []
         self.values: dict[str, Any] = {}
@@ -97,7 +97,7 @@ class _Cut:
             self._sent, self._ports, self._leaves = self._sent + sent, self._ports + ports, self._leaves + leaves
 
     def back(self) -> None:
-        """Each gradient to the processes that had a share; one without a picture has none to send, and sends zeros."""
+        """Return each gradient to the processes that had a share; a process without a picture sends zeros."""
         roots: list[Tensor] = []
         grads: list[Tensor] = []
         for sent, port, leaf in zip(self._sent, self._ports, self._leaves, strict=True):
@@ -115,7 +115,7 @@ def _live(recipe: Recipe, given: Sequence[str], wanted: Sequence[str]) -> list[s
 
 
 def _used(recipe: Recipe, free: Sequence[str], wanted: Sequence[str]) -> list[str]:
-    """Which of the free steps and parameters reach what is wanted."""
+    """Return the free steps and parameters that reach a wanted step."""
     live = set(_live(recipe, free, wanted))
     return [name for name in free if (name if name in recipe.steps else name.rpartition(".")[0]) in live]
 

@@ -1,9 +1,9 @@
-"""Where a process stands among those that learn together: a mesh of (data, band), as `torchrun` starts them.
+"""The mesh (data, band) of the processes that learn together, as `torchrun` starts them.
 
-Every process runs the same program. Along the data axis they look at different pictures; along the band axis they
-share the optics of the same pictures by wavelength. What all of them compute alike (networks, optimisers, the state)
-is not shared but kept alike: gradients are added up over all, and each takes the same step. One process alone is a
-mesh of 1 x 1, which says nothing to anybody.
+Every process runs the same program. Along the data axis the processes see different pictures; along the band axis they
+share the optics of the same pictures by wavelength. Networks, optimisers and the state are equal in all processes:
+gradients are added over all of them, and each process takes the same step. A single process is a mesh of 1 x 1, which
+sends no messages.
 """
 
 from __future__ import annotations
@@ -21,60 +21,60 @@ from torch import nn
 
 
 class MeshError(ValueError):
-    """A mesh that does not fit the processes, the recipe or what the processes were given."""
+    """A mesh that does not fit the processes, the recipe or the arguments of the processes."""
 
 
 @dataclass(frozen=True)
 class Mesh:
-    """One process of ``data`` x ``band``; those next to each other share the bands of the same pictures."""
+    """One process of ``data`` x ``band``; neighbours share the bands of the same pictures."""
 
     data: int = 1
     band: int = 1
     rank: int = 0
-    group: Any = None  #: of torch.distributed: the processes with the same pictures
+    group: Any = None  #: the process group of torch.distributed that has the same pictures
 
     @property
     def size(self) -> int:
-        """How many processes there are."""
+        """Return the number of processes."""
         return self.data * self.band
 
     @property
     def row(self) -> int:
-        """Which of the groups that look at different pictures."""
+        """Return the number of this process along the data axis."""
         return self.rank // self.band
 
     @property
     def column(self) -> int:
-        """Which of those that share the bands of the same pictures."""
+        """Return the number of this process along the band axis."""
         return self.rank % self.band
 
     @property
     def first(self) -> bool:
-        """Whether this is the one process that writes."""
+        """Return True for the one process that writes files."""
         return self.rank == 0
 
     def __str__(self) -> str:
         return f"{self.data}x{self.band}"
 
-    # --- what all say to all --------------------------------------------------------------------------------------
+    # --- messages among all ---------------------------------------------------------------------------------------
 
     def wait(self) -> None:
-        """Until all have come so far."""
+        """Wait until all processes have called this method."""
         if self.size > 1:
             dist.barrier()
 
     def agree(self, about: str) -> None:
-        """Raise MeshError unless all say the same."""
+        """Raise MeshError unless all processes pass the same text."""
         if self.size == 1:
             return
-        said: list[Any] = [None] * self.size
-        dist.all_gather_object(said, about)
-        for rank, other in enumerate(said):
-            if other != said[0]:
-                raise MeshError(f"process 0 is at {said[0]}, process {rank} at {other}: let all see the same folder")
+        texts: list[Any] = [None] * self.size
+        dist.all_gather_object(texts, about)
+        for rank, other in enumerate(texts):
+            if other != texts[0]:
+                raise MeshError(f"process 0 is at {texts[0]}, process {rank} at {other}: let all see the same folder")
 
     def numbers(self, found: Mapping[str, float], names: Sequence[str], device: str) -> dict[str, float]:
-        """The sum of each of ``names`` over all; of one process, what it found."""
+        """Return the sum of each of ``names`` over all processes."""
         if self.size == 1:
             return dict(found)
         total = torch.tensor([found.get(name, 0.0) for name in names], dtype=torch.float64, device=device)
@@ -82,7 +82,7 @@ class Mesh:
         return dict(zip(names, total.tolist(), strict=True))
 
     def add_gradients(self, parts: Iterable[nn.Module]) -> None:
-        """Give all processes the sum of their gradients, in one message for each precision; none stays none."""
+        """Give all processes the sum of their gradients, in one message for each precision; None stays None."""
         if self.size == 1:
             return
         own = [p for part in parts for p in part.parameters()]
@@ -91,7 +91,7 @@ class Mesh:
 
 
 def _add(own: Sequence[nn.Parameter]) -> None:
-    """Behind the gradients stands how many processes had one: a parameter that none moves is not moved by zeros."""
+    """Add gradients over all processes; where no process has a gradient, it stays None, so that no step is taken."""
     there = torch.tensor([float(p.grad is not None) for p in own]).to(own[0])
     grads = [torch.zeros_like(p) if p.grad is None else p.grad for p in own]
     flat = torch.cat([*(g.reshape(-1) for g in grads), there])
@@ -105,12 +105,12 @@ ALONE = Mesh()
 
 
 def processes() -> tuple[int, int]:
-    """This process's number and how many there are, as `torchrun` or whoever else starts them says."""
+    """Return the number of this process and the number of processes, as `torchrun` sets them in the environment."""
     return int(os.environ.get("RANK", "0")), int(os.environ.get("WORLD_SIZE", "1"))
 
 
 def shape_of(text: str, world: int) -> tuple[int, int]:
-    """``4x2`` as numbers; nothing: all processes along the data axis. Raises MeshError where that is not ``world``."""
+    """Return ``4x2`` as numbers, and (world, 1) for no text; raise MeshError unless their product is ``world``."""
     if not text:
         return world, 1
     if not re.fullmatch(r"[1-9]\d*x[1-9]\d*", text):
@@ -124,14 +124,14 @@ def shape_of(text: str, world: int) -> tuple[int, int]:
 
 
 def device_here(device: str) -> str:
-    """Of the devices of one machine, each process takes its own."""
+    """Return the device of this process among those of its machine."""
     local = os.environ.get("LOCAL_RANK", "0")
     return f"cuda:{local}" if device == "cuda" and processes()[1] > 1 else device
 
 
 @contextmanager
 def joined(text: str, device: str) -> Iterator[Mesh]:
-    """The mesh that ``--mesh`` names, for as long as the command runs; raises MeshError where there is none such."""
+    """Join the mesh that ``--mesh`` names for the length of the block; raise MeshError for a mesh that does not fit."""
     rank, world = processes()
     data, band = shape_of(text, world)
     if world == 1:

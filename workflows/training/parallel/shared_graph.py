@@ -1,4 +1,4 @@
-"""What follows the element alone: computed once an iteration, cut off from it, and gradients gather at the cut."""
+"""Results that depend on the mask alone: computed once an iteration, and detached so that gradients gather there."""
 
 from __future__ import annotations
 
@@ -16,16 +16,16 @@ from neusee.workflows.training.parallel.collectives import gathered_back
 
 @dataclass(frozen=True)
 class Shared:
-    """What follows the element alone, cut off from it: gradients gather here until `back`."""
+    """Results that depend on the mask alone, and their detached copies, where gradients gather until `back`."""
 
-    made: Mapping[str, Any]  #: with its history; of what is shared by band, the own bands
-    values: Mapping[str, Any]  #: without
-    whole: Mapping[str, Any] = field(default_factory=dict)  #: all bands of what is shared, where someone reads them
+    made: Mapping[str, Any]  #: the results with their graph; of shared steps, the bands of this process
+    values: Mapping[str, Any]  #: the detached copies
+    whole: Mapping[str, Any] = field(default_factory=dict)  #: all bands, of shared steps that are read whole
     shards: Shards | None = None
 
     @classmethod
     def of(cls, made: Mapping[str, Any], shards: Shards | None = None, whole: Sequence[str] = ()) -> Shared:
-        """Cut what was made off from how it was made; all bands of ``whole`` are gathered."""
+        """Detach results from their graph, and gather all bands of ``whole``."""
         leaves = {name: each_tensor(leaf, value) for name, value in made.items()}
         if shards is None or not leaves:
             return cls(made, leaves)
@@ -34,11 +34,11 @@ class Shared:
 
     @property
     def seen(self) -> Mapping[str, Any]:
-        """What a step reads that needs all bands."""
+        """Return the copies that a step reads which needs all bands."""
         return {**self.values, **self.whole}
 
     def back(self) -> None:
-        """Send what has gathered on to the element."""
+        """Send the gathered gradients on to the mask."""
         for name, value in self.whole.items():
             for own, whole in zip(tensors_in(self.values[name]), tensors_in(value), strict=True):
                 self._to_own(name, own, whole)
@@ -48,7 +48,7 @@ class Shared:
             torch.autograd.backward([x for x, _ in found], [grad for _, grad in found])
 
     def _to_own(self, name: str, own: Tensor, whole: Tensor) -> None:
-        """What all processes ask of the own bands; each takes part, whether it has a picture or not."""
+        """Add what all processes gathered at the bands of this process; processes without a picture take part."""
         if not own.requires_grad:
             return
         assert self.shards is not None
@@ -58,12 +58,12 @@ class Shared:
 
 
 def leaf(x: Tensor) -> Tensor:
-    """The same numbers without their history, where gradients gather."""
+    """Return a detached copy at which gradients gather."""
     return x.detach().requires_grad_(x.requires_grad)
 
 
 def _alike(value: Any, like: Any) -> Any:
-    """Leaves that learn where those of ``like`` do."""
+    """Let the tensors of ``value`` require gradients where those of ``like`` do."""
     for x, y in zip(tensors_in(value), tensors_in(like), strict=True):
         x.requires_grad_(y.requires_grad)
     return value

@@ -20,7 +20,7 @@ from neusee.workflows.training.lift.lift_run import train_lift
 ROOT = Path(__file__).parents[4]
 TINY = [
     "patch.shape=[8, 8]", "patch.leaves=8", "train_lift.iterations=4", "train_lift.batch=1", "train_lift.keep=2",
-    "train_lift.warm=2", "train_lift.judge=2", "train_lift.average=0.5",
+    "train_lift.warmup=2", "train_lift.validation_batches=2", "train_lift.ema_decay=0.5",
 ]  # fmt: skip
 
 pytestmark = pytest.mark.usefixtures("one_thread")
@@ -64,7 +64,7 @@ def same(again, whole):
 
 
 def test_a_training_that_is_stopped_goes_on_to_the_same_weights(tmp_path, whole):
-    def watch(done, found):
+    def watch(stage, done, found):
         if done == 3:
             raise KeyboardInterrupt
 
@@ -82,7 +82,7 @@ import os, signal
 from pathlib import Path
 from neusee.workflows import Store, load
 from neusee.workflows.training.lift.lift_run import train_lift
-def watch(done, found):
+def watch(stage, done, found):
     if done == 3:
         os.kill(os.getpid(), signal.SIGKILL)
 here = Path({str(tmp_path)!r})
@@ -133,7 +133,7 @@ def test_what_is_not_a_number_stops_and_is_kept(tmp_path, monkeypatch):
     from neusee.nodes import losses as nodes
 
     monkeypatch.setattr(nodes, "mrae", lambda a, b, floor: (a - b).mean() * float("nan"))
-    with pytest.raises(ArithmeticError, match=r"iteration 0: not finite: MRAE"):
+    with pytest.raises(ArithmeticError, match=r"iteration 0, picture 0: not finite: MRAE"):
         trained(load("train_lift", TINY), tmp_path)
     (folder,) = (tmp_path / "runs").iterdir()
     assert {"net", "optimiser"} <= torch.load(folder / "not_finite_0.pt", weights_only=True)["parts"].keys()
@@ -169,7 +169,7 @@ def test_steps_that_cannot_be_learnt_from_are_refused(tmp_path, change, said):
 
 
 def test_the_rate_rises_and_falls_as_a_cosine():
-    how = load("train_lift", ["train_lift.iterations=1000", "train_lift.warm=10"]).lifting
+    how = load("train_lift", ["train_lift.iterations=1000", "train_lift.warmup=10"]).lifting
     assert how.rate_at(0) == pytest.approx(4e-5)
     assert how.rate_at(500) == pytest.approx(2e-4, rel=0.01)
     assert how.rate_at(999) == pytest.approx(1e-6, rel=0.01)

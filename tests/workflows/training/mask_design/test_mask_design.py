@@ -12,8 +12,9 @@ from safetensors.torch import load_file
 from neusee.nodes.doe import half_rings
 from neusee.workflows import load
 from neusee.workflows.store.result_store import Store
+from neusee.workflows.training.loop.checkpoint import StateFile
 from neusee.workflows.training.mask_design import design_page, optimizers
-from neusee.workflows.training.mask_design.design_run import DesignError, MaskTraining, design, figures
+from neusee.workflows.training.mask_design.design_run import DesignError, MaskTraining, design, mask_figures
 from neusee.workflows.training.mask_design.design_terms import Terms
 
 SMALL = ["optics.samples=64", "optics.pitch=126 um", "optics.window=[80, 80]", "optics.bands=5"]
@@ -120,12 +121,12 @@ def test_an_interrupted_design_goes_on_bit_for_bit(kind, values, recipe, store, 
 
 
 def test_a_damaged_state_begins_again(recipe, store, tmp_path):
-    kept = optimizers.Kept(tmp_path / "state")
-    assert kept.read() == {}
+    kept = StateFile(tmp_path / "state")
+    assert kept.read(strict=False) == {}
     kept.write({"a": torch.ones(3)})
-    assert torch.equal(kept.read()["a"], torch.ones(3))
+    assert torch.equal(kept.read(strict=False)["a"], torch.ones(3))
     kept.path.write_bytes(kept.path.read_bytes()[:40])
-    assert kept.read() == {}
+    assert kept.read(strict=False) == {}
 
 
 def test_evolved_half_rings_beat_those_that_nobody_optimised(recipe, store, tmp_path):
@@ -145,7 +146,7 @@ def test_what_is_learnt_on_few_samples_is_made_on_all(recipe, store, tmp_path):
     height = load_file(folder / "mask.safetensors")["height"]
     assert height.shape == (64, 64)
     terms = Terms(recipe, how(), store)
-    assert read(folder)["mean"] == pytest.approx(figures(terms, height)["mean"])
+    assert read(folder)["mean"] == pytest.approx(mask_figures(terms, height)["mean"])
 
 
 def test_pixels_start_from_the_relief_of_another_kind(recipe, store, tmp_path):

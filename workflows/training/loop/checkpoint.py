@@ -1,4 +1,4 @@
-"""What a training leaves on disk: one state to go on from, a row for each iteration, and what was learnt."""
+"""The files of a training: a state from which it goes on, a row for each iteration, and what was learnt."""
 
 from __future__ import annotations
 
@@ -13,12 +13,10 @@ from typing import Any
 import torch
 from torch import nn
 
-_EDITION = 1
-COLUMNS = ("stage", "iteration", "LSR", "BSR", "L1", "reconstruction", "adversarial", "critics", "penalty", "slope",
-           "rate", "seconds")  # fmt: skip
+_FORMAT = 1  #: of a state; a state of another format is refused
 
 
-def replaced(path: Path, data: bytes) -> None:
+def write_whole(path: Path, data: bytes) -> None:
     """Write a file whole or not at all."""
     part = path.with_name(f".{path.name}.{os.getpid()}.part")
     try:
@@ -32,40 +30,49 @@ def replaced(path: Path, data: bytes) -> None:
         raise
 
 
-def packed(parts: Mapping[str, Any], **about: Any) -> bytes:
-    """Weights, moments and place of all parts."""
-    memory = io.BytesIO()
-    torch.save({"edition": _EDITION, **about, "parts": {name: x.state_dict() for name, x in parts.items()}}, memory)
-    return memory.getvalue()
+class StateFile:
+    """The state of unfinished work: one file, always whole: a killed process leaves the old one or the new."""
 
+    def __init__(self, path: Path) -> None:
+        self.path = path
 
-def unpacked(path: Path, device: str) -> dict[str, Any]:
-    """Read a state; raises ValueError for what is none."""
-    try:
-        found: dict[str, Any] = torch.load(path, map_location=device, weights_only=True)
-        if found["edition"] != _EDITION:
-            raise ValueError(f"edition {found['edition']}, not {_EDITION}")
-    except (RuntimeError, KeyError, EOFError, OSError, ValueError, TypeError) as error:
-        raise ValueError(f"{path} cannot be gone on from ({error}): remove its folder to begin anew") from error
-    return found
+    def write(self, state: Mapping[str, Any]) -> None:
+        """Replace the file."""
+        self.path.parent.mkdir(parents=True, exist_ok=True)
+        memory = io.BytesIO()
+        torch.save({"edition": _FORMAT, **state}, memory)
+        write_whole(self.path, memory.getvalue())
 
+    def read(self, device: str = "cpu", strict: bool = True) -> dict[str, Any]:
+        """Return the state, or an empty one where there is no file.
 
-def restore(parts: Mapping[str, Any], found: Mapping[str, Any]) -> None:
-    """Put a state back into its parts."""
-    for name, part in parts.items():
-        part.load_state_dict(found["parts"][name])
+        Raises ValueError for a file that cannot be read; without ``strict`` such a file counts as absent.
+        """
+        if not self.path.exists():
+            return {}
+        try:
+            found: dict[str, Any] = torch.load(self.path, map_location=device, weights_only=True)
+            if found.get("edition", _FORMAT) != _FORMAT:
+                raise ValueError(f"edition {found['edition']}, not {_FORMAT}")
+        except (RuntimeError, KeyError, EOFError, OSError, ValueError, TypeError, AttributeError) as error:
+            if not strict:
+                return {}
+            raise ValueError(
+                f"{self.path} cannot be gone on from ({error}): remove its folder to begin anew"
+            ) from error
+        return found
 
 
 class Rows:
-    """``losses.csv``: a row for each iteration; those after the state that is gone on from are cut off."""
+    """The table ``losses.csv``, a row for each iteration; a training that goes on cuts rows after its state off."""
 
-    def __init__(self, path: Path, columns: Sequence[str] = COLUMNS) -> None:
+    def __init__(self, path: Path, columns: Sequence[str]) -> None:
         self._path, self._columns = path, columns
         self.rows: list[dict[str, str]] = []
         self._kept = 0
 
     def cut(self, stage: int, iteration: int, write: bool = True) -> None:
-        """Keep what came before an iteration of a stage."""
+        """Keep the rows before an iteration of a stage."""
         if self._path.exists():
             with self._path.open(newline="", encoding="utf-8") as file:
                 self.rows = [row for row in csv.DictReader(file) if _place(row) < (stage, iteration)]
@@ -74,19 +81,19 @@ class Rows:
             self.keep()
 
     def add(self, stage: int, iteration: int, found: Mapping[str, float]) -> None:
-        """Note an iteration; it is on disk with the next `keep`."""
+        """Add the row of an iteration, which the next `keep` writes to disk."""
         row = {"stage": stage, "iteration": iteration, **{name: f"{x:.6g}" for name, x in found.items()}}
         self.rows.append({name: str(row.get(name, "")) for name in self._columns})
 
     def keep(self) -> None:
-        """Write what is new; at first all of it, whole or not at all."""
+        """Append the new rows; the first call writes all rows, whole or not at all."""
         text = io.StringIO(newline="")
         writer = csv.DictWriter(text, self._columns)
         if self._kept == 0:
             writer.writeheader()
         writer.writerows(self.rows[self._kept :])
         if self._kept == 0:
-            replaced(self._path, text.getvalue().encode())
+            write_whole(self._path, text.getvalue().encode())
         else:
             with self._path.open("ab") as file:
                 file.write(text.getvalue().encode())
@@ -99,33 +106,33 @@ def _place(row: Mapping[str, str | None]) -> tuple[int, int]:
             raise ValueError("not all of its columns")
         return int(row.get("stage") or 0), int(row["iteration"] or 0)
     except (ValueError, TypeError, KeyError):
-        return (1 << 62, 0)  # half a row of a process that was killed
+        return (1 << 62, 0)  # half a row, of a process that was killed
 
 
 def export(
     folder: Path, name: str, tensors: Mapping[str, torch.Tensor], about: Mapping[str, str] | None = None
 ) -> Path:
-    """Tensors as a safetensors file, with what is told about them, whole or not at all."""
+    """Write tensors with their metadata as a safetensors file, whole or not at all, and return its path."""
     from safetensors.torch import save
 
     path = folder / f"{name}.safetensors"
     whole = {key: x.detach().cpu().contiguous() for key, x in tensors.items()}
-    replaced(path, save(whole, dict(about) if about else None))
+    write_whole(path, save(whole, dict(about) if about else None))
     return path
 
 
 def weights_of(net: nn.Module) -> dict[str, torch.Tensor]:
-    """The weights of a network; of an average, those that it averages."""
+    """Return the weights of a network, or of the network inside an average."""
     inner = net.module if isinstance(net, torch.optim.swa_utils.AveragedModel) else net
     return dict(inner.state_dict())
 
 
 def write_json(path: Path, document: Mapping[str, Any]) -> None:
     """Write a document whole or not at all."""
-    replaced(path, (json.dumps(document, indent=1, ensure_ascii=False) + "\n").encode())
+    write_whole(path, (json.dumps(document, indent=1, ensure_ascii=False) + "\n").encode())
 
 
-def columns(rows: Sequence[Mapping[str, str]], stage: int, name: str) -> tuple[list[int], list[float]]:
-    """Iterations of a stage and what a column has there."""
+def loss_curve(rows: Sequence[Mapping[str, str]], stage: int, name: str) -> tuple[list[int], list[float]]:
+    """Return the iterations of a stage that have a value in a column, and these values."""
     pairs = [(int(r["iteration"]), float(r[name])) for r in rows if int(r["stage"]) == stage and r[name]]
     return [i for i, _ in pairs], [x for _, x in pairs]
