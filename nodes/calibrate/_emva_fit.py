@@ -21,13 +21,13 @@ class LeastSquares(NamedTuple):
 
     gain: Tensor  #: K, DN/e-
     efficiency: Tensor  #: electrons per photon
-    dark_noise: Tensor  #: sigma_d, e-
+    temporal_dark_noise: Tensor  #: sigma_d, e-
     dark_signal: Tensor  #: of the shortest exposure, DN
     dark_current: Tensor  #: e-/s; not a number where all darks were exposed alike
     saturation: Tensor  #: electrons in the level of the largest variance, dark signal not counted
     gain_error: Tensor
     efficiency_error: Tensor
-    dark_noise_error: Tensor
+    temporal_dark_noise_error: Tensor
     fitted: Tensor  #: lit levels that both lines were fitted to
 
 
@@ -88,7 +88,7 @@ def least_squares(levels: Levels, *, share: Share = 0.7) -> LeastSquares:
 def _(result: LeastSquares, levels: Levels, **params: float) -> list[Check]:
     text = (
         f"K {float(result.gain):.4g} DN/e-, QE {float(result.efficiency):.3g}, dark noise "
-        f"{float(result.dark_noise):.4g} e-, from {int(result.fitted)} of {len(levels.mean)} levels"
+        f"{float(result.temporal_dark_noise):.4g} e-, from {int(result.fitted)} of {len(levels.mean)} levels"
     )
     return [Check(text, 0.0 < float(result.efficiency) <= 1.0)]
 

@@ -24,14 +24,14 @@ def contrast(psf: Psf, *, floor: Floor = 1e-4, up_to: Frequency | None = None) -
     The mean is over the frequencies that the clear aperture passes, those of `metrics.mtf`, and the contrast is the
     modulus of the OTF over its value at frequency 0. A mean of logarithms is the logarithm of the geometric mean: it
     follows the median, whereas a mean of squares follows the few frequencies near 0 where contrast is plenty. A factor
-    counts alike at every contrast above ``floor``, as it does in ``losses.lsr`` with ``log``, so that a weight
-    says how many factors of suppression one of contrast is worth; below it little is won or lost, so nulls
-    of single frequencies do not rule. ``up_to`` leaves out what is finer, which a picture that is made smaller loses.
+    counts alike at every contrast above ``floor``, as it does in ``losses.suppression_loss`` with ``log``, so that a
+    weight says how many factors of suppression one of contrast is worth; below it little is won or lost, so nulls of
+    single frequencies do not rule. ``up_to`` leaves out what is finer, which a picture that is made smaller loses.
 
     Shapes: psf.intensity (band, y, x) -> ().
     Units:  none; 0 a band where nothing is lost, -ln(floor) where all is; up_to in cycles a pixel.
-    Error:  1e-5 in float32. What left the window is not counted, `losses.bsr` does that. A band without light (1e-30)
-            counts as contrast 0, and has no gradient.
+    Error:  1e-5 in float32. What left the window is not counted, `losses.background_loss` does that. A band without
+            light (1e-30) counts as contrast 0, and has no gradient.
     Source: Goodman, Introduction to Fourier Optics, 4th ed., ch. 7 (OTF, cut-off); the mean of logarithms is ours.
     """
     bands = zip(single(psf.intensity), psf.clear_peak.tolist(), strict=True)

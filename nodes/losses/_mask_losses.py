@@ -14,7 +14,7 @@ _DARK = 1e-30  #: light, or a ratio, that stands for none
 
 
 @node()
-def lsr(psf: Psf, *, power: Annotated[float, Field(ge=8, le=64)] = 8.0, log: bool = False) -> Tensor:
+def suppression_loss(psf: Psf, *, power: Annotated[float, Field(ge=8, le=64)] = 8.0, log: bool = False) -> Tensor:
     """Add up the laser suppression over the bands, with a peak that has a gradient everywhere.
 
     The peak of PSF / clear peak is the p-norm over pixels, which sees every bright pixel where the maximum sees one.
@@ -38,7 +38,7 @@ def lsr(psf: Psf, *, power: Annotated[float, Field(ge=8, le=64)] = 8.0, log: boo
     return loss
 
 
-@lsr.reference
+@suppression_loss.reference
 def _(psf: Psf, *, power: float = 8.0, log: bool = False) -> Tensor:
     ratio = (psf.intensity.double() / psf.clear_peak[:, None, None]).flatten(1)
     dark = ratio.detach().amax(1, keepdim=True) <= _DARK
@@ -50,7 +50,7 @@ def _(psf: Psf, *, power: float = 8.0, log: bool = False) -> Tensor:
 
 
 @node()
-def bsr(image: Tensor, plain_image: Tensor) -> Tensor:
+def background_loss(image: Tensor, plain_image: Tensor) -> Tensor:
     """Add up, over the bands, the scene's light through the plain lens over that through the mask.
 
     Shapes: image and plain_image (..., band, y, x) -> ().

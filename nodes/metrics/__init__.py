@@ -3,7 +3,7 @@
 from neusee.nodes.metrics._mask_limits import Limits, limits
 from neusee.nodes.metrics._picture_quality import Quality, quality
 from neusee.nodes.metrics._psf_contrast import Mtf, encircled, mtf
-from neusee.nodes.metrics._suppression import Peak, Saturated, bsr, lsr, peak, saturated
+from neusee.nodes.metrics._suppression import Peak, Saturated, bsr, lsr, peak_irradiance, saturated
 
 __all__ = [
     "Limits",
@@ -16,7 +16,7 @@ __all__ = [
     "limits",
     "lsr",
     "mtf",
-    "peak",
+    "peak_irradiance",
     "quality",
     "saturated",
 ]

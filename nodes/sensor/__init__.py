@@ -1,19 +1,19 @@
 """Sensor: photons to electrons to digital numbers."""
 
 from neusee.nodes.sensor._digitization import crop, digitize, full_well
-from neusee.nodes.sensor._exposure import expose, gather, level
+from neusee.nodes.sensor._exposure import add_photons, expose, level
 from neusee.nodes.sensor._noise import dark_current, photon_noise, read_noise
 from neusee.nodes.sensor._photon_transfer import photon_transfer
 from neusee.nodes.sensor._saturation import Limits, limits, saturation
 
 __all__ = [
     "Limits",
+    "add_photons",
     "crop",
     "dark_current",
     "digitize",
     "expose",
     "full_well",
-    "gather",
     "level",
     "limits",
     "photon_noise",

@@ -97,7 +97,7 @@ def beside(mean: float, sd: float) -> str:
 def unit_of(name: str, params: Mapping[str, Any]) -> str:
     """Of a parameter of `density` or of `camera`."""
     if name == "gain":
-        return str(params["gain_unit"])
+        return "DN/e-"
     if name == "dark_current":
         return f"e- in {params['dark_exposure']:g} s"
     return {"dark_signal": "DN", "drift": "DN", **dict.fromkeys(_PURE, "")}.get(name, "e-")
@@ -222,7 +222,7 @@ def _corner(finding: Finding) -> Section:
     every = max(1, finding.chains.flat.shape[0] // _CORNER)
     shown = np.stack([x.reshape(-1)[::every] for x in draws.values()], -1)
     names = [f"{r.name.replace('_', ' ')}\n{r.unit}" for r in finding.rows()]
-    text = "Every pair of parameters; in orange what the recipe says. Gain, pedestal, noise and efficiency go together."
+    text = "Every pair of parameters; in orange what the recipe says. Gain, offset, noise and efficiency go together."
     picture = figures.corners(shown, names, [r.nominal for r in finding.rows()])
     return Section("Parameters in pairs", text, picture=picture)
 

@@ -25,6 +25,7 @@ _KINDS = (
     "Angle",
     "Temperature",
     "Electrons",
+    "Gain",
     "Waves",
     "DataFile",
     "DataFiles",
@@ -37,6 +38,7 @@ _SAID = {
     "Angle": "angle, such as 1 mrad",
     "Temperature": "temperature > 0, such as 6504 K",
     "Electrons": "charge >= 0, such as 390 e-",
+    "Gain": "gain > 0, such as 2.7 DN/e- or 0.37 e-/DN",
     "Waves": "wavelengths of path, such as 2 waves",
     "DataFile": "a file",
     "DataFiles": "files: a path, a folder, a pattern such as dark/*.png, or a list of these",
@@ -68,7 +70,7 @@ def nodes_lines() -> list[str]:
 def node_lines(name: str) -> list[str]:
     """One node: its physics, its inputs and parameters, and where it is used; or all readings."""
     if name == "reading":
-        return [line for row in READINGS for line in (*_reading(row.name), "")]
+        return [line for row in READINGS for line in (*_reading(row.path), "")]
     nodes = dict(all_nodes())
     if name not in nodes:
         raise LookupError(f"no node {name}: {nearest(name, nodes)}")
@@ -148,17 +150,18 @@ def _uses(name: str) -> Iterator[tuple[str, Any]]:
 
 def _readings_of(step: Any) -> Iterator[tuple[str, str]]:
     for name, value in (step.get("with") or {}).items():
-        if match := re.fullmatch(r"\$\{reading\.(\w+)\}", str(value)):
+        match = re.fullmatch(r"\$\{(\w+\.\w+)\}", str(value))
+        if match and (match[1].startswith("reading.") or any(row.path == match[1] for row in READINGS)):
             yield match[1], name
 
 
-def _reading(name: str) -> list[str]:
+def _reading(path: str) -> list[str]:
     """One contradiction of the paper: what it says, the two readings, and which packaged group chooses which."""
-    row = next((r for r in READINGS if r.name == name), None)
+    row = next((r for r in READINGS if r.path == path), None)
     if row is None:
-        return [f"reading.{name}"]
+        return [path]
     return [
-        f"reading.{row.name} ({row.number}): {row.matter}",
+        f"{row.path} ({row.number}): {row.matter}",
         f"  coherent (in force by default): {row.coherent}, because {row.reason}",
         f"  as printed (reading=as_printed): {row.as_printed}",
     ]

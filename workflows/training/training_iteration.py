@@ -161,7 +161,9 @@ class Learner:
         return {"LSR": float(peaks.mean()) * (len(peaks) / count) / times}
 
     def _suppression(self, intensity: Tensor, clear: Tensor, band: int) -> Tensor:
-        one: Tensor = losses.lsr(Psf(intensity[band : band + 1], clear[band : band + 1]), log=self.how.logarithm)
+        one: Tensor = losses.suppression_loss(
+            Psf(intensity[band : band + 1], clear[band : band + 1]), log=self.how.logarithm
+        )
         return one
 
     def _restored(self, sample: Sample) -> tuple[dict[str, tuple[float, Tensor]], Scales, Scales]:

@@ -11,9 +11,9 @@ from torch import Tensor
 from neusee.nodes import Check, node
 from neusee.nodes.calibrate._emva_fit import Share
 from neusee.nodes.calibrate._likelihood._linear_sensor import ROUNDED, Likelihood
-from neusee.nodes.sensor._digitization import Gain, GainUnit, Rounding
+from neusee.nodes.sensor._digitization import Rounding
 from neusee.nodes.sensor._saturation import Efficiency
-from neusee.nodes.units import Electrons, Real, Time
+from neusee.nodes.units import Electrons, Gain, Real, Time
 from neusee.nodes.values import Levels
 
 Scattered = Annotated[float, Field(ge=0, allow_inf_nan=False)]  #: a standard deviation; none is 0
@@ -58,10 +58,9 @@ def camera(
     levels: Levels,
     *,
     gain: Gain,
-    gain_unit: GainUnit = "e-/DN",
     quantum_efficiency: Efficiency,
     dark_signal: Real,
-    dark_noise: Electrons,
+    temporal_dark_noise: Electrons,
     dark_current: Electrons = 0.0,
     dark_exposure: Time = 1.0,
     scatter: Scattered = 0.003,
@@ -76,15 +75,16 @@ def camera(
     """Weigh levels of a real camera: each variance against the measured mean, each mean against a lamp that drifts.
 
     A mean of y DN above the dark stands for e electrons, y = K e (1 + bend x + twist x**2), x = y over that of the
-    brightest level used. Then ln(variance) is normal about ln((dy/de)**2 (dark_noise**2 + e) + rounding), whatever the
-    lamp did, and e normal about quantum_efficiency * photons + dark_current * (exposure - shortest dark): a dark is a
-    level without photons. Not stated by frames are ``scatter``, of every variance beyond chance (relative), ``lamp``,
-    of the light (relative), and ``drift``, of the dark signal (DN): each is one normal law for all levels, held or
-    free as any parameter. Left out: levels brighter than ``share`` of saturation, which is where the variance is
-    greatest, and levels that pile up at an end. Any number may be a tensor (walker,).
+    brightest level used. Then ln(variance) is normal about ln((dy/de)**2 (sigma_d**2 + e) + rounding), whatever the
+    lamp did, with sigma_d the temporal dark noise. And e is normal about quantum_efficiency * photons +
+    dark_current * (exposure - shortest dark): a dark is a level without photons. Not stated by frames are
+    ``scatter``, of every variance beyond chance (relative), ``lamp``, of the light (relative), and ``drift``, of
+    the dark signal (DN): each is one normal law for all levels, held or free as any parameter. Left out: levels
+    brighter than ``share`` of saturation, which is where the variance is greatest, and levels that pile up at an
+    end. Any number may be a tensor (walker,).
 
     Shapes: levels -> log (walker,), deviance (walker, level), scaled (walker, row).
-    Units:  gain as gain_unit says, at no signal; dark_signal DN and dark_noise e- of the shortest dark; dark_current
+    Units:  gain K, DN/e-, at no signal; dark_signal DN and temporal_dark_noise e- of the shortest dark; dark_current
             e- in ``dark_exposure``; log in nats, of means in DN and logarithms of variances.
     Error:  levels are taken as independent, photons as right but for ``lamp``: an error of all of them is one of the
             efficiency. The variance must be temporal; a lamp that flickers within a pair is to be taken off it. Pixels
@@ -95,11 +95,11 @@ def camera(
     Source: EMVA Standard 1288, release 4.0 Linear, sections 2 and 6.6 (photon transfer); Janesick, Photon Transfer.
     """
     seen, top, first = _used(levels, share)
-    given = (gain, quantum_efficiency, dark_signal, dark_noise, dark_current, scatter, lamp, drift, bend, twist)
+    dark = (dark_signal, temporal_dark_noise, dark_current)
+    given = (gain, quantum_efficiency, *dark, scatter, lamp, drift, bend, twist)
     columns = [torch.as_tensor(x, dtype=torch.float64)[..., None] for x in given]
     made = _Camera(*columns)
-    k = made.gain if gain_unit == "DN/e-" else 1.0 / made.gain
-    made = made._replace(gain=k, current=made.current / dark_exposure)
+    made = made._replace(current=made.current / dark_exposure)
     found = _told(_only(levels, seen), top, made, first, ROUNDED[rounding][1])
     each = found.variance[0].square() + found.mean[0].square()
     log = -0.5 * each - found.variance[1] - found.mean[1]

@@ -12,27 +12,26 @@ from torch import Tensor
 
 from neusee.nodes import Check, node
 from neusee.nodes.calibrate._prior._free_parameters import Factor, Free, Positive, Prior, believed, freed
-from neusee.nodes.sensor._digitization import Gain
 from neusee.nodes.sensor._saturation import Efficiency, Well
-from neusee.nodes.units import Electrons
+from neusee.nodes.units import Electrons, Gain
 
 NAMES = (
     "gain",
-    "pedestal",
+    "offset",
     "read_noise",
     "dark_current",
     "full_well",
     "quantum_efficiency",
     "spread",
 )  #: of the parameters of `density` that may be free
-_LINEAR = "pedestal"  #: the only one that may be none, or less
+_LINEAR = "offset"  #: the only one that may be none, or less
 
 
 @node()
 def prior(
     *,
     gain: tuple[Gain, Factor] | None = None,
-    pedestal: tuple[Electrons, Electrons] | None = None,
+    offset: tuple[Electrons, Electrons] | None = None,
     read_noise: tuple[Electrons, Factor] | None = None,
     dark_current: tuple[Electrons, Factor] | None = None,
     full_well: tuple[Well, Factor] | None = None,
@@ -41,7 +40,7 @@ def prior(
 ) -> Prior:
     """Say how well each parameter of the sensor is known beforehand; what is not named is held.
 
-    Each is a median and a factor, [0.37, 2] for a half to twice as much in two cases of three; the pedestal a mean
+    Each is a median and a factor, [0.37, 2] for a half to twice as much in two cases of three; the offset a mean
     and a standard deviation.
 
     Shapes: -> (7,).
@@ -51,7 +50,7 @@ def prior(
     Source: log-normal and normal laws.
     """
     given = dict(
-        zip(NAMES, (gain, pedestal, read_noise, dark_current, full_well, quantum_efficiency, spread), strict=True)
+        zip(NAMES, (gain, offset, read_noise, dark_current, full_well, quantum_efficiency, spread), strict=True)
     )
     return believed(given, frozenset({_LINEAR}))
 
@@ -67,32 +66,30 @@ class Coordinates(Free):
     """The free parameters as frames see them, in numbers of the converter, which do not depend on the gain.
 
     A slope of the photon-transfer curve, an offset, a variance in the dark, a response and a saturation level are each
-    known by themselves; gain, pedestal, read noise and well only all together, correlated to 1 - 1e-3. All are
+    known by themselves; gain, offset, read noise and well only all together, correlated to 1 - 1e-3. All are
     logarithms but the offset.
     """
 
     linear: ClassVar[frozenset[str]] = frozenset({_LINEAR})
     edged: ClassVar[frozenset[str]] = frozenset({"full_well"})
 
-    inverse: bool  #: the gain is written in e-/DN
-
     @classmethod
-    def of(cls, prior: Prior, nominal: Mapping[str, float], gain_unit: str) -> Coordinates:
+    def of(cls, prior: Prior, nominal: Mapping[str, float]) -> Coordinates:
         """``nominal``: all of `NAMES`, as `density` takes them."""
         free = freed(NAMES, prior)
         held = {name: float(nominal[name]) for name in NAMES if name not in free}
-        return cls(free, prior, held, gain_unit == "e-/DN")
+        return cls(free, prior, held)
 
     @property
     def labels(self) -> tuple[str, ...]:
         """What each coordinate is."""
-        of = {"gain": "ln slope of the photon-transfer curve", "pedestal": "offset, DN", "spread": "ln spread"}
+        of = {"gain": "ln slope of the photon-transfer curve", "offset": "offset, DN", "spread": "ln spread"}
         return tuple(of.get(name, f"ln {name.replace('_', ' ')} in numbers") for name in self.names)
 
     def place(self, parameters: Mapping[str, float | Tensor]) -> Tensor:
         """(..., free) from parameters."""
         full = {name: torch.as_tensor(parameters.get(name, self.held.get(name)), dtype=torch.float64) for name in NAMES}
-        slope = self._numbers(full["gain"].log())
+        slope = full["gain"].log()
         return torch.stack([self._seen(name, full, slope) for name in self.names], -1)
 
     def parameters(self, place: Tensor) -> dict[str, Tensor]:
@@ -102,11 +99,11 @@ class Coordinates(Free):
         if "gain" in at:
             slope = at["gain"] - 2.0 * spread
         else:
-            slope = self._numbers(torch.tensor(math.log(self.held["gain"]), dtype=torch.float64))
+            slope = torch.tensor(math.log(self.held["gain"]), dtype=torch.float64)
         found = {}
         for name, x in at.items():
             if name == "gain":
-                found[name] = self._numbers(slope).exp()
+                found[name] = slope.exp()
             elif name == _LINEAR:
                 found[name] = x * (-slope).exp()
             else:
@@ -117,12 +114,8 @@ class Coordinates(Free):
         """(...) density per unit of the coordinates, but for a constant."""
         total = -0.5 * self.whitened(parameters).square().sum(-1)
         if _LINEAR in self.names and "gain" in self.names:
-            total = total - self._numbers(parameters["gain"].log())  # a step of the offset is less of a pedestal
+            total = total - parameters["gain"].log()  # a step of 1 DN is one of 1 / K electrons
         return total
-
-    def _numbers(self, log_gain: Tensor) -> Tensor:
-        """ln of DN/e- from that of the gain as it is written, and back."""
-        return -log_gain if self.inverse else log_gain
 
     def _seen(self, name: str, full: Mapping[str, Tensor], slope: Tensor) -> Tensor:
         if name == "gain":

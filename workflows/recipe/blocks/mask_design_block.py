@@ -22,8 +22,8 @@ class Weights(BaseModel):
 
     model_config = ConfigDict(extra="forbid", frozen=True)
 
-    lsr: Weight = 1.0  #: `losses.lsr`
-    bsr: Weight = 1.0  #: `losses.bsr` of a point on the axis: the light that left the field
+    lsr: Weight = 1.0  #: `losses.suppression_loss`
+    bsr: Weight = 1.0  #: `losses.background_loss` of a point on the axis: the light that left the field
     contrast: Weight = 0.0  #: `losses.contrast`
     wiener: Weight = 0.0  #: `losses.wiener`, of all bands at once: what a Wiener filter does not bring back
 

@@ -177,7 +177,7 @@ def _ranks(found: Found, picture: bytes, pixels: int) -> Section:
         too wide; at one end, beside the truth.
 
         The prior is that of the recipe, but no wider than the standard deviations below (of the logarithm; of the
-        pedestal in e-), so that frames of the recipe's levels tell something of every sensor that is drawn. The search
+        offset in e-), so that frames of the recipe's levels tell something of every sensor that is drawn. The search
         for the peak starts near the truth: this study judges the posterior and the draws, not that search. A walker
         is lost whose median log posterior lies 20 nats under that of the others."""
     rows = [(_plain(name), width) for name, width in found.widths.items()]

@@ -17,8 +17,8 @@ from neusee.workflows.recipe.step_declarations import find_node
 from neusee.workflows.studies.stability.extreme_cases import Case, Size
 
 _COMPARES: dict[str, tuple[tuple[str, dict[str, Any]], ...]] = {  # a loss takes what the metric beside it takes
-    "metrics.lsr": (("losses.lsr", {}), ("losses.lsr", {"log": True})),
-    "metrics.bsr": (("losses.bsr", {}),),
+    "metrics.lsr": (("losses.suppression_loss", {}), ("losses.suppression_loss", {"log": True})),
+    "metrics.bsr": (("losses.background_loss", {}),),
     "metrics.mtf": (("losses.contrast", {}), ("metrics.limits", {})),
     "doe.fabricate": (("doe.smooth", {"feature": "400 um"}),),  # three samples of the small pupil
     "metrics.quality": (("losses.charbonnier", {}), ("losses.fft_l1", {}), ("losses.gradient_penalty", {})),

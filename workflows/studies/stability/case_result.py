@@ -30,7 +30,7 @@ _NEAR = 0.5  #: of a bound, beyond which what holds is near it
 _STEEPER = 10.0  #: or to so many times the bound of the result, where that is more
 _LEAST = math.sqrt(torch.finfo(torch.float32).tiny)  #: below, an error counts over this: of what is denormal, a root
 _DIM = 1e-3  #: of the brightest, below which a part counts as dim
-_LIGHT = ("scene.", "spectra.", "optics.", "sensor.expose", "sensor.gather")  #: where what is dim may not drown
+_LIGHT = ("scene.", "spectra.", "optics.", "sensor.expose", "sensor.add_photons")  #: where what is dim may not drown
 _HUGE = 1e30  #: what infinity is compared with
 _HALVES = {torch.float16: 2.0**-11, torch.bfloat16: 2.0**-8}
 

@@ -114,7 +114,7 @@ def _relief(change: Callable[[Tensor], Tensor]) -> dict[str, Callable[[Any], Any
 
 
 _BLACK: dict[str, Callable[[Any], Any]] = {"scene.": lambda scene: scene * 0}
-_LASER, _SCENE = "optics.spot.strength", "sensor.level.strength"
+_LASER, _SCENE = "optics.laser_irradiance.strength", "sensor.level.strength"
 
 USUAL = Case("usual", "the recipe as it is, at this small size", "usual")
 CASES: tuple[Case, ...] = (

@@ -121,7 +121,7 @@ class Terms:
         if weights.lsr:
             found["lsr"] = self._suppression(psf)
         if weights.bsr:
-            found["bsr"] = losses.bsr(psf.intensity, plain.intensity)
+            found["bsr"] = losses.background_loss(psf.intensity, plain.intensity)
         if weights.contrast:
             found["contrast"] = losses.contrast(psf, floor=how.floor, up_to=how.up_to)
         found = {name: term / len(psf.intensity) for name, term in found.items()}
@@ -132,7 +132,7 @@ class Terms:
     def _suppression(self, psf: Psf) -> Tensor:
         """The sum over bands, no less than what is enough of each in the mean."""
         how, count = self.how, len(psf.intensity)
-        found: Tensor = losses.lsr(psf, power=how.power, log=how.log)
+        found: Tensor = losses.suppression_loss(psf, power=how.power, log=how.log)
         if how.enough is None:
             return found
         return found.clamp_min(count * (math.log(how.enough) if how.log else how.enough))

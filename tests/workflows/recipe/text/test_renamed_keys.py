@@ -1,0 +1,94 @@
+"""What was called otherwise in 0.1: one located line says the new name, wherever the old one is written."""
+
+import functools
+import re
+from pathlib import Path
+
+import pytest
+
+from neusee import recipes
+from neusee.workflows.graph.diagnostics import RecipeError
+from neusee.workflows.recipe.loading import load
+from neusee.workflows.recipe.step_declarations import families
+from neusee.workflows.recipe.text.renamed_keys import instead, new_name, old_names
+
+RECIPES = ("first_light", "calibrate", "calibrate_camera")
+BLOCKS = {"camera": "calibrate_camera"}  #: by the block of a key, the recipe that has it; else first_light
+KEYS = [old for old in old_names() if old.count(".") == 1 and old.partition(".")[0] in ("sensor", "reading", "camera")]
+KEYS.remove("sensor.gather")  # a node of the family `sensor`, not a key of the block
+NODES = [old for old in old_names() if old.count(".") == 1 and old not in KEYS]
+PARAMETERS = [old for old in old_names() if old.count(".") == 2]
+
+
+def refused(name, *arguments, folder=None):
+    with pytest.raises(RecipeError) as caught:
+        load(name, arguments, folder) if folder else load(name, arguments)
+    return [(str(p.mark), p.path, p.message) for p in caught.value.diagnostics]
+
+
+@functools.cache
+def using(node):
+    """A recipe that has a step of this node, and that step."""
+    steps = ((name, step) for name in RECIPES for step in load(name).steps.values())
+    return next((name, step.name.partition("[")[0]) for name, step in steps if step.node.path == node)
+
+
+def test_every_old_name_is_of_one_kind_and_is_one_no_more():
+    assert sorted((*KEYS, *NODES, *PARAMETERS)) == sorted(old_names())
+    assert all(old.partition(".")[0] in families() for old in (*NODES, *PARAMETERS))
+    assert not [old for old in old_names() if new_name(old) in old_names()]
+
+
+@pytest.mark.parametrize("old", KEYS)
+def test_an_old_key_in_an_argument(old):
+    name = BLOCKS.get(old.partition(".")[0], "first_light")
+    assert refused(name, f"{old}=1 e-") == [("argument 1", f"{old}=1 e-", instead(old))]
+
+
+@pytest.mark.parametrize("old", KEYS)
+def test_an_old_key_in_a_file(old, tmp_path):
+    """Beside the new one, and in its place: in both cases the old one alone is the mistake."""
+    block, _, key = old.partition(".")
+    name = BLOCKS.get(block, "first_light")
+    folder = Path(recipes.__path__[0])
+    text = (folder / f"{name}.yaml").read_text().replace("samples/", f"{folder}/samples/")
+    beside, there = re.subn(rf"\n{block}:.*\n", f"\n{block}:\n  {key}: 1 e-\n", text, count=1)
+    beside += "" if there else f"{block}:\n  {key}: 1 e-\n"
+    now = (new_name(old) or "").rpartition(".")[2]
+    for n, written in enumerate((beside, re.sub(rf"\n  {now}: .*", "", beside, count=1) if now else beside)):
+        (tmp_path / f"{n}.yaml").write_text(written)
+        ((where, path, message),) = refused(f"{n}.yaml", folder=tmp_path)
+        assert where.startswith(f"{n}.yaml:")
+        assert (path, message) == (old, instead(old))
+
+
+@pytest.mark.parametrize("old", KEYS)
+def test_an_old_key_that_a_reference_names(old):
+    name = BLOCKS.get(old.partition(".")[0], "first_light")
+    found = refused(name, f"seed=${{{old}}}")
+    assert len(found) == 1
+    assert found[0][0] == "argument 1"
+    assert instead(old) in found[0][2]
+
+
+@pytest.mark.parametrize("old", NODES)
+def test_an_old_node(old):
+    found = refused("first_light", f"+steps.old={{node: {old}}}")
+    assert [message for _, _, message in found] == [f"{old} {instead(old)}"]
+    assert found[0][0] == "argument 1"
+
+
+@pytest.mark.parametrize("old", PARAMETERS)
+def test_an_old_parameter(old):
+    node, _, parameter = old.rpartition(".")
+    name, step = using(node)
+    ((where, path, message),) = refused(name, f"+steps.{step}.with.{parameter}=1 e-")
+    assert (where, path, message) == ("argument 1", f"steps.{step}.with.{parameter}", instead(old))
+
+
+@pytest.mark.parametrize("old", [old for old in PARAMETERS if new_name(old)])
+def test_an_old_parameter_in_place_of_the_new_one_is_one_mistake(old):
+    node, _, parameter = old.rpartition(".")
+    name, step = using(node)
+    found = refused(name, f"~steps.{step}.with.{new_name(old)}", f"+steps.{step}.with.{parameter}=1 e-")
+    assert [message for _, _, message in found] == [instead(old)]
