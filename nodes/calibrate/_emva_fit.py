@@ -63,10 +63,10 @@ def least_squares(levels: Levels, *, share: Share = 0.7) -> LeastSquares:
     if not (float(gain) > 0 and float(response) > 0):
         raise ValueError(f"slopes {float(gain):.3g} DN/e- and {float(response):.3g} DN a photon: brighter frames must "
                          "be brighter and noisier; see that the light and the levels belong together")  # fmt: skip
-    scatter = 2 * lit.variance.square() / lit.freedom
-    dim = 2 * below.variance.square() / below.freedom
+    scatter = 2 * lit.variance.square() / lit.degrees_of_freedom
+    dim = 2 * below.variance.square() / below.degrees_of_freedom
     off = _error(mean[used], scatter[used], dim[used], nearest[used]) / gain
-    faint = lit.variance / lit.numbers, below.variance / below.numbers
+    faint = lit.variance / lit.pixels, below.variance / below.pixels
     weak = _error(lit.photons[used], faint[0][used], faint[1][used], nearest[used]) / response
     noise, doubt = _dark_noise(levels, dark)
     efficiency = response / gain
@@ -116,7 +116,7 @@ def _first(levels: Levels, dark: Tensor) -> Tensor:
 
 def _dark_noise(levels: Levels, dark: Tensor) -> tuple[Tensor, Tensor]:
     """Standard deviation of the dark without its rounding, and its standard error, DN; infinite if rounding is all."""
-    variance, freedom = (x[_first(levels, dark)] for x in (levels.variance, levels.freedom))
+    variance, freedom = (x[_first(levels, dark)] for x in (levels.variance, levels.degrees_of_freedom))
     noise = (variance - _QUANTIZATION).clamp_min(0.0).sqrt()
     return noise, torch.where(noise > 0, variance / (2 * freedom).sqrt() / noise, math.inf)
 

@@ -10,7 +10,7 @@ from neusee.nodes._half_precision import single
 from neusee.nodes.spectra._low_rank_cube import Share, compress, mixture, said_of_planes
 from neusee.nodes.spectra._principal_planes import Source, few_planes
 from neusee.nodes.spectra._spectral_tables import mallett, paints, to_srgb
-from neusee.nodes.values import Bands, Mixture
+from neusee.nodes.values import Bands, LowRankCube
 
 _FIRST, _LAST = 380e-9, 780e-9  #: m, where measured reflectances and the basis are known
 
@@ -39,7 +39,7 @@ def _(result: Tensor, rgb: Tensor, bands: Bands) -> list[Check]:
 
 
 @node(rtol=1e-6)
-def lift_mallett_mixture(rgb: Tensor, bands: Bands, *, within: Share = 1e-6) -> Mixture:
+def lift_mallett_mixture(rgb: Tensor, bands: Bands, *, within: Share = 1e-6) -> LowRankCube:
     """Give the reflectance of `lift_mallett` as few planes, some pixels at a time: the cube is never in memory.
 
     Shapes: rgb (3, y, x) -> planes (k, y, x), basis (band, k), rest and spread (k + 1, band) float64.
@@ -52,7 +52,7 @@ def lift_mallett_mixture(rgb: Tensor, bands: Bands, *, within: Share = 1e-6) -> 
 
 
 @lift_mallett_mixture.reference
-def _(rgb: Tensor, bands: Bands, *, within: float = 1e-6) -> Mixture:
+def _(rgb: Tensor, bands: Bands, *, within: float = 1e-6) -> LowRankCube:
     return _mixed_whole(lift_mallett, rgb, bands, within)
 
 
@@ -89,7 +89,7 @@ def _(result: Tensor, rgb: Tensor, bands: Bands) -> list[Check]:
 
 
 @node(rtol=1e-6)
-def lift_lmmse_mixture(rgb: Tensor, bands: Bands, *, within: Share = 1e-6) -> Mixture:
+def lift_lmmse_mixture(rgb: Tensor, bands: Bands, *, within: Share = 1e-6) -> LowRankCube:
     """Give the reflectance of `lift_lmmse` as few planes, some pixels at a time: the cube is never in memory.
 
     Shapes: rgb (3, y, x) -> planes (k, y, x), basis (band, k), rest and spread (k + 1, band) float64.
@@ -102,7 +102,7 @@ def lift_lmmse_mixture(rgb: Tensor, bands: Bands, *, within: Share = 1e-6) -> Mi
 
 
 @lift_lmmse_mixture.reference
-def _(rgb: Tensor, bands: Bands, *, within: float = 1e-6) -> Mixture:
+def _(rgb: Tensor, bands: Bands, *, within: float = 1e-6) -> LowRankCube:
     return _mixed_whole(lift_lmmse, rgb, bands, within)
 
 
@@ -139,7 +139,7 @@ def _lifted(rgb: Tensor, matrix: Tensor) -> Tensor:
     return torch.relu_(matrix.to(rgb) @ rgb.flatten(1)).reshape(-1, *rgb.shape[1:])
 
 
-def _mixed(rgb: Tensor, matrix: Tensor, within: float) -> Mixture:
+def _mixed(rgb: Tensor, matrix: Tensor, within: float) -> LowRankCube:
     """The planes; a learnt picture is lifted whole, so that its gradient flows."""
     needs_rgb(rgb)
     flat, exact = rgb.detach().flatten(1), matrix.to(rgb.device)
@@ -148,11 +148,11 @@ def _mixed(rgb: Tensor, matrix: Tensor, within: float) -> Mixture:
     return mixture(few_planes(source, within), _lifted(rgb, matrix) if rgb.requires_grad else rgb)
 
 
-def _mixed_whole(lift: Node, rgb: Tensor, bands: Bands, within: float) -> Mixture:
+def _mixed_whole(lift: Node, rgb: Tensor, bands: Bands, within: float) -> LowRankCube:
     """The reference of both: the cube of the other reference, and its own components."""
     assert lift.hooks.reference is not None
     assert compress.hooks.reference is not None
-    found: Mixture = compress.hooks.reference(lift.hooks.reference(rgb, bands), within=within)
+    found: LowRankCube = compress.hooks.reference(lift.hooks.reference(rgb, bands), within=within)
     return found
 
 

@@ -8,13 +8,13 @@ from torch import Tensor
 
 from neusee.nodes import Check, node
 from neusee.nodes.spectra._principal_planes import Found, Source, few_planes
-from neusee.nodes.values import Mixture
+from neusee.nodes.values import LowRankCube
 
 Share = Annotated[float, Field(ge=0, allow_inf_nan=False)]  #: of the largest element
 
 
 @node(rtol=1e-6)
-def compress(cube: Tensor, *, within: Share = 1e-6) -> Mixture:
+def compress(cube: Tensor, *, within: Share = 1e-6) -> LowRankCube:
     """Write a cube as the fewest planes, principal components of its spectra, that come within a bound of it.
 
     A grey scene has one plane; a linear lift of three colours has three, and hardly more where few pixels were clipped.
@@ -36,17 +36,18 @@ def compress(cube: Tensor, *, within: Share = 1e-6) -> Mixture:
     return mixture(few_planes(source, within), cube)
 
 
-def mixture(found: Found, cube: Tensor) -> Mixture:
+def mixture(found: Found, cube: Tensor) -> LowRankCube:
     """Planes as pictures; where the cube is learnt, a product with it, so that its gradient flows."""
     if cube.requires_grad:
         planes = torch.tensordot(found.basis.T.to(cube), cube, 1)
     else:
         planes = found.planes.reshape(-1, *cube.shape[-2:])
-    return Mixture(planes, found.basis, found.rest, found.spread, found.off.reshape(cube.shape[-2:]))
+    left = found.residual_map.reshape(cube.shape[-2:])
+    return LowRankCube(planes, found.basis, found.residual_max, found.residual_rms, left)
 
 
 @compress.reference
-def _(cube: Tensor, *, within: float = 1e-6) -> Mixture:
+def _(cube: Tensor, *, within: float = 1e-6) -> LowRankCube:
     flat = cube.double().flatten(1)
     axes = torch.linalg.svd(flat, full_matrices=False)[0]
     errors = [flat - axes[:, :r] @ (axes[:, :r].T @ flat) for r in range(axes.shape[1] + 1)]
@@ -56,12 +57,15 @@ def _(cube: Tensor, *, within: float = 1e-6) -> Mixture:
     planes = (axes[:, :count].T @ flat).reshape(-1, *cube.shape[1:])
     rest = torch.stack([error.abs().amax(1) for error in errors])
     off = errors[count].abs().amax(0).reshape(cube.shape[1:])
-    return Mixture(planes, axes[:, :count], rest[: count + 1], spread[: count + 1], off)
+    return LowRankCube(planes, axes[:, :count], rest[: count + 1], spread[: count + 1], off)
 
 
 @compress.check
-def said_of_planes(result: Mixture, *inputs: object, **params: object) -> list[Check]:
-    """How many planes there are, and how far they are from the cube; of whatever gives a `Mixture`."""
-    rms, most = (float(x[-1].max()) / max(float(result.rest[0].max()), 1e-300) for x in (result.spread, result.rest))
+def said_of_planes(result: LowRankCube, *inputs: object, **params: object) -> list[Check]:
+    """How many planes there are, and how far they are from the cube; of whatever gives a `LowRankCube`."""
+    rms, most = (
+        float(x[-1].max()) / max(float(result.residual_max[0].max()), 1e-300)
+        for x in (result.residual_rms, result.residual_max)
+    )
     few = f"{len(result.planes)} planes for {len(result.basis)} bands"
     return [Check(f"{few}, within {rms:.2g} of the brightest, at worst {most:.2g}")]

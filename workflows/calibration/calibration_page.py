@@ -192,7 +192,7 @@ def _curve(finding: Finding) -> Section:
     flat = finding.chains.flat
     look = finding.problem.look(flat[rng.integers(len(flat), size=_PREDICTED)])
     levels = finding.problem.levels
-    mean, variance, freedom = look.mean.numpy(), look.variance.numpy(), levels.freedom.numpy()
+    mean, variance, freedom = look.mean.numpy(), look.variance.numpy(), levels.degrees_of_freedom.numpy()
     chance = rng.standard_normal(variance.shape) * np.sqrt(2 / freedom.clip(1))
     whole: NDArray[np.bool_] = np.asarray((variance > 0).all(0))
     whole[levels.cell_level.numpy()] = False
@@ -209,7 +209,7 @@ def _moments(levels: Sufficient | Levels) -> tuple[Places, Places]:
     if isinstance(levels, Levels):
         return levels.mean.numpy(), levels.variance.numpy()
     at, value, count = (x.numpy() for x in levels[-3:])
-    total, mean, variance = (x.numpy() for x in (levels.numbers, levels.mean, levels.variance))
+    total, mean, variance = (x.numpy() for x in (levels.pixels, levels.mean, levels.variance))
     sums = [np.bincount(at, count * value**n, minlength=len(total)) for n in range(3)]
     every = total + sums[0]
     middle = (total * mean + sums[1]) / every

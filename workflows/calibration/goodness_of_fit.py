@@ -30,11 +30,11 @@ def fit(likelihood: Likelihood, free: int = 0) -> Fit:
     """
     from scipy.special import chdtrc
 
-    if not len(likelihood.freedom):
+    if not len(likelihood.degrees_of_freedom):
         raise ValueError("this likelihood has no deviances: take one with told: true")
-    if likelihood.deviance.numel() != len(likelihood.freedom):
+    if likelihood.deviance.numel() != len(likelihood.degrees_of_freedom):
         raise ValueError(f"deviances {tuple(likelihood.deviance.shape)} are not of one sensor: give one place")
-    deviance, freedom = float(likelihood.deviance.sum()), float(likelihood.freedom.sum()) - free
+    deviance, freedom = float(likelihood.deviance.sum()), float(likelihood.degrees_of_freedom.sum()) - free
     if freedom <= 0:
         raise ValueError(f"{freedom + free:.0f} numbers are no test of {free} free parameters: give more levels")
     return Fit(deviance, freedom, float(chdtrc(freedom, deviance)))

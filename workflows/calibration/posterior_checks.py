@@ -131,7 +131,7 @@ def _of_peak(problem: SensorPosterior, peak: LaplaceFit, known: Known, chains: C
 
 def _of_data(problem: SensorPosterior, peak: LaplaceFit, known: Known) -> Iterator[Check]:
     look = problem.look(peak.place[None])
-    if float(look.freedom.sum()) > len(known.estimated):
+    if float(look.degrees_of_freedom.sum()) > len(known.estimated):
         found = fit(look, len(known.estimated))
         said = f"deviance {found.deviance:.1f} of {found.freedom:.0f} degrees of freedom, p = {found.p:.2g}"
         yield Check("the sensor's law fits the levels", said, f"p above {MISFIT}", _mark(found.good))

@@ -116,9 +116,9 @@ def camera(
 
 @camera.check
 def _(result: Likelihood, levels: Levels, **params: Any) -> list[Check]:
-    if not len(result.freedom):
+    if not len(result.degrees_of_freedom):
         return []
-    off, used = float(result.deviance.sum()), result.freedom > 0
+    off, used = float(result.deviance.sum()), result.degrees_of_freedom > 0
     count, coarse = int(used.sum()), int((levels.variance[used] < _QUIET).sum())
     said = [Check(f"deviance {off:.4g} of {2 * count} means and variances, {count} of {len(used)} levels")]
     if coarse:
@@ -131,12 +131,12 @@ def _told(levels: Levels, top: float, camera: _Camera, first: float, quantizatio
     law = seen.slope.square() * (camera.noise.square() + seen.electrons) + quantization
     possible = seen.possible & (law > quantization)
     law = law.where(possible, 1.0)
-    width = (2.0 / levels.freedom + camera.scatter.square()).sqrt()
+    width = (2.0 / levels.degrees_of_freedom + camera.scatter.square()).sqrt()
     # the mean of the logarithm of a variance is below the logarithm of the mean, by one over its degrees of freedom
-    off = (levels.variance.log() - law.log() + 1.0 / levels.freedom) / width
+    off = (levels.variance.log() - law.log() + 1.0 / levels.degrees_of_freedom) / width
     light = camera.efficiency * levels.photons
     expected = light + camera.current * (levels.exposure - first)
-    error = levels.variance / levels.numbers + camera.drift.square() + (camera.lamp * light * seen.slope).square()
+    error = levels.variance / levels.pixels + camera.drift.square() + (camera.lamp * light * seen.slope).square()
     away = (seen.electrons - expected) * seen.slope / error.sqrt()
     parts = (off, width.log(), away, 0.5 * error.log(), possible, law)
     told = torch.broadcast_tensors(*parts)  # type: ignore[no-untyped-call]

@@ -71,7 +71,7 @@ def density(
 
 @density.check
 def _(result: Likelihood, *inputs: Sufficient, **params: Any) -> list[Check]:
-    if not len(result.freedom):
+    if not len(result.degrees_of_freedom):
         return []
-    off, freedom = float(result.deviance.sum()), float(result.freedom.sum())
+    off, freedom = float(result.deviance.sum()), float(result.degrees_of_freedom.sum())
     return [Check(f"deviance {off:.4g} of {freedom:.0f} degrees of freedom")]

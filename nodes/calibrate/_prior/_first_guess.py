@@ -26,7 +26,7 @@ def guess(levels: Sufficient, believed: Mapping[str, float], params: Mapping[str
     Source: EMVA Standard 1288, release 4.0 Linear, sections 6.6 to 6.8.
     """
     found = dict(believed)
-    lit = levels.numbers > 0
+    lit = levels.pixels > 0
     try:
         fit = least_squares(Levels(*(x[lit] for x in levels[:6]), *(x[:0] for x in levels[6:])))
     except ValueError:
@@ -71,7 +71,7 @@ def guess_camera(levels: Levels, believed: Mapping[str, float], params: Mapping[
 def _well(levels: Sufficient, found: Mapping[str, float], gain: float, params: Mapping[str, Any]) -> float:
     """Where numbers pile up; else above all that was seen."""
     top, shift = 2 ** params["bits"] - 1, ROUNDED[params["rounding"]][0]
-    seen = levels.mean[levels.numbers > 0]
+    seen = levels.mean[levels.pixels > 0]
     brightest = max([*seen.tolist(), *levels.cell_value.tolist()], default=0.0)
     at = levels.cell_value >= brightest - 2
     piled = bool(at.any()) and float(levels.cell_count[at].sum()) > 0.5 * float(levels.cell_count.max())

@@ -13,7 +13,7 @@ from neusee.nodes.optics._imaging._collapsed_plan import Given, choose, with_win
 from neusee.nodes.optics._imaging._convolve_plan import bordered, convolved, guessed, majorant, rounding
 from neusee.nodes.optics._imaging._light_in_field import flux
 from neusee.nodes.optics._imaging._psf_energy import passed
-from neusee.nodes.values import Channels, Mixture, Psf
+from neusee.nodes.values import Channels, LowRankCube, Psf
 
 Share = Annotated[float, Field(ge=0, allow_inf_nan=False)]  #: of the brightest pixel
 _TRIES = 3  #: the brightest pixels guessed, known, and all kept
@@ -21,7 +21,13 @@ _TRIES = 3  #: the brightest pixels guessed, known, and all kept
 
 @node(rtol=1e-5)
 def image_channels(
-    radiance: Mixture, psf: Psf, rows: Tensor, *, border: Border = "zero", within: Share = 0.0, largest: bool = False
+    radiance: LowRankCube,
+    psf: Psf,
+    rows: Tensor,
+    *,
+    border: Border = "zero",
+    within: Share = 0.0,
+    largest: bool = False,
 ) -> Channels:
     """Sum the bands of the image by each row of weights, convolving few planes with few kernels in place of all bands.
 
@@ -58,7 +64,13 @@ def image_channels(
 
 @image_channels.reference
 def _(
-    radiance: Mixture, psf: Psf, rows: Tensor, *, border: Border = "zero", within: float = 0.0, largest: bool = False
+    radiance: LowRankCube,
+    psf: Psf,
+    rows: Tensor,
+    *,
+    border: Border = "zero",
+    within: float = 0.0,
+    largest: bool = False,
 ) -> Channels:
     assert image.hooks.reference is not None
     cube = torch.tensordot(radiance.basis.double(), radiance.planes.double(), 1)
@@ -82,7 +94,7 @@ def _(result: Channels, *inputs: Any, within: float = 0.0, **params: Any) -> lis
     return [Check(text, within == 0 or float(result.bound) <= within)]
 
 
-def _fitted(radiance: Mixture, psf: Psf, rows: Tensor) -> tuple[Tensor, Tensor]:
+def _fitted(radiance: LowRankCube, psf: Psf, rows: Tensor) -> tuple[Tensor, Tensor]:
     """Planes, and the part of the PSF that reaches the scene, in one precision."""
     bands = {len(radiance.basis), len(psf.intensity), rows.shape[-1]}
     if len(bands) > 1 or radiance.planes.ndim != 3 or psf.intensity.ndim != 3 or rows.ndim != 2:
@@ -97,15 +109,15 @@ def _fitted(radiance: Mixture, psf: Psf, rows: Tensor) -> tuple[Tensor, Tensor]:
     return planes.to(dtype), kernel.to(dtype)
 
 
-def _given(radiance: Mixture, planes: Tensor, intensity: Tensor, rows: Tensor, border: Border) -> Given:
+def _given(radiance: LowRankCube, planes: Tensor, intensity: Tensor, rows: Tensor, border: Border) -> Given:
     flat = planes.detach().flatten(1)
     gram = (flat @ flat.T).double().cpu()
     copies = 9 if border == "reflect" else 1
-    if radiance.spread.numel():
-        rest = radiance.spread.double().cpu() * math.sqrt(copies)
+    if radiance.residual_rms.numel():
+        rest = radiance.residual_rms.double().cpu() * math.sqrt(copies)
         most = (gram.diagonal() * (1.001 * copies / flat.shape[1])).clamp_min(0).sqrt()
     else:
-        rest, most = radiance.rest.double().cpu(), torch.maximum(flat.amax(1), -flat.amin(1)).double().cpu()
+        rest, most = radiance.residual_max.double().cpu(), torch.maximum(flat.amax(1), -flat.amin(1)).double().cpu()
     return Given(
         rows,
         radiance.basis.detach().double().cpu(),
@@ -139,16 +151,16 @@ def _formed(planes: Tensor, intensity: Tensor, given: Given, within: float) -> t
     return result, torch.tensor(bound, dtype=torch.float64), torch.tensor(plan.kept)
 
 
-def _top(result: Tensor, radiance: Mixture, intensity: Tensor, given: Given) -> float:
+def _top(result: Tensor, radiance: LowRankCube, intensity: Tensor, given: Given) -> float:
     """How far the brightest pixel of a row may be off, as a share of it: the worst row.
 
     What the mixture lacks of a pixel, in any band, is imaged by all bands together; the true image lies so far from
     what was found at most. Below it lies no farther than above: at the brightest pixel found, as far as there.
     """
-    if not radiance.off.numel():
+    if not radiance.residual_map.numel():
         return math.inf
     found = result.detach()
-    lacks = majorant(radiance.off.to(found), intensity.detach(), given)
+    lacks = majorant(radiance.residual_map.to(found), intensity.detach(), given)
     low, most = (torch.stack(ends).double().cpu() for ends in zip(*map(torch.aminmax, found), strict=True))
     room = torch.empty_like(lacks)
     above = torch.stack([torch.add(row, lacks, out=room).amax() for row in found]).double().cpu()

@@ -41,7 +41,7 @@ def written(found, file):
     with file.open("w", newline="") as opened:
         writer = csv.writer(opened, lineterminator="\n")
         writer.writerow(COLUMNS)
-        rows = torch.stack([found.photons, found.exposure, found.numbers / 2, found.mean, found.variance], 1)
+        rows = torch.stack([found.photons, found.exposure, found.pixels / 2, found.mean, found.variance], 1)
         for photons, exposure, pixels, mean, variance in rows.tolist():
             writer.writerow([f"{photons:.2f}", f"{exposure:.4g}", int(pixels), f"{mean:.6f}", f"{variance:.6f}"])
     return file

@@ -129,7 +129,7 @@ QUIET = ("sensor.read_noise=0.05 e-", "sensor.dark_current=0.2 e-")  #: 0.02 DN
 def test_frames_too_coarse_for_the_read_noise_are_counted_number_by_number(fitted):
     problem, _, _, told = fitted(*QUIET)
     short = (problem.levels.photons == 0) & (problem.levels.exposure == 0.1)
-    assert problem.levels.numbers[short].tolist() == [0]
+    assert problem.levels.pixels[short].tolist() == [0]
     assert 1 <= int((problem.levels.cell_level == 0).sum()) <= 3
     assert told.kinds["read_noise"] != "estimate"
 
@@ -155,7 +155,9 @@ def test_the_law_is_not_fooled_by_numbers_that_do_not_scatter(fitted, tmp_path):
     """By mean and variance alone the read noise would be 3 sigma off: one twelfth does not hold there."""
     problem, truth, _, _ = fitted(*QUIET)
     found = problem.look(problem.place(truth)[None])
-    assert float(found.deviance.sum()) < float(found.freedom.sum()) + 5 * math.sqrt(2 * float(found.freedom.sum()))
+    assert float(found.deviance.sum()) < float(found.degrees_of_freedom.sum()) + 5 * math.sqrt(
+        2 * float(found.degrees_of_freedom.sum())
+    )
     noisier = {**truth, "read_noise": 0.5}
     assert float(problem.look(problem.place(noisier)[None]).log) < float(found.log) - 20
 

@@ -18,7 +18,7 @@ from typing import Any, Literal, get_args, get_origin
 
 import torch
 
-from neusee.nodes.values import Channels, Mixture, Psf
+from neusee.nodes.values import Channels, LowRankCube, Psf
 from neusee.workflows.engine.node_call import RunError
 from neusee.workflows.engine.runner import run
 from neusee.workflows.graph.recipe_graph import Recipe, Step, needed
@@ -188,7 +188,7 @@ def _inner(psf: Psf, share: float) -> Psf:
 
 def _meant(value: Any) -> Any:
     """What counts of a result: of a mixture the cube that it stands for, of channels the sums alone."""
-    if isinstance(value, Mixture):
+    if isinstance(value, LowRankCube):
         return torch.einsum("bk,kyx->byx", value.basis.to(value.planes), value.planes)
     return (value.planes, value.flux) if isinstance(value, Channels) else value
 

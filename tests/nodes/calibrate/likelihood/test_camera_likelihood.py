@@ -67,7 +67,7 @@ def test_the_law_is_that_which_is_written_out(bent):
 def test_levels_on_the_law_leave_no_deviance_and_each_parameter_matters():
     at = camera(exact(), **SENSOR, share=1.0)
     assert float(at.deviance.sum()) < 1e-3
-    assert at.freedom.tolist() == [2.0] * 8
+    assert at.degrees_of_freedom.tolist() == [2.0] * 8
     for name in ("gain", "quantum_efficiency", "dark_signal", "temporal_dark_noise", "dark_current"):
         assert float(camera(exact(), **{**SENSOR, name: 1.2 * SENSOR[name]}).deviance.sum()) > 5
     for name in ("bend", "twist"):
@@ -87,7 +87,7 @@ def test_many_cameras_are_weighed_at_once_as_one_by_one():
             assert torch.equal(a[i] if a.ndim > b.ndim or a.ndim == 2 else a, b)
     quick = camera(around(), **{**given, **rows}, told=False)
     assert torch.equal(quick.log, together.log)
-    assert len(quick.freedom) == 0
+    assert len(quick.degrees_of_freedom) == 0
 
 
 def test_the_unit_of_the_gain_is_as_written():
@@ -150,11 +150,11 @@ def test_levels_that_pile_up_are_left_out_and_coarse_ones_are_not():
     levels = around()
     cell = {"cell_level": torch.tensor([3]), "cell_value": torch.tensor([4095.0]), "cell_count": torch.tensor([9.0])}
     piled = levels._replace(**cell)
-    assert camera(piled, **SENSOR).freedom.tolist() == [2, 2, 2, 0, 2, 2, 0, 0]
+    assert camera(piled, **SENSOR).degrees_of_freedom.tolist() == [2, 2, 2, 0, 2, 2, 0, 0]
     coarse = piled._replace(variance=torch.where(torch.arange(8) == 3, 0.5, levels.variance))
-    assert camera(coarse, **SENSOR).freedom.tolist() == [2, 2, 2, 2, 2, 2, 0, 0]
+    assert camera(coarse, **SENSOR).degrees_of_freedom.tolist() == [2, 2, 2, 2, 2, 2, 0, 0]
     dark = levels._replace(**{**cell, "cell_level": torch.tensor([0]), "cell_value": torch.tensor([0.0])})
-    assert camera(dark, **SENSOR).freedom.tolist() == [0, 2, 2, 2, 2, 2, 0, 0]
+    assert camera(dark, **SENSOR).degrees_of_freedom.tolist() == [0, 2, 2, 2, 2, 2, 0, 0]
 
 
 def test_negative_signals_are_weighed_and_what_cannot_be_is_not():

@@ -144,10 +144,10 @@ def test_few_electrons_are_counted_out():
     how = {"gain": 0.7, "read_noise": 0.15, "offset": 20.0, "quantum_efficiency": 0.5, "dark_current": 1e-6}
     stacks = frames(light, size=300, distribution="poisson", **how)
     data = sufficient(measured(stacks, light))
-    assert bool((data.numbers == 0)[:2].all())
+    assert bool((data.pixels == 0)[:2].all())
     found = weigh(data, arrivals="poisson", **how)
-    assert float(found.deviance[:2].sum()) < float(found.freedom[:2].sum()) + 5 * math.sqrt(
-        2 * float(found.freedom[:2].sum())
+    assert float(found.deviance[:2].sum()) < float(found.degrees_of_freedom[:2].sum()) + 5 * math.sqrt(
+        2 * float(found.degrees_of_freedom[:2].sum())
     )
     plain = weigh(data, arrivals="gaussian", **how)
     assert float(plain.deviance[:2].sum()) > 100 * float(found.deviance[:2].sum())
@@ -173,9 +173,9 @@ def test_at_any_size_of_anything_there_is_a_number_or_none(gain, noise, dark, we
 def test_levels_are_taken_apart_and_nothing_is_lost():
     whole = measured(frames())
     parts, reference = sufficient(whole), sufficient.hooks.reference(whole)
-    count = parts.numbers.index_add(0, parts.cell_level, parts.cell_count)
-    assert torch.equal(count, whole.numbers)
-    sums = (parts.numbers * parts.mean).index_add(0, parts.cell_level, parts.cell_count * parts.cell_value)
+    count = parts.pixels.index_add(0, parts.cell_level, parts.cell_count)
+    assert torch.equal(count, whole.pixels)
+    sums = (parts.pixels * parts.mean).index_add(0, parts.cell_level, parts.cell_count * parts.cell_value)
     torch.testing.assert_close(sums / count, whole.mean, rtol=1e-12, atol=0)
     assert isinstance(reference, Sufficient)
     for one, other in zip(parts, reference, strict=True):
