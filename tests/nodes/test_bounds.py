@@ -223,6 +223,15 @@ def test_noise_that_undoes_what_is_there_is_unbounded():
     assert sensor.read_noise.hooks.skip_bound(found, offset=5.0, read_noise=0.0, full_well=None) == math.inf
 
 
+@pytest.mark.parametrize("pedestal", [0.0, 30.0])
+def test_noise_of_numbers_below_zero_is_weighed_against_the_darkest(pedestal):
+    electrons = torch.tensor([-100.0, 0.0], dtype=torch.float64)
+    found = sensor.read_noise.hooks.skip_bound(
+        TensorStats.of(electrons), offset=pedestal, read_noise=2.0, full_well=None
+    )
+    assert found == pytest.approx(noise_change(electrons, pedestal, 4.0, None), rel=1e-12)
+
+
 def test_noise_above_the_well_is_weighed_against_the_well():
     found = TensorStats.of(torch.tensor([0.0, 25500.0]))
     assert sensor.dark_current.hooks.skip_bound(found, mean=1e4, full_well=25500.0) == pytest.approx(

@@ -20,6 +20,7 @@ from neusee.workflows.cli.command_frame import (
     FAILED,
     MISSED,
     Debug,
+    Device,
     Out,
     Words,
     bytes_of,
@@ -29,12 +30,12 @@ from neusee.workflows.cli.command_frame import (
     load,
     refuse,
     say,
-    split,
     the_store,
 )
 from neusee.workflows.cli.evaluate_command import evaluate
 from neusee.workflows.cli.list_commands import nodes, recipes, schema
 from neusee.workflows.cli.study_commands import study
+from neusee.workflows.cli.sweep_command import sweep
 from neusee.workflows.cli.train_command import train
 
 if TYPE_CHECKING:
@@ -45,39 +46,41 @@ if TYPE_CHECKING:
 
 app = typer.Typer(
     name="neusee",
-    help="What a laser does to a camera: its light, its glass and its sensor, as recipes. "
-    "`neusee run` is the place to start.",
+    help="Simulate what a laser does to a camera: its light, its glass and its sensor, as recipes. "
+    "Start with `neusee run`. Each command explains itself: `neusee run --help`.",
+    epilog="Exit codes: 0 done; 1 failed while running; 2 mistake in the recipe or the arguments; "
+    "3 expected numbers missed, a check of a calibration failed, or damaged results found.",
     add_completion=False,
     no_args_is_help=True,
     rich_markup_mode=None,
     pretty_exceptions_enable=False,
 )
-app.add_typer(cache, name="cache")
-app.add_typer(study, name="study")
-for command in (calibrate, evaluate, train, recipes, nodes, schema):
-    app.command()(command)
-
-Device = Annotated[str, typer.Option("--device", help="Where to compute: cpu, cuda, or several: cuda:0,cuda:1,cpu.")]
 Where = Annotated[
     str, typer.Option("--executor", help="Who computes: local, dask, dask:4 (workers), or tcp://scheduler:8786.")
 ]
-KeepAll = Annotated[bool, typer.Option("--exact", help="Leave nothing out: every step in full.")]
-Memory = Annotated[str, typer.Option("--memory", help="What a device may use, such as 6 GB; more is refused.")]
+Exact = Annotated[bool, typer.Option("--exact", help="Compute every step in full; omit nothing.")]
+Memory = Annotated[
+    str, typer.Option("--memory", help="Limit of a device's memory, such as 6 GB, as far as earlier runs tell.")
+]
 
 
 @app.command()
 def run(
     words: Words = None,
-    as_json: Annotated[bool, typer.Option("--json", help="One JSON document on stdout.")] = False,
-    quiet: Annotated[bool, typer.Option("--quiet", help="The report's path alone.")] = False,
+    as_json: Annotated[bool, typer.Option("--json", help="Print one JSON document instead of the table.")] = False,
+    quiet: Annotated[bool, typer.Option("--quiet", help="Print only the path of the report.")] = False,
     debug: Debug = False,
     device: Device = "cpu",
     executor: Where = "local",
     memory: Memory = "",
-    exact: KeepAll = False,
+    exact: Exact = False,
     out: Out = Path("runs"),
 ) -> None:
-    """Run a recipe, from the cache where it can, and write its report."""
+    """Run a recipe and write its report.
+
+    Steps whose results are in the cache are not computed again. Without a name the recipe is first_light. The folder
+    of results holds report.html, the numbers, the pictures and the recipe with every final value.
+    """
     recipe, command = load(words, exact=exact)
     from neusee.workflows.report import console
 
@@ -132,7 +135,10 @@ def _simulate(
 
 @app.command()
 def validate(words: Words = None, debug: Debug = False) -> None:
-    """Check a recipe: every mistake at once, and nothing is run."""
+    """Check a recipe without running it.
+
+    All mistakes are listed at once, each with its file, line and column and the nearest known name.
+    """
     recipe, command = load(words)
     from neusee.workflows.report.console import opening
 
@@ -145,10 +151,17 @@ def plan(
     debug: Debug = False,
     device: Device = "cpu",
     memory: Memory = "",
-    exact: KeepAll = False,
-    devices: Annotated[str, typer.Option("--devices", help="Machines to simulate: a YAML file, or eight_a100.")] = "",
+    exact: Exact = False,
+    devices: Annotated[
+        str, typer.Option("--devices", help="Simulate these machines: a YAML file, or the example eight_a100.")
+    ] = "",
 ) -> None:
-    """Say what would run, where, for how long and with how much memory; compute nothing."""
+    """Say what a run would compute, where and for how long.
+
+    Nothing is computed. Seconds, bytes and memory are those of earlier runs of the same step, even at another size;
+    a step that never ran shows a question mark. With --devices the run is simulated on machines that you do not
+    have: makespan, utilisation and critical path.
+    """
     recipe, _ = load(words, exact=exact)
     from neusee.workflows.explain import run_forecast
 
@@ -175,7 +188,11 @@ def why(
     debug: Debug = False,
     device: Device = "cpu",
 ) -> None:
-    """Say what makes a step other than its nearest earlier result: which value, where, or whose code."""
+    """Say why a step differs from its nearest earlier result.
+
+    The answer names the value that changed and where it was written, such as
+    `sensor.read_noise 10.5 -> 20 e- (argument 2)`, or the code that changed.
+    """
     recipe, _ = load(words, before=1)
     from neusee.workflows.explain.why_rerun import why_lines
 
@@ -186,46 +203,11 @@ def why(
 
 
 @app.command()
-def sweep(
-    words: Words = None,
-    paired: Annotated[bool, typer.Option("--zip", help="Pair the axes' values instead of combining them.")] = False,
-    on_error: Annotated[str, typer.Option("--on-error", help="stop, or continue with the next point.")] = "stop",
-    netcdf: Annotated[bool, typer.Option("--netcdf", help="Write sweep.nc too (needs neusee[xarray]).")] = False,
-    quiet: Annotated[bool, typer.Option("--quiet", help="The table's path alone.")] = False,
-    debug: Debug = False,
-    device: Device = "cpu",
-    out: Out = Path("runs"),
-) -> None:
-    """Run a recipe over values: a=1,2,3 b='linspace(450 nm, 650 nm, 5)'; run it again to go on."""
-    name, words, first = split(words)
-    if on_error not in ("stop", "continue"):
-        fail(f"--on-error {on_error}: write stop or continue")
-    check_device(device)
-    from neusee.workflows.graph.diagnostics import RecipeError
-    from neusee.workflows.sweeps.sweep_run import run_sweep
-
-    try:
-        code = run_sweep(
-            name,
-            words,
-            first=first,
-            zip=paired,
-            on_error="continue" if on_error == "continue" else "stop",
-            netcdf=netcdf,
-            device=device,
-            out=out,
-            store=the_store(),
-            quiet=quiet,
-        )
-    except RecipeError as error:
-        refuse(error)
-    if code:
-        raise typer.Exit(code)
-
-
-@app.command()
 def config(words: Words = None, debug: Debug = False) -> None:
-    """Print every final value and where it comes from."""
+    """Print every final value and where it comes from.
+
+    The output is YAML: a recipe that can be run.
+    """
     recipe, _ = load(words)
     from neusee.workflows.simulation.simulate_recipe import recipe_text
 
@@ -235,10 +217,10 @@ def config(words: Words = None, debug: Debug = False) -> None:
 @app.command()
 def report(
     folder: Annotated[str, typer.Argument(metavar="RUN_FOLDER", help="A run's folder, or `latest`.")] = "latest",
-    out: Annotated[Path, typer.Option("--out", help="Where the run's folders lie.")] = Path("runs"),
+    out: Annotated[Path, typer.Option("--out", help="Folder that holds the folders of runs.")] = Path("runs"),
     debug: Debug = False,
 ) -> None:
-    """Write a run's page again from what is stored."""
+    """Write the page of a run again from stored results."""
     from neusee.workflows.report.run_folder import find_run
     from neusee.workflows.report.run_page import rebuild
 
@@ -246,6 +228,12 @@ def report(
         say([str(rebuild(find_run(folder, out)))])
     except FileNotFoundError as error:
         fail(str(error))
+
+
+for command in (sweep, train, calibrate, evaluate, recipes, nodes, schema):
+    app.command()(command)
+app.add_typer(study, name="study")
+app.add_typer(cache, name="cache")
 
 
 def main(arguments: list[str] | None = None) -> None:

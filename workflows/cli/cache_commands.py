@@ -8,14 +8,17 @@ import typer
 
 from neusee.workflows.cli.command_frame import MISSED, fail, say, the_store
 
-cache = typer.Typer(help="What was computed.", no_args_is_help=True, rich_markup_mode=None)
+cache = typer.Typer(help="List, check, remove and keep stored results.", no_args_is_help=True, rich_markup_mode=None)
 
 Key = Annotated[str, typer.Argument(metavar="KEY", help="The first digits of a key, as `cache ls` shows them.")]
 
 
 @cache.command("ls")
 def ls() -> None:
-    """List what is stored: when it was made, bytes, seconds, the step and the recipe it was made for."""
+    """List the stored results.
+
+    For each result: when it was computed, its bytes and seconds, its step and the recipe that first needed it.
+    """
     from neusee.workflows.cli.cache_lines import ls_lines
 
     say(ls_lines(the_store()))
@@ -23,7 +26,10 @@ def ls() -> None:
 
 @cache.command("verify")
 def verify() -> None:
-    """Read every result and compare its checksum; exit code 3 if one is damaged."""
+    """Compare the checksum of every stored result.
+
+    The exit code is 3 where a result is damaged.
+    """
     from neusee.workflows.cli.cache_lines import verify_lines
 
     lines, damaged = verify_lines(the_store())
@@ -34,10 +40,13 @@ def verify() -> None:
 
 @cache.command("gc")
 def gc(
-    budget: Annotated[str, typer.Option("--budget", help="Keep no more than this, such as 20 GB.")] = "",
-    dry: Annotated[bool, typer.Option("--dry-run", help="Only say what would go.")] = False,
+    budget: Annotated[str, typer.Option("--budget", help="Largest size of the cache, such as 20 GB.")] = "",
+    dry: Annotated[bool, typer.Option("--dry-run", help="Say what would be removed, and remove nothing.")] = False,
 ) -> None:
-    """Remove what belongs to no result, and, beyond a budget, what saves the fewest seconds for its bytes."""
+    """Remove files that belong to no result, and results beyond a budget.
+
+    Beyond the budget, the results that save the fewest seconds for their bytes go first. Pinned results stay.
+    """
     from neusee.workflows.cli.cache_lines import gc_lines
 
     try:
@@ -48,19 +57,22 @@ def gc(
 
 @cache.command("pin")
 def pin(key: Key) -> None:
-    """Keep a result whatever the budget."""
+    """Keep a result whatever the budget is."""
     _pinned(key, True)
 
 
 @cache.command("unpin")
 def unpin(key: Key) -> None:
-    """Let a result go again when the budget asks for it."""
+    """Allow a pinned result to be removed again."""
     _pinned(key, False)
 
 
 @cache.command("why")
 def why(key: Key) -> None:
-    """Say what went into a result, and how it differs from the nearest earlier one."""
+    """Say what a result was computed from.
+
+    Also says how that differs from the nearest earlier result.
+    """
     from neusee.workflows.explain.why_rerun import why_key_lines
 
     try:

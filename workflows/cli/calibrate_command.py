@@ -13,14 +13,21 @@ from neusee.workflows.cli.command_frame import FAILED, MISSED, Debug, Out, Words
 
 def calibrate(
     words: Words = None,
-    walkers: Annotated[int, typer.Option("--walkers", min=16, help="Of each of the four ensembles.")] = 64,
-    move: Annotated[str, typer.Option("--move", help="How they walk: de or stretch.")] = "de",
-    draws: Annotated[int, typer.Option("--draws", min=100, help="Independent draws, at least.")] = 1000,
-    quiet: Annotated[bool, typer.Option("--quiet", help="The page's path alone.")] = False,
+    walkers: Annotated[int, typer.Option("--walkers", min=16, help="Walkers in each of the four ensembles.")] = 64,
+    move: Annotated[
+        str, typer.Option("--move", help="Move of the walkers: de (differential evolution) or stretch.")
+    ] = "de",
+    draws: Annotated[int, typer.Option("--draws", min=100, help="Least number of independent draws.")] = 1000,
+    quiet: Annotated[bool, typer.Option("--quiet", help="Print only the path of the page.")] = False,
     debug: Debug = False,
     out: Out = Path("runs"),
 ) -> None:
-    """Find the posterior of a recipe's sensor from its levels, checked; run it again to go on."""
+    """Find the posterior of a sensor from calibration frames.
+
+    Before drawing, the command says which parameters the frames cannot constrain. Afterwards it checks chains and
+    fit; where a check fails, the page has a red banner and the exit code is 3. Run the same command again to
+    continue. Needs: pip install -e ".[calibrate]".
+    """
     recipe, command = load(words)
     from neusee.workflows.calibration import run_calibration
     from neusee.workflows.engine.node_call import RunError

@@ -6,6 +6,7 @@ import importlib
 import inspect
 import re
 from collections.abc import Iterator
+from importlib.resources import files
 from pathlib import Path
 from typing import Any, get_args
 
@@ -68,7 +69,9 @@ def nodes_lines() -> list[str]:
 
 
 def node_lines(name: str) -> list[str]:
-    """One node: its physics, its inputs and parameters, and where it is used; or all readings."""
+    """Return the lines on one node: its physics, its inputs and parameters, where it is used; or readings, or terms."""
+    if name == "glossary":
+        return glossary_lines()
     if name == "reading":
         return [line for row in READINGS for line in (*_reading(row.path), "")]
     nodes = dict(all_nodes())
@@ -82,6 +85,12 @@ def node_lines(name: str) -> list[str]:
     for reading in readings:
         lines += ["", *_reading(reading)]
     return [*lines, "", f"written in  {', '.join(dict.fromkeys(where for where, _ in uses)) or 'no recipe'}"]
+
+
+def glossary_lines() -> list[str]:
+    """Return the terms of the packaged glossary, one a line, without the marks of Markdown."""
+    text = (files("neusee.recipes") / "guide" / "glossary.md").read_text(encoding="utf-8")
+    return [re.sub(r"[*`]", "", line[2:]) for line in text.splitlines() if line.startswith("- **")]
 
 
 def _parameters(node: Node) -> list[str]:

@@ -30,6 +30,7 @@ Words = Annotated[
     ),
 ]
 Debug = Annotated[bool, typer.Option("--debug", help="Show where in the code an error arose.")]
+Device = Annotated[str, typer.Option("--device", help="Where to compute: cpu, cuda, or several: cuda:0,cuda:1,cpu.")]
 Out = Annotated[Path, typer.Option("--out", help="Folder in which to make the folder of results.")]
 
 

@@ -19,20 +19,26 @@ def evaluate(
         typer.Option("--pipelines", help="MASK[@file]+RESTORER[@weights], …; none restores nothing."),
     ] = _PIPELINES,
     data: Annotated[str, typer.Option("--data", help="Folder of photographs; else the recipe's own scene.")] = "",
-    scenes: Annotated[int, typer.Option("--scenes", min=1, help="How many.")] = 20,
+    scenes: Annotated[int, typer.Option("--scenes", min=1, help="Number of scenes.")] = 20,
     strengths: Annotated[
-        str, typer.Option("--strengths", help="Of the laser, multiples of saturation.")
+        str, typer.Option("--strengths", help="Strengths of the laser, multiples of saturation.")
     ] = "0,1e1,1e2,1e3,1e4,1e5,1e6",
     small: Annotated[int, typer.Option("--small", min=11, help="Shorter side of the reduced pictures.")] = 256,
     reference: Annotated[
-        str, typer.Option("--reference", help="The pipeline to compare with; the first if none.")
+        str, typer.Option("--reference", help="Pipeline that the others are compared with; by default the first.")
     ] = "",
     device: Annotated[str, typer.Option("--device", help="Where to compute: cpu or cuda.")] = "cpu",
-    quiet: Annotated[bool, typer.Option("--quiet", help="The page's path alone.")] = False,
+    quiet: Annotated[bool, typer.Option("--quiet", help="Print only the path of the page.")] = False,
     debug: Debug = False,
     out: Out = Path("runs"),
 ) -> None:
-    """Judge masks and restorers on many scenes and laser strengths, as the paper does; run it again to go on."""
+    """Compare masks and restorers on the same scenes and lasers.
+
+    A pipeline is a mask and a restorer. Every pipeline sees the same scenes, lasers and noise. The page has L1, PSNR
+    and SSIM with 95 % confidence intervals, suppression by wavelength (LSR, BSR), the contrast that is left, and the
+    bound that no mask can pass. Values that the recipe gives as distributions are drawn for each scene. Run the
+    same command again to continue.
+    """
     name, changes, _ = split(words)
     check_device(device)
     tell = (lambda line: None) if quiet else (lambda line: say([line]))

@@ -11,7 +11,7 @@ import typer
 from neusee.workflows.cli.command_frame import FAILED, Debug, Out, Words, check_device, fail, load, say, the_store
 
 study = typer.Typer(
-    help="What a recipe's numbers are worth, where it breaks, what it need not compute.",
+    help="Study how accurate, stable and certain a recipe's numbers are.",
     no_args_is_help=True,
     rich_markup_mode=None,
 )
@@ -31,44 +31,63 @@ class Points(StrEnum):
     SOBOL = "sobol"
 
 
-Quiet = Annotated[bool, typer.Option("--quiet", help="The page's path alone.")]
+Quiet = Annotated[bool, typer.Option("--quiet", help="Print only the path of the page.")]
 
 
 @study.command()
 def accuracy(
     words: Words = None,
-    seeds: Annotated[int, typer.Option("--seeds", min=1, help="Draws of the noise, for the error bars.")] = 3,
-    quick: Annotated[bool, typer.Option("--quick", help="Fewer points.")] = False,
+    seeds: Annotated[int, typer.Option("--seeds", min=1, help="Number of noise draws for the error bars.")] = 3,
+    quick: Annotated[bool, typer.Option("--quick", help="Use fewer points.")] = False,
     quiet: Quiet = False,
     debug: Debug = False,
     out: Out = Path("runs"),
 ) -> None:
-    """Draw error against run time, of the whole recipe and of each step, over tolerances and knobs."""
+    """Plot error against run time.
+
+    For the whole recipe and for each step, over tolerances and settings of accuracy; the page names the cheapest
+    setting for each error.
+    """
     _made("accuracy", words, quiet, out, seeds=seeds, quick=quick)
 
 
 @study.command()
 def stability(words: Words = None, quiet: Quiet = False, debug: Debug = False, out: Out = Path("runs")) -> None:
-    """Run stiff and extreme cases against float64, forward and gradient; fail where one does not hold."""
+    """Compare stiff and extreme cases with float64.
+
+    Values and gradients are compared: each case passes, warns or fails with its number. The exit code is 1 where
+    one fails.
+    """
     _made("stability", words, quiet, out)
 
 
 @study.command("leave-out")
 def leave_out(words: Words = None, quiet: Quiet = False, debug: Debug = False, out: Out = Path("runs")) -> None:
-    """Compute each omission in full beside it; fail where one changes more than was said."""
+    """Measure what each omission changes and saves.
+
+    Each omitted step is computed in full as well. The page has the stated bound, the measured change and the
+    seconds saved, and what simpler scenes cost. The exit code is 1 where a change exceeds its bound.
+    """
     _made("leave-out", words, quiet, out)
 
 
 @study.command()
 def calibration(
     words: Words = None,
-    simulations: Annotated[int, typer.Option("--simulations", min=20, help="Sensors drawn from the prior.")] = 200,
-    move: Annotated[Move, typer.Option("--move", help="How walkers move.")] = Move.DE,
+    simulations: Annotated[
+        int, typer.Option("--simulations", min=20, help="Number of sensors drawn from the prior.")
+    ] = 200,
+    move: Annotated[Move, typer.Option("--move", help="Move of the walkers.")] = Move.DE,
     quiet: Quiet = False,
     debug: Debug = False,
     out: Out = Path("runs"),
 ) -> None:
-    """Simulate sensors, calibrate each, rank the truth among the draws; fail where ranks or coverage are not right."""
+    """Test the calibration on simulated sensors.
+
+    Sensors are drawn from the prior, their frames are simulated, and the truth is ranked among draws from each
+    posterior (simulation-based calibration, SBC). The page also has what doubling the width of each prior moves.
+    The exit code is 1 where ranks or coverage are wrong.
+    """
     _made("calibration", words, quiet, out, simulations=simulations, move=move.value)
 
 
@@ -76,17 +95,27 @@ def calibration(
 def uncertainty(
     words: Words = None,
     error: Annotated[
-        float, typer.Option("--error", min=1e-3, max=1.0, help="Of each sd, relative; ends there.")
+        float,
+        typer.Option("--error", min=1e-3, max=1.0, help="Relative error of each standard deviation at which to stop."),
     ] = 0.05,
-    most: Annotated[int, typer.Option("--most", min=64, help="Draws, at most.")] = 1000,
-    points: Annotated[Points, typer.Option("--points", help="Independent draws, or points of Sobol.")] = Points.DRAWS,
-    workers: Annotated[int, typer.Option("--workers", min=0, help="Draws at once; 0: one a core.")] = 0,
+    most: Annotated[int, typer.Option("--most", min=64, help="Largest number of draws.")] = 1000,
+    points: Annotated[
+        Points, typer.Option("--points", help="Independent draws, or a Sobol sequence, which needs fewer.")
+    ] = Points.DRAWS,
+    workers: Annotated[
+        int, typer.Option("--workers", min=0, help="Number of draws computed at the same time; 0: one for each core.")
+    ] = 0,
     device: Annotated[str, typer.Option("--device", help="Where to compute: cpu or cuda.")] = "cpu",
     quiet: Quiet = False,
     debug: Debug = False,
     out: Out = Path("runs"),
 ) -> None:
-    """Draw what is uncertain (laws such as "normal(1 e-, 0.1 e-)", a posterior); show how the outputs scatter."""
+    """Propagate uncertain values to the outputs.
+
+    Uncertain are values given as distributions, such as "normal(1 e-, 0.1 e-)", and those of a `posterior`. Draws
+    go on until each standard deviation is known to --error; the page says which input causes the scatter. Run the
+    same command again to continue. Needs: pip install -e ".[uncertainty]".
+    """
     check_device(device)
     how = {"error": error, "most": most, "points": points.value, "workers": workers, "device": device}
     _made("uncertainty", words, quiet, out, **how)

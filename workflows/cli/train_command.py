@@ -25,24 +25,29 @@ class Stages(StrEnum):
     MASK = "mask"
 
 
-_STAGES = "1: element and network; 2: network; both; mask: element without images, then 2."
+_STAGES = "1: mask and network; 2: network alone; both: 1, then 2; mask: mask alone, without images."
+_MESH = "DATAxBAND processes of torchrun: 4x2, four groups that share the bands by two; else all share the data."
 _NUMBERS = {Stages.FIRST: (1,), Stages.SECOND: (2,), Stages.BOTH: (1, 2), Stages.MASK: (0,)}  #: of `train`
 
 
 def train(
     words: Words = None,
     stage: Annotated[Stages, typer.Option("--stage", help=_STAGES)] = Stages.BOTH,
-    device: Annotated[str, typer.Option("--device", help="Where to learn: cpu or cuda.")] = "cpu",
-    mesh: Annotated[
-        str, typer.Option("--mesh", help="DATAxBAND processes, as torchrun starts them: 4x2; else all share the data.")
-    ] = "",
-    quiet: Annotated[bool, typer.Option("--quiet", help="The folder alone.")] = False,
+    device: Annotated[str, typer.Option("--device", help="Where to train: cpu or cuda.")] = "cpu",
+    mesh: Annotated[str, typer.Option("--mesh", help=_MESH)] = "",
+    quiet: Annotated[bool, typer.Option("--quiet", help="Print only the path of the folder.")] = False,
     debug: Debug = False,
     out: Out = Path("runs"),
 ) -> None:
-    """Learn a recipe's element and restoration; run it again to go on where it was stopped.
+    """Train a recipe's mask and the network that restores.
 
-    With --stage mask the element is designed without images, as train.mask says; --stage 2 then goes on from it.
+    Pictures come from the folder `train.photographs`; the paper trains in two stages. With --stage mask the mask is
+    designed without images, as `train.mask` says; --stage 2 then trains the network behind that mask. The recipe
+    `train_lift` trains a network from RGB to spectra instead. Without a name the recipe is train_small. Run the same
+    command again to continue a training that was stopped.
+
+    Several processes share one training: torchrun --nproc-per-node 8 --no-python neusee train RECIPE --device cuda
+    --mesh 4x2.
     """
     recipe, command = load(words or ["train_small"])
     if recipe.lifting is not None:

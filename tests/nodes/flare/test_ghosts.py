@@ -1,5 +1,7 @@
 """Ghosts: on the line through the axis, point-symmetric to it, and no more energy than asked."""
 
+import math
+
 import pytest
 import torch
 from hypothesis import given, settings
@@ -7,6 +9,7 @@ from hypothesis import strategies as st
 from torch.testing import assert_close
 
 from neusee.nodes import flare
+from neusee.nodes.flare._ghosts import _draw, _reflected
 from neusee.nodes.values import Bands
 
 LENS = {"focal_length": 0.11, "pixel_pitch": 2.9e-6}
@@ -85,6 +88,27 @@ def test_colour_differs_between_ghosts_and_energy_follows_the_spot():
     first, second = (flare.ghosts(light, bands(centres), **params, rng=seeded(k)).sum((-1, -2)) for k in (1, 2))
     assert float(first.max() / first.min()) > 1.2
     assert not torch.allclose(first, second, rtol=0.05)
+
+
+def coated(wavelengths, tuned, layer=1.38, glass=1.70):
+    """Reflectance of magnesium fluoride on dense flint glass, by Airy's sum, over that of the bare glass."""
+    above, below = (1 - layer) / (1 + layer), (layer - glass) / (layer + glass)
+    twice = torch.exp(-1j * math.pi * tuned / wavelengths)
+    return ((above + below * twice) / (1 + above * below * twice)).abs().square() / ((1 - glass) / (1 + glass)) ** 2
+
+
+@pytest.mark.parametrize("tuned", [400e-9, 550e-9, 700e-9])
+def test_a_coating_reflects_as_a_quarter_wave_of_magnesium_fluoride(tuned):
+    waves = torch.linspace(350e-9, 1100e-9, 151, dtype=torch.float64)
+    assert_close(_reflected(waves, tuned), coated(waves, tuned), rtol=0, atol=0.02)
+
+
+def test_coatings_are_tuned_to_all_of_the_visible_range():
+    """That of a camera lens, 400 to 700 nm, and evenly."""
+    tuned = torch.tensor([ghost.tuned for ghost in _draw(1000, 2.0, 3e-4, seeded())], dtype=torch.float64) * 1e9
+    assert 400 <= float(tuned.min()) < 402
+    assert 698 < float(tuned.max()) <= 700
+    assert_close(tuned.mean(0), torch.full((2,), 550.0, dtype=torch.float64), rtol=0, atol=4 * 300 / math.sqrt(12e3))
 
 
 @settings(max_examples=25, deadline=None)

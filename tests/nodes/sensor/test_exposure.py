@@ -1,10 +1,13 @@
 """Light to photons: units, conservation, the level of the scene, light that adds."""
 
+import math
+
 import pytest
 import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from neusee.nodes import ErrorBound, TensorStats
 from neusee.nodes.sensor import add_photons, expose, level, saturation
 from neusee.nodes.spectra import rows
 from neusee.nodes.values import Bands, Channels
@@ -63,6 +66,22 @@ def test_level_fills_the_brightest_channel_to_the_strength(strength):
     electrons = 0.56 * expose(scene(6, 6), BANDS, RESPONSES, factor, **SHUTTER)
     assert float(electrons.max()) == pytest.approx(strength * 25500, rel=1e-5)
     assert len(set(factor.tolist())) == 1
+
+
+@pytest.mark.parametrize("share", [0.01, 0.3, 0.9])
+def test_a_level_is_off_by_as_much_as_stated_where_the_brightest_pixel_is(share):
+    """The level divides by the brightest pixel: of an image too bright by a share it is off by more than that share."""
+    bright = scene(6, 6, dtype=torch.float64)
+    found, low, high = (level(bright * k, BANDS, RESPONSES, strength=0.7, **SENSOR) for k in (1, 1 + share, 1 - share))
+    off = max(float((found - true).abs().max()) for true in (low, high))
+    image = ErrorBound(0.1, TensorStats.of(bright), share)
+    told = level.hooks.propagate_error(image, None, None, result=TensorStats.of(found), strength=0.7, **SENSOR)
+    assert told == pytest.approx(off, rel=1e-9)
+
+
+def test_nothing_is_known_of_a_level_where_the_brightest_pixel_may_be_dark():
+    image, found = ErrorBound(0.1, TensorStats.of(scene(2, 2)), 1.0), TensorStats.of(torch.ones(5))
+    assert level.hooks.propagate_error(image, None, None, result=found, strength=0.7, **SENSOR) == math.inf
 
 
 def test_level_per_band_lets_each_band_reach_the_strength():

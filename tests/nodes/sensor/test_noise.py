@@ -7,7 +7,7 @@ import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from neusee.nodes import TensorStats
+from neusee.nodes import ErrorBound, TensorStats
 from neusee.nodes.sensor import dark_current, photon_noise, read_noise
 
 N = 200_000
@@ -47,6 +47,19 @@ def test_c1_and_c2_in_both_readings(drawn_in, distribution):
     assert added == pytest.approx(1.2 * 5600, rel=1e-3)
     assert literal == pytest.approx(0.2 * 5600, rel=1e-3)
     assert variance == pytest.approx(0.81 * 5600 * (1.0 if drawn_in == "electrons" else 0.56), rel=0.02)
+
+
+@pytest.mark.parametrize("mean", ["additive", "literal"])
+@pytest.mark.parametrize("drawn_in", ["electrons", "photons"])
+@pytest.mark.parametrize(("photons", "less"), [(4.0, 4.0), (100.0, 10.0), (1e4, 100.0), (1e6, 1.0)])
+def test_with_the_same_draws_other_light_has_a_noise_that_is_off_by_no_more_than_stated(photons, less, drawn_in, mean):
+    how = {"drawn_in": drawn_in, "mean": mean, "mean_shift": 0.0, "distribution": "gaussian"}
+    light = torch.full((N,), photons, dtype=torch.float64)
+    found, true = (photon_noise(x, quantum_efficiency=0.56, rng=seeded(), **how) for x in (light, light - less))
+    off = float((found - true).square().mean().sqrt())
+    given = ErrorBound(less, TensorStats.of(light))
+    told = photon_noise.hooks.propagate_error(given, result=TensorStats.of(found), quantum_efficiency=0.56, **how)
+    assert off <= told <= 4 * off
 
 
 @pytest.mark.parametrize("photons", [0.05, 0.37, 1.0, 5.0, 20.0])

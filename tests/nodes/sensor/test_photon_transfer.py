@@ -42,6 +42,12 @@ def test_slope_is_the_gain_and_intercept_the_read_noise(gain, unit, rounding, di
     assert float(error[0]) < 0.005 * slope
 
 
+@pytest.mark.parametrize("rounding", ["nearest", "dithered_floor"])
+def test_what_is_predicted_in_the_dark_is_measured_where_rounding_is_most_of_the_noise(rounding):
+    points = curve(gain=1.0, read_noise=0.8, rounding=rounding, levels=2, pixels=1_000_000)
+    assert float(points[0, 1]) == pytest.approx(float(points[0, 2]), abs=0.01)
+
+
 def test_shape_dark_level_and_saturation():
     points = curve(gain=1 / 0.37)
     assert points.shape == (40, 3)

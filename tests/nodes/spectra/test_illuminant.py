@@ -52,6 +52,20 @@ def test_every_light_has_mean_one_and_no_darkness(kind):
     assert illuminant.hooks.check(result, SCENE, kind=kind)[0].text.startswith(kind)
 
 
+@pytest.mark.parametrize(("first", "last"), [(380, 480), (680, 780)])
+def test_bands_up_to_the_ends_of_a_table_have_light_and_bands_beyond_have_none(first, last):
+    """CIE 15:2018 tabulates light-emitting diodes from 380 to 780 nm."""
+
+    def within(first, last):
+        centres = torch.tensor([first + 5, last - 5], dtype=torch.float64) * NM
+        widths = torch.full_like(centres, 10 * NM)
+        return illuminant(Bands(centres, widths, torch.ones_like(centres)), kind="LED-B1")
+
+    assert bool((within(first, last) >= 0).all())
+    with pytest.raises(ValueError, match="tabulated from 380 to 780 nm"):
+        within(first - 1 * (first == 380), last + 1 * (last == 780))
+
+
 def test_lines_of_a_lamp_keep_their_energy_in_wide_bands():
     fine = illuminant(bands(start=405.5 * NM, stop=694.5 * NM, count=290), kind="FL11").reshape(29, 10).mean(1)
     wide = illuminant(bands(start=410 * NM, stop=690 * NM, count=29), kind="FL11")

@@ -7,6 +7,7 @@ import subprocess
 import sys
 import time
 from pathlib import Path
+from types import SimpleNamespace
 
 import pytest
 import torch
@@ -337,6 +338,48 @@ def test_a_file_is_read_once_when_its_stamp_can_be_trusted(tmp_path, monkeypatch
     old = file_digest(file)
     monkeypatch.setattr("builtins.open", lambda *a: pytest.fail("read again"))
     assert file_digest(file) == old
+
+
+_TICK = 2_000_000_000  #: ns, the coarsest stamp in use: that of files on FAT
+
+
+@pytest.fixture
+def on_fat(tmp_path, monkeypatch):
+    """A file of which stamps are rounded down to ticks, and a clock that stands where it is set."""
+    file, clock = tmp_path / "a.bin", SimpleNamespace(now=10**9 * _TICK)
+
+    def write(text):
+        file.write_text(text)
+        clock.stamp = clock.now // _TICK * _TICK
+
+    def stat(path):
+        true = os.stat(path)
+        return SimpleNamespace(st_dev=1, st_ino=10**15, st_size=true.st_size, st_mtime_ns=clock.stamp,
+                               st_ctime_ns=clock.stamp)  # fmt: skip
+
+    monkeypatch.setattr("neusee.workflows.keys.cache_key._files", {})
+    monkeypatch.setattr("neusee.workflows.keys.cache_key.os", SimpleNamespace(stat=stat))
+    monkeypatch.setattr("neusee.workflows.keys.cache_key.time", SimpleNamespace(time_ns=lambda: clock.now))
+    return file, clock, write
+
+
+@pytest.mark.parametrize("later", [0, _TICK // 2, _TICK - 1])
+def test_a_file_that_is_written_twice_within_one_tick_of_its_stamp_is_read_twice(on_fat, later):
+    file, clock, write = on_fat
+    write("one")
+    clock.now += later
+    before = file_digest(file)
+    write("two")
+    assert file_digest(file) != before
+
+
+def test_a_file_that_was_left_alone_for_ten_seconds_is_read_once(on_fat, monkeypatch):
+    file, clock, write = on_fat
+    write("one")
+    clock.now += 5 * _TICK
+    before = file_digest(file)
+    monkeypatch.setattr("builtins.open", lambda *a: pytest.fail("read again"))
+    assert file_digest(file) == before
 
 
 def test_streams_depend_on_seed_and_name():

@@ -4,9 +4,10 @@ from __future__ import annotations
 
 import importlib.util
 import math
+import random
 from collections import Counter
 from dataclasses import replace
-from itertools import pairwise
+from itertools import pairwise, permutations, product
 from pathlib import Path
 
 import pytest
@@ -195,6 +196,37 @@ def test_a_task_goes_where_there_is_memory():
     small = Cluster((Device("cpu"), Device("gpu", "cuda", 100.0)))
     assert heft(tasks, small).slots[0].device == "cpu"
     assert heft([replace(tasks[0], parts=2)], small).slots[0].device == "gpu"
+
+
+def depth_first(sources, i):
+    """Every order of the tree below task i that finishes one source, with all before it, before it begins the next."""
+    below = [list(depth_first(sources, j)) for j in sources[i]]
+    for places in permutations(range(len(below))):
+        for orders in product(*(below[p] for p in places)):
+            yield [*(j for order in orders for j in order), i]
+
+
+def held_at_once(graph, order):
+    """The most bytes of results, and of the work that is in progress, at any time."""
+    held, most = 0.0, 0.0
+    for i in order:
+        held += graph.own[i]
+        most = max(most, held + graph.work(i, 1))
+        held -= sum(graph.own[j] for j in graph.sources[i])
+    return most
+
+
+@pytest.mark.parametrize("seed", range(40))
+def test_no_other_depth_first_order_of_a_tree_holds_less(seed):
+    rng = random.Random(seed)
+    readers = [rng.randint(max(0, i - 3), i - 1) for i in range(1, 8)]
+    sources = [[str(j) for j, reader in enumerate(readers, 1) if reader == i] for i in range(8)]
+    costs = [{"bytes": rng.randint(0, 100), "work": rng.choice([0, rng.randint(0, 200)])} for _ in range(8)]
+    tasks = [Task(str(i), tuple(sources[i]), {"cpu": 1.0}, **costs[i]) for i in reversed(range(8))]
+    graph = Graph(tasks, one())
+    (root,) = (i for i, task in enumerate(tasks) if task.name == "0")
+    least = min(held_at_once(graph, order) for order in depth_first(graph.sources, root))
+    assert held_at_once(graph, frugal(graph)) == least
 
 
 def test_an_order_that_holds_less_is_found():

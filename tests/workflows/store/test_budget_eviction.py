@@ -110,6 +110,12 @@ def test_the_fewest_seconds_a_byte_go_first_and_count_half_a_week_later():
     assert [c.key for c in chosen([Candidate("dear", 100, 3.0, -1.5 * week), cheap], 1)] == ["cheap"]
 
 
+def test_a_value_stays_where_those_that_go_make_just_enough_room_without_it():
+    small, large = Candidate("small", 10, 0.0, 0.0), Candidate("large", 30, 1.0, 0.0)
+    assert [c.key for c in chosen([small, large], 30)] == ["large"]
+    assert [c.key for c in chosen([small, large], 31)] == ["small", "large"]
+
+
 def test_a_budget_is_kept_while_writing(tmp_path):
     store = Store(tmp_path, budget=10 * SIZE)
     for i in range(40):

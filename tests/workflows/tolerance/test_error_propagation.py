@@ -144,6 +144,14 @@ def test_with_keep_all_nothing_is_left_out(store):
     assert states(run(recipe(*chain(0.0, 0.1), exact=True), store)) == ["run", "run"]
 
 
+def test_what_changes_nothing_is_left_out_where_nothing_is_allowed():
+    facts = TensorStats((2,), "float32", 0.0, 100.0, 100.0, 1, True)
+    for amount in (0.0, 1e-300):
+        glowing = step("g", glow, {"amount": amount}, x="l")
+        ledger = ErrorBudget(recipe(step("l", light), glowing, outputs="g", tolerance=0.0))
+        assert ledger.verdict(glowing, glowing.params, lambda name: facts).left_out == (amount == 0)
+
+
 def test_of_the_tolerance_of_a_recipe_with_economies_half_is_theirs():
     facts = TensorStats((2,), "float32", 0.0, 100.0, 100.0, 1, True)
     glowing = step("g", glow, {"amount": 0.6}, x="l")
@@ -177,6 +185,17 @@ def test_the_bound_holds_and_is_carried(store):
     result, full = run(recipe(*steps), store), run(recipe(*steps, exact=True), store)
     measured = largest_error(result["out"], full["out"])
     assert 0 < measured <= result.proof.of("out") <= 1.1 * measured
+
+
+@pytest.mark.parametrize("amount", [1.0, 50.0, 75.0])
+def test_the_bound_is_a_share_of_what_is_left_and_not_of_what_was_left_out(store, amount):
+    """A share of the full result is a greater share of the result without: 75 of 175, and 75 of 100."""
+    steps = chain(amount)
+    result = run(recipe(*steps, tolerance=0.8), store)
+    full = run(recipe(*steps, exact=True), store)["out"]
+    assert states(result) == ["left out"]
+    off = float((full - result["out"]).square().mean().sqrt() / result["out"].max())
+    assert result.proof.of("out") == pytest.approx(off, rel=1e-6)
 
 
 def test_where_the_bound_grows_on_the_way_less_is_left_out(store):

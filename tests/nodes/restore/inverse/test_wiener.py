@@ -9,7 +9,9 @@ from hypothesis import strategies as st
 
 from neusee.nodes.optics import image
 from neusee.nodes.restore import wiener
+from neusee.nodes.restore._inverse import _wiener
 from neusee.nodes.restore._inverse._wiener import _strengths, effective_psf
+from neusee.nodes.spectra import bands, illuminant, leaves, reflectances, responses
 from neusee.nodes.values import Bands, Psf
 
 ONE = torch.ones(1, dtype=torch.float64)
@@ -101,14 +103,41 @@ def test_a_clipped_laser_does_not_ring_everywhere():
 
 
 def test_each_channel_has_its_own_psf():
-    bands = Bands(*(torch.tensor(x, dtype=torch.float64) for x in ([400e-9, 700e-9], [1e-8] * 2, [1.0] * 2)))
+    line = Bands(*(torch.tensor(x, dtype=torch.float64) for x in ([400e-9, 700e-9], [1e-8] * 2, [1.0] * 2)))
     psf = Psf(torch.stack([disc(1).intensity[0], disc(3).intensity[0]]), torch.ones(2))
-    responses = torch.tensor([[1.0, 0.0], [0.0, 1.0], [1.0, 1.0]], dtype=torch.float64)
-    found = effective_psf(psf, torch.tensor([3.0, 1.0]), responses, bands)
+    seen_by = torch.tensor([[1.0, 0.0], [0.0, 1.0], [1.0, 1.0]], dtype=torch.float64)
+    found = effective_psf(psf, torch.tensor([3.0, 1.0]), seen_by, line)
     torch.testing.assert_close(found[:2], psf.intensity)
     torch.testing.assert_close(found[2], (1200 * psf.intensity[0] + 700 * psf.intensity[1]) / 1900)
     with pytest.raises(ValueError, match="one `bands` step"):
-        effective_psf(psf, torch.ones(3), responses, bands)
+        effective_psf(psf, torch.ones(3), seen_by, line)
+
+
+def photographs(count, size=16):
+    """Pictures of measured reflectances in daylight, as a camera's three channels see them: (channel, y, x)."""
+    visible = bands(start=400e-9, stop=700e-9, count=31)
+    seen_by = responses(visible) * illuminant(visible) * visible.centres
+    seen_by, measured = (seen_by / seen_by.sum(1, keepdim=True)).float(), reflectances(visible)
+    for seed in range(count):
+        rng = torch.Generator().manual_seed(seed)
+        spectra = measured[torch.randint(len(measured), (200,), generator=rng)]
+        yield torch.tensordot(seen_by, leaves(spectra, visible, shape=(size, size), rng=rng), 1)
+
+
+def test_of_measured_colours_no_other_correlation_of_channels_tells_more_of_a_hidden_one(monkeypatch):
+    errors, tried = {}, [0.0, 0.3, 0.6, 0.8, 0.99]
+    for grey in ["as shipped", *tried]:
+        if grey in tried:
+            monkeypatch.setattr(_wiener, "_GREY", grey)
+        apart = []
+        for n, picture in enumerate(photographs(6)):
+            hidden = torch.zeros(picture.shape, dtype=torch.bool)
+            hidden[n % 3, 4:12, 4:12] = True
+            truth = 5000 * picture
+            raw = torch.cat([seen(channel[None], disc(0), seed=n + 10 * c) for c, channel in enumerate(truth)])
+            apart.append((run(raw, disc(0), hidden) - truth)[hidden].square().mean())
+        errors[grey] = float(torch.stack(apart).mean().sqrt())
+    assert errors["as shipped"] < 1.02 * min(errors.values())
 
 
 @settings(max_examples=60, deadline=None)

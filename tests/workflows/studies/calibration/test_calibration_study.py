@@ -132,6 +132,17 @@ def test_walkers_pass_where_the_well_is_beyond_the_converter(tmp_path):
 # --- bars -------------------------------------------------------------------------------------------------------------
 
 
+def test_many_parameters_together_raise_no_more_false_alarms_than_one():
+    """One in a hundred studies of right posteriors, whatever the number of parameters."""
+    rng, names, alarms, studies = np.random.default_rng(1), "abcdefghijkl", 0, 150
+    for _ in range(studies):
+        ranks = rng.integers(0, DRAWS + 1, (200, len(names))).tolist()
+        same = dict.fromkeys(names, True), dict.fromkeys(names, 0.0)
+        found = verdicts([Simulation({}, dict(zip(names, row, strict=True)), *same) for row in ranks])
+        alarms += not all(verdict.uniform for verdict in found)
+    assert alarms <= binom.ppf(0.999, studies, 0.01)
+
+
 def uniform(count, width=1.0, shift=0.0, seed=0):
     """Simulations of a normal posterior whose draws are ``width`` as wide as they should be, and ``shift`` beside."""
     rng = np.random.default_rng(seed)

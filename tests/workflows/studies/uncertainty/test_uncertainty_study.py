@@ -172,6 +172,15 @@ def test_the_error_of_a_deviation_is_that_of_the_closed_form(law, kurtosis):
     assert np.median(said) == pytest.approx(shown.std() / shown.mean(), rel=0.15)
 
 
+@pytest.mark.parametrize("count", [3, 5, 64])
+def test_the_error_of_a_deviation_is_that_of_leaving_out_one_draw_after_another(count):
+    """Efron's jackknife, each deviation worked out anew."""
+    x = np.random.default_rng(2).exponential(size=count)
+    each = np.array([np.delete(x, i).std(ddof=1) for i in range(count)])
+    wanted = math.sqrt((count - 1) / count * ((each - each.mean()) ** 2).sum()) / x.std(ddof=1)
+    assert scatter(x[:, None]).error == pytest.approx(wanted, rel=1e-9)
+
+
 def test_the_error_of_sequences_is_what_repetitions_show():
     inputs = Inputs.of(small("transfer", *LAWS))
     deviations, said = [], []
@@ -215,6 +224,19 @@ def test_shares_of_one_draw_that_differs_are_numbers():
     found = indices(["a"], z, y, 1)
     assert np.isfinite([*found.first, *found.first_error, *found.total, *found.total_error]).all()
     assert not found.told
+
+
+def test_a_polynomial_is_judged_by_draws_that_it_has_not_seen():
+    """As of fitting it again without each draw in turn."""
+    rng = np.random.default_rng(4)
+    z = rng.standard_normal((30, 2))
+    y = z[:, 0] + z[:, 0] * z[:, 1] + rng.standard_normal(30)
+    terms = np.stack([np.ones(30), *z.T, *(z.T**2), z[:, 0] * z[:, 1]], 1)
+    missed = []
+    for i in range(30):
+        fitted = np.linalg.lstsq(np.delete(terms, i, 0), np.delete(y, i), rcond=None)[0]
+        missed.append(y[i] - terms[i] @ fitted)
+    assert indices(["a", "b"], z, y, 1).explained == pytest.approx(1 - np.square(missed).mean() / y.var(), rel=1e-9)
 
 
 def test_a_polynomial_that_tells_nothing_is_not_believed():

@@ -1,0 +1,202 @@
+"""The README and the guide: commands parse, recipes load, links resolve, Python names exist, the glossary is whole."""
+
+from __future__ import annotations
+
+import ast
+import importlib
+import re
+import shlex
+import shutil
+from pathlib import Path
+
+import numpy as np
+import pytest
+import typer
+from safetensors.torch import save_file
+from typer.main import get_command
+
+from neusee.nodes.restore._networks._nafnet import NAFNet
+from neusee.workflows.cli import app, catalogue
+from neusee.workflows.cli.command_frame import split
+from neusee.workflows.evaluation.pipelines import composed, read_pipelines
+from neusee.workflows.placement.machine_file import read_machines
+from neusee.workflows.recipe.loading import load
+from neusee.workflows.sweeps.axes import points, read_words
+
+ROOT = Path(__file__).parents[1]
+GUIDE = ROOT / "recipes" / "guide"
+README = ROOT / "README.md"
+CONTRIBUTING = ROOT / "CONTRIBUTING.md"
+PAGES = sorted(GUIDE.glob("*.md"))
+WRITTEN = [README, CONTRIBUTING, *PAGES]
+COMMANDS = get_command(app.app)
+LOADS = {"run", "validate", "plan", "why", "config", "train", "calibrate", "evaluate", "study"}  #: a recipe in words
+SPOKEN = re.compile(r"(?:torchrun .* --no-python )?neusee (?P<words>[^#\n]*)")
+TERM = re.compile(r"- \*\*(?P<term>[^*]+)\*\*(?: \([^)]*(?:\([^)]*\))?[^)]*\))?: .+\. [^.].*\.")
+
+pytestmark = pytest.mark.filterwarnings("ignore::DeprecationWarning:typer")
+
+
+def lines(page: Path) -> list[str]:
+    """Return the commands of a page's indented lines."""
+    text = re.sub(r"```.*?```", "", page.read_text(encoding="utf-8"), flags=re.DOTALL)
+    indented = re.findall(r"^    (.*)$", text, re.MULTILINE)
+    found = [match["words"].strip() for line in indented if (match := SPOKEN.search(line))]
+    return [words for words in found if "[RECIPE]" not in words]
+
+
+def blocks(page: Path, language: str) -> list[str]:
+    """Return the fenced blocks of a language."""
+    return re.findall(rf"^```{language}\n(.*?)^```", page.read_text(encoding="utf-8"), re.MULTILINE | re.DOTALL)
+
+
+def cases(found):
+    """Return one test case for each thing that is found on a page."""
+    return [pytest.param(x, id=f"{page.stem}-{n}") for page in WRITTEN for n, x in enumerate(found(page))]
+
+
+@pytest.fixture(scope="module")
+def folder(tmp_path_factory):
+    """A working folder with every file that the pages speak of: their own recipes, frames, photographs, weights."""
+    folder = tmp_path_factory.mktemp("guide")
+    for text in (block for page in PAGES for block in blocks(page, "yaml")):
+        path = folder / re.match(r"# (my/[\w/]+\.yaml): .*\.\n", text)[1]
+        path.parent.mkdir(parents=True, exist_ok=True)
+        path.write_text(text, encoding="utf-8")
+    for level in ("dark", "dim", "half", "bright", "full"):
+        (folder / "my" / level).mkdir()
+        np.save(folder / "my" / level / "frames.npy", np.ones((2, 4, 4), np.uint16))
+    (folder / "my" / "set").mkdir()
+    shutil.copy(folder / "my" / "dark" / "frames.npy", folder / "my" / "set" / "dark.npy")
+    (folder / "my" / "set" / "EMVA1288_descriptor.txt").write_text("v 4.0\nn 12 4 4\nd 1000 0\n" + 2 * "i dark.npy\n")
+    shutil.copy(ROOT / "recipes" / "samples" / "camera_levels.csv", folder / "my.csv")
+    save_file(NAFNet(width=16).state_dict(), folder / "net.safetensors")
+    np.save(folder / "mask.npy", np.zeros((540, 540)))
+    return folder
+
+
+def parsed(words: list[str]) -> tuple[str, dict]:
+    """Return the path of a command and its values, parsed and not run."""
+    context, command = COMMANDS.make_context("neusee", list(words), resilient_parsing=False), COMMANDS
+    path, rest = [], list(words)
+    while hasattr(command, "resolve_command"):
+        name, command, rest = command.resolve_command(context, rest)
+        path.append(name)
+        context = command.make_context(name, list(rest), parent=context)
+    return " ".join(path), context.params
+
+
+@pytest.mark.parametrize("words", cases(lines))
+def test_every_command_line_parses_and_its_recipe_loads(words, folder, monkeypatch):
+    monkeypatch.chdir(folder)
+    command, values = parsed(shlex.split(words))
+    if command.split()[0] not in {*LOADS, "sweep"}:
+        return
+    given = values["words"] or (["train_small"] if command == "train" else [])
+    name, changes, first = split(given)
+    if command == "sweep":
+        for point in points(read_words(changes, folder, first), values["paired"]):
+            load(name, point.overrides, folder)
+        return
+    recipe = load(name, changes, folder)
+    if command == "why":
+        assert any(step.partition("[")[0] == values["step"].partition("[")[0] for step in recipe.steps)
+    if command == "plan" and values["devices"]:
+        assert read_machines(values["devices"]).devices
+    if command == "train":
+        assert recipe.training or recipe.lifting
+    if command == "evaluate":
+        composed(name, changes, read_pipelines(values["pipelines"], folder), folder)
+
+
+@pytest.mark.parametrize(("page", "least"), [("README", 11), ("commands", 20), ("own_frames", 6), ("recipes", 6)])
+def test_the_command_lines_are_found(page, least):
+    assert len(next(lines(path) for path in WRITTEN if path.stem == page)) >= least
+
+
+@pytest.mark.parametrize("words", ["runn", "study accurracy", "run --bogus", "evaluate --scenes none"])
+def test_a_wrong_command_line_does_not_parse(words):
+    with pytest.raises(Exception, match=r"(?i)no such|should be a valid|is not a valid"):
+        parsed(words.split())
+
+
+@pytest.mark.parametrize("page", WRITTEN, ids=lambda page: page.stem)
+def test_every_command_that_is_named_exists(page):
+    context = typer.Context(COMMANDS)
+    for spoken in re.findall(r"`neusee ([^`]*)`", page.read_text(encoding="utf-8")):
+        words = [word for word in shlex.split(spoken) if re.fullmatch("[a-z-]+", word) and not word.startswith("-")]
+        if words:
+            command = COMMANDS.get_command(context, words[0])
+            assert command is not None, spoken
+            if hasattr(command, "get_command") and words[1:]:
+                assert command.get_command(context, words[1]) is not None, spoken
+
+
+def test_the_page_of_commands_has_every_command():
+    text = (GUIDE / "commands.md").read_text(encoding="utf-8")
+    assert re.findall(r"^\| `neusee (\w+)` \|", text, re.MULTILINE) == COMMANDS.list_commands(typer.Context(COMMANDS))
+
+
+@pytest.mark.parametrize("page", WRITTEN, ids=lambda page: page.stem)
+def test_every_relative_link_resolves(page):
+    links = re.findall(r"\]\((?!https?:)([^)#]+)", page.read_text(encoding="utf-8"))
+    assert not [link for link in links if not (page.parent / link).is_file()]
+
+
+def test_the_index_has_one_line_for_each_page():
+    text = (GUIDE / "index.md").read_text(encoding="utf-8")
+    assert sorted(re.findall(r"^- \[[\w ]+\]\((\w+)\.md\): .+\.$", text, re.MULTILINE)) == sorted(
+        page.stem for page in PAGES if page.stem != "index"
+    )
+
+
+def test_the_readme_is_short_and_its_picture_small():
+    text = README.read_text(encoding="utf-8")
+    assert len(text.splitlines()) <= 100
+    (picture,) = re.findall(r"!\[[^\]]+\]\(([^)]+)\)", text)
+    assert (ROOT / picture).stat().st_size <= 100_000
+
+
+def test_the_readme_says_the_two_commands_that_are_tested():
+    tested = (ROOT / ".ci" / "run").read_text(encoding="utf-8")
+    for command in ("pip install -e . && neusee run", 'pip install -e ".[test]" && pytest'):
+        assert f"\n    {command}\n" in README.read_text(encoding="utf-8")
+        assert f'say "README: {command.replace(chr(34), chr(92) + chr(34))}"' in tested
+
+
+@pytest.mark.parametrize("code", cases(lambda page: blocks(page, "python")))
+def test_every_python_block_compiles_and_its_names_exist(code):
+    tree = ast.parse(code)
+    modules = {}
+    for item in (item for item in tree.body if isinstance(item, ast.ImportFrom | ast.Import)):
+        for alias in item.names:
+            module = importlib.import_module(item.module if isinstance(item, ast.ImportFrom) else alias.name)
+            modules[alias.asname or alias.name] = getattr(module, alias.name) if hasattr(item, "module") else module
+    for item in ast.walk(tree):
+        if isinstance(item, ast.Attribute) and isinstance(item.value, ast.Name) and item.value.id in modules:
+            assert hasattr(modules[item.value.id], item.attr), f"{item.value.id}.{item.attr}"
+        if isinstance(item, ast.Name) and isinstance(item.ctx, ast.Load):
+            assert item.id in modules or f"{item.id}" in assigned(tree), item.id
+
+
+def assigned(tree: ast.Module) -> set[str]:
+    """Return the names that a block assigns."""
+    return {item.id for item in ast.walk(tree) if isinstance(item, ast.Name) and isinstance(item.ctx, ast.Store)}
+
+
+def test_the_glossary_has_one_whole_line_for_each_term():
+    entries = [line for line in (GUIDE / "glossary.md").read_text(encoding="utf-8").splitlines() if line[:2] == "- "]
+    assert not [line for line in entries if not TERM.fullmatch(line)]
+    terms = [TERM.fullmatch(line)["term"].lower() for line in entries]
+    assert 35 <= len(terms) <= 60
+    assert len(set(terms)) == len(terms)
+
+
+def test_neusee_nodes_glossary_prints_the_terms(capfd):
+    with pytest.raises(SystemExit) as end:
+        app.main(["nodes", "glossary"])
+    out = capfd.readouterr().out
+    assert not end.value.code
+    assert "system gain (K, DN/e-): digital numbers" in out
+    assert len(out.splitlines()) == len(catalogue.glossary_lines()) >= 35
+    assert "*" not in out

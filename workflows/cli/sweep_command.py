@@ -1,0 +1,55 @@
+"""``neusee sweep``: a recipe at several values of its parameters."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+from neusee.workflows.cli.command_frame import Debug, Device, Out, Words, check_device, fail, refuse, split, the_store
+
+
+def sweep(
+    words: Words = None,
+    paired: Annotated[
+        bool, typer.Option("--zip", help="Pair the values of the axes instead of combining them.")
+    ] = False,
+    on_error: Annotated[
+        str, typer.Option("--on-error", help="After a failed point: stop, or continue with the next.")
+    ] = "stop",
+    netcdf: Annotated[bool, typer.Option("--netcdf", help="Write sweep.nc too (needs neusee[xarray]).")] = False,
+    quiet: Annotated[bool, typer.Option("--quiet", help="Print only the path of the table.")] = False,
+    debug: Debug = False,
+    device: Device = "cpu",
+    out: Out = Path("runs"),
+) -> None:
+    """Run a recipe at several values of its parameters.
+
+    Write values as a=1,2,3 or b='linspace(450 nm, 650 nm, 5)'. All combinations run unless --zip pairs them.
+    Run the same command again to continue a sweep that was stopped.
+    """
+    name, words, first = split(words)
+    if on_error not in ("stop", "continue"):
+        fail(f"--on-error {on_error}: write stop or continue")
+    check_device(device)
+    from neusee.workflows.graph.diagnostics import RecipeError
+    from neusee.workflows.sweeps.sweep_run import run_sweep
+
+    try:
+        code = run_sweep(
+            name,
+            words,
+            first=first,
+            zip=paired,
+            on_error="continue" if on_error == "continue" else "stop",
+            netcdf=netcdf,
+            device=device,
+            out=out,
+            store=the_store(),
+            quiet=quiet,
+        )
+    except RecipeError as error:
+        refuse(error)
+    if code:
+        raise typer.Exit(code)
