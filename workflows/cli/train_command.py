@@ -101,10 +101,10 @@ def _lift(recipe: Recipe, told: list[str], out: Path, device: str, quiet: bool) 
 
 def _next(folder: Path, stage: Stages) -> list[str]:
     if stage is Stages.MASK:
-        return [f"element: {folder / 'mask.safetensors'}", f"report:  {folder / 'report.html'}"]
+        return [f"mask:    {folder / 'mask.safetensors'}", f"report:  {folder / 'report.html'}"]
     mask, network = folder / "mask.safetensors", folder / "network.safetensors"
-    element = [f"element: {mask}"] if mask.is_file() else []
-    return [*element, f"network: {network}", f"curves:  {folder / 'curves.png'}"]
+    made = [f"mask:    {mask}"] if mask.is_file() else []
+    return [*made, f"network: {network}", f"curves:  {folder / 'curves.png'}"]
 
 
 class _bar:

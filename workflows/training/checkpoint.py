@@ -14,6 +14,7 @@ import torch
 from torch import nn
 
 _EDITION = 1
+_NAMES = {"relief": "mask"}  #: parts of a state that 0.1 calls otherwise
 COLUMNS = ("stage", "iteration", "LSR", "BSR", "L1", "reconstruction", "adversarial", "critics", "penalty", "slope",
            "rate", "seconds")  # fmt: skip
 
@@ -45,7 +46,8 @@ def unpacked(path: Path, device: str) -> dict[str, Any]:
         found: dict[str, Any] = torch.load(path, map_location=device, weights_only=True)
         if found["edition"] != _EDITION:
             raise ValueError(f"edition {found['edition']}, not {_EDITION}")
-    except (RuntimeError, KeyError, EOFError, OSError, ValueError, TypeError) as error:
+        found["parts"] = {_NAMES.get(name, name): part for name, part in found["parts"].items()}
+    except (RuntimeError, KeyError, EOFError, OSError, ValueError, TypeError, AttributeError) as error:
         raise ValueError(f"{path} cannot be gone on from ({error}): remove its folder to begin anew") from error
     return found
 

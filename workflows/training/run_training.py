@@ -256,8 +256,8 @@ class _Course:
         export(self.folder, "network", weights_of(net), told(self.learner.net))
 
     @property
-    def _element(self) -> str:
-        """Where the element comes from."""
+    def _mask_source(self) -> str:
+        """Return where the mask comes from."""
         if self.how.learn is None:
             return "the recipe's own"
         return "designed without images" if self.designed else "learnt in stage 1"
@@ -268,7 +268,7 @@ class _Course:
         document: dict[str, Any] = {
             "command": list(command),
             "recipe": self.recipe.name,
-            "element": self._element,
+            "mask": self._mask_source,
             "train": self.how.model_dump(mode="json"),
             "photographs": len(self.photographs.paths),
             "mesh": str(self.mesh),

@@ -61,7 +61,7 @@ class Learner:
     def __init__(self, recipe: Recipe, how: Training, device: str, designed: bool = False, mesh: Mesh = ALONE) -> None:
         self.how, self.seed, self.device, self.mesh = how, recipe.seed, device, mesh
         self._step = recipe.steps[how.learn] if how.learn else None
-        self.relief = nn.Module() if designed or self._step is None else self._start(self._step).to(how.dtype)
+        self.mask = nn.Module() if designed or self._step is None else self._start(self._step).to(how.dtype)
         self.net: Restorer = started(lambda: _made(how.network), self._rng("network")).to(how.dtype)
         self.critics = nn.ModuleList(critics(self._rng("critics"), how.critics.width)).to(how.dtype)
         self.average = _averaged(self.net, how.average) if how.average else None
@@ -78,8 +78,8 @@ class Learner:
     def height(self) -> Tensor:
         """The relief (v, u) in m; raises ValueError where none learns."""
         if self._step is None:
-            raise ValueError("train.learn: no element learns")
-        made: Tensor = self.relief(stop(*(self._step.params[name] for name in GRID)))
+            raise ValueError("train.learn: no mask learns")
+        made: Tensor = self.mask(stop(*(self._step.params[name] for name in GRID)))
         return made
 
     def _rng(self, *names: object) -> torch.Generator:
@@ -90,7 +90,7 @@ class Learner:
         rates, self.stage, self.learns = self.how.rates, stage, learns
         groups = parameter_groups(self.net, rates.weights, rates.biases)
         if learns:
-            groups += [{"params": list(self.relief.parameters()), "lr": rates.element}]
+            groups += [{"params": list(self.mask.parameters()), "lr": rates.mask}]
         self.generator_optimizer = torch.optim.Adam(groups, betas=self.how.betas)
         self.critic_optimizer = torch.optim.Adam(
             parameter_groups(self.critics, rates.weights, rates.biases), betas=self.how.critics.betas
@@ -107,7 +107,7 @@ class Learner:
 
     def parts(self) -> dict[str, Any]:
         """All that a later iteration depends on."""
-        found = {"relief": self.relief, "net": self.net, "critics": self.critics, "makers": self.generator_optimizer}
+        found = {"mask": self.mask, "net": self.net, "critics": self.critics, "makers": self.generator_optimizer}
         return {**found, "judges": self.critic_optimizer, **({"average": self.average} if self.average else {})}
 
     # --- one iteration ------------------------------------------------------------------------------------------------
@@ -119,7 +119,7 @@ class Learner:
         """
         self.generator_optimizer.zero_grad(set_to_none=True)
         shared = samples.begin(self.height()) if samples.shared else Shared.of({})
-        found = self._element(shared, samples) if self.learns else {}
+        found = self._mask_losses(shared, samples) if self.learns else {}
         batch, seen, pairs = self.stage.batch, list[Sample](), dict[int, tuple[Scales, Scales]]()
         for i, sample in samples.batch(shared, stage, iteration * batch, batch):
             terms, truth, estimate = self._restored(sample)
@@ -131,7 +131,7 @@ class Learner:
         shared.back()
         found = self.mesh.numbers(found, self._names(), self.device)
         found["slope"] = self._move(
-            self.generator_optimizer, found, (self.net, self.relief) if self.learns else (self.net,)
+            self.generator_optimizer, found, (self.net, self.mask) if self.learns else (self.net,)
         )
         if self.average:
             self.average.update_parameters(self.net)
@@ -145,7 +145,7 @@ class Learner:
                    "adversarial": self.stage.adversarial}  # fmt: skip
         return [*(["LSR"] if self.learns else []), "L1", *(name for name, weight in weights.items() if weight)]
 
-    def _element(self, shared: Shared, samples: TrainingStream) -> Losses:
+    def _mask_losses(self, shared: Shared, samples: TrainingStream) -> Losses:
         """The suppression of each band, one band at a time: what its norm needs is made again on the way back.
 
         Each process has its own bands, or a share of all of them, so that over all processes each band counts once.

@@ -13,8 +13,8 @@ from neusee.nodes.losses._wiener_loss import Noise, Share
 from neusee.nodes.units import Count, DataFile, PositiveLength, Wavelength
 
 Weight = Annotated[float, Field(ge=0, allow_inf_nan=False)]
-Kind = Literal["pixelwise", "element", "zernike", "rings", "unet", "five_half_rings"]
-_RATE = {"pixelwise": 0.05, "element": 4e-3, "zernike": 0.1, "rings": 0.1, "unet": 2e-3, "five_half_rings": 1.0}
+Kind = Literal["pixelwise", "recipe_mask", "zernike", "rings", "unet", "five_half_rings"]
+_RATE = {"pixelwise": 0.05, "recipe_mask": 4e-3, "zernike": 0.1, "rings": 0.1, "unet": 2e-3, "five_half_rings": 1.0}
 
 
 class Weights(BaseModel):
@@ -39,7 +39,7 @@ class MaskSettings(BaseModel):
 
     model_config = ConfigDict(extra="forbid", frozen=True)
 
-    kind: Kind = "pixelwise"  #: `element`: every sample of the recipe's own relief, from its formula or file on
+    kind: Kind = "pixelwise"  #: `recipe_mask`: every sample of the recipe's own height map, from its formula or file on
     iterations: Count = 300  #: of Adam; of five_half_rings, generations
     learning_rate: Annotated[float, Field(gt=0, allow_inf_nan=False)] | None = None  #: None: what suits the kind
     schedule: Literal["cosine", "step"] = "cosine"  #: `step`: halved at each fifth of the iterations

@@ -3,6 +3,10 @@
 from __future__ import annotations
 
 _CALLED = {
+    "element": "mask",
+    "steps.element": "steps.fabricated",
+    "train.rates.element": "train.rates.mask",
+    "train.mask.kind=element": "recipe_mask",
     "sensor.pedestal": "sensor.offset",
     "reading.pedestal_subtracted": "reading.offset_subtracted",
     "camera.dark_noise": "camera.temporal_dark_noise",
@@ -49,14 +53,18 @@ POSTERIOR_NAMES = {"pedestal": "offset", "dark_noise": "temporal_dark_noise"}
 
 
 def new_name(old: str) -> str | None:
-    """Return what an old path is called now, or None for a path that was never renamed."""
-    return _CALLED.get(old)
+    """Return what an old path, or a path below one, is called now; None for a path that was never renamed."""
+    parts = old.split(".")
+    for n in range(len(parts), 0, -1):
+        if now := _CALLED.get(".".join(parts[:n])):
+            return ".".join([now, *parts[n:]])
+    return None
 
 
 def instead(old: str) -> str:
     """Return what to write instead of an old path; empty for a path that was never renamed."""
-    if old in _CALLED:
-        return f"is called {_CALLED[old]} now"
+    if now := new_name(old):
+        return f"is called {now} now"
     return _GONE.get(old, "")
 
 

@@ -44,9 +44,9 @@ def _grid(recipe: Recipe, node: Node, step: Step) -> dict[str, Any]:
     """The pupil's grid, for what has to know it: that of the relief."""
     if "samples" not in node.params.model_fields:
         return {}
-    relief = recipe.steps[step.sources[0]].params
-    lengths = {name: f"{relief[name]!r} m" for name in ("pitch", "diameter")}
-    return {"samples": relief["samples"], "aperture": relief["aperture"], **lengths}
+    grid = recipe.steps[step.sources[0]].params
+    lengths = {name: f"{grid[name]!r} m" for name in ("pitch", "diameter")}
+    return {"samples": grid["samples"], "aperture": grid["aperture"], **lengths}
 
 
 def smaller(steps: Mapping[str, Step], size: Size) -> dict[str, Step]:

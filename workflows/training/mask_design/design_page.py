@@ -23,7 +23,7 @@ def pictures(terms: Terms, height: Tensor, learnt: Learnt) -> dict[str, bytes]:
     pitch = terms.recipe.steps[terms.how.psf].params["pixel_pitch"]
     lsr = psf.intensity.amax((-2, -1)).double() / psf.clear_peak
     shown = {
-        "relief": optics.height(pupil=pupil),
+        "height": optics.height(pupil=pupil),
         "psf": optics.psf(plain=plain, mask=psf, bands=terms.bands, pixel_pitch=pitch),
         "suppression": optics.suppression(lsr=lsr, bands=terms.bands, psf=psf),
     }
@@ -54,7 +54,7 @@ def sections(found: Mapping[str, Any], made: Fabrication, shown: Mapping[str, by
         "no PSF with this peak has more than `at most`."
     )
     parts = [
-        Section("Relief", "Height, and the phase that it is at three wavelengths.", picture=shown.get("relief")),
+        Section("Height map", "Height, and the phase that it is at three wavelengths.", picture=shown.get("height")),
         Section("To be made", f"{made}.", ("limit", "value"), [(name, text) for name, text in made.rows()]),
         Section("Light", "The spread light beside the plain lens's.", picture=shown.get("psf")),
         Section("Suppression", "", picture=shown.get("suppression")),

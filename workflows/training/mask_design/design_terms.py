@@ -78,14 +78,14 @@ class Terms:
         return Fabrication.of(self.recipe, self.how)
 
     @property
-    def relief(self) -> Step:
+    def mask_step(self) -> Step:
         """The step that is replaced."""
         return self.recipe.steps[self.how.height]
 
     @cached_property
     def stop(self) -> Stop:
         """The pupil's grid, as the step that is replaced has it."""
-        params = self.relief.params
+        params = self.mask_step.params
         if missing := [name for name in ("samples", "pitch", "diameter", "aperture") if name not in params]:
             raise DesignError(f"height: {self.how.height} has no {missing[0]}: take a recipe whose mask is a doe")
         return stop(*(params[name] for name in ("samples", "pitch", "diameter", "aperture")))

@@ -78,7 +78,7 @@ def shape_of(how: MaskTraining, start: int, step: Step) -> nn.Module:
 
 
 def _free(how: MaskTraining, rng: torch.Generator, step: Step) -> nn.Module:
-    if how.kind == "element":
+    if how.kind == "recipe_mask":
         if step.node.path not in LEARNT:
             raise DesignError(f"kind: {step.name} is {step.node.path}, whose samples are not learnt")
         return LEARNT[step.node.path](step.params, rng)
@@ -115,7 +115,7 @@ def _descend(terms: Terms, how: MaskTraining, kept: Kept, tell: Tell) -> Learnt:
     if state["start"] or "shape" in state:
         tell(f"going on from start {state['start'] + 1}, iteration {state.get('iteration', 0)}")
     for start in range(state["start"], how.starts):
-        shape = shape_of(how, start, terms.relief).to(terms.device)
+        shape = shape_of(how, start, terms.mask_step).to(terms.device)
         _one_start(terms, how, shape, start, state, kept, tell)
         with torch.no_grad():
             loss = float(terms.total(terms.parts(shape(terms.stop))))
@@ -128,7 +128,7 @@ def _descend(terms: Terms, how: MaskTraining, kept: Kept, tell: Tell) -> Learnt:
             state.pop(name, None)
         state["start"] = start + 1
         kept.write(state)
-    best = shape_of(how, state["best"]["start"], terms.relief)
+    best = shape_of(how, state["best"]["start"], terms.mask_step)
     best.load_state_dict(state["best"]["shape"])
     return Learnt(best, state["best"]["loss"], _few(best), state["history"])
 
@@ -187,7 +187,7 @@ def _few(shape: nn.Module) -> dict[str, Any]:
 # --- by differential evolution ----------------------------------------------------------------------------------------
 
 
-def half_ring_relief(genes: Any, how: MaskTraining) -> Callable[[Stop], Tensor]:
+def half_ring_height(genes: Any, how: MaskTraining) -> Callable[[Stop], Tensor]:
     """The relief of five slopes, the side of every second ring and the orientation."""
     *slopes, side, turn = (float(gene) for gene in genes)
     given = {"waves": tuple(slopes), "alternate": side >= 0.5, "orientation": turn}
@@ -215,7 +215,7 @@ class _Judge:
     def __call__(self, genes: Any) -> float:
         if self.asked == len(self.known):
             with torch.no_grad():
-                height = half_ring_relief(genes, self.how)(self.terms.stop)
+                height = half_ring_height(genes, self.how)(self.terms.stop)
                 loss = float(self.terms.total(self.terms.parts(height.to(self.terms.device), self.chosen)))
             if not math.isfinite(loss):
                 raise DesignError(f"mask {self.asked}: the loss of slopes {list(genes[:-2])} is not finite")
@@ -241,7 +241,7 @@ def _evolve(terms: Terms, how: MaskTraining, kept: Kept, tell: Tell) -> Learnt:
     kept.write({"values": judge.known})
     *slopes, side, turn = (float(x) for x in best[1])
     numbers = {"waves": slopes, "alternate": side >= 0.5, "orientation": turn}
-    return Learnt(half_ring_relief(best[1], how), best[0], numbers, history)
+    return Learnt(half_ring_height(best[1], how), best[0], numbers, history)
 
 
 def _population(

@@ -14,10 +14,15 @@ from neusee.workflows.recipe.text.renamed_keys import instead, new_name, old_nam
 
 RECIPES = ("first_light", "calibrate", "calibrate_camera")
 BLOCKS = {"camera": "calibrate_camera"}  #: by the block of a key, the recipe that has it; else first_light
-KEYS = [old for old in old_names() if old.count(".") == 1 and old.partition(".")[0] in ("sensor", "reading", "camera")]
+BLOCKS_OF_KEYS = ("sensor", "reading", "camera")
+ELEMENT = [
+    old for old in old_names() if "element" in old
+]  #: a block, a step and what `train` says, each of its own kind
+KEYS = [old for old in old_names() if old.count(".") == 1 and old.partition(".")[0] in BLOCKS_OF_KEYS]
 KEYS.remove("sensor.gather")  # a node of the family `sensor`, not a key of the block
-NODES = [old for old in old_names() if old.count(".") == 1 and old not in KEYS]
-PARAMETERS = [old for old in old_names() if old.count(".") == 2]
+KEYS += [f"element.{name}" for name in ("material", "wrap_at", "levels", "max_height")]
+NODES = [old for old in old_names() if old.count(".") == 1 and old not in (*KEYS, *ELEMENT)]
+PARAMETERS = [old for old in old_names() if old.count(".") == 2 and old not in ELEMENT]
 
 
 def refused(name, *arguments, folder=None):
@@ -34,7 +39,9 @@ def using(node):
 
 
 def test_every_old_name_is_of_one_kind_and_is_one_no_more():
-    assert sorted((*KEYS, *NODES, *PARAMETERS)) == sorted(old_names())
+    kinds = (*(old for old in KEYS if not old.startswith("element.")), *NODES, *PARAMETERS, *ELEMENT)
+    assert sorted(kinds) == sorted(old_names())
+    assert sorted(ELEMENT) == ["element", "steps.element", "train.mask.kind=element", "train.rates.element"]
     assert all(old.partition(".")[0] in families() for old in (*NODES, *PARAMETERS))
     assert not [old for old in old_names() if new_name(old) in old_names()]
 
@@ -92,3 +99,26 @@ def test_an_old_parameter_in_place_of_the_new_one_is_one_mistake(old):
     name, step = using(node)
     found = refused(name, f"~steps.{step}.with.{new_name(old)}", f"+steps.{step}.with.{parameter}=1 e-")
     assert [message for _, _, message in found] == [instead(old)]
+
+
+@pytest.mark.parametrize("words", [("outputs=[element]",), ("steps.pupil.from.height=element",)])
+def test_an_old_step(words):
+    found = refused("first_light", *words)
+    assert {message for _, _, message in found} == {"step element is called fabricated now"}
+    assert {where for where, _, _ in found} == {"argument 1"}
+
+
+def test_an_old_step_in_an_argument():
+    word = "steps.element.with.levels=4"
+    assert refused("first_light", word) == [("argument 1", word, "is called steps.fabricated.with.levels now")]
+
+
+@pytest.mark.parametrize(
+    ("word", "path", "message"),
+    [
+        ("+train.rates.element=1e-3", "train.rates.element", "is called train.rates.mask now"),
+        ("train.mask.kind=element", "train.mask.kind", "element is called recipe_mask now"),
+    ],
+)
+def test_an_old_word_of_training(word, path, message):
+    assert refused("train_small", word) == [("argument 1", path, message)]

@@ -58,7 +58,7 @@ def test_what_a_draw_changes_is_what_a_recipe_with_its_values_says():
 
 
 def test_what_reaches_no_output_is_not_drawn():
-    inputs = Inputs.of(small("lsr, saturated", *LAWS, "element.wrap_at=normal(500 nm, 1 nm)"))
+    inputs = Inputs.of(small("lsr, saturated", *LAWS, "mask.wrap_at=normal(500 nm, 1 nm)"))
     assert "sensor.gain" in inputs.names
     with pytest.raises(ValueError, match=r"no output depends on sensor\.read_noise"):
         Inputs.of(small("lsr", LAWS[0]))
