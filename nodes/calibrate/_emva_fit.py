@@ -33,13 +33,13 @@ class LeastSquares(NamedTuple):
 
 @node(rtol=1e-9)
 def least_squares(levels: Levels, *, share: Share = 0.7) -> LeastSquares:
-    """Fit gain, quantum efficiency and dark noise: straight lines through the origin, up to a share of saturation.
+    """Fit gain, quantum efficiency and temporal dark noise: lines through the origin, up to a share of saturation.
 
     Saturation is where the variance is greatest. The slope of mean over photons is the responsivity, that of variance
     over mean the gain, each less the dark of the nearest exposure.
 
     Shapes: levels (level,) -> ten scalars.
-    Units:  K DN/e-; dark noise, saturation e-; dark current e-/s.
+    Units:  K DN/e-; temporal dark noise, saturation e-; dark current e-/s.
     Error:  as far as the camera is linear and Poisson. Every level weighs the same, as the standard has it, so that the
             brightest decide. The rounding of a converter is taken to add 1/12 DN2; dithered, it adds up to 1/6. The
             errors leave out the scatter of means in x, drift and non-linearity, which are larger in real cameras.
@@ -87,7 +87,7 @@ def least_squares(levels: Levels, *, share: Share = 0.7) -> LeastSquares:
 @least_squares.check
 def _(result: LeastSquares, levels: Levels, **params: float) -> list[Check]:
     text = (
-        f"K {float(result.gain):.4g} DN/e-, QE {float(result.efficiency):.3g}, dark noise "
+        f"K {float(result.gain):.4g} DN/e-, QE {float(result.efficiency):.3g}, temporal dark noise "
         f"{float(result.temporal_dark_noise):.4g} e-, from {int(result.fitted)} of {len(levels.mean)} levels"
     )
     return [Check(text, 0.0 < float(result.efficiency) <= 1.0)]

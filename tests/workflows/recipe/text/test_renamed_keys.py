@@ -15,9 +15,7 @@ from neusee.workflows.recipe.text.renamed_keys import instead, new_name, old_nam
 RECIPES = ("first_light", "calibrate", "calibrate_camera")
 BLOCKS = {"camera": "calibrate_camera"}  #: by the block of a key, the recipe that has it; else first_light
 BLOCKS_OF_KEYS = ("sensor", "reading", "camera")
-ELEMENT = [
-    old for old in old_names() if "element" in old
-]  #: a block, a step and what `train` says, each of its own kind
+ELEMENT = [old for old in old_names() if "element" in old]  #: a block, a step, words of `train`
 KEYS = [old for old in old_names() if old.count(".") == 1 and old.partition(".")[0] in BLOCKS_OF_KEYS]
 KEYS.remove("sensor.gather")  # a node of the family `sensor`, not a key of the block
 KEYS += [f"element.{name}" for name in ("material", "wrap_at", "levels", "max_height")]
@@ -62,7 +60,9 @@ def test_an_old_key_in_a_file(old, tmp_path):
     beside, there = re.subn(rf"\n{block}:.*\n", f"\n{block}:\n  {key}: 1 e-\n", text, count=1)
     beside += "" if there else f"{block}:\n  {key}: 1 e-\n"
     now = (new_name(old) or "").rpartition(".")[2]
-    for n, written in enumerate((beside, re.sub(rf"\n  {now}: .*", "", beside, count=1) if now else beside)):
+    for n, written in enumerate(
+        (beside, re.sub(rf"\n  {now}: .*", "", beside, count=1) if now not in ("", key) else beside)
+    ):
         (tmp_path / f"{n}.yaml").write_text(written)
         ((where, path, message),) = refused(f"{n}.yaml", folder=tmp_path)
         assert where.startswith(f"{n}.yaml:")
