@@ -9,7 +9,7 @@ from torch import Tensor
 
 from neusee.nodes import Check, node
 from neusee.nodes._half_precision import refuse_half, refuse_not_finite
-from neusee.nodes.optics._transform._intensity import PupilIntensity, Sampling
+from neusee.nodes.optics._transform._intensity import Sampling, intensity_of
 from neusee.nodes.optics._transform._pupil_field import View
 from neusee.nodes.optics._transform._sample_axis import Axis, centred
 from neusee.nodes.optics._transform._scaled_transform import Method
@@ -109,7 +109,7 @@ def _focus(pupil: Pupil, camera: _Camera, dtype: torch.dtype, method: Method) ->
         views += _views(pupil, camera, band, 1 / area, dtype)
         peaks.append(_clear_peak(pupil, camera, band, area, total))
     sampling = Sampling(tuple(views), dtype, method)
-    intensity: Tensor = PupilIntensity.apply(pupil.amplitude, pupil.height, pupil.path, sampling)  # type: ignore[no-untyped-call]
+    intensity = intensity_of(pupil.amplitude, pupil.height, pupil.path, sampling)
     return Psf(intensity, torch.tensor(peaks, dtype=torch.float64, device=intensity.device))
 
 
@@ -183,7 +183,7 @@ def _clear_peak(pupil: Pupil, camera: _Camera, band: int, area: float, total: fl
     nothing = torch.zeros_like(pupil.height)
     views = _views(pupil, centre, band, 1 / area, torch.float64)
     sampling = Sampling(tuple(replace(view, band=0) for view in views), torch.float64)
-    return float(PupilIntensity.apply(pupil.aperture, nothing, nothing, sampling))  # type: ignore[no-untyped-call]
+    return float(intensity_of(pupil.aperture, nothing, nothing, sampling))
 
 
 def _agree(pupil: Pupil) -> None:

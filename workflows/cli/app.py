@@ -6,26 +6,29 @@ Nothing heavy is imported before a command asks for it: ``neusee --help`` never 
 from __future__ import annotations
 
 import gc
+import inspect
+import os
 import sys
+from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
+from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
+from neusee import __version__
 from neusee.workflows.cli.cache_commands import cache
 from neusee.workflows.cli.calibrate_command import calibrate
 from neusee.workflows.cli.command_frame import (
     BAD,
     DONE,
     FAILED,
-    MISSED,
     Debug,
     Device,
-    Out,
+    Exact,
+    Memory,
     Words,
     bytes_of,
     check_device,
-    executor_of,
     fail,
     load,
     refuse,
@@ -34,103 +37,42 @@ from neusee.workflows.cli.command_frame import (
 )
 from neusee.workflows.cli.evaluate_command import evaluate
 from neusee.workflows.cli.list_commands import nodes, recipes, schema
+from neusee.workflows.cli.run_command import run
 from neusee.workflows.cli.study_commands import study
 from neusee.workflows.cli.sweep_command import sweep
 from neusee.workflows.cli.train_command import train
 
 if TYPE_CHECKING:
-    from neusee.workflows.engine.step_job import Executor
-    from neusee.workflows.graph.recipe_graph import Recipe
-    from neusee.workflows.simulation.simulate_recipe import Simulation
-    from neusee.workflows.store.result_store import Store
+    from typer.models import CommandInfo
 
-app = typer.Typer(
-    name="neusee",
-    help="Simulate what a laser does to a camera: its light, its glass and its sensor, as recipes. "
+_HOW: Mapping[str, Any] = {
+    "name": "neusee",
+    "help": "Simulate what a laser does to a camera: its light, its glass and its sensor, as recipes. "
     "Start with `neusee run`. Each command explains itself: `neusee run --help`.",
-    epilog="Exit codes: 0 done; 1 failed while running; 2 mistake in the recipe or the arguments; "
+    "epilog": "Exit codes: 0 done; 1 failed while running; 2 mistake in the recipe or the arguments; "
     "3 expected numbers missed, a check of a calibration failed, or damaged results found.",
-    add_completion=False,
-    no_args_is_help=True,
-    rich_markup_mode=None,
-    pretty_exceptions_enable=False,
-)
-Where = Annotated[
-    str, typer.Option("--executor", help="Who computes: local, dask, dask:4 (workers), or tcp://scheduler:8786.")
-]
-Exact = Annotated[bool, typer.Option("--exact", help="Compute every step in full; omit nothing.")]
-Memory = Annotated[
-    str, typer.Option("--memory", help="Limit of a device's memory, such as 6 GB, as far as earlier runs tell.")
-]
+    "context_settings": {"help_option_names": ["-h", "--help"]},
+    "no_args_is_help": True,
+    "rich_markup_mode": None,
+    "pretty_exceptions_enable": False,
+}
+app = typer.Typer(**_HOW)
+app.command()(run)
 
 
-@app.command()
-def run(
-    words: Words = None,
-    as_json: Annotated[bool, typer.Option("--json", help="Print one JSON document instead of the table.")] = False,
-    quiet: Annotated[bool, typer.Option("--quiet", help="Print only the path of the report.")] = False,
-    debug: Debug = False,
-    device: Device = "cpu",
-    executor: Where = "local",
-    memory: Memory = "",
-    exact: Exact = False,
-    out: Out = Path("runs"),
+def _say_version(wanted: bool) -> None:
+    if wanted:
+        say([f"neusee {__version__}"])
+        raise typer.Exit(DONE)
+
+
+@app.callback()
+def _options(
+    version: Annotated[
+        bool, typer.Option("--version", help="Show the version and exit.", callback=_say_version, is_eager=True)
+    ] = False,
 ) -> None:
-    """Run a recipe and write its report.
-
-    Steps whose results are in the cache are not computed again. Without a name the recipe is first_light. The folder
-    of results holds report.html, the numbers, the pictures and the recipe with every final value.
-    """
-    recipe, command = load(words, exact=exact)
-    from neusee.workflows.report import console
-
-    check_device(device)
-    room = bytes_of(memory, "--memory") if memory else None
-    if not (as_json or quiet):
-        say(console.opening(recipe, " ".join(command[1:])))
-    store = the_store()
-    if room is not None:
-        _refuse_too_large(recipe, store, device, room)
-    with executor_of(executor, store) as carries_out:
-        done = _simulate(recipe, store, command, device, out, as_json or quiet, carries_out, room)
-    if as_json:
-        import json
-
-        say([json.dumps({"report": str(done.page), **done.document}, ensure_ascii=False)])
-    elif quiet:
-        say([str(done.page)])
-    else:
-        say(console.closing(done.document, str(done.page), console.next_commands(recipe)))
-    if done.document["missed"]:
-        raise typer.Exit(MISSED)
-
-
-def _refuse_too_large(recipe: Recipe, store: Store, device: str, memory: int) -> None:
-    """Stop before anything runs where, as far as earlier runs tell, the memory cannot do."""
-    from neusee.workflows.engine.local_executor import lanes_of
-    from neusee.workflows.explain.run_forecast import planned
-
-    if refused := planned(recipe, store, lanes_of(device.split(","), memory)).refused:
-        fail(f"--memory: {refused}")
-
-
-def _simulate(
-    recipe: Recipe,
-    store: Store,
-    command: list[str],
-    device: str,
-    out: Path,
-    silent: bool,
-    executor: Executor | None,
-    memory: int | None,
-) -> Simulation:
-    from neusee.workflows.report.console import screen
-    from neusee.workflows.simulation.simulate_recipe import simulate, steps_of, wanted
-    from neusee.workflows.tolerance.cheaper_steps import with_substitutions
-
-    recipe = with_substitutions(recipe, wanted(recipe))
-    with screen(recipe, steps_of(recipe), silent) as shown:
-        return simulate(recipe, store, out, command, device, shown.watch, executor, memory)
+    pass
 
 
 @app.command()
@@ -236,12 +178,43 @@ app.add_typer(study, name="study")
 app.add_typer(cache, name="cache")
 
 
+def _asked(arguments: Sequence[str]) -> typer.Typer:
+    """Return the program with the options of the command that ``arguments`` name, and the help alone of all others.
+
+    To read the options of every command takes a fifth of the start. A shell that completes a word needs all of them.
+    """
+    if any(name.endswith("_COMPLETE") for name in os.environ):
+        return app
+    name = next((word for word in arguments if not word.startswith("-")), "")
+    light = typer.Typer(**_HOW)
+    light.callback()(_options)
+    for known in app.registered_commands:
+        if _name(known) == name:
+            light.registered_commands.append(known)
+        else:
+            light.command(_name(known), help=inspect.getdoc(known.callback))(_not_asked)
+    for group in app.registered_groups:
+        if group.name == name:
+            light.registered_groups.append(group)
+        elif group.typer_instance is not None:
+            light.command(group.name, help=group.typer_instance.info.help)(_not_asked)
+    return light
+
+
+def _name(command: CommandInfo) -> str:
+    return str(command.name or getattr(command.callback, "__name__", ""))
+
+
+def _not_asked() -> None:
+    pass
+
+
 def main(arguments: list[str] | None = None) -> None:
     """Entry point: every error is one line and an exit code, unless ``--debug`` asks for the stack."""
     arguments = sys.argv[1:] if arguments is None else arguments
     gc.disable()  # what is imported stays: to look for garbage in it costs a tenth of the start
     try:
-        sys.exit(app(arguments, standalone_mode=False) or DONE)
+        sys.exit(_asked(arguments)(arguments, standalone_mode=False, prog_name="neusee") or DONE)
     except BrokenPipeError:
         sys.stderr.close()
         sys.exit(DONE)

@@ -29,17 +29,18 @@ def calibrate(
     continue. Needs: pip install -e ".[calibrate]".
     """
     recipe, command = load(words)
-    from neusee.workflows.calibration import run_calibration
+    from neusee.workflows.api import verbs
+    from neusee.workflows.calibration.run_calibration import Refused
     from neusee.workflows.engine.node_call import RunError
 
     tell = (lambda line: None) if quiet else (lambda line: say([line]))
     how = {"walkers": walkers, "move": move, "draws": draws}
     command = ["neusee", "calibrate", *command[2:], *(f"--{name} {value}" for name, value in how.items())]
     try:
-        folder = run_calibration.calibrate(
-            recipe, the_store(), out, command, tell, walkers=walkers, move=move, draws=draws
+        folder = verbs.calibrate(
+            recipe, store=the_store(), out=out, command=command, tell=tell, walkers=walkers, move=move, draws=draws
         )
-    except run_calibration.Refused as error:
+    except Refused as error:
         fail(f"refused, nothing was drawn: {error}", FAILED)
     except (RunError, ValueError, ImportError) as error:
         fail(str(error), FAILED)

@@ -31,6 +31,10 @@ Words = Annotated[
 ]
 Debug = Annotated[bool, typer.Option("--debug", help="Show where in the code an error arose.")]
 Device = Annotated[str, typer.Option("--device", help="Where to compute: cpu, cuda, or several: cuda:0,cuda:1,cpu.")]
+Exact = Annotated[bool, typer.Option("--exact", help="Compute every step in full; omit nothing.")]
+Memory = Annotated[
+    str, typer.Option("--memory", help="Limit of a device's memory, such as 6 GB, as far as earlier runs tell.")
+]
 Out = Annotated[Path, typer.Option("--out", help="Folder in which to make the folder of results.")]
 
 

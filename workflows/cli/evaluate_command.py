@@ -48,12 +48,12 @@ def evaluate(
         name,
         changes,
         pipelines,
-        data=Path(data).expanduser() if data else None,
-        count=scenes,
+        data=data or None,
+        scenes=scenes,
         strengths=_numbers(strengths),
         small=small,
         reference=reference.replace(" ", ""),
-        runs=out,
+        out=out,
         command=command,
         tell=tell,
         device=device,
@@ -67,14 +67,13 @@ def _given(how: dict[str, Any]) -> list[str]:
 
 def _evaluated(name: str, changes: list[str], pipelines: str, **how: Any) -> Path:
     """The folder of the evaluation, or one line of what is wrong."""
+    from neusee.workflows.api import verbs
     from neusee.workflows.engine.node_call import RunError
-    from neusee.workflows.evaluation import run_evaluation as protocol
+    from neusee.workflows.evaluation.pipelines import Refused
 
-    here = Path.cwd()
     try:
-        read = protocol.read_pipelines(pipelines, here)
-        return protocol.evaluate(name, read, changes, store=the_store(), folder=here, **how)
-    except protocol.Refused as error:
+        return verbs.evaluate(name, pipelines=pipelines, changes=changes, store=the_store(), **how)
+    except Refused as error:
         fail(str(error))
     except RunError as error:
         fail(str(error), FAILED)

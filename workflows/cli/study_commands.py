@@ -4,11 +4,14 @@ from __future__ import annotations
 
 from enum import StrEnum
 from pathlib import Path
-from typing import Annotated, Any
+from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
 from neusee.workflows.cli.command_frame import FAILED, Debug, Out, Words, check_device, fail, load, say, the_store
+
+if TYPE_CHECKING:
+    from neusee.workflows.api.verbs import Kind
 
 study = typer.Typer(
     help="Study how accurate, stable and certain a recipe's numbers are.",
@@ -121,18 +124,19 @@ def uncertainty(
     _made("uncertainty", words, quiet, out, **how)
 
 
-def _made(kind: str, words: list[str] | None, quiet: bool, out: Path, **options: Any) -> None:
+def _made(kind: Kind, words: list[str] | None, quiet: bool, out: Path, **options: Any) -> None:
     recipe, command = load(words)
+    from neusee.workflows.api import verbs
     from neusee.workflows.engine.node_call import RunError
-    from neusee.workflows.studies import run_study as studies
+    from neusee.workflows.studies.run_study import failed
 
     given = [f"--{name}" if value is True else f"--{name} {value}" for name, value in options.items() if value]
     command = ["neusee", "study", kind, *command[2:], *given]
     tell = (lambda line: None) if quiet else (lambda line: say([line]))
     try:
-        folder = studies.made(kind, recipe, the_store(), out, command, tell, **options)
+        folder = verbs.study(recipe, kind=kind, store=the_store(), out=out, command=command, tell=tell, **options)
     except (RunError, ValueError, ImportError) as error:
         fail(str(error), FAILED)
     say([str(folder / "report.html")])
-    if count := studies.failed(folder):
+    if count := failed(folder):
         fail(f"{count} do not hold: see {folder / 'report.html'}", FAILED)

@@ -55,21 +55,21 @@ def train(
             fail(f"{recipe.name} learns a lift, which has neither stages nor a mesh: leave --stage and --mesh out")
         check_device(device)
         return _lift(recipe, ["neusee", "train", *command[2:]], out, device, quiet)
+    from neusee.workflows.api import verbs
     from neusee.workflows.engine.node_call import RunError
     from neusee.workflows.training.parallel.process_mesh import MeshError, device_here, joined, processes
-    from neusee.workflows.training.run_training import train as learn
 
     device, (rank, world) = device_here(device), processes()
     check_device(device)
     quiet, who = quiet or rank > 0, f"process {rank}: " if world > 1 else ""
-    there = recipe.training.learnt if recipe.training else ()
-    stages = there if stage is Stages.BOTH else _NUMBERS[stage]
+    stages = _NUMBERS[stage] if stage is not Stages.BOTH else recipe.training.learnt if recipe.training else ()
     tell = (lambda line: None) if quiet else (lambda line: say([line]))
     told = ["neusee", "train", *command[2:], "--stage", stage.value, *(["--mesh", mesh] if mesh else [])]
     lengths = {s: recipe.training.stages[s].iterations for s in stages if s} if recipe.training else {}
     try:
         with joined(mesh, device) as processes_here, _bar(quiet, lengths) as bar:
-            folder = learn(recipe, the_store(), out, told, tell, stages, device, bar.watch, processes_here)
+            folder = verbs.train(recipe, store=the_store(), device=device, out=out, tell=tell, command=told,
+                                 stages=stages, watch=bar.watch, mesh=processes_here)  # fmt: skip
     except MeshError as error:
         fail(f"{who}{error}")
     except (RunError, ValueError, ArithmeticError) as error:
@@ -82,14 +82,15 @@ def train(
 
 def _lift(recipe: Recipe, told: list[str], out: Path, device: str, quiet: bool) -> None:
     """Learn a lift from RGB to spectra."""
+    from neusee.workflows.api import verbs
     from neusee.workflows.engine.node_call import RunError
-    from neusee.workflows.training.lift.lift_run import train_lift
 
     assert recipe.lifting is not None
     tell = (lambda line: None) if quiet else (lambda line: say([line]))
     try:
         with _bar(quiet, {1: recipe.lifting.iterations}) as bar:
-            folder = train_lift(recipe, the_store(), out, told, tell, device, lambda n, found: bar.watch(1, n, found))
+            folder = verbs.train(recipe, store=the_store(), device=device, out=out, tell=tell, command=told,
+                                 watch=bar.watch)  # fmt: skip
     except (RunError, ValueError, ArithmeticError) as error:
         fail(str(error), FAILED)
     if not quiet:

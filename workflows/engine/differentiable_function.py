@@ -14,7 +14,7 @@ from neusee.nodes import TensorStats
 from neusee.workflows.engine.node_call import call, place
 from neusee.workflows.engine.runner import run
 from neusee.workflows.graph.diagnostics import nearest
-from neusee.workflows.graph.recipe_graph import Recipe, Step, in_order, needed
+from neusee.workflows.graph.recipe_graph import Recipe, Step, in_order, needed, unknown_step
 from neusee.workflows.store.result_store import Store
 from neusee.workflows.store.serialization import settle
 from neusee.workflows.tolerance.cheaper_steps import with_substitutions
@@ -67,7 +67,7 @@ def _read(recipe: Recipe, free: tuple[str, ...]) -> tuple[set[str], dict[str, di
         if name in recipe.steps:
             given.add(name)
         elif step not in recipe.steps:
-            raise ValueError(f"no step {step or name!r}; {nearest(step or name, recipe.steps)}")
+            raise ValueError(unknown_step(step or name, recipe.steps))
         elif param not in recipe.steps[step].params:
             raise ValueError(f"{step} has no parameter {param!r}; {nearest(param, recipe.steps[step].params)}")
         else:

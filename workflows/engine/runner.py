@@ -14,8 +14,7 @@ from neusee.workflows.engine.execution import Execution
 from neusee.workflows.engine.node_call import to_device
 from neusee.workflows.engine.step_job import Executor
 from neusee.workflows.engine.step_record import Event, StepRecord
-from neusee.workflows.graph.diagnostics import nearest
-from neusee.workflows.graph.recipe_graph import Recipe, needed
+from neusee.workflows.graph.recipe_graph import Recipe, needed, unknown_step
 from neusee.workflows.keys.cache_key import Key
 from neusee.workflows.placement.heft_and_cpop import Schedule
 from neusee.workflows.store.remote_store import open_store
@@ -61,7 +60,10 @@ class Result:
         return arrays_of(self.value(step))
 
     def metrics(self) -> dict[str, float | list[float]]:
-        """The figures of merit by name, such as ``restored_quality.psnr``; a list where there is one a band."""
+        """Return every figure of merit that ``neusee run`` prints, such as ``restored_quality.psnr``.
+
+        One for each band is a list. What this run did not need is read from the store, or computed now.
+        """
         from neusee.workflows.report.notebook import numbers_of
 
         return numbers_of(self)
@@ -96,7 +98,7 @@ def run(
     wanted = recipe.outputs if outputs is None else tuple(outputs)
     for name in wanted:
         if name not in recipe.steps:
-            raise ValueError(f"no step {name!r}; {nearest(name, recipe.steps)}")
+            raise ValueError(unknown_step(name, recipe.steps))
     recipe, store, watch = with_substitutions(recipe, wanted), store or open_store(), watch or (lambda event: None)
     while True:
         work = Execution(recipe, store, device.split(","), watch, wanted, executor, memory)

@@ -11,6 +11,7 @@ from neusee.workflows.graph.diagnostics import Diagnostic, RecipeError, nearest
 from neusee.workflows.graph.recipe_graph import Recipe
 from neusee.workflows.recipe.loading import load
 from neusee.workflows.recipe.text.composition import groups_of, packaged
+from neusee.workflows.recipe.text.overrides import Override
 
 NONE = "none"  #: of restorers: the raw picture, developed; of cases: no laser
 BEAM = "beam"  #: the laser's name in every recipe of an evaluation
@@ -88,7 +89,7 @@ class Composed:
 class _Recipes(dict[str, Recipe]):
     """The recipe of each case, read when it is first asked for: they differ in one wavelength."""
 
-    def __init__(self, recipe: str, words: Sequence[str], fwhm: float, folder: Path) -> None:
+    def __init__(self, recipe: str, words: Sequence[str | Override], fwhm: float, folder: Path) -> None:
         super().__init__()
         self._how = recipe, words, fwhm, folder
 
@@ -119,7 +120,9 @@ def read_pipelines(text: str, folder: Path) -> list[Pipeline]:
     return found
 
 
-def composed(recipe: str, changes: Sequence[str], pipelines: Sequence[Pipeline], folder: Path) -> list[Composed]:
+def composed(
+    recipe: str, changes: Sequence[str | Override], pipelines: Sequence[Pipeline], folder: Path
+) -> list[Composed]:
     """Every pipeline with its recipes; raises `Refused` with the mistakes of all of them."""
     fwhm = _fwhm(recipe, changes, folder)
     found: list[Composed] = []
@@ -179,7 +182,7 @@ def _laser(metres: float | None, fwhm: float) -> str:
     return f"lasers={{{BEAM}: {{{line}, strength: 1, angle: null}}}}"
 
 
-def _fwhm(recipe: str, changes: Sequence[str], folder: Path) -> float:
+def _fwhm(recipe: str, changes: Sequence[str | Override], folder: Path) -> float:
     """The width of the recipe's own first line, 10 nm where it has no laser."""
     try:
         steps = load(recipe, changes, folder).steps

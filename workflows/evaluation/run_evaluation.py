@@ -14,7 +14,7 @@ import time
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 
@@ -28,13 +28,11 @@ from neusee.workflows.evaluation.pipelines import NONE, Composed, Pipeline, Refu
 from neusee.workflows.graph.recipe_graph import Recipe
 from neusee.workflows.keys.cache_key import digest
 from neusee.workflows.recipe.loading import load
+from neusee.workflows.recipe.text.overrides import Override
 from neusee.workflows.report.run_folder import RunFolder, new_run
 from neusee.workflows.store.remote_store import open_store
 from neusee.workflows.store.result_store import Store
 from neusee.workflows.studies.accuracy.work_precision_points import timestamp
-
-if TYPE_CHECKING:
-    pass
 
 __all__ = ["STRENGTHS", "Evaluated", "Refused", "evaluate", "read_pipelines"]
 
@@ -64,7 +62,7 @@ class Evaluated:
 def evaluate(
     recipe: str,
     pipelines: Sequence[Pipeline],
-    changes: Sequence[str] = (),
+    changes: Sequence[str | Override] = (),
     *,
     data: Path | None = None,
     count: int = 20,

@@ -2,12 +2,12 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Callable, Collection, Iterable, Mapping
 from dataclasses import dataclass, field, replace
 from typing import TYPE_CHECKING, Any
 
 from neusee.nodes import Node
-from neusee.workflows.graph.diagnostics import Location
+from neusee.workflows.graph.diagnostics import Location, nearest
 from neusee.workflows.graph.final_values import Config, Setting
 
 if TYPE_CHECKING:
@@ -65,6 +65,7 @@ class Expectation:
     mark: Location
 
 
+_ARMS = 8  #: arms of a step that a message names
 METRIC_TOLERANCE = 1e-3  #: what a figure of merit reads may be off by, for all of it may hang on a small difference
 
 
@@ -140,6 +141,15 @@ def in_order(sources: Mapping[str, Iterable[str]], wanted: Iterable[str]) -> lis
         order.setdefault(name)
         stack.pop()
     return list(order)
+
+
+def unknown_step(name: str, steps: Collection[str]) -> str:
+    """Return why there is no step ``name``: those of its arms, or the nearest name."""
+    arms = sorted(step for step in steps if step.startswith(f"{name}["))
+    if not arms:
+        return f"no step {name!r}; {nearest(name, steps)}"
+    more = f" and {len(arms) - _ARMS} more" if len(arms) > _ARMS else ""
+    return f"no output {name}: this recipe has {', '.join(arms[:_ARMS])}{more}"
 
 
 def kept_promises(recipe: Recipe, written: Recipe) -> Recipe:

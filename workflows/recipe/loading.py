@@ -43,7 +43,7 @@ class Titled:
 def load(
     name_or_path: str | os.PathLike[str],
     /,
-    overrides: Sequence[str] = (),
+    overrides: Sequence[str | Override] = (),
     folder: str | os.PathLike[str] | None = None,
     first: int = 1,
     **values: Any,

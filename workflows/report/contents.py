@@ -14,6 +14,10 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass
+from typing import TYPE_CHECKING
+
+if TYPE_CHECKING:
+    from neusee.workflows.graph.recipe_graph import Recipe
 
 
 @dataclass(frozen=True, slots=True)
@@ -125,6 +129,14 @@ TABLE: Mapping[str, Mapping[str, str]] = {
 }
 #: Steps that only a picture reads; a run makes them where the recipe has them.
 SHOWN = ("transfer",)
+
+
+def wanted(recipe: Recipe) -> tuple[str, ...]:
+    """Return the recipe's outputs, what its expected numbers read, and what the result table shows."""
+    promised = [e.step for e in recipe.expect]
+    shown = [s for s in (*(s for row in TABLE.values() for s in row.values()), *SHOWN) if s in recipe.steps]
+    return tuple(dict.fromkeys([*recipe.outputs, *promised, *shown]))
+
 
 BANDS = "bands"
 LINES = "line[*]"

@@ -12,8 +12,9 @@ from typing import TYPE_CHECKING, Any
 
 from neusee.workflows.graph.final_values import Setting, flow
 from neusee.workflows.graph.recipe_graph import Recipe, in_order
-from neusee.workflows.report.contents import BANDS, FIGURES, LINES, TABLE
-from neusee.workflows.report.result_numbers import metrics, table
+from neusee.workflows.report import result_numbers
+from neusee.workflows.report.contents import BANDS, FIGURES, LINES, TABLE, wanted
+from neusee.workflows.report.result_numbers import metrics_of, table
 
 if TYPE_CHECKING:
     from torch import Tensor
@@ -32,9 +33,14 @@ _LONGEST = 100  #: characters of a value that a table shows
 
 
 def numbers_of(result: Result) -> dict[str, float | list[float]]:
-    """The figures of merit of a run, such as ``restored_quality.psnr``; a list where there is one a band."""
+    """Return the figures of merit that ``neusee run`` prints, by name; a list where there is one for each band."""
+    recipe = result.recipe.unsubstituted or result.recipe
+    names = metrics_of(recipe, {*result.keys, *wanted(recipe)})
+    absent = [name for name in names if name not in result.values]
+    again = recipe.run(result.store, absent, device=result.device).values if absent else {}
+    values = {**again, **result.values}
     found: dict[str, list[float]] = {}
-    for step, field, _, number in metrics(result.recipe, result.keys, result.value):
+    for step, field, _, number in (row for name in names for row in result_numbers.numbers_of(name, values[name])):
         found.setdefault(f"{step}.{field}".rstrip("."), []).append(number)
     return {name: values[0] if len(values) == 1 else values for name, values in found.items()}
 

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Container, Mapping
 from typing import Any
 
 from torch import Tensor
@@ -71,11 +71,12 @@ def _band(recipe: Recipe, keys: Mapping[str, str], value: Value) -> tuple[int, s
 
 def metrics(recipe: Recipe, keys: Mapping[str, str], value: Value) -> list[list[Any]]:
     """(step, field, index, value) of every small result of a metric."""
-    rows: list[list[Any]] = []
-    for name, step in recipe.steps.items():
-        if name in keys and step.node.path.startswith("metrics."):
-            rows += numbers_of(name, value(name))
-    return rows
+    return [row for name in metrics_of(recipe, keys) for row in numbers_of(name, value(name))]
+
+
+def metrics_of(recipe: Recipe, among: Container[str]) -> list[str]:
+    """Return the steps ``among`` those given that are metrics, in the order of the recipe."""
+    return [name for name, step in recipe.steps.items() if name in among and step.node.path.startswith("metrics.")]
 
 
 def numbers_of(step: str, found: Any) -> list[list[Any]]:

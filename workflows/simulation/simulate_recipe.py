@@ -16,13 +16,15 @@ from neusee.workflows.explain.why_rerun import explained
 from neusee.workflows.graph.recipe_graph import Recipe, needed
 from neusee.workflows.keys.cache_key import digest
 from neusee.workflows.report import run_page
-from neusee.workflows.report.contents import SHOWN, TABLE
+from neusee.workflows.report.contents import wanted
 from neusee.workflows.report.data_exports import exports
 from neusee.workflows.report.run_folder import RunFolder, new_run
 from neusee.workflows.report.run_pictures import pictures, timeline
 from neusee.workflows.store.derived_files import DerivedFiles
 from neusee.workflows.store.result_store import Store
 from neusee.workflows.tolerance.cheaper_steps import with_substitutions
+
+__all__ = ["Simulation", "recipe_text", "simulate", "steps_of", "wanted"]
 
 _TIMING = ("step", "node", "device", "lane", "state", "began", "seconds", "predicted", "peak", "bytes", "key")
 
@@ -38,13 +40,6 @@ class Simulation:
     def page(self) -> Path:
         """The page to open."""
         return self.folder / "report.html"
-
-
-def wanted(recipe: Recipe) -> tuple[str, ...]:
-    """The recipe's outputs, what its expected numbers read, and what the result table shows."""
-    promised = [e.step for e in recipe.expect]
-    shown = [s for s in (*(s for row in TABLE.values() for s in row.values()), *SHOWN) if s in recipe.steps]
-    return tuple(dict.fromkeys([*recipe.outputs, *promised, *shown]))
 
 
 def simulate(

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import os
 from pathlib import Path
-from typing import Literal, get_args
+from typing import Literal, cast, get_args
 
 from neusee.workflows.store.budget_eviction import bytes_of
 
@@ -28,13 +28,13 @@ def default_root() -> Path:
     return Path.home() / ".cache" / "neusee"
 
 
-def verify_mode(wanted: str | None) -> str:
+def verify_mode(wanted: str | None) -> Verify:
     """``wanted``, else ``$NEUSEE_CACHE_VERIFY``, else ``always``; a `ValueError` where it is no such word."""
     name = "verify" if wanted else "NEUSEE_CACHE_VERIFY"
     found = wanted or os.environ.get("NEUSEE_CACHE_VERIFY") or "always"
     if found not in get_args(Verify):
         raise ValueError(f"{name} is {found!r}: write always, sampled or never")
-    return found
+    return cast(Verify, found)
 
 
 def budget_bytes(wanted: int | None) -> int | None:

@@ -15,6 +15,7 @@ import warnings
 from collections.abc import Iterator
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import ExitStack
+from functools import partial
 from itertools import starmap
 from pathlib import Path
 from typing import Any
@@ -60,6 +61,9 @@ class RemoteStore(Store):
         self._seen: dict[Key, Metadata] = {}  # descriptions read there
         self._broken: set[Key] = set()  # what is there is of no use
         super().__init__(root or local_layer(url), verify=verify, budget=budget)
+
+    def __reduce__(self) -> tuple[Any, ...]:
+        return partial(type(self), self.url, self.root, verify=self.verify, budget=self.budget), ()
 
     def about(self, key: Key) -> Metadata | None:
         """What is known of a result, here or there, without reading it."""

@@ -16,7 +16,7 @@ import time
 import warnings
 from collections.abc import Callable, Collection, Iterator
 from contextlib import suppress
-from functools import cached_property
+from functools import cached_property, partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -50,7 +50,7 @@ class Store:
         What stands in the JSON is always compared, and the size of every payload.
         """
         self.root = default_root() if root is None else Path(root)
-        self.verify = verify_mode(verify)
+        self.verify: Verify = verify_mode(verify)
         self.budget = budget_bytes(budget)
         self.disk = Disk(self.root)
         self.brief = SmallResults(self.disk)
@@ -63,6 +63,9 @@ class Store:
         self._lost: set[str] = set()  # damaged, and perhaps not to be moved away
         self._used: set[str] = set()
         self._warned = False
+
+    def __reduce__(self) -> tuple[Any, ...]:  # it travels to another process as its place, and is opened there
+        return partial(type(self), self.root, verify=self.verify, budget=self.budget), ()
 
     @cached_property
     def blobs(self) -> Blobs:

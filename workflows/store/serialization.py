@@ -78,7 +78,15 @@ def settle(value: Any) -> Any:
 
 def _settled(x: Tensor) -> Tensor:
     x = x.resolve_conj().resolve_neg().contiguous()
-    return x.clone(memory_format=torch.contiguous_format) if x.untyped_storage().nbytes() > x.nbytes else x
+    return x.clone(memory_format=torch.contiguous_format) if _held(x) > x.nbytes else x
+
+
+def _held(x: Tensor) -> int:
+    """Return the bytes of the memory behind a tensor; its own for one that `torch.func` follows, which has none."""
+    try:
+        return x.untyped_storage().nbytes()
+    except NotImplementedError:
+        return x.nbytes
 
 
 class _Listed:

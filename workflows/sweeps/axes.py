@@ -54,7 +54,7 @@ class Point:
         return ", ".join(f"{name}={c.shown}" for name, c in zip(self.axes, self.coordinates, strict=True))
 
 
-def read_words(words: Sequence[str], folder: Path, first: int = 1) -> list[Argument]:
+def read_words(words: Sequence[str | Override], folder: Path, first: int = 1) -> list[Argument]:
     """Arguments of the command line, counted from ``first``; a `RecipeError` has everything that is wrong with them."""
     found: list[Argument] = []
     diagnostics: list[Diagnostic] = []
@@ -97,7 +97,9 @@ def points(arguments: Sequence[Argument], paired: bool = False) -> list[Point]:
 # --- arguments ------------------------------------------------------------------------------------------------------
 
 
-def _read_word(word: str, mark: Location) -> Argument:
+def _read_word(word: str | Override, mark: Location) -> Argument:
+    if isinstance(word, Override):
+        return word
     name, _, text = word.partition("=")
     if "=" not in word or name.startswith("~"):
         return read_override(word, mark)

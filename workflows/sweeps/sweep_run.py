@@ -21,6 +21,7 @@ from typing import Any, Literal
 
 from neusee.workflows.engine.node_call import versions
 from neusee.workflows.keys.cache_key import digest
+from neusee.workflows.recipe.text.overrides import Override
 from neusee.workflows.report.console import aligned
 from neusee.workflows.report.run_folder import new_run
 from neusee.workflows.store.remote_store import open_store
@@ -83,7 +84,7 @@ class Sweep:
 def sweep(
     recipe: str | os.PathLike[str],
     axes: Mapping[str, str | Iterable[Any]],
-    overrides: Sequence[str] = (),
+    overrides: Sequence[str | Override] = (),
     zip: bool = False,
     store: Store | None = None,
     on_error: OnError = "stop",

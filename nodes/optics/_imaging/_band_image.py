@@ -133,14 +133,18 @@ class _Product(torch.autograd.Function):
     """
 
     @staticmethod
-    def forward(ctx: Any, a: Tensor, b: Tensor, *how: Any) -> Tensor:
-        ctx.save_for_backward(a, b)
-        ctx.how = how
+    def forward(a: Tensor, b: Tensor, *how: Any) -> Tensor:
         at_a, at_b, at, size, conjugate, length = how
         plane, result = _Plane(length, a), a.new_empty(len(a), *size)
         for one, two, out in zip(a, b, result, strict=True):
             out.copy_(plane.window(plane.product(one, at_a, two, at_b, conjugate), at, size))
         return result
+
+    @staticmethod
+    def setup_context(ctx: Any, inputs: tuple[Any, ...], output: Tensor) -> None:
+        """Keep the inputs, as `torch.func` asks it: apart from `forward`."""
+        ctx.save_for_backward(*inputs[:2])
+        ctx.how = inputs[2:]
 
     @staticmethod
     def backward(ctx: Any, *grads: Tensor) -> Any:

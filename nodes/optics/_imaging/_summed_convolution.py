@@ -44,10 +44,14 @@ class Summed(torch.autograd.Function):
     """Both gradients are sums of the same kind, so that nothing but the inputs is kept and any derivative exists."""
 
     @staticmethod
-    def forward(ctx: Any, a: Tensor, b: Tensor, mix: Mix, where: Where) -> Tensor:
-        ctx.save_for_backward(a, b)
-        ctx.how = mix, where
+    def forward(a: Tensor, b: Tensor, mix: Mix, where: Where) -> Tensor:
         return _summed(a, b, mix, where)
+
+    @staticmethod
+    def setup_context(ctx: Any, inputs: tuple[Any, ...], output: Tensor) -> None:
+        """Keep the inputs, as `torch.func` asks it: apart from `forward`."""
+        ctx.save_for_backward(*inputs[:2])
+        ctx.how = inputs[2:]
 
     @staticmethod
     def backward(ctx: Any, *grads: Tensor) -> Any:

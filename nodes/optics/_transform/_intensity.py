@@ -1,6 +1,7 @@
 """Pupil to intensity, with the gradient written by hand: little is kept, the pupil's field is computed again."""
 
 import math
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -12,6 +13,7 @@ from neusee.nodes.optics._transform._sample_axis import patch_of
 from neusee.nodes.optics._transform._scaled_transform import Method, propagate
 from neusee.nodes.optics._transform._workspace import Workspace, borrowed
 
+_ONCE = "the PSF has no second derivative here: differentiate without create_graph=True"
 KEPT_FIELD_BYTES = 1 << 30  #: focal fields up to this size wait for the backward pass; larger ones are computed again
 
 
@@ -24,24 +26,20 @@ class Sampling:
     method: Method = "auto"
 
 
+def intensity_of(amplitude: Tensor, height: Tensor, path: Tensor, sampling: Sampling) -> Tensor:
+    """Return the intensity, by the form that keeps its fields, or by the one that `torch.func` can follow."""
+    form = _Transformed if torch._C._are_functorch_transforms_active() else PupilIntensity
+    result: Tensor = form.apply(amplitude, height, path, sampling)  # type: ignore[no-untyped-call]
+    return result
+
+
 class PupilIntensity(torch.autograd.Function):
     """``sum over views of weight * envelope * |U|^2``; the backward pass is the adjoint transform of g U."""
 
     @staticmethod
     def forward(ctx: Any, amplitude: Tensor, height: Tensor, path: Tensor, sampling: Sampling) -> Tensor:
         screens = Screens.of(amplitude, height, path)
-        views, shape = sampling.views, (sampling.views[0].rows.n_out, sampling.views[0].columns.n_out)
-        intensity = torch.empty(views[-1].band + 1, *shape, dtype=sampling.dtype, device=height.device)
-        size = 2 * len(views) * intensity[0].nbytes
-        keep = any(ctx.needs_input_grad) and size <= KEPT_FIELD_BYTES
-        ctx.fields, done = [], -1
-        with borrowed(sampling.dtype, height.device) as work:
-            for view in views:
-                kept = torch.empty(2, *shape[::-1], dtype=sampling.dtype, device=height.device) if keep else None
-                field = Field(screens, view, sampling.dtype)
-                _power(field, intensity[view.band], view.band == done, kept, sampling.method, work)
-                ctx.fields.append(kept)
-                done = view.band
+        intensity, ctx.fields = _computed(screens, sampling, any(ctx.needs_input_grad))
         ctx.save_for_backward(amplitude, height, path)
         ctx.sampling, ctx.screens = sampling, screens[3:]
         return intensity
@@ -49,16 +47,76 @@ class PupilIntensity(torch.autograd.Function):
     @staticmethod
     def backward(ctx: Any, weight: Tensor) -> tuple[Tensor | None, ...]:
         if torch.is_grad_enabled():
-            raise RuntimeError("the PSF has no second derivative here: differentiate without create_graph=True")
+            raise RuntimeError(_ONCE)
         screens = Screens(*ctx.saved_tensors, *ctx.screens)
-        needs = zip(ctx.saved_tensors, ctx.needs_input_grad[:3], strict=True)
-        grads = [torch.zeros_like(x) if need else None for x, need in needs]
-        with borrowed(weight.dtype, weight.device) as work:
-            for view, kept in zip(ctx.sampling.views, ctx.fields, strict=True):
-                field = Field(screens, view, weight.dtype)
-                planes = kept if kept is not None else _focal(field, ctx.sampling, work)
-                _add_gradient(field, planes, weight[view.band], grads, ctx.sampling.method, work)
-        return (*grads, None)
+        return (*_adjoint(weight, screens, ctx.sampling, ctx.fields, ctx.needs_input_grad[:3]), None)
+
+
+class _Transformed(torch.autograd.Function):
+    """The same for `torch.func`: no field is kept, and the gradient is a function that has no derivative itself."""
+
+    @staticmethod
+    def forward(amplitude: Tensor, height: Tensor, path: Tensor, sampling: Sampling) -> Tensor:
+        return _computed(Screens.of(amplitude, height, path), sampling, False)[0]
+
+    @staticmethod
+    def setup_context(ctx: Any, inputs: tuple[Any, ...], output: Tensor) -> None:
+        ctx.save_for_backward(*inputs[:3])
+        ctx.sampling = inputs[3]
+
+    @staticmethod
+    def backward(ctx: Any, weight: Tensor) -> tuple[Tensor | None, ...]:
+        return (*_Gradient.apply(weight, *ctx.saved_tensors, ctx.sampling), None)  # type: ignore[no-untyped-call]
+
+
+class _Gradient(torch.autograd.Function):
+    """The gradients of amplitude, height and path. Behind it nothing is differentiated in silence."""
+
+    @staticmethod
+    def forward(weight: Tensor, amplitude: Tensor, height: Tensor, path: Tensor, sampling: Sampling) -> Any:
+        fields = [None] * len(sampling.views)
+        return tuple(_adjoint(weight, Screens.of(amplitude, height, path), sampling, fields, (True, True, True)))
+
+    @staticmethod
+    def setup_context(ctx: Any, inputs: tuple[Any, ...], output: Any) -> None:
+        pass
+
+    @staticmethod
+    def backward(ctx: Any, *grads: Tensor) -> Any:
+        raise RuntimeError(_ONCE)
+
+
+def _computed(screens: Screens, sampling: Sampling, keep: bool) -> tuple[Tensor, list[Tensor | None]]:
+    """Return the intensity, and the focal field of each view where they are kept and not too large."""
+    views, shape = sampling.views, (sampling.views[0].rows.n_out, sampling.views[0].columns.n_out)
+    device, fields, done = screens.height.device, list[Tensor | None](), -1
+    intensity = torch.empty(views[-1].band + 1, *shape, dtype=sampling.dtype, device=device)
+    keep = keep and 2 * len(views) * intensity[0].nbytes <= KEPT_FIELD_BYTES
+    with borrowed(sampling.dtype, device) as work:
+        for view in views:
+            kept = torch.empty(2, *shape[::-1], dtype=sampling.dtype, device=device) if keep else None
+            field = Field(screens, view, sampling.dtype)
+            _power(field, intensity[view.band], view.band == done, kept, sampling.method, work)
+            fields.append(kept)
+            done = view.band
+    return intensity, fields
+
+
+def _adjoint(
+    weight: Tensor,
+    screens: Screens,
+    sampling: Sampling,
+    fields: Sequence[Tensor | None],
+    needs: Sequence[bool],
+) -> list[Tensor | None]:
+    """Return the gradients of amplitude, height and path that are needed; a field that was not kept is made again."""
+    grads = [torch.zeros_like(x) if need else None for x, need in zip(screens[:3], needs, strict=True)]
+    with borrowed(weight.dtype, weight.device) as work:
+        for view, kept in zip(sampling.views, fields, strict=True):
+            field = Field(screens, view, weight.dtype)
+            planes = kept if kept is not None else _focal(field, sampling, work)
+            _add_gradient(field, planes, weight[view.band], grads, sampling.method, work)
+    return grads
 
 
 def _scaled(view: View, values: Tensor, rows: slice, columns: slice) -> Tensor:

@@ -13,9 +13,12 @@ from neusee.workflows.engine.node_call import RunError
 from neusee.workflows.engine.runner import run
 from neusee.workflows.graph.diagnostics import Location
 from neusee.workflows.graph.recipe_graph import Recipe, Step
+from neusee.workflows.recipe.loading import load
 from neusee.workflows.store.result_store import Store
 
 CALLS: list[str] = []
+SMALL = ["optics.samples=96", "optics.pitch=84.15 um", "optics.bands=5", "optics.window=[24, 24]"]
+SMALL += ["scene.shape=[32, 32]", "sensor.shape=[24, 24]"]
 
 
 @node()
@@ -224,3 +227,42 @@ def test_the_ends_of_a_picture_are_those_of_its_facts(values):
     for name in ("shape", "dtype", "min", "max", "finite", "sum", "support"):
         one, other = getattr(quick, name), getattr(whole, name)
         assert one == other or (one != one and other != other), name
+
+
+def test_torch_func_follows_it_backwards_as_autograd_does(store):
+    """A given value is a view of a larger tensor: it is settled, although what `torch.func` follows owns no memory."""
+    function = as_function(camera(), "height", outputs=["loss"], store=store)
+    given = torch.linspace(-1.0, 1.0, 128, dtype=torch.float64)[::2]
+    found, pull = torch.func.vjp(lambda x: function({"height": x})["loss"], given)
+    leaf = given.clone().requires_grad_()
+    expected = function({"height": leaf})["loss"]
+    assert torch.equal(found, expected.detach())
+    torch.testing.assert_close(pull(torch.ones_like(found))[0], torch.autograd.grad(expected, leaf)[0])
+
+
+def test_torch_func_follows_a_parameter(store):
+    function = as_function(camera(), "image[a].gain", outputs=["loss"], store=store)
+
+    def loss(gain):
+        return function({"image[a].gain": gain})["loss"]
+
+    gain = torch.tensor(2.0, dtype=torch.float64)
+    leaf = gain.clone().requires_grad_()
+    torch.testing.assert_close(torch.func.grad(loss)(gain), torch.autograd.grad(loss(leaf), leaf)[0])
+
+
+@pytest.mark.parametrize("output", ["lsr[mask]", "raw[mask]"])
+def test_torch_func_follows_the_camera(output, store):
+    recipe = load("laser_free", SMALL, doe="axicon")
+    function = as_function(recipe, "element", outputs=[output], store=store)
+    height = run(recipe, store, ["element"])["element"]
+
+    def result(height):
+        return function({"element": height})[output]
+
+    found, pull = torch.func.vjp(result, height)
+    weight = torch.rand(found.shape, dtype=found.dtype, generator=torch.Generator().manual_seed(1))
+    leaf = height.clone().requires_grad_()
+    expected = result(leaf)
+    assert torch.equal(found, expected.detach())
+    torch.testing.assert_close(pull(weight)[0], torch.autograd.grad(expected, leaf, weight)[0])

@@ -1,0 +1,75 @@
+"""What a laser does to a camera: a YAML recipe runs as a graph of cached, differentiable physical steps.
+
+    import neusee
+
+    recipe = neusee.load("laser_free", doe="axicon", sensor={"read_noise": "20 e-"})
+    result = neusee.run(recipe, outputs=["lsr[mask]", "raw[mask]"])
+    result.metrics()["lsr[mask]"], result.numpy("raw[mask]")
+    table = neusee.sweep("laser_free", axes={"doe": ["axicon", "vortex"]}, changes={"outputs": ["lsr[mask]"]}).table()
+
+Every verb takes a recipe's name or file first, and options by name after it: `run` gives values, `sweep` a table over
+values of parameters, `train` learns a mask and its restoration, `evaluate` judges masks and restorers, `calibrate`
+finds the posterior of a sensor, and `study` tells what the numbers of a recipe are worth. `run`, `train`, `calibrate`
+and `study` also take what `load` returned.
+
+A caller may want to catch: `RecipeError` (a mistake in a recipe, before anything runs), `RunError` (a step failed) and
+`ParameterError` (a node refuses a parameter). ``recipes/guide/exceptions.md`` lists every exception and who raises it,
+``recipes/guide/torch_func.md`` the nodes that work under `torch.func`; ``neusee --help`` lists the commands.
+
+Names are imported when they are first used: ``import neusee`` takes no time, and loads neither torch nor pydantic.
+"""
+
+TYPE_CHECKING = False  # as in `typing`, whose import would take longer than all else here
+if TYPE_CHECKING:
+    from typing import Any
+
+    from neusee.nodes import ParameterError
+    from neusee.workflows import RecipeError, Result, RunError, Store, as_function, load
+    from neusee.workflows.api.verbs import calibrate, evaluate, run, study, sweep, train
+    from neusee.workflows.graph.recipe_graph import Recipe, Step
+    from neusee.workflows.sweeps.sweep_run import Sweep
+
+__version__ = "0.1.0"
+
+_VERBS = ("calibrate", "evaluate", "run", "study", "sweep", "train")
+_HOME = {
+    "ParameterError": "nodes",
+    "Sweep": "workflows.sweeps.sweep_run",
+    **dict.fromkeys(("Recipe", "RecipeError", "Result", "RunError", "Step", "Store"), "workflows"),
+    **dict.fromkeys(("as_function", "load"), "workflows"),
+    **dict.fromkeys(_VERBS, "workflows.api.verbs"),
+}
+
+__all__ = [
+    "ParameterError",
+    "Recipe",
+    "RecipeError",
+    "Result",
+    "RunError",
+    "Step",
+    "Store",
+    "Sweep",
+    "__version__",
+    "as_function",
+    "calibrate",
+    "evaluate",
+    "load",
+    "run",
+    "study",
+    "sweep",
+    "train",
+]
+
+
+def __getattr__(name: str) -> "Any":
+    """Import a public name when it is first used."""
+    if name not in _HOME:
+        raise AttributeError(f"module 'neusee' has no attribute {name!r}")
+    import importlib
+
+    found = globals()[name] = getattr(importlib.import_module(f"neusee.{_HOME[name]}"), name)
+    return found
+
+
+def __dir__() -> list[str]:
+    return sorted({*globals(), *__all__})

@@ -1,0 +1,83 @@
+"""The table of ``recipes/guide/torch_func.md``: every line is run, and what says no must not pass."""
+
+import re
+from pathlib import Path
+
+import pytest
+import torch
+
+from tests.nodes import torch_func_probe
+from tests.nodes.test_contract import NODES
+from tests.nodes.torch_func_cases import NOTHING_TO_FOLLOW, cases
+from tests.nodes.torch_func_probe import TRANSFORMS, Differs, followed, function_of
+
+PAGE = Path(__file__).parents[2] / "recipes" / "guide" / "torch_func.md"
+LINES = re.findall(r"^\| `(\S+)` \|(.*)\|$", PAGE.read_text(encoding="utf-8"), re.MULTILINE)
+TABLE = {
+    path: dict(zip(("of", *TRANSFORMS, "why"), map(str.strip, rest.split("|")), strict=True)) for path, rest in LINES
+}
+BY_PATH = {node.path: node for node in NODES}
+pytestmark = pytest.mark.filterwarnings("ignore")  # of fallbacks of vmap, and of what a half-known sensor warns of
+
+
+@pytest.fixture(scope="module")
+def every_case(tmp_path_factory):
+    return cases(tmp_path_factory.mktemp("weights"))
+
+
+def test_the_table_has_a_line_for_every_node(every_case):
+    assert [path for path, _ in LINES] == sorted(BY_PATH)
+    assert sorted({*every_case, *NOTHING_TO_FOLLOW}) == sorted(BY_PATH)
+
+
+@pytest.mark.parametrize("path", NOTHING_TO_FOLLOW)
+def test_a_node_without_a_tensor_says_why(path):
+    line = dict.fromkeys(TRANSFORMS, "–")
+    assert TABLE[path] == {"of": "", **line, "why": NOTHING_TO_FOLLOW[path]}
+    assert BY_PATH[path].inputs == () or path == "scene.hyperspectral"  # whose bands only choose what is read
+
+
+@pytest.mark.parametrize("path", sorted(set(BY_PATH) - set(NOTHING_TO_FOLLOW)))
+def test_the_line_names_the_tensor_and_gives_a_reason_where_something_does_not_pass(path, every_case):
+    first, *rest = every_case[path].of.split(".")
+    name = ".".join([BY_PATH[path].inputs[int(first)] if first.isdecimal() else first, *rest])
+    line = TABLE[path]
+    assert line["of"] == f"`{name}`"
+    assert bool(line["why"]) == any(line[transform] != "yes" for transform in TRANSFORMS)
+
+
+@pytest.mark.parametrize("transform", TRANSFORMS)
+@pytest.mark.parametrize("path", sorted(set(BY_PATH) - set(NOTHING_TO_FOLLOW)))
+def test_what_the_table_says_is_so(path, transform, every_case):
+    function, x = function_of(BY_PATH[path], every_case[path])
+    compare, said = getattr(torch_func_probe, transform), TABLE[path][transform]
+    if said == "yes":
+        compare(function, x)
+    elif said == "no":
+        with pytest.raises((Differs, RuntimeError, NotImplementedError, ValueError, TypeError)):
+            compare(function, x)
+    else:
+        assert (said, transform == "vmap") == ("–", False)
+        assert not _has_a_derivative(function, x)
+
+
+def _has_a_derivative(function, x):
+    try:
+        return any(followed(function, x))
+    except (TypeError, RuntimeError):  # it takes a number alone
+        return False
+
+
+def test_a_transform_that_gives_something_else_is_found():
+    x = torch.rand(3, dtype=torch.float64)
+
+    def straight_through(x):
+        with torch.no_grad():
+            rest = x.round() - x
+        return (x + rest,)
+
+    torch_func_probe.vjp(straight_through, x)
+    with pytest.raises(Differs):
+        torch_func_probe.jvp(straight_through, x)
+    with pytest.raises(Differs):
+        torch_func_probe._close(x, x + 1e-6)

@@ -1,0 +1,225 @@
+"""One small call of every node, and the tensor or the parameter of it that `torch.func` shall follow."""
+
+from dataclasses import dataclass, field
+from functools import partial
+from pathlib import Path
+from typing import Any
+
+import torch
+from safetensors.torch import save_file
+
+from neusee.nodes import calibrate, doe, spectra
+from neusee.nodes.restore._networks._fft_mamba import FFTMamba
+from neusee.nodes.restore._networks._nafnet import NAFNet
+from neusee.nodes.restore._networks._restorer import started
+from neusee.nodes.restore._networks._unet import UNet
+from neusee.nodes.values import Channels, Dirt, Mixture, Psf, Pupil
+
+HERE = Path(__file__).parent
+
+
+@dataclass
+class Case:
+    """A call, and where the tensor stands: an input and its field (``0.intensity``), or a parameter."""
+
+    of: str
+    inputs: tuple[Any, ...] = ()
+    params: dict[str, Any] = field(default_factory=dict)
+
+
+def seeded(seed=0):
+    return torch.Generator().manual_seed(seed)
+
+
+def rand(*shape, dtype=torch.float64, low=0.1, seed=0):
+    return low + torch.rand(*shape, dtype=dtype, generator=seeded(sum(shape) + seed))
+
+
+BANDS = spectra.bands(start=450e-9, stop=650e-9, count=4)
+LINE = spectra.line(wavelength=532e-9, fwhm=5e-9, count=3)
+INDEX = doe.material(BANDS)
+LIGHT = spectra.illuminant(BANDS)
+RESPONSES = spectra.responses(BANDS)
+PICTURE, OTHER, SCENE, PLAIN = rand(3, 12, 12), rand(3, 12, 12, seed=1), rand(4, 12, 12), rand(4, 12, 12, seed=1)
+RAW = 2000 * rand(3, 12, 12)
+WIDE_RAW = 2000 * rand(3, 48, 48)  # no longer solved exactly
+PSF = Psf(rand(4, 9, 9) / 100, rand(4))
+WIDE = Psf(rand(4, 12, 12) / 200, rand(4))
+DISC = torch.ones(16, 16)
+HEIGHT = rand(16, 16, dtype=torch.float32) * 1e-6
+PUPIL = Pupil(DISC, DISC, HEIGHT, 0 * HEIGHT, INDEX, BANDS.centres, torch.tensor(5e-4, dtype=torch.float64))
+DIRT = Dirt(rand(16, 16, dtype=torch.float32), HEIGHT)
+MIXTURE = Mixture(rand(2, 12, 12), rand(4, 2), torch.zeros(3, 4, dtype=torch.float64))
+ROWS = spectra.rows(BANDS, RESPONSES)
+CHANNELS = Channels(rand(3, 12, 12), rand(3, 4), rand(4), torch.tensor(0.0, dtype=torch.float64))
+LEVEL = 1e3 * rand(4)
+DIRECTION = torch.tensor([1e-4, -2e-4], dtype=torch.float64)
+
+GRID = {"samples": 16, "pitch": 5e-4, "diameter": 8e-3}
+LENS = {"focal_length": 0.11, "pixel_pitch": 2.9e-6}
+WELL = {"full_well": 25500.0, "quantum_efficiency": 0.56, "pixel_pitch": 2.9e-6, "exposure": 0.1}
+SHUTTER = {"pixel_pitch": 2.9e-6, "exposure": 0.1}
+ADC = {"full_well": 25500.0, "gain": 0.37}
+NOISE = {"quantum_efficiency": 0.56, "dark_current": 2.0, "dark_exposure": 0.1, "pedestal": 50.0, "full_well": 5e4}
+CAMERA = {"gain": 2.0, **NOISE, "sigma": 3.0, "bits": 12}
+
+
+def _levels():
+    """Dark and lit frames of a small sensor."""
+    photons = (0.0, 500.0, 2000.0, 8000.0)
+    lit = [calibrate.expose(photons=n, exposure=0.1, shape=(16, 16), rng=seeded(3), **CAMERA) for n in photons]
+    each = [calibrate.reduce(f, photons=n, exposure=0.1) for f, n in zip(lit, photons, strict=True)]
+    return lit[1], each, calibrate.levels(each)
+
+
+FRAMES, EACH, LEVELS = _levels()
+SUFFICIENT = calibrate.sufficient(LEVELS)
+
+
+def number(x):
+    return torch.tensor(x, dtype=torch.float64)
+
+
+def saved(folder, name, make):
+    """A network's file, with weights that are not those of its start."""
+    network = started(make, seeded())
+    with torch.no_grad():
+        for i, p in enumerate(network.parameters()):
+            p.add_(0.05 * torch.randn(p.shape, generator=seeded(i)))
+    save_file(network.state_dict(), folder / f"{name}.safetensors")
+    return folder / f"{name}.safetensors"
+
+
+def _networks(folder):
+    sizes = {"width": 4, "blocks": 2, "states": 3}
+    single = PICTURE.float()
+    return {
+        "restore.fft_mamba": Case(
+            "0", (single,), {"weights": saved(folder, "fft_mamba", partial(FFTMamba, **sizes)), **sizes}
+        ),
+        "restore.nafnet": Case("0", (single,), {"weights": saved(folder, "nafnet", partial(NAFNet, 4)), "width": 4}),
+        "restore.unet": Case("0", (single,), {"weights": saved(folder, "unet", partial(UNet, 4)), "width": 4}),
+        "spectra.lift_mst_plus_plus": Case(
+            "0",
+            (rand(3, 16, 16, dtype=torch.float32), spectra.bands(start=400e-9, stop=700e-9, count=31)),
+            {"untrained": "allow"},
+        ),
+    }
+
+
+CASES = {
+    "calibrate.camera": Case(
+        "gain", (LEVELS,), {"gain": number(2.0), "quantum_efficiency": 0.56, "dark_signal": 25.0, "dark_noise": 3.0}
+    ),
+    "calibrate.density": Case("gain", (SUFFICIENT,), {"gain": number(2.0), **NOISE, "read_noise": 3.0, "bits": 12}),
+    "calibrate.expose": Case("photons", (), {"photons": number(500.0), "exposure": 0.1, "shape": (4, 4), **CAMERA}),
+    "calibrate.least_squares": Case("0.variance", (LEVELS,)),
+    "calibrate.levels": Case("0.0.mean", (EACH,)),
+    "calibrate.reduce": Case("0", (FRAMES,), {"photons": 500.0, "exposure": 0.1}),
+    "calibrate.sufficient": Case("0.mean", (LEVELS,)),
+    "doe.axicon": Case("waves", (), {"waves": number(2.0), **GRID}),
+    "doe.cubic": Case("waves", (), {"waves": number(2.0), **GRID}),
+    "doe.fabricate": Case("0", (HEIGHT,), {"wrap_at": 550e-9, "levels": 4}),
+    "doe.half_rings": Case("waves.0", (), {"waves": [number(2.0), number(1.0)], **GRID}),
+    "doe.material": Case("0.centres", (BANDS,)),
+    "doe.smooth": Case("0", (HEIGHT,), {"feature": 1e-3, **GRID}),
+    "doe.spiral_axicon": Case("waves", (), {"waves": number(2.0), "charge": 1, **GRID}),
+    "doe.zernike": Case("coefficients.4", (), {"coefficients": {4: number(0.3), 6: number(0.1)}, **GRID}),
+    "flare.dirt": Case("grease", (), {"grease": number(1e-7), "dust": 3.0, **GRID}),
+    "flare.ghosts": Case("0", (rand(3, 12, 12), LINE, DIRECTION), {**LENS, "count": 3, "radius": 3e-5}),
+    "losses.bsr": Case("0", (SCENE, PLAIN)),
+    "losses.charbonnier": Case("0", (PICTURE, OTHER)),
+    "losses.contrast": Case("0.intensity", (WIDE,)),
+    "losses.fft_l1": Case("0", (PICTURE, OTHER)),
+    "losses.gradient_penalty": Case("0", (rand(2, 3, 5),)),
+    "losses.lsr": Case("0.intensity", (PSF,)),
+    "losses.mrae": Case("0", (SCENE, PLAIN)),
+    "losses.wiener": Case("0.intensity", (WIDE, LIGHT, RESPONSES, BANDS)),
+    "metrics.bsr": Case("0", (SCENE, PLAIN)),
+    "metrics.encircled": Case("0.intensity", (PSF,), {"pixel_pitch": 2.9e-6, "radius": 8e-6}),
+    "metrics.limits": Case("0.clear_peak", (PSF,)),
+    "metrics.lsr": Case("0.intensity", (PSF,)),
+    "metrics.mtf": Case("0.intensity", (WIDE,)),
+    "metrics.peak": Case("0", (SCENE, BANDS, LEVEL), WELL),
+    "metrics.quality": Case("0", (PICTURE.float(), OTHER.float())),
+    "metrics.saturated": Case("0", (RAW,), ADC),
+    "optics.direction": Case("focal_length", (), {**LENS, "focal_length": number(0.11), "shape": (64, 64)}),
+    "optics.image": Case("1.intensity", (SCENE, PSF)),
+    "optics.image_channels": Case("1.intensity", (MIXTURE, PSF, ROWS)),
+    "optics.psf": Case("0.height", (PUPIL,), {**LENS, "shape": (9, 9)}),
+    "optics.pupil": Case("0", (HEIGHT, INDEX, BANDS, DIRT), {"pitch": 5e-4, "diameter": 8e-3}),
+    "optics.spot": Case("0.intensity", (Psf(rand(3, 9, 9), rand(3)), LINE), {"strength": 10.0, **WELL}),
+    "restore.clipped": Case("0", (RAW,), ADC),
+    "restore.colour": Case("0", (PICTURE, rand(3, 3))),
+    "restore.colour_matrix": Case("1", (BANDS, LIGHT, RESPONSES, LEVEL), {**SHUTTER, "quantum_efficiency": 0.56}),
+    "restore.electrons": Case("0", (RAW,), {"gain": 0.37, "pedestal": 50.0}),
+    "restore.wiener": Case(
+        "0", (WIDE_RAW, PSF, LIGHT, RESPONSES, BANDS, torch.zeros(3, 48, 48, dtype=torch.bool)), {"read_noise": 5.0}
+    ),
+    "scene.targets": Case("high", (), {"kind": "siemens", "shape": (12, 12), "high": number(0.9)}),
+    "sensor.crop": Case("0", (SCENE,), {"shape": (8, 8)}),
+    "sensor.dark_current": Case("0", (RAW,), {"mean": 2.0, "full_well": 25500.0}),
+    "sensor.digitize": Case("0", (RAW,), {"gain": 0.37}),
+    "sensor.expose": Case("0", (SCENE, BANDS, RESPONSES, LEVEL), SHUTTER),
+    "sensor.full_well": Case("0", (RAW,), {"capacity": 3000.0}),
+    "sensor.gather": Case("0", (RAW, [RAW], [RAW])),
+    "sensor.level": Case("0", (SCENE, BANDS, RESPONSES), {"strength": 0.7, **WELL}),
+    "sensor.limits": Case(
+        "read_noise", (), {"full_well": 25500.0, "quantum_efficiency": 0.56, "read_noise": number(5.0)}
+    ),
+    "sensor.photon_noise": Case("0", (RAW,), {"quantum_efficiency": 0.56}),
+    "sensor.photon_transfer": Case(
+        "full_well",
+        (),
+        {
+            **ADC,
+            "full_well": number(25500.0),
+            "quantum_efficiency": 0.56,
+            "pedestal": 50.0,
+            "sigma": 3.0,
+            "dark": 2.0,
+            "levels": 3,
+            "pixels": 64,
+        },
+    ),
+    "sensor.read_noise": Case("0", (RAW,), {"pedestal": 50.0, "sigma": 3.0}),
+    "sensor.saturation": Case("0.centres", (BANDS,), WELL),
+    "spectra.bands": Case("start", (), {"start": number(450e-9), "stop": 650e-9, "count": 4}),
+    "spectra.compress": Case("0", (SCENE,)),
+    "spectra.filters": Case("centres.0", (), {"centres": [number(500e-9), number(600e-9)], "widths": [1e-8, 1e-8]}),
+    "spectra.grain": Case("0", (PICTURE,)),
+    "spectra.illuminant": Case("0.centres", (BANDS,)),
+    "spectra.illuminate": Case("0", (SCENE, LIGHT)),
+    "spectra.leaves": Case("0", (rand(5, 4), BANDS), {"shape": (12, 12)}),
+    "spectra.lift_lmmse": Case("0", (PICTURE, BANDS)),
+    "spectra.lift_lmmse_mixture": Case("0", (PICTURE, BANDS)),
+    "spectra.lift_mallett": Case("0", (PICTURE, BANDS)),
+    "spectra.lift_mallett_mixture": Case("0", (PICTURE, BANDS)),
+    "spectra.line": Case("wavelength", (), {"wavelength": number(532e-9)}),
+    "spectra.metamers": Case("0", (rand(5, 4), BANDS), {"count": 4}),
+    "spectra.reflectances": Case("0.centres", (BANDS,)),
+    "spectra.render": Case("0", (SCENE, BANDS)),
+    "spectra.responses": Case("0.centres", (BANDS,)),
+    "spectra.rows": Case("1", (BANDS, RESPONSES)),
+}
+
+#: nodes that take no tensor and no parameter that could be one
+NOTHING_TO_FOLLOW = {
+    "calibrate.camera_prior": "states the prior that a recipe writes",
+    "calibrate.descriptor": "reads a file",
+    "calibrate.frames": "reads files",
+    "calibrate.prior": "states the prior that a recipe writes",
+    "calibrate.table": "reads a file",
+    "doe.flat": "has no parameter but its grid",
+    "doe.pixelwise": "reads a file, or draws heights that are to be learnt",
+    "doe.unet": "draws a network that is to be learnt",
+    "doe.vortex": "has a whole charge alone",
+    "scene.exr": "reads a file",
+    "scene.hyperspectral": "reads a file",
+    "scene.photograph": "reads a file",
+}
+
+
+def cases(folder):
+    """Every case; the files of networks are written to ``folder``."""
+    return CASES | _networks(folder)

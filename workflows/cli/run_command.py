@@ -1,0 +1,103 @@
+"""``neusee run``: a recipe from the cache where it can, its report, and one line for each step."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated
+
+import typer
+
+from neusee.workflows.cli.command_frame import (
+    MISSED,
+    Debug,
+    Device,
+    Exact,
+    Memory,
+    Out,
+    Words,
+    bytes_of,
+    check_device,
+    executor_of,
+    fail,
+    load,
+    say,
+    the_store,
+)
+
+if TYPE_CHECKING:
+    from neusee.workflows.engine.step_job import Executor
+    from neusee.workflows.graph.recipe_graph import Recipe
+    from neusee.workflows.simulation.simulate_recipe import Simulation
+    from neusee.workflows.store.result_store import Store
+
+Where = Annotated[
+    str, typer.Option("--executor", help="Who computes: local, dask, dask:4 (workers), or tcp://scheduler:8786.")
+]
+
+
+def run(
+    words: Words = None,
+    as_json: Annotated[bool, typer.Option("--json", help="Print one JSON document instead of the table.")] = False,
+    quiet: Annotated[bool, typer.Option("--quiet", help="Print only the path of the report.")] = False,
+    debug: Debug = False,
+    device: Device = "cpu",
+    executor: Where = "local",
+    memory: Memory = "",
+    exact: Exact = False,
+    out: Out = Path("runs"),
+) -> None:
+    """Run a recipe and write its report.
+
+    Steps whose results are in the cache are not computed again. Without a name the recipe is first_light. The folder
+    of results holds report.html, the numbers, the pictures and the recipe with every final value.
+    """
+    recipe, command = load(words, exact=exact)
+    from neusee.workflows.report import console
+
+    check_device(device)
+    room = bytes_of(memory, "--memory") if memory else None
+    if not (as_json or quiet):
+        say(console.opening(recipe, " ".join(command[1:])))
+    store = the_store()
+    if room is not None:
+        _refuse_too_large(recipe, store, device, room)
+    with executor_of(executor, store) as carries_out:
+        done = _simulate(recipe, store, command, device, out, as_json or quiet, carries_out, room)
+    if as_json:
+        import json
+
+        say([json.dumps({"report": str(done.page), **done.document}, ensure_ascii=False)])
+    elif quiet:
+        say([str(done.page)])
+    else:
+        say(console.closing(done.document, str(done.page), console.next_commands(recipe)))
+    if done.document["missed"]:
+        raise typer.Exit(MISSED)
+
+
+def _refuse_too_large(recipe: Recipe, store: Store, device: str, memory: int) -> None:
+    """Stop before anything runs where, as far as earlier runs tell, the memory cannot do."""
+    from neusee.workflows.engine.local_executor import lanes_of
+    from neusee.workflows.explain.run_forecast import planned
+
+    if refused := planned(recipe, store, lanes_of(device.split(","), memory)).refused:
+        fail(f"--memory: {refused}")
+
+
+def _simulate(
+    recipe: Recipe,
+    store: Store,
+    command: list[str],
+    device: str,
+    out: Path,
+    silent: bool,
+    executor: Executor | None,
+    memory: int | None,
+) -> Simulation:
+    from neusee.workflows.report.console import screen
+    from neusee.workflows.simulation.simulate_recipe import simulate, steps_of, wanted
+    from neusee.workflows.tolerance.cheaper_steps import with_substitutions
+
+    recipe = with_substitutions(recipe, wanted(recipe))
+    with screen(recipe, steps_of(recipe), silent) as shown:
+        return simulate(recipe, store, out, command, device, shown.watch, executor, memory)
