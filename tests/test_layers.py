@@ -1,54 +1,365 @@
-"""Layers: nodes know nothing of workflows, one room for emcee, full names, and nothing heavy on import."""
+"""Layers: nodes know nothing of workflows, a room of workflows imports earlier rooms alone, and nothing is heavy.
+
+Every rule of a room is a function from the files of workflows to its offences, so that a test can plant one.
+"""
 
 import ast
 import functools
+import itertools
+import re
 import subprocess
 import sys
+from collections import Counter, defaultdict
 from pathlib import Path
+from typing import NamedTuple
 
 import pytest
 
 ROOT = Path(__file__).parents[1]
+HOUSE = ROOT / "workflows"
 NODES, WORKFLOWS = sorted(ROOT.glob("nodes/**/*.py")), sorted(ROOT.glob("workflows/**/*.py"))
 HEAVY = {"colour", "kornia", "OpenEXR", "scipy", "matplotlib", "skimage"}
 FORBIDDEN_IN_NODES = {"yaml", "ruamel", "emcee", "typer", "rich", "jinja2", "logging", "xxhash"}
 
+# --- what is allowed --------------------------------------------------------------------------------------------------
 
+#: The rooms in order: a file imports its own room and earlier ones.
+ROOMS = (
+    "graph", "keys", "recipe.text", "recipe.blocks", "recipe.distributions", "recipe", "store", "placement",
+    "tolerance", "engine", "report.figures", "report", "explain", "simulation", "sweeps", "training.parallel",
+    "training.mask_design", "training", "training.lift", "evaluation", "calibration", "studies", "studies.accuracy",
+    "studies.stability", "studies.leave_out", "studies.uncertainty", "studies.calibration", "api", "cli",
+)  # fmt: skip
+DOOR = ""  #: neusee.workflows itself, which offers names of all rooms: no room imports it
+
+#: From a room to a later one, in a function or for types alone.
+UPWARD = {
+    ("graph", "engine"): "type-only, and lazy: Recipe.run runs the recipe",
+    ("graph", "store"): "type-only: the store that Recipe.run takes",
+    ("graph", "recipe.blocks"): "type-only: what a recipe says of its training",
+    ("graph", "recipe.distributions"): "type-only: what a recipe is not sure of",
+    ("graph", "report"): "lazy representation: what a notebook shows of a recipe",
+    ("engine", "report"): "lazy representation: what a notebook shows of a result, and its numbers",
+    ("recipe.distributions", "recipe"): "lazy: a recipe with drawn values is checked again as a whole",
+}
+
+#: Rooms that answer a command each, and do not import one another.
+COMMANDS = ("explain", "simulation", "sweeps", "training", "calibration", "evaluation", "studies")
+ACROSS = {
+    ("simulation", "explain"): "a run says why each of its steps ran",
+    ("studies", "calibration"): "the study of calibration judges the posterior that this room computes",
+}
+
+#: Calls that import a module by a name that is only known when they run.
+DYNAMIC = {
+    "__init__.py": "the names that workflows offers are imported when they are first used",
+    "report/run_pictures.py": "report.contents names the function that draws each picture",
+    "studies/run_study.py": "a kind of study names its room",
+    "recipe/step_declarations.py": "a recipe names the family of a node",
+    "cli/catalogue.py": "a family of nodes is listed with its own words",
+    "store/serialization.py": "a stored result names the class of its values",
+    "training/tensorboard_log.py": "TensorBoard is optional, and has no types",
+}
+
+#: Files that may use pi.
+PI = {
+    "recipe/blocks/train_lift_block.py": "half a cosine, along which the rate of training falls",
+    "training/mask_design/optimizers.py": "half a cosine, along which a rate falls, and the bound of an angle",
+}
+MEASURED = {
+    "clear_peak",
+    "wavelengths",
+    "centres",
+}  #: fields of neusee.nodes.values that formulas of optics are made of
+
+TWICE = {("studies", "Bench"), ("studies", "Found"), ("studies", "Row")}  #: public classes, until they are renamed
+MOST_LINES = 5000  #: of a room with its inner rooms
+
+# --- what a file says -------------------------------------------------------------------------------------------------
+
+
+class Import(NamedTuple):
+    """One name that is imported."""
+
+    module: str
+    name: str  #: empty: the module itself
+    line: int
+    when: str  #: top, function or type
+
+    @property
+    def full(self):
+        return f"{self.module}.{self.name}".rstrip(".")
+
+
+@functools.cache
 def imports(tree):
-    """Every module that is imported, and whether at module level."""
-    top = set(map(id, tree.body))
-    for item in ast.walk(tree):
+    """Every name that is imported, and when: at module level, in a function, or for types alone."""
+    return tuple(_imports(tree, "top"))
+
+
+def _imports(tree, when):
+    for item in ast.iter_child_nodes(tree):
+        inner = when
+        if isinstance(item, ast.FunctionDef | ast.AsyncFunctionDef | ast.Lambda):
+            inner = "function"
+        elif isinstance(item, ast.If) and "TYPE_CHECKING" in ast.unparse(item.test):
+            inner = "type"
         if isinstance(item, ast.ImportFrom):
             assert item.level == 0, "import by the full name"
-            yield item.module, id(item) in top
+            yield from (Import(item.module, alias.name, item.lineno, when) for alias in item.names)
         elif isinstance(item, ast.Import):
-            yield from ((a.name, id(item) in top) for a in item.names)
+            yield from (Import(alias.name, "", item.lineno, when) for alias in item.names)
+        else:
+            yield from _imports(item, inner)
 
 
 @functools.cache
 def parsed(path):
-    return list(imports(ast.parse(path.read_text())))
+    return ast.parse(path.read_text())
 
+
+def house():
+    """The files of workflows: syntax trees by path."""
+    return {path.relative_to(HOUSE).as_posix(): parsed(path) for path in WORKFLOWS}
+
+
+def alone(file, code=""):
+    """One file, with more code in it."""
+    if not code:
+        return {file: parsed(HOUSE / file)}
+    source = (HOUSE / file).read_text() if (HOUSE / file).exists() else ""
+    return {file: ast.parse(f"{source}\n{code}\n")}
+
+
+def room_of(module):
+    """The innermost room of a module below neusee.workflows."""
+    return next((room for room in sorted(ROOMS, key=len, reverse=True) if f"{module}.".startswith(f"{room}.")), DOOR)
+
+
+def home(file):
+    return room_of(file.removesuffix(".py").removesuffix("/__init__").replace("/", "."))
+
+
+def outer(room):
+    return room.partition(".")[0]
+
+
+def edges(files):
+    """(from, to, when, where) of every import from one room to another."""
+    for file, tree in files.items():
+        for each in imports(tree):
+            if f"{each.full}.".startswith("neusee.workflows."):
+                target = room_of(each.full.removeprefix("neusee.workflows").lstrip("."))
+                if target != home(file):
+                    yield home(file), target, each.when, f"{file}:{each.line}: {each.full}"
+
+
+def is_later(room, other):
+    return other == DOOR or (room != DOOR and ROOMS.index(other) > ROOMS.index(room))
+
+
+# --- the rules: offences of a house -----------------------------------------------------------------------------------
+
+
+def direction(files):
+    """Imports of a later room, but for those in a function, or for types alone, that are allowed."""
+    allowed = {(source, target) for source, target in UPWARD}
+    for source, target, when, where in edges(files):
+        if source != DOOR and is_later(source, target) and (when == "top" or (source, target) not in allowed):
+            yield f"{where} ({when}): {source} imports {target or 'the whole of workflows'}, which comes later"
+
+
+def siblings(files):
+    """Imports between rooms that answer a command each, and between kinds of studies."""
+    for source, target, _, where in edges(files):
+        one, other = outer(source), outer(target)
+        if one != other and {one, other} <= set(COMMANDS) and (one, other) not in ACROSS:
+            yield f"{where}: {one} imports {other}"
+        if one == other == "studies" and "." in source and "." in target:
+            yield f"{where}: {source} imports {target}"
+
+
+def exits(files):
+    """Ends of the program, and imports of typer, outside cli."""
+    for file, tree in files.items():
+        if home(file) == "cli":
+            continue
+        yield from (f"{file}:{e.line}: {e.full}" for e in imports(tree) if outer(e.full) in ("typer", "click"))
+        for item in ast.walk(tree):
+            called = ast.unparse(item.func) if isinstance(item, ast.Call) else ""
+            raised = ast.unparse(item.exc) if isinstance(item, ast.Raise) and item.exc else ""
+            if called in ("sys.exit", "os._exit", "exit", "quit") or raised.startswith("SystemExit"):
+                yield f"{file}:{item.lineno}: {called or raised}"
+
+
+def terminal(files):
+    """Words to a terminal outside cli and the console of report."""
+    for file, tree in files.items():
+        if home(file) == "cli" or file == "report/console.py":
+            continue
+        names = [e for e in imports(tree) if outer(e.full) == "rich" or e.full in ("sys.stdout", "sys.stderr")]
+        yield from (f"{file}:{e.line}: {e.full}" for e in names)
+        for item in ast.walk(tree):
+            said = ast.unparse(item.func) if isinstance(item, ast.Call) else ast.unparse(item) if _dotted(item) else ""
+            if said in ("print", "input", "sys.stdout", "sys.stderr", "sys.__stdout__", "sys.__stderr__"):
+                yield f"{file}:{item.lineno}: {said}"
+
+
+def _dotted(item):
+    return isinstance(item, ast.Attribute) and isinstance(item.value, ast.Name)
+
+
+def samplers(files):
+    """Imports of emcee outside calibration."""
+    for file, tree in files.items():
+        if home(file) != "calibration":
+            yield from (f"{file}:{e.line}" for e in imports(tree) if outer(e.full) == "emcee")
+
+
+def private(files):
+    """Imports of an underscored module, or name, of nodes or of another file of workflows."""
+    for file, tree in files.items():
+        for each in imports(tree):
+            if each.full.startswith("neusee.") and re.search(r"\._[a-z]", each.full):
+                yield f"{file}:{each.line}: {each.full}"
+
+
+def dynamic(files, allowed=DYNAMIC):
+    """Calls that import a module by a name, but for those that are allowed."""
+    for file, tree in files.items():
+        for item in ast.walk(tree):
+            called = ast.unparse(item.func) if isinstance(item, ast.Call) else ""
+            if called.rpartition(".")[2] in ("import_module", "__import__") and file not in allowed:
+                yield f"{file}:{item.lineno}: {called}"
+
+
+def formulas(files, allowed=PI):
+    """Signs of a formula of physics: pi, a constant of nature, or arithmetic with what a node measured.
+
+    It sees pi of any library, imports of neusee.nodes.constants and scipy.constants, and a product, a quotient or a
+    power of `MEASURED` fields, unless the other side is a number: nanometres are no physics. It does not see a formula
+    that is written with plain names.
+    """
+    for file, tree in files.items():
+        for each in imports(tree):
+            if each.full.startswith(("neusee.nodes.constants", "scipy.constants")) or each.full == "math.pi":
+                yield f"{file}:{each.line}: {each.full}"
+        for item in ast.walk(tree):
+            if isinstance(item, ast.Attribute) and item.attr == "pi" and file not in allowed:
+                yield f"{file}:{item.lineno}: {ast.unparse(item)}"
+            if isinstance(item, ast.BinOp) and isinstance(item.op, ast.Mult | ast.Div | ast.Pow):
+                sides = (item.left, item.right)
+                if any(map(_is_measured, sides)) and not any(isinstance(side, ast.Constant) for side in sides):
+                    yield f"{file}:{item.lineno}: {ast.unparse(item)}"
+
+
+def _is_measured(side):
+    """Whether a value is a measured field, or a method, an item or a part of one."""
+    if isinstance(side, ast.Attribute):
+        return side.attr in MEASURED or (side.attr != "shape" and _is_measured(side.value))
+    if isinstance(side, ast.Call):
+        inside = side.args if ast.unparse(side.func) == "float" else []
+        return _is_measured(side.func) or any(map(_is_measured, inside))
+    if isinstance(side, ast.BinOp):
+        return _is_measured(side.left) or _is_measured(side.right)
+    return isinstance(side, ast.Subscript | ast.UnaryOp) and _is_measured(getattr(side, "value", None) or side.operand)
+
+
+def defined(tree):
+    """Names that a module defines at its top, without what it imports."""
+    for item in tree.body:
+        if isinstance(item, ast.FunctionDef | ast.AsyncFunctionDef | ast.ClassDef):
+            yield item.name
+        elif isinstance(item, ast.Assign | ast.AnnAssign):
+            targets = item.targets if isinstance(item, ast.Assign) else [item.target]
+            yield from (n.id for target in targets for n in ast.walk(target) if isinstance(n, ast.Name))
+
+
+def classes(files):
+    """Public classes of one name in a room with its inner rooms."""
+    found = Counter(
+        (file.partition("/")[0], item.name)
+        for file, tree in files.items()
+        for item in tree.body
+        if isinstance(item, ast.ClassDef) and not item.name.startswith("_")
+    )
+    yield from (
+        f"{room}: {name} is {n} classes" for (room, name), n in found.items() if n > 1 and (room, name) not in TWICE
+    )
+
+
+def names(files):
+    """Names in a room that are a module, or an inner room, and a public function too."""
+    modules, functions = defaultdict(set), defaultdict(set)
+    for file, tree in files.items():
+        room = file.partition("/")[0]
+        modules[room] |= set(file.removesuffix(".py").split("/")[1:]) - {"__init__"}
+        functions[room] |= {i.name for i in tree.body if isinstance(i, ast.FunctionDef) and not i.name.startswith("_")}
+    yield from (f"{room}: {name}" for room in modules for name in sorted(modules[room] & functions[room]))
+
+
+def places(files):
+    """Files outside of a room, rooms that the list does not name, and names of the list that are no room."""
+    for file in files:
+        folder = file.rpartition("/")[0].replace("/", ".")
+        if file != "__init__.py" and folder not in ROOMS:
+            yield f"{file} stands in no room of the list"
+    yield from (f"{room} is no room" for room in ROOMS if f"{room.replace('.', '/')}/__init__.py" not in files)
+
+
+def lengths(files, most=MOST_LINES):
+    """Rooms with too many lines, inner rooms counted with them."""
+    lines = Counter()
+    for file, tree in files.items():
+        path = HOUSE / file
+        lines[file.partition("/")[0]] += (
+            len(path.read_text().splitlines()) if path.exists() else tree.body[-1].end_lineno
+        )
+    yield from (f"{room}: {count} lines" for room, count in lines.items() if count > most)
+
+
+def offers(files):
+    """Rooms whose `__init__` does not ask a question and name what the room offers, or holds more than words."""
+    for room in ROOMS:
+        file = f"{room.replace('.', '/')}/__init__.py"
+        tree = files[file]
+        question, _, rest = (ast.get_docstring(tree) or "").partition("\n")
+        offered = re.findall(r"`(\w+)\.(\w+)`", rest.partition("Offers: ")[2])
+        if not question.endswith("?") or not offered:
+            yield f"{file}: no question, or nothing that it offers"
+        if len(tree.body) != 1:
+            yield f"{file}: more than a docstring"
+        for module, name in offered:
+            path = file.replace("__init__", module)
+            if path not in files or name not in defined(files[path]):
+                yield f"{file}: offers {module}.{name}, which is not there"
+
+
+FILE_RULES = (direction, siblings, exits, terminal, samplers, private, dynamic, formulas)
+HOUSE_RULES = (classes, names, places, lengths, offers)
+
+# --- the tests --------------------------------------------------------------------------------------------------------
 
 every_file = pytest.mark.parametrize("path", NODES + WORKFLOWS, ids=lambda p: str(p.relative_to(ROOT)))
 every_node_file = pytest.mark.parametrize("path", NODES, ids=lambda p: str(p.relative_to(ROOT)))
+every_workflow_file = pytest.mark.parametrize("path", WORKFLOWS, ids=lambda p: p.name)
 
 
 @every_file
 def test_the_house_is_imported_by_its_full_name(path):
-    assert not [n for n, _ in parsed(path) if n.split(".")[0] in ("nodes", "workflows", "recipes")]
+    assert not [e for e in imports(parsed(path)) if outer(e.module) in ("nodes", "workflows", "recipes")]
 
 
 @every_node_file
 def test_nodes_know_only_physics(path):
-    names = [n for n, _ in parsed(path)]
+    names = [e.full for e in imports(parsed(path))]
     assert not [n for n in names if n.startswith(("neusee.workflows", "neusee.recipes"))]
-    assert not [n for n in names if n.split(".")[0] in FORBIDDEN_IN_NODES]
+    assert not [n for n in names if outer(n) in FORBIDDEN_IN_NODES]
 
 
 @every_node_file
 def test_units_below_node_below_the_families(path):
-    names = {n for n, _ in parsed(path) if n.startswith("neusee.nodes")}
+    names = {e.module for e in imports(parsed(path)) if e.module.startswith("neusee.nodes")}
     allowed = {
         "units.py": set(),
         "constants.py": set(),
@@ -63,25 +374,140 @@ def test_units_below_node_below_the_families(path):
 @every_file
 def test_heavy_imports_wait_until_they_are_needed(path):
     if path.is_relative_to(ROOT / "nodes"):
-        assert not [n for n, top in parsed(path) if top and n.split(".")[0] in HEAVY]
+        assert not [e for e in imports(parsed(path)) if e.when == "top" and outer(e.module) in HEAVY]
 
 
-@pytest.mark.parametrize("path", WORKFLOWS, ids=lambda p: p.name)
+@every_workflow_file
 def test_only_calibration_imports_emcee(path):
-    if path.parent.name != "calibration":
-        assert not [n for n, _ in parsed(path) if n.split(".")[0] == "emcee"]
+    assert not list(samplers(alone(path.relative_to(HOUSE).as_posix())))
 
 
-LADDER = ["_marks", "_graph", "_keys", "_store", "_place", "_recipe", "_run", "cli"]
-
-
-@pytest.mark.parametrize("path", WORKFLOWS, ids=lambda p: p.name)
+@every_workflow_file
 def test_no_room_of_workflows_imports_one_above_it(path):
-    if path.stem not in LADDER:
-        return
-    above = set(LADDER[LADDER.index(path.stem) + 1 :]) - {"_keys", "_store", "_place", "_graph"}
-    used = {n.split(".")[2] for n, _ in parsed(path) if n.startswith("neusee.workflows.")}
-    assert not used & above
+    files = alone(path.relative_to(HOUSE).as_posix())
+    assert not [*direction(files), *siblings(files)]
+
+
+@pytest.mark.parametrize("rule", FILE_RULES + HOUSE_RULES, ids=lambda rule: rule.__name__)
+def test_the_house_keeps_the_rule(rule):
+    assert not list(rule(house()))
+
+
+def test_workflows_holds_rooms_and_nothing_else():
+    there = {path.name for path in HOUSE.iterdir()} - {"__pycache__"}
+    assert there == {"__init__.py"} | {outer(room) for room in ROOMS}
+
+
+def test_every_exception_is_needed():
+    found = list(edges(house()))
+    assert {(a, b) for a, b, _, _ in found if a != DOOR and is_later(a, b)} == set(UPWARD)
+    assert {(outer(a), outer(b)) for a, b, _, _ in found if {outer(a), outer(b)} <= set(COMMANDS)} >= set(ACROSS)
+    assert {line.partition(":")[0] for line in dynamic(house(), allowed=())} == set(DYNAMIC)
+    assert {line.partition(":")[0] for line in formulas(house(), allowed=())} == set(PI)
+
+
+@pytest.mark.parametrize("name", sorted(TWICE), ids=" ".join)
+def test_a_name_that_may_be_twice_is(name):
+    room, wanted = name
+    found = [f for f, tree in house().items() if f.startswith(f"{room}/") and wanted in defined(tree)]
+    assert len(found) > 1, f"{wanted} is one class of {room} now: take it from the set"
+
+
+# --- planted offences -------------------------------------------------------------------------------------------------
+
+
+def later(room):
+    """A room that a room may not import: the last one, and for the last one all of workflows."""
+    return "neusee.workflows import load" if room == ROOMS[-1] else "neusee.workflows.cli.app import app"
+
+
+@pytest.mark.parametrize("room", ROOMS)
+@pytest.mark.parametrize(
+    "form", ["from {}", "def _():\n    from {}", "if TYPE_CHECKING:\n    from {}"], ids=["top", "function", "type"]
+)
+def test_a_forbidden_import_that_is_planted_in_a_room_is_found(room, form):
+    file = f"{room.replace('.', '/')}/__init__.py"
+    found = list(direction(alone(file, form.format(later(room)))))
+    assert len(found) == 1
+    assert found[0].startswith(f"{file}:")
+
+
+@pytest.mark.parametrize(("room", "after"), list(itertools.pairwise(ROOMS)))
+def test_the_very_next_room_is_later(room, after):
+    file = f"{room.replace('.', '/')}/__init__.py"
+    assert len(list(direction(alone(file, f"import neusee.workflows.{after}.some_module")))) == 1
+    assert not list(direction(alone(f"{after.replace('.', '/')}/__init__.py", f"import neusee.workflows.{room}.x")))
+
+
+def test_what_is_allowed_in_a_function_is_forbidden_at_the_top():
+    for source, target in UPWARD:
+        file, code = f"{source.replace('.', '/')}/__init__.py", f"import neusee.workflows.{target}"
+        assert not list(direction(alone(file, f"def _():\n    {code}")))
+        assert len(list(direction(alone(file, code)))) == 1
+
+
+OFFENCES = [
+    (siblings, "training/run_training.py", "import neusee.workflows.sweeps.axes"),
+    (siblings, "evaluation/pipelines.py", "def _():\n    from neusee.workflows.training import checkpoint"),
+    (siblings, "evaluation/pipelines.py", "from neusee.workflows.calibration.run_calibration import calibrate"),
+    (siblings, "calibration/ensembles.py", "from neusee.workflows.sweeps import axes"),
+    (siblings, "studies/leave_out/leave_out_study.py", "from neusee.workflows.studies.accuracy import recipe_knobs"),
+    (exits, "engine/runner.py", "sys.exit(1)"),
+    (exits, "store/lease.py", "raise SystemExit"),
+    (exits, "report/console.py", "def _():\n    import typer"),
+    (exits, "training/run_training.py", "os._exit(3)"),
+    (terminal, "sweeps/sweep_run.py", "print('done')"),
+    (terminal, "engine/runner.py", "sys.stderr.write('x')"),
+    (terminal, "engine/runner.py", "from sys import stdout"),
+    (terminal, "report/run_page.py", "from rich.console import Console"),
+    (samplers, "studies/calibration/calibration_study.py", "def _():\n    import emcee"),
+    (private, "report/data_exports.py", "def _():\n    from neusee.nodes.scene._spectral_exr import write_spectral"),
+    (private, "training/run_training.py", "import neusee.nodes._half_precision"),
+    (private, "engine/runner.py", "from neusee.nodes.doe import _refractive_index"),
+    (private, "engine/runner.py", "from neusee.workflows.store.lease import _name"),
+    (dynamic, "engine/runner.py", "importlib.import_module('neusee.workflows.cli.app')"),
+    (dynamic, "keys/cache_key.py", "__import__('neusee.workflows.cli')"),
+    (formulas, "report/figures/optics.py", "area = np.pi * radius**2"),
+    (formulas, "engine/runner.py", "from math import pi"),
+    (formulas, "sweeps/axes.py", "from neusee.nodes.constants import PLANCK"),
+    (formulas, "sweeps/axes.py", "from scipy.constants import c"),
+    (formulas, "training/training_iteration.py", "x = psf.intensity.amax((-2, -1)).double() / psf.clear_peak.cpu()"),
+    (formulas, "report/result_numbers.py", "x = float((line.centres * line.weights).sum())"),
+    (formulas, "report/result_numbers.py", "x = height / pupil.wavelengths[band]"),
+    (classes, "store/lease.py", "class Store:\n    pass"),
+    (classes, "recipe/text/overrides.py", "class Uncertain:\n    pass"),
+    (names, "store/lease.py", "def result_store():\n    pass"),
+    (names, "studies/run_study.py", "def accuracy():\n    pass"),
+    (places, "helpers.py", "x = 1"),
+    (places, "engine/loops/__init__.py", "x = 1"),
+    (lengths, "graph/more.py", "\n" * MOST_LINES + "x = 1"),
+    (offers, "graph/__init__.py", "import torch"),
+]
+
+
+@pytest.mark.parametrize(("rule", "file", "code"), OFFENCES, ids=[f"{r.__name__}: {c[:60]}" for r, _, c in OFFENCES])
+def test_a_planted_offence_is_found(rule, file, code):
+    found = list(rule({**(house() if rule in HOUSE_RULES else {}), **alone(file, code)}))
+    assert len(found) == 1, "one offence, found once"
+
+
+@pytest.mark.parametrize(
+    "words", ['"""What?\n\nOffers: `runner.gone`."""', '"""Rooms.\n\nOffers: `runner.run`."""', '"""What?"""', "pass"]
+)
+def test_a_room_that_does_not_say_what_it_offers_is_found(words):
+    assert len(list(offers({**house(), "engine/__init__.py": ast.parse(words)}))) == 1
+
+
+def test_a_room_that_is_gone_is_missed():
+    files = {file: tree for file, tree in house().items() if not file.startswith("placement/")}
+    assert list(places(files)) == ["placement is no room"]
+
+
+def test_nanometres_are_no_formula():
+    assert not list(formulas(alone("report/figures/optics.py", "x = bands.centres.double() * 1e9")))
+
+
+# --- imports cost little ----------------------------------------------------------------------------------------------
 
 
 def test_importing_every_node_loads_nothing_heavy():

@@ -13,26 +13,27 @@ from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
     from neusee.workflows.engine.differentiable_function import as_function
-    from neusee.workflows.engine.node_call import RunError
-    from neusee.workflows.engine.runner import Event, Result, StepRecord, run
+    from neusee.workflows.engine.runner import Result, run
     from neusee.workflows.engine.step_job import Executor
     from neusee.workflows.graph.diagnostics import Diagnostic, RecipeError
     from neusee.workflows.graph.recipe_graph import Recipe, Step
+    from neusee.workflows.graph.run_error import RunError
+    from neusee.workflows.graph.step_record import Event, StepRecord
     from neusee.workflows.placement.tasks_and_devices import Schedule
     from neusee.workflows.recipe.loading import load, recipes
     from neusee.workflows.store.result_store import Store
 
 _HOME = {
-    "RunError": "engine.node_call",
     "as_function": "engine.differentiable_function",
     "Recipe": "graph.recipe_graph",
     "Step": "graph.recipe_graph",
     "Diagnostic": "graph.diagnostics",
     "RecipeError": "graph.diagnostics",
+    "RunError": "graph.run_error",
+    "StepRecord": "graph.step_record",
+    "Event": "graph.step_record",
     "load": "recipe.loading",
     "recipes": "recipe.loading",
-    "StepRecord": "engine.runner",
-    "Event": "engine.runner",
     "Result": "engine.runner",
     "run": "engine.runner",
     "Schedule": "placement.tasks_and_devices",

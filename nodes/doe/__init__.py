@@ -3,11 +3,19 @@
 from neusee.nodes.doe._analytic_masks import axicon, cubic, flat, half_rings, spiral_axicon, vortex, zernike
 from neusee.nodes.doe._fabrication_limits import fabricate
 from neusee.nodes.doe._minimum_feature import smooth
-from neusee.nodes.doe._refractive_index import material
-from neusee.nodes.doe._sampled_height_map import pixelwise
+from neusee.nodes.doe._parametrisations import PARAMETRISATIONS, Drawn, Modes, Pixels, Rings, Written
+from neusee.nodes.doe._refractive_index import Material, material, wave_height
+from neusee.nodes.doe._sampled_height_map import pixelwise, read_height_map
 from neusee.nodes.doe._unet_height_map import unet
 
 __all__ = [
+    "PARAMETRISATIONS",
+    "Drawn",
+    "Material",
+    "Modes",
+    "Pixels",
+    "Rings",
+    "Written",
     "axicon",
     "cubic",
     "fabricate",
@@ -15,9 +23,11 @@ __all__ = [
     "half_rings",
     "material",
     "pixelwise",
+    "read_height_map",
     "smooth",
     "spiral_axicon",
     "unet",
     "vortex",
+    "wave_height",
     "zernike",
 ]

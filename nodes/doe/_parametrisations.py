@@ -11,14 +11,14 @@ from typing import Any
 import torch
 from torch import Tensor, nn
 
-from neusee.nodes._bicubic_resize import enlarge
-from neusee.nodes._network_weights import loaded
+from neusee.nodes.bicubic_resize import enlarge
 from neusee.nodes.doe._analytic_masks import axicon, cubic, half_rings, spiral_axicon, vortex, zernike
 from neusee.nodes.doe._height_from_phase import height_from_phase
 from neusee.nodes.doe._minimum_feature import smooth
 from neusee.nodes.doe._refractive_index import Material
 from neusee.nodes.doe._sampled_height_map import pixelwise
 from neusee.nodes.doe._unet_height_map import HeightNet, fresh, height_of
+from neusee.nodes.network_weights import loaded
 from neusee.nodes.optics._phase_screen import screen
 from neusee.nodes.optics._pupil_grid import Stop, axes, inside, stop
 from neusee.nodes.optics._zernike import combine
@@ -178,7 +178,7 @@ def _drawn(params: Mapping[str, Any], rng: torch.Generator) -> Drawn:
 
 
 #: by node: a relief that starts as the node draws it, from the node's own parameters; a flat one has no slope to leave
-LEARNT: dict[str, Callable[[Mapping[str, Any], torch.Generator], nn.Module]] = {
+PARAMETRISATIONS: dict[str, Callable[[Mapping[str, Any], torch.Generator], nn.Module]] = {
     "doe.pixelwise": _pixels,
     "doe.unet": _drawn,
     **{make.path: _freed(make) for make in (half_rings, axicon, spiral_axicon, vortex, cubic, zernike)},

@@ -65,7 +65,7 @@ def _name(file: Path, names: list[str]) -> str:
     raise ParameterError("file", f"{file.name} holds {', '.join(sorted(names)) or 'nothing'}: name the relief 'height'")
 
 
-def _read(file: Path, depth: float) -> Tensor:
+def read_height_map(file: Path, depth: float) -> Tensor:
     import numpy as np
 
     if file.suffix == ".png":
@@ -107,7 +107,7 @@ def pixelwise(
         noise = screen(stop(samples, pitch, diameter, aperture), scale, rng)
         return (depth * torch.sigmoid(1.5 * noise)).to(torch.float32)
     _fits(file, _header(file), samples)
-    height = _read(file, depth)
+    height = read_height_map(file, depth)
     if not bool(torch.isfinite(height).all()) or float(height.min()) < 0:
         low = float(height.min())
         raise ValueError(f"{file.name}: lowest height {low:.3g} m; a relief is finite and counted up from 0")

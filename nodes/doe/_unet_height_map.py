@@ -10,9 +10,9 @@ from torch import Tensor, nn
 from torch.nn import functional as F
 
 from neusee.nodes import node
-from neusee.nodes._bicubic_resize import enlarge
-from neusee.nodes._network_weights import loaded, same_layout
+from neusee.nodes.bicubic_resize import enlarge
 from neusee.nodes.doe._height_from_phase import height_checks
+from neusee.nodes.network_weights import loaded, same_layout
 from neusee.nodes.optics._pupil_grid import Aperture, grid_notes
 from neusee.nodes.units import Count, DataFile, PositiveLength
 

@@ -1,13 +1,17 @@
 """Losses: what learning minimises."""
 
-from neusee.nodes.losses._contrast_loss import contrast
+from neusee.nodes.losses._contrast_loss import ContrastFloor, HighestFrequency, contrast
 from neusee.nodes.losses._gradient_penalty import gradient_penalty
 from neusee.nodes.losses._mask_losses import background_loss, suppression_loss
 from neusee.nodes.losses._restoration_losses import charbonnier, fft_l1
 from neusee.nodes.losses._spectral_loss import mrae
-from neusee.nodes.losses._wiener_loss import wiener
+from neusee.nodes.losses._wiener_loss import NoiseVariance, OneBandShare, wiener
 
 __all__ = [
+    "ContrastFloor",
+    "HighestFrequency",
+    "NoiseVariance",
+    "OneBandShare",
     "background_loss",
     "charbonnier",
     "contrast",

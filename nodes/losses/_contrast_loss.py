@@ -13,12 +13,12 @@ from neusee.nodes.values import Psf
 
 _DARK = 1e-30  #: share of the light that counts as none
 
-Floor = Annotated[float, Field(gt=0, le=0.1)]
-Frequency = Annotated[float, Field(gt=0, le=0.5)]  #: cycles a pixel
+ContrastFloor = Annotated[float, Field(gt=0, le=0.1)]
+HighestFrequency = Annotated[float, Field(gt=0, le=0.5)]  #: cycles a pixel
 
 
 @node()
-def contrast(psf: Psf, *, floor: Floor = 1e-4, up_to: Frequency | None = None) -> Tensor:
+def contrast(psf: Psf, *, floor: ContrastFloor = 1e-4, up_to: HighestFrequency | None = None) -> Tensor:
     """Add up, over the bands, how far the contrast lies below 1: minus the mean of ln sqrt(MTF**2 + floor**2).
 
     The mean is over the frequencies that the clear aperture passes, those of `metrics.mtf`, and the contrast is the

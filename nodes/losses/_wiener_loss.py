@@ -8,13 +8,13 @@ from torch import Tensor
 
 from neusee.nodes import node
 from neusee.nodes._half_precision import single
-from neusee.nodes.losses._contrast_loss import Frequency
+from neusee.nodes.losses._contrast_loss import HighestFrequency
 from neusee.nodes.restore._inverse._masked_blur import variance
 from neusee.nodes.restore._inverse._wiener import effective_psf, fall, grey_shares
 from neusee.nodes.values import Bands, Psf
 
-Share = Annotated[float, Field(ge=0, le=1)]
-Noise = Annotated[float, Field(gt=0, allow_inf_nan=False)]
+OneBandShare = Annotated[float, Field(ge=0, le=1)]
+NoiseVariance = Annotated[float, Field(gt=0, allow_inf_nan=False)]
 
 
 @node()
@@ -24,9 +24,9 @@ def wiener(
     responses: Tensor,
     bands: Bands,
     *,
-    noise: Noise = 1e-3,
-    colour: Share = 1.0,
-    up_to: Frequency | None = None,
+    noise: NoiseVariance = 1e-3,
+    colour: OneBandShare = 1.0,
+    up_to: HighestFrequency | None = None,
 ) -> Tensor:
     """Take the share of a picture's variance that a Wiener filter leaves wrong: its logarithm, mean over channels.
 

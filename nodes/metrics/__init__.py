@@ -1,8 +1,8 @@
 """Metrics: what a reader of results asks for."""
 
-from neusee.nodes.metrics._mask_limits import Limits, limits
+from neusee.nodes.metrics._mask_limits import Limits, least_lsr, limits, most_contrast, most_unsuppressed
 from neusee.nodes.metrics._picture_quality import Quality, quality
-from neusee.nodes.metrics._psf_contrast import Mtf, encircled, mtf
+from neusee.nodes.metrics._psf_contrast import Mtf, encircled, encircled_curve, mtf, over_clear_peak
 from neusee.nodes.metrics._suppression import Peak, Saturated, bsr, lsr, peak_irradiance, saturated
 
 __all__ = [
@@ -13,9 +13,14 @@ __all__ = [
     "Saturated",
     "bsr",
     "encircled",
+    "encircled_curve",
+    "least_lsr",
     "limits",
     "lsr",
+    "most_contrast",
+    "most_unsuppressed",
     "mtf",
+    "over_clear_peak",
     "peak_irradiance",
     "quality",
     "saturated",

@@ -84,3 +84,8 @@ def shares(psf: Psf) -> Tensor:
     fy, fx = (torch.fft.fftfreq(n, dtype=torch.float64) for n in psf.intensity.shape[-2:])
     radius = torch.hypot(fy[:, None], fx)
     return torch.stack([(radius <= math.sqrt(4.0 * float(p) / math.pi)).double().mean() for p in psf.clear_peak])
+
+
+def most_contrast(unsuppressed: float, lsr: Tensor) -> Tensor:
+    """Return the bound of the root mean square contrast at each `lsr`, given the bound at an LSR of 1; at most 1."""
+    return (unsuppressed * lsr.sqrt()).clamp_max(1.0)

@@ -79,3 +79,20 @@ def encircled(psf: Psf, *, pixel_pitch: PositiveLength, radius: PositiveLength) 
 def _(result: Tensor, *inputs: Psf, **params: float) -> list[Check]:
     low, high = float(result.min()), float(result.max())
     return [Check(f"{low:.1%} to {high:.1%} inside", high <= 1.01)]
+
+
+# --- as curves --------------------------------------------------------------------------------------------------------
+
+
+def encircled_curve(light: Tensor) -> Tensor:
+    """Return the light of one band (y, x) within 0, 1, 2, … pixels of the axis: (radius,) float64."""
+    y, x = (torch.arange(n, dtype=torch.float64) - n // 2 for n in light.shape)
+    radius = torch.hypot(y[:, None], x[None, :]).ceil().long().flatten()
+    found = torch.zeros(int(radius.max()) + 1, dtype=torch.float64)
+    return found.index_add_(0, radius, light.detach().double().cpu().flatten()).cumsum(0)
+
+
+def over_clear_peak(psf: Psf, band: int) -> Tensor:
+    """Return the light (y, x) of a band as multiples of the peak of the clear lens."""
+    found: Tensor = psf.intensity[band] / psf.clear_peak[band]
+    return found

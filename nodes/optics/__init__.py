@@ -2,9 +2,21 @@
 
 from neusee.nodes.optics._imaging._band_image import image
 from neusee.nodes.optics._imaging._channel_image import image_channels
-from neusee.nodes.optics._laser_direction import direction
+from neusee.nodes.optics._laser_direction import direction, field_of_view
 from neusee.nodes.optics._laser_spot import laser_irradiance
 from neusee.nodes.optics._psf import psf
-from neusee.nodes.optics._pupil import pupil
+from neusee.nodes.optics._pupil import mask_turns, pupil
+from neusee.nodes.optics._pupil_grid import Stop, stop
 
-__all__ = ["direction", "image", "image_channels", "laser_irradiance", "psf", "pupil"]
+__all__ = [
+    "Stop",
+    "direction",
+    "field_of_view",
+    "image",
+    "image_channels",
+    "laser_irradiance",
+    "mask_turns",
+    "psf",
+    "pupil",
+    "stop",
+]

@@ -114,3 +114,9 @@ def phase_steps(pupil: Pupil) -> tuple[float, float]:
     along = turns[0].diff(dim=1)[lit[0][:, 1:] & lit[0][:, :-1]]
     steps = torch.cat([down, along]).abs()
     return (float(steps.median()), float((steps > 0.5).double().mean())) if steps.numel() else (0.0, 0.0)
+
+
+def mask_turns(pupil: Pupil, band: int, step: int = 1) -> Tensor:
+    """Return the phase in turns that the height of the mask gives in a band, at every ``step``-th sample: float64."""
+    turns: Tensor = pupil.index[band] * pupil.height[::step, ::step].double() / pupil.wavelengths[band]
+    return turns

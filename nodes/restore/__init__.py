@@ -3,8 +3,28 @@
 from neusee.nodes.restore._colour_matrix import colour_matrix
 from neusee.nodes.restore._electrons_and_colour import clipped, colour, electrons
 from neusee.nodes.restore._inverse._wiener import wiener
-from neusee.nodes.restore._networks._fft_mamba import fft_mamba
-from neusee.nodes.restore._networks._nafnet import nafnet
-from neusee.nodes.restore._networks._unet import unet
+from neusee.nodes.restore._networks._critic import critic_slopes, critics, skip_critic_draws
+from neusee.nodes.restore._networks._fft_mamba import FFTMamba, fft_mamba
+from neusee.nodes.restore._networks._nafnet import NAFNet, nafnet
+from neusee.nodes.restore._networks._restorer import Restorer, parameter_groups, start_network
+from neusee.nodes.restore._networks._unet import UNet, unet
 
-__all__ = ["clipped", "colour", "colour_matrix", "electrons", "fft_mamba", "nafnet", "unet", "wiener"]
+__all__ = [
+    "FFTMamba",
+    "NAFNet",
+    "Restorer",
+    "UNet",
+    "clipped",
+    "colour",
+    "colour_matrix",
+    "critic_slopes",
+    "critics",
+    "electrons",
+    "fft_mamba",
+    "nafnet",
+    "parameter_groups",
+    "skip_critic_draws",
+    "start_network",
+    "unet",
+    "wiener",
+]

@@ -20,7 +20,7 @@ def weighted(image: Tensor | Channels, weights: Tensor) -> Tensor:
     return flat.reshape(*flat.shape[:-1], *image.shape[-2:])
 
 
-def summed(image: Tensor, rows: Tensor) -> Channels:
+def channel_sums(image: Tensor, rows: Tensor) -> Channels:
     """Sum an image (..., band, y, x) by each of ``rows`` (row, band), exactly; of some of its bands, their share."""
     exact = torch.zeros((), dtype=torch.float64)
     light = single(image).sum(-1).sum(-1, dtype=torch.float64)

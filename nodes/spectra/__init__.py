@@ -1,16 +1,27 @@
 """Spectra: bands, lights, channels, and lifts from three colours to many."""
 
-from neusee.nodes.spectra._bands import bands, filters, line
+from neusee.nodes.spectra._bands import bands, filters, line, mean_wavelength
 from neusee.nodes.spectra._camera_colour import grain, render
 from neusee.nodes.spectra._channel_responses import responses
 from neusee.nodes.spectra._dead_leaves import leaves
 from neusee.nodes.spectra._distinct_band_sums import rows
 from neusee.nodes.spectra._illuminant import illuminant, illuminate
-from neusee.nodes.spectra._linear_lift import lift_lmmse, lift_lmmse_mixture, lift_mallett, lift_mallett_mixture
+from neusee.nodes.spectra._linear_lift import (
+    lift_lmmse,
+    lift_lmmse_mixture,
+    lift_mallett,
+    lift_mallett_mixture,
+    lift_matrix,
+)
 from neusee.nodes.spectra._low_rank_cube import compress
 from neusee.nodes.spectra._measured_reflectances import reflectances
 from neusee.nodes.spectra._metamers import metamers
-from neusee.nodes.spectra._mst_lift_node import lift_mst_plus_plus
+from neusee.nodes.spectra._mst_lift_node import (
+    lift_mst_plus_plus,
+    lift_pictures,
+    need_mst_plus_plus_bands,
+    start_mst_plus_plus,
+)
 
 __all__ = [
     "bands",
@@ -24,11 +35,16 @@ __all__ = [
     "lift_lmmse_mixture",
     "lift_mallett",
     "lift_mallett_mixture",
+    "lift_matrix",
     "lift_mst_plus_plus",
+    "lift_pictures",
     "line",
+    "mean_wavelength",
     "metamers",
+    "need_mst_plus_plus_bands",
     "reflectances",
     "render",
     "responses",
     "rows",
+    "start_mst_plus_plus",
 ]

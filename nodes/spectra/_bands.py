@@ -134,3 +134,8 @@ def _points(wavelength: float, sigma: float, count: int, floor: float) -> Sample
     shape: Tensor = torch.exp(-(((centres - wavelength) / sigma) ** 2) / 2) + floor
     weights = shape * _GRID / (sigma * math.sqrt(2 * math.pi))
     return Samples(centres, torch.full_like(centres, _GRID), weights)
+
+
+def mean_wavelength(line: Samples) -> float:
+    """Return the mean wavelength of a laser line in m, weighted by the energy of its bands."""
+    return float((line.centres * line.weights).sum() / line.weights.sum())

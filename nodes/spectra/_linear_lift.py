@@ -170,10 +170,10 @@ def _estimator(bands: Bands) -> Tensor:
 def _solved(centres: tuple[float, ...]) -> Tensor:
     """W, (band, 3) float64."""
     at = torch.tensor(centres, dtype=torch.float64)
-    return wiener(torch.cat([paint.at(at) for paint in paints()]), at)
+    return lift_matrix(torch.cat([paint.at(at) for paint in paints()]), at)
 
 
-def wiener(known: Tensor, centres: Tensor) -> Tensor:
+def lift_matrix(known: Tensor, centres: Tensor) -> Tensor:
     """W of known reflectances (spectrum, band): the matrix (band, 3) float64 from linear sRGB to the likeliest one."""
     second, rgb = known.T @ known / len(known), to_srgb(centres)
     seen = rgb @ second @ rgb.T

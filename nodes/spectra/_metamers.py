@@ -7,7 +7,7 @@ from pydantic import Field
 from torch import Tensor
 
 from neusee.nodes import Check, ParameterError, node
-from neusee.nodes.spectra._linear_lift import wiener
+from neusee.nodes.spectra._linear_lift import lift_matrix
 from neusee.nodes.spectra._spectral_tables import to_srgb
 from neusee.nodes.units import Count
 from neusee.nodes.values import Bands
@@ -74,7 +74,7 @@ def _(result: Tensor, *inputs: Any, **params: Any) -> list[Check]:
 def metameric_blacks(spectra: Tensor, known: Tensor, bands: Bands) -> Tensor:
     """What the linear estimate from the colours of (spectrum, band) leaves of them; its colour is (0, 0, 0)."""
     centres = bands.centres.detach().cpu().double()
-    estimate = wiener(known.cpu(), centres) @ to_srgb(centres)
+    estimate = lift_matrix(known.cpu(), centres) @ to_srgb(centres)
     return spectra - spectra @ estimate.T.to(spectra)
 
 

@@ -36,9 +36,9 @@ def lift_mst_plus_plus(
     Source: Cai et al., MST++, CVPR Workshops 2022 (NTIRE spectral recovery).
     """
     needs_rgb(rgb)
-    needs_bands(bands)
+    need_mst_plus_plus_bands(bands)
     network = _loaded(weights) if weights is not None else _untrained(untrained, rng)
-    return torch.relu_(through(network.to(rgb), rgb[None])[0])
+    return torch.relu_(lift_pictures(network.to(rgb), rgb[None])[0])
 
 
 @lift_mst_plus_plus.reference
@@ -68,15 +68,15 @@ def _(result: Tensor, rgb: Tensor, bands: Bands, *, weights: Path | None = None,
     return lift_checks(result, rgb, bands) + noise
 
 
-def through(network: nn.Module, rgb: Tensor) -> Tensor:
-    """Pictures (n, 3, y, x) through MST++, each stretched to [0, 1] and back: (n, 31, y, x), not yet clipped."""
+def lift_pictures(network: nn.Module, rgb: Tensor) -> Tensor:
+    """Run pictures (n, 3, y, x) through MST++, each stretched to [0, 1] and back: (n, 31, y, x), not yet clipped."""
     low, high = rgb.amin((1, 2, 3), keepdim=True), rgb.amax((1, 2, 3), keepdim=True)
     span = high - low
     cube: Tensor = network((rgb - low) / span.where(span > 0, 1.0))
     return cube * span + low
 
 
-def started(rng: torch.Generator, linear: Tensor | None = None) -> MSTPlusPlus:
+def start_mst_plus_plus(rng: torch.Generator, linear: Tensor | None = None) -> MSTPlusPlus:
     """A network to train, its layers orthogonal; given W (31, 3), its first estimate is W times each pixel's colour.
 
     The linear estimate stands in the long skip around the body, whose last layer is 0: what is learnt is what the
@@ -90,7 +90,7 @@ def started(rng: torch.Generator, linear: Tensor | None = None) -> MSTPlusPlus:
     return network
 
 
-def needs_bands(bands: Bands) -> None:
+def need_mst_plus_plus_bands(bands: Bands) -> None:
     """Refuse bands that MST++ does not give."""
     centres = bands.centres.cpu().double()
     wanted = torch.linspace(400e-9, 700e-9, BANDS, dtype=torch.float64)

@@ -23,7 +23,7 @@ from neusee.nodes.optics._imaging import _channel_image
 from neusee.workflows import load
 from neusee.workflows.engine import execution, resolve_keys, runner
 from neusee.workflows.store.result_store import Store
-from neusee.workflows.studies.accuracy.work_precision_points import cold
+from neusee.workflows.studies.cold_run import cold
 from neusee.workflows.tolerance.error_budget import ErrorBudget
 
 ENGINE = (

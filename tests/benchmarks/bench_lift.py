@@ -28,7 +28,7 @@ from neusee.nodes.spectra import (
     reflectances,
     render,
 )
-from neusee.nodes.spectra._linear_lift import wiener
+from neusee.nodes.spectra._linear_lift import lift_matrix
 
 SCENE = bands(start=400e-9, stop=700e-9, count=31)
 PICTURES, SIZE, LEAST = 32, (64, 64), 1e-2
@@ -37,7 +37,7 @@ Lift = Callable[[Tensor], Tensor]
 
 def lifts(weights: Path) -> dict[str, Lift]:
     """The three lifts of a recipe, MST++ with these weights, and the estimate that its training starts at."""
-    rng, linear = torch.Generator(), wiener(reflectances(SCENE), SCENE.centres)
+    rng, linear = torch.Generator(), lift_matrix(reflectances(SCENE), SCENE.centres)
     return {
         "lmmse": lambda rgb: lift_lmmse(rgb, SCENE),
         "lmmse over all sets": lambda rgb: torch.einsum("bc,cyx->byx", linear, rgb).clamp_min(0),

@@ -24,12 +24,13 @@ import torch
 sys.path.insert(0, str(Path(__file__).parents[1] / "workflows"))
 import random_recipes
 
-from neusee.workflows.engine.node_call import RunError
 from neusee.workflows.engine.runner import run
 from neusee.workflows.graph.diagnostics import RecipeError
+from neusee.workflows.graph.run_error import RunError
+from neusee.workflows.recipe.changed_recipe import changed
 from neusee.workflows.store.result_store import Store
-from neusee.workflows.studies.accuracy.recipe_knobs import changed, knobs
-from neusee.workflows.studies.accuracy.work_precision_points import cold
+from neusee.workflows.studies.accuracy.recipe_knobs import knobs
+from neusee.workflows.studies.cold_run import cold
 from neusee.workflows.tolerance.error_norm import error_of
 
 OUTPUTS = ("raw[plain]", "raw[mask]")

@@ -26,9 +26,9 @@ sys.path.insert(0, str(Path(__file__).parents[1]))
 
 from live_bytes import LiveBytes
 
+from neusee.nodes.scene import Photographs
 from neusee.workflows import Store, load
 from neusee.workflows.training.checkpoint import export
-from neusee.workflows.training.photograph_folder import Photographs
 from neusee.workflows.training.run_training import frozen
 from neusee.workflows.training.training_iteration import Learner
 from neusee.workflows.training.training_pictures import TrainingStream

@@ -5,7 +5,7 @@ import torch
 from torch.nn.functional import interpolate
 from torch.testing import assert_close
 
-from neusee.nodes._bicubic_resize import enlarge, resize
+from neusee.nodes.bicubic_resize import enlarge, resize
 
 SIZES = [((16, 16), (8, 8)), ((37, 53), (18, 26)), ((9, 5), (31, 64)), ((8, 30), (19, 7)), ((1, 6), (4, 1))]
 

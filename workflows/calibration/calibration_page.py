@@ -14,8 +14,7 @@ from neusee.nodes.values import Levels
 from neusee.workflows.calibration import calibration_figures as figures
 from neusee.workflows.calibration.identifiability import KINDS, Known
 from neusee.workflows.calibration.log_posterior import SensorPosterior
-from neusee.workflows.calibration.model_spread import Figure
-from neusee.workflows.calibration.model_spread import Row as Model
+from neusee.workflows.calibration.model_spread import Figure, ModelSpread
 from neusee.workflows.calibration.posterior_checks import Check, failed
 from neusee.workflows.calibration.posterior_mode import LaplaceFit
 from neusee.workflows.report.study_page import Mark, Section
@@ -32,7 +31,7 @@ _PURE = ("quantum_efficiency", "spread", "scatter", "lamp", "bend", "twist")  #:
 
 
 @dataclass(frozen=True)
-class Row:
+class ParameterRow:
     """What is known of one parameter."""
 
     name: str
@@ -66,14 +65,14 @@ class Finding:
     known: Known
     chains: Chains
     checks: Sequence[Check]
-    models: Sequence[Model] = ()  #: of a camera whose response is not known
+    models: Sequence[ModelSpread] = ()  #: of a camera whose response is not known
 
     @property
     def draws(self) -> Mapping[str, Places]:
         """Of each parameter all draws: (ensemble, step, walker)."""
         return {name: x.numpy() for name, x in self.problem.parameters(self.chains.draws).items()}
 
-    def rows(self) -> list[Row]:
+    def rows(self) -> list[ParameterRow]:
         """One a parameter."""
         params = self.problem.recipe.steps[self.problem.step].params
         found = []
@@ -82,7 +81,9 @@ class Finding:
             nominal, kind = float(params[name]), self.known.kinds[name]
             below, unit = float((draws < nominal).mean()), unit_of(name, params)
             mean, sd = float(draws.mean()), float(draws.std())
-            found.append(Row(name, unit, kind, mean, sd, float(low), float(high), nominal, below, float(share)))
+            found.append(
+                ParameterRow(name, unit, kind, mean, sd, float(low), float(high), nominal, below, float(share))
+            )
         return found
 
 
@@ -146,7 +147,7 @@ def _parameters(finding: Finding) -> Section:
     return Section("The sensor", text, columns, rows, marks=marks)
 
 
-def _told(r: Row) -> Sequence[Any]:
+def _told(r: ParameterRow) -> Sequence[Any]:
     numbers = (f"{x:.6g}" for x in (r.low, r.high))
     return r.name.replace("_", " "), r.said, *numbers, r.unit, f"{r.nominal:.6g}", r.share, r.narrower
 

@@ -99,12 +99,12 @@ class SensorPosterior:
 
 def _pair(recipe: Recipe) -> tuple[Step, Step, type[Coordinates] | type[CameraCoordinates]]:
     """The step that weighs, the one that says what is free, and how that is walked."""
-    weighing = _the(recipe, *_KINDS)
+    weighing = the_step(recipe, *_KINDS)
     prior, kind = _KINDS[weighing.node.path]
-    return weighing, _the(recipe, prior), kind
+    return weighing, the_step(recipe, prior), kind
 
 
-def _the(recipe: Recipe, *paths: str) -> Step:
+def the_step(recipe: Recipe, *paths: str) -> Step:
     found = [step for step in recipe.steps.values() if step.node.path in paths]
     if len(found) != 1:
         has = "no step" if not found else f"{len(found)} steps"

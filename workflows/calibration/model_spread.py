@@ -36,7 +36,7 @@ class Figure:
 
 
 @dataclass(frozen=True)
-class Row:
+class ModelSpread:
     """One parameter."""
 
     name: str
@@ -57,7 +57,7 @@ class _Law:
         return float(self.centre[at]), float(self.width[at])
 
 
-def spread(recipe: Recipe, store: Store, seed: int = 0) -> list[Row]:
+def spread(recipe: Recipe, store: Store, seed: int = 0) -> list[ModelSpread]:
     """The parameters that are free in every model, with the posterior of each model and what is to be stated.
 
     Stated is the middle of the two richest models, with the wider of both and half their distance, in quadrature.
@@ -122,12 +122,12 @@ def _posterior(problem: SensorPosterior, rng: np.random.Generator) -> _Law:
     return _Law(problem.names, centre, np.sqrt(weight @ (places - centre) ** 2))
 
 
-def _row(name: str, problem: SensorPosterior, laws: list[_Law]) -> Row:
+def _row(name: str, problem: SensorPosterior, laws: list[_Law]) -> ModelSpread:
     linear = name in problem.coordinates.linear
     known = [law.of(name) for law in laws]
     (low, narrow), (high, wide) = known[-2:] if len(known) > 1 else known * 2
     middle, width = 0.5 * (low + high), float(np.hypot(max(narrow, wide), 0.5 * (high - low)))
-    return Row(name, tuple(_figure(*each, linear) for each in known), _figure(middle, width, linear))
+    return ModelSpread(name, tuple(_figure(*each, linear) for each in known), _figure(middle, width, linear))
 
 
 def _figure(centre: float, width: float, linear: bool) -> Figure:

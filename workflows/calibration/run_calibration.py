@@ -22,14 +22,13 @@ from neusee.workflows.calibration.log_posterior import SensorPosterior
 from neusee.workflows.calibration.model_spread import spread
 from neusee.workflows.calibration.posterior_checks import arviz, checks, failed, weighed
 from neusee.workflows.calibration.posterior_mode import peak
-from neusee.workflows.engine.node_call import versions
+from neusee.workflows.engine.provenance import timestamp, versions
 from neusee.workflows.graph.recipe_graph import Recipe
 from neusee.workflows.keys.cache_key import digest
 from neusee.workflows.keys.engine_digest import engine
 from neusee.workflows.report.run_folder import RunFolder, new_run
 from neusee.workflows.report.study_page import page
 from neusee.workflows.store.result_store import Store
-from neusee.workflows.studies.accuracy.work_precision_points import timestamp
 
 Tell = Callable[[str], None]
 _KEPT = 4000  #: draws that go into the folder

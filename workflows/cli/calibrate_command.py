@@ -31,7 +31,7 @@ def calibrate(
     recipe, command = load(words)
     from neusee.workflows.api import verbs
     from neusee.workflows.calibration.run_calibration import Refused
-    from neusee.workflows.engine.node_call import RunError
+    from neusee.workflows.graph.run_error import RunError
 
     tell = (lambda line: None) if quiet else (lambda line: say([line]))
     how = {"walkers": walkers, "move": move, "draws": draws}
@@ -54,7 +54,7 @@ def calibrate(
 
 
 def _lines(parameters: dict[str, dict[str, object]]) -> list[str]:
-    from neusee.workflows.calibration.calibration_page import Row
+    from neusee.workflows.calibration.calibration_page import ParameterRow
 
-    rows = [Row(**{"mean": 0.0, "sd": 0.0, **row}) for row in parameters.values()]  # type: ignore[arg-type]
+    rows = [ParameterRow(**{"mean": 0.0, "sd": 0.0, **row}) for row in parameters.values()]  # type: ignore[arg-type]
     return [f"{row.name.replace('_', ' '):20s} {row.said}" for row in rows]

@@ -68,8 +68,8 @@ def _given(how: dict[str, Any]) -> list[str]:
 def _evaluated(name: str, changes: list[str], pipelines: str, **how: Any) -> Path:
     """The folder of the evaluation, or one line of what is wrong."""
     from neusee.workflows.api import verbs
-    from neusee.workflows.engine.node_call import RunError
     from neusee.workflows.evaluation.pipelines import Refused
+    from neusee.workflows.graph.run_error import RunError
 
     try:
         return verbs.evaluate(name, pipelines=pipelines, changes=changes, store=the_store(), **how)

@@ -95,7 +95,8 @@ def _simulate(
     memory: int | None,
 ) -> Simulation:
     from neusee.workflows.report.console import screen
-    from neusee.workflows.simulation.simulate_recipe import simulate, steps_of, wanted
+    from neusee.workflows.report.contents import steps_of, wanted
+    from neusee.workflows.simulation.simulate_recipe import simulate
     from neusee.workflows.tolerance.cheaper_steps import with_substitutions
 
     recipe = with_substitutions(recipe, wanted(recipe))

@@ -127,7 +127,7 @@ def uncertainty(
 def _made(kind: Kind, words: list[str] | None, quiet: bool, out: Path, **options: Any) -> None:
     recipe, command = load(words)
     from neusee.workflows.api import verbs
-    from neusee.workflows.engine.node_call import RunError
+    from neusee.workflows.graph.run_error import RunError
     from neusee.workflows.studies.run_study import failed
 
     given = [f"--{name}" if value is True else f"--{name} {value}" for name, value in options.items() if value]

@@ -33,8 +33,8 @@ def sweep(
     if on_error not in ("stop", "continue"):
         fail(f"--on-error {on_error}: write stop or continue")
     check_device(device)
+    from neusee.workflows.cli.sweep_output import run_sweep
     from neusee.workflows.graph.diagnostics import RecipeError
-    from neusee.workflows.sweeps.sweep_run import run_sweep
 
     try:
         code = run_sweep(

@@ -56,7 +56,7 @@ def train(
         check_device(device)
         return _lift(recipe, ["neusee", "train", *command[2:]], out, device, quiet)
     from neusee.workflows.api import verbs
-    from neusee.workflows.engine.node_call import RunError
+    from neusee.workflows.graph.run_error import RunError
     from neusee.workflows.training.parallel.process_mesh import MeshError, device_here, joined, processes
 
     device, (rank, world) = device_here(device), processes()
@@ -83,7 +83,7 @@ def train(
 def _lift(recipe: Recipe, told: list[str], out: Path, device: str, quiet: bool) -> None:
     """Learn a lift from RGB to spectra."""
     from neusee.workflows.api import verbs
-    from neusee.workflows.engine.node_call import RunError
+    from neusee.workflows.graph.run_error import RunError
 
     assert recipe.lifting is not None
     tell = (lambda line: None) if quiet else (lambda line: say([line]))

@@ -18,8 +18,8 @@ from typing import Any
 import torch
 
 from neusee.workflows.engine.memory_use import there_is
-from neusee.workflows.engine.node_call import RunError
 from neusee.workflows.engine.step_job import InputMissing, Lane, Outcome, StepJob, carry_out
+from neusee.workflows.graph.run_error import RunError
 from neusee.workflows.keys.cache_key import Key
 from neusee.workflows.keys.code_digest import Code
 from neusee.workflows.store.remote_store import open_store

@@ -15,13 +15,15 @@ from typing import Any
 from neusee.nodes import Check, TensorStats
 from neusee.workflows.engine.cost_model import Costs, Estimate
 from neusee.workflows.engine.dispatch import Loop, chains_of
+from neusee.workflows.engine.finished_step import error_in, facts_in, ran
 from neusee.workflows.engine.load_or_recompute import Upstream, cheaper_to_recompute, uses_of, worth_solving
 from neusee.workflows.engine.local_executor import Local
-from neusee.workflows.engine.node_call import RunError, places
+from neusee.workflows.engine.node_call import places
 from neusee.workflows.engine.placement_inputs import joined, past_costs, prepare, room_for
 from neusee.workflows.engine.step_job import Executor, InputMissing, Outcome, Read, StepJob
-from neusee.workflows.engine.step_record import Event, StepRecord, error_in, facts_in, ran
 from neusee.workflows.graph.recipe_graph import Recipe, Step, Wire, in_order
+from neusee.workflows.graph.run_error import RunError
+from neusee.workflows.graph.step_record import Event, StepRecord
 from neusee.workflows.keys.cache_key import Key, key_of
 from neusee.workflows.keys.code_digest import Code
 from neusee.workflows.placement.heft_and_cpop import Schedule, TooLarge
@@ -121,10 +123,9 @@ class Execution:
 
     def asleep(self, name: str) -> StepRecord:
         """The account of a step that nothing has needed."""
-        bound, error = self._bound(name), error_in(self.store.about(self.keys[name]))
-        return StepRecord(
-            name, "not needed", "nothing that ran needed it", 0.0, self.keys[name], bound=bound, error=error
-        )
+        key, why = self.keys[name], "nothing that ran needed it"
+        error = error_in(self.store.about(key))
+        return StepRecord(name, "not needed", why, 0.0, key, bound=self._bound(name), error=error)
 
     def missing(self, names: Iterable[str]) -> set[Key]:
         """What would have to be computed for the values of ``names``."""
@@ -228,8 +229,7 @@ class Execution:
 
     def _note(self, outcome: Outcome, expected: Estimate) -> None:
         """Take in what became of a step."""
-        work = outcome.work
-        step, key = work.step, work.key
+        work, step, key = outcome.work, outcome.work.step, outcome.work.key
         if outcome.lost:
             raise InputMissing(*outcome.lost)
         if outcome.error is not None:

@@ -2,42 +2,16 @@
 
 from __future__ import annotations
 
-import functools
-import platform
 from collections.abc import Mapping, Sequence
-from importlib.metadata import PackageNotFoundError, version
 from typing import Any
 
 import torch
-from torch import Tensor
 
 from neusee.nodes import Check
 from neusee.workflows.graph.recipe_graph import Step
+from neusee.workflows.graph.run_error import RunError
 from neusee.workflows.keys.cache_key import stream_seed
 from neusee.workflows.store.serialization import each_tensor, settle, tensors_in
-
-
-class RunError(RuntimeError):
-    """A step failed. Names it, its node, where it is written, what it was given, and the cause."""
-
-    def __init__(self, step: Step, inputs: Sequence[Any], cause: BaseException) -> None:
-        self.step, self.cause = step.name, cause
-        given = ", ".join(f"{name} {_shape(value)}" for name, value in zip(step.node.inputs, inputs, strict=False))
-        super().__init__(
-            f"{step.mark}   {step.name} ({step.node.path}): {type(cause).__name__}: {cause}"
-            + (f"\n  given {given}" if given else "")
-        )
-
-    def __reduce__(self) -> tuple[Any, ...]:
-        return _remade, (self.step, str(self), repr(self.cause))
-
-
-def _remade(step: str, text: str, cause: str) -> RunError:
-    """The error as another process sees it: its text, without the traceback of the cause."""
-    error = RunError.__new__(RunError, text)
-    RuntimeError.__init__(error, text)
-    error.step, error.cause = step, RuntimeError(cause)
-    return error
 
 
 def call(step: Step, inputs: Sequence[Any], params: Mapping[str, Any], seed: int, device: str) -> Any:
@@ -95,23 +69,3 @@ def _kind(device: str) -> str:
 
 def to_device(value: Any, device: str) -> Any:
     return each_tensor(lambda x: x.to(device), value)
-
-
-@functools.cache
-def versions() -> dict[str, str]:
-    """Of Python and of what computes; kept beside each result, but not in its key."""
-    found = {"python": platform.python_version()}
-    for name in ("neusee", "torch", "kornia", "colour-science", "OpenEXR"):
-        try:
-            found[name] = version(name)
-        except PackageNotFoundError:
-            found[name] = "none"
-    return found
-
-
-def _shape(value: Any) -> str:
-    if isinstance(value, Tensor):
-        return f"{tuple(value.shape)} {str(value.dtype).removeprefix('torch.')}"
-    if isinstance(value, list | tuple):
-        return f"{type(value).__name__}[{', '.join(_shape(v) for v in value)}]"
-    return "absent" if value is None else type(value).__name__

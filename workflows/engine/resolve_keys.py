@@ -7,9 +7,10 @@ from dataclasses import dataclass, field
 from typing import Any
 
 from neusee.nodes import TensorStats
-from neusee.workflows.engine.node_call import RunError, place
-from neusee.workflows.engine.step_record import facts_in
+from neusee.workflows.engine.finished_step import facts_in
+from neusee.workflows.engine.node_call import place
 from neusee.workflows.graph.recipe_graph import Recipe
+from neusee.workflows.graph.run_error import RunError
 from neusee.workflows.keys.cache_key import Key, key_of
 from neusee.workflows.keys.code_digest import Code
 from neusee.workflows.store.result_store import Store

@@ -13,8 +13,8 @@ import torch
 from neusee.workflows.engine.execution import Execution
 from neusee.workflows.engine.node_call import to_device
 from neusee.workflows.engine.step_job import Executor
-from neusee.workflows.engine.step_record import Event, StepRecord
 from neusee.workflows.graph.recipe_graph import Recipe, needed, unknown_step
+from neusee.workflows.graph.step_record import Event, StepRecord
 from neusee.workflows.keys.cache_key import Key
 from neusee.workflows.placement.heft_and_cpop import Schedule
 from neusee.workflows.store.remote_store import open_store

@@ -17,9 +17,11 @@ import torch
 from neusee.nodes import Check, TensorStats
 from neusee.workflows.engine.band_results import call_by_band, plain_of
 from neusee.workflows.engine.memory_use import PeakMemory
-from neusee.workflows.engine.node_call import RunError, call, examine, versions
+from neusee.workflows.engine.node_call import call, examine
+from neusee.workflows.engine.provenance import versions
 from neusee.workflows.engine.write_behind import LARGE, WriteBehind
 from neusee.workflows.graph.recipe_graph import Step
+from neusee.workflows.graph.run_error import RunError
 from neusee.workflows.keys.cache_key import Key, plain
 from neusee.workflows.store.lease import Lease
 from neusee.workflows.store.metadata import INLINE

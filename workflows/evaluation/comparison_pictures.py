@@ -8,11 +8,11 @@ from dataclasses import dataclass, replace
 
 from torch import Tensor
 
+from neusee.workflows.engine.provenance import timestamp
 from neusee.workflows.evaluation.evaluation_points import Bench, Wanted, smaller
 from neusee.workflows.evaluation.evaluation_scenes import Scene
 from neusee.workflows.evaluation.pipelines import CASES, NONE, Composed
 from neusee.workflows.keys.cache_key import digest
-from neusee.workflows.studies.accuracy.work_precision_points import timestamp
 
 _SIDE = 200  #: pixels of the shorter side, as drawn
 _PLAIN = "developed[plain]"

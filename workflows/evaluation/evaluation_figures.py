@@ -6,7 +6,9 @@ from collections.abc import Mapping, Sequence
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
+import torch
 
+from neusee.nodes.metrics import most_contrast
 from neusee.workflows.evaluation.confidence_intervals import Table, mean
 from neusee.workflows.report.figures.camera_overview import high
 from neusee.workflows.report.figures.style import BLACK, BLUE, GREEN, ORANGE, VERMILION, canvas, drawn, encoded, picture
@@ -129,7 +131,8 @@ def plane(masks: Mapping[str, Mask]) -> Any:
     floor = float(np.mean([mask.floor.mean() for mask in masks.values()]))
     least = min(floor, *(float(mask.lsr.mean()) for mask in masks.values()))
     x = np.geomspace(least / 3, 1.6, 200)
-    bound = (float(next(iter(masks.values())).unsuppressed.mean()) * np.sqrt(x)).clip(max=1)
+    unsuppressed = float(next(iter(masks.values())).unsuppressed.mean())
+    bound = most_contrast(unsuppressed, torch.from_numpy(x)).numpy()
     ax.fill_between(x, bound, 1.5, color=_GREY, alpha=0.15, linewidth=0)
     ax.plot(x, bound, color=_GREY, linewidth=1.2, label="rms contrast: no mask is above (Parseval)")
     ax.axvspan(x[0], floor, color=BLUE, alpha=0.12, linewidth=0, label="LSR: no mask that keeps its light is here")

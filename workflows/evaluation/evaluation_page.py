@@ -14,7 +14,7 @@ from neusee.workflows.evaluation.pipelines import CASES
 from neusee.workflows.report.study_page import Mark, Section
 
 if TYPE_CHECKING:
-    from neusee.workflows.evaluation.run_evaluation import Evaluated
+    from neusee.workflows.evaluation.evaluation_result import Evaluated
 
 _EACH = ("mean", "low", "high")
 COLUMNS = ("pipeline", "mask", "restorer", "scenes", *(f"{m} {e}" for m in METRICS for e in _EACH),

@@ -11,10 +11,11 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from neusee.nodes._bicubic_resize import resize
+from neusee.nodes.bicubic_resize import resize
 from neusee.nodes.metrics import quality
 from neusee.workflows.engine.differentiable_function import as_function
 from neusee.workflows.engine.node_call import call, place
+from neusee.workflows.engine.provenance import timestamp
 from neusee.workflows.evaluation.evaluation_scenes import Scene
 from neusee.workflows.evaluation.pipelines import BEAM, NONE, Composed
 from neusee.workflows.graph.recipe_graph import Recipe, Step, needed
@@ -23,7 +24,6 @@ from neusee.workflows.keys.code_digest import Code
 from neusee.workflows.keys.engine_digest import engine
 from neusee.workflows.recipe.distributions.uncertain_inputs import Inputs
 from neusee.workflows.store.result_store import Store
-from neusee.workflows.studies.accuracy.work_precision_points import timestamp
 from neusee.workflows.tolerance.cheaper_steps import with_substitutions
 
 _MOVED = ("spot", "photons")  #: steps with whose results, and all that follows, another strength is another scene
@@ -105,7 +105,7 @@ class Bench:
         }
         keys = self._keys(replace(recipe, steps={**recipe.steps, **steps}), wanted, outputs)
         within = [recipe.tolerance, recipe.exact, self.device.partition(":")[0], self.small]
-        own = [self._code.digest(f"neusee.nodes.{name}") for name in ("metrics._picture_quality", "_bicubic_resize")]
+        own = [self._code.digest(used.__module__) for used in (quality, resize)]
         return digest("evaluate", engine("evaluation.evaluation_points"), [keys[name] for name in outputs], within, own)
 
     def _keys(self, recipe: Recipe, wanted: Wanted, outputs: Sequence[str]) -> dict[str, str]:

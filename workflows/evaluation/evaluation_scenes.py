@@ -10,15 +10,15 @@ from pathlib import Path
 from torch import Tensor
 
 from neusee.nodes import ParameterError
+from neusee.nodes.scene import choose_photograph, crop_photograph, list_photographs
 from neusee.workflows.engine.node_call import call
 from neusee.workflows.engine.runner import run
 from neusee.workflows.evaluation.pipelines import BEAM, CASES, NONE, Refused
 from neusee.workflows.graph.recipe_graph import Recipe
-from neusee.workflows.keys.cache_key import digest, key_of, stream_seed
+from neusee.workflows.keys.cache_key import digest, file_digest, key_of, stream_seed
 from neusee.workflows.keys.code_digest import Code
 from neusee.workflows.recipe.distributions.uncertain_inputs import Inputs
 from neusee.workflows.store.result_store import Store
-from neusee.workflows.training.photograph_folder import chosen, crop, crop_key, listed
 
 _PHOTOGRAPH = "scene.photograph"
 
@@ -73,15 +73,15 @@ class _Source:
     def name(self, number: int) -> str:
         if not self.paths:
             return self.recipe.steps["scene"].node.path
-        path = chosen(self.paths, self.recipe.seed, number)
+        path = choose_photograph(self.paths, self.recipe.seed, number)
         return path.relative_to(self.root).as_posix() if self.root else path.name
 
     def picture(self, number: int) -> Tensor:
         if not self.paths:
             return self._own
-        path = chosen(self.paths, self.recipe.seed, number)
+        path = choose_photograph(self.paths, self.recipe.seed, number)
         try:
-            return crop(path, self.shape, self.recipe.seed, number)
+            return crop_photograph(path, self.shape, self.recipe.seed, number)
         except (ParameterError, OSError, ValueError, SyntaxError) as error:
             raise Refused(f"{path}: {error}: take it away; all other points are kept") from error
 
@@ -94,7 +94,9 @@ class _Source:
         if not self.paths:
             step = self.recipe.steps["scene"]
             return digest("own scene", key_of(step, {}, self.recipe.seed, code)[0])
-        return crop_key(chosen(self.paths, self.recipe.seed, number), self.shape, self.recipe.seed, number, code)
+        path = choose_photograph(self.paths, self.recipe.seed, number)
+        own = code.digest(crop_photograph.__module__)
+        return digest("photograph", own, file_digest(path), list(self.shape), self.recipe.seed, number)
 
 
 def scenes(
@@ -108,7 +110,7 @@ def scenes(
     if root is not None:
         if not root.is_dir():
             raise Refused(f"--data {root}: no such folder")
-        paths, broken = listed(root)
+        paths, broken = list_photographs(root)
         if not paths:
             said = f"; {broken[0][0].name}: {broken[0][1]}" if broken else ""
             raise Refused(f"--data {root}: no photograph that can be read, PNG or JPEG{said}")

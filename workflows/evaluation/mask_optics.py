@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from neusee.nodes import metrics
-from neusee.nodes.metrics._mask_limits import least_lsr, most_unsuppressed
+from neusee.nodes.metrics import least_lsr, most_unsuppressed
 from neusee.workflows.engine.runner import run
 from neusee.workflows.evaluation.pipelines import NONE, Composed
 from neusee.workflows.store.result_store import Store

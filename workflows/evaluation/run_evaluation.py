@@ -12,51 +12,32 @@ from __future__ import annotations
 import json
 import time
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
-from neusee.workflows.engine.node_call import versions
-from neusee.workflows.evaluation.comparison_pictures import Panel, panels
-from neusee.workflows.evaluation.confidence_intervals import METRICS, Interval, Table, against, table
+from neusee.workflows.engine.provenance import timestamp, versions
+from neusee.workflows.evaluation.comparison_pictures import panels
+from neusee.workflows.evaluation.confidence_intervals import METRICS, against, table
 from neusee.workflows.evaluation.evaluation_points import Bench, Point, Wanted
+from neusee.workflows.evaluation.evaluation_result import Evaluated
 from neusee.workflows.evaluation.evaluation_scenes import Scene, scenes
-from neusee.workflows.evaluation.mask_optics import Mask, masks
+from neusee.workflows.evaluation.mask_optics import masks
 from neusee.workflows.evaluation.pipelines import NONE, Composed, Pipeline, Refused, composed, read_pipelines
-from neusee.workflows.graph.recipe_graph import Recipe
 from neusee.workflows.keys.cache_key import digest
 from neusee.workflows.recipe.loading import load
 from neusee.workflows.recipe.text.overrides import Override
 from neusee.workflows.report.run_folder import RunFolder, new_run
 from neusee.workflows.store.remote_store import open_store
 from neusee.workflows.store.result_store import Store
-from neusee.workflows.studies.accuracy.work_precision_points import timestamp
 
 __all__ = ["STRENGTHS", "Evaluated", "Refused", "evaluate", "read_pipelines"]
 
 STRENGTHS = (0.0, 1e1, 1e2, 1e3, 1e4, 1e5, 1e6)  #: the paper's
 SMALL = 256  #: pixels of the shorter side, at which the paper restores
 Tell = Callable[[str], None]
-
-
-@dataclass(frozen=True)
-class Evaluated:
-    """All that was measured."""
-
-    recipe: Recipe
-    scenes: Sequence[Scene]
-    broken: Sequence[tuple[Path, str]]
-    strengths: tuple[float, ...]
-    small: int  #: pixels of the shorter side of the small pictures
-    reference: str  #: the pipeline that others are compared with
-    points: dict[str, list[dict[float, Point]]]  #: by pipeline, and scene by scene
-    tables: dict[str, Table]  #: by pipeline
-    against: dict[str, dict[str, Interval]]  #: by pipeline, what the reference's L1 is more
-    masks: dict[str, Mask]  #: by mask
-    panels: Sequence[Panel]
-    pipelines: Sequence[Pipeline]
 
 
 def evaluate(

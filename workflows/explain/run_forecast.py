@@ -15,8 +15,8 @@ from neusee.workflows.engine.step_job import Lane, StepJob
 from neusee.workflows.graph.recipe_graph import Recipe
 from neusee.workflows.keys.cache_key import Key
 from neusee.workflows.placement.heft_and_cpop import Schedule, TooLarge
+from neusee.workflows.report.contents import steps_of, wanted
 from neusee.workflows.report.run_page import size_of
-from neusee.workflows.simulation.simulate_recipe import steps_of, wanted
 from neusee.workflows.store.result_store import Store
 from neusee.workflows.tolerance.cheaper_steps import with_substitutions
 

@@ -7,11 +7,11 @@ from dataclasses import replace
 from typing import Any
 
 from neusee.workflows.engine.resolve_keys import Resolved, resolve
-from neusee.workflows.engine.runner import Event
 from neusee.workflows.explain.change_causes import Comparison, Origin, Pair, Roots
 from neusee.workflows.explain.change_wording import spoken
 from neusee.workflows.graph.diagnostics import nearest
 from neusee.workflows.graph.recipe_graph import Recipe, Step, needed
+from neusee.workflows.graph.step_record import Event
 from neusee.workflows.keys.cache_key import Key
 from neusee.workflows.store.result_store import Store
 from neusee.workflows.tolerance.cheaper_steps import with_substitutions

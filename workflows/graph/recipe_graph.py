@@ -11,10 +11,13 @@ from neusee.workflows.graph.diagnostics import Location, nearest
 from neusee.workflows.graph.final_values import Config, Setting
 
 if TYPE_CHECKING:
-    from neusee.workflows import Event, Executor, Result, Store
+    from neusee.workflows.engine.runner import Result
+    from neusee.workflows.engine.step_job import Executor
+    from neusee.workflows.graph.step_record import Event
     from neusee.workflows.recipe.blocks.train_block import Training
     from neusee.workflows.recipe.blocks.train_lift_block import LiftTraining
     from neusee.workflows.recipe.distributions.nominal_values import Uncertain
+    from neusee.workflows.store.result_store import Store
 
 __all__ = ["Config", "Expectation", "Recipe", "Setting", "Step", "Substitution", "Wire", "in_order", "needed"]
 
@@ -110,7 +113,7 @@ class Recipe:
         memory: int | None = None,
     ) -> Result:
         """Run it; see `neusee.workflows.run`. Several threads may do so at once, on one store."""
-        from neusee.workflows import run
+        from neusee.workflows.engine.runner import run
 
         return run(self, store, outputs, watch, device, executor, memory)
 

@@ -11,7 +11,7 @@ from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Any
 
-from neusee.workflows.engine.runner import Event, StepRecord
+from neusee.workflows.graph.step_record import Event, StepRecord
 from neusee.workflows.report.run_page import shape_of, unit_of
 from neusee.workflows.report.tolerance_spent import said_of_economies
 

@@ -19,6 +19,9 @@ from typing import TYPE_CHECKING
 if TYPE_CHECKING:
     from neusee.workflows.graph.recipe_graph import Recipe
 
+from neusee.workflows.graph.recipe_graph import Recipe, needed
+from neusee.workflows.tolerance.cheaper_steps import with_substitutions
+
 
 @dataclass(frozen=True, slots=True)
 class Figure:
@@ -130,14 +133,6 @@ TABLE: Mapping[str, Mapping[str, str]] = {
 #: Steps that only a picture reads; a run makes them where the recipe has them.
 SHOWN = ("transfer",)
 
-
-def wanted(recipe: Recipe) -> tuple[str, ...]:
-    """Return the recipe's outputs, what its expected numbers read, and what the result table shows."""
-    promised = [e.step for e in recipe.expect]
-    shown = [s for s in (*(s for row in TABLE.values() for s in row.values()), *SHOWN) if s in recipe.steps]
-    return tuple(dict.fromkeys([*recipe.outputs, *promised, *shown]))
-
-
 BANDS = "bands"
 LINES = "line[*]"
 
@@ -152,3 +147,15 @@ FILES: Mapping[str, tuple[str, Mapping[str, str]]] = {
     "raw_mask.exr": ("exr", {"image": "raw[mask]"}),
     "restored.exr": ("exr", {"image": "restored"}),
 }
+
+
+def wanted(recipe: Recipe) -> tuple[str, ...]:
+    """Return the recipe's outputs, the steps of its expected numbers, and those that the result table shows."""
+    promised = [e.step for e in recipe.expect]
+    shown = [s for s in (*(s for row in TABLE.values() for s in row.values()), *SHOWN) if s in recipe.steps]
+    return tuple(dict.fromkeys([*recipe.outputs, *promised, *shown]))
+
+
+def steps_of(recipe: Recipe) -> list[str]:
+    """Return every step that a run of ``recipe`` looks at, in running order."""
+    return needed(with_substitutions(recipe, wanted(recipe)), wanted(recipe))

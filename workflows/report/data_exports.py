@@ -43,7 +43,7 @@ def exports(result: Result, shelf: DerivedFiles) -> tuple[dict[str, Path], dict[
 
 def spectral(cube: Tensor | Psf, bands: Bands) -> bytes:
     """A spectral cube as OpenEXR in the layout of Fichet et al., JCGT 2021."""
-    from neusee.nodes.scene._spectral_exr import write_spectral
+    from neusee.nodes.scene import write_spectral
 
     values = cube.intensity if isinstance(cube, Psf) else cube
     return _written(".exr", lambda path: write_spectral(path, values.detach().cpu().float(), bands.centres))

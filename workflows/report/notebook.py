@@ -19,7 +19,7 @@ from neusee.workflows.report.result_numbers import metrics_of, table
 if TYPE_CHECKING:
     from torch import Tensor
 
-    from neusee.workflows import Result
+    from neusee.workflows.engine.runner import Result
 
 _TEMPLATE = Path(__file__).parent / "templates" / "notebook.html.j2"
 _PATIENCE = 2.0  #: s that showing a result may take to have again what the store does not hold

@@ -7,6 +7,7 @@ from typing import Any
 
 from torch import Tensor
 
+from neusee.nodes.spectra import mean_wavelength
 from neusee.workflows.graph.recipe_graph import Recipe
 from neusee.workflows.report.contents import BANDS, LINES, TABLE
 
@@ -62,8 +63,7 @@ def _band(recipe: Recipe, keys: Mapping[str, str], value: Value) -> tuple[int, s
     lines = [name for name in recipe.steps if name.startswith(prefix) and name in keys]
     wanted = _DESIGN
     if lines:
-        line = value(lines[0])
-        wanted = float((line.centres * line.weights).sum() / line.weights.sum())
+        wanted = mean_wavelength(value(lines[0]))
     centres = value(BANDS).centres
     band = int((centres - wanted).abs().argmin())
     return band, f"{float(centres[band]) * 1e9:.0f} nm"

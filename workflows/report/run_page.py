@@ -22,9 +22,10 @@ from pathlib import Path
 from typing import Any
 
 from neusee.nodes import Check
-from neusee.workflows.engine.runner import Result, StepRecord
-from neusee.workflows.engine.step_record import facts_in
+from neusee.workflows.engine.finished_step import facts_in
+from neusee.workflows.engine.runner import Result
 from neusee.workflows.graph.recipe_graph import Recipe
+from neusee.workflows.graph.step_record import StepRecord
 from neusee.workflows.recipe.distributions.nominal_values import told
 from neusee.workflows.recipe.paper_readings import in_force
 from neusee.workflows.report.contents import FIGURES

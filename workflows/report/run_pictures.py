@@ -8,7 +8,8 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
-from neusee.workflows.engine.runner import Result, StepRecord, run
+from neusee.workflows.engine.runner import Result, run
+from neusee.workflows.graph.step_record import StepRecord
 from neusee.workflows.keys.cache_key import digest
 from neusee.workflows.keys.code_digest import Code
 from neusee.workflows.keys.engine_digest import engine

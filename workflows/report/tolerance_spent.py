@@ -7,11 +7,11 @@ from dataclasses import replace
 from typing import Any
 
 from neusee.workflows.engine.cost_model import Costs
-from neusee.workflows.engine.node_call import RunError
 from neusee.workflows.engine.placement_inputs import past_costs
 from neusee.workflows.engine.resolve_keys import resolve
 from neusee.workflows.engine.runner import Result
 from neusee.workflows.graph.recipe_graph import Recipe, needed
+from neusee.workflows.graph.run_error import RunError
 from neusee.workflows.tolerance.error_norm import error_of
 
 NORM = "root mean square over the largest element"

@@ -10,10 +10,11 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
-from neusee.workflows.engine.runner import Event, Result, StepRecord, run
+from neusee.workflows.engine.runner import Result, run
 from neusee.workflows.engine.step_job import Executor
 from neusee.workflows.explain.why_rerun import explained
-from neusee.workflows.graph.recipe_graph import Recipe, needed
+from neusee.workflows.graph.recipe_graph import Recipe
+from neusee.workflows.graph.step_record import Event, StepRecord
 from neusee.workflows.keys.cache_key import digest
 from neusee.workflows.report import run_page
 from neusee.workflows.report.contents import wanted
@@ -24,7 +25,7 @@ from neusee.workflows.store.derived_files import DerivedFiles
 from neusee.workflows.store.result_store import Store
 from neusee.workflows.tolerance.cheaper_steps import with_substitutions
 
-__all__ = ["Simulation", "recipe_text", "simulate", "steps_of", "wanted"]
+__all__ = ["Simulation", "recipe_text", "simulate"]
 
 _TIMING = ("step", "node", "device", "lane", "state", "began", "seconds", "predicted", "peak", "bytes", "key")
 
@@ -74,11 +75,6 @@ def _both(told: dict[str, StepRecord], watch: Callable[[Event], None] | None) ->
             watch(event)
 
     return note
-
-
-def steps_of(recipe: Recipe) -> list[str]:
-    """Every step that a run of ``recipe`` looks at, in running order."""
-    return needed(with_substitutions(recipe, wanted(recipe)), wanted(recipe))
 
 
 def _run_key(result: Result) -> str:

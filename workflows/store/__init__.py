@@ -1,1 +1,6 @@
-"""store"""
+"""Which results are kept, where, are they whole, and which go first?
+
+The folder of results by key: files, checksums, leases, the budget, other machines, and what is derived from results.
+Nothing here knows of recipes or decides what is computed.
+Offers: `result_store.Store`, `remote_store.open_store`, `derived_files.DerivedFiles`, `serialization.each_tensor`.
+"""

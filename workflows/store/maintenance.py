@@ -6,15 +6,25 @@ import os
 from collections.abc import Iterator
 from contextlib import suppress
 from dataclasses import dataclass
-from typing import TYPE_CHECKING
+from typing import Any, Protocol
 
 from neusee.workflows.store import metadata, orphan_files
 from neusee.workflows.store.budget_eviction import Candidate, candidates, evict, files, total
+from neusee.workflows.store.journal import Journal
 from neusee.workflows.store.metadata import UNREADABLE, Metadata, is_kept
 from neusee.workflows.store.shared_folder import Disk
 
-if TYPE_CHECKING:
-    from neusee.workflows.store.result_store import Store
+
+class Upkept(Protocol):
+    """The part of a store that its upkeep needs."""
+
+    disk: Disk
+    journal: Journal
+
+    def pinned(self) -> set[str]: ...
+    def read_seconds(self, size: float) -> float: ...
+    def load(self, about: Metadata, verify: str) -> Any: ...
+    def put_aside(self, key: str, error: Exception) -> None: ...
 
 
 @dataclass(frozen=True, slots=True)
@@ -37,7 +47,7 @@ class Checked:
     problem: str  #: empty where it is as it was written
 
 
-def gc(store: Store, budget: int | None, dry: bool) -> Swept:
+def gc(store: Upkept, budget: int | None, dry: bool) -> Swept:
     """Remove what belongs to no result, and values beyond ``budget``, where there is one."""
     before = total(store.disk)
     orphans = dict(orphan_files.sweep(store.disk, dry))
@@ -50,7 +60,7 @@ def gc(store: Store, budget: int | None, dry: bool) -> Swept:
     return Swept(tuple(c.key for c in gone), tuple(c.key for c in refused), freed, len(orphans), after)
 
 
-def make_room(store: Store, excess: float, dry: bool = False) -> tuple[list[Candidate], list[Candidate]]:
+def make_room(store: Upkept, excess: float, dry: bool = False) -> tuple[list[Candidate], list[Candidate]]:
     """Let values go until ``excess`` bytes are free; those that went, and those that we may not remove."""
     if excess <= 0:
         return [], []
@@ -61,7 +71,7 @@ def make_room(store: Store, excess: float, dry: bool = False) -> tuple[list[Cand
     return gone, refused
 
 
-def check(store: Store) -> Iterator[Checked]:
+def check(store: Upkept) -> Iterator[Checked]:
     """Read every value and compare every checksum; what is damaged is put aside."""
     for key in metadata.names(store.disk):
         about, problem = None, ""

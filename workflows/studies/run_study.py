@@ -1,10 +1,10 @@
 """Studies of a recipe: what its numbers are worth, where it breaks, and what it need not compute.
 
-    study.accuracy(load("first_light"))     error against run time, over tolerances and knobs
-    study.stability(load("first_light"))    stiff and extreme cases against float64
-    study.leave_out(load("first_light"))    each omission beside the full computation
-    study.calibration(load("calibrate"))    whether the posterior of a sensor is right, by simulations
-    study.uncertainty(load("first_light", ["sensor.read_noise=normal(10.5 e-, 0.5 e-)"]))    what outputs are worth
+    made("accuracy", load("first_light"))       error against run time, over tolerances and knobs
+    made("stability", load("first_light"))      stiff and extreme cases against float64
+    made("leave-out", load("first_light"))      each omission beside the full computation
+    made("calibration", load("calibrate"))      whether the posterior of a sensor is right, by simulations
+    made("uncertainty", load("first_light", ["sensor.read_noise=normal(10.5 e-, 0.5 e-)"]))  what outputs are worth
 
 Each writes a folder with a page, a table and pictures, and goes on where it was interrupted.
 """
@@ -22,31 +22,6 @@ from neusee.workflows.store.remote_store import open_store
 from neusee.workflows.store.result_store import Store
 
 KINDS = ("accuracy", "stability", "leave-out", "calibration", "uncertainty")
-
-
-def accuracy(recipe: Recipe, **how: Any) -> Path:
-    """Error against run time of the recipe and of its steps; see `made`."""
-    return made("accuracy", recipe, **how)
-
-
-def stability(recipe: Recipe, **how: Any) -> Path:
-    """Stiff and extreme cases, forward and gradient, against float64; see `made`."""
-    return made("stability", recipe, **how)
-
-
-def leave_out(recipe: Recipe, **how: Any) -> Path:
-    """Runs with and without each omission, and whether its bound holds; see `made`."""
-    return made("leave-out", recipe, **how)
-
-
-def calibration(recipe: Recipe, **how: Any) -> Path:
-    """Ranks of the truth among draws from the posterior of simulated frames; see `made`."""
-    return made("calibration", recipe, **how)
-
-
-def uncertainty(recipe: Recipe, **how: Any) -> Path:
-    """How outputs scatter over draws of what the recipe is not sure of; see `made`."""
-    return made("uncertainty", recipe, **how)
 
 
 def made(

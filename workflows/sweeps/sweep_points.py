@@ -14,10 +14,12 @@ from pathlib import Path
 from statistics import median
 from typing import Any, Literal
 
-from neusee.workflows.engine.node_call import RunError, place
-from neusee.workflows.engine.runner import Event, Result, run
+from neusee.workflows.engine.node_call import place
+from neusee.workflows.engine.runner import Result, run
 from neusee.workflows.graph.diagnostics import Diagnostic, RecipeError
 from neusee.workflows.graph.recipe_graph import Recipe, needed
+from neusee.workflows.graph.run_error import RunError
+from neusee.workflows.graph.step_record import Event
 from neusee.workflows.keys.cache_key import Key, key_of
 from neusee.workflows.keys.code_digest import Code
 from neusee.workflows.recipe.loading import check

@@ -11,15 +11,12 @@ from __future__ import annotations
 import html
 import os
 import shlex
-import sys
-import time
-from collections.abc import Iterable, Iterator, Mapping, Sequence
-from contextlib import closing
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, Literal
 
-from neusee.workflows.engine.node_call import versions
+from neusee.workflows.engine.provenance import versions
 from neusee.workflows.keys.cache_key import digest
 from neusee.workflows.recipe.text.overrides import Override
 from neusee.workflows.report.console import aligned
@@ -30,9 +27,8 @@ from neusee.workflows.sweeps.axes import Argument, Axis, points, read_axes, read
 from neusee.workflows.sweeps.point_order import Sharing, sharing
 from neusee.workflows.sweeps.sweep_files import dataset, require_xarray, write_account, write_table
 from neusee.workflows.sweeps.sweep_points import OnError, Outcome, Plan, outcomes, planned
-from neusee.workflows.sweeps.sweep_table import Column, column, header, lasts, rows_of, screen, wide
+from neusee.workflows.sweeps.sweep_table import Column, column, header, rows_of, wide
 
-DONE, FAILED, INTERRUPTED = 0, 1, 130
 State = Literal["complete", "stopped", "interrupted"]
 
 
@@ -77,7 +73,7 @@ class Sweep:
         names, *rows = wide(self.outcomes, self.columns)
         head = "".join(f"<th>{html.escape(name)}</th>" for name in names)
         body = "".join("<tr>" + "".join(f"<td>{html.escape(c)}</td>" for c in row) + "</tr>" for row in rows)
-        said = html.escape(f"{self.title or self.recipe}: {_counted(self)}")
+        said = html.escape(f"{self.title or self.recipe}: {counted(self)}")
         return f"<p>{said}</p><table><thead><tr>{head}</tr></thead><tbody>{body}</tbody></table>"
 
 
@@ -102,50 +98,12 @@ def sweep(
     """
     place = Path(folder or ".").absolute()
     arguments = [*read_words(overrides, place), *read_axes(axes, place)]
-    work = _Sweeping(os.fspath(recipe), arguments, place, store or open_store(), zip, device)
+    work = Sweeping(os.fspath(recipe), arguments, place, store or open_store(), zip, device)
     found = list(outcomes(work.plan, work.store, on_error, device))
     return work.sweep(found, "complete")
 
 
-def run_sweep(
-    recipe: str,
-    words: Sequence[str],
-    *,
-    first: int = 2,
-    zip: bool = False,
-    on_error: OnError = "stop",
-    netcdf: bool = False,
-    device: str = "cpu",
-    out: Path = Path("runs"),
-    store: Store | None = None,
-    quiet: bool = False,
-) -> int:
-    """The command ``neusee sweep``: run, show, and write ``out/sweeps/<date>_<recipe>_<key>/``; gives the exit code.
-
-    ``words`` are the changes and axes, counted from ``first``. Raises: RecipeError with every
-    mistake of every point, before anything runs.
-    """
-    if netcdf:
-        require_xarray("--netcdf")
-    began, place = time.perf_counter(), Path().absolute()
-    work = _Sweeping(recipe, read_words(words, place, first), place, store or open_store(), zip, device)
-    again = _again(recipe, words, zip, on_error, netcdf, device, out)
-    if not quiet:
-        print(*work.opening(), sep="\n", flush=True)
-    found, state, error = _shown(work, on_error, quiet)
-    if error is not None and not (on_error == "stop" and found and found[-1].state == "failed"):
-        raise error
-    result = work.sweep(found, state)
-    path = _written(work, result, again, out, netcdf, time.perf_counter() - began)
-    if quiet:
-        print(*_failures(result), sep="\n", end="\n" if result.failed else "", file=sys.stderr)
-        print(path / "sweep.csv", flush=True)
-    else:
-        print(*_closing(result, path, again, time.perf_counter() - began), sep="\n", flush=True)
-    return INTERRUPTED if state == "interrupted" else FAILED if result.failed else DONE
-
-
-class _Sweeping:
+class Sweeping:
     """A sweep that is checked and ready to run."""
 
     def __init__(
@@ -163,53 +121,21 @@ class _Sweeping:
         count = len(self.plan.checked)
         return Sweep(recipe.name, recipe.title, self.columns, tuple(in_turn), count, self.sharing, self.paired, state)
 
-    def opening(self) -> Iterator[str]:
-        """The lines before anything runs."""
-        recipe, sizes = self.plan.recipe, f" {'+' if self.paired else '×'} ".join(map(_sized, self.axes))
-        shared = self.sharing
-        yield f"neusee sweep: {recipe.title or recipe.name}"
-        yield f"checked  {shared.points} points ({sizes}), {shared.steps} steps: all right"
-        yield f"shared   {shared.made} different results: {100 * shared.saved:.0f} % less work than point by point"
-        if self.plan.costs and any(self.plan.work):
-            yield f"time     about {lasts(sum(self.plan.work))}, as earlier runs took"
-        yield from (f"note     {line}" for line in self.plan.notes)
 
-
-def _sized(axis: Axis) -> str:
-    return f"{axis.name}: {len(axis.coordinates)}"
-
-
-def _shown(work: _Sweeping, on_error: OnError, quiet: bool) -> tuple[list[Outcome], State, Exception | None]:
-    """Run the points on the screen that fits; Ctrl-C and a failure end the sweep, and keep what there is."""
-    shown = screen(work.columns, len(work.plan.checked), quiet)
-    try:
-        with (
-            shown,
-            closing(outcomes(work.plan, work.store, on_error, work.device, shown.started, shown.watch)) as running,
-        ):
-            for outcome in running:
-                shown.finished(outcome)
-    except KeyboardInterrupt:
-        return shown.outcomes, "interrupted", None
-    except Exception as error:
-        return shown.outcomes, "stopped", error
-    return shown.outcomes, "complete", None
-
-
-def _written(work: _Sweeping, result: Sweep, again: Sequence[str], out: Path, netcdf: bool, seconds: float) -> Path:
-    """The folder of a sweep; of one that did not reach its end, with ``partial`` in its name."""
+def write_sweep(work: Sweeping, result: Sweep, again: Sequence[str], out: Path, netcdf: bool, seconds: float) -> Path:
+    """Write the folder of a sweep and return its path. A sweep that did not end has ``partial`` in its name."""
     name = f"{result.recipe}{'' if result.state == 'complete' else '_partial'}"
     key = digest([checked.job.keys[name] for checked in work.plan.checked for name in checked.job.outputs])
     with new_run(out / "sweeps", name, key) as folder:
         write_table(folder, result.outcomes, result.columns)
-        title = f"{(result.title or result.recipe).rstrip('.')}: {_counted(result)}"
+        title = f"{(result.title or result.recipe).rstrip('.')}: {counted(result)}"
         write_account(folder, title, _account(work, result, again, seconds))
         if netcdf:
             result.to_xarray().to_netcdf(folder.path / "sweep.nc", engine="h5netcdf")
     return folder.path
 
 
-def _account(work: _Sweeping, result: Sweep, again: Sequence[str], seconds: float) -> dict[str, Any]:
+def _account(work: Sweeping, result: Sweep, again: Sequence[str], seconds: float) -> dict[str, Any]:
     return {
         "recipe": result.recipe,
         "state": result.state,
@@ -228,33 +154,7 @@ def _account(work: _Sweeping, result: Sweep, again: Sequence[str], seconds: floa
     }
 
 
-def _again(
-    recipe: str, words: Sequence[str], paired: bool, on_error: str, netcdf: bool, device: str, out: Path
-) -> list[str]:
-    """The words that run a sweep again, or let it go on."""
-    options = ["--zip"] * paired + ["--netcdf"] * netcdf
-    options += ["--on-error", on_error] if on_error != "stop" else []
-    options += ["--device", device] if device != "cpu" else []
-    options += ["--out", str(out)] if out != Path("runs") else []
-    return ["neusee", "sweep", recipe, *words, *options]
-
-
-def _closing(result: Sweep, path: Path, again: Sequence[str], seconds: float) -> Iterator[str]:
-    """The lines after the last point."""
-    yield ""
-    yield f"{_counted(result)}  ({lasts(seconds)})"
-    yield from (f"  {line}" for line in _failures(result))
-    yield f"table    {path / 'sweep.csv'}"
-    if result.state != "complete":
-        yield f"partial: what is done is kept; to go on: {shlex.join(again)}"
-
-
-def _failures(result: Sweep) -> Iterator[str]:
-    for outcome in result.failed:
-        yield f"failed: point {outcome.point.number}, {outcome.point.shown}: {outcome.message.splitlines()[0]}"
-
-
-def _counted(result: Sweep) -> str:
+def counted(result: Sweep) -> str:
     """``12 points: 8 run, 3 cached, 1 failed``."""
     states = [outcome.state for outcome in result.outcomes]
     parts = [f"{states.count(state)} {state}" for state in ("run", "cached", "failed") if state in states]

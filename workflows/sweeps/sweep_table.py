@@ -1,22 +1,18 @@
-"""The table of a sweep: its columns, its rows for a file, and what a terminal shows while it runs."""
+"""The table of a sweep: its columns, its rows for a file, and the words of its cells."""
 
 from __future__ import annotations
 
-import sys
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 
 from neusee.nodes import units
 
 if TYPE_CHECKING:
-    from neusee.workflows.engine.runner import Event
     from neusee.workflows.sweeps.axes import Axis, Point
     from neusee.workflows.sweeps.sweep_points import Number, Outcome
 
 AFTER = ("status", "step", "field", "index", "value", "seconds", "cached", "message")  #: columns after the axes
-_NUMBERS = 4  #: columns of numbers that a screen shows
-_LAST = 25  #: points that a live table shows
 
 
 @dataclass(frozen=True, slots=True)
@@ -70,7 +66,7 @@ def header(columns: Sequence[Column]) -> list[str]:
 
 def rows_of(outcome: Outcome, columns: Sequence[Column]) -> Iterator[list[Any]]:
     """One row for each number of a point; one for a point that failed or has no numbers."""
-    where = [outcome.point.number, *_cells(outcome.point, columns)]
+    where = [outcome.point.number, *point_cells(outcome.point, columns)]
     status = "failed" if outcome.state == "failed" else "ok"
     last = [round(outcome.seconds, 6), outcome.state == "cached", outcome.message]
     for number in outcome.numbers or ((outcome.step, "", "", ""),):
@@ -92,13 +88,14 @@ def wide(outcomes: Sequence[Outcome], columns: Sequence[Column]) -> list[list[st
     names = list(dict.fromkeys(name for result in results for name in result))
     rows = [["point", *(c.header for c in columns), *names, "state", "seconds"]]
     for outcome, result in zip(outcomes, results, strict=True):
-        cells = [_text(cell) for cell in _cells(outcome.point, columns)]
+        cells = [cell_text(cell) for cell in point_cells(outcome.point, columns)]
         values = [result.get(name, "") for name in names]
         rows.append([str(outcome.point.number), *cells, *values, outcome.state, f"{outcome.seconds:.3f}"])
     return rows
 
 
-def _cells(point: Point, columns: Sequence[Column]) -> list[Any]:
+def point_cells(point: Point, columns: Sequence[Column]) -> list[Any]:
+    """Return the values of a point on the axes."""
     return [c.cells[i] for c, i in zip(columns, point.place, strict=True)]
 
 
@@ -106,7 +103,8 @@ def _said(values: Sequence[float]) -> str:
     return f"{values[0]:.4g}" if len(values) == 1 else f"{min(values):.3g} … {max(values):.3g}"
 
 
-def _text(cell: Any) -> str:
+def cell_text(cell: Any) -> str:
+    """Return a value of an axis as a table shows it."""
     return f"{cell:.6g}" if isinstance(cell, float) else str(cell)
 
 
@@ -116,115 +114,3 @@ def lasts(seconds: float) -> str:
     if whole >= 3600:
         return f"{whole // 3600} h {whole % 3600 // 60:02} min"
     return f"{whole // 60} min {whole % 60:02} s" if whole >= 60 else f"{whole} s"
-
-
-# --- on the screen --------------------------------------------------------------------------------------------------
-
-
-@dataclass
-class Silent:
-    """Shows nothing."""
-
-    columns: Sequence[Column]
-    points: int
-    outcomes: list[Outcome] = field(default_factory=list)
-    running: Point | None = None
-    step: str = ""
-
-    def __enter__(self) -> Silent:
-        return self
-
-    def __exit__(self, *error: object) -> None:
-        return None
-
-    def started(self, point: Point) -> None:
-        """A point begins."""
-        self.running, self.step = point, ""
-
-    def watch(self, event: Event) -> None:
-        """A step of it begins or ended."""
-        self.step = event.step if event.done is None else ""
-
-    def finished(self, outcome: Outcome) -> None:
-        """A point ended."""
-        self.outcomes.append(outcome)
-        self.running = None
-
-    def cells(self, outcome: Outcome) -> list[str]:
-        """One row: which of how many, the values, state, seconds, the first numbers, and the time that is left."""
-        values = map(_text, _cells(outcome.point, self.columns))
-        numbers = list(headline(outcome.numbers).items())[:_NUMBERS]
-        said = "  ".join(f"{name} {value}" for name, value in numbers)
-        where, left = f"{len(self.outcomes)}/{self.points}", lasts(outcome.left) if outcome.left else ""
-        return [where, str(outcome.point.number), *values, outcome.state, f"{outcome.seconds:.3f}", left, said]
-
-    @property
-    def headers(self) -> list[str]:
-        return ["done", "point", *(c.header for c in self.columns), "state", "seconds", "left", "results"]
-
-
-class Plain(Silent):
-    """One line a point."""
-
-    def __enter__(self) -> Plain:
-        widest = [max(map(len, (c.header, *map(_text, c.cells)))) for c in self.columns]
-        count = len(str(self.points))
-        self.widths = [max(4, 2 * count + 1), max(5, count), *widest, 6, 8, 12, 0]
-        self._say(self.headers)
-        return self
-
-    def finished(self, outcome: Outcome) -> None:
-        super().finished(outcome)
-        self._say(self.cells(outcome))
-        if outcome.state == "failed":
-            print(*(f"  {line}" for line in outcome.message.splitlines()), sep="\n", flush=True)
-
-    def _say(self, cells: Sequence[str]) -> None:
-        line = "  ".join(f"{cell:<{width}}" for cell, width in zip(cells, self.widths, strict=True))
-        print(f"  {line}".rstrip(), flush=True)
-
-
-class Live(Silent):
-    """A table that fills; failures stay above it."""
-
-    def __enter__(self) -> Live:
-        from rich.live import Live as RichLive
-
-        self.lines = list[list[str]]()
-        self.live = RichLive(self, refresh_per_second=8, vertical_overflow="visible")
-        self.live.start()
-        return self
-
-    def __exit__(self, *error: object) -> None:
-        self.live.stop()
-
-    def finished(self, outcome: Outcome) -> None:
-        super().finished(outcome)
-        self.lines.append(self.cells(outcome))
-        if outcome.state == "failed":
-            told = f"point {outcome.point.number}: {outcome.point.shown}\n{outcome.message}"
-            self.live.console.print(told, style="red", markup=False, highlight=False)
-
-    def __rich__(self) -> Any:
-        from rich import box
-        from rich.table import Table
-
-        table = Table(box=box.SIMPLE_HEAD, pad_edge=False, header_style="bold")
-        for name in self.headers:
-            table.add_column(name, overflow="fold")
-        state = len(self.columns) + 2
-        for line in self.lines[-_LAST:]:
-            table.add_row(*line, style={"run": "bold", "cached": "cyan", "failed": "red"}[line[state]])
-        if self.running is not None:
-            left = self.outcomes[-1].left if self.outcomes else 0.0
-            about = [f"about {lasts(left)} left"] if left else []
-            now = [f"point {len(self.outcomes) + 1} of {self.points}: {self.running.shown}", *filter(None, [self.step])]
-            table.caption = "; ".join(now + about)
-        return table
-
-
-def screen(columns: Sequence[Column], points: int, silent: bool) -> Silent:
-    """The display that fits where the output goes."""
-    if silent:
-        return Silent(columns, points)
-    return Live(columns, points) if sys.stdout.isatty() else Plain(columns, points)

@@ -11,9 +11,9 @@ from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass, field
 
 from neusee.nodes import ErrorBound, TensorStats
-from neusee.workflows.engine.node_call import RunError
-from neusee.workflows.engine.step_record import StepRecord
 from neusee.workflows.graph.recipe_graph import Recipe, Step, Wire
+from neusee.workflows.graph.run_error import RunError
+from neusee.workflows.graph.step_record import StepRecord
 
 FactsOf = Callable[[str], TensorStats | None]
 _EXACT = ErrorBound(0.0)

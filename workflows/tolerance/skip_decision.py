@@ -9,8 +9,8 @@ from typing import Any
 from torch import Tensor
 
 from neusee.nodes import TensorStats
-from neusee.workflows.engine.node_call import RunError
 from neusee.workflows.graph.recipe_graph import Step
+from neusee.workflows.graph.run_error import RunError
 
 FactsOf = Callable[[str], TensorStats | None]
 

@@ -11,8 +11,9 @@ from typing import Any
 import torch
 
 from neusee.nodes import doe
-from neusee.nodes._network_weights import told
-from neusee.workflows.engine.node_call import versions
+from neusee.nodes.network_weights import file_metadata
+from neusee.nodes.scene import Photographs
+from neusee.workflows.engine.provenance import versions
 from neusee.workflows.graph.recipe_graph import Recipe
 from neusee.workflows.keys.cache_key import digest
 from neusee.workflows.recipe.blocks.mask_design_block import MaskSettings
@@ -30,7 +31,6 @@ from neusee.workflows.training.checkpoint import (
 )
 from neusee.workflows.training.mask_stage import MASK, design_in, designed
 from neusee.workflows.training.parallel.process_mesh import ALONE, Mesh, MeshError
-from neusee.workflows.training.photograph_folder import Photographs
 from neusee.workflows.training.tensorboard_log import TensorBoardLog
 from neusee.workflows.training.training_figures import curves, strip
 from neusee.workflows.training.training_iteration import Learner, NotFinite
@@ -253,7 +253,7 @@ class _Course:
             with torch.no_grad():
                 export(self.folder, "mask", {"height": self.learner.height()})
         net = self.learner.average or self.learner.net
-        export(self.folder, "network", weights_of(net), told(self.learner.net))
+        export(self.folder, "network", weights_of(net), file_metadata(self.learner.net))
 
     @property
     def _mask_source(self) -> str:

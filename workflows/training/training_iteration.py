@@ -11,15 +11,21 @@ from torch import Tensor, nn
 from torch.optim.swa_utils import AveragedModel, get_ema_multi_avg_fn
 from torch.utils.checkpoint import checkpoint
 
-from neusee.nodes import losses
-from neusee.nodes._bicubic_resize import resize
-from neusee.nodes.doe._parametrisations import LEARNT
-from neusee.nodes.optics._pupil_grid import stop
-from neusee.nodes.restore._networks._critic import critics, passed_over, slopes
-from neusee.nodes.restore._networks._fft_mamba import FFTMamba
-from neusee.nodes.restore._networks._nafnet import NAFNet
-from neusee.nodes.restore._networks._restorer import Restorer, parameter_groups, started
-from neusee.nodes.restore._networks._unet import UNet
+from neusee.nodes import losses, metrics
+from neusee.nodes.bicubic_resize import resize
+from neusee.nodes.doe import PARAMETRISATIONS
+from neusee.nodes.optics import stop
+from neusee.nodes.restore import (
+    FFTMamba,
+    NAFNet,
+    Restorer,
+    UNet,
+    critic_slopes,
+    critics,
+    parameter_groups,
+    skip_critic_draws,
+    start_network,
+)
 from neusee.nodes.values import Psf
 from neusee.workflows.graph.diagnostics import nearest
 from neusee.workflows.graph.recipe_graph import Recipe, Step
@@ -62,7 +68,7 @@ class Learner:
         self.how, self.seed, self.device, self.mesh = how, recipe.seed, device, mesh
         self._step = recipe.steps[how.learn] if how.learn else None
         self.mask = nn.Module() if designed or self._step is None else self._start(self._step).to(how.dtype)
-        self.net: Restorer = started(lambda: _made(how.network), self._rng("network")).to(how.dtype)
+        self.net: Restorer = start_network(lambda: _made(how.network), self._rng("network")).to(how.dtype)
         self.critics = nn.ModuleList(critics(self._rng("critics"), how.critics.width)).to(how.dtype)
         self.average = _averaged(self.net, how.average) if how.average else None
         self.begin(Stage(iterations=0), learns=True)
@@ -70,10 +76,10 @@ class Learner:
     def _start(self, step: Step) -> nn.Module:
         """The relief that learns; one that was designed does not."""
         path = step.node.path
-        if path not in LEARNT:
-            text = f"{self.how.learn} is {path}, of which nothing is learnt; {nearest(path, LEARNT)}"
+        if path not in PARAMETRISATIONS:
+            text = f"{self.how.learn} is {path}, of which nothing is learnt; {nearest(path, PARAMETRISATIONS)}"
             raise ValueError(f"train: {text}; or design it without images: --stage mask")
-        return LEARNT[path](step.params, self._rng("element"))
+        return PARAMETRISATIONS[path](step.params, self._rng("element"))
 
     def height(self) -> Tensor:
         """The relief (v, u) in m; raises ValueError where none learns."""
@@ -153,7 +159,7 @@ class Learner:
         psf: Psf = shared.values[self.how.psf]
         count, times = samples.counted(self.how.psf, len(psf.clear_peak))
         with torch.no_grad():
-            peaks = psf.intensity.detach().amax((-2, -1)).double() / psf.clear_peak
+            peaks: Tensor = metrics.lsr(psf)
         if self.stage.lsr:
             for one in range(len(psf.clear_peak)):
                 loss = checkpoint(self._suppression, psf.intensity, psf.clear_peak, one, use_reentrant=False)
@@ -195,11 +201,11 @@ class Learner:
         for i in range(batch):
             if i not in pairs:
                 for _ in self.critics:
-                    passed_over(rng, self.how.patches if self.how.patch else 1)
+                    skip_critic_draws(rng, self.how.patches if self.how.patch else 1)
                 continue
             for critic, t, e in zip(self.critics, *pairs[i], strict=True):
                 apart = (critic(e) - critic(t)).mean()
-                steep = losses.gradient_penalty(slopes(critic, t, e, rng))
+                steep = losses.gradient_penalty(critic_slopes(critic, t, e, rng))
                 _backward([(self.stage.adversarial * apart + self.stage.penalty * steep) / batch])
                 found["critics"] += float(apart.detach()) / batch
                 found["penalty"] += float(steep.detach()) / batch

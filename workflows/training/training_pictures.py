@@ -16,6 +16,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from neusee.nodes.scene import Photographs
 from neusee.workflows.engine.differentiable_function import as_function
 from neusee.workflows.graph.recipe_graph import Recipe, needed
 from neusee.workflows.recipe.blocks.train_block import Training
@@ -26,7 +27,6 @@ from neusee.workflows.training.parallel.band_shards import Shards
 from neusee.workflows.training.parallel.picture_rounds import Pictures
 from neusee.workflows.training.parallel.process_mesh import ALONE, Mesh
 from neusee.workflows.training.parallel.shared_graph import Shared
-from neusee.workflows.training.photograph_folder import Photographs
 
 _LASER = ("optics.laser_irradiance", "strength")  #: of a step, what is 0 where there is no laser
 _SEEDS = 2**31
@@ -174,7 +174,7 @@ class TrainingStream:
 
 
 def _resized(picture: Tensor, size: Sequence[int]) -> Tensor:
-    from neusee.nodes._bicubic_resize import resize
+    from neusee.nodes.bicubic_resize import resize
 
     return resize(picture, *size)
 

@@ -11,7 +11,7 @@ import torch
 from torch import Tensor, nn
 
 from neusee.nodes._half_precision import single
-from neusee.nodes.restore._networks._restorer import LEAK, LEAKY, started
+from neusee.nodes.restore._networks._restorer import LEAK, LEAKY, start_network
 
 SMALLEST = 16  #: pixels a side, that four halvings leave one
 
@@ -36,16 +36,16 @@ class Critic(nn.Module):
 
 def critics(rng: torch.Generator, width: int = 64) -> tuple[Critic, Critic]:
     """D0 of the coarse estimate and D1 of the fine one: orthogonal weights that keep the power, zero biases."""
-    first, second = (started(partial(Critic, width), rng) for _ in range(2))
+    first, second = (start_network(partial(Critic, width), rng) for _ in range(2))
     return first, second
 
 
-def passed_over(rng: torch.Generator, count: int = 1) -> None:
-    """Draw what `slopes` draws for ``count`` pictures, where another process looks at them."""
+def skip_critic_draws(rng: torch.Generator, count: int = 1) -> None:
+    """Draw what `critic_slopes` draws for ``count`` pictures, where another process looks at them."""
     torch.rand(count, 1, 1, 1, generator=rng, device=rng.device)
 
 
-def slopes(critic: nn.Module, truth: Tensor, estimate: Tensor, rng: torch.Generator) -> Tensor:
+def critic_slopes(critic: nn.Module, truth: Tensor, estimate: Tensor, rng: torch.Generator) -> Tensor:
     """How the critic rises somewhere between each true picture and its estimate, in single precision at least.
 
     To be differentiated again, as by `losses.gradient_penalty`; nothing reaches the pictures.

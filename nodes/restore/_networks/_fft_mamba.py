@@ -9,7 +9,7 @@ from torch import Tensor, nn
 from torch.nn import functional as F
 
 from neusee.nodes import node
-from neusee.nodes._bicubic_resize import resize
+from neusee.nodes.bicubic_resize import resize
 from neusee.nodes.restore._networks._mamba_blocks import Block, Directions, Form
 from neusee.nodes.restore._networks._restorer import Restorer, Tile, fitting, restored, restorer_checks
 from neusee.nodes.restore._networks._scan_layer import Kind

@@ -12,10 +12,10 @@ from torch import Tensor, nn
 from torch.nn import functional as F
 
 from neusee.nodes import Check, ParameterError
-from neusee.nodes._bicubic_resize import resize
 from neusee.nodes._half_precision import refuse_not_finite, single
 from neusee.nodes._mirror_padding import mirrored
-from neusee.nodes._network_weights import empty, loaded, same_layout
+from neusee.nodes.bicubic_resize import resize
+from neusee.nodes.network_weights import empty, loaded, same_layout
 from neusee.nodes.restore._networks._tiles import tiled
 from neusee.nodes.units import Count
 
@@ -79,7 +79,7 @@ class Scale(nn.Module):
         return x * self.factor
 
 
-def started(make: Callable[[], Net], rng: torch.Generator) -> Net:
+def start_network(make: Callable[[], Net], rng: torch.Generator) -> Net:
     """Draw a network: its layers with orthogonal weights and zero biases; norms, decays and factors as these need.
 
     Those of a network with leaky layers are larger by its `gain`, which keeps the power from layer to layer. What is

@@ -10,8 +10,8 @@ from safetensors.torch import save_file
 from torch.testing import assert_close
 
 from neusee.nodes import ParameterError, doe
-from neusee.nodes._bicubic_resize import enlarge
-from neusee.nodes.doe._parametrisations import LEARNT
+from neusee.nodes.bicubic_resize import enlarge
+from neusee.nodes.doe._parametrisations import PARAMETRISATIONS
 from neusee.nodes.doe._unet_height_map import HeightNet, coordinates, fresh, height_of
 from neusee.nodes.optics._pupil_grid import stop
 
@@ -182,7 +182,7 @@ def test_pixelwise_reads_levels_of_a_grey_picture(tmp_path):
 @pytest.mark.parametrize(("name", "params"), [("half_rings", {"waves": (9.0,)}), ("cubic", {"waves": 3.0})])
 def test_every_sample_of_a_formula_can_be_freed(name, params):
     start = getattr(doe, name)(**GRID, **params)
-    freed = LEARNT[f"doe.{name}"]({**GRID, **params}, seeded())
+    freed = PARAMETRISATIONS[f"doe.{name}"]({**GRID, **params}, seeded())
     grid = stop(**GRID)
     moved = freed(grid).detach() - start
     assert_close(moved, torch.full_like(moved, float(moved.mean())), rtol=1e-3, atol=1e-10)  # a piston

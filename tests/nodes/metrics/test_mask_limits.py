@@ -7,7 +7,7 @@ import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from neusee.nodes.metrics import limits, lsr, mtf
+from neusee.nodes.metrics import limits, lsr, most_contrast, mtf
 from neusee.nodes.metrics._mask_limits import least_lsr, most_unsuppressed, shares
 from neusee.nodes.values import Psf
 
@@ -64,3 +64,11 @@ def test_without_light_all_are_zero_and_pull_nowhere(scale):
     found = limits(psf(dark, 0.12))
     assert all(float(x.detach()) == 0 for x in found)
     assert float(torch.autograd.grad(sum(x.sum() for x in found), dark)[0].abs().max()) == 0
+
+
+def test_the_bound_of_contrast_goes_as_the_root_of_the_suppression_and_ends_at_one():
+    drawn = psf(torch.rand((1, 32, 32), generator=torch.Generator().manual_seed(3)) ** 6, 0.12)
+    kept = Psf(drawn.intensity / drawn.intensity.sum(), drawn.clear_peak)
+    found = most_contrast(float(most_unsuppressed(kept)), lsr(kept))
+    assert float(found) == pytest.approx(float(limits(kept).passed), rel=1e-6)
+    assert float(most_contrast(10.0, torch.ones(1))) == 1.0

@@ -5,7 +5,7 @@ import math
 import pytest
 import torch
 
-from neusee.nodes.metrics import encircled, mtf
+from neusee.nodes.metrics import encircled, encircled_curve, mtf, over_clear_peak
 from neusee.nodes.values import Psf
 
 DIAMETER, FOCAL, WAVE, PITCH = 8.0784e-3, 0.11, 550e-9, 2.9e-6
@@ -79,3 +79,17 @@ def test_encircled_energy_of_an_airy_pattern():
         1 - 2 / (math.pi * math.pi * DIAMETER * 200 * PITCH / (WAVE * FOCAL)), abs=2e-3
     )
     assert encircled.hooks.check(found)[0].ok
+
+
+@pytest.mark.parametrize("pixels", [0, 1, 7])
+def test_the_curve_of_encircled_light_has_what_lies_within_each_radius(pixels):
+    spread = lens(half_ring(2.0), window=32, samples=64)
+    curve = encircled_curve(spread.intensity[0])
+    within = encircled(spread, pixel_pitch=PITCH, radius=(pixels + 1e-3) * PITCH)
+    assert float(curve[pixels]) == pytest.approx(float(within), rel=1e-9)
+    assert float(curve[-1]) == pytest.approx(float(spread.intensity.sum()), rel=1e-12)
+
+
+def test_the_clear_lens_over_its_own_peak_is_one_on_the_axis():
+    clear = lens(window=32, samples=64)
+    assert float(over_clear_peak(clear, 0)[16, 16]) == pytest.approx(1.0, rel=1e-9)

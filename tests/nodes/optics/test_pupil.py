@@ -263,3 +263,11 @@ def test_everything_is_made_where_the_relief_is():
         torch.zeros(8, 8, device="meta"), doe.material(line), line, **LENS, defocus=1.0, aberrations={5: 1e-8, 8: 1e-8}
     )
     assert {x.device.type for x in p} == {"meta"}
+
+
+def test_a_height_of_one_wave_turns_the_phase_once_and_at_twice_the_wavelength_nearly_half():
+    height = torch.full((200, 200), doe.wave_height("fused silica", 450e-9))
+    turns = optics.mask_turns(pupil(height, wavelengths=(450, 900)), 0, step=4)
+    assert turns.shape == (50, 50)
+    assert_close(turns, torch.ones(50, 50, dtype=torch.float64), rtol=1e-6, atol=0)
+    assert float(optics.mask_turns(pupil(height, wavelengths=(450, 900)), 1).mean()) == pytest.approx(0.485, abs=0.01)

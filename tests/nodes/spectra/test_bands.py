@@ -9,7 +9,8 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from neusee.nodes import ParameterError
-from neusee.nodes.spectra import bands, filters, line
+from neusee.nodes.spectra import bands, filters, line, mean_wavelength
+from neusee.nodes.values import Bands
 
 NM = 1e-9
 
@@ -116,3 +117,8 @@ def test_refuses_bands_below_100_nm():
         line.hooks.preflight(wavelength=110 * NM)
     assert error.value.parameter == "fwhm"
     assert line.hooks.preflight(wavelength=400 * NM) == []
+
+
+def test_the_mean_of_a_line_counts_its_bands_by_their_energy():
+    sampled = Bands(torch.tensor([500 * NM, 510 * NM]), torch.full((2,), 10 * NM), torch.tensor([3.0, 1.0]))
+    assert mean_wavelength(sampled) == pytest.approx(502.5 * NM, rel=1e-6)

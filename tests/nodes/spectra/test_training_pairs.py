@@ -10,7 +10,7 @@ import torch
 from neusee.nodes import ParameterError
 from neusee.nodes.spectra import bands, grain, leaves, lift_lmmse, metamers, reflectances, render
 from neusee.nodes.spectra._metamers import metameric_blacks
-from neusee.nodes.spectra._mst_lift_node import started, through
+from neusee.nodes.spectra._mst_lift_node import lift_pictures, start_mst_plus_plus
 from neusee.nodes.spectra._spectral_tables import paints, to_srgb
 
 NM = 1e-9
@@ -135,15 +135,15 @@ def test_grain_has_the_deviation_that_is_asked_for():
 
 
 def test_a_network_starts_at_the_linear_estimate(measured):
-    from neusee.nodes.spectra._linear_lift import wiener
+    from neusee.nodes.spectra._linear_lift import lift_matrix
 
-    linear = wiener(measured, SCENE.centres)
-    net = started(generator(), linear)
+    linear = lift_matrix(measured, SCENE.centres)
+    net = start_mst_plus_plus(generator(), linear)
     rgb = torch.rand(2, 3, 8, 8, generator=generator(1))
     low, span = rgb.amin((1, 2, 3), keepdim=True), rgb.amax((1, 2, 3), keepdim=True) - rgb.amin((1, 2, 3), keepdim=True)
     wanted = torch.einsum("bc,ncyx->nbyx", linear.float(), (rgb - low) / span) * span + low
-    torch.testing.assert_close(through(net, rgb), wanted, rtol=1e-4, atol=1e-5)
-    through(net, rgb).square().sum().backward()
+    torch.testing.assert_close(lift_pictures(net, rgb), wanted, rtol=1e-4, atol=1e-5)
+    lift_pictures(net, rgb).square().sum().backward()
     assert float(net.conv_out.weight.grad.abs().max()) > 0
 
 

@@ -10,8 +10,8 @@ import pytest
 import torch
 
 from neusee.workflows import load
-from neusee.workflows.engine.node_call import RunError
 from neusee.workflows.engine.runner import run
+from neusee.workflows.graph.run_error import RunError
 from neusee.workflows.store.result_store import Store
 
 distributed = pytest.importorskip("distributed")

@@ -9,10 +9,10 @@ import pytest
 import torch
 
 from neusee.nodes import node
-from neusee.workflows.engine.node_call import RunError
 from neusee.workflows.engine.runner import run
 from neusee.workflows.graph.diagnostics import Location
 from neusee.workflows.graph.recipe_graph import Recipe, Step
+from neusee.workflows.graph.run_error import RunError
 from neusee.workflows.store.result_store import Store
 
 BIG = 1 << 20

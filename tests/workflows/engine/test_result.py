@@ -8,7 +8,8 @@ import pytest
 import torch
 
 from neusee.workflows import as_function, load
-from neusee.workflows.simulation.simulate_recipe import simulate, wanted
+from neusee.workflows.report.contents import wanted
+from neusee.workflows.simulation.simulate_recipe import simulate
 from neusee.workflows.store.remote_store import RemoteStore
 from neusee.workflows.store.result_store import Store
 

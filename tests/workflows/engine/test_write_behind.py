@@ -12,9 +12,9 @@ import pytest
 import torch
 
 from neusee.workflows.engine import write_behind
-from neusee.workflows.engine.node_call import RunError
 from neusee.workflows.engine.runner import run
 from neusee.workflows.engine.write_behind import WriteBehind
+from neusee.workflows.graph.run_error import RunError
 from neusee.workflows.store.result_store import Store
 
 SPEC = importlib.util.spec_from_file_location("engine_toys", Path(__file__).with_name("test_engine_choices.py"))

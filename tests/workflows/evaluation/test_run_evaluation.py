@@ -12,7 +12,7 @@ import torch
 from PIL import Image
 from typer.testing import CliRunner
 
-from neusee.nodes._bicubic_resize import resize
+from neusee.nodes.bicubic_resize import resize
 from neusee.nodes.metrics import quality
 from neusee.workflows import load
 from neusee.workflows.cli.app import app
@@ -56,14 +56,14 @@ def pipelines(text, *more):
 
 def by_hand(tmp_path, scene, pipeline, strength, more=()):
     """The recipe with the scene in a file and the laser as anyone would write them."""
-    from neusee.workflows.training.photograph_folder import chosen
+    from neusee.nodes.scene import choose_photograph
 
     line = pipeline.pipeline
     laser = "lasers={}"
     if scene.case != "none" and strength:
         metres = CASES[scene.case]
         laser = f"lasers={{beam: {{wavelength: {metres * 1e9:g} nm, fwhm: 10 nm, strength: {strength}, angle: null}}}}"
-    path = chosen(scene.source.paths, 7, scene.number)
+    path = choose_photograph(scene.source.paths, 7, scene.number)
     words = [f"doe={line.mask}", laser, f"seed={scene.seed}", f"scene.file={path}"]
     words += [f"restore={line.restorer}"] if line.restorer != "none" else []
     recipe = load("first_light", [*SMALL, *words, *more])

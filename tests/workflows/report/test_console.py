@@ -8,9 +8,9 @@ import pytest
 import torch
 
 from neusee.nodes import Check, TensorStats, node
-from neusee.workflows.engine.runner import Event, StepRecord
 from neusee.workflows.graph.diagnostics import Location
 from neusee.workflows.graph.recipe_graph import Recipe, Step
+from neusee.workflows.graph.step_record import Event, StepRecord
 from neusee.workflows.report import console as console_room
 
 

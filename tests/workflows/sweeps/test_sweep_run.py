@@ -11,11 +11,12 @@ from pathlib import Path
 import pytest
 import torch
 
-from neusee.workflows.engine.node_call import RunError
+from neusee.workflows.cli.sweep_output import run_sweep
 from neusee.workflows.graph.diagnostics import RecipeError
+from neusee.workflows.graph.run_error import RunError
 from neusee.workflows.store.result_store import Store
 from neusee.workflows.sweeps import sweep_files
-from neusee.workflows.sweeps.sweep_run import run_sweep, sweep
+from neusee.workflows.sweeps.sweep_run import sweep
 
 RECIPE = """\
 # A camera of three steps

@@ -9,7 +9,7 @@ from torch.testing import assert_close
 
 from neusee.nodes.restore._networks._fft_mamba import FFTMamba
 from neusee.nodes.restore._networks._nafnet import NAFNet
-from neusee.nodes.restore._networks._restorer import started
+from neusee.nodes.restore._networks._restorer import start_network
 from neusee.nodes.restore._networks._unet import UNet
 from neusee.workflows import load
 from neusee.workflows.engine.runner import run
@@ -43,7 +43,7 @@ def small(name, *changes):
 def test_a_recipe_names_its_network_and_the_picture_goes_through_it(name, tmp_path):
     store = Store(tmp_path / "store")
     for seed in (0, 1):
-        net = started(MAKE[name], torch.Generator().manual_seed(seed))
+        net = start_network(MAKE[name], torch.Generator().manual_seed(seed))
         save_file(net.state_dict(), tmp_path / "trained.safetensors")  # other weights in a file of the same name
         found = run(small(name, f"restore.weights={tmp_path / 'trained.safetensors'}"), store)
         with torch.no_grad():
@@ -66,6 +66,6 @@ def test_without_weights_a_recipe_is_refused_where_they_are_to_be_given(name):
 
 
 def test_weights_of_another_width_are_refused_before_the_run(tmp_path):
-    save_file(started(partial(UNet, 3), torch.Generator()).state_dict(), tmp_path / "wide.safetensors")
+    save_file(start_network(partial(UNet, 3), torch.Generator()).state_dict(), tmp_path / "wide.safetensors")
     with pytest.raises(RecipeError, match=r"wide.safetensors: down.0.0.bias is \(3,\), this network \(width 2\)"):
         small("unet", f"restore.weights={tmp_path / 'wide.safetensors'}")

@@ -5,8 +5,8 @@ from pathlib import Path
 
 import pytest
 
+from neusee.nodes.scene import Photographs
 from neusee.workflows import Store, load
-from neusee.workflows.training.photograph_folder import Photographs
 from neusee.workflows.training.training_iteration import Learner
 from neusee.workflows.training.training_pictures import TrainingStream
 

@@ -7,9 +7,8 @@ from typing import Annotated, Any, Literal, Self
 
 from pydantic import BaseModel, ConfigDict, Field, model_validator
 
-from neusee.nodes.doe._refractive_index import Material
-from neusee.nodes.losses._contrast_loss import Floor, Frequency
-from neusee.nodes.losses._wiener_loss import Noise, Share
+from neusee.nodes.doe import Material
+from neusee.nodes.losses import ContrastFloor, HighestFrequency, NoiseVariance, OneBandShare
 from neusee.nodes.units import Count, DataFile, PositiveLength, Wavelength
 
 Weight = Annotated[float, Field(ge=0, allow_inf_nan=False)]
@@ -47,10 +46,10 @@ class MaskSettings(BaseModel):
     power: Annotated[float, Field(ge=8, le=64)] = 16.0  #: of the norm that stands for the peak
     log: bool = True  #: each band by the logarithm of its LSR
     enough: Annotated[float, Field(gt=0, le=1)] | None = None  #: LSR below which, in the mean, no less is asked for
-    floor: Floor = 1e-4  #: contrast below which little is won
-    up_to: Frequency | None = None  #: cycles a pixel: what is finer does not count
-    noise_share: Noise = 1e-3  #: of `losses.wiener`, of the variance
-    colour: Share = 1.0  #: of `losses.wiener`: share of the variance that is of one band
+    floor: ContrastFloor = 1e-4  #: contrast below which little is won
+    up_to: HighestFrequency | None = None  #: cycles a pixel: what is finer does not count
+    noise_share: NoiseVariance = 1e-3  #: of `losses.wiener`, of the variance
+    colour: OneBandShare = 1.0  #: of `losses.wiener`: share of the variance that is of one band
     bands: Count | None = 7  #: of the recipe's, at a time; None: all of them
     seed: int = 0
     starts: Count = 1  #: independent ones, of which the best on all bands is kept

@@ -7,6 +7,8 @@ from typing import Any
 import torch
 from torch import Tensor
 
+from neusee.nodes import metrics
+from neusee.nodes.optics import mask_turns
 from neusee.nodes.values import Bands, Psf, Pupil
 from neusee.workflows.report.figures.style import (
     BLACK,
@@ -36,10 +38,17 @@ def height(*, pupil: Pupil) -> Any:
     _map(figure, axes[0, 0], (metres * 1e6).where(clear, torch.nan), "height", "µm", extent, cmap="cividis")
     for ax, wanted in zip(axes[0, 1:], _SHOWN, strict=True):
         band = nearest(pupil.wavelengths, wanted)
-        turns = pupil.index[band] * metres / pupil.wavelengths[band]
         title = f"phase at {nanometres(float(pupil.wavelengths[band])):.0f} nm"
         limits = {"cmap": "twilight", "vmin": 0.0, "vmax": 1.0}
-        _map(figure, ax, torch.remainder(turns, 1.0).where(clear, torch.nan), title, "turns, wrapped", extent, **limits)
+        _map(
+            figure,
+            ax,
+            torch.remainder(mask_turns(pupil, band, step), 1.0).where(clear, torch.nan),
+            title,
+            "turns, wrapped",
+            extent,
+            **limits,
+        )
     axes[0, 0].set_ylabel("v (mm)")
     return figure
 
@@ -71,8 +80,7 @@ def psf(*, plain: Psf, mask: Psf, bands: Bands, pixel_pitch: float) -> Any:
 
 def _spot(ax: Any, psf: Psf, band: int, bands: Bands, pitch: float, arm: str) -> Any:
     size = min(257, *psf.intensity.shape[-2:])
-    light = _window(psf.intensity[band], size) / psf.clear_peak[band]
-    log = light.double().clamp_min(1e-30).log10()
+    log = _window(metrics.over_clear_peak(psf, band), size).double().clamp_min(1e-30).log10()
     shown = picture(ax, log.cpu().numpy(), "", origin="lower", cmap="viridis", vmin=-8.0, vmax=0.0)
     ax.set_title(f"{arm}, {nanometres(float(bands.centres[band])):.0f} nm")
     ax.set_xlabel(f"{size * pitch * 1e6:.0f} µm across")
@@ -87,12 +95,9 @@ def _window(image: Tensor, size: int) -> Tensor:
 
 def _encircled(ax: Any, psf: Psf, bands: Bands, pitch: float, arm: str) -> None:
     """Share of the clear pupil's light within a radius, at three wavelengths."""
-    y, x = (torch.arange(n, dtype=torch.float64) - n // 2 for n in psf.intensity.shape[-2:])
-    radius = torch.hypot(y[:, None], x[None, :]).ceil().long().flatten()
     for wanted in _SHOWN:
         band = nearest(bands.centres, wanted)
-        light = psf.intensity[band].detach().double().cpu().flatten()
-        share = torch.zeros(int(radius.max()) + 1, dtype=torch.float64).index_add_(0, radius, light).cumsum(0)
+        share = metrics.encircled_curve(psf.intensity[band])
         microns = (torch.arange(len(share)) + 0.5) * pitch * 1e6
         colour = wavelength_colour(wanted)
         ax.semilogx(
@@ -109,12 +114,10 @@ def _encircled(ax: Any, psf: Psf, bands: Bands, pitch: float, arm: str) -> None:
 def suppression(*, lsr: Tensor, bands: Bands, psf: Psf, bsr: Tensor | None = None) -> Any:
     """Laser and background suppression against wavelength, with the floor that energy sets."""
     figure, axes = canvas(11.0, 4.2, 1, 2)
-    pixels = psf.intensity.shape[-2] * psf.intensity.shape[-1]
     nm, left, right = nanometres(bands.centres), axes[0, 0], axes[0, 1]
     left.axhline(1.0, color=BLACK, linewidth=0.8, linestyle=":", label="plain lens")
     left.semilogy(nm, lsr.cpu().numpy(), "o-", color=VERMILION, markersize=3.5, label="with mask")
-    floor = 1.0 / (pixels * psf.clear_peak.double().cpu())
-    left.semilogy(nm, floor.numpy(), "--", color=BLUE, label="energy floor")
+    left.semilogy(nm, metrics.least_lsr(psf).cpu().numpy(), "--", color=BLUE, label="energy floor")
     left.set_title("laser suppression ratio (peak / clear peak)")
     left.set_ylabel("LSR")
     right.axhline(1.0, color=BLACK, linewidth=0.8, linestyle=":", label="plain lens")

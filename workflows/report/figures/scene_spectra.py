@@ -8,6 +8,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
+from neusee.nodes.spectra import mean_wavelength
 from neusee.nodes.values import Bands
 from neusee.workflows.report.figures.style import (
     BLACK,
@@ -98,6 +99,6 @@ def _channels(ax: Any, illuminant: Tensor, responses: Tensor, bands: Bands) -> N
 def _lasers(ax: Any, lines: Mapping[str, Bands]) -> None:
     """An upright line at each laser's wavelength; more than two share a label."""
     for number, (name, line) in enumerate(lines.items()):
-        nm = float((line.centres * line.weights).sum() / line.weights.sum()) * 1e9
+        nm = mean_wavelength(line) * 1e9
         label = f"laser {name}, {nm:.0f} nm" if len(lines) < 3 else f"{len(lines)} lasers" if number == 0 else None
         ax.axvline(nm, color="#555555", linewidth=1.2, linestyle=":", label=label)

@@ -1,1 +1,6 @@
-"""studies/accuracy"""
+"""How much error does which run time buy?
+
+Settings that trade accuracy for time, cold runs of each, and the work-precision diagram.
+No other study belongs here.
+Offers: `accuracy_study.study`, `recipe_knobs.knobs`.
+"""

@@ -15,18 +15,19 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
-from neusee.workflows.engine.node_call import versions
+from neusee.workflows.engine.provenance import timestamp, versions
 from neusee.workflows.graph.diagnostics import RecipeError
 from neusee.workflows.graph.recipe_graph import Recipe
 from neusee.workflows.keys.cache_key import digest
 from neusee.workflows.keys.engine_digest import engine
+from neusee.workflows.recipe.changed_recipe import changed
 from neusee.workflows.report.run_folder import RunFolder, new_run
 from neusee.workflows.report.study_page import page
 from neusee.workflows.store.result_store import Store
 from neusee.workflows.studies.accuracy import accuracy_report
-from neusee.workflows.studies.accuracy.recipe_knobs import Knobs, changed, finest, knobs
+from neusee.workflows.studies.accuracy.recipe_knobs import Knobs, finest, knobs
 from neusee.workflows.studies.accuracy.single_steps import StepTried, that_matter, try_step
-from neusee.workflows.studies.accuracy.work_precision_points import TIMES, Bench, Measured, Point, Trial, timestamp
+from neusee.workflows.studies.accuracy.work_precision_points import TIMES, Bench, Measured, Point, Trial
 from neusee.workflows.tolerance.cheaper_steps import with_substitutions
 
 TOLERANCES = (1e-1, 1e-2, 1e-3, 1e-4, 1e-5, 1e-6)

@@ -10,13 +10,11 @@ from __future__ import annotations
 import re
 from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass, replace
-from pathlib import Path
-from tempfile import TemporaryDirectory
 from typing import Any, Literal, get_args, get_origin
 
 from neusee.nodes.values import Bands, Psf
 from neusee.workflows.graph.recipe_graph import Recipe, Step, needed
-from neusee.workflows.recipe.loading import load
+from neusee.workflows.recipe.changed_recipe import changed
 
 _REFERENCE = re.compile(r"\$\{([\w.-]+)\}")
 _ONE_BY_ONE = ("item", "each")  #: begin what differs from item to item
@@ -76,16 +74,6 @@ def knobs(recipe: Recipe, quick: bool = False) -> Knobs:
         if not mine:
             without.append(f"{what}: this recipe has none")
     return Knobs(tuple(found), tuple(without))
-
-
-def changed(recipe: Recipe, overrides: Sequence[str]) -> Recipe:
-    """``recipe`` with other values, checked anew; raises `RecipeError` where they cannot be."""
-    with TemporaryDirectory(prefix="neusee-") as folder:
-        path = Path(folder) / "recipe.yaml"
-        path.write_text(recipe.config.to_yaml(), encoding="utf-8")
-        found = load(path, overrides)
-    found = replace(found, name=recipe.name, title=recipe.title, seed=recipe.seed, outputs=recipe.outputs, expect=())
-    return replace(found, tolerance=recipe.tolerance, exact=recipe.exact)
 
 
 def finest(recipe: Recipe) -> Recipe:

@@ -19,16 +19,16 @@ from typing import Any, Literal, get_args, get_origin
 import torch
 
 from neusee.nodes.values import Channels, LowRankCube, Psf
-from neusee.workflows.engine.node_call import RunError
+from neusee.workflows.engine.provenance import machine, timestamp
 from neusee.workflows.engine.runner import run
 from neusee.workflows.graph.recipe_graph import Recipe, Step, needed
+from neusee.workflows.graph.run_error import RunError
 from neusee.workflows.keys.cache_key import digest, key_of, stream_seed
 from neusee.workflows.keys.code_digest import Code
 from neusee.workflows.keys.engine_digest import engine
 from neusee.workflows.store.result_store import Store
 from neusee.workflows.store.serialization import each_tensor, tensors_in
 from neusee.workflows.studies.accuracy.smaller_inputs import Cut, cut, said
-from neusee.workflows.studies.accuracy.work_precision_points import machine, timestamp
 from neusee.workflows.tolerance.error_norm import error_of
 
 SHARE = 0.01  #: of the time, below which a step does not matter

@@ -8,26 +8,21 @@ that was stopped goes on from there.
 from __future__ import annotations
 
 import os
-import platform
-import shutil
-from collections.abc import Iterator, Mapping, Sequence
-from contextlib import contextmanager
+from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass, field, replace
-from datetime import UTC, datetime
-from pathlib import Path
 from statistics import median
-from tempfile import TemporaryDirectory
 from typing import Any
 
-import torch
-
-from neusee.workflows.engine.node_call import RunError, versions
-from neusee.workflows.engine.runner import Event, run
+from neusee.workflows.engine.provenance import machine, timestamp
+from neusee.workflows.engine.runner import run
 from neusee.workflows.graph.recipe_graph import Recipe, needed
+from neusee.workflows.graph.run_error import RunError
+from neusee.workflows.graph.step_record import Event
 from neusee.workflows.keys.cache_key import digest, key_of
 from neusee.workflows.keys.code_digest import Code
 from neusee.workflows.keys.engine_digest import engine
 from neusee.workflows.store.result_store import Store
+from neusee.workflows.studies.cold_run import cold
 from neusee.workflows.tolerance.cheaper_steps import with_substitutions
 from neusee.workflows.tolerance.error_norm import error_of
 
@@ -198,28 +193,10 @@ def compared(values: Mapping[str, Any], truth: Mapping[str, Any]) -> dict[str, l
     return found
 
 
-@contextmanager
-def cold(store: Store) -> Iterator[Store]:
-    """An empty store for as long as it is used; that code was read before is no work of this run."""
-    with TemporaryDirectory(prefix="neusee-") as folder:
-        if os.path.isfile(store.code_memo):
-            shutil.copyfile(store.code_memo, Path(folder) / store.code_memo.name)
-        yield Store(folder)
-
-
 def draws(recipe: Recipe) -> bool:
     """Whether anything that the outputs need is random."""
     return any(recipe.steps[name].node.random for name in needed(recipe, recipe.outputs))
 
 
-def machine() -> Sequence[str]:
-    """Where a time was measured; on another machine it is another."""
-    return [platform.node(), platform.machine(), str(torch.get_num_threads()), *versions().values()]
-
-
 def _about(seconds: Sequence[float]) -> dict[str, Any]:
     return {"step": "study accuracy", "seconds": sum(seconds), "date": timestamp()}
-
-
-def timestamp() -> str:
-    return datetime.now(UTC).isoformat(timespec="seconds")

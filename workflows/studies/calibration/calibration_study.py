@@ -16,14 +16,13 @@ from neusee.workflows.calibration.identifiability import KINDS, known
 from neusee.workflows.calibration.initial_guess import begin
 from neusee.workflows.calibration.log_posterior import SensorPosterior
 from neusee.workflows.calibration.posterior_mode import peak
-from neusee.workflows.engine.node_call import versions
+from neusee.workflows.engine.provenance import timestamp, versions
 from neusee.workflows.engine.threads import one_thread
 from neusee.workflows.graph.recipe_graph import Recipe
 from neusee.workflows.keys.cache_key import digest
 from neusee.workflows.report.run_folder import RunFolder, new_run
 from neusee.workflows.report.study_page import Mark, Section, page
 from neusee.workflows.store.result_store import Store
-from neusee.workflows.studies.accuracy.work_precision_points import timestamp
 from neusee.workflows.studies.calibration.independent_draws import DRAWS, walked
 from neusee.workflows.studies.calibration.prior_sensitivity import ENOUGH, Finding, Sensitivity, sensitivity
 from neusee.workflows.studies.calibration.rank_uniformity import Verdict, verdicts

@@ -21,15 +21,14 @@ import torch
 from neusee.nodes.calibrate import NAMES, Prior, Sufficient
 from neusee.workflows.calibration.identifiability import known
 from neusee.workflows.calibration.initial_guess import begin
-from neusee.workflows.calibration.log_posterior import SensorPosterior, _the
+from neusee.workflows.calibration.log_posterior import SensorPosterior, the_step
 from neusee.workflows.calibration.posterior_mode import LaplaceFit, peak
 from neusee.workflows.engine.differentiable_function import as_function
-from neusee.workflows.engine.node_call import versions
+from neusee.workflows.engine.provenance import timestamp, versions
 from neusee.workflows.graph.recipe_graph import Recipe, needed
 from neusee.workflows.keys.cache_key import digest, stream_seed
 from neusee.workflows.keys.engine_digest import engine
 from neusee.workflows.store.result_store import Store
-from neusee.workflows.studies.accuracy.work_precision_points import timestamp
 from neusee.workflows.studies.calibration.independent_draws import Drawn
 
 Sampler = Callable[[SensorPosterior, LaplaceFit, int], Drawn]  #: of a problem and its peak, by a seed
@@ -158,7 +157,7 @@ def _given(function: Callable[[Any], Any], levels: Mapping[str, Any], theta: Map
 
 def narrowed(recipe: Recipe, changed: Mapping[str, Mapping[str, Any]]) -> Recipe:
     """The recipe with parameters of steps ``changed``, and a prior no wider than `WIDEST`."""
-    prior = _the(recipe, "calibrate.prior")
+    prior = the_step(recipe, "calibrate.prior")
     capped = {name: _capped(name, law) for name, law in prior.params.items()}
     both = {**changed, prior.name: capped}
     steps = {n: replace(recipe.steps[n], params={**recipe.steps[n].params, **new}) for n, new in both.items()}

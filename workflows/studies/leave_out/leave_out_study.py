@@ -10,13 +10,12 @@ from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
 
-from neusee.workflows.engine.node_call import versions
+from neusee.workflows.engine.provenance import timestamp, versions
 from neusee.workflows.graph.recipe_graph import Recipe
 from neusee.workflows.keys.cache_key import digest
 from neusee.workflows.report.run_folder import RunFolder, new_run
 from neusee.workflows.report.study_page import Mark, Section, page
 from neusee.workflows.store.result_store import Store
-from neusee.workflows.studies.accuracy.work_precision_points import timestamp
 from neusee.workflows.studies.leave_out.omission_rows import Bench, Promise, Row
 from neusee.workflows.studies.leave_out.scene_costs import Cost, costs
 

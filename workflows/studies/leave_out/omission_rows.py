@@ -15,14 +15,14 @@ from typing import Any
 from torch import Tensor
 
 from neusee.nodes import TensorStats
+from neusee.workflows.engine.finished_step import facts_in
+from neusee.workflows.engine.provenance import timestamp
 from neusee.workflows.engine.resolve_keys import resolve
 from neusee.workflows.engine.runner import Result, run
-from neusee.workflows.engine.step_record import facts_in
 from neusee.workflows.graph.recipe_graph import Recipe, needed
 from neusee.workflows.keys.cache_key import Key, digest
 from neusee.workflows.keys.engine_digest import engine
 from neusee.workflows.store.result_store import Store
-from neusee.workflows.studies.accuracy.work_precision_points import timestamp
 from neusee.workflows.studies.leave_out.possible_omissions import Omission, omissions
 from neusee.workflows.tolerance.error_norm import error_of, largest_error
 

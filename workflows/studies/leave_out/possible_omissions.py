@@ -15,9 +15,9 @@ from typing import Literal
 from torch import Tensor
 
 from neusee.nodes import TensorStats
-from neusee.workflows.engine.node_call import RunError
 from neusee.workflows.engine.runner import Result
 from neusee.workflows.graph.recipe_graph import Recipe, Step, Wire, in_order, needed
+from neusee.workflows.graph.run_error import RunError
 from neusee.workflows.tolerance.cheaper_steps import with_substitutions
 from neusee.workflows.tolerance.skip_decision import judge
 from neusee.workflows.tolerance.zero_effect_steps import without

@@ -9,16 +9,17 @@ from __future__ import annotations
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import asdict, dataclass, replace
 
-from neusee.workflows.engine.node_call import RunError
+from neusee.workflows.engine.provenance import machine, timestamp
 from neusee.workflows.engine.runner import Result, run
 from neusee.workflows.graph.diagnostics import RecipeError
 from neusee.workflows.graph.recipe_graph import Recipe, needed
+from neusee.workflows.graph.run_error import RunError
 from neusee.workflows.keys.cache_key import Key, digest, key_of
 from neusee.workflows.keys.code_digest import Code
 from neusee.workflows.keys.engine_digest import engine
+from neusee.workflows.recipe.changed_recipe import changed
 from neusee.workflows.store.result_store import Store
-from neusee.workflows.studies.accuracy.recipe_knobs import changed
-from neusee.workflows.studies.accuracy.work_precision_points import cold, machine, timestamp
+from neusee.workflows.studies.cold_run import cold
 
 _TIMES = 3  #: cold runs, of which the median counts
 _QUICK = 5.0  #: s; what takes longer is run once

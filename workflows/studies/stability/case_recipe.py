@@ -9,8 +9,9 @@ from typing import Any
 import torch
 
 from neusee.nodes import Node
-from neusee.workflows.engine.node_call import RunError, call
+from neusee.workflows.engine.node_call import call
 from neusee.workflows.graph.recipe_graph import Recipe, Step, in_order
+from neusee.workflows.graph.run_error import RunError
 from neusee.workflows.keys.cache_key import Key, digest, key_of
 from neusee.workflows.keys.code_digest import Code
 from neusee.workflows.recipe.step_declarations import find_node

@@ -14,8 +14,8 @@ from typing import Any, Literal
 import torch
 from torch import Tensor
 
-from neusee.nodes.optics._laser_direction import field_of_view
-from neusee.nodes.sensor._saturation import photons_that_fill
+from neusee.nodes.optics import field_of_view
+from neusee.nodes.sensor import photons_that_fill
 from neusee.nodes.values import Pupil
 
 Params = Mapping[str, Any]

@@ -12,7 +12,7 @@ from datetime import UTC, datetime
 from pathlib import Path
 from typing import Any
 
-from neusee.workflows.engine.node_call import versions
+from neusee.workflows.engine.provenance import versions
 from neusee.workflows.engine.threads import one_thread
 from neusee.workflows.graph.recipe_graph import Recipe
 from neusee.workflows.keys.cache_key import Key, digest

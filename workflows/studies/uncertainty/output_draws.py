@@ -19,6 +19,7 @@ from torch import Tensor
 
 from neusee.workflows.engine.differentiable_function import as_function
 from neusee.workflows.engine.node_call import place
+from neusee.workflows.engine.provenance import timestamp
 from neusee.workflows.engine.threads import one_thread
 from neusee.workflows.graph.recipe_graph import needed
 from neusee.workflows.keys.cache_key import digest, key_of
@@ -27,7 +28,6 @@ from neusee.workflows.keys.engine_digest import engine
 from neusee.workflows.recipe.distributions.uncertain_inputs import Inputs
 from neusee.workflows.report.result_numbers import numbers_of
 from neusee.workflows.store.result_store import Store
-from neusee.workflows.studies.accuracy.work_precision_points import timestamp
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
@@ -57,3 +58,9 @@ def _of_sequences(x: Places, count: int) -> float:
     squares = (x - x.mean()) ** 2
     each = np.array([squares[i::count].mean() for i in range(count)])
     return float(each.std(ddof=1) / math.sqrt(count) / each.mean() / 2)
+
+
+def worst_known(found: Mapping[str, Scatter]) -> tuple[str, float]:
+    """Return the quantity whose standard deviation is known worst, and the relative error of it."""
+    name = max(found, key=lambda each: found[each].error)
+    return name, found[name].error

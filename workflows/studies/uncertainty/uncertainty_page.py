@@ -16,7 +16,7 @@ from neusee.workflows.studies.uncertainty.sobol_indices import EXPLAINED
 if TYPE_CHECKING:
     from numpy.typing import NDArray
 
-    from neusee.workflows.studies.uncertainty.uncertainty_study import Found
+    from neusee.workflows.studies.uncertainty.uncertainty_result import Found
 
     Places = NDArray[np.float64]
 

@@ -6,14 +6,13 @@ import io
 import json
 import time
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import asdict, dataclass
+from dataclasses import asdict
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
-from torch import Tensor
 
-from neusee.workflows.engine.node_call import versions
+from neusee.workflows.engine.provenance import timestamp, versions
 from neusee.workflows.graph.recipe_graph import Recipe
 from neusee.workflows.keys.cache_key import digest
 from neusee.workflows.recipe.distributions.joint import Z_90
@@ -22,10 +21,10 @@ from neusee.workflows.recipe.distributions.uncertain_inputs import SCRAMBLES, In
 from neusee.workflows.report.run_folder import RunFolder, new_run
 from neusee.workflows.report.study_page import page
 from neusee.workflows.store.result_store import Store
-from neusee.workflows.studies.accuracy.work_precision_points import timestamp
 from neusee.workflows.studies.uncertainty.output_draws import Draws, Numbers
-from neusee.workflows.studies.uncertainty.scatter_estimate import Scatter, scatter
-from neusee.workflows.studies.uncertainty.sobol_indices import Indices, indices, require_salib
+from neusee.workflows.studies.uncertainty.scatter_estimate import Scatter, scatter, worst_known
+from neusee.workflows.studies.uncertainty.sobol_indices import indices, require_salib
+from neusee.workflows.studies.uncertainty.uncertainty_result import Found
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray
@@ -37,48 +36,6 @@ LEAST = 64  #: draws before any stop
 _ROUND = 16  #: independent draws by round
 PICTURED = 32  #: draws that pictures are made of: a deviation to 13 %
 _COLUMNS = ("quantity", "element", "at the medians", "mean", "sd", "5 %", "95 %")
-
-
-@dataclass(frozen=True)
-class Found:
-    """All that the study measured."""
-
-    inputs: Inputs
-    points: Points  #: those that were used
-    values: Mapping[str, Places]  #: by quantity (draw, element)
-    scatter: Mapping[str, Scatter]
-    middle: Mapping[str, Sequence[float]]  #: every input at its median
-    swings: Mapping[str, Sequence[tuple[str, float, float]]]  #: by number: input, at its 5 %, at its 95 %
-    shares: Mapping[str, Indices]  #: by number
-    pictures: Mapping[str, tuple[Tensor, Tensor]]
-    is_constant: tuple[str, ...]  #: outputs that no input reaches
-    wanted: float  #: relative error
-    sequences: int  #: of Sobol's points; 0 for independent draws
-
-    @property
-    def error(self) -> float:
-        """The greatest relative error of a standard deviation."""
-        return _worst(self.scatter)[1]
-
-    @property
-    def worst(self) -> str:
-        """The quantity that has it."""
-        return _worst(self.scatter)[0]
-
-    @property
-    def strange(self) -> list[str]:
-        """Quantities that are not finite in some draw."""
-        return [name for name, x in self.values.items() if not np.isfinite(x).all()]
-
-    @property
-    def failed(self) -> int:
-        """Bars that do not hold: the error that was asked for, and that all is finite."""
-        return len(self.strange) + (not self.error <= self.wanted)
-
-    @property
-    def numbers(self) -> list[str]:
-        """Quantities of one element that vary, without those that are another one in another unit."""
-        return list(self.swings)
 
 
 def study(
@@ -139,7 +96,7 @@ def _found(inputs: Inputs, draws: Draws, at: Points, tell: Tell, wanted: float, 
         numbers += draws.numbers(at.values[len(numbers) : used])
         values = {name: np.array([n[name] for n in numbers]) for name in ends[0]}
         scattered = {name: scatter(x, sequences) for name, x in values.items()}
-        worst, error = _worst(scattered)
+        worst, error = worst_known(scattered)
         tell(f"{used} draws: every standard deviation to {error:.1%} ({worst})")
         if error <= wanted:
             break
@@ -154,12 +111,6 @@ def _next(used: int, most: int, sequences: int) -> int:
     """Sobol's points are even after powers of two alone."""
     more = max(LEAST, 2 * used) if sequences else max(LEAST, used + _ROUND)
     return min(more, most)
-
-
-def _worst(found: Mapping[str, Scatter]) -> tuple[str, float]:
-    """The quantity whose standard deviation is known worst, and its relative error."""
-    name = max(found, key=lambda each: found[each].error)
-    return name, found[name].error
 
 
 def _swings(

@@ -10,9 +10,7 @@ from torch import Tensor, nn
 from torch.optim.swa_utils import AveragedModel, get_ema_multi_avg_fn
 
 from neusee.nodes import losses
-from neusee.nodes.spectra import render
-from neusee.nodes.spectra._linear_lift import wiener
-from neusee.nodes.spectra._mst_lift_node import needs_bands, started, through
+from neusee.nodes.spectra import lift_matrix, lift_pictures, need_mst_plus_plus_bands, render, start_mst_plus_plus
 from neusee.nodes.values import Bands
 from neusee.workflows.engine.differentiable_function import as_function
 from neusee.workflows.graph.diagnostics import nearest
@@ -44,7 +42,7 @@ class Pairs:
         known = recipe.run(store, [bands, how.measured], device=device)
         self.bands: Bands = known[bands]
         self.measured: Tensor = known[how.measured]
-        needs_bands(self.bands)
+        need_mst_plus_plus_bands(self.bands)
         self._draw = as_function(recipe, outputs=self._names, store=store, device=device, redraw=random)
 
     def __call__(self, *number: object) -> tuple[Tensor, Tensor]:
@@ -65,8 +63,8 @@ class LiftLearner:
     def __init__(self, how: LiftTraining, pairs: Pairs, seed: int, device: str) -> None:
         self.how, self.pairs = how, pairs
         rng = torch.Generator(device).manual_seed(stream_seed(seed, "train lift network"))
-        self.linear = wiener(pairs.measured.cpu(), pairs.bands.centres.cpu()).to(device, torch.float32)
-        self.net = started(rng, self.linear if how.start == "linear" else None)
+        self.linear = lift_matrix(pairs.measured.cpu(), pairs.bands.centres.cpu()).to(device, torch.float32)
+        self.net = start_mst_plus_plus(rng, self.linear if how.start == "linear" else None)
         self.optimiser = torch.optim.Adam(self.net.parameters(), lr=how.rate, betas=how.betas)
         self.average = _averaged(self.net, how.average) if how.average else None
 
@@ -82,7 +80,7 @@ class LiftLearner:
             group["lr"] = rate
         self.optimiser.zero_grad(set_to_none=True)
         picture, cube = self.pairs.batch(range(iteration * batch, (iteration + 1) * batch))
-        estimate = through(self.net, picture)
+        estimate = lift_pictures(self.net, picture)
         loss = losses.mrae(estimate, cube, floor=self.how.floor)
         loss.backward()
         slope = float(nn.utils.clip_grad_norm_(self.net.parameters(), _STEEPEST))
@@ -114,7 +112,10 @@ class LiftLearner:
     def estimates(self, picture: Tensor) -> dict[str, Tensor]:
         """Spectra of a picture by the network, and linearly."""
         linear = torch.einsum("bc,cyx->byx", self.linear, picture)
-        return {"mst_plus_plus": through(self.best(), picture[None])[0].clamp_min(0), "linear": linear.clamp_min(0)}
+        return {
+            "mst_plus_plus": lift_pictures(self.best(), picture[None])[0].clamp_min(0),
+            "linear": linear.clamp_min(0),
+        }
 
 
 def _averaged(net: nn.Module, decay: float) -> AveragedModel:

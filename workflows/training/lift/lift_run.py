@@ -9,7 +9,7 @@ from typing import Any
 
 import torch
 
-from neusee.workflows.engine.node_call import versions
+from neusee.workflows.engine.provenance import versions
 from neusee.workflows.graph.recipe_graph import Recipe, needed
 from neusee.workflows.keys.cache_key import digest, plain
 from neusee.workflows.recipe.blocks.train_lift_block import LiftTraining

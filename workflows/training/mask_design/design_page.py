@@ -7,6 +7,7 @@ from typing import Any
 
 from torch import Tensor
 
+from neusee.nodes import metrics
 from neusee.workflows.report.figures import optics
 from neusee.workflows.report.figures.style import canvas, drawn
 from neusee.workflows.report.study_page import Section
@@ -21,11 +22,10 @@ def pictures(terms: Terms, height: Tensor, learnt: Learnt) -> dict[str, bytes]:
     """Relief, PSF, suppression by wavelength and the way of the loss, as PNG."""
     pupil, psf, plain = terms.pupil(height), terms.psf(height), terms.plain()
     pitch = terms.recipe.steps[terms.how.psf].params["pixel_pitch"]
-    lsr = psf.intensity.amax((-2, -1)).double() / psf.clear_peak
     shown = {
         "height": optics.height(pupil=pupil),
         "psf": optics.psf(plain=plain, mask=psf, bands=terms.bands, pixel_pitch=pitch),
-        "suppression": optics.suppression(lsr=lsr, bands=terms.bands, psf=psf),
+        "suppression": optics.suppression(lsr=metrics.lsr(psf), bands=terms.bands, psf=psf),
     }
     return shown | ({"history": history(learnt.history)} if learnt.history else {})
 

@@ -15,29 +15,29 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from neusee.nodes import metrics
-from neusee.workflows.engine.node_call import versions
+from neusee.nodes import losses, metrics
+from neusee.nodes.doe import PARAMETRISATIONS, half_rings
+from neusee.workflows.engine.provenance import timestamp, versions
 from neusee.workflows.graph.diagnostics import RecipeError
 from neusee.workflows.graph.recipe_graph import Recipe, needed
 from neusee.workflows.keys.cache_key import digest, file_digest
 from neusee.workflows.keys.code_digest import Code
 from neusee.workflows.keys.engine_digest import engine
 from neusee.workflows.recipe.blocks.mask_design_block import DesignError, MaskTraining, Weights, need_steps, state_file
+from neusee.workflows.recipe.changed_recipe import changed
 from neusee.workflows.report.run_folder import RunFolder, new_run
 from neusee.workflows.report.study_page import page
 from neusee.workflows.store.result_store import Store
-from neusee.workflows.studies.accuracy.recipe_knobs import changed
-from neusee.workflows.studies.accuracy.work_precision_points import timestamp
 from neusee.workflows.training.mask_design.design_terms import Terms
 from neusee.workflows.training.mask_design.optimizers import Kept, Learnt, learn
 
 __all__ = ["DesignError", "MaskTraining", "Weights", "design", "figures"]
 
 Tell = Callable[[str], None]
-_LEARNT_WITH = tuple(
-    f"neusee.nodes.{name}"
-    for name in ("doe._analytic_masks", "doe._parametrisations", "losses._contrast_loss", "losses._mask_losses")
-)
+_LEARNT_WITH = {
+    used.__module__
+    for used in (half_rings, PARAMETRISATIONS["doe.pixelwise"], losses.contrast, losses.suppression_loss)
+}
 
 
 def design(
@@ -139,7 +139,7 @@ def _key(recipe: Recipe, how: MaskTraining, store: Store | None) -> str:
     """What decides the bits of a mask: the recipe, the settings, and the code of nodes and design."""
     code = Code((store or Store()).code_memo)
     steps = [recipe.steps[name] for name in needed(recipe, [how.psf, how.plain])]
-    nodes = sorted({step.node.fn.__module__ for step in steps} | set(_LEARNT_WITH))
+    nodes = sorted({step.node.fn.__module__ for step in steps} | _LEARNT_WITH)
     settings = how.model_dump(mode="json", exclude={"save_every", "start"})
     settings["start"] = how.start and file_digest(how.start)
     return digest(

@@ -12,7 +12,7 @@ import torch
 from torch import Tensor
 
 from neusee.nodes import losses
-from neusee.nodes.optics._pupil_grid import Stop, stop
+from neusee.nodes.optics import Stop, stop
 from neusee.nodes.values import BAND_FIELDS, Bands, Psf, Pupil
 from neusee.workflows.engine.differentiable_function import as_function
 from neusee.workflows.engine.runner import run

@@ -14,11 +14,18 @@ from typing import Any
 import torch
 from torch import Tensor, nn
 
-from neusee.nodes.doe import half_rings
-from neusee.nodes.doe._parametrisations import LEARNT, Drawn, Modes, Pixels, Rings, Written
-from neusee.nodes.doe._refractive_index import wave_height
-from neusee.nodes.doe._sampled_height_map import _read
-from neusee.nodes.optics._pupil_grid import Stop
+from neusee.nodes.doe import (
+    PARAMETRISATIONS,
+    Drawn,
+    Modes,
+    Pixels,
+    Rings,
+    Written,
+    half_rings,
+    read_height_map,
+    wave_height,
+)
+from neusee.nodes.optics import Stop
 from neusee.workflows.graph.recipe_graph import Step
 from neusee.workflows.recipe.blocks.mask_design_block import DesignError, MaskTraining
 from neusee.workflows.training.mask_design.design_terms import Terms
@@ -79,9 +86,9 @@ def shape_of(how: MaskTraining, start: int, step: Step) -> nn.Module:
 
 def _free(how: MaskTraining, rng: torch.Generator, step: Step) -> nn.Module:
     if how.kind == "recipe_mask":
-        if step.node.path not in LEARNT:
+        if step.node.path not in PARAMETRISATIONS:
             raise DesignError(f"kind: {step.name} is {step.node.path}, whose samples are not learnt")
-        return LEARNT[step.node.path](step.params, rng)
+        return PARAMETRISATIONS[step.node.path](step.params, rng)
     if how.kind == "pixelwise":
         return Pixels(how.grid, how.max_height, how.scale, rng, _start(how))
     if how.kind == "zernike":
@@ -95,7 +102,7 @@ def _start(how: MaskTraining) -> Tensor | None:
     """The relief that pixels start from."""
     if how.start is None:
         return None
-    height = _read(how.start, how.max_height)
+    height = read_height_map(how.start, how.max_height)
     if float(height.max()) > how.max_height:
         deep, most = f"{float(height.max()) * 1e6:.3g} um", f"{how.max_height * 1e6:.3g} um"
         raise DesignError(f"start: {how.start.name} is {deep} deep: set max_height to more than {most}")

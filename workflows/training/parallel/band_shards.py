@@ -15,7 +15,7 @@ from typing import Any, get_args
 from torch import Tensor
 
 from neusee.nodes import spectra
-from neusee.nodes.sensor._channel_sums import summed
+from neusee.nodes.sensor import channel_sums
 from neusee.nodes.values import Bands, Channels, LowRankCube
 from neusee.workflows.engine.band_results import band_tensors, taken, with_band_tensors
 from neusee.workflows.engine.node_call import call
@@ -94,7 +94,7 @@ class Shards:
         """What goes of a result of one picture to the process that goes on with it."""
         if name not in self.rows:
             return band_tensors(value)
-        part = summed(value, self.rows[name][:, self.own])
+        part = channel_sums(value, self.rows[name][:, self.own])
         return [part.planes, part.flux]
 
     def ports(self, name: str, sent: Sequence[Tensor]) -> list[Port]:

@@ -8,7 +8,7 @@ from torch import nn
 from torch.testing import assert_close
 
 from neusee.nodes.losses import gradient_penalty
-from neusee.nodes.restore._networks._critic import Critic, critics, slopes
+from neusee.nodes.restore._networks._critic import Critic, critic_slopes, critics
 from neusee.nodes.restore._networks._restorer import parameter_groups
 
 
@@ -58,7 +58,7 @@ def test_what_is_too_small_is_refused():
 def test_slopes_are_those_of_each_picture_on_the_line_between():
     critic = critics(seeded(), 4)[0].double()
     truth, estimate = drawn(4, 3, 16, 16), drawn(4, 3, 16, 16, seed=8)
-    found = slopes(critic, truth, estimate, seeded(1))
+    found = critic_slopes(critic, truth, estimate, seeded(1))
     share = torch.rand(4, 1, 1, 1, generator=seeded(1)).double()
     assert share.unique().numel() == 4
     between = share * truth + (1 - share) * estimate
@@ -75,7 +75,7 @@ def test_the_penalty_has_a_true_slope_for_every_parameter(seed):
     truth, estimate = drawn(2, 3, 18, 16), drawn(2, 3, 18, 16, seed=8)
 
     def penalty():
-        return gradient_penalty(slopes(critic, truth, estimate, seeded(seed)))
+        return gradient_penalty(critic_slopes(critic, truth, estimate, seeded(seed)))
 
     weights = [p for name, p in critic.named_parameters() if name.endswith("weight")]
     found = torch.autograd.grad(penalty(), weights)
@@ -96,8 +96,8 @@ def test_nothing_reaches_the_pictures_and_they_are_single_under_autocast():
     truth = torch.rand(2, 3, 16, 16, generator=seeded())
     estimate = torch.rand(2, 3, 16, 16, generator=seeded(1)).requires_grad_()
     with torch.autocast("cpu", torch.bfloat16), torch.no_grad():
-        found = slopes(critic, truth, estimate, seeded(2))
-    exact = slopes(critic, truth, estimate, seeded(2))
+        found = critic_slopes(critic, truth, estimate, seeded(2))
+    exact = critic_slopes(critic, truth, estimate, seeded(2))
     assert torch.equal(found, exact)
     gradient_penalty(exact).backward()
     assert estimate.grad is None
@@ -108,7 +108,7 @@ def test_nothing_reaches_the_pictures_and_they_are_single_under_autocast():
 def test_finite_for_any_light(size):
     critic = critics(seeded(), 4)[0]
     picture = size * torch.rand(2, 3, 16, 16, generator=seeded())
-    (critic(picture).mean() + gradient_penalty(slopes(critic, picture, picture.sqrt(), seeded()))).backward()
+    (critic(picture).mean() + gradient_penalty(critic_slopes(critic, picture, picture.sqrt(), seeded()))).backward()
     assert all(bool(p.grad.isfinite().all()) for p in critic.parameters())
 
 

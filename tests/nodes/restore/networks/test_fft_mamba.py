@@ -11,12 +11,12 @@ from torch.nn.functional import softplus
 from torch.testing import assert_close
 
 from neusee.nodes import ParameterError
-from neusee.nodes._network_weights import told
+from neusee.nodes.network_weights import file_metadata
 from neusee.nodes.restore import fft_mamba
 from neusee.nodes.restore._networks._fft_mamba import FFTMamba
 from neusee.nodes.restore._networks._mamba_blocks import SMALL, Block, Frequency, Spatial, _Phase
 from neusee.nodes.restore._networks._radial_order import radial_order
-from neusee.nodes.restore._networks._restorer import started
+from neusee.nodes.restore._networks._restorer import start_network
 from neusee.nodes.restore._networks._scan_layer import BothWays, DualScan, Scan, _decay, _step
 from neusee.nodes.restore._scan._one_decay_scan import dual_scan
 
@@ -33,7 +33,7 @@ def drawn(*shape, seed=5):
 
 
 def begun(make):
-    return started(make, seeded()).requires_grad_(False)
+    return start_network(make, seeded()).requires_grad_(False)
 
 
 def parameters(width, blocks, states, shuffle, ssm="s6", directions=2, pyramid=False, frequency="complex"):
@@ -121,7 +121,7 @@ def test_the_order_made_where_nobody_learns_serves_those_who_learn():
     radial_order.cache_clear()
     with torch.inference_mode():
         radial_order((6, 10), CPU)
-    net = started(lambda: Frequency(4, 2), seeded())
+    net = start_network(lambda: Frequency(4, 2), seeded())
     net(drawn(1, 4, 6, 10)).square().sum().backward()
     assert bool(net.strength.grad)
 
@@ -167,7 +167,7 @@ def test_a_scan_is_its_recurrence():
 
 @pytest.mark.parametrize("make", SCANS)
 def test_decays_and_steps_stay_within_bounds_whatever_is_learnt(make):
-    scan, u = started(make, seeded()), 100 * drawn(1, 40, 6)
+    scan, u = start_network(make, seeded()), 100 * drawn(1, 40, 6)
     with torch.no_grad():
         scan.A_log.copy_(torch.linspace(-200, 200, scan.A_log.numel()).view_as(scan.A_log))
         scan.dt_bias.copy_(torch.linspace(-300, 300, scan.dt_bias.numel()))
@@ -344,7 +344,7 @@ def test_the_fine_pass_sees_the_coarse_one_and_both_have_the_same_weights():
 @pytest.mark.parametrize("directions", [2, 4])
 def test_every_option_gives_two_scales_of_any_size_and_slopes(directions, pyramid, frequency):
     options = {"directions": directions, "pyramid": pyramid, "frequency": frequency}
-    net = started(lambda: FFTMamba(4, 2, 2, 2, **options), seeded())
+    net = start_network(lambda: FFTMamba(4, 2, 2, 2, **options), seeded())
     picture = torch.rand(1, 3, 9, 14, generator=seeded())
     coarse, fine = net.pyramid(picture)
     assert (coarse.shape, fine.shape) == ((1, 3, 5, 7), (1, 3, 9, 14))
@@ -416,7 +416,7 @@ def test_a_file_of_weights_tells_what_its_tensors_do_not(tmp_path, option, learn
     sizes = {"width": 4, "blocks": 1, "states": 2, "shuffle": 2}
     usual = {"ssm": "s6", "directions": 2, "pyramid": False, "frequency": "complex"}
     net = begun(lambda: FFTMamba(**sizes, **{option: learnt}))
-    save_file(net.state_dict(), file := tmp_path / "net.safetensors", told(net))
+    save_file(net.state_dict(), file := tmp_path / "net.safetensors", file_metadata(net))
     with pytest.raises(ParameterError, match=f"net.safetensors.*{said}") as caught:
         fft_mamba.hooks.preflight(**sizes, **usual, weights=file)
     assert caught.value.parameter == "weights"

@@ -10,10 +10,10 @@ from torch import nn
 from torch.testing import assert_close
 
 from neusee.nodes import ParameterError, restore
-from neusee.nodes._bicubic_resize import resize
+from neusee.nodes.bicubic_resize import resize
 from neusee.nodes.restore._networks._fft_mamba import FFTMamba
 from neusee.nodes.restore._networks._nafnet import NAFBlock, NAFNet
-from neusee.nodes.restore._networks._restorer import parameter_groups, started
+from neusee.nodes.restore._networks._restorer import parameter_groups, start_network
 from neusee.nodes.restore._networks._unet import UNet
 
 SMALL = {"width": 4, "blocks": 2, "states": 3}
@@ -40,7 +40,7 @@ def drawn(*shape, seed=3):
 
 
 def fresh(name, seed=0):
-    return started(MAKE[name], seeded(seed))
+    return start_network(MAKE[name], seeded(seed))
 
 
 @pytest.fixture
@@ -216,7 +216,7 @@ def test_detail_passes_beside_what_is_small(name):
 
 
 def test_a_block_of_nafnet_multiplies_channels_and_weighs_them_by_their_mean():
-    block, x = started(lambda: NAFBlock(3), seeded()).requires_grad_(False).double(), drawn(2, 3, 5, 4).double()
+    block, x = start_network(lambda: NAFBlock(3), seeded()).requires_grad_(False).double(), drawn(2, 3, 5, 4).double()
 
     def normed(x):
         return (x - x.mean(1, keepdim=True)) / (x.var(1, keepdim=True, correction=0) + 1e-5).sqrt()
@@ -340,7 +340,7 @@ def test_a_picture_that_is_not_finite_is_refused(saved):
 @every_network
 def test_the_full_size_works_on_an_odd_picture(name):
     full = {"fft_mamba": FFTMamba, "ssd": partial(FFTMamba, ssm="ssd"), "unet": UNet, "nafnet": NAFNet}
-    net = started(full[name], seeded())
+    net = start_network(full[name], seeded())
     picture = drawn(1, 3, 37, 53)
     coarse, fine = net.pyramid(picture)
     ((fine - picture).square().mean() + coarse.square().mean()).backward()

@@ -9,9 +9,9 @@ from torch.nn import functional as F
 from torch.testing import assert_close
 
 from neusee.nodes import restore
-from neusee.nodes._bicubic_resize import resize
+from neusee.nodes.bicubic_resize import resize
 from neusee.nodes.restore._networks._nafnet import NAFNet
-from neusee.nodes.restore._networks._restorer import started
+from neusee.nodes.restore._networks._restorer import start_network
 from neusee.nodes.restore._networks._tiles import tiled
 
 
@@ -53,7 +53,7 @@ def test_no_seam_where_a_tile_does_not_know_its_edge():
 
 
 def test_a_node_restores_a_large_picture_in_tiles(tmp_path):
-    net = started(lambda: NAFNet(4), seeded())
+    net = start_network(lambda: NAFNet(4), seeded())
     file = tmp_path / "net.safetensors"
     save_file(net.state_dict(), file)
     picture = torch.rand(3, 80, 40, generator=seeded())
@@ -64,7 +64,7 @@ def test_a_node_restores_a_large_picture_in_tiles(tmp_path):
 
 
 def test_a_node_restores_a_picture_made_smaller(tmp_path):
-    net = started(lambda: NAFNet(4), seeded())
+    net = start_network(lambda: NAFNet(4), seeded())
     file = tmp_path / "net.safetensors"
     save_file(net.state_dict(), file)
     picture = torch.rand(3, 70, 41, generator=seeded())
@@ -80,7 +80,7 @@ def test_a_node_restores_a_picture_made_smaller(tmp_path):
 
 def test_detail_changes_nothing_where_nothing_is_made_smaller(tmp_path):
     file = tmp_path / "net.safetensors"
-    save_file(started(lambda: NAFNet(4), seeded()).state_dict(), file)
+    save_file(start_network(lambda: NAFNet(4), seeded()).state_dict(), file)
     picture = torch.rand(3, 40, 41, generator=seeded())
     given = {"weights": file, "width": 4}
     assert torch.equal(restore.nafnet(picture, **given, detail=True), restore.nafnet(picture, **given))

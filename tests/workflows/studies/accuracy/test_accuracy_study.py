@@ -12,12 +12,13 @@ import pytest
 import torch
 
 from neusee.workflows import load
+from neusee.workflows.recipe.changed_recipe import changed
 from neusee.workflows.store.result_store import Store
 from neusee.workflows.studies.accuracy.accuracy_figures import EXACT, Dot, Line, steps, work_precision
 from neusee.workflows.studies.accuracy.accuracy_report import lead, missed
 from neusee.workflows.studies.accuracy.accuracy_study import study, trials
 from neusee.workflows.studies.accuracy.pareto_line import Choice, cheapest, front, median_ratio
-from neusee.workflows.studies.accuracy.recipe_knobs import changed, finest, knobs
+from neusee.workflows.studies.accuracy.recipe_knobs import finest, knobs
 from neusee.workflows.studies.accuracy.single_steps import that_matter, try_step
 from neusee.workflows.studies.accuracy.smaller_inputs import cut
 from neusee.workflows.studies.accuracy.work_precision_points import TIMES, Bench, Point, Trial

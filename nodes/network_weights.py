@@ -29,7 +29,7 @@ def loaded(make: Callable[[], Net], weights: Path) -> Net:
     return net.float()
 
 
-def told(net: nn.Module) -> dict[str, str]:
+def file_metadata(net: nn.Module) -> dict[str, str]:
     """Metadata of a file of this network's weights: its ``options``, where it has some."""
     options = getattr(net, "options", None)
     return {} if options is None else {OPTIONS: json.dumps(options, sort_keys=True)}

@@ -7,14 +7,14 @@ import os
 from collections.abc import Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 from torch import Tensor
 
 from neusee.nodes import ParameterError
-from neusee.workflows.keys.cache_key import digest, file_digest
-from neusee.workflows.keys.engine_digest import engine
+from neusee.nodes.bicubic_resize import resize
+from neusee.nodes.scene._crop_to_frame import covering
+from neusee.nodes.scene._photograph import photograph
 
 _PICTURES = frozenset({".png", ".jpg", ".jpeg", ".jpe", ".webp", ".tif", ".tiff", ".bmp", ".gif"})
 _ENDS = {b"\xff\xd8": b"\xff\xd9", b"\x89P": b"IEND"}  #: first bytes of a format -> what stands near its end
@@ -26,7 +26,7 @@ _TRIES = 100  #: broken ones in a row, after which a folder is given up
 Index = int | Sequence[int]  #: of a scene; of a sample of training (epoch, index)
 
 
-def listed(root: Path) -> tuple[list[Path], list[tuple[Path, str]]]:
+def list_photographs(root: Path) -> tuple[list[Path], list[tuple[Path, str]]]:
     """Photographs below a folder in the order of their paths, and those that cannot be read, with the reason.
 
     Headers and ends of the files are looked at, no picture is decoded. What is hidden, or no picture by its name, is
@@ -53,8 +53,6 @@ def _files(root: Path) -> list[Path]:
 
 def _wrong(path: Path) -> str:
     """Why a file is no photograph that can be read, or nothing."""
-    from neusee.nodes.scene import photograph
-
     try:
         if photograph.hooks.preflight is not None:
             photograph.hooks.preflight(file=path, shape=None)
@@ -66,21 +64,18 @@ def _wrong(path: Path) -> str:
         return str(error)
 
 
-def chosen(paths: Sequence[Path], seed: int, index: int) -> Path:
+def choose_photograph(paths: Sequence[Path], seed: int, index: int) -> Path:
     """The photograph of a scene: all of them in an order that the seed decides, and then from the start again."""
     order: list[int] = np.random.default_rng([seed, _ORDER]).permutation(len(paths)).tolist()
     return paths[order[index % len(paths)]]
 
 
-def crop(path: Path, shape: tuple[int, int], seed: int, index: Index) -> Tensor:
+def crop_photograph(path: Path, shape: tuple[int, int], seed: int, index: Index) -> Tensor:
     """A part of a photograph, linear sRGB (3, y, x), its place drawn from the seed and the index alone.
 
     One that is smaller is first enlarged, by the bicubic kernel in linear light, just until it covers ``shape``; what
     the kernel puts below black is black.
     """
-    from neusee.nodes._bicubic_resize import resize
-    from neusee.nodes.scene._crop_to_frame import covering
-
     picture = _decoded(path)
     size = (picture.shape[-2], picture.shape[-1])
     if any(have < want for have, want in zip(size, shape, strict=True)):
@@ -92,18 +87,8 @@ def crop(path: Path, shape: tuple[int, int], seed: int, index: Index) -> Tensor:
 
 @functools.lru_cache(maxsize=_KEPT)
 def _decoded(path: Path) -> Tensor:
-    from neusee.nodes.scene import photograph
-
     found: Tensor = photograph(file=path)
     return found
-
-
-def crop_key(path: Path, shape: tuple[int, int], seed: int, index: Index, code: Any) -> str:
-    """What decides `crop`: the file's content, the size, the draw and the code that decodes."""
-    own = [code.digest(f"neusee.nodes.{name}") for name in ("scene._photograph", "_bicubic_resize")]
-    return digest(
-        "photograph", engine("training.photograph_folder"), file_digest(path), list(shape), seed, _indices(index), own
-    )
 
 
 def _place(size: tuple[int, int], shape: tuple[int, int], seed: int, index: Index) -> tuple[int, int]:
@@ -126,7 +111,7 @@ class Photographs:
     @classmethod
     def under(cls, root: Path) -> Photographs:
         """All below a folder, however deep. Raises ValueError where there is none."""
-        good, broken = listed(root)
+        good, broken = list_photographs(root)
         if not good:
             why = f"; {len(broken)} cannot be read, such as {broken[0][0]}: {broken[0][1]}" if broken else ""
             raise ValueError(f"no photograph below {root}{why}")
@@ -141,7 +126,7 @@ class Photographs:
         for _ in range(_TRIES):
             path = self.paths[int(rng.integers(len(self.paths)))]
             try:
-                picture = crop(path, shape, seed, index)
+                picture = crop_photograph(path, shape, seed, index)
             except (OSError, ValueError, SyntaxError) as error:
                 self.broken[path] = str(error)
                 continue

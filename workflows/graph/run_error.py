@@ -1,0 +1,41 @@
+"""The error of a step that fails: which step, where it is written, what it was given, and the cause."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Any
+
+from torch import Tensor
+
+from neusee.workflows.graph.recipe_graph import Step
+
+
+class RunError(RuntimeError):
+    """A step failed. Names it, its node, where it is written, what it was given, and the cause."""
+
+    def __init__(self, step: Step, inputs: Sequence[Any], cause: BaseException) -> None:
+        self.step, self.cause = step.name, cause
+        given = ", ".join(f"{name} {_shape(value)}" for name, value in zip(step.node.inputs, inputs, strict=False))
+        super().__init__(
+            f"{step.mark}   {step.name} ({step.node.path}): {type(cause).__name__}: {cause}"
+            + (f"\n  given {given}" if given else "")
+        )
+
+    def __reduce__(self) -> tuple[Any, ...]:
+        return _remade, (self.step, str(self), repr(self.cause))
+
+
+def _remade(step: str, text: str, cause: str) -> RunError:
+    """The error as another process sees it: its text, without the traceback of the cause."""
+    error = RunError.__new__(RunError, text)
+    RuntimeError.__init__(error, text)
+    error.step, error.cause = step, RuntimeError(cause)
+    return error
+
+
+def _shape(value: Any) -> str:
+    if isinstance(value, Tensor):
+        return f"{tuple(value.shape)} {str(value.dtype).removeprefix('torch.')}"
+    if isinstance(value, list | tuple):
+        return f"{type(value).__name__}[{', '.join(_shape(v) for v in value)}]"
+    return "absent" if value is None else type(value).__name__
