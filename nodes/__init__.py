@@ -1,6 +1,6 @@
 """The physics: one plain, differentiable function for each step of the camera.
 
-Nothing here knows of recipes, caches, devices or graphs.
+No node depends on a recipe, a cache, a device or a graph.
 """
 
 from neusee.nodes._node import Check, ErrorBound, Node, ParameterError, TensorStats, node

@@ -1,4 +1,4 @@
-"""Half precision is for storing pictures, not for computing with light: 65504 photons are less than two full wells."""
+"""Guards against half precision, which can store pictures but not light: 65504 photons are less than two full wells."""
 
 import torch
 from torch import Tensor
@@ -7,12 +7,12 @@ HALVES = (torch.float16, torch.bfloat16)
 
 
 def single(x: Tensor) -> Tensor:
-    """The same in single precision where it came in half; a gradient goes back in the type that came."""
+    """Return ``x`` in single precision where ``x`` is in half precision; the gradient keeps the type of ``x``."""
     return x.float() if x.dtype in HALVES else x
 
 
 def refuse_half(**lengths: Tensor) -> None:
-    """Refuse lengths in half precision: a micrometre is 17 steps of float16, a wave 2 of 256 in bfloat16."""
+    """Raise ValueError for lengths in half precision: 1 µm is 17 steps of float16, a wave 2 of 256 in bfloat16."""
     for name, x in lengths.items():
         if x.dtype in HALVES:
             kind = str(x.dtype).removeprefix("torch.")
@@ -20,7 +20,7 @@ def refuse_half(**lengths: Tensor) -> None:
 
 
 def refuse_not_finite(why: str, **values: Tensor | float) -> None:
-    """Refuse a value, or the sum of one, that is not finite; ``why`` says what would come of it."""
+    """Raise ValueError for a value, or the sum of a value, that is not finite; ``why`` states the consequence."""
     for name, x in values.items():
         if not bool(torch.as_tensor(x).isfinite().all()):
             raise ValueError(f"{name} holds values that are not finite: {why}")

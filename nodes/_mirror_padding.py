@@ -1,11 +1,11 @@
-"""Pictures made larger by their own mirror image."""
+"""Padding of a picture with its own mirror image."""
 
 import torch
 from torch import Tensor
 
 
 def mirrored(x: Tensor, down: int, right: int) -> Tensor:
-    """Mirror at the lower and right rim; a picture thinner than the rim is mirrored again and again."""
+    """Mirror a picture at its lower and right edges; a picture narrower than the padding is mirrored repeatedly."""
     if down == right == 0:
         return x
     rows, columns = (_places(n, n + add, x.device) for n, add in zip(x.shape[-2:], (down, right), strict=True))

@@ -1,4 +1,4 @@
-"""Bicubic resampling by two small matrix products: deterministic on every device, and differentiable at will."""
+"""Bicubic resampling by two small matrix products: deterministic on every device, and differentiable to any order."""
 
 import functools
 
@@ -10,14 +10,15 @@ from neusee.nodes._half_precision import single
 
 
 def enlarge(image: Tensor, height: int, width: int) -> Tensor:
-    """Resample (…, y, x) through its samples: smooth between them, and aliased where there are fewer."""
+    """Resample (…, y, x) by bicubic interpolation: smooth between the samples, and aliased on a coarser grid."""
     return _product(image, _through(image.shape[-2], height, image), _through(image.shape[-1], width, image))
 
 
 def resize(image: Tensor, height: int, width: int) -> Tensor:
-    """Resample (…, y, x) with Keys' kernel, as wide as the coarser of the two grids: nothing aliases.
+    """Resample (…, y, x) without aliasing, by Keys' kernel scaled to the coarser of the two grids.
 
-    As torch's ``interpolate(mode="bicubic", antialias=True)``, to rounding; in single precision under autocast too.
+    The result equals torch's ``interpolate(mode="bicubic", antialias=True)`` within round-off, in single precision
+    under autocast too.
     """
     image = single(image)
     rows, columns = (_keys(n, new).to(image) for n, new in zip(image.shape[-2:], (height, width), strict=True))
@@ -30,15 +31,15 @@ def _product(image: Tensor, rows: Tensor, columns: Tensor) -> Tensor:
 
 
 def _through(size: int, new: int, like: Tensor) -> Tensor:
-    """Matrix (new, size) of bicubic interpolation between grids of the same extent."""
+    """Return the matrix (new, size) of bicubic interpolation between two grids of the same extent."""
     one = torch.eye(size, dtype=like.dtype, device=like.device)[None, None]
     return F.interpolate(one, size=(new, size), mode="bicubic", align_corners=False)[0, 0]
 
 
 @functools.lru_cache(maxsize=64)
 def _keys(size: int, new: int) -> Tensor:
-    """Matrix (new, size), float64; beyond the edge there is nothing, and what is inside has weights of sum 1."""
-    with torch.inference_mode(False):  # kept for others, who may learn
+    """Return the matrix (new, size), float64; samples beyond the edge are absent, and the weights of a row sum to 1."""
+    with torch.inference_mode(False):  # a later caller of the cached matrix may need gradients
         scale = size / new
         centres = (torch.arange(new, dtype=torch.float64)[:, None] + 0.5) * scale
         x = (torch.arange(size, dtype=torch.float64) + 0.5 - centres).abs() / max(scale, 1.0)

@@ -1,4 +1,4 @@
-"""Weights of a network in a safetensors file, and whether they are this network's."""
+"""Weights of a network in a safetensors file, and the check that the weights fit the network."""
 
 import json
 from collections.abc import Callable, Mapping
@@ -11,17 +11,17 @@ from torch import nn
 from neusee.nodes import ParameterError
 
 Net = TypeVar("Net", bound=nn.Module)
-OPTIONS = "neusee.options"  #: of a file's metadata: what of its network its tensors may not tell
+OPTIONS = "neusee.options"  #: metadata key of a network's options, which the tensors alone may not reveal
 
 
 def empty(make: Callable[[], Net]) -> Net:
-    """The network without memory, and without a draw from the global random stream."""
+    """Build the network without memory for its tensors and without a draw from the global random stream."""
     with torch.device("meta"):
         return make()
 
 
 def loaded(make: Callable[[], Net], weights: Path) -> Net:
-    """The network with these weights, in single precision."""
+    """Return the network with these weights, in single precision."""
     from safetensors.torch import load_file
 
     net = empty(make)
@@ -30,13 +30,13 @@ def loaded(make: Callable[[], Net], weights: Path) -> Net:
 
 
 def file_metadata(net: nn.Module) -> dict[str, str]:
-    """Metadata of a file of this network's weights: its ``options``, where it has some."""
+    """Return the metadata for a file of this network's weights: the ``options`` of the network, if any."""
     options = getattr(net, "options", None)
     return {} if options is None else {OPTIONS: json.dumps(options, sort_keys=True)}
 
 
 def same_layout(make: Callable[[], nn.Module], weights: Path, width: int) -> None:
-    """Refuse a file unless its tensors have the names and shapes of this network's, and what it tells the options."""
+    """Raise ParameterError unless a file holds the names and shapes of this network's tensors, and its options."""
     from safetensors import SafetensorError, safe_open
 
     net = empty(make)
@@ -46,7 +46,7 @@ def same_layout(make: Callable[[], nn.Module], weights: Path, width: int) -> Non
             found = {name: tuple(tensors.get_slice(name).get_shape()) for name in tensors.keys()}  # noqa: SIM118
             said = (tensors.metadata() or {}).get(OPTIONS)
     except SafetensorError as error:
-        raise ParameterError("weights", f"{weights.name} is no safetensors file: {error}") from error
+        raise ParameterError("weights", f"{weights.name} is not a safetensors file: {error}") from error
     if said is not None:
         _same_options(json.loads(said), getattr(net, "options", {}), weights)
     odd = sorted(name for name in wanted | found if wanted.get(name) != found.get(name))
@@ -57,10 +57,10 @@ def same_layout(make: Callable[[], nn.Module], weights: Path, width: int) -> Non
 
 
 def _same_options(learnt: Mapping[str, Any], options: Mapping[str, Any], weights: Path) -> None:
-    """Other options may have tensors of the same names and shapes, and make another picture of them."""
+    """Raise ParameterError for other options, because tensors of the same names and shapes then act differently."""
     for name in options:
         if name in learnt and learnt[name] != options[name]:
-            text = f"{weights.name} was learnt with {name}: {_word(learnt[name])}, and this network has {name}: "
+            text = f"{weights.name} was trained with {name}: {_word(learnt[name])}, and this network has {name}: "
             raise ParameterError("weights", f"{text}{_word(options[name])}; write {name}: {_word(learnt[name])}")
 
 

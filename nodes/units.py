@@ -1,8 +1,8 @@
-"""Units: a recipe writes ``550 nm``, a node receives metres.
+"""Physical units: a recipe writes ``550 nm``, and a node receives metres.
 
-A parameter with a dimension must carry its unit in the recipe, so that no one can
-mistake micrometres for nanometres. Inside the program everything is SI (or e-, DN).
-A gain is K of EMVA 1288 inside the program, DN/e-; a recipe may also write its reciprocal, ``0.37 e-/DN``.
+A parameter with a dimension must carry a unit in the recipe, so that no reader mistakes
+micrometres for nanometres. Inside the program every quantity is in SI units, e- or DN.
+A gain is K of EMVA 1288 inside the program, DN/e-; a recipe may also give the reciprocal, ``0.37 e-/DN``.
 """
 
 from __future__ import annotations
@@ -33,12 +33,12 @@ def _usual(si: str) -> str:
 
 
 def read_quantity(value: Any, si: str) -> float:
-    """Read ``"550 nm"`` as a finite number of ``si``; a bare number is refused with the fix."""
+    """Read ``"550 nm"`` as a finite number of ``si``; raise ValueError, which names the fix, without a unit."""
     text = str(value).strip()
     match = _NUMBER.fullmatch(text)
     units = ", ".join(_SCALE[si])
     if isinstance(value, bool) or match is None:
-        raise ValueError(f"is no quantity: write a number and a unit, such as '1 {_usual(si)}'")
+        raise ValueError(f"is not a quantity: write a number and a unit, such as '1 {_usual(si)}'")
     number, unit = float(match[1]), match[2].strip()
     if not unit:
         raise ValueError(f"needs a unit: write {_with_unit(match[1], si)}")
@@ -65,21 +65,21 @@ def _in_si(number: float, si: str, unit: str) -> float:
 
 
 def read_any(text: Any) -> tuple[float, str]:
-    """Read ``"550 nm"`` or ``0.56`` as a finite number and its SI unit, empty where it has none; else ValueError."""
+    """Read ``"550 nm"`` or ``0.56`` as a finite number and an SI unit, empty for a bare number, or raise ValueError."""
     number, si, reciprocal = read_written(text)
     return (_in_si(number, si, "e-/DN"), si) if reciprocal else (number, si)
 
 
 def read_written(text: Any) -> tuple[float, str, bool]:
-    """Read as `read_any` does, but leave a number in a reciprocal unit such as e-/DN: number, SI unit, whether so.
+    """Read as `read_any` does, but keep a number in a reciprocal unit such as e-/DN: number, SI unit, is reciprocal.
 
-    What a reciprocal follows, such as a normal law of 0.37 e-/DN, is no law of the same kind of the quantity itself.
+    A distribution of the reciprocal, such as a normal one of 0.37 e-/DN, is not of the same kind for the quantity.
     """
     match = _NUMBER.fullmatch(str(text).strip())
     unit = match[2].strip() if match else ""
     si = next((si for si, known in _SCALE.items() if unit in known), "")
     if isinstance(text, bool) or match is None or (unit and not si):
-        raise ValueError(f"{text} is no number and no quantity, such as 0.5 or '1 um'")
+        raise ValueError(f"{text} is neither a number nor a quantity, such as 0.5 or '1 um'")
     if not math.isfinite(float(match[1])):
         raise ValueError(f"{text} is not finite")
     return float(match[1]) * (_SCALE[si][unit] if si else 1.0), si, unit in _RECIPROCAL
@@ -102,7 +102,7 @@ Time = Annotated[float, Field(gt=0), _reader("s")]  #: second
 Angle = Annotated[float, _reader("rad")]  #: radian
 Temperature = Annotated[float, Field(gt=0), _reader("K")]  #: kelvin
 Electrons = Annotated[float, Field(ge=0), _reader("e-")]  #: electron
-Waves = Annotated[float, _reader("waves")]  #: wavelengths of path
+Waves = Annotated[float, _reader("waves")]  #: optical path in wavelengths
 Gain = Annotated[float, Field(gt=0, allow_inf_nan=False), _reader("DN/e-")]  #: K of EMVA 1288, DN per electron
 Fraction = Annotated[float, Field(ge=0, le=1)]  #: number in [0, 1]
 Count = Annotated[int, Field(ge=1)]  #: whole number from 1
@@ -111,7 +111,7 @@ Shape = tuple[Count, Count]  #: (y, x) in pixels
 
 
 class IsFile:
-    """Marks a parameter whose *content* decides the result; the engine digests it."""
+    """The mark of a file parameter: the *content* of the file decides the result and enters the engine's digest."""
 
 
 def _existing(path: Path) -> Path:
@@ -124,7 +124,7 @@ DataFile = Annotated[Path, AfterValidator(_existing), IsFile()]  #: path of a fi
 
 
 def _found(given: Any) -> list[Path]:
-    """The files that a path, a pattern, a folder or a list of these means, in the order of their names."""
+    """Return the files of a path, a pattern, a folder or a list of these; patterns and folders are sorted by name."""
     if isinstance(given, list | tuple):
         return [path for each in given for path in _found(each)]
     path = Path(given)
@@ -137,5 +137,5 @@ def _found(given: Any) -> list[Path]:
     return files
 
 
-#: one file or more: a path, a folder, a pattern such as ``dark/*.png``, or a list of these
+#: one or more files: a path, a folder, a pattern such as ``dark/*.png``, or a list of these
 DataFiles = Annotated[tuple[Path, ...], BeforeValidator(_found, json_schema_input_type=str | list[str]), IsFile()]

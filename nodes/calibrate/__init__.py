@@ -1,4 +1,4 @@
-"""Calibrate: frames of flat illumination to the constants of a sensor, and to how well they are known."""
+"""Calibrate: the constants of a sensor and their uncertainties, from frames of flat illumination."""
 
 from neusee.nodes.calibrate._emva_fit import LeastSquares, least_squares
 from neusee.nodes.calibrate._frames._emva_descriptor import descriptor

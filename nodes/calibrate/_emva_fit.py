@@ -1,4 +1,4 @@
-"""The linear camera model of EMVA 1288, fitted as the standard prescribes: a first answer, and a start for others."""
+"""The linear camera model of EMVA 1288, fitted as the standard prescribes: a first estimate, and a start for others."""
 
 from __future__ import annotations
 
@@ -17,33 +17,35 @@ _QUANTIZATION = 1.0 / 12.0  #: DN2, of rounding to the nearest number
 
 
 class LeastSquares(NamedTuple):
-    """What a photon-transfer measurement gives; all () float64, errors as standard errors of the noise alone."""
+    """The results of a photon-transfer measurement; all () float64, errors are standard errors from the noise alone."""
 
     gain: Tensor  #: K, DN/e-
     efficiency: Tensor  #: electrons per photon
     temporal_dark_noise: Tensor  #: sigma_d, e-
-    dark_signal: Tensor  #: of the shortest exposure, DN
-    dark_current: Tensor  #: e-/s; not a number where all darks were exposed alike
-    saturation: Tensor  #: electrons in the level of the largest variance, dark signal not counted
+    dark_signal: Tensor  #: dark signal of the shortest exposure, DN
+    dark_current: Tensor  #: e-/s; NaN where all dark levels have the same exposure
+    saturation: Tensor  #: electrons in the level of the largest variance, without the dark signal
     gain_error: Tensor
     efficiency_error: Tensor
     temporal_dark_noise_error: Tensor
-    fitted: Tensor  #: lit levels that both lines were fitted to
+    fitted: Tensor  #: number of lit levels in both fits
 
 
 @node(rtol=1e-9)
 def least_squares(levels: Levels, *, share: Share = 0.7) -> LeastSquares:
     """Fit gain, quantum efficiency and temporal dark noise: lines through the origin, up to a share of saturation.
 
-    Saturation is where the variance is greatest. The slope of mean over photons is the responsivity, that of variance
-    over mean the gain, each less the dark of the nearest exposure.
+    The level of the greatest variance marks saturation. The slope of mean over photons is the responsivity, and the
+    slope of variance over mean is the gain, after subtraction of the dark level of the nearest exposure.
 
     Shapes: levels (level,) -> ten scalars.
     Units:  K DN/e-; temporal dark noise, saturation e-; dark current e-/s.
-    Error:  as far as the camera is linear and Poisson. Every level weighs the same, as the standard has it, so that the
-            brightest decide. The rounding of a converter is taken to add 1/12 DN2; dithered, it adds up to 1/6. The
-            errors leave out the scatter of means in x, drift and non-linearity, which are larger in real cameras.
-    Raises: ValueError without a dark level, without two lit ones below saturation, and for a camera without response.
+    Error:  valid as far as the camera is linear and the light is Poisson. Every level has the same weight, as in the
+            standard, so that the brightest levels dominate. Rounding in the converter is assumed to add 1/12 DN2;
+            dithered rounding adds up to 1/6. The errors omit the scatter of means in x, drift and non-linearity,
+            which are larger in real cameras.
+    Raises: ValueError without a dark level, without two lit levels of different light below saturation, and for a
+            camera without response.
     Source: EMVA Standard 1288, release 4.0 Linear, sections 6.6 to 6.8.
     """
     dark = levels.photons == 0
@@ -61,8 +63,8 @@ def least_squares(levels: Levels, *, share: Share = 0.7) -> LeastSquares:
                          "dark: give two or more of different light there")  # fmt: skip
     gain, response = _slope(mean[used], variance[used]), _slope(lit.photons[used], mean[used])
     if not (float(gain) > 0 and float(response) > 0):
-        raise ValueError(f"slopes {float(gain):.3g} DN/e- and {float(response):.3g} DN a photon: brighter frames must "
-                         "be brighter and noisier; see that the light and the levels belong together")  # fmt: skip
+        raise ValueError(f"slopes {float(gain):.3g} DN/e- and {float(response):.3g} DN/photon: brighter frames must "
+                         "be brighter and noisier; check that the light belongs to the levels")  # fmt: skip
     scatter = 2 * lit.variance.square() / lit.degrees_of_freedom
     dim = 2 * below.variance.square() / below.degrees_of_freedom
     off = _error(mean[used], scatter[used], dim[used], nearest[used]) / gain
@@ -94,35 +96,35 @@ def _(result: LeastSquares, levels: Levels, **params: float) -> list[Check]:
 
 
 def _only(levels: Levels, which: Tensor) -> Levels:
-    """Some of the levels, without their histograms."""
+    """Select some of the levels, without their histograms."""
     return Levels._make([*(x[which] for x in levels[:6]), *(x[:0] for x in levels[6:])])
 
 
 def _slope(x: Tensor, y: Tensor) -> Tensor:
-    """Of the line through the origin."""
+    """Return the slope of the line through the origin."""
     return (x @ y) / (x @ x)
 
 
 def _error(x: Tensor, own: Tensor, dark: Tensor, which: Tensor) -> Tensor:
-    """Standard error of that slope, where y is less a dark that several levels may share."""
+    """Return the standard error of that slope, where several levels may share the dark level subtracted from y."""
     shared = torch.zeros(int(which.max()) + 1, dtype=x.dtype, device=x.device).index_add_(0, which, x * dark.sqrt())
     return (x.square() @ own + shared.square().sum()).sqrt() / (x @ x)
 
 
 def _first(levels: Levels, dark: Tensor) -> Tensor:
-    """The dark of the shortest exposure."""
+    """Return the index of the dark level of the shortest exposure."""
     return torch.where(dark, levels.exposure, math.inf).argmin()
 
 
 def _dark_noise(levels: Levels, dark: Tensor) -> tuple[Tensor, Tensor]:
-    """Standard deviation of the dark without its rounding, and its standard error, DN; infinite if rounding is all."""
+    """Return the temporal dark noise without rounding, and its standard error, DN; infinite without other noise."""
     variance, freedom = (x[_first(levels, dark)] for x in (levels.variance, levels.degrees_of_freedom))
     noise = (variance - _QUANTIZATION).clamp_min(0.0).sqrt()
     return noise, torch.where(noise > 0, variance / (2 * freedom).sqrt() / noise, math.inf)
 
 
 def _dark_current(levels: Levels, dark: Tensor) -> Tensor:
-    """Rise of the dark signal with exposure, DN/s."""
+    """Return the slope of the dark signal over exposure, DN/s."""
     time, signal = levels.exposure[dark], levels.mean[dark]
     apart = time - time.mean()
     return torch.where(time.max() > time.min(), (apart @ signal) / (apart @ apart), math.nan)

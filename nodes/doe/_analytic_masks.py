@@ -1,4 +1,4 @@
-"""Analytic masks. Radius r and coordinates u, v are in units of the stop's radius, slopes in waves at its rim."""
+"""Analytic masks. Radius r and coordinates u, v are in units of the stop's radius, slopes in waves at the rim."""
 
 import math
 from typing import Annotated
@@ -85,7 +85,7 @@ def spiral_axicon(
     wavelength: Wavelength = 550e-9,
     material: Material = "fused silica",
 ) -> Tensor:
-    """Wind an axicon: phi = 2 pi waves r + charge * theta.
+    """Add a vortex to an axicon: phi = 2 pi waves r + charge * theta.
 
     Shapes: -> (v, u).
     Units:  waves at the rim; result m.
@@ -108,7 +108,7 @@ def cubic(
     wavelength: Wavelength = 550e-9,
     material: Material = "fused silica",
 ) -> Tensor:
-    """Bend the phase cubically: phi = 2 pi waves (u**3 + v**3), an MTF without zeros over a long focus.
+    """Make the phase cubic: phi = 2 pi waves (u**3 + v**3), which gives an MTF without zeros over a long focus.
 
     Shapes: -> (v, u).
     Units:  waves at the rim on an axis; result m.
@@ -144,8 +144,8 @@ def half_rings(
 ) -> Tensor:
     """Send both halves of each annulus to the same half ring: phi = 2 pi a r sgn(cos(theta - orientation)).
 
-    One slope a per annulus of equal area, from the axis outwards; ``alternate`` flips the side of every second
-    one. The phase is odd about the axis, so the amplitude of its point-spread function is real.
+    Each annulus of equal area has one slope a, from the axis outwards; ``alternate`` flips the side of every second
+    annulus. The phase is odd about the axis, so the amplitude of the point-spread function is real.
 
     Shapes: -> (v, u).
     Units:  waves at the rim; orientation rad; result m.

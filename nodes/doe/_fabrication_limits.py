@@ -1,4 +1,4 @@
-"""What can be made of a relief: wrapped, limited in depth, cut in steps."""
+"""Fabrication limits of a relief: wrapping, limited depth, discrete levels."""
 
 import math
 from typing import Annotated
@@ -13,11 +13,11 @@ from neusee.nodes.doe._refractive_index import Material, wave_height
 from neusee.nodes.units import PositiveLength, Wavelength
 
 Levels = Annotated[int, Field(ge=2)]
-_VIOLET = 400e-9  #: m, at which a move of the relief is weighed as phase
+_VIOLET = 400e-9  #: m, wavelength at which a change of height is converted to a change of phase
 
 
 def _quantize(height: Tensor, step: float, levels: int, cyclic: bool) -> Tensor:
-    """Round to the nearest step; the gradient passes straight through."""
+    """Round to the nearest step; the gradient passes through unchanged."""
     with torch.no_grad():
         place = (height / step).round()
         place = place.remainder(levels) if cyclic else place.clamp(0, levels - 1)
@@ -50,7 +50,7 @@ def fabricate(
 
     Shapes: (v, u) -> (v, u).
     Units:  m.
-    Error:  1e-7 of the result (float32), however often it was wrapped.
+    Error:  1e-7 of the result (float32), for any number of wraps.
     Raises: ParameterError where one wave is deeper than ``max_height``, or levels have no depth to divide; ValueError
             for a height in half precision.
     Source: Swanson, MIT Lincoln Laboratory Technical Report 854 (1989), for multi-level elements.
@@ -71,7 +71,7 @@ def fabricate(
 def _(
     height: Tensor, *, material: Material, wrap_at: float | None, levels: int | None, max_height: float | None
 ) -> Tensor:
-    """The nearest of all allowed heights, by trying each."""
+    """Return the nearest of all allowed heights, found by comparing each."""
     wave = None if wrap_at is None else wave_height(material, wrap_at)
     x = height.to(torch.float64)
     x = x if wave is None else x - wave * (x / wave).floor()
@@ -89,9 +89,9 @@ def _(
 def _(
     height: TensorStats, *, material: Material, wrap_at: float | None, levels: int | None, max_height: float | None
 ) -> float:
-    """What wrapping, cutting and steps move at most, over the deepest that is known to be made; 0 where all fits.
+    """Return the largest change of height, relative to the deepest height that is made; 0 if every height fits.
 
-    What is small in height is not small in phase: the bound is never below the phase, in radians at 400 nm, that
+    A small change of height may be a large phase: the bound is never below the phase, in radians at 400 nm, that
     the move turns. Wrapping turns no phase at ``wrap_at``, and counts in full all the same.
     """
     top = max_height if wrap_at is None else wave_height(material, wrap_at)
@@ -107,15 +107,15 @@ def _(
 
 
 def _moved(ends: Tensor, top: float, levels: int | None, cyclic: bool) -> float:
-    """Bound of what any height between two ends moves, m; exact without steps."""
+    """Return an upper bound of the change of any height between two ends, m; exact without steps."""
     low, high = (float(end) for end in ends)
     if not cyclic:
-        top = float(torch.tensor(top, dtype=ends.dtype))  # where it is cut
+        top = float(torch.tensor(top, dtype=ends.dtype))  # the cut in the precision of the relief
         return max(high - top, -low, 0.0 if levels is None else top / (levels - 1) / 2)
     waves = max(abs(math.floor(low / top)), abs(math.floor(high / top)))
     if levels is None:
         return top * waves
-    rounded_up = high >= top * (1 - 0.5 / levels) * (1 - 4 * torch.finfo(ends.dtype).eps)  # to a whole wave, so to 0
+    rounded_up = high >= top * (1 - 0.5 / levels) * (1 - 4 * torch.finfo(ends.dtype).eps)  # to a whole wave, which is 0
     return top * (waves + rounded_up + 0.5 / levels)
 
 
@@ -137,7 +137,7 @@ def _(
     levels: int | None,
     max_height: float | None,
 ) -> list[Check]:
-    checks = [Check(f"relief {float(height.max()) * 1e6:.4g} um made {float(result.max()) * 1e6:.4g} um deep")]
+    checks = [Check(f"relief {float(height.max()) * 1e6:.4g} um deep, {float(result.max()) * 1e6:.4g} um as made")]
     if max_height is not None and wrap_at is None:
         share = float((height > max_height).double().mean())
         checks.append(Check(f"cut flat at max_height: {share:.2%} of the grid", share == 0))

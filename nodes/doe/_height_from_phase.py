@@ -1,4 +1,4 @@
-"""From a wanted phase to the relief that makes it, and what to look at on a relief."""
+"""Conversion of a phase to the relief that produces this phase, and the check of a relief."""
 
 import math
 from typing import Any

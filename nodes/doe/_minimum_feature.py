@@ -1,4 +1,4 @@
-"""The least feature that a tool can make: a relief seen through the spot that writes it."""
+"""Smallest feature of a fabrication tool: the average of a relief over the spot of the tool."""
 
 import math
 from typing import Any
@@ -28,26 +28,26 @@ def smooth(
     """Write the relief with a round Gaussian spot whose full width at half maximum is ``feature``.
 
     Depth follows dose, and dose is the wanted relief averaged over the spot: steps get flanks of ``feature``, pillars
-    narrower than it vanish, planes and everything wide stay. An average lies between the least and the greatest
-    of what it averages, so a relief that keeps to its depth still does. At the edge of the grid the average is over
-    what there is. A Gaussian and not a disc, for its transfer function has no negative lobes: features too
-    small to be made fade, and none comes out upside down.
+    that are narrower vanish, planes and wide features stay. An average lies between the least and the greatest
+    height under the spot, so the relief does not become deeper. At the edge of the grid, the average covers only the
+    samples inside the grid. The spot is a Gaussian and not a disc, whose transfer function has negative lobes: with a
+    Gaussian, features that are too small fade, and no feature is inverted.
 
     Shapes: (v, u) -> (v, u).
     Units:  m.
-    Error:  1e-6 of the deepest height (float32). A spot narrower than a sample and a half is the samples' own.
+    Error:  1e-6 of the deepest height (float32). A spot below 1.5 samples is not resolved by the grid.
     Raises: ValueError for a height in half precision, or of another shape than the pupil grid.
     Source: Gaussian spot of laser lithography: Gale et al., Opt. Eng. 33, 3556 (1994).
     """
     refuse_half(height=height)
     if tuple(height.shape) != (samples, samples):
-        raise ValueError(f"height is {tuple(height.shape)}, the pupil grid ({samples}, {samples}): give both alike")
+        raise ValueError(f"height is {tuple(height.shape)}, not the pupil grid ({samples}, {samples}): resample it")
     spread = _spread(samples, feature / stop(samples, pitch, diameter, aperture).pitch).to(height)
     return spread @ height @ spread.T
 
 
 def _spread(samples: int, feature: float) -> Tensor:
-    """Matrix of averages along an axis, rows of sum 1, float64; ``feature`` in samples."""
+    """Return the averaging matrix along one axis, float64, each row of sum 1; ``feature`` is in samples."""
     sigma = feature / math.sqrt(8 * math.log(2))
     place = torch.arange(samples, dtype=torch.float64)
     weights = torch.exp(-((place[:, None] - place) ** 2) / (2 * sigma**2))
@@ -59,7 +59,7 @@ def _spread(samples: int, feature: float) -> Tensor:
 def _(
     height: Tensor, *, feature: float, samples: int, pitch: float, diameter: float, aperture: Aperture = "inscribed"
 ) -> Tensor:
-    """The average at each place over all others, one place after another."""
+    """Compute the weighted average over all places, for one place after another."""
     sigma = feature / stop(samples, pitch, diameter, aperture).pitch / math.sqrt(8 * math.log(2))
     x, place = height.double(), torch.arange(samples, dtype=torch.float64)
     made = torch.empty_like(x)
@@ -75,9 +75,7 @@ def _(
 def _(*, feature: float, samples: int, pitch: float, diameter: float, aperture: Aperture) -> list[str]:
     own = stop(samples, pitch, diameter, aperture).pitch
     if feature < 1.5 * own:
-        return [
-            f"feature {feature * 1e6:.3g} um is less than 1.5 samples of {own * 1e6:.3g} um: the samples' own shows"
-        ]
+        return [f"feature {feature * 1e6:.3g} um is less than 1.5 samples of {own * 1e6:.3g} um: not resolved"]
     return []
 
 

@@ -1,7 +1,7 @@
-"""Reliefs that learn: pixels, Zernike polynomials, rings and a network, each at any sampling of the pupil.
+"""Trainable reliefs: pixels, Zernike polynomials, rings and a network, each for any sampling of the pupil.
 
-A module is called with the stop and gives the height, float32 in m, counted up from 0. Nothing of it depends on the
-sampling, so that what was learnt on few samples is made on many.
+A module is called with the stop and returns the height, float32 in m, at least 0. The trained numbers do not depend on
+the sampling, so that a relief that was trained on few samples can be evaluated on many samples.
 """
 
 import math
@@ -24,12 +24,12 @@ from neusee.nodes.optics._pupil_grid import Stop, axes, inside, stop
 from neusee.nodes.optics._zernike import combine
 
 Make = Callable[[Stop], Tensor]
-_END = 0.01  #: share of the depth, at its ends, that a start is kept out of: a sigmoid has no slope there
-_ROOM = 0.05  #: of a formula's depth, above and below
+_END = 0.01  #: share of the depth at both ends that a start avoids, because the sigmoid has almost no slope there
+_ROOM = 0.05  #: share of a formula's depth that is free above and below the relief
 
 
 class _Kept:
-    """One value per stop: what depends on the stop alone is computed once."""
+    """A function of the stop that keeps its last value, so that equal stops are computed once."""
 
     def __init__(self, make: Make) -> None:
         self._make, self._found = make, dict[Stop, Tensor]()
@@ -59,7 +59,7 @@ class Pixels(nn.Module):
         self.logits = nn.Parameter(logits.to(torch.float32))
 
     def forward(self, grid: Stop) -> Tensor:
-        """Height (v, u)."""
+        """Return the height (v, u)."""
         logits: Tensor = self.logits
         if grid.samples != logits.shape[-1]:
             logits = enlarge(logits, grid.samples, grid.samples)
@@ -69,7 +69,7 @@ class Pixels(nn.Module):
 class Modes(nn.Module):
     """Zernike polynomials from Noll's number 4 on, ``count`` of them; coefficients in waves, root mean square.
 
-    Piston moves nothing, and tilt only the spot. The start is a random sum, ``waves`` root mean square in all.
+    Piston changes nothing, and tilt only shifts the spot. The start is a random sum, ``waves`` root mean square in all.
     """
 
     def __init__(self, count: int, waves: float, wavelength: float, material: Material, rng: torch.Generator) -> None:
@@ -85,7 +85,7 @@ class Modes(nn.Module):
         return torch.stack(each).where(inside(grid, v.device), 0.0).to(torch.float32)
 
     def forward(self, grid: Stop) -> Tensor:
-        """Height (v, u)."""
+        """Return the height (v, u)."""
         basis = self._basis(grid)
         phase = (2 * math.pi * self.waves) @ basis.flatten(1)
         return height_from_phase(phase.view(grid.samples, grid.samples), grid, self.wavelength, self.material)
@@ -94,8 +94,8 @@ class Modes(nn.Module):
 class Rings(nn.Module):
     """A slope and a step for each of ``count`` annuli of equal area, in waves at the rim; odd about the axis or not.
 
-    phi = 2 pi (a r + c), times the sign of u where it is sided. Five half-rings are among them wherever ``count``
-    is a multiple of five; the start has their slopes, alternating by fifths, with ``noise`` waves of chance on each.
+    phi = 2 pi (a r + c), times the sign of u if ``sided``. If ``count`` is a multiple of five, five half-rings are a
+    special case. The start has the slopes of the half-rings, alternating by fifths, plus ``noise`` random waves.
     """
 
     def __init__(
@@ -114,7 +114,7 @@ class Rings(nn.Module):
         return ((v.square() + u.square()) * len(self.slopes)).floor().long().clamp(max=len(self.slopes) - 1)
 
     def forward(self, grid: Stop) -> Tensor:
-        """Height (v, u)."""
+        """Return the height (v, u)."""
         v, u = axes(grid, self.slopes.device)
         zone = self._zones(grid)
         phase = self.slopes.double()[zone] * torch.hypot(v, u) + self.steps.double()[zone]
@@ -123,7 +123,7 @@ class Rings(nn.Module):
 
 
 class Drawn(nn.Module):
-    """The network of `doe.unet`, on ``grid`` samples; from ``net``, or as it starts."""
+    """The network of `doe.unet` on ``grid`` samples, with the weights of ``net`` or with new random weights."""
 
     def __init__(
         self, width: int, grid: int, max_height: float, rng: torch.Generator, net: HeightNet | None = None
@@ -132,19 +132,19 @@ class Drawn(nn.Module):
         self.grid, self.max_height, self.net = grid, max_height, net or fresh(width, grid, rng)
 
     def forward(self, grid: Stop) -> Tensor:
-        """Height (v, u)."""
+        """Return the height (v, u)."""
         return height_of(self.net, grid.samples, self.grid, self.max_height)
 
 
 class Written(nn.Module):
-    """A relief as a spot of ``feature`` writes it, `doe.smooth`: nothing is learnt that is too fine to be made."""
+    """A relief after `doe.smooth` with ``feature``, so that training cannot use details too fine for the tool."""
 
     def __init__(self, shape: Make, feature: float) -> None:
         super().__init__()
         self.shape, self.feature = shape, feature
 
     def forward(self, grid: Stop) -> Tensor:
-        """Height (v, u)."""
+        """Return the height (v, u)."""
         made: Tensor = smooth(
             self.shape(grid), feature=self.feature, samples=grid.samples, pitch=grid.pitch, diameter=grid.diameter,
             aperture="clipped",
@@ -152,7 +152,7 @@ class Written(nn.Module):
         return made
 
 
-# --- of a step --------------------------------------------------------------------------------------------------------
+# --- the start, from a step -------------------------------------------------------------------------------------------
 
 
 def _pixels(params: Mapping[str, Any], rng: torch.Generator) -> Pixels:
@@ -161,7 +161,7 @@ def _pixels(params: Mapping[str, Any], rng: torch.Generator) -> Pixels:
 
 
 def _freed(make: Callable[..., Tensor]) -> Callable[[Mapping[str, Any], torch.Generator], Pixels]:
-    """Start as a formula has it, lifted off the ends, where a sigmoid has no slope: a piston is not seen."""
+    """Return a function that starts pixels at a formula's relief, plus a piston that keeps off the sigmoid's ends."""
 
     def start(params: Mapping[str, Any], rng: torch.Generator) -> Pixels:
         height = make(**params)
@@ -177,7 +177,7 @@ def _drawn(params: Mapping[str, Any], rng: torch.Generator) -> Drawn:
     return Drawn(width, grid, params["max_height"], rng, net)
 
 
-#: by node: a relief that starts as the node draws it, from the node's own parameters; a flat one has no slope to leave
+#: By node: a function that returns a trainable relief, started at the node's relief. A flat relief has no gradient.
 PARAMETRISATIONS: dict[str, Callable[[Mapping[str, Any], torch.Generator], nn.Module]] = {
     "doe.pixelwise": _pixels,
     "doe.unet": _drawn,

@@ -1,4 +1,4 @@
-"""Materials: how much slower light is in the element than in air."""
+"""Materials of the element, and their refractive indices relative to air."""
 
 from typing import Literal, NamedTuple
 
@@ -34,7 +34,7 @@ _DISPERSION: dict[str, _Dispersion] = {
 
 
 def excess_index(name: Material, wavelengths: Tensor) -> Tensor:
-    """n - 1 of a material at wavelengths in m; differentiable, dtype kept."""
+    """Return n - 1 of a material at wavelengths in m; the result is differentiable and keeps the dtype."""
     material, square = _DISPERSION[name], (wavelengths * 1e6).square()
     if material.cauchy:
         return torch.stack([a / square**k for k, a in enumerate(material.cauchy)]).sum(0) - 1
@@ -42,17 +42,17 @@ def excess_index(name: Material, wavelengths: Tensor) -> Tensor:
 
 
 def wave_height(name: Material, wavelength: float) -> float:
-    """Height, in m, of the element that delays light of ``wavelength`` by one wave."""
+    """Return the height, in m, of the element that delays light of ``wavelength`` by one wave."""
     return wavelength / float(excess_index(name, torch.tensor(wavelength, dtype=torch.float64)))
 
 
 @node(rtol=1e-12)
 def material(bands: Bands, *, material: Material = "fused silica") -> Tensor:
-    """Slow light down: the refractive index of the element minus that of air, taken as 1.
+    """Compute the refractive index of the element minus the refractive index of air, taken as 1.
 
     Shapes: bands -> (band,), float64.
     Units:  wavelengths m; result 1.
-    Error:  that of the fit: 1e-5 for the glasses, 1e-3 for the polymers.
+    Error:  error of the fit: 1e-5 for the glasses, 1e-3 for the polymers.
     Source: fused silica: Malitson, J. Opt. Soc. Am. 55, 1205 (1965); N-BK7: SCHOTT data sheet; PMMA: fit to
         Sultanova et al., Acta Phys. Pol. A 116, 585 (2009); photoresist: MicroChem SU-8 3000 data sheet (2011), Cauchy.
     """

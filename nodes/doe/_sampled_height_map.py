@@ -1,4 +1,4 @@
-"""A relief given sample by sample: from a file, or a smooth random one to start learning from."""
+"""Relief given by its samples: from a file, or a smooth random relief as the start of a training."""
 
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
@@ -16,12 +16,12 @@ from neusee.nodes.units import Count, DataFile, PositiveLength
 if TYPE_CHECKING:
     from PIL.Image import Image
 
-_GREYS = {"L": 255, "I;16": 65535, "I;16B": 65535, "I": 65535}  #: the whitest level of each kind of grey picture
+_GREYS = {"L": 255, "I;16": 65535, "I;16B": 65535, "I": 65535}  #: the level of white in each mode of a grey picture
 Scale = Annotated[float, Field(gt=0, le=1)]  #: part of the pupil's diameter
 
 
 def _header(file: Path) -> tuple[int, ...]:
-    """Shape of the relief in a file, without reading it."""
+    """Return the shape of the relief in a file without reading the heights."""
     from safetensors import SafetensorError
 
     try:
@@ -49,13 +49,13 @@ def _stated(file: Path) -> tuple[int, ...]:
 
 
 def _levels(file: Path) -> "Image":
-    """A grey picture, open."""
+    """Open a grey picture; raise ParameterError for any other picture."""
     from PIL import Image
 
     picture = Image.open(file)
     if picture.mode not in _GREYS:
         picture.close()
-        raise ParameterError("file", f"{file.name} is {picture.mode}, not grey: a level for each sample, 8 or 16 bit")
+        raise ParameterError("file", f"{file.name} is {picture.mode}, not grey: store one level a sample, 8 or 16 bit")
     return picture
 
 
@@ -94,13 +94,13 @@ def pixelwise(
 ) -> Tensor:
     """Read a relief from ``file``, or draw a smooth one between 0 and ``depth`` with features of ``scale`` diameters.
 
-    The drawn one is a start for learning: a flat relief sits on a saddle where suppression has no gradient.
+    The random relief is a start for training: a flat relief is a saddle point, where suppression has no gradient.
 
     Shapes: -> (v, u).
     Units:  m; of a .png, levels, of which the whitest is ``depth``.
     Error:  exact.
-    Raises: ParameterError for a file that is no relief; ValueError where it does not fit the grid, or holds a height
-            below 0 or not finite.
+    Raises: ParameterError for a file without a relief; ValueError for a relief that does not fit the grid, or with a
+            height that is negative or not finite.
     Source: by definition.
     """
     if file is None:
@@ -110,14 +110,14 @@ def pixelwise(
     height = read_height_map(file, depth)
     if not bool(torch.isfinite(height).all()) or float(height.min()) < 0:
         low = float(height.min())
-        raise ValueError(f"{file.name}: lowest height {low:.3g} m; a relief is finite and counted up from 0")
+        raise ValueError(f"{file.name}: lowest height {low:.3g} m, but a relief must be finite and at least 0")
     return height
 
 
 def _fits(file: Path, shape: tuple[int, ...], samples: int) -> None:
     if shape != (samples, samples):
-        fix = f"resample it, or set samples to {shape[-1] if shape else 1}"
-        raise ParameterError("file", f"{file.name} is {shape}, the pupil grid ({samples}, {samples}): {fix}")
+        fix = f"resample the relief, or set samples to {shape[-1] if shape else 1}"
+        raise ParameterError("file", f"{file.name} is {shape}, not the pupil grid ({samples}, {samples}): {fix}")
 
 
 @pixelwise.preflight

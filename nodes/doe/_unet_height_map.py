@@ -1,4 +1,4 @@
-"""A relief drawn by a network from the pupil coordinates alone: a smooth prior with a million numbers."""
+"""Relief computed by a network from the pupil coordinates alone: a smooth prior with a million parameters."""
 
 from functools import partial
 from itertools import pairwise
@@ -16,13 +16,13 @@ from neusee.nodes.network_weights import loaded, same_layout
 from neusee.nodes.optics._pupil_grid import Aperture, grid_notes
 from neusee.nodes.units import Count, DataFile, PositiveLength
 
-PITCH = 15.0  #: of the first layer's sines: about four periods across the pupil at the start
+PITCH = 15.0  #: frequency of the first layer's sines: about four periods across the pupil at the start
 
 
 class HeightNet(nn.Module):
-    """Eight convolutions, four down and four up, from (u, v) to one logit a sample.
+    """A network of eight convolutions, four down and four up, from (u, v) to one logit for each sample.
 
-    The first is followed by sines, so that the relief is not bound to be as smooth as its coordinates.
+    Sines follow the first convolution, so that the relief can be less smooth than the coordinates.
     """
 
     def __init__(self, width: int = 32) -> None:
@@ -34,7 +34,7 @@ class HeightNet(nn.Module):
         self.last = nn.Conv2d(width, 1, 3)
 
     def forward(self, coordinates: Tensor) -> Tensor:
-        """(2, y, x) -> (y, x)."""
+        """Return the logits (y, x) at the coordinates (2, y, x)."""
         passed = [torch.sin(PITCH * self.down[0](_edged(coordinates[None])))]
         for layer in self.down[1:]:
             passed.append(F.silu(layer(_edged(passed[-1]))))
@@ -46,27 +46,27 @@ class HeightNet(nn.Module):
 
 
 def _edged(x: Tensor) -> Tensor:
-    """Repeat the outermost rows and columns: zeros there would draw a frame around the relief."""
+    """Repeat the outermost rows and columns: zeros would draw a frame around the relief."""
     x = torch.cat([x[..., :1, :], x, x[..., -1:, :]], dim=-2)
     return torch.cat([x[..., :1], x, x[..., -1:]], dim=-1)
 
 
 def coordinates(grid: int, device: torch.device | None = None) -> Tensor:
-    """What the network sees: u and v from -1 to 1 across the pupil grid, (2, grid, grid)."""
+    """Return the input of the network: u and v from -1 to 1 across the pupil grid, (2, grid, grid)."""
     line = (torch.arange(grid, dtype=torch.float64, device=device) - (grid - 1) / 2) * (2 / grid)
     v, u = torch.meshgrid(line, line, indexing="ij")
     return torch.stack([u, v]).to(torch.float32)
 
 
 def height_of(net: nn.Module, samples: int, grid: int, max_height: float) -> Tensor:
-    """Relief (samples, samples) between 0 and ``max_height``, through which the network learns."""
+    """Return the relief (samples, samples) between 0 and ``max_height``, differentiable in the weights."""
     like = next(net.parameters())
     logits = net(coordinates(min(grid, samples), like.device).to(like))
     return max_height * torch.sigmoid(enlarge(logits, samples, samples))
 
 
 def fresh(width: int, grid: int, rng: torch.Generator) -> HeightNet:
-    """Draw a network: orthogonal weights, zero biases; the last layer centred and scaled: a start far from flat."""
+    """Draw a network with orthogonal weights and zero biases; scale the last layer, far from a flat relief."""
     net = HeightNet(width).to(rng.device)
     with torch.no_grad():
         for name, parameter in net.named_parameters():
@@ -96,7 +96,7 @@ def unet(
 ) -> Tensor:
     """Draw the relief with a UNet of the pupil coordinates: max_height * sigmoid(UNet(u, v)).
 
-    Evaluated on ``grid`` samples and resampled bicubically before the sigmoid, so that it stays inside its range.
+    The network has ``grid`` samples. The bicubic resampling precedes the sigmoid, which keeps the relief in its range.
 
     Shapes: -> (v, u).
     Units:  m.

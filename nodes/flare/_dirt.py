@@ -1,4 +1,4 @@
-"""What lies on the window in front of the lens, with statistics that do not depend on the sampling."""
+"""Dirt on the window in front of the lens, with statistics that do not depend on the sampling."""
 
 import math
 from typing import Annotated, Any
@@ -15,11 +15,11 @@ from neusee.nodes.units import Count, Fraction, PositiveLength, Waves
 from neusee.nodes.values import Dirt
 
 Mean = Annotated[float, Field(ge=0, le=10_000)]  #: expected number
-Part = Annotated[float, Field(gt=0, le=1)]  #: of the pupil's diameter
+Part = Annotated[float, Field(gt=0, le=1)]  #: relative to the diameter of the pupil
 Rms = Annotated[Waves, Field(ge=0)]  #: root mean square path, waves at 550 nm
 WAVE = 550e-9  #: m
-_VIOLET = 400e-9  #: m, at which a path is weighed as phase
-_ROUNDING = 6e-8  #: of an amplitude near 1, float32
+_VIOLET = 400e-9  #: m, shortest wavelength, at which a path gives the largest phase
+_ROUNDING = 6e-8  #: round-off of an amplitude near 1, float32
 DENT_TERMS = range(4, 16)  #: Noll numbers from defocus to the fourth radial order
 
 
@@ -44,17 +44,18 @@ def dirt(
 ) -> Dirt:
     """Soil the pupil: grains of dust, scratches, a greasy film, smudges and dents of a windshield.
 
-    dust, scratches: expected numbers (Wu et al.: 30 each). The largest grain is drawn about ``dust_radius``, the widest
-        scratch about ``scratch_width``; ``scratch_length`` is the longest of its up to 16 steps; all of the diameter.
-    grease: a phase screen of that root mean square and correlation length ``grease_scale`` (0.02 to 0.2).
-    smudges: opacity of the field under the thickest, soft patches of size ``smudge_scale``.
-    dents: Zernike terms 4 to 15 of that root mean square (0.1 to 2 waves). All zero is clean glass.
+    dust, scratches: expected numbers (Wu et al.: 30 each). The radius of the largest grain is drawn about
+        ``dust_radius``, the width of the widest scratch about ``scratch_width``. A scratch has up to 16 steps, none
+        longer than ``scratch_length``. All lengths are relative to the diameter.
+    grease: root mean square of a phase screen with correlation length ``grease_scale`` (0.02 to 0.2).
+    smudges: opacity of the field under the thickest of the soft patches, whose size is ``smudge_scale``.
+    dents: root mean square of Zernike terms 4 to 15 (0.1 to 2 waves). With all five at zero the glass is clean.
 
     Shapes: -> Dirt (v, u).
     Units:  grease, dents waves at 550 nm; result amplitude 1, path m.
-    Error:  covered area of a mark 1 % from 3 samples across, 10 % at 1 sample, right on average at any size.
-    Source: numbers, sizes and opacities of dust and scratches: Wu et al., ICCV 2021 (arXiv 2011.12485), in parts of
-        their 6000 samples; the soft kinds are ours.
+    Error:  covered area of a mark: 1 % from 3 samples across, 10 % at 1 sample, unbiased at any size.
+    Source: numbers, sizes and opacities of dust and scratches: Wu et al., ICCV 2021 (arXiv 2011.12485), relative to
+        their 6000 samples; grease, smudges and dents are ours.
     """
     grid = stop(samples, pitch, diameter, aperture)
     grains_rng, lines_rng, film_rng, patches_rng, dents_rng = _streams(5, rng)
@@ -72,7 +73,7 @@ def dirt(
 
 
 def _streams(count: int, rng: torch.Generator) -> list[torch.Generator]:
-    """One generator a kind, so that more dust leaves the scratches as they were."""
+    """Create one generator for each kind of dirt, so that more dust leaves the scratches unchanged."""
     seeds = torch.randint(2**62, (count,), generator=rng, device=rng.device).tolist()
     return [torch.Generator(rng.device).manual_seed(seed) for seed in seeds]
 
@@ -82,7 +83,7 @@ def _uniform(rng: torch.Generator, low: float = 0.0, high: float = 1.0) -> float
 
 
 def _about(mean: float, spread: float, rng: torch.Generator) -> float:
-    """A normal number, not below 0."""
+    """Draw a normal number, clipped at 0."""
     return max(mean + spread * float(torch.randn((), generator=rng, device=rng.device, dtype=torch.float64)), 0.0)
 
 
@@ -100,7 +101,7 @@ def _scratches(mean: float, length: float, width: float, rng: torch.Generator) -
 
 
 def _scratch(length: float, widest: float, rng: torch.Generator) -> Scratch:
-    """A walk of 1 to 16 steps in random directions, each at most a random part of ``length``."""
+    """Draw a walk of 1 to 16 steps in random directions, with steps of at most a random share of ``length``."""
     points = [(_uniform(rng, -0.5, 0.5), _uniform(rng, -0.5, 0.5))]
     stride = length * _uniform(rng)
     for _ in range(1 + int(16 * _uniform(rng))):
@@ -111,7 +112,7 @@ def _scratch(length: float, widest: float, rng: torch.Generator) -> Scratch:
 
 
 def _dents(rms: float, rng: torch.Generator) -> dict[int, float]:
-    """Coefficients of the given root sum of squares, drawn evenly over directions."""
+    """Draw coefficients of the given root sum of squares, with a uniform direction."""
     draw = torch.randn(len(DENT_TERMS), generator=rng, device=rng.device, dtype=torch.float64)
     parts = (rms * draw / draw.norm()).tolist()
     return dict(zip(DENT_TERMS, parts, strict=True)) if rms else {}
@@ -119,10 +120,11 @@ def _dents(rms: float, rng: torch.Generator) -> dict[int, float]:
 
 @dirt.zero_bound
 def _(*, dust: float, scratches: float, grease: float, smudges: float, dents: float, **_: Any) -> float:
-    """How far the field behind the window is from that behind clear glass, at 400 nm or longer; 0 where nothing lies.
+    """Bound the change of the field against clear glass, at 400 nm or longer; a clean window gives 0.
 
-    A grain or a scratch may be black. A film is a sum of normal numbers that the generator keeps below 8.6, so below
-    31 root mean squares; the twelve terms of a dent reach sqrt(50) of theirs together, at the rim.
+    A grain or a scratch may be black. A film is a sum of normal numbers, which the generator keeps below 8.6, so that
+    the film stays below 31 times its root mean square. The twelve terms of a dent together reach sqrt(50) times their
+    root mean square, at the rim.
     """
     if not any((dust, scratches, grease, smudges, dents)):
         return 0.0
@@ -143,7 +145,7 @@ def _(result: Dirt, *, samples: int, pitch: float, diameter: float, aperture: Ap
 
 
 def _effect(dirt: Dirt, grid: Stop) -> tuple[float, float]:
-    """Share of the light that passes, and how far it is bent, in waves root mean square."""
+    """Return the share of the light that passes, and the root mean square path in waves."""
     sums = torch.zeros(4, dtype=torch.float64)
     for rows in stripes(grid):
         open_ = inside(grid, dirt.path.device, rows)

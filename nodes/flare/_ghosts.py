@@ -1,4 +1,4 @@
-"""Ghosts: reflections between the surfaces of the lens, paraxially, without its prescription."""
+"""Ghosts: reflections between the surfaces of the lens, in paraxial form, without a lens prescription."""
 
 import math
 from typing import Annotated, Any, NamedTuple
@@ -12,13 +12,13 @@ from neusee.nodes._half_precision import single
 from neusee.nodes.units import Fraction, PositiveLength
 from neusee.nodes.values import Bands
 
-_SMALLEST = 0.1  #: radius of a ghost, of the largest
+_SMALLEST = 0.1  #: least radius of a ghost, relative to the largest
 
 
 class _Ghost(NamedTuple):
-    magnification: float  #: of the source's place on the sensor
+    magnification: float  #: distance of the ghost from the axis, relative to the source
     radius: float  #: m
-    share: float  #: of the energy of all ghosts, before colour
+    share: float  #: relative to the energy of all ghosts, before colour
     tuned: tuple[float, float]  #: wavelengths, m, of the two reflecting coatings
 
 
@@ -38,23 +38,24 @@ def ghosts(
 ) -> Tensor:
     """Reflect the spot into discs on the line through the source and the axis.
 
-    Ghost j is an image of the round stop, out of focus: a disc of radius r_j (U(0.1, 1) * ``radius``) centred at s_j
-    times the place of the source, s_j from U(-``spread``, ``spread``), coloured by two quarter-wave coatings.
-    Together they carry ``energy`` times the energy of the spot inside the window, over all bands; what falls
-    outside the window is lost. The spot itself is not dimmed.
+    Ghost j is a defocused image of the round stop: a disc of radius r_j (U(0.1, 1) * ``radius``), centred at s_j times
+    the position of the source, with s_j from U(-``spread``, ``spread``), and coloured by two quarter-wave coatings.
+    All ghosts together carry ``energy`` times the energy of the spot inside the window, over all bands; light that
+    falls outside the window is lost. The spot itself is not dimmed.
 
     Shapes: (band, y, x), bands, direction (2,) (n_y, n_x) -> (band, y, x).
     Units:  as the spot (W/m2); direction rad.
-    Error:  energy of a ghost inside the window 1e-6; its edge one pixel wide; none is smaller than one pixel.
-    Raises: ValueError where spot and bands do not belong together.
+    Error:  energy of a ghost inside the window 1e-6; the edge of a ghost is one pixel wide, and no ghost is smaller
+            than one pixel.
+    Raises: ValueError where spot and bands differ in the number of bands.
     Source: Hullin et al., ACM Trans. Graph. 30, 108 (2011), reduced to first order; coatings: Hecht, Optics,
         single quarter-wave layer.
     """
     if spot.ndim != 3 or spot.shape[0] != bands.centres.numel():
-        raise ValueError(f"spot is {tuple(spot.shape)}, bands {bands.centres.numel()}: take both of one laser")
+        raise ValueError(f"spot is {tuple(spot.shape)}, bands {bands.centres.numel()}: give both of one laser")
     drawn = _draw(count, spread, radius, rng)
     spot = single(spot)
-    flux = spot.sum(-1).sum(-1, dtype=torch.float64)  # all of it in float64 would be a copy twice as large
+    flux = spot.sum(-1).sum(-1, dtype=torch.float64)  # a float64 copy of the spot would be twice as large
     place = tuple(focal_length * n / pixel_pitch for n in direction.tolist())
     total = torch.zeros_like(spot)
     for ghost, colour in zip(drawn, _colours(drawn, bands.centres, flux), strict=True):
@@ -78,26 +79,26 @@ def _draw(count: int, spread: float, radius: float, rng: torch.Generator) -> lis
 
 
 def _reflected(wavelengths: Tensor, tuned: float) -> Tensor:
-    """Reflectance of a quarter-wave layer: least where it is tuned, never quite 0; at most 1."""
+    """Return the reflectance of a quarter-wave layer: least at the tuned wavelength, never quite 0, at most 1."""
     return 0.05 + 0.95 * torch.cos(torch.pi / 2 * tuned / wavelengths).square()
 
 
 def _colours(drawn: list[_Ghost], wavelengths: Tensor, flux: Tensor) -> list[Tensor]:
-    """Gain of each ghost in each band, scaled so that all of them together move exactly the whole flux."""
+    """Return the gain of each ghost in each band, scaled so that all ghosts together move exactly the whole flux."""
     raw = [g.share * _reflected(wavelengths, g.tuned[0]) * _reflected(wavelengths, g.tuned[1]) for g in drawn]
     moved = torch.stack(raw).sum(0).mul(flux).sum() if raw else flux.sum()
-    dark = moved <= 0  # so that what is not a number is seen
+    dark = moved <= 0  # false for NaN, so that NaN reaches the result
     whole = torch.where(dark, 0.0, flux.sum() / moved.where(~dark, 1.0))
     return [gain * whole for gain in raw]
 
 
 def _in_pixels(radius: float, pixel_pitch: float) -> float:
-    """A radius that covers a sample wherever the disc lies; a smaller disc could fall between them."""
+    """Return a radius in pixels, large enough that a disc at any position covers a sample."""
     return max(radius / pixel_pitch, 0.5)
 
 
 def _add(total: Tensor, energy: Tensor, centre: tuple[float, float], radius: float) -> None:
-    """Add one disc, of unit sum over the infinite plane, where it meets the window."""
+    """Add the part of one disc that lies in the window; the disc has unit sum over the infinite plane."""
     height, width = total.shape[-2:]
     y, x = centre[0] + height // 2, centre[1] + width // 2
     rows, columns = _reach(y, radius), _reach(x, radius)
@@ -109,13 +110,13 @@ def _add(total: Tensor, energy: Tensor, centre: tuple[float, float], radius: flo
 
 
 def _reach(middle: float, radius: float) -> Tensor:
-    """Sample numbers, float64, that a disc can touch along one axis, inside the window or not."""
+    """Return the indices, float64, of the samples that a disc can touch on one axis, inside the window or outside."""
     first, last = math.floor(middle - radius) - 1, math.ceil(middle + radius) + 1
     return torch.arange(first, last + 1, dtype=torch.float64)
 
 
 def _part(numbers: Tensor, samples: int) -> slice:
-    """The part of these sample numbers that lies in the window; empty where none does."""
+    """Return the slice of these sample indices that lies in the window, or an empty slice."""
     first = int(numbers[0])
     return slice(min(max(-first, 0), len(numbers)), max(samples - first, 0))
 
@@ -133,9 +134,9 @@ def _(
     spread: float,
     radius: float,
 ) -> float:
-    """All that is reflected, in one band and in the smallest ghost; only the sum of the spot is asked for.
+    """Bound the ghosts: all reflected light in one band and in the smallest ghost, from the sum of the spot alone.
 
-    The samples of a disc of half a pixel or more sum to its area, pi (r^2 + 1 / 12), within 16 %.
+    The samples of a disc of half a pixel or more sum to the area of the disc, pi (r^2 + 1 / 12), within 16 %.
     """
     if count == 0 or energy == 0:
         return 0.0

@@ -1,4 +1,4 @@
-"""Opaque marks on glass, drawn with the right area at any sampling: round grains and scratched lines."""
+"""Opaque marks on glass, with the correct area at any sampling: round grains and scratched lines."""
 
 import math
 from collections.abc import Sequence
@@ -11,16 +11,16 @@ from neusee.nodes.optics._pupil_grid import Stop
 
 
 class Grain(NamedTuple):
-    """A round grain; lengths in diameters of the stop, from its centre."""
+    """A round grain; positions and lengths are in diameters of the stop, from its centre."""
 
     v: float
     u: float
     radius: float
-    opacity: float  #: of the field, 1 is black
+    opacity: float  #: opacity for the field; 1 is black
 
 
 class Scratch(NamedTuple):
-    """A scratched line through points; lengths in diameters of the stop, from its centre."""
+    """A scratched line through points; positions and lengths are in diameters of the stop, from its centre."""
 
     points: Sequence[tuple[float, float]]  #: (v, u)
     width: float
@@ -57,7 +57,7 @@ def _darken(amplitude: Tensor, places: list[tuple[float, float]], size: float, o
 
 
 def _window(places: list[tuple[float, float]], margin: float, samples: int) -> tuple[slice, slice] | None:
-    """Rows and columns that a mark can touch, or None where it misses the grid."""
+    """Return the rows and columns that a mark can touch, or None for a mark outside the grid."""
     spans = []
     for axis in (0, 1):
         low = max(int(min(place[axis] for place in places) - margin), 0)
@@ -69,7 +69,7 @@ def _window(places: list[tuple[float, float]], margin: float, samples: int) -> t
 
 
 def _distance(y: Tensor, x: Tensor, start: tuple[float, float], end: tuple[float, float]) -> Tensor:
-    """Distance, in samples, to the line from start to end."""
+    """Return the distance, in samples, to the line from start to end."""
     along_y, along_x = end[0] - start[0], end[1] - start[1]
     length = along_y**2 + along_x**2
     share = ((y - start[0]) * along_y + (x - start[1]) * along_x) / length if length > 0 else torch.zeros_like(y + x)
@@ -78,7 +78,7 @@ def _distance(y: Tensor, x: Tensor, start: tuple[float, float], end: tuple[float
 
 
 def _cover(distance: Tensor, size: float, round_: bool) -> Tensor:
-    """Covered part of a sample by a mark ``size`` samples wide; its volume is the area of the mark, thin or not."""
+    """Return the covered share of each sample for a mark ``size`` samples wide; the sum is the area of any mark."""
     if round_:
         square = size**2 / 4
         edge = math.sqrt(max(square - 1 / 12, 1 / 4))

@@ -1,4 +1,4 @@
-"""What a mask must not do: take the contrast from the scene while it takes the peak from the laser."""
+"""The contrast loss of a mask, which keeps the contrast of the scene while another loss lowers the laser peak."""
 
 import math
 from typing import Annotated
@@ -14,24 +14,25 @@ from neusee.nodes.values import Psf
 _DARK = 1e-30  #: share of the light that counts as none
 
 ContrastFloor = Annotated[float, Field(gt=0, le=0.1)]
-HighestFrequency = Annotated[float, Field(gt=0, le=0.5)]  #: cycles a pixel
+HighestFrequency = Annotated[float, Field(gt=0, le=0.5)]  #: cycles per pixel
 
 
 @node()
 def contrast(psf: Psf, *, floor: ContrastFloor = 1e-4, up_to: HighestFrequency | None = None) -> Tensor:
-    """Add up, over the bands, how far the contrast lies below 1: minus the mean of ln sqrt(MTF**2 + floor**2).
+    """Sum the loss of contrast over the bands: minus the mean of ln sqrt(MTF**2 + floor**2).
 
-    The mean is over the frequencies that the clear aperture passes, those of `metrics.mtf`, and the contrast is the
-    modulus of the OTF over its value at frequency 0. A mean of logarithms is the logarithm of the geometric mean: it
-    follows the median, whereas a mean of squares follows the few frequencies near 0 where contrast is plenty. A factor
-    counts alike at every contrast above ``floor``, as it does in ``losses.suppression_loss`` with ``log``, so that a
-    weight says how many factors of suppression one of contrast is worth; below it little is won or lost, so nulls of
-    single frequencies do not rule. ``up_to`` leaves out what is finer, which a picture that is made smaller loses.
+    The mean is over the frequencies that the clear aperture passes, as in `metrics.mtf`, and the contrast is the
+    modulus of the OTF over its value at frequency 0. A mean of logarithms is the logarithm of the geometric mean and
+    follows the median, whereas a mean of squares follows the few frequencies near 0 with high contrast. A factor of
+    contrast counts alike at every contrast above ``floor``, as a factor of suppression does in
+    ``losses.suppression_loss`` with ``log``, so that the weights of the two losses set the exchange rate. Below
+    ``floor`` the loss hardly changes, so that nulls at single frequencies do not dominate. ``up_to`` excludes finer
+    frequencies, which a reduced picture loses.
 
     Shapes: psf.intensity (band, y, x) -> ().
-    Units:  none; 0 a band where nothing is lost, -ln(floor) where all is; up_to in cycles a pixel.
-    Error:  1e-5 in float32. What left the window is not counted, `losses.background_loss` does that. A band without
-            light (1e-30) counts as contrast 0, and has no gradient.
+    Units:  none; per band 0 at full contrast and -ln(floor) at none; up_to in cycles per pixel.
+    Error:  1e-5 in float32. Light outside the window is not counted; `losses.background_loss` counts that light. A
+            band without light (1e-30) counts as contrast 0, and has no gradient.
     Source: Goodman, Introduction to Fourier Optics, 4th ed., ch. 7 (OTF, cut-off); the mean of logarithms is ours.
     """
     bands = zip(single(psf.intensity), psf.clear_peak.tolist(), strict=True)
@@ -41,12 +42,12 @@ def contrast(psf: Psf, *, floor: ContrastFloor = 1e-4, up_to: HighestFrequency |
 def _lost(kernel: Tensor, clear_peak: float, floor: float, up_to: float | None) -> Tensor:
     y, x = kernel.shape
     fy, fx = (torch.fft.fftfreq(n, dtype=torch.float64, device=kernel.device) for n in (y, x))
-    cut = min(math.sqrt(4.0 * clear_peak / math.pi), up_to or math.inf)  # cycles a pixel, of a round aperture
+    cut = min(math.sqrt(4.0 * clear_peak / math.pi), up_to or math.inf)  # cycles per pixel, for a round aperture
     inside = torch.hypot(fy[:, None], fx[None, : x // 2 + 1]) <= cut
     light = kernel.sum()
-    dark = light.detach() <= _DARK  # so that what is not a number is seen
+    dark = light.detach() <= _DARK  # false for NaN, so that NaN reaches the result
     otf = torch.fft.rfft2(kernel / light.where(~dark, 1.0))[inside]
-    square = (otf.real.square() + otf.imag.square()).where(~dark, 0.0).double()  # the floor is lost beside 1 in single
+    square = (otf.real.square() + otf.imag.square()).where(~dark, 0.0).double()  # float32 loses the floor beside 1
     lost: Tensor = -0.5 * (square + floor**2).log().mean()
     return lost.to(kernel)
 

@@ -1,4 +1,4 @@
-"""What keeps a critic honest: a slope of one."""
+"""The gradient penalty that keeps the slope of a critic at one."""
 
 from torch import Tensor
 
@@ -8,19 +8,19 @@ from neusee.nodes._half_precision import single
 
 @node()
 def gradient_penalty(slopes: Tensor) -> Tensor:
-    """Average (norm of each sample's slope - 1)^2, so that a critic rises as fast as its input and no faster.
+    """Average (norm of each sample's slope - 1)^2, which keeps the slope of a critic near 1.
 
     ``slopes`` are the gradients of the critic with respect to its inputs, made with ``create_graph=True``.
 
     Shapes: slopes (sample, ...) -> ().
     Units:  none.
-    Error:  float32, 1e-5. A slope of exactly 0 costs 1 and is pulled nowhere: there the norm has no direction.
+    Error:  float32, 1e-5. A slope of exactly 0 costs 1 and has no gradient: the norm of 0 has no direction.
     Source: Gulrajani et al., Improved Training of Wasserstein GANs, NeurIPS 2017 (WGAN-GP).
     """
     flat = single(slopes).flatten(1)
     top = flat.detach().abs().amax(1, keepdim=True)
     still = top == 0
-    scale = top.where(~still, 1.0)  # squares of slopes below 1e-19 would be 0, and the root of 0 has no slope
+    scale = top.where(~still, 1.0)  # squares of slopes below 1e-19 underflow, and sqrt has no gradient at 0
     squares = (flat / scale).square().sum(1, keepdim=True)
     norm = squares.where(~still, 1.0).sqrt().where(~still, 0.0) * scale
     return (norm - 1).square().mean()

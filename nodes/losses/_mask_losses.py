@@ -1,4 +1,4 @@
-"""What a mask is trained for: little laser in one place, all of the scene in the field."""
+"""Losses of a mask: a low peak of the laser, and all light of the scene in the field."""
 
 from typing import Annotated
 
@@ -10,28 +10,29 @@ from neusee.nodes import node
 from neusee.nodes._half_precision import single
 from neusee.nodes.values import Psf
 
-_DARK = 1e-30  #: light, or a ratio, that stands for none
+_DARK = 1e-30  #: light, or a ratio, that counts as none
 
 
 @node()
 def suppression_loss(psf: Psf, *, power: Annotated[float, Field(ge=8, le=64)] = 8.0, log: bool = False) -> Tensor:
-    """Add up the laser suppression over the bands, with a peak that has a gradient everywhere.
+    """Sum the laser suppression ratio over the bands, with a peak that has a gradient everywhere.
 
-    The peak of PSF / clear peak is the p-norm over pixels, which sees every bright pixel where the maximum sees one.
-    With ``log`` each band counts by its logarithm, so that 1e-3 pulls as hard as 1.
+    The peak of PSF / clear peak is the p-norm over pixels, whose gradient reaches every bright pixel, while the
+    gradient of the maximum reaches a single pixel. With ``log`` each band counts by its logarithm, so that a factor
+    counts alike at 1e-3 and at 1.
 
     Shapes: psf.intensity (band, y, x) -> ().
     Units:  none.
-    Error:  the p-norm of n equal pixels is n^(1/p) of their peak, never below it: 1 % at p = 8 and one bright pixel.
-            float32: 1e-5; of the logarithms 1e-6 a band, which near a ratio of 1 is more of their sum. A band without
-            light has the logarithm of 1e-30, and no gradient.
+    Error:  the p-norm of n equal pixels is n^(1/p) times their peak and never below the peak: 1 % at p = 8 and one
+            bright pixel. float32: 1e-5; with ``log`` 1e-6 per band, a larger share of a sum near 0. A band without
+            light counts as the logarithm of 1e-30, and has no gradient.
     Source: NeuSee, section Two-Stage Training (L_DOE); p-norm for the maximum is ours.
     """
     ratio = single(psf.intensity) / psf.clear_peak.to(single(psf.intensity))[:, None, None]
     top = ratio.detach().amax((-2, -1), keepdim=True)
-    dark = top <= _DARK  # so that what is not a number is seen
+    dark = top <= _DARK  # false for NaN, so that NaN reaches the result
     scale = top.where(~dark, 1.0)
-    sums = (ratio / scale).pow(power).sum((-2, -1)).where(~dark[:, 0, 0], 1.0)  # the root has no slope at 0
+    sums = (ratio / scale).pow(power).sum((-2, -1)).where(~dark[:, 0, 0], 1.0)  # the root has no gradient at 0
     norm = sums.pow(1.0 / power).where(~dark[:, 0, 0], 0.0)
     peaks = scale[:, 0, 0] * norm
     loss: Tensor = (peaks + _DARK).log().sum() if log else peaks.sum()
@@ -51,14 +52,14 @@ def _(psf: Psf, *, power: float = 8.0, log: bool = False) -> Tensor:
 
 @node()
 def background_loss(image: Tensor, plain_image: Tensor) -> Tensor:
-    """Add up, over the bands, the scene's light through the plain lens over that through the mask.
+    """Sum, over the bands, the light of the scene through the plain lens over the light through the mask.
 
     Shapes: image and plain_image (..., band, y, x) -> ().
-    Units:  none; the number of bands where nothing is lost.
-    Error:  by energy in the field: blind to sharpness. A band without light counts as 1.
+    Units:  none; equal to the number of bands where no light is lost.
+    Error:  compares energy in the field and ignores sharpness. A band without light counts as 1.
     Source: NeuSee, section Two-Stage Training (L_DOE), as a ratio of energies.
     """
     kept, plain = (x.sum((-2, -1), dtype=torch.float64) for x in (image, plain_image))
-    dark = (plain <= _DARK) | (kept <= _DARK)  # so that what is not a number is seen
+    dark = (plain <= _DARK) | (kept <= _DARK)  # false for NaN, so that NaN reaches the result
     ratios: Tensor = torch.where(dark, 1.0, plain / kept.where(~dark, 1.0))
     return ratios.sum().to(single(image).dtype)

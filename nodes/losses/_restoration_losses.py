@@ -1,4 +1,4 @@
-"""What a restoration is trained for: the right colour at every pixel and in every frequency."""
+"""Losses of a restoration: the error of the colour at every pixel and at every frequency."""
 
 from typing import Annotated
 
@@ -9,7 +9,7 @@ from torch import Tensor
 from neusee.nodes import node
 from neusee.nodes._half_precision import single
 
-_LEAST = 1e-30  #: of a power: the root has no slope at 0
+_LEAST = 1e-30  #: least power, because the root has no gradient at 0
 
 
 @node()
@@ -20,8 +20,8 @@ def charbonnier(
 
     Shapes: estimate and truth alike -> ().
     Units:  those of the pictures; epsilon in their square.
-    Error:  above the mean absolute difference by sqrt(epsilon) at most, 1e-3.
-    Raises: ValueError for pictures of different shape.
+    Error:  above the mean absolute difference by at most sqrt(epsilon), 1e-3.
+    Raises: ValueError for pictures of different shapes.
     Source: NeuSee, section Two-Stage Training (L_REC), with the mean; epsilon is ours.
     """
     _alike(estimate, truth)
@@ -30,15 +30,15 @@ def charbonnier(
 
 @node()
 def fft_l1(estimate: Tensor, truth: Tensor) -> Tensor:
-    """Average the absolute difference of the two spectra.
+    """Average the absolute difference of the Fourier spectra of estimate and truth.
 
-    In float64: of a coefficient near 0, a transform in single precision knows neither size nor direction, and its slope
-    is its direction.
+    The transform is in float64: in single precision a coefficient near 0 has neither a reliable size nor a reliable
+    direction, and the gradient is that direction.
 
     Shapes: estimate and truth (..., y, x) -> ().
     Units:  those of the pictures: the transform is unitary, so the size of a picture does not matter.
-    Error:  that of the result's type, 1e-7 in float32; a coefficient under 1e-15 has no slope.
-    Raises: ValueError for pictures of different shape.
+    Error:  round-off of the type of the loss, 1e-7 in float32; a coefficient below 1e-15 has no gradient.
+    Raises: ValueError for pictures of different shapes.
     Source: NeuSee, section Two-Stage Training (L_REC), with a unitary transform and the mean.
     """
     _alike(estimate, truth)
@@ -50,5 +50,5 @@ def fft_l1(estimate: Tensor, truth: Tensor) -> Tensor:
 def _alike(estimate: Tensor, truth: Tensor) -> None:
     if estimate.shape != truth.shape:
         raise ValueError(
-            f"estimate {tuple(estimate.shape)} and truth {tuple(truth.shape)} differ: crop the truth alike"
+            f"estimate {tuple(estimate.shape)} and truth {tuple(truth.shape)} differ: crop the truth to the estimate"
         )

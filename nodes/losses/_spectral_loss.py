@@ -1,4 +1,4 @@
-"""What a spectral lift is trained for: every band right in proportion to what it is."""
+"""The loss of a spectral lift: the error of every band, relative to the true value."""
 
 from typing import Annotated
 
@@ -14,15 +14,15 @@ from neusee.nodes._half_precision import single
 def mrae(
     estimate: Tensor, truth: Tensor, *, floor: Annotated[float, Field(gt=0, allow_inf_nan=False)] = 0.02
 ) -> Tensor:
-    """Average the absolute difference over the truth, which counts as `floor` at least.
+    """Average the absolute difference, divided by the truth or by `floor`, whichever is larger.
 
-    Without a floor a black at 1e-4 pulls ten thousand times as hard as white, and its noise is all that is learnt; with
-    it the slope is never above 1 / floor, and below it the difference counts as it is.
+    Without a floor a black of 1e-4 has ten thousand times the gradient of white, and training fits the noise of the
+    black. With a floor no gradient exceeds 1 / floor, and for a truth below the floor the divisor is constant.
 
     Shapes: estimate and truth alike -> ().
-    Units:  none; floor in those of the spectra.
-    Error:  equal to the published measure where the truth is above the floor, else less.
-    Raises: ValueError for spectra of different shape.
+    Units:  none; floor in the unit of the spectra.
+    Error:  equal to the published measure where the truth is above the floor, smaller elsewhere.
+    Raises: ValueError for spectra of different shapes.
     Source: mean relative absolute error as in NTIRE 2022 and Cai et al., MST++, CVPRW 2022; the floor is ours.
     """
     if estimate.shape != truth.shape:

@@ -1,4 +1,4 @@
-"""What a mask takes from the scene for good: the part of a picture that no Wiener filter brings back."""
+"""The permanent damage of a mask to the scene: the part of a picture that no Wiener filter recovers."""
 
 from typing import Annotated
 
@@ -28,30 +28,30 @@ def wiener(
     colour: OneBandShare = 1.0,
     up_to: HighestFrequency | None = None,
 ) -> Tensor:
-    """Take the share of a picture's variance that a Wiener filter leaves wrong: its logarithm, mean over channels.
+    """Compute the log share of a picture's variance that a Wiener filter leaves as error, as a mean over channels.
 
-    Pictures whose power falls as that of `restore.wiener`'s prior, filtered with the PSF that a channel sees of a grey
-    scene. Wrong is, by frequency, what the noise hides, and for the share ``colour`` of the variance, which is of one
-    band alone, what that band's PSF differs from the channel's by. ``up_to`` leaves out what is finer, which a picture
-    that is made smaller loses.
+    The power of the pictures falls with frequency as in the prior of `restore.wiener`. The filter uses the PSF of a
+    channel for a grey scene. The error at a frequency has two parts: the part of the picture that noise hides, and, for
+    the share ``colour`` of the variance, which belongs to one band alone, the difference of the PSF of that band from
+    the PSF of the channel. ``up_to`` excludes finer frequencies, which a reduced picture loses.
 
     Shapes: psf.intensity (band, y, x), responses (channel, band) -> ().
-    Units:  none; ``noise``: variance of a pixel's noise, of the picture's variance; up_to in cycles a pixel.
-    Error:  1e-5 in float32. Clipped pixels, the edge and that noise follows the light are not in it: a measure to
-            compare masks by, not an error to expect.
-    Raises: ValueError where bands differ.
+    Units:  none; ``noise``: variance of a pixel's noise over the picture's variance; up_to in cycles per pixel.
+    Error:  1e-5 in float32. Clipped pixels, the edges and the dependence of noise on light are neglected: the loss
+            compares masks and does not predict an error.
+    Raises: ValueError where the inputs differ in the number of bands.
     Source: Wiener filter as in Goodman, Introduction to Fourier Optics, 4th ed., ch. 8; the share of one band is ours.
     """
     y, x = psf.intensity.shape[-2:]
     intensity = single(psf.intensity)
     effective = effective_psf(psf, illuminant, responses, bands).to(intensity)
     shares = grey_shares(illuminant, responses, bands).to(intensity)
-    signal = (fall((y, x)) / noise).to(intensity)  # of a frequency's noise
+    signal = (fall((y, x)) / noise).to(intensity)  # signal over noise, by frequency
     known = signal * _counted((y, x), up_to).to(signal)
     each, lost = torch.fft.rfft2(intensity), list[Tensor]()
     for channel, share in zip(torch.fft.rfft2(effective), shares, strict=True):
         passed = signal * _square(channel)
-        filtered = signal * passed / (passed + 1).square()  # of the filter, its square
+        filtered = signal * passed / (passed + 1).square()  # signal times the square of the filter
         apart = torch.tensordot(share, _square(each - channel), 1)
         wrong = 1 / (passed + 1) + colour * filtered * apart
         lost.append(variance(wrong * known, (y, x)) / variance(known, (y, x)))
@@ -64,7 +64,7 @@ def _square(spectrum: Tensor) -> Tensor:
 
 
 def _counted(size: tuple[int, int], up_to: float | None) -> Tensor:
-    """Which frequencies of half a spectrum count: up to ``up_to``, and never the mean."""
+    """Mark the frequencies of half a spectrum that count: up to ``up_to``, without frequency 0."""
     fy, fx = torch.fft.fftfreq(size[0], dtype=torch.float64), torch.fft.rfftfreq(size[1], dtype=torch.float64)
     square = fy[:, None].square() + fx.square()
     inside: Tensor = (square > 0) & (square <= (1.0 if up_to is None else up_to**2))

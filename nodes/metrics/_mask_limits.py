@@ -1,4 +1,4 @@
-"""What no mask beats: light that stays in the field shines somewhere, and a low peak leaves little contrast."""
+"""Limits of every mask: light that stays in the field reaches some pixel, and a low peak leaves little contrast."""
 
 import math
 from typing import NamedTuple
@@ -13,27 +13,27 @@ _DARK = 1e-30  #: share of the light that counts as none
 
 
 class Limits(NamedTuple):
-    """Bounds from this PSF's window, light and peak alone, and what it makes of them."""
+    """Bounds from the window, the light and the peak of a PSF alone, and the contrast of the PSF for comparison."""
 
-    floor: Tensor  #: (band,) float64, LSR if the light in the window were spread evenly over it
+    floor: Tensor  #: (band,) float64, LSR of the light in the window if spread evenly over the window
     rms: Tensor  #: (band,) float64, root mean square contrast over all frequencies that the pixels sample
-    bound: Tensor  #: (band,) float64, above which that cannot be: sqrt(LSR p0 / light)
-    passed: Tensor  #: (band,) float64, the bound of the root mean square over the frequencies of the clear aperture
-    median: Tensor  #: (band,) float64, the bound of the median over these
+    bound: Tensor  #: (band,) float64, upper bound of `rms`: sqrt(LSR p0 / light)
+    passed: Tensor  #: (band,) float64, upper bound of the root mean square over the frequencies of the clear aperture
+    median: Tensor  #: (band,) float64, upper bound of the median over the same frequencies
 
 
 @node(rtol=1e-6)
 def limits(psf: Psf) -> Limits:
-    """Find what bounds suppression and contrast: an even spread of the light, and Parseval's theorem.
+    """Compute bounds of suppression and contrast, from an even spread of the light and from Parseval's theorem.
 
-    Light E in N pixels has a peak of E / N at least, and LSR = peak / p0. The mean of |OTF|**2 over all frequencies is
-    the sum of PSF**2, which is no more than peak times light; over a share s of the frequencies it is at most 1 / s
-    times that, and half of these lie above the median: median <= sqrt(2 LSR p0 / (E s)).
+    Light E in N pixels has a peak of at least E / N, and LSR = peak / p0. The mean of |OTF|**2 over all frequencies is
+    the sum of PSF**2, which is at most peak times light. Over a share s of the frequencies the mean is at most 1 / s
+    times as large. Half of these frequencies lie above the median: median <= sqrt(2 LSR p0 / (E s)).
 
     Shapes: psf.intensity (band, y, x) -> five of (band,) float64.
     Units:  none.
-    Error:  1e-6 in float32. The floor is that of the window: a wider field has a lower one. Without light (1e-30) all
-            are 0.
+    Error:  1e-6 in float32. The floor holds for the window: a wider field has a lower floor. Without light (1e-30) all
+            five are 0.
     Source: Parseval's theorem; the cut-off of the clear aperture as in `metrics.mtf`.
     """
     rows = [_limits(one.double()) for one in psf.intensity]
@@ -43,9 +43,9 @@ def limits(psf: Psf) -> Limits:
 
 
 def _limits(kernel: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-    """Light, root mean square contrast and its bound."""
-    dark = kernel.sum() <= _DARK  # so that what is not a number is seen
-    kernel = kernel.where(~dark, 1.0)  # a root has no slope at 0
+    """Return the light, the root mean square contrast, and the upper bound of the contrast."""
+    dark = kernel.sum() <= _DARK  # false for NaN, so that NaN reaches the result
+    kernel = kernel.where(~dark, 1.0)  # a root has no gradient at 0
     light, peak = kernel.sum(), kernel.amax()
     found = (light, kernel.square().sum().sqrt() / light, (peak / light).sqrt())
     return tuple(x.where(~dark, 0.0) for x in found)  # type: ignore[return-value]
@@ -59,28 +59,28 @@ def _(result: Limits, psf: Psf) -> list[Check]:
                   f"{float(result.bound.mean()):.3g}", held)]  # fmt: skip
 
 
-# --- of any mask behind this lens -------------------------------------------------------------------------------------
+# --- limits of any mask on this lens ----------------------------------------------------------------------------------
 
 
 def least_lsr(psf: Psf) -> Tensor:
-    """The laser suppression ratio of light spread evenly over the field: (band,) float64.
+    """Return the laser suppression ratio of light spread evenly over the field: (band,) float64.
 
-    The field has N pixels and the clear lens puts a share p0 of the light into the brightest one, so an element that
-    keeps all light in the field has no pixel below 1/N, and LSR >= 1 / (N p0). One that scatters light out of the
-    field may go below by the share that it keeps.
+    The field has N pixels, and the clear lens puts a share p0 of the light into the brightest pixel. With an element
+    that keeps all light in the field the brightest pixel holds at least 1/N, so that LSR >= 1 / (N p0). An element that
+    scatters light out of the field can reach a lower LSR, by the share of the light that the element keeps.
     """
     pixels = psf.intensity.shape[-2] * psf.intensity.shape[-1]
     return 1.0 / (pixels * psf.clear_peak.double())
 
 
 def most_unsuppressed(psf: Psf) -> Tensor:
-    """`Limits.passed` of an element with an LSR of 1 that keeps all light: (band,); it goes as the root of the LSR."""
+    """Return `Limits.passed` of an element that keeps all light at LSR 1: (band,); the bound scales with sqrt(LSR)."""
     clear_peak = psf.clear_peak.double()
     return (clear_peak / shares(psf).to(clear_peak)).sqrt()
 
 
 def shares(psf: Psf) -> Tensor:
-    """Share of the frequencies that the pixels sample within the cut-off sqrt(4 p0 / pi): (band,) float64."""
+    """Return the share of the sampled frequencies that lies within the cut-off sqrt(4 p0 / pi): (band,) float64."""
     fy, fx = (torch.fft.fftfreq(n, dtype=torch.float64) for n in psf.intensity.shape[-2:])
     radius = torch.hypot(fy[:, None], fx)
     return torch.stack([(radius <= math.sqrt(4.0 * float(p) / math.pi)).double().mean() for p in psf.clear_peak])

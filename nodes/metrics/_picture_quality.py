@@ -1,4 +1,4 @@
-"""How close a restored picture is to the truth."""
+"""Quality of a restored picture, by comparison with the truth."""
 
 import math
 from typing import Annotated, Literal, NamedTuple
@@ -12,12 +12,12 @@ from neusee.nodes import Check, node
 from neusee.nodes._half_precision import single
 
 _WINDOW, _SIGMA = 11, 1.5  #: pixels, of the Gaussian of SSIM
-_C1, _C2 = 0.01**2, 0.03**2  #: of SSIM, for a white of 1
-_STRIPE, _BLOCK = 54, 54  #: rows at a time and columns at a time: 64 with the rim
+_C1, _C2 = 0.01**2, 0.03**2  #: constants of SSIM, for a white of 1
+_STRIPE, _BLOCK = 54, 54  #: rows and columns of one block: 64 with the margin of the window
 
 
 class Quality(NamedTuple):
-    """Three ways to compare two pictures, over all channels together."""
+    """Three measures of the difference of two pictures, over all channels together."""
 
     l1: Tensor  #: () float64, mean absolute difference
     psnr: Tensor  #: () float64, dB, for a white of 1; 200 dB for equal pictures
@@ -34,19 +34,19 @@ def quality(
 ) -> Quality:
     """Compare a picture with the truth: mean absolute difference, PSNR and SSIM.
 
-    Both are clipped to [0, 1], the range a display shows. `encoded` compares them as sRGB encodes them, the way
-    photographs are published and compared; `linear` compares light. SSIM is the Gaussian form (11 x 11, sigma 1.5)
-    of each RGB channel over the pixels whose window lies inside the picture.
+    Both pictures are clipped to [0, 1], the range of a display. `encoded` compares sRGB-encoded values, as is usual for
+    published photographs; `linear` compares light. SSIM has the Gaussian form (11 x 11, sigma 1.5) and is averaged
+    over the RGB channels and over the pixels whose window lies inside the picture.
 
     Shapes: estimate and truth (3, y, x), linear sRGB -> three scalars, float64.
     Units:  none; PSNR dB. ``border`` pixels at each side do not count.
     Error:  PSNR 2e-5 dB and SSIM 1e-5 against scikit-image.
-    Raises: ValueError for pictures of different shape, or smaller than the window of SSIM.
+    Raises: ValueError for pictures of different shapes, and for pictures smaller than the window of SSIM.
     Source: Wang et al., IEEE Trans. Image Process. 13, 600 (2004); sRGB as IEC 61966-2-1.
     """
     if estimate.shape != truth.shape:
         raise ValueError(
-            f"estimate {tuple(estimate.shape)} and truth {tuple(truth.shape)} differ: crop the truth alike"
+            f"estimate {tuple(estimate.shape)} and truth {tuple(truth.shape)} differ: crop the truth to the estimate"
         )
     a, b = (_inside(x, border) for x in (estimate, truth))
     if min(a.shape[-2:]) < _WINDOW:
@@ -76,13 +76,13 @@ def _shown(picture: Tensor, domain: str) -> Tensor:
 
 
 def _sums(a: Tensor, b: Tensor, domain: str) -> tuple[Tensor, Tensor, Tensor]:
-    """Sums of absolute and of square differences over all pixels, and of SSIM: by stripes, which stay in cache."""
+    """Sum absolute differences, square differences and SSIM over all pixels, in stripes that stay in the cache."""
     absolute, square, alike = (torch.zeros((), dtype=torch.float64, device=a.device) for _ in range(3))
     rows = a.shape[-2] - _WINDOW + 1
     for first in range(0, rows, _STRIPE):
         last = min(first + _STRIPE, rows)
         p, q = (_shown(x[..., first : last + _WINDOW - 1, :], domain) for x in (a, b))
-        own = None if last == rows else last - first  # the rest counts in the next stripe
+        own = None if last == rows else last - first  # the next stripe counts the remaining rows
         difference = (p - q)[..., :own, :]
         absolute = absolute + difference.abs().sum(-1).sum(dtype=torch.float64)
         square = square + difference.square().sum(-1).sum(dtype=torch.float64)
@@ -91,7 +91,7 @@ def _sums(a: Tensor, b: Tensor, domain: str) -> tuple[Tensor, Tensor, Tensor]:
 
 
 def _ssim(p: Tensor, q: Tensor) -> Tensor:
-    """SSIM at the pixels whose window lies inside; the two variances are only asked for together."""
+    """Return SSIM at the pixels whose window lies inside; only the sum of the two variances is needed."""
     mean_p, mean_q, squares, product = _blurred(torch.stack([p, q, p * p + q * q, p * q]))
     means, mean_squares = mean_p * mean_q, mean_p * mean_p + mean_q * mean_q
     numerator = (2 * means + _C1) * (2 * (product - means) + _C2)
@@ -100,7 +100,7 @@ def _ssim(p: Tensor, q: Tensor) -> Tensor:
 
 
 def _blurred(maps: Tensor) -> Tensor:
-    """Means (..., y, x) under the window: along y, and then along x by blocks, as products with small matrices."""
+    """Average (..., y, x) over the window: along y, then along x in blocks, by products with small matrices."""
     rows, columns = (n - _WINDOW + 1 for n in maps.shape[-2:])
     tall = _windows(rows, maps) @ maps
     blocks = -(-columns // _BLOCK)
@@ -110,7 +110,7 @@ def _blurred(maps: Tensor) -> Tensor:
 
 
 def _windows(count: int, like: Tensor) -> Tensor:
-    """The window at so many places in a row: (count, count + window - 1)."""
+    """Return the window at ``count`` neighbouring positions: (count, count + window - 1)."""
     offset = torch.arange(count + _WINDOW - 1, dtype=torch.float64) - torch.arange(count)[:, None] - _WINDOW // 2
     weight: Tensor = torch.exp(-offset.square() / (2 * _SIGMA**2)).where(offset.abs() <= _WINDOW // 2, 0.0)
     return (weight / weight[0].sum()).to(like)

@@ -1,4 +1,4 @@
-"""How much contrast a PSF leaves, and how far it spreads the light."""
+"""Contrast that a PSF leaves, and the spread of its light."""
 
 import math
 from typing import NamedTuple
@@ -15,25 +15,26 @@ _DARK = 1e-30  #: share of the light that counts as none
 
 
 class Mtf(NamedTuple):
-    """Contrast inside the band that the clear aperture can pass."""
+    """Contrast over the frequencies that the clear aperture passes."""
 
     rms: Tensor  #: (band,) float64, root mean square
     median: Tensor  #: (band,) float64
-    low: Tensor  #: (band,) float64, the first percentile: deep nulls show here
+    low: Tensor  #: (band,) float64, the first percentile, which shows deep nulls
 
 
 @node(rtol=1e-5)
 def mtf(psf: Psf) -> Mtf:
-    """Find the contrast that is left, |OTF| over its value at frequency 0, within the band of the clear aperture.
+    """Compute the contrast, |OTF| over its value at frequency 0, up to the cut-off frequency of the clear aperture.
 
-    The band ends at D / (wavelength x f), which the peak of the clear lens p0 tells: sqrt(4 p0 / pi) cycles a pixel.
+    The cut-off D / (wavelength x f) follows from the peak of the clear lens p0: sqrt(4 p0 / pi) cycles per pixel.
     Parseval: no mask has an rms contrast (over all frequencies that the pixels sample) above sqrt(LSR p0 / light kept).
 
     Shapes: psf.intensity (band, y, x) -> three of (band,) float64.
     Units:  none.
-    Error:  1e-7 in float32, and that of the window: light outside it counts as lost, frequencies are its own. The
-            cut-off holds for a round aperture and a PSF sampled at points. Without light (1e-30) it is 0. The gradient
-            is that of `rms`: a median hangs on one frequency, and of equal ones it is chance on which.
+    Error:  1e-7 in float32, plus the error of the window: light outside the window counts as lost, and the window sets
+            the frequencies. The cut-off holds for a round aperture and a PSF sampled at points. Without light (1e-30)
+            the contrast is 0. Only `rms` has a gradient: a median depends on a single frequency, and among equal
+            values the choice of that frequency is arbitrary.
     Source: Goodman, Introduction to Fourier Optics, 4th ed., ch. 7 (OTF as autocorrelation of the pupil).
     """
     rows = [_contrast(one, float(p)) for one, p in zip(psf.intensity, psf.clear_peak, strict=True)]
@@ -62,7 +63,7 @@ def _(result: Mtf, *inputs: Psf) -> list[Check]:
 
 @node(rtol=1e-6)
 def encircled(psf: Psf, *, pixel_pitch: PositiveLength, radius: PositiveLength) -> Tensor:
-    """Add up the share of the pupil's light that falls within a radius of the axis.
+    """Sum the share of the pupil's light that falls within a radius of the axis.
 
     Shapes: psf.intensity (band, y, x) -> (band,) float64.
     Units:  radius m on the sensor; result a share of the light through the clear pupil.

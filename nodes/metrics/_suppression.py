@@ -1,4 +1,4 @@
-"""What the element does to the laser and to the scene, and what is left on the sensor."""
+"""Effect of the element on the laser and on the scene, and the remaining peak on the sensor."""
 
 from typing import Annotated, Any, NamedTuple
 
@@ -19,26 +19,26 @@ _DARK = 1e-30  #: light that counts as none
 
 
 class Peak(NamedTuple):
-    """The brightest pixel, as a multiple of what saturates."""
+    """The brightest pixel, as a multiple of the saturation irradiance."""
 
     irradiance: Tensor  #: () float64, multiple of saturation
-    damaged: Tensor  #: () float64, 1 where that passes the damage threshold
+    damaged: Tensor  #: () float64, 1 where the irradiance exceeds the damage threshold
 
 
 class Saturated(NamedTuple):
     """Pixels with at least one clipped channel."""
 
     pixels: Tensor  #: () float64
-    share: Tensor  #: () float64, of all pixels
+    share: Tensor  #: () float64, relative to all pixels
 
 
 @node(rtol=1e-6)
 def lsr(psf: Psf) -> Tensor:
-    """Find the laser suppression ratio: the brightest pixel of the PSF over that of the clear lens.
+    """Compute the laser suppression ratio: the brightest pixel of the PSF over the brightest pixel of the clear lens.
 
     Shapes: psf.intensity (band, y, x) -> (band,) float64.
     Units:  none; 1 for the clear lens.
-    Error:  of the sampling: a spot between two pixels reads up to 20 % low, so the convention of the PSF counts.
+    Error:  of the sampling: a spot between two pixels reads up to 20 % low, so that the PSF convention matters.
     Source: NeuSee, section Sensor Image (LSR).
     """
     return psf.intensity.amax((-2, -1)).double() / psf.clear_peak.to(psf.intensity.device)
@@ -53,23 +53,23 @@ def _(result: Tensor, *inputs: Psf) -> list[Check]:
 
 @node(rtol=1e-6, accepts_channel_sums=("image", "plain_image"))
 def bsr(image: Tensor | Channels, plain_image: Tensor | Channels) -> Tensor:
-    """Find the background suppression ratio: light of the scene in the field, over that of the plain lens.
+    """Compute the background suppression ratio: scene light in the field, over the scene light of the plain lens.
 
-    Of an image summed over its bands, `Channels`, the light of each band is known still.
+    An image summed over its bands, `Channels`, still carries the light of each band.
 
     Shapes: image and plain_image (..., band, y, x) -> (..., band) float64.
-    Units:  none; about 1 for an element that absorbs nothing and scatters nothing out of the field.
-    Error:  rows are summed in the precision of the image, 1e-7; a band without light (1e-30) has ratio 1. It
-            says nothing of sharpness.
-    Raises: ValueError for images of different shape.
+    Units:  none; about 1 for an element that absorbs no light and scatters no light out of the field.
+    Error:  rows are summed in the precision of the image, 1e-7; a band without light (1e-30) has ratio 1. The ratio
+            does not measure sharpness.
+    Raises: ValueError for images of different shapes.
     Source: NeuSee, section Sensor Image (BSR), as a ratio of energies.
     """
     here, there = ((*x.flux.shape, *x.planes.shape[1:]) if isinstance(x, Channels) else tuple(x.shape)
                    for x in (image, plain_image))  # fmt: skip
     if here != there:
-        raise ValueError(f"image {here} and plain image {there} differ in shape")
+        raise ValueError(f"image {here} and plain image {there} differ in shape: compute both from the same scene")
     kept, plain = (x.flux if isinstance(x, Channels) else _light(x) for x in (image, plain_image))
-    dark = plain <= _DARK  # so that what is not a number is seen
+    dark = plain <= _DARK  # false for NaN, so that NaN reaches the result
     ratio: Tensor = torch.where(dark, 1.0, kept / plain.where(~dark, 1.0))
     return ratio
 
@@ -85,7 +85,7 @@ def _(result: Tensor, *inputs: Tensor | Channels) -> list[Check]:
 
 @node(rtol=1e-6)
 def saturated(raw: Tensor, *, full_well: Well, gain: Gain, bits: Bits = 16) -> Saturated:
-    """Count the pixels that hold no more: some channel is at the full well or at the end of the converter.
+    """Count the saturated pixels, with a channel at the full well or at the largest number of the converter.
 
     Shapes: raw (..., channel, y, x) -> two scalars, float64.
     Units:  raw DN; pixels.
@@ -103,9 +103,9 @@ def _(result: Saturated, *inputs: Tensor, **params: Any) -> list[Check]:
 
 
 def clipped(raw: Tensor, *, full_well: float, gain: float, bits: int) -> Tensor:
-    """Which values have come to the full well or to the last number of the converter."""
+    """Mark the values at the full well, at the largest number of the converter, or NaN."""
     full = int(full_well * gain - 0.5)
-    marked: Tensor = ~(raw < max(1, min(2**bits - 1, full)))  # nor is known what is not a number
+    marked: Tensor = ~(raw < max(1, min(2**bits - 1, full)))  # NaN counts as clipped
     return marked
 
 
@@ -123,12 +123,13 @@ def peak_irradiance(
     exposure: Time,
     damage: Annotated[float, Field(gt=0)] = 1e6,
 ) -> Peak:
-    """Find the brightest pixel, scene and lasers together: the sum over wavelengths of I / I_sat.
+    """Find the brightest pixel of scene and lasers together: the sum over wavelengths of I / I_sat.
 
     Shapes: image (band, y, x), level (band,), each spot (line band, y, x) -> two scalars, float64.
-    Units:  multiples of saturation; damage the multiple at which a sensor may break.
-    Error:  before the channels: a real channel takes in less. Damage is a threshold, not a model of heat.
-    Raises: ValueError where spots and lines do not pair up, or channels of an image hold no row of the well.
+    Units:  multiples of saturation; damage the multiple above which a sensor may break.
+    Error:  computed before the colour filters: a real channel receives less. Damage is a threshold, not a heat model.
+    Raises: ValueError where spots and lines differ in number, or where the `Channels` of an image hold no row of the
+            well.
     Source: NeuSee, Eq. (peak_irrad_coded); damage above 1e6 as stated there.
     """
     sensor = {"full_well": full_well, "quantum_efficiency": quantum_efficiency}
@@ -142,7 +143,7 @@ def peak_irradiance(
 
 
 def _in_wells(irradiance: Tensor | Channels, saturating: Tensor) -> Tensor:
-    """Irradiance over what saturates, summed over wavelengths."""
+    """Sum irradiance over saturation irradiance over all wavelengths."""
     return weighted(irradiance, (1.0 / saturating)[None])[0]
 
 

@@ -1,4 +1,4 @@
-"""Optics: pupil, point-spread function, image and laser spot."""
+"""Optical nodes: pupil function, point-spread function, image and laser spot."""
 
 from neusee.nodes.optics._imaging._band_image import image
 from neusee.nodes.optics._imaging._channel_image import image_channels

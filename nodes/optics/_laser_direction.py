@@ -1,4 +1,4 @@
-"""Where a laser stands: in a given direction, or in one drawn as the paper draws it."""
+"""The direction of a laser, either given or drawn at random as in the paper."""
 
 import math
 from typing import Any, Literal
@@ -23,15 +23,15 @@ def direction(
     rule: Rule = "width_over_focal_length",
     rng: Generator,
 ) -> Tensor:
-    """Point at a source: at ``angle``, or without one at a normal draw with 3 sigma = share x W / f on each axis.
+    """Return the direction of a source: ``angle``, or a normal draw with 3 sigma = share x W / f on each axis.
 
-    W is the side of the sensor, so the spot falls on it; a draw beyond its edge is drawn again. The paper prints
-    f / W, 6.7 rad for its camera, which no lens images: asked for, it is refused.
+    W is the side of the sensor. A draw beyond the edge of the sensor is repeated, so the spot lies on the sensor.
+    The paper prints f / W instead: 6.7 rad for its camera, which no lens images. A draw by f / W is refused.
 
     Shapes: -> (2,), (n_y, n_x) float64.
-    Units:  rad (direction cosines; they agree to 1e-6 at 2 mrad).
+    Units:  rad (direction cosines; sine and angle agree to 1e-6 at 2 mrad).
     Error:  exact.
-    Raises: ParameterError where the printed rule is asked to draw.
+    Raises: ParameterError where ``rule`` asks for a draw by f / W.
     Source: NeuSee, section Experiment Setup; by definition.
     """
     if angle is not None:
@@ -41,13 +41,13 @@ def direction(
 
 
 def field_of_view(focal_length: float, pixel_pitch: float, shape: tuple[int, int]) -> tuple[float, float]:
-    """Direction cosines (n_y, n_x) from one edge of the sensor to the other: side x pitch / f."""
+    """Return the direction cosines (n_y, n_x) between opposite edges of the sensor: side x pitch / f."""
     height, width = (side * pixel_pitch / focal_length for side in shape)
     return height, width
 
 
 def _inside(sigma: float, edge: float, rng: Generator) -> Tensor:
-    """A normal number of standard deviation ``sigma``, drawn again until it lies within ``edge``."""
+    """Return a normal draw of standard deviation ``sigma``, repeated until its absolute value is at most ``edge``."""
     while True:
         drawn = sigma * torch.randn((), generator=rng, device=rng.device, dtype=torch.float64)
         if float(drawn.abs()) <= edge:
@@ -71,7 +71,7 @@ def _(
         raise ParameterError(
             "rule",
             f"{share:g} f / W = {wide:.3g} rad would put the spot {wide * focal_length:.2g} m off the axis: "
-            "give the laser an angle, or use width_over_focal_length",
+            "set `angle`, or set rule: width_over_focal_length",
         )
     return []
 
@@ -81,5 +81,5 @@ def _(result: Tensor, *, focal_length: float, pixel_pitch: float, shape: tuple[i
     place = [float(n) * focal_length / pixel_pitch for n in result]
     seen = all(abs(p) <= side / 2 for p, side in zip(place, shape, strict=True))
     off = math.degrees(math.hypot(*(float(n) for n in result)))
-    beyond = "" if seen else ": beyond the sensor, only its glare is seen"
+    beyond = "" if seen else ": beyond the sensor, where only glare reaches the picture"
     return [Check(f"spot {place[0]:+.1f}, {place[1]:+.1f} px (y, x) off the axis, {off:.3g} deg{beyond}")]

@@ -1,4 +1,4 @@
-"""The laser on the sensor: its PSF, scaled by what saturates a pixel of the unprotected lens."""
+"""The laser spot on the sensor: a PSF scaled by the irradiance that saturates a pixel behind the clear lens."""
 
 import math
 from typing import Annotated, Any
@@ -13,7 +13,7 @@ from neusee.nodes.sensor._saturation import Efficiency, Well, saturation
 from neusee.nodes.units import PositiveLength, Time
 from neusee.nodes.values import Bands, Psf
 
-_LSR = 2.2  #: largest of a pupil that only absorbs and delays; see the bound
+_LSR = 2.2  #: largest laser suppression ratio of a pupil that only absorbs and delays; derived in the bound
 
 
 @node()
@@ -27,20 +27,20 @@ def laser_irradiance(
     pixel_pitch: PositiveLength,
     exposure: Time,
 ) -> Tensor:
-    """Scale the PSF of a laser so that through the clear lens, on axis, it would reach strength times saturation.
+    """Scale the PSF of a laser so that its peak behind the clear lens, on axis, is ``strength`` times saturation.
 
-    That peak is the sum over the line of I / I_sat; each wavelength sends its share (``bands.weights``) of the energy
-    through the pupil. The spot is added to the image of the scene and never convolved.
+    That peak is the sum of I / I_sat over the wavelengths of the line. Each wavelength sends its share of the energy
+    (``bands.weights``) through the pupil. The spot is added to the image of the scene and is not convolved.
 
     Shapes: psf.intensity (band, y, x), bands (band,) -> (band, y, x).
     Units:  result W/m2 of each sub-band; strength is a plain multiple.
-    Error:  float32 of the PSF, 1e-6 of its peak; exact in scale.
+    Error:  float32 of the PSF, 1e-6 of its peak; the scale is exact.
     Raises: ValueError where PSF and line have different bands.
     Source: NeuSee, Eq. (peak_irrad_laser_coded).
     """
     if psf.intensity.shape[0] != len(bands.centres):
         raise ValueError(
-            f"PSF of {psf.intensity.shape[0]} bands and line of {len(bands.centres)}: give both the same `line` step"
+            f"PSF of {psf.intensity.shape[0]} bands and line of {len(bands.centres)}: compute both from one `line` step"
         )
     sensor = {"full_well": full_well, "quantum_efficiency": quantum_efficiency}
     saturating: Tensor = saturation(bands, **sensor, pixel_pitch=pixel_pitch, exposure=exposure)
@@ -61,15 +61,16 @@ def _(
     pixel_pitch: float,
     exposure: float,
 ) -> float:
-    """What saturates, times strength, times the largest LSR: no PSF is asked for, so that none need be computed.
+    """Return an upper bound of the spot: saturation irradiance x strength x largest laser suppression ratio (LSR).
 
-    No pixel that samples a point can be brighter than the clear peak, for there all of the pupil is in phase; nor one
-    that averages, up to a width of lambda f / D, within which all pairs of the pupil still add up. A wider one, within
-    the alias-free field, holds 1 / 2.2 of the clear pupil's light or more on axis, and no other more than all of it.
+    The bound needs no PSF, so no PSF is computed for it. A pixel that samples a point is at most as bright as the clear
+    peak, where all of the pupil is in phase. The same holds for a pixel that averages over a width up to lambda f / D,
+    because within that width all pairs of pupil points still add up. A wider pixel within the alias-free field holds at
+    least 1 / 2.2 of the clear pupil's light on axis, and no other pixel holds more than all of that light.
     """
     if strength == 0:
         return 0.0
-    ends = torch.tensor([bands.min], dtype=torch.float64)  # what saturates falls with wavelength
+    ends = torch.tensor([bands.min], dtype=torch.float64)  # the saturation irradiance falls with wavelength
     sensor = {"full_well": full_well, "quantum_efficiency": quantum_efficiency}
     saturating: Tensor = saturation(Bands(ends, ends, ends), **sensor, pixel_pitch=pixel_pitch, exposure=exposure)
     return _LSR * strength * float(saturating)

@@ -1,4 +1,4 @@
-"""Smooth random screens over the pupil, the same at every sampling."""
+"""Smooth random screens over the pupil, independent of the sampling."""
 
 import math
 
@@ -17,10 +17,10 @@ def screen(grid: Stop, scale: float, rng: torch.Generator, device: torch.device 
 def factors(
     grid: Stop, scale: float, rng: torch.Generator, device: torch.device | None = None
 ) -> tuple[Tensor, Tensor]:
-    """The same as two matrices (v, few) and (few, u), for a few rows of their product at a time.
+    """Return two matrices (v, few) and (few, u) whose product is the screen, so that single rows can be computed.
 
-    ``scale`` is in units of the diameter. White noise on a lattice is spread by Gaussians of
-    width scale / 2; the lattice does not depend on the sampling, so neither does the screen.
+    ``scale`` is in units of the diameter. Gaussians of width scale / 2 smooth white noise on a lattice. The lattice
+    does not depend on the sampling of the pupil, so the screen does not depend on the sampling either.
     """
     width = scale / 2
     half = max(0.5, grid.samples * grid.pitch / (2 * grid.diameter)) + 4 * width

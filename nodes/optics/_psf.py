@@ -1,4 +1,4 @@
-"""The point-spread function: the lens, the element and the sensor's sampling in one scaled transform."""
+"""The point-spread function: lens, element and pixel sampling in one scaled Fourier transform."""
 
 import math
 from dataclasses import replace
@@ -18,7 +18,7 @@ from neusee.nodes.values import Psf, Pupil
 
 
 class _Camera(NamedTuple):
-    """What stands behind the pupil, in metres, radians and pixels."""
+    """The geometry behind the pupil, in metres, radians and pixels."""
 
     focal_length: float
     pixel_pitch: float
@@ -41,20 +41,20 @@ def psf(
     sensor: Literal["point", "integrated"] = "point",
     precision: Literal["single", "double"] = "single",
 ) -> Psf:
-    """Focus the pupil on the sensor by the scaled Fraunhofer integral, at the sensor's own pitch.
+    """Focus the pupil on the sensor by the scaled Fraunhofer integral, sampled at the sensor's pixel pitch.
 
-    A source at ``angle`` (n_y, n_x) has its spot at (f n_y, f n_x), to a fraction of a pixel; ``direction``, where
-    wired, is added to ``angle``. The window is centred on the axis whatever the angle.
-    ``pixel="zoh"`` holds the element constant over each square pupil pixel (a sinc envelope).
-    ``sensor="integrated"`` averages over the square of the sensor's pixel, ``"point"`` samples its middle.
-    The gradient reaches amplitude, height and path, once (a second derivative raises).
+    A source at ``angle`` (n_y, n_x) has its spot at (f n_y, f n_x), to a fraction of a pixel. An input ``direction`` is
+    added to ``angle``. The window stays centred on the axis for every angle.
+    ``pixel="zoh"`` holds the element constant over each square pupil pixel, which gives a sinc envelope.
+    ``sensor="integrated"`` averages over the square of each sensor pixel; ``"point"`` samples its middle.
+    Amplitude, height and path receive a first derivative; a second derivative raises an error.
 
     Shapes: pupil (v, u), direction (2,) rad -> intensity (band, y, x), clear_peak (band,).
-    Units: metres -> share of the clear pupil's light per pixel, not normalised to sum one.
-    Error: single, 2e-6 of the brightest pixel and 1e-4 of a tail at 1e-8 of it; double, 1e-12;
-        integrated, further 1e-5 of the clear peak.
+    Units: metres -> share of the clear pupil's light per pixel, not normalised to a sum of one.
+    Error: single, 2e-6 of the brightest pixel, and 1e-4 of the value in a tail at 1e-8 of the brightest pixel;
+        double, 1e-12; integrated, a further 1e-5 of the clear peak.
     Raises: ValueError where the window reaches beyond half the alias-free field, lambda f / (2 pitch), from the spot;
-        for a closed aperture, heights or paths that are not finite, and a pupil in half precision.
+        for a closed aperture, for heights or paths that are not finite, and for a pupil in half precision.
     Source: Goodman, Introduction to Fourier Optics, 3rd edition, eq. 5-14 (field in the focal plane of a lens).
     """
     camera = _Camera(
@@ -89,7 +89,7 @@ def _towards(angle: tuple[float, float], direction: Tensor | None) -> tuple[floa
 
 @psf.check
 def _(result: Psf, *inputs: object, **params: object) -> list[Check]:
-    rows = result.intensity.detach().sum(-1)  # all of it in float64 would be a copy of 1 GB
+    rows = result.intensity.detach().sum(-1)  # a float64 copy of the whole stack would take 1 GB
     shares = 100 * rows.sum(-1, dtype=torch.float64)
     low, high = float(shares.min()), float(shares.max())
     energy = f"energy in window {low:.1f} %" + (f" to {high:.1f} %" if high - low >= 0.05 else "")
@@ -101,9 +101,9 @@ def _focus(pupil: Pupil, camera: _Camera, dtype: torch.dtype, method: Method) ->
     _refuse_aliases(pupil, camera)
     views: list[View] = []
     area, total = _area(pupil)
-    refuse_not_finite("nothing to normalise by", aperture=area)
+    refuse_not_finite("the PSF cannot be normalised", aperture=area)
     if not area > 0:
-        raise ValueError("the aperture is closed everywhere: no light to normalise by")
+        raise ValueError("the aperture is closed everywhere: there is no light to normalise the PSF by")
     peaks: list[float] = []
     for band in range(pupil.wavelengths.numel()):
         views += _views(pupil, camera, band, 1 / area, dtype)
@@ -114,7 +114,7 @@ def _focus(pupil: Pupil, camera: _Camera, dtype: torch.dtype, method: Method) ->
 
 
 def _area(pupil: Pupil) -> tuple[float, float]:
-    """Light through the clear pupil and its field on the axis, in samples."""
+    """Return the light through the clear pupil and its field on the axis, both in samples."""
     rows = pupil.aperture.detach()
     light, field = torch.bmm(rows[:, None, :], rows[:, :, None]), rows.sum(dim=1)
     return float(light.sum(dtype=torch.float64)), float(field.sum(dtype=torch.float64))
@@ -125,7 +125,7 @@ def _alpha(pupil: Pupil, camera: _Camera, band: int) -> float:
 
 
 def _views(pupil: Pupil, camera: _Camera, band: int, scale: float, dtype: torch.dtype) -> list[View]:
-    """The windows of point samples that make the pixels of one band: one, or one per quadrature node."""
+    """Return the windows of point samples that make up the pixels of one band: one window per quadrature node."""
     alpha, wavelength = _alpha(pupil, camera, band), float(pupil.wavelengths[band])
     nodes, weights = _nodes(max(pupil.height.shape) * alpha) if camera.integrated else ([0.0], [1.0])
     axes = [Axis(n, k, alpha) for n, k in zip(pupil.height.shape, camera.shape, strict=True)]
@@ -142,7 +142,7 @@ def _views(pupil: Pupil, camera: _Camera, band: int, scale: float, dtype: torch.
 
 
 def _spot(camera: _Camera) -> list[float]:
-    """Where the spot lies on the sensor's grid, in samples."""
+    """Return the position of the spot on the sensor's grid, in samples."""
     return [
         n // 2 + camera.focal_length * a / camera.pixel_pitch for n, a in zip(camera.shape, camera.angle, strict=True)
     ]
@@ -159,10 +159,10 @@ def _envelopes(
 
 
 def _nodes(bandwidth: float) -> tuple[list[float], list[float]]:
-    """Gauss-Legendre nodes over one pixel, as few as integrate its fastest fringe to 5e-6.
+    """Return the fewest Gauss-Legendre nodes over one pixel that integrate its fastest fringe to 5e-6.
 
-    ``bandwidth``: fringes per pixel from opposite rims of the pupil. As the clear pupil's
-    transfer function bounds any other, the error is below 1e-5 of the clear peak.
+    ``bandwidth`` is the number of fringes per pixel from opposite rims of the pupil. The clear pupil's
+    optical transfer function bounds every other one, so the error is below 1e-5 of the clear peak.
     """
     import numpy as np
 
@@ -175,7 +175,7 @@ def _nodes(bandwidth: float) -> tuple[list[float], list[float]]:
 
 
 def _clear_peak(pupil: Pupil, camera: _Camera, band: int, area: float, total: float) -> float:
-    """The pixel on the axis with nothing but the clear aperture, sampled as the rest is."""
+    """Return the pixel on the axis behind the clear aperture alone, sampled like the other pixels."""
     alpha = _alpha(pupil, camera, band)
     if not camera.integrated:
         return total**2 * alpha**2 / area
@@ -198,11 +198,14 @@ def _agree(pupil: Pupil) -> None:
         )
 
     if pupil.index.requires_grad or pupil.wavelengths.requires_grad:
-        raise ValueError("index and wavelengths take no gradient here: detach them, or learn amplitude, height or path")
+        raise ValueError("index and wavelengths take no gradient here: detach both, or train amplitude, height or path")
 
 
 def _refuse_aliases(pupil: Pupil, camera: _Camera) -> None:
-    """A sampled pupil repeats its PSF every lambda f / pitch; only with square pillars is the repeated light real."""
+    """Raise ValueError where the window reaches light that a sampled pupil repeats every lambda f / pitch.
+
+    With ``pixel="zoh"`` the repeated light is real, because square pillars do send light there.
+    """
     if camera.zoh:
         return
     shortest = float(pupil.wavelengths.min())
@@ -213,6 +216,6 @@ def _refuse_aliases(pupil: Pupil, camera: _Camera) -> None:
             raise ValueError(
                 f"the window reaches {reach * 1e3:.3g} mm from the spot along {axis}, but at {shortest * 1e9:.4g} nm "
                 f"a pupil pitch of {float(pupil.pitch) * 1e6:.4g} um carries only {limit * 1e3:.3g} mm "
-                "(lambda f / (2 pitch)) before the PSF repeats: take a smaller angle, a smaller shape, "
+                "(lambda f / (2 pitch)) before the PSF repeats: choose a smaller angle, a smaller shape, "
                 "a finer pupil pitch, or pixel='zoh'"
             )

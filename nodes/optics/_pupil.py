@@ -1,4 +1,4 @@
-"""The pupil function: stop, element, aberrations and dirt, kept in factors."""
+"""The pupil function, kept as factors: stop, element, aberrations and dirt."""
 
 from collections.abc import Mapping
 from typing import Any
@@ -13,8 +13,8 @@ from neusee.nodes.optics._zernike import surface
 from neusee.nodes.units import Count, Length, PositiveLength, Waves
 from neusee.nodes.values import Bands, Dirt, Pupil
 
-DEFOCUS_WAVELENGTH = 550e-9  #: m; what a wave of defocus is counted in
-_ROWS = 512  #: of a pupil in which its steps are looked at, at least
+DEFOCUS_WAVELENGTH = 550e-9  #: m; the wavelength in which waves of defocus are counted
+_ROWS = 512  #: the least number of pupil rows in which phase steps are measured
 
 
 @node(additive_inputs=[("dirt",)])
@@ -30,14 +30,14 @@ def pupil(
     defocus: Waves = 0.0,
     aberrations: dict[Count, Length] = {},  # noqa: B006 (read only)
 ) -> Pupil:
-    """Let light through the stop: element, defocus, aberrations and dirt, in one plane.
+    """Build the pupil function from stop, element, defocus, aberrations and dirt, all in one plane.
 
     Field of band b: amplitude * exp(2 pi i (index[b] * height + path) / wavelength[b]). Defocus adds the path
-    W * 550 nm * r**2, r = 1 at the rim, so W is peak to valley in waves at 550 nm. The stop passes a sample if
-    its centre is inside.
+    W * 550 nm * r**2 with r = 1 at the rim, so W is the peak-to-valley defocus in waves at 550 nm. The stop passes a
+    sample if the centre of the sample lies inside the stop.
 
     Shapes: height (v, u), index (band,), bands, dirt (v, u) -> Pupil.
-    Units:  height m; defocus waves at 550 nm; aberrations m of path, root mean square, by Noll's number.
+    Units:  height m; defocus waves at 550 nm; aberrations m of path, root mean square, by Noll index.
     Error:  path 1e-7 relative (float32); area of the staircase rim 2 / samples.
     Raises: ValueError where the shapes do not belong together, and for a height in half precision.
     Source: Goodman, Introduction to Fourier Optics, 3rd ed., section 6.4; Noll, J. Opt. Soc. Am. 66, 207 (1976).
@@ -56,7 +56,7 @@ def pupil(
 
 
 def _lens_path(grid: Stop, defocus: float, aberrations: Mapping[int, float], like: Tensor) -> Tensor | None:
-    """Defocus and aberrations; None of a lens without."""
+    """Return the path of defocus and aberrations, or None for a lens without either."""
     if not defocus and not any(aberrations.values()):
         return None
     path, device = torch.empty_like(like), like.device
@@ -70,12 +70,12 @@ def _lens_path(grid: Stop, defocus: float, aberrations: Mapping[int, float], lik
 def _shapes(height: Tensor, index: Tensor, bands: Bands, dirt: Dirt | None) -> None:
     refuse_half(height=height)
     if height.ndim != 2 or height.shape[0] != height.shape[1]:
-        raise ValueError(f"height is {tuple(height.shape)}: the pupil grid is square, (samples, samples)")
+        raise ValueError(f"height is {tuple(height.shape)}: give a square pupil grid, (samples, samples)")
     if index.shape != bands.centres.shape:
-        raise ValueError(f"index is {tuple(index.shape)}, bands {tuple(bands.centres.shape)}: take both of one step")
+        raise ValueError(f"index {tuple(index.shape)}, bands {tuple(bands.centres.shape)}: compute both from one step")
     if dirt is not None and dirt.amplitude.shape != height.shape:
         found, wanted = tuple(dirt.amplitude.shape), tuple(height.shape)
-        raise ValueError(f"dirt is {found}, height {wanted}: give both the same samples")
+        raise ValueError(f"dirt is {found} and height is {wanted}: give both the same samples")
 
 
 @pupil.check
@@ -84,10 +84,10 @@ def _(result: Pupil, *_: Any, pitch: float, diameter: float, aperture: Aperture,
     passed = _light(result.amplitude) / _light(result.aperture)
     median, share = phase_steps(result)
     text = f"phase step {median:.3f} turn between samples (median), {share:.1%} above half a turn"
-    held = f", {aperture} where {diameter * 1e3:#.3g} mm was asked" if used < diameter * (1 - 1e-9) else ""
+    held = f", {aperture} instead of the requested {diameter * 1e3:#.3g} mm" if used < diameter * (1 - 1e-9) else ""
     return [
         Check(f"throughput {passed:.4f} of the clear pupil {min(used, diameter) * 1e3:#.3g} mm{held}", passed > 0),
-        Check(text if share <= 0.1 else f"{text}: aliased, use finer samples", share <= 0.1),
+        Check(text if share <= 0.1 else f"{text}: aliased, use a finer pupil pitch", share <= 0.1),
     ]
 
 
@@ -96,11 +96,11 @@ def _light(amplitude: Tensor) -> float:
 
 
 def phase_steps(pupil: Pupil) -> tuple[float, float]:
-    """Steps between neighbours inside the stop, in the band that has most: median in turns, share above one half.
+    """Return the phase steps between neighbours inside the stop: median in turns, and share above one half.
 
-    Of a large pupil every second row or every few is looked at, 512 of them or more.
-    A wrapped or split element has steps at its edges by design, so a few large ones mean nothing; many mean
-    that the samples cannot follow the phase.
+    Both numbers are from the band with the largest phase steps. In a large pupil only every k-th row is measured, 512
+    rows or more. A wrapped or split element has steps at its edges by design, so a few large steps mean nothing. Many
+    large steps mean that the samples cannot follow the phase.
     """
     worst = int((pupil.index / pupil.wavelengths).argmax())
     every = max(1, len(pupil.height) // _ROWS)

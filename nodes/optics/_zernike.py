@@ -1,4 +1,4 @@
-"""Zernike polynomials over the stop: unit root mean square, numbered after Noll."""
+"""Zernike polynomials over the stop, of unit root mean square, in Noll's numbering."""
 
 import math
 from collections.abc import Mapping
@@ -12,7 +12,7 @@ _ALL = slice(None)
 
 
 def noll(index: int) -> tuple[int, int]:
-    """Radial order n and signed azimuthal order m: m > 0 with the cosine, m < 0 with the sine."""
+    """Return radial order n and signed azimuthal order m: m > 0 for the cosine, m < 0 for the sine."""
     if index < 1:
         raise ValueError(f"Zernike index {index}: Noll counts from 1 (piston)")
     n = (math.isqrt(8 * index - 7) - 1) // 2
@@ -22,7 +22,7 @@ def noll(index: int) -> tuple[int, int]:
 
 
 def _radial(n: int, m: int) -> list[float]:
-    """Coefficients of the orthonormal R(n, m)(r) / r**m in rising powers of r squared."""
+    """Return the coefficients of the orthonormal R(n, m)(r) / r**m in rising powers of r squared."""
     low, high, factorial = (n - m) // 2, (n + m) // 2, math.factorial
     norm = math.sqrt((n + 1) * (1 if m == 0 else 2))
     terms = reversed(range(low + 1))
@@ -32,7 +32,7 @@ def _radial(n: int, m: int) -> list[float]:
 
 
 def _by_azimuth(coefficients: Mapping[int, float]) -> dict[int, list[float]]:
-    """Radial polynomials summed over the terms that share a signed azimuthal order."""
+    """Return one radial polynomial for each signed azimuthal order, summed over the terms of that order."""
     sums: dict[int, list[float]] = {}
     for index, rms in coefficients.items():
         n, m = noll(index)
@@ -51,9 +51,9 @@ def _horner(coefficients: list[float], x: Tensor) -> Tensor:
 
 
 def combine(coefficients: Mapping[int, float], v: Tensor, u: Tensor) -> Tensor:
-    """Sum of polynomials at (v, u) in units of the radius, each with its root mean square.
+    """Return the sum of polynomials at (v, u) in units of the radius, each polynomial with its root mean square.
 
-    Written in powers of u + iv, so that neither the centre nor the cut of an azimuth is special.
+    The sum is written in powers of u + iv, so neither the centre nor the cut of the azimuth needs special treatment.
     Source: Noll, J. Opt. Soc. Am. 66, 207 (1976), Eqs. 1 and 2.
     """
     sums = _by_azimuth(coefficients)
@@ -70,6 +70,6 @@ def combine(coefficients: Mapping[int, float], v: Tensor, u: Tensor) -> Tensor:
 def surface(
     coefficients: Mapping[int, float], grid: Stop, device: torch.device | None = None, rows: slice = _ALL
 ) -> Tensor:
-    """The same over the stop, float64 (v, u), 0 outside; or some rows of it."""
+    """Return the sum of polynomials over the stop, float64 (v, u), 0 outside; ``rows`` selects some rows."""
     v, u = axes(grid, device)
     return torch.where(inside(grid, device, rows), combine(coefficients, v[rows], u), 0.0)

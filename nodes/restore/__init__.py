@@ -1,4 +1,4 @@
-"""Restoration: from raw digital numbers back to colour."""
+"""Restoration nodes: from raw digital numbers back to colour."""
 
 from neusee.nodes.restore._colour_matrix import colour_matrix
 from neusee.nodes.restore._electrons_and_colour import clipped, colour, electrons

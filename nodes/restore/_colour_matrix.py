@@ -1,4 +1,4 @@
-"""The colour matrix: from what the channels counted to the colour the scene would have in daylight."""
+"""The colour matrix: from electrons of the channels to the colour that the scene would have in daylight."""
 
 from typing import Any
 
@@ -24,15 +24,15 @@ def colour_matrix(
     exposure: Time,
     quantum_efficiency: Efficiency,
 ) -> Tensor:
-    """Find the matrix from electrons to linear sRGB that is right on average over measured paints.
+    """Compute the matrix from electrons to linear sRGB with the least mean square error over measured paints.
 
     Linear least mean square over the reflectances s of colour charts, C = E[s s^T]: M = T C A^T (A C A^T)^-1, where
-    A s are the electrons under this illuminant and T s the linear sRGB under D65. White balance is part of it.
+    A s are the electrons under this illuminant and T s is the linear sRGB under D65. The matrix includes white balance.
 
     Shapes: bands, illuminant, level (band,), responses (3, band) -> (3, 3) float64.
     Units:  linear sRGB per electron.
-    Error:  metamerism: rms 0.01 to 0.05 on the charts, by the channels; worse for saturated lights. The scene
-            is taken as illuminated once.
+    Error:  metamerism: rms 0.01 to 0.05 on the charts, depending on the channels; larger for saturated lights. The
+            light of the scene is assumed to be reflected once.
     Raises: ValueError where the bands of the inputs differ.
     Source: Wiener estimation as in Pratt and Mancill, Appl. Opt. 15, 73 (1976); charts of colour-science.
     """
@@ -64,12 +64,12 @@ def _counts(
     exposure: float,
     quantum_efficiency: float,
 ) -> Tensor:
-    """Electrons in each channel for one unit of reflectance in each band, on the CPU."""
+    """Return the electrons in each channel for one unit of reflectance in each band, on the CPU."""
     lit = level.cpu().double() * illuminant.cpu().double()
     weights = channel_weights(bands, responses.cpu(), lit, pixel_pitch=pixel_pitch, exposure=exposure)
     return weights * quantum_efficiency
 
 
 def _paints(centres: Tensor) -> Tensor:
-    """Reflectances of the colour charts at these wavelengths: (paint, band) float64."""
+    """Return the reflectances of the colour charts at these wavelengths: (paint, band) float64."""
     return torch.cat([paint.at(centres) for paint in paints()])

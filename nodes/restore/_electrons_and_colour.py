@@ -1,4 +1,4 @@
-"""Digital numbers back to electrons, and electrons to colour."""
+"""Digital numbers to electrons, and electrons to colour."""
 
 import torch
 from torch import Tensor
@@ -13,10 +13,10 @@ from neusee.nodes.units import Electrons, Gain
 
 @node()
 def electrons(raw: Tensor, *, gain: Gain, offset: Electrons, offset_subtracted: bool = True) -> Tensor:
-    """Undo the gain of the sensor, and its offset.
+    """Convert digital numbers to electrons: undo the gain of the sensor and subtract its offset.
 
     Shapes: raw (..., y, x) -> (..., y, x).
-    Units:  raw DN; gain K, DN/e-; offset e-; result e-, negative where read noise was.
+    Units:  raw DN; gain K, DN/e-; offset e-; result e-, negative where read noise was negative.
     Error:  the rounding of the converter, 0.29 DN rms; clipped pixels stay clipped.
     Source: NeuSee, Eq. (SensorImage), inverted.
     """
@@ -26,17 +26,17 @@ def electrons(raw: Tensor, *, gain: Gain, offset: Electrons, offset_subtracted: 
 @electrons.preflight
 def _(*, offset: float, offset_subtracted: bool = True, **params: object) -> list[str]:
     if offset and not offset_subtracted:
-        return [f"an offset of {offset:g} e- stays in the picture"]
+        return [f"an offset of {offset:g} e- stays in the picture: set offset_subtracted: true to remove it"]
     return []
 
 
 @node(rtol=0.0)
 def clipped(raw: Tensor, *, full_well: Well, gain: Gain, bits: Bits = 16) -> Tensor:
-    """Mark the values that say only "at least this much": at the full well, or at the end of the converter.
+    """Mark clipped values, which give only a lower bound: at the full well, or at the largest number of the converter.
 
     Shapes: raw (..., y, x) -> (..., y, x) bool.
     Units:  raw DN.
-    Error:  a value within one DN of the full well is marked too, and so is what is not a number.
+    Error:  a value within one DN of the full well is marked too, and so is what is not a number (NaN).
     Source: NeuSee, Eq. (SensorImage).
     """
     return at_the_end(raw, full_well=full_well, gain=gain, bits=bits)
@@ -47,9 +47,9 @@ def colour(channels: Tensor, matrix: Tensor) -> Tensor:
     """Turn the channels of the sensor into linear sRGB.
 
     Shapes: channels (..., 3, y, x), matrix (3, 3) -> (..., 3, y, x).
-    Units:  channels e-; result linear sRGB, white 1; out of gamut below 0.
+    Units:  channels e-; result linear sRGB, white 1; colours out of gamut below 0.
     Error:  that of the matrix: no matrix is right for all spectra.
-    Raises: ValueError for other than three channels.
+    Raises: ValueError for a number of channels other than three.
     Source: Reinhard et al., High Dynamic Range Imaging, 2nd ed. (colour spaces as 3 x 3 matrices).
     """
     if channels.ndim < 3 or channels.shape[-3] != matrix.shape[-1]:

@@ -1,4 +1,4 @@
-"""Scenes: where light enters a recipe."""
+"""Scenes: the sources of light in a recipe."""
 
 from neusee.nodes.scene._exr_picture import exr
 from neusee.nodes.scene._hyperspectral import hyperspectral

@@ -1,4 +1,4 @@
-"""The frame of a scene: scale to cover it, cut what stands over."""
+"""The frame of a scene: a scene is scaled to cover the frame and cropped at its centre."""
 
 import math
 
@@ -8,9 +8,9 @@ from neusee.nodes.units import Shape
 
 
 def framed(scene: Tensor, shape: Shape | None) -> Tensor:
-    """Scale linear light evenly until it covers `shape`, then cut the centre: (band, y, x) -> (band, *shape).
+    """Scale linear light with its aspect ratio until it covers `shape`, then crop: (band, y, x) -> (band, *shape).
 
-    Kornia's antialiased bilinear resampling: no overshoot, so nothing turns negative.
+    Kornia's antialiased bilinear resampling has no overshoot, so that no value becomes negative.
     """
     from kornia.geometry.transform import resize
 
@@ -23,14 +23,14 @@ def framed(scene: Tensor, shape: Shape | None) -> Tensor:
 
 
 def covering(size: tuple[int, int], shape: Shape) -> tuple[int, int]:
-    """The smallest size of the same proportions that covers `shape`."""
+    """Return the smallest size of the same aspect ratio that covers `shape`."""
     scale = max(shape[0] / size[0], shape[1] / size[1])
     y, x = (max(n, math.floor(k * scale + 0.5)) for k, n in zip(size, shape, strict=True))
     return y, x
 
 
 def enlarged(size: tuple[int, int], shape: Shape | None) -> list[str]:
-    """A note where a frame asks for more pixels than the file has."""
+    """Return a note where a frame needs more pixels than the file has."""
     if shape is None:
         return []
     scale = max(shape[0] / size[0], shape[1] / size[1])

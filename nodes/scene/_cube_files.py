@@ -18,7 +18,7 @@ _TYPES = {"double": "float64", "single": "float32", "logical": "bool", "char": "
 def cube_and_wavelengths(
     file: Path, variable: str | None, start: float | None, stop: float | None, layout: Layout
 ) -> tuple[Tensor, Tensor]:
-    """Cube (band, y, x) float32 and its wavelengths in m."""
+    """Read a cube (band, y, x) float32 and its wavelengths in m."""
     if file.suffix == ".exr":
         cube, known, _ = read_spectral(file)
         return cube, known
@@ -32,21 +32,21 @@ def cube_and_wavelengths(
 
 
 def size_and_type(file: Path, variable: str | None) -> tuple[tuple[int, ...], str]:
-    """Shape and type of the cube, from the head of the file."""
+    """Read the shape and the type of the cube from the header of the file."""
     if file.suffix == ".npy":
         head = np.load(file, mmap_mode="r")
         size, kind = head.shape, str(head.dtype)
     elif file.suffix == ".mat":
         size, kind = _listed(file)[_only(file, variable)]
     else:
-        raise ParameterError("file", f"{file.name} is none of .mat, .npy and .exr: save it as one of these")
+        raise ParameterError("file", f"{file.name} is not a .mat, .npy or .exr file: save the cube as one of these")
     if len(size) != 3:
         raise ParameterError("file", f"{file.name} holds shape {size}: a cube has three axes")
     return size, kind
 
 
 def exr_size(file: Path) -> tuple[int, int]:
-    """Rows and columns of a spectral OpenEXR, from its header."""
+    """Read the numbers of rows and columns from the header of a spectral OpenEXR."""
     import OpenEXR
 
     try:
@@ -62,21 +62,21 @@ def exr_size(file: Path) -> tuple[int, int]:
 
 
 def _listed(file: Path) -> dict[str, tuple[tuple[int, ...], str]]:
-    """Variables of a .mat file, with shape and type."""
+    """Return the variables of a .mat file, with shape and type."""
     try:
         from scipy.io import whosmat
     except ImportError:
         raise ParameterError("file", f"{file.name}: .mat files need scipy: pip install scipy") from None
     try:
         return {name: (size, _TYPES.get(kind, kind)) for name, size, kind in whosmat(file)}
-    except Exception:  # scipy fails on foreign bytes in many ways
+    except Exception:  # scipy raises many kinds of errors for foreign bytes
         raise ParameterError(
-            "file", f"{file.name} is no .mat file up to version 7: save it in MATLAB with -v7"
+            "file", f"{file.name} is not a .mat file up to version 7: save the cube in MATLAB with -v7"
         ) from None
 
 
 def _only(file: Path, variable: str | None) -> str:
-    """The variable asked for, or the only cube of the file."""
+    """Return the requested variable, or the only cube of the file."""
     held = _listed(file)
     cubes = [name for name, (size, _) in held.items() if len(size) == 3]
     if variable in held:

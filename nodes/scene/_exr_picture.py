@@ -1,4 +1,4 @@
-"""A scene-linear OpenEXR picture, with the primaries its header names."""
+"""A scene-linear OpenEXR picture, in the primaries that its header names."""
 
 from pathlib import Path
 from typing import Annotated, Any, Literal
@@ -14,7 +14,7 @@ from neusee.nodes.scene._crop_to_frame import enlarged, framed
 from neusee.nodes.units import DataFile, Shape
 
 White = Annotated[float, Field(gt=0, allow_inf_nan=False)]
-_REC709 = (0.64, 0.33, 0.30, 0.60, 0.15, 0.06, 0.3127, 0.3290)  #: what the format means where it names no primaries
+_REC709 = (0.64, 0.33, 0.30, 0.60, 0.15, 0.06, 0.3127, 0.3290)  #: of a file without named primaries
 
 
 @node(rtol=1e-5)
@@ -25,12 +25,12 @@ def exr(
     white: White | None = None,
     negatives: Literal["clip", "keep"] = "clip",
 ) -> Tensor:
-    """Read scene-linear light, from the primaries the header names to linear sRGB (Bradford where whites differ).
+    """Read scene-linear light and convert the primaries of the header to linear sRGB (Bradford where whites differ).
 
-    Shapes: -> (3, y, x) float32, the file's own size or `shape` (scaled to cover it, centre cut).
-    Units:  linear sRGB, 1 = `white` of the file's values (as they are where it is null); no upper limit.
-    Error:  half floats carry 5e-4. Negative light, of noise or of colours outside sRGB, is clipped unless kept.
-    Raises: ParameterError before the run where R, G, B and Y are all missing; ValueError on values not finite.
+    Shapes: -> (3, y, x) float32, the size of the file or `shape` (scaled to cover `shape`, cropped at the centre).
+    Units:  linear sRGB, 1 = `white` in the values of the file (with null the values stay unscaled); no upper limit.
+    Error:  half floats resolve 5e-4. Negative light, from noise or colours outside sRGB, is clipped unless kept.
+    Raises: ParameterError before the run without R, G and B, or Y alone; ValueError for values that are not finite.
     Source: OpenEXR technical introduction (chromaticities, adoptedNeutral); matrices of colour-science.
     """
     scene = framed(_linear(file), shape) / (white or 1.0)
@@ -70,7 +70,7 @@ def _header(file: Path) -> dict[str, Any]:
 
 
 def _wanted(file: Path, names: list[str]) -> list[str]:
-    """Channels to read: R, G, B, or else Y alone."""
+    """Return the channels to read: R, G, B, or else Y alone."""
     for wanted in (["R", "G", "B"], ["Y"]):
         if set(wanted) <= set(names) and not {"RY", "BY"} & set(names):
             return wanted
@@ -81,7 +81,7 @@ def _wanted(file: Path, names: list[str]) -> list[str]:
 
 
 def _linear(file: Path) -> Tensor:
-    """Linear sRGB as the file has it, (3, y, x) float32."""
+    """Read linear sRGB in the size of the file, (3, y, x) float32."""
     import OpenEXR
 
     with OpenEXR.File(str(file), separate_channels=True) as opened:
@@ -89,7 +89,7 @@ def _linear(file: Path) -> Tensor:
         names = _wanted(file, list(channels))
         pixels = np.stack([np.asarray(channels[name].pixels, dtype=np.float32) for name in names])
     if bad := int((~np.isfinite(pixels)).sum()):
-        raise ValueError(f"{file.name} holds {bad} values that are not finite: replace them, say by the largest")
+        raise ValueError(f"{file.name} holds {bad} values that are not finite: replace these, say by the largest")
     if names == ["Y"]:
         return torch.from_numpy(pixels).expand(3, -1, -1).clone()
     matrix = torch.from_numpy(_to_srgb(header)).to(torch.float32)
@@ -97,7 +97,7 @@ def _linear(file: Path) -> Tensor:
 
 
 def _to_srgb(header: dict[str, Any]) -> NDArray[np.float64]:
-    """The matrix from the file's primaries to linear sRGB; its neutral goes to D65 by Bradford."""
+    """Return the matrix from the file's primaries to linear sRGB; Bradford adapts the file's neutral to D65."""
     import colour
 
     values = np.asarray(header.get("chromaticities", _REC709), dtype=np.float64)

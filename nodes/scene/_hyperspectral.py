@@ -1,4 +1,4 @@
-"""A hyperspectral scene: reflectance that was measured, not lifted from three channels."""
+"""A hyperspectral scene: measured reflectance, not reflectance lifted from three channels."""
 
 from pathlib import Path
 from typing import Any
@@ -27,17 +27,17 @@ def hyperspectral(
     layout: Layout = "y x band",
     shape: Shape | None = None,
 ) -> Tensor:
-    """Read a spectral cube and interpolate it linearly in wavelength to `bands`.
+    """Read a spectral cube and interpolate the cube linearly in wavelength to `bands`.
 
-    A spectral OpenEXR carries its wavelengths; .mat (`variable`, or the only cube in it) and .npy need `start` and
-    `stop`, the first and last of evenly spaced bands. Whole numbers are scaled by their type: 65535 is 1.
+    A spectral OpenEXR carries its wavelengths; .mat (`variable`, or the only cube in the file) and .npy need `start`
+    and `stop`, the first and last of evenly spaced bands. Whole numbers are scaled by their type: 65535 becomes 1.
 
-    Shapes: -> (band, y, x) float32, the file's own size or `shape` (scaled to cover it, centre cut).
+    Shapes: -> (band, y, x) float32, the size of the file or `shape` (scaled to cover `shape`, cropped at the centre).
     Units:  reflectance, 1 = white.
-    Error:  linear interpolation: h^2/8 of the curvature, some 1e-3 for paints at 10 nm; none on the file's own bands.
-            Negative values are clipped.
-    Raises: ParameterError before the run where the file does not fit; ValueError where `bands` go beyond it or values
-            are not finite.
+    Error:  linear interpolation: h^2/8 of the curvature, some 1e-3 for paints at 10 nm; exact on the bands of the
+            file. Negative values are clipped.
+    Raises: ParameterError before the run where the file does not fit the parameters; ValueError where `bands` leave
+            the range of the file or values are not finite.
     Source: layout of spectral OpenEXR: Fichet, Pacanowski, Wilkie, JCGT 10(3), 2021.
     """
     cube, known = cube_and_wavelengths(file, variable, start, stop, layout)
@@ -47,7 +47,7 @@ def hyperspectral(
     if below < first - _ROUNDING or above > last + _ROUNDING:
         raise ValueError(
             f"bands from {below * 1e9:.4g} to {above * 1e9:.4g} nm, but {file.name} holds {first * 1e9:.4g} to "
-            f"{last * 1e9:.4g} nm: choose bands inside it"
+            f"{last * 1e9:.4g} nm: choose bands inside that range"
         )
     if not bool(torch.isfinite(cube).all()):
         raise ValueError(
@@ -88,7 +88,7 @@ def _(result: Tensor, bands: Bands, **params: Any) -> list[Check]:
 
 
 def _between(known: Tensor, wanted: Tensor) -> Tensor:
-    """Matrix (wanted, known) of linear interpolation."""
+    """Return the matrix (wanted, known) of linear interpolation."""
     right = torch.searchsorted(known, wanted).clamp(1, max(len(known) - 1, 1))
     if len(known) == 1:
         return torch.ones(len(wanted), 1, dtype=torch.float64)

@@ -1,4 +1,4 @@
-"""A photograph: sRGB files to linear light."""
+"""A photograph: linear light from an sRGB file."""
 
 from pathlib import Path
 from typing import Any
@@ -17,13 +17,13 @@ _ROTATED = range(5, 9)  #: EXIF orientations that exchange width and height
 
 @node(rtol=1e-5)
 def photograph(*, file: DataFile, shape: Shape | None = None) -> Tensor:
-    """Read a photograph as linear light: decode the sRGB curve, turn it upright, and frame it in linear light.
+    """Read a photograph as linear light: decode the sRGB curve, turn the picture upright, then scale and crop.
 
-    Shapes: -> (3, y, x) float32, the file's own size or `shape` (scaled to cover it, centre cut).
+    Shapes: -> (3, y, x) float32, the size of the file or `shape` (scaled to cover `shape`, cropped at the centre).
     Units:  linear sRGB, 1 = the white of the file.
-    Error:  half a code value (8 bit: 1.8e-3 near white); what a camera's tone curve did is not undone. Read as sRGB:
-            an embedded profile is named, not applied.
-    Raises: ParameterError before the run for other formats, depths and transparency.
+    Error:  half a code value (8 bit: 1.8e-3 near white); the tone curve of the camera is not undone. Every file is
+            read as sRGB: a note names an embedded profile, which is not applied.
+    Raises: ParameterError before the run for another format, for another depth, and for transparency.
     Source: IEC 61966-2-1:1999 (sRGB); EXIF 2.3, tag Orientation.
     """
     from kornia.color import rgb_to_linear_rgb
@@ -46,12 +46,12 @@ def _(*, file: Path, shape: Shape | None = None) -> list[str]:
             _refuse(file, image)
             profile = _profile(image)
             notes = (
-                [f"{file.name}: its colour profile {profile!r} is not applied, it is read as sRGB"] if profile else []
+                [f"{file.name}: colour profile {profile!r} not applied, the file is read as sRGB"] if profile else []
             )
             turned = image.getexif().get(0x0112, 1)
             size = image.size if turned in _ROTATED else image.size[::-1]
     except UnidentifiedImageError:
-        raise ParameterError("file", f"{file} is no picture that can be read: give a PNG or JPEG file") from None
+        raise ParameterError("file", f"{file} is not a readable picture: give a PNG or JPEG file") from None
     notes += [f"{file.name}: turned upright, as its EXIF orientation {turned} says"] if turned != 1 else []
     return notes + enlarged(size, shape)
 
@@ -67,13 +67,13 @@ def _refuse(file: Path, image: Any) -> None:
     if image.format not in ("PNG", "JPEG", "MPO"):
         raise ParameterError("file", f"{file} is {image.format}, not PNG or JPEG: {fix}; scene-linear: scene.exr")
     if "transparency" in image.info or image.mode.endswith("A"):
-        raise ParameterError("file", f"{file} has transparency, which is no light: {fix}")
+        raise ParameterError("file", f"{file} has transparency, which is not light: {fix}")
     if image.mode not in _MODES:
         raise ParameterError("file", f"{file} has pixels of kind {image.mode}, not grey or RGB: {fix}")
 
 
 def _profile(image: Any) -> str:
-    """The name of an embedded profile, unless it is sRGB itself."""
+    """Return the name of an embedded profile, or an empty text for sRGB itself."""
     from io import BytesIO
 
     from PIL import ImageCms
@@ -88,7 +88,7 @@ def _profile(image: Any) -> str:
 
 
 def _codes(file: Path) -> Tensor:
-    """Code values in [0, 1], upright: (3, y, x) float32. Pillow halves 16-bit colour to 8, so kornia_rs reads that."""
+    """Read upright code values in [0, 1]: (3, y, x) float32. Pillow reduces 16-bit colour to 8; kornia_rs does not."""
     import numpy as np
     from PIL import Image, ImageOps
 
@@ -105,13 +105,13 @@ def _codes(file: Path) -> Tensor:
 
 
 def _depth(file: Path) -> int:
-    """Bits a channel: byte 24 of a PNG header; every JPEG read here has 8."""
+    """Return the bits per channel: byte 24 of a PNG header, and 8 for every JPEG."""
     head = file.read_bytes()[:26]
     return head[24] if head.startswith(b"\x89PNG") else 8
 
 
 def _words(file: Path, turned: int) -> Any:
-    """16-bit RGB, turned as the EXIF orientation says."""
+    """Read 16-bit RGB, turned as the EXIF orientation says."""
     import numpy as np
     from kornia_rs.io import read_image_png_u16
 

@@ -1,6 +1,7 @@
-"""Spectral pictures as OpenEXR: one channel a wavelength, named as Fichet, Pacanowski and Wilkie (JCGT 10(3), 2021) do.
+"""Spectral OpenEXR: one channel per wavelength, named as by Fichet, Pacanowski and Wilkie (JCGT 10(3), 2021).
 
-Emitted light is ``S0.550,0nm``, reflectance ``T.550,0nm``: the decimal mark is a comma, for a point parts layers.
+Emitted light is ``S0.550,0nm``, reflectance is ``T.550,0nm``. The decimal mark is a comma because a point separates
+layers.
 """
 
 import re
@@ -31,7 +32,7 @@ def write_spectral(
 ) -> None:
     """Write a cube (band, y, x) with its wavelengths in metres as float32, losslessly.
 
-    Raises: ValueError where cube and wavelengths disagree, or two bands would get one name.
+    Raises: ValueError where cube and wavelengths differ in number, and where two bands would get the same name.
     """
     import OpenEXR
 
@@ -48,10 +49,10 @@ def write_spectral(
 
 
 def read_spectral(path: Path | str) -> tuple[Tensor, Tensor, dict[str, Any]]:
-    """Read cube (band, y, x) float32, wavelengths (band,) float64 in m, rising, and the header.
+    """Read a cube (band, y, x) float32, its rising wavelengths (band,) float64 in m, and the header.
 
-    Emission is taken where a file holds both emission and reflectance.
-    Raises: ValueError, with the channels it holds, where none is spectral.
+    From a file with both emission and reflectance the emission is read.
+    Raises: ValueError, which lists the channels of the file, where no channel is spectral.
     """
     import OpenEXR
 
@@ -68,7 +69,7 @@ def read_spectral(path: Path | str) -> tuple[Tensor, Tensor, dict[str, Any]]:
 
 
 def spectral_channels(names: Sequence[str]) -> dict[float, str]:
-    """Wavelength in m to channel, by rising wavelength: emission, or else reflectance."""
+    """Map each wavelength in m to its channel, by rising wavelength: emission, or else reflectance."""
     for kind in ("S0", "T"):
         matches = [m for m in map(_NAME.fullmatch, names) if m and m[1] == kind and m[2] not in ("", ",")]
         if matches:
@@ -84,6 +85,6 @@ def _name(wavelength: float, kind: str) -> str:
 def _wavelength(match: re.Match[str]) -> float:
     exponent = _PREFIX[match[3] or ""]
     number = float(f"{match[2].replace(',', '.')}")
-    # nanometres by division, so that 550,0nm reads as the same float64 as 550 / 1e9
+    # a division converts nanometres, so that 550,0nm gives the same float64 as 550 / 1e9
     value = number / 10.0**-exponent if exponent < 0 else number * 10.0**exponent
     return value if match[4] == "m" else _LIGHT / value

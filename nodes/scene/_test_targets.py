@@ -10,8 +10,8 @@ from neusee.nodes import Check, ParameterError, node
 from neusee.nodes.units import Fraction, Shape
 
 Kind = Literal["flat", "edge", "slanted_edge", "siemens", "points"]
-_TILT = math.radians(5.0)  #: of the slanted edge, against the columns
-_CYCLES = 36  #: of the star, once round
+_TILT = math.radians(5.0)  #: angle of the slanted edge to the columns
+_CYCLES = 36  #: cycles of the star over one full turn
 _SPACING = 64  #: pixels between points
 
 
@@ -19,13 +19,13 @@ _SPACING = 64  #: pixels between points
 def targets(*, kind: Kind, shape: Shape, low: Fraction = 0.0, high: Fraction = 1.0) -> Tensor:
     """Draw a grey test target whose image has a known answer.
 
-    `flat` is `high` everywhere; `edge` runs through the axis, bright to +x; `slanted_edge` is the same tilted by 5
-    degrees; `siemens` is a sinusoidal star of 36 cycles; `points` are single pixels, 64 apart, one on the axis.
+    `flat` is `high` everywhere; `edge` runs through the axis, bright towards +x; `slanted_edge` is an edge tilted by 5
+    degrees; `siemens` is a sinusoidal star of 36 cycles; `points` are single pixels, 64 apart, with one on the axis.
 
     Shapes: -> (3, y, x) float32, the axis at sample N//2.
     Units:  linear sRGB, grey between `low` and `high`.
-    Error:  edges are exact area averages of the pixel; the star is its value at the pixel's centre, and grey
-            where it is finer than two pixels a cycle.
+    Error:  edges are exact averages over the area of a pixel; the star is sampled at the centre of a pixel, and grey
+            where a cycle is shorter than two pixels.
     Raises: ParameterError before the run where low exceeds high.
     Source: slanted edge and sinusoidal star as in ISO 12233:2017.
     """
@@ -56,7 +56,7 @@ def _edge(y: Tensor, x: Tensor) -> Tensor:
 
 
 def _slanted(y: Tensor, x: Tensor) -> Tensor:
-    """Share of each pixel beyond a line through the axis: the second integral of a corner, differenced twice."""
+    """Return the share of each pixel beyond a line through the axis, by a second difference of a second integral."""
     c, s = math.cos(_TILT), math.sin(_TILT)
     distance = x * c + y * s
     corners = [sign * (distance + off).clamp_min(0) ** 2 / 2 for sign, off in _corners(c, s)]
@@ -70,7 +70,7 @@ def _corners(c: float, s: float) -> list[tuple[int, float]]:
 def _siemens(y: Tensor, x: Tensor) -> Tensor:
     radius = torch.hypot(y, x)
     edge = min(int(y.numel()), int(x.numel())) / 2 - 1
-    fine = _CYCLES / math.pi  # radius at which a cycle is two pixels long
+    fine = _CYCLES / math.pi  # radius where a cycle is two pixels long
     inside = (edge - radius + 0.5).clamp(0, 1) * (radius - fine + 0.5).clamp(0, 1)
     return 0.5 + 0.5 * inside * torch.cos(_CYCLES * torch.atan2(y, x))
 

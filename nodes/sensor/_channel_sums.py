@@ -1,4 +1,4 @@
-"""Reading weighted sums of an image that has been summed over its bands already."""
+"""Weighted sums over the bands of an image, also of an image that is stored as channel sums."""
 
 import torch
 from torch import Tensor
@@ -6,11 +6,11 @@ from torch import Tensor
 from neusee.nodes._half_precision import single
 from neusee.nodes.values import Channels
 
-_OFF = 1e-9  #: part of the weights that may lie outside the rows
+_OFF = 1e-9  #: relative error, at most, of weights that are combined from the rows
 
 
 def weighted(image: Tensor | Channels, weights: Tensor) -> Tensor:
-    """Sum the bands of ``image`` by ``weights`` (..., band): (..., y, x); raises ValueError where they do not fit."""
+    """Return the sum (..., y, x) of the bands, weighted by (..., band); raise ValueError if the bands do not fit."""
     if isinstance(image, Channels):
         mixed = _of_rows(weights, image.rows).to(image.planes)
         summed: Tensor = torch.tensordot(mixed, image.planes, 1)
@@ -21,21 +21,24 @@ def weighted(image: Tensor | Channels, weights: Tensor) -> Tensor:
 
 
 def channel_sums(image: Tensor, rows: Tensor) -> Channels:
-    """Sum an image (..., band, y, x) by each of ``rows`` (row, band), exactly; of some of its bands, their share."""
+    """Return the sums of an image (..., band, y, x) with each of ``rows`` (row, band), without error.
+
+    The sums of a part of the bands are the contribution of these bands to the whole.
+    """
     exact = torch.zeros((), dtype=torch.float64)
     light = single(image).sum(-1).sum(-1, dtype=torch.float64)
     return Channels(weighted(image, rows), rows.detach().double(), light, exact, largest=exact)
 
 
 def _of_rows(weights: Tensor, rows: Tensor) -> Tensor:
-    """M with weights = M rows, by least squares in float64; the gradient reaches the weights."""
+    """Return M with weights = M rows, by least squares in float64; the gradient reaches the weights."""
     known = rows.detach().cpu().double()
     scale = known.abs().amax(1, keepdim=True)
     inverse = torch.linalg.pinv(known / scale.where(scale > 0, 1.0)) / scale.where(scale > 0, 1.0).T
     wanted = weights.cpu().double()
     if wanted.shape[-1] != known.shape[1]:
         raise ValueError(
-            f"weights of {wanted.shape[-1]} bands, but channels of {known.shape[1]}: give both the same `bands` step"
+            f"weights of {wanted.shape[-1]} bands, but channels of {known.shape[1]}: use the same `bands` step for both"
         )
     found: Tensor = wanted @ inverse
     _inside(wanted.detach(), found.detach() @ known)
@@ -43,12 +46,12 @@ def _of_rows(weights: Tensor, rows: Tensor) -> Tensor:
 
 
 def _inside(wanted: Tensor, made: Tensor) -> None:
-    """Refuse weights that the rows cannot make, each row by its own largest."""
+    """Raise ValueError for weights that are no combination of the rows; each row has its own scale."""
     off, most = (wanted - made).abs().flatten(0, -2), wanted.abs().flatten(0, -2).amax(-1)
     if not bool((off.amax(-1) <= _OFF * most).all()):
         worst = float((off.amax(-1) / most.clamp_min(1e-300)).max())
         raise ValueError(
-            f"the image was summed over its bands by other weights: {worst:.2g} of what is asked for lies outside its "
-            "rows, and 1e-9 is allowed: make the rows of the same `bands` and `responses`, with a level that is the "
-            "same in all bands, or keep the image of all bands"
+            f"the image was summed over its bands with other weights: {worst:.2g} of the wanted weights lies outside "
+            "its rows, and 1e-9 is allowed: compute the rows from the same `bands` and `responses`, with a level that "
+            "is equal in all bands, or keep the image of all bands"
         )

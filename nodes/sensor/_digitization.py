@@ -1,4 +1,4 @@
-"""Electrons to digital numbers: the full well, the converter and the window that is kept."""
+"""Conversion of electrons to digital numbers: the full well, the converter, and the window of the sensor."""
 
 import math
 from typing import Annotated, Any, Literal
@@ -18,7 +18,7 @@ Bits = Annotated[int, Field(ge=1, le=16)]
 
 @node(rtol=0.0)
 def full_well(electrons: Tensor, *, capacity: Well) -> Tensor:
-    """Hold no more electrons than a pixel can.
+    """Limit the electrons of each pixel to its full well.
 
     Shapes: electrons (..., y, x) -> (..., y, x).
     Units:  e-.
@@ -31,9 +31,9 @@ def full_well(electrons: Tensor, *, capacity: Well) -> Tensor:
 
 @full_well.skip_bound
 def _(electrons: TensorStats, *, capacity: float) -> float:
-    """What the brightest pixel loses, over the well or over what lies furthest below 0; exact.
+    """Return the loss of the brightest pixel relative to the largest absolute result; the bound is exact.
 
-    The well is the number that the dtype holds, which lies beside ``capacity`` by up to half a step.
+    The well is rounded to the dtype, and so differs from ``capacity`` by up to half a step of the dtype.
     """
     dtype = torch.promote_types(getattr(torch, electrons.dtype), torch.float32)
     held = float(torch.tensor(capacity, dtype=dtype))
@@ -62,7 +62,7 @@ def digitize(
     bits: Bits = 16,
     rng: Generator | None = None,
 ) -> Tensor:
-    """Convert electrons to whole digital numbers that a converter of so many bits can hold.
+    """Convert electrons to whole digital numbers, clipped to the range of the converter.
 
     Shapes: electrons (..., y, x) -> (..., y, x), whole numbers in the dtype of the input (of half precision, float32).
     Units:  electrons e-; gain K of EMVA 1288, DN/e-, which a recipe may also write as e-/DN; result DN in
@@ -75,7 +75,7 @@ def digitize(
     """
     line = single(electrons) * gain
     ideal = line.clamp(0, 2**bits - 1)
-    if rounding == "nearest":  # the sum is exact: without a gradient, the rounded number itself
+    if rounding == "nearest":  # the sum is exact; without a gradient, the rounded number is enough
         return ideal + (ideal.round() - ideal).detach() if ideal.requires_grad else ideal.round_()
     if rng is None:
         raise ValueError("dithered_floor draws random numbers: give rng=torch.Generator()")
@@ -123,7 +123,7 @@ def _(result: Tensor, *inputs: Tensor, bits: int = 16, **params: Any) -> list[Ch
 
 @node(rtol=0.0)
 def crop(image: Tensor, *, shape: Shape) -> Tensor:
-    """Keep the window of the sensor; the sample on the optical axis stays at N // 2.
+    """Cut the window of the sensor out of the image; the sample on the optical axis stays at N // 2.
 
     Shapes: image (..., y, x) -> (..., *shape).
     Units:  any.
@@ -132,14 +132,14 @@ def crop(image: Tensor, *, shape: Shape) -> Tensor:
     Source: NeuSee, Eq. (SensorImage).
     """
     if any(n > m for n, m in zip(shape, image.shape[-2:], strict=True)):
-        raise ValueError(f"no window of {tuple(shape)} in an image of {tuple(image.shape[-2:])}: enlarge the scene")
+        raise ValueError(f"a window of {tuple(shape)} exceeds an image of {tuple(image.shape[-2:])}: enlarge the scene")
     top, left = (m // 2 - n // 2 for n, m in zip(shape, image.shape[-2:], strict=True))
     return image[..., top : top + shape[0], left : left + shape[1]].contiguous()
 
 
 @crop.propagate_error
 def _(image: ErrorBound, *, result: TensorStats, **params: Any) -> float:
-    """All that is off may lie in the window."""
+    """Return a bound for the case that the whole error lies in the window."""
     before = math.prod(image.stats.shape) if image.stats else math.inf
     return image.rms * math.sqrt(before / max(1, math.prod(result.shape)))
 

@@ -1,4 +1,4 @@
-"""Light to photons: the level of the scene, the channels of the sensor, and all light together."""
+"""Conversion of irradiance to photons: the level of the scene, the channels of the sensor, the sum of all light."""
 
 import math
 from collections.abc import Mapping
@@ -15,7 +15,7 @@ from neusee.nodes.sensor._saturation import Efficiency, Well, photons_per_joule,
 from neusee.nodes.units import PositiveLength, Time
 from neusee.nodes.values import Bands, Channels
 
-Strength = Annotated[float, Field(ge=0, allow_inf_nan=False)]  #: multiple of what saturates
+Strength = Annotated[float, Field(ge=0, allow_inf_nan=False)]  #: multiple of the exposure that saturates a pixel
 
 
 @node(accepts_channel_sums=("irradiance",), needs_band_invariant=("level",))
@@ -28,21 +28,21 @@ def expose(
     pixel_pitch: PositiveLength,
     exposure: Time,
 ) -> Tensor:
-    """Count the photons that each channel of a pixel takes in: sum over bands of r I level lambda t dx^2 / (h c).
+    """Compute the photons that each channel of a pixel receives: sum over bands of r I level lambda t dx^2 / (h c).
 
-    Of an image that has been summed over its bands, `Channels`, the photons are sums of its planes.
+    If the image has already been summed over its bands (`Channels`), the photons are weighted sums of its planes.
 
     Shapes: irradiance (..., band, y, x), responses (channel, band), level (band,) -> (..., channel, y, x).
     Units:  irradiance W/m2 of the whole band (without level: of the band, with it: any); result photons.
-    Error:  one wavelength stands for its band: below (width / wavelength)^2 / 12, 5e-5 at 10 nm.
-    Raises: ValueError where the bands of the inputs differ, and where the rows of channels cannot make the weights.
+    Error:  one wavelength represents its band: error below (width / wavelength)^2 / 12, 5e-5 at 10 nm.
+    Raises: ValueError if the bands of the inputs differ, or if no combination of the rows gives the weights.
     Source: NeuSee, Eq. (photon_count); the channel sum as EMVA Standard 1288, release 4.0, for each wavelength.
     """
     weights = channel_weights(bands, responses, level, pixel_pitch=pixel_pitch, exposure=exposure)
     if isinstance(irradiance, Tensor) and (irradiance.ndim < 3 or irradiance.shape[-3] != weights.shape[1]):
         raise ValueError(
             f"irradiance {tuple(irradiance.shape)} is not (band, y, x) of {weights.shape[1]} bands: "
-            "give irradiance, bands and responses the same `bands` step"
+            "compute irradiance, bands and responses from the same `bands` step"
         )
     return weighted(irradiance, weights)
 
@@ -72,7 +72,7 @@ def _(result: Tensor, *inputs: object, **params: object) -> list[Check]:
 
 @expose.propagate_error
 def _(irradiance: ErrorBound, *others: ErrorBound | None, result: TensorStats, **params: Any) -> float:
-    """No light is negative, so that no channel loses more than the image, or the level, in parts of its largest."""
+    """Add the relative errors of image and level: light is not negative, so no channel has a larger relative error."""
     level = others[2] if len(others) > 2 else None
     return (irradiance.share + (level.share if level else 0.0)) * result.max
 
@@ -80,12 +80,12 @@ def _(irradiance: ErrorBound, *others: ErrorBound | None, result: TensorStats, *
 def channel_weights(
     bands: Bands, responses: Tensor, level: Tensor | None, *, pixel_pitch: float, exposure: float
 ) -> Tensor:
-    """Photons in each channel for one unit of each band: (channel, band) float64."""
+    """Return the photons in each channel for one unit of each band, (channel, band) float64."""
     lengths = {len(bands.centres), responses.shape[-1]} | (set() if level is None else {len(level)})
     if len(lengths) > 1:
         raise ValueError(
             f"bands {len(bands.centres)}, responses {tuple(responses.shape)}, level "
-            f"{None if level is None else tuple(level.shape)} must have the same bands: give them the same `bands` step"
+            f"{None if level is None else tuple(level.shape)} must have the same bands: use one `bands` step for all"
         )
     photons = photons_per_joule(bands.centres) * (exposure * pixel_pitch**2)
     weights = responses.double() * photons.to(responses.device)
@@ -105,22 +105,22 @@ def level(
     exposure: Time,
     rule: Literal["channel_sum", "per_band"] = "channel_sum",
 ) -> Tensor:
-    """Find the factor that makes W/m2 of the unscaled image, so that the plain lens fills its brightest pixel.
+    """Compute the factor from the unscaled image to W/m2 with which the plain lens fills its brightest pixel.
 
     `channel_sum`: the brightest pixel of the brightest channel holds strength x full well, summed over bands.
-    `per_band`: each band alone peaks at strength x I_sat, as the paper prints; 31 bands then overexpose.
+    `per_band`: each band alone peaks at strength x I_sat, as the paper prints; the sum of 31 bands overexposes.
 
     Shapes: plain_image (..., band, y, x), responses (channel, band) -> (band,) float64.
     Units:  result W/m2 per unit of the image.
     Error:  exact; a scene without light has level 0.
-    Raises: ValueError for `per_band` where the image has been summed over its bands, and for an image that is not
+    Raises: ValueError for `per_band` if the image has been summed over its bands, and for an image that is not
             finite.
     Source: NeuSee, Eq. (peak_irrad_coded).
     """
     if rule == "per_band":
         if isinstance(plain_image, Channels):
-            raise ValueError("rule per_band needs the peak of each band, and this image is summed over its bands: "
-                             "take rule channel_sum, or keep the image of all bands")  # fmt: skip
+            raise ValueError("rule per_band needs the peak of each band, but this image is summed over its bands: "
+                             "use rule channel_sum, or keep the image of all bands")  # fmt: skip
         peaks = plain_image.amax((-2, -1)).reshape(-1, len(bands.centres)).amax(0).double()
         top = saturation(
             bands,
@@ -133,7 +133,7 @@ def level(
         photons: Tensor = expose(plain_image, bands, responses, pixel_pitch=pixel_pitch, exposure=exposure)
         peaks = photons.amax().double().expand(len(bands.centres))
         top = torch.tensor(full_well / quantum_efficiency, dtype=torch.float64)
-    refuse_not_finite("no level makes a picture of it", plain_image=peaks)
+    refuse_not_finite("no level can scale this image", plain_image=peaks)
     lit = peaks > 0
     return torch.where(lit, strength * top.to(peaks) / peaks.where(lit, 1.0), 0.0)
 
@@ -145,7 +145,7 @@ def _(params: Mapping[str, Any]) -> bool:
 
 @level.propagate_error
 def _(plain_image: ErrorBound, *others: object, result: TensorStats, **params: Any) -> float:
-    """What the brightest pixel is off, the level is off the other way."""
+    """Return the error of the level, which divides by the brightest pixel of the image."""
     share = plain_image.largest
     return result.max * share / (1.0 - share) if share < 1.0 else math.inf
 
@@ -164,8 +164,8 @@ def add_photons(photons: Tensor, lasers: list[Tensor] | None = None, ghosts: lis
 
     Shapes: photons (..., channel, y, x), each laser and ghost the same -> (..., channel, y, x).
     Units:  photons.
-    Error:  float32: 6e-8 of the sum. Half precision, which ends at 65504, is added in single.
-    Raises: ValueError where a shape differs.
+    Error:  float32: 6e-8 of the sum. Half precision ends at 65504, so such photons are added in float32.
+    Raises: ValueError if a shape differs.
     Source: NeuSee, Eq. (photon_count).
     """
     total = single(photons)
@@ -205,7 +205,7 @@ def _(
     pixel_pitch: float,
     exposure: float,
 ) -> float:
-    """As many photons as if every band were as bright as the brightest, and seen best; exact for one band."""
+    """Return the photons if all bands had the largest irradiance and the largest response; exact for one band."""
     brightest = max(irradiance.max, -irradiance.min)
     if brightest == 0:
         return 0.0

@@ -1,4 +1,4 @@
-"""What the sensor adds: the noise of arriving light, of the dark and of reading out."""
+"""Noise of the sensor: photon noise, dark current and read noise."""
 
 import math
 from collections.abc import Callable
@@ -15,8 +15,8 @@ from neusee.nodes.sensor._saturation import Efficiency, Well
 from neusee.nodes.units import Electrons, Fraction
 
 Distribution = Literal["gaussian", "poisson"]
-_PART = 1 << 15  #: elements: more of them torch would cut into threads, which wait for each other where others compute
-_DARK = 1e-30  #: electrons that count as none: the root of what is denormal has no digits and no end of a slope
+_PART = 1 << 15  #: elements; torch splits larger arrays among threads, which wait for each other on a busy machine
+_DARK = 1e-30  #: e-; fewer count as 0: the root of a denormal number is inexact, and its slope unbounded
 Spread = Annotated[float, Field(ge=0, allow_inf_nan=False)]
 
 
@@ -32,16 +32,16 @@ def photon_noise(
     drawn_in: Literal["electrons", "photons"] = "electrons",
     rng: Generator,
 ) -> Tensor:
-    """Detect photons as electrons, with the noise of their arrival.
+    """Convert photons to electrons and add photon noise.
 
     With n the mean count where the noise is drawn: `additive` gives n + N(c1 n, c2 sqrt(n)), `literal` as printed
     N(c1 n, c2 sqrt(n)), with c1 = mean_shift and c2 = spread. `poisson` draws the fluctuation from the Poisson law.
-    Drawn in photons and then multiplied by the efficiency, the noise is sqrt(efficiency) too small.
+    If the noise is drawn in photons and then multiplied by the efficiency, the noise is sqrt(efficiency) too small.
 
     Shapes: photons (..., y, x) -> (..., y, x).
     Units:  photons per exposure; result e-.
-    Error:  never negative: the cut at 0 lifts the Gaussian mean by 0.1 e- at most, near 0.4 e-, and by less than
-            1e-3 e- above 10 e-. Negative photons (the rounding of a convolution) count as dark.
+    Error:  the result is clipped at 0, which raises the Gaussian mean by at most 0.1 e-, near 0.4 e-, and by less
+            than 1e-3 e- above 10 e-. Negative photons (round-off of a convolution) count as 0.
     Source: NeuSee, section Sensor Image; EMVA Standard 1288, release 4.0 (variance = mean, in electrons).
     """
     kept = mean_shift if mean == "literal" else 1.0 + mean_shift
@@ -58,7 +58,7 @@ def photon_noise(
 @photon_noise.preflight
 def _(*, mean: str = "additive", mean_shift: float = 0.0, **params: object) -> list[str]:
     if mean == "literal" and mean_shift < 1:
-        return [f"photon noise read literally: of the light {mean_shift:.0%} stays as the mean"]
+        return [f"photon noise read literally: the mean is {mean_shift:.0%} of the light"]
     return []
 
 
@@ -73,9 +73,9 @@ def _(result: Tensor, photons: Tensor, **params: Any) -> list[Check]:
 def _(
     photons: ErrorBound, *, result: TensorStats, quantum_efficiency: float, spread: float = 1.0, **params: Any
 ) -> float:
-    """Of the mean, and of its root: |sqrt(a) - sqrt(b)| is at most sqrt|a - b| and |a - b| / sqrt(a).
+    """Bound the errors of the mean and of its square root: |sqrt(a) - sqrt(b)| <= sqrt|a - b| and <= |a - b| / sqrt(a).
 
-    Poisson numbers of another mean are others.
+    Poisson numbers are drawn anew for another mean, so their error has no bound.
     """
     if params["distribution"] == "poisson" and photons.rms > 0:
         return math.inf
@@ -89,10 +89,10 @@ def _(
 
 
 def _gaussian(counts: Tensor, rng: Generator) -> Tensor:
-    lit = ~(counts <= _DARK)  # so that what is not a number is seen
+    lit = ~(counts <= _DARK)  # True for NaN, so that NaN reaches the result
     if not counts.requires_grad:
         return normal(counts, rng).mul_(counts.where(lit, 0.0).sqrt_())
-    sigma = counts.where(lit, 1.0).sqrt().where(lit, 0.0)  # the square root has no slope at 0
+    sigma = counts.where(lit, 1.0).sqrt().where(lit, 0.0)  # at 0, the square root has no finite slope
     return sigma * normal(counts, rng)
 
 
@@ -102,9 +102,10 @@ def _poisson(counts: Tensor, rng: Generator) -> Tensor:
 
 
 def _by_parts(compute: Callable[[Tensor], Tensor], whole: Tensor, rng: Generator) -> Tensor:
-    """``compute(whole)`` to the last bit, by parts that stay in cache: a picture is read and written once, not often.
+    """Return ``compute(whole)`` to the last bit, computed in parts that fit into the cache of the processor.
 
-    The stream must not show where it was cut: fewer than 16 normal numbers are drawn in another way than more are.
+    The random numbers must not depend on the parts. Torch draws fewer than 16 normal numbers by another method, so no
+    part is that short.
     """
     count = whole.numel()
     if torch.is_grad_enabled() or {whole.device.type, rng.device.type} != {"cpu"} or count < 2 * _PART:
@@ -117,16 +118,16 @@ def _by_parts(compute: Callable[[Tensor], Tensor], whole: Tensor, rng: Generator
 
 
 def normal(like: Tensor, rng: Generator) -> Tensor:
-    """Standard normal numbers in the shape of ``like``, drawn where ``rng`` lives; the same in every precision."""
+    """Draw standard normal numbers in the shape of ``like`` on the device of ``rng``, equal in every precision."""
     return torch.randn(like.shape, generator=rng, device=rng.device, dtype=torch.float32).to(like)
 
 
 @node()
 def dark_current(electrons: Tensor, *, mean: Electrons, full_well: Well | None = None, rng: Generator) -> Tensor:
-    """Add the electrons that heat frees during the exposure: Poisson of the given mean.
+    """Add the thermal electrons of the exposure, with a Poisson distribution of the given mean.
 
-    ``full_well`` only says what the dark is weighed against when it is small enough to leave out: what a laser
-    heaps up above the well is cut off later and cannot hide anything.
+    ``full_well`` only limits the scale that decides if the dark current is small enough to leave out: electrons
+    above the well are cut off later, so a laser must not raise this scale.
 
     Shapes: electrons (..., y, x) -> (..., y, x).
     Units:  e-; mean e- per exposure.
@@ -194,16 +195,16 @@ def _(electrons: ErrorBound, **params: Any) -> float:
 
 
 def _scale(electrons: TensorStats, full_well: float | None) -> float:
-    """The largest count that the well can hold."""
+    """Return the largest absolute count, limited to the full well."""
     largest = max(abs(electrons.max), abs(electrons.min))
     return largest if full_well is None else min(largest, full_well)
 
 
 def _share(shift: float, spread: float, electrons: TensorStats, full_well: float | None) -> float:
-    """Root mean square of what is added, over the largest of the result or over the well, whichever is less.
+    """Return the root mean square of the addition over the largest result or over the well, whichever is less.
 
-    The largest is that of the brightest or of the darkest pixel, for below 0 the darkest may be it. The well alone
-    is not enough: in the dark the noise is all there is. Exact for one mean and spread everywhere.
+    The largest result is that of the brightest pixel, or that of the darkest pixel if the counts are below 0. The well
+    alone is not enough, because a dark frame is noise alone. The bound is exact for one mean and spread everywhere.
     """
     added = math.hypot(shift, spread)
     if added == 0:

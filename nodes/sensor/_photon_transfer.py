@@ -1,4 +1,4 @@
-"""The photon-transfer curve: what a laboratory would measure of this sensor."""
+"""Photon-transfer curve of a sensor, measured with simulated pairs of flat fields."""
 
 from typing import Any
 
@@ -32,8 +32,8 @@ def photon_transfer(
 ) -> Tensor:
     """Measure this sensor with pairs of flat fields: signal above the dark, temporal variance, predicted variance.
 
-    The first level is dark; the others rise geometrically from one electron to 1.2 full wells. The same functions
-    make these frames and a picture. The prediction is K^2 sigma_d^2 + sigma_q^2 + K (mean - dark mean).
+    The first level is dark; the others rise geometrically from one electron to 1.2 full wells. The frames are made by
+    the same nodes as a picture. The prediction is K^2 sigma_d^2 + sigma_q^2 + K (mean - dark mean).
 
     Shapes: -> (level, 3) float64.
     Units:  gain K, DN/e-; result DN, DN2, DN2.
@@ -64,7 +64,7 @@ def _rise(top: float, first: float, levels: int) -> list[float]:
 
 
 def _pair(one: Tensor, two: Tensor) -> tuple[float, float]:
-    """Mean of two frames, and the temporal variance from their difference."""
+    """Return the mean of two frames, and the temporal variance from the difference of the frames."""
     return float((one + two).mean() / 2), float((one - two).square().mean() / 2)
 
 

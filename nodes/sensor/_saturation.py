@@ -1,4 +1,4 @@
-"""Where the sensor ends: the irradiance that fills a pixel, and the figures that follow from it."""
+"""Saturation of the sensor: the irradiance that fills a pixel, signal to noise at saturation, dynamic range."""
 
 import math
 from typing import Annotated, NamedTuple
@@ -17,7 +17,7 @@ Well = Annotated[Electrons, Field(gt=0)]  #: electrons that fill a pixel
 
 
 class Limits(NamedTuple):
-    """What a sensor can tell apart at best."""
+    """Limits of a sensor: photons that fill a pixel, best signal to noise, dynamic range."""
 
     photons: Tensor  #: () float64, photons that fill a pixel
     snr: Tensor  #: () float64, signal to noise at saturation
@@ -25,12 +25,12 @@ class Limits(NamedTuple):
 
 
 def photons_per_joule(centres: Tensor) -> Tensor:
-    """Photons of each wavelength in a joule: wavelength / (h c)."""
+    """Return the number of photons of each wavelength in a joule: wavelength / (h c)."""
     return centres.double() / (PLANCK * SPEED_OF_LIGHT)
 
 
 def photons_that_fill(full_well: float, quantum_efficiency: float) -> float:
-    """Photons that fill a pixel: those of which ``full_well`` become electrons."""
+    """Return the number of photons whose electrons fill a pixel."""
     return full_well / quantum_efficiency
 
 
@@ -38,7 +38,7 @@ def photons_that_fill(full_well: float, quantum_efficiency: float) -> float:
 def saturation(
     bands: Bands, *, full_well: Well, quantum_efficiency: Efficiency, pixel_pitch: PositiveLength, exposure: Time
 ) -> Tensor:
-    """Find the irradiance that fills a pixel within one exposure, of each wavelength alone.
+    """Compute the irradiance that fills a pixel within one exposure, for each wavelength alone.
 
     Shapes: bands (band,) -> (band,) float64.
     Units:  result W/m2.
@@ -58,7 +58,7 @@ def _(result: Tensor, bands: Bands, **params: object) -> list[Check]:
 
 @node(rtol=1e-12)
 def limits(*, full_well: Well, quantum_efficiency: Efficiency, read_noise: Electrons) -> Limits:
-    """Tell what the sensor can resolve at best: photons that fill a pixel, their signal to noise, the dynamic range.
+    """Compute the limits of the sensor: photons that fill a pixel, signal to noise at saturation, dynamic range.
 
     Shapes: -> three scalars, float64.
     Units:  photons; signal to noise as a ratio; dynamic range in dB, 20 log10(well / read noise).

@@ -1,4 +1,4 @@
-"""Spectra: bands, lights, channels, and lifts from three colours to many."""
+"""Spectra: bands, illuminants, channels, and lifts from three colours to many bands."""
 
 from neusee.nodes.spectra._bands import bands, filters, line, mean_wavelength
 from neusee.nodes.spectra._camera_colour import grain, render

@@ -1,4 +1,4 @@
-"""Where the spectrum is sampled: the bands of a scene, and the few of one laser line."""
+"""Sampling of the spectrum: the bands of a scene, and the few bands of one laser line."""
 
 import math
 from typing import Annotated, Any, Literal
@@ -11,12 +11,12 @@ from neusee.nodes import Check, ParameterError, node
 from neusee.nodes.units import Count, Fraction, PositiveLength, Wavelength
 from neusee.nodes.values import Bands as Samples
 
-_GRID = 10e-9  #: m, spacing of the scene's bands on which the paper samples its lasers
+_GRID = 10e-9  #: m, spacing of the scene's bands, on which the paper also samples the lasers
 
 
 @node(rtol=1e-12)
 def bands(*, start: Wavelength, stop: Wavelength, count: Count) -> Samples:
-    """Divide the spectrum into bands with evenly spaced centres, both ends being centres (one band: the middle).
+    """Divide the spectrum into bands with evenly spaced centres from start to stop (a single band: in the middle).
 
     Shapes: -> centres, widths, weights (band,) float64.
     Units:  centres and widths m; weights 1.
@@ -50,14 +50,14 @@ def filters(
     centres: Annotated[tuple[Wavelength, ...], Field(min_length=1)],
     widths: Annotated[tuple[PositiveLength, ...], Field(min_length=1)],
 ) -> Samples:
-    """Take the bands one by one as they are listed, such as those of a set of filters; one width stands for all.
+    """List bands one by one, such as the bands of a set of filters; a single width applies to all bands.
 
-    A band of its own place and width: changing one leaves the others as they are, to the last bit.
+    Each band has its own centre and width: a change of one band leaves the other bands unchanged to the last bit.
 
     Shapes: -> centres, widths, weights (band,) float64.
     Units:  centres and widths m; weights 1.
-    Error:  each filter passes all inside its width and nothing outside; real ones have slopes of some nm.
-    Raises: ParameterError before the run unless there is one width, or one for each centre.
+    Error:  each filter passes all light inside its width and none outside; real filters have edges of some nm.
+    Raises: ParameterError before the run unless one width, or one width for each centre, is given.
     Source: the filters' data sheets: central wavelength and full width at half maximum.
     """
     centre = torch.tensor(centres, dtype=torch.float64)
@@ -67,7 +67,7 @@ def filters(
 @filters.preflight
 def _(*, centres: tuple[float, ...], widths: tuple[float, ...]) -> list[str]:
     if len(widths) not in (1, len(centres)):
-        raise ParameterError("widths", f"{len(widths)} widths for {len(centres)} centres: give one, or one for each")
+        raise ParameterError("widths", f"{len(widths)} widths for {len(centres)} centres: give one, or one per centre")
     return []
 
 
@@ -87,15 +87,16 @@ def line(
     floor: Fraction = 1e-3,
     sampling: Literal["integrated", "point"] = "integrated",
 ) -> Samples:
-    """Share the energy of a Gaussian laser line, on a floor given in parts of its peak, among a few bands of its own.
+    """Distribute the energy of a Gaussian laser line, on a floor relative to its peak, over a few bands of its own.
 
-    `integrated`: `count` equal bands over `span` (3 fwhm), each with the exact energy inside it; the weights sum to 1.
-    `point`: the `count` nearest multiples of 10 nm with the line's value there, as printed; the sum is not 1.
+    `integrated`: `count` equal bands cover `span` (3 fwhm). A weight is the exact energy in a band; the weights sum
+    to 1. `point`: the bands are the `count` nearest multiples of 10 nm. A weight is the value of the line at the
+    centre, as printed in the paper; the weights do not sum to 1.
 
     Shapes: -> centres, widths, weights (band,) float64.
     Units:  centres and widths m; weights in parts of the line's energy.
-    Error:  integrated: 4e-4 of the line lies beyond 3 fwhm and is shared out again; the floor beyond `span` (3 % over
-            400-700 nm) is left away. point: the sum is off by up to 5.7 % at fwhm 10 nm.
+    Error:  integrated: the 4e-4 of the line beyond 3 fwhm is redistributed over the bands; the floor beyond `span`
+            (3 % over 400-700 nm) is neglected. point: the sum is off by up to 5.7 % at fwhm 10 nm.
     Raises: ParameterError before the run where the bands would reach below 100 nm.
     Source: NeuSee, laser of 10 nm FWHM with 0.1 % floor; bin integrals by the error function.
     """

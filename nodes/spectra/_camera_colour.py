@@ -1,4 +1,4 @@
-"""The colour of spectra: what a camera without faults gives, and the grain that a real one adds."""
+"""Colours of spectra: the picture of a camera without faults, and the grain that a real camera adds."""
 
 from typing import Annotated, Any
 
@@ -16,12 +16,13 @@ GrainDeviation = Annotated[float, Field(ge=0, le=1)]
 
 @node(rtol=1e-5)
 def render(reflectance: Tensor, bands: Bands) -> Tensor:
-    """Render reflectance under D65 to linear sRGB by the CIE 1931 observer: what a lift from RGB is to undo.
+    """Render reflectance under D65 to linear sRGB by the CIE 1931 observer; a lift from RGB inverts this step.
 
     Shapes: reflectance (..., band, y, x) -> (..., 3, y, x).
-    Units:  reflectance to linear sRGB; white is (1, 1, 1) on these very bands, and colours beyond sRGB are negative.
-    Error:  float32: 1e-6 of the brightest; 31 bands move saturated colours by some 1e-3 against 5 nm.
-    Raises: ValueError where the bands differ.
+    Units:  reflectance to linear sRGB; white is (1, 1, 1) on exactly these bands, and a colour outside sRGB has a
+            negative value.
+    Error:  float32: 1e-6 of the brightest value; 31 bands shift saturated colours by some 1e-3 from 5 nm sampling.
+    Raises: ValueError where reflectance and bands differ in the number of bands.
     Source: CIE 15:2004; IEC 61966-2-1.
     """
     _needs_bands(reflectance, bands)
@@ -43,11 +44,11 @@ def _(result: Tensor, *inputs: Any) -> list[Check]:
 
 @node(rtol=1e-5)
 def grain(picture: Tensor, *, read: GrainDeviation = 1e-3, shot: GrainDeviation = 2e-3, rng: torch.Generator) -> Tensor:
-    """Add the grain of a camera to a developed picture: normal, its variance rising with the light.
+    """Add camera grain to a developed picture: normal noise whose variance rises with the light.
 
     Shapes: picture (..., y, x) -> the same.
-    Units:  those of the picture; deviation `read` in the dark, sqrt(read^2 + shot^2) at 1.
-    Error:  channels are independent, which a colour matrix makes them not; no quantiser, no blooming.
+    Units:  those of the picture; standard deviation `read` in the dark, sqrt(read^2 + shot^2) at 1.
+    Error:  the channels are independent, whereas a colour matrix correlates them; no quantiser, no blooming.
     Source: EMVA Standard 1288, release 4.0 Linear, section 2 (variance linear in the mean).
     """
     picture = single(picture)
@@ -64,5 +65,5 @@ def _needs_bands(reflectance: Tensor, bands: Bands) -> None:
     if reflectance.ndim < 3 or reflectance.shape[-3] != len(bands.centres):
         raise ValueError(
             f"reflectance {tuple(reflectance.shape)} is not (band, y, x) of {len(bands.centres)} bands: "
-            "give both the same `bands` step"
+            "compute both from the same `bands` step"
         )

@@ -1,4 +1,4 @@
-"""The channels of the sensor."""
+"""Spectral responses of the channels of the sensor."""
 
 from typing import Literal
 
@@ -13,12 +13,13 @@ Camera = Literal["CIE 1931", "Nikon 5100", "Sigma SDMerill"]
 
 @node(rtol=1e-9)
 def responses(bands: Bands, *, camera: Camera = "CIE 1931") -> Tensor:
-    """Average each channel's sensitivity over each band: the matching functions of the paper, or a measured camera.
+    """Average the sensitivity of each channel over each band: colour-matching functions, or a measured camera.
 
     Shapes: -> (3, band) float64.
-    Units:  relative to the largest sensitivity of any channel at any wavelength; none is negative.
-    Error:  straight lines between the samples of the table (1, 5 and 10 nm); 0 beyond it, which is below 6e-3 of the
-            peak (CIE 360-830 nm, Nikon 380-780 nm, Sigma 400-680 nm; but Sigma's blue is still 0.16 at 400 nm).
+    Units:  relative to the largest sensitivity of any channel at any wavelength; no response is negative.
+    Error:  linear interpolation between the samples of the table (1, 5 and 10 nm); 0 beyond the table, whose ends are
+            below 6e-3 of the peak (CIE 360-830 nm, Nikon 380-780 nm, Sigma 400-680 nm; except that the blue of Sigma
+            is still 0.16 at 400 nm).
     Source: CIE 1931 2 degree observer; NPL measurements of the Nikon 5100 and Sigma SD Merrill in colour-science.
     """
     table = _table(camera)

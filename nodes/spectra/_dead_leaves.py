@@ -1,4 +1,4 @@
-"""A picture of spectra: leaves that lie over one another, with edges, texture and shade."""
+"""A synthetic picture of spectra: leaves that cover one another, with edges, texture and shade."""
 
 from typing import Annotated, Any
 
@@ -12,9 +12,9 @@ from neusee.nodes.spectra._spectral_tables import daylight, light
 from neusee.nodes.units import Fraction, Shape
 from neusee.nodes.values import Bands
 
-_FINE = 2  #: samples a pixel along each axis, so that edges are mixtures
-_COARSE = 8  #: pixels between the numbers that texture and shade are drawn from
-_WARMEST, _COOLEST, _LIGHTS = 4000.0, 15000.0, 24  #: K, and how many daylights are told apart
+_FINE = 2  #: samples per pixel along each axis, so that a pixel on an edge mixes spectra
+_COARSE = 8  #: pixels between the random numbers from which texture and shade are interpolated
+_WARMEST, _COOLEST, _LIGHTS = 4000.0, 15000.0, 24  #: K, K, and the number of distinct daylights
 
 
 @node(rtol=1e-5)
@@ -30,22 +30,23 @@ def leaves(
     daylights: Fraction = 0.2,
     rng: torch.Generator,
 ) -> Tensor:
-    """Lay ellipses of all sizes over one another, a spectrum each: the dead leaves that have a photograph's statistics.
+    """Draw overlapping ellipses of all sizes, one spectrum each: dead leaves, with the statistics of a photograph.
 
-    Radii go from `smallest` to half the picture, their density with the inverse cube. A leaf's brightness is even in
-    its logarithm from `darkest` to 1; up to `texture` of another spectrum is mixed in, and up to `shade` of the light
-    taken off, both smooth. A share `daylights` of pictures is under another daylight, seen with the balance of D65.
+    Radii range from `smallest` to half the picture, with a density that falls with the inverse cube of the radius. The
+    brightness of a leaf is log-uniform from `darkest` to 1. Up to a share `texture` of another spectrum is mixed in,
+    and up to a share `shade` of the light is removed; both shares vary smoothly. A share `daylights` of the pictures is
+    lit by another daylight but keeps the white balance of D65.
 
-    Shapes: spectra (leaf, band), the first one behind all -> (band, y, x) float32.
-    Units:  `smallest` pixels; reflectance under D65, in [0, 1]: the brightest band of another daylight is kept at it.
-    Error:  edges by four samples a pixel; daylights on 24 temperatures from 4000 to 15 000 K.
-    Raises: ValueError where the bands differ.
+    Shapes: spectra (leaf, band), the first leaf behind all others -> (band, y, x) float32.
+    Units:  `smallest` pixels; reflectance under D65, in [0, 1]: another daylight is scaled to exceed D65 in no band.
+    Error:  edges from four samples per pixel; daylights at 24 temperatures from 4000 to 15 000 K.
+    Raises: ValueError where spectra and bands differ in the number of bands.
     Source: Lee, Mumford and Huang, Int. J. Comput. Vis. 41, 35 (2001).
     """
     if spectra.ndim != 2 or spectra.shape[1] != len(bands.centres):
         raise ValueError(
             f"spectra {tuple(spectra.shape)} are not (leaf, band) of {len(bands.centres)} bands: "
-            "give both the same `bands` step"
+            "compute both from the same `bands` step"
         )
     fine = (_FINE * shape[0], _FINE * shape[1])
     top = _topmost(len(spectra), fine, _FINE * smallest, rng)
@@ -65,7 +66,7 @@ def _(result: Tensor, *inputs: Any, **params: Any) -> list[Check]:
 
 
 def _topmost(count: int, size: tuple[int, int], smallest: float, rng: torch.Generator) -> Tensor:
-    """Which leaf is seen at each sample, (y, x)."""
+    """Return the index of the leaf that is visible at each sample, (y, x)."""
     largest = max(min(size) / 2, smallest)
     share = _even(rng, count)
     radius = (smallest**-2 * (1 - share) + largest**-2 * share) ** -0.5
@@ -79,14 +80,14 @@ def _topmost(count: int, size: tuple[int, int], smallest: float, rng: torch.Gene
 
 
 def _smooth(size: tuple[int, int], rng: torch.Generator) -> Tensor:
-    """Numbers from 0 to 1 that change slowly, (y, x)."""
+    """Draw numbers from 0 to 1 that vary slowly, (y, x)."""
     coarse = (max(2, size[0] // (_FINE * _COARSE)), max(2, size[1] // (_FINE * _COARSE)))
     grid = torch.rand(1, 1, *coarse, generator=rng, device=rng.device)
     return F.interpolate(grid, size, mode="bilinear", align_corners=True)[0, 0]
 
 
 def _lights(bands: Bands, share: float, rng: torch.Generator) -> Tensor:
-    """The light of the picture over D65, at most 1: (band,) float64 on the CPU unless it is D65."""
+    """Draw the light of the picture over D65, at most 1: (band,) float64, on the CPU unless the light is D65."""
     other, which = torch.rand(2, generator=rng, device=rng.device).tolist()
     centres = bands.centres
     if other >= share:

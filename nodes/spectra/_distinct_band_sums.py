@@ -1,4 +1,4 @@
-"""The few weighted sums over bands that a sensor can tell apart."""
+"""The few weighted sums over bands that a sensor can distinguish."""
 
 import torch
 from torch import Tensor
@@ -9,21 +9,22 @@ from neusee.nodes.values import Bands
 
 @node(rtol=1e-12)
 def rows(bands: Bands, responses: Tensor, *, well: bool = True) -> Tensor:
-    """List the weights of the bands in all that a sensor makes of its light: each channel's photons, and the well.
+    """List the weights of the bands in every sum that a sensor forms: the photons of each channel, and the well.
 
-    A channel counts photons, response times wavelength. What is told in parts of saturation goes as the wavelength
-    itself, for a photon frees an electron of whatever colour; where no one asks that, it can do without `well`.
+    A channel counts photons, so its weights are response times wavelength. A quantity relative to saturation is
+    weighted by the wavelength alone, because a photon of any wavelength frees one electron. With `well` false
+    the row of that quantity is omitted.
 
     Shapes: bands (band,), responses (channel, band) -> (channel + 1, band) float64; the last row is the well's.
-    Units:  m; a common factor is left to whoever counts photons.
+    Units:  m; the node that counts photons applies the common factor.
     Error:  exact.
-    Raises: ValueError where the bands differ.
+    Raises: ValueError where responses and bands differ in the number of bands.
     Source: NeuSee, Eq. (photon_count) and Eq. (ThresSat).
     """
     if responses.ndim != 2 or responses.shape[1] != len(bands.centres):
         raise ValueError(
             f"responses {tuple(responses.shape)} are not (channel, band) of {len(bands.centres)} bands: "
-            "give both the same `bands` step"
+            "compute both from the same `bands` step"
         )
     centres = bands.centres.double().to(responses.device)
     channels = responses.double() * centres

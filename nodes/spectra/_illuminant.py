@@ -1,4 +1,4 @@
-"""The light on the scene."""
+"""The illuminant of the scene."""
 
 from typing import Any, Literal
 
@@ -19,11 +19,11 @@ Kind = Literal[
 
 @node(rtol=1e-9)
 def illuminant(bands: Bands, *, kind: Kind = "daylight", temperature: Temperature = 6504.0) -> Tensor:
-    """Average the relative power of a CIE illuminant over each band; `temperature` is that of `daylight` alone.
+    """Average the relative power of a CIE illuminant over each band; `temperature` applies to `daylight` alone.
 
     Shapes: -> (band,) float64.
     Units:  relative, mean 1 over the bands.
-    Error:  straight lines between samples 1 to 10 nm apart; 31 bands move the white of D65 by 0.2 %.
+    Error:  linear interpolation between samples 1 to 10 nm apart; 31 bands shift the white of D65 by 0.2 %.
     Raises: ParameterError before the run for daylight outside 4000 to 25 000 K; ValueError where bands leave the table.
     Source: CIE 15:2004 (D series, A, E, FL, HP), CIE 15:2018 (LED), by way of colour-science.
     """
@@ -34,7 +34,7 @@ def illuminant(bands: Bands, *, kind: Kind = "daylight", temperature: Temperatur
     if low < first - 1e-12 or high > last + 1e-12:
         raise ValueError(
             f"bands reach from {low * 1e9:.4g} to {high * 1e9:.4g} nm, but {kind} is tabulated from "
-            f"{first * 1e9:.4g} to {last * 1e9:.4g} nm: choose bands inside it"
+            f"{first * 1e9:.4g} to {last * 1e9:.4g} nm: choose bands inside that range"
         )
     power = table.over(bands)[0]
     if not float(power.mean()) > 0:
@@ -47,7 +47,7 @@ def _(*, kind: str = "daylight", temperature: float = 6504.0) -> list[str]:
     if kind == "daylight" and not 4000 <= temperature <= 25000:
         raise ParameterError(
             "temperature",
-            f"CIE daylight is defined from 4000 K to 25000 K, not at {temperature:g} K: take kind A or an LED",
+            f"CIE daylight is defined from 4000 K to 25000 K, not at {temperature:g} K: choose kind A or an LED",
         )
     return []
 
@@ -63,15 +63,15 @@ def _(result: Tensor, bands: Bands, *, kind: str = "daylight", temperature: floa
 def illuminate(
     reflectance: Tensor | LowRankCube, illuminant: Tensor, *, times: Literal["once", "twice"] = "once"
 ) -> Tensor | LowRankCube:
-    """Multiply reflectance by the light on it: once, as light does, or twice, as the paper's chain of formulas says.
+    """Multiply reflectance by the illuminant: once, as in nature, or twice, as in the paper's formulas.
 
-    Of a cube in few planes, a `LowRankCube`, the planes stay and their spectra are multiplied.
+    In a low-rank cube, a `LowRankCube`, the planes stay and the basis spectra are multiplied.
 
     Shapes: reflectance (..., band, y, x), illuminant (band,) -> (..., band, y, x).
-    Units:  relative spectral radiance, that of a white scene having mean 1 over the bands.
+    Units:  relative spectral radiance; the radiance of a white scene has mean 1 over the bands.
     Error:  float32: 6e-8.
-    Raises: ValueError where the bands differ.
-    Source: NeuSee, T_b and the CIE formula after it; twice is contradiction C5 of its reading.
+    Raises: ValueError where reflectance and illuminant differ in the number of bands.
+    Source: NeuSee, T_b and the CIE formula after T_b; `twice` is contradiction C5 in the reading of the paper.
     """
     _same_bands(reflectance, illuminant)
     power = illuminant if times == "once" else illuminant.square()
@@ -91,7 +91,7 @@ def _same_bands(reflectance: Tensor | LowRankCube, illuminant: Tensor) -> None:
     if len(shape) < 3 or illuminant.ndim != 1 or shape[-3] != len(illuminant):
         raise ValueError(
             f"reflectance {shape} is not (band, y, x) of the {tuple(illuminant.shape)} bands of the "
-            "illuminant: give both the same `bands` step"
+            "illuminant: compute both from the same `bands` step"
         )
 
 

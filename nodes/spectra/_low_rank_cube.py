@@ -1,4 +1,4 @@
-"""A cube of many bands as few planes and their spectra, with a bound of what is left away."""
+"""Low-rank form of a cube of many bands: few planes and their spectra, with an upper bound of the error."""
 
 from typing import Annotated
 
@@ -10,21 +10,22 @@ from neusee.nodes import Check, node
 from neusee.nodes.spectra._principal_planes import Found, Source, few_planes
 from neusee.nodes.values import LowRankCube
 
-Share = Annotated[float, Field(ge=0, allow_inf_nan=False)]  #: of the largest element
+Share = Annotated[float, Field(ge=0, allow_inf_nan=False)]  #: relative to the largest element
 
 
 @node(rtol=1e-6)
 def compress(cube: Tensor, *, within: Share = 1e-6) -> LowRankCube:
-    """Write a cube as the fewest planes, principal components of its spectra, that come within a bound of it.
+    """Approximate a cube within a bound by the fewest planes, the principal components of its spectra.
 
-    A grey scene has one plane; a linear lift of three colours has three, and hardly more where few pixels were clipped.
+    A grey scene has one plane; a linear lift of three colours has three, and hardly more where few pixels are clipped.
 
-    Shapes: cube (band, y, x) -> planes (k, y, x), basis (band, k), rest and spread (k + 1, band) float64, off (y, x).
-    Units:  planes, rest, spread and off those of the cube; the basis has none.
-    Error:  `spread[k]`, the root mean square, is at most `within` times the largest element, but not asked to be below
-            2e-7 or eight roundings of the planes. `rest[k]` and `off`, measured on every pixel in float64, are the
-            largest, of a band and of a pixel. `rest[r]` between none and all: at most five times too large as a rule.
-            The gradient holds the basis still.
+    Shapes: cube (band, y, x) -> planes (k, y, x), basis (band, k), residual_max and residual_rms (k + 1, band)
+            float64, residual_map (y, x).
+    Units:  planes and residuals as the cube; the basis has none.
+    Error:  `residual_rms[k]` is at most the largest of `within`, 2e-7 and eight round-off units
+            of the planes, times the largest element. `residual_max[k]` and `residual_map` are the largest errors of a band and of a
+            pixel, measured on every pixel in float64. `residual_max[r]` for 0 < r < k is as a rule at most five times too
+            large. The gradient treats the basis as constant.
     Raises: ValueError where the cube is not (band, y, x), has no pixels or holds NaN.
     Source: principal components, Pearson 1901; Maloney, J. Opt. Soc. Am. A 3, 1673 (1986) for spectra.
     """
@@ -37,7 +38,7 @@ def compress(cube: Tensor, *, within: Share = 1e-6) -> LowRankCube:
 
 
 def mixture(found: Found, cube: Tensor) -> LowRankCube:
-    """Planes as pictures; where the cube is learnt, a product with it, so that its gradient flows."""
+    """Return the planes as pictures; a cube that requires a gradient is projected here, so that the gradient flows."""
     if cube.requires_grad:
         planes = torch.tensordot(found.basis.T.to(cube), cube, 1)
     else:
@@ -62,7 +63,7 @@ def _(cube: Tensor, *, within: float = 1e-6) -> LowRankCube:
 
 @compress.check
 def said_of_planes(result: LowRankCube, *inputs: object, **params: object) -> list[Check]:
-    """How many planes there are, and how far they are from the cube; of whatever gives a `LowRankCube`."""
+    """Report the number of planes and their distance from the cube, for any node that returns a `LowRankCube`."""
     rms, most = (
         float(x[-1].max()) / max(float(result.residual_max[0].max()), 1e-300)
         for x in (result.residual_rms, result.residual_max)

@@ -1,4 +1,4 @@
-"""Reflectances that were measured: those of colour-science, and files of one's own."""
+"""Measured reflectances, from colour-science and from files of the user."""
 
 import csv
 import functools
@@ -30,17 +30,18 @@ Numbers = NDArray[np.float64]
 def reflectances(
     bands: Bands, *, sets: tuple[Set, ...] = ("charts", "CIE 2017", "CQS"), files: DataFiles | None = None
 ) -> Tensor:
-    """Gather measured reflectances: sets of colour-science, and files of one's own, one spectrum after another.
+    """Gather measured reflectances from sets of colour-science and from files of the user, spectrum after spectrum.
 
     `charts` are the 102 patches of `spectra.lift_lmmse`, `CIE 2017` the 99 objects of the colour fidelity index, `CQS`
-    15 saturated paints. A file is .csv (a header; first column nm, then a column each), .npz (`wavelengths` in nm and
-    `reflectances`, (spectrum, wavelength)), or a .mat of the Psychtoolbox (`S_name`: start, step, count; `sur_name`).
+    15 saturated paints. A file is .csv (a header; first column nm, then one column for each spectrum), .npz
+    (`wavelengths` in nm and `reflectances`, (spectrum, wavelength)), or a .mat of the Psychtoolbox (`S_name`: start,
+    step, count; `sur_name`).
 
     Shapes: -> (spectrum, band) float64.
-    Units:  reflectance, 1 = white; what leaves [0, 1] is clipped.
-    Error:  straight lines between the samples, some 1e-3 for paints at 10 nm.
+    Units:  reflectance, 1 = white; values outside [0, 1] are clipped.
+    Error:  linear interpolation between the samples: some 1e-3 for paints at 10 nm.
     Raises: ParameterError before the run for a file that holds no reflectances; ValueError where bands leave 380 to
-            780 nm, or a file.
+            780 nm, or the range of a file.
     Source: charts and NIST CQS 9.0 (Davis and Ohno 2010) by colour-science; CIE 224:2017.
     """
     if sets:
@@ -78,7 +79,7 @@ def _inside(table: Table, bands: Bands, file: Path) -> Table:
     if low < first - _SLACK or high > last + _SLACK:
         raise ValueError(
             f"bands from {low * 1e9:.4g} to {high * 1e9:.4g} nm, but {file.name} holds {first * 1e9:.4g} to "
-            f"{last * 1e9:.4g} nm: leave the file out, or choose bands inside it"
+            f"{last * 1e9:.4g} nm: leave the file out, or choose bands inside that range"
         )
     return table
 
@@ -92,7 +93,7 @@ def _read(file: Path) -> Table:
 
 @functools.lru_cache(maxsize=32)
 def _known(file: Path, stamp: int) -> Table:
-    """The table of a file; read again when the file has changed."""
+    """Return the table of a file; a changed file is read again."""
     reader = {".csv": _csv, ".npz": _npz, ".mat": _mat}.get(file.suffix.lower())
     if reader is None:
         raise ParameterError("files", f"{file.name} holds no reflectances: {_FILES}")
@@ -107,15 +108,15 @@ def _known(file: Path, stamp: int) -> Table:
 
 
 def _wrong(wavelengths: Numbers, values: Numbers) -> str:
-    """Why these are no reflectances, or nothing."""
+    """Return why the values are not reflectances, or an empty text."""
     if wavelengths.ndim != 1 or values.ndim != 2 or values.shape[1] != len(wavelengths) or values.size == 0:
         return f"{wavelengths.shape} wavelengths and {values.shape} reflectances: write (spectrum, wavelength)"
     if not (np.isfinite(wavelengths).all() and np.isfinite(values).all()):
         return "not every number is finite"
     if len(wavelengths) < 2 or not (np.diff(wavelengths) > 0).all() or wavelengths[0] < 100:
-        return "wavelengths must be two at least, rise, and be in nm"
+        return "wavelengths must be at least two, rising, and in nm"
     if values.max() > _MOST or values.min() < -0.1:
-        return f"values from {values.min():.3g} to {values.max():.3g} are no reflectances: write 1 for white, not 100"
+        return f"values from {values.min():.3g} to {values.max():.3g} are not reflectances: write 1 for white, not 100"
     return ""
 
 
@@ -140,8 +141,8 @@ def _mat(file: Path) -> tuple[Numbers, Numbers]:
         raise ValueError(".mat files need scipy: pip install scipy") from None
     try:
         held = loadmat(file)
-    except Exception as why:  # scipy fails on foreign bytes in many ways
-        raise ValueError(f"no .mat file up to version 7: {why}") from None
+    except Exception as why:  # scipy raises many kinds of errors for foreign bytes
+        raise ValueError(f"not a .mat file up to version 7: {why}") from None
     name = next(name.removeprefix("sur_") for name in [*held, "sur_"] if name.startswith("sur_"))
     start, step, count = np.asarray(held[f"S_{name}"], np.float64).ravel()
     return start + step * np.arange(int(count)), np.asarray(held[f"sur_{name}"], np.float64).T

@@ -1,4 +1,4 @@
-"""Spectra that could have been measured: mixtures of those that were, and others of the same colour."""
+"""Plausible spectra: mixtures of measured spectra, and metamers, which share a colour with a mixture."""
 
 from typing import Annotated, Any
 
@@ -12,7 +12,7 @@ from neusee.nodes.spectra._spectral_tables import to_srgb
 from neusee.nodes.units import Count
 from neusee.nodes.values import Bands
 
-_DARKEST = 1e-6  #: reflectance of which a layer's thickness is still told
+_DARKEST = 1e-6  #: least reflectance to which the thickness of a layer is applied
 
 Thickness = Annotated[float, Field(gt=0, le=10)]
 Strength = Annotated[float, Field(ge=0, le=10)]
@@ -29,24 +29,26 @@ def metamers(
     blacks: Strength = 0.5,
     rng: torch.Generator,
 ) -> Tensor:
-    """Draw reflectances: mixtures of measured ones, in layers thinner and thicker, each with a metameric black.
+    """Draw reflectances: mixtures of measured spectra, as thinner and thicker layers, each with a metameric black.
 
     A layer of thickness p turns a reflectance s into s^p (Beer and Lambert), which makes colours paler and deeper than
-    measured. A metameric black is what the linear estimate from the colour leaves of a measured spectrum: added, it
-    changes the spectrum and not the colour. Its strength is normal with deviation `blacks`, 1 being that of measured
-    spectra of the same brightness, and it is cut where the sum would leave [0, 1]. The mixtures do not depend on it.
+    measured. A metameric black is a measured spectrum minus the linear estimate from its colour: a black changes the
+    spectrum and not the colour. The strength of a black is normal with standard deviation `blacks`, where 1 is the
+    strength in measured spectra of the same brightness. The strength is limited where the sum would leave [0, 1]. The
+    mixtures do not depend on `blacks`.
 
     Shapes: reflectances (spectrum, band) -> (count, band) float64.
     Units:  reflectance.
     Error:  float64: a black moves the colour under D65 by less than 1e-12 of white.
-    Raises: ParameterError before the run unless the thinnest layer comes first; ValueError where the bands differ.
+    Raises: ParameterError before the run unless the thinnest layer comes first; ValueError where reflectances and
+            bands differ in the number of bands, and for fewer than four spectra.
     Source: metameric blacks: Wyszecki (1953), Cohen and Kappauf, Am. J. Psychol. 95, 537 (1982); here oblique to the
-            colours, along the covariance of what was measured.
+            colours, along the covariance of the measured spectra.
     """
     if reflectances.ndim != 2 or reflectances.shape[1] != len(bands.centres) or len(reflectances) < 4:
         raise ValueError(
             f"reflectances {tuple(reflectances.shape)} are not four spectra or more of {len(bands.centres)} bands: "
-            "give both the same `bands` step"
+            "compute both from the same `bands` step"
         )
     known = reflectances.double()
     base = _mixtures(known, count, mixed, thickness, rng)
@@ -72,14 +74,14 @@ def _(result: Tensor, *inputs: Any, **params: Any) -> list[Check]:
 
 
 def metameric_blacks(spectra: Tensor, known: Tensor, bands: Bands) -> Tensor:
-    """What the linear estimate from the colours of (spectrum, band) leaves of them; its colour is (0, 0, 0)."""
+    """Return spectra (spectrum, band) minus the linear estimates from their colours: spectra of colour (0, 0, 0)."""
     centres = bands.centres.detach().cpu().double()
     estimate = lift_matrix(known.cpu(), centres) @ to_srgb(centres)
     return spectra - spectra @ estimate.T.to(spectra)
 
 
 def _mixtures(known: Tensor, count: int, mixed: int, thickness: tuple[float, float], rng: torch.Generator) -> Tensor:
-    """Convex sums, most of them ruled by one spectrum; the thickness is drawn evenly in its logarithm."""
+    """Draw convex sums, most of them dominated by one spectrum, with a log-uniform thickness of the layer."""
     how = {"generator": rng, "device": rng.device, "dtype": torch.float64}
     weights = -torch.rand(count, mixed, **how).clamp_min(1e-12).log()  # type: ignore[call-overload]
     weights = weights.square()
@@ -96,7 +98,7 @@ def _drawn(of: int, shape: tuple[int, ...], rng: torch.Generator) -> Tensor:
 
 
 def _room(base: Tensor, black: Tensor) -> tuple[Tensor, Tensor]:
-    """How much of a black, taken off and added, keeps each spectrum in [0, 1]: two of (spectrum, 1)."""
+    """Return the least and the largest share of a black that keep a spectrum in [0, 1]: two tensors (spectrum, 1)."""
     to_white, to_dark = (1.0 - base) / black, -base / black
     high = torch.where(black > 0, to_white, torch.where(black < 0, to_dark, torch.inf))
     low = torch.where(black > 0, to_dark, torch.where(black < 0, to_white, -torch.inf))

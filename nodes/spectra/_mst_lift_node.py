@@ -23,16 +23,16 @@ def lift_mst_plus_plus(
     untrained: Literal["refuse", "allow"] = "refuse",
     rng: torch.Generator,
 ) -> Tensor:
-    """Lift all pixels together by MST++; its per-image stretch to [0, 1] is undone, so that radiometry survives.
+    """Lift a whole picture by MST++; the stretch of the picture to [0, 1] is undone, so that radiometry is preserved.
 
-    Takes the published checkpoint as it is (.pth or .safetensors). Without weights the network is orthogonal noise
-    from `rng`: good for trying a recipe, not for looking at it.
+    The published checkpoint loads unchanged (.pth or .safetensors). Without weights the network consists of random
+    orthogonal layers from `rng`: a recipe runs, but the spectra have no meaning.
 
     Shapes: rgb (3, y, x) -> (31, y, x).
-    Units:  linear sRGB to what the weights were trained on, taken as reflectance; negative results are clipped.
+    Units:  linear sRGB to the quantity of the training data, taken as reflectance; negative results are clipped.
     Error:  published: relative error 0.16, PSNR 34.3 dB (NTIRE 2022); one pass, without the eightfold self-ensemble.
-    Raises: ParameterError before the run without weights, or where they do not fit; ValueError unless the bands are
-            31 from 400 to 700 nm.
+    Raises: ParameterError before the run without weights, or where the weights do not fit the network; ValueError
+            unless the bands are 31 from 400 to 700 nm.
     Source: Cai et al., MST++, CVPR Workshops 2022 (NTIRE spectral recovery).
     """
     needs_rgb(rgb)
@@ -64,12 +64,12 @@ def _(*, weights: Path | None = None, untrained: str = "refuse", **params: Any) 
 
 @lift_mst_plus_plus.check
 def _(result: Tensor, rgb: Tensor, bands: Bands, *, weights: Path | None = None, **params: Any) -> list[Check]:
-    noise = [] if weights is not None else [Check("MST++ untrained: these spectra mean nothing", False)]
+    noise = [] if weights is not None else [Check("MST++ is untrained: these spectra have no meaning", False)]
     return lift_checks(result, rgb, bands) + noise
 
 
 def lift_pictures(network: nn.Module, rgb: Tensor) -> Tensor:
-    """Run pictures (n, 3, y, x) through MST++, each stretched to [0, 1] and back: (n, 31, y, x), not yet clipped."""
+    """Lift pictures (n, 3, y, x) by MST++, each stretched to [0, 1] and back: (n, 31, y, x), not yet clipped."""
     low, high = rgb.amin((1, 2, 3), keepdim=True), rgb.amax((1, 2, 3), keepdim=True)
     span = high - low
     cube: Tensor = network((rgb - low) / span.where(span > 0, 1.0))
@@ -77,10 +77,10 @@ def lift_pictures(network: nn.Module, rgb: Tensor) -> Tensor:
 
 
 def start_mst_plus_plus(rng: torch.Generator, linear: Tensor | None = None) -> MSTPlusPlus:
-    """A network to train, its layers orthogonal; given W (31, 3), its first estimate is W times each pixel's colour.
+    """Return a network to train, with orthogonal layers; with W (31, 3) the network starts as W times a pixel's colour.
 
-    The linear estimate stands in the long skip around the body, whose last layer is 0: what is learnt is what the
-    shapes in a picture and a curved estimate know better.
+    The skip connection around the body holds the linear estimate W, and the last layer starts at 0. Training adds the
+    corrections that image structure and a non-linear estimate allow.
     """
     network = _untrained("allow", rng).requires_grad_(True).train()
     if linear is not None:
@@ -91,18 +91,18 @@ def start_mst_plus_plus(rng: torch.Generator, linear: Tensor | None = None) -> M
 
 
 def need_mst_plus_plus_bands(bands: Bands) -> None:
-    """Refuse bands that MST++ does not give."""
+    """Raise ValueError unless the bands are those of MST++."""
     centres = bands.centres.cpu().double()
     wanted = torch.linspace(400e-9, 700e-9, BANDS, dtype=torch.float64)
     if len(centres) != BANDS or float((centres - wanted).abs().max()) > 0.5e-9:
         raise ValueError(
             f"MST++ gives {BANDS} bands from 400 to 700 nm, not {len(centres)} from {float(centres[0]) * 1e9:.4g} to "
-            f"{float(centres[-1]) * 1e9:.4g} nm: set the bands so, or choose another lift"
+            f"{float(centres[-1]) * 1e9:.4g} nm: give the bands of MST++, or choose another lift"
         )
 
 
 def _empty() -> MSTPlusPlus:
-    """The network without memory, and without a draw from the global random stream."""
+    """Build the network without memory for its tensors and without a draw from the global random stream."""
     with torch.device("meta"):
         return MSTPlusPlus().requires_grad_(False).eval()
 
@@ -128,7 +128,7 @@ def _untrained(untrained: str, rng: torch.Generator) -> MSTPlusPlus:
 
 
 def _fitting(weights: Path) -> dict[str, Tensor]:
-    """The tensors of a checkpoint, under the names of the network; refused unless names and shapes are its own."""
+    """Return the tensors of a checkpoint; raise ParameterError unless names and shapes are those of the network."""
     found = {name.removeprefix("module."): tensor for name, tensor in _read(weights).items()}
     wanted = _shapes()
     wrong = [name for name in wanted if name not in found or found[name].shape != wanted[name]]
@@ -147,16 +147,16 @@ def _shapes() -> dict[str, torch.Size]:
 
 
 def _read(weights: Path) -> dict[str, Tensor]:
-    """A file of tensors: .safetensors, or a pickle of tensors alone, bare or under `state_dict`."""
+    """Read a file of tensors: .safetensors, or a pickle that holds tensors alone, bare or under `state_dict`."""
     try:
         if weights.suffix == ".safetensors":
             from safetensors.torch import load_file
 
             return load_file(weights)
         held = torch.load(weights, map_location="cpu", weights_only=True)
-    except Exception as why:  # a broken file fails in as many ways as there are libraries
+    except Exception as why:  # each library raises its own errors for a broken file
         raise ParameterError("weights", f"{weights} holds no tensors that can be read safely ({why})") from None
     state = held.get("state_dict", held) if isinstance(held, dict) else held
     if not isinstance(state, dict) or not all(isinstance(v, Tensor) for v in state.values()):
-        raise ParameterError("weights", f"{weights} is no state dict: save model.state_dict()")
+        raise ParameterError("weights", f"{weights} is not a state dict: save model.state_dict()")
     return state

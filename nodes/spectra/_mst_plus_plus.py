@@ -1,7 +1,7 @@
 """MST++: three stages of spectral attention from RGB to 31 bands.
 
-Names of modules are those of the published network, so that its checkpoint loads as it is: 1 619 625 parameters in
-227 tensors. Architecture: Cai et al., CVPRW 2022; reference code caiyuanhao1998/MST-plus-plus (MIT).
+The modules have the names of the published network, so that the published checkpoint loads unchanged: 1 619 625
+parameters in 227 tensors. Architecture: Cai et al., CVPRW 2022; reference code caiyuanhao1998/MST-plus-plus (MIT).
 """
 
 from collections.abc import Iterable
@@ -17,7 +17,7 @@ BANDS = 31
 
 
 class MSTPlusPlus(nn.Module):
-    """RGB in [0, 1], (n, 3, y, x) of any size -> (n, 31, y, x)."""
+    """The network: RGB in [0, 1], (n, 3, y, x) of any size -> (n, 31, y, x)."""
 
     def __init__(self) -> None:
         super().__init__()
@@ -33,7 +33,7 @@ class MSTPlusPlus(nn.Module):
 
 
 class Stage(nn.Module):
-    """A U-Net of spectral attention with two levels, and its input added."""
+    """A U-Net of spectral attention with two levels and a residual connection."""
 
     def __init__(self, dim: int) -> None:
         super().__init__()
@@ -61,7 +61,7 @@ class Stage(nn.Module):
 
 
 class Blocks(nn.Module):
-    """Spectral attention, then a feed-forward net behind a layer norm; each adds to its input."""
+    """Spectral attention, then a feed-forward network behind a layer norm, both with a residual connection."""
 
     def __init__(self, dim: int) -> None:
         super().__init__()
@@ -75,7 +75,7 @@ class Blocks(nn.Module):
 
 
 class SpectralAttention(nn.Module):
-    """Every band attends to every band; 31 x 31 weights a head, so the cost is linear in pixels."""
+    """Attention of every band to every band: 31 x 31 weights per head, at a cost that is linear in the pixels."""
 
     def __init__(self, dim: int) -> None:
         super().__init__()
@@ -96,13 +96,13 @@ class SpectralAttention(nn.Module):
         return result
 
     def _across(self, pixels: Tensor) -> tuple[Tensor, Tensor]:
-        """Query and key, each band of length 1 over the picture."""
+        """Return query and key, with each band normalised to length 1 over the picture."""
         query, key = (F.normalize(to(pixels).transpose(1, 2), dim=-1) for to in (self.to_q, self.to_k))
         return query, key
 
 
 class Normed(nn.Module):
-    """Layer norm over bands, then the feed-forward net (the published names: norm, fn)."""
+    """A layer norm over bands, then the feed-forward network (the published names: norm, fn)."""
 
     def __init__(self, dim: int) -> None:
         super().__init__()
@@ -115,7 +115,7 @@ class Normed(nn.Module):
 
 
 class FeedForward(nn.Module):
-    """Four times as many channels, a 3 x 3 filter on each, and back."""
+    """A feed-forward network: four times as many channels, a 3 x 3 filter on each channel, and back."""
 
     def __init__(self, dim: int) -> None:
         super().__init__()

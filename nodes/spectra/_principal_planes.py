@@ -1,4 +1,4 @@
-"""A cube as few planes: principal components of its spectra, found and proved some pixels at a time."""
+"""Principal components of the spectra of a cube, computed and verified a block of pixels at a time."""
 
 from collections.abc import Callable
 from typing import NamedTuple
@@ -6,26 +6,26 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
-_PIECE = 4096  #: pixels looked at together: 31 bands of them in float64 are 1 MB and stay in the cache
-_FLOOR = 8  #: roundings of the planes, below which no bound can be had
-_ROOT = 2e-7  #: what products in float64 can tell of a root mean square
+_PIECE = 4096  #: pixels of a block: 31 bands in float64 take 1 MB and stay in the cache
+_FLOOR = 8  #: round-off units of the planes; no smaller error can be guaranteed
+_ROOT = 2e-7  #: relative resolution of a root mean square that is computed from products in float64
 
 
 class Source(NamedTuple):
     """A cube that need not be in memory."""
 
-    part: Callable[[slice], Tensor]  #: some pixels, (band, pixel) float64, in memory of their own
+    part: Callable[[slice], Tensor]  #: a block of pixels, (band, pixel) float64, as a copy that may be changed
     bands: int
     pixels: int
     dtype: torch.dtype  #: of the planes
 
     def pieces(self) -> list[slice]:
-        """All pixels, some at a time."""
+        """Return slices of all pixels, block by block."""
         return [slice(i, min(i + _PIECE, self.pixels)) for i in range(0, self.pixels, _PIECE)]
 
 
 class Found(NamedTuple):
-    """What `LowRankCube` holds, pixels in one row."""
+    """The fields of a `LowRankCube`, with all pixels in one row."""
 
     planes: Tensor  #: (k, pixel)
     basis: Tensor  #: (band, k) float64
@@ -35,9 +35,9 @@ class Found(NamedTuple):
 
 
 def few_planes(source: Source, within: float) -> Found:
-    """The fewest principal components whose root mean square error is within a share of the largest element.
+    """Find the fewest principal components whose root mean square error is within a share of the largest element.
 
-    Raises ValueError for NaN. What they leave of every pixel is measured too.
+    The error of every pixel is measured too. Raises ValueError for NaN.
     """
     most, gram = _looked_at(source)
     scale = float(most.max())
@@ -51,12 +51,12 @@ def few_planes(source: Source, within: float) -> Found:
     count = max(1, next((k for k, left in enumerate(spread) if float(left.max()) <= target), source.bands))
     planes, last, off = _projected(source, axes[:, :count])
     rest = _rest(most, planes, axes[:, :count], last)
-    spread = torch.cat([spread[:count], torch.minimum(spread[count], rest[count])[None]])  # of what was measured
+    spread = torch.cat([spread[:count], torch.minimum(spread[count], rest[count])[None]])  # no more than was measured
     return Found(planes, axes[:, :count], rest, spread, off)
 
 
 def _looked_at(source: Source, scale: float = 1.0) -> tuple[Tensor, Tensor]:
-    """The largest |element| of each band, and the products of the bands, of the cube over ``scale``."""
+    """Return the largest |element| of each band, and the products of the bands of the cube over ``scale``."""
     if not source.pixels or not source.bands:
         raise ValueError("the cube has no pixels: give a scene")
     tops, gram = [], None
@@ -66,12 +66,12 @@ def _looked_at(source: Source, scale: float = 1.0) -> tuple[Tensor, Tensor]:
         tops.append(x.abs_().amax(1))
     most = torch.stack(tops).amax(0) * scale
     if gram is None or not bool(torch.isfinite(most).all()):
-        raise ValueError("the cube holds NaN or infinite light: mend the scene, or keep the image of all bands")
+        raise ValueError("the cube holds NaN or infinite light: repair the scene, or keep the image of all bands")
     return most, gram
 
 
 def _projected(source: Source, axes: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-    """Planes in their own precision, the largest that they leave of each band, and of each pixel."""
+    """Return the planes in their own precision, and the largest error of each band and of each pixel."""
     planes = torch.empty(axes.shape[1], source.pixels, dtype=source.dtype, device=axes.device)
     last, off = axes.new_zeros(source.bands), planes.new_empty(source.pixels)
     for piece in source.pieces():
@@ -84,9 +84,9 @@ def _projected(source: Source, axes: Tensor) -> tuple[Tensor, Tensor, Tensor]:
 
 
 def _spread(power: Tensor, axes: Tensor, count: int, eps: float) -> Tensor:
-    """Root mean square of what the first r planes leave: that of the other axes, and the rounding of the planes.
+    """Return the root mean square error of the first r planes: the omitted axes, and the round-off of the planes.
 
-    ``power``: mean products of the bands. Rounding of the products themselves counts as if it were left too.
+    ``power`` holds the mean products of the bands. The round-off of these products counts as part of the error.
     """
     each = axes.square() * ((power @ axes) * axes).sum(0).clamp_min(0)
     after = torch.cat([each.flip(1).cumsum(1).flip(1), torch.zeros_like(each[:, :1])], 1)[:, : count + 1].T
@@ -97,8 +97,8 @@ def _spread(power: Tensor, axes: Tensor, count: int, eps: float) -> Tensor:
 
 
 def _rest(most: Tensor, planes: Tensor, basis: Tensor, last: Tensor) -> Tensor:
-    """What the first r planes leave: measured for none and for all, and between them no more than the others' sum."""
+    """Return a bound of the error of the first r planes: measured at both ends, a sum over omitted planes between."""
     each = basis.abs() * torch.maximum(planes.amax(1), -planes.amin(1)).double()
-    last = last + 4 * torch.finfo(torch.float64).eps * (most + each.sum(1))  # what measuring it may have lost
+    last = last + 4 * torch.finfo(torch.float64).eps * (most + each.sum(1))  # round-off of the measurement
     after = each.flip(1).cumsum(1).flip(1).T
     return torch.cat([most[None], last + after[1:], last[None]])

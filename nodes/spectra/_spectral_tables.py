@@ -19,7 +19,7 @@ class Table(NamedTuple):
     values: Tensor  #: (spectrum, sample)
 
     def at(self, centres: Tensor) -> Tensor:
-        """Values between the samples, linearly; beyond the ends the last value: (spectrum, band) on the CPU."""
+        """Interpolate linearly between the samples, with the last value beyond the ends: (spectrum, band), on CPU."""
         wanted = centres.detach().cpu().double()
         right = torch.searchsorted(self.wavelengths, wanted).clamp(1, len(self.wavelengths) - 1)
         low, high = self.wavelengths[right - 1], self.wavelengths[right]
@@ -27,7 +27,7 @@ class Table(NamedTuple):
         return self.values[:, right - 1] * (1 - share) + self.values[:, right] * share
 
     def over(self, bands: Bands) -> Tensor:
-        """Mean over each band of the straight lines between the samples; 0 beyond the ends: (spectrum, band)."""
+        """Average the linear interpolation over each band, with 0 beyond the ends: (spectrum, band)."""
         centres, half = bands.centres.detach().cpu().double(), bands.widths.detach().cpu().double() / 2
         thin = half <= 1e-13
         mean = (self._below(centres + half) - self._below(centres - half)) / (2 * half).where(~thin, 1.0)
@@ -35,7 +35,7 @@ class Table(NamedTuple):
         return torch.where(thin, self.at(centres) * inside, mean)
 
     def _below(self, limits: Tensor) -> Tensor:
-        """Integral from the first sample up to each limit, exact for straight lines."""
+        """Integrate the linear interpolation exactly, from the first sample up to each limit."""
         steps = self.wavelengths.diff()
         areas = ((self.values[:, 1:] + self.values[:, :-1]) / 2 * steps).cumsum(1)
         whole = torch.cat([torch.zeros_like(areas[:, :1]), areas], 1)
@@ -47,7 +47,7 @@ class Table(NamedTuple):
 
 @functools.cache
 def observer() -> Table:
-    """The matching functions of the CIE 1931 observer, 360 to 830 nm by 1 nm."""
+    """Return the colour-matching functions of the CIE 1931 observer, 360 to 830 nm by 1 nm."""
     import colour
 
     return _table(colour.MSDS_CMFS[OBSERVER])
@@ -55,7 +55,7 @@ def observer() -> Table:
 
 @functools.cache
 def camera(name: str) -> Table:
-    """Measured channels of a camera, red, green, blue."""
+    """Return the measured channels of a camera: red, green, blue."""
     import colour
 
     return _table(colour.MSDS_CAMERA_SENSITIVITIES[f"{name} (NPL)"])
@@ -63,7 +63,7 @@ def camera(name: str) -> Table:
 
 @functools.cache
 def light(kind: str) -> Table:
-    """Relative power of a CIE illuminant."""
+    """Return the relative power of a CIE illuminant."""
     import colour
 
     return _table(colour.SDS_ILLUMINANTS[kind])
@@ -71,7 +71,7 @@ def light(kind: str) -> Table:
 
 @functools.cache
 def daylight(temperature: float) -> Table:
-    """Relative power of CIE daylight of a correlated colour temperature, 4000 to 25 000 K."""
+    """Return the relative power of CIE daylight of a correlated colour temperature, 4000 to 25 000 K."""
     import colour
 
     return _table(colour.sd_CIE_illuminant_D_series(colour.temperature.CCT_to_xy_CIE_D(temperature)))
@@ -79,7 +79,7 @@ def daylight(temperature: float) -> Table:
 
 @functools.cache
 def mallett() -> Table:
-    """The three basis reflectances of Mallett and Yuksel (2019), 380 to 780 nm by 5 nm."""
+    """Return the three basis reflectances of Mallett and Yuksel (2019), 380 to 780 nm by 5 nm."""
     from colour.recovery import MSDS_BASIS_FUNCTIONS_sRGB_MALLETT2019
 
     return _table(MSDS_BASIS_FUNCTIONS_sRGB_MALLETT2019)
@@ -87,7 +87,7 @@ def mallett() -> Table:
 
 @functools.cache
 def paints() -> tuple[Table, ...]:
-    """Reflectances of the 102 patches of four measured colour charts; some stop at 400 and 700 nm."""
+    """Return the reflectances of the 102 patches of four measured colour charts; some end at 400 and 700 nm."""
     import colour
 
     return tuple(_table(sd) for chart in _CHARTS for sd in colour.SDS_COLOURCHECKERS[chart].values())
@@ -95,7 +95,7 @@ def paints() -> tuple[Table, ...]:
 
 @functools.cache
 def gamut_samples(name: str) -> Table:
-    """Reflectances on which colour rendition is judged: the 99 objects of CIE 2017, or the 15 paints of the CQS."""
+    """Return the reflectances that test colour rendition: the 99 objects of CIE 2017, or the 15 paints of the CQS."""
     import colour
 
     if name == "CQS":
@@ -107,14 +107,14 @@ def gamut_samples(name: str) -> Table:
 
 @functools.cache
 def xyz_to_srgb() -> Tensor:
-    """The matrix of linear sRGB, (3, 3)."""
+    """Return the matrix from CIE XYZ to linear sRGB, (3, 3)."""
     import colour
 
     return torch.tensor(colour.RGB_COLOURSPACES["sRGB"].matrix_XYZ_to_RGB, dtype=torch.float64)
 
 
 def to_srgb(centres: Tensor) -> Tensor:
-    """Reflectance under D65 to linear sRGB, (3, band): white is (1, 1, 1) on these very bands."""
+    """Return the matrix (3, band) from reflectance under D65 to linear sRGB: white is (1, 1, 1) on these bands."""
     matrix = xyz_to_srgb() @ (observer().at(centres) * light("D65").at(centres))
     return matrix / matrix.sum(1, keepdim=True)
 

@@ -107,7 +107,7 @@ def line(seed, memo):
             setting.seconds.append(timed(setting.recipe, memo)[0])
     best = min((s for s in again if s in good), key=lambda s: s.median)
     bound, done = first[0]  # as it chooses
-    attempts = 3 if done.exact else 1 + (done.strict != 1.0)
+    attempts = 3 if done.exact else 1 + (done.tolerance_scale != 1.0)
     seconds = (whole.median, ours.median, best.median)
     return Line(seed, recipe.tolerance, ours.error, bound, attempts, *seconds, best.label)
 

@@ -1,8 +1,8 @@
-"""Results by band: of a stack in which one band of 31 has changed, one band is computed and written.
+"""Results by band: if one band of a stack of 31 has changed, one band is computed and written.
 
-A node that declares its bands gives each of them the same bits whatever stands beside it. So a band has a key of its
-own, made of the content of that band of the inputs and of all else that decides it, and its slice of the result is a
-blob of that name. The content is hashed at the speed of memory, where computing reads it many times.
+A node that declares its bands computes each band to the same bits whatever the other bands are. A band therefore has a
+key of its own: a digest of that band of the inputs and of everything else that determines the band. Its slice of the
+result is a blob of that name. Hashing reads the inputs once at memory speed, where computing reads them many times.
 """
 
 from __future__ import annotations
@@ -21,9 +21,9 @@ from neusee.workflows.keys.cache_key import digest, plain
 from neusee.workflows.store.band_files import Blobs, Damaged, Stacked, bytes_of
 from neusee.workflows.store.serialization import pack
 
-LEAST = 1 << 22  #: bytes of a result below which it is kept whole
-_ALIGN = 64  #: bytes; a kernel may take another path elsewhere
-_TRIES = 3  #: after so many bands that turned out to be damaged, all are computed
+LEAST = 1 << 22  #: bytes of a result below which the result is kept as one tensor
+_ALIGN = 64  #: bytes; a kernel may take another path at another alignment
+_TRIES = 3  #: attempts that may find damaged bands before all bands are computed
 
 
 def call_by_band(
@@ -34,10 +34,10 @@ def call_by_band(
     blobs: Blobs,
     parts: int = 1,
 ) -> Any:
-    """The result of ``step``, of which ``evaluate`` computes the bands that ``blobs`` does not hold.
+    """Return the result of ``step``; ``evaluate`` computes only the bands that ``blobs`` does not hold.
 
-    ``code``: digest of the node's code. ``parts``: compute in so many passes, for less memory. Tensors of the result
-    that can be stored by band come as `Stacked`; `plain_of` gives the value itself.
+    ``code`` is the digest of the node's code. ``parts`` is the number of passes; more need less memory. Tensors of
+    the result that can be stored by band are returned as `Stacked`; `plain_of` returns the value itself.
     """
     count = band_count(step, inputs)
     if count < 2:
@@ -50,29 +50,29 @@ def call_by_band(
             break
         try:
             return _gathered(step, inputs, evaluate, keys, missing, ceil(count / parts), blobs)
-        except Damaged:  # the next look finds it missing
+        except Damaged:  # the next attempt finds the damaged band missing
             continue
     return _stacked(step, evaluate(inputs), keys)
 
 
 def plain_of(value: Any) -> Any:
-    """``value`` with a tensor for every stack."""
+    """Return ``value`` with a plain tensor in place of every stack."""
     if isinstance(value, Stacked):
         return value.tensor
     return value._make(map(plain_of, value)) if type(value) in BAND_FIELDS else value
 
 
 def band_count(step: Step, inputs: Sequence[Any]) -> int:
-    """How many bands a step works on, each for itself; 0 where its node, or what it is given, has none."""
+    """Return the number of bands that a step computes independently; 0 where its node or its inputs have none."""
     banded = list(_banded(step, inputs))
     if any(not isinstance(value, Tensor) and type(value) not in BAND_FIELDS for _, value in banded):
-        return 0  # a mixture of planes has no slice of one band
+        return 0  # a low-rank cube has no slice of one band
     found = {x.shape[axis] for axis, value in banded for x in band_tensors(value) if _has(x, axis)}
     return found.pop() if len(found) == 1 else 0
 
 
 def band_keys(step: Step, inputs: Sequence[Any], code: str) -> list[str]:
-    """The key of each band: node, code, parameters, that band of the inputs, and the whole of the others."""
+    """Return the key of each band: node, code, parameters, that band of the inputs and the whole other inputs."""
     params = {name: plain(value) for name, value in step.params.items()}
     same: list[Any] = ["band", step.node.path, code, params]
     each: list[list[str]] = []
@@ -85,7 +85,7 @@ def band_keys(step: Step, inputs: Sequence[Any], code: str) -> list[str]:
 
 
 def content(value: Any) -> list[Any]:
-    """What a value is, as JSON: its layout, and the type, shape and xxh3 of each tensor."""
+    """Return the content of a value as JSON: its layout, and type, shape and xxh3 of each tensor."""
     layout, tensors = pack(value)
     return [layout, [_hashed(x) for x in tensors]]
 
@@ -106,14 +106,14 @@ def _banded(step: Step, inputs: Sequence[Any]) -> Iterator[tuple[int, Any]]:
 
 
 def band_tensors(value: Any) -> list[Tensor]:
-    """The tensors of a value that have bands."""
+    """Return the tensors of a value that have bands."""
     if isinstance(value, Tensor):
         return [value]
     return [getattr(value, name) for name in BAND_FIELDS[type(value)]]
 
 
 def with_band_tensors(value: Any, tensors: Sequence[Tensor]) -> Any:
-    """``value`` with others in place of its tensors that have bands."""
+    """Return ``value`` with other tensors in place of those that have bands."""
     if isinstance(value, Tensor):
         return tensors[0]
     return value._replace(**dict(zip(BAND_FIELDS[type(value)], tensors, strict=True)))
@@ -128,7 +128,7 @@ def _has(x: Tensor, axis: int) -> bool:
 
 
 def taken(step: Step, inputs: Sequence[Any], which: list[int], of: Collection[str] | None = None) -> list[Any]:
-    """The inputs with a few of their bands; ``of``: only of these, for the others have no more than these."""
+    """Return the inputs with the bands ``which`` only; ``of`` names the inputs to slice (all banded inputs if None)."""
     found = list(inputs)
     for i, (name, value) in enumerate(zip(step.node.inputs, inputs, strict=False)):
         axis = _axis(step, name, value)
@@ -143,7 +143,7 @@ def taken(step: Step, inputs: Sequence[Any], which: list[int], of: Collection[st
 
 
 def _slices(x: Tensor, axis: int, which: list[int]) -> Tensor:
-    """A view where it lies in memory as a fresh tensor would, else a copy."""
+    """Return a view where it is laid out in memory like a new tensor, else a copy."""
     if which == list(range(which[0], which[0] + len(which))):
         part = x.narrow(axis, which[0], len(which))
         if part.is_contiguous() and part.data_ptr() % _ALIGN == 0:
@@ -152,7 +152,7 @@ def _slices(x: Tensor, axis: int, which: list[int]) -> Tensor:
 
 
 def _fields(step: Step) -> int:
-    """How many tensors the result has."""
+    """Return the number of tensors in the result of a step."""
     kind = step.node.hints["return"]
     return len(kind._fields) if kind in BAND_FIELDS else 1
 
@@ -163,7 +163,7 @@ def _rebuilt(step: Step, items: list[Any]) -> Any:
 
 
 def _stacked(step: Step, value: Any, keys: list[str]) -> Any:
-    """A result that was computed whole, with the names of its bands where it is large."""
+    """Return a result that was computed as a whole, with the names of its bands if the result is large."""
     tensors = band_tensors(value)
     leading = all(x.shape[0] == len(keys) and _leads(step, x) for x in tensors)
     if not leading or sum(x.nbytes for x in tensors) < LEAST:
@@ -173,7 +173,7 @@ def _stacked(step: Step, value: Any, keys: list[str]) -> Any:
 
 
 def _leads(step: Step, x: Tensor) -> bool:
-    """Whether the bands are the first axis: only such a stack lies in memory band by band."""
+    """Return True if the bands are the first axis, because only such a stack lies in memory band by band."""
     assert step.node.bands is not None
     return _has(x, step.node.bands["return"]) and step.node.bands["return"] % x.dim() == 0
 
@@ -187,7 +187,7 @@ def _gathered(
     size: int,
     blobs: Blobs,
 ) -> Any:
-    """Compute the missing bands, ``size`` at a time, and put all of them together; raises `Damaged`."""
+    """Compute the missing bands, ``size`` at a time, and assemble all bands; raise `Damaged` for a damaged band."""
     assert step.node.bands is not None
     axis = step.node.bands["return"]
     stacks = [_Stack(axis, [f"{key}.{n}" for key in keys], blobs) for n in range(_fields(step))]
@@ -199,15 +199,15 @@ def _gathered(
 
 
 class _Stack:
-    """One tensor of a result in the making: its bands go to the store, and to memory where they cannot."""
+    """One tensor of an unfinished result: its bands go to the store, or to memory where the store cannot be written."""
 
     def __init__(self, axis: int, names: list[str], blobs: Blobs) -> None:
         self.axis, self.names, self.blobs = axis, names, blobs
         self.held: Tensor | None = None
-        self.inside: set[int] = set()  # bands that are in what is held
+        self.inside: set[int] = set()  # bands that are in memory
 
     def add(self, which: list[int], x: Tensor) -> None:
-        """Take the bands ``which``."""
+        """Add the bands ``which``."""
         axis = self.axis % x.dim()
         slices = x.unbind(axis)
         if axis == 0 and self._written(which, slices):
@@ -219,7 +219,7 @@ class _Stack:
         self.inside.update(which)
 
     def whole(self) -> Tensor | Stacked:
-        """All bands; raises `Damaged`."""
+        """Return all bands as one tensor; raise `Damaged` for a damaged band."""
         blob = self.blobs.about(self.names[0]) if self.held is None else None
         if blob is not None:
             shape = (len(self.names), *blob.shape)

@@ -1,4 +1,4 @@
-"""What a step will cost, from what it and its like cost before: seconds by kind of device, bytes, memory."""
+"""Cost model: seconds by kind of device, bytes and memory of a step, predicted from earlier runs."""
 
 from __future__ import annotations
 
@@ -9,25 +9,25 @@ from typing import Any
 
 from neusee.workflows.graph.recipe_graph import Step
 
-GUESS = 0.01  #: s of a step of which nothing is known
-_FASTER = 10.0  #: how many times as fast another kind of device is taken to be until both were measured
-_NEWEST = 5  #: how many earlier results count
+GUESS = 0.01  #: s for a step without any measurement
+_FASTER = 10.0  #: speed ratio of another kind of device to the CPU, until both are measured
+_NEWEST = 5  #: number of earlier results that count
 
 Row = Mapping[str, Any]  #: a line of the journal
 
 
 @dataclass(frozen=True, slots=True)
 class Estimate:
-    """What a step is expected to take."""
+    """The predicted cost of a step."""
 
     seconds: Mapping[str, float]  #: by kind of device: ``cpu``, ``cuda``
-    bytes: float  #: of its result
-    work: float  #: memory beside its inputs and its result while it runs
+    bytes: float  #: size of the result
+    work: float  #: memory during the run, beside the inputs and the result
     known: bool  #: whether this very step was measured before
 
 
 class Costs:
-    """Costs by step and by node, from the lines of a journal, the newest last."""
+    """Costs by step and by node, from the lines of a journal, the newest line last."""
 
     def __init__(self, rows: Iterable[Row]) -> None:
         self._steps: dict[str, list[Row]] = {}
@@ -39,7 +39,7 @@ class Costs:
         self._ratio = {"cpu": 1.0, **self._measured_ratios()}
 
     def of(self, step: Step, kinds: Sequence[str], exact: Row | None = None) -> Estimate:
-        """The estimate for ``step`` on each of ``kinds``; ``exact`` is what is known of this very result."""
+        """Return the estimate for ``step`` on each of ``kinds``; ``exact`` is the measurement of this very result."""
         own = self._steps.get(f"{step.name} {step.node.path}", [])
         rows = [exact] if exact else own[-_NEWEST:] or self._nodes.get(step.node.path, [])[-_NEWEST:]
         if not rows:
@@ -61,7 +61,7 @@ class Costs:
         return self._ratio.get(kind, _FASTER)
 
     def _measured_ratios(self) -> dict[str, float]:
-        """How many times as fast as the CPU each kind was, over the steps that were measured on both."""
+        """Return the speed of each kind of device relative to the CPU, over the steps that were measured on both."""
         found: dict[str, list[float]] = {}
         for rows in self._steps.values():
             by_kind: dict[str, list[float]] = {}

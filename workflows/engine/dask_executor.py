@@ -1,9 +1,9 @@
-"""Work on a dask.distributed cluster: keys travel, tensors never.
+"""Executor on a dask.distributed cluster: keys are sent, tensors are not.
 
-A task is a chain of steps with the keys of what it reads. The worker reads values by key from
-the store, or from those it made or read before, and writes the end of the chain to the store.
-Only what is known of the results comes back. Whatever happens to a worker, what it finished
-is stored, and putting a result twice does no harm.
+A task is a chain of steps with the keys of its inputs. The worker reads values by key from the
+store, or from its memory of earlier tasks, and writes the end of the chain to the store. Only
+the metadata of the results are sent back. If a worker dies, its finished results are stored,
+and storing a result twice does no harm.
 """
 
 from __future__ import annotations
@@ -26,20 +26,20 @@ from neusee.workflows.store.remote_store import open_store
 from neusee.workflows.store.result_store import Store
 from neusee.workflows.store.serialization import tensors_in
 
-_SHARE = 0.4  #: of the planned memory for values that a worker's next tasks may read
-_PLANNED = 0.6  #: of a worker's memory that a task may be planned with
-_LOOK = 1.0  #: s between looks at which workers there are
-_TRIES = 3  #: workers that one chain may bring down before it is given up
+_SHARE = 0.4  #: of the planned memory, for values that the next tasks of a worker may read
+_PLANNED = 0.6  #: of a worker's memory, which a plan may use
+_LOOK = 1.0  #: s between two queries for the present workers
+_TRIES = 3  #: workers that one chain may kill before the run gives up
 
 
 class Dask:
-    """An `Executor` of a cluster; ``client`` is a `distributed.Client`, and every worker can open ``store``."""
+    """An `Executor` on a cluster: ``client`` is a `distributed.Client`, and every worker can open ``store``."""
 
     shares = False
 
     def __init__(self, client: Any, store: Store) -> None:
         self.client, self.where = client, getattr(store, "url", None) or str(store.root.absolute())
-        self.threads = torch.get_num_threads()  # sums over threads round as they do here
+        self.threads = torch.get_num_threads()  # the same thread count gives the same round-off as in this process
         self._lanes: dict[str, Lane] = {}
         self._looked = -_LOOK
         self._running: dict[Any, tuple[StepJob, ...]] = {}
@@ -47,13 +47,13 @@ class Dask:
 
     @property
     def lanes(self) -> Mapping[str, Lane]:
-        """One lane a worker; looked up again once a second, for workers come and go."""
+        """Return one lane for each worker; the workers are queried once a second because they come and go."""
         if time.monotonic() - self._looked > _LOOK or not self._lanes:
             self._look()
         return self._lanes
 
     def submit(self, work: Sequence[StepJob]) -> None:
-        """Send one chain to the worker of its lane, or to another if that one goes."""
+        """Send one chain to the worker of its lane, or to another worker if that one is gone."""
         self._tries[work[0].key] = self._tries.get(work[0].key, 0) + 1
         future = self.client.submit(
             work_here,
@@ -70,7 +70,7 @@ class Dask:
         self._running[future] = tuple(work)
 
     def wait(self, seconds: float | None = None) -> list[Outcome]:
-        """What came back since."""
+        """Return the outcomes that have arrived since the last call."""
         from distributed import wait
 
         if not self._running:
@@ -83,26 +83,26 @@ class Dask:
         return [outcome for future in done for outcome in self._taken(future)]
 
     def cancel(self) -> None:
-        """Take back what has not begun; what is under way ends, and its results are stored."""
+        """Cancel the tasks that have not begun; running tasks end, and their results are stored."""
         if self._running:
             self.client.cancel(list(self._running))
             self._running = {}
 
     def _taken(self, future: Any) -> list[Outcome]:
-        """The outcomes of a chain; where its workers died under it, an error that says so."""
+        """Return the outcomes of a chain, or a `RunError` where its workers died."""
         chain = self._running.pop(future)
         if future.status == "finished":
             found: list[Outcome] = future.result()
             return [_of_lane(outcome, chain[0].lane) for outcome in found]
         cause = future.exception() if future.status == "error" else None
-        if cause is None and self._tries[chain[0].key] < _TRIES:  # lost with its worker or its scheduler
+        if cause is None and self._tries[chain[0].key] < _TRIES:  # the task was lost with its worker or its scheduler
             self.submit(chain)
             return []
-        text = f"no worker could carry it out ({cause or future.status})"
+        text = f"no worker could carry out the step ({cause or future.status})"
         return [Outcome(chain[0], error=RunError(chain[0].step, [], OSError(text)))]
 
     def _look(self) -> None:
-        """Find out which workers there are and what they compute on; wait for the first."""
+        """Query the present workers and their devices; wait for the first worker."""
         if not self.client.nthreads():
             self.client.wait_for_workers(1, timeout=60)
         there = self.client.nthreads()
@@ -114,7 +114,7 @@ class Dask:
 
 
 def _of_lane(outcome: Outcome, lane: str) -> Outcome:
-    """As the one who submitted it knows it: the lane is where it was sent, wherever it went."""
+    """Return the outcome with the lane to which its task was sent, whichever worker ran the task."""
     outcome.work = replace(outcome.work, lane=lane)
     return outcome
 
@@ -123,7 +123,7 @@ def _of_lane(outcome: Outcome, lane: str) -> Outcome:
 
 
 class _Here:
-    """What one worker keeps between tasks: the store, digests of the code it runs, the values it used last."""
+    """State of one worker between tasks: the store, digests of the worker's code, the values used last."""
 
     def __init__(self, where: str, room: float) -> None:
         self.store = open_store(where)
@@ -152,7 +152,7 @@ _here: dict[str, _Here] = {}
 
 
 def lane_here(dask_worker: Any) -> tuple[str, float]:
-    """The device of a worker and the bytes that may be planned with; dask fills in the worker."""
+    """Return the device of a worker and the bytes that a plan may use; dask passes the worker."""
     if torch.cuda.is_available():
         return "cuda:0", _PLANNED * there_is("cuda:0")
     allowed = getattr(dask_worker.memory_manager, "memory_limit", None)
@@ -160,25 +160,25 @@ def lane_here(dask_worker: Any) -> tuple[str, float]:
 
 
 def work_here(chain: tuple[StepJob, ...], where: str, threads: int, room: float) -> list[Outcome]:
-    """Carry out a chain; the outcomes go back without their values, ``room`` bytes of which stay here."""
+    """Carry out a chain and return its outcomes without their values; keep ``room`` bytes of values on the worker."""
     if torch.get_num_threads() != threads:
         torch.set_num_threads(threads)
     here = _here.get(where) or _here.setdefault(where, _Here(where, room))
     outcomes: list[Outcome] = []
-    below = chain[0].below
+    refetch = chain[0].refetch_seconds
     for work in chain:
-        outcome = _one_here(replace(work, below=below), here)
+        outcome = _one_here(replace(work, refetch_seconds=refetch), here)
         outcomes.append(outcome)
         if outcome.held or outcome.error or outcome.lost:
             break
-        below = 0.0 if outcome.kept else outcome.seconds + below
+        refetch = 0.0 if outcome.kept else outcome.seconds + refetch
     return [_light(outcome) for outcome in outcomes]
 
 
 def _one_here(work: StepJob, here: _Here) -> Outcome:
     own = here.code.digest(work.step.node.fn.__module__)
     if own != work.origin["code"]:
-        text = f"a worker has other code of {work.step.node.path}: give it the version that runs here"
+        text = f"a worker has other code of {work.step.node.path}: install the version of this process there"
         return Outcome(work, error=RunError(work.step, [], OSError(text)))
     outcome = carry_out(work, here.fetch, here.store)
     if outcome.value is not None:
@@ -187,7 +187,7 @@ def _one_here(work: StepJob, here: _Here) -> Outcome:
 
 
 def _light(outcome: Outcome) -> Outcome:
-    """What may travel: no value, and an error without the objects that it came from."""
+    """Return the outcome without its value, and with an error that can be pickled."""
     outcome.value = None
     if outcome.error is not None and not isinstance(outcome.error, RunError):
         outcome.error = RunError(outcome.work.step, [], outcome.error)
@@ -203,7 +203,7 @@ def _size(value: Any) -> int:
 
 @contextmanager
 def cluster(where: str, store: Store) -> Iterator[Dask]:
-    """``dask`` or ``dask:4`` (workers on this machine), ``dask:here`` (in this process), or a scheduler's address."""
+    """Yield an executor for ``dask``, ``dask:4`` (local workers), ``dask:here`` (in process) or a scheduler address."""
     from distributed import Client, LocalCluster
 
     kind, _, count = where.partition(":")

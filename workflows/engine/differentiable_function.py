@@ -32,13 +32,13 @@ def as_function(
     redraw: Collection[str] = (),
     caller: Callable[..., Any] = call,
 ) -> _Function:
-    """The recipe as ``theta -> {output: value}``, bit for bit what `run` gives, with gradients.
+    """Return the recipe as a differentiable ``theta -> {output: value}``, equal to `run` to the last bit.
 
-    Args: free: parameters such as ``"spot.strength"``, or steps whose whole value is given,
-    such as ``"height"``. What they cannot reach is computed once, here, or read from the
-    store. Noise is the same at every call: its stream depends on the seed and the step.
+    Args: free: parameters such as ``"spot.strength"``, or steps whose whole value is given, such
+    as ``"height"``. Steps that do not depend on ``free`` are computed once, here, or read from
+    the store. Noise is the same at every call: its stream depends on the seed and the step.
     Random steps in ``redraw`` are computed at every call, which may be given another seed.
-    ``caller`` is asked for every live step in place of `call`: to keep some, or for another seed.
+    ``caller`` replaces `call` for every live step, for example to keep values.
     """
     wanted = recipe.outputs if outputs is None else tuple(outputs)
     given, tuned = _read(recipe, free)
@@ -59,7 +59,7 @@ def as_function(
 
 
 def _read(recipe: Recipe, free: tuple[str, ...]) -> tuple[set[str], dict[str, dict[str, str]]]:
-    """Steps that are given whole, and by step the free parameters with their full names."""
+    """Return the steps that are given whole, and by step the free parameters with their full names."""
     given: set[str] = set()
     tuned: dict[str, dict[str, str]] = {}
     for name in free:
@@ -76,7 +76,7 @@ def _read(recipe: Recipe, free: tuple[str, ...]) -> tuple[set[str], dict[str, di
 
 
 class _Function:
-    """The live part of a recipe, with the values of everything that feeds it."""
+    """The live part of a recipe, with the values of all steps that feed the live part."""
 
     def __init__(
         self,
@@ -99,10 +99,10 @@ class _Function:
         self._last = {source: name for name in live if name not in given for source in recipe.steps[name].sources}
 
     def __call__(self, theta: Theta, seed: int | None = None) -> dict[str, Any]:
-        """Outputs at ``theta``; noise as of ``seed``, or of the recipe's own."""
+        """Return the outputs at ``theta``, with the noise of ``seed`` or of the recipe's own seed."""
         seed = self.recipe.seed if seed is None else seed
         if set(theta) != set(self.free):
-            raise ValueError(f"give exactly {', '.join(self.free)}, not {', '.join(theta) or 'nothing'}")
+            raise ValueError(f"give values for exactly {', '.join(self.free)}, not for {', '.join(theta) or 'nothing'}")
         values, ledger = dict(self.fixed), self._spent.copy()
         for name in self.live:
             step, given = self.recipe.steps[name], name in self.given
@@ -134,7 +134,7 @@ class _Function:
 
 
 class _Ends:
-    """Facts of a picture that each call makes anew, its least and greatest first: a bound rarely asks for more."""
+    """Statistics of an image that each call computes anew; most bounds need the least and greatest value only."""
 
     def __init__(self, value: Tensor) -> None:
         self._value = value.detach()
@@ -157,7 +157,7 @@ class _Ends:
 
     @property
     def finite(self) -> bool:
-        """Whether all is finite; then the sum is, which is taken in double precision."""
+        """Return True if all elements are finite, which makes their sum in double precision finite."""
         return self._value.numel() == 0 or all(map(math.isfinite, self._ends))
 
     @cached_property
@@ -171,7 +171,7 @@ class _Ends:
 
 
 def _spent(recipe: Recipe, fixed: Mapping[str, Any], left_out: Mapping[str, float]) -> ErrorBudget:
-    """What the fixed steps have spent of the tolerance."""
+    """Return the error budget with the bounds of all fixed steps entered."""
     ledger = ErrorBudget(recipe)
     for name in needed(recipe, fixed):
         ledger.pass_on(recipe.steps[name])

@@ -1,4 +1,4 @@
-"""Hand out work as its inputs become ready, and take in what comes of it."""
+"""Dispatch: submit work when its inputs are ready, and collect the outcomes."""
 
 from __future__ import annotations
 
@@ -11,14 +11,14 @@ from neusee.workflows.keys.cache_key import Key
 
 _FIRST_LOOK, _LONGEST = 0.01, 0.5  #: s between looks at work that another process holds
 
-Chain = tuple[StepJob, ...]  #: steps of which each feeds the next and nothing else
+Chain = tuple[StepJob, ...]  #: steps of which each feeds only the next one
 MemoryProfile = Callable[
     [StepJob, Sequence[StepJob]], bool
-]  #: whether there is memory for one more beside those that run
+]  #: whether the memory suffices for one more step beside the running steps
 
 
 class Loop:
-    """The state of one plan: what waits for inputs, what is ready, what each lane does."""
+    """State of one plan: the chains that wait for inputs, the ready chains and the chain of each lane."""
 
     def __init__(
         self,
@@ -37,29 +37,29 @@ class Loop:
             for key in missing:
                 self._after.setdefault(key, []).append(i)
         self._ready = [i for i, missing in enumerate(self._missing) if not missing]
-        self._ready.reverse()  # the next one is the last: a list pops there
-        self._held: dict[int, tuple[float, float]] = {}  # chain -> when to look again, and how long to wait then
+        self._ready.reverse()  # the next chain is the last item, because a list pops there
+        self._held: dict[int, tuple[float, float]] = {}  # chain -> time of the next look, and the wait after that
         self._open = len(chains)
 
     def outcomes(self) -> Iterator[Outcome]:
-        """Each outcome as it comes, until all work is done; the caller raises where one is an error."""
+        """Yield each outcome as it arrives, until all work is done; the caller raises the error of an outcome."""
         while self._open:
             self._hand_out()
             if not self.busy and not self._held:
                 ready = self._chains[self._ready[-1]][0] if self._ready else None
-                raise RuntimeError(f"no lane takes {ready.step.name if ready else 'what is left'}: they are gone")
+                raise RuntimeError(f"no lane is left for {ready.step.name if ready else 'the remaining steps'}")
             for outcome in self.executor.wait(self._patience()):
                 self._settle(outcome)
                 if not outcome.held:
                     yield outcome
 
     def _outside(self, chain: Chain) -> set[Key]:
-        """Keys of this plan that a chain reads from other chains."""
+        """Return the keys of this plan that a chain reads from other chains."""
         own = {work.key for work in chain}
         return {key for work in chain for key in work.sources if key in self._chain_of and key not in own}
 
     def _hand_out(self) -> None:
-        """Give every idle lane the first ready chain that may go there."""
+        """Give every idle lane the first ready chain that may run there."""
         self._look_again()
         for lane, where in self.executor.lanes.items():
             if lane in self.busy or not self._ready:
@@ -73,7 +73,7 @@ class Loop:
                 self.executor.submit(chain)
 
     def _first_for(self, lane: str, device: str) -> int | None:
-        """Where in the ready list the next chain for ``lane`` stands: its own, or one whose lane is busy or gone."""
+        """Return the place in the ready list of the next chain for ``lane``: its own, or one of a busy or lost lane."""
         running = [work for chain in self.busy.values() for work in chain]
         there = self.executor.lanes
         for place in range(len(self._ready) - 1, -1, -1):
@@ -91,7 +91,7 @@ class Loop:
             self._held[i] = (float("inf"), self._held[i][1])
 
     def _patience(self) -> float | None:
-        """How long to wait for what is under way; where all else is held by others, sleep here."""
+        """Return the s to wait for running work; sleep here where other processes hold all the remaining work."""
         waits = [when for when, _ in self._held.values() if when < float("inf")]
         if not waits:
             return None
@@ -101,7 +101,7 @@ class Loop:
         return pause
 
     def _settle(self, outcome: Outcome) -> None:
-        """Free the lane, and release what waited for this key."""
+        """Free the lane, and release the chains that waited for this key."""
         i = self._chain_of[outcome.work.key]
         chain = self._chains[i]
         last = outcome.work.key == chain[-1].key
@@ -127,7 +127,7 @@ class Loop:
 
 
 def chains_of(works: Sequence[StepJob], fused: bool) -> list[Chain]:
-    """Every step alone, or, ``fused``, with those that follow it and nothing else on the same lane."""
+    """Return each step as a chain, or, if ``fused``, join it with the steps that alone follow on its lane."""
     if not fused:
         return [(work,) for work in works]
     readers: dict[Key, int] = {}
@@ -149,7 +149,7 @@ def chains_of(works: Sequence[StepJob], fused: bool) -> list[Chain]:
 
 
 def _moved(work: StepJob, lane: str, device: str) -> StepJob:
-    """``work`` on another lane; what computes on the CPU beside an accelerator does so there too."""
+    """Return ``work`` on another lane; a step that computes on the CPU of an accelerator's lane still does so there."""
     return replace(work, lane=lane, device=device if _kind(work.device) == _kind(device) else work.device)
 
 

@@ -1,7 +1,7 @@
-"""A run under way: keys first, then the cheapest way to the values that are wanted, then the account.
+"""Execution of one run: resolve the keys, find the cheapest way to the wanted values, record the steps.
 
-Nothing here is recursive over the graph, and values are held by key: two steps that are
-the same computation are computed once, and a step that is left out shares its input's key.
+No function here is recursive over the graph, and values are held by key: two steps that are the
+same computation are computed once, and a step that is left out shares the key of its input.
 """
 
 from __future__ import annotations
@@ -31,12 +31,12 @@ from neusee.workflows.store.result_store import Store
 from neusee.workflows.tolerance.error_budget import ErrorBudget
 from neusee.workflows.tolerance.skip_decision import SkipDecision
 
-_QUICK = 1e-3  #: s below which two processes may as well both compute a step
-_UNKNOWN = 100.0  #: s of a step that nobody measured, where to load is weighed against to compute
+_QUICK = 1e-3  #: s below which two processes may both compute a step without a lease
+_UNKNOWN = 100.0  #: s of a step without measurement, when loading is compared with computing
 
 
 class Execution:
-    """One run under way."""
+    """One run in progress."""
 
     def __init__(
         self,
@@ -56,19 +56,19 @@ class Execution:
         self.began = time.time()
         self.keys: dict[str, Key] = {}
         self.makers: dict[Key, Step] = {}  # the first step of each key
-        self.origins: dict[Key, dict[str, Any]] = {}  # what went into each key
+        self.origins: dict[Key, dict[str, Any]] = {}  # the parts of each key
         self.values: dict[Key, Any] = {}
         self.facts: dict[Key, TensorStats | None] = {}
-        self.again: dict[Key, float] = {}  # s to have a value again that was computed here
-        self.took: dict[str, float] = {}  # the longest that a step of each node took, s
+        self.again: dict[Key, float] = {}  # s for obtaining again a value that was computed here
+        self.took: dict[str, float] = {}  # the longest time of a step of each node, s
         self.verdicts, self.ledger = dict[str, SkipDecision](), ErrorBudget(recipe)
         self.done: dict[str, StepRecord] = {}
-        self.receipts: dict[Key, dict[str, Any]] = {}  # what is known of values that were not kept
+        self.receipts: dict[Key, dict[str, Any]] = {}  # metadata of values that were not kept
         self.costs: Costs | None = None
         self.schedule: Schedule | None = None
 
     def resolve(self, order: list[str]) -> None:
-        """Give every step its key, and leave out those whose bound allows it."""
+        """Give every step its key, and leave out the steps whose bound allows the omission."""
         for name in order:
             step = self.recipe.steps[name]
             if step.node.hooks.skip_bound is not None:
@@ -88,7 +88,7 @@ class Execution:
                 self.makers[key], self.origins[key] = step, origin
 
     def make(self, targets: list[Key], keep: bool, later: Sequence[Key] = ()) -> None:
-        """Hold the values of ``targets``, what ``later`` needs of those made, and with ``keep`` what no store holds."""
+        """Hold the values of ``targets`` and the made ones that ``later`` needs; ``keep`` holds unstored values too."""
         while True:
             below = Upstream(self.known, self.sources)
             order = in_order(below, targets)
@@ -103,13 +103,13 @@ class Execution:
                 continue
 
     def close(self) -> None:
-        """Keep what was learnt of the code, and let go of the executor, which holds this run that holds it."""
+        """Save the digests of the code, and drop the executor to break the reference cycle with this run."""
         self.code.save()
         self.own.cancel()
         del self.own, self.executor
 
     def account(self, order: list[str]) -> dict[str, StepRecord]:
-        """What became of every step, in running order."""
+        """Return the record of every step, in running order."""
         for name in order:
             if name in self.done:
                 continue
@@ -118,17 +118,17 @@ class Execution:
             if twin is None or twin.state == "not needed":
                 self._finish(self.asleep(name))
             else:
-                self._finish(replace(twin, step=name, state="cached", why=f"the same as {twin.step}", seconds=0.0))
+                self._finish(replace(twin, step=name, state="cached", why=f"the same key as {twin.step}", seconds=0.0))
         return {name: self.done[name] for name in order}
 
     def asleep(self, name: str) -> StepRecord:
-        """The account of a step that nothing has needed."""
+        """Return the record of a step that was not needed."""
         key, why = self.keys[name], "nothing that ran needed it"
         error = error_in(self.store.about(key))
         return StepRecord(name, "not needed", why, 0.0, key, bound=self._bound(name), error=error)
 
     def missing(self, names: Iterable[str]) -> set[Key]:
-        """What would have to be computed for the values of ``names``."""
+        """Return the keys to compute for the values of ``names``."""
         below = Upstream(self.known, self.sources)
         in_order(below, [self.keys[name] for name in names])
         return set(below.missing)
@@ -137,7 +137,7 @@ class Execution:
         return [self.keys[name] for name in self.makers[key].sources]
 
     def known(self, key: Key) -> bool:
-        """Whether the value is in memory or in the store; what is known without it is remembered."""
+        """Return True if the value is in memory or in the store; remember the receipt of a value that is not kept."""
         if key in self.values:
             return True
         about = self.store.about(key)
@@ -147,7 +147,7 @@ class Execution:
         return False
 
     def _dear(self, below: Upstream, targets: list[Key]) -> frozenset[Key]:
-        """Stored values that take longer to read than to compute again, as far as that is the cheaper way."""
+        """Return the stored values that take longer to read than to compute, as far as recomputing is cheaper."""
 
         def compute(key: Key) -> float:
             about = self.receipts.get(key) or self.store.about(key)
@@ -162,7 +162,7 @@ class Execution:
         return frozenset(cheaper_to_recompute(targets, self.sources, load, compute))
 
     def _reading(self, key: Key) -> float:
-        """Seconds to read a stored value."""
+        """Return the predicted seconds for reading a stored value."""
         about = self.store.about(key)
         return self.store.read_seconds(about["bytes"]) if about else float("inf")
 
@@ -181,14 +181,14 @@ class Execution:
             self._fetch(key)
 
     def _free(self, keys: Iterable[Key], uses: Counter[Key], keep: bool) -> None:
-        """Let go of values at their last use."""
+        """Delete values after their last use."""
         for key in keys:
             unsafe = key in self.own.later or (keep and not self.store.has(key))
             if uses[key] <= 0 and key in self.values and not unsafe:
                 del self.values[key]
 
     def _outcomes(self, plan: list[Key], again: frozenset[Key], targets: list[Key]) -> Iterator[Outcome]:
-        """Carry the plan out; what ends is noted, and the first failure stops what has not begun."""
+        """Carry out the plan and record each outcome; the first failure stops the steps that have not begun."""
         works = [self._work(key, key in again, key in targets) for key in plan]
         self.costs = self.costs or past_costs(self.store)
         try:
@@ -197,7 +197,7 @@ class Execution:
             raise RunError(self.recipe.steps[error.task], [], error) from error
         self.schedule = joined(self.schedule, prepared.schedule)
         chains = chains_of(prepared.works, fused=not self.executor.shares)
-        if not self.executor.shares:  # what another chain reads must lie in the store
+        if not self.executor.shares:  # values for other chains must be in the store
             chains = [(*chain[:-1], replace(chain[-1], wanted=True)) for chain in chains]
         room = room_for(prepared.expected, self.executor, self.values)
         try:
@@ -208,44 +208,45 @@ class Execution:
             self.executor.cancel()
             raise
 
-    def _work(self, key: Key, anew: bool, target: bool) -> StepJob:
+    def _work(self, key: Key, recompute: bool, target: bool) -> StepJob:
         step = self.makers[key]
         reads = tuple(self._read(step.wires.get(name)) for name in step.node.inputs)
         device, lanes = places(step, self.devices)[0], self.executor.lanes
         lane = next(iter(lanes)) if len(lanes) == 1 else ""
         wanted = target or step.name in self.wanted
         name, seed = self.recipe.name, self.recipe.seed
-        return StepJob(step, key, self.origins[key], reads, seed, name, device, lane, wanted, anew=anew)
+        return StepJob(step, key, self.origins[key], reads, seed, name, device, lane, wanted, recompute=recompute)
 
     def _read(self, wire: Wire) -> Read:
         return self.keys[wire] if isinstance(wire, str) else wire and tuple(self.keys[name] for name in wire)
 
     def _begin(self, work: StepJob) -> StepJob:
-        """Say that a step begins; by now it is known what its inputs would cost to have again."""
+        """Report that a step begins, and add the seconds for obtaining its inputs again."""
         self.watch(Event(work.step.name, None))
-        below = sum(self.again[key] if key in self.again else self._reading(key) for key in set(work.sources))
-        quick = self.took.get(work.step.node.path, _QUICK) < _QUICK
-        return replace(work, below=below, quick=quick)
+        refetch = sum(self.again[key] if key in self.again else self._reading(key) for key in set(work.sources))
+        unlocked = self.took.get(work.step.node.path, _QUICK) < _QUICK
+        return replace(work, refetch_seconds=refetch, unlocked=unlocked)
 
     def _note(self, outcome: Outcome, expected: Estimate) -> None:
-        """Take in what became of a step."""
+        """Record the outcome of a step."""
         work, step, key = outcome.work, outcome.work.step, outcome.work.key
         if outcome.lost:
             raise InputMissing(*outcome.lost)
         if outcome.error is not None:
             raise outcome.error if isinstance(outcome.error, RunError) else RunError(step, [], outcome.error)
         if outcome.found:
-            self._finish(self._cached(key, "another process made it"))
+            self._finish(self._cached(key, "another process computed this result"))
             return
         self.facts[key] = outcome.facts
         path = step.node.path
         self.took[path] = max(outcome.seconds, self.took.get(path, 0.0))
-        self.again[key] = self.store.read_seconds(outcome.bytes) if outcome.kept else outcome.seconds + work.below
+        computing = outcome.seconds + work.refetch_seconds
+        self.again[key] = self.store.read_seconds(outcome.bytes) if outcome.kept else computing
         predicted = expected.seconds[work.device.partition(":")[0]] if expected.known else None
         self._finish(ran(outcome, self._why(step.name, key), self._bound(step.name), self.began, predicted))
 
     def _fetch(self, key: Key) -> Any:
-        """A value that was computed, or is stored; `InputMissing` where it is neither."""
+        """Return a value from memory or the store; raise `InputMissing` where both lack the value."""
         if key not in self.values:
             began = time.perf_counter()
             try:
@@ -261,13 +262,13 @@ class Execution:
         if about is None:
             raise InputMissing(key)
         name = self.makers[key].name
-        why = why or f"made {about['date']} in {about['seconds']:.3g} s"
+        why = why or f"computed {about['date']} in {about['seconds']:.3g} s"
         checks = tuple(Check(text, ok) for text, ok in about["checks"])
         facts, bound, error = facts_in(about), self._bound(name), error_in(about)
         return StepRecord(name, "cached", why, seconds, key, facts, checks, "cpu", about["bytes"], bound, error=error)
 
     def _judge(self, step: Step) -> SkipDecision:
-        """The verdict on a step; an input runs first where the bound asks for facts that no one has yet."""
+        """Return the decision on a step; compute an input first where the bound needs its unknown statistics."""
 
         def facts_of(name: str) -> TensorStats | None:
             key = self.keys[name]
@@ -278,7 +279,7 @@ class Execution:
         return self.ledger.verdict(step, step.params, facts_of)
 
     def known_facts(self, name: str) -> TensorStats | None:
-        """Facts of a step that ran, now or before."""
+        """Return the statistics of a step's result from this run or an earlier run."""
         key = self.keys[name]
         return self.facts[key] if key in self.facts else facts_in(self.store.about(key))
 
@@ -288,7 +289,7 @@ class Execution:
 
     def _why(self, name: str, key: Key) -> str:
         verdict = self.verdicts.get(name)
-        why = "quicker to compute than to keep" if key in self.receipts else "not in the store"
+        why = "faster to compute than to store" if key in self.receipts else "not in the store"
         return f"{why}; {verdict.why}" if verdict else why
 
     def _bound(self, name: str) -> float | None:

@@ -13,19 +13,19 @@ if TYPE_CHECKING:
 
 
 def error_in(about: Mapping[str, Any] | None) -> tuple[float, float] | None:
-    """What a stored result says of its own error."""
+    """Return the approximation error that a stored result carries, or None."""
     found = (about or {}).get("error")
     return (float(found[0]), float(found[1])) if found else None
 
 
 def facts_in(about: Mapping[str, Any] | None) -> TensorStats | None:
-    """What a stored result says of its facts."""
+    """Return the statistics that a stored result carries, or None."""
     found = (about or {}).get("facts")
     return TensorStats(**{**found, "shape": tuple(found["shape"])}) if found else None
 
 
 def ran(outcome: Outcome, why: str, bound: float | None, began: float, predicted: float | None) -> StepRecord:
-    """The account of a step that was computed in a run that ``began`` then."""
+    """Return the record of a step computed in a run that started at ``began``."""
     work = outcome.work
     return StepRecord(
         work.step.name,

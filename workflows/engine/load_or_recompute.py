@@ -1,10 +1,10 @@
-"""Load or recompute, whichever is cheaper: exactly, as a smallest cut.
+"""Load or recompute, whichever is cheaper: an exact choice by a minimum cut.
 
-Each value is either loaded, for the price of reading it, or computed, for its seconds and with
-its inputs at hand. The cheapest choice for a whole graph is a smallest cut (Xin et al., Helix,
+Each value is either loaded, which costs the time of reading, or computed, which costs its seconds
+and requires its inputs. The cheapest choice for a whole graph is a minimum cut (Xin et al., Helix,
 PVLDB 12(4), 2018, section 5): ``have v`` and ``compute v`` are two nodes, loading is the edge
-between them, computing the edge to the sink, and an input that must be at hand one that is
-never cut.
+between the two, computing is the edge to the sink, and an input that is required is an edge that
+is never cut.
 """
 
 from __future__ import annotations
@@ -15,14 +15,14 @@ from collections.abc import Callable, Iterable, Sequence
 from neusee.workflows.graph.recipe_graph import in_order
 from neusee.workflows.keys.cache_key import Key
 
-_GAIN = 1e-3  #: s that recomputing a value must save before anyone looks
-_SCALE = 1 << 30  #: capacities are whole numbers of 31 bits
+_GAIN = 1e-3  #: s that recomputing a value must save before the cut is solved
+_SCALE = 1 << 30  #: capacities are integers of 31 bits
 
 Price = Callable[[Key], float]
 
 
 class Upstream(dict[Key, list[Key]]):
-    """By key the keys that it needs: its sources where it must be computed, none where its value is known."""
+    """Keys by the key that needs them: the sources of a value to compute, none for a known value."""
 
     def __init__(self, known: Callable[[Key], bool], sources: Callable[[Key], list[Key]]) -> None:
         self._known, self._sources = known, sources
@@ -40,7 +40,7 @@ class Upstream(dict[Key, list[Key]]):
 def uses_of(
     plan: Iterable[Key], targets: Sequence[Key], known: Callable[[Key], bool], sources: Callable[[Key], list[Key]]
 ) -> Counter[Key]:
-    """How often ``plan``, ``targets``, and what has yet to be computed for them afterwards, take each value."""
+    """Return how often each value is read for ``plan``, ``targets`` and the values yet to be computed for them."""
     below, uses = Upstream(known, sources), Counter(targets)
     in_order(below, targets)
     for key in below.missing.union(plan):
@@ -49,16 +49,16 @@ def uses_of(
 
 
 def worth_solving(load: float, compute: float) -> bool:
-    """Whether a stored value may be cheaper to compute than to load."""
+    """Return True if a stored value may be cheaper to compute than to load."""
     return load > compute + _GAIN
 
 
 def cheaper_to_recompute(
     targets: Sequence[Key], sources: Callable[[Key], Sequence[Key]], load: Price, compute: Price
 ) -> set[Key]:
-    """Stored keys that are cheaper to compute than to load.
+    """Return the stored keys that are cheaper to compute than to load.
 
-    ``load`` gives inf for what is not stored, 0 for what is in memory.
+    ``load`` returns inf for a value that is not stored, and 0 for a value in memory.
     """
     reach = _reached(targets, sources)
     computed = _smallest_cut(targets, reach, sources, load, compute)
@@ -78,7 +78,7 @@ def _reached(targets: Iterable[Key], sources: Callable[[Key], Sequence[Key]]) ->
 def _smallest_cut(
     targets: Sequence[Key], keys: Sequence[Key], sources: Callable[[Key], Sequence[Key]], load: Price, compute: Price
 ) -> set[Key]:
-    """Keys whose ``compute`` node lies on the source's side."""
+    """Return the keys whose ``compute`` node lies on the source's side of the minimum cut."""
     import numpy as np
     from scipy.sparse import csr_array
     from scipy.sparse.csgraph import breadth_first_order, maximum_flow
@@ -102,7 +102,7 @@ def _smallest_cut(
 
 
 def _unit(keys: Sequence[Key], load: Price, compute: Price) -> float:
-    """s to one unit of capacity, so that the sum of all finite prices stays below the edges that are never cut."""
+    """Return the s in one unit of capacity, so that the sum of all finite prices stays below an uncuttable edge."""
     total = sum(price(key) for key in keys for price in (load, compute) if price(key) < float("inf"))
     return max(total, 1e-9) / _SCALE
 

@@ -1,6 +1,6 @@
-"""Work in this process: one thread a device, or none at all where there is one device.
+"""Executor in this process: one thread for each device, or no thread where there is one device.
 
-``cpu:0,cpu:1`` are two lanes of one CPU: worth it where steps are too small to fill its cores.
+``cpu:0,cpu:1`` are two lanes of one CPU, which helps where steps are too small to fill its cores.
 """
 
 from __future__ import annotations
@@ -16,17 +16,17 @@ from neusee.workflows.engine.write_behind import WriteBehind
 from neusee.workflows.keys.cache_key import Key
 from neusee.workflows.store.result_store import Store
 
-_SHARE = 0.9  #: of the memory of a device that may be planned with
+_SHARE = 0.9  #: fraction of a device's memory that a plan may use
 
 
 def lanes_of(devices: Sequence[str], memory: int | None = None) -> dict[str, Lane]:
-    """One lane a device; lanes that use one memory share what may be planned with."""
+    """Return one lane for each device; lanes that use the same memory share its planned part."""
     pools = [pool_of(device) for device in devices]
     return {d: Lane(d, (memory or _SHARE * there_is(d)) / pools.count(pool_of(d))) for d in devices}
 
 
 class Local:
-    """An `Executor` of this process. With one device it works in `wait`, in the caller's own thread."""
+    """An `Executor` in this process. With one device the work is done in `wait`, in the thread of the caller."""
 
     shares = True
 
@@ -41,7 +41,7 @@ class Local:
         self._running: set[Future[Outcome]] = set()
 
     def submit(self, work: Sequence[StepJob]) -> None:
-        """Queue one step."""
+        """Queue the steps of ``work``."""
         for one in work:
             if len(self.lanes) == 1:
                 self._queue.append(one)
@@ -49,7 +49,7 @@ class Local:
                 self._running.add(self._pool(one.lane).submit(carry_out, one, self._fetch, self._store, self.later))
 
     def wait(self, seconds: float | None = None) -> list[Outcome]:
-        """Carry out the next step, or wait for a thread to end one."""
+        """Carry out the next step, or wait until a thread ends one."""
         if self._queue:
             return [carry_out(self._queue.popleft(), self._fetch, self._store, self.later)]
         if not self._running:
@@ -58,7 +58,7 @@ class Local:
         return [future.result() for future in done]
 
     def cancel(self) -> None:
-        """Forget what has not begun, let what has come to its end, and write all that is to be kept."""
+        """Drop the steps that have not begun, let running steps end, and write all results that are to be kept."""
         self._queue.clear()
         for pool in self._pools.values():
             pool.shutdown(wait=True, cancel_futures=True)

@@ -1,4 +1,4 @@
-"""How much memory a step took, and how much there is."""
+"""Memory use: peak memory of a step, and memory of a device."""
 
 from __future__ import annotations
 
@@ -13,10 +13,10 @@ _CGROUPS = ("/sys/fs/cgroup/memory.max", "/sys/fs/cgroup/memory/memory.limit_in_
 
 
 class PeakMemory:
-    """Bytes that a block of code took at most, beside what was there before it.
+    """Peak bytes of a block of code, beside the memory in use before the block.
 
-    Of the CPU it is the resident memory of the whole process, so that steps side by side
-    count for each other; ``bytes`` is None where the system does not tell.
+    On the CPU this is the resident memory of the whole process, so that parallel steps count for
+    each other; ``bytes`` is None where the system gives no numbers.
     """
 
     def __init__(self, device: str, watched: bool = True) -> None:
@@ -44,12 +44,12 @@ class PeakMemory:
 
 
 def pool_of(device: str) -> str:
-    """The memory that a device uses: all lanes of the CPU have one."""
+    """Return the name of the memory that a device uses, which all lanes of the CPU share."""
     return "cpu" if device.startswith("cpu") else device
 
 
 def _forgotten() -> bool:
-    """Let the system forget the highest mark so far."""
+    """Reset the peak memory of this process; return False where the system does not allow the reset."""
     try:
         with open("/proc/self/clear_refs", "w") as file:
             file.write("5")
@@ -67,7 +67,7 @@ def _resident(field: str) -> int | None:
 
 
 def there_is(device: str) -> int:
-    """Bytes of memory of a device; of the CPU what this process may have of it."""
+    """Return the bytes of memory of a device, or on the CPU the bytes that this process may use."""
     if device.startswith("cuda"):
         return int(torch.cuda.get_device_properties(device).total_memory)
     found = os.sysconf("SC_PAGE_SIZE") * os.sysconf("SC_PHYS_PAGES")

@@ -1,4 +1,4 @@
-"""Call the node of one step: on its device, with its random stream, and with an error that says where."""
+"""Call of one step's node, on its device and with its random stream; an error names the step and its place."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from neusee.workflows.store.serialization import each_tensor, settle, tensors_in
 
 
 def call(step: Step, inputs: Sequence[Any], params: Mapping[str, Any], seed: int, device: str) -> Any:
-    """The result of a step, laid out as the store would give it back; gradients flow."""
+    """Return the result of a step, laid out as the store would return it; gradients are kept."""
     moved = [to_device(value, device) for value in inputs]
     rng = {"rng": torch.Generator(device).manual_seed(stream_seed(seed, step.name))} if step.node.random else {}
     tensors = tensors_in(moved)
@@ -25,30 +25,30 @@ def call(step: Step, inputs: Sequence[Any], params: Mapping[str, Any], seed: int
     except Exception as error:
         raise RunError(step, inputs, error) from error
     if before != [x._version for x in tensors]:
-        raise RunError(step, inputs, ValueError("the node changed its input in place: let it work on a copy"))
+        raise RunError(step, inputs, ValueError("the node changed its input in place: let the node clone the input"))
     return value
 
 
 def examine(step: Step, value: Any, inputs: Sequence[Any]) -> tuple[Check, ...]:
-    """What the node's own check says of a result; a check that fails to run is a check that failed."""
+    """Return the results of the node's own check; a check that raises counts as failed."""
     if step.node.hooks.check is None:
         return ()
     try:
         return tuple(step.node.hooks.check(value, *inputs, **step.params))
     except Exception as error:
-        return (Check(f"the check itself failed: {type(error).__name__}: {error}", False),)
+        return (Check(f"the check raised an error: {type(error).__name__}: {error}", False),)
 
 
 def place(step: Step, device: str) -> str:
-    """Where a step runs of a device, or of several that commas separate, were there no other work."""
+    """Return the preferred device of a step among the devices that commas separate."""
     return places(step, device.split(","))[0]
 
 
 def places(step: Step, devices: Sequence[str]) -> tuple[str, ...]:
-    """Devices on which a step may run, the preferred one first.
+    """Return the devices on which a step may run, the preferred device first.
 
-    A recipe's hint goes before that of the node. A random step stays on one kind of device, because
-    its stream, and so its key, depends on it.
+    The recipe's hint precedes the hint of the node. A random step stays on one kind of device, because
+    its random stream, and so its key, depends on that kind.
     """
     hint = step.device or step.node.device
     if hint == "cpu":

@@ -1,4 +1,4 @@
-"""From the steps that must run to work on lanes: what each will cost, where it goes, whether there is memory for it."""
+"""Inputs of the placement: from the steps to run, their predicted costs, lanes and memory."""
 
 from __future__ import annotations
 
@@ -16,12 +16,12 @@ from neusee.workflows.placement.heft_and_cpop import Cluster, Device, Schedule, 
 from neusee.workflows.store.result_store import Store
 from neusee.workflows.store.serialization import tensors_in
 
-_MOST_PARTS = 64  #: into which a step may be cut by bands; how many bands there are is known only when it runs
+_MOST_PARTS = 64  #: upper bound on the parts of a step cut by bands; the number of bands is known when the step runs
 
 
 @dataclass(frozen=True, slots=True)
 class Prepared:
-    """Work in the order in which it should begin, what it should take, and when it should be where."""
+    """Work in the order in which to begin, its predicted costs, and the schedule."""
 
     works: list[StepJob]
     expected: Mapping[Key, Estimate]
@@ -35,7 +35,7 @@ def prepare(
     lanes: Mapping[str, Lane],
     keep: Collection[Key],
 ) -> Prepared:
-    """Give every piece of work a lane and a device. Raises `TooLarge` where the memory cannot do."""
+    """Return the work with a lane and a device for every step. Raises `TooLarge` where the memory is too small."""
     kinds = sorted({lane.kind for lane in lanes.values()} | {"cpu"})
     expected = {w.key: costs.of(w.step, kinds, abouts.get(w.key)) for w in works}
     only, lane = next(iter(lanes.items()))
@@ -53,7 +53,7 @@ def prepare(
 
 
 def room_for(expected: Mapping[Key, Estimate], executor: Executor, values: Mapping[Key, Any]) -> MemoryProfile:
-    """Whether one more step may run beside those that do, given the ``values`` that are held at that moment."""
+    """Return a function that tells if one more step fits beside the running steps and the present ``values``."""
 
     def room(work: StepJob, running: Sequence[StepJob]) -> bool:
         pool = pool_of(work.device)
@@ -68,7 +68,7 @@ def room_for(expected: Mapping[Key, Estimate], executor: Executor, values: Mappi
 
 
 def joined(first: Schedule | None, then: Schedule | None) -> Schedule | None:
-    """One plan after the other: a run whose verdicts need values makes several."""
+    """Return one schedule after the other; a run whose decisions need values makes several schedules."""
     if first is None or then is None:
         return first or then
     by = first.makespan
@@ -97,7 +97,7 @@ def _task(work: StepJob, estimate: Estimate, lanes: Mapping[str, Lane], names: M
 
 
 def _cpu_only(work: StepJob) -> bool:
-    """Whether a step computes on the CPU of whatever lane it gets; the key of a random one says of what kind it is."""
+    """Return True if a step computes on the CPU of any lane; the key of a random step fixes its kind of device."""
     hint = work.step.device or work.step.node.device
     return hint == "cpu" or (work.step.node.random and work.device == "cpu")
 
@@ -109,7 +109,7 @@ def _of_kind(kind: str, lanes: Mapping[str, Lane]) -> list[str]:
 def _one_after_another(
     works: Sequence[StepJob], expected: Mapping[Key, Estimate], lane: str, keep: Collection[Key]
 ) -> Schedule:
-    """The works in their order, each result let go after its last use."""
+    """Return the schedule of the works in their order, where each result is freed after its last use."""
     last = {key: work.key for work in works for key in work.sources}
     now, held, most, slots = 0.0, 0.0, 0.0, []
     for work in works:
@@ -128,5 +128,5 @@ def _kind(device: str) -> str:
 
 
 def past_costs(store: Store) -> Costs:
-    """Costs of all that a store remembers."""
+    """Return the costs of all results that a store remembers."""
     return Costs(store.journal.rows())

@@ -1,4 +1,4 @@
-"""The keys that a run would give the steps of a recipe, found without running anything."""
+"""Resolution of keys: the keys that a run would give the steps of a recipe, without running a step."""
 
 from __future__ import annotations
 
@@ -20,27 +20,27 @@ from neusee.workflows.tolerance.skip_decision import SkipDecision
 
 @dataclass(frozen=True, slots=True)
 class Resolved:
-    """Keys, what went into them, and which steps are left out."""
+    """Keys, their origins, and the decisions on the steps that may be left out."""
 
     keys: dict[str, Key] = field(default_factory=dict)
     origins: dict[Key, Mapping[str, Any]] = field(default_factory=dict)
     makers: dict[Key, str] = field(default_factory=dict)  #: the first step of each key that is not left out
-    verdicts: dict[str, SkipDecision | None] = field(default_factory=dict)  #: None where facts are missing that decide
+    verdicts: dict[str, SkipDecision | None] = field(default_factory=dict)  #: None where statistics are missing
 
     def left_out(self, name: str) -> bool | None:
-        """Whether a step is left out; None where only what feeds it will tell, and it is taken to run."""
+        """Return whether a step is left out; None, which counts as run, where only its inputs can decide."""
         verdict = self.verdicts.get(name)
         return None if verdict is None and name in self.verdicts else verdict is not None and verdict.left_out
 
     def stands_for(self, name: str) -> str:
-        """The step whose result a step hands on: itself, unless it is left out."""
+        """Return the step whose result a step passes on: the step itself, unless it is left out."""
         while (verdict := self.verdicts.get(name)) is not None and verdict.left_out:
             name = verdict.instead
         return name
 
 
 def resolve(recipe: Recipe, order: Iterable[str], store: Store, device: str = "cpu") -> Resolved:
-    """Give each step of ``order``, in which sources come first, its key as a run on ``device`` would."""
+    """Return the key of each step of ``order`` (sources first) as a run on ``device`` would compute it."""
     found, code, ledger = Resolved(), Code(store.code_memo), ErrorBudget(recipe)
 
     def facts_of(name: str) -> TensorStats | None:

@@ -1,4 +1,4 @@
-"""Run a recipe: walk back from what is wanted, stop at what is known, compute the rest."""
+"""Run of a recipe: walk back from the wanted outputs, stop at known results, compute the rest."""
 
 from __future__ import annotations
 
@@ -25,28 +25,28 @@ from neusee.workflows.tolerance.tolerance_frontier import border
 
 __all__ = ["Event", "Result", "StepRecord", "run"]
 
-_SAFE = 0.8  #: of what would just do, the share that a second attempt may spend
+_SAFE = 0.8  #: fraction of the just sufficient tolerance scale that a second attempt uses
 
 
 @dataclass(frozen=True, repr=False)
 class Result:
-    """What a run gives: the values that were asked for, and an account of every step they need."""
+    """Result of a run: the requested values, and a record of every step that they need."""
 
     values: dict[str, Any]
     done: dict[str, StepRecord]
     keys: dict[str, Key]
     seconds: float
-    peak_memory: int  #: bytes, of this process so far
+    peak_memory: int  #: peak bytes of this process so far
     recipe: Recipe
     store: Store
     device: str = "cpu"
-    schedule: Schedule | None = None  #: what was expected of the steps that ran
+    schedule: Schedule | None = None  #: predicted times of the steps that ran
     proof: ErrorBounds = field(
         default_factory=ErrorBounds
-    )  #: what was left out, or computed more cheaply, may change at each step
+    )  #: upper bounds on the errors of omitted and approximated steps, at each step
 
     def value(self, step: str) -> Any:
-        """The value of any step of the recipe: from this run, from the store, or computed now."""
+        """Return the value of any step of the recipe: from this run, from the store, or computed now."""
         if step in self.values:
             return self.values[step]
         return run(self.recipe, self.store, (step,), device=self.device).values[step]
@@ -54,7 +54,7 @@ class Result:
     __getitem__ = value
 
     def numpy(self, step: str) -> Any:
-        """The value of a step with a numpy array for every tensor."""
+        """Return the value of a step with a numpy array in place of every tensor."""
         from neusee.workflows.report.notebook import arrays_of
 
         return arrays_of(self.value(step))
@@ -62,7 +62,7 @@ class Result:
     def metrics(self) -> dict[str, float | list[float]]:
         """Return every figure of merit that ``neusee run`` prints, such as ``restored_quality.psnr``.
 
-        One for each band is a list. What this run did not need is read from the store, or computed now.
+        A figure of each band is a list. A figure that this run did not need is read from the store, or computed now.
         """
         from neusee.workflows.report.notebook import numbers_of
 
@@ -88,11 +88,11 @@ def run(
     executor: Executor | None = None,
     memory: int | None = None,
 ) -> Result:
-    """Give the values of ``outputs`` (the recipe's own, if None), computing what ``store`` does not hold.
+    """Return the values of ``outputs`` (the recipe's own, if None); compute what ``store`` does not hold.
 
     Args: device: one or several, ``cuda:0,cuda:1,cpu``, the preferred one first. executor: where to
-    compute instead of this process. memory: bytes that may be planned with, of each device;
-    nine tenths of what there is if None. Raises `RunError`, naming the step.
+    compute instead of this process. memory: bytes of each device that a plan may use; nine tenths
+    of its memory if None. Raises `RunError`, which names the step.
     """
     began = time.perf_counter()
     wanted = recipe.outputs if outputs is None else tuple(outputs)
@@ -111,13 +111,13 @@ def run(
 
 
 def _stricter(recipe: Recipe, over: float) -> Recipe:
-    """The recipe with less to spend, where it could not be proved that its tolerance held; the second time nothing."""
-    strict = _SAFE / over if recipe.strict == 1.0 else 0.0
-    return replace(recipe.unsubstituted or recipe, strict=strict, exact=strict == 0.0)
+    """Return the recipe with a smaller tolerance scale after a failed proof; 0 (exact) after the second."""
+    scale = _SAFE / over if recipe.tolerance_scale == 1.0 else 0.0
+    return replace(recipe.unsubstituted or recipe, tolerance_scale=scale, exact=scale == 0.0)
 
 
 def _attempt(work: Execution, wanted: tuple[str, ...], began: float) -> Result:
-    """Run the recipe, first as far as the proof of the tolerance needs; raise `ToleranceNotProven` if it fails."""
+    """Run the recipe, first as far as the proof of its tolerance needs; raise `ToleranceNotProven` if that fails."""
     recipe, store = work.recipe, work.store
     order = needed(recipe, wanted)
     with torch.no_grad():
@@ -140,7 +140,7 @@ def _attempt(work: Execution, wanted: tuple[str, ...], began: float) -> Result:
     done = work.account(order)
     peak = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss * 1024
     seconds = time.perf_counter() - began
-    if missing:  # else all was known before
+    if missing:  # otherwise all results were known before
         proved = proof(recipe, order, wanted, done.__getitem__, work.known_facts)
     device = ",".join(work.devices)
     return Result(values, done, work.keys, seconds, peak, recipe, store, device, work.schedule, proved)

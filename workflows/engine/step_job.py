@@ -1,7 +1,7 @@
-"""One piece of work: a step with the keys of what it reads, and what comes of it.
+"""Job of one step: the step with the keys of its inputs, and the outcome.
 
-A piece carries keys and parameters and never a tensor, so that it may be carried out here or
-in another process; what a value is worth decides whether the store keeps it.
+A job carries keys and parameters and never a tensor, so that this process or another one can
+carry it out. The cost of a value decides whether the store keeps the value.
 """
 
 from __future__ import annotations
@@ -28,14 +28,14 @@ from neusee.workflows.store.metadata import INLINE
 from neusee.workflows.store.result_store import Store
 from neusee.workflows.store.serialization import pack, tensors_in
 
-Read = Key | tuple[Key, ...] | None  #: what one input reads: one value, a list of them, or nothing
+Read = Key | tuple[Key, ...] | None  #: content of one input: one value, a list of values, or nothing
 Fetch = Callable[[Key], Any]
 _FACTS = tuple(f.name for f in fields(TensorStats))
 _WATCHED = 1 << 20  #: bytes of inputs from which the memory of a step is measured
 
 
 class InputMissing(Exception):
-    """A stored result turned out to be damaged or gone when it was read: plan again without it."""
+    """A stored result is damaged or gone when it is read: the run plans again without that result."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -44,89 +44,89 @@ class StepJob:
 
     step: Step
     key: Key
-    origin: Mapping[str, Any]  #: everything that went into the key
-    reads: tuple[Read, ...]  #: by input, in the node's order
+    origin: Mapping[str, Any]  #: every part of the key
+    reads: tuple[Read, ...]  #: keys by input, in the node's order
     seed: int
     recipe: str
-    device: str  #: where it computes: ``cpu``, ``cuda:1``
-    lane: str  #: which of the executor's places has it
-    wanted: bool = False  #: whether the result is asked for, and is kept whatever it costs
-    quick: bool = False  #: whether its like took so little that no other process need wait for it
-    anew: bool = False  #: whether to compute it although it is stored, because that is quicker
-    below: float = 0.0  #: s to have its inputs again, were this result not kept
-    parts: int = 1  #: into how many runs of bands it is cut for want of memory
+    device: str  #: device of the computation: ``cpu``, ``cuda:1``
+    lane: str  #: lane of the executor
+    wanted: bool = False  #: whether the result is requested, and so is kept whatever its cost
+    unlocked: bool = False  #: compute without a lease, because the node takes so little time
+    recompute: bool = False  #: whether to compute a stored result because computing is faster than reading
+    refetch_seconds: float = 0.0  #: s to obtain the inputs again if this result is not kept
+    parts: int = 1  #: number of passes over the bands, for less memory
 
     @property
     def sources(self) -> tuple[Key, ...]:
-        """Every key that it reads."""
+        """Return every key that the job reads."""
         return tuple(k for read in self.reads for k in ((read,) if isinstance(read, str) else read or ()))
 
 
 @dataclass(slots=True)
 class Outcome:
-    """What became of a piece of work."""
+    """Outcome of a job."""
 
     work: StepJob
-    value: Any = None  #: absent where another process computed it
+    value: Any = None  #: None where another process computed the value
     facts: TensorStats | None = None
     checks: tuple[Check, ...] = ()
-    began: float = 0.0  #: s of the clock of `time.time`
+    began: float = 0.0  #: s, by `time.time`
     seconds: float = 0.0
     bytes: int = 0
     deviation: tuple[float, float] | None = None  #: of a cheaper form: `Node.approximation_error`
-    peak: int | None = None  #: bytes beside what was there before
+    peak: int | None = None  #: peak bytes beside the memory in use before
     kept: bool = False  #: whether the store has the value
-    waits: bool = False  #: it is written beside the next steps, and its lease goes with it
-    held: bool = False  #: another process is at it
-    found: bool = False  #: another process was quicker, and its result is there
+    waits: bool = False  #: the value is written during the next steps, and its lease is released afterwards
+    held: bool = False  #: another process computes this key
+    found: bool = False  #: another process has already stored this result
     error: BaseException | None = None
     lost: tuple[Key, ...] = field(default=())  #: inputs that could not be read
 
 
 @dataclass(frozen=True, slots=True)
 class Lane:
-    """A place that does one piece of work at a time."""
+    """A place that carries out one job at a time."""
 
     device: str
-    memory: float  #: bytes that may be planned with
+    memory: float  #: bytes that a plan may use
 
     @property
     def kind(self) -> str:
-        """``cpu`` or ``cuda``, without the number."""
+        """Return ``cpu`` or ``cuda``, without the number."""
         return self.device.partition(":")[0]
 
 
 class Executor(Protocol):
-    """Where work is done. Three calls, so that another engine can follow."""
+    """Interface of an executor, three calls wide, so that another engine can be added."""
 
     @property
     def lanes(self) -> Mapping[str, Lane]:
-        """The places where work can be done, by name."""
+        """Return the lanes of the executor by name."""
 
     @property
     def shares(self) -> bool:
-        """Whether values stay in this process; otherwise they travel through the store, by key."""
+        """Return True if values stay in this process; otherwise they pass through the store by key."""
 
     def submit(self, work: Sequence[StepJob]) -> None:
         """Begin with ``work``, steps of one lane of which each feeds the next."""
 
     def wait(self, seconds: float | None = None) -> list[Outcome]:
-        """What has ended since; at least one, unless nothing is under way or the time is over."""
+        """Return the outcomes since the last call; at least one, unless no job runs or the time is over."""
 
     def cancel(self) -> None:
-        """Begin with nothing more, and wait for what is under way."""
+        """Begin with no further job, and wait for the running jobs."""
 
 
 def carry_out(work: StepJob, fetch: Fetch, store: Store, later: WriteBehind | None = None) -> Outcome:
-    """Compute one step and keep what is worth keeping, perhaps ``later``; a failure is part of the outcome."""
-    if work.quick:
+    """Compute one step and store the result if that pays, perhaps ``later``; return a failure in the outcome."""
+    if work.unlocked:
         return _carried_out(work, fetch, store, None, Lease())
     lease = store.claim(work.key)
     if lease is None:
         return Outcome(work, held=True)
     outcome = Outcome(work)
     try:
-        if not work.anew and store.has(work.key):
+        if not work.recompute and store.has(work.key):
             return Outcome(work, kept=True, found=True)
         outcome = _carried_out(work, fetch, store, later, lease)
         return outcome
@@ -153,7 +153,7 @@ def _gathered(read: Read, fetch: Fetch) -> Any:
 
 
 def _computed(work: StepJob, inputs: list[Any], store: Store) -> Outcome:
-    """The value, what is known of it, and what it cost."""
+    """Return the value, its statistics and its cost."""
     step = work.step
     began, clock = time.time(), time.perf_counter()
     size = sum(t.nbytes for t in tensors_in(inputs))
@@ -173,23 +173,23 @@ def _computed(work: StepJob, inputs: list[Any], store: Store) -> Outcome:
         checks = examine(step, bare, inputs)
     seconds = time.perf_counter() - clock
     if work.origin["params"] != {name: plain(param) for name, param in step.params.items()}:
-        raise RunError(step, [], OSError("a file changed while it was read: run again"))
+        raise RunError(step, [], OSError("an input file changed while it was read: run again"))
     found = sum(t.nbytes for t in tensors_in(bare))
     deviation = step.node.hooks.approximation_error(bare) if step.node.hooks.approximation_error else None
     return Outcome(work, value, TensorStats.of(bare), checks, began, seconds, found, deviation, peak.bytes)
 
 
 def _kept(outcome: Outcome, store: Store, later: WriteBehind | None, lease: Lease) -> Outcome:
-    """Store the value where that pays, and in any case what is known of it."""
+    """Store the value where that pays, and its metadata in any case."""
     work, value, about = outcome.work, outcome.value, _about(outcome)
     small = outcome.bytes <= INLINE
     try:
-        if work.quick and (small or not work.wanted) and not _pays(outcome, store, 0):
-            outcome.kept = store.jot(work.key, value, about)
+        if work.unlocked and (small or not work.wanted) and not _pays(outcome, store, 0):
+            outcome.kept = store.put_small(work.key, value, about)
         elif not (work.wanted or small or _pays(outcome, store, outcome.bytes)):
-            store.note(work.key, about)
+            store.put_receipt(work.key, about)
         elif later is not None and outcome.bytes >= LARGE:
-            pack(value)  # what cannot be stored is refused here, where the step is known
+            pack(value)  # a value that cannot be stored raises here, where the step is known
             later.add(work.key, outcome.bytes, lambda: _written(store, work.key, value, about, lease))
             outcome.kept = outcome.waits = True
         else:
@@ -206,8 +206,8 @@ def _written(store: Store, key: Key, value: Any, about: dict[str, Any], lease: L
 
 
 def _pays(outcome: Outcome, store: Store, size: int) -> bool:
-    """Whether to have the result again costs more than to write ``size`` bytes now and read them once."""
-    return outcome.seconds + outcome.work.below > store.write_seconds(size) + store.read_seconds(size)
+    """Return True if computing the result again costs more than writing ``size`` bytes now and reading them once."""
+    return outcome.seconds + outcome.work.refetch_seconds > store.write_seconds(size) + store.read_seconds(size)
 
 
 def _about(outcome: Outcome) -> dict[str, Any]:

@@ -1,4 +1,4 @@
-"""A pause of torch's other threads, where what is computed is over before they are awake."""
+"""Pause of torch's thread pool, for computations that end before the threads wake up."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ from contextlib import contextmanager
 
 @contextmanager
 def one_thread() -> Iterator[None]:
-    """Compute with a single thread, and with as many as before when it is over."""
+    """Run a block of code on one thread, and restore the thread count afterwards."""
     import torch
 
     before = torch.get_num_threads()

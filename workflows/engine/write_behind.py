@@ -1,7 +1,7 @@
-"""Write large results while the next steps compute.
+"""Writes of large results while the next steps compute.
 
-A run does not end before all is written. What waits stays in memory and keeps its lease, so that
-another process which wants the same result finds either the one or the other.
+A run ends after all writes. A waiting result stays in memory and keeps its lease, so that another
+process that needs the same result finds either the lease or the result.
 """
 
 from __future__ import annotations
@@ -16,13 +16,13 @@ from typing import Any
 
 from neusee.workflows.keys.cache_key import Key
 
-LARGE = 1 << 20  #: bytes from which a result is written beside the next step
-_ROOM = 1 << 29  #: bytes that may wait; one larger result waits alone
+LARGE = 1 << 20  #: bytes from which a result is written during the next step
+_ROOM = 1 << 29  #: bytes that may wait; a larger result waits alone
 _NICE = 10
 
 
 class WriteBehind:
-    """Writes under way, one at a time."""
+    """Pending writes, carried out one at a time."""
 
     def __init__(self) -> None:
         self._pool: ThreadPoolExecutor | None = None
@@ -31,11 +31,11 @@ class WriteBehind:
         self._guard = threading.Lock()
 
     def __contains__(self, key: Key) -> bool:
-        """Whether a result still waits to be written."""
+        """Return True if a result still waits to be written."""
         return key in self._sizes
 
     def add(self, key: Key, size: int, write: Callable[[], Any]) -> None:
-        """Write when there is time; waits for earlier ones where ``size`` bytes more would be too many."""
+        """Queue a write; wait for earlier writes where ``size`` more bytes would exceed the limit."""
         while self._sizes and sum(list(self._sizes.values())) + size > _ROOM:
             wait([self._writes[key] for key in list(self._sizes) if key in self._writes], return_when=FIRST_COMPLETED)
         with self._guard:
@@ -44,7 +44,7 @@ class WriteBehind:
             self._writes[key] = self._pool.submit(self._write, key, write)
 
     def finish(self) -> None:
-        """Wait for all of them; an error of one is raised here."""
+        """Wait for all writes; raise the error of a failed write."""
         with self._guard:
             pool, self._pool = self._pool, None
             writes, self._writes = self._writes, {}
@@ -61,7 +61,7 @@ class WriteBehind:
 
 
 def _yielding() -> None:
-    """Let whoever computes go first: its threads wait for each other, so that one without a core delays them all."""
-    if sys.platform == "linux":  # elsewhere it would be the whole process; threads that this one starts are as nice
+    """Lower the priority of the writing thread, so that the computing threads, which wait for each other, run first."""
+    if sys.platform == "linux":  # elsewhere: the whole process; new threads inherit it
         with suppress(OSError):
             os.setpriority(os.PRIO_PROCESS, threading.get_native_id(), _NICE)

@@ -71,7 +71,7 @@ class Bench:
         point = self._numbers(pipeline, values)
         self.seconds += (spent := time.perf_counter() - began)
         self.computed += 1
-        self.store.jot(key, point, {"step": "evaluate", "seconds": spent, "date": timestamp()})
+        self.store.put_small(key, point, {"step": "evaluate", "seconds": spent, "date": timestamp()})
         return point
 
     def values(self, pipeline: Composed, wanted: Wanted, more: Sequence[str] = ()) -> dict[str, Any]:

@@ -1,8 +1,8 @@
-"""What makes one result another than an earlier one: at a step itself, and up through all that feeds it.
+"""Causes of a change: the differences between a result and an earlier one, at a step and upstream of it.
 
-A pair is a present result beside a past one. Pairs are compared by what went into their
-keys, so that no tensor is read and nothing need have run; the walk from a pair to the pairs
-behind it follows the keys of the inputs that differ.
+A pair is a present result and a past one. Pairs are compared by the parts of their keys, so that
+no tensor is read and no step need have run. The search goes from a pair to the pairs of its
+inputs whose keys differ.
 """
 
 from __future__ import annotations
@@ -18,31 +18,31 @@ from neusee.workflows.graph.recipe_graph import Recipe
 from neusee.workflows.keys.cache_key import Key
 from neusee.workflows.store.result_store import Store
 
-Origin = Mapping[str, Any]  #: what went into a key: node, code, params, inputs, stream
+Origin = Mapping[str, Any]  #: the parts of a key: node, code, params, inputs, stream
 _FEW = 4  #: steps of an input that are named
-_FAR = 100  #: steps that are looked at for one that came in between
+_FAR = 100  #: steps that are searched for an inserted one
 
 
 class Pair(NamedTuple):
-    """A step's result now, beside one that was stored earlier."""
+    """A step's present result and an earlier stored result."""
 
     label: str
     new: Key
     old: Key
 
 
-Found = tuple[list[str], list[Pair]]  #: causes at a pair itself, and the pairs behind it
+Found = tuple[list[str], list[Pair]]  #: causes at a pair itself, and the pairs of its inputs
 
 
 @dataclass(frozen=True, slots=True)
 class Roots:
-    """Differences that no other step explains, the nearest first, and how each one reaches the first pair."""
+    """Differences that no other step explains, the nearest first, and the path of each one to the first pair."""
 
-    found: dict[str, Pair]  #: by what is said of it
+    found: dict[str, Pair]  #: by its description
     above: dict[Pair, Pair | None]
 
     def chain(self, text: str) -> list[str]:
-        """Steps from the first one to the one where it arose."""
+        """Return the steps from the start of the comparison to the step with the cause."""
         way: list[str] = []
         pair: Pair | None = self.found[text]
         while pair is not None:
@@ -52,7 +52,7 @@ class Roots:
 
 
 class Comparison:
-    """Compares present results, of a recipe if there is one, with stored ones."""
+    """Comparison of present results, of a recipe if there is one, with stored results."""
 
     def __init__(self, store: Store, recipe: Recipe | None = None, resolved: Resolved | None = None) -> None:
         self.store, self.recipe, self.resolved = store, recipe, resolved or Resolved()
@@ -62,11 +62,11 @@ class Comparison:
         self._abouts: dict[Key, Mapping[str, Any] | None] = {}
 
     def roots(self, start: Pair, most: float = float("inf")) -> Roots | None:
-        """Every root cause once; None as soon as there are more than ``most``."""
+        """Return every root cause once, or None as soon as there are more than ``most``."""
         above: dict[Pair, Pair | None] = {start: None}
         found: dict[str, Pair] = {}
         todo = [start]
-        for pair in todo:  # grows while it is walked, so that the nearest come first
+        for pair in todo:  # the list grows during the loop, so that the nearest pairs come first
             texts, below = self.compare(pair)
             for text in texts:
                 found.setdefault(text, pair)
@@ -79,13 +79,13 @@ class Comparison:
         return Roots(found, above)
 
     def compare(self, pair: Pair) -> Found:
-        """What differs at a pair itself, and the pairs of sources that differ."""
+        """Return the differences at a pair itself, and the pairs of sources that differ."""
         if pair not in self.seen:
             self.seen[pair] = self._compare(pair)
         return self.seen[pair]
 
     def own(self, label: str, old: Origin, new: Origin) -> list[str]:
-        """What differs between two origins of a step, but for its inputs."""
+        """Return the differences between two origins of a step, except for its inputs."""
         if old["node"] != new["node"]:
             where = self.wording.source("steps", label.partition("[")[0], "node")
             return [f"{old['node']} -> {new['node']}{where}"]
@@ -95,15 +95,15 @@ class Comparison:
         return found + self._stream(old.get("stream"), new.get("stream"))
 
     def origin(self, key: Key) -> Origin | None:
-        """What went into a key, as far as the recipe or the store knows it."""
+        """Return the parts of a key, from the recipe or the store, or None."""
         return self.resolved.origins.get(key) or (self.about(key) or {}).get("origin")
 
     def step(self, key: Key) -> str | None:
-        """The step that a key was first made for."""
+        """Return the step for which a key was first computed."""
         return self.resolved.makers.get(key) or (self.about(key) or {}).get("step")
 
     def about(self, key: Key) -> Mapping[str, Any] | None:
-        """What the store knows of a key; a receipt, too, is read but once."""
+        """Return the stored metadata of a key; each key is read once."""
         if key not in self._abouts:
             self._abouts[key] = self.store.about(key)
         return self._abouts[key]
@@ -111,7 +111,7 @@ class Comparison:
     def _compare(self, pair: Pair) -> Found:
         old, new = self.origin(pair.old), self.origin(pair.new)
         if old is None or new is None:
-            return [f"what {pair.label} was {'then' if old is None else 'made of'} is no longer known"], []
+            return [f"the {'earlier origin' if old is None else 'origin'} of {pair.label} is no longer known"], []
         texts = self.own(pair.label, old, new)
         if old["node"] != new["node"] or len(old["inputs"]) != len(new["inputs"]):
             return texts, []
@@ -123,7 +123,7 @@ class Comparison:
         return texts, pairs
 
     def _labels(self, pair: Pair, origin: Origin) -> list[tuple[tuple[str, ...], list[str]]]:
-        """By input, where a recipe says what feeds it, and the steps that do: else the steps that made its keys."""
+        """Return, by input, its path in the recipe and the steps that feed it, else the steps that made its keys."""
         step = self.recipe.steps.get(pair.label) if self.recipe else None
         if step is None or self.resolved.keys.get(pair.label) != pair.new:
             return [((), [self.step(key) or "a step" for key in _listed(keys)]) for keys in origin["inputs"]]
@@ -132,7 +132,7 @@ class Comparison:
         return [((*path, name), [self.resolved.stands_for(wire) for wire in wired]) for name, wired in wires]
 
     def _input(self, path: tuple[str, ...], labels: list[str], new: list[Key], old: list[Key]) -> Found:
-        """One input, which takes one step or many."""
+        """Return the differences of one input, which takes one step or many."""
         if len(new) == 1 and len(old) == 1:
             return self._source(path, labels[0], new[0], old[0])
         then = dict(zip([self.step(key) or key for key in old], old, strict=True))
@@ -142,10 +142,10 @@ class Comparison:
             return [t for texts, _ in found for t in texts], [p for _, pairs in found for p in pairs]
         texts = self._joined(path, [n for n in now if n not in then], [n for n in then if n not in now])
         pairs = [Pair(name, key, then[name]) for name, key in now.items() if then.get(name, key) != key]
-        return texts or ([] if pairs else ["reads its sources in another order"]), pairs
+        return texts or ([] if pairs else ["the order of its sources changed"]), pairs
 
     def _source(self, path: tuple[str, ...], label: str, new: Key, old: Key) -> Found:
-        """A source that is not what it was: changed, exchanged, left out, or with a step in between."""
+        """Return the differences of a source: changed, exchanged, left out, or with a step in between."""
         if new == old:
             return [], []
         was = self.step(old)
@@ -165,13 +165,13 @@ class Comparison:
         return [f"reads {label}, not {was}{self._wired(path)}"], []
 
     def _joined(self, path: tuple[str, ...], came: list[str], went: list[str]) -> list[str]:
-        """What a step reads in addition, and no more; of items their recipe's list decides, and not the wire."""
+        """Return clauses for added and removed sources; only a source that is no item is located by its wire."""
         where = self._wired(path) if any("[" not in name for name in came) else ""
         texts = [f"reads {_few(came)} now{where}"] if came else []
         return [*texts, f"reads {_few(went)} no more{self._absent(went[0])}"] if went else texts
 
     def _between(self, key: Key, wanted: tuple[str | None, ...]) -> tuple[list[str], Key | None]:
-        """Up along first inputs to one of the ``wanted`` steps: the steps on the way, and its key if it is there."""
+        """Search upstream along first inputs for a ``wanted`` step; return the steps passed and its key, if found."""
         passed: list[str] = []
         for _ in range(_FAR):
             first = next(iter((self.origin(key) or {}).get("inputs", ())), None)
@@ -187,14 +187,14 @@ class Comparison:
         if name not in self.resolved.verdicts:
             return ""
         verdict = self.resolved.verdicts[name]
-        return f"{name} is no longer left out: {verdict.why if verdict else 'or is, as what feeds it will tell'}"
+        return f"{name} is no longer left out: {verdict.why if verdict else 'its inputs decide'}"
 
     def _went(self, name: str) -> str:
         verdict = self.resolved.verdicts.get(name)
         return f"{name} is left out now: {verdict.why}" if verdict and verdict.left_out else ""
 
     def _wired(self, path: tuple[str, ...]) -> str:
-        """Where it is written what an input reads."""
+        """Return the location of the wire of an input."""
         return self.wording.source(*path) or self.wording.source(*path[:-1]) if path else ""
 
     def _absent(self, name: str) -> str:
@@ -207,19 +207,19 @@ class Comparison:
         return self._edits[old, new]
 
     def _stream(self, old: list[Any] | None, new: list[Any] | None) -> list[str]:
-        """What differs in how the noise of a step is drawn."""
+        """Return the differences in the random stream of a step."""
         if old is None or new is None:
             return [] if old == new else ["it draws noise now" if new else "it draws no noise any more"]
         said = (
             f"seed {old[0]} -> {new[0]}{self.wording.source('seed')}",
-            f"its noise is that of {new[1]}, not of {old[1]}",
+            f"its noise uses the stream of {new[1]}, not of {old[1]}",
             f"its noise is drawn on {new[2]}, not on {old[2]}",
         )
         return [text for text, before, after in zip(said, old, new, strict=True) if before != after]
 
 
 def _few(names: list[str]) -> str:
-    """``a, b and 4 more``."""
+    """Return names as ``a, b and 4 more``."""
     rest = len(names) - _FEW
     return ", ".join(names) if rest <= 0 else f"{', '.join(names[:_FEW])} and {rest} more"
 

@@ -1,4 +1,4 @@
-"""Changes of parameters in the words of the recipe: its paths, its units, and where the value is written."""
+"""Wording of changed parameters: with the recipe's paths and units, and the location of the value."""
 
 from __future__ import annotations
 
@@ -19,26 +19,26 @@ _ABSENT = object()
 
 
 class Wording:
-    """Says what changed; without a recipe, in the parameter's own name and in SI."""
+    """Description of changes; without a recipe, by the parameter's own name and in SI."""
 
     def __init__(self, recipe: Recipe | None = None) -> None:
         self._recipe = recipe
         self._by_mark: dict[str, list[Setting]] | None = None
 
     def params(self, label: str, old: Mapping[str, Any], new: Mapping[str, Any]) -> list[str]:
-        """One clause for each parameter of a step, as `plain` makes them, that differs."""
+        """Return one clause for each differing parameter of a step, given as `plain` writes parameters."""
         step = self._recipe.steps.get(label) if self._recipe else None
         names = [n for n in dict.fromkeys([*old, *new]) if old.get(n) != new.get(n)]
         return [self._param(step, n, old.get(n, _ABSENT), new.get(n, _ABSENT)) for n in names]
 
     def source(self, *path: str) -> str:
-        """`` (recipe.yaml:3:7)`` of a value of the recipe; nothing where it is not known."""
+        """Return `` (recipe.yaml:3:7)`` for a value of the recipe, or an empty string where its place is unknown."""
         setting = self._recipe.config.settings.get(".".join(path)) if self._recipe else None
         return f" ({setting.source})" if setting else ""
 
     def _param(self, step: Step | None, name: str, old: Any, new: Any) -> str:
         if new is _ABSENT:
-            return f"{name} is no parameter any more"
+            return f"{name} is no longer a parameter"
         setting, source = self._setting(step, name)
         path = ".".join(map(str, setting.path)) if setting else name
         where = f" ({source})" if source else ""
@@ -52,7 +52,7 @@ class Wording:
         return f"{path} {before} -> {after}{where}"
 
     def _setting(self, step: Step | None, name: str) -> tuple[Setting | None, str]:
-        """What the recipe says of a parameter, wherever it says so, and where."""
+        """Return the recipe's setting of a parameter, wherever it is written, and its location."""
         if step is None:
             return None, ""
         if name not in step.param_marks:
@@ -65,7 +65,7 @@ class Wording:
         return setting, setting.source if setting else mark
 
     def _marked(self) -> dict[str, list[Setting]]:
-        """What was written, by where it stands."""
+        """Return the written settings by their location."""
         if self._by_mark is None:
             self._by_mark = defaultdict(list)
             for setting in self._recipe.config.settings.values() if self._recipe else ():
@@ -86,7 +86,7 @@ def _other_file(old: Any, new: Mapping[str, Any]) -> str:
 
 
 def _both(written: Any, old: Any, new: Any) -> tuple[str, str]:
-    """Old and new value, in the unit in which the new one is written."""
+    """Return the old and the new value, in the unit of the new one."""
     after = _as_written(written, new)
     if isinstance(old, list) and isinstance(new, list) and len(old) == len(new):
         parts = written if isinstance(written, list) and len(written) == len(old) else [None] * len(old)
@@ -101,7 +101,7 @@ def _both(written: Any, old: Any, new: Any) -> tuple[str, str]:
 
 
 def _in_unit_of(written: Any, new: Any, old: Any) -> str:
-    """An old number with the unit of the one that is written now."""
+    """Return an old number with the unit of the present one."""
     unit = _unit(written, new)
     return f"{spoken(unit[0](old))} {unit[1]}" if unit and _is_number(old) else spoken(old)
 
@@ -111,21 +111,21 @@ def _is_number(value: Any) -> bool:
 
 
 def _items(old: Mapping[str, Any], new: Mapping[str, Any]) -> tuple[str, str]:
-    """The entries of two mappings that differ."""
+    """Return the entries in which two mappings differ."""
     pairs = [[(str(key), value) for key, value in m.get("items", ())] for m in (old, new)]
     only = [[f"{k}: {spoken(v)}" for k, v in pairs[i] if (k, v) not in pairs[1 - i]] for i in (0, 1)]
     return f"{{{', '.join(only[0])}}}", f"{{{', '.join(only[1])}}}"
 
 
 def _as_written(written: Any, new: Any) -> str:
-    """A new value as its user wrote it, where that says more than the number."""
+    """Return a new value as its user wrote it, where the text says more than the number."""
     if _unit(written, new) or (isinstance(written, list) and isinstance(new, list)):
         return flow(written)
     return spoken(new)
 
 
 def _unit(written: Any, new: Any) -> tuple[Callable[[float], float], str] | None:
-    """Return how a number in SI is said in the unit of a written quantity, and its name; None where it has none."""
+    """Return the function from SI to a written quantity's unit, and the unit's name; None without a unit."""
     match = _QUANTITY.fullmatch(written.strip()) if isinstance(written, str) else None
     if match is None or not _is_number(new):
         return None
@@ -144,7 +144,7 @@ def _times(factor: float) -> Callable[[float], float]:
 
 
 def spoken(value: Any) -> str:
-    """A parameter, as `plain` makes it, in few words."""
+    """Return a short text for a parameter, given as `plain` writes parameters."""
     if isinstance(value, float):
         return f"{value:.6g}"
     if isinstance(value, Mapping):

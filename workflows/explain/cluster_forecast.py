@@ -1,4 +1,4 @@
-"""What a recipe would take on machines that are not here: how long, how busy, what is sent, what is held."""
+"""Forecast of a recipe on other machines: makespan, utilisation, transfers and peak memory."""
 
 from __future__ import annotations
 
@@ -10,12 +10,12 @@ from neusee.workflows.placement.heft_and_cpop import Device, Schedule, Slot, Tas
 from neusee.workflows.placement.machine_file import Machines
 from neusee.workflows.report.run_timing import size_of
 
-_MOST_PARTS = 64  #: into which a step may be cut by bands; how many bands there are is known only when it runs
+_MOST_PARTS = 64  #: upper bound on the parts of a step cut by bands; the number of bands is known when the step runs
 _SHOWN = 24  #: steps of the critical path
 
 
 class Cost(Protocol):
-    """What earlier runs tell of a step."""
+    """Cost of a step, from earlier runs."""
 
     @property
     def seconds(self) -> Mapping[str, float]: ...
@@ -28,10 +28,10 @@ class Cost(Protocol):
 
 
 def cluster_lines(recipe: Recipe, estimates: Mapping[str, Cost], machines: Machines) -> list[str]:
-    """Makespan, what each device does and holds, bytes sent, the critical path, and which costs are guesses.
+    """Return lines on makespan, devices, bytes sent, critical path, and on costs that were never measured.
 
-    Every step of ``estimates`` runs, as if nothing were stored; seconds on a device are those on the CPU that
-    was measured, divided by the speed of the device. What fits nowhere is one line with the bytes it needs.
+    Every step of ``estimates`` runs, as if nothing were stored. The seconds on a device are those on the
+    measured CPU divided by the device's speed. A plan that does not fit is one line with the needed bytes.
     """
     devices, alone = len(machines.devices), sum(map(_measured, estimates.values()))
     head = f"{_count(len(estimates), 'step')} on {_count(devices, 'device')}: {machines.title or 'no title'}"
@@ -56,7 +56,7 @@ def cluster_lines(recipe: Recipe, estimates: Mapping[str, Cost], machines: Machi
 
 
 def simulated(recipe: Recipe, estimates: Mapping[str, Cost], machines: Machines) -> Schedule:
-    """The schedule of a recipe's steps on other machines; raises `TooLarge` where the memory cannot do."""
+    """Return the schedule of a recipe's steps on other machines; raise `TooLarge` where the memory is too small."""
     tasks = [_task(recipe.steps[name], cost, estimates, machines) for name, cost in estimates.items()]
     return heft(tasks, machines.cluster, [name for name in dict.fromkeys(recipe.outputs) if name in estimates])
 
@@ -70,14 +70,14 @@ def _task(step: Step, cost: Cost, among: Mapping[str, Cost], machines: Machines)
 
 
 def _fits(device: Device, hint: str) -> bool:
-    """Whether a hint such as ``cpu``, ``gpu`` or ``cuda:1`` allows a device."""
+    """Return True if a hint such as ``cpu``, ``gpu`` or ``cuda:1`` allows a device."""
     if hint in ("any", ""):
         return True
     return device.kind != "cpu" if hint == "gpu" else hint in (device.kind, device.name.rpartition("/")[2])
 
 
 def _measured(cost: Cost) -> float:
-    """Seconds on the CPU on which the costs were measured."""
+    """Return the seconds on the CPU on which the costs were measured."""
     return cost.seconds["cpu"]
 
 
@@ -85,7 +85,7 @@ def _measured(cost: Cost) -> float:
 
 
 def _devices(schedule: Schedule, machines: Machines) -> list[str]:
-    """One line a device: its share of the makespan, its steps, and its memory."""
+    """Return one line for each device: its share of the makespan, its steps and its memory."""
     shares, steps = schedule.utilisation(), dict.fromkeys(schedule.peak, 0)
     for slot in schedule.slots:
         steps[slot.device] += 1
@@ -99,7 +99,7 @@ def _devices(schedule: Schedule, machines: Machines) -> list[str]:
 
 
 def _path(schedule: Schedule) -> list[str]:
-    """The critical path, its middle left out where it is long."""
+    """Return the critical path; the middle of a long path is left out."""
     path = schedule.critical_path()
     busy = sum(slot.end - slot.start for slot in path)
     share = (
@@ -119,7 +119,7 @@ def _row(slot: Slot) -> list[str]:
 
 
 def _cut(schedule: Schedule) -> str:
-    """Steps that must be cut by bands to fit."""
+    """Return the steps that must be cut by bands to fit into memory."""
     return ", ".join(f"{slot.task} ({slot.parts})" for slot in schedule.slots if slot.parts > 1)
 
 
@@ -144,7 +144,7 @@ def _count(number: int, one: str, many: str = "") -> str:
 
 
 def _columns(rows: Sequence[Sequence[str]], numbers: str = "<") -> list[str]:
-    """Aligned columns, the first to the left."""
+    """Return aligned columns, the first one to the left."""
     widths = [max(len(row[i]) for row in rows) for i in range(len(rows[0]))]
     form = [f"<{widths[0]}", *(f"{numbers}{wide}" for wide in widths[1:])]
     return ["  ".join(f"{cell:{how}}" for cell, how in zip(row, form, strict=True)).rstrip() for row in rows]

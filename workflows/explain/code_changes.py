@@ -1,4 +1,4 @@
-"""Which function or constant it was that changed between two digests of code."""
+"""Code changes: the functions and constants that differ between two digests of code."""
 
 from __future__ import annotations
 
@@ -11,22 +11,22 @@ Parts = dict[str, dict[str, str]]  #: digests of definitions, by module
 
 
 def edits(root: Path, old: str, new: str) -> list[str]:
-    """One clause for each definition that differs, as far as the store at ``root`` remembers; else nothing."""
+    """Return one clause for each definition that differs, or nothing where the store at ``root`` has no record."""
     before, after = _parts(root, old), _parts(root, new)
     if not before or not after:
         return []
     inside = [text for name in after if name in before for text in _inside(name, before[name], after[name])]
     came = [f"{_file(name)} is imported now" for name in after if name not in before]
-    gone = [f"{_file(name)} is imported no more" for name in before if name not in after]
+    gone = [f"{_file(name)} is no longer imported" for name in before if name not in after]
     return sorted(inside, key=lambda text: text.startswith("the ")) + came + gone
 
 
 def _inside(module: str, old: dict[str, str], new: dict[str, str]) -> list[str]:
-    """What differs within one module."""
+    """Return the differences within one module."""
     file = _file(module)
     changed = [f"{_changed(label)} in {file} changed" for label in new if label in old and old[label] != new[label]]
     added = [f"{_named(label)} was added to {file}" for label in new if label not in old]
-    removed = [f"{_named(label)} was taken out of {file}" for label in old if label not in new]
+    removed = [f"{_named(label)} was removed from {file}" for label in old if label not in new]
     return changed + added + removed
 
 
@@ -35,7 +35,7 @@ def _changed(label: str) -> str:
 
 
 def _named(label: str) -> str:
-    """``function psf()``, ``constant _FALL``, ``class Psf``, ``the imports``."""
+    """Return ``function psf()``, ``constant _FALL``, ``class Psf`` or ``the imports``."""
     if label.endswith("()"):
         return f"function {label}"
     return label if label.startswith(("class ", "constant ")) else f"the {label}"
@@ -48,7 +48,7 @@ def _file(module: str) -> str:
 
 
 def _parts(root: Path, found: str) -> Parts:
-    """The definitions behind a digest; nothing where the file is missing or damaged."""
+    """Return the definitions behind a digest, or nothing where the file is missing or damaged."""
     try:
         parts = json.loads(parts_file(root, found).read_bytes())
         whole = all(isinstance(found, str) for inside in parts.values() for found in inside.values())

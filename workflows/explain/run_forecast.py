@@ -1,4 +1,4 @@
-"""What a run would do, without doing it: hits, bytes, seconds, memory and place, from what earlier runs left behind."""
+"""Forecast of a run: cache hits, bytes, seconds, memory and devices, from the records of earlier runs."""
 
 from __future__ import annotations
 
@@ -23,22 +23,22 @@ from neusee.workflows.tolerance.cheaper_steps import with_substitutions
 
 @dataclass(frozen=True)
 class Plan:
-    """What would become of every step."""
+    """Forecast for every step of a recipe."""
 
     recipe: Recipe
     order: list[str]
     keys: dict[str, Key]
-    left_out: dict[str, bool | None]  #: None where only what feeds a step will tell
+    left_out: dict[str, bool | None]  #: None where only the inputs of a step can decide
     awake: set[str]  #: steps that would run
-    loaded: dict[str, int]  #: stored steps that these would read, and their bytes
-    expected: Mapping[str, Estimate]  #: by step, of those that would run
+    loaded: dict[str, int]  #: stored steps that would be read, with their bytes
+    expected: Mapping[str, Estimate]  #: by step, for the steps that would run
     lanes: Mapping[str, str]  #: by step
     schedule: Schedule | None
-    refused: str = ""  #: why there is not memory enough
+    refused: str = ""  #: why the memory is too small
 
 
 def planned(recipe: Recipe, store: Store, lanes: Mapping[str, Lane]) -> Plan:
-    """Look up what a run would compute, read and need; compute nothing."""
+    """Return what a run would compute, read and need, without computing anything."""
     recipe = with_substitutions(recipe, wanted(recipe))
     order = steps_of(recipe)
     devices = [lane.device for lane in lanes.values()]
@@ -64,9 +64,9 @@ def planned(recipe: Recipe, store: Store, lanes: Mapping[str, Lane]) -> Plan:
 
 
 def plan_lines(recipe: Recipe, store: Store, device: str = "cpu", memory: int | None = None) -> tuple[list[str], bool]:
-    """One line a step: stored or to be run, where, its seconds, bytes and memory as far as they are known; the sums.
+    """Return one line for each step (state, device, seconds, bytes, memory), the sums, and whether memory is short.
 
-    With it, whether the run would be refused for want of memory.
+    A run that is short of memory would be refused.
     """
     lanes = lanes_of(device.split(","), memory)
     plan = planned(recipe, store, lanes)
@@ -76,7 +76,7 @@ def plan_lines(recipe: Recipe, store: Store, device: str = "cpu", memory: int | 
 
 
 def simulated_lines(recipe: Recipe, store: Store, machines: str) -> list[str]:
-    """What the whole recipe would take on the machines of a YAML file, with nothing stored."""
+    """Return the forecast of the whole recipe on the machines of a YAML file, with an empty store."""
     from neusee.workflows.explain.cluster_forecast import cluster_lines
     from neusee.workflows.placement.machine_file import read_machines
 
@@ -105,12 +105,12 @@ def _row(name: str, plan: Plan, store: Store) -> list[str]:
 
 
 def _sums(plan: Plan, lanes: Mapping[str, Lane]) -> list[str]:
-    """What all of it takes, and what is not known yet."""
+    """Return lines with the sums over all steps, and with the steps whose state is not known yet."""
     ran, new = len(plan.expected), sum(e.bytes for e in plan.expected.values())
     guesses = sum(not e.known for e in plan.expected.values())
     lines = []
     if unsure := [name for name, known in plan.left_out.items() if known is None]:
-        lines.append(f"left out or not, only what feeds it will tell: {', '.join(unsure)}")
+        lines.append(f"left out or not, depending on the values of the inputs: {', '.join(unsure)}")
     took = f"about {plan.schedule.makespan:.3g} s" if plan.schedule else "no schedule"
     guessed = f", {guesses} of them never measured" if guesses else ""
     read = size_of(sum(plan.loaded.values()))
@@ -133,7 +133,7 @@ def _work(recipe: Recipe, name: str, keys: Mapping[str, Key], devices: Sequence[
 
 
 def _awake(recipe: Recipe, keys: Mapping[str, Key], store: Store) -> tuple[set[str], dict[str, int]]:
-    """Steps that a run would compute, walking back from what is wanted, and what it would read on the way."""
+    """Return the steps that a run would compute, and the stored steps that it would read, with their bytes."""
     found, loaded, todo = set[str](), dict[str, int](), [*wanted(recipe)]
     while todo:
         name = todo.pop()
@@ -149,6 +149,6 @@ def _awake(recipe: Recipe, keys: Mapping[str, Key], store: Store) -> tuple[set[s
 
 
 def _columns(rows: list[list[str]]) -> list[str]:
-    """Left-aligned columns."""
+    """Return left-aligned columns."""
     widths = [max(len(row[i]) for row in rows) for i in range(len(rows[0]))]
     return ["  ".join(f"{cell:<{wide}}" for cell, wide in zip(row, widths, strict=True)).rstrip() for row in rows]

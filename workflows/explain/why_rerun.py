@@ -1,4 +1,4 @@
-"""Why a step ran, or would: what differs from the nearest earlier result of the same step, and where it began."""
+"""Reason for a rerun: the differences from the nearest earlier result of the same step, and their origin."""
 
 from __future__ import annotations
 
@@ -16,17 +16,17 @@ from neusee.workflows.keys.cache_key import Key
 from neusee.workflows.store.result_store import Store
 from neusee.workflows.tolerance.cheaper_steps import with_substitutions
 
-_CANDIDATES = 200  #: earlier results of a step that are compared, the newest ones
-_PAIRS = 20_000  #: comparisons after which no further earlier result is taken up
-_AT_ONCE = 5  #: earlier results that a step is compared with while a run goes on
+_CANDIDATES = 200  #: newest earlier results of a step that are compared
+_PAIRS = 20_000  #: comparisons after which no further earlier result is examined
+_AT_ONCE = 5  #: earlier results that a step is compared with during a run
 _SHOWN = 10  #: causes that are listed
 _LINKS = 6  #: steps of a chain that are named
 
 
 def why_lines(recipe: Recipe, store: Store, step: str, device: str = "cpu") -> list[str]:
-    """Whether ``step``, or each of its items, is stored, and what makes it another than the nearest earlier result.
+    """Return lines that tell whether ``step`` or its items are stored, and the differences from earlier results.
 
-    Raises `ValueError` with the nearest name where there is no such step.
+    Raises `ValueError` with the nearest name where the step does not exist.
     """
     names = [name for name in recipe.steps if step in (name, name.partition("[")[0])]
     if not names:
@@ -39,9 +39,9 @@ def why_lines(recipe: Recipe, store: Store, step: str, device: str = "cpu") -> l
 
 
 def why_key_lines(store: Store, prefix: str) -> list[str]:
-    """What went into the one result whose key begins with ``prefix``, and how it differs from an earlier one.
+    """Return the parts of the one key that begins with ``prefix``, and its differences from an earlier result.
 
-    Raises `LookupError` where there is no such result, or more than one.
+    Raises `LookupError` where no result or more than one matches.
     """
     found = sorted(dict.fromkeys(row["key"] for row in _rows(store) if row["key"].startswith(prefix)))
     if len(found) != 1:
@@ -49,14 +49,14 @@ def why_key_lines(store: Store, prefix: str) -> list[str]:
         raise LookupError(f"{len(found) or 'no'} results have a key that begins with {prefix!r}{some}")
     key, about = found[0], store.about(found[0])
     if about is None:
-        raise LookupError(f"the result {found[0]} is no longer there")
+        raise LookupError(f"the result {found[0]} is no longer in the store")
     comparison = Comparison(store)
     head = f"{about['step']} of {about.get('recipe') or 'a recipe'}: {_state(about)}, key {key}"
     return [head, *_made_of(comparison, key), *_because(comparison, about["step"], key, about)]
 
 
 def explained(recipe: Recipe, store: Store, watch: Callable[[Event], None]) -> Callable[[Event], None]:
-    """``watch``, told also why each step that ran did so."""
+    """Return ``watch``, extended by the reason why each step ran."""
     comparison = Comparison(store, recipe)
     before: dict[str, list[Key]] = {}
 
@@ -73,24 +73,24 @@ def explained(recipe: Recipe, store: Store, watch: Callable[[Event], None]) -> C
 
 
 def _step_lines(comparison: Comparison, recipe: Recipe, step: Step, resolved: Resolved) -> list[str]:
-    """One step: its state, and what makes it so."""
+    """Return the lines of one step: its state, and the causes of that state."""
     key, verdict = resolved.keys[step.name], resolved.verdicts.get(step.name)
     head = f"{step.name} ({step.node.path})"
     if verdict is not None and verdict.left_out:
-        return [f"{head}: left out, {verdict.instead} stands for it: {verdict.why}"]
+        return [f"{head}: left out and replaced by {verdict.instead}: {verdict.why}"]
     about = comparison.store.about(key)
     lines = [f"{head}: {_state(about)}, key {key[:8]}"]
     maker = resolved.makers[key]
     if maker != step.name:
-        lines.append(f"  the same computation as {maker}")
+        lines.append(f"  same key as {maker}")
     unsure = _unsure(recipe, step.name, resolved)
     if unsure:
-        lines.append(f"  left out or not, only what feeds it will tell: {', '.join(unsure[:_SHOWN])}")
+        lines.append(f"  left out or not, depending on the values of the inputs: {', '.join(unsure[:_SHOWN])}")
     return [*lines, *_because(comparison, step.name, key, about, maker)]
 
 
 def _unsure(recipe: Recipe, step: str, resolved: Resolved) -> list[str]:
-    """Steps behind a step that may be left out: it was taken that they run."""
+    """Return the steps upstream of a step that may be left out; they are assumed to run."""
     unsure = {name for name in resolved.verdicts if resolved.left_out(name) is None}
     return [name for name in needed(recipe, [step]) if name in unsure] if unsure else []
 
@@ -98,20 +98,20 @@ def _unsure(recipe: Recipe, step: str, resolved: Resolved) -> list[str]:
 def _state(about: Mapping[str, Any] | None) -> str:
     if about is None:
         return "not stored, so it would run where it is needed"
-    made = f"{_date(about)}, made in {about.get('seconds', 0.0):.3g} s"
+    made = f"{_date(about)}, computed in {about.get('seconds', 0.0):.3g} s"
     return f"stored since {made}" if about.get("kept", True) else f"ran {made}, but its value was not kept"
 
 
 def _because(
     comparison: Comparison, label: str, key: Key, about: Mapping[str, Any] | None, maker: str = ""
 ) -> Iterator[str]:
-    """What differs from the nearest earlier result, and which that is."""
+    """Yield the differences from the nearest earlier result, and name that result."""
     rows = _rows(comparison.store, label) or _rows(comparison.store, maker or label)
     keys = _keys(rows)
     earlier = keys[: keys.index(key)] if key in keys else keys
     found = _nearest(comparison, label, key, earlier)
     if found is None:
-        yield f"  nothing earlier to compare it with: {'the first' if key in keys else 'no'} result of this step"
+        yield f"  no earlier result to compare with: {'the first' if key in keys else 'no'} result of this step"
         return
     old, roots = found
     for text in list(roots.found)[:_SHOWN]:
@@ -119,11 +119,11 @@ def _because(
     if len(roots.found) > _SHOWN:
         yield f"  and {len(roots.found) - _SHOWN} more"
     which = "the earlier result" if len(earlier) == 1 else f"the nearest of {len(earlier)} earlier results"
-    yield f"  beside {which}, {old[:8]} of {_date(comparison.about(old) or {})}"
+    yield f"  compared with {which}, {old[:8]} of {_date(comparison.about(old) or {})}"
 
 
 def _nearest(comparison: Comparison, label: str, key: Key, earlier: list[Key]) -> tuple[Key, Roots] | None:
-    """Of the newest earlier results the one with the fewest root causes, the newest of these."""
+    """Return the newest of the earlier results with the fewest root causes."""
     best: tuple[Key, Roots] | None = None
     for old in earlier[: -_CANDIDATES - 1 : -1]:
         if comparison.origin(old) is None:
@@ -137,9 +137,9 @@ def _nearest(comparison: Comparison, label: str, key: Key, earlier: list[Key]) -
 
 
 def _at_once(comparison: Comparison, step: Step, key: Key, earlier: list[Key]) -> str:
-    """One line on why a step ran, from what is at hand; empty where it has no earlier result."""
+    """Return one line on why a step ran, from the known keys; an empty string without an earlier result."""
     if key in earlier:
-        return "made before, but its value is not stored"
+        return "computed before, but its value is not stored"
     best: list[str] = []
     for old in earlier[: -_AT_ONCE - 1 : -1]:
         before, now = comparison.origin(old), comparison.origin(key)
@@ -151,7 +151,7 @@ def _at_once(comparison: Comparison, step: Step, key: Key, earlier: list[Key]) -
 
 
 def _direct(comparison: Comparison, step: Step, old: Origin, new: Origin) -> list[str]:
-    """What differs at a step itself, and then the sources that do."""
+    """Return the differences at a step itself, and then the sources that differ."""
     texts = comparison.own(step.name, old, new)
     if old["node"] != new["node"] or len(old["inputs"]) != len(new["inputs"]):
         return texts
@@ -163,7 +163,7 @@ def _direct(comparison: Comparison, step: Step, old: Origin, new: Origin) -> lis
 
 
 def _made_of(comparison: Comparison, key: Key) -> Iterator[str]:
-    """What went into a key, one line each."""
+    """Yield the parts of a key, one line each."""
     origin = comparison.origin(key)
     if origin is None:
         return
@@ -172,20 +172,20 @@ def _made_of(comparison: Comparison, key: Key) -> Iterator[str]:
         yield f"  with    {name} = {spoken(value)}"
     for given in origin["inputs"]:
         for source in [given] if isinstance(given, str) else given or ():
-            yield f"  from    {comparison.step(source) or 'a step that is no longer known'}, {source[:8]}"
+            yield f"  from    {comparison.step(source) or 'an unknown step'}, {source[:8]}"
     if stream := origin.get("stream"):
         yield f"  noise   seed {stream[0]}, of {stream[1]}, on {stream[2]}"
 
 
 def _chain(names: list[str]) -> str:
-    """``restored <- raw <- read``, short."""
+    """Return ``restored <- raw <- read``, shortened."""
     if len(names) > _LINKS:
         names = [*names[: _LINKS - 2], f"({len(names) - _LINKS + 1} more)", names[-1]]
     return " <- ".join(names)
 
 
 def _keys(rows: Iterable[dict[str, Any]]) -> list[Key]:
-    """Keys in the order in which they were first made."""
+    """Return the keys in the order in which they were first computed."""
     return list(dict.fromkeys(row["key"] for row in rows))
 
 
@@ -194,5 +194,5 @@ def _date(about: Mapping[str, Any]) -> str:
 
 
 def _rows(store: Store, step: str | None = None) -> list[dict[str, Any]]:
-    """What was made, of one step or of all, the newest last."""
+    """Return the journal lines of one step or of all steps, the newest last."""
     return store.journal.rows() if step is None else store.journal.of_step(step)

@@ -1,4 +1,4 @@
-"""Where a value was written, and what is wrong with it: one located line for each mistake."""
+"""Diagnostics: the location of a value in a recipe, and one located line for each mistake."""
 
 from __future__ import annotations
 
@@ -11,10 +11,10 @@ from dataclasses import dataclass, field
 class Location:
     """A place in a file (lines and columns count from 1), or an argument such as ``argument 2`` (line 0)."""
 
-    file: str  #: as the user knows it: ``first_light.yaml``, ``sensor/neusee.yaml``
+    file: str  #: as the user knows the file: ``first_light.yaml``, ``sensor/neusee.yaml``
     line: int = 0
     column: int = 0
-    folder: str = field(default=".", compare=False)  #: what a relative path written here is relative to
+    folder: str = field(default=".", compare=False)  #: folder to which a relative path written here is relative
 
     def __str__(self) -> str:
         return f"{self.file}:{self.line}:{self.column}" if self.line else self.file
@@ -22,7 +22,7 @@ class Location:
 
 @dataclass(frozen=True, slots=True, order=True)
 class Diagnostic:
-    """One mistake: where, of what, and what to write instead."""
+    """One mistake: its location, the path of the value, and the message with the fix."""
 
     mark: Location
     path: str
@@ -30,7 +30,7 @@ class Diagnostic:
 
 
 class RecipeError(ValueError):
-    """A recipe cannot be run; ``str`` gives one line a problem, in the order of the files."""
+    """Error for a recipe that cannot be run; ``str`` gives one line for each mistake, in the order of the files."""
 
     def __init__(self, diagnostics: Iterable[Diagnostic]) -> None:
         self.diagnostics = tuple(sorted(set(diagnostics)))
@@ -44,7 +44,7 @@ def _table(diagnostics: tuple[Diagnostic, ...]) -> str:
 
 
 def nearest(name: str, among: Iterable[str]) -> str:
-    """``did you mean gain?``, or what there is, or nothing where there is nothing."""
+    """Return ``did you mean gain?``, else a list of the names, else ``there are none``."""
     names = sorted(set(map(str, among)))
     close = difflib.get_close_matches(str(name), names, 1, 0.6)
     if close:

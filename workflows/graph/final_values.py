@@ -1,4 +1,4 @@
-"""The final values of a recipe, each with where it comes from, and the same as YAML that can be run again."""
+"""Final values of a recipe, each with its source, and the same values as YAML that can be run again."""
 
 from __future__ import annotations
 
@@ -15,12 +15,12 @@ _WORDS = {"true", "false", "null", "yes", "no", "on", "off"}
 
 @dataclass(frozen=True, slots=True)
 class Setting:
-    """A final value and where it comes from: ``file:line:column``, ``argument n`` or a node's default."""
+    """A final value and its source: ``file:line:column``, ``argument n`` or a node's default."""
 
     value: Any
     source: str
     path: tuple[str | int, ...] = ()  #: keys from the top
-    default: bool = False  #: whether no one wrote it
+    default: bool = False  #: whether the value is the node's default
 
 
 @dataclass(frozen=True, slots=True)
@@ -33,7 +33,7 @@ class Config:
         return self.settings[path]
 
     def to_yaml(self) -> str:
-        """A recipe of these values without groups; sources stand as comments, and defaults, in SI, as comments only."""
+        """Return a recipe of these values without groups; sources and defaults (in SI) are comments."""
         tree: dict[str | int, Any] = {}
         for name, setting in self.settings.items():
             *parents, last = setting.path or tuple(name.split("."))
@@ -56,7 +56,7 @@ def _lines(tree: Mapping[str | int, Any], depth: int) -> Iterator[str]:
 
 
 def flow(value: Any) -> str:
-    """A value as YAML on one line."""
+    """Return a value as YAML on one line."""
     if isinstance(value, Mapping):
         return f"{{{', '.join(f'{_scalar(key)}: {flow(child)}' for key, child in value.items())}}}"
     if isinstance(value, list | tuple):

@@ -26,19 +26,19 @@ Wire = str | tuple[str, ...] | None  #: one step, the steps of all items, or an 
 
 @dataclass(frozen=True, slots=True)
 class Step:
-    """One bound step: a node, its validated parameters and the steps that feed it."""
+    """One step of the graph: a node, its validated parameters and the steps that feed the node."""
 
     name: str  #: ``psf[mask]``, ``spot[mask,green]``
     node: Node
-    params: Mapping[str, Any]  #: validated, SI, with the node's defaults
+    params: Mapping[str, Any]  #: validated, in SI, with the node's defaults
     wires: Mapping[str, Wire]  #: by input, in the node's order
     mark: Location
-    param_marks: Mapping[str, Location]  #: where each value that was given stands
-    device: str = ""  #: where it asks to run: ``cpu``, ``gpu``, ``cuda:1``; empty if anywhere, and never part of a key
+    param_marks: Mapping[str, Location]  #: location of each given value
+    device: str = ""  #: requested device: ``cpu``, ``gpu``, ``cuda:1``; empty if any; never part of a key
 
     @property
     def sources(self) -> tuple[str, ...]:
-        """Every step that feeds this one, in the order of the inputs."""
+        """Return every step that feeds this one, in the order of the inputs."""
         return tuple(name for wire in self.wires.values() for name in _names(wire))
 
 
@@ -48,11 +48,11 @@ def _names(wire: Wire) -> tuple[str, ...]:
 
 @dataclass(frozen=True, slots=True)
 class Substitution:
-    """A cheaper step that stands in for a full one."""
+    """A cheaper step that replaces a full step."""
 
     step: str  #: the full step
-    instead: str  #: the one that is computed
-    within: float  #: what it may change at most, as a share of the largest element of its result
+    instead: str  #: the step that is computed
+    within: float  #: upper bound on the error, relative to the largest element of the result
     why: str
 
 
@@ -69,12 +69,12 @@ class Expectation:
 
 
 _ARMS = 8  #: arms of a step that a message names
-METRIC_TOLERANCE = 1e-3  #: what a figure of merit reads may be off by, for all of it may hang on a small difference
+METRIC_TOLERANCE = 1e-3  #: error limit for inputs of figures of merit, which may depend on a small difference
 
 
 @dataclass(frozen=True, slots=True, repr=False)
 class Recipe:
-    """A recipe whose every value, wire and file was looked at; nothing of it has run."""
+    """A recipe with checked values, wires and files; no step has run yet."""
 
     name: str
     title: str
@@ -85,23 +85,23 @@ class Recipe:
     expect: tuple[Expectation, ...] = ()
     config: Config = field(default_factory=Config)
     notes: tuple[str, ...] = ()
-    absent: Mapping[str, str] = field(default_factory=dict)  #: step that is null -> where that is written
+    absent: Mapping[str, str] = field(default_factory=dict)  #: step that is null -> location of the null
     exact: bool = False  #: compute every step in full, whatever the tolerance allows
-    substitutions: tuple[Substitution, ...] = ()  #: what stands in for full steps; a recipe as it is read has none
-    strict: float = 1.0  #: share of the tolerance that may be spent: less where a run could not prove that it held
+    substitutions: tuple[Substitution, ...] = ()  #: cheaper steps in place of full steps; empty when read
+    tolerance_scale: float = 1.0  #: share of the tolerance in use; below 1 after a failed proof
     unsubstituted: Recipe | None = field(default=None, compare=False)  #: the recipe before substitutions, if any
-    uncertain: Uncertain | None = field(default=None, compare=False)  #: what the study of uncertainty draws from
-    training: Training | None = field(default=None, compare=False)  #: how it is learnt
-    lifting: LiftTraining | None = field(default=None, compare=False)  #: how a lift is learnt from its pictures
-    unheard: frozenset[str] = frozenset()  #: steps whose errors reach a node that does not tell what becomes of them
+    uncertain: Uncertain | None = field(default=None, compare=False)  #: distributions for the study of uncertainty
+    training: Training | None = field(default=None, compare=False)  #: training of a network
+    lifting: LiftTraining | None = field(default=None, compare=False)  #: training of a lift
+    unbounded: frozenset[str] = frozenset()  #: steps whose errors reach a node without an error bound
 
     def limit(self, step: str) -> float:
         """Return the error allowed for a step: the tolerance, at most `METRIC_TOLERANCE` where nothing bounds it."""
-        return min(self.tolerance, METRIC_TOLERANCE) if step in self.unheard else self.tolerance
+        return min(self.tolerance, METRIC_TOLERANCE) if step in self.unbounded else self.tolerance
 
     def allowed(self, step: str) -> float:
-        """What all that is left out or computed more cheaply, up to a step, may change of it."""
-        return self.limit(step) * self.strict
+        """Return the total error that omissions and approximations up to a step may cause."""
+        return self.limit(step) * self.tolerance_scale
 
     def run(
         self,
@@ -112,7 +112,7 @@ class Recipe:
         executor: Executor | None = None,
         memory: int | None = None,
     ) -> Result:
-        """Run it; see `neusee.workflows.run`. Several threads may do so at once, on one store."""
+        """Run the recipe; see `neusee.workflows.run`. Several threads may call this at once, on one store."""
         from neusee.workflows.engine.runner import run
 
         return run(self, store, outputs, watch, device, executor, memory)
@@ -127,12 +127,12 @@ class Recipe:
 
 
 def needed(recipe: Recipe, outputs: Iterable[str]) -> list[str]:
-    """Steps that ``outputs`` need, each after its sources."""
+    """Return the steps that ``outputs`` need, each after its sources."""
     return in_order({name: step.sources for name, step in recipe.steps.items()}, outputs)
 
 
 def in_order(sources: Mapping[str, Iterable[str]], wanted: Iterable[str]) -> list[str]:
-    """Names after their sources, without recursion; a cycle must have been ruled out before."""
+    """Return names after their sources, without recursion; the graph must have no cycle."""
     order: dict[str, None] = {}
     stack = [(name, iter(sources[name])) for name in reversed(list(wanted))]
     while stack:
@@ -147,7 +147,7 @@ def in_order(sources: Mapping[str, Iterable[str]], wanted: Iterable[str]) -> lis
 
 
 def unknown_step(name: str, steps: Collection[str]) -> str:
-    """Return why there is no step ``name``: those of its arms, or the nearest name."""
+    """Return a message for a missing step ``name``, with the step's arms or the nearest name."""
     arms = sorted(step for step in steps if step.startswith(f"{name}["))
     if not arms:
         return f"no step {name!r}; {nearest(name, steps)}"
@@ -156,7 +156,7 @@ def unknown_step(name: str, steps: Collection[str]) -> str:
 
 
 def kept_promises(recipe: Recipe, written: Recipe) -> Recipe:
-    """``recipe`` with the expected numbers that still hold: those of ``written`` whose steps come about as there."""
+    """Return ``recipe`` with those expected numbers whose steps are unchanged from ``written``."""
     same = {name for name in recipe.steps if _alike(recipe, written, name)}
     for name in in_order({n: s.sources for n, s in recipe.steps.items()}, recipe.steps):
         if not same.issuperset(recipe.steps[name].sources):
@@ -164,7 +164,7 @@ def kept_promises(recipe: Recipe, written: Recipe) -> Recipe:
     lost = [e for e in recipe.expect if e in written.expect and e.step not in same]
     if not lost:
         return recipe
-    note = f"not compared, because your changes reach them: {', '.join(e.name for e in lost)}"
+    note = f"not compared, because your changes affect these numbers: {', '.join(e.name for e in lost)}"
     kept = tuple(e for e in recipe.expect if e not in lost)
     return replace(recipe, expect=kept, notes=(*recipe.notes, note))
 

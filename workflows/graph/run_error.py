@@ -1,4 +1,4 @@
-"""The error of a step that fails: which step, where it is written, what it was given, and the cause."""
+"""Error of a failed step."""
 
 from __future__ import annotations
 
@@ -11,14 +11,14 @@ from neusee.workflows.graph.recipe_graph import Step
 
 
 class RunError(RuntimeError):
-    """A step failed. Names it, its node, where it is written, what it was given, and the cause."""
+    """Error of a failed step: names the step, its node, its place in the recipe, its inputs and the cause."""
 
     def __init__(self, step: Step, inputs: Sequence[Any], cause: BaseException) -> None:
         self.step, self.cause = step.name, cause
         given = ", ".join(f"{name} {_shape(value)}" for name, value in zip(step.node.inputs, inputs, strict=False))
         super().__init__(
             f"{step.mark}   {step.name} ({step.node.path}): {type(cause).__name__}: {cause}"
-            + (f"\n  given {given}" if given else "")
+            + (f"\n  inputs: {given}" if given else "")
         )
 
     def __reduce__(self) -> tuple[Any, ...]:
@@ -26,7 +26,7 @@ class RunError(RuntimeError):
 
 
 def _remade(step: str, text: str, cause: str) -> RunError:
-    """The error as another process sees it: its text, without the traceback of the cause."""
+    """Return the unpickled error in another process: its text, without the traceback of the cause."""
     error = RunError.__new__(RunError, text)
     RuntimeError.__init__(error, text)
     error.step, error.cause = step, RuntimeError(cause)

@@ -12,7 +12,7 @@ State = Literal["run", "cached", "left out", "not needed"]
 
 @dataclass(frozen=True, slots=True)
 class StepRecord:
-    """What became of a step, and why."""
+    """Record of a step, with the reason."""
 
     step: str
     state: State  #: ``not needed``: nothing that ran needed the step
@@ -23,18 +23,18 @@ class StepRecord:
     checks: tuple[Check, ...] = ()
     device: str = "cpu"
     bytes: int = 0
-    bound: float | None = None  #: what leaving the step out may change at most
+    bound: float | None = None  #: upper bound on the change that omitting the step makes
     began: float = 0.0  #: s since the run began
-    lane: str = ""  #: which place of the executor computed it
-    peak: int | None = None  #: bytes of memory beside what was there before it ran
-    predicted: float | None = None  #: s that earlier runs made one expect
-    error: tuple[float, float] | None = None  #: of a cheaper form: rms and of the largest element, over the largest
+    lane: str = ""  #: lane of the executor that computed the step
+    peak: int | None = None  #: peak bytes of memory beside the memory in use before
+    predicted: float | None = None  #: s predicted from earlier runs
+    error: tuple[float, float] | None = None  #: of a cheaper form: rms and maximum, over the largest element
     kept: bool = True  #: whether the store has the value
 
 
 @dataclass(frozen=True, slots=True)
 class Event:
-    """For a live table: ``step`` has started (``done`` is None) or has finished."""
+    """Event for a live table: ``step`` has started (``done`` is None) or has finished."""
 
     step: str
     done: StepRecord | None

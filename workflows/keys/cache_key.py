@@ -1,8 +1,9 @@
-"""Cache keys: a digest of what decides a result, and of nothing else.
+"""Cache keys: a digest of everything that determines a result, and of nothing else.
 
-A key covers the node and its code, the parameters, the content of input files, the keys
-of the inputs and the random stream. No tensor is read to make one. Thread count, versions
-of libraries and, but for random nodes, the device are not physics and stay out of it.
+A key covers the node and its code, the parameters, the content of input files, the keys of the
+inputs and the random stream. No tensor is read to compute a key. A key does not contain the
+thread count, the versions of libraries or the device (except for random nodes), because these
+are not physics.
 """
 
 from __future__ import annotations
@@ -22,12 +23,12 @@ if TYPE_CHECKING:
     from neusee.workflows.keys.code_digest import Code
 
 Key = str
-_SETTLED = 2_000_000_000  #: ns after which a file's stamp tells one content from the next
+_SETTLED = 2_000_000_000  #: age in ns from which a file's time stamp distinguishes its contents
 _files: dict[tuple[int, ...], str] = {}
 
 
 def digest(*parts: Any) -> str:
-    """32 hexadecimal digits of ``parts``, which must be plain JSON; floats count to the last bit."""
+    """Return 32 hexadecimal digits of ``parts``, which must be plain JSON; floats count to the last bit."""
     text = json.dumps(parts, sort_keys=True, separators=(",", ":"))
     return hashlib.blake2b(text.encode(), digest_size=16).hexdigest()
 
@@ -35,7 +36,7 @@ def digest(*parts: Any) -> str:
 def key_of(
     step: Step, keys: Mapping[str, Key], seed: int, code: Code, device: str = "cpu"
 ) -> tuple[Key, dict[str, Any]]:
-    """The key of ``step``, given the keys of its sources, and everything that went into it."""
+    """Return the key of ``step``, given the keys of its sources, and all parts of that key."""
     node = step.node
     recipe: dict[str, Any] = {
         "node": node.path,
@@ -49,7 +50,7 @@ def key_of(
 
 
 def stream_seed(seed: int, step: str) -> int:
-    """Seed of a step's random stream: the recipe's seed and the step's name, and nothing else."""
+    """Return the seed of a step's random stream, which depends on the recipe's seed and the step's name only."""
     return int(digest(seed, step)[:15], 16)
 
 
@@ -60,7 +61,7 @@ def _input(wire: str | tuple[str, ...] | None, keys: Mapping[str, Key]) -> Any:
 
 
 def plain(value: Any) -> Any:
-    """A parameter as JSON, the same in every process; a file is its content and its kind."""
+    """Return a parameter as JSON that is equal in every process; a file becomes its content digest and suffix."""
     if value is None or isinstance(value, bool | int | str):
         return value
     if isinstance(value, float):
@@ -73,11 +74,11 @@ def plain(value: Any) -> Any:
         return [plain(v) for v in value]
     if isinstance(value, complex):
         return {"complex": [value.real, value.imag]}
-    raise TypeError(f"a parameter must be a number, a text, a file or a collection of these, not {value!r}")
+    raise TypeError(f"a parameter must be a number, a string, a file or a collection of these, not {value!r}")
 
 
 def file_digest(path: Path) -> str:
-    """xxh3 of a file's bytes; read again only when its stamp has changed or is too young to tell."""
+    """Return the xxh3 of a file's bytes; read the file again only if its time stamp is new or too young."""
     stat = os.stat(path)
     stamp = (stat.st_dev, stat.st_ino, stat.st_size, stat.st_mtime_ns, stat.st_ctime_ns)
     if stamp in _files:

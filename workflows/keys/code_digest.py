@@ -1,10 +1,10 @@
-"""Digests of code: what a node's module says, and every `neusee.nodes` module it imports.
+"""Digests of code: of a node's module and of every `neusee.nodes` module that it imports.
 
-Comments, layout and docstrings are left out, so better words keep the cache; helpers and
-constants are in, so a changed constant never serves an old result. The syntax trees'
-digests are kept in a file by the digest of the source, so that a cached run parses nothing.
-Beside it ``code/<digest>.json`` keeps the digests of the single definitions behind a digest:
-no key needs them, but with them one can say which function it was that changed.
+Comments, layout and docstrings do not count, so that better words keep the cache. Helpers and
+constants count, so that a changed constant never leads to an old result. The digests of syntax
+trees are kept in a file by the digest of the source, so that a cached run parses nothing. The
+files ``code/<digest>.json`` keep the digests of the single definitions behind each digest: no
+key needs them, but they tell which function has changed.
 """
 
 from __future__ import annotations
@@ -24,13 +24,13 @@ import xxhash
 from neusee.workflows.keys.cache_key import digest
 from neusee.workflows.keys.source_summary import ROOT, Summary, Use, summarise
 
-_LEFT_OUT = frozenset({ROOT, f"{ROOT}._node"})  #: decide nothing of what a node computes
-_KEPT = 1000  #: summaries in the file
-_PYTHON = "{}.{}".format(*sys.version_info)  #: a syntax tree's text changes with it
+_LEFT_OUT = frozenset({ROOT, f"{ROOT}._node"})  #: modules that do not affect what a node computes
+_KEPT = 1000  #: number of summaries in the file
+_PYTHON = "{}.{}".format(*sys.version_info)  #: the text of a syntax tree depends on the version of Python
 _THIS_PROCESS = os.urandom(8).hex()
 
-_edited_since: set[str] = set()  #: loaded modules whose source is no longer what runs
-_frozen: dict[str, tuple[Any, str]] = {}  #: module -> its spec and the digest of its source when first seen
+_edited_since: set[str] = set()  #: loaded modules whose source has been edited since the import
+_frozen: dict[str, tuple[Any, str]] = {}  #: module -> its spec, and the digest of its source when first seen
 
 
 class Code:
@@ -45,9 +45,9 @@ class Code:
         self._paths: dict[str, Path | None] = {}
 
     def digest(self, module: str) -> str:
-        """Digest of ``module`` and, transitively, of what it imports of `neusee.nodes`.
+        """Return the digest of ``module`` and of every `neusee.nodes` module that it imports, directly or not.
 
-        Raises `LookupError` where what it imports, or its source, cannot be told.
+        Raises `LookupError` where the imported modules or their source cannot be determined.
         """
         if module not in self._digests:
             seen: dict[str, str] = {}
@@ -59,12 +59,12 @@ class Code:
                     seen[name], parts[name], imports = self._look(name)
                     todo += imports
             found = self._digests[module] = digest(seen)
-            if _edited_since.isdisjoint(seen):  # else this digest means something in this process alone
+            if _edited_since.isdisjoint(seen):  # otherwise the digest is valid in this process only
                 self._parts[found] = parts
         return self._digests[module]
 
     def save(self) -> None:
-        """Keep the summaries that this run had to make; failing to is no failure."""
+        """Save the new summaries and definitions; ignore a folder that cannot be written."""
         if self._new:
             self._new = False
             _write(self._memo, dict(list(self._summaries.items())[-_KEPT:]), self._memo.parent / "tmp")
@@ -77,7 +77,7 @@ class Code:
     def _look(self, module: str) -> tuple[str, dict[str, str], list[str]]:
         path = self._path(module)
         if path is None:
-            raise LookupError(f"{module} has no source file, so its results cannot be told from others: put it in one")
+            raise LookupError(f"{module} has no source file, which the cache keys need: save the module as a file")
         summary = self._summary(module, path)
         tree = summary.tree + (_THIS_PROCESS if module in _edited_since else "")
         package = module if path.name == "__init__.py" else module.rpartition(".")[0]
@@ -87,12 +87,12 @@ class Code:
             if used is not None:
                 names += used
             elif module.startswith(ROOT):
-                what = "the whole of the nodes is used, so that no one can tell what a result depends on"
-                raise LookupError(f"{path}:{use[-1]}: {what}: import what the node needs by its full name")
+                what = "the package of all nodes is used, so that the modules behind a result are unknown"
+                raise LookupError(f"{path}:{use[-1]}: {what}: import each needed name from its own module")
         return tree, summary.definitions, [n for n in names if n.startswith(f"{ROOT}.") and n not in _LEFT_OUT]
 
     def _imported(self, level: int, base: str, name: str, package: str) -> Iterator[str]:
-        """Modules that one import reads: a submodule alone, or the module that holds the name."""
+        """Yield the modules that one import reads: a submodule alone, or the module that defines the name."""
         base = _absolute(level, base, package)
         below = f"{base}.{name}"
         if name and below.startswith(ROOT) and self._path(below) is not None:
@@ -103,7 +103,7 @@ class Code:
         yield base
 
     def _used(self, use: Use, package: str) -> list[str] | None:
-        """Modules that ``name.a.b`` goes through; None where it does not say which of all the nodes it is about."""
+        """Return the modules that ``name.a.b`` passes through, or None if the chain ends at the whole of the nodes."""
         level, base, name, chain, _ = use
         found = [".".join(filter(None, (_absolute(level, base, package), name)))]
         rest = chain.split(".") if chain else []
@@ -113,7 +113,7 @@ class Code:
         return None if whole else found[1:]
 
     def _holds(self, module: str, name: str) -> bool:
-        """Whether a name of a module is a module below it."""
+        """Return True if a name in a module is a submodule."""
         below = f"{module}.{name}"
         return below == ROOT or (self._is_package(module) and self._path(below) is not None)
 
@@ -136,12 +136,12 @@ class Code:
 
 
 def parts_file(root: Path, found: str) -> Path:
-    """Where a store keeps the definitions behind a digest of code."""
+    """Return the file in which a store keeps the definitions behind a digest of code."""
     return root / "code" / f"{found}.json"
 
 
 def _absolute(level: int, base: str, package: str) -> str:
-    """The full name of what is imported ``from`` a base."""
+    """Return the full name of the module of a ``from`` import."""
     if not level:
         return base
     above = package.split(".")
@@ -149,7 +149,7 @@ def _absolute(level: int, base: str, package: str) -> str:
 
 
 def _write(path: Path, content: Any, folder: Path) -> None:
-    """Write JSON whole or not at all, without a word where that fails."""
+    """Write JSON by atomic rename; do nothing where the folder cannot be written."""
     part = folder / f"{path.name}.{os.getpid()}.{threading.get_ident()}"
     with suppress(OSError):
         folder.mkdir(parents=True, exist_ok=True)
@@ -159,7 +159,7 @@ def _write(path: Path, content: Any, folder: Path) -> None:
 
 
 def _read(memo: Path) -> dict[str, Summary]:
-    """Summaries of earlier runs; a damaged file, or one of an older form, is an empty one."""
+    """Return the summaries of earlier runs; an empty dict where the file is damaged or has an older format."""
     try:
         return {name: _summary_of(*fields) for name, fields in json.loads(memo.read_bytes()).items()}
     except (OSError, ValueError, TypeError, AttributeError):
@@ -177,7 +177,7 @@ def _summary_of(tree: Any, imports: Any, binds: Any, uses: Any, definitions: Any
 
 
 def source_file(module: str) -> Path | None:
-    """Source file of a module, without importing it."""
+    """Return the source file of a module, without importing the module."""
     if module in sys.modules:
         file = getattr(sys.modules[module], "__file__", None)
         return Path(file) if file and os.path.isfile(file) else None
@@ -191,7 +191,7 @@ def source_file(module: str) -> Path | None:
 
 
 def _source_digest(module: str, path: Path) -> str:
-    """xxh3 of a source; of a loaded module, as it was when first seen, for that is what runs."""
+    """Return the xxh3 of a source file; for a loaded module that of its first reading, because that code runs."""
     spec = getattr(sys.modules.get(module), "__spec__", None)
     if spec is not None and module in _frozen and _frozen[module][0] is spec:
         return _frozen[module][1]
@@ -201,12 +201,12 @@ def _source_digest(module: str, path: Path) -> str:
         _frozen[module] = (spec, found)
         if _edited(spec, path):
             _edited_since.add(module)
-            warnings.warn(f"{path} was edited after it was imported: start again to keep its results", stacklevel=2)
+            warnings.warn(f"{path} was edited after its import: restart Python to keep its results", stacklevel=2)
     return found
 
 
 def _edited(spec: Any, path: Path) -> bool:
-    """Whether the byte code that Python left at import is of another source than ``path`` now holds."""
+    """Return True if the byte code that Python wrote at the import belongs to another source than ``path``."""
     try:
         with open(spec.cached or "", "rb") as file:
             head = file.read(16)

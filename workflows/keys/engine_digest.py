@@ -1,7 +1,7 @@
-"""A digest of the program itself: of some of its modules, and of all that they import of `neusee.workflows`.
+"""Digest of the program itself: of some of its modules, and of all `neusee.workflows` modules that they import.
 
-What is stored of a study, a design or a posterior is keyed by it, so that a change of the code that made a result
-never serves the old one. It is the one identity of code outside nodes, which `Code` digests.
+A stored study, design or posterior has this digest in its key, so that a change of the code never leads to an old
+result. This digest is the only identity of code outside the nodes; `Code` digests the nodes.
 """
 
 from __future__ import annotations
@@ -20,7 +20,7 @@ _ROOT = "neusee.workflows"
 
 @functools.cache
 def engine(*modules: str) -> str:
-    """Return the digest of ``modules`` of neusee.workflows (``engine.runner`` by default) and of what they import.
+    """Return the digest of ``modules`` of neusee.workflows (default ``engine.runner``) and of their imports.
 
     Only imports at the top of a module count: by them a run is decided.
 

@@ -1,4 +1,4 @@
-"""What the source of a module says: a digest of the whole, one of each definition, and what it uses of `neusee`."""
+"""Summary of a module's source: a digest of the whole, a digest of each definition, and the used `neusee` names."""
 
 from __future__ import annotations
 
@@ -11,15 +11,15 @@ from typing import NamedTuple
 from neusee.workflows.keys.cache_key import digest
 
 ROOT = "neusee.nodes"
-_parsing = threading.Lock()  #: the parser of Python 3.11 loses count of its depth where two threads are in it
-_SHORT = 16  #: digits of a definition's digest: it is told from its earlier self alone
+_parsing = threading.Lock()  #: the parser of Python 3.11 miscounts its recursion depth if two threads use it
+_SHORT = 16  #: digits of a definition's digest, which is compared with its earlier versions only
 
-Import = tuple[int, str, str]  #: level, module, name (empty: the module itself)
-Use = tuple[int, str, str, str, int]  #: of an imported name: how it came in, the attributes after it, the line
+Import = tuple[int, str, str]  #: level, module, name (empty for the module itself)
+Use = tuple[int, str, str, str, int]  #: an imported name: its import, the attributes after the name, the line
 
 
 class Summary(NamedTuple):
-    """A module's source as far as keys, and words about them, need it."""
+    """The parts of a module's source that keys and reports of changes need."""
 
     tree: str  #: digest of the syntax tree without docstrings
     imports: list[Import]
@@ -29,7 +29,7 @@ class Summary(NamedTuple):
 
 
 def summarise(source: bytes) -> Summary:
-    """Digests of a syntax tree and its parts, without docstrings, and what it imports and uses of `neusee`."""
+    """Return the digests of a syntax tree and its definitions, without docstrings, and the `neusee` names in use."""
     with _parsing:
         tree = ast.parse(source)
     imports: list[Import] = []
@@ -53,7 +53,7 @@ def summarise(source: bytes) -> Summary:
 
 
 def _uses(tree: ast.Module, bound: dict[str, set[Import]]) -> list[Use]:
-    """The attribute chains that begin with an imported name, and packages that are used whole, each once."""
+    """Return the attribute chains that begin with an imported name, and packages used as a whole, each once."""
     found: dict[tuple[int, str, str, str], int] = {}
     for name, attributes, line in _chains(tree):
         for way in bound.get(name, ()):
@@ -63,8 +63,8 @@ def _uses(tree: ast.Module, bound: dict[str, set[Import]]) -> list[Use]:
 
 
 def _chains(tree: ast.Module) -> Iterator[tuple[str, list[str], int]]:
-    """``a.b.c`` as a, [b, c] and its line, for the longest chains, and names alone."""
-    inner: set[int] = set()  # parts of a chain that was seen: a walk meets the whole before its parts
+    """Yield ``a.b.c`` as a, [b, c] and its line, for the longest chains, and also names alone."""
+    inner: set[int] = set()  # parts of chains already seen: a walk meets a chain before its parts
     for item in ast.walk(tree):
         if id(item) in inner or not isinstance(item, ast.Attribute | ast.Name):
             continue
@@ -79,7 +79,7 @@ def _chains(tree: ast.Module) -> Iterator[tuple[str, list[str], int]]:
 
 
 def _definitions(tree: ast.Module) -> dict[str, str]:
-    """A digest of each definition at the top of a module; of those with one label, a digest of all."""
+    """Return a digest for each top-level definition; definitions with the same label share a digest."""
     found: dict[str, list[str]] = defaultdict(list)
     for item in tree.body:
         dump = ast.dump(item)
@@ -89,7 +89,7 @@ def _definitions(tree: ast.Module) -> dict[str, str]:
 
 
 def _labels(item: ast.stmt) -> Iterable[str]:
-    """What a statement at the top of a module defines."""
+    """Return the labels of the definitions in a top-level statement."""
     if isinstance(item, ast.FunctionDef | ast.AsyncFunctionDef):
         return [f"{_owner(item)}()"]
     if isinstance(item, ast.ClassDef):
@@ -102,7 +102,7 @@ def _labels(item: ast.stmt) -> Iterable[str]:
 
 
 def _owner(function: ast.FunctionDef | ast.AsyncFunctionDef) -> str:
-    """A function's name; ``psf.check`` of one that is ``_`` and belongs to a node."""
+    """Return a function's name, or ``psf.check`` for a function ``_`` that is a hook of the node ``psf``."""
     for mark in function.decorator_list:
         if function.name == "_" and isinstance(mark, ast.Attribute) and isinstance(mark.value, ast.Name):
             return f"{mark.value.id}.{mark.attr}"

@@ -1,8 +1,8 @@
-"""Which task runs when and where: HEFT with insertion and CPOP, with memory as a hard constraint.
+"""Placement of tasks on devices in time: HEFT with insertion and CPOP, with memory as a hard constraint.
 
-A pure function of tasks, costs and devices, for this machine and for those that nobody here owns.
-Results leave a device after their last use, a task that does not fit is cut into band parts, waits
-or goes elsewhere, and what fits nowhere is refused with the number of bytes that it needs.
+A pure function of tasks, costs and devices, for this machine and for machines described in a file.
+A result leaves a device after its last use. A task that does not fit is cut into parts of bands, waits
+or runs elsewhere; a task that fits nowhere is refused with the number of bytes that it needs.
 
 Source: Topcuoglu, Hariri, Wu, IEEE Transactions on Parallel and Distributed Systems 13 (2002) 260.
 """
@@ -33,14 +33,14 @@ __all__ = ["BUS", "Cluster", "Device", "Link", "Move", "Schedule", "Slot", "Task
 
 
 def heft(tasks: Sequence[Task], cluster: Cluster, keep: Collection[str] = ()) -> Schedule:
-    """Place the task with the longest way to the end first, each where it ends first.
+    """Place the task with the longest remaining path first, each where it ends first.
 
     ``keep`` names the results that are held to the end. Where memory is short, orders that hold less at
-    once are tried too. What one device could do alone, and be done sooner, it does alone; and what one
-    could run alone is never refused.
+    once are tried too. If one device alone would finish all tasks sooner, it runs them all; tasks that one
+    device could run alone are never refused.
 
-    Raises: `TooLarge` where no such plan fits, with what the one that comes closest needs; ValueError
-    for tasks that no device runs, or that make no graph.
+    Raises: `TooLarge` where no such plan fits, with the need of the plan that comes closest; ValueError
+    for tasks that no device runs, and for cyclic dependencies.
     """
     graph = Graph(tasks, cluster, keep)
     if len(cluster.devices) == 1:
@@ -49,7 +49,7 @@ def heft(tasks: Sequence[Task], cluster: Cluster, keep: Collection[str] = ()) ->
     try:
         schedule = _best(graph, orders)
     except TooLarge as error:
-        return _alone(graph, _able(graph), error)  # which tells what one device alone would need, if that is less
+        return _alone(graph, _able(graph), error)  # gives the need of one device alone, if smaller
     sooner = {d: took for d in _able(graph) if (took := sum(row[d] for row in graph.seconds)) < schedule.makespan}
     try:
         return _alone(graph, sorted(sooner, key=sooner.__getitem__)) if sooner else schedule
@@ -58,7 +58,7 @@ def heft(tasks: Sequence[Task], cluster: Cluster, keep: Collection[str] = ()) ->
 
 
 def cpop(tasks: Sequence[Task], cluster: Cluster, keep: Collection[str] = ()) -> Schedule:
-    """Place the critical path on the one device that runs it fastest, and all else where it ends first.
+    """Place the critical path on the one device that runs it fastest, and every other task where it ends first.
 
     Raises: as `heft`.
     """
@@ -71,7 +71,7 @@ def cpop(tasks: Sequence[Task], cluster: Cluster, keep: Collection[str] = ()) ->
 
 
 def _best(graph: Graph, orders: Sequence[Sequence[int]], pinned: Mapping[int, int] | None = None) -> Schedule:
-    """The schedule of the first order, if it fits as it is; else of that order which ends first with the memory."""
+    """Return the schedule of the first order if it fits without limits, else the shortest that fits the memory."""
     pinned = pinned or {}
     memory = {device.name: device.memory for device in graph.cluster.devices}
     best, refused = _placed(PartialSchedule(graph, bounded=False), orders[0], pinned).schedule(), list[TooLarge]()
@@ -95,7 +95,7 @@ def _placed(
 ) -> PartialSchedule:
     """Place tasks in an order; those of ``pinned`` on their device, if they ever fit there.
 
-    A task for which there is no memory lets those go first that follow it and may give some back. It
+    A task that does not fit into memory lets later tasks go first that may free memory. The placement
     stops half-way where it cannot end before ``below``.
     """
     graph = board.graph
@@ -126,7 +126,7 @@ def _placed(
 
 
 def _critical(graph: Graph, through: Sequence[float]) -> list[int]:
-    """From the first task with the longest way through it, always on to the reader with the longest."""
+    """Return the critical path: from the first task of the longest path, always on to the reader with the longest."""
     at = max((i for i, sources in enumerate(graph.sources) if not sources), key=through.__getitem__, default=-1)
     path = []
     while at >= 0:
@@ -139,14 +139,14 @@ def _critical(graph: Graph, through: Sequence[float]) -> list[int]:
 
 
 def _able(graph: Graph) -> list[int]:
-    """Devices that can run everything, those with most memory first."""
+    """Return the devices that can run every task, those with most memory first."""
     devices = graph.cluster.devices
     able = [d for d in range(len(devices)) if all(d in a for a in graph.able)]
     return sorted(able, key=lambda d: -devices[d].memory)
 
 
 def _alone(graph: Graph, devices: Sequence[int], *refused: TooLarge) -> Schedule:
-    """One after another on one device, as given or holding little at once: the first that fits."""
+    """Return the first schedule that fits on one device: tasks in their order, or in the order that holds least."""
     for d in devices:
         for order in (graph.by(range(len(graph.tasks))), frugal(graph)):
             try:
@@ -157,7 +157,7 @@ def _alone(graph: Graph, devices: Sequence[int], *refused: TooLarge) -> Schedule
 
 
 def _sequence(graph: Graph, d: int, order: Sequence[int]) -> Schedule:
-    """Tasks one after another on device ``d``; what is refused would run with just the memory that is named."""
+    """Return the schedule of tasks one after another on device ``d``; a refusal names the memory that suffices."""
     board, name, limit = (
         PartialSchedule(graph, bounded=False),
         graph.cluster.devices[d].name,
@@ -184,6 +184,6 @@ def _sequence(graph: Graph, d: int, order: Sequence[int]) -> Schedule:
 
 
 def _fewest(graph: Graph, i: int, room: float) -> int:
-    """The smallest number of parts whose work fits into ``room``, or as many as there are."""
+    """Return the smallest number of parts whose work fits into ``room``, or the largest allowed number."""
     most = graph.tasks[i].parts
     return 1 + bisect_left(range(1, most), True, key=lambda parts: graph.work(i, parts) <= room)

@@ -1,4 +1,4 @@
-"""Machines from a YAML file: which devices, how fast, how much memory, and what lies between them.
+"""Machine files: devices with speed and memory, and the links between them, in YAML.
 
     devices:
       host: {kind: cpu, memory: 2 TB, speed: 10}
@@ -7,9 +7,9 @@
       cuda-cuda: {bandwidth: 300 GB/s, latency: 5 us}
     network: {bandwidth: 25 GB/s, latency: 5 us}
 
-``speed`` is how many times as fast as the machine on which the costs were measured, for all nodes or by
-family. ``node: [a, b]`` puts a group of devices on each machine of these names; between machines lies the
-network.
+``speed`` is the ratio to the machine on which the costs were measured, for all nodes or by family of
+nodes. ``node: [a, b]`` puts a group of devices on each machine of these names; the network links the
+machines.
 """
 
 from __future__ import annotations
@@ -34,13 +34,13 @@ _BYTES = {"B": 1.0, "kB": 1e3, "MB": 1e6, "GB": 1e9, "TB": 1e12, "MiB": 2.0**20,
 _SECONDS = {"s": 1.0, "ms": 1e-3, "us": 1e-6, "µs": 1e-6, "μs": 1e-6, "ns": 1e-9}
 _RATES = {f"{unit}/s": scale for unit, scale in _BYTES.items() if unit in ("MB", "GB", "TB")}
 _QUANTITY = re.compile(r"((?:\d+\.?\d*|\.\d+)(?:[eE][-+]?\d+)?)\s*(.*)")
-_MOST = 4096  #: devices of one file
+_MOST = 4096  #: limit on the devices of one file
 _Reader = Callable[[Value, "list[Diagnostic]"], Any]
 
 
 @dataclass(frozen=True)
 class Machines:
-    """A cluster, and how many times as fast each device is as the machine that was measured, by family of nodes."""
+    """A cluster, and the speed of each device relative to the measured machine, by family of nodes."""
 
     title: str
     cluster: Cluster
@@ -51,13 +51,13 @@ class Machines:
         return self.cluster.devices
 
     def speed(self, device: str, node: str) -> float:
-        """How many times as fast ``device`` runs the node of a path such as ``optics.psf``."""
+        """Return the relative speed at which ``device`` runs the node of a path such as ``optics.psf``."""
         speeds = self.speeds[device]
         return speeds.get(node.partition(".")[0], speeds["default"])
 
 
 def read_machines(path: Path | str) -> Machines:
-    """The machines of a file, or of an example by its name; a `RecipeError` locates every mistake at once."""
+    """Return the machines of a file, or of an example by its name; raise one `RecipeError` with all mistakes."""
     document = read(_found(path), str(path))
     diagnostics: list[Diagnostic] = []
     root = _fields(document.root, {"devices": _groups, "links": _links, "network": _link}, ("devices",), diagnostics)
@@ -68,14 +68,14 @@ def read_machines(path: Path | str) -> Machines:
         raise RecipeError(diagnostics)
     devices = _devices(groups)
     if len(devices) > _MOST:
-        raise RecipeError([_problem(document.root.items["devices"], f"are {len(devices)}; at most {_MOST} can be")])
+        raise RecipeError([_problem(document.root.items["devices"], f"are {len(devices)}; the maximum is {_MOST}")])
     speeds = {device.name: group["speed"] for device, group in devices.items()}
     network = root.get("network") or Cluster.network
     return Machines(document.title, Cluster(tuple(devices), links, BUS, network), speeds)
 
 
 def examples() -> dict[str, Path]:
-    """The examples that come with the program, by name."""
+    """Return the examples that come with the program, by name."""
     folder = Path(str(files("neusee.recipes"))) / "samples" / "clusters"
     return {path.stem: path for path in sorted(folder.glob("*.yaml"))}
 
@@ -91,7 +91,7 @@ def _found(path: Path | str) -> Path:
 
 
 def _devices(groups: list[dict[str, Any]]) -> dict[Device, dict[str, Any]]:
-    """Every single device with its group: ``cpu``, ``cuda:0``, and ``a/cuda:0`` on a machine that has a name."""
+    """Return every single device with its group: ``cpu``, ``cuda:0``, or ``a/cuda:0`` on a machine with a name."""
     rows = [(machine, group) for group in groups for machine in group["node"] for _ in range(group["count"])]
     total, seen = Counter((machine, group["kind"]) for machine, group in rows), Counter[tuple[str, str]]()
     found = {}
@@ -137,9 +137,9 @@ def _link(value: Value, diagnostics: list[Diagnostic]) -> Link:
 def _fields(
     value: Value, readers: Mapping[str, _Reader], required: tuple[str, ...], diagnostics: list[Diagnostic]
 ) -> dict[str, Any]:
-    """What a mapping says, each field by its reader; what it must say and does not is a mistake."""
+    """Return the fields of a mapping, each read by its reader; report unknown and missing fields."""
     if not isinstance(value.data, dict):
-        diagnostics.append(_problem(value, f"must be a mapping of {', '.join(readers)}; it is {kind(value)}"))
+        diagnostics.append(_problem(value, f"must be a mapping of {', '.join(readers)}, not {kind(value)}"))
         return {}
     found = {}
     for name, item in value.data.items():
@@ -154,7 +154,7 @@ def _fields(
 
 def _kind(value: Value, diagnostics: list[Diagnostic]) -> str:
     if value.data not in _KINDS:
-        diagnostics.append(_problem(value, f"no kind of device; {nearest(str(value.data), _KINDS)}"))
+        diagnostics.append(_problem(value, f"unknown kind of device; {nearest(str(value.data), _KINDS)}"))
     return str(value.data)
 
 
@@ -186,7 +186,7 @@ def _speed(value: Value, diagnostics: list[Diagnostic]) -> dict[str, float]:
 def _factor(value: Value, diagnostics: list[Diagnostic]) -> float:
     good = isinstance(value.data, int | float) and not isinstance(value.data, bool)
     if not good or not 0 < value.data < math.inf:
-        diagnostics.append(_problem(value, "must be a number above 0: how many times as fast as what was measured"))
+        diagnostics.append(_problem(value, "must be a number above 0: the speed relative to the measured machine"))
         return 1.0
     return float(value.data)
 
@@ -204,7 +204,7 @@ def _time(value: Value, diagnostics: list[Diagnostic]) -> float:
 
 
 def _quantity(value: Value, units: Mapping[str, float], such: str, diagnostics: list[Diagnostic]) -> float:
-    """A number and its unit; one of nothing is no quantity but for a time."""
+    """Return a number times its unit in SI; report a missing unit, and a zero except for a time."""
     match = _QUANTITY.fullmatch(str(value.data).strip())
     if isinstance(value.data, bool) or match is None:
         diagnostics.append(_problem(value, f"must be a number and a unit, such as {such}"))
@@ -219,13 +219,13 @@ def _quantity(value: Value, units: Mapping[str, float], such: str, diagnostics: 
 
 
 def _families() -> list[str]:
-    """The families of nodes, without importing any."""
+    """Return the families of nodes, without importing a node."""
     spec = find_spec("neusee.nodes")
     return [m.name for m in pkgutil.iter_modules(spec.submodule_search_locations if spec else []) if m.ispkg]
 
 
 def _absent(links: Value | None, kinds: set[str]) -> list[Diagnostic]:
-    """Kinds that ``links`` names and no device is of."""
+    """Return a diagnostic for each kind in ``links`` of which no device exists."""
     items = links.items.items() if links else ()
     pairs = [(item, name) for pair, item in items for name in dict.fromkeys(pair.split("-"))]
     said = "there is no device of kind"

@@ -1,4 +1,4 @@
-"""The memory of one device over all time, as promised to the tasks placed so far."""
+"""Memory profile of one device: the bytes promised to the tasks placed so far, over all time."""
 
 from __future__ import annotations
 
@@ -9,40 +9,40 @@ from itertools import pairwise
 
 import numpy as np
 
-Hold = tuple[float, float, float]  #: from, until (infinity if nobody knows yet), bytes
+Hold = tuple[float, float, float]  #: start, end (infinity if not yet known), bytes
 
 
 class MemoryProfile:
     """Bytes in use as a step function of time that never rises above ``limit``.
 
-    What still has readers to be placed is held for ever, and given back when the last of them has its
-    place. So promises only ever shrink, apart from what `wait` has looked at, and no later placement,
-    not even one in an earlier gap, can break what was found to fit.
+    A result whose readers are not all placed is held for ever, and freed when its last reader is
+    placed. Promises therefore only shrink after `wait` has checked them, and no later placement, not
+    even one in an earlier gap, can break a placement that was found to fit.
     """
 
     def __init__(self, limit: float) -> None:
         self.limit = limit
         self.times = [-math.inf]
         self.level = np.zeros(64)
-        self.kept = 0.0  # at the end of time
+        self.kept = 0.0  # bytes at the end of time
 
     def add(self, start: float, end: float, size: float) -> None:
-        """Hold ``size`` bytes (give them back, if negative) from ``start`` until ``end``."""
+        """Hold ``size`` bytes (free them, if negative) from ``start`` until ``end``."""
         if size and start < end:
             first = self._cut(start)
             self.level[first : self._cut(end) if end < math.inf else len(self.times)] += size
             self.kept += size if end == math.inf else 0.0
 
     def highest(self, start: float, end: float) -> float:
-        """Most bytes in use at any moment in [start, end)."""
+        """Return the maximum of the bytes in use in [start, end)."""
         return float(self.level[self._within(start, end)].max())
 
     def free(self) -> float:
-        """Bytes that are free when all that was placed is over."""
+        """Return the bytes that are free after the end of all placed tasks."""
         return self.limit - self.kept
 
     def wait(self, holds: Iterable[Hold]) -> float:
-        """By how many seconds all holds must come later to fit, at least: 0 if they fit as they are."""
+        """Return the least delay (s) with which all holds fit: 0 if they fit without a delay."""
         shift = 0.0
         for start, end, size in stacked(holds):
             span = self._within(start, end)
@@ -57,7 +57,7 @@ class MemoryProfile:
         return slice(first, len(self.times) if end == math.inf else max(bisect_left(self.times, end), first + 1))
 
     def _cut(self, time: float) -> int:
-        """Index of the step that begins at ``time``, made if there is none."""
+        """Return the index of the step that begins at ``time``; insert the step if needed."""
         at, count = bisect_left(self.times, time), len(self.times)
         if at < count and self.times[at] == time:
             return at
@@ -70,7 +70,7 @@ class MemoryProfile:
 
 
 def stacked(holds: Iterable[Hold]) -> Iterator[Hold]:
-    """Overlapping holds as spans that follow one another, each with the sum of its bytes."""
+    """Yield overlapping holds as consecutive spans, each with the sum of its bytes."""
     steps: dict[float, float] = {}
     for start, end, size in holds:
         if start < end and size:
@@ -84,7 +84,7 @@ def stacked(holds: Iterable[Hold]) -> Iterator[Hold]:
 
 
 def without(start: float, end: float, taken: Iterable[tuple[float, float]]) -> Iterator[tuple[float, float]]:
-    """What of [start, end) the ``taken`` spans, sorted and apart, leave uncovered."""
+    """Yield the parts of [start, end) that the ``taken`` spans, sorted and disjoint, leave uncovered."""
     for first, last in taken:
         if first < end and last > start:
             if start < first:

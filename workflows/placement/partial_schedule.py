@@ -1,4 +1,4 @@
-"""Tasks being placed one by one: which gaps the devices have, and what memory is promised to whom."""
+"""Partial schedule: the tasks placed so far, the gaps of each device and the memory promised to each task."""
 
 from __future__ import annotations
 
@@ -10,18 +10,18 @@ from neusee.workflows.placement.memory_profile import Hold, MemoryProfile, stack
 from neusee.workflows.placement.task_priorities import Graph
 from neusee.workflows.placement.tasks_and_devices import Move, Schedule, Slot, TooLarge
 
-Copy = tuple[float, float, float]  #: leaves its source, arrives, last use
-Of = tuple[int, float, int]  #: which task's result, how many bytes of it, on which device
+Copy = tuple[float, float, float]  #: departure from the source, arrival, last use
+Of = tuple[int, float, int]  #: task of the result, bytes of the result, device
 
 
 class PartialSchedule:
-    """One schedule in the making: each task is placed after its sources, and never moves again."""
+    """An unfinished schedule: each task is placed after its sources, and never moves again."""
 
     def __init__(self, graph: Graph, bounded: bool = True) -> None:
         self.graph, devices, count = graph, graph.cluster.devices, len(graph.tasks)
         self.where, self.parts = [-1] * count, [1] * count
         self.start, self.end = [0.0] * count, [0.0] * count
-        self.free_at: list[float] = [0.0] * count  # when the last reader placed so far has what it needs
+        self.free_at: list[float] = [0.0] * count  # time when the last reader placed so far has its input
         self.left = [len(readers) for readers in graph.readers]
         self.gaps: list[tuple[list[float], list[float]]] = [([0.0], [math.inf]) for _ in devices]
         most = sum(graph.own) + max((graph.work(i, 1) for i in range(count)), default=0.0)
@@ -31,12 +31,12 @@ class PartialSchedule:
         self.least = [own + graph.work(i, graph.tasks[i].parts) for i, own in enumerate(graph.own)]
         self.copies: dict[Of, list[Copy]] = {}
         self.placed: list[int] = []
-        self.refused: list[tuple[int, int, float]] = []  # task, device, bytes it needs there
+        self.refused: list[tuple[int, int, float]] = []  # task, device, bytes needed there
 
     # --- where and when -------------------------------------------------------------------------------------------
 
     def place(self, i: int, among: Sequence[int]) -> bool:
-        """Give task ``i`` the slot of ``among`` in which it ends first; False if none ever has the memory."""
+        """Give task ``i`` the slot of ``among`` in which the task ends first; return False if none has the memory."""
         best, on, begin = math.inf, -1, 0.0
         for d in among:
             room = self.rooms[d]
@@ -53,11 +53,11 @@ class PartialSchedule:
         return on >= 0
 
     def gave_back(self, i: int) -> bool:
-        """Whether placing task ``i`` made memory free for those that had none."""
+        """Return True if placing task ``i`` freed memory for waiting tasks."""
         return any(not self.left[j] for j in self.graph.sources[i]) or bool(self.refused)
 
     def force(self, i: int) -> None:
-        """Place a task that fits nowhere as if one device had the memory, and note how much that is."""
+        """Place a task that fits nowhere as if one device had the memory, and note the needed bytes."""
         able = [d for d in self.graph.able[i] if self.rooms[d] is not None]
         needs = {d: self._needs(i, d) for d in able}
         d = min(able, key=lambda d: (needs[d] - self.graph.cluster.devices[d].memory, d))
@@ -68,7 +68,7 @@ class PartialSchedule:
         self.place(i, [d])
 
     def _ready(self, i: int, d: int) -> float:
-        """When the last input of ``i`` can be on device ``d``."""
+        """Return the time at which the last input of ``i`` can be on device ``d``."""
         ready = 0.0
         for j, size in zip(self.graph.sources[i], self.graph.sizes[i], strict=True):
             at = self.end[j]
@@ -78,7 +78,7 @@ class PartialSchedule:
         return ready
 
     def _slot(self, i: int, d: int, ready: float, seconds: float, best: float) -> float:
-        """The first start in a gap of ``d`` that is long enough and has the memory; infinity if not before ``best``."""
+        """Return the first start in a gap of ``d`` with enough time and memory; infinity if not before ``best``."""
         starts, ends = self.gaps[d]
         for gap in range(bisect_left(ends, ready + seconds), len(ends)):
             start = max(starts[gap], ready)
@@ -93,7 +93,7 @@ class PartialSchedule:
         return math.inf
 
     def _fitting(self, i: int, d: int, start: float, seconds: float, end: float) -> float:
-        """The first moment from ``start`` on at which there is the memory, or one at which it is past ``end``."""
+        """Return the first time from ``start`` on with enough memory, or a time too late for the gap."""
         room, parts = self.rooms[d], self.graph.tasks[i].parts
         if room is None:
             return start
@@ -105,7 +105,7 @@ class PartialSchedule:
         return start
 
     def _holds(self, i: int, d: int, start: float, end: float, parts: int) -> list[Hold]:
-        """All memory that ``i`` takes beside what is on ``d`` already: result, work, and copies of its inputs."""
+        """Return all memory that ``i`` adds on ``d``: result, work, and copies of its inputs."""
         graph = self.graph
         holds = [(start, math.inf if graph.held(i) else end, graph.own[i]), (start, end, graph.work(i, parts))]
         for of, leaves in self._arriving(i, d, start):
@@ -114,14 +114,14 @@ class PartialSchedule:
         return holds
 
     def _arriving(self, i: int, d: int, start: float) -> Iterator[tuple[Of, float]]:
-        """The inputs that are made elsewhere, and when they must leave there to be in time."""
+        """Yield the inputs from other devices, and the latest time at which they must be sent."""
         for j, size in zip(self.graph.sources[i], self.graph.sizes[i], strict=True):
             if self.where[j] != d:
                 leaves = start - self.links[self.where[j]][d].seconds(size)
                 yield (j, size, d), max(leaves, self.end[j])
 
     def _needs(self, i: int, d: int) -> float:
-        """Bytes that ``d`` must have for ``i`` to run there after all that was placed before."""
+        """Return the bytes that ``d`` must have for ``i`` to run there after all tasks placed before."""
         graph, room = self.graph, self.rooms[d]
         assert room is not None
         pairs = zip(graph.sources[i], graph.sizes[i], strict=True)
@@ -152,7 +152,7 @@ class PartialSchedule:
         self.placed.append(i)
 
     def _fewest(self, i: int, d: int, start: float, end: float, room: MemoryProfile) -> int:
-        """The smallest number of parts with which ``i`` fits into its slot; cut into all of them, it does."""
+        """Return the smallest number of parts with which ``i`` fits into its slot; the largest number always fits."""
 
         def fits(parts: int) -> bool:
             return not room.wait(self._holds(i, d, start, end, parts))
@@ -160,7 +160,7 @@ class PartialSchedule:
         return 1 + bisect_left(range(1, self.graph.tasks[i].parts), True, key=fits)
 
     def _fill(self, d: int, start: float, end: float) -> None:
-        """Cut a slot out of the gap that it lies in."""
+        """Remove a slot from its gap."""
         starts, ends = self.gaps[d]
         gap = bisect_left(ends, end)
         left = [(a, b) for a, b in ((starts[gap], start), (end, ends[gap])) if a < b]
@@ -170,13 +170,13 @@ class PartialSchedule:
     # --- the end --------------------------------------------------------------------------------------------------
 
     def too_large(self) -> TooLarge:
-        """Why the first task that had to be forced does not fit, and what all that were forced need there."""
+        """Return the error of the first task that had to be forced, with the need of all forced tasks on its device."""
         graph, (i, d, _) = self.graph, self.refused[0]
         needed, device = max(n for _, on, n in self.refused if on == d), graph.cluster.devices[d]
         return TooLarge(graph.tasks[i].name, device.name, needed, device.memory, graph.tasks[i].parts)
 
     def schedule(self) -> Schedule:
-        """The whole schedule."""
+        """Return the complete schedule."""
         devices = self.graph.cluster.devices
         self._bridge()
         moves = sorted(self._moves(), key=lambda m: (m.start, m.task, m.device))
@@ -186,7 +186,7 @@ class PartialSchedule:
         return Schedule(tuple(slots), max(self.end, default=0.0), peak, sum(m.bytes for m in moves), tuple(moves))
 
     def _bridge(self) -> None:
-        """Where there is the memory, keep a copy for its next use instead of sending it again."""
+        """Keep a copy for its next use instead of sending it again, where the memory allows this."""
         for (j, size, d), copies in self.copies.items():
             room, kept = self.rooms[d], copies[:1]
             for copy in copies[1:]:
@@ -207,7 +207,7 @@ class PartialSchedule:
                 yield Move(task, size, source, devices[d].name, leaves, arrives, until)
 
     def _held(self) -> list[list[Hold]]:
-        """By device, every span of memory that the schedule takes in the end."""
+        """Return every span of memory that the finished schedule uses, by device."""
         graph, held = self.graph, list[list[Hold]]([] for _ in self.rooms)
         until, over = list(self.end), max(self.end, default=0.0)
         for (j, size, d), copies in self.copies.items():
@@ -223,7 +223,7 @@ class PartialSchedule:
         return held
 
     def _slots(self) -> Iterator[Slot]:
-        """Every slot, with the task that kept it from beginning earlier."""
+        """Yield every slot, with the task that delayed its start."""
         tasks, devices, turn = self.graph.tasks, self.graph.cluster.devices, [0] * len(self.where)
         for number, i in enumerate(self.placed):
             turn[i] = number
@@ -237,7 +237,7 @@ class PartialSchedule:
             ended[self.end[i]] = i
 
     def _waited(self, i: int, before: int, other: int) -> int:
-        """What ``i`` waited for: an input, its device, or the end of another task, which freed memory."""
+        """Return the task that delayed ``i``: the maker of an input, the task before, or a task that freed memory."""
         start, d = self.start[i], self.where[i]
         for j, size in zip(self.graph.sources[i], self.graph.sizes[i], strict=True):
             sent = 0.0 if self.where[j] == d else self.links[self.where[j]][d].seconds(size)
@@ -250,12 +250,12 @@ class PartialSchedule:
 
 
 def _highest(holds: list[Hold]) -> float:
-    """Most bytes at once."""
+    """Return the maximum of the bytes held at the same time."""
     return max((size for _, _, size in stacked(holds)), default=0.0)
 
 
 def _joined(copies: list[Copy]) -> list[Copy]:
-    """Copies in order of time, those that touch as one."""
+    """Return the copies in order of time; copies that touch are joined."""
     joined: list[Copy] = []
     for leaves, arrives, until in sorted(copies):
         if joined and leaves <= joined[-1][2]:

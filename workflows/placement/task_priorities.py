@@ -1,4 +1,4 @@
-"""The orders in which tasks may be placed: by rank, as they were given, or so that little is held at once."""
+"""Priorities of tasks: the orders of placement by rank, as given, or with little memory in use."""
 
 from __future__ import annotations
 
@@ -12,14 +12,14 @@ from neusee.workflows.placement.tasks_and_devices import Cluster, Task
 
 
 class Graph:
-    """Tasks by number: who reads whom, what travels, and who can run what."""
+    """Tasks by number: their sources and readers, the bytes sent, and the devices that can run them."""
 
     def __init__(self, tasks: Sequence[Task], cluster: Cluster, keep: Collection[str] = ()) -> None:
         self.tasks, self.cluster = tuple(tasks), cluster
         index = {task.name: i for i, task in enumerate(self.tasks)}
         if len(index) < len(self.tasks):
             twice = next(t.name for i, t in enumerate(self.tasks) if index[t.name] != i)
-            raise ValueError(f"two tasks are called {twice}")
+            raise ValueError(f"two tasks have the name {twice}")
         for name in (*(s for task in self.tasks for s in task.sources), *keep):
             if name not in index:
                 raise ValueError(f"no task {name}; {nearest(name, index)}")
@@ -30,20 +30,20 @@ class Graph:
                 self.readers[j].append(i)
         self.kept = {index[name] for name in keep}
         self.sizes = [[t.takes.get(self.tasks[j].name, self.tasks[j].bytes) for j in s] for t, s in self._rows()]
-        self.own = [float(math.ceil(task.bytes)) for task in self.tasks]  # whole bytes add up without rounding
+        self.own = [float(math.ceil(task.bytes)) for task in self.tasks]  # whole bytes add up without round-off
         self.able = [[d for d, device in enumerate(cluster.devices) if device.name in t.seconds] for t in self.tasks]
         self.seconds = [[t.seconds.get(device.name, math.inf) for device in cluster.devices] for t in self.tasks]
         self._check()
 
     def held(self, i: int) -> bool:
-        """Whether the result of task ``i`` outlives it."""
+        """Return True if the result of task ``i`` is needed after the task."""
         return bool(self.readers[i]) or i in self.kept
 
     def work(self, i: int, parts: int) -> float:
         return float(math.ceil(self.tasks[i].work / parts))
 
     def by(self, keys: Sequence[Any]) -> list[int]:
-        """Every task after its sources; of those that may come, the one with the least key."""
+        """Return every task after its sources; among the ready tasks the one with the least key comes first."""
         missing = [len(sources) for sources in self.sources]
         ready = [(keys[i], i) for i, count in enumerate(missing) if not count]
         heapq.heapify(ready)
@@ -66,18 +66,18 @@ class Graph:
             if not able:
                 raise ValueError(f"{task.name} runs on {', '.join(task.seconds) or 'no device'}; there are: {there}")
             if not all(0 <= seconds < math.inf for seconds in task.seconds.values()):
-                raise ValueError(f"{task.name} must take a finite time: {dict(task.seconds)} s")
+                raise ValueError(f"{task.name} must have finite seconds of 0 or more: {dict(task.seconds)} s")
         if len(self.by(range(len(self.tasks)))) < len(self.tasks):
-            raise ValueError("the tasks read one another in a circle")
+            raise ValueError("the tasks depend on each other in a cycle")
 
 
 def ranked(graph: Graph, ranks: Sequence[float]) -> list[int]:
-    """Highest rank first; ranks that differ by rounding alone count as equal, and the name decides."""
+    """Return the tasks by falling rank; ranks that differ by round-off count as equal, and then the name decides."""
     return graph.by([(-float(f"{rank:.9g}"), graph.tasks[i].name) for i, rank in enumerate(ranks)])
 
 
 def upward(graph: Graph) -> list[float]:
-    """rank_u: seconds from the start of each task to the end of all, with mean costs.
+    """Return rank_u: seconds from the start of each task to the end of the graph, with mean costs.
 
     Source: Topcuoglu, Hariri, Wu, IEEE TPDS 13 (2002) 260, eq. 8.
     """
@@ -91,7 +91,7 @@ def upward(graph: Graph) -> list[float]:
 
 
 def downward(graph: Graph) -> list[float]:
-    """rank_d: seconds from the start of all to the start of each task, with mean costs (eq. 10 of the same)."""
+    """Return rank_d: seconds from the start of the graph to the start of each task, with mean costs (eq. 10)."""
     ranks, wait, cost = [0.0] * len(graph.tasks), _mean_transfer(graph), _mean_seconds(graph)
     for i in graph.by(range(len(graph.tasks))):
         pairs = zip(graph.sources[i], graph.sizes[i], strict=True)
@@ -100,9 +100,9 @@ def downward(graph: Graph) -> list[float]:
 
 
 def frugal(graph: Graph) -> list[int]:
-    """Depth first, and of the inputs of a task first the one that leaves most of its memory free again.
+    """Return a depth-first order in which the input that frees most of its memory comes first.
 
-    Of all depth-first orders of a tree, the one that holds least at once (Liu, ACM TOMS 12 (1986) 249).
+    Of all depth-first orders of a tree this order has the smallest peak memory (Liu, ACM TOMS 12 (1986) 249).
     """
     need, befores = _needs(graph)
     left = {i: graph.own[i] if i in graph.kept else 0.0 for i, r in enumerate(graph.readers) if not r}
@@ -119,7 +119,7 @@ def frugal(graph: Graph) -> list[int]:
 
 
 def _needs(graph: Graph) -> tuple[list[float], list[list[int]]]:
-    """Bytes that each task needs at once with all that comes before it, and its sources in the best order."""
+    """Return the peak bytes of each task with all its predecessors, and its sources in the best order."""
     need, befores = [0.0] * len(graph.tasks), list[list[int]]([] for _ in graph.tasks)
     for i in graph.by(range(len(graph.tasks))):
         befores[i] = sorted(graph.sources[i], key=lambda j: (graph.own[j] - need[j], j))
@@ -136,7 +136,7 @@ def _mean_seconds(graph: Graph) -> list[float]:
 
 
 def _mean_transfer(graph: Graph) -> tuple[float, float]:
-    """Mean latency, and mean seconds a byte, over all pairs of devices."""
+    """Return the mean latency and the mean seconds per byte over all pairs of devices."""
     names = [device.name for device in graph.cluster.devices]
     links = [graph.cluster.link(a, b) for a in names for b in names if a != b]
     count = max(len(links), 1)

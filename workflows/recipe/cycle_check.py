@@ -1,4 +1,4 @@
-"""Loops among the steps, without recursion."""
+"""Check for cycles among the steps, without recursion."""
 
 from __future__ import annotations
 
@@ -7,11 +7,11 @@ from collections.abc import Iterator, Mapping
 from neusee.workflows.graph.diagnostics import Diagnostic, Location
 from neusee.workflows.graph.recipe_graph import Step
 
-_MOST = 12  #: steps of a loop that a message names
+_MOST = 12  #: steps of a cycle that a message names
 
 
 def cycles(steps: Mapping[str, Step], marks: Mapping[str, Location]) -> Iterator[Diagnostic]:
-    """One problem for each loop, with the lines of the steps in it."""
+    """Yield one diagnostic for each cycle, with the lines of its steps."""
     seen: set[frozenset[str]] = set()
     for loop in _loops({name: [s for s in step.sources if s in steps] for name, step in steps.items()}):
         names = list(dict.fromkeys(name.partition("[")[0] for name in loop))
@@ -32,7 +32,7 @@ def _places(marks: list[Location]) -> str:
 
 
 def _loops(sources: Mapping[str, list[str]]) -> Iterator[list[str]]:
-    """Each loop that a walk from sink to source closes, in the direction of the light."""
+    """Yield each cycle that a walk from sink to source closes, in the direction of the data."""
     done: set[str] = set()
     for root in sources:
         path: dict[str, Iterator[str]] = {} if root in done else {root: iter(sources[root])}

@@ -1,4 +1,4 @@
-"""What a recipe says beside its blocks and steps: outputs, seed, tolerance, expected numbers."""
+"""Global settings of a recipe: outputs, seed, tolerance and expected numbers."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ _EXPECTED = ("step", "at", "value", "rtol")
 
 
 def seed_and_tolerance(root: Value, references: References, diagnostics: list[Diagnostic]) -> tuple[int, float]:
-    """Seed and tolerance; 0 where nothing is said."""
+    """Return seed and tolerance; 0 where the recipe does not set them."""
     seed = tolerance = 0
     given = {
         key: references.resolve(root.items[key], Scope({}, key)) for key in ("seed", "tolerance") if key in root.items
@@ -24,24 +24,24 @@ def seed_and_tolerance(root: Value, references: References, diagnostics: list[Di
     if "seed" in given and given["seed"].data is not BROKEN:
         seed = given["seed"].data
         if isinstance(seed, bool) or not isinstance(seed, int) or seed < 0:
-            diagnostics.append(Diagnostic(given["seed"].mark, f"seed = {seed}", "must be a whole number from 0"))
+            diagnostics.append(Diagnostic(given["seed"].mark, f"seed = {seed}", "must be a whole number of 0 or more"))
     if "tolerance" in given and given["tolerance"].data is not BROKEN:
         tolerance = given["tolerance"].data
         if not _is_number(tolerance) or tolerance < 0:
             diagnostics.append(
-                Diagnostic(given["tolerance"].mark, f"tolerance = {tolerance}", "must be a number from 0")
+                Diagnostic(given["tolerance"].mark, f"tolerance = {tolerance}", "must be a number of 0 or more")
             )
     return seed, tolerance
 
 
 def outputs_of(root: Value, wiring: Wiring) -> tuple[str, ...]:
-    """The copies of the steps that ``outputs`` names."""
+    """Return the copies of the steps that ``outputs`` names."""
     given = root.items.get("outputs")
     if given is None or given.data in (None, "", [], {}):
         mark = root.mark if given is None else given.mark
         if given is None and get_close_matches("outputs", map(str, root.items)):
             return ()  # misspelt, and reported as unknown
-        wiring.diagnostics.append(Diagnostic(mark, "outputs", "nothing is asked for: write outputs: [STEP, …]"))
+        wiring.diagnostics.append(Diagnostic(mark, "outputs", "no output is requested: write outputs: [STEP, …]"))
         return ()
     if isinstance(given.data, dict):
         wiring.diagnostics.append(Diagnostic(given.mark, "outputs", "must be a list of steps, not a mapping"))
@@ -53,7 +53,7 @@ def outputs_of(root: Value, wiring: Wiring) -> tuple[str, ...]:
 
 
 def expectations(root: Value, wiring: Wiring) -> tuple[Expectation, ...]:
-    """The numbers that a recipe promises."""
+    """Return the numbers that a recipe promises."""
     given = root.items.get("expect")
     if given is None or given.data is None:
         return ()
@@ -93,7 +93,7 @@ def _expectation(name: str, given: Value, wiring: Wiring) -> Expectation | None:
 
 
 def _place(given: Value | None, diagnostics: list[Diagnostic]) -> tuple[int | str, ...]:
-    """Indices, or the names of fields."""
+    """Return indices, or the names of fields."""
     if given is None:
         return ()
     at = given.plain if isinstance(given.data, list) else [given.plain]

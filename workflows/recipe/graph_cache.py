@@ -1,8 +1,8 @@
-"""What was found out of a recipe's graph, for as long as the graph, its items and its nodes stay what they were.
+"""Cache of recipe graphs, valid while the graph, its items and its nodes are unchanged.
 
-Which node a step names and which steps feed it hang on the ``steps`` and on the names of the
-items, and on no other value: a thousand points of a sweep need not ask again. The parameters,
-the files and all else that a value decides are looked at every time.
+The node of a step and the steps that feed it depend on ``steps`` and on the names of the items,
+and on no other value: a thousand points of a sweep need not resolve them again. Parameters, files
+and everything else that depends on values are checked every time.
 """
 
 from __future__ import annotations
@@ -19,7 +19,7 @@ from neusee.workflows.recipe.text.yaml_values import Value
 
 K = TypeVar("K")
 V = TypeVar("V")
-Names = tuple[tuple[str, tuple[str, ...] | None], ...]  #: of every block: its items, or None if it is no list of items
+Names = tuple[tuple[str, tuple[str, ...] | None], ...]  #: by block: its items; None if it is no list of items
 
 _MOST = 16
 _graphs: dict[tuple[int, Names], CachedGraph] = {}
@@ -28,16 +28,16 @@ _written: dict[int, tuple[Value, Recipe]] = {}  #: id of a top mapping -> that m
 
 @dataclass(frozen=True, slots=True)
 class CachedGraph:
-    """Steps and wires in which nothing was wrong."""
+    """Steps and wires without a mistake."""
 
-    value: Value  #: the ``steps``, held so that no other value takes its id
+    value: Value  #: the ``steps``, held so that no other value takes their id
     steps: dict[str, Declared]
     absent: dict[str, Value]
-    wires: Mapping[str, Mapping[str, Wire]]  #: of the bound steps whose wires are no references
+    wires: Mapping[str, Mapping[str, Wire]]  #: of the bound steps whose wires are not references
 
 
 def cached_graph(root: Value) -> CachedGraph | None:
-    """What is known of the graph of a recipe, if its nodes are still those of the program."""
+    """Return the cached graph of a recipe if its nodes are still those of the program, else None."""
     steps = root.items.get("steps")
     found = _graphs.get((id(steps), _names(root)))
     return found if found is not None and all(map(_current, found.steps.values())) else None
@@ -46,29 +46,29 @@ def cached_graph(root: Value) -> CachedGraph | None:
 def cache_graph(
     root: Value, steps: dict[str, Declared], absent: dict[str, Value], wires: Mapping[str, Mapping[str, Wire]]
 ) -> None:
-    """Remember a graph in which nothing is wrong, but for its references: they are followed every time."""
+    """Cache a graph without mistakes; its references are resolved every time."""
     if any(_refers(step.value.items.get("node")) for step in steps.values()):
         return
     fixed = [name for step in steps.values() if not _refers(step.value.items.get("from")) for name in step.instances]
     value = root.items["steps"]
     found = CachedGraph(value, steps, absent, {name: wires[name] for name in fixed})
-    remember(_graphs, (id(value), _names(root)), found)
+    memoise(_graphs, (id(value), _names(root)), found)
 
 
 def cached_recipe(root: Value) -> Recipe | None:
-    """The recipe of a top mapping that was checked before."""
+    """Return the recipe of a top mapping that was checked before, else None."""
     found = _written.get(id(root))
     return found[1] if found is not None and cached_graph(root) is not None else None
 
 
 def cache_recipe(root: Value, recipe: Recipe) -> Recipe:
-    """Remember the recipe of a top mapping."""
-    remember(_written, id(root), (root, recipe))
+    """Cache the recipe of a top mapping, and return the recipe."""
+    memoise(_written, id(root), (root, recipe))
     return recipe
 
 
-def remember(known: dict[K, V], name: K, value: V) -> None:
-    """Keep what was made, and let the oldest go."""
+def memoise(known: dict[K, V], name: K, value: V) -> None:
+    """Store a value in a cache of limited size, and drop the oldest entries."""
     while len(known) >= _MOST:
         known.pop(next(iter(known), name), None)
     known[name] = value
@@ -84,7 +84,7 @@ def _items(block: dict[str | int, Value]) -> tuple[str, ...] | None:
 
 
 def _current(step: Declared) -> bool:
-    """Whether the node that a step names is still the one that was found."""
+    """Return True if the node that a step names is still the cached node."""
     family, _, name = str(step.value.items["node"].data).partition(".")
     return getattr(sys.modules.get(f"{neusee.nodes.__name__}.{family}"), name, None) is step.node
 

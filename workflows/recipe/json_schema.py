@@ -1,7 +1,7 @@
-"""JSON schema of a recipe file, for editors: they complete names and mark a mistake while it is written.
+"""JSON schema of a recipe file, for editors: they complete names and mark mistakes during typing.
 
-A step is told by its ``node``, so that a wrong name under ``with`` is one error and not one
-for each node there is. A file need not be whole (groups are merged), so nothing is required.
+The schema of a step depends on its ``node``, so that a wrong name under ``with`` is one error and
+not one error for every node. A file may be incomplete (groups are merged), so no key is required.
 """
 
 from __future__ import annotations
@@ -23,17 +23,17 @@ from neusee.workflows.recipe.wiring import takes_many
 
 Schema = dict[str, Any]
 
-#: ``${a.b}`` or a law may stand for every value
+#: a reference ``${a.b}`` or a distribution, which may replace every value
 REFERENCE: Schema = {"type": "string", "pattern": rf"\$\{{.+\}}|^({'|'.join(LAWS)})\(.+\)$"}
 _WIRE: Schema = {"type": ["string", "null"], "pattern": r"^[^\[\]\s]+(\[[^\[\]]+\])?$|\$\{"}
 _DEVICE: Schema = {"type": ["string", "null"], "pattern": r"^(any|cpu|gpu|mps|cuda(:\d+)?)$|\$\{"}
 _ANY: Schema = {}
-_REFERABLE = {"float", "int", "bool", "literal", "tuple", "list", "dict", "function-before"}  #: not a text as it is
+_REFERABLE = {"float", "int", "bool", "literal", "tuple", "list", "dict", "function-before"}  #: all but plain strings
 _NUMBER = r"(\d+\.?\d*|\.\d+)([eE][-+]?\d+)?"
 
 
 def schema() -> Schema:
-    """Schema of recipes and of the options of groups."""
+    """Return the schema of recipes and of the options of groups."""
     nodes = dict(all_nodes())
     return {
         "$schema": "https://json-schema.org/draft/2020-12/schema",
@@ -56,7 +56,7 @@ def schema() -> Schema:
 
 
 def _defaults() -> Schema:
-    """One entry of ``defaults``: the packaged options are offered, one's own are allowed."""
+    """Return the schema of one entry of ``defaults``: packaged options are offered, other names are allowed."""
     options = {
         group: {"anyOf": [{"enum": [option.name for option in found]}, {"type": ["string", "null"]}]}
         for group, found in groups().items()
@@ -65,7 +65,7 @@ def _defaults() -> Schema:
 
 
 def _step(nodes: Mapping[str, Node]) -> Schema:
-    """A step: what it may say at all, and for each node what that node allows."""
+    """Return the schema of a step: its general keys, and for each node the inputs and parameters."""
     each: Schema = {"type": ["string", "array", "null"], "items": {"type": "string"}, "maxItems": 2}
     names: Schema = {"anyOf": [{"enum": list(nodes)}, REFERENCE]}
     return {
@@ -87,7 +87,7 @@ def _step(nodes: Mapping[str, Node]) -> Schema:
 
 
 def _inputs(node: Node) -> Schema:
-    """What may stand under ``from``."""
+    """Return the schema of ``from`` for a node."""
     if not node.inputs:
         return {"type": "null"}
     lists = [name for name in node.inputs if takes_many(node, name)]
@@ -104,7 +104,7 @@ def _expectation() -> Schema:
 
 
 def _parameters(nodes: Mapping[str, Node]) -> Schema:
-    """The parameters of every node by its name."""
+    """Return the schema of the parameters of every node, by the node's name."""
     found = {}
     for name, node in nodes.items():
         model = node.params.model_json_schema(schema_generator=_Generator)
@@ -116,7 +116,7 @@ def _parameters(nodes: Mapping[str, Node]) -> Schema:
 
 
 def _training() -> Schema:
-    """How a recipe is learnt; a file need not say all of it."""
+    """Return the schema of the ``train`` block; every key is optional."""
     model = Training.model_json_schema(schema_generator=_Generator, ref_template="#/$defs/train.{model}")
     blocks = {f"train.{name}": block for name, block in model.pop("$defs").items()}
     for block in (model, *blocks.values()):
@@ -125,14 +125,14 @@ def _training() -> Schema:
 
 
 class _Generator(GenerateJsonSchema):
-    """Pydantic's schema of a recipe's own words: quantities with their units, and references."""
+    """Pydantic's schema extended by quantities with units, and by references."""
 
     def generate_inner(self, schema: Any) -> JsonSchemaValue:
         found = super().generate_inner(schema)
         return {"anyOf": [found, REFERENCE]} if schema["type"] in _REFERABLE else found
 
     def function_before_schema(self, schema: core_schema.BeforeValidatorFunctionSchema) -> JsonSchemaValue:
-        """A quantity: a number and one of the units that its reader takes."""
+        """Return the schema of a quantity: a number and one of the units that its reader accepts."""
         read = schema["function"]["function"]
         found = [unit for unit in _all_units() if _takes(read, unit)]
         if not found:

@@ -1,6 +1,6 @@
-"""From a recipe's name, or its file, and arguments to steps that are checked and ready to run.
+"""Loading of a recipe: from its name or file, and arguments, to checked steps that are ready to run.
 
-Everything is looked at before anything runs, and every mistake is reported at once.
+All checks are made before the run, and every mistake is reported at once.
 """
 
 from __future__ import annotations
@@ -34,7 +34,7 @@ from neusee.workflows.recipe.wiring import Wiring
 
 @dataclass(frozen=True, slots=True)
 class Titled:
-    """A packaged recipe or an option of a group, and the first line that says what it shows."""
+    """A packaged recipe or an option of a group, with the first line of its file."""
 
     name: str
     title: str
@@ -54,10 +54,10 @@ def load(
         load("first_light", doe="axicon", sensor={"read_noise": "20 e-"}, lasers={"green": {"strength": 1e4}})
         load("first_light", **{"sensor.read_noise": "20 e-", "+lasers.red": {"wavelength": "638 nm", …}})
 
-    ``values`` are changes as Python values, made after ``overrides``; a mapping changes what it
-    names and leaves the rest. Paths are relative to ``folder`` (the working folder), and messages
-    count ``overrides`` from ``first``. An expected number whose step a change reaches is no longer
-    expected, and a note says so. Raises `RecipeError` with every problem.
+    ``values`` are changes as Python values, made after ``overrides``; a mapping changes the values that
+    it names and leaves the others. Paths are relative to ``folder`` (the working folder), and messages
+    count ``overrides`` from ``first``. An expected number is dropped if a change affects its step, and
+    a note says so. Raises `RecipeError` with every mistake.
     """
     name, place = os.fspath(name_or_path), Path(folder or ".").absolute()
     changes: tuple[str | Override, ...] = (*overrides, *overrides_of(values, place))
@@ -66,13 +66,13 @@ def load(
 
 
 def _as_written(name: str, place: Path) -> Recipe:
-    """A recipe without changes; it is not checked again while its files and nodes are what they were."""
+    """Return a recipe without changes; a recipe is not checked again while its files and nodes are unchanged."""
     composed = compose(name, (), place)
     return cached_recipe(composed.root) or cache_recipe(composed.root, check(composed))
 
 
 def check(composed: Composed) -> Recipe:
-    """A composed recipe with its steps bound, or a `RecipeError` with every problem."""
+    """Return a composed recipe with its steps bound; raise `RecipeError` with every mistake."""
     learnt = [composed.root.items[key] for key in (TRAINING, LIFTING) if key in composed.root.items]
     composed, training = read_training(composed)
     composed, lifting = read_lift_training(composed)
@@ -88,7 +88,7 @@ def check(composed: Composed) -> Recipe:
     outputs = outputs_of(root, wiring)
     expect = expectations(root, wiring)
     references.finish()
-    if not composed.whole:  # without a group, much else looks wrong that is not
+    if not composed.whole:  # a missing group causes further errors
         diagnostics = list(composed.diagnostics)
     if diagnostics or checker.diagnostics:
         raise RecipeError([*diagnostics, *checker.diagnostics])
@@ -110,7 +110,7 @@ def _bind(
     checker: Checker,
     known: Mapping[str, Mapping[str, Wire]],
 ) -> Iterator[Step]:
-    """Every copy of every step that can be bound; ``known`` are wires that were looked at before."""
+    """Yield every copy of every step that can be bound; ``known`` are wires that were checked before."""
     for step in steps.values():
         if not step.items:
             for part in ("from", "with", "device"):
@@ -138,7 +138,7 @@ def _config(
     spare: set[Where],
     uncertain: Uncertain | None,
 ) -> Config:
-    """Final values by path: what was written, and after each step's what its node has by default."""
+    """Return the final values by path: the written ones, and after each step the defaults of its node."""
     settings: dict[str, Setting] = {}
     for key, block in root.items.items():
         if key != "steps":
@@ -162,7 +162,7 @@ def _settings(block: Value, checker: Checker) -> Iterator[tuple[str, Setting]]:
 
 
 def _defaults(step: Declared, bound: dict[str, Step]) -> Iterator[tuple[str, Setting]]:
-    """Parameters of a step that no one wrote, in SI."""
+    """Yield the parameters of a step that have their default value, in SI."""
     first = bound.get(step.instances[0]) if step.instances else None
     for name, value in (first.params if first else {}).items():
         if first and name not in first.param_marks:
@@ -174,12 +174,12 @@ def _defaults(step: Declared, bound: dict[str, Step]) -> Iterator[tuple[str, Set
 
 
 def recipes() -> list[Titled]:
-    """The packaged recipes."""
+    """Return the packaged recipes."""
     return [_titled(path) for path in sorted(packaged().glob("*.yaml"))]
 
 
 def groups(beside: Path | None = None) -> dict[str, list[Titled]]:
-    """The options of every group: packaged, and beside a recipe of one's own."""
+    """Return the options of every group: packaged ones, and those in folders beside a user's recipe."""
     folders = [folder for folder in (beside, packaged()) if folder]
     return {
         group: [_titled(next(p for f in folders if (p := f / group / f"{name}.yaml").is_file())) for name in names]

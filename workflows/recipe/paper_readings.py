@@ -1,7 +1,7 @@
-"""How the paper is read where it contradicts itself: every choice, with its reason.
+"""Readings of the paper where the paper contradicts itself: every choice, with its reason.
 
-Peng et al., "Learning to See Through Flare", ICCV 2025 workshops, is the source. Each row is one
-parameter that the groups ``reading`` decide; nothing is corrected silently.
+The source is Peng et al., "Learning to See Through Flare", ICCV 2025 workshops. Each row is one
+parameter that the groups ``reading`` decide; no contradiction is corrected silently.
 """
 
 from __future__ import annotations
@@ -11,7 +11,7 @@ from typing import NamedTuple
 
 
 class Reading(NamedTuple):
-    """One contradiction: the parameter, the two values, and why ours is ours."""
+    """One contradiction: the parameter, the coherent and the printed value, and the reason for the choice."""
 
     name: str
     number: str
@@ -114,7 +114,7 @@ READINGS = (
 
 
 def in_force(values: dict[str, object]) -> Iterable[tuple[Reading, str]]:
-    """Give each reading with its state: ``coherent``, ``as printed``, or the value that is neither; values by path."""
+    """Yield each reading with its state, from values by path: ``coherent``, ``as printed``, or another value."""
     for row in READINGS:
         if row.path in values:
             value = values[row.path]

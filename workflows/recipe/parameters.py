@@ -1,4 +1,4 @@
-"""Parameters: what a recipe gives, against what a node's signature allows."""
+"""Parameters of steps: the values of a recipe checked against the signature of the node."""
 
 from __future__ import annotations
 
@@ -24,15 +24,15 @@ _LONGEST = 40  #: characters of a value that a message repeats
 
 @dataclass(slots=True)
 class Checker:
-    """Checks the parameters of one step after another and gathers what is wrong or worth a note."""
+    """Check of the parameters of all steps, which collects diagnostics and notes."""
 
     diagnostics: list[Diagnostic]
     notes: dict[str, None] = field(default_factory=dict)
-    #: path of a value -> the file, or files, in full
+    #: path of a value -> full path of its file or files
     files: dict[tuple[str | int, ...], str | list[str]] = field(default_factory=dict)
 
     def read(self, node: Node, given: Value, step: Location) -> dict[str, Any] | None:
-        """Validated parameters with the node's defaults, or None if there are problems."""
+        """Return the validated parameters with the node's defaults, or None if there are mistakes."""
         if given.data is not None and not isinstance(given.data, dict):
             message = f"must be a mapping of parameters, not {kind(given)}"
             self.diagnostics.append(Diagnostic(given.mark, given.name, message))
@@ -49,7 +49,7 @@ class Checker:
         return {name: getattr(model, name) for name in node.params.model_fields}
 
     def preflight(self, node: Node, params: Mapping[str, Any], values: Mapping[str, Value], step: Value) -> None:
-        """Let the node look at its parameters before anything runs."""
+        """Call the node's own check of its parameters before the run."""
         if node.hooks.preflight is None:
             return
         try:
@@ -64,7 +64,7 @@ class Checker:
             self.diagnostics.append(Diagnostic(step.key, step.name, str(error)))
 
     def _plain(self, node: Node, name: str, value: Value) -> Any:
-        """A value alone; the path of a file is taken from the folder of the YAML file that names it."""
+        """Return a plain value; the path of a file is relative to the folder of the YAML file that names the path."""
         given = value.data if isinstance(value.data, list) else [value]
         if name not in node.hints or not _is_file(node.hints[name]) or not all(isinstance(v.data, str) for v in given):
             return value.plain
@@ -75,7 +75,7 @@ class Checker:
 
 
 def _is_file(hint: Any) -> bool:
-    """Whether an annotation holds `IsFile` anywhere."""
+    """Return True if an annotation contains `IsFile` at any depth."""
     extras = getattr(hint, "__metadata__", ())
     return any(isinstance(extra, IsFile) for extra in extras) or any(map(_is_file, get_args(hint)))
 
@@ -83,7 +83,7 @@ def _is_file(hint: Any) -> bool:
 def _problems(
     error: ValidationError, node: Node, values: Mapping[str, Value], given: Value, step: Location
 ) -> Iterator[Diagnostic]:
-    """One problem for each value that is wrong, unknown or missing."""
+    """Yield one diagnostic for each value that is wrong, unknown or missing."""
     details = error.errors(include_url=False)
     strangers = [str(e["loc"][0]) for e in details if e["type"] == "extra_forbidden"]
     meant = {nearest(name, node.params.model_fields) for name in strangers}
@@ -96,7 +96,7 @@ def _problems(
             yield Diagnostic(values[name].key, f"{given.name}.{name}", instead(f"{node.path}.{name}") or unknown)
         elif e["type"] == "missing" and len(e["loc"]) == 1:
             if f"did you mean {name}?" not in meant and name not in now:
-                yield Diagnostic(step, f"{given.name}.{name}", f"is missing: {node.path} needs it")
+                yield Diagnostic(step, f"{given.name}.{name}", f"is missing: {node.path} needs this parameter")
         else:
             value = _deepest(values[name], e["loc"][1:])
             wrong.setdefault((value.mark, _said(value)), []).append(_message(e) + _in_si(e, value))
@@ -105,7 +105,7 @@ def _problems(
 
 
 def _deepest(value: Value, path: tuple[int | str, ...]) -> Value:
-    """The part of a value that an error is about."""
+    """Return the part of a value to which an error refers."""
     for part in path:
         by_name = {str(key): child for key, child in value.items.items()}
         if str(part) not in by_name:
@@ -115,13 +115,13 @@ def _deepest(value: Value, path: tuple[int | str, ...]) -> Value:
 
 
 def _said(value: Value) -> str:
-    """``sensor.gain = -1``."""
+    """Return a value with its name, such as ``sensor.gain = -1``."""
     text = str(value.plain)
     return f"{value.name} = {text if len(text) <= _LONGEST else text[: _LONGEST - 1] + '…'}"
 
 
 def _message(error: ErrorDetails) -> str:
-    """What pydantic says, as one line that says what to write."""
+    """Return pydantic's message as one line that says what to write."""
     if error["type"] == "missing":
         return f"must have at least {int(error['loc'][-1]) + 1} values"
     text = error["msg"].removeprefix("Value error, ")
@@ -140,7 +140,7 @@ def _message(error: ErrorDetails) -> str:
 
 
 def _in_si(error: ErrorDetails, value: Value) -> str:
-    """What a quantity is in SI, where it is beyond a limit that is given in SI."""
+    """Return the SI value of a quantity that exceeds a limit given in SI."""
     limit = next((v for key, v in error.get("ctx", {}).items() if key in ("gt", "ge", "lt", "le")), 0)
     return f" in SI, not {error['input']:.4g}" if limit and isinstance(value.data, str) else ""
 

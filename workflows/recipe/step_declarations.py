@@ -1,4 +1,4 @@
-"""The steps as a recipe declares them: what each may say, which node it names, which items it has."""
+"""Declarations of steps in a recipe: the keys of each step, its node and its items."""
 
 from __future__ import annotations
 
@@ -30,9 +30,9 @@ class Declared:
 
     name: str
     value: Value
-    node: Node | None  #: None where no such node is found: its wires are still looked at
+    node: Node | None  #: None where the node does not exist; the wires are checked all the same
     dims: tuple[str, ...]
-    items: tuple[tuple[str, ...], ...]  #: one empty tuple where there is no ``each``; nothing where that is wrong
+    items: tuple[tuple[str, ...], ...]  #: one empty tuple without ``each``; no tuple where ``each`` is wrong
 
     def instance(self, items: tuple[str, ...]) -> str:
         return f"{self.name}[{','.join(items)}]" if items else self.name
@@ -42,7 +42,7 @@ class Declared:
         return tuple(map(self.instance, self.items))
 
     def part(self, key: str) -> Value:
-        """What it says under ``from``, ``with`` or ``device``; an empty mapping if nothing."""
+        """Return the value under ``from``, ``with`` or ``device``; an empty mapping if the key is absent."""
         given = self.value.items.get(key)
         return Value({}, self.value.key, self.value.key, (*self.value.path, key)) if given is None else given
 
@@ -54,13 +54,11 @@ class Declared:
 def declare(
     root: Value, references: References, diagnostics: list[Diagnostic]
 ) -> tuple[dict[str, Declared], dict[str, Value]]:
-    """The steps that can be read, and those that are null."""
+    """Return the steps that can be read, and those that are null."""
     given = root.items.get("steps")
     if given is None or not isinstance(given.data, dict) or not given.data:
         mark = root.mark if given is None else given.mark
-        diagnostics.append(
-            Diagnostic(mark, "steps", "a recipe needs steps, or a group that has them (`camera: neusee`)")
-        )
+        diagnostics.append(Diagnostic(mark, "steps", "a recipe needs steps, or a group with steps (`camera: neusee`)"))
         return {}, {}
     absent = {str(name): value for name, value in given.data.items() if value.data is None}
     steps = {}
@@ -77,7 +75,7 @@ def declare(
 
 def _well_formed(name: str, value: Value, diagnostics: list[Diagnostic]) -> bool:
     if not _NAME.fullmatch(name):
-        diagnostics.append(Diagnostic(value.key, value.name, "a step's name is letters, digits, _ and -"))
+        diagnostics.append(Diagnostic(value.key, value.name, "a step's name must consist of letters, digits, _ and -"))
         return False
     if not isinstance(value.data, dict):
         diagnostics.append(Diagnostic(value.mark, value.name, f"must be a mapping or null, not {kind(value)}"))
@@ -89,7 +87,7 @@ def _well_formed(name: str, value: Value, diagnostics: list[Diagnostic]) -> bool
 
 
 def _node(step: Value, nodes: dict[str, Node], references: References, diagnostics: list[Diagnostic]) -> Node | None:
-    """The node that a step names; ``nodes`` are those found before."""
+    """Return the node that a step names; ``nodes`` are those found before."""
     given = step.items.get("node")
     if given is None:
         diagnostics.append(Diagnostic(step.key, step.name, "has no node: write `node: family.name`"))
@@ -107,7 +105,7 @@ def _node(step: Value, nodes: dict[str, Node], references: References, diagnosti
 
 
 def _dims(step: Value, root: Value, diagnostics: list[Diagnostic]) -> tuple[str, ...] | None:
-    """The item lists of ``each``: none, one or two; None if there is something wrong with them."""
+    """Return the item lists of ``each``: none, one or two; None if ``each`` has a mistake."""
     given = step.items.get("each")
     if given is None or given.data is None:
         return ()
@@ -121,7 +119,7 @@ def _dims(step: Value, root: Value, diagnostics: list[Diagnostic]) -> tuple[str,
             hint = nearest(str(value.data), map(str, lists))
             diagnostics.append(Diagnostic(value.mark, given.name, f"no list of items {value.data}; {hint}"))
         elif value.data in dims or len(dims) == 2:
-            diagnostics.append(Diagnostic(value.mark, given.name, "takes one list of items or two different ones"))
+            diagnostics.append(Diagnostic(value.mark, given.name, "must name one list of items or two different lists"))
         else:
             dims.append(value.data)
             diagnostics += [
@@ -133,23 +131,23 @@ def _dims(step: Value, root: Value, diagnostics: list[Diagnostic]) -> tuple[str,
 
 
 def device_of(step: Declared, references: References, scope: Scope, diagnostics: list[Diagnostic]) -> str:
-    """Where a copy of a step asks to run; empty where that does not matter."""
+    """Return the device that a copy of a step requests; empty for any device."""
     given = references.resolve(step.part("device"), scope)
     if broken(given) or given.data in ({}, None, "any"):
         return ""
     if not isinstance(given.data, str) or not _DEVICE.fullmatch(given.data):
         hint = "write any, cpu, gpu, cuda, cuda:1 or mps"
-        diagnostics.append(Diagnostic(given.mark, f"{given.name} = {given.plain}", f"is no device: {hint}"))
+        diagnostics.append(Diagnostic(given.mark, f"{given.name} = {given.plain}", f"is not a device: {hint}"))
         return ""
     only = step.node.device if step.node else "any"
     if only != "any" and (only == "cpu") != (given.data == "cpu"):
-        message = f"{step.node and step.node.path} computes on a {only.upper()} alone"
+        message = f"{step.node and step.node.path} runs only on a {only.upper()}"
         diagnostics.append(Diagnostic(given.mark, f"{given.name} = {given.data}", message))
     return given.data
 
 
 def _is_item_list(block: Value) -> bool:
-    """A mapping of mappings, perhaps empty."""
+    """Return True for a mapping of mappings, which may be empty."""
     return isinstance(block.data, dict) and all(isinstance(item.data, dict) for item in block.data.values())
 
 
@@ -157,7 +155,7 @@ def _is_item_list(block: Value) -> bool:
 
 
 def find_node(name: str) -> Node:
-    """``sensor.digitize`` -> that node; only its family is imported. `LookupError` with the nearest name if none."""
+    """Return the node of a name such as ``sensor.digitize``; raise `LookupError` with the nearest name."""
     family, _, attribute = name.partition(".")
     if now := instead(name):
         raise LookupError(f"{name} {now}")
@@ -170,7 +168,7 @@ def find_node(name: str) -> Node:
 
 
 def _is_family(name: str) -> bool:
-    """Whether there is such a family: one look, for to list them all reads folders."""
+    """Return True if the family exists, by one look-up, because a list of all families reads folders."""
     if f"{neusee.nodes.__name__}.{name}" not in sys.modules:
         folders = neusee.nodes.__path__ if name.isidentifier() else []
         if not any(os.path.isfile(os.path.join(folder, name, "__init__.py")) for folder in folders):
@@ -184,31 +182,31 @@ def _in_family(family: str, attribute: str, nodes: Mapping[str, Node]) -> str:
 
 
 def _elsewhere(attribute: str) -> str:
-    """The same name in another family."""
+    """Return a hint to the nodes of the same name in other families."""
     found = [f"{family}.{attribute}" for family in families() if attribute in nodes_of(family)]
     return f"did you mean {' or '.join(found)}?" if found else ""
 
 
 def families() -> list[str]:
-    """Packages of nodes by name, found without importing one, and modules of nodes that are imported already."""
+    """Return the packages of nodes by name, without importing one, and the modules of nodes already imported."""
     names = {info.name for info in pkgutil.iter_modules(neusee.nodes.__path__) if info.ispkg}
     return sorted(names | {name for name in map(_inner, list(sys.modules)) if name and nodes_of(name)})
 
 
 def _inner(module: str) -> str:
-    """``optics`` of ``neusee.nodes.optics``; nothing of all else."""
+    """Return ``optics`` for ``neusee.nodes.optics``, and an empty string for other modules."""
     inner = module.removeprefix(f"{neusee.nodes.__name__}.")
     return inner if inner != module and re.fullmatch(r"[a-z]\w*", inner) else ""
 
 
 def nodes_of(family: str) -> dict[str, Node]:
-    """The public nodes of a family by name."""
+    """Return the public nodes of a family by name."""
     module = importlib.import_module(f"{neusee.nodes.__name__}.{family}")
     return {name: value for name, value in vars(module).items() if isinstance(value, Node)}
 
 
 def all_nodes() -> Iterator[tuple[str, Node]]:
-    """Every node with the name that a recipe writes."""
+    """Yield every node with the name that a recipe uses."""
     for family in families():
         for name, node in nodes_of(family).items():
             yield f"{family}.{name}", node

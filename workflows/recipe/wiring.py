@@ -1,4 +1,4 @@
-"""Wires: which steps feed which, item by item, and whether what they make is what is needed."""
+"""Wiring of a recipe: the steps that feed each step, item by item, and the check of their types."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ _WIRE = re.compile(r"\s*([^\[\]\s]+)\s*(?:\[([^\[\]]*)\])?\s*")
 
 @dataclass(frozen=True, slots=True)
 class Wiring:
-    """All steps of a recipe as far as their wires go."""
+    """Wires of all steps of a recipe."""
 
     root: Value
     steps: Mapping[str, Declared]
@@ -31,7 +31,7 @@ class Wiring:
     diagnostics: list[Diagnostic]
 
     def wires(self, step: Declared, items: tuple[str, ...]) -> dict[str, Wire]:
-        """The wires of one copy of a step, in the order of the node's inputs."""
+        """Return the wires of one copy of a step, in the order of the node's inputs."""
         given = self.references.resolve(step.part("from"), step.scope(self.root, items))
         if step.node is None:
             return {}
@@ -47,11 +47,11 @@ class Wiring:
         return found
 
     def outputs(self, value: Value, path: str) -> tuple[str, ...]:
-        """Steps named by an output or an expectation."""
+        """Return the steps named by an output or an expectation."""
         return self._producers(value, path, {}) or ()
 
     def _by_input(self, node: Node, given: Value) -> dict[str, Value] | None:
-        """What ``from`` says, by input; a single name feeds the first. None if it cannot be read."""
+        """Return the values of ``from`` by input; a single name feeds the first input. None if ``from`` is wrong."""
         if given.data is BROKEN:
             return None
         if given.data is None:
@@ -71,7 +71,7 @@ class Wiring:
         return {str(name): value for name, value in given.data.items()}
 
     def _unwired(self, step: Declared, node: Node, name: str, given: Value) -> Wire:
-        """An input of which ``from`` says nothing."""
+        """Return the wire of an input that ``from`` does not name, and report a required one."""
         if name in node.optional:
             return None
         if not (isinstance(given.data, dict) and _misspelt(name, node, given)):
@@ -102,7 +102,7 @@ class Wiring:
             return found[0]
         left = ", ".join(dim for dim in producer.dims if dim not in here)
         example = f"{parsed[0]}[{producer.items[0][0]}]" if producer.items else f"{parsed[0]}[…]"
-        message = f"{node.path} takes one {name}; {parsed[0]} makes one for each of {left}: write {example}"
+        message = f"{node.path} takes one step as {name}; {parsed[0]} is a step for each of {left}: write {example}"
         self._refuse(value, path, message)
         return None
 
@@ -114,7 +114,7 @@ class Wiring:
         return None
 
     def _producers(self, value: Value, path: str, here: Mapping[str, str], makers: str = "") -> tuple[str, ...] | None:
-        """The copies of a step that a wire means, where ``here`` are the items of whoever asks."""
+        """Return the copies of a step that a wire names; ``here`` are the items of the reading step."""
         parsed = _parse(value)
         if parsed is None:
             what = value.data if isinstance(value.data, str) else kind(value)
@@ -124,7 +124,7 @@ class Wiring:
             return self._refuse(value, path, f"step {name} is null ({self.absent[name].mark})")
         if name not in self.steps:
             hint = nearest(name, self.steps)
-            hint = hint if hint.startswith("did you mean") else f"no step makes it{makers}"
+            hint = hint if hint.startswith("did you mean") else f"check the name{makers}"
             now = new_name(f"steps.{name}")
             told = f"step {name} is called {now.removeprefix('steps.')} now" if now else f"no step {name}; {hint}"
             return self._refuse(value, path, told)
@@ -139,7 +139,7 @@ class Wiring:
         return tuple(producer.instance(items) for items in itertools.product(*choices))
 
     def _chosen(self, producer: Declared, wanted: Sequence[str], value: Value, path: str) -> dict[str, str] | None:
-        """Items in brackets by dimension: in order if all are given, else each where it belongs."""
+        """Return the items in brackets by dimension: in order if all are given, else each in the list that has it."""
         if not producer.dims:
             self._refuse(value, path, f"{producer.name} has no items: leave out the brackets")
             return None
@@ -160,18 +160,18 @@ class Wiring:
         return [str(name) for name in self.root.items[dim].items]
 
     def _agree(self, node: Node, name: str, producer: Declared, value: Value, path: str) -> None:
-        """Report a step that makes another kind of thing than is needed."""
+        """Report a step that returns another type than the input needs."""
         needed = needs(node, name)
         if producer.node is None:
             return
         made = _kinds(producer.node.hints.get("return"))
         if not made or not needed or any(issubclass(m, n) for m in made for n in needed):
             return
-        message = f"{node.path} needs {_a(needed)}; {producer.name} makes {_a(made)}{self._makers(needed)}"
+        message = f"{node.path} needs {_a(needed)}; {producer.name} returns {_a(made)}{self._makers(needed)}"
         self._refuse(value, path, message)
 
     def _makers(self, needed: Sequence[type]) -> str:
-        """Steps that make what is needed, where that is special enough to say."""
+        """Return a hint with the steps of the needed type, where that type is specific."""
         if not needed or all(n.__name__ == "Tensor" for n in needed):
             return ""
         found = [
@@ -180,7 +180,7 @@ class Wiring:
             if step.node and any(issubclass(m, n) for m in _kinds(step.node.hints.get("return")) for n in needed)
             for name in step.instances
         ]
-        return f"; steps that make one: {', '.join(found[:6])}" if found else f"; no step makes {_a(needed)}"
+        return f"; steps returning {_a(needed)}: {', '.join(found[:6])}" if found else f"; no step returns {_a(needed)}"
 
     def _refuse(self, value: Value, path: str, message: str) -> tuple[str, ...] | None:
         self.diagnostics.append(Diagnostic(value.mark, path, message))
@@ -188,7 +188,7 @@ class Wiring:
 
 
 def _parse(value: Value) -> tuple[str, list[str] | None] | None:
-    """``spot[mask,green]`` -> the step and its items."""
+    """Return the step and the items of a wire such as ``spot[mask,green]``."""
     match = _WIRE.fullmatch(value.data) if isinstance(value.data, str) else None
     if match is None:
         return None
@@ -196,18 +196,18 @@ def _parse(value: Value) -> tuple[str, list[str] | None] | None:
 
 
 def _misspelt(name: str, node: Node, given: Value) -> bool:
-    """Whether an input is there under a name that is reported already."""
+    """Return True if an input is given under a misspelt name, which is already reported."""
     strangers = [str(key) for key in given.items if key not in node.inputs]
     return any(nearest(stranger, node.inputs) == f"did you mean {name}?" for stranger in strangers)
 
 
 def takes_many(node: Node, name: str) -> bool:
-    """Whether an input takes a list of steps."""
+    """Return True if an input takes a list of steps."""
     return any(get_origin(hint) in (list, tuple, Sequence) for hint in _options(node.hints.get(name)))
 
 
 def needs(node: Node, name: str) -> tuple[type, ...]:
-    """Classes that an input accepts, or none if it says nothing that can be compared."""
+    """Return the classes that an input accepts; none if its annotation cannot be compared."""
     found: list[type] = []
     for hint in _options(node.hints.get(name)):
         inner = get_args(hint)[0] if get_origin(hint) in (list, tuple, Sequence) else hint
@@ -216,7 +216,7 @@ def needs(node: Node, name: str) -> tuple[type, ...]:
 
 
 def _options(hint: Any) -> list[Any]:
-    """The members of a union, without None and without what ``Annotated`` adds."""
+    """Return the members of a union, without None and without the extras of ``Annotated``."""
     if get_origin(hint) is Annotated:
         return _options(get_args(hint)[0])
     if get_origin(hint) in (Union, types.UnionType):

@@ -1,13 +1,13 @@
-"""Which steps the pictures, the table and the files read: the one place that knows the names of the camera graph.
+"""Contents of a run's report: its figures, its result table, its data files, and the steps that each of them reads.
 
-A need is written as a recipe would say it:
+Only this file names the steps of the camera graph. A need names a value in the notation of a recipe:
 
     psf[mask]                    the value of a step
-    spot[mask,*]                 the values of all its items, by item
-    psf[mask].pixel_pitch        a parameter of the step
-    psf[mask]()                  the step itself, bound to its parameters, to be tried out
+    spot[mask,*]                 the values of all items of a step, by item
+    psf[mask].pixel_pitch        a parameter of a step
+    psf[mask]()                  a step with its parameters, which the figure calls itself
 
-A leading ``?`` marks what a figure can do without.
+A leading ``?`` marks an optional need: the figure is drawn without this argument if the recipe lacks the step.
 """
 
 from __future__ import annotations
@@ -25,12 +25,12 @@ from neusee.workflows.tolerance.cheaper_steps import with_substitutions
 
 @dataclass(frozen=True, slots=True)
 class Figure:
-    """One picture: what draws it, and what that reads."""
+    """A figure of the report: its texts, its drawing function, and the need of each argument of that function."""
 
     name: str
     title: str
     caption: str
-    draw: str  #: ``module:function`` of neusee.workflows
+    draw: str  #: the drawing function, as ``module:function`` below neusee.workflows
     needs: Mapping[str, str]
 
 
@@ -38,8 +38,9 @@ FIGURES = (
     Figure(
         "overview",
         "What the camera sees",
-        "The scene, the same scene with the laser through the plain lens and through the mask, what is restored, and "
-        "what is still wrong. One stretch for all, sRGB encoded; a ring marks each laser.",
+        "The scene without the laser, the scene with the laser through the plain lens and through the mask, the "
+        "restored picture, and its error. All pictures have the same scale and are sRGB encoded. A ring marks each "
+        "laser.",
         "report.figures.camera_overview:overview",
         {
             "truth": "truth",
@@ -52,31 +53,32 @@ FIGURES = (
     Figure(
         "suppression",
         "Suppression against wavelength",
-        "Left: the peak of the masked PSF over the peak of the clear lens. No phase mask can go below the dashed "
-        "floor, where the light is spread evenly over the window. Right: the background's energy kept in the field.",
+        "Left: the peak of the PSF with the mask, divided by the peak of the clear lens. No phase mask can go below "
+        "the dashed floor, where the light is spread evenly over the window. Right: the share of the background's "
+        "energy that stays in the field.",
         "report.figures.optics:suppression",
         {"lsr": "lsr[mask]", "bands": "bands", "psf": "psf[mask]", "bsr": "?bsr[mask]"},
     ),
     Figure(
         "psf",
         "Point-spread functions",
-        "Logarithm of the light per pixel over the peak of the clear lens, and the share of the pupil's light within a "
-        "radius. Where a curve ends below 1, the rest fell outside the window.",
+        "Logarithm of the light in each pixel, divided by the peak of the clear lens; and the share of the pupil's "
+        "light within a radius. If a curve ends below 1, the rest of the light falls outside the window.",
         "report.figures.optics:psf",
         {"plain": "psf[plain]", "mask": "psf[mask]", "bands": "bands", "pixel_pitch": "psf[mask].pixel_pitch"},
     ),
     Figure(
         "height",
         "The mask",
-        "Height over the clear aperture, and the phase it gives, wrapped to one turn.",
+        "Height of the mask over the clear aperture, and the phase shift of the mask, wrapped to one turn.",
         "report.figures.optics:height",
         {"pupil": "pupil[mask]"},
     ),
     Figure(
         "spectra",
         "Spectra",
-        "Three points of the scene as RGB and as the spectrum lifted from it; the light on the scene and the channels "
-        "of the sensor; dotted, the lasers.",
+        "Three points of the scene: the RGB values, and the spectra reconstructed from these values. The illuminant "
+        "and the spectral responses of the sensor's channels. Dotted lines mark the lasers.",
         "report.figures.scene_spectra:spectra",
         {
             "scene": "scene",
@@ -90,29 +92,30 @@ FIGURES = (
     Figure(
         "sensor",
         "The sensor, measured",
-        "Flat fields of rising light through this sensor, as a laboratory would measure them, and what "
-        "its parameters predict.",
+        "Simulated flat fields of increasing irradiance, as a laboratory measures them, and the curve that the "
+        "parameters of the sensor predict.",
         "report.figures.photon_transfer:transfer",
         {"measured": "transfer"},
     ),
     Figure(
         "stability",
-        "What a strong laser does to single precision",
-        "Error against float64, on a random scene with the middle of the plain lens's PSF. A laser is added as a "
-        "shifted PSF; convolved together with the scene, its rounding error would cover the whole picture.",
+        "Round-off error of a strong laser in single precision",
+        "Error in float32 compared with float64, for a random scene and the centre of the plain lens's PSF. The camera "
+        "adds the laser as a shifted PSF. If the laser were convolved together with the scene, the round-off error "
+        "would cover the whole picture.",
         "report.figures.numerics:stability",
         {"step": "image[plain]()", "psf": "psf[plain]"},
     ),
     Figure(
         "error_time",
         "Error against run time",
-        "The PSF step of this recipe for one band, against the plain float64 sum over the pupil.",
+        "The PSF step of this recipe for one band, compared with the direct float64 sum over the pupil.",
         "report.figures.numerics:error_time",
         {"step": "psf[mask]()", "pupil": "pupil[mask]"},
     ),
 )
 
-#: Rows of the result table: column -> step. `LSR` is read at the first laser's wavelength.
+#: Rows of the result table: the step that each column reads. `LSR` is taken at the wavelength of the first laser.
 TABLE: Mapping[str, Mapping[str, str]] = {
     "plain lens": {
         "peak/I_sat": "peak[plain]",
@@ -130,13 +133,13 @@ TABLE: Mapping[str, Mapping[str, str]] = {
     },
     "restored": {"quality": "restored_quality"},
 }
-#: Steps that only a picture reads; a run makes them where the recipe has them.
+#: Steps that only a figure reads. A run computes each of these steps if the recipe has the step.
 SHOWN = ("transfer",)
 
 BANDS = "bands"
 LINES = "line[*]"
 
-#: Files of ``data/``: how they are written, and from what.
+#: Files of ``data/``: the format of each file, and the needs of its writer.
 FILES: Mapping[str, tuple[str, Mapping[str, str]]] = {
     "radiance.exr": ("spectral", {"cube": "radiance", "bands": "bands"}),
     "psf_plain.exr": ("spectral", {"cube": "psf[plain]", "bands": "bands"}),

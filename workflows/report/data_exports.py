@@ -1,4 +1,4 @@
-"""Files of ``data/``: spectral OpenEXR, RGB OpenEXR and 16-bit PNG, each kept by the key of what it holds."""
+"""Data files of a run: spectral OpenEXR, RGB OpenEXR, 16-bit PNG and safetensors, stored by the key of their values."""
 
 from __future__ import annotations
 
@@ -21,11 +21,11 @@ from neusee.workflows.report.requirements import Missing
 from neusee.workflows.report.run_pictures import Job, finished, needs
 from neusee.workflows.store.derived_files import DerivedFiles
 
-_FORM = 1  #: raised when a file is written differently
+_FORM = 1  #: version of the file formats; to be increased when a file is written differently
 
 
 def exports(result: Result, shelf: DerivedFiles) -> tuple[dict[str, Path], dict[str, str]]:
-    """Every file of ``data/`` that a run can give, and why the others cannot be."""
+    """Return the path of every file of ``data/`` that the run provides, and the reason why another file is missing."""
     code, jobs, missing = Code(result.store.code_memo), [], {}
     for name, (form, wanted) in FILES.items():
         try:
@@ -42,7 +42,7 @@ def exports(result: Result, shelf: DerivedFiles) -> tuple[dict[str, Path], dict[
 
 
 def spectral(cube: Tensor | Psf, bands: Bands) -> bytes:
-    """A spectral cube as OpenEXR in the layout of Fichet et al., JCGT 2021."""
+    """Encode a spectral cube as OpenEXR in the layout of Fichet et al., JCGT 2021."""
     from neusee.nodes.scene import write_spectral
 
     values = cube.intensity if isinstance(cube, Psf) else cube
@@ -50,7 +50,7 @@ def spectral(cube: Tensor | Psf, bands: Bands) -> bytes:
 
 
 def safetensors(**values: Any) -> bytes:
-    """Tensors by the name of their step, and of their field where a step gives several."""
+    """Encode tensors as safetensors, named ``step``, or ``step.field`` if a step returns several tensors."""
     from safetensors.torch import save
 
     tensors: dict[str, Tensor] = {}
@@ -62,7 +62,7 @@ def safetensors(**values: Any) -> bytes:
 
 
 def exr(image: Tensor) -> bytes:
-    """Three channels as float32 OpenEXR."""
+    """Encode an image of three channels as float32 OpenEXR."""
     import OpenEXR
 
     pixels = {"RGB": image.detach().cpu().float().permute(1, 2, 0).contiguous().numpy()}
@@ -71,10 +71,10 @@ def exr(image: Tensor) -> bytes:
 
 
 def png16(image: Tensor) -> bytes:
-    """Whole numbers in [0, 65535], (3, y, x), as a 16-bit RGB PNG, bit for bit."""
+    """Encode whole numbers in [0, 65535], shape (3, y, x), as a 16-bit RGB PNG without loss."""
     words = image.detach().cpu().double().round()
     if image.ndim != 3 or image.shape[0] != 3 or float(words.min()) < 0 or float(words.max()) > 65535:
-        raise ValueError(f"16-bit PNG holds (3, y, x) in [0, 65535], not {tuple(image.shape)}")
+        raise ValueError(f"a 16-bit PNG holds (3, y, x) in [0, 65535], not {tuple(image.shape)}")
     height, width = image.shape[1:]
     big = words.permute(1, 2, 0).to(torch.int32).numpy().astype(">u2").reshape(height, -1)
     lines = b"".join(b"\0" + row.tobytes() for row in big)
@@ -88,7 +88,7 @@ def _chunk(name: bytes, body: bytes) -> bytes:
 
 
 def _written(suffix: str, write: Callable[[Path], Any]) -> bytes:
-    """What a library that only writes files has written."""
+    """Return the bytes that ``write`` writes to a temporary file."""
     with TemporaryDirectory(prefix="neusee-") as folder:
         path = Path(folder) / f"file{suffix}"
         write(path)

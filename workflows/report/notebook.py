@@ -1,4 +1,4 @@
-"""What a notebook shows of a recipe and of a result: one small page that fetches nothing and computes little."""
+"""HTML views of a recipe and of a result for a notebook: one small page without external files."""
 
 from __future__ import annotations
 
@@ -22,11 +22,11 @@ if TYPE_CHECKING:
     from neusee.workflows.engine.runner import Result
 
 _TEMPLATE = Path(__file__).parent / "templates" / "notebook.html.j2"
-_PATIENCE = 2.0  #: s that showing a result may take to have again what the store does not hold
-_WEIGHT = 800_000  #: bytes of base64 that the pictures may weigh together
-_EDGES = {1: 640, 2: 400}  #: pixels of the longer side, by the number of pictures; else 280
+_PATIENCE = 2.0  #: s, limit of the time for computing again the values that the store does not hold
+_WEIGHT = 800_000  #: bytes of base64, limit for all pictures together
+_EDGES = {1: 640, 2: 400}  #: pixels of the longer side, by the number of pictures; 280 for other numbers
 _NAMES = {"plain": "plain lens", "mask": "with mask"}
-_LONGEST = 100  #: characters of a value that a table shows
+_LONGEST = 100  #: characters of a value in a table, at most
 
 
 # --- numbers and arrays ---------------------------------------------------------------------------------------------
@@ -46,7 +46,7 @@ def numbers_of(result: Result) -> dict[str, float | list[float]]:
 
 
 def arrays_of(value: Any) -> Any:
-    """``value`` with a numpy array for every tensor; of what numpy has no type for, the next larger one."""
+    """Return ``value`` with a NumPy array in place of every tensor; bfloat16, which NumPy lacks, becomes float32."""
     import torch
     from torch import Tensor
 
@@ -65,12 +65,12 @@ def arrays_of(value: Any) -> Any:
 
 
 def result_line(result: Result) -> str:
-    """``<result of first_light: restored, raw; 12 run, 3 cached in 0.31 s>``."""
+    """Return one line such as ``<result of first_light: restored, raw; 12 run, 3 cached in 0.31 s>``."""
     return f"<result of {result.recipe.name}: {', '.join(families(result.values))}; {_said(result)}>"
 
 
 def result_html(result: Result) -> str:
-    """Pictures, the table of results, and what became of each step; nothing is computed that took longer than 2 s."""
+    """Return a page with pictures, the result table and the state of each step; skip values that take more than 2 s."""
     values = _at_hand(result, [*_of_table(result), *_of_overview()])
     checks = [f"{d.step}: {c.text}" for d in result.done.values() for c in d.checks if not c.ok]
     return _page(
@@ -89,7 +89,7 @@ def _said(result: Result) -> str:
 
 
 def _of_table(result: Result) -> list[str]:
-    """Steps that the result table reads."""
+    """Return the names of the steps that the result table reads."""
     cells = [step for row in TABLE.values() for step in row.values()]
     return [BANDS, *[n for n in result.keys if n.startswith(LINES.removesuffix("*]"))], *cells]
 
@@ -99,7 +99,7 @@ def _of_overview() -> list[str]:
 
 
 def _at_hand(result: Result, steps: Iterable[str]) -> dict[str, Any]:
-    """Values of those ``steps`` that are held, or can be had again without waiting."""
+    """Return the values of those ``steps`` that are stored, or that can be computed again within ``_PATIENCE``."""
     held = {name for name, key in result.keys.items() if name in result.values or result.store.has(key)}
     sources = {name: () if name in held else result.recipe.steps[name].sources for name in result.keys}
     kept: list[str] = []
@@ -113,7 +113,7 @@ def _at_hand(result: Result, steps: Iterable[str]) -> dict[str, Any]:
 
 
 def _took(result: Result, step: str) -> float:
-    """Seconds of a step when it last ran."""
+    """Return the seconds that the last execution of a step took."""
     done = result.done[step]
     if done.state == "run":
         return done.seconds
@@ -122,7 +122,7 @@ def _took(result: Result, step: str) -> float:
 
 
 def _results(result: Result, values: Mapping[str, Any]) -> list[dict[str, Any]]:
-    """The table of results without its empty rows and columns, or nothing."""
+    """Return the result table without empty rows and columns, or an empty list if no cell has a value."""
     found = table(result.recipe, {name: result.keys[name] for name in values}, values.__getitem__)
     rows = [[row["name"], *row["cells"]] for row in found["rows"] if any(row["cells"])]
     columns = ["", *found["columns"]]
@@ -140,7 +140,7 @@ def _outputs(result: Result) -> dict[str, Any]:
 
 
 def _looks(value: Any) -> tuple[str, str, str]:
-    """Shape, type and span of a value; of a named tuple, its small numbers by name."""
+    """Return shape, type and range of a value; for a named tuple, return its scalars by name as the range."""
     from neusee.nodes import TensorStats
 
     facts = TensorStats.of(value)
@@ -166,7 +166,7 @@ def _steps(result: Result) -> dict[str, Any]:
 
 
 def _pictures(values: Mapping[str, Any]) -> list[dict[str, Any]]:
-    """Truth, plain lens, with mask and restored by one stretch; without these, what looks like a picture."""
+    """Encode the pictures of the camera overview with one scale; without them, encode up to four other images."""
     from neusee.workflows.report.figures.camera_overview import centre, high
 
     needs = {name: need for name, need in FIGURES[0].needs.items() if not need.startswith("?")}
@@ -194,7 +194,7 @@ def _is_picture(value: Any) -> bool:
 
 
 def _picture(name: str, linear: Tensor, edge: int) -> dict[str, Any]:
-    """One picture of at most ``edge`` pixels a side, made small in linear light and then encoded."""
+    """Return a picture as PNG, at most ``edge`` pixels on a side: reduced in linear light, then encoded as sRGB."""
     from kornia.geometry.transform import resize
     from PIL import Image
 
@@ -215,7 +215,7 @@ def _picture(name: str, linear: Tensor, edge: int) -> dict[str, Any]:
 
 
 def recipe_html(recipe: Recipe) -> str:
-    """What a recipe gives, what was changed, its steps, and every value with the place that it comes from."""
+    """Return a page with the outputs of a recipe, the changed values, the steps, and every value with its source."""
     written = {name: s for name, s in recipe.config.settings.items() if not s.default and not name.startswith("steps.")}
     changed = {name: s for name, s in recipe.config.settings.items() if "argument " in s.source}
     lines = [recipe.title, f"gives {', '.join(families(recipe.outputs))}"]
@@ -233,7 +233,7 @@ def recipe_html(recipe: Recipe) -> str:
 
 
 def families(names: Iterable[str]) -> dict[str, list[str]]:
-    """Names by what stands before their bracket: ``psf[plain]`` and ``psf[mask]`` are both ``psf``."""
+    """Group names by the part before the bracket: ``psf[plain]`` and ``psf[mask]`` belong to ``psf``."""
     found: dict[str, list[str]] = {}
     for name in names:
         found.setdefault(name.partition("[")[0], []).append(name)
@@ -241,7 +241,7 @@ def families(names: Iterable[str]) -> dict[str, list[str]]:
 
 
 def _graph(recipe: Recipe) -> dict[str, Any]:
-    """Steps with the items of one under one name."""
+    """Return the table of steps; all items of one step share a row."""
     rows = []
     for family, names in families(recipe.steps).items():
         step = recipe.steps[names[0]]

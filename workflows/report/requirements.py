@@ -1,4 +1,4 @@
-"""Find what a picture or a file reads in a recipe: values, parameters and bound steps, each with its identity."""
+"""Lookup of the values, parameters and bound steps that a picture or a file reads in a recipe."""
 
 from __future__ import annotations
 
@@ -17,12 +17,12 @@ _PARAMETER = re.compile(r"(?P<step>[^.]+)\.(?P<name>\w+)")
 
 
 class Missing(LookupError):
-    """The recipe has no such step, or what it asked for does not need it."""
+    """A step that the recipe does not have, or that no output of the run needs."""
 
 
 @dataclass(frozen=True, slots=True)
 class Bound:
-    """A step outside the graph: its node and parameters, to be called with anything."""
+    """A step outside the graph: the node with its parameters, callable with any inputs."""
 
     step: Step
 
@@ -32,27 +32,27 @@ class Bound:
 
     @property
     def random(self) -> bool:
-        """Whether it draws numbers."""
+        """Return True if the node draws random numbers."""
         return self.step.node.random
 
     def reference(self, *inputs: Any, **changes: Any) -> Any:
-        """The plain float64 form of the node."""
+        """Compute the node's reference, its direct float64 form; raise Missing if the node has none."""
         if self.step.node.hooks.reference is None:
-            raise Missing(f"{self.step.node.path} has no reference")
+            raise Missing(f"the node {self.step.node.path} has no reference")
         return self.step.node.hooks.reference(*inputs, **{**self.step.params, **changes})
 
 
 @dataclass(frozen=True, slots=True)
 class Found:
-    """One need: the steps whose values it reads, how to make the argument of them, and what identifies it."""
+    """A resolved need: the steps that are read, a function that builds the argument, and the argument's identity."""
 
     steps: tuple[str, ...]
-    make: Any  #: called with the values by step
+    make: Any  #: a function of the values by step, which returns the argument
     identity: Any  #: plain JSON
 
 
 def find(need: str, recipe: Recipe, keys: Mapping[str, str], code: Code) -> Found:
-    """Resolve a need as `neusee.workflows.report.contents` writes it."""
+    """Resolve a need, whose notation `neusee.workflows.report.contents` describes."""
     if need.endswith("()"):
         step = _step(need[:-2], recipe)
         return Found((), lambda values: Bound(step), _identity(step, code))
@@ -73,12 +73,12 @@ def _step(name: str, recipe: Recipe) -> Step:
 
 def _key(name: str, keys: Mapping[str, str]) -> str:
     if name not in keys:
-        raise Missing(f"nothing that was asked for needs the step {name}")
+        raise Missing(f"no output of this run needs the step {name}")
     return keys[name]
 
 
 def _items(prefix: str, recipe: Recipe, keys: Mapping[str, str]) -> Found:
-    """All items of a step, ``spot[mask,`` by the rest of their name."""
+    """Find all items of a step: for the prefix ``spot[mask,``, by the rest of the name of each item."""
     names = {n[len(prefix) : -1]: n for n in recipe.steps if n.startswith(prefix) and n in keys}
     if not names:
         raise Missing(f"the recipe has no step {prefix}…]")

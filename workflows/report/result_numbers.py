@@ -1,4 +1,4 @@
-"""The numbers of a run: what the recipe promised, the result table, and every metric as a row."""
+"""Numbers of a run: the expected numbers of the recipe, the result table, and the rows of the metrics file."""
 
 from __future__ import annotations
 
@@ -11,14 +11,14 @@ from neusee.nodes.spectra import mean_wavelength
 from neusee.workflows.graph.recipe_graph import Recipe
 from neusee.workflows.report.contents import BANDS, LINES, TABLE
 
-Value = Callable[[str], Any]  #: the value of a step, read from the store when it is asked for
+Value = Callable[[str], Any]  #: a function that returns the value of a step and reads the store only when called
 _COLUMNS = ("peak/I_sat", "LSR", "BSR", "PSNR (dB)", "SSIM", "saturated px")
-_DESIGN = 550e-9
-_SMALL = 4096  #: numbers of a result that is given in full
+_DESIGN = 550e-9  #: m, wavelength of the LSR in the result table for a recipe without a laser
+_SMALL = 4096  #: elements, at most, of a result whose numbers become rows
 
 
 def expected(recipe: Recipe, value: Value) -> list[dict[str, Any]]:
-    """Every number that the recipe promises, beside what was found."""
+    """Return every expected number of the recipe with the number that the run found."""
     rows = []
     for e in recipe.expect:
         found: Any = value(e.step)
@@ -31,7 +31,7 @@ def expected(recipe: Recipe, value: Value) -> list[dict[str, Any]]:
 
 
 def table(recipe: Recipe, keys: Mapping[str, str], value: Value) -> dict[str, Any]:
-    """Plain lens, with mask, restored: one row each, a cell where the recipe has the step; no rows without a cell."""
+    """Return the result table: a row each for plain lens, mask and restored picture; no rows if all cells are empty."""
     band, where = _band(recipe, keys, value)
     rows = []
     for name, cells in TABLE.items():
@@ -56,7 +56,7 @@ def _cells(known: Mapping[str, Any], band: int) -> list[str]:
 
 
 def _band(recipe: Recipe, keys: Mapping[str, str], value: Value) -> tuple[int, str]:
-    """The scene's band nearest to the first laser, or to 550 nm where there is none."""
+    """Return the band of the scene that is nearest to the first laser, or to 550 nm if there is no laser."""
     if BANDS not in keys:
         return 0, "the first band"
     prefix = LINES.removesuffix("*]")
@@ -70,7 +70,7 @@ def _band(recipe: Recipe, keys: Mapping[str, str], value: Value) -> tuple[int, s
 
 
 def metrics(recipe: Recipe, keys: Mapping[str, str], value: Value) -> list[list[Any]]:
-    """(step, field, index, value) of every small result of a metric."""
+    """Return a row (step, field, index, value) for each number of each small result of a metric."""
     return [row for name in metrics_of(recipe, keys) for row in numbers_of(name, value(name))]
 
 
@@ -80,7 +80,7 @@ def metrics_of(recipe: Recipe, among: Container[str]) -> list[str]:
 
 
 def numbers_of(step: str, found: Any) -> list[list[Any]]:
-    """(step, field, index, value) of a small result; of a large one, such as a picture, nothing."""
+    """Return a row (step, field, index, value) for each number of a small result; none for a picture."""
     rows: list[list[Any]] = []
     for field, tensor in _fields(found):
         if tensor.numel() <= _SMALL and not tensor.is_complex():

@@ -1,7 +1,7 @@
-"""What a run says of itself: the numbers, the account of every step, and the page made of them.
+"""Document and page of a run: its numbers, the record of every step, and the HTML page.
 
-`document` gathers everything as plain JSON, which is stored beside the pictures as
-``provenance.json``; `page` makes the page of that alone, so that it can be made again.
+`document` returns plain JSON, which a run stores beside the pictures as ``provenance.json``.
+`page` renders the page from this document and the pictures alone, so that `rebuild` can render the page again.
 """
 
 from __future__ import annotations
@@ -37,13 +37,13 @@ from neusee.workflows.report.tolerance_spent import spent
 _TEMPLATE = Path(__file__).parent / "templates" / "run_page.html.j2"
 _LIBRARIES = ("torch", "numpy", "kornia", "colour-science", "OpenEXR", "pydantic", "safetensors")
 _UNITS = frozenset(("m", "nm", "rad", "e-", "DN", "photons", "W/m2", "dB"))
-_SAMPLING = "PSF point-sampled: a sample on the axis, at the pixel centre."
+_SAMPLING = "The PSF is sampled at the pixel centres; one pixel centre lies on the optical axis."
 
 
 def document(
     result: Result, command: Sequence[str], warnings: Iterable[str], missing: Mapping[str, str]
 ) -> dict[str, Any]:
-    """Everything there is to say of a run, as plain JSON."""
+    """Return all information of a run's report as plain JSON."""
     recipe, done = result.recipe, list(result.done.values())
     found = expected(recipe, result.value)
     steps = [_step(d, result) for d in done]
@@ -83,7 +83,7 @@ def document(
 
 
 def page(doc: Mapping[str, Any], pictures: Mapping[str, bytes]) -> str:
-    """The page of a document and its pictures: one file, nothing to fetch."""
+    """Render a document and its pictures as one HTML file that loads no other file."""
     from jinja2 import Environment, StrictUndefined
 
     environment = Environment(autoescape=True, undefined=StrictUndefined)
@@ -94,7 +94,7 @@ def page(doc: Mapping[str, Any], pictures: Mapping[str, bytes]) -> str:
 
 
 def rebuild(folder: Path) -> Path:
-    """Write a run's page again from what is stored beside it."""
+    """Write the page of a run again, from the document and the pictures in its folder, and return its path."""
     doc = json.loads((folder / "provenance.json").read_text(encoding="utf-8"))
     pictures = {p.stem: p.read_bytes() for p in sorted((folder / "figures").glob("*.png"))}
     target = folder / "report.html"
@@ -105,7 +105,7 @@ def rebuild(folder: Path) -> Path:
 
 
 def verdict(found: Sequence[Mapping[str, Any]], failed: Sequence[str]) -> str:
-    """One line: were the expected numbers met, and did every check hold?"""
+    """Return one line: how many expected numbers are met, and how many checks failed."""
     met = sum(e["ok"] for e in found)
     numbers = (
         f"{met} of {len(found)} expected numbers within tolerance" if found else "No expected numbers in this recipe"
@@ -115,14 +115,14 @@ def verdict(found: Sequence[Mapping[str, Any]], failed: Sequence[str]) -> str:
 
 
 def said(counts: Mapping[str, int]) -> str:
-    """``12 run, 3 cached, 1 left out``; what was never looked at counts as cached."""
+    """Return the counts as ``12 run, 3 cached, 1 left out``; steps that were not needed count as cached."""
     merged = Counter({"cached": counts.get("cached", 0) + counts.get("not needed", 0)})
     merged.update({s: n for s, n in counts.items() if s not in ("cached", "not needed")})
     return ", ".join(f"{merged[s]} {s}" for s in ("run", "cached", "left out") if merged[s]) or "nothing to do"
 
 
 def shape_of(done: StepRecord) -> str:
-    """``31 × 512 × 512``, or nothing where it is not known."""
+    """Return the shape as ``31 × 512 × 512``, or an empty string if the shape is unknown."""
     return " × ".join(map(str, done.facts.shape)) or "number" if done.facts else ""
 
 
@@ -154,7 +154,7 @@ def _step(done: StepRecord, result: Result) -> dict[str, Any]:
 
 
 def _planned(result: Result) -> float | None:
-    """How long the plan was, where it was made of known costs and held every step that ran."""
+    """Return the planned seconds of the run; None if the plan lacks a step that ran or the cost of such a step."""
     ran = [done for done in result.done.values() if done.state == "run"]
     if result.schedule is None or any(done.predicted is None for done in ran):
         return None
@@ -163,14 +163,14 @@ def _planned(result: Result) -> float | None:
 
 
 def _remembered(done: StepRecord, about: Mapping[str, Any]) -> StepRecord:
-    """A step that was not run, with what the store says of its result."""
+    """Return the record of a step that did not run, completed with the stored facts about its result."""
     checks = tuple(Check(text, ok) for text, ok in about.get("checks", ()))
     why = f"made {about['date'][:16].replace('T', ' ')} UTC"
     return replace(done, why=why, facts=facts_in(about), checks=checks, bytes=about["bytes"])
 
 
 def unit_of(docstring: str) -> str:
-    """The unit of the result, as a node's ``Units:`` line says it: after the word ``result``, or alone."""
+    """Return the unit of a node's result from its ``Units:`` line: the word after ``result``, else the first word."""
     lines = (line.strip() for line in docstring.splitlines())
     units = next((line for line in lines if line.startswith("Units:")), "Units:").removeprefix("Units:").strip()
     before, found, after = units.partition("result ")
@@ -179,9 +179,9 @@ def unit_of(docstring: str) -> str:
 
 
 def _sampling(recipe: Recipe) -> list[str]:
-    """How the PSF is sampled: the convention is part of every LSR."""
+    """Return a note on the sampling of the PSF, because every LSR depends on the sampling."""
     kinds = {step.params.get("sensor") for step in recipe.steps.values() if step.node.path == "optics.psf"}
-    return [_SAMPLING] if "point" in kinds else ["PSF integrated over each pixel."] if kinds else []
+    return [_SAMPLING] if "point" in kinds else ["The PSF is integrated over each pixel."] if kinds else []
 
 
 def _readings(recipe: Recipe) -> list[dict[str, str]]:
@@ -208,7 +208,7 @@ def _title(name: str) -> str:
 
 
 def _facts(result: Result) -> list[list[str]]:
-    """What made this run, by name."""
+    """Return names and values of the software, the machine and the settings of the run."""
     import torch
 
     rows = [
@@ -236,7 +236,7 @@ def _version(package: str) -> str:
 
 
 def _inputs(recipe: Recipe) -> list[dict[str, str]]:
-    """Every file whose content decides the result."""
+    """Return a row for every file that the parameters of the recipe name."""
     from neusee.workflows.keys.cache_key import file_digest
 
     rows: dict[str, dict[str, str]] = {}

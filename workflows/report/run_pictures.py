@@ -1,4 +1,4 @@
-"""The pictures of a run, each kept by the key of what it shows: drawn once, taken as it is from then on."""
+"""Pictures of a run. Each picture is stored by the key of its values, and is drawn once."""
 
 from __future__ import annotations
 
@@ -21,18 +21,19 @@ from neusee.workflows.store.derived_files import DerivedFiles
 GRAPH = (
     "graph",
     "The graph",
-    "Each box is a step; items of one step share a box. What reads stands below what it reads.",
+    "Each box is a step; the items of one step share a box. A step stands below the steps that it reads.",
 )
 TIMELINE = (
     "timeline",
-    "Planned and done",
-    "When each step ran, and where. Hollow bars: the plan, of what earlier runs took; a step that never ran has none.",
+    "Planned and actual times",
+    "Time and device of each step. Hollow bars show the plan, which uses the times of earlier runs. A step that "
+    "never ran before has no hollow bar.",
 )
 
 
 @dataclass(frozen=True, slots=True)
 class Job:
-    """A file that can be made of a run: its name, its key, what it reads and who writes it."""
+    """A file that a run can provide: its name, its key, the values that it needs, and the function that writes it."""
 
     name: str
     suffix: str
@@ -42,7 +43,7 @@ class Job:
 
 
 def pictures(result: Result, shelf: DerivedFiles) -> tuple[dict[str, Path], dict[str, str]]:
-    """Every picture that can be drawn of a run, and why the others cannot."""
+    """Return the path of every picture that can be drawn, and the reason why each other picture is missing."""
     code, drawing = Code(result.store.code_memo), _drawing()
     jobs, missing = [], {}
     for figure in FIGURES:
@@ -59,7 +60,10 @@ def pictures(result: Result, shelf: DerivedFiles) -> tuple[dict[str, Path], dict
 
 
 def timeline(result: Result) -> bytes | None:
-    """When each step ran beside the plan, or None where none did. It differs each time, and so it is not kept."""
+    """Draw the times of all steps beside the plan; return None if no step ran.
+
+    Times differ from run to run, so the picture is not stored.
+    """
     ran = [done for done in result.done.values() if done.state == "run"]
     if not ran:
         return None
@@ -74,7 +78,7 @@ def timeline(result: Result) -> bytes | None:
 
 
 def _in_turn(known: Iterable[StepRecord]) -> tuple[Slot, ...]:
-    """What several plans placed, as one: on each lane one after another, as they ran."""
+    """Return one plan in place of several: on each lane, the steps follow each other in the order in which they ran."""
     end: dict[str, Slot] = {}
     slots = []
     for done in sorted(known, key=lambda done: done.began):
@@ -86,7 +90,7 @@ def _in_turn(known: Iterable[StepRecord]) -> tuple[Slot, ...]:
 
 
 def needs(wanted: Mapping[str, str], result: Result, code: Code) -> dict[str, Found]:
-    """What each argument reads; an argument whose need begins with ``?`` is left out where there is none."""
+    """Resolve the need of each argument; omit an argument if its need begins with ``?`` and its step is missing."""
     found = {}
     for argument, need in wanted.items():
         try:
@@ -98,7 +102,7 @@ def needs(wanted: Mapping[str, str], result: Result, code: Code) -> dict[str, Fo
 
 
 def finished(jobs: Iterable[Job], result: Result, shelf: DerivedFiles, missing: dict[str, str]) -> dict[str, Path]:
-    """The file of each job: kept, or made now of values that are read together."""
+    """Return the file of each job, either stored or made now; one run provides the values of all new files."""
     jobs = list(jobs)
     done = {job.name: path for job in jobs if (path := shelf.find(job.key, job.suffix))}
     todo = [job for job in jobs if job.name not in done]
@@ -116,7 +120,7 @@ def finished(jobs: Iterable[Job], result: Result, shelf: DerivedFiles, missing: 
 
 
 def _function(path: str) -> Callable[..., bytes]:
-    """A drawing function by ``module:function``, imported when it is called."""
+    """Return the drawing function ``module:function``; its module is imported at the first call."""
     module, _, name = path.partition(":")
 
     def draw(**arguments: Any) -> bytes:
@@ -127,12 +131,12 @@ def _function(path: str) -> Callable[..., bytes]:
 
 
 def _drawing() -> str:
-    """Digest of everything that draws, so that a better picture is drawn again."""
+    """Return a digest of the drawing code, so that a change of this code draws every picture again."""
     return engine(*sorted({figure.draw.partition(":")[0] for figure in FIGURES}), "report.figures.recipe_graph")
 
 
 def _graph(result: Result, shelf: DerivedFiles, drawing: str) -> Path:
-    """The graph with what became of each step; the one of a wholly cached run is drawn along, for the next time."""
+    """Draw the graph with the state of each step; also draw and store the graph of a fully cached run for later."""
     states = {name: "cached" if done.state == "not needed" else str(done.state) for name, done in result.done.items()}
     again = {name: "left out" if state == "left out" else "cached" for name, state in states.items()}
     sources = {name: list(result.recipe.steps[name].sources) for name in result.done}

@@ -1,4 +1,4 @@
-"""What a run cost and what the cache saved: from the account of its steps, as plain JSON."""
+"""Time that a run took and time that the cache saved, computed from the records of the steps."""
 
 from __future__ import annotations
 
@@ -9,9 +9,9 @@ Row = Mapping[str, Any]  #: a step as the report says it
 
 
 def timing(steps: Sequence[Row], planned: float | None = None) -> dict[str, Any]:
-    """Seconds predicted and taken, what was served instead of computed, and what went through the disk.
+    """Return predicted and actual seconds, the seconds that the cache saved, and the bytes read and written.
 
-    A key that several steps share is counted once. ``planned`` is the length of the schedule, where one was made.
+    A key that several steps share counts once. ``planned`` is the planned duration of the run in s, or None.
     """
     ran = [s for s in steps if s["state"] == "run"]
     own = {s["key"] for s in ran}
@@ -37,7 +37,7 @@ def timing(steps: Sequence[Row], planned: float | None = None) -> dict[str, Any]
 
 
 def _once(steps: Any) -> list[Row]:
-    """The first step of each key; one that was read counts before one that was not looked at."""
+    """Return one step for each key: the step that was read from the cache, or else the first step with this key."""
     found: dict[str, Row] = {}
     for step in steps:
         if step["key"] not in found or step["state"] == "cached":
@@ -46,19 +46,19 @@ def _once(steps: Any) -> list[Row]:
 
 
 def said_of(found: Mapping[str, Any]) -> list[str]:
-    """The same in sentences."""
+    """Return the result of `timing` as sentences."""
     lines = []
     if found["ran"]:
-        lines.append(f"{found['ran']} of {found['steps']} steps ran: {_seconds(found['seconds'])} of computing.")
+        lines.append(f"{found['ran']} of {found['steps']} steps ran: {_seconds(found['seconds'])} of computing time.")
     if found["told"]:
-        known = "they were" if found["told"] == found["ran"] else f"the {found['told']} that ran before were"
+        known = "these steps" if found["told"] == found["ran"] else f"the {found['told']} that had run before"
         predicted, actual = _seconds(found["predicted"]), _seconds(found["actual"])
-        lines.append(f"By earlier runs {known} expected to take {predicted}; they took {actual}.")
+        lines.append(f"Predicted from earlier runs for {known}: {predicted}; actual: {actual}.")
     if found["planned"] is not None:
         planned, span = _seconds(found["planned"]), _seconds(found["span"])
-        lines.append(f"The plan, with branches side by side, was {planned} long; it took {span}.")
+        lines.append(f"Planned duration, with parallel branches: {planned}; actual: {span}.")
     if found["served"]:
-        share = f"{100 * found['share']:.3g} % of all computing"
+        share = f"{100 * found['share']:.3g} % of all computing time"
         lines.append(f"The cache served {found['served']} steps and saved {_seconds(found['saved'])}, {share}.")
     lines.append(f"Read from the cache: {size_of(found['read'])}; written to it: {size_of(found['written'])}.")
     return lines

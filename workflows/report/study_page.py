@@ -1,7 +1,7 @@
-"""The page of a study: paragraphs, pictures and tables whose cells are coloured by what they say.
+"""Page of a study: paragraphs, pictures and tables whose cells are coloured by a verdict.
 
-One file that fetches nothing, readable in light, in dark and on paper; what a colour says stands
-as a sign in the cell too.
+The page is one file that loads no other file. Light mode, dark mode and print are supported. A sign in each coloured
+cell repeats the meaning of the colour.
 """
 
 from __future__ import annotations
@@ -20,20 +20,20 @@ Mark = Literal["pass", "warn", "fail"]
 
 @dataclass(frozen=True)
 class Section:
-    """A heading with text, a picture and a table; a blank line in the text begins a new paragraph."""
+    """A section of the page: heading, text, picture and table. A blank line in the text begins a new paragraph."""
 
     heading: str
     text: str
     columns: Sequence[str] = ()
-    rows: Sequence[Sequence[Any]] = ()  #: a number is set with three digits, None as a dash
+    rows: Sequence[Sequence[Any]] = ()  #: numbers are shown with three digits, None as a dash
     picture: bytes | None = None  #: PNG
     marks: Mapping[tuple[int, int], Mark] = field(default_factory=dict)  #: (row, column), from 0
 
 
 def page(title: str, lead: str, sections: Sequence[Section], provenance: Mapping[str, Any], banner: str = "") -> str:
-    """The page: ``lead`` says the result, each section shows a part of it, ``provenance`` what made it.
+    """Render a page: ``lead`` states the result, the sections show the details, ``provenance`` lists the sources.
 
-    ``banner`` stands above all, in red: why the result must not be used.
+    ``banner`` stands in red above all other text and says why the result must not be used.
     """
     from jinja2 import Environment, StrictUndefined
 
@@ -49,7 +49,7 @@ def page(title: str, lead: str, sections: Sequence[Section], provenance: Mapping
 
 
 def said(value: Any) -> str:
-    """A cell as text: three digits of a number, all of an integer, a dash where there is none."""
+    """Return a cell's text: three digits of a real number, all digits of an integer, a dash for None."""
     if value is None:
         return "–"
     if isinstance(value, bool):
@@ -76,10 +76,10 @@ def _section(anchor: str, section: Section) -> dict[str, Any]:
 
 
 def _refuse_stray_marks(section: Section) -> None:
-    """A mark beside the table would be a failure that nobody sees."""
+    """Raise ValueError for a mark outside the table, because such a mark would hide a failure."""
     for row, column in section.marks:
         if not (0 <= row < len(section.rows) and 0 <= column < len(section.rows[row])):
-            raise ValueError(f"{section.heading}: a mark at ({row}, {column}), where the table has no cell")
+            raise ValueError(f"{section.heading}: a mark at ({row}, {column}) is outside the table: mark a cell of it")
 
 
 def _cell(value: Any, mark: Mark | None) -> dict[str, str]:
@@ -91,7 +91,7 @@ def _is_number(value: Any) -> bool:
 
 
 def _holds_numbers(cells: Sequence[Any]) -> bool:
-    """Whether a column is of numbers, so that its head stands to the right as they do."""
+    """Return True if a column holds numbers only, so that its header is right-aligned like the numbers."""
     found = [c for c in cells if c is not None]
     return bool(found) and all(map(_is_number, found))
 

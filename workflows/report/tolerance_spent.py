@@ -1,4 +1,4 @@
-"""What a run spent of its tolerance: what was left out or made more cheaply, the bounds, and errors where measured."""
+"""Use of the tolerance by a run: omitted steps, cheaper steps, upper bounds of the error, and measured errors."""
 
 from __future__ import annotations
 
@@ -18,17 +18,18 @@ NORM = "root mean square over the largest element"
 
 
 def spent(result: Result) -> dict[str, Any]:
-    """The tolerance of a run and what became of it, as plain JSON.
+    """Return the tolerance of a run and its use as plain JSON.
 
-    ``bounds``: of what is held to the tolerance, outputs or what feeds a step whose error nothing bounds.
-    ``measured``: by output, beside a run with ``--exact`` whose results this store still has.
+    ``bounds`` holds the error bound of each value that must meet the tolerance: an output, or an input of a step that
+    states no error bound. ``measured`` holds the error of each output compared with a run with ``--exact``, if the
+    store has the results of such a run.
     """
     costs = past_costs(result.store) if result.recipe.substitutions or _left_out(result) else Costs([])
     return {
         "tolerance": result.recipe.tolerance,
         "norm": NORM,
         "held": min(map(result.recipe.limit, result.proof.held), default=result.recipe.tolerance),
-        "strict": result.recipe.strict,
+        "strict": result.recipe.tolerance_scale,
         "exact": result.recipe.exact,
         "bounds": {name: share for name, share in result.proof.held.items() if share > 0},
         "unbounded": [name for name in result.recipe.outputs if result.proof.of(name) is None],
@@ -39,18 +40,18 @@ def spent(result: Result) -> dict[str, Any]:
 
 
 def said_of_economies(account: Mapping[str, Any]) -> str:
-    """One line for the console: what stands in for full steps, what that may change, and what it did where known."""
+    """Return one line for the console: the replaced and skipped steps, their error bounds, and measured errors."""
     summed = [f"{e['step']} ({_within(e['bound'])})" for e in account["economies"] if e["instead"]]
-    nothing = [f"{e['step']} (nothing)" for e in account["economies"] if not e["instead"]]
+    nothing = [f"{e['step']} (no error)" for e in account["economies"] if not e["instead"]]
     worst = max(account["bounds"].values(), default=0.0)
     found = max(account["measured"].values(), default=None)
     measured = f", measured {found:.1e}" if found is not None else ""
     names = ", ".join([*summed, *nothing])
-    return f"spared   {names}: in all at most {worst:.1e}{measured}; tolerance {account['tolerance']:g}"
+    return f"spared   {names}: error at most {worst:.1e} in all{measured}; tolerance {account['tolerance']:g}"
 
 
 def _within(bound: float | None) -> str:
-    return "its error is not known" if bound is None else f"at most {bound:.1e}"
+    return "error unknown" if bound is None else f"at most {bound:.1e}"
 
 
 def _left_out(result: Result) -> list[str]:
@@ -72,13 +73,13 @@ def _omission(result: Result, costs: Costs, step: str) -> dict[str, Any]:
 
 
 def _seconds(result: Result, costs: Costs, step: str) -> float | None:
-    """What a step would have taken, as far as earlier runs tell."""
+    """Return the seconds that the full step takes, estimated from earlier runs; None without such a run."""
     estimate = costs.of(result.recipe.steps[step], ["cpu"])
     return estimate.seconds["cpu"] if estimate.known else None
 
 
 def _measured(result: Result) -> dict[str, float]:
-    """Errors of the outputs beside those of a run that left nothing out, where the store has these."""
+    """Return the error of each output compared with an exact run whose results are in the store."""
     recipe = result.recipe
     if recipe.exact or not (recipe.substitutions or _left_out(result)):
         return {}
@@ -88,7 +89,7 @@ def _measured(result: Result) -> dict[str, float]:
             try:
                 found[name] = error_of(result.value(name), result.store.get(full[name]))
             except (KeyError, ValueError):
-                continue  # removed meanwhile
+                continue  # another process has removed the result
     same = {name: 0.0 for name in recipe.outputs if full.get(name) == result.keys[name]} if found else {}
     return {name: {**same, **found}[name] for name in recipe.outputs if name in same or name in found}
 

@@ -1,4 +1,4 @@
-"""Run a recipe and write its folder: page, pictures, numbers, data and where every value came from."""
+"""Run of a recipe, and the folder of the run: page, pictures, numbers, data files and provenance."""
 
 from __future__ import annotations
 
@@ -32,14 +32,14 @@ _TIMING = ("step", "node", "device", "lane", "state", "began", "seconds", "predi
 
 @dataclass(frozen=True)
 class Simulation:
-    """A finished run: where it lies, and everything that it says of itself."""
+    """A finished run: its folder and its document, the content of ``provenance.json``."""
 
     folder: Path
     document: dict[str, Any]
 
     @property
     def page(self) -> Path:
-        """The page to open."""
+        """Return the path of the HTML page."""
         return self.folder / "report.html"
 
 
@@ -53,7 +53,7 @@ def simulate(
     executor: Executor | None = None,
     memory: int | None = None,
 ) -> Simulation:
-    """Run ``recipe`` and write ``runs/<date>_<recipe>_<key>/``, complete or not at all."""
+    """Run ``recipe`` and write the folder ``runs/<date>_<recipe>_<key>/``; after a failure no folder remains."""
     with _noted() as notes:
         told: dict[str, StepRecord] = {}
         recipe = with_substitutions(recipe, wanted(recipe))
@@ -66,7 +66,7 @@ def simulate(
 
 
 def _both(told: dict[str, StepRecord], watch: Callable[[Event], None] | None) -> Callable[[Event], None]:
-    """A watch that also remembers what it was told."""
+    """Return a watcher that records each finished step in ``told`` and then calls ``watch``."""
 
     def note(event: Event) -> None:
         if event.done is not None:
@@ -106,7 +106,7 @@ def _write(result: Result, folder: RunFolder, command: Sequence[str], notes: Ite
 
 @contextmanager
 def _noted() -> Iterator[list[str]]:
-    """Warnings as lines of the report instead of noise between the steps."""
+    """Yield a list that collects the warnings, each once, for the report instead of the console."""
     notes: list[str] = []
 
     def note(message: Warning | str, *rest: Any, **named: Any) -> None:
@@ -120,6 +120,6 @@ def _noted() -> Iterator[list[str]]:
 
 
 def recipe_text(recipe: Recipe) -> str:
-    """Every final value as YAML that can be run again, with the place it comes from as a comment."""
-    head = f"# {recipe.title or recipe.name}\n# Final values; after each, where it was written.\n"
+    """Return all final values of the recipe as YAML that can be run again, each with its source as a comment."""
+    head = f"# {recipe.title or recipe.name}\n# Final values; the comment after each value names its source.\n"
     return head + recipe.config.to_yaml()

@@ -1,8 +1,8 @@
-"""Slices of stacks, one file a band, shared by every result that has the band; and one tensor over many of them.
+"""Band files: one file for each slice of a stack of bands, shared by every result that contains the slice.
 
-A blob is a slice's bytes and, behind them, a trailer: what it is, its checksum, the trailer's length. The bytes begin
-at the start of the file, so that files whose slices are whole pages are mapped side by side into one range of
-addresses: a contiguous tensor without a copy. The maps are private: what is written to the tensor reaches no file.
+A blob holds the bytes of a slice and a trailer: type and shape, checksum and the trailer's length. The bytes begin
+at the start of the file, so that slices of whole memory pages are mapped side by side into one address range, which
+gives a contiguous tensor without a copy. The maps are private: a write to the tensor changes no file.
 """
 
 from __future__ import annotations
@@ -27,7 +27,7 @@ from torch import Tensor
 
 from neusee.workflows.store.shared_folder import Disk
 
-_SMALL = 4096  #: bytes up to which a blob need not wait for the disk: a torn one fails its checksum
+_SMALL = 4096  #: bytes up to which a blob is not synced to disk: a torn blob fails its checksum
 _WRITERS = 8
 _FIXED = 0x10  #: MAP_FIXED of Linux and macOS
 _LIBC = ctypes.CDLL(None, use_errno=True) if sys.platform in ("linux", "darwin") else None
@@ -40,7 +40,7 @@ if _LIBC is not None:
 
 
 class Damaged(ValueError):
-    """A blob is missing, or is not what was written: whoever needs it must do without."""
+    """Error for a blob that is missing or differs from the blob that was written; the band must be recomputed."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -48,11 +48,11 @@ class Stacked:
     """A tensor whose slices along the first axis are stored as one blob each."""
 
     tensor: Tensor
-    names: tuple[str, ...]  #: one a slice; equal names are equal slices
+    names: tuple[str, ...]  #: one name for each slice; equal names are equal slices
 
 
 class Blob(NamedTuple):
-    """What the trailer of a blob says."""
+    """Content of the trailer of a blob."""
 
     dtype: torch.dtype
     shape: tuple[int, ...]
@@ -70,14 +70,14 @@ class Blobs:
         self.root = root
         self._folder = os.fspath(root)
         self._disk = Disk(root.parent)
-        self._lost: set[str] = set()  # damaged, and perhaps not to be moved away
+        self._lost: set[str] = set()  # damaged blobs, which the user may not be allowed to move away
 
     def has(self, name: str) -> bool:
-        """Whether there is a blob of this name; its bytes are not read."""
+        """Return True if a blob of this name exists, without reading its bytes."""
         return name not in self._lost and os.path.exists(self._path(name))
 
     def about(self, name: str) -> Blob:
-        """Type, shape and checksum of a blob; raises `Damaged`."""
+        """Return type, shape and checksum of a blob; raise `Damaged` where the trailer cannot be read."""
         try:
             with open(self._path(name), "rb") as file:
                 return _trailer(file.fileno())[0]
@@ -85,7 +85,7 @@ class Blobs:
             raise self._damaged(name, error) from None
 
     def write(self, name: str, x: Tensor) -> str:
-        """Keep ``x`` unless there is such a blob; the xxh3 of what is there now. Raises `OSError` where none fits."""
+        """Write ``x`` unless the blob exists; return the xxh3 of the stored blob. Raises `OSError` on a full disk."""
         if self.has(name):
             with suppress(Damaged):
                 return self.about(name).xxh3
@@ -100,12 +100,12 @@ class Blobs:
             return self._named(name, part) or xxh3
 
     def write_all(self, names: Sequence[str], slices: Sequence[Tensor]) -> list[str]:
-        """Write several at a time: a disk syncs many files in little more time than one."""
+        """Write several blobs in parallel: a disk syncs many files in little more time than one file."""
         with ThreadPoolExecutor(_WRITERS) as pool:
             return list(pool.map(self.write, names, slices))
 
     def _named(self, name: str, part: str) -> str | None:
-        """Give a complete blob its name; the xxh3 of another that had it first."""
+        """Rename a complete blob to its name; return the checksum of an existing blob of that name, else None."""
         self._disk.make_folder(self._folder)
         if name in self._lost or not self._disk.link(part, self._path(name)):
             if name not in self._lost:
@@ -123,17 +123,17 @@ class Blobs:
         verify: bool = True,
         xxh3: Sequence[str] | None = None,
     ) -> Tensor:
-        """One contiguous tensor of ``shape`` whose slices along the first axis are the blobs ``names``.
+        """Return one contiguous tensor of ``shape`` whose slices along the first axis are the blobs ``names``.
 
-        Mapped where a slice is whole pages, else copied. ``verify``: compare the checksum of every byte. ``xxh3``:
-        the checksums that the blobs must have. Raises `Damaged`, and counts that blob as missing from then on.
+        The blobs are mapped where a slice is whole memory pages, else copied. ``verify`` compares the checksum of every
+        byte; ``xxh3`` lists the expected checksums. Raises `Damaged`; a damaged blob then counts as missing.
         """
         wanted = [Blob(dtype, tuple(shape[1:]), xxh3[i] if xxh3 else "") for i in range(len(names))]
         size = wanted[0].nbytes if wanted else 0
         if not size:
             return torch.empty(*shape, dtype=dtype)
         if _LIBC is not None and size % mmap.PAGESIZE == 0:
-            with suppress(OSError):  # a file system or a limit that takes no maps
+            with suppress(OSError):  # a file system or a limit that allows no maps
                 space = _reserve(len(names) * size)
                 self._fill(names, wanted, memoryview(space).cast("B"), ctypes.addressof(space), verify)
                 return torch.frombuffer(space, dtype=dtype).reshape(*shape)
@@ -144,7 +144,7 @@ class Blobs:
     def _fill(
         self, names: Sequence[str], wanted: Sequence[Blob], into: memoryview, address: int | None, verify: bool
     ) -> None:
-        """Put blobs side by side: mapped where there is an ``address``, else read."""
+        """Place blobs side by side: map the files where an ``address`` is given, else read them."""
         size = wanted[0].nbytes
         for i, (name, want) in enumerate(zip(names, wanted, strict=True)):
             try:
@@ -162,7 +162,7 @@ class Blobs:
         return f"{self._folder}/{name[:2]}/{name}"
 
     def _damaged(self, name: str, error: Exception) -> Damaged:
-        """Move a damaged blob to the store's ``bad/``, where someone may look at it."""
+        """Move a damaged blob to the folder ``bad/`` of the store for inspection; return the error to raise."""
         self._lost.add(name)
         if not isinstance(error, OSError):
             with suppress(OSError):
@@ -172,18 +172,18 @@ class Blobs:
 
 
 def bytes_of(x: Tensor) -> memoryview:
-    """The bytes of a tensor, without a copy where it is contiguous and on the CPU."""
+    """Return the bytes of a tensor, without a copy where the tensor is contiguous and on the CPU."""
     flat = x.detach().cpu().resolve_conj().resolve_neg().contiguous().reshape(-1)
-    if flat.stride() != (1,):  # a single element is contiguous whatever its stride, and yet cannot be seen as bytes
+    if flat.stride() != (1,):  # a single element is contiguous whatever its stride, but cannot be viewed as bytes
         flat = flat.clone(memory_format=torch.contiguous_format)
     return flat.view(torch.uint8).numpy().data
 
 
 def dtype_of(name: str) -> torch.dtype:
-    """``torch.float32`` of ``"float32"``; raises `ValueError`."""
+    """Return ``torch.float32`` for ``"float32"``; raise `ValueError` for a name that torch does not know."""
     found = getattr(torch, name, None)
     if not isinstance(found, torch.dtype):
-        raise ValueError(f"{name!r} is no type of tensors")
+        raise ValueError(f"{name!r} is not a dtype of torch")
     return found
 
 
@@ -198,33 +198,33 @@ def _checksum(data: memoryview, kind: bytes) -> str:
 
 
 def _trailer(file: int) -> tuple[Blob, bytes]:
-    """What a blob says of itself, once its size agrees; raises `ValueError`."""
+    """Return the content of a blob's trailer after comparing the file size; raise `ValueError` where they disagree."""
     size = os.fstat(file).st_size
     tail = os.pread(file, 512, max(0, size - 512))
     length = int.from_bytes(tail[-4:], "little")
     body = tail[-36 - length : -4]
     if len(body) != length + 32:
-        raise ValueError("it has no end")
+        raise ValueError("the trailer is missing or cut short")
     dtype, shape = json.loads(body[:length])
     blob = Blob(dtype_of(dtype), tuple(int(n) for n in shape), body[length:].decode())
     if size != blob.nbytes + length + 36:
-        raise ValueError(f"it has {size} bytes, not the {blob.nbytes + length + 36} that were written")
+        raise ValueError(f"the file has {size} bytes instead of the {blob.nbytes + length + 36} that were written")
     return blob, body[:length]
 
 
 def _load(file: int, want: Blob, into: memoryview, address: int | None, verify: bool) -> None:
-    """Put the slice in a file in its place; raises `ValueError` where it is not the one that is wanted."""
+    """Load the slice of a file into its place; raise `ValueError` where the file holds another slice."""
     blob, kind = _trailer(file)
     if blob[:2] != want[:2]:
-        raise ValueError(f"it holds {blob.dtype} {blob.shape}, not {want.dtype} {want.shape}")
+        raise ValueError(f"the file holds {blob.dtype} {blob.shape} instead of {want.dtype} {want.shape}")
     if want.xxh3 and blob.xxh3 != want.xxh3:
-        raise ValueError("it holds something else than was written with this result")
+        raise ValueError("the file holds another band than the one written with this result")
     if address is None:
         _read_all(file, into)
     else:
         _map(file, address, blob.nbytes)
     if verify and _checksum(into, kind) != blob.xxh3:
-        raise ValueError("its bytes are not those that were written")
+        raise ValueError("checksum mismatch: the stored bytes have changed since they were written")
 
 
 def _read_all(file: int, into: memoryview) -> None:
@@ -232,24 +232,24 @@ def _read_all(file: int, into: memoryview) -> None:
     while done < len(into):
         read = os.preadv(file, [into[done:]], done)
         if not read:
-            raise ValueError("it was cut while it was read")
+            raise ValueError("the file was truncated while being read")
         done += read
 
 
 def _reserve(size: int) -> Any:
-    """An array over ``size`` bytes of addresses with nothing behind them yet; they go when the array goes."""
+    """Return an array over a reserved address range of ``size`` bytes, which is released with the array."""
     assert _LIBC is not None
     flags = mmap.MAP_PRIVATE | mmap.MAP_ANON
     address = _LIBC.mmap(None, size, 0, flags, -1, 0)
     if address in (None, ctypes.c_void_p(-1).value):
-        raise OSError(ctypes.get_errno(), "no range of addresses is free")
+        raise OSError(ctypes.get_errno(), "no address range is free")
     space = (ctypes.c_char * size).from_address(address)
-    weakref.finalize(space, _LIBC.munmap, address, size).atexit = False  # a thread may use it to the very end
+    weakref.finalize(space, _LIBC.munmap, address, size).atexit = False  # a thread may use it until the very end
     return space
 
 
 def _map(file: int, address: int, size: int) -> None:
-    """Put the beginning of a file at an address that `_reserve` gave."""
+    """Map the beginning of a file to an address inside a range of `_reserve`."""
     assert _LIBC is not None
     access = mmap.PROT_READ | mmap.PROT_WRITE
     if _LIBC.mmap(address, size, access, mmap.MAP_PRIVATE | _FIXED, file, 0) != address:

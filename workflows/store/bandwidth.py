@@ -1,4 +1,4 @@
-"""How fast a store reads and writes: learnt from its own transfers and remembered beside them."""
+"""Read and write speed of a store: measured at its own transfers and kept in a file beside them."""
 
 from __future__ import annotations
 
@@ -10,15 +10,15 @@ from typing import Literal
 from neusee.workflows.store.shared_folder import Disk
 
 Direction = Literal["read", "write"]
-LARGE = 1_000_000  #: bytes from which a transfer says something
+LARGE = 1_000_000  #: bytes from which a transfer updates the speed
 _USUAL: dict[Direction, float] = {"read": 8e9, "write": 0.4e9}  #: bytes / s
-_SETUP: dict[Direction, float] = {"read": 5e-5, "write": 2e-4}  #: s, whatever the size
+_SETUP: dict[Direction, float] = {"read": 5e-5, "write": 2e-4}  #: s for each transfer, whatever its size
 _LEARN = 0.3  #: weight of the newest transfer
-_NEWS = 1.25  #: factor by which a speed must differ from the remembered one to be written down
+_NEWS = 1.25  #: factor by which a speed must differ from the stored speed to be written to the file
 
 
 class Speeds:
-    """Bytes a second of one store, each way."""
+    """Bytes a second of one store in each direction."""
 
     def __init__(self, disk: Disk) -> None:
         self._disk = disk
@@ -27,11 +27,11 @@ class Speeds:
         self._written: dict[Direction, float] = {}
 
     def seconds(self, way: Direction, size: float) -> float:
-        """What moving ``size`` bytes takes."""
+        """Return the predicted seconds for moving ``size`` bytes."""
         return _SETUP[way] + size / self._speed(way)
 
     def learn(self, way: Direction, size: int, seconds: float) -> None:
-        """Take a transfer into account."""
+        """Update the speed with the measured ``seconds`` of one transfer."""
         if size < LARGE:
             return
         found = size / max(seconds - _SETUP[way], 1e-6)

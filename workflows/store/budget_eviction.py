@@ -1,8 +1,8 @@
-"""What goes when a store outgrows its budget: first the values that save the fewest seconds a byte.
+"""Eviction of a store beyond its budget: the values that save the fewest seconds per byte are evicted first.
 
-A value counts half for every week since it was last of use, told by the newest use in the
-store and not by today's date. Pinned values stay. What goes leaves its receipt, so that
-what it was and what it cost stay known; whoever reads it at that moment keeps what is mapped.
+The weight of a value halves for every week between its last use and the newest use in the
+store, whatever today's date is. Pinned values stay. An evicted value leaves its receipt, so
+that its origin and its cost stay known; a process that reads the value at that moment keeps its map.
 """
 
 from __future__ import annotations
@@ -19,8 +19,8 @@ from neusee.workflows.store import metadata
 from neusee.workflows.store.metadata import UNREADABLE, Metadata
 from neusee.workflows.store.shared_folder import Disk
 
-LOW = 0.9  #: of the budget: what is left after it was reached
-_HALF = 7 * 86400.0  #: s
+LOW = 0.9  #: fraction of the budget that remains after an eviction
+_HALF = 7 * 86400.0  #: s in which the weight of an unused value halves
 _UNITS = {"": 1, "k": 10**3, "m": 10**6, "g": 10**9, "t": 10**12}
 _NONE = (0, 0.0)
 _FULL = (errno.ENOSPC, errno.EDQUOT, errno.EFBIG)
@@ -29,19 +29,19 @@ _SIZE = re.compile(r"\s*(\d+(?:\.\d+)?)\s*([kmgt]?)(i?)b?\s*", re.IGNORECASE)
 
 @dataclass(frozen=True, slots=True)
 class Candidate:
-    """A value that may go."""
+    """A value that may be evicted."""
 
     key: str
-    size: int  #: bytes that its going frees
-    seconds: float  #: what it takes to compute it, less what it takes to load it
-    used: float  #: when it was last of use, s
+    size: int  #: bytes that the eviction frees
+    seconds: float  #: s for computing the value, less the s for loading it
+    used: float  #: time of the last use, s
 
 
 def bytes_of(text: str) -> int:
-    """Bytes that ``text`` such as ``20 GB`` or ``1.5 TiB`` says, or a `ValueError`."""
+    """Return the bytes that ``text`` such as ``20 GB`` or ``1.5 TiB`` states; raise `ValueError` for another text."""
     found = _SIZE.fullmatch(text)
     if not found or (found[3] and not found[2]):
-        raise ValueError(f"{text!r} is no size: write bytes, such as 20 GB")
+        raise ValueError(f"{text!r} is not a size: write a number of bytes, such as 20 GB")
     unit = _UNITS[found[2].lower()]
     if found[3]:
         unit = 1024 ** list(_UNITS).index(found[2].lower())
@@ -49,7 +49,7 @@ def bytes_of(text: str) -> int:
 
 
 def chosen(candidates: Iterable[Candidate], excess: float) -> list[Candidate]:
-    """Those that go so that at least ``excess`` bytes become free, none of them without need; the least worth first."""
+    """Return the values to evict so that at least ``excess`` bytes become free, the least valuable value first."""
     all_ = [c for c in candidates if c.size > 0]
     newest = max((c.used for c in all_), default=0.0)
     all_.sort(key=lambda c: (max(c.seconds, 0.0) / c.size * 2 ** ((c.used - newest) / _HALF), c.used, c.key))
@@ -67,7 +67,7 @@ def chosen(candidates: Iterable[Candidate], excess: float) -> list[Candidate]:
 
 
 def evict(disk: Disk, found: Iterable[Candidate], excess: float, dry: bool) -> tuple[list[Candidate], list[Candidate]]:
-    """Let values go until ``excess`` bytes are free; those that went, and those that are not ours to remove."""
+    """Evict values until ``excess`` bytes are free; return the evicted values and those that we may not remove."""
     left, gone, refused = {c.key: c for c in found}, list[Candidate](), list[Candidate]()
     while excess > 0 and (batch := chosen(left.values(), excess)):
         for candidate in batch:
@@ -81,14 +81,14 @@ def evict(disk: Disk, found: Iterable[Candidate], excess: float, dry: bool) -> t
 
 
 class CacheBudget:
-    """The bytes of a store against its budget, without counting them at each write."""
+    """Check of the store's bytes against its budget, without counting all bytes at each write."""
 
     def __init__(self, disk: Disk, budget: int) -> None:
         self._disk, self.budget = disk, budget
-        self._spare = 0.0  # bytes that may be written before they are all counted again
+        self._spare = 0.0  # bytes that may be written before all bytes are counted again
 
     def excess(self, size: int) -> float:
-        """Bytes that have to go after ``size`` more; that others write more is seen after 5 % of the budget."""
+        """Return the bytes to evict after a write of ``size``; writes of others are noticed after 5 % of the budget."""
         self._spare -= size
         if self._spare > 0:
             return 0.0
@@ -101,12 +101,12 @@ class CacheBudget:
 
 
 def total(disk: Disk) -> int:
-    """Bytes of all results, with the files and bands that belong to them."""
+    """Return the bytes of all results, with the files and bands that belong to them."""
     return sum(size for _, size, _ in files(disk))
 
 
 def candidates(disk: Disk, pinned: Collection[str], read_seconds: Callable[[float], float]) -> Iterator[Candidate]:
-    """Every value that is not pinned; a band that several values share counts in part for each."""
+    """Yield every value that is not pinned; the bytes of a band are divided among the values that share the band."""
     stats = {os.path.basename(path): (size, changed) for path, size, changed in files(disk)}
     kept = {key: about for key, about in metadata.each(disk) if metadata.is_kept(about)}
     bands = {key: set(metadata.bands(about)) for key, about in kept.items()}
@@ -121,7 +121,7 @@ def candidates(disk: Disk, pinned: Collection[str], read_seconds: Callable[[floa
 
 
 def drop(disk: Disk, key: str) -> bool:
-    """Leave of a value the receipt alone; False where that is not allowed to us."""
+    """Reduce a value to its receipt; return False where we have no permission."""
     try:
         with disk.lock():
             about = metadata.read(disk, key)
@@ -129,14 +129,14 @@ def drop(disk: Disk, key: str) -> bool:
                 _write_receipt(disk, key, about)
                 _unlink(disk, key, about)
     except FileNotFoundError:
-        return True  # another user was first
+        return True  # another process was first
     except UNREADABLE:
         return False
     return True
 
 
 def _write_receipt(disk: Disk, key: str, about: Metadata) -> None:
-    """On a disk without room not even that."""
+    """Write the receipt of an evicted value; on a full disk delete the metadata instead."""
     try:
         with disk.temporary(key) as (part, file):
             file.write(metadata.seal(metadata.receipt(about)))
@@ -158,7 +158,7 @@ def _unlink(disk: Disk, key: str, about: Metadata) -> None:
 
 
 def files(disk: Disk) -> Iterator[tuple[str, int, float]]:
-    """Path, bytes and last change of everything that counts against the budget."""
+    """Yield path, bytes and last change of every file that counts against the budget."""
     for base in (disk.folder, f"{disk.folder}/files", f"{disk.folder}/bands"):
         for folder in entries(base):
             if len(folder.name) == 2 and folder.is_dir(follow_symlinks=False):

@@ -1,6 +1,6 @@
-"""Finished files by key: pictures, spectral EXR. A second run takes them as they are and draws nothing.
+"""Derived files by key, such as pictures and spectral EXR: a second run takes each file and draws nothing.
 
-The bytes lie in ``files/`` of the store's folder; the store itself remembers their checksum.
+The bytes lie in ``files/`` of the store's folder; the store itself keeps their checksum.
 """
 
 from __future__ import annotations
@@ -17,7 +17,7 @@ from neusee.workflows.store.result_store import Store
 
 
 class DerivedFiles:
-    """Files beside a store; where its folder takes none, they live as long as this object."""
+    """Files beside a store; where the store's folder cannot be written, the files live as long as this object."""
 
     def __init__(self, store: Store) -> None:
         self.store = store
@@ -25,7 +25,7 @@ class DerivedFiles:
         self._spare: TemporaryDirectory[str] | None = None
 
     def find(self, key: str, suffix: str) -> Path | None:
-        """The file of a key, if it is there and is what was written."""
+        """Return the file of a key if the file exists and its checksum matches, else None."""
         path = self._path(key, suffix)
         if not path.is_file() or not self.store.has(key):
             return None
@@ -36,7 +36,7 @@ class DerivedFiles:
         return path if known == _checksum(path) else None
 
     def keep(self, key: str, suffix: str, what: str, content: bytes) -> Path:
-        """Write a file and keep it; it gets its name when it is complete, and is then read-only."""
+        """Write a read-only file by atomic rename and put its checksum into the store; return the path of the file."""
         try:
             path = self._written(key, suffix, content)
         except PermissionError:

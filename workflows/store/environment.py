@@ -1,4 +1,4 @@
-"""Where the store lies, how far it trusts its files and how large it may grow, as the environment says."""
+"""Settings of the store from the environment: its folder, its verify mode and its budget."""
 
 from __future__ import annotations
 
@@ -12,13 +12,13 @@ Verify = Literal["always", "sampled", "never"]
 
 
 def default_root() -> Path:
-    """``$NEUSEE_CACHE``, else ``cache/`` of the checkout around us, else ``~/.cache/neusee``.
+    """Return ``$NEUSEE_CACHE``, else ``cache/`` of the surrounding checkout, else ``~/.cache/neusee``.
 
-    Raises `ValueError` where a URL is named.
+    Raises `ValueError` where the variable names a URL.
     """
     if named := os.environ.get("NEUSEE_CACHE"):
         if "://" in named:
-            raise ValueError(f"NEUSEE_CACHE is {named!r}, which is no folder: `open_store` takes URLs too")
+            raise ValueError(f"NEUSEE_CACHE is {named!r}, which is not a folder: `open_store` takes URLs too")
         return Path(named)
     here = Path.cwd()
     for folder in (here, *here.parents):
@@ -29,7 +29,7 @@ def default_root() -> Path:
 
 
 def verify_mode(wanted: str | None) -> Verify:
-    """``wanted``, else ``$NEUSEE_CACHE_VERIFY``, else ``always``; a `ValueError` where it is no such word."""
+    """Return ``wanted``, else ``$NEUSEE_CACHE_VERIFY``, else ``always``; raise `ValueError` for any other word."""
     name = "verify" if wanted else "NEUSEE_CACHE_VERIFY"
     found = wanted or os.environ.get("NEUSEE_CACHE_VERIFY") or "always"
     if found not in get_args(Verify):
@@ -38,7 +38,7 @@ def verify_mode(wanted: str | None) -> Verify:
 
 
 def budget_bytes(wanted: int | None) -> int | None:
-    """``wanted``, else ``$NEUSEE_CACHE_BUDGET`` such as ``20 GB``, else none; a `ValueError` where it is no size."""
+    """Return ``wanted``, else ``$NEUSEE_CACHE_BUDGET`` such as ``20 GB``, else None; raise `ValueError` for no size."""
     named = os.environ.get("NEUSEE_CACHE_BUDGET")
     if wanted is not None or not named:
         return wanted

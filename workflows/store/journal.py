@@ -1,7 +1,7 @@
-"""The journal: one line for every finished result, so that to know what was need not mean to read them all.
+"""Journal of a store: one line for every finished result, so that a query need not read all results.
 
-It is advice. Each line is one write, and a line that is torn is skipped; where the file is
-missing, or is not one, it is made anew from what the results themselves say.
+The journal is advice. Each line is one write, and a torn line is skipped. A journal that is
+missing or damaged is rebuilt from the metadata of the results.
 """
 
 from __future__ import annotations
@@ -25,11 +25,11 @@ _TEXT, _NUMBER = str | None, int | float | None
 _KINDS = {"key": str, "step": _TEXT, "node": _TEXT, "seconds": _NUMBER, "bytes": _NUMBER, "kept": bool}
 _HEAD = re.compile(rb'\{"journal":"[0-9a-f]{16}"\}')
 _encode = json.JSONEncoder(separators=(",", ":")).encode
-_SPARE = 20_000  #: lines that were superseded, from which the file is written anew
+_SPARE = 20_000  #: superseded lines from which the file is rewritten
 
 
 def row_of(key: str, about: Row) -> Row:
-    """What the journal says of a result."""
+    """Return the journal's line of a result."""
     node = (about.get("origin") or {}).get("node")
     return {"key": key, **{f: about.get(f) for f in _FIELDS}, "node": node, "kept": metadata.is_kept(about)}
 
@@ -38,13 +38,13 @@ class Journal:
     """The lines of one store, the newest last."""
 
     def __init__(self, disk: Disk, others: Callable[[], Iterable[tuple[str, Row]]] = tuple) -> None:
-        """``others``: results beside those that have files of their own."""
+        """Open the journal of ``disk``; ``others`` yields the results that have no files of their own."""
         self._disk, self._others, self._guard = disk, others, threading.RLock()
         self._path = f"{disk.folder}/journal.jsonl"
         self._forget()
 
     def append(self, key: str, about: Row) -> None:
-        """Add a line; where that cannot be done, nothing is lost but time."""
+        """Append a line; a line that cannot be written is lost, which costs time and no result."""
         with suppress(OSError):
             try:
                 self._write(b"\n" + _encode(row_of(key, about)).encode())
@@ -53,28 +53,28 @@ class Journal:
                     self._rebuild()
 
     def rows(self) -> list[Row]:
-        """Every line: key, step, recipe, node, seconds, bytes, device, peak, date, kept. Not to be changed."""
+        """Return every line: key, step, recipe, node, seconds, bytes, device, peak, date, kept. Do not change them."""
         self._read()
         return self._rows
 
     def of_step(self, name: str) -> list[Row]:
-        """The lines of a step, the newest last."""
+        """Return the lines of a step, the newest last."""
         self._read()
         return self._by_step.get(name, [])
 
     def of_node(self, path: str) -> list[Row]:
-        """The lines of a node, the newest last."""
+        """Return the lines of a node, the newest last."""
         self._read()
         return self._by_node.get(path, [])
 
     def mark_evicted(self, keys: Collection[str]) -> None:
-        """Say of these that their values are no longer kept."""
+        """Mark the values of these keys as no longer kept."""
         with self._guard:
             self._read()
             self._replace([{**row, "kept": False} if row["key"] in keys else row for row in self._rows])
 
     def compact(self) -> None:
-        """Write it anew, with one line for each result that there is: the newest, and whether its value is kept."""
+        """Rewrite the journal with the newest line of each result that exists, and with whether its value is kept."""
         self._read()
         known = {row["key"]: (i, row) for i, row in enumerate(self._rows)}
         found = []
@@ -103,7 +103,7 @@ class Journal:
             self._take_in()
 
     def _take_in(self) -> None:
-        """What has been added since the last time; where no file could be made, what was found then."""
+        """Read the lines added since the last call; skip the file where none can be written."""
         if self._fileless:
             return None
         try:
@@ -139,7 +139,7 @@ class Journal:
         self._replace(sorted(rows, key=lambda row: str(row["date"])))
 
     def _replace(self, rows: list[Row]) -> None:
-        """Put a new file in place of the old; a line that is added meanwhile may be lost."""
+        """Replace the file by one with these rows; a line that another process adds meanwhile may be lost."""
         self._forget()
         for row in rows:
             self._take(row)
@@ -158,7 +158,7 @@ class Journal:
 
 
 def _parsed(raw: bytes) -> Iterator[Row]:
-    """The rows among the lines of ``raw``: all at once, or one by one where some are damaged."""
+    """Yield the rows in the lines of ``raw``: parse all at once, or one by one where some lines are damaged."""
     lines = [line for line in raw.split(b"\n") if line]
     try:
         found = json.loads(b"[" + b",".join(lines) + b"]")

@@ -1,12 +1,12 @@
-"""Leases: who computes a key right now, so that two processes need not both do it.
+"""Leases: a process that holds the lease of a key computes the key, so that no second process does the same.
 
-A lease is a second name of a file in which its process says who it is, so that to take one
-is a single step that either succeeds or does not, and one heartbeat serves them all. On
-this machine the owner is looked for by its number and the time at which it began: after
-``kill -9`` the next one takes over at once. The owner on another machine must be seen to
-change its file; how long it does not is told by the observer's own steady clock, so no
-clock that jumps makes a live owner dead. A lease is advice: were two processes to hold
-the same one, they would do the same work twice and nothing else.
+A lease is a second hard link to the badge of a process, a file that names the process. Taking
+a lease is therefore one atomic step, and one heartbeat serves all leases of a process. On the
+same machine, an observer looks up the owner by process number and start time: after
+``kill -9`` the next process takes over at once. An owner on another machine must be seen to
+change its badge. The observer measures the time without a change by its own monotonic clock,
+so that no clock that jumps makes a live owner dead. A lease is advice: if two processes held
+the same lease, they would do the same work twice and do no other harm.
 """
 
 from __future__ import annotations
@@ -22,15 +22,15 @@ from neusee.workflows.store.process_owner import me, owner_of
 from neusee.workflows.store.shared_folder import Disk
 
 BEAT = 2.0  #: s between heartbeats
-WINDOW = 10.0  #: s without one after which an owner whom one cannot look for is dead
+WINDOW = 10.0  #: s without a heartbeat after which an owner on another machine counts as dead
 _guard = threading.Lock()
 _held: set[Lease] = set()
-_badges: dict[str, str] = {}  #: by folder the file in which this process says who it is
+_badges: dict[str, str] = {}  #: by folder, the badge of this process: the file that names the process
 _thread: threading.Thread | None = None
 
 
 class Lease:
-    """The right to compute a key, until `release`; one without a path is for a folder that takes no files."""
+    """The right to compute a key until `release`; a lease without a path stands for a folder that takes no files."""
 
     __slots__ = ("_inode", "_path")
 
@@ -39,7 +39,7 @@ class Lease:
         self._inode = os.stat(path).st_ino if path else 0
 
     def release(self) -> None:
-        """Let others have it; one that was taken over, or that a forked child inherited, stays as it is."""
+        """Give the lease back; a lease that was taken over, or inherited by a forked child, stays unchanged."""
         with _guard:
             if self not in _held:
                 return
@@ -59,16 +59,16 @@ class Lease:
 
 
 class Leases:
-    """The leases of one store, as one observer sees them."""
+    """The leases of one store, as seen by one observer."""
 
     def __init__(self, disk: Disk) -> None:
         self._disk = disk
-        self._seen: dict[str, tuple[object, float]] = {}  #: by path what was there, and since when nothing changed
+        self._seen: dict[str, tuple[object, float]] = {}  #: by path: content, and since when unchanged
 
     def claim(self, key: str) -> Lease | None:
-        """The lease of ``key``; None while a live process holds it.
+        """Return the lease of ``key``, or None while a live process holds the lease.
 
-        Who had to wait looks for the result once more before computing it.
+        A caller that had to wait looks up the result once more before computing it.
         """
         try:
             return self._claimed(key, f"{self._disk.folder}/tmp/{key}.lease")
@@ -88,7 +88,7 @@ class Leases:
             return None
 
     def _taken(self, path: str) -> Lease:
-        """Two tries: the folder may not be there yet, and our file in it may have been swept away."""
+        """Take a free lease; try twice, because the folder may not exist yet or a sweep may have removed our badge."""
         with _guard:
             try:
                 os.link(_badge(self._disk), path)
@@ -99,14 +99,14 @@ class Leases:
         return self._kept(path)
 
     def _taken_over(self, key: str, path: str, found: tuple[object, ...] | None) -> Lease:
-        """One observer at a time; who finds that another was faster waits for that one."""
+        """Take over the lease of a dead owner under the lock; raise `FileExistsError` if another observer was first."""
         part = f"{self._disk.folder}/tmp/{key}.{me()}.{threading.get_ident()}"
         with self._disk.lock():
             now = _look(path)
             if now is not None and (found is None or now[:2] != found[:2]):
                 raise FileExistsError(path)
             with _guard:
-                os.link(_badge(self._disk), path if now is None else part)  # of two who find nobody, one is first
+                os.link(_badge(self._disk), path if now is None else part)  # one of two observers is first
             try:
                 if now is not None:
                     os.replace(part, path)
@@ -136,7 +136,7 @@ class Leases:
 
 
 def _look(path: str) -> tuple[object, ...] | None:
-    """What a lease says, its file, and what a heartbeat changes; None where there is none."""
+    """Return the content of a lease, its inode and the numbers that a heartbeat changes; None if there is no lease."""
     try:
         with open(path, "rb") as file:
             stat, text = os.fstat(file.fileno()), file.readline(200).decode(errors="replace")
@@ -148,7 +148,7 @@ def _look(path: str) -> tuple[object, ...] | None:
 
 
 def _badge(disk: Disk) -> str:
-    """The file in which this process says who it is; made when it is first needed."""
+    """Return the path of this process's badge; write the badge when it is first needed."""
     if disk.folder not in _badges:
         disk.prepare()
         path = f"{disk.folder}/tmp/badge.{me()}"
@@ -173,7 +173,7 @@ def _start() -> None:
 
 
 def _beat() -> None:
-    """While leases are held, show from time to time that their owner is alive."""
+    """Change the badges from time to time while leases are held, to show that their owner is alive."""
     global _thread
     while True:
         time.sleep(BEAT)
@@ -189,7 +189,7 @@ def _beat() -> None:
 
 
 def beat(path: str) -> None:
-    """Change a file so that others see it, whatever the clocks say: it grows."""
+    """Append a byte to a file, so that other processes see a change whatever their clocks say."""
     file = os.open(path, os.O_WRONLY | os.O_APPEND)
     try:
         os.write(file, b".")
@@ -198,7 +198,7 @@ def beat(path: str) -> None:
 
 
 def _retire() -> None:
-    """Also runs at the end of the process, when `_beat` may be at it too."""
+    """Remove all badges of this process; also called at exit, perhaps at the same time as `_beat`."""
     with suppress(KeyError):
         while True:
             _, path = _badges.popitem()
@@ -207,7 +207,7 @@ def _retire() -> None:
 
 
 def _forked() -> None:
-    """A child holds none of its parent's leases."""
+    """Forget all leases in a forked child, which holds none of its parent's leases."""
     global _guard, _thread
     _guard, _thread = threading.Lock(), None
     _held.clear()

@@ -1,4 +1,4 @@
-"""The upkeep of a store: its pins, what goes when room is needed, what is damaged."""
+"""Maintenance of a store: pins, eviction and the check for damage."""
 
 from __future__ import annotations
 
@@ -29,26 +29,26 @@ class Upkept(Protocol):
 
 @dataclass(frozen=True, slots=True)
 class Swept:
-    """What went, or would go."""
+    """Summary of a clean-up, or with ``dry`` of the clean-up that would be done."""
 
-    evicted: tuple[str, ...]  #: keys whose values went
-    refused: tuple[str, ...]  #: keys whose values another user would have to remove
-    freed: int  #: bytes of both kinds
-    orphans: int  #: files that belonged to no result
-    left: int  #: bytes
+    evicted: tuple[str, ...]  #: keys whose values were evicted
+    refused: tuple[str, ...]  #: keys whose values only another user can remove
+    freed: int  #: bytes of evicted values and of orphan files
+    orphans: int  #: number of orphan files, which belonged to no result
+    left: int  #: bytes that remain
 
 
 @dataclass(frozen=True, slots=True)
 class Checked:
-    """A result that was read as a whole."""
+    """A result whose bytes were all read and compared."""
 
     key: str
     about: Metadata | None
-    problem: str  #: empty where it is as it was written
+    problem: str  #: empty where the result is undamaged
 
 
 def gc(store: Upkept, budget: int | None, dry: bool) -> Swept:
-    """Remove what belongs to no result, and values beyond ``budget``, where there is one."""
+    """Remove orphan files and, if a ``budget`` is given, evict the values beyond it."""
     before = total(store.disk)
     orphans = dict(orphan_files.sweep(store.disk, dry))
     left = sum(size for path, size, _ in files(store.disk) if path not in orphans)
@@ -61,7 +61,7 @@ def gc(store: Upkept, budget: int | None, dry: bool) -> Swept:
 
 
 def make_room(store: Upkept, excess: float, dry: bool = False) -> tuple[list[Candidate], list[Candidate]]:
-    """Let values go until ``excess`` bytes are free; those that went, and those that we may not remove."""
+    """Evict values until ``excess`` bytes are free; return the evicted values and those that we may not remove."""
     if excess <= 0:
         return [], []
     found = candidates(store.disk, store.pinned(), store.read_seconds)
@@ -72,7 +72,7 @@ def make_room(store: Upkept, excess: float, dry: bool = False) -> tuple[list[Can
 
 
 def check(store: Upkept) -> Iterator[Checked]:
-    """Read every value and compare every checksum; what is damaged is put aside."""
+    """Read every value, compare every checksum and put damaged results aside."""
     for key in metadata.names(store.disk):
         about, problem = None, ""
         try:
@@ -88,20 +88,20 @@ def check(store: Upkept) -> Iterator[Checked]:
 
 
 def pin(disk: Disk, key: str) -> None:
-    """Keep a value whatever the budget."""
+    """Exempt a value from eviction."""
     disk.prepare()
     disk.make_folder(f"{disk.folder}/pins")
     open(f"{disk.folder}/pins/{key}", "wb").close()
 
 
 def unpin(disk: Disk, key: str) -> None:
-    """Let a value go again when room is needed."""
+    """Allow the eviction of a value again."""
     with suppress(FileNotFoundError):
         os.unlink(f"{disk.folder}/pins/{key}")
 
 
 def pinned(disk: Disk) -> set[str]:
-    """The keys that are pinned."""
+    """Return the keys that are pinned."""
     try:
         return set(os.listdir(f"{disk.folder}/pins"))
     except OSError:
@@ -109,7 +109,7 @@ def pinned(disk: Disk) -> set[str]:
 
 
 def _is_gone(disk: Disk, key: str) -> bool:
-    """Whether a value went, as values may, while we were about to read it."""
+    """Return True if another process evicted a value while this process was about to read it."""
     try:
         return not is_kept(metadata.read(disk, key))
     except FileNotFoundError:
@@ -119,5 +119,5 @@ def _is_gone(disk: Disk, key: str) -> bool:
 
 
 def _beside(disk: Disk, path: str) -> bool:
-    """Whether a file does not count against the budget: half-made or damaged."""
+    """Return True if a file is temporary or damaged, and so does not count against the budget."""
     return path.startswith((f"{disk.folder}/tmp/", f"{disk.folder}/bad/"))

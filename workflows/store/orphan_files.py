@@ -1,7 +1,7 @@
-"""What lies in a store and belongs to no result: the sweep of `neusee cache gc`.
+"""Orphan files: files of a store that belong to no result, removed by `neusee cache gc`.
 
-Whether something is in use is decided under the lock and by what the descriptions say now,
-not by its age; only what has no owner that one could ask is left alone for an hour.
+Whether a file is in use is decided under the lock and from the present metadata, not from the
+file's age. Only a file whose owner cannot be determined is left alone for an hour.
 """
 
 from __future__ import annotations
@@ -16,11 +16,11 @@ from neusee.workflows.store.budget_eviction import entries
 from neusee.workflows.store.metadata import UNREADABLE
 from neusee.workflows.store.shared_folder import OLD, Disk
 
-_WEEK = 7 * 86400.0  #: s for which a damaged entry may be looked at
+_WEEK = 7 * 86400.0  #: s for which a damaged entry is kept for inspection
 
 
 def sweep(disk: Disk, dry: bool = False) -> list[tuple[str, int]]:
-    """Remove what belongs to no result; the paths and bytes of what went, or would go."""
+    """Remove the files that belong to no result; return path and bytes of each file (``dry``: remove nothing)."""
     if not os.path.isdir(disk.folder):
         return []
     gone = disk.sweep(dry, _WEEK) if os.path.isdir(f"{disk.folder}/tmp") else []
@@ -31,7 +31,7 @@ def sweep(disk: Disk, dry: bool = False) -> list[tuple[str, int]]:
 
 
 def removed(disk: Disk, find: Callable[[Disk], Iterator[os.DirEntry[str]]], dry: bool) -> list[tuple[str, int]]:
-    """Look without the lock whether there is anything, and once more with it."""
+    """Remove the files that ``find`` yields: look without the lock first, and once more under the lock."""
     gone = []
     with suppress(OSError):
         found = list(find(disk))
@@ -47,7 +47,7 @@ def removed(disk: Disk, find: Callable[[Disk], Iterator[os.DirEntry[str]]], dry:
 
 
 def _payloads(disk: Disk) -> Iterator[os.DirEntry[str]]:
-    """Payloads that no description refers to; one with a description that cannot be read stays for who reads it."""
+    """Yield payloads without metadata; a payload whose metadata cannot be read is kept for its reader."""
     for entry in _below(disk.folder):
         key, _, suffix = entry.name.partition(".")
         if suffix == "safetensors":
@@ -63,7 +63,7 @@ def _payloads(disk: Disk) -> Iterator[os.DirEntry[str]]:
 
 
 def bands(disk: Disk) -> Iterator[os.DirEntry[str]]:
-    """Bands that no value needs; none while another user's description is not for us to read, for it may need some."""
+    """Yield bands that no value needs; yield none if the metadata of another user's values cannot be read."""
     found, needed = list(_below(f"{disk.folder}/bands")), set[str]()
     for key in metadata.names(disk) if found else ():
         try:
@@ -76,7 +76,7 @@ def bands(disk: Disk) -> Iterator[os.DirEntry[str]]:
 
 
 def _files(disk: Disk) -> Iterator[os.DirEntry[str]]:
-    """Pictures whose entry went, and halves of them."""
+    """Yield pictures whose entry is gone, and half-written pictures."""
     for entry in _below(f"{disk.folder}/files"):
         try:
             wanted = not entry.name.startswith(".") and metadata.read(disk, entry.name[:32]).get("file") == entry.name
@@ -87,19 +87,19 @@ def _files(disk: Disk) -> Iterator[os.DirEntry[str]]:
 
 
 def _damaged(disk: Disk) -> Iterator[os.DirEntry[str]]:
-    """What was put aside a week ago."""
+    """Yield damaged entries that were put aside more than a week ago."""
     for folder in (f"{disk.folder}/bad", f"{disk.folder}/bands/bad"):
         yield from (entry for entry in entries(folder) if _age(entry) > _WEEK)
 
 
 def _below(base: str) -> Iterator[os.DirEntry[str]]:
-    """The files in the folders of two digits."""
+    """Yield the files in the folders with names of two letters."""
     for folder in entries(base):
         if len(folder.name) == 2 and folder.is_dir(follow_symlinks=False):
             yield from entries(folder.path)
 
 
 def _age(entry: os.DirEntry[str]) -> float:
-    """Seconds since a file was last written or moved."""
+    """Return the seconds since a file was last written or moved."""
     stat = entry.stat(follow_symlinks=False)
     return time.time() - max(stat.st_mtime, stat.st_ctime)

@@ -1,4 +1,4 @@
-"""The payload of a result: loaded, and its checksum compared as often as was asked for."""
+"""Load the payload of a result and compare its checksum as often as the verify mode asks."""
 
 from __future__ import annotations
 
@@ -13,21 +13,21 @@ from neusee.workflows.store.shared_folder import Disk
 if TYPE_CHECKING:
     from neusee.workflows.store.band_files import Blobs
 
-_SAMPLED = 1 / 20  #: of the loads under ``sampled`` that are verified although the file has not been touched
-_draw = random.Random()  # our own: the numbers that others draw do not depend on what is loaded
+_SAMPLED = 1 / 20  #: fraction of the loads that mode ``sampled`` verifies although the file has not been touched
+_draw = random.Random()  # a generator of the store's own: loads do not change the random numbers of a user
 
 
 def blobs_of(disk: Disk) -> Blobs:
-    """The bands of the stacks of a store."""
+    """Return the band files of the store in ``disk``."""
     from neusee.workflows.store.band_files import Blobs
 
     return Blobs(disk.root / "bands")
 
 
 def load(disk: Disk, about: Metadata, verify: str, blobs: Blobs) -> tuple[Any, int]:
-    """The value that ``about`` describes, and how many bytes of its payload were compared.
+    """Return the value that ``about`` describes and the number of payload bytes whose checksum was compared.
 
-    Raises one of `UNREADABLE` where it cannot be trusted.
+    Raises one of `UNREADABLE` where the value cannot be trusted.
     """
     from neusee.workflows.store import serialization
 
@@ -38,7 +38,7 @@ def load(disk: Disk, about: Metadata, verify: str, blobs: Blobs) -> tuple[Any, i
         path = disk.path(about["key"], "safetensors")
         stamp = stamp_of(path)
         if stamp[1] != payload["size"]:
-            raise ValueError(f"its payload has not the {payload['size']} bytes that were written")
+            raise ValueError(f"the payload has {stamp[1]} bytes instead of the {payload['size']} that were written")
         due = check or (verify == "sampled" and stamp != payload.get("stamp"))
         tensors, compared = serialization.read(path, payload["xxh3"] if due else None), payload["size"] if due else 0
     if bands and verify == "sampled" and not check:
@@ -47,12 +47,12 @@ def load(disk: Disk, about: Metadata, verify: str, blobs: Blobs) -> tuple[Any, i
 
 
 def stamp_of(path: str) -> list[int]:
-    """What changes when somebody writes to a file: which one it is, its bytes, its times in ns."""
+    """Return inode, bytes and times (ns) of a file; one of these numbers changes when a process writes to the file."""
     stat = os.stat(path)
     return [stat.st_ino, stat.st_size, stat.st_mtime_ns, stat.st_ctime_ns]
 
 
 def newest(disk: Disk, bands: Iterable[str]) -> int:
-    """When a file of these bands was last written to, in ns."""
+    """Return the time (ns) of the last write to the files of these bands."""
     stats = [os.stat(f"{disk.folder}/bands/{name[:2]}/{name}") for name in bands]
     return max((max(stat.st_mtime_ns, stat.st_ctime_ns) for stat in stats), default=0)

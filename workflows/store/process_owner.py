@@ -1,4 +1,4 @@
-"""Who made a file: a process of a machine, and whether it is still at work. No clock is asked."""
+"""Owner of a file: a process of a machine, and whether the process still runs. No clock is used."""
 
 from __future__ import annotations
 
@@ -9,23 +9,23 @@ from functools import cache
 from typing import Literal
 
 State = Literal["alive", "dead", "foreign"]
-_IDLE = "ZTtXx"  #: of /proc: ended, or stopped by somebody
+_IDLE = "ZTtXx"  #: states in /proc of a process that has ended or is stopped
 
 
 @dataclass(frozen=True, slots=True)
 class Owner:
-    """A process: one that comes later with the same number began at another time."""
+    """A process, told apart by its start time from a later process with the same number."""
 
-    host: str  #: digest of the machine, its present boot and its space of process numbers
+    host: str  #: digest of the machine, its present boot and its namespace of process numbers
     pid: int
-    began: str  #: in ticks since the machine's boot; empty where the system does not tell
+    began: str  #: start time in ticks since the machine's boot; empty where the system does not give the time
 
     def __str__(self) -> str:
         return f"{self.host}-{self.pid}-{self.began}"
 
     @property
     def state(self) -> State:
-        """``foreign``: on another machine, where one cannot look. A process that was stopped counts as dead."""
+        """Return whether the process runs: ``foreign`` on another machine; a stopped process counts as ``dead``."""
         if self.host != host():
             return "foreign"
         if self.pid == os.getpid():
@@ -40,14 +40,14 @@ class Owner:
 
 
 def owner_of(text: str) -> Owner | None:
-    """The owner that ``text`` names; None where it names none."""
+    """Return the owner that ``text`` names, or None where ``text`` names no owner."""
     host, _, rest = text.partition("-")
     pid, _, began = rest.partition("-")
     return Owner(host, int(pid), began) if len(host) == 12 and pid.isdecimal() and len(pid) < 12 else None
 
 
 def me() -> Owner:
-    """This process."""
+    """Return this process."""
     return _me(os.getpid())
 
 
@@ -61,19 +61,19 @@ def _me(pid: int) -> Owner:
 
 @cache
 def host() -> str:
-    """This machine until its next boot; two containers with one name differ too."""
+    """Return a digest of this machine until its next boot; two containers with the same name differ."""
     parts = [os.uname().nodename]
     try:
         with open("/proc/sys/kernel/random/boot_id") as file:
             parts.append(file.read())
         parts.append(str(os.stat("/proc/self/ns/pid").st_ino))
     except OSError:
-        pass  # a system that tells neither
+        pass  # a system that gives neither number
     return hashlib.blake2b("\n".join(parts).encode(), digest_size=6).hexdigest()
 
 
 def _process(pid: int) -> tuple[str, str]:
-    """What a process is doing and when it began; its name, which stands before, may hold anything."""
+    """Return state and start time of a process, the fields behind the name, which may hold any character."""
     with open(f"/proc/{pid}/stat", "rb") as file:
         fields = file.read().rpartition(b")")[2].split()
     if len(fields) < 20:

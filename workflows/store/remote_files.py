@@ -1,7 +1,7 @@
-"""Files by name behind fsspec: what fails there is as good as absent, for one warning.
+"""Files by name behind fsspec: a failing remote counts as empty, after one warning.
 
-Whether a file is there is read from listings of its folder, which are believed for a while:
-a cold run of a thousand steps asks 256 times, side by side, and not a thousand times in a row.
+Whether a file exists is read from listings of its folder, which count as valid for a while: a
+cold run of a thousand steps sends 256 requests in parallel instead of a thousand in a row.
 """
 
 from __future__ import annotations
@@ -20,13 +20,13 @@ from neusee.workflows.graph.diagnostics import nearest
 
 T = TypeVar("T")
 Direction = Literal["down", "up"]
-_FRESH = 20.0  #: s for which a listing is believed
-_FEW = 3  #: folders that are listed one by one; whoever asks for more is told of all of them
-_PAUSE = 60.0  #: s for which a remote that failed is left alone; twice as long each time
-_LEARN = 1_000_000  #: bytes from which a transfer tells the rate; a smaller one tells the latency
-_ORPHAN = 86400.0  #: s after which a half-written file has no owner
+_FRESH = 20.0  #: s for which a listing counts as valid
+_FEW = 3  #: folders that are listed one by one; a request for a further folder lists all folders
+_PAUSE = 60.0  #: s for which a failed remote is not used; doubled at each failure
+_LEARN = 1_000_000  #: bytes from which a transfer updates the rate; a smaller transfer updates the latency
+_ORPHAN = 86400.0  #: s after which a half-written file counts as abandoned
 _FOLDERS = tuple(f"{i:02x}" for i in range(256))
-_RENAMES = frozenset({"file", "local", "sftp", "ssh"})  #: show a file while it is written, and can rename it then
+_RENAMES = frozenset({"file", "local", "sftp", "ssh"})  #: show half-written files, but can rename
 _NEAR = frozenset({"file", "local", "memory"})
 
 
@@ -47,39 +47,39 @@ class RemoteFiles:
         self._made: set[str] = set()
         self._lock = threading.Lock()
 
-    def seconds(self, way: Direction, size: float) -> float:
-        """Predicted s to move ``size`` bytes and the description that names them."""
-        return 2 * self._latency[way] + size / self._rate[way]
+    def seconds(self, direction: Direction, size: float) -> float:
+        """Return the predicted seconds for moving ``size`` bytes and the metadata that name them."""
+        return 2 * self._latency[direction] + size / self._rate[direction]
 
     def exists(self, name: str) -> bool:
-        """Whether there was such a file when its folder was last listed."""
+        """Return True if the file existed when its folder was last listed."""
         with self._lock:
             if not self._fresh(name[:2]):
                 few = sum(map(self._fresh, self._listed)) < _FEW
-                self._look([name[:2]] if few else _FOLDERS)
+                self._list_folders([name[:2]] if few else _FOLDERS)
             return name in self._listed[name[:2]][1]
 
     def names(self) -> set[str]:
-        """Names of all files in the folders."""
+        """Return the names of all files in the folders."""
         with self._lock:
-            self._look(_FOLDERS)
+            self._list_folders(_FOLDERS)
             return set().union(*(names for _, names in self._listed.values()))
 
     def read(self, name: str) -> bytes | None:
-        """The bytes of a small file."""
-        return self._try("down", lambda: bytes(self._fs.cat_file(self._path(name))), len)
+        """Return the bytes of a small file, or None where the file cannot be read."""
+        return self._attempt("down", lambda: bytes(self._fs.cat_file(self._path(name))), len)
 
     def fetch(self, name: str, path: str) -> bool:
-        """Copy a file from there to ``path``."""
+        """Copy a remote file to ``path``; return False where the copy fails."""
 
         def get() -> int:
             self._fs.get_file(self._path(name), path)
             return os.path.getsize(path)
 
-        return self._try("down", get, int) is not None
+        return self._attempt("down", get, int) is not None
 
     def send(self, path: str, name: str) -> bool:
-        """Copy the file at ``path`` there; False also where it has gone in the meantime."""
+        """Copy the file at ``path`` to the remote; return False where the copy fails or ``path`` is gone."""
 
         def put(to: str) -> int:
             try:
@@ -93,21 +93,21 @@ class RemoteFiles:
         return self._write(name, put)
 
     def write(self, name: str, raw: bytes, over: bool = False) -> bool:
-        """Write a small file; what is there stays, unless ``over``, as far as the file system can tell."""
+        """Write a small file; keep an existing file unless ``over``, as far as the file system can tell."""
 
         def pipe(to: str) -> int:
             try:
                 self._fs.pipe_file(to, raw, mode="overwrite" if over or self._renames else "create")
             except FileExistsError:
                 pass
-            except (TypeError, NotImplementedError):  # a file system that knows no `mode` has only this call
+            except (TypeError, NotImplementedError):  # a file system that does not know `mode` has only this call
                 self._fs.pipe_file(to, raw)
             return len(raw)
 
         return (not over and self._renames and self._exists(name)) or self._write(name, pipe)
 
     def warn(self, text: str) -> None:
-        """Say it, if nothing was said before."""
+        """Give the warning ``text`` unless a warning was given before."""
         if not self._warned:
             self._warned = True
             warnings.warn(text, stacklevel=5)
@@ -118,8 +118,8 @@ class RemoteFiles:
     def _fresh(self, folder: str) -> bool:
         return folder in self._listed and time.monotonic() - self._listed[folder][0] < _FRESH
 
-    def _look(self, folders: Sequence[str]) -> None:
-        """List those of ``folders`` whose listings are old, side by side."""
+    def _list_folders(self, folders: Sequence[str]) -> None:
+        """List the outdated ones of ``folders`` in parallel."""
         old = [folder for folder in folders if not self._fresh(folder)]
         with suppress(AttributeError):
             self._fs.invalidate_cache()
@@ -129,14 +129,14 @@ class RemoteFiles:
                 self._listed[folder] = (now, found)
 
     def _listing(self, folder: str) -> set[str]:
-        found = self._try("down", lambda: self._fs.ls(f"{self._root}/{folder}", detail=False))
+        found = self._attempt("down", lambda: self._fs.ls(f"{self._root}/{folder}", detail=False))
         return {str(path).rpartition("/")[2] for path in found or ()}
 
     def _exists(self, name: str) -> bool:
-        return bool(self._try("down", lambda: self._fs.exists(self._path(name))))
+        return bool(self._attempt("down", lambda: self._fs.exists(self._path(name))))
 
     def _write(self, name: str, put: Callable[[str], int]) -> bool:
-        """Let ``put`` write a file that has its name only when it is complete."""
+        """Let ``put`` write a file that gets its name only when the file is complete."""
 
         def whole() -> int:
             if not self._renames:
@@ -149,7 +149,7 @@ class RemoteFiles:
                 self._fs.mv(part, self._path(name))
             return size
 
-        size = self._try("up", whole, int)
+        size = self._attempt("up", whole, int)
         if size is None or size < 0:
             return False
         with self._lock:
@@ -165,47 +165,47 @@ class RemoteFiles:
                 self._sweep(path)
 
     def _sweep(self, path: str) -> None:
-        """Remove what killed processes left half-written; a file system that tells no times keeps it."""
+        """Remove the half-written files of killed processes; keep them where the file system gives no times."""
         with suppress(OSError, LookupError, TypeError):
             for entry in self._fs.ls(path, detail=True):
                 if time.time() - entry["mtime"] > _ORPHAN:
                     self._fs.rm_file(entry["name"])
 
-    def _try(self, way: Direction, do: Callable[[], T], size: Callable[[T], int] | None = None) -> T | None:
-        """What ``do`` gives; None where there is no such file, and while the remote is left alone."""
-        if time.monotonic() < self._resume[way]:
+    def _attempt(self, direction: Direction, do: Callable[[], T], size: Callable[[T], int] | None = None) -> T | None:
+        """Return the result of ``do``; return None where the file does not exist, and while the remote is not used."""
+        if time.monotonic() < self._resume[direction]:
             return None
         began = time.perf_counter()
         try:
             found = do()
-        except Exception as error:  # each file system has its own, and they have no other kind in common
-            if not (way == "down" and isinstance(error, FileNotFoundError)):
-                self._failed(way, error)
+        except Exception as error:  # each file system raises its own errors, which share no narrower base class
+            if not (direction == "down" and isinstance(error, FileNotFoundError)):
+                self._failed(direction, error)
             return None
-        self._pause[way] = _PAUSE
+        self._pause[direction] = _PAUSE
         if size is not None:
-            self._learn(way, size(found), time.perf_counter() - began)
+            self._update_speed(direction, size(found), time.perf_counter() - began)
         return found
 
-    def _failed(self, way: Direction, error: Exception) -> None:
-        alone = isinstance(error, PermissionError | FileNotFoundError)  # what may not be written may yet be read
-        for each in (way,) if alone else ("down", "up"):
+    def _failed(self, direction: Direction, error: Exception) -> None:
+        alone = isinstance(error, PermissionError | FileNotFoundError)  # what cannot be written may be readable
+        for each in (direction,) if alone else ("down", "up"):
             self._resume[each] = time.monotonic() + self._pause[each]
             self._pause[each] *= 2
-        what = "read" if way == "down" else "written"
-        self.warn(f"{self.url} cannot be {what} ({type(error).__name__}: {error}): results are kept here alone")
+        what = "read" if direction == "down" else "written"
+        self.warn(f"{self.url} cannot be {what} ({type(error).__name__}: {error}): results stay local")
 
-    def _learn(self, way: Direction, size: int, seconds: float) -> None:
-        """Move what is predicted a third of the way towards what was measured."""
+    def _update_speed(self, direction: Direction, size: int, seconds: float) -> None:
+        """Move the prediction a third of the way towards the measured value."""
         if size < _LEARN:
-            self._latency[way] += (seconds - self._latency[way]) / 3
+            self._latency[direction] += (seconds - self._latency[direction]) / 3
         else:
-            rate = size / max(seconds - self._latency[way], 1e-6)
-            self._rate[way] += (rate - self._rate[way]) / 3
+            rate = size / max(seconds - self._latency[direction], 1e-6)
+            self._rate[direction] += (rate - self._rate[direction]) / 3
 
 
 def _file_system(url: str) -> tuple[Any, str]:
-    """The file system of a URL and the path in it; errors say what to install or what was meant."""
+    """Return the file system of a URL and the path in it; raise errors that name the package or the nearest scheme."""
     try:
         import fsspec
     except ImportError as error:
@@ -219,5 +219,5 @@ def _file_system(url: str) -> tuple[Any, str]:
         known, scheme = fsspec.available_protocols(), url.partition("://")[0]
         if scheme in known:
             raise
-        raise ValueError(f"no file system goes by {scheme}://, of {url}; {nearest(scheme, known)}") from error
+        raise ValueError(f"no file system has the scheme {scheme}:// of {url}; {nearest(scheme, known)}") from error
     return found, str(path).rstrip("/")

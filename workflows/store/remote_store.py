@@ -1,10 +1,11 @@
-"""A store that many machines share, behind any file system that fsspec knows, with a local layer in front.
+"""A store shared by many machines on any file system that fsspec supports, with a local layer in front.
 
-What is read is kept in the local layer, an ordinary `Store`; what is written goes to both. A
-payload there bears its own checksum in its name and is complete before the description that
-names it, so that two writers of one key cannot mix their halves. Leases, pins and the size
-budget are of the local layer alone: two machines may compute the same key, and the first one
-stays. A remote that fails costs one warning; the run goes on with the local layer.
+A value that is read is kept in the local layer, an ordinary `Store`; a value that is written
+goes to both. At the remote, a payload carries its checksum in its name and is complete before
+the metadata that name the payload, so that two writers of one key cannot mix their halves.
+Leases, pins and the size budget belong to the local layer alone: two machines may compute the
+same key, and the first result stays. A remote that fails costs one warning; the run goes on
+with the local layer.
 """
 
 from __future__ import annotations
@@ -33,10 +34,10 @@ _NAME = re.compile("[0-9a-f]{32}")
 
 
 def open_store(where: str | Path | None = None) -> Store:
-    """The store at a folder or a URL (``s3://bucket/name``); None: ``$NEUSEE_CACHE``, else the usual folder.
+    """Return the store at a folder or a URL (``s3://bucket/name``); None means ``$NEUSEE_CACHE`` or the usual folder.
 
-    Raises `ValueError` for a scheme that nobody knows, `ModuleNotFoundError` with the fix where
-    the package for it is missing.
+    Raises `ValueError` for an unknown scheme, and `ModuleNotFoundError` with the fix where the
+    package for the scheme is missing.
     """
     where = os.environ.get("NEUSEE_CACHE") or None if where is None else where
     if isinstance(where, str) and "://" in where:
@@ -45,118 +46,118 @@ def open_store(where: str | Path | None = None) -> Store:
 
 
 def local_layer(url: str) -> Path:
-    """``$NEUSEE_CACHE_LOCAL``, else a folder of the URL's own in ``~/.cache/neusee``."""
+    """Return ``$NEUSEE_CACHE_LOCAL``, else a folder of the URL's own in ``~/.cache/neusee``."""
     if named := os.environ.get("NEUSEE_CACHE_LOCAL"):
         return Path(named)
     return Path.home() / ".cache" / "neusee" / digest(url.rstrip("/"))[:16]
 
 
 class RemoteStore(Store):
-    """A `Store` whose misses are looked for at ``url``, and whose results go there too."""
+    """A `Store` that looks up its misses at ``url`` and also writes its results there."""
 
     def __init__(
         self, url: str, root: Path | str | None = None, *, verify: Verify | None = None, budget: int | None = None
     ) -> None:
-        self.url, self._far = url, RemoteFiles(url)
-        self._seen: dict[Key, Metadata] = {}  # descriptions read there
-        self._broken: set[Key] = set()  # what is there is of no use
+        self.url, self._remote = url, RemoteFiles(url)
+        self._seen: dict[Key, Metadata] = {}  # metadata read from the remote
+        self._broken: set[Key] = set()  # keys whose remote copy is unusable
         super().__init__(root or local_layer(url), verify=verify, budget=budget)
 
     def __reduce__(self) -> tuple[Any, ...]:
         return partial(type(self), self.url, self.root, verify=self.verify, budget=self.budget), ()
 
     def about(self, key: Key) -> Metadata | None:
-        """What is known of a result, here or there, without reading it."""
+        """Return the metadata of a result from the local layer or the remote, without reading the value."""
         here = super().about(key)
         if here is not None and is_kept(here):
             return here
-        return self._about_there(key) or here
+        return self._remote_metadata(key) or here
 
     def get(self, key: Key) -> Any:
-        """The result, or `KeyError` where there is none that can be trusted, neither here nor there."""
-        if not self._is_here(key):
-            self._bring(key)
+        """Return the value; raise `KeyError` where neither the local layer nor the remote has a trustworthy value."""
+        if not self._is_local(key):
+            self._fetch_value(key)
         return super().get(key)
 
     def put(self, key: Key, value: Any, about: Metadata) -> bool:
-        """Keep a result here and there; False where not even the local layer takes it."""
+        """Store a value locally and at the remote; return False where the local layer does not take the value."""
         if not super().put(key, value, about):
             return False
         self._send(key)
         return True
 
-    def note(self, key: Key, about: Metadata) -> bool:
-        """Keep what is known of a result, here and there, without its value."""
-        if not super().note(key, about):
+    def put_receipt(self, key: Key, about: Metadata) -> bool:
+        """Store the metadata of a result without its value, locally and at the remote."""
+        if not super().put_receipt(key, about):
             return False
-        if not self._far.exists(_note(key)) and not self._far.exists(f"{key}.json"):
-            self._far.write(_note(key), seal(receipt({"key": key, **about})))
+        if not self._remote.exists(_receipt_name(key)) and not self._remote.exists(f"{key}.json"):
+            self._remote.write(_receipt_name(key), seal(receipt({"key": key, **about})))
         return True
 
     def entries(self) -> Iterator[tuple[Key, Metadata]]:
-        """Every result's key and what is known of it: those here, then those that are only there; receipts too."""
+        """Yield every key with its metadata: the local ones, then those only at the remote; receipts are included."""
         here = set()
         for key, about in super().entries():
             here.add(key)
             yield key, about
-        there = sorted({name.partition(".")[0] for name in self._far.names() if ".json" in name} - here)
+        there = sorted({name.partition(".")[0] for name in self._remote.names() if ".json" in name} - here)
         with ThreadPoolExecutor(16) as pool:
-            for key, found in zip(there, pool.map(self._about_there, there), strict=True):
+            for key, found in zip(there, pool.map(self._remote_metadata, there), strict=True):
                 if found is not None:
                     yield key, found
 
     def write_seconds(self, size: float) -> float:
-        return super().write_seconds(size) + self._far.seconds("up", size)
+        return super().write_seconds(size) + self._remote.seconds("up", size)
 
     def read_seconds(self, size: float) -> float:
-        return super().read_seconds(size) + self._far.seconds("down", size)
+        return super().read_seconds(size) + self._remote.seconds("down", size)
 
-    def _is_here(self, key: Key) -> bool:
+    def _is_local(self, key: Key) -> bool:
         here = super().about(key)
         return here is not None and is_kept(here)
 
-    def _about_there(self, key: Key, look: bool = False) -> Metadata | None:
-        """The description at the remote of a value, else of a receipt; ``look``: whatever the listing says."""
+    def _remote_metadata(self, key: Key, look: bool = False) -> Metadata | None:
+        """Return the remote metadata of a value, else of a receipt; ``look`` reads them whatever the listing says."""
         value = f"{key}.json"
-        if key not in self._broken and (look or self._far.exists(value)) and not self._is_there(key):
-            self._learn(key, value)
-        if key not in self._seen and self._far.exists(_note(key)):
-            self._learn(key, _note(key))
+        if key not in self._broken and (look or self._remote.exists(value)) and not self._has_remote_value(key):
+            self._read_metadata(key, value)
+        if key not in self._seen and self._remote.exists(_receipt_name(key)):
+            self._read_metadata(key, _receipt_name(key))
         return self._seen.get(key)
 
-    def _is_there(self, key: Key) -> bool:
+    def _has_remote_value(self, key: Key) -> bool:
         return key in self._seen and is_kept(self._seen[key])
 
-    def _learn(self, key: Key, name: str) -> None:
-        """Read a description; one that is damaged is as good as none."""
-        raw = self._far.read(name)
+    def _read_metadata(self, key: Key, name: str) -> None:
+        """Read metadata from the remote; damaged metadata count as missing."""
+        raw = self._remote.read(name)
         if raw is None:
             return
         try:
             about = unseal(raw)
             if about["key"] != key:
-                raise ValueError(f"it is the result of {about['key']}")
+                raise ValueError(f"the metadata belong to the key {about['key']}")
         except (ValueError, LookupError, TypeError) as error:
             self._distrust(key, error)
         else:
             self._seen[key] = about
 
-    def _bring(self, key: Key) -> None:
-        """Fetch a value into the local layer; what cannot be fetched is not counted on again."""
-        about = self._about_there(key, look=True)
+    def _fetch_value(self, key: Key) -> None:
+        """Fetch a value into the local layer; a value that cannot be fetched is not tried again."""
+        about = self._remote_metadata(key, look=True)
         if about is None or not is_kept(about):
             return
         try:
-            if not self._brought(key, about):
+            if not self._value_fetched(key, about):
                 self._give_up(key)
         except ValueError as error:
             self._distrust(key, error)
         except OSError as error:
             self._give_up(key)
-            self._far.warn(f"{self.root} takes no copy of what is at {self.url} ({error}): set NEUSEE_CACHE_LOCAL")
+            self._remote.warn(f"{self.root} cannot keep copies of {self.url} ({error}): set NEUSEE_CACHE_LOCAL")
 
-    def _brought(self, key: Key, about: Metadata) -> bool:
-        """Whether it came, every byte compared with its checksum."""
+    def _value_fetched(self, key: Key, about: Metadata) -> bool:
+        """Return True if the value was fetched and every byte matches its checksum."""
         payload, bands = about["payload"], _bands(about["layout"])
         missing = {name: xxh3 for name, xxh3 in bands.items() if not self.blobs.has(name)}
         with ExitStack() as files:
@@ -164,10 +165,10 @@ class RemoteStore(Store):
             if payload and not self._fetched(_payload_name(key, payload["xxh3"]), part, payload):
                 return False
             with ThreadPoolExecutor(16) as pool:
-                if not all(pool.map(self._far.fetch, starmap(_band_name, missing.items()), parts)):
+                if not all(pool.map(self._remote.fetch, starmap(_band_name, missing.items()), parts)):
                     return False
             with self.disk.lock():
-                if not self._is_here(key):
+                if not self._is_local(key):
                     self._named(dict(zip(missing, parts, strict=True)), bands)
                     self._described(key, about, part)
         self.journal.append(key, about)
@@ -179,7 +180,7 @@ class RemoteStore(Store):
         return part
 
     def _named(self, parts: dict[str, str], bands: dict[str, str]) -> None:
-        """Put bands in their places; `ValueError` where one is not what was written, or another has its name."""
+        """Move bands to their places; raise `ValueError` where a band differs from the written one."""
         for name, part in parts.items():
             self.disk.make_folder(str(self.blobs.root))
             self.disk.link(part, f"{self.blobs.root}/{name[:2]}/{name}")
@@ -188,7 +189,7 @@ class RemoteStore(Store):
             self.blobs.read([name], (1, *blob.shape), blob.dtype, xxh3=[xxh3])
 
     def _described(self, key: Key, about: Metadata, part: str) -> None:
-        """Put a payload in its place and its description beside it, with the stamps that files have here."""
+        """Move a payload to its place and write its metadata with the time stamps of the local files."""
         about = dict(about)
         if about["payload"]:
             path = self.disk.path(key, "safetensors")
@@ -200,8 +201,8 @@ class RemoteStore(Store):
         self._lost.discard(key)
 
     def _fetched(self, name: str, part: str, payload: Metadata) -> bool:
-        """Whether ``name`` came; `ValueError` where it is not what was written."""
-        if not self._far.fetch(name, part):
+        """Return True if the file ``name`` was fetched; raise `ValueError` where its checksum differs."""
+        if not self._remote.fetch(name, part):
             return False
         found, size = xxhash.xxh3_128(), 0
         with open(part, "rb") as file:
@@ -210,13 +211,13 @@ class RemoteStore(Store):
                 size += len(block)
             os.fsync(file.fileno())
         if (size, found.hexdigest()) != (payload["size"], payload["xxh3"]):
-            raise ValueError("its bytes are not those that were written")
+            raise ValueError("checksum mismatch: the stored bytes have changed since they were written")
         return True
 
     def _send(self, key: Key) -> None:
-        """What is large first, then what names it; nothing where it was evicted in between."""
+        """Send the large files first and then the metadata that name them; send nothing where the value was evicted."""
         name, over = f"{key}.json", key in self._broken
-        if not over and self._far.exists(name):
+        if not over and self._remote.exists(name):
             return
         try:
             raw = Path(self.disk.path(key, "json")).read_bytes()
@@ -225,14 +226,16 @@ class RemoteStore(Store):
         except (OSError, ValueError, LookupError):
             return
         with ThreadPoolExecutor(16) as pool:
-            sent = pool.map(lambda to: (not over and self._far.exists(to)) or self._far.send(files[to], to), files)
+            sent = pool.map(
+                lambda to: (not over and self._remote.exists(to)) or self._remote.send(files[to], to), files
+            )
             if not all(sent):
                 return
-        if self._far.write(name, raw, over):
+        if self._remote.write(name, raw, over):
             self._broken.discard(key)
 
     def _files(self, key: Key, about: Metadata) -> dict[str, str]:
-        """By name at the remote the path of each file that a value needs beside its description."""
+        """Return, by name at the remote, the path of each file that a value needs beside its metadata."""
         found = {}
         if payload := about["payload"]:
             found[_payload_name(key, payload["xxh3"])] = self.disk.path(key, "safetensors")
@@ -246,10 +249,10 @@ class RemoteStore(Store):
 
     def _distrust(self, key: Key, error: Exception) -> None:
         self._give_up(key)
-        warnings.warn(f"the result {key} at {self.url} is damaged ({error}): it is not used", stacklevel=4)
+        warnings.warn(f"the result {key} at {self.url} is damaged ({error}) and is not used", stacklevel=4)
 
 
-def _note(key: Key) -> str:
+def _receipt_name(key: Key) -> str:
     return f"{key}.note.json"
 
 
@@ -262,7 +265,7 @@ def _band_name(name: str, xxh3: str) -> str:
 
 
 def _bands(layout: Any) -> dict[str, str]:
-    """Checksum by name of every band that a layout needs."""
+    """Return the checksum of every band that a layout needs, by name."""
     found: dict[str, str] = {}
     todo = [layout]
     while todo:
@@ -271,5 +274,5 @@ def _bands(layout: Any) -> dict[str, str]:
             found |= zip(item["stacked"]["names"], item["stacked"]["xxh3"], strict=True)
         todo += item.get("items", item.get("list", item.get("dict", {}).values()))
     if bad := [name for name in found if not _NAME.fullmatch(name)]:
-        raise ValueError(f"{bad[0]!r} is no name of a band")
+        raise ValueError(f"{bad[0]!r} is not the name of a band (32 hexadecimal digits)")
     return found

@@ -1,11 +1,11 @@
-"""The store: a folder of results by key, ``<2>/<key>.safetensors`` beside ``<key>.json``.
+"""Store of results: a folder of results by key, ``<2>/<key>.safetensors`` beside ``<key>.json``.
 
-The JSON says what a result is: the recipe of its key, its layout, facts, checks, seconds
-and versions. Small results stand in it whole; of others it may be all that there is, a
-receipt. Every byte is covered by a checksum that is compared on each load; an entry that
-fails is put aside with one warning and counts as missing. A result gets its name only when
-it is complete, so a killed process leaves no half of one. Where the folder cannot be
-written, a run warns once and goes on.
+The JSON describes a result: the recipe of its key, its layout, statistics, checks, seconds and
+versions. The JSON contains the whole value of a small result; of an evicted or unsaved value
+the JSON alone remains, called a receipt. A checksum covers every byte and is compared at each
+load. A result that fails the comparison is put aside with one warning and counts as missing.
+A result is renamed to its final name only when it is complete, so that a killed process leaves
+no half result. Where the folder cannot be written, a run warns once and goes on.
 """
 
 from __future__ import annotations
@@ -38,16 +38,17 @@ if TYPE_CHECKING:
 
 
 class Store:
-    """Results by key. Every way in which a folder can fail is a missing result, never a wrong one."""
+    """Results by key. Every failure of the folder leads to a missing result, never to a wrong result."""
 
     def __init__(
         self, root: Path | str | None = None, *, verify: Verify | None = None, budget: int | None = None
     ) -> None:
-        """``verify`` and ``budget`` (bytes): None takes ``$NEUSEE_CACHE_VERIFY`` and ``$NEUSEE_CACHE_BUDGET``.
+        """Open the store in ``root``; None takes ``$NEUSEE_CACHE_VERIFY`` and ``$NEUSEE_CACHE_BUDGET`` (bytes).
 
-        ``always`` compares the checksum of every payload that is loaded; ``sampled`` only where
-        its file is not the one that was written, untouched, and one time in twenty; ``never`` none.
-        What stands in the JSON is always compared, and the size of every payload.
+        ``verify="always"`` compares the checksum of every payload that is loaded. ``"sampled"``
+        compares a checksum where the file was touched after it was written, and otherwise one load in
+        twenty. ``"never"`` compares none. The checksum of the JSON and the size of every payload are
+        always compared.
         """
         self.root = default_root() if root is None else Path(root)
         self.verify: Verify = verify_mode(verify)
@@ -60,7 +61,7 @@ class Store:
         self._room = None if self.budget is None else CacheBudget(self.disk, self.budget)
         self._speeds = Speeds(self.disk)
         self._known: dict[str, Metadata] = {}
-        self._lost: set[str] = set()  # damaged, and perhaps not to be moved away
+        self._lost: set[str] = set()  # damaged results, which the user may not be allowed to move away
         self._used: set[str] = set()
         self._warned = False
 
@@ -69,16 +70,16 @@ class Store:
 
     @cached_property
     def blobs(self) -> Blobs:
-        """The bands of stacks."""
+        """Return the folder of the bands of stacks."""
         return payload.blobs_of(self.disk)
 
     def has(self, key: str) -> bool:
-        """Whether there is a value; its payload is not read."""
+        """Return True if the value is stored, without reading its payload."""
         about = self.about(key)
         return about is not None and is_kept(about)
 
     def about(self, key: str) -> Metadata | None:
-        """What is known of a result, without reading it; ``kept`` in it says whether there is a value too."""
+        """Return the metadata of a result, or None; the field ``kept`` tells whether the value is stored as well."""
         if key in self._known and is_kept(self._known[key]):
             return self._known[key]
         if key in self._lost:
@@ -94,7 +95,7 @@ class Store:
         return about
 
     def get(self, key: str) -> Any:
-        """The value, or `KeyError` where there is none that can be trusted."""
+        """Return the value; raise `KeyError` where no value exists that can be trusted."""
         about = self.about(key)
         while about is not None and is_kept(about):
             try:
@@ -110,61 +111,61 @@ class Store:
         raise KeyError(key)
 
     def put(self, key: str, value: Any, about: Metadata) -> bool:
-        """Keep a value with what is ``about`` it; False where the folder takes none (one warning) or the budget."""
+        """Store a value with its metadata; return False where the folder (one warning) or the budget forbids it."""
         return self._try(self._write, key, value, about)
 
-    def note(self, key: str, about: Metadata) -> bool:
-        """Keep what is ``about`` a result without its value, unless there is a value or such a receipt already."""
+    def put_receipt(self, key: str, about: Metadata) -> bool:
+        """Store the metadata of a result without its value, unless the value or its receipt is stored already."""
         return self._try(self._write_receipt, key, about)
 
     def pin(self, key: str) -> None:
-        """Keep a value whatever the budget. Raises `OSError` where the folder takes nothing."""
+        """Exempt a value from eviction. Raises `OSError` where the folder cannot be written."""
         maintenance.pin(self.disk, key)
 
     def unpin(self, key: str) -> None:
-        """Let a value go again when room is needed."""
+        """Allow the eviction of a value again."""
         maintenance.unpin(self.disk, key)
 
     def pinned(self) -> set[str]:
-        """The keys that are pinned."""
+        """Return the keys that are pinned."""
         return maintenance.pinned(self.disk)
 
     def gc(self, budget: int | None = None, dry: bool = False) -> Swept:
-        """Remove what belongs to no result, and, beyond ``budget`` (or the store's own), what saves least a byte."""
+        """Remove orphan files and evict values beyond ``budget`` (or the store's own), the cheapest per byte first."""
         swept = maintenance.gc(self, self.budget if budget is None else budget, dry)
         if not dry:
             self._forget(swept.evicted)
         return swept
 
     def check(self) -> Iterator[Checked]:
-        """Read every value, whatever ``verify`` says; what is damaged is put aside."""
+        """Read every value, compare every checksum whatever ``verify`` says, and put damaged results aside."""
         return maintenance.check(self)
 
-    def jot(self, key: str, value: Any, about: Metadata) -> bool:
-        """Keep a small value, of a larger one what is ``about`` it, without a file: to lose it is no loss."""
-        return self._try(self._jot, key, value, about)
+    def put_small(self, key: str, value: Any, about: Metadata) -> bool:
+        """Store a small value without a file of its own; store only the metadata of a larger value."""
+        return self._try(self._write_small, key, value, about)
 
     def entries(self) -> Iterator[tuple[str, Metadata]]:
-        """Every result's key and what is known of it, in the order of the keys; receipts too."""
+        """Yield every key with its metadata, receipts included, in the order of the keys."""
         for key in heapq.merge(metadata.names(self.disk), (key for key, _ in self.brief.each())):
             about = self.about(key)
             if about is not None:
                 yield key, about
 
     def claim(self, key: str) -> Lease | None:
-        """The right to compute ``key``; None while another live process has it. Who gets it late looks again first."""
+        """Return the lease to compute ``key``, or None while another process has it; look up again after a wait."""
         return self._leases.claim(key)
 
     def read_seconds(self, size: float) -> float:
-        """What loading ``size`` bytes takes, as this store's own loads did."""
+        """Return the predicted seconds for loading ``size`` bytes, from the loads of this store."""
         return self._speeds.seconds("read", size)
 
     def write_seconds(self, size: float) -> float:
-        """What keeping ``size`` bytes takes, as this store's own writes did."""
+        """Return the predicted seconds for storing ``size`` bytes, from the writes of this store."""
         return self._speeds.seconds("write", size)
 
     def _again(self, key: str) -> Metadata | None:
-        """What stands beside a result now; None where somebody has removed it."""
+        """Return the present metadata of a result, or None where another process has removed them."""
         self._known.pop(key, None)
         try:
             return metadata.read(self.disk, key)
@@ -172,7 +173,7 @@ class Store:
             return None
 
     def load(self, about: Metadata, verify: str) -> Any:
-        """The value that ``about`` describes; one of `UNREADABLE` where it cannot be trusted."""
+        """Return the value that ``about`` describes; raise one of `UNREADABLE` where the value cannot be trusted."""
         began = time.perf_counter()
         value, size = payload.load(self.disk, about, verify, self.blobs)
         self._speeds.learn("read", size, time.perf_counter() - began)
@@ -184,7 +185,7 @@ class Store:
             metadata.note_use(self.disk, key)
 
     def _try(self, write: Callable[..., bool], key: str, *what: Any) -> bool:
-        """Write; once more where what it needs was removed meanwhile."""
+        """Write; try once more where another process removed a needed folder or file meanwhile."""
         try:
             try:
                 return write(key, *what)
@@ -220,13 +221,13 @@ class Store:
         self._make_room(size)
         return True
 
-    def _jot(self, key: str, value: Any, about: Metadata) -> bool:
+    def _write_small(self, key: str, value: Any, about: Metadata) -> bool:
         entry = self._known[key] = self.brief.put(key, value, about)
         self.journal.append(key, entry)
         return is_kept(entry)
 
     def _write_parts(self, key: str, entry: Metadata, tensors: list[Tensor], banded: Any) -> None:
-        """What is large first, then what names it; of two processes with one key the first one's stays."""
+        """Write the large files first, then the metadata that name them; of two writers the first one stays."""
         from neusee.workflows.store import serialization
 
         with self.disk.temporary(key) as (part, file):
@@ -238,7 +239,7 @@ class Store:
             with self.disk.lock():
                 if key not in self._lost and metadata.has_value(self.disk, key):
                     return
-                if banded is not None:  # bands of no value yet may have been swept
+                if banded is not None:  # a sweep may have removed bands that no value names yet
                     names = serialization.blobs_in(serialization.pack(banded, self.blobs)[0])
                     entry["bands"] = {"names": names, "newest": payload.newest(self.disk, names)}
                 if tensors:
@@ -248,7 +249,7 @@ class Store:
                 self._write_about(key, entry)
 
     def _write_about(self, key: str, entry: Metadata) -> None:
-        """A torn entry fails its seal, so this small file need not wait for the disk."""
+        """Write the metadata without a sync to disk, because torn metadata fail their checksum."""
         path = self.disk.path(key, "json")
         with self.disk.temporary(key) as (part, file):
             file.write(metadata.seal(entry))
@@ -258,7 +259,7 @@ class Store:
         self._known[key] = entry
 
     def _write_receipt(self, key: str, about: Metadata) -> bool:
-        """What has the name already stays: it tells no less."""
+        """Write a receipt unless the name is taken: an existing file tells no less than a receipt."""
         entry = metadata.receipt({"key": key, **about})
         if self.about(key) is None:
             with self.disk.temporary(key) as (part, file):
@@ -270,7 +271,7 @@ class Store:
         return True
 
     def _make_room(self, size: int) -> None:
-        """Let values go where ``size`` more bytes are too many."""
+        """Evict values where ``size`` more bytes exceed the budget."""
         if self._room and (excess := self._room.excess(size)) > 0:
             gone = {candidate.key for candidate in maintenance.make_room(self, excess)[0]}
             self._forget(gone)
@@ -282,10 +283,10 @@ class Store:
 
     def _put_aside(self, key: str, error: Exception) -> None:
         self.put_aside(key, error)
-        warnings.warn(f"the stored result {key} is damaged ({error}): it is put aside", stacklevel=5)
+        warnings.warn(f"the stored result {key} is damaged ({error}) and is put aside", stacklevel=5)
 
     def put_aside(self, key: str, error: Exception) -> None:
-        """Move a damaged entry to ``bad/``, where someone may look at it; what another user owns stays."""
+        """Move a damaged result to ``bad/`` for inspection; a file of another user stays."""
         self._known.pop(key, None)
         self._lost.add(key)
         unreadable = isinstance(error, OSError) and not isinstance(error, FileNotFoundError)

@@ -1,9 +1,9 @@
-"""How a result lies on disk: a layout in JSON and its tensors in one safetensors file.
+"""Format of a result on disk: a layout in JSON and the tensors in one safetensors file.
 
-The file is written from the tensors' own memory and read through a memory map, so that
-neither way makes a copy. Each tensor begins at a multiple of 64 bytes, as a fresh one
-does: a kernel then takes the same path on a stored value as on a computed one. A `Stacked`
-tensor stands in no such file: its layout names one blob for each of its slices.
+The file is written from the memory of the tensors and read through a memory map, so that
+neither direction makes a copy. Each tensor begins at a multiple of 64 bytes, as a newly
+allocated tensor does: a kernel then takes the same path for a stored value as for a computed
+value. A `Stacked` tensor is not in the safetensors file: its layout names one blob for each slice.
 """
 
 from __future__ import annotations
@@ -22,7 +22,7 @@ from torch import Tensor
 from neusee.workflows.store.band_files import Blobs, Stacked, bytes_of, dtype_of
 
 _ALIGN = 64
-_FILLER = "_"  #: begins the names of entries that only fill up to the next multiple
+_FILLER = "_"  #: first letter of the names of padding entries, which fill up to the next multiple of `_ALIGN`
 _DTYPES = {
     torch.float64: "F64",
     torch.float32: "F32",
@@ -44,12 +44,16 @@ _NAMES = {name: dtype for dtype, name in _DTYPES.items()}
 
 
 def each_tensor(change: Callable[[Tensor], Tensor], value: Any) -> Any:
-    """``value`` with every tensor in it changed; one that occurs twice is changed once."""
+    """Return ``value`` with ``change`` applied to every tensor; a tensor that occurs twice is changed once."""
     return change(value) if isinstance(value, Tensor) else _change(value, change, {})
 
 
 def _change(item: Any, change: Callable[[Tensor], Tensor], done: dict[int, Tensor]) -> Any:
-    """A function of the module: a nested one that calls itself would hold its tensors until a garbage collection."""
+    """Change one item recursively.
+
+    This is a function of the module because a nested recursive function would hold its tensors until
+    the next garbage collection.
+    """
     if isinstance(item, Tensor):
         if id(item) not in done:
             done[id(item)] = change(item)
@@ -63,7 +67,7 @@ def _change(item: Any, change: Callable[[Tensor], Tensor], done: dict[int, Tenso
 
 
 def tensors_in(value: Any) -> list[Tensor]:
-    """Every tensor in ``value``, once."""
+    """Return every tensor in ``value``, each of them once."""
     if isinstance(value, Tensor):
         return [value]
     found: list[Tensor] = []
@@ -72,7 +76,7 @@ def tensors_in(value: Any) -> list[Tensor]:
 
 
 def settle(value: Any) -> Any:
-    """``value`` as the store would give it back: contiguous, and holding no larger memory than its own."""
+    """Return ``value`` as the store would return it: contiguous tensors that hold no memory beyond their own."""
     return each_tensor(_settled, value)
 
 
@@ -90,7 +94,7 @@ def _held(x: Tensor) -> int:
 
 
 class _Listed:
-    """Tensors in the order of a file; memory that is shared is listed once."""
+    """Tensors in the order of a file; memory that two tensors share is listed once."""
 
     def __init__(self) -> None:
         self.tensors: list[Tensor] = []
@@ -105,9 +109,9 @@ class _Listed:
 
 
 def pack(value: Any, blobs: Blobs | None = None) -> tuple[Any, list[Tensor]]:
-    """The layout of ``value`` as JSON, and its tensors; what is `Stacked` goes to ``blobs``, where there are some.
+    """Return the layout of ``value`` as JSON and its tensors; write each `Stacked` tensor to ``blobs`` if given.
 
-    Raises `TypeError` for what cannot be stored, and `OSError` where ``blobs`` takes none.
+    Raises `TypeError` for a value that cannot be stored, and `OSError` where ``blobs`` cannot be written.
     """
     listed = _Listed()
     return _layout(value, listed, blobs), listed.tensors
@@ -128,7 +132,7 @@ def _layout(item: Any, listed: _Listed, blobs: Blobs | None) -> dict[str, Any]:
         return {"dict": {k: _layout(v, listed, blobs) for k, v in item.items()}}
     if item is None or isinstance(item, bool | int | float | str):
         return {"value": item}
-    raise TypeError(f"a step must give tensors, numbers, texts, bytes or collections of these, not {type(item)}")
+    raise TypeError(f"a step must return tensors, numbers, strings, bytes or collections of these, not {type(item)}")
 
 
 def _stack_layout(item: Stacked, blobs: Blobs) -> dict[str, Any]:
@@ -138,13 +142,13 @@ def _stack_layout(item: Stacked, blobs: Blobs) -> dict[str, Any]:
 
 
 def unpack(layout: Any, tensors: list[Tensor], blobs: Blobs | None = None, verify: bool = True) -> Any:
-    """The value that `pack` took apart; raises `ValueError` where a band of it is lost."""
+    """Return the value that `pack` took apart; raise `ValueError` where a band of the value is lost."""
     ((kind, body),) = ((k, v) for k, v in layout.items() if k != "items")
     if kind == "tensor":
         return tensors[body]
     if kind == "stacked":
         if blobs is None:
-            raise ValueError("its bands are stored apart, and no one says where")
+            raise ValueError("the bands are stored in files of their own, and no folder of bands is given")
         return blobs.read(body["names"], body["shape"], dtype_of(body["dtype"]), verify, body["xxh3"])
     if kind == "bytes":
         return tensors[body].numpy().tobytes()
@@ -157,7 +161,7 @@ def unpack(layout: Any, tensors: list[Tensor], blobs: Blobs | None = None, verif
 
 
 def blobs_in(layout: Any) -> list[str]:
-    """The names of all blobs that a layout needs."""
+    """Return the names of all blobs that a layout needs."""
     found: list[str] = []
     todo = [layout]
     while todo:
@@ -169,35 +173,35 @@ def blobs_in(layout: Any) -> list[str]:
 
 
 def _class_path(item: tuple[Any, ...]) -> str:
-    """Where a named tuple's class stands; empty for a plain tuple."""
+    """Return module and name of a named tuple's class, or an empty string for a plain tuple."""
     kind = type(item)
     if kind is tuple:
         return ""
     if not kind.__module__.startswith("neusee.nodes.") or not hasattr(item, "_fields"):
-        raise TypeError(f"{kind.__module__}.{kind.__qualname__} cannot be stored: make it a NamedTuple in neusee.nodes")
+        raise TypeError(f"{kind.__module__}.{kind.__qualname__} cannot be stored: use a NamedTuple of neusee.nodes")
     return f"{kind.__module__}:{kind.__qualname__}"
 
 
 def _class(path: str) -> Callable[..., Any]:
     module, _, name = path.partition(":")
     if not module.startswith("neusee.nodes."):
-        raise ValueError(f"{path} is no class of neusee.nodes")
+        raise ValueError(f"{path} is not a class of neusee.nodes")
     found: Callable[..., Any] = getattr(importlib.import_module(module), name)
     return found
 
 
 def to_text(x: Tensor) -> list[Any]:
-    """A small tensor as JSON: type, shape, bytes."""
+    """Return a small tensor as JSON: type, shape, complex or real, and bytes."""
     return [*_kind(x), base64.b64encode(bytes_of(x)).decode()]
 
 
 def from_text(kind: str, shape: list[int], is_complex: bool, text: str) -> Tensor:
-    """The tensor that `to_text` wrote."""
+    """Return the tensor that `to_text` wrote."""
     return _tensor(bytearray(base64.b64decode(text)), 0, kind, shape, is_complex)
 
 
 def write(file: IO[bytes], tensors: list[Tensor]) -> str:
-    """Write a safetensors file; return the xxh3 of all its bytes."""
+    """Write a safetensors file; return the xxh3 checksum of all its bytes."""
     header: dict[str, Any] = {"__metadata__": {}}
     end = 0
     for i, x in enumerate(tensors):
@@ -222,11 +226,11 @@ def write(file: IO[bytes], tensors: list[Tensor]) -> str:
 
 
 def read(path: str, expected: str | None) -> list[Tensor]:
-    """Tensors of a file that `write` made, mapped into memory; all its bytes have the ``expected`` xxh3, if one is."""
+    """Return the tensors of a file that `write` made, mapped into memory; check the xxh3 if ``expected`` is given."""
     with open(path, "rb") as file:
         data = mmap.mmap(file.fileno(), 0, access=mmap.ACCESS_COPY)
     if expected is not None and xxhash.xxh3_128_hexdigest(data) != expected:
-        raise ValueError("its bytes are not those that were written")
+        raise ValueError("checksum mismatch: the stored bytes have changed since they were written")
     size = int.from_bytes(data[:8], "little")
     header = json.loads(data[8 : 8 + size])
     tensors = []

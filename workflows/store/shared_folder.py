@@ -1,8 +1,9 @@
-"""A folder to which many processes and users write at once.
+"""A folder to which many processes and users write at the same time.
 
-A file gets its name only when it is complete, and until then carries its owner's: what a
-killed process left behind is removed by the next one that writes, whatever the clock says.
-Folders, and the few files that all write to, take over what the root lets others do.
+A file is complete before it is renamed to its final name, and until then its temporary name
+contains the owner. The next writer removes the temporary files of killed processes, whatever
+the clock says. Folders, and the few files to which all processes write, copy the permissions
+of the root.
 """
 
 from __future__ import annotations
@@ -20,26 +21,26 @@ from typing import IO
 
 from neusee.workflows.store.process_owner import me, owner_of
 
-OLD = 3600.0  #: s after which a temporary file of another machine has no owner
-_PATIENCE = 10.0  #: s to wait for the lock; its holder may be stopped, and without it nothing goes wrong but work
-_LINKLESS = (errno.EPERM, errno.EOPNOTSUPP, errno.ENOSYS, errno.EMLINK)  #: of a file system without links
+OLD = 3600.0  #: s after which a temporary file of another machine counts as abandoned
+_PATIENCE = 10.0  #: s to wait for the lock; its holder may be stopped, and a missing lock costs repeated work only
+_LINKLESS = (errno.EPERM, errno.EOPNOTSUPP, errno.ENOSYS, errno.EMLINK)  #: errors of a file system without hard links
 _count = itertools.count()
 
 
 class Disk:
-    """The root of a store, and how one writes below it."""
+    """The root folder of a store, and the ways to write below the root."""
 
     def __init__(self, root: Path) -> None:
         self.root = root
-        self.folder = os.fspath(root)  # text, for a path object costs as much as the look-up
+        self.folder = os.fspath(root)  # text, because a path object costs as much as the look-up itself
         self._ready = False
 
     def path(self, key: str, suffix: str) -> str:
-        """Where a result lies."""
+        """Return the path of a result's file."""
         return f"{self.folder}/{key[:2]}/{key}.{suffix}"
 
     def prepare(self) -> None:
-        """Make the folder of temporary files, and remove what killed processes left in it."""
+        """Make the folder of temporary files, and remove the files of killed processes."""
         if not self._ready:
             self.root.mkdir(parents=True, exist_ok=True)
             self.make_folder(f"{self.folder}/tmp")
@@ -47,12 +48,12 @@ class Disk:
             self._ready = True
 
     def forget(self) -> None:
-        """Look again at what is there before the next write: somebody has removed it."""
+        """Look at the folder again before the next write, because another process has removed it."""
         self._ready = False
 
     @contextmanager
     def temporary(self, name: str) -> Iterator[tuple[str, IO[bytes]]]:
-        """A new file without a name of its own yet; what is not named in time is gone."""
+        """Yield path and handle of a new temporary file, which is deleted at the end unless it was renamed."""
         self.prepare()
         part = f"{self.folder}/tmp/{name}.{me()}.{next(_count)}"
         try:
@@ -63,7 +64,7 @@ class Disk:
                 os.unlink(part)
 
     def rename(self, part: str, path: str) -> None:
-        """Give a complete file its name, in place of what had it."""
+        """Rename a complete file to its final name, replacing an existing file."""
         try:
             os.replace(part, path)
         except FileNotFoundError:
@@ -71,7 +72,7 @@ class Disk:
             os.replace(part, path)
 
     def link(self, part: str, path: str) -> bool:
-        """Give a complete file its name unless it is taken; False where it is."""
+        """Link a complete file to its final name; return False where the name is already taken."""
         try:
             try:
                 os.link(part, path)
@@ -89,13 +90,13 @@ class Disk:
         return True
 
     def make_folder(self, folder: str) -> None:
-        """A folder in which all may write who may write in the root."""
+        """Make a folder in which every user may write who may write in the root."""
         with suppress(FileExistsError):
             os.mkdir(folder)
             self.share(folder, 0o7777)
 
     def share(self, path: str, mask: int = 0o666) -> None:
-        """Let others do with ``path`` what the root lets them do."""
+        """Give other users the permissions on ``path`` that they have on the root."""
         wanted, found = os.stat(self.folder).st_mode & mask, os.stat(path).st_mode
         if wanted & ~found:
             with suppress(OSError):
@@ -103,7 +104,7 @@ class Disk:
 
     @contextmanager
     def lock(self) -> Iterator[None]:
-        """One process at a time; a file system that knows no locks, or a holder that is stopped, goes without."""
+        """Hold the lock of the folder; go on without the lock if the file system has none or the holder is stopped."""
         self.prepare()
         file = self._lock_file()
         try:
@@ -126,9 +127,9 @@ class Disk:
             return os.open(path, os.O_RDONLY)
 
     def sweep(self, dry: bool = False, patience: float = math.inf) -> list[tuple[str, int]]:
-        """Remove the temporary files of processes that are dead; those removed, with their bytes.
+        """Remove the temporary files of dead processes; return the removed paths with their bytes.
 
-        Leases and badges of other machines stay for ``patience`` seconds: a clock that jumps makes none of them old.
+        Leases and badges of other machines stay for ``patience`` seconds, so that no jump of a clock makes them old.
         """
         gone = []
         for entry in os.scandir(f"{self.folder}/tmp"):
@@ -146,12 +147,12 @@ def _locked(file: int) -> bool:
     except BlockingIOError:
         return False
     except OSError:
-        pass  # a file system that knows no locks
+        pass  # a file system without locks
     return True
 
 
 def _abandoned(entry: os.DirEntry[str], patience: float) -> bool:
-    """Whether nobody works on a temporary file any more: its owner is dead, or unknown and it is old."""
+    """Return True if the owner of a temporary file is dead, or is unknown and the file is old."""
     words = entry.name.split(".")
     presence = words[-1] == "lease" or words[0] == "badge"
     if words[-1] == "lease":

@@ -1,8 +1,8 @@
-"""Small results that took less to compute than a file of their own takes to write: sealed lines of one file.
+"""Small results as sealed lines of one file, for results that take less time to compute than to write to a file.
 
-A line is one write. One that is torn, or not what was written, is no line; to lose one costs
-less than a millisecond. What several processes add is seen by all, for a look-up that finds
-nothing reads what has come since.
+A line is one write. A line that is torn or fails its checksum is ignored; the loss of a line
+costs less than a millisecond of computation. All processes see the lines of each other,
+because a look-up that misses reads the lines added since the last look-up.
 """
 
 from __future__ import annotations
@@ -17,7 +17,7 @@ from neusee.workflows.store import metadata
 from neusee.workflows.store.metadata import INLINE, UNREADABLE, Metadata
 from neusee.workflows.store.shared_folder import Disk
 
-MOST = 64 << 20  #: bytes from which the older half is let go
+MOST = 64 << 20  #: bytes of the file above which the older half is dropped
 _HEAD = b'{"key":"'
 _KEY = slice(len(_HEAD), len(_HEAD) + 32)
 
@@ -32,7 +32,7 @@ class SmallResults:
         self._file, self._offset = 0, 0
 
     def find(self, key: str) -> Metadata | None:
-        """What a line says of ``key``; None where there is none that can be trusted."""
+        """Return the content of the line of ``key``, or None where no line can be trusted."""
         if key not in self._lines:
             self._take_in()
         raw = self._lines.get(key)
@@ -45,7 +45,7 @@ class SmallResults:
             return None
 
     def put(self, key: str, value: Any, about: Metadata) -> Metadata:
-        """Add a value if it is small, else its receipt; gives what was written. Raises `OSError`, `TypeError`."""
+        """Append a value if it is small, else its receipt; return the line. Raises `OSError` or `TypeError`."""
         from neusee.workflows.store import serialization
 
         layout, tensors = serialization.pack(value)
@@ -59,7 +59,7 @@ class SmallResults:
         return entry
 
     def append(self, about: Metadata) -> None:
-        """Add a line. Raises `OSError` where that cannot be done."""
+        """Append a line. Raises `OSError` where the line cannot be written."""
         raw = metadata.seal(about)
         try:
             self._write(raw, os.O_APPEND | os.O_WRONLY)
@@ -69,14 +69,14 @@ class SmallResults:
             self._disk.share(self._path)
 
     def each(self) -> Iterator[tuple[str, Metadata]]:
-        """Every key with what its newest line says."""
+        """Yield every key with the content of its newest line."""
         self._take_in()
         for key in sorted(self._lines):
             if (about := self.find(key)) is not None:
                 yield key, about
 
     def compact(self) -> None:
-        """Keep the newest lines, half of what there may be; a line that comes meanwhile may be lost."""
+        """Keep the newest lines, up to half of `MOST` bytes; a line that is added meanwhile may be lost."""
         self._take_in()
         kept, size = list[bytes](), 0
         for raw in reversed(self._lines.values()):
@@ -91,16 +91,16 @@ class SmallResults:
             os.replace(part, self._path)
 
     def _write(self, raw: bytes, flags: int) -> None:
-        """The line begins with its end: what a killed process left of one before it stays by itself."""
+        """Write a line with its line end first, so that a torn line of a killed process stays separate."""
         file = os.open(self._path, flags, 0o666)
         try:
             if os.write(file, b"\n" + raw) != len(raw) + 1:
-                raise OSError(f"{self._path}: no room for a line")
+                raise OSError(f"{self._path}: no space left for a line")
         finally:
             os.close(file)
 
     def _take_in(self) -> None:
-        """What has been added since the last time; all of it where it is another file."""
+        """Read the lines added since the last call, or the whole file where the file was replaced."""
         try:
             stat = os.stat(self._path)
         except OSError:
@@ -115,7 +115,7 @@ class SmallResults:
             whole = raw.rfind(b"\n") if not raw.endswith(b"}") else len(raw)
             for line in raw[:whole].split(b"\n"):
                 if line.startswith(_HEAD):
-                    self._lines.pop(line[_KEY].decode(errors="replace"), None)  # the newest last
+                    self._lines.pop(line[_KEY].decode(errors="replace"), None)  # keep the newest line last
                     self._lines[line[_KEY].decode(errors="replace")] = line
             self._file, self._offset = os.fstat(file.fileno()).st_ino, self._offset + max(0, whole)
         if self._offset > MOST:

@@ -1,9 +1,9 @@
-"""Leave out what nobody will see: a recipe with cheaper steps where its outputs do not need the full ones.
+"""Cheaper steps: substitutes for full steps where the error in the outputs stays below the tolerance.
 
-The sensor sums bands into a few channels before anything random happens. Where all that is
-asked of an image are such sums, they are convolved instead of its bands. The steps that
-stand in are added beside the full ones, and only the wires of what reads them change; so a
-value that is asked for by name is always the full one.
+The sensor sums bands into a few channels before any random step. Where the steps after an image
+read only such sums, the sums are convolved instead of the bands. The substitutes are added beside
+the full steps, and only the wires of their readers change. A value requested by name is therefore
+always the full one.
 """
 
 from __future__ import annotations
@@ -14,22 +14,22 @@ from dataclasses import dataclass, field, replace
 from typing import TYPE_CHECKING, Any
 
 from neusee.workflows.graph.recipe_graph import METRIC_TOLERANCE, Recipe, Step, Substitution, Wire, in_order, needed
-from neusee.workflows.tolerance.tolerance_frontier import unheard
+from neusee.workflows.tolerance.tolerance_frontier import unbounded
 from neusee.workflows.tolerance.zero_effect_steps import without_nothing
 
 if TYPE_CHECKING:
     from neusee.nodes import Node
 
-CHANNELS = 0.25  #: share of the tolerance for the channels of one image; the level may follow a second one
-_LEAST = 2e-5  #: of a tolerance, below which sums over bands can hardly be proved: their rounding alone is 1.4e-6
-_MIXTURE = 0.1  #: share of the tolerance for a mixture, rounded down to a power of ten so that it is seldom another
+CHANNELS = 0.25  #: share of the tolerance for the channels of one image; the level may follow a second image
+_LEAST = 2e-5  #: tolerance below which sums over bands cannot be proved, because their round-off alone is 1.4e-6
+_MIXTURE = 0.1  #: share for a low-rank cube, rounded down to a power of ten so that the cube seldom changes
 
 
 def with_substitutions(recipe: Recipe, wanted: Iterable[str], pinned: Collection[str] = ()) -> Recipe:
-    """``recipe`` with cheaper steps for what only ``wanted`` needs; as it is with ``exact``.
+    """Return ``recipe`` with cheaper steps where only ``wanted`` needs them; unchanged with ``exact``.
 
-    The scene of an image that follows a step in ``pinned`` stays whole: what is being learnt
-    has no mixture yet. A recipe that was economised does not change again.
+    The scene of an image that follows a step in ``pinned`` stays whole, because a cube that is being
+    optimised has no low-rank form yet. A recipe with substitutions does not change again.
     """
     wanted = frozenset(wanted)
     if recipe.exact:
@@ -38,7 +38,7 @@ def with_substitutions(recipe: Recipe, wanted: Iterable[str], pinned: Collection
     order = needed(recipe, sorted(wanted))
     recipe = _limited(recipe, order)
     images = [recipe.steps[n] for n in order if recipe.steps[n].node.channel_sum_form is not None and n not in wanted]
-    if not images or recipe.tolerance * recipe.strict <= _LEAST:
+    if not images or recipe.tolerance * recipe.tolerance_scale <= _LEAST:
         return recipe
     behind = _behind(recipe, order, pinned)
     draft = _Draft(recipe, wanted, _readers(recipe, order))
@@ -50,13 +50,13 @@ def with_substitutions(recipe: Recipe, wanted: Iterable[str], pinned: Collection
 
 
 def _limited(recipe: Recipe, order: Sequence[str]) -> Recipe:
-    """The recipe with a limit where nodes do not tell, if its tolerance is larger."""
-    steps = unheard(recipe, order) if recipe.tolerance > METRIC_TOLERANCE else frozenset[str]()
-    return recipe if steps == recipe.unheard else replace(recipe, unheard=steps)
+    """Return the recipe with its unbounded steps noted, if its tolerance exceeds `METRIC_TOLERANCE`."""
+    steps = unbounded(recipe, order) if recipe.tolerance > METRIC_TOLERANCE else frozenset[str]()
+    return recipe if steps == recipe.unbounded else replace(recipe, unbounded=steps)
 
 
 def _behind(recipe: Recipe, order: Iterable[str], pinned: Collection[str]) -> set[str]:
-    """The pinned steps and what follows them."""
+    """Return the pinned steps and all steps that depend on them."""
     found = set(pinned)
     for name in order if found else ():
         if not found.isdisjoint(recipe.steps[name].sources):
@@ -65,7 +65,7 @@ def _behind(recipe: Recipe, order: Iterable[str], pinned: Collection[str]) -> se
 
 
 def _readers(recipe: Recipe, order: Iterable[str]) -> dict[str, list[str]]:
-    """By step, those that read it."""
+    """Return the readers of each step."""
     found: dict[str, list[str]] = {}
     for name in order:
         for source in dict.fromkeys(recipe.steps[name].sources):
@@ -75,7 +75,7 @@ def _readers(recipe: Recipe, order: Iterable[str]) -> dict[str, list[str]]:
 
 @dataclass(frozen=True)
 class Asked:
-    """What is read of an image: sums over its bands, by the channels' weights, and by the well's or not."""
+    """What the readers of an image need: sums over its bands with the weights of channels, and perhaps of the well."""
 
     bands: str
     responses: str
@@ -84,7 +84,7 @@ class Asked:
 
 
 def asked_of(recipe: Recipe, image: str, wanted: Iterable[str]) -> Asked | None:
-    """What the steps that ``wanted`` needs read of an image; None where it is more than sums over its bands."""
+    """Return what the steps for ``wanted`` read of an image; None where they read more than sums over its bands."""
     names = _readers(recipe, needed(recipe, wanted)).get(image, [])
     readers = [recipe.steps[name] for name in names]
     found = _Draft(recipe, frozenset(wanted), {}).spectral(image, readers)
@@ -93,7 +93,7 @@ def asked_of(recipe: Recipe, image: str, wanted: Iterable[str]) -> Asked | None:
 
 @dataclass
 class _Draft:
-    """A recipe while steps are put beside its own."""
+    """A recipe with the substitutes collected so far."""
 
     recipe: Recipe
     wanted: frozenset[str]
@@ -103,7 +103,7 @@ class _Draft:
     substitutions: list[Substitution] = field(default_factory=list)
 
     def collapse(self, image: Step) -> None:
-        """Put the channels of an image beside it, if all that reads it asks for sums over its bands."""
+        """Add the channel sums of an image, if all its readers need only sums over its bands."""
         readers = [self.rewired.get(name, self.recipe.steps[name]) for name in self.readers.get(image.name, ())]
         node, radiance, spectral = (
             image.node.channel_sum_form,
@@ -126,10 +126,10 @@ class _Draft:
         for reader in readers:
             changed = {i: _exchanged(wire, image.name, name) for i, wire in reader.wires.items()}
             self.rewired[reader.name] = replace(reader, wires=changed)
-        self.substitutions.append(Substitution(image.name, name, within, "only sums over its bands are asked for"))
+        self.substitutions.append(Substitution(image.name, name, within, "only sums over its bands are needed"))
 
     def spectral(self, image: str, readers: Sequence[Step]) -> tuple[str, str] | None:
-        """The bands and responses by which all ``readers`` ask for sums over an image; None where one asks for more."""
+        """Return the bands and responses with which all ``readers`` sum an image, or None where one needs more."""
         found = {(r.wires.get("bands"), r.wires.get("responses")) for r in readers if "responses" in r.node.inputs}
         if len(found) != 1 or not all(self._sums(r, image) for r in readers):
             return None
@@ -137,7 +137,7 @@ class _Draft:
         return (bands, responses) if isinstance(bands, str) and isinstance(responses, str) else None
 
     def finished(self) -> Recipe:
-        """The recipe with the steps that stand in."""
+        """Return the recipe with the substitutes."""
         if not self.substitutions:
             return self.recipe
         steps = {**self.recipe.steps, **self.added, **self.rewired}
@@ -149,7 +149,7 @@ class _Draft:
         )
 
     def _sums(self, reader: Step, image: str) -> bool:
-        """Whether a step asks nothing of the image but sums over its bands."""
+        """Return True if a step needs nothing of the image but sums over its bands."""
         reads = {i for i, wire in reader.wires.items() if image == wire or (isinstance(wire, tuple) and image in wire)}
         if not reads <= set(reader.node.accepts_channel_sums) or (
             reader.node.hooks.band_invariant and not reader.node.hooks.band_invariant(reader.params)
@@ -158,14 +158,14 @@ class _Draft:
         return all(self._even(reader.wires.get(i)) for i in reader.node.needs_band_invariant)
 
     def _even(self, wire: Wire) -> bool:
-        """Whether a result is the same for every band, as its own node says."""
+        """Return True if a result is the same for every band, as its own node states."""
         if not isinstance(wire, str):
             return wire is None
         step = self.recipe.steps[wire]
         return step.node.hooks.band_invariant is not None and step.node.hooks.band_invariant(step.params)
 
     def _rows(self, bands: str, responses: str, readers: list[Step], image: Step) -> str:
-        """The step that gives the weights of the bands; with the well's where a step reads bands but no responses."""
+        """Return the step that gives the weights of the bands, with those of the well where a step needs them."""
         from neusee.nodes import spectra
 
         well = _well(readers)
@@ -173,7 +173,7 @@ class _Draft:
         return self._add(name, spectra.rows, wires, {"well": well}, image)
 
     def _mixture(self, name: str, image: Step) -> str:
-        """The step that gives a cube as a mixture of few planes, made as far up as nodes take one."""
+        """Return the step that gives a cube in low-rank form, converted as early as the nodes accept the form."""
         from neusee.nodes import spectra
 
         step, new = self.recipe.steps[name], f"{name}.mixture"
@@ -187,18 +187,18 @@ class _Draft:
         return self._add(new, spectra.compress, {"cube": name}, within, step)
 
     def _add(self, name: str, node: Node, wires: Mapping[str, Wire], params: Mapping[str, Any], like: Step) -> str:
-        """A step that stands where ``like`` is written; gives its name."""
+        """Add a step with the place of ``like``; return its name."""
         self.added[name] = Step(name, node, params, wires, like.mark, {}, like.device)
         return name
 
 
 def _well(readers: Iterable[Step]) -> bool:
-    """Whether a step reads bands but no responses."""
+    """Return True if a step reads bands but no responses."""
     return any("bands" in r.node.inputs and "responses" not in r.node.inputs for r in readers)
 
 
 def _exchanged(wire: Wire, old: str, new: str) -> Wire:
-    """A wire with one step in place of another."""
+    """Return a wire with one step in place of another."""
     if isinstance(wire, tuple):
         return tuple(new if name == old else name for name in wire)
     return new if wire == old else wire

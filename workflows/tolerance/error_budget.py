@@ -1,4 +1,4 @@
-"""The account of a tolerance: what each step that is left out may have spent of it, for all that follows."""
+"""Error budget: the share of the tolerance that the omitted steps before each step may have used."""
 
 from __future__ import annotations
 
@@ -14,9 +14,9 @@ _NOTHING: dict[str, float] = {}
 
 
 class ErrorBudget:
-    """Bounds by decision, summed along the graph: what is left out upstream leaves less for what follows.
+    """Bounds by decision, summed along the graph: an omission upstream leaves less for the steps after it.
 
-    Steps are brought in running order, each with `pass_on` or `verdict`.
+    Steps are added in running order, each with `pass_on` or `verdict`.
     """
 
     def __init__(self, recipe: Recipe) -> None:
@@ -25,28 +25,28 @@ class ErrorBudget:
         self._spent: dict[str, dict[str, float]] = {}  # by step: decision -> its bound; shared where equal
 
     def copy(self) -> ErrorBudget:
-        """The same account, to be carried on by itself."""
+        """Return an independent copy of the budget."""
         found = copy(self)
         found._spent = dict(self._spent)
         return found
 
     def verdict(self, step: Step, params: Mapping[str, Any], facts_of: FactsOf) -> SkipDecision:
-        """Whether a step whose node has a bound is left out; with `Recipe.exact` nothing is."""
+        """Return the decision whether a step with a bound is left out; with `Recipe.exact` no step is."""
         spent = self.pass_on(step)
         if self._recipe.exact:
-            return SkipDecision(float("inf"), False, "everything is kept", "")
+            return SkipDecision(float("inf"), False, "the recipe is exact", "")
         found = judge(step, params, facts_of, self._recipe.allowed(step.name) * self._share - sum(spent.values()))
         if found.left_out:
             self.leave_out(step, found.bound)
         return found
 
     def leave_out(self, step: Step, bound: float) -> None:
-        """Note what leaving a step out may change."""
+        """Add the bound of a step that is left out."""
         if bound > 0:
             self._spent[step.name] = {**self._spent.get(step.name, _NOTHING), step.name: bound}
 
     def pass_on(self, step: Step) -> dict[str, float]:
-        """What was spent on the way to a step."""
+        """Return the bounds used on the way to a step, by decision."""
         parts = [spent for name in dict.fromkeys(step.sources) if (spent := self._spent.get(name))]
         if not parts:
             return _NOTHING

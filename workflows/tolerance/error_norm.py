@@ -1,8 +1,8 @@
-"""How far a result is from its reference: the one norm that every tolerance and every study means.
+"""Error norm: the distance of a result from its reference that every tolerance and every study uses.
 
-Root mean square of the difference over the reference's largest element; 1e-3 is a peak
-signal-to-noise ratio of 60 dB. Every bound of a node is on the largest difference, and so
-on this one too.
+The norm is the root mean square of the difference over the reference's largest element; 1e-3 is a
+peak signal-to-noise ratio of 60 dB. Every bound of a node bounds the largest difference, and
+therefore also this norm.
 """
 
 from __future__ import annotations
@@ -21,7 +21,7 @@ _PART = 1 << 22  #: elements that are compared at once in float64
 
 @dataclass(slots=True)
 class Sums:
-    """Of the differences between two tensors."""
+    """Sums over the differences between two tensors."""
 
     count: int
     squares: float = 0.0
@@ -29,23 +29,23 @@ class Sums:
 
 
 def error_of(value: Any, reference: Any) -> float:
-    """Root mean square of ``value - reference`` over the largest ``|reference|``.
+    """Return the root mean square of ``value - reference`` over the largest ``|reference|``.
 
-    Of tuples, lists and mappings the worst member. Where the reference is 0 everywhere, the root mean
-    square itself. Elements that are the same infinity, or both not a number, agree; one
-    that is not finite where the other is makes the error infinite. Raises `ValueError` where
-    the two are of different kind or shape.
+    For tuples, lists and mappings the worst member counts. Where the reference is 0 everywhere, the
+    root mean square itself is returned. Elements that are the same infinity, or both NaN, agree; an
+    element that is not finite where the other is finite makes the error infinite. Raises
+    `ValueError` where the two values differ in kind or shape.
     """
     return worst(value, reference, _rms)
 
 
 def largest_error(value: Any, reference: Any) -> float:
-    """The same with the largest difference instead of the root mean square."""
+    """Return the largest difference over the largest ``|reference|``; otherwise like `error_of`."""
     return worst(value, reference, _largest)
 
 
 def worst(value: Any, reference: Any, norm: Norm) -> float:
-    """The greatest ``norm`` of any pair of tensors or numbers."""
+    """Return the greatest ``norm`` of any pair of tensors or numbers."""
     pairs, found = [(value, reference)], 0.0
     while pairs:
         a, b = pairs.pop()

@@ -1,7 +1,7 @@
-"""What all that was left out, or computed more cheaply, may change at every step: carried along the graph by the nodes.
+"""Error propagation: upper bounds on the effect of omitted and approximated steps, from node to node.
 
-A node says how far its result may be off where its inputs are (`Node.propagate_error`). Where one does
-not, nothing is known behind it, and its inputs are what is held to the tolerance.
+A node computes the error of its result from the errors of its inputs (`Node.propagate_error`).
+Behind a node without this hook nothing is known, and its inputs are held to the tolerance instead.
 """
 
 from __future__ import annotations
@@ -21,39 +21,39 @@ _EXACT = ErrorBound(0.0)
 
 @dataclass(frozen=True, slots=True)
 class ErrorBounds:
-    """Bounds as shares of the largest element of each result."""
+    """Upper bounds, each relative to the largest element of a result."""
 
-    shares: Mapping[str, float] = field(default_factory=dict)  #: by step; infinite where no node tells
-    held: Mapping[str, float] = field(default_factory=dict)  #: of outputs, or what feeds a node that does not tell
+    shares: Mapping[str, float] = field(default_factory=dict)  #: by step; infinite where a node gives no bound
+    held: Mapping[str, float] = field(default_factory=dict)  #: of outputs, and of what feeds nodes without bounds
 
     def of(self, step: str) -> float | None:
-        """The bound of a step; None where nothing is known of it."""
+        """Return the bound of a step; None where no bound is known."""
         share = self.shares.get(step, 0.0)
         return share if math.isfinite(share) else None
 
     @property
     def worst(self) -> float:
-        """The greatest bound of what is held to the tolerance."""
+        """Return the greatest bound among the steps held to the tolerance."""
         return max(self.held.values(), default=0.0)
 
     def over(self, recipe: Recipe) -> float:
-        """The greatest bound over what it is held to; infinite where nothing is allowed."""
+        """Return the greatest ratio of a bound to its limit; infinite where the limit is 0."""
         shares = [(share, recipe.limit(name)) for name, share in self.held.items() if share > 0]
         return max((share / limit if limit > 0 else math.inf for share, limit in shares), default=0.0)
 
 
 class ToleranceNotProven(Exception):
-    """What was left out may have changed so many times what is allowed."""
+    """Error of a run whose bounds exceed the tolerance ``over`` times."""
 
     def __init__(self, over: float) -> None:
-        super().__init__(f"changes at most {over:.2g} times what the tolerance allows")
+        super().__init__(f"the error bound is {over:.2g} times the tolerance")
         self.over = over
 
 
 def proof(
     recipe: Recipe, order: Iterable[str], wanted: Iterable[str], done: Callable[[str], StepRecord], facts_of: FactsOf
 ) -> ErrorBounds:
-    """Carry the bounds of a run from step to step, in running order; nothing is computed."""
+    """Return the bounds of a run, carried from step to step in running order; nothing is computed."""
     found: dict[str, ErrorBound] = {}
     held: dict[str, float] = {}
     for name in order:
@@ -61,7 +61,7 @@ def proof(
         inputs = [_gathered(step.wires.get(i), found) for i in step.node.inputs]
         own = _own(step, done(name), facts_of)
         if own is None and not any(d.rms for part in inputs for d in _each(part)):
-            continue  # exact, as almost every step is
+            continue  # exact, like almost every step
         carried, facts = _carried(step, inputs, facts_of(name)), facts_of(name)
         if math.isinf(carried):
             told = {source: found[source].share for source in step.sources if source in found}
@@ -74,7 +74,7 @@ def proof(
 
 
 def _own(step: Step, done: StepRecord, facts_of: FactsOf) -> float | None:
-    """What a step itself adds, in the unit of its result: as a cheaper form, or by being left out."""
+    """Return the error that a step itself adds, in the unit of its result: by approximation or by omission."""
     share = done.bound if done.state == "left out" else done.error and done.error[0]
     facts = facts_of(done.step)
     if not share or facts is None:
@@ -89,7 +89,7 @@ def _carried(step: Step, inputs: list[ErrorBound | list[ErrorBound] | None], res
     if not any(d.rms for part in inputs for d in _each(part)):
         return 0.0
     if step.node.hooks.approximation_error is not None:
-        return 0.0  # it tells of all that it lacks
+        return 0.0  # the hook covers all errors of the result
     if (
         step.node.hooks.propagate_error is None
         or result is None

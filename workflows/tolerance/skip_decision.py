@@ -1,4 +1,4 @@
-"""Whether a step may be left out: its bound, from the facts of its inputs, against the recipe's tolerance."""
+"""Decision to leave out a step: its error bound, from the statistics of its inputs, against the tolerance."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ FactsOf = Callable[[str], TensorStats | None]
 
 @dataclass(frozen=True, slots=True)
 class SkipDecision:
-    """What leaving a step out changes at most, and what stands in for its result."""
+    """Upper bound on the effect of leaving a step out, and the step that replaces its result."""
 
     bound: float
     left_out: bool
@@ -26,7 +26,7 @@ class SkipDecision:
 
 
 class _Later:
-    """Facts that are looked up, and if need be computed, only when a bound asks for one of them."""
+    """Statistics that are looked up, or computed, only when a bound reads one of them."""
 
     __slots__ = ("_find", "_seen")
 
@@ -41,10 +41,10 @@ class _Later:
 
 
 def judge(step: Step, params: Mapping[str, Any], facts_of: FactsOf, tolerance: float) -> SkipDecision:
-    """The verdict on a step whose node has a bound; ``facts_of`` is asked for what the bound reads and no more."""
+    """Return the decision on a step with a bound; ``facts_of`` is called only for statistics that the bound reads."""
     node, first = step.node, step.wires.get(step.node.inputs[0])
     if node.hooks.skip_bound is None or not isinstance(first, str):
-        return SkipDecision(float("inf"), False, "nothing could stand in for it", "")
+        return SkipDecision(float("inf"), False, "the step has no input that could replace its result", "")
     seen: list[TensorStats] = []
     facts = [_facts(step.wires.get(name), facts_of, seen) for name in node.inputs]
     try:
@@ -54,10 +54,10 @@ def judge(step: Step, params: Mapping[str, Any], facts_of: FactsOf, tolerance: f
     except Exception as error:
         raise RunError(step, [], error) from error
     if not all(f.finite for f in seen):
-        return SkipDecision(float("inf"), False, "its input is not finite, so nothing bounds its effect", first)
+        return SkipDecision(float("inf"), False, "its input is not finite, so its effect has no bound", first)
     left_out = bound <= tolerance
     why = (
-        f"changes at most {bound:.2g}, tolerance {tolerance:.2g}" if bound < float("inf") else "no bound on its effect"
+        f"changes at most {bound:.2g}, tolerance {tolerance:.2g}" if bound < float("inf") else "its effect has no bound"
     )
     return SkipDecision(bound, left_out, why, first)
 

@@ -1,7 +1,7 @@
-"""Leave out what is nothing: a laser without light, ghosts of no energy, a window on which nothing lies.
+"""Steps of zero effect: a laser without power, ghosts without energy, a clean window.
 
-Found from parameters alone, before anything runs: a step whose node bounds its result by 0
-(`Node.absent`) is taken off the inputs to which it would add nothing.
+They are found from parameters alone, before the run: a step whose node bounds its result by 0
+(`Node.zero_bound`) is removed from the inputs to which it would add nothing.
 """
 
 from __future__ import annotations
@@ -14,18 +14,18 @@ from typing import Any
 from neusee.nodes import TensorStats
 from neusee.workflows.graph.recipe_graph import Recipe, Step, Substitution, Wire
 
-_DARK = TensorStats((), "float32", 0.0, 0.0, 0.0, 0, True)  #: of a result that is 0 everywhere
+_DARK = TensorStats((), "float32", 0.0, 0.0, 0.0, 0, True)  #: statistics of a result that is 0 everywhere
 
 
 class _Unknown:
-    """Facts of what has not run: to ask for one ends the question."""
+    """Statistics of a step that has not run; reading one of them raises `LookupError`."""
 
     def __getattr__(self, name: str) -> Any:
         raise LookupError(name)
 
 
 def without_nothing(recipe: Recipe, order: Iterable[str]) -> Recipe:
-    """``recipe`` whose steps do not read what is nothing; ``order``: its steps after their sources."""
+    """Return ``recipe`` without the inputs from steps of zero effect; ``order`` lists its steps after their sources."""
     dark: dict[str, None] = {}
     changed: dict[str, Step] = {}
     for name in order:
@@ -37,14 +37,14 @@ def without_nothing(recipe: Recipe, order: Iterable[str]) -> Recipe:
     if not changed:
         return recipe
     told = {e.step for e in recipe.substitutions}
-    why = "its parameters say that it is nothing"
+    why = "its parameters make its result 0"
     found = tuple(Substitution(name, "", 0.0, why) for name in dark if name not in told)
     steps, whole = {**recipe.steps, **changed}, recipe.unsubstituted or recipe
     return replace(recipe, steps=steps, substitutions=(*recipe.substitutions, *found), unsubstituted=whole)
 
 
 def _nothing(step: Step, dark: Mapping[str, None]) -> bool:
-    """Whether a step is nothing, as its parameters and what is known to be nothing tell."""
+    """Return True if a step's result is 0, from its parameters and the known zero inputs."""
     inputs = [_known(step.wires.get(name), dark) for name in step.node.inputs]
     try:
         bound = float(step.node.hooks.zero_bound(*inputs, **step.params)) if step.node.hooks.zero_bound else math.inf
@@ -62,7 +62,7 @@ def _known(wire: Wire, dark: Mapping[str, None]) -> Any:
 
 
 def without(step: Step, dark: Mapping[str, None]) -> dict[str, Wire]:
-    """The wires of a step less those that add nothing, and what goes with them."""
+    """Return the wires of a step without its zero inputs and the inputs that belong to them."""
     wires = dict(step.wires)
     for light, *others in step.node.additive_inputs:
         wire = wires.get(light)

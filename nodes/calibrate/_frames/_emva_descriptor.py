@@ -1,4 +1,4 @@
-"""A measurement as EMVA 1288 hands it on: a descriptor file and the images it names."""
+"""A measurement in the data format of EMVA 1288: a descriptor file, and the images that the file names."""
 
 from __future__ import annotations
 
@@ -22,12 +22,12 @@ _WORDS = {"b": "b EXPOSURE_NS PHOTONS", "d": "d EXPOSURE_NS [0]", "n": "n BITS W
 
 @dataclass
 class _Level:
-    """What a descriptor says of one level."""
+    """The entries of a descriptor for one level."""
 
     line: int
     photons: float
     exposure: float  #: s
-    images: list[tuple[int, Path]] = field(default_factory=list)  #: with the line that names it
+    images: list[tuple[int, Path]] = field(default_factory=list)  #: each with the number of its line
 
 
 @dataclass
@@ -38,7 +38,7 @@ class _Measurement:
 
 
 def _with_images(file: Any) -> tuple[Path, ...]:
-    """The descriptor and every image that it names, so that the content of all of them is what counts."""
+    """Return the descriptor and every image that the descriptor names, so that the content of all files counts."""
     if isinstance(file, tuple):
         return file
     path = Path(file)
@@ -47,7 +47,7 @@ def _with_images(file: Any) -> tuple[Path, ...]:
     images = [named for level in _parsed(path).levels for named in level.images]
     for line, image in images:
         if not image.is_file():
-            raise ValueError(f"{path.name}:{line}: no such image: {image}: put the images beside the descriptor")
+            raise ValueError(f"{path.name}:{line}: no such image: {image}: put the image beside the descriptor")
     return (path, *(image for _, image in images))
 
 
@@ -56,14 +56,14 @@ DescriptorFile = Annotated[tuple[Path, ...], BeforeValidator(_with_images, json_
 
 @node(rtol=0.0)
 def descriptor(*, file: DescriptorFile, scatter: Temporal = "temporal") -> Levels:
-    """Read a measurement by its EMVA 1288 descriptor, and reduce it level by level with variances as `reduce` has them.
+    """Read a measurement by its EMVA 1288 descriptor, and reduce each level with the variance of `reduce`.
 
     Shapes: -> (level,), in the order of the descriptor.
-    Units:  the descriptor's exposures ns, its photons per pixel and exposure; mean DN; variance DN2.
-    Error:  counted in whole numbers, as `reduce`. The difference of the means of a pair is part of its variance, but
-            not with `steady`.
-    Raises: ValueError, before the run where the descriptor or an image is missing or cannot be understood; for a level
-            of one image, and for images of another size or more bits than the descriptor says.
+    Units:  in the descriptor exposures ns, photons per pixel and exposure; mean DN; variance DN2.
+    Error:  counted in whole numbers, as in `reduce`. The difference of the means of a pair counts as variance, except
+            with `steady`.
+    Raises: ValueError, before the run, where the descriptor or an image is missing or cannot be read, and for a level
+            of one image; ValueError for images of another size or of more bits than the descriptor says.
     Source: EMVA Standard 1288, release 3.0 and 4.0 (data sets of the working group, descriptor file).
     """
     files = _with_images(file)
@@ -91,9 +91,9 @@ def _(result: Levels, **params: Any) -> list[Check]:
 def _reduced(name: str, said: _Measurement, level: _Level, scatter: Temporal) -> Levels:
     numbers = stack([image for _, image in level.images])
     if said.shape and numbers.shape[1:] != said.shape:
-        raise ValueError(f"{name}:{level.line}: images of {numbers.shape[1:]} where it says {said.shape} (y, x)")
+        raise ValueError(f"{name}:{level.line}: images of {numbers.shape[1:]}, descriptor says {said.shape} (y, x)")
     if int(numbers.max()) >= 2**said.bits:
-        raise ValueError(f"{name}:{level.line}: an image holds {numbers.max()} DN, more than {said.bits} bits can")
+        raise ValueError(f"{name}:{level.line}: an image holds {numbers.max()} DN, more than {said.bits} bits")
     found: Levels = reduce(torch.from_numpy(numbers), photons=level.photons, exposure=level.exposure, scatter=scatter)
     return found
 
@@ -110,12 +110,12 @@ def _parsed(path: Path) -> _Measurement:
         if len(level.images) < 2:
             raise ValueError(f"{path.name}:{level.line}: {len(level.images)} image(s): a level needs two")
     if not found.levels:
-        raise ValueError(f"{path.name}: no line 'b' or 'd', so no level: give an EMVA 1288 descriptor")
+        raise ValueError(f"{path.name}: no line 'b' or 'd', hence no level: give an EMVA 1288 descriptor")
     return found
 
 
 def _lines(path: Path) -> Iterator[tuple[int, str]]:
-    """Lines that say something, with their number."""
+    """Yield the lines with content, each with its number."""
     text = path.read_text(encoding="utf-8-sig", errors="replace")
     for number, line in enumerate(text.splitlines(), 1):
         if line.strip() and not line.lstrip().startswith("#"):
@@ -123,7 +123,7 @@ def _lines(path: Path) -> Iterator[tuple[int, str]]:
 
 
 def _take(found: _Measurement, kind: str, rest: str, folder: Path, line: int) -> None:
-    """What one line says."""
+    """Add the content of one line to the measurement."""
     if kind == "i":
         if not found.levels:
             raise ValueError("an image before the first level: begin a level with 'b' or 'd'")
@@ -143,7 +143,7 @@ def _take(found: _Measurement, kind: str, rest: str, folder: Path, line: int) ->
 
 
 def _level(line: int, kind: str, numbers: list[float]) -> _Level:
-    """A bright level has an exposure and photons above 0; a dark one no photons, or 0."""
+    """Return a level; a bright level needs exposure and photons above 0, and a dark level 0 photons or none."""
     exposure, photons = (*numbers, 0.0)[:2] if kind == "d" else numbers
     if not 0 < exposure < float("inf") or not (0 < photons < float("inf") if kind == "b" else photons == 0):
         raise ValueError

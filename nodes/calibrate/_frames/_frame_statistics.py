@@ -1,4 +1,4 @@
-"""Frames of a flat illumination to what a fit of the sensor needs: counts, means, variances, and histograms at ends."""
+"""Statistics of frames of a flat illumination: counts, means, variances, and histograms where moments mislead."""
 
 from __future__ import annotations
 
@@ -17,33 +17,33 @@ from neusee.nodes.values import Levels
 Photons = Annotated[float, Field(ge=0, allow_inf_nan=False)]  #: per pixel and exposure
 Temporal = Literal["temporal", "steady"]
 Scatter = Literal["all", "temporal", "steady"]
-_PIECE = 1 << 20  #: numbers that are looked at together, so that no second copy of a stack is made
-_TOP = 1 << 24  #: DN; more than any converter gives, and where float32 stops counting
+_PIECE = 1 << 20  #: numbers of one block, so that no second copy of a stack is needed
+_TOP = 1 << 24  #: DN; above any converter, and the limit of exact whole numbers in float32
 _COARSE = 0.8  #: DN, standard deviation below which whole numbers are too coarse for a mean and a variance
-_FEW, _SURE, _RATIO = 8, 5.0, 5.0  #: numbers at an end that count at all; beyond chance, in sigma; a multiple
+_FEW, _SURE, _RATIO = 8, 5.0, 5.0  #: least count at an end; least excess in sigma; least excess as a ratio
 
 
 @node(rtol=1e-12)
 def reduce(frames: Tensor, *, photons: Photons, exposure: Time, scatter: Scatter = "all") -> Levels:
-    """Reduce the frames of one flat illumination to their mean and variance, and to a histogram where these mislead.
+    """Reduce the frames of one flat illumination to mean and variance, and to a histogram where moments mislead.
 
-    `all`: every pixel of every frame is alike, as in a simulation. `temporal`: the variance is that within a pixel from
-    frame to frame, of two frames half the mean squared difference. `steady`: the same without what all pixels have in
-    common, half the squared difference of the means, as of a lamp that drifts: what `camera` wants. The histogram is
-    kept where numbers pile up at an end, and where they scatter by less than 0.8 DN.
+    `all`: every pixel of every frame is alike, as in a simulation. `temporal`: the variance of a pixel from frame to
+    frame, which for two frames is half the mean squared difference. `steady`: the temporal variance minus the part that
+    all pixels share, for two frames half the squared difference of the means, as from a drifting lamp; `camera` needs
+    this variance. The histogram is kept where numbers pile up at an end or have a standard deviation below 0.8 DN.
 
     Shapes: frames (frame, y, x) -> one level.
     Units:  frames DN, whole; photons per pixel and exposure; exposure s; mean DN; variance DN2.
-    Error:  counted in whole numbers: 1e-15. What piles up counts by a Gaussian of the mean and the variance of all
-            pixels: of `all` 5 sigma more than it has at an end, of the others, whose pixels differ, 5 times as much.
-    Raises: ValueError for numbers that are not whole, negative or not finite, for a stack that is not (frame, y, x),
+    Error:  counted in whole numbers: 1e-15. Numbers pile up at an end where their count exceeds the count of a Gaussian
+            with the mean and variance of all pixels: for `all` by 5 sigma; for the others, whose pixels differ, 5-fold.
+    Raises: ValueError for numbers that are fractional, negative or not finite, for a stack that is not (frame, y, x),
             for a single number, for `temporal` and `steady` of one frame, and for `steady` of one pixel.
     Source: EMVA Standard 1288, release 4.0 Linear, sections 6.5 and 6.6.
     """
     if frames.ndim != 3 or not frames.numel():
         raise ValueError(f"frames {tuple(frames.shape)} are not (frame, y, x): give a stack, one frame as (1, y, x)")
     if scatter != "all" and len(frames) < 2:
-        raise ValueError("one frame has no temporal variance: give two frames or more, or take scatter: all")
+        raise ValueError("one frame has no temporal variance: give two frames or more, or set scatter: all")
     if frames.numel() < 2 or (scatter == "steady" and frames[0].numel() < 2):
         raise ValueError("one number has no variance: give more pixels or frames")
     value, count = histogram(frames)
@@ -69,9 +69,9 @@ def _(result: Levels, *inputs: Tensor, **params: Any) -> list[Check]:
 
 @node(rtol=0.0)
 def levels(parts: list[Levels]) -> Levels:
-    """Join levels to one measurement, in the order given.
+    """Join levels into one measurement, in the given order.
 
-    Shapes: each (level,) and (cell,) -> all of them, one behind the other.
+    Shapes: each (level,) and (cell,) -> the same, concatenated.
     Units:  as in `Levels`.
     Error:  exact.
     Raises: ValueError without a level.
@@ -94,7 +94,7 @@ def _(result: Levels, *inputs: object) -> list[Check]:
 
 
 def histogram(frames: Tensor) -> tuple[Tensor, Tensor]:
-    """The whole numbers that occur, rising, and how often each does: two (cell,) int64."""
+    """Return the whole numbers that occur, rising, and the count of each number: two (cell,) int64."""
     counts = torch.zeros(0, dtype=torch.int64, device=frames.device)
     for piece in _pieces(frames.reshape(1, -1)):
         found = torch.bincount(_whole(piece).reshape(-1), minlength=len(counts))
@@ -105,25 +105,25 @@ def histogram(frames: Tensor) -> tuple[Tensor, Tensor]:
 
 
 def _pieces(rows: Tensor) -> Iterator[Tensor]:
-    """``rows`` cut into columns that together hold about as many numbers as are looked at together."""
+    """Split ``rows`` by columns into blocks of about `_PIECE` numbers."""
     return iter(torch.split(rows, max(1, _PIECE // len(rows)), 1))
 
 
 def _whole(piece: Tensor) -> Tensor:
-    """The same as int64; refuses what is no number of a converter."""
+    """Return the piece as int64; raise ValueError for a number that no converter gives."""
     whole = piece.to(torch.int64)
     low, high = (int(end) for end in torch.aminmax(whole))
     if low < 0 or high >= _TOP or (piece.is_floating_point() and not bool((whole == piece).all())):
         bad = (whole < 0) | (whole >= _TOP) | (whole != piece)
         raise ValueError(
-            f"frames hold {float(piece[bad][0]):g}, which is no digital number: give whole numbers from 0 to {_TOP - 1}"
+            f"frames hold {float(piece[bad][0]):g}, not a digital number: give whole numbers from 0 to {_TOP - 1}"
             ", as the camera gives them, neither corrected nor scaled"
         )
     return whole
 
 
 def _within(frames: Tensor, steady: bool) -> float:
-    """Sum over the pixels of the squared deviations from the mean of each pixel, and from that of each frame."""
+    """Sum the squared deviations from the mean of each pixel, and with ``steady`` also from the mean of each frame."""
     parts, sums = [], torch.zeros(len(frames), dtype=torch.float64)
     for piece in _pieces(frames.reshape(len(frames), -1)):
         numbers = piece.double()
@@ -135,7 +135,7 @@ def _within(frames: Tensor, steady: bool) -> float:
 
 
 def _kept(value: Tensor, count: Tensor, mean: float, sigma: float, alike: bool) -> bool:
-    """Whether mean and variance tell less than the histogram does."""
+    """Return True where the histogram holds information that mean and variance lack."""
     if sigma < _COARSE:
         return True
     ends = ((value >= value[-1] - 1, value[-1] - 1.5), (value <= value[0] + 1, value[0] - 0.5))
@@ -143,8 +143,8 @@ def _kept(value: Tensor, count: Tensor, mean: float, sigma: float, alike: bool) 
 
 
 def _piled(held: float, total: float, low: float, sigma: float, alike: bool) -> bool:
-    """Whether two neighbouring numbers, the lower from ``low`` above the mean, are held by more pixels than they would
-    be of a Gaussian."""
+    """Return True where two neighbouring numbers, the lower ``low`` above the mean, have more pixels than a Gaussian
+    gives."""
     expected = total * 0.5 * abs(math.erf((low + 2.0) / sigma / math.sqrt(2)) - math.erf(low / sigma / math.sqrt(2)))
     more = _SURE * math.sqrt(expected) if alike else (_RATIO - 1) * expected
     return held >= _FEW and held - expected > more

@@ -1,4 +1,4 @@
-"""Frames out of files, number by number as the camera gave them."""
+"""Frames from files, with the unchanged numbers of the camera."""
 
 from __future__ import annotations
 
@@ -10,13 +10,13 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-_GREY = ("L", "I", "I;16", "I;16B", "I;16L", "F")  #: pixels that Pillow gives as they stand in the file
+_GREY = ("L", "I", "I;16", "I;16B", "I;16L", "F")  #: pixel modes that Pillow reads without conversion
 _FITS = (".fits", ".fit", ".fts")
-_TOP = 1 << 24  #: DN; no converter gives as much
+_TOP = 1 << 24  #: DN; above any converter
 
 
 def read(file: Path) -> NDArray[np.int32]:
-    """The frames that a file holds, (frame, y, x) int32; raises `ValueError` for what is no raw frame."""
+    """Read the frames of a file, (frame, y, x) int32; raise ValueError for a file without raw frames."""
     reader = readable(file)
     stack = reader(file)
     if stack.ndim not in (2, 3) or not stack.size:
@@ -25,13 +25,13 @@ def read(file: Path) -> NDArray[np.int32]:
         whole = stack.astype(np.int64)
     bad = (whole != stack) | (whole < 0) | (whole >= _TOP)
     if bad.any():
-        raise ValueError(f"{file} holds {stack[bad][0]}, which is no digital number: give raw frames, whole numbers "
+        raise ValueError(f"{file} holds {stack[bad][0]}, not a digital number: give raw frames, whole numbers "
                          f"from 0 to {_TOP - 1}")  # fmt: skip
     return whole.astype(np.int32).reshape(-1, *stack.shape[-2:])
 
 
 def readable(file: Path) -> Callable[[Path], NDArray[Any]]:
-    """What reads this kind of file; raises `ValueError` where nothing does."""
+    """Return the reader of this kind of file; raise ValueError for an unknown kind."""
     suffix = file.suffix.lower()
     if suffix in _FITS and importlib.util.find_spec("astropy") is None:
         raise ValueError(f"{file.name} needs astropy: pip install 'neusee[fits]'")
@@ -41,14 +41,14 @@ def readable(file: Path) -> Callable[[Path], NDArray[Any]]:
 
 
 def _picture(file: Path) -> NDArray[Any]:
-    """PNG and TIFF, all pages, by Pillow."""
+    """Read all pages of a PNG or TIFF file by Pillow."""
     from PIL import Image, ImageSequence, UnidentifiedImageError
 
     try:
         with Image.open(file) as image:
             pages = [_page(file, page) for page in ImageSequence.Iterator(image)]
     except UnidentifiedImageError:
-        raise ValueError(f"{file} is no picture that can be read: save it as 16-bit grey PNG") from None
+        raise ValueError(f"{file} is not a readable picture: save the frame as 16-bit grey PNG") from None
     return np.stack(_alike(file, pages))
 
 
@@ -56,13 +56,13 @@ def _page(file: Path, page: Any) -> NDArray[Any]:
     depth = file.read_bytes()[24:25] if page.format == "PNG" else b"\x08"
     if page.mode not in _GREY or page.format not in ("PNG", "TIFF") or depth not in (b"\x08", b"\x10"):
         raise ValueError(f"{file} is {page.format} with pixels of kind {page.mode}, not raw grey of 8 or 16 bits: save "
-                         "one channel as PNG or TIFF, without colour or compression that loses")  # fmt: skip
+                         "one channel as PNG or TIFF, without colour and without lossy compression")  # fmt: skip
     return np.array(page)
 
 
 def _alike(file: Path, pages: list[NDArray[Any]]) -> list[NDArray[Any]]:
     if len({page.shape for page in pages}) > 1:
-        raise ValueError(f"{file}: its pages differ in size: give frames of one size")
+        raise ValueError(f"{file}: the pages differ in size: give frames of one size")
     return pages
 
 
@@ -82,14 +82,14 @@ def _exr(file: Path) -> NDArray[Any]:
 
 
 def _fits(file: Path) -> NDArray[Any]:
-    """The first image of a FITS file, with its zero and scale applied."""
+    """Read the first image of a FITS file, with zero and scale of the file applied."""
     from astropy.io import fits
 
     with fits.open(file) as opened:
         for part in opened:
             if part.data is not None and getattr(part, "is_image", False):
                 return np.array(part.data)
-    raise ValueError(f"{file} holds no image: give a FITS file with one")
+    raise ValueError(f"{file} holds no image: give a FITS file with an image")
 
 
 _READERS: dict[str, Callable[[Path], NDArray[Any]]] = {

@@ -19,12 +19,12 @@ from neusee.nodes.units import DataFiles
 def frames(*, files: DataFiles) -> Tensor:
     """Read the frames of one flat illumination: PNG, TIFF, EXR, NumPy or FITS files of raw numbers.
 
-    Shapes: -> (frame, y, x) int32, all frames of one file after the other.
+    Shapes: -> (frame, y, x) int32, the frames of all files in order.
     Units:  DN.
     Error:  exact.
-    Raises: ParameterError before the run for a kind of file that is not read; ValueError for colour, for numbers that
-            are not whole, and for frames that differ in size.
-    Source: EMVA Standard 1288, release 4.0 Linear, section 6.5 (raw frames, nothing corrected).
+    Raises: ParameterError before the run for an unknown kind of file; ValueError for colour, for numbers that are not
+            whole, and for frames that differ in size.
+    Source: EMVA Standard 1288, release 4.0 Linear, section 6.5 (raw frames, without corrections).
     """
     return torch.from_numpy(stack(files))
 
@@ -46,7 +46,7 @@ def _(result: Tensor, **params: Any) -> list[Check]:
 
 
 def stack(files: Sequence[Path]) -> np.ndarray[Any, np.dtype[np.int32]]:
-    """The frames of all files; they must agree in size."""
+    """Read the frames of all files; raise ValueError where the frames differ in size."""
     found = [read(file) for file in files]
     for file, each in zip(files, found, strict=True):
         if each.shape[1:] != found[0].shape[1:]:

@@ -1,4 +1,4 @@
-"""Moments that another program has measured, from a table."""
+"""Moments of frames, measured by another program, from a table."""
 
 from __future__ import annotations
 
@@ -29,21 +29,21 @@ def table(
     drift: str | None = None,
     exposure_unit: Literal["s", "ms", "us", "ns"] = "s",
 ) -> Levels:
-    """Read the moments of pairs of frames from a CSV file, a level a line, by the names of its columns.
+    """Read the moments of pairs of frames from a CSV file, one level per line, by the names of the columns.
 
-    ``drift`` names the difference of the two means, where that was taken off the variance: half its square is put back,
-    for EMVA does not take it off.
+    ``drift`` names the column with the difference of the two means, for a table whose variance excludes that
+    difference. Half the square of the difference is then added, because the variance of EMVA 1288 includes that part.
 
     Shapes: -> (level,), in the order of the file; no histograms.
-    Units:  photons per pixel and exposure; exposure as its unit says; pixels of one frame; mean DN; variance DN2.
+    Units:  photons per pixel and exposure; exposure in `exposure_unit`; pixels of one frame; mean DN; variance DN2.
     Error:  exact.
-    Raises: ParameterError before the run for a column that is missing; ValueError for what is no number.
+    Raises: ParameterError before the run for a missing column; ValueError for a cell without a valid number.
     Source: EMVA Standard 1288, release 4.0 Linear, section 6.6 (variance of a pair of frames).
     """
     names = {"photons": photons, "exposure": exposure, "pixels": pixels, "mean": mean, "variance": variance}
     rows = _rows(file, {**names, **({} if drift is None else {"drift": drift})})
     if not rows:
-        raise ValueError(f"{file.name} has no line below its header: give a level a line")
+        raise ValueError(f"{file.name} has no line below its header: give one line per level")
     columns = {name: torch.tensor([row[name] for row in rows], dtype=torch.float64) for name in rows[0]}
     measured = columns["variance"] + (columns["drift"].square() / 2 if drift is not None else 0.0)
     times, number = columns["exposure"] * _SECONDS[exposure_unit], columns["pixels"]
@@ -86,5 +86,5 @@ def _number(text: str | None, name: str, where: str) -> float:
     least = {">= 0": number >= 0, "> 0": number > 0, ">= 1": number >= 1 and number.is_integer()}
     if not math.isfinite(number) or not least.get(wanted, True):
         kind = "whole number" if name == "pixels" else "number"
-        raise ValueError(f"{where}: {text!r} is no {name}: write a {kind}, {wanted}")
+        raise ValueError(f"{where}: {text!r} is not valid for {name}: write a {kind}, {wanted}")
     return number

@@ -1,4 +1,4 @@
-"""Frames of a flat field, by the functions that make a picture."""
+"""Simulated frames of a flat field, from the steps that simulate a picture."""
 
 from __future__ import annotations
 
@@ -39,12 +39,12 @@ def expose(
     spread: Spread = 1.0,
     rng: Generator,
 ) -> Tensor:
-    """Take frames of a flat field with this sensor, by the very functions that make a picture.
+    """Simulate frames of a flat field with this sensor, by the same steps that simulate a picture.
 
     Shapes: -> (frame, y, x).
     Units:  result DN; photons per pixel and exposure; dark_current e- of one dark_exposure, in proportion to the
             exposure; offset, read_noise, full_well e-; gain K, DN/e-.
-    Error:  every pixel alike: neither non-uniformity nor drift of the lamp. That of each step of the sensor.
+    Error:  that of each step of the sensor. All pixels are alike: neither non-uniformity nor drift of the lamp.
     Source: NeuSee, section Sensor Image; EMVA Standard 1288, release 4.0 Linear (mathematical model).
     """
     flat = torch.full((frames, *shape), photons, device=rng.device)

@@ -1,4 +1,4 @@
-"""How likely levels of a real camera are: its lamp drifts, its pixels differ, and it is not quite linear."""
+"""Likelihood of the levels of a real camera, with a drifting lamp, unequal pixels and a slight non-linearity."""
 
 from __future__ import annotations
 
@@ -16,13 +16,13 @@ from neusee.nodes.sensor._saturation import Efficiency
 from neusee.nodes.units import Electrons, Gain, Real, Time
 from neusee.nodes.values import Levels
 
-Scattered = Annotated[float, Field(ge=0, allow_inf_nan=False)]  #: a standard deviation; none is 0
-_QUIET = 0.24  #: DN2, least variance that EMVA 1288 takes for that of a signal
-_COARSE = 0.8  #: DN, standard deviation below which levels are counted though nothing is cut off
+Scattered = Annotated[float, Field(ge=0, allow_inf_nan=False)]  #: a standard deviation; 0 for none
+_QUIET = 0.24  #: DN2, least variance that EMVA 1288 accepts for a signal
+_COARSE = 0.8  #: DN, standard deviation below which levels keep a histogram although no number is cut off
 
 
 class _Camera(NamedTuple):
-    """All (..., 1) float64."""
+    """The parameters of a camera; all (..., 1) float64."""
 
     gain: Tensor  #: K at no signal, DN/e-
     efficiency: Tensor
@@ -37,20 +37,20 @@ class _Camera(NamedTuple):
 
 
 class _Seen(NamedTuple):
-    """What the measured means stand for, by one camera: all (..., level)."""
+    """The electrons that the measured means stand for in one camera; all (..., level)."""
 
-    electrons: Tensor  #: more than in the shortest dark
-    slope: Tensor  #: DN per electron, there
-    possible: Tensor  #: the response rises
+    electrons: Tensor  #: electrons above the shortest dark level
+    slope: Tensor  #: DN per electron at that signal
+    possible: Tensor  #: whether the response rises
 
 
 class _Told(NamedTuple):
-    """What was measured, less what is expected, in standard deviations, and these as logarithms: (..., level)."""
+    """Pairs (..., level): measured minus expected value in standard deviations, and the log standard deviation."""
 
     variance: tuple[Tensor, Tensor]
     mean: tuple[Tensor, Tensor]
     possible: Tensor
-    law: Tensor  #: the variance that is expected, DN2
+    law: Tensor  #: the expected variance, DN2
 
 
 @node()
@@ -72,26 +72,27 @@ def camera(
     share: Share = 0.7,
     told: bool = True,
 ) -> Likelihood:
-    """Weigh levels of a real camera: each variance against the measured mean, each mean against a lamp that drifts.
+    """Compute the likelihood of a real camera's levels: variances given the means, and means given a drifting lamp.
 
-    A mean of y DN above the dark stands for e electrons, y = K e (1 + bend x + twist x**2), x = y over that of the
-    brightest level used. Then ln(variance) is normal about ln((dy/de)**2 (sigma_d**2 + e) + rounding), whatever the
-    lamp did, with sigma_d the temporal dark noise. And e is normal about quantum_efficiency * photons +
-    dark_current * (exposure - shortest dark): a dark is a level without photons. Not stated by frames are
-    ``scatter``, of every variance beyond chance (relative), ``lamp``, of the light (relative), and ``drift``, of
-    the dark signal (DN): each is one normal law for all levels, held or free as any parameter. Left out: levels
-    brighter than ``share`` of saturation, which is where the variance is greatest, and levels that pile up at an
-    end. Any number may be a tensor (walker,).
+    A mean of y DN above the dark stands for e electrons, y = K e (1 + bend x + twist x**2), where x is y over the y of
+    the brightest level used. Then ln(variance) is normal about ln((dy/de)**2 (temporal_dark_noise**2 + e) + rounding),
+    however the lamp drifts, and e is normal about quantum_efficiency * photons + dark_current * (exposure - shortest
+    dark). A dark level is a level without photons. Three standard deviations are not measured within a level:
+    ``scatter`` of every variance beyond chance (relative), ``lamp`` of the light (relative), and ``drift`` of the dark
+    signal (DN). Each stands for one normal distribution over all levels, and may be held or free like any parameter.
+    Two kinds of levels are excluded: levels brighter than ``share`` of saturation, where saturation is the level of the
+    greatest variance, and levels whose numbers pile up at an end. Any number may be a tensor (walker,).
 
     Shapes: levels -> log (walker,), deviance (walker, level), scaled (walker, row).
     Units:  gain K, DN/e-, at no signal; dark_signal DN and temporal_dark_noise e- of the shortest dark; dark_current
-            e- in ``dark_exposure``; log in nats, of means in DN and logarithms of variances.
-    Error:  levels are taken as independent, photons as right but for ``lamp``: an error of all of them is one of the
-            efficiency. The variance must be temporal; a lamp that flickers within a pair is to be taken off it. Pixels
-            that differ by 1 % then move the gain by 1e-4. A response that is no parabola is left to `spread` of the
-            posterior. Below 0.24 DN2 rounding is no noise of its own: 0.2 DN of dark noise are found wrong.
-    Raises: ValueError without a dark, without two levels of different light below saturation, for a level without
-            variance, and where light makes nothing brighter.
+            e- in ``dark_exposure``; log in nats, for means in DN and logarithms of variances.
+    Error:  levels count as independent, and photons as exact except for ``lamp``: a common error of all photons becomes
+            an error of the efficiency. The variance must be temporal, without flicker of the lamp within a pair
+            (`steady`). Pixels that differ by 1 % then shift the gain by 1e-4. A response that is not a parabola is left
+            to `spread` of the posterior. Below 0.24 DN2 rounding is not independent noise: a temporal dark noise of
+            0.2 DN is estimated wrongly.
+    Raises: ValueError without a dark level, without two levels of different light below saturation, for a level
+            without variance, and where more light does not raise the signal.
     Source: EMVA Standard 1288, release 4.0 Linear, sections 2 and 6.6 (photon transfer); Janesick, Photon Transfer.
     """
     seen, top, first = _used(levels, share)
@@ -108,9 +109,9 @@ def camera(
         return Likelihood(total, *(torch.zeros(0, dtype=torch.float64) for _ in range(5)))
     deviance = each.new_zeros(*each.shape[:-1], len(levels.mean)).index_copy(-1, seen, each)
     freedom = torch.zeros_like(levels.mean).index_fill(0, seen, 2.0)
-    # A residual and the logarithm of its width tell, squared and summed, what Fisher's information is in the mean
+    # squared derivatives of a residual and of its log width sum, on average, to the Fisher information
     mean = levels.mean.expand(*each.shape[:-1], -1)
-    variance = torch.zeros_like(mean).index_copy(-1, seen, found.law)  # of levels that are looked at
+    variance = torch.zeros_like(mean).index_copy(-1, seen, found.law)  # for the levels used
     return Likelihood(total, deviance, freedom, torch.cat([*found.variance, *found.mean], -1), mean, variance)
 
 
@@ -122,7 +123,7 @@ def _(result: Likelihood, levels: Levels, **params: Any) -> list[Check]:
     count, coarse = int(used.sum()), int((levels.variance[used] < _QUIET).sum())
     said = [Check(f"deviance {off:.4g} of {2 * count} means and variances, {count} of {len(used)} levels")]
     if coarse:
-        said.append(Check(f"{coarse} levels of less than {_QUIET} DN2, where rounding is no noise of its own", False))
+        said.append(Check(f"{coarse} levels of less than {_QUIET} DN2, where rounding is not independent noise", False))
     return said
 
 
@@ -132,7 +133,7 @@ def _told(levels: Levels, top: float, camera: _Camera, first: float, quantizatio
     possible = seen.possible & (law > quantization)
     law = law.where(possible, 1.0)
     width = (2.0 / levels.degrees_of_freedom + camera.scatter.square()).sqrt()
-    # the mean of the logarithm of a variance is below the logarithm of the mean, by one over its degrees of freedom
+    # the mean log variance is below the log of the mean variance by one over the degrees of freedom
     off = (levels.variance.log() - law.log() + 1.0 / levels.degrees_of_freedom) / width
     light = camera.efficiency * levels.photons
     expected = light + camera.current * (levels.exposure - first)
@@ -144,7 +145,7 @@ def _told(levels: Levels, top: float, camera: _Camera, first: float, quantizatio
 
 
 def _seen(signal: Tensor, top: float, camera: _Camera) -> _Seen:
-    """The response solved for electrons: with x of the measured signal it needs no iteration."""
+    """Solve the response for electrons; with x from the measured signal no iteration is needed."""
     x = signal / top
     curve = 1.0 + camera.bend * x + camera.twist * x.square()
     straight = 1.0 - camera.twist * x.square()  # curve - x dcurve/dx
@@ -154,10 +155,10 @@ def _seen(signal: Tensor, top: float, camera: _Camera) -> _Seen:
 
 
 def _used(levels: Levels, share: float) -> tuple[Tensor, float, float]:
-    """The levels that are looked at, the signal of the brightest of them, DN, and the exposure of the shortest dark."""
+    """Return the levels used, the signal of the brightest level used, DN, and the exposure of the shortest dark."""
     dark, whole = levels.photons == 0, ~_piled(levels)
     if not bool((dark & whole).any()):
-        raise ValueError("no dark level that is not cut off at an end, so that the offset of the camera is not known: "
+        raise ValueError("no dark level without clipped numbers, so that the offset of the camera is not known: "
                          "give frames without light")  # fmt: skip
     shortest = torch.where(dark & whole, levels.exposure, torch.inf).argmin()
     signal = levels.mean - levels.mean[shortest]
@@ -171,17 +172,17 @@ def _used(levels: Levels, share: float) -> tuple[Tensor, float, float]:
                          "the dark: give two or more of different light there")  # fmt: skip
     top = float(signal[used].max())
     if top <= 0:
-        raise ValueError(f"the brightest level is {top:.4g} DN above the dark: see that light and levels belong "
-                         "together")  # fmt: skip
+        raise ValueError(f"the brightest level is {top:.4g} DN above the dark: check that the light belongs "
+                         "to the levels")  # fmt: skip
     if bool((levels.variance[used] <= 0).any()):
         at = int(used.nonzero().squeeze(1)[(levels.variance[used] <= 0).nonzero()[0]])
         raise ValueError(f"level {at}, of {float(levels.mean[at]):.4g} DN, has no variance: give frames whose noise "
-                         "is more than rounding")  # fmt: skip
+                         "exceeds rounding")  # fmt: skip
     return used.nonzero().squeeze(1), top, float(levels.exposure[shortest])
 
 
 def _piled(levels: Levels) -> Tensor:
-    """Which levels were counted because numbers pile up at an end; others that are counted are only coarse."""
+    """Mark the levels whose histogram is kept because numbers pile up at an end, not because numbers are coarse."""
     counted, at_zero = (torch.zeros_like(levels.mean, dtype=torch.bool) for _ in range(2))
     counted[levels.cell_level] = True
     at_zero[levels.cell_level[levels.cell_value == 0]] = True

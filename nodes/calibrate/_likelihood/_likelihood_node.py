@@ -1,4 +1,4 @@
-"""How likely calibration frames are by the parameters of a sensor."""
+"""Likelihood of calibration frames, given the parameters of a sensor."""
 
 from __future__ import annotations
 
@@ -35,18 +35,18 @@ def density(
     bits: Bits = 16,
     told: bool = True,
 ) -> Likelihood:
-    """Weigh what was measured by the law of the sensor: the very steps of `sensor`, in distribution instead of draws.
+    """Compute the likelihood of the measured levels: the steps of `sensor`, as distributions instead of draws.
 
-    Where numbers are as good as continuous, a level's mean and variance are all that it tells, so that the cost does
-    not depend on the number of pixels. Of what the well cuts off, and of coarse numbers, each is weighed exactly in the
-    quantiser. Any of the seven numbers of the sensor may be a tensor (walker,): all are weighed at once. ``told`` also
-    gives deviances and what the levels tell, which a sampler does not ask for.
+    Where numbers count as continuous, mean and variance are sufficient statistics of a level, so that the cost does not
+    depend on the number of pixels. Numbers cut off by the well, and coarse numbers, have their exact probabilities in
+    the quantiser. Any of the seven numbers of the sensor may be a tensor (walker,), and all walkers are computed at
+    once. ``told`` adds deviances and the rows of the Fisher information, which a sampler does not need.
 
     Shapes: levels -> log (walker,), deviance (walker, level), scaled (walker, row).
-    Units:  gain K, DN/e-; dark_current e- in ``dark_exposure``; log in nats, of numbers of 1 DN.
-    Error:  the signal is taken as Gaussian but in coarse levels of up to 8 electrons: relative 1e-3 at 3 standard
-            deviations of 100 electrons by Poisson's law. Every pixel is taken to be like every other; neighbours,
-            lag and drift of the lamp are left out, which real frames are not free of (see `camera`).
+    Units:  gain K, DN/e-; dark_current e- in ``dark_exposure``; log in nats, for numbers of 1 DN.
+    Error:  the signal counts as Gaussian, except in coarse levels of up to 8 electrons: relative 1e-3 at 3 standard
+            deviations of 100 Poisson electrons. All pixels are assumed alike; crosstalk of neighbours, lag and drift
+            of the lamp, which real frames show, are neglected (see `camera`).
     Source: NeuSee, section Sensor Image; EMVA Standard 1288, release 4.0 Linear, section 3.
     """
     given = (gain, quantum_efficiency, offset, read_noise, dark_current, full_well, mean_shift, spread)

@@ -1,4 +1,4 @@
-"""The law of a linear sensor's numbers under flat light, and how likely the measured levels are by it."""
+"""The distribution of a linear sensor's numbers under flat light, and the likelihood of the measured levels."""
 
 from __future__ import annotations
 
@@ -12,35 +12,35 @@ from torch.special import log_ndtr, ndtr
 from neusee.nodes.calibrate._likelihood._quantised_gaussian import Rounding, log_cell
 from neusee.nodes.calibrate._likelihood._sufficient_statistics import Sufficient
 
-#: of rounding, by its kind: how much it shifts the mean, DN, and what variance it adds, DN2
+#: for each kind of rounding, the shift of the mean, DN, and the added variance, DN2
 ROUNDED: dict[str, tuple[float, float]] = {"nearest": (0.0, 1.0 / 12.0), "dithered_floor": (-0.5, 1.0 / 6.0)}
-_FEW = 8.0  #: electrons up to which their number is counted out, where the numbers are coarse
-_GRAIN = 1e-3  #: of the variance, from which it matters that electrons are whole
-_MOST = 40  #: of which there are never more then, but in 1e-15 of all pixels
+_FEW = 8.0  #: electrons; up to this mean, coarse levels sum over the number of electrons
+_GRAIN = 1e-3  #: share of the variance above which the discreteness of electrons matters
+_MOST = 40  #: electrons; with a mean of _FEW, only 1e-15 of all pixels hold more
 
 
 class Sensor(NamedTuple):
-    """A linear sensor seen from its numbers; all (..., 1) float64."""
+    """A linear sensor in units of digital numbers; all (..., 1) float64."""
 
     gain: Tensor  #: K, DN/e-
-    response: Tensor  #: DN a photon
-    noise: Tensor  #: DN2 that a photon adds to the variance
+    response: Tensor  #: DN per photon
+    noise: Tensor  #: DN2, variance added per photon
     offset: Tensor  #: DN, before rounding
     read: Tensor  #: DN rms
     dark: Tensor  #: DN/s
-    well: Tensor  #: DN of a full pixel
-    counted: bool  #: photons come as whole electrons, by Poisson's law
+    well: Tensor  #: DN, signal of a full pixel
+    counted: bool  #: whether photons give whole electrons with a Poisson distribution
 
 
 class Likelihood(NamedTuple):
-    """How likely levels are; leading dimensions are those of the sensors."""
+    """The likelihood of the levels; leading dimensions are those of the sensors."""
 
     log: Tensor  #: (...)
-    deviance: Tensor  #: (..., level) twice the log-likelihood that is missing to a law that fits each level by itself
-    degrees_of_freedom: Tensor  #: (level,) of each deviance; 0 where there is none
-    scaled: Tensor  #: (..., row) what the levels tell, in standard deviations: J^T J of it is Fisher's information
-    mean: Tensor  #: (..., level) DN, of all numbers of a level, were there neither well nor end of the converter
-    variance: Tensor  #: (..., level) DN2, the same
+    deviance: Tensor  #: (..., level) twice the log-likelihood below that of a separate fit of each level
+    degrees_of_freedom: Tensor  #: (level,) of each deviance; 0 for a level without deviance
+    scaled: Tensor  #: (..., row) expected values in standard deviations: J^T J of these rows is the Fisher information
+    mean: Tensor  #: (..., level) DN, of all numbers of a level, without clipping by well and converter
+    variance: Tensor  #: (..., level) DN2, as `mean`
 
 
 class _Law(NamedTuple):
@@ -49,9 +49,9 @@ class _Law(NamedTuple):
 
 
 def likelihood(levels: Sufficient, sensor: Sensor, rounding: Rounding, bits: int, told: bool) -> Likelihood:
-    """Of moments where numbers are as good as continuous, exact in the quantiser where every number was counted.
+    """Compute the likelihood: from moments where numbers count as continuous, exact in the quantiser for histograms.
 
-    Without ``told`` the logarithm alone: a sampler asks for no more.
+    Without ``told`` only the logarithm is computed, which is all that a sampler needs.
     """
     law, (shift, spread), top = _law(levels, sensor), ROUNDED[rounding], 2**bits - 1
     mean, variance = law.mean + shift, law.variance + spread
@@ -72,20 +72,20 @@ def likelihood(levels: Sufficient, sensor: Sensor, rounding: Rounding, bits: int
     )
     rows = [_scaled(levels, mean, variance).where(measured.repeat(2), 0.0)]
     rows.append(2.0 * (_of_level(levels)[levels.cell_level] * cells.exp()).sqrt())
-    if rounding == "nearest":  # a well is anywhere in its number, 1 DN wide
+    if rounding == "nearest":  # the well lies anywhere within one number, 1 DN wide
         rows.append(math.sqrt(12.0) * sensor.well * _cut_off(levels, law, sensor, top))
     return Likelihood(total, deviance, freedom, torch.cat(rows, -1), mean, variance)
 
 
 def _cut_off(levels: Sufficient, law: _Law, sensor: Sensor, top: int) -> Tensor:
-    """(..., 1) whether the well holds numbers back that the converter would still give."""
+    """Return True, (..., 1), where the well cuts off numbers that the converter could still give."""
     over = _of_level(levels) * ndtr((law.mean - sensor.well) / law.variance.sqrt())
     found: Tensor = (over.sum(-1, keepdim=True) > 1.0) & (sensor.well < top - 0.5)
     return found
 
 
 def _scaled(levels: Sufficient, mean: Tensor, variance: Tensor) -> Tensor:
-    """Mean and variance of each level in standard deviations of what was measured."""
+    """Return the mean and the log variance of each level in standard deviations of the measured values."""
     known = levels.variance.where(levels.pixels > 0, 1.0)
     return torch.cat(
         [(levels.pixels / known).sqrt() * mean, ((levels.degrees_of_freedom + 1) / 2).sqrt() * variance.log()], -1
@@ -99,17 +99,17 @@ def _law(levels: Sufficient, sensor: Sensor) -> _Law:
 
 
 def _cells_in(levels: Sufficient) -> Tensor:
-    """Which levels have cells."""
+    """Mark the levels that have cells."""
     return torch.zeros_like(levels.pixels, dtype=torch.bool).index_fill_(0, levels.cell_level, True)
 
 
 def _of_level(levels: Sufficient) -> Tensor:
-    """How many pixels a level has, in cells and not."""
+    """Count the pixels of each level, inside and outside of cells."""
     return levels.pixels.index_add(0, levels.cell_level, levels.cell_count)
 
 
 def _log_cells(levels: Sufficient, law: _Law, sensor: Sensor, rounding: Rounding, top: int) -> Tensor:
-    """(..., cell) logarithm of each cell's probability."""
+    """Return the logarithm of the probability of each cell, (..., cell)."""
     at = levels.cell_level
     mean, variance = law.mean.index_select(-1, at), law.variance.index_select(-1, at)
     found = log_cell(levels.cell_value, mean, variance.sqrt(), sensor.well, rounding, top)
@@ -124,7 +124,7 @@ def _log_cells(levels: Sufficient, law: _Law, sensor: Sensor, rounding: Rounding
 def _counted_out(
     levels: Sufficient, law: _Law, sensor: Sensor, rounding: Rounding, top: int, electrons: Tensor
 ) -> Tensor:
-    """Of few electrons the law is no Gaussian: a sum over their number, each with the noise that is left."""
+    """Sum over the number of electrons, each with the remaining noise, where few electrons make no Gaussian."""
     at = levels.cell_level
     count = torch.arange(_MOST + 1, dtype=torch.float64).view(-1, *(1 for _ in electrons.shape))
     expected = electrons.clamp_min(1e-300)
@@ -136,7 +136,7 @@ def _counted_out(
 
 
 def _deviance(levels: Sufficient, moments: Tensor, cells: Tensor, measured: Tensor) -> tuple[Tensor, Tensor]:
-    """By level: of mean and variance, or of all its cells; none of levels of which a part is cut off."""
+    """Return the deviance of each level from its moments or from its cells, and 0 for a partly clipped level."""
     whole = levels.pixels == 0
     count, total = levels.cell_count, _of_level(levels)[levels.cell_level]
     each = 2.0 * count * ((count / total).log() - cells)

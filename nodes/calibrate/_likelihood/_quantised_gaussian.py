@@ -1,6 +1,6 @@
-"""How often a converter gives a number, of a Gaussian signal that ends at a full well: exact in the quantiser.
+"""Probability of each number of a converter, for a Gaussian signal that ends at a full well: exact in the quantiser.
 
-Nothing is taken for continuous, and no variance of quantization is added.
+No number counts as continuous, and no quantization variance is added.
 """
 
 from __future__ import annotations
@@ -13,14 +13,14 @@ from torch import Tensor
 from torch.special import log_ndtr
 
 Rounding = Literal["nearest", "dithered_floor"]
-_LEAST = 1e-300  #: probability below which none is told from none at all
+_LEAST = 1e-300  #: probability below which a probability counts as 0
 
 
 def log_cell(value: Tensor, mean: Tensor, sd: Tensor, well: Tensor, rounding: Rounding, top: int) -> Tensor:
-    """Logarithm of the probability of a whole number; minus infinity where it cannot be.
+    """Return the logarithm of the probability of a whole number; minus infinity for an impossible number.
 
     Shapes: all broadcast.
-    Units:  DN; ``well`` is the signal of a full pixel, above which there is none, ``top`` the converter's last number.
+    Units:  DN; ``well`` is the signal of a full pixel, the largest signal; ``top`` the largest number of the converter.
     Error:  `nearest` 1e-13 of the logarithm; `dithered_floor` 1e-15 sd**2 of the probability.
     Source: s = round(x) or floor(x + U(-1/2, 1/2)); NeuSee, Eq. (SensorImage).
     """
@@ -33,7 +33,7 @@ def log_cell(value: Tensor, mean: Tensor, sd: Tensor, well: Tensor, rounding: Ro
 
 
 def _between(low: Tensor, high: Tensor, mean: Tensor, sd: Tensor) -> Tensor:
-    """log P(low < x < high), on that side of the mean where nothing cancels."""
+    """Return log P(low < x < high), computed on the side of the mean without cancellation."""
     a, b = (low - mean) / sd, (high - mean) / sd
     above = a + b > 0
     a, b = torch.where(above, -b, a), torch.where(above, -a, b)
@@ -43,11 +43,12 @@ def _between(low: Tensor, high: Tensor, mean: Tensor, sd: Tensor) -> Tensor:
 
 
 def _dithered(value: Tensor, mean: Tensor, sd: Tensor, well: Tensor, top: int) -> Tensor:
-    """floor(x + U(-1/2, 1/2)) = k: a triangle about k + 1/2, one wide on either side, over the law of x.
+    """Return P(floor(x + U(-1/2, 1/2)) = k): the density of x under a triangle about k + 1/2, 1 wide on either side.
 
-    By parts, from the integral G of the distribution: G'' is the density, and the triangle has three corners. Beyond
-    the well there is no x, and what would be there stands at the well. Above the mean G is taken less its asymptote,
-    x - mean, so that far out nothing cancels: with the triangle at the well the asymptotes add up to nothing.
+    Integration by parts uses the integral G of the distribution function: G'' is the density, and the triangle has
+    three corners. No x lies beyond the well; the probability beyond the well is concentrated at the well. Above the
+    mean the asymptote x - mean is subtracted from G, so that no digits cancel far from the mean; the asymptotes and the
+    triangle at the well add up to 0.
     """
     middle = value + 0.5
     start, end = middle - 1.0, torch.minimum(torch.maximum(well, middle - 1.0), middle + 1.0)
@@ -62,10 +63,10 @@ def _dithered(value: Tensor, mean: Tensor, sd: Tensor, well: Tensor, top: int) -
 
 
 def _integral(x: Tensor, mean: Tensor, sd: Tensor, above: Tensor) -> Tensor:
-    """Integral of the distribution up to x; where ``above``, less x - mean."""
+    """Integrate the distribution function up to x; where ``above``, subtract x - mean."""
     z = (x - mean) / sd
     density = torch.exp(-0.5 * z.square()) / math.sqrt(2.0 * math.pi)
     side = torch.where(above, z, -z)
-    share = 0.5 * torch.special.erfc(side / math.sqrt(2.0))  # `ndtr` has no digits left below -8
+    share = 0.5 * torch.special.erfc(side / math.sqrt(2.0))  # `ndtr` loses all digits below -8
     found: Tensor = sd * (density - side * share)
     return found

@@ -1,4 +1,4 @@
-"""All that levels tell of a sensor whose pixels are alike, in as few numbers as hold it."""
+"""Sufficient statistics of levels, for a sensor whose pixels are alike."""
 
 from __future__ import annotations
 
@@ -11,16 +11,16 @@ from torch import Tensor
 from neusee.nodes import Check, node
 from neusee.nodes.values import Levels
 
-_EDGE = 4  #: DN from either end that are counted one by one: a full well touches two or three numbers
-_COARSE = 0.8  #: DN, standard deviation below which mean and variance do not hold all
+_EDGE = 4  #: DN from either end that keep a histogram: a full well affects two or three numbers
+_COARSE = 0.8  #: DN, standard deviation below which mean and variance are not sufficient
 
 
 class Sufficient(NamedTuple):
-    """Of each level mean and variance of most pixels, and the rest counted number by number; nothing stands twice."""
+    """Mean and variance of most pixels of each level, and a histogram of the others; no pixel counts twice."""
 
-    photons: Tensor  #: (level,) float64, in a pixel and exposure
+    photons: Tensor  #: (level,) float64, per pixel and exposure
     exposure: Tensor  #: (level,) float64, s
-    pixels: Tensor  #: (level,) float64, pixels of `mean` and `variance`
+    pixels: Tensor  #: (level,) float64, count of the pixels of `mean` and `variance`
     mean: Tensor  #: (level,) float64, DN
     variance: Tensor  #: (level,) float64, DN2
     degrees_of_freedom: Tensor  #: (level,) float64, of the variance
@@ -31,14 +31,14 @@ class Sufficient(NamedTuple):
 
 @node(rtol=1e-9)
 def sufficient(levels: Levels) -> Sufficient:
-    """Take apart levels whose numbers were counted: those at an end stay counted, of the rest moments are enough.
+    """Split the histograms of levels: numbers at an end keep their counts, and moments replace the other numbers.
 
-    Between the ends numbers are as good as continuous, and mean and variance hold all that they tell; at a full well
-    one number more or less tells a lot. Levels of less than 0.8 DN of scatter are counted whole.
+    Between the ends numbers count as continuous, and mean and variance are sufficient; at a full well every single
+    number carries information. A level with a standard deviation below 0.8 DN keeps its whole histogram.
 
-    Shapes: levels (level,), cells (cell,) -> the same with at most ten cells a level that is not coarse.
+    Shapes: levels (level,), cells (cell,) -> the same, with at most ten cells for a level that is not coarse.
     Units:  those of `Levels`.
-    Error:  1e-12 of the moments. Of what is counted the pixels are taken to be alike.
+    Error:  1e-12 of the moments. The pixels of a histogram are assumed alike.
     Source: Fisher, Phil. Trans. R. Soc. A 222, 309 (1922), sufficiency.
     """
     moments = torch.stack([levels.pixels, levels.mean, levels.variance, levels.degrees_of_freedom], 1)
@@ -82,7 +82,7 @@ def _(levels: Levels) -> Sufficient:
 
 
 def _inner(value: Tensor, count: Tensor, sd: float) -> tuple[Tensor, Tensor]:
-    """Which numbers go into moments, and those: pixels, mean, variance, degrees of freedom."""
+    """Mark the numbers that go into moments, and return the moments: pixels, mean, variance, degrees of freedom."""
     inner = (value > value[0] + _EDGE) & (value < value[-1] - _EDGE)
     total = float(count[inner].sum())
     if sd < _COARSE or total < 2:

@@ -1,4 +1,4 @@
-"""What was believed of a real camera before any frame was looked at, and the coordinates in which it is walked."""
+"""The prior of a real camera's parameters, and the coordinates in which a sampler moves."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ CAMERA_NAMES = (
     "drift",
     "bend",
     "twist",
-)  #: of the parameters of `camera` that may be free
+)  #: the parameters of `camera` that may be free
 _LINEAR = frozenset({"dark_signal", "bend", "twist"})
 
 
@@ -43,16 +43,16 @@ def camera_prior(
     bend: tuple[Real, Positive] | None = None,
     twist: tuple[Real, Positive] | None = None,
 ) -> Prior:
-    """Say how well each parameter of a camera is known beforehand; what is not named is held.
+    """State the prior of each free parameter of a camera; a parameter without a prior is held.
 
-    Each is a median and a factor, [0.37, 2] for a half to twice as much in two cases of three; the dark signal and the
-    two terms of the response a mean and a standard deviation.
+    A prior is a median and a factor: [0.37, 2] means half to twice the median with a probability of two thirds. The
+    priors of the dark signal and of the two terms of the response are a mean and a standard deviation.
 
     Shapes: -> (10,).
     Units:  those of `camera`.
     Error:  exact.
-    Raises: ValueError where nothing is free, or a width is none.
-    Source: log-normal and normal laws.
+    Raises: ValueError where no parameter is free, or where a median or width is not positive.
+    Source: log-normal and normal distributions.
     """
     dark = (dark_signal, temporal_dark_noise, dark_current)
     pairs = (gain, quantum_efficiency, *dark, scatter, lamp, drift, bend, twist)
@@ -67,31 +67,31 @@ def _(result: Prior, **params: object) -> list[Check]:
 
 @dataclass(frozen=True)
 class CameraCoordinates(Free):
-    """The free parameters one by one: logarithms, but of those that may be none or less."""
+    """One coordinate for each free parameter: the logarithm, or the value itself if 0 or negative values may occur."""
 
     linear: ClassVar[frozenset[str]] = _LINEAR
 
     @classmethod
     def of(cls, prior: Prior, nominal: Mapping[str, float]) -> CameraCoordinates:
-        """``nominal``: all of `CAMERA_NAMES`, as `camera` takes them."""
+        """Build coordinates from ``nominal``, all of `CAMERA_NAMES` in the units of `camera`."""
         free = freed(CAMERA_NAMES, prior)
         return cls(free, prior, {name: float(nominal[name]) for name in CAMERA_NAMES if name not in free})
 
     @property
     def labels(self) -> tuple[str, ...]:
-        """What each coordinate is."""
+        """Return the name of each coordinate."""
         plain = {name: name.replace("_", " ") for name in self.names}
         return tuple(plain[name] if name in self.linear else f"ln {plain[name]}" for name in self.names)
 
     def place(self, parameters: Mapping[str, float | Tensor]) -> Tensor:
-        """(..., free) from parameters."""
+        """Return the coordinates (..., free) of parameters."""
         given = {name: torch.as_tensor(parameters[name], dtype=torch.float64) for name in self.names}
         return torch.stack([self._walked(name, x) for name, x in given.items()], -1)
 
     def parameters(self, place: Tensor) -> dict[str, Tensor]:
-        """The free parameters at (..., free)."""
+        """Return the free parameters at coordinates (..., free)."""
         return {n: x if n in self.linear else x.exp() for n, x in zip(self.names, place.unbind(-1), strict=True)}
 
     def log_prior(self, parameters: Mapping[str, Tensor]) -> Tensor:
-        """(...) density per unit of the coordinates, but for a constant."""
+        """Return the log density (...) per unit of the coordinates, up to a constant."""
         return -0.5 * self.whitened(parameters).square().sum(-1)

@@ -1,4 +1,4 @@
-"""A first guess of a sensor's parameters, from the levels themselves."""
+"""A first guess of a sensor's parameters, from the levels."""
 
 from __future__ import annotations
 
@@ -13,16 +13,16 @@ from neusee.nodes.calibrate._likelihood._linear_sensor import ROUNDED
 from neusee.nodes.calibrate._likelihood._sufficient_statistics import Sufficient
 from neusee.nodes.values import Levels
 
-_ABOVE = 1.3  #: times the brightest number, where a well that nobody saw may be
-_LEAST = 1e-3  #: of a dark current or a read noise that came out as none, of what was believed
+_ABOVE = 1.3  #: factor on the brightest number, for a full well that no level reaches
+_LEAST = 1e-3  #: least dark current or read noise, relative to the believed value
 
 
 def guess(levels: Sufficient, believed: Mapping[str, float], params: Mapping[str, Any]) -> dict[str, float]:
-    """What least squares say, and beyond them what was ``believed``; ``params`` are those of `density`.
+    """Return the least-squares estimates, and the ``believed`` values elsewhere; ``params`` are those of `density`.
 
-    Shapes: levels (level,); numbers by name, those of ``believed``.
+    Shapes: levels (level,); numbers by name, with the names of ``believed``.
     Units:  those of `density`.
-    Error:  a start for a search, no estimate.
+    Error:  a start for a search, not an estimate.
     Source: EMVA Standard 1288, release 4.0 Linear, sections 6.6 to 6.8.
     """
     found = dict(believed)
@@ -47,12 +47,12 @@ def guess(levels: Sufficient, believed: Mapping[str, float], params: Mapping[str
 
 
 def guess_camera(levels: Levels, believed: Mapping[str, float], params: Mapping[str, Any]) -> dict[str, float]:
-    """The same of a real camera; ``params`` are those of `camera`.
+    """Return the first guess of a real camera; ``params`` are those of `camera`.
 
-    Shapes: levels (level,); numbers by name, those of ``believed``.
+    Shapes: levels (level,); numbers by name, with the names of ``believed``.
     Units:  those of `camera`.
-    Error:  a start for a search, no estimate.
-    Raises: ValueError as `least_squares` does.
+    Error:  a start for a search, not an estimate.
+    Raises: ValueError where `least_squares` raises ValueError.
     Source: EMVA Standard 1288, release 4.0 Linear, sections 6.6 to 6.8.
     """
     fit = least_squares(levels, share=params["share"])
@@ -69,7 +69,7 @@ def guess_camera(levels: Levels, believed: Mapping[str, float], params: Mapping[
 
 
 def _well(levels: Sufficient, found: Mapping[str, float], gain: float, params: Mapping[str, Any]) -> float:
-    """Where numbers pile up; else above all that was seen."""
+    """Return the well at which numbers pile up, or else a well above every number."""
     top, shift = 2 ** params["bits"] - 1, ROUNDED[params["rounding"]][0]
     seen = levels.mean[levels.pixels > 0]
     brightest = max([*seen.tolist(), *levels.cell_value.tolist()], default=0.0)

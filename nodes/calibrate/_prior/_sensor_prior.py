@@ -1,4 +1,4 @@
-"""What was believed of a sensor before any frame was looked at, and the coordinates in which frames know it best."""
+"""The prior of a sensor's parameters, and the coordinates that frames constrain independently."""
 
 from __future__ import annotations
 
@@ -23,8 +23,8 @@ NAMES = (
     "full_well",
     "quantum_efficiency",
     "spread",
-)  #: of the parameters of `density` that may be free
-_LINEAR = "offset"  #: the only one that may be none, or less
+)  #: the parameters of `density` that may be free
+_LINEAR = "offset"  #: the only parameter that may be 0 or negative
 
 
 @node()
@@ -38,16 +38,16 @@ def prior(
     quantum_efficiency: tuple[Efficiency, Factor] | None = None,
     spread: tuple[Positive, Factor] | None = None,
 ) -> Prior:
-    """Say how well each parameter of the sensor is known beforehand; what is not named is held.
+    """State the prior of each free parameter of the sensor; a parameter without a prior is held.
 
-    Each is a median and a factor, [0.37, 2] for a half to twice as much in two cases of three; the offset a mean
-    and a standard deviation.
+    A prior is a median and a factor: [0.37, 2] means half to twice the median with a probability of two thirds. The
+    prior of the offset is a mean and a standard deviation.
 
     Shapes: -> (7,).
     Units:  those of `density`.
     Error:  exact.
-    Raises: ValueError where nothing is free, or a width is none.
-    Source: log-normal and normal laws.
+    Raises: ValueError where no parameter is free, or where a median or width is not positive.
+    Source: log-normal and normal distributions.
     """
     given = dict(
         zip(NAMES, (gain, offset, read_noise, dark_current, full_well, quantum_efficiency, spread), strict=True)
@@ -63,11 +63,11 @@ def _(result: Prior, **params: object) -> list[Check]:
 
 @dataclass(frozen=True)
 class Coordinates(Free):
-    """The free parameters as frames see them, in numbers of the converter, which do not depend on the gain.
+    """The free parameters in digital numbers, which do not depend on the gain.
 
-    A slope of the photon-transfer curve, an offset, a variance in the dark, a response and a saturation level are each
-    known by themselves; gain, offset, read noise and well only all together, correlated to 1 - 1e-3. All are
-    logarithms but the offset.
+    Frames constrain the slope of the photon-transfer curve, the offset in DN, the dark variance, the response and the
+    saturation level independently. Frames constrain gain, offset in electrons, read noise and well only jointly, with a
+    correlation of 1 - 1e-3. All coordinates except the offset in DN are logarithms.
     """
 
     linear: ClassVar[frozenset[str]] = frozenset({_LINEAR})
@@ -75,25 +75,25 @@ class Coordinates(Free):
 
     @classmethod
     def of(cls, prior: Prior, nominal: Mapping[str, float]) -> Coordinates:
-        """``nominal``: all of `NAMES`, as `density` takes them."""
+        """Build coordinates from ``nominal``, all of `NAMES` in the units of `density`."""
         free = freed(NAMES, prior)
         held = {name: float(nominal[name]) for name in NAMES if name not in free}
         return cls(free, prior, held)
 
     @property
     def labels(self) -> tuple[str, ...]:
-        """What each coordinate is."""
+        """Return the name of each coordinate."""
         of = {"gain": "ln slope of the photon-transfer curve", "offset": "offset, DN", "spread": "ln spread"}
         return tuple(of.get(name, f"ln {name.replace('_', ' ')} in numbers") for name in self.names)
 
     def place(self, parameters: Mapping[str, float | Tensor]) -> Tensor:
-        """(..., free) from parameters."""
+        """Return the coordinates (..., free) of parameters."""
         full = {name: torch.as_tensor(parameters.get(name, self.held.get(name)), dtype=torch.float64) for name in NAMES}
         slope = full["gain"].log()
         return torch.stack([self._seen(name, full, slope) for name in self.names], -1)
 
     def parameters(self, place: Tensor) -> dict[str, Tensor]:
-        """The free parameters at (..., free)."""
+        """Return the free parameters at coordinates (..., free)."""
         at = dict(zip(self.names, place.unbind(-1), strict=True))
         spread = at["spread"] if "spread" in at else torch.tensor(math.log(self.held["spread"]), dtype=torch.float64)
         if "gain" in at:
@@ -111,10 +111,10 @@ class Coordinates(Free):
         return found
 
     def log_prior(self, parameters: Mapping[str, Tensor]) -> Tensor:
-        """(...) density per unit of the coordinates, but for a constant."""
+        """Return the log density (...) per unit of the coordinates, up to a constant."""
         total = -0.5 * self.whitened(parameters).square().sum(-1)
         if _LINEAR in self.names and "gain" in self.names:
-            total = total - parameters["gain"].log()  # a step of 1 DN is one of 1 / K electrons
+            total = total - parameters["gain"].log()  # Jacobian from offset in DN to electrons
         return total
 
     def _seen(self, name: str, full: Mapping[str, Tensor], slope: Tensor) -> Tensor:

@@ -12,19 +12,19 @@ from neusee.nodes.values import Psf
 
 Border = Literal["zero", "reflect"]
 Corner = tuple[int, int]
-_DEEP = 100.0  #: root mean square over the mean of most of a scene, from which float32 is too short
+_DEEP = 100.0  #: ratio of a scene's root mean square to its typical value, from which float32 is too short
 
 
 @node(rtol=1e-5, bands={"radiance": -3, "psf": 0, "return": -3})
 def image(radiance: Tensor, psf: Psf, *, border: Border = "zero") -> Tensor:
-    """Convolve each band with its PSF, linearly: what leaves one edge does not come back at the other.
+    """Convolve each band with its PSF linearly, so that light that leaves one edge does not return at the other edge.
 
     Shapes: radiance (..., band, y, x), psf.intensity (band, any, any) -> (..., band, y, x).
     Units:  those of the radiance, times the share of the pupil's light that reaches each pixel.
-    Error:  float32 FFT: rms 2e-7 of the scene's root mean square or less. A band whose root mean square is over 100
-            times what it mostly holds (lamps at night) is transformed in float64, at twice the time, so that lamps do
-            not drown the dark. Lasers are added as spots and never convolved.
-            Of a PSF wider than twice the scene only what reaches the scene counts. `reflect` needs up to four
+    Error:  float32 FFT: rms 2e-7 of the scene's root mean square or less. A band whose root mean square exceeds 100
+            times its typical value (lamps at night) is transformed in float64, in twice the time, so that round-off
+            of the lamps does not hide the dark parts. Lasers are added as spots and are not convolved.
+            A PSF wider than twice the scene is cropped to the part that reaches the scene. `reflect` needs up to four
             times the memory of `zero`.
     Raises: ValueError where scene and PSF have different bands.
     Source: Goodman, Introduction to Fourier Optics, 4th ed., ch. 7 (incoherent imaging).
@@ -50,7 +50,7 @@ def _(radiance: Tensor, psf: Psf, *, border: Border = "zero") -> Tensor:
 def _(result: Tensor, radiance: Tensor, psf: Psf, **params: Any) -> list[Check]:
     before, after = (float(x.sum(-1).sum(dtype=torch.float64)) for x in (radiance, result))
     if before <= 0:
-        return [Check("no light in the scene")]
+        return [Check("the scene holds no light")]
     most = float(psf.intensity.sum(-1).sum(-1, dtype=torch.float64).amax())
     return [
         Check(f"flux kept {after / before:.2%}", ok=params.get("border") == "reflect" or after <= before * most * 1.001)
@@ -58,11 +58,11 @@ def _(result: Tensor, radiance: Tensor, psf: Psf, **params: Any) -> list[Check]:
 
 
 def _fitted(radiance: Tensor, intensity: Tensor, border: Border) -> tuple[Tensor, Tensor, Corner]:
-    """Scene with its border, the part of the PSF that can reach it, and where the result begins."""
+    """Return the scene with its border, the part of the PSF that can reach the scene, and the result's first pixel."""
     if radiance.ndim < 3 or radiance.shape[-3] != intensity.shape[0]:
         raise ValueError(
             f"radiance {tuple(radiance.shape)} and PSF {tuple(intensity.shape)} must have the same bands: "
-            "give both the same `bands` step"
+            "compute both from the same `bands` step"
         )
     dtype = torch.promote_types(torch.promote_types(radiance.dtype, intensity.dtype), torch.float32)
     kernel = reach(reach(intensity, -2, radiance.shape[-2]), -1, radiance.shape[-1]).to(dtype)
@@ -75,14 +75,14 @@ def _fitted(radiance: Tensor, intensity: Tensor, border: Border) -> tuple[Tensor
 
 
 def reach(kernel: Tensor, dim: int, size: int) -> Tensor:
-    """The samples of the kernel no farther from its centre than the scene is wide."""
+    """Return the samples of the kernel that are at most one scene width from its centre."""
     centre = kernel.shape[dim] // 2
     low, high = max(0, centre - size + 1), min(kernel.shape[dim], centre + size)
     return kernel.narrow(dim, low, high - low)
 
 
 def _by_contrast(scene: Tensor, kernel: Tensor, at: Corner, size: Corner) -> Tensor:
-    """The convolution, of each band in the precision that it needs."""
+    """Convolve each band in the precision that the contrast of the band needs."""
     deep = _deep(scene) if scene.dtype == torch.float32 else []
     if not any(deep):
         return _convolve(scene, kernel, at, size)
@@ -94,7 +94,7 @@ def _by_contrast(scene: Tensor, kernel: Tensor, at: Corner, size: Corner) -> Ten
 
 
 def _deep(scene: Tensor) -> list[bool]:
-    """Bands with so much light in so little of the field that in float32 the rest would drown."""
+    """Return True for each band whose light is so concentrated that float32 round-off hides the rest of the band."""
     flat = scene.detach().flatten(1)
     few = flat[:, :: max(1, flat.shape[1] >> 16)]
     mostly = few.abs().sqrt().mean(1).square()
@@ -104,7 +104,7 @@ def _deep(scene: Tensor) -> list[bool]:
 
 
 def _convolve(scene: Tensor, kernel: Tensor, at: Corner, size: Corner) -> Tensor:
-    """Window of the convolution; the transform is just long enough that nothing wraps into the window."""
+    """Return a window of the convolution, by the shortest transform from which nothing wraps into the window."""
     length = [
         smooth(max(s, a + w, s + k - 1 - a))
         for s, k, a, w in zip(scene.shape[1:], kernel.shape[1:], at, size, strict=True)
@@ -114,7 +114,7 @@ def _convolve(scene: Tensor, kernel: Tensor, at: Corner, size: Corner) -> Tensor
 
 
 def smooth(n: int) -> int:
-    """The next whole number with no prime factor above 5: what fast Fourier transforms like."""
+    """Return the least whole number from ``n`` on with no prime factor above 5, for which FFTs are fast."""
     while True:
         rest = n
         for prime in (2, 3, 5):
@@ -126,10 +126,10 @@ def smooth(n: int) -> int:
 
 
 class _Product(torch.autograd.Function):
-    """Window of the inverse transform of F(a) F(b), or of F(a) conj F(b), band by band.
+    """The window of the inverse transform of F(a) F(b), or of F(a) conj F(b), band by band.
 
-    ``a`` and ``b`` lie in zeros at their corners. Both gradients are products of the same
-    kind, so that nothing but the inputs is kept and any derivative exists.
+    ``a`` and ``b`` are padded with zeros around their corners. Both gradients are products of the same
+    kind, so only the inputs are stored and derivatives of every order exist.
     """
 
     @staticmethod
@@ -159,9 +159,9 @@ class _Product(torch.autograd.Function):
 
 
 class _Plane:
-    """Room for the padded rows of one band, used again for the next.
+    """Memory for the padded rows of one band, used again for the next band.
 
-    The columns go without ``out=``: there it costs a copy, 21 ms instead of 12 at 3072 x 1537.
+    The transform of the columns does not use ``out=``, which makes a copy: 21 ms instead of 12 ms at 3072 x 1537.
     """
 
     def __init__(self, length: Corner, like: Tensor) -> None:
@@ -176,7 +176,7 @@ class _Plane:
         return both
 
     def _spectrum(self, x: Tensor, at: Corner) -> Tensor:
-        """Transform only the rows that hold something, then all columns."""
+        """Transform only the rows that hold samples, then all columns."""
         (y, left), (h, w) = at, x.shape
         for edge in (self.rows[:y], self.rows[y + h :], self.real[:h, :left], self.real[:h, left + w :]):
             edge.zero_()

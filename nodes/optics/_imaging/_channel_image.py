@@ -1,4 +1,4 @@
-"""The image of a scene, summed over its bands before it is formed: few planes in, few out."""
+"""The image of a scene summed over its bands before the convolution: few planes in, few planes out."""
 
 import math
 from typing import Annotated, Any
@@ -15,8 +15,8 @@ from neusee.nodes.optics._imaging._light_in_field import flux
 from neusee.nodes.optics._imaging._psf_energy import passed
 from neusee.nodes.values import Channels, LowRankCube, Psf
 
-Share = Annotated[float, Field(ge=0, allow_inf_nan=False)]  #: of the brightest pixel
-_TRIES = 3  #: the brightest pixels guessed, known, and all kept
+Share = Annotated[float, Field(ge=0, allow_inf_nan=False)]  #: as a share of the brightest pixel
+_TRIES = 3  #: plans tried: with the brightest pixels estimated, then measured, then with nothing omitted
 
 
 @node(rtol=1e-5)
@@ -29,21 +29,21 @@ def image_channels(
     within: Share = 0.0,
     largest: bool = False,
 ) -> Channels:
-    """Sum the bands of the image by each row of weights, convolving few planes with few kernels in place of all bands.
+    """Sum the bands of the image by each row of weights, convolving few planes with few kernels instead of all bands.
 
     Plane i is the sum over k of planes[k] convolved with sum_b rows[i, b] basis[b, k] psf[b]: three planes and three
-    rows take 15 transforms where 31 bands take 93. Planes, kernels, bands and the tails of the PSF are left away as
-    far as `within` lets the root mean square error, whichever saves the most; 0 leaves nothing away. With `largest` no
-    more is left away than the mixture does, and how far the brightest pixel may be off is bounded as well.
+    rows take 15 transforms where 31 bands take 93. Planes, kernels, bands and the tails of the PSF are omitted as far
+    as the root mean square error `within` allows, whichever saves the most time; 0 omits nothing. With `largest` only
+    the error of the low-rank cube is allowed, and the error of the brightest pixel is bounded as well.
 
     Shapes: radiance k planes (y, x), psf.intensity (band, any, any), rows (row, band) -> planes (row, y, x).
     Units:  those of the radiance times those of the rows; flux those of the radiance.
-    Error:  `bound`, of the brightest pixel of each row. True bounds: what the mixture leaves, by the sum of each PSF
-            (Young's inequality, as for the root mean square; where the border reflects, three times the scene's);
-            of the brightest pixel, what every pixel of the mixture may lack, imaged too;
-            tails, by Young's inequality; kernels, by the sum of what they miss. Estimated, not proved: rounding of the
-            transforms, from the powers of planes and kernels, never less than was found. Flux: 1e-6, and what
-            the mixture leaves. Gradients reach the planes and the PSF; basis and rows are held still.
+    Error:  `bound`, as a share of the brightest pixel of each row. Proved upper bounds: the residual of the cube,
+            by the sum of each PSF (Young's inequality, as for the root mean square; where the border reflects, three
+            times that of the scene); of the brightest pixel, the image of the largest residual of each pixel;
+            tails, by Young's inequality; kernels, by the sum of their residuals. Estimated, not proved: round-off of
+            the transforms, from the powers of planes and kernels, never less than was measured. Flux: 1e-6, and the
+            residual of the cube. Planes and PSF receive gradients; basis and rows are constants.
     Raises: ValueError where scene, PSF and rows have different bands, or the scene is a batch.
     Source: linearity of incoherent imaging, Goodman, Introduction to Fourier Optics, 4th ed., ch. 7.
     """
@@ -95,13 +95,13 @@ def _(result: Channels, *inputs: Any, within: float = 0.0, **params: Any) -> lis
 
 
 def _fitted(radiance: LowRankCube, psf: Psf, rows: Tensor) -> tuple[Tensor, Tensor]:
-    """Planes, and the part of the PSF that reaches the scene, in one precision."""
+    """Return the planes, and the part of the PSF that reaches the scene, in one precision."""
     bands = {len(radiance.basis), len(psf.intensity), rows.shape[-1]}
     if len(bands) > 1 or radiance.planes.ndim != 3 or psf.intensity.ndim != 3 or rows.ndim != 2:
         raise ValueError(
             f"radiance of {len(radiance.basis)} bands in planes {tuple(radiance.planes.shape)}, PSF "
             f"{tuple(psf.intensity.shape)} and rows {tuple(rows.shape)} must have the same bands, without a batch: "
-            "give all the same `bands` step"
+            "compute all three from the same `bands` step"
         )
     planes, dtype = radiance.planes, torch.promote_types(radiance.planes.dtype, psf.intensity.dtype)
     kernel = reach(reach(psf.intensity, -2, planes.shape[-2]), -1, planes.shape[-1])
@@ -132,7 +132,7 @@ def _given(radiance: LowRankCube, planes: Tensor, intensity: Tensor, rows: Tenso
 
 
 def _formed(planes: Tensor, intensity: Tensor, given: Given, within: float) -> tuple[Tensor, Tensor, Tensor]:
-    """Rows of the image, their bound and what was kept; the brightest pixels are guessed at first, then known."""
+    """Return rows of the image, their error bound and the sizes of the first plan that satisfies ``within``."""
     eps = torch.finfo(planes.dtype).eps
     brightest, allowed = given.rows.new_zeros(len(given.rows)), within / (1 + within) - 16 * eps
     if within > 0:
@@ -152,10 +152,12 @@ def _formed(planes: Tensor, intensity: Tensor, given: Given, within: float) -> t
 
 
 def _top(result: Tensor, radiance: LowRankCube, intensity: Tensor, given: Given) -> float:
-    """How far the brightest pixel of a row may be off, as a share of it: the worst row.
+    """Return the largest error of a row's brightest pixel, as a share of that pixel.
 
-    What the mixture lacks of a pixel, in any band, is imaged by all bands together; the true image lies so far from
-    what was found at most. Below it lies no farther than above: at the brightest pixel found, as far as there.
+    All bands together form the image of the cube's largest residual at each pixel. The true image differs from the
+    computed image by at most that image of the residual. The true maximum is therefore at most the maximum of computed
+    image plus residual. The true maximum is at least the computed maximum less the residual at the same pixel, and this
+    second error is never the larger one.
     """
     if not radiance.residual_map.numel():
         return math.inf
@@ -169,7 +171,7 @@ def _top(result: Tensor, radiance: LowRankCube, intensity: Tensor, given: Given)
 
 
 def _share(off: Tensor, found: Tensor) -> float:
-    """Of the true brightest pixel, which may be less than that found by what is off: the worst row."""
+    """Return the largest ratio, over the rows, of ``off`` to the true brightest pixel, at least ``found - off``."""
     share = torch.where(off > 0, torch.where(off < found, off / (found - off), math.inf), 0.0)
     worst = float(share.amax()) if bool(torch.isfinite(off + found).all()) else math.inf
     return worst

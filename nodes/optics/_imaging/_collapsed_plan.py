@@ -1,4 +1,4 @@
-"""Which planes, kernels, bands and window of the PSF are enough for a few sums over the bands of an image."""
+"""The choice of planes, kernels, bands and PSF window that suffice for a few sums over the bands of an image."""
 
 import math
 from collections.abc import Iterator
@@ -11,54 +11,54 @@ from neusee.nodes.optics._imaging._band_image import smooth
 from neusee.nodes.optics._imaging._psf_energy import Passed, by_window
 from neusee.nodes.optics._imaging._summed_convolution import Mix
 
-_SMALL = 0.05  #: of the bound goes to bands that are too weak
-_FARTHER = 6  #: planes more than are needed that are tried
-_EVERY = 8  #: one band of so many is asked first whether a smaller window may do
+_SMALL = 0.05  #: share of the error bound that is spent on omitting weak bands
+_FARTHER = 6  #: numbers of planes that are tried, from the least sufficient number on
+_EVERY = 8  #: one band of this many is tested first for a smaller window
 
 
 class Given(NamedTuple):
-    """What is known of scene, PSF and rows before anything is convolved; on the CPU, float64."""
+    """The properties of scene, PSF and rows that are known before a convolution; on the CPU, float64."""
 
     rows: Tensor  #: (row, band)
     basis: Tensor  #: (band, k)
-    rest: Tensor  #: (k + 1, band) what the first planes leave of each band, in the norm that is asked for
-    most: Tensor  #: (k,) the planes, in that norm
+    rest: Tensor  #: (k + 1, band) norm of the residual of each band after the first 0, 1, ... k planes
+    most: Tensor  #: (k,) the same norm of each plane
     gram: Tensor  #: (k, k) products of the planes
-    copies: int  #: how often a point of the scene may occur: 9 where the border reflects
+    copies: int  #: the largest number of copies of a scene point: 9 where the border reflects
     passed: Passed
     size: tuple[int, int]
     reflect: bool
 
 
 class Plan(NamedTuple):
-    """What is convolved, and what that leaves away."""
+    """The planes, kernels, bands and window of one way to convolve, with its error bound and cost."""
 
     planes: int
-    bands: Tensor  #: indices of those that count
+    bands: Tensor  #: indices of the bands that are not omitted
     window: tuple[int, int]
-    kernels: Tensor | None  #: (kernel, those bands); None: the PSF of each is a kernel
+    kernels: Tensor | None  #: (kernel, bands used); None: the PSF of each band is a kernel
     mix: Mix
-    off: Tensor  #: (row,) bound of what is left away
-    cost: float  #: s, about, on two cores
-    whole: bool  #: nothing is left away that is not zero
+    off: Tensor  #: (row,) upper bound of the omitted light
+    cost: float  #: estimated seconds on two cores
+    whole: bool  #: nothing but zeros is omitted
 
     @property
     def kept(self) -> list[int]:
-        """What `Channels.kept` says."""
+        """Return the sizes in the order of `Channels.kept`."""
         count = len(self.bands) if self.kernels is None else len(self.kernels)
         return [self.planes, count, len(self.bands), *self.window]
 
 
 class Fewer(NamedTuple):
-    """Kernels in the order of the light that they move; the wanted ones are mixed of the first few."""
+    """Kernels in order of the light that they contribute, and the weights that mix the first few into all others."""
 
     kernels: Tensor  #: (q, band)
     mixed: Tensor  #: (row x plane, q)
-    off: Tensor  #: (q - 1, row) bound of what the first 1, 2, ... leave away
+    off: Tensor  #: (q - 1, row) upper bound of the light that the first 1, 2, ... kernels omit
 
 
 def with_windows(given: Given, intensity: Tensor, brightest: Tensor, within: float) -> Given:
-    """What smaller windows of the PSF would lose, unless a few bands alone would lose too much in any of them."""
+    """Add the losses of smaller PSF windows, unless a sample of the bands already shows that each loses too much."""
     few, signed = slice(_EVERY // 2, None, _EVERY), given.passed.signed
     if len(intensity) > _EVERY:
         some = given._replace(rows=given.rows[:, few], basis=given.basis[few], rest=given.rest[:, few])
@@ -68,7 +68,7 @@ def with_windows(given: Given, intensity: Tensor, brightest: Tensor, within: flo
 
 
 def _narrow(given: Given, limit: Tensor) -> bool:
-    """Whether the largest window but one may do for any number of planes."""
+    """Return True if the second largest window may suffice for any number of planes."""
     bands, planes = torch.arange(len(given.basis)), range(1, len(given.most) + 1)
     return len(given.passed.windows) > 1 and any(
         bool((given.rows.abs() @ _tail(given, bands, k, 1) <= limit).all()) for k in planes
@@ -76,7 +76,7 @@ def _narrow(given: Given, limit: Tensor) -> bool:
 
 
 def choose(given: Given, brightest: Tensor, within: float) -> Plan:
-    """The cheapest plan that leaves away no more than ``within`` of the brightest pixel of each row, or the whole."""
+    """Return the cheapest plan that omits at most ``within`` of each row's brightest pixel, or the complete plan."""
     bands, lost = _strong(given, brightest, within)
     whole = min(_plans(given, bands, lost, len(given.most), 0), key=lambda plan: plan.cost)
     best = whole._replace(whole=True)
@@ -91,7 +91,7 @@ def choose(given: Given, brightest: Tensor, within: float) -> Plan:
 
 
 def _strong(given: Given, brightest: Tensor, within: float) -> tuple[Tensor, Tensor]:
-    """The bands that count, and by row what the others may add at most."""
+    """Return the bands that are not omitted, and an upper bound of what the omitted bands add to each row."""
     may = given.rows.abs() * (given.rest[0] * given.passed.total)
     share = torch.where(may > 0, may / brightest.clamp_min(1e-300)[:, None], 0.0).amax(0)
     order = share.argsort()
@@ -103,7 +103,7 @@ def _strong(given: Given, brightest: Tensor, within: float) -> tuple[Tensor, Ten
 
 
 def _enough(given: Given, bands: Tensor, lost: Tensor, brightest: Tensor, within: float) -> list[int]:
-    """Numbers of planes that are worth a try."""
+    """Return the numbers of planes that can satisfy ``within``, the smallest numbers first."""
     off = lost + (given.rest[:, bands] * given.passed.total[bands]) @ given.rows[:, bands].abs().T
     fits = [k for k in range(1, len(given.most) + 1) if bool((off[k] <= within * brightest).all())]
     return fits[:_FARTHER]
@@ -112,7 +112,10 @@ def _enough(given: Given, bands: Tensor, lost: Tensor, brightest: Tensor, within
 def _plans(
     given: Given, bands: Tensor, lost: Tensor, k: int, j: int, within: tuple[Tensor, Fewer] | None = None
 ) -> Iterator[Plan]:
-    """Ways to convolve k planes in a window: a kernel for each plane and row, fewer that these mix, or each band."""
+    """Yield plans for k planes in a window.
+
+    The kernels of the three plans are one for each plane and row, one for each band, and fewer kernels to mix.
+    """
     rows, basis, through = given.rows[:, bands], given.basis[bands, :k], given.passed.total[bands]
     off = lost + rows.abs() @ (given.rest[k, bands] * through) + rows.abs() @ _tail(given, bands, k, j)
     if within is not None and not bool((off <= within[0]).all()):
@@ -135,7 +138,7 @@ def _plans(
 
 
 def _fewer(given: Given, bands: Tensor, k: int, brightest: Tensor) -> Fewer:
-    """Singular values of the wanted sums, each by the light that it moves: that of its plane and of its band."""
+    """Return singular vectors of the wanted sums, weighted by the light that each plane and each band contributes."""
     rows, band = given.rows[:, bands], given.passed.total[bands]
     plane = torch.where(brightest[:, None] > 0, given.most[:k] / brightest[:, None], 0.0).flatten()
     scaled = plane[:, None] * _sums(rows, given.basis[bands, :k]) * band
@@ -143,17 +146,17 @@ def _fewer(given: Given, bands: Tensor, k: int, brightest: Tensor) -> Fewer:
     off = [(scaled - (a[:, :q] * s[:q]) @ b[:q]).abs().sum(1).reshape(len(rows), -1).sum(1) for q in range(1, len(s))]
     kernels = torch.where(band > 0, b / band, 0.0)
     mixed = torch.where(plane[:, None] > 0, a * s / plane[:, None], 0.0)
-    unknown = torch.where((brightest == 0) & (rows != 0).any(1), math.inf, 0.0)  # a row of no weight in the sum above
+    unknown = torch.where((brightest == 0) & (rows != 0).any(1), math.inf, 0.0)  # a row without weight above
     return Fewer(kernels, mixed, torch.stack(off) * brightest + unknown if off else brightest[None][:0])
 
 
 def _sums(rows: Tensor, basis: Tensor) -> Tensor:
-    """The weights of the bands in the kernel of each row and plane."""
+    """Return the weights of the bands in the kernel of each row and plane."""
     return (rows[:, None, :] * basis.T).flatten(0, 1)
 
 
 def _tail(given: Given, bands: Tensor, k: int, j: int) -> Tensor:
-    """By band, the most that the PSF outside the window adds to a pixel: Young's inequality in three norms."""
+    """Bound, by band, the light that the PSF outside the window adds to a pixel: Young's inequality in three norms."""
     basis = given.basis[bands, :k]
     beyond, above = given.passed.beyond[j, bands], given.passed.above[j, bands]
     top = given.rest[0, bands] + given.rest[k, bands]
@@ -162,7 +165,7 @@ def _tail(given: Given, bands: Tensor, k: int, j: int) -> Tensor:
 
 
 def _cost(given: Given, window: tuple[int, int], k: int, bands: int, kernels: Tensor | None, mix: Mix) -> float:
-    """Seconds, about: transforms, products of spectra, sums of kernels, as they were measured on two cores."""
+    """Return estimated seconds for transforms, products of spectra and sums of kernels, fitted on two cores."""
     area = math.prod(transform(given, window))
     count = bands if kernels is None else len(kernels)
     terms = len(mix.x) if mix.x is not None else k
@@ -172,7 +175,7 @@ def _cost(given: Given, window: tuple[int, int], k: int, bands: int, kernels: Te
 
 
 def transform(given: Given, window: tuple[int, int]) -> tuple[int, int]:
-    """Lengths of the transform: just long enough that nothing wraps into the field."""
+    """Return the shortest lengths of the transform from which nothing wraps into the field."""
     if given.reflect:
         y, x = (smooth(s + w - 1) for s, w in zip(given.size, window, strict=True))
     else:

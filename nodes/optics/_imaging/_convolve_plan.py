@@ -1,4 +1,4 @@
-"""Carry out a plan: borders, kernels, the convolutions, and how far their rounding may reach."""
+"""The execution of a plan: borders, kernels, convolutions and an estimate of their round-off."""
 
 import math
 
@@ -10,24 +10,27 @@ from neusee.nodes.optics._imaging._collapsed_plan import Given, Plan, transform
 from neusee.nodes.optics._imaging._psf_energy import centred
 from neusee.nodes.optics._imaging._summed_convolution import Mix, Where, summed
 
-_SOME = 16  #: rows of the PSF summed at a time: those of 31 bands stay in the cache
+_SOME = 16  #: rows of the PSF summed at a time; these rows of 31 bands fit in the cache
 
 
 def convolved(planes: Tensor, intensity: Tensor, given: Given, plan: Plan) -> Tensor:
-    """The rows of the image: (row, y, x)."""
+    """Return the rows of the image: (row, y, x)."""
     scene = bordered(planes[: plan.planes], given, plan.window)
     return summed(scene, _kernels(intensity, plan), plan.mix, _where(given, plan.window))
 
 
 def _where(given: Given, window: tuple[int, int]) -> Where:
-    """The part of the convolution that is the image."""
+    """Return the part of the convolution that is the image."""
     (m, n), zero = window, (0, 0)
     at = (m - 1, n - 1) if given.reflect else (m // 2, n // 2)
     return Where(zero, zero, at, given.size, transform(given, window))
 
 
 def majorant(off: Tensor, intensity: Tensor, given: Given) -> Tensor:
-    """What ``off`` (y, x) in every band adds to any row at most: (y, x); one kernel for all rows."""
+    """Return an upper bound (y, x) of the light that ``off`` (y, x) in every band adds to any row.
+
+    One kernel serves all rows.
+    """
     window = (intensity.shape[1], intensity.shape[2])
     heaviest = given.rows.abs().amax(0).to(intensity)
     kernel = _summed_bands(heaviest[None], intensity, given.passed.signed)
@@ -36,7 +39,7 @@ def majorant(off: Tensor, intensity: Tensor, given: Given) -> Tensor:
 
 
 def bordered(planes: Tensor, given: Given, window: tuple[int, int]) -> Tensor:
-    """The planes as they are convolved with a PSF of this size."""
+    """Return the planes with the border that a convolution with a PSF of this size needs."""
     if not given.reflect:
         return planes
     m, n = window
@@ -55,7 +58,10 @@ def _kernels(intensity: Tensor, plan: Plan) -> Tensor:
 
 
 def _summed_bands(weights: Tensor, stack: Tensor, absolute: bool = False) -> Tensor:
-    """Sums (kernel, y, x) over the bands of a stack, or of its size; where that is a copy, of some rows at a time."""
+    """Return sums (kernel, y, x) over the bands of a stack, or of its absolute value.
+
+    A stack that must be copied is copied in slabs of a few rows.
+    """
     if stack.requires_grad or (stack.is_contiguous() and not absolute):
         return (weights @ stack.flatten(1)).view(-1, *stack.shape[1:])
     sums = stack.new_empty(len(weights), *stack.shape[1:])
@@ -67,7 +73,11 @@ def _summed_bands(weights: Tensor, stack: Tensor, absolute: bool = False) -> Ten
 
 
 def guessed(planes: Tensor, given: Given) -> Tensor:
-    """About the brightest pixel of each row: a quarter of that without blur, and half of what the blur can leave."""
+    """Estimate the brightest pixel of each row.
+
+    The estimate is the smaller of two numbers: a quarter of the brightest pixel without blur, and half of an upper
+    bound of the brightest pixel with blur.
+    """
     through = given.passed.total
     room, sharp = planes.new_empty(planes[0].numel()), torch.zeros_like(given.rows[:, 0])
     for i, weights in enumerate((given.rows * through @ given.basis).to(planes)):
@@ -79,11 +89,11 @@ def guessed(planes: Tensor, given: Given) -> Tensor:
 
 
 def rounding(given: Given, plan: Plan, found: Tensor, eps: float) -> Tensor:
-    """By row, about the largest error of the transforms.
+    """Estimate, by row, the largest round-off of the transforms.
 
-    Their rounding is as good as white: a share eps sqrt(log2 N) / 2 of the power, spread over all N samples. Of that
-    spread eight sigma, and ten roundings of the brightest pixel for what is not spread: sums over the bands, planes and
-    rows of a PSF, of which five were found.
+    The round-off is close to white: a share eps sqrt(log2 N) / 2 of the power, spread over all N samples. The estimate
+    takes eight standard deviations of that noise. It adds ten roundings of the brightest pixel for errors that are not
+    spread: sums over the bands, planes and rows of a PSF, of which five roundings were measured.
     """
     count = math.prod(transform(given, plan.window))
     u, x, y, _ = plan.mix

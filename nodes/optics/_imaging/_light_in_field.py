@@ -1,17 +1,17 @@
-"""The light of an image, without the image: what of each plane every sample of the PSF brings into the field."""
+"""The flux of an image computed without the image, from the light that each PSF sample moves into the field."""
 
 import torch
 from torch import Tensor
 
-_ROWS = 32  #: of the PSF at a time: those of 31 bands stay in the cache
+_ROWS = 32  #: rows of the PSF at a time; these rows of 31 bands fit in the cache
 
 
 def flux(planes: Tensor, intensity: Tensor, basis: Tensor, size: tuple[int, int]) -> Tensor:
-    """Sum over the pixels of each band's image: (band,) float64.
+    """Return the sum over the pixels of each band's image: (band,) float64.
 
-    Planes (k, y, x) as they are convolved, with their border where that is reflected; ``intensity`` (band, m, n) no
-    wider than the scene of ``size`` reaches; ``basis`` (band, k). Sample p of the PSF brings in a box of the plane, so
-    that the flux of a band is the product of its PSF with the sums over those boxes.
+    ``planes`` (k, y, x) include their border where the border reflects. ``intensity`` (band, m, n) is no wider than the
+    scene of ``size`` can receive; ``basis`` is (band, k). Sample p of the PSF moves a box of each plane into the field,
+    so the flux of a band is the product of its PSF with the sums over these boxes.
     """
     boxes = torch.stack([_boxes(plane, intensity.shape[1:], size) for plane in planes]).to(intensity.dtype)
     if torch.is_grad_enabled() and (planes.requires_grad or intensity.requires_grad):
@@ -25,10 +25,10 @@ def flux(planes: Tensor, intensity: Tensor, basis: Tensor, size: tuple[int, int]
 
 
 def _boxes(plane: Tensor, kernel: torch.Size, size: tuple[int, int]) -> Tensor:
-    """By sample of the PSF, the sum of the plane over what that sample brings into the field: (m, n).
+    """Return, by sample of the PSF, the sum of the plane over the box that the sample moves into the field: (m, n).
 
-    Turned by half a turn, the plane has its boxes in the order of the samples. It is summed in float64, some rows at a
-    time: in whole planes of it, fresh memory takes longer than the sums.
+    The plane is rotated by 180 degrees, so that its boxes follow the order of the samples. The sums are in float64, a
+    few rows at a time, because allocating whole float64 planes takes longer than the sums.
     """
     above = torch.ones(_ROWS, _ROWS, dtype=torch.float64, device=plane.device).tril()
     down, parts = plane.new_zeros(kernel[1], dtype=torch.float64), []
@@ -41,9 +41,9 @@ def _boxes(plane: Tensor, kernel: torch.Size, size: tuple[int, int]) -> Tensor:
 
 
 def _along(sums: Tensor, dim: int, kernel: int, size: int) -> Tensor:
-    """From the sums up to and with each sample, those over each box."""
+    """Turn cumulative sums along ``dim`` into sums over each box."""
     before = kernel // 2
-    if sums.shape[dim] == size:  # zeros about the scene: a box ends with it, or begins with it
+    if sums.shape[dim] == size:  # zeros about the scene: each box starts or ends at the scene's edge
         first = sums.narrow(dim, size - before - 1, before + 1)
         return torch.cat([first, sums.narrow(dim, -1, 1) - sums.narrow(dim, 0, kernel - before - 1)], dim)
     first = sums.narrow(dim, size - 1, 1)

@@ -1,4 +1,4 @@
-"""What a stack of PSFs lets through inside and outside of windows about its centre."""
+"""The light of a stack of PSFs inside and outside of windows about its centre."""
 
 from itertools import pairwise
 from typing import NamedTuple
@@ -7,25 +7,25 @@ import torch
 from torch import Tensor
 
 _LADDER = (1.0, 0.75, 0.5, 0.375, 0.25, 0.1875, 0.125, 0.0625, 0.03125, 0.015625)
-_ROUNDED = 4e-6  #: of a sum in single precision: cascades of a few dozen additions in a row, a few deep
+_ROUNDED = 4e-6  #: relative round-off of a float32 sum: a few nested sums of a few dozen additions each
 
 
 class Passed(NamedTuple):
-    """By window, the largest first, and band; on the CPU, float64."""
+    """Sums and maxima of a stack of PSFs by window (the largest first) and band; on the CPU, float64."""
 
     windows: list[tuple[int, int]]
     total: Tensor  #: (band,) sum of |PSF|
-    peak: Tensor  #: (band,) its largest
-    beyond: Tensor  #: (window, band) sum of |PSF| outside
-    above: Tensor  #: (window, band) the largest outside
+    peak: Tensor  #: (band,) maximum of |PSF|
+    beyond: Tensor  #: (window, band) sum of |PSF| outside the window
+    above: Tensor  #: (window, band) maximum of |PSF| outside the window
     signed: bool  #: the PSF is negative somewhere
 
 
 def passed(intensity: Tensor) -> Passed:
-    """Measure (band, y, x) whole: its only window."""
-    ends = [torch.aminmax(band) for band in intensity]  # over several dimensions it takes three times as long
+    """Measure (band, y, x) with the whole PSF as the only window."""
+    ends = [torch.aminmax(band) for band in intensity]  # a maximum over several dimensions takes three times as long
     low, high = (torch.stack(found).double().cpu() for found in zip(*ends, strict=True))
-    signed = not bool((low >= 0).all())  # NaN too
+    signed = not bool((low >= 0).all())  # True for NaN too
     rows = (intensity.abs() if signed else intensity).sum(2)
     total = rows.sum(1, dtype=torch.float64).cpu() * (1 + _ROUNDED)
     nothing = torch.zeros_like(total)[None]
@@ -34,7 +34,7 @@ def passed(intensity: Tensor) -> Passed:
 
 
 def by_window(intensity: Tensor, signed: bool) -> Passed:
-    """Measure (band, y, x) by windows that lie in one another: their edges cut it into pieces, each read once."""
+    """Measure (band, y, x) by nested windows, whose edges cut the PSF into pieces; each piece is read once."""
     m, n = intensity.shape[1:]
     windows = list(dict.fromkeys((max(1, round(m * f)), max(1, round(n * f))) for f in _LADDER))
     tall, wide = ([_inside(whole, w[axis]) for w in windows] for axis, whole in enumerate((m, n)))
@@ -48,7 +48,7 @@ def by_window(intensity: Tensor, signed: bool) -> Passed:
 
 
 def centred(stack: Tensor, window: tuple[int, int]) -> Tensor:
-    """The samples of a window about the centre, sample n // 2, which is then the window's own."""
+    """Return the samples of a window about the centre, sample n // 2, which is also the centre of the window."""
     (top, bottom), (left, right) = (_inside(n, w) for n, w in zip(stack.shape[1:], window, strict=True))
     return stack[:, top:bottom, left:right]
 
@@ -63,14 +63,14 @@ def _cuts(spans: list[tuple[int, int]]) -> list[int]:
 
 
 def _covered(span: tuple[int, int], cuts: list[int]) -> Tensor:
-    """Which pieces between the cuts lie in the span."""
+    """Return True for each piece between the cuts that lies in the span."""
     return torch.tensor([span[0] <= cut < span[1] for cut in cuts[:-1]])
 
 
 def _pieces(size: Tensor, rows: list[int], columns: list[int]) -> tuple[Tensor, Tensor]:
-    """Sum, a little above what rounding may have lost, and largest of each piece: (band, rows, columns).
+    """Return the sum (rounded up by its largest round-off) and the maximum of each piece: (band, rows, columns).
 
-    Few calls with much in each: of many small ones, each waits for whatever else the machine does.
+    A few large calls are faster than many small calls, each of which waits for other work on the machine.
     """
     along = [(size[:, a:b].sum(1), size[:, a:b].amax(1)) for a, b in pairwise(rows)]
     sums, tops = (torch.stack(found, 1).double().cpu() for found in zip(*along, strict=True))

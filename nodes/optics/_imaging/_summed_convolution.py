@@ -1,8 +1,9 @@
 """Sums of convolutions of few planes with few kernels, in one pass over the columns of their spectra.
 
-Result i is ``sum_s U[i, s] (X a)_s * (Y b)_s`` with planes a and kernels b. All planes and kernels are transformed
-along their rows; then some columns of all of them at a time are transformed, multiplied and transformed back, in memory
-that the cache holds. At 3072 x 3072 a plane's columns take 11 ms this way and 35 ms in place, on two cores.
+Result i is ``sum_s U[i, s] (X a)_s * (Y b)_s`` with planes a and kernels b. First all planes and kernels are
+transformed along their rows. Then a few columns of all of them at a time are transformed, multiplied and transformed
+back, in memory that fits in the cache. At 3072 x 3072 this takes 11 ms for the columns of a plane, on two cores;
+a transform of all columns in place takes 35 ms.
 """
 
 from typing import Any, NamedTuple
@@ -12,36 +13,36 @@ from torch import Tensor
 
 Corner = tuple[int, int]
 
-_COLUMNS = 16  #: of each spectrum at a time; in a GPU all
+_COLUMNS = 16  #: columns of each spectrum at a time; on a GPU all columns
 
 
 class Mix(NamedTuple):
-    """Which planes meet which kernels, and in which results; None for the identity."""
+    """The matrices that assign planes to kernels and both to results; None stands for the identity."""
 
     u: Tensor | None  #: (result, s)
     x: Tensor | None  #: (s, plane)
     y: Tensor | None  #: (s, kernel)
-    results: int = 0  #: where every result has a kernel of its own for every plane, in this order: how many results
+    results: int = 0  #: number of results, where each has its own kernel for each plane, in this order
 
     def to(self, like: Tensor) -> "Mix":
-        """In the precision and on the device of the planes."""
+        """Return the matrices in the precision and on the device of the planes."""
         u, x, y = (m if m is None else m.to(like) for m in self[:3])
         return Mix(u, x, y, self.results)
 
 
 class Where(NamedTuple):
-    """How planes and kernels lie in the zeros of the transform, and which window of it is the result."""
+    """The positions of planes and kernels in the zero padding, and the window of the transform that is the result."""
 
     at_a: Corner
     at_b: Corner
     at: Corner
     size: Corner
     length: Corner
-    conjugate: bool = False  #: F(b): correlation
+    conjugate: bool = False  #: of F(b): correlation instead of convolution
 
 
 class Summed(torch.autograd.Function):
-    """Both gradients are sums of the same kind, so that nothing but the inputs is kept and any derivative exists."""
+    """A sum of convolutions whose gradients are such sums: only inputs are stored, and all derivatives exist."""
 
     @staticmethod
     def forward(a: Tensor, b: Tensor, mix: Mix, where: Where) -> Tensor:
@@ -72,7 +73,7 @@ class Summed(torch.autograd.Function):
 
 
 def summed(a: Tensor, b: Tensor, mix: Mix, where: Where) -> Tensor:
-    """Planes (k, y, x) and kernels (q, y, x) to results (r, y, x)."""
+    """Convolve planes (k, y, x) with kernels (q, y, x) and sum them into results (r, y, x)."""
     result: Tensor = Summed.apply(a, b, mix, where)  # type: ignore[no-untyped-call]
     return result
 
@@ -98,7 +99,7 @@ def _results(mix: Mix, a: Tensor) -> int:
 
 
 def _mixed(mix: Mix, x: Tensor, y: Tensor) -> Tensor:
-    """The spectra of the results."""
+    """Return the spectra of the results."""
     if not mix.results:
         return _times(mix.u, _times(mix.x, x) * y)
     each = y.view(mix.results, len(x), *y.shape[1:])
@@ -109,9 +110,9 @@ def _mixed(mix: Mix, x: Tensor, y: Tensor) -> Tensor:
 
 
 def _rows(x: Tensor, left: int, wide: int, step: int) -> Tensor:
-    """Transform the rows, which begin ``left`` of a longer row of zeros: (plane, block, row, ``step`` columns).
+    """Transform the rows, padded by ``left`` zeros in front, into (plane, block, row, ``step`` columns).
 
-    A block of columns lies in one piece: read from rows 12 kB apart, each element would need a page of its own.
+    A block of columns is contiguous: in rows 12 kB apart, each element would lie in another memory page.
     """
     count, tall, broad = x.shape
     whole, more = divmod(wide // 2 + 1, step)
@@ -129,7 +130,7 @@ def _rows(x: Tensor, left: int, wide: int, step: int) -> Tensor:
 
 
 class _Columns:
-    """A block of columns at a time, each in one piece, in memory used again: fresh memory costs more than they do."""
+    """Blocks of columns, each contiguous, in memory used again, because allocation costs more than the transforms."""
 
     def __init__(self, blocks: Tensor, top: int, high: int) -> None:
         self.blocks = blocks
@@ -145,7 +146,7 @@ class _Columns:
 
 
 def _times(matrix: Tensor | None, spectra: Tensor) -> Tensor:
-    """A real matrix times complex spectra."""
+    """Multiply complex spectra by a real matrix."""
     if matrix is None:
         return spectra
     pairs = torch.view_as_real(spectra)

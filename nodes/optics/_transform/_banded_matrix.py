@@ -1,4 +1,4 @@
-"""Banded matrices as batches of small dense ones: interpolation and gridding at the speed of a matrix product."""
+"""Banded matrices as batches of small dense matrices: interpolation and gridding at the speed of a matrix product."""
 
 import copy
 import math
@@ -12,7 +12,7 @@ _SLACK = 8  #: columns of zeros that let blocks of unequal spacing share one str
 
 
 class _Run(NamedTuple):
-    """Blocks first..first+count, whose columns begin at start, start + stride, ..."""
+    """A range of blocks, from ``first`` on, whose columns begin at start, start + stride, ..."""
 
     first: int
     blocks: int
@@ -25,10 +25,10 @@ class _Run(NamedTuple):
 
 
 class Banded:
-    """Rows ``i`` that weigh the columns within ``reach`` of ``origin + step i``; rows come in whole blocks.
+    """A matrix whose row ``i`` weighs the columns within ``reach`` of ``origin + step i``; rows form whole blocks.
 
-    ``n_rows`` is rounded up to whole blocks; the rows beyond are finite and meaningless. What is
-    multiplied needs ``margin`` zeros before and behind its ``n_columns``, so that all blocks are alike.
+    ``n_rows`` is rounded up to whole blocks; the extra rows are finite and meaningless. The other factor of a product
+    needs ``margin`` zeros before and behind its ``n_columns`` samples, so that all blocks have the same size.
     """
 
     def __init__(self, n_rows: int, n_columns: int, origin: float, step: float, reach: float, block: int) -> None:
@@ -49,7 +49,7 @@ class Banded:
         return self.origin + self.step * row
 
     def fill(self, weigh: Callable[[Tensor, Tensor], Tensor]) -> "Banded":
-        """Set the weights to ``weigh(row, column)``, called with float64 indices that broadcast; zero out of reach."""
+        """Set the weights to ``weigh(row, column)`` of float64 indices that broadcast, and to zero out of reach."""
         starts = [start for run in self.runs for start in run.starts]
         columns = torch.tensor(starts, dtype=torch.float64)[:, None, None] + torch.arange(self.width)
         rows = torch.arange(self.n_rows, dtype=torch.float64).view(self.count, self.block, 1)
@@ -58,12 +58,12 @@ class Banded:
         return self
 
     def to(self, dtype: torch.dtype, device: torch.device) -> "Banded":
-        """Cast the weights and move them."""
+        """Cast the weights to ``dtype`` and move the weights to ``device``."""
         self.weights = self.weights.to(device, dtype)
         return self
 
     def part(self, first: int, last: int) -> "Banded":
-        """Blocks first..last only."""
+        """Return the matrix of the blocks first..last only."""
         part = copy.copy(self)
         part.count, part.n_rows = last - first, (last - first) * self.block
         part.weights, part.runs = self.weights[first:last], []
@@ -74,7 +74,7 @@ class Banded:
         return part
 
     def left(self, x: Tensor, out: Tensor) -> None:
-        """``out[n_rows, c] = matrix @ x[margin + n_columns + margin, c]``; the rows of ``x`` may stand apart."""
+        """Write ``matrix @ x[margin + n_columns + margin, c]`` to ``out[n_rows, c]``; ``x`` may have a row stride."""
         wide, pitch = x.shape[1], x.stride(0)
         blocks = out.view(self.count, self.block, wide)
         for first, count, start, stride in self.runs:
@@ -83,7 +83,7 @@ class Banded:
             _multiply(self.weights[first : first + count], view, blocks[first : first + count])
 
     def right(self, x: Tensor, out: Tensor) -> None:
-        """``out[block, r, i] = (x[r, margin + n_columns + margin] @ matrix^T)``, in blocks of rows of the matrix."""
+        """Write ``x[r, margin + n_columns + margin] @ matrix^T`` to ``out[block, r, i]``, in blocks of matrix rows."""
         tall, wide = x.shape
         for first, count, start, stride in self.runs:
             at = start + self.margin + x.storage_offset()
@@ -92,7 +92,7 @@ class Banded:
 
 
 def _multiply(a: Tensor, b: Tensor, out: Tensor) -> None:
-    """Batched product; a few large ones go one by one, each on all threads."""
+    """Multiply two batches of matrices; a few large products run one after another, each on all threads."""
     if len(a) >= 8:
         torch.bmm(a, b, out=out)
         return

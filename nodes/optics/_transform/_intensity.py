@@ -1,4 +1,4 @@
-"""Pupil to intensity, with the gradient written by hand: little is kept, the pupil's field is computed again."""
+"""Intensity from pupil with a hand-written gradient, which computes the field in the pupil again to save memory."""
 
 import math
 from collections.abc import Sequence
@@ -14,12 +14,12 @@ from neusee.nodes.optics._transform._scaled_transform import Method, propagate
 from neusee.nodes.optics._transform._workspace import Workspace, borrowed
 
 _ONCE = "the PSF has no second derivative here: differentiate without create_graph=True"
-KEPT_FIELD_BYTES = 1 << 30  #: focal fields up to this size wait for the backward pass; larger ones are computed again
+KEPT_FIELD_BYTES = 1 << 30  #: bytes; focal fields up to this size are kept for back-propagation
 
 
 @dataclass(frozen=True, slots=True)
 class Sampling:
-    """All views, the type and the method they are computed with."""
+    """The windows of point samples, and the precision and method of their transform."""
 
     views: tuple[View, ...]
     dtype: torch.dtype
@@ -34,7 +34,7 @@ def intensity_of(amplitude: Tensor, height: Tensor, path: Tensor, sampling: Samp
 
 
 class PupilIntensity(torch.autograd.Function):
-    """``sum over views of weight * envelope * |U|^2``; the backward pass is the adjoint transform of g U."""
+    """The ``sum over views of weight * envelope * |U|^2``, with the adjoint transform of g U as its gradient."""
 
     @staticmethod
     def forward(ctx: Any, amplitude: Tensor, height: Tensor, path: Tensor, sampling: Sampling) -> Tensor:
@@ -120,7 +120,7 @@ def _adjoint(
 
 
 def _scaled(view: View, values: Tensor, rows: slice, columns: slice) -> Tensor:
-    """``values`` times what the view weighs |U|^2 with, on one patch."""
+    """Multiply ``values``, on one patch, by the weight and the envelope of the view's |U|^2."""
     if view.envelope is None:
         return values.mul_(view.weight)
     y, x = view.envelope
@@ -128,7 +128,7 @@ def _scaled(view: View, values: Tensor, rows: slice, columns: slice) -> Tensor:
 
 
 def _power(field: Field, out: Tensor, add: bool, kept: Tensor | None, method: Method, work: Workspace) -> None:
-    """Write, or add, the weighed |U|^2 of one view."""
+    """Write the weighted |U|^2 of one view to ``out``, or add it there."""
 
     def sink(rows: slice, columns: slice, patch: Tensor) -> None:
         if kept is not None:
@@ -141,12 +141,12 @@ def _power(field: Field, out: Tensor, add: bool, kept: Tensor | None, method: Me
 
 
 def _keep(kept: Tensor, rows: slice, columns: slice, patch: Tensor) -> None:
-    """Store a patch transposed, which is how the fast method makes it and its adjoint wants it."""
+    """Store a patch transposed: the fast method returns patches, and its adjoint takes patches, in this layout."""
     patch_of(kept.transpose(1, 2), rows, columns, patch).copy_(patch)
 
 
 def _focal(field: Field, sampling: Sampling, work: Workspace) -> Tensor:
-    """The focal field once more, transposed."""
+    """Compute the focal field again, transposed."""
     view = field.view
     planes = work.take("focal", 2, view.columns.n_out, view.rows.n_out)
 
@@ -160,12 +160,12 @@ def _focal(field: Field, sampling: Sampling, work: Workspace) -> Tensor:
 def _add_gradient(
     field: Field, planes: Tensor, weight: Tensor, grads: list[Tensor | None], method: Method, work: Workspace
 ) -> None:
-    """Add the gradients of ``sum(weight * scaled |U|^2)``: the adjoint of 2 weight U, against the pupil.
+    """Add the gradients of ``sum(weight * scaled |U|^2)``: the adjoint transform of 2 weight U.
 
-    It runs on the transposed problem, so that the pupil's rows come back as rows.
+    The transform runs on the transposed problem, so that its result comes back in rows of the pupil.
     """
     view, everywhere = field.view, slice(0, planes.shape[2])
-    gain = work.take("gain", *planes.shape[1:]).copy_(weight.T)  # at once: by slabs of a power of two it is slow
+    gain = work.take("gain", *planes.shape[1:]).copy_(weight.T)  # one copy; by slabs of a power of two it is slow
 
     def source(start: int, stop: int, out: Tensor) -> None:
         _scaled(view, gain[start:stop].mul_(2).T, everywhere, slice(start, stop))
@@ -182,7 +182,7 @@ def _add_gradient(
 def _chain(
     field: Field, rows: slice, columns: slice, patch: Tensor, grads: list[Tensor | None], work: Workspace
 ) -> None:
-    """From the gradient with respect to the field, ``patch``, to amplitude, height and path."""
+    """Turn ``patch``, the gradient with respect to the field, into gradients of amplitude, height and path."""
     unit = work.take("unit", *patch.shape)
     field.phasor(rows, columns, unit, work)
     if grads[0] is not None:

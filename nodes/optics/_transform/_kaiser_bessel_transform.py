@@ -1,8 +1,8 @@
-"""The scaled transform by two griddings about one short FFT: exact to the kernel's chosen error.
+"""The scaled Fourier transform by two griddings and one short FFT, exact to the chosen error of the kernel.
 
-The window needs only ``alpha n_in n_out`` samples of information (800 for 2160 -> 2048 at 550 nm),
-so the pupil is gathered onto a grid 1.75 times finer than that, and the FFT is 1.75 times as long
-again, where a chirp needs n_in + n_out. All weights are real: both grids are centred by signs.
+The window needs only ``alpha n_in n_out`` samples of information (800 for 2160 -> 2048 at 550 nm).
+The pupil is therefore gathered onto a grid 1.75 times finer than that, and the FFT is longer by another
+factor of 1.75; a chirp transform needs n_in + n_out. All weights are real, since signs centre both grids.
 """
 
 import functools
@@ -19,14 +19,14 @@ from neusee.nodes.optics._transform._workspace import Workspace
 
 
 class _Kernel(NamedTuple):
-    """Kaiser-Bessel kernel of full ``width`` samples for a grid ``oversampling`` times as fine as needed."""
+    """The Kaiser-Bessel kernel of ``width`` samples for a grid ``oversampling`` times as fine as needed."""
 
     width: int
     oversampling: float
 
     @property
     def peak(self) -> float:
-        """Scale that keeps weights near one."""
+        """Return the scale that keeps weights near one."""
         return self.width * math.sinh(self.beta) / self.beta
 
     @property
@@ -44,13 +44,13 @@ class _Kernel(NamedTuple):
 
 
 _BLOCK = 16
-_WIDEST = 8  #: a grid is at least this fine, of the input, however little of it the window asks for
+_WIDEST = 8  #: the grid divides the input into at least this many parts, however few the window needs
 _COLUMN_BLOCKS = 8
 _SINGLE, _DOUBLE = _Kernel(8, 1.75), _Kernel(18, 2.0)
 
 
 class Plan(NamedTuple):
-    """One axis: gather (n_in -> points), FFT of ``length`` about the middle, keep ``kept``, interpolate (-> n_out)."""
+    """The steps along one axis: gather (n_in -> points), FFT of ``length``, crop to ``kept``, spread to n_out."""
 
     gather: Banded
     spread: Banded
@@ -61,18 +61,18 @@ class Plan(NamedTuple):
 
     @property
     def padded(self) -> int:
-        """Where the gathered points stand in the FFT's input."""
+        """Return the index of the first gathered point in the input of the FFT."""
         return self.length // 2 - (self.points - 1) // 2
 
     @property
     def cropped(self) -> int:
-        """Where the kept frequencies begin in the FFT's result."""
+        """Return the index of the first kept frequency in the result of the FFT."""
         return self.length // 2 - (self.kept - 1) // 2
 
 
 @functools.lru_cache(maxsize=64)
 def plan(axis: Axis, dtype: torch.dtype, device: torch.device) -> Plan:
-    """Grids and weights of one axis; equal axes and later calls share them."""
+    """Return grids and weights of one axis; later calls with an equal axis return the same plan."""
     kernel = _SINGLE if dtype == torch.float32 else _DOUBLE
     pitch = min(1 / (axis.alpha * axis.n_out * kernel.oversampling), max(axis.n_in, _WIDEST) / _WIDEST)
     points = _odd(math.ceil((axis.n_in - 1) / pitch) + kernel.width)
@@ -87,7 +87,7 @@ def plan(axis: Axis, dtype: torch.dtype, device: torch.device) -> Plan:
 
 
 def _gather(axis: Axis, kernel: _Kernel, pitch: float, points: int, length: int) -> Banded:
-    """Field onto the grid of ``points``, divided by what the interpolation behind the FFT will multiply by."""
+    """Return the matrix from field to grid points, divided by the factor of the interpolation behind the FFT."""
     j0, l0 = (axis.n_in - 1) / 2, (points - 1) // 2
     band = Banded(points, axis.n_in, j0 - pitch * l0, pitch, pitch * kernel.width / 2, _BLOCK)
 
@@ -100,7 +100,7 @@ def _gather(axis: Axis, kernel: _Kernel, pitch: float, points: int, length: int)
 
 
 def _spread(axis: Axis, kernel: _Kernel, pitch: float, length: int) -> Banded:
-    """The kept frequencies onto the window, divided by the transform of the kernel that gathered."""
+    """Return the matrix from kept frequencies to the window, divided by the transform of the gathering kernel."""
     k0, fine = (axis.n_out - 1) / 2, axis.alpha * pitch * length
     kept = _odd(math.ceil((axis.n_out - 1) * fine) + kernel.width)
     q0 = (kept - 1) // 2
@@ -114,7 +114,7 @@ def _spread(axis: Axis, kernel: _Kernel, pitch: float, length: int) -> Banded:
 
 
 def _alternating(index: Tensor) -> Tensor:
-    """(-1)^index: the middle of a grid becomes the origin of its FFT."""
+    """Return (-1)^index, which moves the origin of an FFT to the middle of its grid."""
     return 1 - 2 * index.remainder(2)
 
 
@@ -123,7 +123,7 @@ def _odd(n: int) -> int:
 
 
 def kaiser_bessel(rows: Axis, columns: Axis, source: Source, sink: Sink, work: Workspace) -> None:
-    """Gather, short FFT, interpolate: columns first, in chunks of rows that stay in cache."""
+    """Gather, transform by a short FFT and interpolate: along u first, in chunks of rows that fit in the cache."""
     along_x, along_y = (plan(axis, work.dtype, work.device) for axis in (columns, rows))
     half = _rows_to_frequencies(along_x, along_y.gather.margin, rows.n_in, source, work)
     spectrum = _columns_to_frequencies(along_y, half, work)
@@ -131,7 +131,7 @@ def kaiser_bessel(rows: Axis, columns: Axis, source: Source, sink: Sink, work: W
 
 
 def _rows_to_frequencies(x: Plan, margin: int, n_rows: int, source: Source, work: Workspace) -> Tensor:
-    """The kept frequencies along u of every row, between ``margin`` rows of zeros."""
+    """Return the kept frequencies along u of every row, between ``margin`` rows of zeros."""
     kind, wide = work.dtype.to_complex(), x.gather.n_columns
     half = _zero_margins(work.take("half", n_rows + 2 * margin, x.kept, dtype=kind), 0, margin)
     for start, stop in row_chunks(n_rows, wide):
@@ -163,21 +163,21 @@ def _place(blocks: Tensor, line: Tensor, x: Plan) -> None:
 
 
 def _columns_to_frequencies(y: Plan, half: Tensor, work: Workspace) -> Tensor:
-    """Gather along v straight into the zero-padded columns, and transform them; what returns is transposed."""
+    """Gather along v into the zero-padded columns and transform the columns; the result is transposed."""
     wide = half.shape[1]
     columns = work.take("columns", y.length, wide, dtype=half.dtype)
     y.gather.left(_flat(half), _flat(columns[y.padded : y.padded + y.gather.n_rows]))
     columns[: y.padded] = 0
     columns[y.padded + y.points :] = 0
     spectrum = work.take("spectrum", wide, y.kept, dtype=half.dtype)
-    for start, stop in row_chunks(wide, y.length):  # small pieces: what the FFT allocates must not be large
+    for start, stop in row_chunks(wide, y.length):  # small chunks keep the memory that the FFT allocates small
         lines = _fft(columns[:, start:stop].T, y.sign)
         spectrum[start:stop] = lines[:, y.cropped : y.cropped + y.kept]
     return spectrum
 
 
 def _interpolate(x: Plan, y: Plan, shape: tuple[int, int], spectrum: Tensor, sink: Sink, work: Workspace) -> None:
-    """Frequencies (x, y), margins included, onto the window, a few columns of it at a time."""
+    """Interpolate the frequencies (x, y), with their margins, onto the window, a few columns at a time."""
     for first in range(0, x.spread.count, _COLUMN_BLOCKS):
         part = x.spread.part(first, min(first + _COLUMN_BLOCKS, x.spread.count))
         line = work.take("stripe", part.n_rows, spectrum.shape[1], dtype=spectrum.dtype)
@@ -191,7 +191,7 @@ def _interpolate(x: Plan, y: Plan, shape: tuple[int, int], spectrum: Tensor, sin
 
 
 def _deliver(tiles: Tensor, columns: slice, n_rows: int, sink: Sink) -> None:
-    """Hand on whole blocks of rows, then what is left of the last."""
+    """Pass whole blocks of rows to ``sink``, then the remaining rows of the last block."""
     block = tiles.shape[2]
     whole = n_rows // block
     if whole:
@@ -201,7 +201,7 @@ def _deliver(tiles: Tensor, columns: slice, n_rows: int, sink: Sink) -> None:
 
 
 def _flat(x: Tensor) -> Tensor:
-    """Complex (r, c) as real (r, 2 c): what a real matrix from the left may act on."""
+    """Return a complex (r, c) as real (r, 2 c), which a real matrix can multiply from the left."""
     return torch.view_as_real(x).flatten(1)
 
 

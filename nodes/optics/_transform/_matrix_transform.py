@@ -1,4 +1,4 @@
-"""The scaled transform as matrix products: plain, and folded at the middle of both grids."""
+"""The scaled Fourier transform as matrix products: plain, and folded about the middle of both grids."""
 
 import torch
 from torch import Tensor
@@ -8,7 +8,7 @@ from neusee.nodes.optics._transform._workspace import Workspace
 
 
 def direct(rows: Axis, columns: Axis, source: Source, sink: Sink, work: Workspace) -> None:
-    """Complex matrix products with the kernel itself; nothing assumed, nothing saved."""
+    """Transform by complex matrix products with the full kernel, without any symmetry."""
     along_x, along_y = _kernel(columns, work), _kernel(rows, work)
     half = torch.empty(rows.n_in, columns.n_out, dtype=along_x.dtype, device=work.device)
     for start, stop in row_chunks(rows.n_in, columns.n_in):
@@ -21,7 +21,7 @@ def direct(rows: Axis, columns: Axis, source: Source, sink: Sink, work: Workspac
 
 
 def folded(rows: Axis, columns: Axis, source: Source, sink: Sink, work: Workspace) -> None:
-    """Real products of half length on the even and odd parts: a quarter of the work, and exact."""
+    """Transform by real products of half length on the even and odd parts: exact, in a quarter of the operations."""
     turn_x, turn_y = _half_kernels(columns, work), _half_kernels(rows, work)
     half = work.take("half", 2, rows.n_in, columns.n_out)
     for start, stop in row_chunks(rows.n_in, columns.n_in):
@@ -42,7 +42,7 @@ def _kernel(axis: Axis, work: Workspace) -> Tensor:
 
 
 def _half_kernels(axis: Axis, work: Workspace) -> tuple[Tensor, Tensor]:
-    """Cosine and signed sine on the half grids j >= 0, k >= 0; a sample on the axis counts once."""
+    """Return cosine and signed sine on the half grids j >= 0, k >= 0; a sample on the axis counts once."""
     j, k = centred(axis.n_in, work.device)[axis.n_in // 2 :], centred(axis.n_out, work.device)[axis.n_out // 2 :]
     angle = radians(torch.outer(k, j).mul_(axis.alpha))
     cosine, sine = angle.cos().to(work.dtype), angle.sin().mul_(axis.sign).to(work.dtype)
@@ -57,7 +57,7 @@ def _fold(field: Tensor, n: int) -> tuple[Tensor, Tensor]:
 
 
 def _unfold(even: Tensor, odd: Tensor, axis: Axis, out: Tensor) -> None:
-    """Write even(k) ± i odd(k) to both halves of ``out``; all are (re, im) planes."""
+    """Write even(k) ± i odd(k) to both halves of ``out``; all arguments are (re, im) planes."""
     n = axis.n_out
     low = (n + 1) // 2
     mirrored = torch.stack((even[0] + odd[1], even[1] - odd[0]))

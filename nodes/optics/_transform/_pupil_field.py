@@ -1,4 +1,4 @@
-"""The field in the pupil, made patch by patch from its factors and never stored."""
+"""The field in the pupil, computed patch by patch from its factors and never stored as a whole."""
 
 import math
 from dataclasses import dataclass
@@ -11,12 +11,12 @@ from neusee.nodes._half_precision import refuse_not_finite
 from neusee.nodes.optics._transform._sample_axis import Axis, Source, centred
 from neusee.nodes.optics._transform._workspace import Workspace
 
-_FEW_TURNS = 2.0  #: below, float32 holds a phase to 5e-7 rad, which is what a cast to it costs anyway
+_FEW_TURNS = 2.0  #: below this many turns a float32 phase is exact to 5e-7 rad, like a float64 phase after a cast
 
 
 @dataclass(frozen=True, slots=True)
 class View:
-    """One window of point samples in one band. ``|U|^2`` is weighed by ``weight`` and by ``envelope_y envelope_x``."""
+    """One window of point samples in one band, whose |U|^2 is multiplied by ``weight`` and by the two envelopes."""
 
     band: int
     rows: Axis
@@ -29,7 +29,7 @@ class View:
 
 
 class Screens(NamedTuple):
-    """What all bands share, and the largest height and path, in metres."""
+    """The factors of the pupil that all bands share, with the largest height and path in metres."""
 
     amplitude: Tensor
     height: Tensor
@@ -39,14 +39,14 @@ class Screens(NamedTuple):
 
     @classmethod
     def of(cls, amplitude: Tensor, height: Tensor, path: Tensor) -> "Screens":
-        """Measure the extents once a call. Raises ValueError where one is not finite."""
+        """Measure the largest height and path once for each call; raise ValueError where one is not finite."""
         extents = [float(torch.stack(x.detach().aminmax()).abs().max()) for x in (height, path)]
         refuse_not_finite("no light has such a phase", height=extents[0], path=extents[1])
         return cls(amplitude, height, path, *extents)
 
 
 class Field:
-    """The pupil of one view, row by row: amplitude * exp(2 pi i (height + path + tilt))."""
+    """The field in the pupil for one view, row by row: amplitude * exp(2 pi i (height + path + tilt))."""
 
     def __init__(self, screens: Screens, view: View, dtype: torch.dtype) -> None:
         self.screens, self.view = screens, view
@@ -58,7 +58,7 @@ class Field:
         self.tilt_v, self.tilt_u = v.to(kind)[:, None], u.to(kind)
 
     def phasor(self, rows: slice, columns: slice, planes: Tensor, work: Workspace) -> None:
-        """Write cosine and sine of one patch; turns are float64 and reduced to half a turn unless they are few."""
+        """Write cosine and sine of one patch; more than a few turns are computed in float64, reduced to half a turn."""
         angle = work.take("angle", *planes.shape[1:])
         turns = angle if self.few else work.take("turns", *planes.shape[1:], dtype=torch.float64)
         unit = 2 * math.pi if self.few else 1.0
@@ -72,7 +72,7 @@ class Field:
         torch.sin(angle, out=planes[1])
 
     def rows(self, work: Workspace) -> Source:
-        """The field as a source for a transform."""
+        """Return the field as the source of a transform."""
         everywhere = slice(0, self.screens.height.shape[1])
 
         def fill(start: int, stop: int, planes: Tensor) -> None:

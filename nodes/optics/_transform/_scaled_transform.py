@@ -1,4 +1,4 @@
-"""The scaled Fourier transform between two grids of any pitch: which method, and the plain call."""
+"""The scaled Fourier transform between two grids of any pitch: the choice of method, and the plain call."""
 
 from typing import Literal
 
@@ -12,18 +12,18 @@ from neusee.nodes.optics._transform._sample_axis import Axis, Sink, Source, cent
 from neusee.nodes.optics._transform._workspace import Workspace, borrowed
 
 Method = Literal["auto", "direct", "folded", "bluestein", "kaiser_bessel"]
-_FEW_SAMPLES = 60.0  #: below, the banded products are too few and too long to be fast
+_FEW_SAMPLES = 60.0  #: with fewer samples than this the banded products are too few and too long to be fast
 _METHODS = {"direct": direct, "folded": folded, "bluestein": bluestein, "kaiser_bessel": kaiser_bessel}
 
 
 def propagate(rows: Axis, columns: Axis, source: Source, sink: Sink, work: Workspace, method: Method = "auto") -> None:
-    """Transform what ``source`` gives, in pieces that fit the cache, and hand the pieces of the result to ``sink``."""
+    """Transform the field that ``source`` writes, in chunks that fit in the cache, and pass each result to ``sink``."""
     name = cheapest(rows, columns, work.device) if method == "auto" else method
     _METHODS[name](rows, columns, source, sink, work)
 
 
 def cheapest(rows: Axis, columns: Axis, device: torch.device) -> str:
-    """The method with the least expected time; on a GPU matrix products win at every size that fits."""
+    """Return the method of least expected time; on a GPU matrix products are fastest at every size that fits."""
     if device.type != "cpu":
         return "folded"
     expected = _expected_seconds(rows, columns)
@@ -31,7 +31,7 @@ def cheapest(rows: Axis, columns: Axis, device: torch.device) -> str:
 
 
 def _expected_seconds(rows: Axis, columns: Axis) -> dict[str, float]:
-    """Fitted to two cores with AVX-512 (tests/benchmarks/bench_psf.py); only the ratios matter."""
+    """Return times fitted on two cores with AVX-512 (tests/benchmarks/bench_psf.py); only their ratios matter."""
     n_in, n_out = rows.n_in * columns.n_in, rows.n_out * columns.n_out
     products = rows.n_in * columns.n_out * (columns.n_in + rows.n_out)
     chirped = rows.n_in * smooth(columns.n_in + columns.n_out) + columns.n_out * smooth(rows.n_in + rows.n_out)
@@ -55,10 +55,10 @@ def transform(
     sign: int = -1,
     method: Method = "auto",
 ) -> Tensor:
-    """``U = K_y P K_x^T`` with kernels ``exp(sign 2 pi i alpha (j - centre_in) (k - centre_out))``, each per axis.
+    """Return ``U = K_y P K_x^T`` with kernels ``exp(sign 2 pi i alpha (j - centre_in) (k - centre_out))`` on each axis.
 
-    The field is complex64 or complex128, of any shape (v, u); both centres may lie between
-    samples or outside. Phases are float64, reduced to half a turn before they are cast.
+    The field is complex64 or complex128, of any shape (v, u). Both centres may lie between
+    samples or outside the grid. Phases are computed in float64 and reduced to half a turn before a cast.
     """
     axes = [Axis(n, k, a, sign) for n, k, a in zip(field.shape, shape, alpha, strict=True)]
     real = field.real.dtype
@@ -83,7 +83,7 @@ def _tilts(
     real: torch.dtype,
     device: torch.device,
 ) -> tuple[list[Tensor], list[Tensor]]:
-    """Phasors along each axis that turn the transform about the middles into the one about the given centres."""
+    """Return phasors along each axis that shift the centres of a transform from the middles to the given centres."""
     before, after = [], []
     for axis, c_in, c_out in zip(axes, centre_in, centre_out, strict=True):
         d_in, d_out = (axis.n_in - 1) / 2 - c_in, (axis.n_out - 1) / 2 - c_out

@@ -1,4 +1,4 @@
-"""Buffers that are kept: a fresh 100 MB temporary costs more in page faults than the transform it serves."""
+"""Reusable buffers: page faults of a fresh 100 MB temporary cost more than the transform that fills it."""
 
 import contextlib
 import threading
@@ -14,14 +14,14 @@ _lock = threading.Lock()
 
 
 class Workspace:
-    """Named buffers of one caller at a time; a name always returns the same memory, grown when needed."""
+    """Named buffers for one caller at a time; a name always returns the same memory, enlarged when needed."""
 
     def __init__(self, dtype: torch.dtype, device: torch.device) -> None:
         self.dtype, self.device = dtype, device
         self._flat: dict[tuple[str, torch.dtype], Tensor] = {}
 
     def take(self, name: str, *shape: int, dtype: torch.dtype | None = None) -> Tensor:
-        """Uninitialised buffer; what another buffer of this name held is gone."""
+        """Return an uninitialised buffer; an earlier buffer of the same name and type is overwritten."""
         key = (name, dtype or self.dtype)
         flat, size = self._flat.get(key), prod(shape)
         if flat is None or flat.numel() < size:
@@ -32,7 +32,7 @@ class Workspace:
 
 @contextlib.contextmanager
 def borrowed(dtype: torch.dtype, device: torch.device) -> Iterator[Workspace]:
-    """Lend a workspace that no other thread has; at most two idle ones are kept."""
+    """Yield a workspace that no other thread uses; at most two idle workspaces are kept."""
     with _lock:
         fits = [w for w in _idle if (w.dtype, w.device) == (dtype, device)]
         work = fits[-1] if fits else Workspace(dtype, device)

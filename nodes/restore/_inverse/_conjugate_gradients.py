@@ -1,4 +1,4 @@
-"""Conjugate gradients towards the most likely picture, in place, with little memory and few passes over it."""
+"""Preconditioned conjugate gradients for the most likely picture, in place, in little memory."""
 
 from __future__ import annotations
 
@@ -10,12 +10,12 @@ from torch import Tensor
 from neusee.nodes.restore._inverse._lowest_frequencies import Lowest
 from neusee.nodes.restore._inverse._masked_blur import Blurred, Size, inverse_colour, mixed, weighing
 
-LOWEST = 256  #: of a picture of no more pixels a side, each step solves the lowest frequencies at once
-_PIECE = 2**18  #: numbers of a spectrum worked on at a time: what the processor's cache holds
+LOWEST = 256  #: pixels a side, up to which each step solves the lowest frequencies exactly
+_PIECE = 2**18  #: numbers of a spectrum worked on at a time, which fit in the cache
 
 
 def descend(seen: Blurred, x: Tensor, steps: int, enough: float) -> Tensor:
-    """From `x`, which is overwritten, until the square distance left is `enough` of the posterior's, or steps end."""
+    """Improve `x` in place until its squared distance in posterior units is at most `enough`, or for `steps` steps."""
     if steps < 1:
         return x
     normal, inverse = _Normal(seen), _Inverse(seen)
@@ -36,18 +36,18 @@ def descend(seen: Blurred, x: Tensor, steps: int, enough: float) -> Tensor:
 
 
 def pieces(spectrum: Tensor) -> Iterator[slice]:
-    """Rows of half a spectrum, a few at a time."""
+    """Return slices of a few rows of half a spectrum."""
     return _few(spectrum.shape[-2], len(spectrum) * spectrum.shape[-1])
 
 
 def _few(count: int, numbers: int) -> Iterator[slice]:
-    """So many lines of so many numbers each, a few at a time."""
+    """Return slices of `count` lines of `numbers` numbers each, a few lines at a time."""
     step = max(1, _PIECE // numbers)
     return (slice(i, i + step) for i in range(0, count, step))
 
 
 def corner(spectrum: Tensor, torus: Size, pixels: Tensor) -> None:
-    """Fill pixels with the first corner of what half a spectrum (fy, fx) stands for: `irfft2` in half its time."""
+    """Write the first corner of the inverse of half a spectrum (fy, fx) to `pixels`, in half the time of `irfft2`."""
     rows, columns = pixels.shape
     tall = spectrum.new_empty(rows, spectrum.shape[1])
     for some in _few(spectrum.shape[1], torus[0]):
@@ -57,7 +57,7 @@ def corner(spectrum: Tensor, torus: Size, pixels: Tensor) -> None:
 
 
 class _Normal:
-    """Prior and noise: the matrix whose inverse is the spread of what is likely."""
+    """The normal matrix, from prior and noise, whose inverse is the posterior covariance."""
 
     def __init__(self, seen: Blurred) -> None:
         self.seen, self.weigh = seen, weighing(seen)
@@ -65,13 +65,13 @@ class _Normal:
         self.plane, self.pixels = seen.picture.new_zeros(seen.torus), torch.empty_like(seen.picture)
 
     def __call__(self, x: Tensor, result: Tensor) -> Tensor:
-        """Write its product with x, and give the inner product of the two."""
+        """Write the product of the matrix with x to `result`, and return the inner product of x and `result`."""
         self._gather(self.weigh(self._blurred(x, result)), result)
         self._finish(x, result, 1.0)
         return inner(x, result, self.seen.torus)
 
     def slope(self, x: Tensor) -> Tensor:
-        """How the log likelihood rises with x."""
+        """Return the gradient of the log posterior at x."""
         result = torch.empty_like(x)
         self._gather(self.weigh(self._blurred(x, result).neg_().add_(self.seen.picture)), result)
         self._finish(x, result, -1.0)
@@ -84,14 +84,14 @@ class _Normal:
         return self.pixels
 
     def _gather(self, pixels: Tensor, result: Tensor) -> None:
-        """Spectra of the pixels, yet without the blur."""
+        """Write the spectra of the pixels, without the adjoint of the blur."""
         rows, columns = pixels.shape[-2:]
         for channel, picture in enumerate(pixels):
             self.plane[:rows, :columns] = picture
             torch.fft.rfft2(self.plane, out=result[channel])
 
     def _finish(self, x: Tensor, result: Tensor, sign: float) -> None:
-        """The rest of the blur's adjoint, and the prior times x with this sign."""
+        """Multiply by the adjoint of the blur, and add `sign` times the inverse prior covariance times x."""
         own, shared = inverse_colour(len(x), self.seen.grey)
         for rows in pieces(x):
             prior = mixed(x[:, rows], own, -shared).mul_(self.inverse[rows])
@@ -99,7 +99,7 @@ class _Normal:
 
 
 class _Inverse:
-    """About the inverse of that: the one for a picture without edges, and the right one for the lowest frequencies."""
+    """The preconditioner: the inverse for a picture without edges, made exact at the lowest frequencies."""
 
     def __init__(self, seen: Blurred) -> None:
         own, shared = inverse_colour(len(seen.picture), seen.grey)
@@ -116,7 +116,7 @@ class _Inverse:
         self.lowest = Lowest(seen, self.gain) if max(seen.picture.shape[-2:]) <= LOWEST else None
 
     def __call__(self, slope: Tensor, result: Tensor) -> Tensor:
-        """Write its product with the slope, and give the inner product of the two."""
+        """Write the product of the preconditioner with the slope, and return the inner product of slope and product."""
         for rows in pieces(slope):
             gain = self.gain[:, rows]
             own = torch.mul(slope[:, rows], gain, out=result[:, rows])
@@ -126,7 +126,7 @@ class _Inverse:
 
 
 def inner(a: Tensor, b: Tensor, torus: Size) -> Tensor:
-    """Inner product of pixels, given half of their spectra."""
+    """Return the inner product of two pictures, given half of their spectra."""
     whole = torch.stack([torch.vdot(p.flatten(), q.flatten()) for p, q in zip(a, b, strict=True)]).sum() * 2.0
     for column in (0,) if torus[1] % 2 else (0, -1):
         whole = whole - torch.linalg.vecdot(a[..., column], b[..., column]).sum()

@@ -1,9 +1,10 @@
 """The most likely picture behind a blur of which only some pixels are seen.
 
 Linear least squares with a Gaussian prior (Kaipio and Somersalo, Statistical and Computational Inverse Problems, 2005,
-ch. 3), with what lies beyond the edge as unknown as what lies within. Light from there mixes with all that is seen, so
-conjugate gradients get nowhere from a bad start: the problem is solved exactly on a coarse grid, each finer grid starts
-from the one before, and on the coarser ones each step solves the lowest frequencies at once.
+ch. 3), in which pixels beyond the edge are as unknown as pixels within. Light from beyond the edge mixes with the seen
+light, so conjugate gradients converge too slowly from a bad start. The problem is therefore solved exactly on a coarse
+grid, each finer grid starts from the solution of the coarser grid, and on the coarser grids each step also solves the
+lowest frequencies exactly.
 """
 
 from __future__ import annotations
@@ -20,30 +21,30 @@ from torch.nn.functional import avg_pool2d, pad
 from neusee.nodes.restore._inverse._conjugate_gradients import descend, inner, pieces
 from neusee.nodes.restore._inverse._masked_blur import Blurred, Size, mixed, narrowed, variance, widened
 
-DENSE = 40  #: a picture of no more pixels a side is solved exactly
-STEPS = 20  #: on the finest grid, at most, and four times as many on each coarser one up to
+DENSE = 40  #: pixels a side, up to which a picture is solved exactly
+STEPS = 20  #: the most steps on the finest grid; each coarser grid may take four times as many, up to MOST
 MOST = 100
-ENOUGH = 1e-5  #: it ends where so much square distance is left per pixel seen, in the answer's own spread, as the
-#: residual tells it: 10 to 30 times too little, since it tells the slowest part too small
-CAREFUL = 8.0  #: so much less is left on each coarser grid, where steps are cheap and mend what finer ones cannot
+ENOUGH = 1e-5  #: squared distance for each seen pixel, in units of the posterior, at which the iteration ends. The
+#: residual underestimates this distance by a factor of 10 to 30, because it underestimates the slowest modes
+CAREFUL = 8.0  #: factor by which the tolerance falls with each coarser grid, whose steps are cheap
 
 
 def torus(picture: Size, edge: Size) -> Size:
-    """A grid with `edge` of unknown pixels around the picture, that can be halved until the picture is small."""
+    """Return a grid with `edge` unknown pixels around the picture, which can be halved until the picture is small."""
     whole = 2 ** _halvings(picture)
     y, x = (whole * _smooth(-(-(n + 2 * e) // whole)) for n, e in zip(picture, edge, strict=True))
     return y, x
 
 
 def _smooth(n: int) -> int:
-    """The next whole number with no prime factor above 7: what fast Fourier transforms like."""
+    """Return the least whole number from ``n`` on with no prime factor above 7, for which FFTs are fast."""
     while 210**32 % n:
         n += 1
     return n
 
 
 def most_likely(seen: Blurred, steps: int = STEPS, enough: float = ENOUGH) -> Tensor:
-    """Half the spectrum of the x that the picture and the prior make most likely."""
+    """Return half the spectrum of the x with the greatest posterior, given the picture and the prior."""
     if not _halvings(_size(seen)):
         return _exact(seen)
     tensors = (seen.picture, seen.weight, seen.transfer, *seen.glare)
@@ -58,7 +59,7 @@ def most_likely(seen: Blurred, steps: int = STEPS, enough: float = ENOUGH) -> Te
 
 
 class _Followed(torch.autograd.Function):
-    """The answer, as a function of how far the slope is from zero there."""
+    """The solution as a function of the residual slope, through which its gradient is computed."""
 
     @staticmethod
     def forward(ctx: Any, answer: Tensor, rest: Tensor, seen: Blurred, steps: int) -> Tensor:
@@ -68,7 +69,7 @@ class _Followed(torch.autograd.Function):
     @staticmethod
     @once_differentiable
     def backward(ctx: Any, grad: Tensor) -> tuple[None, Tensor, None, None]:
-        """Solve the same problem for the gradient."""
+        """Solve the same linear problem for the gradient."""
         pull = torch.fft.rfft2(grad)
         seen = replace(ctx.seen, picture=torch.zeros_like(ctx.seen.picture), pull=pull)
         enough = 1e-10 * float(inner(pull, _spread(seen, pull), seen.torus))
@@ -94,7 +95,7 @@ def _halvings(picture: Size) -> int:
 
 
 def halved(seen: Blurred) -> Blurred:
-    """The same picture on pixels twice as wide; what these cannot hold counts as noise."""
+    """Return the same problem on pixels twice as wide; variance lost by the wider pixels counts as noise."""
     weight = _pooled(seen.weight)
     picture, *glare = (_pooled(seen.weight * p) / weight.clamp_min(1e-30) for p in (seen.picture, *seen.glare))
     size = (seen.torus[0] // 2, seen.torus[1] // 2)
@@ -117,24 +118,24 @@ def halved(seen: Blurred) -> Blurred:
 
 
 def _pooled(pixels: Tensor) -> Tensor:
-    """Sums of two by two."""
+    """Return the sums over blocks of two by two pixels."""
     y, x = pixels.shape[-2:]
     return 4.0 * avg_pool2d(pad(pixels, (0, x % 2, 0, y % 2)) if x % 2 or y % 2 else pixels, 2)
 
 
 def _pooling(size: int, like: Tensor) -> Tensor:
-    """Transfer of the mean of a pixel and the next one, along an axis of so many."""
+    """Return the transfer function of the mean of each pixel and the next one, along an axis of `size` pixels."""
     turns = torch.arange(size, dtype=torch.float64, device=like.device) / size
     turns = torch.where(turns > 0.5, turns - 1.0, turns)
     return ((1.0 + torch.exp(2j * math.pi * turns)) / 2.0).to(like)
 
 
 def _exact(seen: Blurred) -> Tensor:
-    """Solve for the weights of all seen pixels at once, in float64, by Cholesky."""
+    """Solve for the weights of all seen pixels at once by Cholesky decomposition, in float64."""
     channels = len(seen.picture)
     fine = replace(seen, transfer=seen.transfer.to(torch.complex128), power=seen.power.double())
     weight = seen.weight.double().flatten()
-    root = weight.where(weight > 0, 1.0).sqrt().where(weight > 0, 0.0)  # at what is not seen the root has no slope
+    root = weight.where(weight > 0, 1.0).sqrt().where(weight > 0, 0.0)  # the gradient of sqrt is infinite at 0
     colours = torch.full((channels, channels), seen.grey, dtype=torch.float64, device=root.device).fill_diagonal_(1.0)
     rows = [torch.cat([colours[i, j] * _covariance(fine, a * b.conj()) for j, b in enumerate(fine.transfer)], 1)
             for i, a in enumerate(fine.transfer)]  # fmt: skip
@@ -150,7 +151,7 @@ def _exact(seen: Blurred) -> Tensor:
 
 
 def _covariance(seen: Blurred, passed: Tensor) -> Tensor:
-    """Covariance of every two pixels of the picture, for a product of two transfers."""
+    """Return the covariance of every two pixels of the picture, for the product of two transfer functions."""
     lags = torch.fft.irfft2(passed * seen.power, s=seen.torus)
     y, x = (torch.arange(n, device=lags.device) for n in seen.picture.shape[-2:])
     down, right = (y[:, None] - y) % seen.torus[0], (x[:, None] - x) % seen.torus[1]
@@ -159,5 +160,5 @@ def _covariance(seen: Blurred, passed: Tensor) -> Tensor:
 
 
 def _spread(seen: Blurred, spectrum: Tensor) -> Tensor:
-    """The prior's covariance times half a spectrum."""
+    """Return the prior covariance times half a spectrum."""
     return seen.power * mixed(spectrum, 1.0 - seen.grey, seen.grey)

@@ -1,7 +1,7 @@
-"""The slowest part of a picture at once: its lowest frequencies, as a dense matrix.
+"""The exact solution among the lowest frequencies of a picture, by a dense matrix.
 
-What lies beyond the edge and in holes is told by the rest in the lowest frequencies, where the signal is up to 1e8
-times the noise: there the inverse for a picture without edges is wrong by that factor, and this one is right.
+Seen pixels constrain unseen pixels (beyond the edge and in holes) through the lowest frequencies, where the signal is
+up to 1e8 times the noise. There the inverse for a picture without edges is wrong by that factor; this inverse is right.
 """
 
 from __future__ import annotations
@@ -14,17 +14,17 @@ from torch.nn.functional import pad
 
 from neusee.nodes.restore._inverse._masked_blur import Blurred, Size, inverse_colour
 
-_LEAST = 1e-11  #: of the largest number of the matrix: what float64 cannot tell from nothing
-MODES = 1000  #: real unknowns of each of at most three channels; of more, as many as three have,
-_ROWS = 256  #: of the inverse that are read at a time
-SHARE = 24  #: and of a small torus one for so many of its points
+_LEAST = 1e-11  #: times the largest diagonal number of the matrix: its round-off in float64
+MODES = 1000  #: real unknowns of each channel for up to three channels; more channels share the total of three
+_ROWS = 256  #: rows of the inverse that are read at a time
+SHARE = 24  #: grid points for each unknown, at least, on a small torus
 
 
 class Lowest:
-    """The inverse of a blur's normal matrix among its lowest frequencies, from the mean on."""
+    """The inverse of a blur's normal matrix among its lowest frequencies, including the mean."""
 
     def __init__(self, seen: Blurred, gain: Tensor) -> None:
-        """`gain` (channel, fy, fx) scales the matrix: the diagonal of an inverse that is about right."""
+        """Build the inverse; `gain` (channel, fy, fx), the diagonal of an approximate inverse, scales the matrix."""
         self.torus = seen.torus
         count = min(MODES, 3 * MODES // len(seen.picture), int(math.prod(seen.torus) / SHARE))
         self.fy, self.fx = (f.to(gain.device) for f in _lowest(seen.torus, max(1, count // 2)))
@@ -34,14 +34,14 @@ class Lowest:
         matrix = self._matrix(seen).mul_(root[:, None]).mul_(root)
         matrix.diagonal().add_(_LEAST * matrix.diagonal().max())
         whiten = _inverse(torch.linalg.cholesky(matrix)).mul_(root)
-        ends = range(_ROWS, len(whiten) + _ROWS, _ROWS)  # lower triangular: the rest of these rows is 0
+        ends = range(_ROWS, len(whiten) + _ROWS, _ROWS)  # lower triangular: numbers beyond `end` are 0
         self.whiten = [whiten[end - _ROWS : end, :end].to(gain, copy=True) for end in ends]
 
     def add(self, slope: Tensor, onto: Tensor) -> Tensor:
-        """Add the inverse times `slope` onto a spectrum; give the inner product of both, as pixels."""
+        """Add the inverse times `slope` to a spectrum, and return the inner product of both, as pixels."""
         risen = _real(slope[:, self.fy, self.fx])
         both, rise = torch.zeros_like(risen), torch.zeros((), dtype=torch.float64, device=slope.device)
-        for some in self.whiten:  # both products while it is in cache
+        for some in self.whiten:  # both products while the rows are in the cache
             told = some @ risen[: some.shape[1]]
             both[: some.shape[1]] += told @ some
             rise += told.square().sum(dtype=torch.float64)
@@ -55,7 +55,7 @@ class Lowest:
         return rise * (2.0 / (self.torus[0] * self.torus[1]))
 
     def _matrix(self, seen: Blurred) -> Tensor:
-        """Prior, noise and glare, for the real parts and then the imaginary ones of each channel, in float64."""
+        """Return the float64 normal matrix of prior, noise and glare, for real then imaginary parts of each channel."""
         transfer = seen.transfer[:, self.fy, self.fx].to(torch.complex128)
         inverse = 1.0 / seen.power[self.fy, self.fx].double().clamp_min(1e-30)
         inverse = torch.cat([2.0 * inverse[:1], inverse[1:], inverse[1:]])
@@ -70,7 +70,7 @@ class Lowest:
         return self._without_glare(matrix.view(size, size), seen, transfer)
 
     def _noise(self, weight: Tensor, through: Tensor) -> Tensor:
-        """How one channel's pixels tell its frequencies: each with each, and each with the mirror image of each."""
+        """Return one channel's information on its frequencies, for all pairs of frequencies and of mirror images."""
         plus, minus = (self._at(weight, s) * through.conj()[:, None] for s in (-1, 1))
         plus, minus = plus * through, minus * through.conj()
         top = torch.cat([plus.real + minus.real, (minus.imag - plus.imag)[:, 1:]], 1)
@@ -79,7 +79,7 @@ class Lowest:
         return both
 
     def _at(self, spectrum: Tensor, sign: int) -> Tensor:
-        """Half a spectrum at the sum or the difference of every two frequencies."""
+        """Return half a spectrum at the sum (`sign` 1) or the difference (-1) of every two frequencies."""
         y, x = self.torus
         fy, fx = self.fy[:, None] + sign * self.fy, (self.fx[:, None] + sign * self.fx) % x
         far = fx > x // 2
@@ -87,7 +87,7 @@ class Lowest:
         return torch.where(far, values.conj(), values)
 
     def _without_glare(self, matrix: Tensor, seen: Blurred, transfer: Tensor) -> Tensor:
-        """Take away, in place, what the unknown strength of each glare hides."""
+        """Subtract, in place, the information that the unknown strength of each glare removes."""
         if not seen.glare:
             return matrix
         flat = torch.stack(seen.glare).double().flatten(1)
@@ -100,7 +100,7 @@ class Lowest:
 
 
 def _inverse(lower: Tensor) -> Tensor:
-    """Inverse of a lower triangular matrix, by halves: faster than to solve for the unit matrix."""
+    """Return the inverse of a lower triangular matrix by recursive halving, faster than a solve for the unit matrix."""
     inverse = torch.zeros_like(lower)
     _invert(lower, inverse)
     return inverse
@@ -118,12 +118,12 @@ def _invert(lower: Tensor, inverse: Tensor) -> None:
 
 
 def _real(spectrum: Tensor) -> Tensor:
-    """Real parts and imaginary ones, channel by channel; the first frequency has none of these."""
+    """Return real and then imaginary parts, channel by channel; the first frequency has no imaginary part."""
     return torch.cat([spectrum.real, spectrum.imag[:, 1:]], 1).flatten()
 
 
 def _lowest(size: Size, count: int) -> tuple[Tensor, Tensor]:
-    """The lowest frequencies (fy, fx), one of each with its mirror image, that of no sign left out; the mean first."""
+    """Return the lowest frequencies (fy, fx), the mean first, with one frequency of each mirror pair."""
     reach = (size[0] - 1) // 2
     fy = torch.arange(-reach, reach + 1)[:, None]
     fx = torch.arange((size[1] - 1) // 2 + 1)

@@ -1,6 +1,6 @@
-"""A blurred picture of which only some pixels are seen, the prior of what is behind it, and their algebra in spectra.
+"""A blurred picture of which only some pixels are seen, the prior of the picture before the blur, and their algebra.
 
-A spectrum is half that of a torus: (channel, fy, fx) with fx >= 0, as `torch.fft.rfft2` gives it.
+All spectra are half spectra of a torus: (channel, fy, fx) with fx >= 0, as `torch.fft.rfft2` returns them.
 """
 
 from __future__ import annotations
@@ -17,30 +17,30 @@ Map = Callable[[Tensor], Tensor]
 
 @dataclass(frozen=True)
 class Blurred:
-    """A picture = (blur of x) + noise; x has mean 0, and its channels correlate."""
+    """The model  picture = (blur of x) + noise,  where x has mean 0 and correlated channels."""
 
     picture: Tensor  #: (channel, y, x)
-    weight: Tensor  #: (channel, y, x), 1 / variance of the noise; 0 where nothing is known
+    weight: Tensor  #: (channel, y, x), 1 / variance of the noise; 0 where a pixel is not seen
     transfer: Tensor  #: (channel, fy, fx), half a spectrum of the torus, with the picture in its first corner
-    power: Tensor  #: (fy, fx) of x; its mean over the whole spectrum is the variance of x
+    power: Tensor  #: (fy, fx), power spectrum of x; the mean over the whole spectrum is the variance of x
     torus: Size
     grey: float  #: correlation of any two channels of x, below 1
-    glare: tuple[Tensor, ...] = ()  #: (channel, y, x) patterns of unknown strength that lie over the picture
-    pull: Tensor | None = None  #: (channel, fy, fx), what else raises the log likelihood: its slope
+    glare: tuple[Tensor, ...] = ()  #: (channel, y, x) patterns of unknown strength that are added to the picture
+    pull: Tensor | None = None  #: (channel, fy, fx), a further term of the log posterior's gradient
 
     def blur(self, spectrum: Tensor) -> Tensor:
-        """From half the spectrum of x to the pixels of the picture."""
+        """Return the pixels of the picture from half the spectrum of x."""
         y, x = self.picture.shape[-2:]
-        pairs = zip(self.transfer, spectrum.expand_as(self.transfer), strict=True)  # at once takes twice as long
+        pairs = zip(self.transfer, spectrum.expand_as(self.transfer), strict=True)  # one batch takes twice as long
         return torch.stack([torch.fft.irfft2(t * s, s=self.torus)[:y, :x] for t, s in pairs])
 
     def gathered(self, pixels: Tensor) -> Tensor:
-        """The adjoint of `blur`."""
+        """Return the adjoint of `blur` applied to pixels."""
         spectrum: Tensor = self.transfer.conj() * torch.fft.rfft2(pixels, s=self.torus)
         return spectrum
 
     def slope(self, x: Tensor) -> Tensor:
-        """How the log likelihood rises with x; 0 at the most likely."""
+        """Return the gradient of the log posterior at x, which is 0 at the most likely x."""
         own, shared = inverse_colour(len(x), self.grey)
         prior = mixed(x, own, -shared) / self.power.clamp_min(1e-30)
         rise = self.gathered(weighing(self)(self.picture - self.blur(x))) - prior
@@ -48,7 +48,7 @@ class Blurred:
 
 
 def weighing(seen: Blurred) -> Map:
-    """Residuals times their weight, blind to any amount of each glare."""
+    """Return a function that weighs residuals and projects out any amount of each glare."""
     if not seen.glare:
         return lambda residual: seen.weight * residual
     flat = torch.stack(seen.glare).flatten(1)
@@ -65,22 +65,22 @@ def weighing(seen: Blurred) -> Map:
 
 
 def mixed(spectrum: Tensor, own: float, shared: float) -> Tensor:
-    """Each channel, and the sum of all."""
+    """Return `own` times each channel plus `shared` times the sum of all channels."""
     return own * spectrum + shared * spectrum.sum(0)
 
 
 def inverse_colour(channels: int, grey: float) -> tuple[float, float]:
-    """The inverse of  (1 - grey) I + grey  over the channels, as  own I - shared."""
+    """Return (own, shared) such that  own I - shared  is the inverse of  (1 - grey) I + grey  over the channels."""
     return 1.0 / (1.0 - grey), grey / ((1.0 - grey) * (1.0 - grey + channels * grey))
 
 
 def variance(power: Tensor, size: Size) -> Tensor:
-    """Mean over a whole spectrum of which the last dimension holds one half."""
+    """Return the mean over a whole spectrum, given half of it along the last dimension."""
     return (power.sum(-2) * times(size, power)).sum(-1) / (size[0] * size[1])
 
 
 def times(size: Size, like: Tensor) -> Tensor:
-    """How often each column of half a spectrum stands in the whole."""
+    """Return how often each column of half a spectrum occurs in the whole spectrum."""
     count = torch.full((size[1] // 2 + 1,), 2.0, dtype=like.real.dtype, device=like.device)
     count[0] = 1.0
     if size[1] % 2 == 0:
@@ -89,7 +89,7 @@ def times(size: Size, like: Tensor) -> Tensor:
 
 
 def narrowed(spectrum: Tensor, size: Size) -> Tensor:
-    """Half a spectrum of a grid twice as fine, cut to this size; nothing at the highest frequency if that is even."""
+    """Return half a spectrum of a grid twice as fine, cut to `size`, with 0 at an even size's highest frequency."""
     up, down, right = (size[0] + 1) // 2, (size[0] - 1) // 2, (size[1] + 1) // 2
     cut = spectrum.new_zeros(*spectrum.shape[:-2], size[0], size[1] // 2 + 1)
     cut[..., :up, :right] = spectrum[..., :up, :right]
@@ -98,7 +98,7 @@ def narrowed(spectrum: Tensor, size: Size) -> Tensor:
 
 
 def widened(spectrum: Tensor, size: Size, wide: Size) -> Tensor:
-    """Half a spectrum on a grid twice as fine."""
+    """Return half a spectrum on a grid twice as fine."""
     up, down, right = (size[0] + 1) // 2, (size[0] - 1) // 2, (size[1] + 1) // 2
     whole = spectrum.new_zeros(*spectrum.shape[:-2], wide[0], wide[1] // 2 + 1)
     whole[..., :up, :right] = 4.0 * spectrum[..., :up, :right]

@@ -1,4 +1,4 @@
-"""Wiener deconvolution with the known PSF: the baseline that learns nothing."""
+"""Wiener deconvolution with the known PSF: the baseline without training."""
 
 import math
 from itertools import product
@@ -18,10 +18,10 @@ from neusee.nodes.sensor._digitization import crop
 from neusee.nodes.units import Electrons
 from neusee.nodes.values import Bands, Psf
 
-_FALL = 3.0  #: power of pictures falls with frequency to this power, as that of edges does
-_GREY = 0.95  #: correlation of the channels of pictures
-_ROWS = 64  #: of a picture at a time, of which float64 copies stay in cache
-_LIGHT = 0.999  #: share of the light for which the unknown around the picture has room
+_FALL = 3.0  #: the power spectrum of pictures falls with frequency to this power, like that of edges
+_GREY = 0.95  #: correlation between the channels of pictures
+_ROWS = 64  #: rows of a picture at a time, so that their float64 copies fit in the cache
+_LIGHT = 0.999  #: share of the light that the unknown border around the picture is wide enough for
 
 
 @node(additive_inputs=[("glare",)])
@@ -37,22 +37,22 @@ def wiener(
     balance: Annotated[float, Field(gt=0, allow_inf_nan=False)] = 1.0,
     read_noise: Electrons,
 ) -> Tensor:
-    """Undo the blur as far as the noise allows: the most likely picture, given the pixels that are seen.
+    """Deconvolve the picture as far as the noise allows: compute the most likely picture, given the seen pixels.
 
     Least squares with a Gaussian prior, which for a picture without edges is the Wiener filter. Each channel has the
-    PSF it sees of a grey scene: the mean over bands, weighted by illuminant x response x wavelength. The prior's power
-    falls as 1 / frequency^3, as that of edges, with the variance of this picture; channels correlate by 0.95. Clipped
-    pixels and what lies beyond the edge are unknown. The patterns of `glare`, wide as the scene, lie over the picture
-    in unknown strength and are taken out: the direction and wavelength of those lasers are then taken as known.
+    PSF that it sees of a grey scene: the mean over bands, weighted by illuminant x response x wavelength. The power
+    spectrum of the prior falls as 1 / frequency^3, like that of edges, with the variance of this picture; channels have
+    a correlation of 0.95. Clipped pixels and pixels beyond the edge are unknown. The patterns of `glare`, wide as the
+    scene, are removed with unknown strength: direction and wavelength of those lasers are then assumed to be known.
 
     Shapes: electrons and clipped (channel, y, x), psf.intensity (band, any, any), responses (channel, band),
             each glare (channel, at least y, at least x), of which the centre counts -> (channel, y, x).
-    Units:  e-; glare any; the result as if the lens were perfect and lost nothing. `balance` multiplies the noise.
-    Error:  a grey scene is assumed, and noise no smaller in the dark than that of the mean picture. Without `glare` a
-            laser that does not clip is taken for scene. Nothing keeps the result positive: beside lamps hundreds of
+    Units:  e-; glare any; the result as behind a perfect lens without losses. `balance` multiplies the noise variance.
+    Error:  a grey scene is assumed, and noise in the dark no smaller than that of the mean picture. Without `glare` a
+            laser that does not clip is taken for scene. The result may be negative: beside lamps hundreds of
             times as bright as the scene it rings. The iteration ends by its residual, or after 20 steps on the finest
             grid: behind five half-rings rms 0.005 to 0.02 of the contrast from the converged answer (512 to 2048 pixels
-            a side), behind a plain lens 1e-3; float32 adds 3e-4. Gradients: those of the exact answer, no second ones.
+            a side), behind a plain lens 1e-3; float32 adds 3e-4. Gradients: of the exact answer, first order only.
     Raises: ValueError where shapes or bands differ, and for pictures and PSFs that are not finite.
     Source: Wiener filter as in Gonzalez and Woods, Digital Image Processing, 4th ed., ch. 5; as least squares with a
             prior, Kaipio and Somersalo, Statistical and Computational Inverse Problems, 2005, ch. 3.
@@ -65,7 +65,7 @@ def wiener(
     electrons = single(electrons)
     for name, values in {"electrons": [electrons], "psf": [psf.intensity], "glare": glare or ()}.items():
         for x in values:
-            refuse_not_finite("nothing can be restored from it", **{name: x.sum(-1).sum(dtype=torch.float64)})
+            refuse_not_finite("the picture cannot be restored", **{name: x.sum(-1).sum(dtype=torch.float64)})
     size = (electrons.shape[-2], electrons.shape[-1])
     kernels = effective_psf(psf, illuminant, responses, bands).to(electrons)
     patterns = [crop(pattern.to(electrons), shape=size) for pattern in glare or ()]
@@ -81,19 +81,19 @@ def _(result: Tensor, electrons: Tensor, *inputs: Any, **params: float) -> list[
 
 
 def effective_psf(psf: Psf, illuminant: Tensor, responses: Tensor, bands: Bands) -> Tensor:
-    """The PSF that each channel sees of a grey scene: (channel, y, x)."""
+    """Return the PSF that each channel sees of a grey scene: (channel, y, x)."""
     lengths = {len(psf.intensity), len(illuminant), responses.shape[-1], len(bands.centres)}
     if len(lengths) > 1:
-        raise ValueError(f"PSF, illuminant, responses and bands have {sorted(lengths)} bands: give one `bands` step")
+        raise ValueError(f"PSF, illuminant, responses and bands have {sorted(lengths)} bands: use one `bands` step")
     intensity = single(psf.intensity)
     seen: Tensor = torch.tensordot(grey_shares(illuminant, responses, bands).to(intensity), intensity, 1)
     return seen
 
 
 def grey_shares(illuminant: Tensor, responses: Tensor, bands: Bands) -> Tensor:
-    """Of what each channel sees of a grey scene, the share of each band: (channel, band), float64."""
+    """Return the share of each band in the signal of each channel from a grey scene: (channel, band), float64."""
     share = responses.cpu().double() * illuminant.cpu().double() * bands.centres.cpu()
-    blind = share.sum(-1, keepdim=True) <= 0  # a channel that sees none of these bands: one PSF is as good as another
+    blind = share.sum(-1, keepdim=True) <= 0  # a channel without response gets equal shares
     share = share.where(~blind, 1.0)
     return share / share.sum(-1, keepdim=True)
 
@@ -101,7 +101,7 @@ def grey_shares(illuminant: Tensor, responses: Tensor, bands: Bands) -> Tensor:
 def _restored(
     electrons: Tensor, known: Tensor, kernels: Tensor, glare: list[Tensor], balance: float, read: float
 ) -> Tensor:
-    """Scale the problem to a scene of mean 0 and variance 1, solve it, and scale back."""
+    """Scale the problem to a scene of mean 0 and variance 1, solve the scaled problem, and scale the solution back."""
     y, x = electrons.shape[-2:]
     known = torch.where(known.amax((-2, -1), keepdim=True) > 0, known, 1.0)
     picture = electrons - _strengths(electrons, known, glare)
@@ -115,12 +115,12 @@ def _restored(
     weight = known * (scale / (balance * noise).sqrt()).square()
     scaled = tuple(pattern / scale for pattern in glare)
     spectrum = most_likely(Blurred((picture - mean) / scale, weight, transfer, power, size, _GREY, scaled))
-    sharp = torch.stack([torch.fft.irfft2(s, s=size)[:y, :x] for s in spectrum])  # at once takes twice as long
+    sharp = torch.stack([torch.fft.irfft2(s, s=size)[:y, :x] for s in spectrum])  # one batch takes twice as long
     return sharp * scale + mean / kernels.sum((-2, -1)).clamp_min(1e-3)[:, None, None]
 
 
 def _passed(transfer: Tensor, power: Tensor, size: tuple[int, int]) -> Tensor:
-    """Variance of a blurred picture: (channel, 1, 1); by rows, for its spectrum is large."""
+    """Return the variance of a blurred picture: (channel, 1, 1); its large spectrum is read a few rows at a time."""
     total = power.new_zeros(len(transfer))
     for rows in pieces(transfer):
         through = transfer[:, rows]
@@ -129,7 +129,7 @@ def _passed(transfer: Tensor, power: Tensor, size: tuple[int, int]) -> Tensor:
 
 
 def _noise(electrons: Tensor, mean: Tensor, read: float) -> Tensor:
-    """Variance of the noise: that of the mean picture, and more where it is brighter around."""
+    """Return the variance of the noise: that of the mean picture, or of the local mean where that is brighter."""
     around = electrons[None]
     for window, rim in (((9, 1), (4, 0)), ((1, 9), (0, 4))):
         around = avg_pool2d(around, window, stride=1, padding=rim, count_include_pad=False)
@@ -137,19 +137,19 @@ def _noise(electrons: Tensor, mean: Tensor, read: float) -> Tensor:
 
 
 def _mean(picture: Tensor, known: Tensor) -> Tensor:
-    """Mean of what is known of each channel: (channel, 1, 1)."""
+    """Return the mean over the known pixels of each channel: (channel, 1, 1)."""
     total: Tensor = (picture * known).sum((-2, -1), keepdim=True)
     return total / known.sum((-2, -1), keepdim=True)
 
 
 def _visible(patterns: list[Tensor], known: Tensor) -> list[Tensor]:
-    """Patterns that are anywhere to be seen, with a greatest value of 1."""
+    """Return the patterns that are nonzero at some known pixel, scaled to a maximum of 1."""
     peaks = [float((pattern.detach().abs() * known).max()) for pattern in patterns]
     return [pattern / peak for pattern, peak in zip(patterns, peaks, strict=True) if peak > 0]
 
 
 def _strengths(electrons: Tensor, known: Tensor, glare: list[Tensor]) -> Tensor:
-    """A first guess of what the glare adds: least squares beside a constant."""
+    """Return a first estimate of the glare, by least squares beside a constant."""
     if not glare:
         return torch.zeros_like(electrons)
     means = [_mean(pattern, known) for pattern in glare]
@@ -168,7 +168,7 @@ def _strengths(electrons: Tensor, known: Tensor, glare: list[Tensor]) -> Tensor:
 
 
 def fall(size: tuple[int, int]) -> Tensor:
-    """Power of pictures by frequency, half a spectrum of mean 1."""
+    """Return the power of pictures by frequency, half a spectrum of mean 1."""
     fy, fx = (torch.fft.fftfreq(n, dtype=torch.float64) for n in size)
     squared = fy[:, None].square() + fx[None, : size[1] // 2 + 1].square() + 1.0 / (size[0] * size[1])
     power: Tensor = squared.pow_(-_FALL / 2.0)
@@ -177,7 +177,7 @@ def fall(size: tuple[int, int]) -> Tensor:
 
 
 def edge(kernels: Tensor, picture: tuple[int, int]) -> tuple[int, int]:
-    """How far up and down, left and right, almost all light goes; no farther than 256 pixels or half the picture."""
+    """Return the reach (y, x) of almost all light of the PSF, at most the larger of 256 pixels and half the picture."""
     found = []
     for dim, size in ((-1, picture[0]), (-2, picture[1])):
         profile = kernels.detach().sum((0, dim)).double()
@@ -188,7 +188,7 @@ def edge(kernels: Tensor, picture: tuple[int, int]) -> tuple[int, int]:
 
 
 def wrapped(kernels: Tensor, size: tuple[int, int]) -> Tensor:
-    """The kernels around the first sample of a torus, with what is wider than that laid over the rest."""
+    """Return the kernels around the first sample of a torus; a kernel wider than the torus wraps around."""
     (m, n), (y, x) = kernels.shape[-2:], size
     rows, columns = -(-m // y), -(-n // x)
     if rows * columns > 1:

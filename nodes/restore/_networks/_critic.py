@@ -1,7 +1,7 @@
-"""Critics: how far a picture is from the true ones, to be learnt beside what restores it.
+"""Critics, which score how far a restored picture is from true pictures and are trained beside the restoring network.
 
-Plain convolutions that are run as they stand: their slopes are differentiated again, and what is compiled, or has a
-derivative of its own, may give a wrong second one without a word.
+Critics are plain convolutions that are run uncompiled: their gradients are differentiated again, and a compiled or
+hand-written derivative may return a wrong second derivative without an error.
 """
 
 from functools import partial
@@ -13,11 +13,11 @@ from torch import Tensor, nn
 from neusee.nodes._half_precision import single
 from neusee.nodes.restore._networks._restorer import LEAK, LEAKY, start_network
 
-SMALLEST = 16  #: pixels a side, that four halvings leave one
+SMALLEST = 16  #: pixels a side, from which four halvings leave one
 
 
 class Critic(nn.Module):
-    """Four halvings and a mean: (n, 3, y, x) -> (n,). No norm, for a picture is judged by itself."""
+    """A network of four halvings and a mean: (n, 3, y, x) -> (n,). It has no norm, so each picture is scored alone."""
 
     gain = LEAKY
 
@@ -35,20 +35,20 @@ class Critic(nn.Module):
 
 
 def critics(rng: torch.Generator, width: int = 64) -> tuple[Critic, Critic]:
-    """D0 of the coarse estimate and D1 of the fine one: orthogonal weights that keep the power, zero biases."""
+    """Draw critic D0 of the coarse estimate and D1 of the fine one: power-keeping orthogonal weights, zero biases."""
     first, second = (start_network(partial(Critic, width), rng) for _ in range(2))
     return first, second
 
 
 def skip_critic_draws(rng: torch.Generator, count: int = 1) -> None:
-    """Draw what `critic_slopes` draws for ``count`` pictures, where another process looks at them."""
+    """Draw the random numbers of `critic_slopes` for ``count`` pictures whose slopes another process computes."""
     torch.rand(count, 1, 1, 1, generator=rng, device=rng.device)
 
 
 def critic_slopes(critic: nn.Module, truth: Tensor, estimate: Tensor, rng: torch.Generator) -> Tensor:
-    """How the critic rises somewhere between each true picture and its estimate, in single precision at least.
+    """Return the critic's gradient at a random point between each true picture and its estimate, at least in float32.
 
-    To be differentiated again, as by `losses.gradient_penalty`; nothing reaches the pictures.
+    The result can be differentiated again, as `losses.gradient_penalty` does. The pictures receive no gradient.
     """
     truth, estimate = single(truth.detach()), single(estimate.detach())
     share = torch.rand(len(truth), 1, 1, 1, generator=rng, device=rng.device).to(truth)

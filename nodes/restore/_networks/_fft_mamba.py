@@ -1,4 +1,4 @@
-"""The paper's restoration: a network that scans a picture and its spectrum, coarse and then fine."""
+"""The restoring network of the paper, which scans a picture and its spectrum, first coarse and then fine."""
 
 from functools import partial
 from pathlib import Path
@@ -17,11 +17,11 @@ from neusee.nodes.units import Count, DataFile
 
 
 class FFTMamba(Restorer):
-    """Blocks that take turns between rows and columns; two passes with the same weights, the fine one shown the coarse.
+    """A network of blocks that alternate between rows and columns, run twice with the same weights: coarse, then fine.
 
-    With ``directions`` 4 every block scans both. As a ``pyramid`` it has one pass, and the coarse estimate is the fine
-    one made smaller. Published: eight blocks, two scales, which modules there are. Ours: their sizes and how they are
-    put together.
+    The fine pass also takes the coarse estimate. With ``directions`` 4 every block scans rows and columns. With
+    ``pyramid`` the network runs once, and the coarse estimate is the reduced fine estimate. Eight blocks, two scales
+    and the modules are those of the paper. The sizes and connections of the modules are our choice.
     """
 
     def __init__(
@@ -56,7 +56,7 @@ class FFTMamba(Restorer):
         return coarse, self.improved(picture, resize(coarse, y, x))
 
     def improved(self, picture: Tensor, guess: Tensor) -> Tensor:
-        """One pass: the picture with what is missing, seen beside a first guess of the restored one."""
+        """Return the picture plus the part that one pass predicts to be missing, given a first estimate."""
         first = self.enter(F.pixel_unshuffle(torch.cat([picture, guess], 1), self.shuffle))
         missing = self.last(first + self.leave(self.blocks(first)))
         return picture + F.pixel_shuffle(missing, self.shuffle)
@@ -81,23 +81,24 @@ def fft_mamba(
 ) -> Tensor:
     """Restore a colour picture with the FFT-Mamba network.
 
-    Each block scans the picture there and back by rows or by columns, scans its spectrum from low to high frequencies
-    and back to draw a gate for it, and weighs both. One pass at half the size; one at the full size, which sees it.
-    ``tile``: a larger picture is restored in pieces of this side, which overlap: give that of the pictures it learnt
-    from, for the longer a scan, the less a network knows it. ``reduce``: it is made smaller by this factor before, and
-    larger again afterwards, where all that is finer is lost behind an element; ``detail``: where it is not, because the
-    picture is deconvolved, what is finer stays as it was.
-    ``ssm`` is the scan: s6 has a decay for each channel and state, ssd one for 16 channels, of which matrices are made.
+    Each block scans the picture in both directions along rows or columns, scans the spectrum from low to high
+    frequencies and back to compute a gate for the spectrum, and weighs both. One pass runs at half the size; one pass
+    at the full size takes the result of the first pass.
+    ``tile``: a larger picture is restored in overlapping pieces of this side. Use the side of the training pictures,
+    because a network is less accurate on longer scans. ``reduce``: the picture is reduced by this factor first and
+    enlarged again afterwards, for an element behind which finer detail is lost. ``detail``: the finer detail is added
+    unchanged, for a deconvolved picture, in which finer detail is not lost.
+    ``ssm`` is the scan: s6 has a decay for each channel and state; ssd has a decay for 16 channels, by matrix products.
     ``directions`` 4: each block scans rows and columns. ``pyramid``: one pass, at the full size. ``frequency``
-    amp_phase, to compare: the gate is drawn from amplitude and phase, and turns and scales.
+    amp_phase, for comparison: the gate is computed from amplitude and phase, and changes amplitude and phase.
 
     Shapes: picture (3, y, x) of any size -> (3, y, x).
-    Units:  linear sRGB, as the weights were trained on.
-    Error:  float32, 1e-5; of the restoration, what the training reached.
-    Raises: ParameterError before the run without weights, or where they do not fit; ValueError for a picture
-            that is no colour picture or not finite.
+    Units:  linear sRGB, as in the training of the weights.
+    Error:  float32, 1e-5; of the restoration, the error that the training reached.
+    Raises: ParameterError before the run without weights, or where the weights do not fit; ValueError for a picture
+            that is not a colour picture or not finite.
     Source: NeuSee, section Image Restoration; Gu and Dao, Mamba, 2023 (s6), Dao and Gu, Mamba-2, 2024
-            (ssd); sizes and wiring are ours.
+            (ssd); sizes and connections are ours.
     """
     kind = partial(FFTMamba, width, blocks, states, shuffle, ssm, directions, pyramid, frequency)
     return restored(picture, kind, weights, tile, reduce, detail)

@@ -1,4 +1,4 @@
-"""Blocks of the FFT-Mamba network: scans over the picture and over its spectrum, and a gate between them."""
+"""Blocks of the FFT-Mamba network: scans over the picture and over its spectrum, and a gate between both."""
 
 from typing import Any, Literal
 
@@ -11,13 +11,13 @@ from neusee.nodes.restore._networks._radial_order import radial_order
 from neusee.nodes.restore._networks._restorer import ChannelNorm, Scale, gated
 from neusee.nodes.restore._networks._scan_layer import BothWays, Kind
 
-Directions = Literal[2, 4]  #: a block scans rows or columns, or both
-Form = Literal["complex", "amp_phase"]  #: how a spectrum is read and gated
-SMALL = 1e-4  #: beside the square of an amplitude
+Directions = Literal[2, 4]  #: 2: a block scans rows or columns; 4: both
+Form = Literal["complex", "amp_phase"]  #: the numbers that represent a spectrum in a scan and in its gate
+SMALL = 1e-4  #: added to the square of an amplitude, so that gradients stay finite
 
 
 class Spatial(nn.Module):
-    """Scan the picture row by row, or column by column, or both in four ``directions``, and let it through a gate."""
+    """A scan of the picture along its rows, its columns, or both (four ``directions``), followed by a gate."""
 
     def __init__(
         self, width: int, states: int, by_columns: bool, kind: Kind = "s6", directions: Directions = 2
@@ -43,14 +43,14 @@ class Spatial(nn.Module):
 
 
 def _along(scan: nn.Module, value: Tensor, by_columns: bool) -> Tensor:
-    """A scan of (n, channel, y, x) along its rows or its columns."""
+    """Scan (n, channel, y, x) along its rows or its columns."""
     value = value.mT if by_columns else value
     scanned: Tensor = scan(value.flatten(2).transpose(1, 2)).transpose(1, 2).unflatten(2, value.shape[-2:])
     return scanned.mT if by_columns else scanned
 
 
 class _Phase(torch.autograd.Function):
-    """The angle of real + i imaginary, with a slope of 1 / |z| that stays finite: by |z|**2 + `SMALL`."""
+    """The angle of real + i imaginary, with a finite gradient: |z|**2 + `SMALL` replaces |z|**2."""
 
     @staticmethod
     def forward(ctx: Any, real: Tensor, imaginary: Tensor) -> Tensor:
@@ -65,10 +65,10 @@ class _Phase(torch.autograd.Function):
 
 
 class Frequency(nn.Module):
-    """Multiply the spectrum by a gate that a scan from low to high frequencies and back has drawn.
+    """A gate for the spectrum, computed by a scan from low to high frequencies and back.
 
-    Real and imaginary parts, for phase has no slope at 0; amplitude and phase, ``amp_phase``, are there to compare.
-    Near 1 at the start: the picture passes as it is.
+    The gate uses real and imaginary parts, because phase has no gradient at 0. Amplitude and phase, ``amp_phase``, are
+    for comparison. At the start of training the gate is close to 1 and the picture passes almost unchanged.
     """
 
     def __init__(self, width: int, states: int, kind: Kind = "s6", form: Form = "complex") -> None:
@@ -87,7 +87,7 @@ class Frequency(nn.Module):
     def forward(self, x: Tensor) -> Tensor:
         x, size = single(x), (x.shape[-2], x.shape[-1])
         order, place = radial_order(size, x.device)
-        with torch.autocast(x.device.type, enabled=False):  # a spectrum has no half precision
+        with torch.autocast(x.device.type, enabled=False):  # FFTs need full precision
             spectrum = torch.fft.rfft2(x, norm="ortho")
             sorted_ = spectrum.flatten(2).index_select(2, order)
             seen = self.norm(torch.cat(self._parts(sorted_), 1).transpose(1, 2))
@@ -107,7 +107,7 @@ class Frequency(nn.Module):
         return (real.square() + imaginary.square() + SMALL).sqrt(), phase
 
     def _factor(self, first: Tensor, second: Tensor) -> Tensor:
-        """Of the spectrum: 1 and a complex number, or a change of amplitude and a turn."""
+        """Return the factor of the spectrum: 1 plus a complex number, or a change of amplitude and of phase."""
         if self.form == "complex":
             return 1 + self.strength * torch.complex(first, second)
         amplitude, turn = 1 + self.strength * first, self.strength * second
@@ -115,7 +115,7 @@ class Frequency(nn.Module):
 
 
 class Block(nn.Module):
-    """What the two scans find, weighed against each other at every pixel; then a gated feed-forward."""
+    """A block that weighs both scans against each other at every pixel, followed by a gated feed-forward layer."""
 
     def __init__(
         self,

@@ -13,7 +13,7 @@ from neusee.nodes.units import Count, DataFile
 
 
 class NAFBlock(nn.Module):
-    """Channels multiply each other where others have an activation, and are weighed by their mean over the picture."""
+    """A block that multiplies pairs of channels instead of an activation, and scales channels by mean-based factors."""
 
     def __init__(self, width: int) -> None:
         super().__init__()
@@ -34,7 +34,7 @@ class NAFBlock(nn.Module):
 
 
 class NAFNet(Flat):
-    """Levels of blocks, each half the size and twice as wide, and back; what was there on the way down is added."""
+    """Levels of blocks, each of half the size and twice the width, and back, with skip connections that are added."""
 
     def __init__(self, width: int = 16, levels: Sequence[int] = (1, 1, 2, 4), middle: int = 2) -> None:
         super().__init__()
@@ -80,16 +80,16 @@ def nafnet(
     reduce: Count = 1,
     detail: bool = False,
 ) -> Tensor:
-    """Restore a colour picture with a small NAFNet: a strong baseline.
+    """Restore a colour picture with a small NAFNet, a strong baseline.
 
     ``tile``, ``reduce`` and ``detail`` as in `fft_mamba`.
 
     Shapes: picture (3, y, x) of any size -> (3, y, x).
-    Units:  linear sRGB, as the weights were trained on.
-    Error:  float32, 1e-5; of the restoration, what the training reached. Channels are weighed by their mean over the
-            whole picture, so that a crop is not restored as the picture is.
-    Raises: ParameterError before the run without weights, or where they do not fit; ValueError for a picture
-            that is no colour picture or not finite.
+    Units:  linear sRGB, as in the training of the weights.
+    Error:  float32, 1e-5; of the restoration, the error that the training reached. Channels are scaled by a function of
+            their mean over the whole picture, so a crop is not restored like the whole picture.
+    Raises: ParameterError before the run without weights, or where the weights do not fit; ValueError for a picture
+            that is not a colour picture or not finite.
     Source: Chen et al., Simple Baselines for Image Restoration, ECCV 2022; fewer blocks, and factors that start at 0.1.
     """
     return restored(picture, partial(NAFNet, width), weights, tile, reduce, detail)

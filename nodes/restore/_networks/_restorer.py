@@ -1,4 +1,4 @@
-"""What all networks that restore have in common: two scales, any size, how they start, how they are used."""
+"""The common base of all restoring networks: two scales, any picture size, initial weights and application."""
 
 import math
 from abc import ABC, abstractmethod
@@ -21,23 +21,23 @@ from neusee.nodes.units import Count
 
 Net = TypeVar("Net", bound=nn.Module)
 Tile = Annotated[Count, Field(ge=32)]  #: side of a piece, pixels
-LEAK = 0.2  #: of what is negative, where a layer leaks
+LEAK = 0.2  #: slope of a leaky layer for negative numbers
 LEAKY = nn.init.calculate_gain("leaky_relu", LEAK)
 LAYERS = (nn.Conv2d, nn.ConvTranspose2d, nn.Linear)
 
 
 class Restorer(nn.Module, ABC):
-    """A network from a picture to the same picture restored, (n, 3, y, x) of any size, at two scales."""
+    """A network from a picture to the restored picture, (n, 3, y, x) of any size, at two scales."""
 
-    multiple: int  #: of which height and width must be, inside
-    last: nn.Conv2d  #: from which what is added to the picture comes
+    multiple: int  #: divisor of the height and width inside the network
+    last: nn.Conv2d  #: layer that computes the change that is added to the picture
 
     @abstractmethod
     def scales(self, picture: Tensor) -> tuple[Tensor, Tensor]:
-        """Restore a picture whose size fits: the coarse estimate, of half the size, and the fine one."""
+        """Restore a picture of a size that fits: return the coarse estimate (half the size) and the fine one."""
 
     def pyramid(self, picture: Tensor) -> tuple[Tensor, Tensor]:
-        """Estimate at L = 0, half the size rounded up, and L = 1, the full size."""
+        """Return the estimates at L = 0, half the size rounded up, and at L = 1, the full size."""
         y, x = picture.shape[-2:]
         coarse, fine = self.scales(mirrored(picture, -y % self.multiple, -x % self.multiple))
         return coarse[..., : -(-y // 2), : -(-x // 2)], fine[..., :y, :x]
@@ -47,11 +47,11 @@ class Restorer(nn.Module, ABC):
 
 
 class Flat(Restorer):
-    """A network of one scale, which gives what is to be added to the picture; its coarse estimate is the fine one's."""
+    """A network of one scale that computes a change of the picture; its coarse estimate is the reduced fine one."""
 
     @abstractmethod
     def change(self, picture: Tensor) -> Tensor:
-        """Difference of the restored picture to this one, whose size fits."""
+        """Return the restored picture minus this picture, whose size fits."""
 
     def scales(self, picture: Tensor) -> tuple[Tensor, Tensor]:
         fine = picture + self.change(picture)
@@ -59,14 +59,14 @@ class Flat(Restorer):
 
 
 class ChannelNorm(nn.LayerNorm):
-    """Layer norm over the channels of (n, channel, y, x), never in half precision."""
+    """A layer norm over the channels of (n, channel, y, x), never in half precision."""
 
     def forward(self, input: Tensor) -> Tensor:
         return super().forward(single(input).movedim(1, -1)).movedim(-1, 1)
 
 
 class Scale(nn.Module):
-    """A factor for each channel: what a block adds is small at the start."""
+    """A factor for each channel, small at the start, which scales the change that a block adds."""
 
     def __init__(self, channels: int) -> None:
         super().__init__()
@@ -80,10 +80,10 @@ class Scale(nn.Module):
 
 
 def start_network(make: Callable[[], Net], rng: torch.Generator) -> Net:
-    """Draw a network: its layers with orthogonal weights and zero biases; norms, decays and factors as these need.
+    """Draw a network: orthogonal weights and zero biases for layers; norms, decays and factors by their own rules.
 
-    Those of a network with leaky layers are larger by its `gain`, which keeps the power from layer to layer. What is
-    added to a picture is a tenth of what comes, so that the network starts as almost the picture itself.
+    The weights of a network with leaky layers are multiplied by its `gain`, which keeps the power from layer to layer.
+    The change to a picture is multiplied by a tenth, so that the network at first returns almost the same picture.
     """
     net = empty(make).to_empty(device=rng.device)
     gain = getattr(net, "gain", 1.0)
@@ -103,7 +103,7 @@ def start_network(make: Callable[[], Net], rng: torch.Generator) -> Net:
 
 
 def parameter_groups(net: nn.Module, weights: float = 2e-4, biases: float = 4e-4) -> list[dict[str, Any]]:
-    """Two groups for an optimiser: all else, and the biases of layers; those of scans and norms are none of these."""
+    """Return two groups for an optimiser: all other parameters, and the biases of layers (not of scans and norms)."""
     of_layers = [m.bias for m in net.modules() if isinstance(m, LAYERS) and m.bias is not None]
     known = set(map(id, of_layers))
     others = [p for p in net.parameters() if id(p) not in known]
@@ -118,14 +118,14 @@ def restored(
     reduce: int = 1,
     detail: bool = False,
 ) -> Tensor:
-    """The picture through the network with these weights, in single precision; gradients reach the picture alone.
+    """Restore the picture by the network with these weights, in single precision; only the picture receives gradients.
 
-    ``tile``: the side of the pieces it is restored in, where it is larger. ``reduce``: by what it is made smaller
-    before, and larger again afterwards, antialiased; with ``detail`` what that loses is added as it was.
+    ``tile``: the side of the pieces in which a larger picture is restored. ``reduce``: the factor by which the picture
+    is first reduced and afterwards enlarged, antialiased; ``detail`` adds the detail that the reduction loses.
     """
     if picture.ndim != 3 or len(picture) != 3:
-        raise ValueError(f"a picture {tuple(picture.shape)} is no colour picture: give (3, y, x)")
-    refuse_not_finite("one of them is soon everywhere", picture=picture)
+        raise ValueError(f"a picture {tuple(picture.shape)} is not a colour picture: give (3, y, x)")
+    refuse_not_finite("the network would spread them to every pixel", picture=picture)
     net = loaded(make, _needed(weights)).requires_grad_(False).eval().to(picture.device)
     exact = torch.backends.cudnn.flags(enabled=True, benchmark=False, deterministic=True, allow_tf32=False)
     with exact, torch.autocast(picture.device.type, enabled=False):
@@ -139,28 +139,26 @@ def restored(
 
 
 def fitting(make: Callable[[], Restorer], weights: Path | None, width: int) -> list[str]:
-    """Refuse a network without weights, and weights of another network."""
+    """Raise ParameterError for a network without weights, or with weights of another network."""
     same_layout(make, _needed(weights), width)
     return []
 
 
 def _needed(weights: Path | None) -> Path:
     if weights is None:
-        text = (
-            "a network restores nothing untrained: give the .safetensors file of its weights, or choose restore: wiener"
-        )
+        text = "a network needs trained weights: give the .safetensors file of its weights, or choose restore: wiener"
         raise ParameterError("weights", text)
     return weights
 
 
 def restorer_checks(result: Tensor, picture: Tensor, **params: Any) -> list[Check]:
-    """How much the network changed, against how much there is."""
+    """Return a check of the root mean square change by the network, beside that of the picture."""
     change = float((result - picture).square().mean(dtype=torch.float64).sqrt())
     there = float(picture.square().mean(dtype=torch.float64).sqrt())
     return [Check(f"changed by {change:.3g} rms, of {there:.3g}", math.isfinite(change))]
 
 
 def gated(x: Tensor) -> Tensor:
-    """One half of the channels, let through by the other."""
+    """Return the first half of the channels, gated by the second half."""
     value, gate = x.chunk(2, 1)
     return F.gelu(gate) * value

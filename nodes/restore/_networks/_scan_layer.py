@@ -1,4 +1,4 @@
-"""Selective scans along a line, with weights: what they are given, what they keep, and how they start."""
+"""Selective scans along a line with trainable weights: their inputs, decays and initial values."""
 
 import math
 from typing import Literal
@@ -11,13 +11,13 @@ from neusee.nodes._half_precision import single
 from neusee.nodes.restore._scan._one_decay_scan import dual_scan
 from neusee.nodes.restore._scan._selective_scan import selective_scan
 
-Kind = Literal["s6", "ssd"]  #: a decay for each channel and state, or one for each head
+Kind = Literal["s6", "ssd"]  #: s6: a decay for each channel and state; ssd: a decay for each head
 HEAD = 16  #: channels that share a decay
-STEPS = (1e-3, 0.1)  #: of a scan at the start, log-uniform: a memory of ten to a thousand places
+STEPS = (1e-3, 0.1)  #: range of the first steps of a scan, log-uniform: a memory of ten to a thousand positions
 
 
 class Scan(nn.Module):
-    """One selective scan along (n, length, channel), with step, input and output read from what passes."""
+    """A selective scan along (n, length, channel) whose step, input and output are computed from the line itself."""
 
     def __init__(self, channels: int, states: int, rank: int) -> None:
         super().__init__()
@@ -29,7 +29,7 @@ class Scan(nn.Module):
         self.D = nn.Parameter(torch.empty(channels))
 
     def start(self, rng: torch.Generator) -> None:
-        """Zeros here, as for other biases, would leave a memory of one place."""
+        """Set the first step and decay; zero biases, as in other layers, would give a memory of one position."""
         self.dt_bias.copy_(_first_steps(len(self.D), rng))
         self.A_log.copy_(torch.arange(1.0, 1.0 + self.A_log.shape[1], device=rng.device).log().expand_as(self.A_log))
         self.D.fill_(1.0)
@@ -43,7 +43,7 @@ class Scan(nn.Module):
 
 
 class DualScan(nn.Module):
-    """The same with one step and one decay for all channels of a head, which products of matrices compute."""
+    """A selective scan with one step and one decay for all channels of a head, computed by matrix products."""
 
     def __init__(self, channels: int, states: int, rank: int) -> None:
         super().__init__()
@@ -53,7 +53,7 @@ class DualScan(nn.Module):
         self.dt_bias, self.A_log, self.D = (nn.Parameter(torch.empty(heads)) for _ in range(3))
 
     def start(self, rng: torch.Generator) -> None:
-        """Decays as uniform from 1 to 16 as those of `Scan` are; zero biases would leave a memory of one place."""
+        """Set decays uniform from 1 to 16, the range of `Scan`; zero biases would give a memory of one position."""
         self.dt_bias.copy_(_first_steps(len(self.D), rng))
         self.A_log.uniform_(1.0, 16.0, generator=rng).log_()
         self.D.fill_(1.0)
@@ -65,7 +65,7 @@ class DualScan(nn.Module):
 
 
 class BothWays(nn.Module):
-    """A scan there and one back, each with its own weights, added."""
+    """The sum of a forward and a backward scan, each with its own weights."""
 
     def __init__(self, channels: int, states: int, rank: int, kind: Kind = "s6") -> None:
         super().__init__()
@@ -78,7 +78,7 @@ class BothWays(nn.Module):
 
 
 def _first_steps(count: int, rng: torch.Generator) -> Tensor:
-    """What softplus turns into steps at the start."""
+    """Return the biases that softplus turns into the first steps."""
     low, high = map(math.log, STEPS)
     steps = torch.rand(count, generator=rng, device=rng.device).mul_(high - low).add_(low).exp_()
     return steps + torch.log(-torch.expm1(-steps))

@@ -1,4 +1,4 @@
-"""A picture in pieces of the size that a network was trained on, put together without seams."""
+"""Restoration of a picture in tiles of the size that a network was trained on, joined without seams."""
 
 import math
 from collections.abc import Callable
@@ -7,14 +7,14 @@ from itertools import product
 import torch
 from torch import Tensor
 
-_OVERLAP = 0.25  #: of a tile's side, at least, that it shares with the next
+_OVERLAP = 0.25  #: least share of a tile's side that overlaps the next tile
 
 
 def tiled(change: Callable[[Tensor], Tensor], picture: Tensor, side: int) -> Tensor:
-    """What ``change`` makes of a picture (n, 3, y, x), tile by tile; where tiles overlap, their weighted mean.
+    """Apply ``change`` to a picture (n, 3, y, x) tile by tile, and return the weighted mean where tiles overlap.
 
-    Weights fall linearly to an edge where another tile goes on, so that nothing jumps there. Tiles lie inside the
-    picture; one that is no larger than a tile is changed as it is.
+    Weights fall linearly towards an edge beyond which another tile continues, so that tiles join without a step. Tiles
+    lie inside the picture; a picture that is no larger than a tile is changed as a whole.
     """
     size = (picture.shape[-2], picture.shape[-1])
     if max(size) <= side:
@@ -30,7 +30,7 @@ def tiled(change: Callable[[Tensor], Tensor], picture: Tensor, side: int) -> Ten
 
 
 def _starts(length: int, side: int) -> list[int]:
-    """Where tiles begin: as few as overlap enough, evenly spread."""
+    """Return the starts of evenly spread tiles, as few as give the least overlap."""
     if length <= side:
         return [0]
     count = 1 + math.ceil((length - side) / (side * (1 - _OVERLAP)))
@@ -38,7 +38,7 @@ def _starts(length: int, side: int) -> list[int]:
 
 
 def _ramp(start: int, side: int, length: int, like: Tensor) -> Tensor:
-    """Weight along one axis: 1, and down to almost 0 at an edge that is not the picture's."""
+    """Return the weight along one axis: 1, falling to almost 0 at an edge inside the picture."""
     side = min(side, length)
     at = torch.arange(side, dtype=like.dtype, device=like.device) + 0.5
     rise = (at / (side * _OVERLAP)).clamp(max=1.0)

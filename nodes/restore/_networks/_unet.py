@@ -1,4 +1,4 @@
-"""A plain UNet: what a network restores that knows nothing of spectra and scans."""
+"""A plain UNet, which shows how well a network restores without spectra and scans."""
 
 from functools import partial
 from itertools import pairwise
@@ -14,7 +14,7 @@ from neusee.nodes.units import Count, DataFile
 
 
 class UNet(Flat):
-    """Two convolutions a level, four levels, each half the size and twice as wide, and the way back beside them."""
+    """A network of four levels, each of two convolutions, half the size and twice the width, and back with skips."""
 
     multiple, gain = 8, LEAKY
 
@@ -53,16 +53,16 @@ def unet(
     reduce: Count = 1,
     detail: bool = False,
 ) -> Tensor:
-    """Restore a colour picture with a plain UNet: a baseline.
+    """Restore a colour picture with a plain UNet, a baseline.
 
     ``tile``, ``reduce`` and ``detail`` as in `fft_mamba`.
 
     Shapes: picture (3, y, x) of any size -> (3, y, x).
-    Units:  linear sRGB, as the weights were trained on.
-    Error:  float32, 1e-5; of the restoration, what the training reached.
-    Raises: ParameterError before the run without weights, or where they do not fit; ValueError for a picture
-            that is no colour picture or not finite.
-    Source: Ronneberger et al., U-Net, MICCAI 2015; four levels, padded convolutions and the picture added are ours.
+    Units:  linear sRGB, as in the training of the weights.
+    Error:  float32, 1e-5; of the restoration, the error that the training reached.
+    Raises: ParameterError before the run without weights, or where the weights do not fit; ValueError for a picture
+            that is not a colour picture or not finite.
+    Source: Ronneberger et al., U-Net, MICCAI 2015; four levels, padded convolutions and the added picture are ours.
     """
     return restored(picture, partial(UNet, width), weights, tile, reduce, detail)
 

@@ -1,8 +1,8 @@
-"""The selective scan in C++, compiled for this very processor on first use and kept for the next.
+"""The selective scan in C++, compiled for the processor of this machine on first use and then reused.
 
-The source asks for nothing but a compiler: no headers of torch and none of Python, so that it compiles in a second or
-two and the library serves any version of both. A library is made beside its place and moved there whole: two processes
-that make it at once both end with a good one, and one that is killed leaves nothing that others wait for.
+The source needs only a compiler, no headers of torch or Python. It compiles in a second or two, and the library works
+with any version of both. The library is compiled in a temporary folder and moved by an atomic rename: two processes
+that compile at once both get a valid library, and a process that is killed leaves no lock behind.
 """
 
 import ctypes
@@ -23,8 +23,8 @@ from torch import Tensor
 from neusee.nodes.restore._scan._torch_scan import refuse_twice
 
 CODE = Path(__file__).with_name("_scan.cpp")
-#: of the source: the keys of what is cached follow this file, and so that one; a test compares
-DIGEST = "863111a7de82003b"
+#: digest of the source: keys of cached results depend on this file, and so on the C++ source; a test compares both
+DIGEST = "379aa95ba41e1932"
 FLAGS = (
     *("-std=c++17", "-O3", "-march=native", "-fopenmp", "-fPIC", "-shared", "-w"),
     *("-ffp-contract=fast", "-fno-math-errno", "-fno-trapping-math"),
@@ -33,19 +33,19 @@ NAMES = {torch.float32: "f32", torch.float64: "f64"}
 
 
 class NoCompilerError(RuntimeError):
-    """The operator cannot be made here; says why in one line."""
+    """The error that the operator cannot be compiled on this machine; its message gives the reason in one line."""
 
 
 def folder() -> Path:
-    """Where compiled code lies: ``$XDG_CACHE_HOME/neusee/build``, else ``~/.cache/neusee/build``.
+    """Return the folder of compiled code: ``$XDG_CACHE_HOME/neusee/build``, else ``~/.cache/neusee/build``.
 
-    It must outlive the process, or each would compile; no result is ever kept there, nor hangs on it.
+    The folder must outlive the process, or each process would compile. No result is kept there or depends on it.
     """
     return Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache") / "neusee" / "build"
 
 
 def _processor() -> str:
-    """What tells processors apart that cannot run each other's code, as a home shared by many machines needs."""
+    """Return the text that identifies a processor, because a home folder may be shared by different machines."""
     try:
         lines = Path("/proc/cpuinfo").read_text(encoding="utf-8", errors="replace").splitlines()
     except OSError:
@@ -55,10 +55,10 @@ def _processor() -> str:
 
 
 def _compile(where: Path) -> None:
-    """Make the library at ``where``; a `NoCompilerError` where that fails."""
+    """Compile the library to ``where``; raise `NoCompilerError` where that fails."""
     compiler = os.environ.get("CXX") or shutil.which("g++") or shutil.which("c++") or shutil.which("clang++")
     if compiler is None:
-        raise NoCompilerError("there is no C++ compiler")
+        raise NoCompilerError("there is no C++ compiler: install g++, or set CXX")
     try:
         where.parent.mkdir(parents=True, exist_ok=True)
         with tempfile.TemporaryDirectory(dir=where.parent) as aside:
@@ -75,7 +75,7 @@ def _compile(where: Path) -> None:
 
 @functools.cache
 def _made(build: Path, compiler: str | None) -> ctypes.CDLL | NoCompilerError:
-    """The library, or why there is none: tried once a process for each folder and compiler."""
+    """Return the library, or the reason why there is none, after one attempt for each folder and compiler."""
     words = [CODE.read_text(encoding="utf-8"), *FLAGS, compiler or "", _processor()]
     where = build / f"scan_{hashlib.sha256(chr(0).join(words).encode()).hexdigest()[:32]}.so"
     try:
@@ -89,7 +89,7 @@ def _made(build: Path, compiler: str | None) -> ctypes.CDLL | NoCompilerError:
 
 
 def operators() -> ctypes.CDLL:
-    """The compiled operator; a `NoCompilerError` where it cannot be made."""
+    """Return the compiled operator; raise `NoCompilerError` where it cannot be compiled."""
     found = _made(folder(), os.environ.get("CXX"))
     if isinstance(found, NoCompilerError):
         raise found
@@ -98,11 +98,11 @@ def operators() -> ctypes.CDLL:
 
 @functools.cache
 def _say_once(why: str) -> None:
-    warnings.warn(f"the selective scan is not compiled, torch computes it, slower: {why}", stacklevel=4)
+    warnings.warn(f"the selective scan is not compiled and torch computes the scan, slower: {why}", stacklevel=4)
 
 
 def compiled() -> bool:
-    """Whether the operator is there, made now if need be; warns the first time it is not."""
+    """Return True if the operator is available, compiling it if needed; warn the first time it is not available."""
     try:
         operators()
     except NoCompilerError as error:
@@ -112,20 +112,20 @@ def compiled() -> bool:
 
 
 def _sizes(u: Tensor, rate: Tensor) -> tuple[int, int, int, int, int, int]:
-    """Batch, length, d, n, groups of channels whose gradients of B and C are summed apart, and threads."""
+    """Return batch, length, d, n, groups of channels (gradients of B and C are summed by group), and threads."""
     (batch, length, d), n, threads = u.shape, rate.shape[1], torch.get_num_threads()
     blocks = -(-d // (64 // u.element_size()))
     return batch, length, d, n, min(blocks, -(-threads // batch)), threads
 
 
 def _call(name: str, sizes: tuple[int, ...], *tensors: Tensor) -> None:
-    """Hand contiguous tensors to the operator ``name`` of their type; Python's other threads run meanwhile."""
+    """Pass contiguous tensors to the operator ``name`` of their type, without the global interpreter lock."""
     operator = getattr(operators(), f"neusee_scan_{name}_{NAMES[tensors[0].dtype]}")
     operator((ctypes.c_int64 * len(sizes))(*sizes), *(ctypes.c_void_p(x.data_ptr()) for x in tensors))
 
 
 class Scan(torch.autograd.Function):
-    """u, dt (batch, length, d), A (d, n), B, C (batch, length, n) -> y (batch, length, d); once differentiable."""
+    """The scan, differentiable once: u, dt (batch, length, d), A (d, n), B, C (batch, length, n) -> as u."""
 
     @staticmethod
     def forward(ctx: Any, *tensors: Tensor) -> Tensor:

@@ -1,4 +1,4 @@
-"""The selective scan with one decay for a whole head, as products of matrices: no kernel of its own is needed."""
+"""The selective scan with one decay for each head, as matrix products, which need no kernel of their own."""
 
 import torch
 from torch import Tensor
@@ -6,18 +6,18 @@ from torch.nn import functional as F
 
 
 def dual_scan(u: Tensor, dt: Tensor, A: Tensor, B: Tensor, C: Tensor, D: Tensor, *, chunk: int = 32) -> Tensor:
-    """h = exp(dt A) h + dt B u, y = C h + D u along the length, where all channels of a head share dt and A.
+    """Compute h = exp(dt A) h + dt B u, y = C h + D u along the length, where all channels of a head share dt and A.
 
-    Within a chunk every place sees every earlier one by a matrix; from chunk to chunk a state is handed on. Logarithms
-    of decays are added over each stretch anew: a difference of running sums loses what is small beside them.
+    Within a chunk a matrix connects every position with all earlier positions; a state passes from chunk to chunk.
+    Logarithms of decays are summed over each stretch separately, because a difference of running sums loses precision.
 
     Shapes: u (batch, length, head * channel), dt (batch, length, head), A and D (head,), B and C (batch, length, n)
             -> as u. In single precision at least.
     """
     heads, length = len(A), u.shape[1]
-    more = -length % chunk  # no light and no decay: nothing changes
+    more = -length % chunk  # padding without input and decay changes nothing
     x, step, into, out = (F.pad(v, (0, 0, 0, more)).view(len(v), -1, chunk, v.shape[-1]) for v in (u, dt, B, C))
-    x = x.view(*x.shape[:3], heads, -1).movedim(-2, 2)  # batch, chunk, head, place, channel
+    x = x.view(*x.shape[:3], heads, -1).movedim(-2, 2)  # batch, chunk, head, position, channel
     step = step.movedim(-1, 2)
     stretch = _stretches(step * A[:, None])
     fed = step[..., None] * x
@@ -30,7 +30,7 @@ def dual_scan(u: Tensor, dt: Tensor, A: Tensor, B: Tensor, C: Tensor, D: Tensor,
 
 
 def _stretches(logs: Tensor) -> Tensor:
-    """(…, place) -> (…, i, j): the sum over the places after j up to i; minus infinity where j is later than i."""
+    """Sum (…, position) to (…, i, j) over the positions after j up to i; minus infinity where j is later than i."""
     size = logs.shape[-1]
     here = torch.ones(size, size, dtype=torch.bool, device=logs.device).tril()
     after = logs[..., None].expand(*logs.shape, size).masked_fill(~here.tril(-1), 0.0)
@@ -38,7 +38,7 @@ def _stretches(logs: Tensor) -> Tensor:
 
 
 def _handed_on(left: Tensor, decay: Tensor) -> Tensor:
-    """What each chunk is given: what all earlier ones left."""
+    """Return the state at the start of each chunk, which all earlier chunks contribute to."""
     state, given = torch.zeros_like(left[:, 0]), []
     for new, share in zip(left.unbind(1), decay.unbind(1), strict=True):
         given.append(state)

@@ -1,6 +1,6 @@
-// The selective scan on a CPU, in plain C++ with GCC's vectors: a vector holds neighbouring channels d, so that any n
-// runs at full width and nothing is summed across lanes until the gradients of B and C. Layouts as in _scan.py, rows
-// contiguous. Decays enter as exp(x) - 1: near 1, a decay rounded to its own type would be forgotten wrongly for ever.
+// The selective scan on a CPU, in plain C++ with GCC's vectors. A vector holds neighbouring channels d, so that any n
+// runs at full width and only the gradients of B and C are summed across lanes. Layouts as in _cpp_scan.py, rows
+// contiguous. Decays enter as exp(x) - 1, because the round-off of a decay near 1 would act at each step.
 
 #include <algorithm>
 #include <cstdint>
@@ -12,7 +12,7 @@
 
 namespace {
 
-constexpr int64_t STEPS = 32;  // between kept states: what one chunk needs again stays in the second cache
+constexpr int64_t STEPS = 32;  // between stored states, so that the states of one chunk fit in the second-level cache
 
 template <class T>
 struct Kind;
@@ -38,8 +38,8 @@ struct Kind<double> {
 template <class T>
 using Vector = typename Kind<T>::Vector;
 
-// Numbers too small for a full mantissa count as zero while this lives: a state that has died away would stay among
-// them, and each product there takes a hundred times as long. (It stays at some 1e-38 / dt |A| instead.)
+// While this object lives, subnormal numbers count as zero: a decayed state would stay subnormal, and each product
+// with a subnormal number takes a hundred times as long. (The state stays at some 1e-38 / dt |A| instead.)
 struct NoSubnormals {
 #ifdef __SSE2__
     unsigned before = _mm_getcsr();
@@ -50,7 +50,7 @@ struct NoSubnormals {
 #endif
 };
 
-// exp(x) - 1 and exp(x), each to an ulp or two of its own, by 2^k (1 + p(r)) with |r| <= ln(2)/2.
+// exp(x) - 1 and exp(x), each to one or two ulp of its own, by 2^k (1 + p(r)) with |r| <= ln(2)/2.
 template <class T>
 struct Decay {
     Vector<T> lost, left;
@@ -101,8 +101,8 @@ inline T across(const Vector<T>& v) {
     return part[0];
 }
 
-// sum += more, and what rounding lost of it in ``lost``, to be added with the next: thousands of steps of a state that
-// hardly decays would round away more than the scan as a whole is good for.
+// sum += more, with the round-off in ``lost``, which is added at the next step. Otherwise the round-off of thousands of
+// steps of a state that hardly decays would exceed the error of the rest of the scan.
 template <class V>
 inline void add(V& sum, V& lost, V more) {
     more += lost;
@@ -116,7 +116,7 @@ struct Sizes {
     int64_t chunks() const { return (length + STEPS - 1) / STEPS; }
 };
 
-// What a lane block needs of A: (n) vectors.
+// The vectors of A for one lane block: (n).
 template <class T>
 void rates(const Sizes& s, const T* A, int64_t first, Vector<T>* out) {
     for (int64_t n = 0; n < s.n; ++n) {
@@ -156,8 +156,8 @@ struct Gradients {
 };
 
 // One chunk of one lane block backwards. kept: (STEPS + 1, n) states, twice (STEPS, n) decays, (n) for sums;
-// acc: (STEPS, n) each of the gradients of B and C, over lanes; carry, its lost parts and slope: (n), of the state and
-// of A.
+// acc: (STEPS, n) for the gradient of B and as many for that of C, by lane; carry, its round-off and slope: (n), of the
+// state and of A.
 template <class T>
 void backward_chunk(const Sizes& s, int64_t b, int64_t chunk, int64_t first, const T* u, const T* dt, const T* B,
                     const T* C, const T* dy, const T* states, const Vector<T>* rate, Vector<T>* kept, Vector<T>* acc,
@@ -202,7 +202,7 @@ void backward_chunk(const Sizes& s, int64_t b, int64_t chunk, int64_t first, con
     }
 }
 
-// The blocks of one group, chunk by chunk from the end; B and C of the group: sums across its lanes.
+// The blocks of one group, chunk by chunk from the end, with gradients of B and C summed over the lanes of the group.
 template <class T>
 void backward_group(const Sizes& s, int64_t b, int64_t group, const T* u, const T* dt, const T* A, const T* B,
                     const T* C, const T* dy, const T* states, const Gradients<T>& out) {
@@ -255,7 +255,7 @@ void backward(const Sizes& s, const T* u, const T* dt, const T* A, const T* B, c
 }  // namespace
 
 // sizes: batch, length, d, n, groups, threads. states: (batch, chunks, n, d). Gradients: A (batch, n, d), B and C
-// (group, batch, length, n), to be summed over their first.
+// (group, batch, length, n), which the caller sums over their first dimension.
 #define NEUSEE_SCAN(T, name)                                                                                        \
     extern "C" void neusee_scan_forward_##name(const int64_t* sizes, const T* u, const T* dt, const T* A,           \
                                                const T* B, const T* C, T* y, T* states) {                           \

@@ -1,4 +1,4 @@
-"""The selective scan: a linear recurrence whose step, input and output each position chooses for itself."""
+"""The selective scan: a linear recurrence whose step, input and output depend on the position."""
 
 import functools
 import importlib.util
@@ -24,18 +24,18 @@ def selective_scan(
     *,
     backend: Literal["auto", "torch", "cpp", "triton", "mamba_ssm"] = "auto",
 ) -> Tensor:
-    """Run h_t = exp(dt_t A) h_(t-1) + dt_t B_t u_t from h = 0 and read y_t = C_t . h_t + D u_t.
+    """Run h_t = exp(dt_t A) h_(t-1) + dt_t B_t u_t from h = 0 and return y_t = C_t . h_t + D u_t.
 
-    ``A`` is negative and ``dt`` positive: decays are at most 1 and only ever multiplied, so that nothing overflows at
-    any length. ``backend`` "auto" is C++ on a CPU where there is a compiler, on CUDA, in float32, a Triton kernel or
-    else mamba_ssm where these are installed, and torch else; ``NEUSEE_SCAN=torch`` makes it torch everywhere.
-    Differentiable once: a gradient of its gradient is refused.
+    ``A`` is negative and ``dt`` positive: decays are at most 1 and are only multiplied, so nothing overflows at any
+    length. ``backend`` "auto" is C++ on a CPU with a compiler; on CUDA in float32 a Triton kernel, or mamba_ssm where
+    only mamba_ssm is installed; and torch in all other cases. ``NEUSEE_SCAN=torch`` selects torch everywhere.
+    The scan is differentiable once: a gradient of its gradient raises an error.
 
     Shapes: u, dt (batch, length, d), A (d, n), B, C (batch, length, n), D (d) -> (batch, length, d).
     Units:  none; dt in those of 1 / A.
     Error:  float32, also from half precision and under autocast: of the largest |y|, over 65 536 steps and for
-            dt |A| from 1e-6 to 200, 2e-7 in C++ and Triton, 7e-7 in torch. float64 if any input is: 1e-12.
-    Raises: ValueError for shapes that do not fit and for a backend that these tensors, or this machine, do not have.
+            dt |A| from 1e-6 to 200, 2e-7 in C++ and Triton, 7e-7 in torch. float64 if any input is float64: 1e-12.
+    Raises: ValueError for shapes that do not fit and for a backend that these tensors, or this machine, do not support.
     Source: Gu and Dao, Mamba: Linear-Time Sequence Modeling with Selective State Spaces, 2023, algorithm 2.
     """
     _check_shapes(u, dt, A, B, C, D)
@@ -47,14 +47,14 @@ def selective_scan(
 
 
 def reference(u: Tensor, dt: Tensor, A: Tensor, B: Tensor, C: Tensor, D: Tensor | None = None) -> Tensor:
-    """The same by the loop that defines it, in float64, to measure others by: slow, and differentiable at will.
+    """Compute the scan by the loop that defines it, in float64, as a slow reference with all derivatives.
 
     Shapes: as `selective_scan`.
     """
     _check_shapes(u, dt, A, B, C, D)
     u, dt, A, B, C = (x.double() for x in (u, dt, A, B, C))
     h, rows = u.new_zeros(u.shape[0], *A.shape), []
-    # unbind, for a row that is indexed has a gradient as long as all rows
+    # unbind, because the gradient of an indexed row is as long as all rows
     for push, step, into, out in zip((dt * u).unbind(1), dt.unbind(1), B.unbind(1), C.unbind(1), strict=True):
         h = torch.exp(step[..., None] * A) * h + push[..., None] * into[:, None]
         rows.append((h @ out[..., None])[..., 0])
@@ -84,10 +84,10 @@ def _check_shapes(u: Tensor, dt: Tensor, A: Tensor, B: Tensor, C: Tensor, D: Ten
 
 
 def _kind(*tensors: Tensor) -> torch.dtype:
-    """float64 if any is, else float32."""
+    """Return float64 if any tensor is float64, else float32."""
     for x in tensors:
         if not x.is_floating_point():
-            raise ValueError(f"the selective scan is of real numbers, not of {x.dtype}")
+            raise ValueError(f"the selective scan takes real numbers, not {x.dtype}")
     return torch.float64 if any(x.dtype == torch.float64 for x in tensors) else torch.float32
 
 
@@ -105,18 +105,18 @@ def _auto(u: Tensor, kind: torch.dtype) -> Backend:
 
 
 def _kernel(named: str) -> Backend:
-    """What scans on CUDA: what is named if it is installed, else what is."""
+    """Return the backend for CUDA: the named backend if it is installed, else an installed one, else torch."""
     if named != "mamba_ssm" and importlib.util.find_spec("triton"):
         return "triton"
     if named != "triton" and importlib.util.find_spec("mamba_ssm"):
         return "mamba_ssm"
-    _say_once(f"neither Triton nor mamba_ssm is here for the selective scan{named and f' ({named} is asked for)'}")
+    _say_once(f"neither Triton nor mamba_ssm is installed for the selective scan{named and f' ({named} is requested)'}")
     return "torch"
 
 
 @functools.cache
 def _say_once(why: str) -> None:
-    warnings.warn(f"{why}: torch computes it, slower", stacklevel=5)
+    warnings.warn(f"{why}: torch computes the scan, slower", stacklevel=5)
 
 
 def _run(backend: str, u: Tensor, dt: Tensor, A: Tensor, B: Tensor, C: Tensor) -> Tensor:
@@ -124,19 +124,19 @@ def _run(backend: str, u: Tensor, dt: Tensor, A: Tensor, B: Tensor, C: Tensor) -
         raise ValueError(f"backend is {backend!r}: write auto, {', '.join(get_args(Backend))}")
     if backend in ("triton", "mamba_ssm"):
         if u.device.type != "cuda" or u.dtype != torch.float32:
-            raise ValueError(f"the backend {backend} is for float32 on CUDA, and u is {u.dtype} on {u.device}")
+            raise ValueError(f"the backend {backend} is for float32 on CUDA, but u is {u.dtype} on {u.device}")
         return (by_mamba if backend == "mamba_ssm" else by_triton)(u, dt, A, B, C)
     if backend == "cpp" and u.device.type != "cpu":
-        raise ValueError(f"the backend cpp is for the CPU, and u is on {u.device}")
+        raise ValueError(f"the backend cpp is for the CPU, but u is on {u.device}")
     scan = _cpp_scan.Scan if backend == "cpp" and _cpp_scan.compiled() else _torch_scan.Scan
     y: Tensor = scan.apply(u, dt, A, B, C)  # type: ignore[no-untyped-call]
     return y
 
 
 def by_triton(*tensors: Tensor) -> Tensor:
-    """By our own kernel; a `ValueError` where Triton is not installed."""
+    """Run the scan by the Triton kernel; raise ValueError where Triton is not installed."""
     if not importlib.util.find_spec("triton"):
-        raise ValueError("the backend triton is not here: it comes with torch's CUDA builds")
+        raise ValueError("the backend triton is not installed: install a CUDA build of torch, which includes it")
     from neusee.nodes.restore._scan import _triton_scan
 
     y: Tensor = _triton_scan.Scan.apply(*tensors)  # type: ignore[no-untyped-call]
@@ -144,7 +144,7 @@ def by_triton(*tensors: Tensor) -> Tensor:
 
 
 class _Once(torch.autograd.Function):
-    """Its input, whose gradient must not be asked for a gradient: mamba_ssm's would be wrong without a word."""
+    """An identity that refuses a second derivative, because that of mamba_ssm is wrong without an error."""
 
     @staticmethod
     def forward(ctx: object, y: Tensor) -> Tensor:
@@ -157,11 +157,11 @@ class _Once(torch.autograd.Function):
 
 
 def by_mamba(u: Tensor, dt: Tensor, A: Tensor, B: Tensor, C: Tensor) -> Tensor:
-    """By mamba_ssm's kernel, which has the length last; a `ValueError` where it is not installed."""
+    """Run the scan by mamba_ssm's kernel, which takes the length last; raise ValueError where it is not installed."""
     try:
         from mamba_ssm.ops.selective_scan_interface import selective_scan_fn
     except ImportError as error:
-        raise ValueError(f"the backend mamba_ssm is not here: {error}") from error
+        raise ValueError(f"the backend mamba_ssm is not installed: {error}") from error
     u, dt, B, C = (x.transpose(1, 2).contiguous() for x in (u, dt, B, C))
     y: Tensor = _Once.apply(selective_scan_fn(u, dt, A, B, C))  # type: ignore[no-untyped-call]
     return y.transpose(1, 2)

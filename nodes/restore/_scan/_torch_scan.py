@@ -1,9 +1,10 @@
-"""The selective scan in torch's own operations: anywhere torch runs, in little memory.
+"""The selective scan in torch operations: on any device that torch supports, in little memory.
 
-The length is cut into segments that stay in a cache, and a segment into chunks that are walked side by side: as many
-operations as a chunk has steps, then one for each chunk's carry. Only the states between segments are kept; the rest
-is computed again on the way back. Decays enter as exp(x) - 1: one near 1 that is rounded forgets wrongly at each step.
-What one chunk hands to the next is in float64, for a state that hardly decays is rounded as often as it is handed on.
+The length is cut into segments that fit in a cache, and each segment into chunks that are walked in parallel. A segment
+takes as many operations as a chunk has steps, and one more for the carry of each chunk. Only the states between
+segments are stored; back-propagation computes all others again. Decays enter as exp(x) - 1, because the round-off of a
+decay near 1 would act at each step. The carry between chunks is float64, because a state that hardly decays is rounded
+at each carry.
 """
 
 from collections.abc import Iterator
@@ -13,20 +14,20 @@ import torch
 from torch import Tensor
 from torch.nn import functional as F
 
-#: Numbers of a segment's states, and of one operation: what was fastest on one core at 1536 numbers a step, by 3 % over
-#: twice the segment, by a tenth over a walk without chunks; smaller operations cost more to call than to do.
+#: Numbers in the states of a segment, and in one operation: the fastest on one core at 1536 numbers a step, by 3 % over
+#: segments twice as long, by a tenth over no chunks. Smaller operations take longer to call than to compute.
 SEGMENT, ROW = 1 << 17, 1 << 14
-SEGMENT_CUDA, ROW_CUDA = 1 << 23, 1 << 17  #: the same on a GPU: chosen, not measured
+SEGMENT_CUDA, ROW_CUDA = 1 << 23, 1 << 17  #: the same two numbers on a GPU: chosen, not measured
 
 
 def refuse_twice() -> None:
-    """Refuse a gradient of a gradient, which would be wrong without a word: the way back has no graph of its own."""
+    """Refuse a second derivative, which would be wrong without an error, because the backward pass has no graph."""
     if torch.is_grad_enabled():
         raise RuntimeError("the selective scan has no second derivative: do not ask for create_graph through it")
 
 
 class Plan(NamedTuple):
-    """How a length is cut: ``chunks`` chunks of ``steps`` steps make a segment."""
+    """The division of a length: ``chunks`` chunks of ``steps`` steps make a segment."""
 
     steps: int
     chunks: int
@@ -37,7 +38,7 @@ class Plan(NamedTuple):
 
 
 def plan(length: int, width: int, cuda: bool) -> Plan:
-    """Cut ``length`` steps of ``width`` numbers each."""
+    """Divide ``length`` steps of ``width`` numbers each into segments and chunks."""
     row, whole = (ROW_CUDA, SEGMENT_CUDA) if cuda else (ROW, SEGMENT)
     segment = min(length, max(16, whole // width))
     chunks = max(1, min(row // width, int(segment**0.5)))
@@ -45,7 +46,7 @@ def plan(length: int, width: int, cuda: bool) -> Plan:
 
 
 class _Segment:
-    """Its lines with time first, (step, chunk, batch, d or n), and its decays; filled up with steps of no length."""
+    """One segment's lines, time first, (step, chunk, batch, d or n), and decays, filled up with steps of length 0."""
 
     def __init__(self, how: Plan, rows: slice, rate: Tensor, *lines: Tensor) -> None:
         self.how, self.rows, self.rate = how, rows, rate
@@ -55,23 +56,23 @@ class _Segment:
         self.lost = (self.dt[..., None] * rate).expm1_()
 
     def turn(self, x: Tensor) -> Tensor:
-        """(batch, length, m) -> (step, chunk, batch, m)."""
+        """Rearrange (batch, length, m) into (step, chunk, batch, m)."""
         part = F.pad(x[:, self.rows], (0, 0, 0, self.how.segment - self.size)).contiguous()
         return part.view(len(x), self.how.chunks, self.how.steps, -1).permute(2, 1, 0, 3).contiguous()
 
     def back(self, x: Tensor) -> Tensor:
-        """(step, chunk, batch, m) -> (batch, rows, m)."""
+        """Rearrange (step, chunk, batch, m) into (batch, rows, m)."""
         return x.permute(2, 1, 0, 3).flatten(1, 2)[:, : self.size]
 
     def states(self, start: Tensor) -> tuple[Tensor, Tensor]:
-        """After each step, from ``start`` (batch, d, n); the last one's, in float64."""
+        """Return the state after each step, from ``start`` (batch, d, n), and the last state in float64."""
         h = self.pushed[..., None] * self.into[..., None, :]
         return h, _walk(h, list(self.lost.unbind(0)), start)
 
     def slopes(self, seen: Tensor, end: Tensor) -> tuple[Tensor, Tensor]:
-        """Of the states: what is ``seen`` of each, and what the next step leaves of the next one's; ``end`` beyond.
+        """Return the gradients of all states, and of the state before the first step in float64.
 
-        And of the state before the first step, in float64.
+        The gradient of a state is that through its own output ``seen`` plus that through the next state, or ``end``.
         """
         g = seen[..., None] * self.out[..., None, :]
         first, *others = self.lost.unbind(0)
@@ -80,7 +81,7 @@ class _Segment:
         return g, at_first + first[0] * at_first
 
     def gradients(self, dy: Tensor, start: Tensor, end: Tensor) -> tuple[Tensor, ...]:
-        """Of u, dt, B, C, each (batch, rows, m), of A, and of the state before the first step, (batch, d, n)."""
+        """Return the gradients of u, dt, B, C (batch, rows, m), A and the state before the first step (batch, d, n)."""
         seen = self.turn(dy)
         (h, _), (g, before) = self.states(start), self.slopes(seen, end)
         pushed = (g @ self.into[..., None])[..., 0]
@@ -88,7 +89,7 @@ class _Segment:
         g[1:] *= h[:-1]
         g[0, 1:] *= h[-1, :-1]
         g[0, 0] *= start
-        g *= torch.mul(self.dt[..., None], self.rate, out=self.lost).exp_()  # now the slope of dt * A
+        g *= torch.mul(self.dt[..., None], self.rate, out=self.lost).exp_()  # now the gradient of dt * A
         dt = torch.mul(g, self.rate, out=h).sum(-1).addcmul_(pushed, self.u)
         rate = g.mul_(self.dt[..., None]).sum((0, 1, 2))
         lines = (self.dt * pushed, dt, into[..., 0, :], out[..., 0, :])
@@ -98,8 +99,9 @@ class _Segment:
 def _walk(h: Tensor, lost: list[Tensor], start: Tensor, back: bool = False) -> Tensor:
     """Turn pushes (step, chunk, ...) into states: h_i <- h_i + h_(i-1) + lost_i * h_(i-1), from ``start``.
 
-    ``back`` walks from the last to the first; ``lost``, one (chunk, ...) a step, is in the order of the walk. Every
-    chunk begins with nothing, and is then given what the ones before it left; what the last leaves, in float64.
+    ``back`` walks from the last step to the first; ``lost``, (chunk, ...) for each step, is in the order of the walk.
+    Every chunk starts from 0, and the state that earlier chunks carry over is added afterwards. The last state is
+    returned in float64.
     """
     turn = slice(None, None, -1 if back else 1)
     rows, through = h.unbind(0)[turn], torch.empty_like(h)
@@ -107,7 +109,7 @@ def _walk(h: Tensor, lost: list[Tensor], start: Tensor, back: bool = False) -> T
     shares[0].copy_(lost[0])
     for less, before, now, share, further in zip(lost[1:], rows, rows[1:], shares, shares[1:], strict=False):
         now.addcmul_(less, before).add_(before)
-        torch.add(less, share, out=further).addcmul_(less, share)  # (1 + e)(1 + l) - 1: what is near 0 stays exact
+        torch.add(less, share, out=further).addcmul_(less, share)  # (1 + e)(1 + l) - 1, exact near 0
     left, kept, given = rows[-1].double(), shares[-1].double(), torch.empty_like(rows[-1])
     for chunk in range(h.shape[1])[turn]:
         given[chunk] = start
@@ -121,7 +123,7 @@ def _segments(length: int, how: Plan) -> Iterator[slice]:
 
 
 class Scan(torch.autograd.Function):
-    """u, dt (batch, length, d), A (d, n), B, C (batch, length, n) -> y (batch, length, d); once differentiable."""
+    """The scan, differentiable once: u, dt (batch, length, d), A (d, n), B, C (batch, length, n) -> as u."""
 
     @staticmethod
     def forward(ctx: Any, *given: Tensor) -> Tensor:

@@ -1,12 +1,12 @@
-"""The selective scan as one kernel each way on CUDA, in Triton, which comes with torch's CUDA builds.
+"""The selective scan as one CUDA kernel for each direction, in Triton, which is part of torch's CUDA builds.
 
-A program walks one picture's line for some of its channels with their states in registers. It keeps the states between
-chunks; the way back makes those within a chunk again, in memory of its own. What is summed over channels or pictures is
-summed by torch from parts, never by atomics: the same numbers at every run. As in C++ decays enter as exp(x) - 1, and
-what rounding takes from a state is added with its next step.
+A program walks the line of one picture for some of its channels, with the states in registers. It stores the states
+between chunks; the backward pass computes the states within a chunk again, in its own memory. Torch sums partial sums
+over channels and pictures, without atomics, so every run gives the same numbers. As in C++, decays enter as
+exp(x) - 1, and the round-off of a state is added at its next step.
 """
 
-# Triton reads the annotations of a kernel, and knows none of ours.
+# Triton reads the annotations of a kernel as its own, so kernels have none.
 # mypy: disallow-untyped-defs=False, disallow-incomplete-defs=False
 # mypy: disallow-untyped-calls=False, disallow-untyped-decorators=False
 
@@ -20,13 +20,13 @@ from torch import Tensor
 
 from neusee.nodes.restore._scan._torch_scan import refuse_twice
 
-#: Channels of a program, steps of a chunk, and warps: chosen, not measured. What is kept is 1 / CHUNK of all states.
+#: Channels of a program, steps of a chunk, and warps: chosen, not measured. 1 / CHUNK of all states are stored.
 CHANNELS, CHUNK, WARPS = 16, 64, 2
 
 
 @triton.jit
 def _lost(x):
-    """exp(x) - 1 to an ulp or two, of what is not positive: a series near 0, to its ninth power."""
+    """Return exp(x) - 1 to one or two ulp, for x <= 0: near 0 by a series to the ninth power."""
     series = 1.0 + x * (1.0 / 9.0)
     series = 1.0 + x * (1.0 / 8.0) * series
     series = 1.0 + x * (1.0 / 7.0) * series
@@ -40,7 +40,7 @@ def _lost(x):
 
 @triton.jit
 def _add(total, missed, more):
-    """The sum, and what rounding lost of it, to be added with the next."""
+    """Return the sum, and its round-off, which is added at the next step."""
     more = more + missed
     now = total + more
     return now, more - (now - total)
@@ -100,7 +100,7 @@ def _backward(
             push = step * tl.load(u + row * d + at_d, mask=some_d, other=0.0)
             into = tl.load(B + row * n + at_n, mask=some_n, other=0.0)
             h, missed = _add(h, missed, _lost(step[:, None] * rate) * h + push[:, None] * into[None, :])
-        tl.debug_barrier()  # what one thread stored another may load
+        tl.debug_barrier()  # a thread may load numbers that another thread stored
         here = tl.zeros([channels, wide], tl.float32)
         for turn in range(0, steps):
             i = steps - 1 - turn
@@ -123,24 +123,24 @@ def _backward(
             carry, carried = _add(g, carried, _lost(x) * g)
             h = before
         slope += here
-        tl.debug_barrier()  # before the room is written again
+        tl.debug_barrier()  # before the memory is written again
     tl.store(dA + b * d * n + at, slope, mask=some)
 
 
 @functools.cache
 def _wide(n: int) -> int:
-    """The next power of 2, which Triton's tensors have."""
+    """Return the least power of 2 from ``n`` on, because sizes of Triton's tensors are powers of 2."""
     return 1 << (n - 1).bit_length()
 
 
 def _sizes(u: Tensor, rate: Tensor) -> tuple[int, int, int, int, int, int]:
-    """Batch, length, d, n, blocks of channels, and chunks."""
+    """Return batch, length, d, n, blocks of channels, and chunks."""
     (batch, length, d), n = u.shape, rate.shape[1]
     return batch, length, d, n, -(-d // CHANNELS), -(-length // CHUNK)
 
 
 class Scan(torch.autograd.Function):
-    """u, dt (batch, length, d), A (d, n), B, C (batch, length, n) of float32 -> y as u; once differentiable."""
+    """The float32 scan, once differentiable: u, dt (batch, length, d), A (d, n), B, C (batch, length, n) -> as u."""
 
     @staticmethod
     def forward(ctx: Any, *tensors: Tensor) -> Tensor:

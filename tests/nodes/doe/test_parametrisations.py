@@ -87,7 +87,7 @@ def test_pixelwise_refuses_a_file_that_does_not_fit(tmp_path):
         doe.pixelwise.hooks.preflight(**params, file=tmp_path / "small.npy")
     assert caught.value.parameter == "file"
     np.save(tmp_path / "low.npy", np.full((64, 64), -1e-9))
-    with pytest.raises(ValueError, match="counted up from 0"):
+    with pytest.raises(ValueError, match="must be finite and at least 0"):
         doe.pixelwise(**params, file=tmp_path / "low.npy", rng=seeded())
     (tmp_path / "relief.txt").write_text("0")
     with pytest.raises(ParameterError, match=r"npy, \.safetensors or grey"):

@@ -182,7 +182,7 @@ def test_shapes_that_do_not_belong_together_are_refused():
     index = doe.material(line)
     with pytest.raises(ValueError, match="square"):
         optics.pupil(torch.zeros(4, 5), index, line, **LENS)
-    with pytest.raises(ValueError, match="of one step"):
+    with pytest.raises(ValueError, match="from one step"):
         optics.pupil(torch.zeros(4, 4), index[:1], line, **LENS)
     with pytest.raises(ValueError, match="same samples"):
         optics.pupil(torch.zeros(4, 4), index, line, Dirt(torch.ones(5, 5), torch.zeros(5, 5)), **LENS)
@@ -199,7 +199,7 @@ def test_check_measures_throughput_and_clipping():
     assert "asked" not in throughput.text
     wide = pupil(diameter=11e-3)
     throughput, _ = check(wide, diameter=11e-3)
-    assert "2.00 mm, inscribed where 11.0 mm was asked" in throughput.text
+    assert "2.00 mm, inscribed instead of the requested 11.0 mm" in throughput.text
     black = Dirt(torch.zeros(200, 200), torch.zeros(200, 200))
     assert not check(pupil(dirt=black))[0].ok
 

@@ -86,7 +86,7 @@ def test_refusals_before_the_run(tmp_path):
         hyperspectral.hooks.preflight(file=path, start=700 * NM, stop=400 * NM)
     (tmp_path / "c.txt").write_text("1")
     (tmp_path / "bad.mat").write_text("no mat file at all, just text")
-    for name, words in (("c.txt", ".mat, .npy and .exr"), ("bad.mat", "-v7")):
+    for name, words in (("c.txt", ".mat, .npy or .exr"), ("bad.mat", "-v7")):
         with pytest.raises(ParameterError, match=words):
             hyperspectral.hooks.preflight(file=tmp_path / name, start=400 * NM, stop=700 * NM)
     with pytest.raises(ParameterError, match="complex"):

@@ -136,7 +136,7 @@ def _text(folder):
         (_alpha, "transparency"),
         (_cmyk, "CMYK"),
         (_clear_palette, "transparency"),
-        (_text, "no picture"),
+        (_text, "not a readable picture"),
     ],
 )
 def test_refuses_before_the_run_with_the_fix(tmp_path, made, words):

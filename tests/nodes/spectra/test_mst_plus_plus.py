@@ -101,7 +101,7 @@ def test_a_checkpoint_that_does_not_fit_is_refused_before_the_run(tmp_path):
         ("less", "conv_in.weight"),
         ("more", "extra"),
         ("other", "conv_out.weight"),
-        ("list", "no state dict"),
+        ("list", "not a state dict"),
         ("text", "no tensors"),
     ):
         with pytest.raises(ParameterError, match=words) as error:

@@ -18,7 +18,7 @@ def store(tmp_path):
         found.put(
             key, value, {"step": f"s{i}", "recipe": "r", "seconds": i + 0.5, "date": f"2026-01-0{i + 1}T00:00:00"}
         )
-    found.note(KEYS[2], {"step": "n", "recipe": "r", "seconds": 0.1, "bytes": 7, "date": "2026-01-03T00:00:00"})
+    found.put_receipt(KEYS[2], {"step": "n", "recipe": "r", "seconds": 0.1, "bytes": 7, "date": "2026-01-03T00:00:00"})
     return found
 
 
@@ -57,8 +57,8 @@ def test_what_is_damaged_is_named_and_put_aside(store, mode):
     lines, bad = cache_lines.verify_lines(Store(store.root, verify=mode))
     assert bad == 3
     assert lines[:3] == [
-        f"{KEYS[0]}  s0  its bytes are not those that were written",
-        f"{KEYS[2]}  ?  its description is not the one that was written",
+        f"{KEYS[0]}  s0  checksum mismatch: the stored bytes have changed since they were written",
+        f"{KEYS[2]}  ?  checksum mismatch: the metadata have changed since they were written",
         f"{'ef' * 16}  picture  its file {picture.name} is not what was written",
     ]
     assert lines[3].startswith("1 result, 20 kB, as written; 3 damaged, put aside in ")
@@ -78,7 +78,7 @@ def test_room_is_made(store):
     assert not store.has(KEYS[0])
     assert store.has(KEYS[1])
     assert cache_lines.gc_lines(store)[0].startswith("0 values and 0 files")
-    with pytest.raises(ValueError, match="'a lot' is no size"):
+    with pytest.raises(ValueError, match="'a lot' is not a size"):
         cache_lines.gc_lines(store, "a lot")
 
 

@@ -199,14 +199,14 @@ def test_a_wrong_name_is_refused_with_the_nearest(store, free, message):
 
 @pytest.mark.parametrize("theta", [{}, {"height": 1.0, "scene": 1.0}, {"scene": 1.0}])
 def test_theta_must_be_what_was_asked_for(store, theta):
-    with pytest.raises(ValueError, match="give exactly height"):
+    with pytest.raises(ValueError, match="give values for exactly height"):
         as_function(camera(), "height", store=store)(theta)
 
 
 def test_an_error_names_the_step(store):
     function = as_function(camera(), "height", store=store)
     with pytest.raises(
-        RunError, match=r"image\[a\] .*RuntimeError(?s:.*)given scene \(64,\) float64, psf \(63,\) float64"
+        RunError, match=r"image\[a\] .*RuntimeError(?s:.*)inputs: scene \(64,\) float64, psf \(63,\) float64"
     ):
         function({"height": torch.ones(63, dtype=torch.float64)})
 

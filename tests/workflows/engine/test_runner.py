@@ -222,7 +222,7 @@ def test_steps_that_are_the_same_computation_run_once(store):
     result = run(twins, store)
     assert CALLS == ["source", "add", "add"]
     assert states(result) == {"s": "run", "a": "run", "b": "cached", "c": "run"}
-    assert result.done["b"].why == "the same as a"
+    assert result.done["b"].why == "the same key as a"
     assert torch.equal(result.values["b"], result.values["a"])
 
 
@@ -349,7 +349,7 @@ def test_the_account_says_what_it_cost(store):
     assert 0 < done.seconds < 5
     cached = run(diamond(count=BIG), again(store), outputs=("left",)).done["left"]
     assert (cached.bytes, cached.facts, cached.key) == (done.bytes, done.facts, done.key)
-    assert cached.why.startswith("made 20")
+    assert cached.why.startswith("computed 20")
     about = again(store).about(done.key)
     assert about["origin"]["params"] == {"k": 1.0}
     assert about["origin"]["inputs"] == [run(diamond(count=BIG), again(store)).keys["head"]]
@@ -374,7 +374,7 @@ def test_an_error_names_the_step_and_what_it_was_given(store):
     text = str(caught.value)
     assert text.startswith("test.yaml:3:5   f (")
     assert "fails): ValueError: 40000 samples are too few: give at least 1000" in text
-    assert text.endswith("given x (40000,) float32")
+    assert text.endswith("inputs: x (40000,) float32")
     assert isinstance(caught.value.__cause__, ValueError)
     assert caught.value.step == "f"
     assert states(run(steps, again(store), outputs=("a",))) == {"s": "not needed", "a": "cached"}
@@ -395,7 +395,7 @@ def test_a_node_that_changes_its_input_is_refused(store):
 
 
 def test_a_result_that_cannot_be_kept_is_refused(store):
-    with pytest.raises(RunError, match=r"f \(.*must give tensors"):
+    with pytest.raises(RunError, match=r"f \(.*must return tensors"):
         run(recipe("f", s=(source,), f=(strange, {"x": "s"})), store)
 
 

@@ -238,7 +238,7 @@ def test_every_mistake_is_said_before_anything_runs(tmp_path):
     for part in (
         "falt+none: argument 7 doe=falt no option falt",
         "flat+wener: argument 8 restore=wener no option wener",
-        "is no safetensors file",
+        "is not a safetensors file",
         "flat+unet:",
         "untrained",
         "flat takes no file",

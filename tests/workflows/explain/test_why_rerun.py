@@ -147,8 +147,8 @@ class Trial:
         """The causes alone."""
         head, *causes, beside = self.why(step, *arguments)
         assert head.startswith(f"{step} (trial.")
-        assert beside.startswith("  beside")
-        return [line.strip() for line in causes if "only what feeds it will tell" not in line]
+        assert beside.startswith("  compared with")
+        return [line.strip() for line in causes if "depending on the values of the inputs" not in line]
 
 
 def forget():
@@ -342,7 +342,7 @@ def test_a_function_that_is_gone(trial):
     trial.edit("nodes/trial/_helper.py", "FALL = 2.0\n", "FALL = 2.0\nNEVER = 1\n")
     trial.run()
     trial.edit("nodes/trial/_helper.py", "NEVER = 1\n", "")
-    assert trial.causes("photo") == ["photo: constant NEVER was taken out of neusee/nodes/trial/_helper.py"]
+    assert trial.causes("photo") == ["photo: constant NEVER was removed from neusee/nodes/trial/_helper.py"]
 
 
 @pytest.mark.parametrize("damage", [None, "", "{", "[]", '{"a": 1}', '{"a": {"b": [1]}}', "\x00"])
@@ -383,7 +383,7 @@ def test_a_store_that_cannot_be_written_does_not_need_them(trial):
 def test_a_step_that_is_left_out_says_its_bound(trial):
     trial.run()
     (line,) = trial.why("read", "sensor.read_noise=0.001 e-")
-    assert line.startswith("read (trial.noise): left out, all stands for it: changes at most ")
+    assert line.startswith("read (trial.noise): left out and replaced by all: changes at most ")
     assert line.endswith("tolerance 0.001")
 
 
@@ -396,21 +396,21 @@ def test_a_step_that_is_left_out_now_or_no_longer(trial):
     (said,) = trial.causes("raw")
     assert said.startswith("raw: read is no longer left out: changes at most")
     both = trial.causes("raw", "scene.value=9")
-    assert both[0] == "raw: read is no longer left out: or is, as what feeds it will tell"
+    assert both[0] == "raw: read is no longer left out: its inputs decide"
     assert "scene.value 8 -> 9" in both[1]
 
 
 def test_what_only_a_run_can_tell_is_said(trial):
     lines = trial.why("raw")
-    assert lines[1] == "  left out or not, only what feeds it will tell: read"
-    assert lines[2] == "  nothing earlier to compare it with: no result of this step"
+    assert lines[1] == "  left out or not, depending on the values of the inputs: read"
+    assert lines[2] == "  no earlier result to compare with: no result of this step"
 
 
 def test_a_stored_result_says_since_when_and_beside_what(trial):
     trial.run()
     head, rest = trial.why("restored")
     assert head.startswith("restored (trial.add): stored since 20")
-    assert rest == "  nothing earlier to compare it with: the first result of this step"
+    assert rest == "  no earlier result to compare with: the first result of this step"
 
 
 def test_the_nearest_earlier_result_is_the_one_with_the_fewest_causes(trial):
@@ -418,7 +418,7 @@ def test_the_nearest_earlier_result_is_the_one_with_the_fewest_causes(trial):
     trial.run("scene.value=9", "sensor.gain=4")
     trial.run("scene.value=7", "sensor.gain=5")
     assert trial.causes("restored", "scene.value=9") == ["restored <- raw: sensor.gain 4 -> 3 (mine.yaml:6:9)"]
-    assert trial.why("restored", "scene.value=9")[-1].startswith("  beside the nearest of 3 earlier results, ")
+    assert trial.why("restored", "scene.value=9")[-1].startswith("  compared with the nearest of 3 earlier results, ")
 
 
 def test_every_item_of_a_step_is_told(trial):
@@ -432,7 +432,7 @@ def test_every_item_of_a_step_is_told(trial):
 def test_twins_are_said_to_be_one_computation(trial):
     trial.run()
     lines = trial.why("spot", "lasers.green.amount=1")
-    assert "  the same computation as spot[red]" in lines
+    assert "  same key as spot[red]" in lines
 
 
 def test_a_run_tells_every_step_s_own_cause(trial):
@@ -460,14 +460,14 @@ def test_a_value_that_was_not_kept_is_said_to_have_been_made(trial):
     for path in (trial.cache / key[:2]).glob(f"{key}.*"):
         path.unlink()
     (trial.cache / "brief.jsonl").unlink(missing_ok=True)
-    assert trial.store.note(key, about)
+    assert trial.store.put_receipt(key, about)
     head, *rest = trial.why("raw")
     assert head.startswith("raw (trial.add): ran 20")
     assert f"but its value was not kept, key {key[:8]}" in head
-    assert rest == ["  nothing earlier to compare it with: the first result of this step"]
+    assert rest == ["  no earlier result to compare with: the first result of this step"]
     recipe, told, store = trial.load(), {}, trial.store
     run(recipe, store, ["raw"], explained(recipe, store, lambda event: told.update({event.step: event.done})))
-    assert told["raw"].why == "made before, but its value is not stored"
+    assert told["raw"].why == "computed before, but its value is not stored"
 
 
 @pytest.mark.parametrize("damage", [None, "", "{", "\x00"])
@@ -484,7 +484,7 @@ def test_results_that_were_removed_are_passed_over(trial):
     for path in trial.cache.glob(f"{second[:2]}/{second}.*"):
         path.unlink()
     *_, beside = trial.why("raw", "sensor.gain=4")
-    assert beside.startswith(f"  beside the nearest of 2 earlier results, {first[:8]} of ")
+    assert beside.startswith(f"  compared with the nearest of 2 earlier results, {first[:8]} of ")
 
 
 def test_a_run_compares_few_results(trial, monkeypatch):
@@ -509,7 +509,7 @@ def test_what_went_into_a_key(trial):
     assert lines[2] == "  with    sigma = 10.5"
     assert lines[3] == f"  from    all, {first.keys['all'][:8]}"
     assert lines[4] == "  noise   seed 1, of read, on cpu"
-    assert lines[-1] == "  nothing earlier to compare it with: the first result of this step"
+    assert lines[-1] == "  no earlier result to compare with: the first result of this step"
 
 
 def test_a_key_that_is_none_or_many_is_refused(trial):
@@ -564,7 +564,8 @@ def test_results_that_are_gone_are_said_to_be(tmp_path, toy):
     shelf.abouts = {key: {"step": "s4", "origin": before.origins[key]}}
     after = resolve(recipe, list(recipe.steps), shelf)
     roots = Comparison(shelf, recipe, after).roots(Pair("s4", after.keys["s4"], key))
-    assert {text: roots.chain(text) for text in roots.found} == {"what s3 was then is no longer known": ["s4", "s3"]}
+    found = {text: roots.chain(text) for text in roots.found}
+    assert found == {"the earlier origin of s3 is no longer known": ["s4", "s3"]}
 
 
 def test_code_of_a_module_that_was_edited_after_its_import_is_not_remembered(trial, monkeypatch):
@@ -572,7 +573,7 @@ def test_code_of_a_module_that_was_edited_after_its_import_is_not_remembered(tri
     trial.load()
     (trial.folder / "nodes/trial/_helper.py").write_text(MODULES["trial/_helper.py"].replace("2", "25"))
     code = Code(trial.cache / "code.json")
-    with pytest.warns(UserWarning, match="edited after it was imported"):
+    with pytest.warns(UserWarning, match="edited after its import"):
         code.digest("neusee.nodes.trial._light")
     code.save()
     assert not list((trial.cache / "code").glob("*.json"))

@@ -145,7 +145,7 @@ def test_an_edit_after_the_import_cannot_poison_the_store(trial, monkeypatch):
     code = Code(trial.store / "code.json").digest
     path = trial.folder / "trial/_helper.py"
     path.write_text(path.read_text().replace("x / ", "20 * x / "))
-    with pytest.warns(UserWarning, match="edited after it was imported"):
+    with pytest.warns(UserWarning, match="edited after its import"):
         stale = code("neusee.nodes.trial._head")
     forget()
     assert module is not importlib.import_module("neusee.nodes.trial")
@@ -236,7 +236,7 @@ WHOLE = {
 @pytest.mark.parametrize("line", WHOLE)
 def test_a_package_that_is_used_whole_is_refused_with_its_line(trial, line):
     (trial.folder / "trial/_helper.py").write_text(f"{line}\n\n\ndef half(x):\n    return x / {WHOLE[line]}\n")
-    with pytest.raises(LookupError, match=r"_helper.py:5: the whole of the nodes is used.*by its full name"):
+    with pytest.raises(LookupError, match=r"_helper.py:5: the package of all nodes is used.*from its own module"):
         Code(trial.store / "code.json").digest("neusee.nodes.trial._head")
 
 

@@ -93,11 +93,11 @@ def test_every_mistake_is_told_at_once_with_its_place(refused):
         "2:39 devices.a100.memory: needs a unit: write a number and one of B, kB, MB, GB, TB, MiB, GiB, TiB",
         "2:43 devices.a100.speed: needs default",
         "2:51 devices.a100.speed.optcs: unknown; did you mean optics?",
-        "3:13 devices.b.kind: no kind of device; did you mean cuda?",
+        "3:13 devices.b.kind: unknown kind of device; did you mean cuda?",
         "3:27 devices.b.memory: has the wrong unit 'GBB': write a number and one of B, kB, MB, GB, TB, MiB, GiB, TiB",
         "3:42 devices.b.count: must be a whole number from 1 to 4096",
         "3:51 devices.b.node: must name one machine or more, each once",
-        "4:6 devices.c: must be a mapping of kind, count, memory, speed, node; it is a number",
+        "4:6 devices.c: must be a mapping of kind, count, memory, speed, node, not a number",
         "6:3 links.cuda-cpu: needs bandwidth",
         "6:14 links.cuda-cpu.bandwith: unknown; did you mean bandwidth?",
         "6:41 links.cuda-cpu.latency: needs a unit: write a number and one of s, ms, us, µs, μs, ns",
@@ -122,7 +122,7 @@ ONE = "devices: {a: {kind: cpu, memory: 1 GB}}\n"
         ),
         (
             ONE + "links: {cpu-cpu: {bandwidth: 1 GB/s}, cpu-cpu: {bandwidth: 1 GB/s}}",
-            "2:39 links.cpu-cpu: stands twice; first in line 2",
+            "2:39 links.cpu-cpu: given twice, first in line 2",
         ),
         (
             "devices: {a: {kind: cpu, memory: 1 GB}, b: {kind: cuda, memory: 1 GB}}\n"
@@ -131,7 +131,7 @@ ONE = "devices: {a: {kind: cpu, memory: 1 GB}}\n"
         ),
         (
             "devices: {a: {kind: cpu, memory: 1 GB, count: 4000, node: [x, y]}}",
-            "1:10 devices: are 8000; at most 4096 can be",
+            "1:10 devices: are 8000; the maximum is 4096",
         ),
         (
             "devices: {a: {kind: cpu, memory: true}}",
@@ -139,7 +139,7 @@ ONE = "devices: {a: {kind: cpu, memory: 1 GB}}\n"
         ),
         (
             "devices: {a: {kind: cpu, memory: 1 GB, speed: 0}}",
-            "1:47 devices.a.speed: must be a number above 0: how many times as fast as what was measured",
+            "1:47 devices.a.speed: must be a number above 0: the speed relative to the measured machine",
         ),
         (
             "devices: {a: {kind: cpu, memory: 1 GB, node: 3}}",

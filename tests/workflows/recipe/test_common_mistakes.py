@@ -150,10 +150,10 @@ def test_14_a_missing_producer(refused):
     more = "steps: {psf: {from: glass}, laser_psf: {from: psf}}\n"
     diagnostics = refused(more=more)
     assert diagnostics == [
-        "mine.yaml:15:21 | steps.psf.from.pupil | no step glass; no step makes it; "
-        "steps that make one: pupil[plain], pupil[mask], laser_pupil[plain,green], laser_pupil[mask,green]",
-        "mine.yaml:15:47 | steps.laser_psf.from.pupil | optics.psf needs a Pupil; psf makes a Psf; "
-        "steps that make one: pupil[plain], pupil[mask], laser_pupil[plain,green], laser_pupil[mask,green]",
+        "mine.yaml:15:21 | steps.psf.from.pupil | no step glass; check the name; "
+        "steps returning a Pupil: pupil[plain], pupil[mask], laser_pupil[plain,green], laser_pupil[mask,green]",
+        "mine.yaml:15:47 | steps.laser_psf.from.pupil | optics.psf needs a Pupil; psf returns a Psf; "
+        "steps returning a Pupil: pupil[plain], pupil[mask], laser_pupil[plain,green], laser_pupil[mask,green]",
     ]
 
 
@@ -163,7 +163,7 @@ def test_15_an_output_that_is_switched_off(refused):
 
 
 def test_16_a_key_that_stands_twice(refused):
-    assert refused(more="seed: 1\nseed: 2\n") == ["mine.yaml:16:1 | seed | stands twice; first in line 15"]
+    assert refused(more="seed: 1\nseed: 2\n") == ["mine.yaml:16:1 | seed | given twice, first in line 15"]
 
 
 def test_17_an_aperture_beyond_the_grid_is_legal_and_noted(accepted):

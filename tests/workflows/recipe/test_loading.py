@@ -179,7 +179,7 @@ def test_two_dimensions_make_item_ambiguous(mistakes):
         "seed: 7", "arms: {one: {}}\nseed: 7"
     )
     assert mistakes(text)[:1] == [
-        "mine.yaml:7:31 | lasers.green.strength | unknown: no step refers to it",
+        "mine.yaml:7:31 | lasers.green.strength | unknown: no step refers to this value",
     ]
     assert "write ${each.lasers.strength} or ${each.arms.strength}" in "\n".join(mistakes(text))
 

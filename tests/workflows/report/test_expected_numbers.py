@@ -35,4 +35,4 @@ def test_an_override_takes_back_the_promises_it_reaches(tmp_path, override, kept
     recipe = load(path, override)
     assert {e.name for e in recipe.expect} == kept
     taken = {"bands", "height"} - kept
-    assert any("your changes reach" in n for n in recipe.notes) == bool(taken)
+    assert any("your changes affect" in n for n in recipe.notes) == bool(taken)

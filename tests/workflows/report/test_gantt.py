@@ -86,7 +86,7 @@ def test_of_too_many_the_longest_have_a_row(drawn):
     schedule = planned(200)
     _, _, steps = drawn(schedule, ran(schedule))
     assert len(names(steps)) == 80
-    assert steps.get_xlabel().endswith("120 of the shortest have no row")
+    assert steps.get_xlabel().endswith("the 120 shortest steps have no row")
 
 
 @pytest.mark.parametrize("rows", [[], [("other", "mps", 0.0, 1e-5)]])

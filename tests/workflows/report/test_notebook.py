@@ -139,20 +139,20 @@ def test_groups_are_chosen_by_keyword():
         (
             {"sensor.bits": object(), "optics": {"window": {1.5: 2}}},
             [
-                "argument optics | optics.window | a key is a name or a whole number, not 1.5",
-                "argument sensor.bits | sensor.bits | a recipe holds no object: give a number, a text, "
-                "True or False, None, a list or a mapping",
+                "argument optics | optics.window | a key must be a name or an integer, not 1.5",
+                "argument sensor.bits | sensor.bits | a recipe cannot contain a value of type object: give a number, "
+                "a string, True or False, None, a list or a mapping",
             ],
         ),
         (
             {"a b": 1},
-            ["argument a b | a b | is no override: write path=value, +path=value, ~path or group=option"],
+            ["argument a b | a b | is not an override: write path=value, +path=value, ~path or group=option"],
         ),
         (
             {"~sensor.bits": 3},
             [
                 "argument ~sensor.bits | ~sensor.bits | "
-                "~ takes a value away and gives none: write {'~sensor.bits': None}"
+                "~ removes a value and cannot set one: write {'~sensor.bits': None}"
             ],
         ),
     ],
@@ -182,18 +182,18 @@ def test_a_step_says_where_it_wants_to_run(given):
 
 def test_a_wrong_device_is_located(refused, toy):
     assert refused(**{"optics.device": "cuda1"}) == [
-        "argument optics.device | optics.device = cuda1 | is no device: write any, cpu, gpu, cuda, cuda:1 or mps"
+        "argument optics.device | optics.device = cuda1 | is not a device: write any, cpu, gpu, cuda, cuda:1 or mps"
     ]
     assert refused(**{"steps.raw.device": 3}) == [
-        "argument steps.raw.device | steps.raw.device = 3 | is no device: write any, cpu, gpu, cuda, cuda:1 or mps"
+        "argument steps.raw.device | steps.raw.device = 3 | is not a device: write any, cpu, gpu, cuda, cuda:1 or mps"
     ]
     toy.digitize.device = "cpu"
     assert refused(**{"steps.raw.device": "mps"}) == [
-        "argument steps.raw.device | steps.raw.device = mps | toy.digitize computes on a CPU alone"
+        "argument steps.raw.device | steps.raw.device = mps | toy.digitize runs only on a CPU"
     ]
     toy.digitize.device = "gpu"
     assert refused(**{"steps.raw.device": "cpu"}) == [
-        "argument steps.raw.device | steps.raw.device = cpu | toy.digitize computes on a GPU alone"
+        "argument steps.raw.device | steps.raw.device = cpu | toy.digitize runs only on a GPU"
     ]
 
 

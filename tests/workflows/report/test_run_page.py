@@ -279,10 +279,10 @@ def test_time_is_added_up_with_each_key_once():
     assert (found["saved"], found["share"]) == (8.0, 8 / 11)
     assert (found["read"], found["written"]) == (400, 1000)
     assert run_timing.said_of(found) == [
-        "2 of 7 steps ran: 3 s of computing.",
-        "By earlier runs the 1 that ran before were expected to take 1.5 s; they took 1 s.",
-        "The plan, with branches side by side, was 2.5 s long; it took 2.25 s.",
-        "The cache served 4 steps and saved 8 s, 72.7 % of all computing.",
+        "2 of 7 steps ran: 3 s of computing time.",
+        "Predicted from earlier runs for the 1 that had run before: 1.5 s; actual: 1 s.",
+        "Planned duration, with parallel branches: 2.5 s; actual: 2.25 s.",
+        "The cache served 4 steps and saved 8 s, 72.7 % of all computing time.",
         "Read from the cache: 400 B; written to it: 1 kB.",
     ]
 

@@ -67,7 +67,9 @@ def test_sizes_are_read_as_people_write_them(text, size, monkeypatch, tmp_path):
 @pytest.mark.parametrize("text", ["much", "-1 GB", "20 XB", "1e9", "GB", "20 iB", "1 G B", "nan"])
 def test_what_is_no_size_is_refused_with_the_fix(text, monkeypatch, tmp_path):
     monkeypatch.setenv("NEUSEE_CACHE_BUDGET", text)
-    with pytest.raises(ValueError, match=r"NEUSEE_CACHE_BUDGET: .* is no size: write bytes, such as 20 GB"):
+    with pytest.raises(
+        ValueError, match=r"NEUSEE_CACHE_BUDGET: .* is not a size: write a number of bytes, such as 20 GB"
+    ):
         Store(tmp_path)
 
 

@@ -49,7 +49,7 @@ def path_of(root):
 def test_a_line_for_each_result_and_each_receipt(tmp_path):
     store = Store(tmp_path)
     store.put(key_of(0), torch.zeros(2), about(0))
-    store.note(key_of(1), {**about(1), "bytes": 4000, "peak": 77})
+    store.put_receipt(key_of(1), {**about(1), "bytes": 4000, "peak": 77})
     expected = [
         {"key": key_of(0), "step": "s", "recipe": "r", "seconds": 0.0, "bytes": 8, "device": "cpu", "peak": None},
         {"key": key_of(1), "step": "s", "recipe": "r", "seconds": 1.0, "bytes": 4000, "device": "cpu", "peak": 77},
@@ -63,7 +63,7 @@ def test_a_line_for_each_result_and_each_receipt(tmp_path):
 def test_lines_are_found_by_step_and_by_node(tmp_path):
     store = Store(tmp_path)
     for i in range(6):
-        store.note(key_of(i), about(i, "even" if i % 2 == 0 else "odd", f"n.{i // 3}"))
+        store.put_receipt(key_of(i), about(i, "even" if i % 2 == 0 else "odd", f"n.{i // 3}"))
     for found in (store.journal, Store(tmp_path).journal):
         assert [row["seconds"] for row in found.of_step("odd")] == [1.0, 3.0, 5.0]
         assert [row["seconds"] for row in found.of_node("n.1")] == [3.0, 4.0, 5.0]
@@ -74,7 +74,7 @@ def test_lines_are_found_by_step_and_by_node(tmp_path):
 def test_what_others_add_is_seen_and_nothing_is_read_twice(tmp_path):
     one, two = filled(tmp_path), Store(tmp_path)
     assert keys(two) == keys(one) == [key_of(i) for i in range(5)]
-    one.note(key_of(7), about(7))
+    one.put_receipt(key_of(7), about(7))
     assert keys(two) == [*map(key_of, range(5)), key_of(7)]
     assert [row["seconds"] for row in two.journal.of_step("s")] == [0.0, 1.0, 2.0, 3.0, 4.0, 7.0]
 
@@ -101,7 +101,7 @@ def test_a_journal_that_is_none_is_made_anew(tmp_path, damage):
     path_of(tmp_path).write_bytes(damage)
     store = Store(tmp_path)
     assert store.journal.rows() == rows
-    store.note(key_of(6), about(6))
+    store.put_receipt(key_of(6), about(6))
     assert keys(Store(tmp_path))[-1] == key_of(6)
 
 
@@ -109,7 +109,7 @@ def test_torn_lines_are_skipped(tmp_path):
     store = filled(tmp_path)
     with path_of(tmp_path).open("ab") as file:
         file.write(b'\n{"key":"' + b"f" * 32)
-    store.note(key_of(8), about(8))
+    store.put_receipt(key_of(8), about(8))
     with path_of(tmp_path).open("ab") as file:
         file.write(b'\nnull\n[]\n7\n{"key":3}\n{"key":"a","step":[],"node":"n","seconds":1,"bytes":1,"kept":true}')
     assert keys(Store(tmp_path)) == keys(store) == [*map(key_of, range(5)), key_of(8)]
@@ -131,7 +131,7 @@ def test_a_row_knows_its_kept_value_after_compaction(tmp_path):
     store = Store(tmp_path)
     for again in range(3):
         for i in range(4):
-            store.note(key_of(i), {**about(i), "seconds": again + i / 10})
+            store.put_receipt(key_of(i), {**about(i), "seconds": again + i / 10})
     store.put(key_of(2), torch.zeros(3), about(2))
     store.put(key_of(5), torch.zeros(3), about(5))
     assert len(store.journal.rows()) == 14
@@ -148,7 +148,7 @@ def test_a_row_knows_its_kept_value_after_compaction(tmp_path):
             (key_of(5), True),
         ]
         assert rows[0]["seconds"] == 2.0
-    other.note(key_of(6), about(6))
+    other.put_receipt(key_of(6), about(6))
     assert keys(store)[-1] == key_of(6)
 
 
@@ -156,7 +156,7 @@ def test_many_superseded_lines_go_by_themselves(tmp_path, monkeypatch):
     monkeypatch.setattr(journal, "_SPARE", 50)
     store = Store(tmp_path)
     for i in range(60):
-        store.note(key_of(i % 4), {**about(i % 4), "seconds": float(i)})
+        store.put_receipt(key_of(i % 4), {**about(i % 4), "seconds": float(i)})
     rows = Store(tmp_path).journal.rows()
     assert [row["seconds"] for row in rows] == [56.0, 57.0, 58.0, 59.0]
     assert len(path_of(tmp_path).read_bytes().splitlines()) == 5
@@ -201,5 +201,5 @@ def test_lines_of_many_writers_do_not_mix(tmp_path):
 def test_threads_may_write_and_read_at_once(tmp_path):
     store = filled(tmp_path, 1)
     with ThreadPoolExecutor(4) as pool:
-        list(pool.map(lambda i: store.note(key_of(i), about(i)), range(1, 80)))
+        list(pool.map(lambda i: store.put_receipt(key_of(i), about(i)), range(1, 80)))
     assert sorted(keys(Store(tmp_path))) == sorted(map(key_of, range(80)))

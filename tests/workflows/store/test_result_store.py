@@ -123,7 +123,7 @@ class Own(tuple):
 
 @pytest.mark.parametrize("value", [object(), {1: 2}, Own(), {3}, torch.empty(2, dtype=torch.float8_e4m3fnuz)])
 def test_what_cannot_be_stored_is_refused(tmp_path, value):
-    with pytest.raises(TypeError, match=r"must give tensors|cannot be stored"):
+    with pytest.raises(TypeError, match=r"must return tensors|cannot be stored"):
         Store(tmp_path).put(KEY, [value], {})
     assert not Store(tmp_path).has(KEY)
 
@@ -160,7 +160,7 @@ def test_whatever_two_users_do_no_value_is_wrong(tmp_path_factory, acts):
             assert store.put(key, value, {"step": f"s{i}", "seconds": float(i)})
             there.add(key)
         elif act == "note":
-            assert store.note(key, {"step": f"s{i}", "seconds": float(i)})
+            assert store.put_receipt(key, {"step": f"s{i}", "seconds": float(i)})
         elif act == "get" and key in there:
             same(store.get(key), value)
         elif act == "gc":
@@ -235,7 +235,7 @@ def test_an_entry_under_a_wrong_name_is_not_served(tmp_path):
     other = "ab" + "1" * 30
     for suffix in ("json", "safetensors"):
         os.link(tmp_path / "ab" / f"{KEY}.{suffix}", tmp_path / "ab" / f"{other}.{suffix}")
-    with pytest.warns(UserWarning, match=f"it is the result of {KEY}"):
+    with pytest.warns(UserWarning, match=f"the metadata belong to the key {KEY}"):
         assert not Store(tmp_path).has(other)
 
 
@@ -389,7 +389,7 @@ def test_many_killed_writers_leave_no_wrong_entry(tmp_path):
 
 def test_a_receipt_is_all_that_is_known_and_no_value(tmp_path):
     store = Store(tmp_path)
-    assert store.note(KEY, {"step": "s", "seconds": 2.0, "bytes": 10**9, "facts": {"max": 1}})
+    assert store.put_receipt(KEY, {"step": "s", "seconds": 2.0, "bytes": 10**9, "facts": {"max": 1}})
     for found in (store, Store(tmp_path)):
         about = found.about(KEY)
         assert about == {"key": KEY, "step": "s", "seconds": 2.0, "bytes": 10**9, "facts": {"max": 1}, "kept": False}
@@ -403,13 +403,13 @@ def test_a_receipt_is_all_that_is_known_and_no_value(tmp_path):
 @pytest.mark.parametrize("value", [BIG, BIG[:10]], ids=["large", "small"])
 def test_a_value_takes_the_place_of_a_receipt_and_never_the_reverse(tmp_path, value):
     reader = Store(tmp_path)
-    Store(tmp_path).note(KEY, {"step": "note"})
+    Store(tmp_path).put_receipt(KEY, {"step": "note"})
     assert not reader.has(KEY)
     assert Store(tmp_path).put(KEY, value, {"step": "value"})
     assert reader.has(KEY)
     same(reader.get(KEY), value)
     for store in (reader, Store(tmp_path)):
-        assert store.note(KEY, {"step": "late"})
+        assert store.put_receipt(KEY, {"step": "late"})
         assert store.about(KEY)["step"] == "value"
         assert store.about(KEY)["kept"] is True
     same(Store(tmp_path).get(KEY), value)
@@ -418,7 +418,7 @@ def test_a_value_takes_the_place_of_a_receipt_and_never_the_reverse(tmp_path, va
 def test_a_note_that_loses_the_race_leaves_the_value(tmp_path, monkeypatch):
     late = Store(tmp_path)
     monkeypatch.setattr(late, "about", lambda key: Store(tmp_path).put(key, BIG, {}) and None)
-    assert late.note(KEY, {"step": "late"})
+    assert late.put_receipt(KEY, {"step": "late"})
     same(Store(tmp_path).get(KEY), BIG)
 
 
@@ -451,11 +451,11 @@ def test_entries_from_before_there_were_receipts_are_values(tmp_path):
 
 
 def test_a_damaged_receipt_is_put_aside(tmp_path):
-    Store(tmp_path).note(KEY, {"step": "s"})
+    Store(tmp_path).put_receipt(KEY, {"step": "s"})
     flip(sidecar(tmp_path), 0.5)
     with pytest.warns(UserWarning, match="is damaged"):
         assert Store(tmp_path).about(KEY) is None
-    assert Store(tmp_path).note(KEY, {"step": "s"})
+    assert Store(tmp_path).put_receipt(KEY, {"step": "s"})
     assert Store(tmp_path).about(KEY)["step"] == "s"
 
 
@@ -592,7 +592,7 @@ def test_who_may_write_in_the_root_may_write_below_it(tmp_path, mode):
     try:
         store = Store(root)
         store.put(KEY, BIG, {})
-        store.note("cd" + "0" * 30, {})
+        store.put_receipt("cd" + "0" * 30, {})
         store.pin(KEY)
         store.claim(KEY).release()
         store.gc()
@@ -616,7 +616,7 @@ def test_another_user_goes_on_where_the_first_one_stopped(tmp_path_factory):
         root = Path(folder)
         root.chmod(0o777)
         Store(root).put(KEY, BIG, {"seconds": 1.0})
-        Store(root).note("cd" + "0" * 30, {})
+        Store(root).put_receipt("cd" + "0" * 30, {})
         child = os.fork()
         if child == 0:
             failed = True
@@ -653,7 +653,7 @@ def test_the_store_stands_where_one_expects_it(tmp_path, monkeypatch):
 
 def test_a_url_is_no_folder(monkeypatch):
     monkeypatch.setenv("NEUSEE_CACHE", "s3://bucket/name")
-    with pytest.raises(ValueError, match="'s3://bucket/name', which is no folder: `open_store` takes URLs"):
+    with pytest.raises(ValueError, match="'s3://bucket/name', which is not a folder: `open_store` takes URLs"):
         Store()
 
 

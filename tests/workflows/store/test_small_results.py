@@ -22,7 +22,7 @@ def key(i):
 def jotted(root, count, start=0):
     store = Store(root)
     for i in range(start, start + count):
-        assert store.jot(key(i), torch.full((3,), float(i)), {"step": f"s{i}", "seconds": 1e-4})
+        assert store.put_small(key(i), torch.full((3,), float(i)), {"step": f"s{i}", "seconds": 1e-4})
     return store
 
 
@@ -38,7 +38,7 @@ def test_a_small_value_comes_back_in_the_next_process_without_a_file_of_its_own(
 
 def test_of_a_large_value_there_is_a_receipt_until_it_is_kept(tmp_path):
     store, large = Store(tmp_path), torch.rand(INLINE)
-    assert not store.jot(key(1), large, {"step": "s", "seconds": 1e-4})
+    assert not store.put_small(key(1), large, {"step": "s", "seconds": 1e-4})
     fresh = Store(tmp_path)
     assert not fresh.has(key(1))
     assert fresh.about(key(1))["bytes"] == large.nbytes
@@ -89,7 +89,7 @@ def test_where_no_line_can_be_written_there_is_one_warning(tmp_path, monkeypatch
 
     monkeypatch.setattr(os, "write", full)
     with pytest.warns(UserWarning, match="cannot be written") as seen:
-        assert [store.jot(key(i), torch.zeros(2), {"step": "s"}) for i in range(3)] == [False] * 3
+        assert [store.put_small(key(i), torch.zeros(2), {"step": "s"}) for i in range(3)] == [False] * 3
     assert len(seen) == 1
 
 
@@ -110,7 +110,7 @@ from pathlib import Path
 from neusee.workflows.store.result_store import Store
 store, first = Store(Path(sys.argv[1])), int(sys.argv[2])
 for i in range(first, first + 300):
-    store.jot(f"{i:032x}", torch.full((3,), float(i)), {"step": "s", "seconds": 0.0})
+    store.put_small(f"{i:032x}", torch.full((3,), float(i)), {"step": "s", "seconds": 0.0})
 """
 
 

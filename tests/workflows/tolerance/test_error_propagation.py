@@ -203,7 +203,7 @@ def test_where_the_bound_grows_on_the_way_less_is_left_out(store):
     steps = chain(0.5, last=step("out", corner, x="g0"))
     result = run(recipe(*steps), store)
     assert states(result) == ["run"]
-    assert result.recipe.strict < 1
+    assert result.recipe.tolerance_scale < 1
     assert torch.equal(result["out"], run(recipe(*steps, exact=True), store)["out"])
     again = run(recipe(*steps), store)
     assert states(again) != ["left out"]

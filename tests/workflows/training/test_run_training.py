@@ -315,8 +315,8 @@ def test_photographs_are_found_and_broken_ones_said(photographs, tmp_path):
     ("change", "said"),
     [
         ("train.stages.1.iterations=-1", "train.stages.1.iterations"),
-        ("+train.fish=1", "is not known here"),
-        ("train.photographs=nowhere", "is no folder"),
+        ("+train.fish=1", "unknown; "),
+        ("train.photographs=nowhere", "is not a folder"),
         ("train.network.kind=foo", "fft_mamba"),
         ("train.network.directions=3", "train.network.directions"),
         ("train.network.frequency=phase", "amp_phase"),
@@ -329,7 +329,7 @@ def test_a_mistake_is_located(change, said):
 
 
 def test_options_of_one_network_are_refused_of_another():
-    with pytest.raises(RecipeError, match="directions, pyramid: of fft_mamba alone, not of unet"):
+    with pytest.raises(RecipeError, match="directions, pyramid: only fft_mamba has this option, not unet"):
         load("train_small", ["train.network.kind=unet", "train.network.pyramid=true", "train.network.directions=4"])
 
 
@@ -453,10 +453,10 @@ def test_the_recommended_mask_is_that_of_trainings_that_say_nothing_of_it():
     ("change", "said"),
     [
         ("train.mask.kind=cubic", "train.mask.kind: .*five_half_rings"),
-        ("+train.mask.fish=1", "train.mask.fish: is not known here"),
-        ("+train.mask.weights.lsrr=1", "train.mask.weights.lsrr: is not known here; .*lsr"),
+        ("+train.mask.fish=1", "train.mask.fish: unknown; "),
+        ("+train.mask.weights.lsrr=1", "train.mask.weights.lsrr: unknown; .*lsr"),
         ("train.mask.max_height=3", "train.mask.max_height: .*needs a unit"),
-        ("+train.mask.slopes=[9, 3]", "train.mask: .*give the least first"),
+        ("+train.mask.slopes=[9, 3]", "train.mask: .*give the smaller slope first"),
         ("+train.mask.start=no.npy", "train.mask.start: .*no such file"),
     ],
 )

@@ -1,4 +1,4 @@
-"""How a lift from RGB to spectra is learnt: a recipe's ``train_lift`` block, read and checked where it stands."""
+"""Lift training block of a recipe: the settings under ``train_lift`` for a lift from RGB to spectra."""
 
 from __future__ import annotations
 
@@ -11,14 +11,14 @@ from neusee.workflows.graph.diagnostics import Diagnostic, nearest
 from neusee.workflows.recipe.text.composition import Composed
 from neusee.workflows.recipe.text.yaml_values import Value
 
-KEY = "train_lift"  #: of a recipe
+KEY = "train_lift"  #: key of the block in a recipe
 
 Beta = Annotated[float, Field(ge=0, lt=1)]
 Number = Annotated[int, Field(ge=1)]
 
 
 class LiftTraining(BaseModel):
-    """A recipe's ``train_lift`` block."""
+    """Settings of a recipe's ``train_lift`` block."""
 
     model_config = ConfigDict(extra="forbid", frozen=True)
 
@@ -39,13 +39,13 @@ class LiftTraining(BaseModel):
     show: Number = 1000
 
     def rate_at(self, iteration: int) -> float:
-        """The learning rate of an iteration, from 0: half a cosine from `rate` to `least`, rising evenly at first."""
+        """Return the rate of an iteration from 0: linear warm-up, then half a cosine from `rate` to `least`."""
         least, rising = min(self.least, self.rate), min(1.0, (iteration + 1) / max(self.warm, 1))
         return rising * (least + (self.rate - least) * 0.5 * (1 + math.cos(math.pi * iteration / self.iterations)))
 
 
 def read_lift_training(composed: Composed) -> tuple[Composed, LiftTraining | None]:
-    """The recipe without its ``train_lift`` block, and the block; what is wrong with it becomes a problem."""
+    """Return the recipe without its ``train_lift`` block, and the block; mistakes become diagnostics of the recipe."""
     block = composed.root.items.get(KEY)
     if block is None:
         return composed, None
@@ -57,13 +57,13 @@ def read_lift_training(composed: Composed) -> tuple[Composed, LiftTraining | Non
 
 
 def _problem(block: Value, error: Any) -> Diagnostic:
-    """Where it stands, as far as what pydantic names is there, and what to write."""
+    """Return a diagnostic at the innermost location that pydantic names, with the fix."""
     names = [str(key) for key in error["loc"]]
     below = {str(key): value for key, value in block.items.items()}
     at = below.get(names[0], block) if names else block
     path = ".".join([KEY, *names[: at is not block]])
     if error["type"] == "extra_forbidden":
-        return Diagnostic(at.key, path, f"is not known here; {nearest(names[0], LiftTraining.model_fields)}")
+        return Diagnostic(at.key, path, f"unknown; {nearest(names[0], LiftTraining.model_fields)}")
     if error["type"] == "missing":
-        return Diagnostic(at.mark, path, f"lacks {names[-1]}")
+        return Diagnostic(at.mark, path, f"needs {names[-1]}")
     return Diagnostic(at.mark, path, str(error["msg"]))

@@ -1,4 +1,4 @@
-"""What is known of several values at once: draws, or a mean with a covariance, and the files that hold them."""
+"""Joint distributions of several values: draws, or a mean with a covariance, and the files that contain them."""
 
 from __future__ import annotations
 
@@ -24,22 +24,22 @@ if TYPE_CHECKING:
 GAIN_UNIT = "DN/e-"  #: of K, EMVA 1288
 BARE_GAIN = (
     "head its draws 'gain [DN/e-]' or 'gain [e-/DN]', or write its mean and sd with DN/e-; "
-    "the folder of `neusee calibrate` says it by itself"
+    "the folder of `neusee calibrate` contains the unit"
 )
-Z_90 = 1.6448536269514722  #: standard deviations on either side that hold 90 % of a normal law
-_LEAST = 30  #: draws that can tell anything of a law
+Z_90 = 1.6448536269514722  #: standard deviations on either side that contain 90 % of a normal distribution
+_LEAST = 30  #: smallest number of draws from which a distribution is estimated
 _HEAD = re.compile(r"\s*(.*?)\s*\[([^\[\]]*)\]\s*")  #: ``gain [DN/e-]``
-_JITTER = 1e-10  #: added to a correlation of 1, so that its factor exists
+_JITTER = 1e-10  #: added to the diagonal of a correlation so that its Cholesky factor exists
 _FILES = "the folder of `neusee calibrate`, its posterior.json, draws in .npz or .csv, or a mean and sd in .json, .yaml"
 
 
 @dataclass(frozen=True)
 class Joint:
-    """Values that are known together, and how they come of standard normal numbers that know nothing of each other.
+    """A joint distribution of values as a function of independent standard normal numbers.
 
-    The first number moves the first value and all that goes with it, the second what is left of the second, and so
-    on: the factor of Cholesky of the correlation. Of draws the values keep their own laws, and the correlation is that
-    of their normal scores (a Gaussian copula).
+    The first number moves the first value and the values correlated with it, the second number moves the rest of the
+    second value, and so on: the Cholesky factor of the correlation. Values given by draws keep their own marginal
+    distributions, and their correlation is that of their normal scores (a Gaussian copula).
     """
 
     names: tuple[str, ...]
@@ -50,19 +50,19 @@ class Joint:
 
     @classmethod
     def of_draws(cls, names: Sequence[str], draws: Places) -> Joint:
-        """Raises ValueError for too few, for what is not finite and for a value that does not vary."""
+        """Return the joint distribution of draws; raise ValueError for too few, non-finite or constant draws."""
         if len(draws) < _LEAST:
-            raise ValueError(f"{len(draws)} draws: {_LEAST} at least can tell anything")
+            raise ValueError(f"{len(draws)} draws are too few: give {_LEAST} or more")
         if not np.isfinite(draws).all():
-            raise ValueError("not every draw is finite")
+            raise ValueError("a draw is NaN or infinite: remove the draw")
         if still := [name for name, x in zip(names, draws.T, strict=True) if np.ptp(x) == 0]:
-            raise ValueError(f"every draw of {still[0]} is the same: leave it out")
+            raise ValueError(f"every draw of {still[0]} is the same: leave {still[0]} out")
         correlation = np.atleast_2d(np.corrcoef(_scores(draws).T))
         return cls(tuple(names), draws.mean(0), draws.std(0, ddof=1), _factor(correlation), draws)
 
     @classmethod
     def of_normal(cls, names: Sequence[str], mean: Places, sd: Places, correlation: Places) -> Joint:
-        """Raises ValueError for what is no correlation, and for a deviation that is none."""
+        """Return a normal joint distribution; raise ValueError for an invalid correlation or standard deviation."""
         count = len(names)
         if correlation.shape != (count, count) or not np.allclose(correlation, correlation.T):
             raise ValueError(f"the correlation must be a symmetric matrix of {count} x {count}")
@@ -73,7 +73,7 @@ class Joint:
         return cls(tuple(names), mean, sd, _factor(correlation))
 
     def at(self, z: Places) -> Places:
-        """(…, name) values at (…, name) standard normal numbers."""
+        """Return (…, name) values at (…, name) standard normal numbers."""
         score = z @ self.factor.T
         if self.draws is None:
             return np.asarray(self.mean + self.sd * score, np.float64)
@@ -84,12 +84,12 @@ class Joint:
         return np.stack(columns, -1)
 
     def numbers(self) -> Places:
-        """(draw, name) the standard normal numbers that the draws stand for."""
+        """Return (draw, name) standard normal numbers that reproduce the draws."""
         assert self.draws is not None
         return np.asarray(np.linalg.solve(self.factor, _scores(self.draws).T).T, np.float64)
 
     def below(self, name: str, value: float) -> float:
-        """The share of the law of ``name`` that lies below ``value``."""
+        """Return the probability that ``name`` lies below ``value``."""
         i = self.names.index(name)
         if self.draws is not None:
             return float((self.draws[:, i] < value).mean())
@@ -98,7 +98,7 @@ class Joint:
         return float(ndtr((value - self.mean[i]) / self.sd[i]))
 
     def interval(self, name: str) -> tuple[float, float]:
-        """5 and 95 %."""
+        """Return the 5 % and the 95 % quantile."""
         i = self.names.index(name)
         if self.draws is not None:
             low, high = np.quantile(self.draws[:, i], [0.05, 0.95])
@@ -106,7 +106,7 @@ class Joint:
         return float(self.mean[i] - Z_90 * self.sd[i]), float(self.mean[i] + Z_90 * self.sd[i])
 
     def only(self, names: Sequence[str]) -> Joint:
-        """Of some of the values; what is known of the rest is forgotten."""
+        """Return the joint distribution of some of the values; the other values are marginalised."""
         at = [self.names.index(name) for name in names]
         if self.draws is not None:
             return Joint.of_draws(names, self.draws[:, at])
@@ -116,7 +116,7 @@ class Joint:
 
 
 def _scores(draws: Places) -> Places:
-    """(draw, name) normal scores of the ranks; what is equal has one rank."""
+    """Return (draw, name) normal scores of the ranks; equal draws share one rank."""
     from scipy.special import ndtri
     from scipy.stats import rankdata
 
@@ -129,19 +129,19 @@ def _factor(correlation: Places) -> Places:
 
 @dataclass(frozen=True)
 class Posterior:
-    """A joint law with what its file says beside it."""
+    """A joint distribution with the remarks of its file."""
 
     joint: Joint
     kinds: Mapping[str, str] = field(default_factory=dict)  #: of `neusee calibrate`: estimate, upper, lower, none
-    units: Mapping[str, str] = field(default_factory=dict)  #: in words, as far as the file says them
+    units: Mapping[str, str] = field(default_factory=dict)  #: in words, as far as the file gives them
 
     def kind(self, name: str) -> str:
-        """What is told of a value; what came from elsewhere is an estimate."""
+        """Return how a value is constrained; a value from another source is an estimate."""
         return self.kinds.get(name, "estimate")
 
 
 def read_posterior(path: Path) -> Posterior:
-    """Read a posterior, of a pattern the newest; raises ValueError that says what is wrong with it."""
+    """Read a posterior, the newest file for a pattern; raise ValueError with the fault of the file."""
     if any(sign in str(path) for sign in "*?["):
         path = max(map(Path, glob(str(path))), key=lambda each: (each.stat().st_mtime, each), default=path)
     if path.is_dir():
@@ -157,11 +157,11 @@ def read_posterior(path: Path) -> Posterior:
             return _document(path)
     except (OSError, KeyError, TypeError, BadZipFile, UnicodeDecodeError) as error:
         raise ValueError(f"{path.name} cannot be read as a posterior: {error!r}") from None
-    raise ValueError(f"{path.name} is no posterior: give {_FILES}")
+    raise ValueError(f"{path.name} is not a posterior: give {_FILES}")
 
 
 def _document(path: Path) -> Posterior:
-    """What `neusee calibrate` wrote, or a summary by mean and deviation."""
+    """Read the file of `neusee calibrate`, or a summary by mean and standard deviation."""
     from ruamel.yaml import YAML
     from ruamel.yaml.error import YAMLError
 
@@ -170,12 +170,12 @@ def _document(path: Path) -> Posterior:
     except YAMLError as error:
         raise ValueError(f"{path.name} cannot be read: {' '.join(str(error).split())}") from None
     if not isinstance(doc, dict):
-        raise ValueError(f"{path.name} holds no mapping")
+        raise ValueError(f"{path.name} must contain a mapping")
     if "parameters" not in doc:
         return summarised(doc)
     if doc.get("failed"):
         wrong = [check["name"] for check in doc.get("checks", ()) if check["mark"] == "fail"]
-        raise ValueError(f"the calibration is not fit for use: {doc['failed']} checks fail ({'; '.join(wrong)})")
+        raise ValueError(f"the calibration cannot be used: {doc['failed']} checks fail ({'; '.join(wrong)})")
     joint = read_posterior(path.with_name("draws.npz")).joint
     assert joint.draws is not None
     rows = {_renamed(name): row for name, row in doc["parameters"].items()}
@@ -185,19 +185,19 @@ def _document(path: Path) -> Posterior:
 
 
 def _renamed(name: str) -> str:
-    """Return what a calibration of 0.1 calls otherwise by the name that it has now."""
+    """Return the present name of a parameter of a calibration by neusee 0.1."""
     return POSTERIOR_NAMES.get(name, name)
 
 
 def _headed(columns: Mapping[str, Places]) -> tuple[dict[str, Places], dict[str, str]]:
-    """Return draws by name, and the unit of each whose heading says it: ``gain [DN/e-]``."""
+    """Return draws by name, and the units that headings contain: ``gain [DN/e-]``."""
     heads = {head: _HEAD.fullmatch(head) for head in columns}
     found = {m[1] if m else head: columns[head] for head, m in heads.items()}
     return found, {m[1]: m[2].strip() for m in heads.values() if m}
 
 
 def _drawn(columns: Mapping[str, Places], units: Mapping[str, str]) -> Posterior:
-    """Return the law of draws; those in e-/DN become draws of K."""
+    """Return the distribution of draws; draws in e-/DN become draws of K."""
     with np.errstate(divide="ignore"):
         si = {name: 1.0 / x if units.get(name) == "e-/DN" else x for name, x in columns.items()}
     said = {name: GAIN_UNIT if unit == "e-/DN" else unit for name, unit in units.items()}
@@ -207,14 +207,14 @@ def _drawn(columns: Mapping[str, Places], units: Mapping[str, str]) -> Posterior
 def _of_columns(columns: Mapping[str, Places]) -> Joint:
     lengths = {len(x) for x in columns.values()}
     if len(lengths) != 1:
-        raise ValueError("not every value has as many draws" if lengths else "it holds no draws")
+        raise ValueError("the values have different numbers of draws" if lengths else "the file contains no draws")
     return Joint.of_draws(tuple(columns), np.stack(list(columns.values()), 1))
 
 
 def _arrays(path: Path) -> dict[str, Places]:
     with path.open("rb") as file:
         if file.read(2) != b"PK":
-            raise ValueError(f"{path.name} cannot be read: it is no .npz file")
+            raise ValueError(f"{path.name} cannot be read: the file is not in .npz format")
     with np.load(path) as found:
         return {name: np.asarray(found[name], np.float64).reshape(-1) for name in found}
 
@@ -223,22 +223,22 @@ def _columns(path: Path) -> dict[str, Places]:
     with path.open(newline="", encoding="utf-8") as file:
         header, *rows = list(csv.reader(file)) or [[]]
     if short := [n for n, row in enumerate(rows, 2) if len(row) != len(header)]:
-        raise ValueError(f"line {short[0]} has not {len(header)} values, as the first line has")
+        raise ValueError(f"line {short[0]} must have {len(header)} values like the first line")
     try:
         numbers = np.array(rows, np.float64).reshape(-1, len(header))
     except ValueError as error:
-        raise ValueError(f"below the names of the first line there must be numbers: {error}") from None
+        raise ValueError(f"the lines below the names must contain numbers: {error}") from None
     return {name.strip(): numbers[:, i] for i, name in enumerate(header)}
 
 
 def summarised(given: Mapping[str, Any]) -> Posterior:
-    """Return the law that `summary` reads, with the units of its means."""
+    """Return the distribution that `summary` reads, with the units of its means."""
     joint = summary(given)
     return Posterior(joint, units={str(name): read_any(x)[1] for name, x in given["mean"].items()})
 
 
 def summary(given: Mapping[str, Any]) -> Joint:
-    """Of ``mean``, ``sd`` and perhaps ``correlation``, or of ``mean`` and ``covariance``; in SI or with units."""
+    """Return the joint distribution of a summary, in SI or with units: mean with sd or with covariance."""
     if strange := sorted(set(given) - {"mean", "sd", "correlation", "covariance"}):
         raise ValueError(f"{strange[0]} is unknown: give mean with sd and perhaps correlation, or mean with covariance")
     if not isinstance(given.get("mean"), dict) or ("sd" in given) == ("covariance" in given):
@@ -252,7 +252,7 @@ def summary(given: Mapping[str, Any]) -> Joint:
             raise ValueError(f"the covariance must be a matrix of {len(names)} x {len(names)} with positive variances")
         return Joint.of_normal(names, mean, sd, covariance / sd / sd[:, None])
     if not isinstance(given["sd"], dict) or set(map(str, given["sd"])) != set(names):
-        raise ValueError("sd must name what mean names")
+        raise ValueError("sd must have the same names as mean")
     sd = np.array([_si(given["sd"][name]) for name in given["mean"]])
     correlation = _matrix(given["correlation"]) if "correlation" in given else np.eye(len(names))
     return Joint.of_normal(names, mean, sd, correlation)
@@ -269,4 +269,4 @@ def _matrix(given: Any) -> Places:
     try:
         return np.array(given, np.float64)
     except (TypeError, ValueError):
-        raise ValueError("a matrix is a list of rows of numbers, all of one length") from None
+        raise ValueError("a matrix must be a list of rows of numbers, all of the same length") from None

@@ -1,6 +1,6 @@
-"""What a recipe is not sure of: laws in the place of values, and a ``posterior`` over several of them.
+"""Nominal values of a recipe's uncertain inputs: distributions in place of values, and a ``posterior`` over several.
 
-A run takes the median of a law and what ``posterior`` says it shall take; the study of uncertainty draws from both.
+A run uses the median of a distribution, and the value that ``posterior`` chooses; the study of uncertainty draws both.
 """
 
 from __future__ import annotations
@@ -26,58 +26,58 @@ from neusee.workflows.recipe.text.references import BROKEN
 from neusee.workflows.recipe.text.renamed_keys import POSTERIOR_NAMES
 from neusee.workflows.recipe.text.yaml_values import Value, Where, dotted
 
-KEY = "posterior"  #: of a recipe
-_BLOCK = "sensor"  #: whose values a calibration names without it
+KEY = "posterior"  #: key of the block in a recipe
+_BLOCK = "sensor"  #: block of the values that a calibration names without a block
 _SAID = ("file", "use", "values")
 _SUMMARY = ("mean", "sd", "correlation", "covariance")
-_FAR = 0.005  #: share of a posterior beyond which a recipe's own value is far off
+_FAR = 0.005  #: tail probability of a posterior beyond which a recipe's own value counts as far off
 
 
 @dataclass(frozen=True)
 class Standing:
-    """A value of the recipe beside its posterior."""
+    """A value of the recipe compared with its posterior."""
 
     path: str
-    own: str  #: what the recipe says
+    own: str  #: the recipe's own value
     kind: str  #: estimate, upper, lower, none
     mean: float
     sd: float
     low: float  #: 5 %
     high: float  #: 95 %
     unit: str
-    below: float  #: share of the posterior below the recipe's own value
-    used: str  #: what a run takes
-    why: str  #: where it takes that from
+    below: float  #: probability of the posterior below the recipe's own value
+    used: str  #: the value that a run uses
+    why: str  #: source of the value that a run uses
 
     @property
     def far(self) -> bool:
-        """Whether the recipe's own value lies where there is hardly any posterior."""
+        """Return True if the recipe's own value lies in the far tails of its posterior."""
         return not _FAR <= self.below <= 1 - _FAR
 
 
 @dataclass(frozen=True)
 class Uncertain:
-    """What can be drawn from, and the recipe that it belongs to."""
+    """The uncertain inputs of a recipe, and the recipe itself."""
 
-    composed: Composed  #: with a value in the place of every law
+    composed: Composed  #: with a value in place of every distribution
     laws: Mapping[str, Law]  #: by path
     joint: Joint | None  #: its names are paths
     standings: tuple[Standing, ...] = ()
     notes: tuple[str, ...] = ()
     source: str = ""  #: of the posterior
-    units: Mapping[str, str] = field(default_factory=dict)  #: SI unit by path of what is in the joint law
+    units: Mapping[str, str] = field(default_factory=dict)  #: SI unit by path of the values in the joint distribution
 
     @property
     def names(self) -> tuple[str, ...]:
-        """Paths of all that is uncertain."""
+        """Return the paths of all uncertain values."""
         return (*self.laws, *(self.joint.names if self.joint else ()))
 
     def said(self, name: str) -> str:
-        """Its law, or where its posterior is from."""
+        """Return the distribution of a value as text, or the source of its posterior."""
         return self.laws[name].text if name in self.laws else f"posterior {self.source}"
 
     def at(self, values: Mapping[str, float]) -> Any:
-        """The recipe with these values, in SI, checked anew; raises `RecipeError`."""
+        """Return the recipe checked with these values, in SI; raise `RecipeError` for a bad value."""
         from neusee.workflows.recipe.loading import check
 
         root = self.composed.root
@@ -88,7 +88,7 @@ class Uncertain:
 
 
 def settle(composed: Composed) -> tuple[Composed, Uncertain | None]:
-    """The recipe with a value in the place of all that is uncertain; of one that is sure of all, itself."""
+    """Return the recipe with a value in place of every distribution; return a recipe without them unchanged."""
     laws, root = dict[str, Law](), composed.root
     diagnostics = list(composed.diagnostics)
     for path, leaf in _laws(root):
@@ -102,7 +102,7 @@ def settle(composed: Composed) -> tuple[Composed, Uncertain | None]:
     given = root.items.get(KEY)
     if given is None and not laws and len(diagnostics) == len(composed.diagnostics):
         return composed, None
-    notes = [f"{path} is {law.text}: run at {_said(law.median, law.unit)}" for path, law in laws.items()]
+    notes = [f"{path} is {law.text}: this run uses {_said(law.median, law.unit)}" for path, law in laws.items()]
     found = _Reader(replace(root, data={key: v for key, v in root.data.items() if key != KEY}), laws, diagnostics)
     if given is not None:
         found.read(given)
@@ -112,7 +112,7 @@ def settle(composed: Composed) -> tuple[Composed, Uncertain | None]:
 
 
 def _laws(root: Value) -> Iterator[tuple[Where, Value]]:
-    """Every scalar that is written as a law, by the keys that lead to it: an alias stands at several places."""
+    """Yield every scalar that is written as a distribution, by its keys; an alias occurs at several places."""
     stack: list[tuple[Where, Value]] = [((key,), value) for key, value in root.items.items() if key != KEY]
     while stack:
         path, value = stack.pop()
@@ -122,7 +122,7 @@ def _laws(root: Value) -> Iterator[tuple[Where, Value]]:
 
 
 def put(root: Value, path: Where, data: Any, mark: Location | None = None) -> Value:
-    """``root`` with another scalar at ``path``, which must be there."""
+    """Return ``root`` with another scalar at ``path``, which must exist."""
     if not path:
         return replace(root, data=data, mark=mark or root.mark)
     key = next(key for key in root.items if str(key) == str(path[0]))
@@ -140,7 +140,7 @@ def _at(root: Value, path: str) -> Value | None:
 
 
 class _Reader:
-    """Reads ``posterior`` of a recipe, and puts what a run shall take in its place."""
+    """Reader of a recipe's ``posterior``, which puts the chosen values into the recipe."""
 
     def __init__(self, root: Value, laws: Mapping[str, Law], diagnostics: list[Diagnostic]) -> None:
         self.root, self.laws, self.diagnostics = root, laws, diagnostics
@@ -151,7 +151,7 @@ class _Reader:
         self.source = ""
 
     def read(self, given: Value) -> None:
-        """Apply it; every mistake is a problem that stands where it was written."""
+        """Read the posterior and apply it; report each mistake at the place where it was written."""
         if given.data is None:
             return
         said = given.items if isinstance(given.data, dict) else {"file": given}
@@ -184,10 +184,10 @@ class _Reader:
         if isinstance(use, int) and not isinstance(use, bool) and drawn is not None and 0 <= use < len(drawn):
             return use
         some = f", or the number of a draw, 0 to {len(drawn) - 1}" if drawn is not None else ""
-        raise ValueError(f"use = {use}: write mean, nominal (what the recipe says){some}")
+        raise ValueError(f"use = {use}: write mean, nominal (the recipe's own value){some}")
 
     def _pairs(self, given: Value | None, posterior: Posterior, whole: Value) -> dict[str, str]:
-        """Names of the posterior by the path of the recipe's value."""
+        """Return the names in the posterior by the path of the recipe's value."""
         names = posterior.joint.names
         if given is not None and not isinstance(given.data, dict):
             raise ValueError("values: write {path of the recipe: name in the posterior}")
@@ -203,16 +203,16 @@ class _Reader:
             all_pairs = {name if "." in name else f"{_BLOCK}.{name}": name for name in names}
             pairs = {path: name for path, name in all_pairs.items() if _at(self.root, path) is not None}
             if lost := [name for path, name in all_pairs.items() if path not in pairs]:
-                self.notes.append(f"of the posterior, this recipe has no {', '.join(lost)}")
+                self.notes.append(f"this recipe does not have these values of the posterior: {', '.join(lost)}")
         if wrong := [path for path in pairs if _at(self.root, path) is None]:
-            raise ValueError(f"values: the recipe has no {wrong[0]}")
+            raise ValueError(f"values: the recipe has no value {wrong[0]}")
         if not pairs:
-            raise ValueError(f"no value of the recipe is in the posterior, which knows {', '.join(names)}")
+            raise ValueError(f"no value of the recipe is in the posterior, which contains {', '.join(names)}")
         self._conventions(posterior, pairs)
         return pairs
 
     def _conventions(self, posterior: Posterior, pairs: Mapping[str, str]) -> None:
-        """A number means what it says only by the convention that it was found by."""
+        """Raise ValueError where the posterior's gain has no unit, or where its exposure is not the recipe's."""
         for path, name in pairs.items():
             if self._is_gain(path) and posterior.units.get(name) != GAIN_UNIT:
                 raise ValueError(f"its {name} has no unit: {BARE_GAIN}")
@@ -221,7 +221,7 @@ class _Reader:
         if "dark_current" in pairs.values() and exposure is not None and " in " in words:
             told, own = read_any(words.partition(" in ")[2])[0], read_any(exposure.data)[0]
             if abs(told - own) > 1e-9 * own:
-                raise ValueError(f"its dark current is in {told:g} s, the recipe exposes {own:g} s")
+                raise ValueError(f"the posterior's dark current is for {told:g} s, the recipe's exposure is {own:g} s")
 
     def _is_gain(self, path: str) -> bool:
         value = _at(self.root, path)
@@ -234,8 +234,8 @@ class _Reader:
             assert value is not None
             if path in self.laws or value.mark.line == 0:
                 if path in self.laws and value.mark.line:
-                    self._fail(value.mark, path, "is a law here and in the posterior: leave one out")
-                self.notes.append(f"{path} is what the argument says, not the posterior")
+                    self._fail(value.mark, path, "has a distribution here and in the posterior: remove one of the two")
+                self.notes.append(f"{path} comes from the argument, not from the posterior")
                 continue
             try:
                 own, unit = read_any(value.data)
@@ -250,7 +250,7 @@ class _Reader:
             self.joint = replace(joint, names=tuple(kept))
 
     def _stand(self, posterior: Posterior, path: str, name: str, own: float, use: str | int, mark: Location) -> None:
-        """Where the recipe's own value lies, and what a run takes in its place."""
+        """Compare the recipe's own value with its posterior, and put the value for a run into the recipe."""
         joint, unit, kind = posterior.joint, self.units[path], posterior.kind(name)
         i = joint.names.index(name)
         taken, why = own, "recipe"
@@ -275,7 +275,7 @@ class _Reader:
 
 
 def _flat(value: Value) -> Any:
-    """A mapping by dotted paths, however deep an argument made it; of all else its plain value."""
+    """Return a mapping by dotted paths, however deep; return the plain value of anything else."""
     if not isinstance(value.data, dict):
         return value.plain
     return {dotted(leaf.path[len(value.path) :]): leaf.plain for leaf in value.leaves() if leaf is not value}
@@ -286,5 +286,5 @@ def _said(value: float, unit: str) -> str:
 
 
 def told(standings: Sequence[Standing]) -> list[dict[str, Any]]:
-    """As plain JSON."""
+    """Return the comparisons as plain JSON."""
     return [{**{name: getattr(s, name) for name in Standing.__dataclass_fields__}, "far": s.far} for s in standings]

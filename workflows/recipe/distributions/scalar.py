@@ -1,4 +1,4 @@
-"""A scalar that is not known for certain: ``normal(10.5 e-, 0.5 e-)`` in the place of ``10.5 e-``."""
+"""Distribution of one scalar: ``normal(10.5 e-, 0.5 e-)`` in place of ``10.5 e-``."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ if TYPE_CHECKING:
 
     Places = NDArray[np.float64]
 
-#: by kind, what its two arguments are
+#: by kind, the meaning of its two arguments
 KINDS = {
     "normal": ("the mean", "the standard deviation"),
     "lognormal": ("the median", "the factor of one standard deviation"),
@@ -28,17 +28,17 @@ _CALL = re.compile(rf"({'|'.join(KINDS)})\((.*)\)", re.DOTALL)
 
 @dataclass(frozen=True)
 class Law:
-    """A law of one number, by its two arguments in SI, or of the reciprocal of that number: a gain in e-/DN."""
+    """A distribution of one number or of its reciprocal (a gain in e-/DN), with its two arguments in SI."""
 
     kind: str
-    text: str  #: as it was written
+    text: str  #: as written in the recipe
     first: float
     second: float
-    unit: str  #: SI unit of a draw; empty for a number without one
-    reciprocal: bool = False  #: whether the law is that of 1 over a draw
+    unit: str  #: SI unit of a draw; empty for a number without a unit
+    reciprocal: bool = False  #: whether the distribution is that of 1 over a draw
 
     def at(self, z: Places) -> Places:
-        """The value that lies where ``z`` lies in the standard normal law."""
+        """Return the value at the quantile of ``z`` in the standard normal distribution."""
         from scipy.special import ndtr
 
         a, b = self.first, self.second
@@ -56,29 +56,29 @@ class Law:
 
     @property
     def median(self) -> float:
-        """What a run takes that draws nothing."""
+        """Return the median, which a run without draws uses."""
         return float(self.at(np.zeros(())))
 
 
 def is_law(text: Any) -> bool:
-    """Whether a value is written as one, or begins as one."""
+    """Return True if a value is written as a distribution, or begins like one."""
     return isinstance(text, str) and _BEGIN.match(text) is not None
 
 
 def read_law(text: str) -> Law:
-    """Read a law; raises ValueError that says what to write."""
+    """Read a distribution; raise ValueError with the correct form."""
     match = _CALL.fullmatch(text.strip())
     if match is None:
-        raise ValueError("is no whole law: write kind(…, …), and within [ ] or { } in quotes")
+        raise ValueError("is not a complete distribution: write kind(…, …), in quotes inside [ ] or { }")
     kind, given = match[1], [part.strip() for part in match[2].split(",")]
     if len(given) != 2 or not all(given):
         raise ValueError(f"needs {' and '.join(KINDS[kind])}: write {kind}(…, …)")
     (first, unit, reciprocal), (second, other, also) = read_written(given[0]), read_written(given[1])
     if kind == "lognormal":
         if other:
-            raise ValueError(f"{KINDS[kind][1]} is a number without unit, such as 1.1, not {given[1]}")
+            raise ValueError(f"{KINDS[kind][1]} is a number without a unit, such as 1.1, not {given[1]}")
     elif (unit, reciprocal) != (other, also):
-        raise ValueError(f"{given[0]} and {given[1]} are not of one unit")
+        raise ValueError(f"{given[0]} and {given[1]} must have the same unit")
     if fault := _fault(kind, first, second):
         raise ValueError(fault)
     return Law(kind, text.strip(), first, second, unit, reciprocal)
@@ -90,10 +90,10 @@ def _fault(kind: str, first: float, second: float) -> str:
     if kind == "lognormal":
         return "" if first > 0 and second > 1 else "the median must be greater than 0, and the factor than 1"
     if not first < second:
-        return "the least value comes first, and the largest is greater"
+        return "the first value must be smaller than the second"
     return "" if kind == "uniform" or first > 0 else "the least value must be greater than 0"
 
 
 def written(value: float, unit: str) -> str | float:
-    """A value in SI as a recipe has it."""
+    """Return a value in SI as a recipe writes the value."""
     return f"{value!r} {unit}" if unit else value

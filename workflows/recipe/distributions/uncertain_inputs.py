@@ -1,4 +1,4 @@
-"""The uncertain values of a recipe as inputs: which parameters read them, and what draws of them are."""
+"""Uncertain inputs of a recipe: the parameters that read the uncertain values, and draws of these values."""
 
 from __future__ import annotations
 
@@ -17,10 +17,10 @@ if TYPE_CHECKING:
 
     Places = NDArray[np.float64]
 
-SCRAMBLES = 8  #: of Sobol's points, each by itself: how they differ tells the error
-_PROBE = 0.3  #: standard deviations from the median at which a value is followed to the parameters
-_TIED = 0.1  #: correlation from which two values are said to go together
-_EDGE = 1e-12  #: share next to 0 and 1 that no point may reach
+SCRAMBLES = 8  #: independent scramblings of Sobol's points, whose differences give the error
+_PROBE = 0.3  #: standard deviations from the median at which a value is traced to the parameters
+_TIED = 0.1  #: correlation from which two values count as correlated
+_EDGE = 1e-12  #: probability next to 0 and 1 that no point may reach
 
 Index = tuple[int | str, ...]
 
@@ -29,31 +29,31 @@ Index = tuple[int | str, ...]
 class Points:
     """Draws of all inputs."""
 
-    z: Places  #: (draw, input) standard normal numbers that know nothing of each other
+    z: Places  #: (draw, input) independent standard normal numbers
     values: Places  #: (draw, input) in SI
 
 
 @dataclass(frozen=True)
 class Inputs:
-    """What is drawn, in the order of `names`."""
+    """The inputs that are drawn, in the order of `names`."""
 
     recipe: Recipe
     uncertain: Uncertain
-    names: tuple[str, ...]  #: paths of the recipe that reach an output
-    idle: tuple[str, ...]  #: paths that reach none
-    readers: Mapping[str, tuple[tuple[Index, str], ...]]  #: by ``step.parameter``: where in it stands which input
+    names: tuple[str, ...]  #: paths of the recipe that affect an output
+    idle: tuple[str, ...]  #: paths that affect no output
+    readers: Mapping[str, tuple[tuple[Index, str], ...]]  #: by ``step.parameter``: index in the parameter, and input
 
     @classmethod
     def of(cls, recipe: Recipe, outputs: Sequence[str] | None = None) -> Inputs:
-        """What reaches the outputs, the recipe's own or others.
+        """Return the uncertain values that affect the outputs (the recipe's own, if None).
 
-        Raises ValueError for a recipe that is sure of all, or whose outputs hang on nothing uncertain.
+        Raises ValueError for a recipe without uncertain values, or where no output depends on one.
         """
         outputs = recipe.outputs if outputs is None else outputs
         uncertain = recipe.uncertain
         if uncertain is None or not uncertain.names:
             raise ValueError(
-                "nothing is uncertain: write a law in the place of a value, such as "
+                "no value is uncertain: write a distribution in place of a value, such as "
                 'sensor.read_noise="normal(10.5 e-, 0.5 e-)", or posterior: PATH'
             )
         found: dict[str, list[tuple[Index, str]]] = {}
@@ -69,17 +69,17 @@ class Inputs:
 
     @property
     def labels(self) -> list[str]:
-        """What each standard normal number moves."""
+        """Return the label of each standard normal number."""
         return [_label(self.uncertain, name) for name in self.names]
 
     @property
     def most(self) -> int | None:
-        """How many independent draws there are; None where there is no end."""
+        """Return the number of independent draws, or None where the number is unlimited."""
         joint = self.uncertain.joint
         return None if joint is None or joint.draws is None else len(joint.draws)
 
     def theta(self, values: Mapping[str, float]) -> dict[str, Any]:
-        """The parameters that read the inputs, by ``step.parameter``."""
+        """Return the parameters that read the inputs, by ``step.parameter``."""
         found = {}
         for reader, places in self.readers.items():
             step, _, param = reader.rpartition(".")
@@ -90,13 +90,13 @@ class Inputs:
         return found
 
     def at(self, z: Places) -> Places:
-        """(draw, input) values at standard normal numbers."""
+        """Return (draw, input) values at standard normal numbers."""
         columns = [law.at(z[:, i]) for i, law in enumerate(self.uncertain.laws.values())]
         joint = self.uncertain.joint
         return np.stack([*columns, *(joint.at(z[:, len(columns) :]).T if joint else ())], 1)
 
     def independent(self, count: int, seed: int) -> Points:
-        """Draws that know nothing of each other; more of them begin with the same."""
+        """Return independent draws; a larger count begins with the same draws."""
         z = np.random.default_rng([seed, 1]).standard_normal((count, len(self.names)))
         values, joint = self.at(z), self.uncertain.joint
         if joint is None or joint.draws is None:
@@ -107,7 +107,7 @@ class Inputs:
         return Points(z, np.concatenate([values[: len(rows), :first], joint.draws[rows]], 1))
 
     def sobol(self, count: int, seed: int) -> Points:
-        """Points of `SCRAMBLES` scrambled sequences of Sobol in turn: point i belongs to the sequence i % SCRAMBLES."""
+        """Return points of `SCRAMBLES` scrambled Sobol sequences in turn: point i belongs to sequence i % SCRAMBLES."""
         from scipy.special import ndtri
         from scipy.stats import qmc
 
@@ -119,7 +119,7 @@ class Inputs:
         return Points(z, self.at(z))
 
     def checked(self, values: Places) -> None:
-        """Look at the least and the greatest of each input before anything runs; raises `RecipeError`."""
+        """Check the least and the greatest value of each input before a run; raise `RecipeError`."""
         for name, column in zip(self.names, values.T, strict=True):
             for value in (float(column.min()), float(column.max())):
                 try:
@@ -130,7 +130,7 @@ class Inputs:
 
 
 def _only(uncertain: Uncertain, names: Collection[str]) -> Uncertain:
-    """What is left when the rest is not drawn."""
+    """Return the uncertain values with only ``names`` drawn."""
     laws = {name: law for name, law in uncertain.laws.items() if name in names}
     joint = uncertain.joint
     kept = [name for name in joint.names if name in names] if joint else []
@@ -138,7 +138,7 @@ def _only(uncertain: Uncertain, names: Collection[str]) -> Uncertain:
 
 
 def _readers(recipe: Recipe, uncertain: Uncertain, name: str, outputs: Sequence[str]) -> Iterator[tuple[str, Index]]:
-    """The parameters of steps that the outputs need, and where in them the value of ``name`` stands."""
+    """Yield the parameters of needed steps that read the value of ``name``, with the index in the parameter."""
     if name in uncertain.laws:
         probe = float(uncertain.laws[name].at(np.array(_PROBE)))
     else:
@@ -147,18 +147,18 @@ def _readers(recipe: Recipe, uncertain: Uncertain, name: str, outputs: Sequence[
         probe = float(uncertain.joint.mean[at] + _PROBE * uncertain.joint.sd[at])
     changed: Recipe = uncertain.at({name: probe})
     if changed.steps.keys() != recipe.steps.keys() or changed.outputs != recipe.outputs:
-        raise ValueError(f"{name} decides which steps there are: it cannot be drawn")
+        raise ValueError(f"{name} changes the list of steps and therefore cannot be drawn")
     for step in needed(recipe, outputs):
         before, after = recipe.steps[step], changed.steps[step]
         for param, value in after.params.items():
             for index, new in _changed(before.params[param], value):
                 if not isinstance(new, float) or abs(new - probe) > 1e-9 * abs(probe):
-                    raise ValueError(f"{name} is no number that {step}.{param} reads as it is: it cannot be drawn")
+                    raise ValueError(f"{step}.{param} does not read {name} unchanged, so {name} cannot be drawn")
                 yield f"{step}.{param}", index
 
 
 def _changed(before: Any, after: Any) -> Iterator[tuple[Index, Any]]:
-    """Where two parameters differ, and what the second has there."""
+    """Yield the index of each difference between two parameters, and the second value there."""
     if isinstance(after, list | tuple) and isinstance(before, list | tuple) and len(after) == len(before):
         for i, (a, b) in enumerate(zip(before, after, strict=True)):
             yield from (((i, *rest), new) for rest, new in _changed(a, b))

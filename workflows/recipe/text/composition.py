@@ -1,4 +1,4 @@
-"""One recipe out of many files: the groups that it names, its own text over them, the arguments over all."""
+"""Composition of a recipe from several files: its groups first, then its own text, then the arguments."""
 
 from __future__ import annotations
 
@@ -20,41 +20,41 @@ _known: dict[tuple[int, ...], tuple[tuple[Value, ...], Value]] = {}  #: ids of t
 
 @dataclass(frozen=True, slots=True)
 class Composed:
-    """The final values of a recipe, nothing of them checked yet but that they are YAML."""
+    """The final values of a recipe, read as YAML and not yet checked."""
 
     name: str
     title: str
     root: Value
     diagnostics: tuple[Diagnostic, ...]
-    whole: bool = True  #: whether every group that is named could be read
+    whole: bool = True  #: whether every named group could be read
 
     def without(self, key: str) -> Composed:
-        """The same but for one block, which is read apart."""
+        """Return the recipe without one block, which is read separately."""
         return replace(self, root=replace(self.root, data={k: v for k, v in self.root.data.items() if k != key}))
 
     def with_problems(self, diagnostics: Iterable[Diagnostic]) -> Composed:
-        """The same, with what else is wrong."""
+        """Return the recipe with further diagnostics."""
         return replace(self, diagnostics=(*self.diagnostics, *diagnostics))
 
 
 @dataclass(frozen=True, slots=True)
 class Choice:
-    """An entry of ``defaults``: which option of a group, or none."""
+    """An entry of ``defaults``: the option of a group, or no option."""
 
     group: str
     option: str | None
     mark: Location
-    shown: str  #: what the user wrote, for a message
+    shown: str  #: the user's text, for a message
 
 
 @functools.cache
 def packaged() -> Path:
-    """The folder of the recipes that are installed with the program."""
+    """Return the folder of the recipes that are installed with the program."""
     return Path(str(files("neusee.recipes")))
 
 
 def locate(recipe: str | Path, folder: Path) -> Path:
-    """The file of a packaged recipe's name, or of a path that ends in ``.yaml``."""
+    """Return the file of a packaged recipe's name, or of a path that ends in ``.yaml``."""
     if str(recipe).endswith((".yaml", ".yml")):
         path = folder / Path(recipe).expanduser()
         if path.is_file():
@@ -89,7 +89,7 @@ def compose(recipe: str | Path, arguments: Sequence[str | Override], folder: Pat
 
 
 def shown(path: Path, folder: Path) -> str:
-    """A file as its user knows it: from the packaged recipes, from the working folder, or in full."""
+    """Return a file's name as its user knows it: relative to the packaged recipes or the working folder, or in full."""
     for above in (packaged(), folder):
         if path.is_relative_to(above):
             return path.relative_to(above).as_posix()
@@ -97,7 +97,7 @@ def shown(path: Path, folder: Path) -> str:
 
 
 def merge(below: Value, above: Value) -> Value:
-    """``above`` over ``below``: mappings by key, all else whole; a step with another ``node`` is another step."""
+    """Merge ``above`` over ``below``: mappings by key, other values and steps with their own ``node`` as a whole."""
     if not isinstance(below.data, dict) or not isinstance(above.data, dict) or _new_step(above):
         return above
     data = dict(below.data)
@@ -107,7 +107,7 @@ def merge(below: Value, above: Value) -> Value:
 
 
 def _merged(parts: tuple[Value, ...]) -> Value:
-    """The groups' options and the recipe over one another; of the same parts, the very same value again."""
+    """Merge the groups' options and the recipe; equal parts give the identical value again."""
     name = tuple(map(id, parts))  # no other value takes an id while `_known` holds the parts
     found = _known.get(name)
     if found is None:
@@ -135,7 +135,7 @@ def _without_defaults(root: Value) -> Value:
 
 
 def groups_of(*folders: Path) -> dict[str, list[str]]:
-    """Options by group: the folders of YAML files beside a recipe and among the packaged ones."""
+    """Return options by group: the folders of YAML files beside a recipe and among the packaged ones."""
     found: dict[str, set[str]] = {}
     for folder in folders:
         for path in folder.glob("*/*.yaml"):
@@ -146,7 +146,7 @@ def groups_of(*folders: Path) -> dict[str, list[str]]:
 def _choose(
     root: Value, overrides: list[Override], beside: Path, diagnostics: list[Diagnostic]
 ) -> tuple[list[Choice], list[Override]]:
-    """The defaults after ``group=option``, and the overrides that are of values."""
+    """Return the defaults after ``group=option``, and the overrides of values."""
     choices = {choice.group: choice for choice in _defaults(root, diagnostics)}
     groups = groups_of(beside, packaged())
     rest = []
@@ -157,14 +157,14 @@ def _choose(
             rest.append(o)
         elif o.sign == "+" and group in choices:
             diagnostics.append(
-                Diagnostic(o.mark, o.text, f"{group} is {choices[group].option} already: leave out the +")
+                Diagnostic(o.mark, o.text, f"{group} is already set to {choices[group].option}: remove the +")
             )
         elif o.sign == "" and group not in choices:
             diagnostics.append(
-                Diagnostic(o.mark, o.text, f"{group} is no group of this recipe; to add it, write +{o.text}")
+                Diagnostic(o.mark, o.text, f"this recipe has no group {group}; to add the group, write +{o.text}")
             )
         elif o.sign == "~" and group not in choices:
-            diagnostics.append(Diagnostic(o.mark, o.text, f"is not among the groups; {nearest(group, choices)}"))
+            diagnostics.append(Diagnostic(o.mark, o.text, f"is not a group of this recipe; {nearest(group, choices)}"))
         elif o.sign == "~":
             del choices[group]
         else:
@@ -174,7 +174,7 @@ def _choose(
 
 
 def _defaults(root: Value, diagnostics: list[Diagnostic]) -> Iterator[Choice]:
-    """Entries of the ``defaults`` list that can be read."""
+    """Yield the entries of the ``defaults`` list that can be read."""
     given = root.items.get("defaults")
     if given is None:
         return
@@ -190,7 +190,7 @@ def _defaults(root: Value, diagnostics: list[Diagnostic]) -> Iterator[Choice]:
         group, option = str(pair[0][0]), pair[0][1]
         if group in seen:
             diagnostics.append(
-                Diagnostic(entry.mark, f"defaults.{group}", f"stands twice; first in line {seen[group].line}")
+                Diagnostic(entry.mark, f"defaults.{group}", f"given twice, first in line {seen[group].line}")
             )
             continue
         seen[group] = entry.mark
@@ -198,7 +198,7 @@ def _defaults(root: Value, diagnostics: list[Diagnostic]) -> Iterator[Choice]:
 
 
 def _option(choice: Choice, beside: Path, folder: Path, diagnostics: list[Diagnostic]) -> Value | None:
-    """The values of an option; the folder beside the recipe comes before the packaged one."""
+    """Return the values of an option; the folder beside the recipe precedes the packaged one."""
     names = (choice.group, str(choice.option))
     for above in dict.fromkeys((beside, packaged())):
         path = above / choice.group / f"{names[1]}.yaml"

@@ -1,4 +1,4 @@
-"""Arguments over a recipe: ``a.b=1``, ``+a.b=1``, ``~a.b``."""
+"""Overrides of a recipe as arguments: ``a.b=1``, ``+a.b=1``, ``~a.b``."""
 
 from __future__ import annotations
 
@@ -13,20 +13,20 @@ from neusee.workflows.recipe.text.yaml_values import Value, parse
 
 RESERVED = frozenset(
     {"steps", "seed", "tolerance", "outputs", "expect", "posterior"}
-)  #: keys that are no parameter block
+)  #: keys that are not parameter blocks
 
-Trail = list[tuple[Value, str | int]]  #: values along a path, each with the key that leads on
+Trail = list[tuple[Value, str | int]]  #: values along a path, each with the key to the next one
 
 _SYNTAX = re.compile(r"(?P<sign>[+~]?)(?P<path>[^\s=+~.]+(?:\.[^\s=.]+)*)(?:=(?P<value>.*))?", re.DOTALL)
-_HELP = "is no override: write path=value, +path=value, ~path or group=option"
+_HELP = "is not an override: write path=value, +path=value, ~path or group=option"
 
 
 @dataclass(frozen=True, slots=True)
 class Override:
-    """One argument, read."""
+    """One parsed argument."""
 
     text: str
-    sign: str  #: ``""`` changes a value, ``+`` adds one, ``~`` takes one away
+    sign: str  #: ``""`` changes a value, ``+`` adds one, ``~`` removes one
     path: tuple[str, ...]
     value: Value | None
     mark: Location
@@ -37,14 +37,14 @@ class Override:
 
 
 def read_override(text: str, mark: Location) -> Override:
-    """Read one argument; its value is YAML, so that ``20 e-`` stays a text."""
+    """Read one argument; its value is YAML, so that ``20 e-`` stays a string."""
     match = _SYNTAX.fullmatch(text)
     if match is None:
         raise RecipeError([Diagnostic(mark, text, _HELP)])
     sign, path, value = match["sign"], tuple(match["path"].split(".")), match["value"]
     if sign == "~":
         if value is not None:
-            raise RecipeError([Diagnostic(mark, text, f"~ takes a value away and gives none: write ~{match['path']}")])
+            raise RecipeError([Diagnostic(mark, text, f"~ removes a value and cannot set one: write ~{match['path']}")])
         return Override(text, sign, path, None, mark)
     if value is None:
         raise RecipeError([Diagnostic(mark, text, f"has no value: write {text}=VALUE")])
@@ -57,7 +57,7 @@ def read_override(text: str, mark: Location) -> Override:
 
 
 def apply(root: Value, override: Override, diagnostics: list[Diagnostic], groups: Iterable[str] = ()) -> Value:
-    """``root`` with one value changed, added or taken away; a mistake leaves it as it was."""
+    """Return ``root`` with one value changed, added or removed; a mistake leaves ``root`` unchanged."""
     trail, missing = _follow(root, override.path)
     fault = _fault(root, override, trail, missing, groups)
     if fault:
@@ -67,7 +67,7 @@ def apply(root: Value, override: Override, diagnostics: list[Diagnostic], groups
 
 
 def _follow(root: Value, path: tuple[str, ...]) -> tuple[Trail, tuple[str, ...]]:
-    """The values along ``path`` with the key that leads on, and the part of the path that is not there."""
+    """Return the values along ``path`` with the key to the next one, and the part of the path that does not exist."""
     trail: Trail = []
     here = root
     for n, part in enumerate(path):
@@ -81,21 +81,21 @@ def _follow(root: Value, path: tuple[str, ...]) -> tuple[Trail, tuple[str, ...]]
 
 
 def _fault(root: Value, o: Override, trail: Trail, missing: tuple[str, ...], groups: Iterable[str]) -> str | None:
-    """What is wrong with an override, or None."""
+    """Return the mistake of an override, or None."""
     here = trail[-1][0]
     if not missing:
-        return "is there already: leave out the + to change it" if o.sign == "+" else None
+        return "exists already: remove the + to change the value" if o.sign == "+" else None
     if isinstance(here.data, list):
         if o.sign == "+" and len(missing) == 1 and missing[0] == str(len(here.data)):
             return None
         return f"{here.name} has {len(here.data)} values: 0 to {len(here.data) - 1}"
     if o.sign == "+" or (o.sign == "" and _implied(root, o.path)):
-        return None if isinstance(here.data, dict | None) else f"{here.name} is one value, not a mapping"
+        return None if isinstance(here.data, dict | None) else f"{here.name} is a single value, not a mapping"
     return instead(".".join(o.path)) or f"unknown; {_suggest(root, o.path, groups)}"
 
 
 def _implied(root: Value, path: tuple[str, ...]) -> bool:
-    """Whether a path need not be written to exist: a key of the recipe itself, or of one of its steps."""
+    """Return True if a path may be set without being written: a key of the recipe, or of one of its steps."""
     if path[0] != "steps":
         return path[0] in RESERVED and (len(path) == 1 or path[0] in ("expect", "posterior"))
     steps = root.items.get("steps")
@@ -103,7 +103,7 @@ def _implied(root: Value, path: tuple[str, ...]) -> bool:
 
 
 def _suggest(root: Value, path: tuple[str, ...], groups: Iterable[str]) -> str:
-    """The nearest path that exists; a new one is never the first advice for what may be a typo."""
+    """Return the nearest path that exists, because a new path is often a typo."""
     here, found = root, list[str]()
     for part in path:
         names = {str(key): value for key, value in here.items.items()}
@@ -126,7 +126,7 @@ def _close(name: str, other: str | int) -> bool:
 
 
 def _rebuild(trail: Trail, missing: tuple[str, ...], o: Override) -> Value:
-    """The values along the trail made anew, from the inside out."""
+    """Return the values along the trail with the change, rebuilt from the inside out."""
     made = _placed(trail, missing, o)
     for n in range(len(missing) - 1, 0, -1):
         assert made is not None
@@ -138,7 +138,7 @@ def _rebuild(trail: Trail, missing: tuple[str, ...], o: Override) -> Value:
 
 
 def _placed(trail: Trail, missing: tuple[str, ...], o: Override) -> Value | None:
-    """The value, which knows where it comes to stand: a number is a number there, as in the file."""
+    """Return the value parsed for its final place: a digit string is a number as a key there, as in the file."""
     there = tuple(key for _, key in trail)
     where = (*there[:-1], *map(_key, missing)) if missing else there
     return o.value if o.value is None or where == o.path else parse(o.text.partition("=")[2], o.mark, where)
@@ -158,7 +158,7 @@ def _with(here: Value, key: str | int, made: Value | None, mark: Location) -> Va
 
 
 def arguments_in(value: Value) -> Iterator[Location]:
-    """Arguments that changed a part of a value."""
+    """Yield the arguments that changed a part of a value."""
     for child in value.items.values():
         if not child.mark.line:
             yield child.mark

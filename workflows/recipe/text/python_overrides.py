@@ -1,7 +1,7 @@
-"""Changes of a recipe as Python values: ``sensor={"read_noise": "20 e-"}`` is ``sensor.read_noise=20 e-``.
+"""Overrides of a recipe as Python values: ``sensor={"read_noise": "20 e-"}`` is ``sensor.read_noise=20 e-``.
 
-A mapping changes what it names and leaves the rest; an empty one, and a step with its
-``node``, stand for the whole. A text is taken as it is, not read as YAML.
+A mapping changes the values that it names and leaves the others. An empty mapping, and a step
+with its ``node``, replace the whole. A string is used unchanged and is not read as YAML.
 """
 
 from __future__ import annotations
@@ -17,12 +17,12 @@ from neusee.workflows.graph.final_values import flow
 from neusee.workflows.recipe.text.overrides import Override, read_override
 from neusee.workflows.recipe.text.yaml_values import Value, Where
 
-_ALLOWED = "give a number, a text, True or False, None, a list or a mapping"
+_ALLOWED = "give a number, a string, True or False, None, a list or a mapping"
 _LONGEST = 40  #: characters of a value that a message repeats
 
 
 def overrides_of(values: Mapping[str, Any], folder: Path) -> list[Override]:
-    """The changes that keyword arguments ask for; a `RecipeError` names everything that cannot stand in a recipe."""
+    """Return the overrides of keyword arguments; raise one `RecipeError` for all values that cannot be in a recipe."""
     found: list[Override] = []
     diagnostics: list[Diagnostic] = []
     for key, value in values.items():
@@ -37,9 +37,9 @@ def overrides_of(values: Mapping[str, Any], folder: Path) -> list[Override]:
 
 
 def _read(key: str, given: Any, mark: Location) -> Iterator[Override]:
-    """One keyword: its sign and path as on the command line, then each value below it."""
+    """Yield the overrides of one keyword: its sign and path as on the command line, then each value below."""
     if key.startswith("~") and given is not None:
-        raise RecipeError([Diagnostic(mark, key, f"~ takes a value away and gives none: write {{{key!r}: None}}")])
+        raise RecipeError([Diagnostic(mark, key, f"~ removes a value and cannot set one: write {{{key!r}: None}}")])
     try:
         named = read_override(key if key.startswith("~") else f"{key}=null", mark)
     except RecipeError as error:
@@ -70,7 +70,7 @@ def _override(named: Override, path: tuple[str, ...], given: Any) -> Override:
 
 
 def _value(given: Any, mark: Location, path: Where) -> Value:
-    """A Python value as the reader of a file would give it."""
+    """Return a Python value as the reader of a file would return it."""
     if isinstance(given, Mapping):
         data = {_key(key, mark, path): _value(item, mark, (*path, str(key))) for key, item in given.items()}
         return Value(data, mark, mark, path)
@@ -82,7 +82,7 @@ def _value(given: Any, mark: Location, path: Where) -> Value:
         return Value(given, mark, mark, path)
     listed = given.tolist() if hasattr(given, "tolist") else given  # a number or an array of numpy or torch
     if not isinstance(listed, bool | int | float | str | list):
-        message = f"a recipe holds no {type(given).__name__}: {_ALLOWED}"
+        message = f"a recipe cannot contain a value of type {type(given).__name__}: {_ALLOWED}"
         raise RecipeError([Diagnostic(mark, ".".join(map(str, path)), message)])
     return _value(listed, mark, path)
 
@@ -90,4 +90,4 @@ def _value(given: Any, mark: Location, path: Where) -> Value:
 def _key(key: Any, mark: Location, path: Where) -> str | int:
     if isinstance(key, str | int) and not isinstance(key, bool) and key != "":
         return key
-    raise RecipeError([Diagnostic(mark, ".".join(map(str, path)), f"a key is a name or a whole number, not {key!r}")])
+    raise RecipeError([Diagnostic(mark, ".".join(map(str, path)), f"a key must be a name or an integer, not {key!r}")])

@@ -1,4 +1,4 @@
-"""``${a.b}``: values that are other values, found from the steps that use them."""
+"""References ``${a.b}``: values that copy other values, resolved from the steps that use them."""
 
 from __future__ import annotations
 
@@ -17,18 +17,18 @@ from neusee.workflows.recipe.text.renamed_keys import new_name
 from neusee.workflows.recipe.text.yaml_values import Value, Where, dotted
 
 _REFERENCE = re.compile(r"\$\{([^${}]*)\}")
-_DEEPEST = 50  #: references to references
+_DEEPEST = 50  #: depth of references to references
 
 
 @dataclass(frozen=True, slots=True)
 class Scope:
-    """What ``${item.x}`` and ``${each.lasers.x}`` stand for in one copy of a step."""
+    """Meaning of ``${item.x}`` and ``${each.lasers.x}`` in one copy of a step."""
 
     items: Mapping[str, Value]  #: by dimension
     step: str
 
     def find(self, parts: list[str]) -> tuple[Value | None, list[str], str]:
-        """Where to start, what then to follow, and what is wrong if there is nowhere to start."""
+        """Return the start, the path to follow and, where no start exists, the mistake."""
         dims = list(self.items)
         if parts[0] == "item" and len(dims) == 1:
             return self.items[dims[0]], parts[1:], ""
@@ -41,7 +41,7 @@ class Scope:
 
 
 class References:
-    """Follows references in the values of one recipe and remembers which values were used."""
+    """Resolution of the references in one recipe, which records the values in use."""
 
     def __init__(self, root: Value, diagnostics: list[Diagnostic]) -> None:
         self.root, self.diagnostics = root, diagnostics
@@ -49,10 +49,10 @@ class References:
         self.known: dict[Where, Value] = {}
         self.open: list[Where] = []
         self.lacking: list[tuple[Where, Diagnostic]] = []
-        self.spare: set[Where] = set()  #: values of packaged options that this recipe has no use for
+        self.spare: set[Where] = set()  #: unused values of packaged options
 
     def resolve(self, value: Value, scope: Scope) -> Value:
-        """``value`` with every reference followed; what cannot be followed is a problem, and None."""
+        """Return ``value`` with every reference resolved; report a failed one and return `BROKEN` in its place."""
         if isinstance(value.data, dict):
             children = ((key, child, self.resolve(child, scope)) for key, child in value.data.items())
             return replace(value, data={key: replace(found, key=child.key) for key, child, found in children})
@@ -63,7 +63,7 @@ class References:
         return self._text(value, scope)
 
     def _text(self, value: Value, scope: Scope) -> Value:
-        """A text with its references followed, the innermost first."""
+        """Return a string with its references resolved, the innermost first."""
         text = value.data
         while match := _REFERENCE.search(text):
             target = self._target(match[1], value, scope)
@@ -72,10 +72,10 @@ class References:
             if match[0] == text:
                 return target
             if isinstance(target.data, dict | list):
-                return self._fail(value, f"${{{match[1]}}} is no single value: it cannot stand inside a text")
+                return self._fail(value, f"${{{match[1]}}} is a list or a mapping: it cannot be part of a string")
             text = text[: match.start()] + _pasted(target.data) + text[match.end() :]
         if "${" in text:
-            return self._fail(value, "a reference is written ${block.name}")
+            return self._fail(value, "write a reference as ${block.name}")
         return replace(value, data=text)
 
     def _target(self, text: str, origin: Value, scope: Scope) -> Value | None:
@@ -95,7 +95,7 @@ class References:
         return self._followed(target, scope, origin)
 
     def _followed(self, target: Value, scope: Scope, origin: Value) -> Value | None:
-        """A target with its own references followed, once; a loop is a problem."""
+        """Return a target with its own references resolved, once; report a cycle."""
         if target.path in self.known:
             return self.known[target.path]
         if target.path in self.open:
@@ -113,11 +113,11 @@ class References:
         return value
 
     def _missing(self, start: Value, parts: list[str], origin: Value, scope: Scope) -> None:
-        """A target is not there: an item's mistake if other items have it, else the reference's."""
+        """Report a missing target: as a mistake of the item if other items have the target, else of the reference."""
         name, wanted = ".".join(parts), (*start.path, *parts)
         siblings = self.root.items[str(start.path[0])].items.values() if start.path else ()
         if any(_follow(other, parts) for other in siblings):
-            problem = Diagnostic(start.key, start.name, f"has no {name}; steps.{scope.step} needs it")
+            problem = Diagnostic(start.key, start.name, f"has no {name}; steps.{scope.step} needs this value")
         else:
             near = _nearest(wanted, {leaf.path for leaf in self.root.leaves() if leaf.path[0] not in RESERVED})
             hint = f" is unknown; did you mean {dotted(near)}?" if near else " is unknown"
@@ -131,7 +131,7 @@ class References:
         return replace(origin, data=BROKEN)
 
     def touch(self, value: Value, dims: Sequence[str]) -> None:
-        """Follow what a step without items would refer to, so that no value looks unused for lack of a laser."""
+        """Mark the values that a step without items would read as used, so that they are not reported."""
         for text in _texts(value):
             for match in _REFERENCE.finditer(text.data):
                 parts = match[1].strip().split(".")
@@ -146,9 +146,9 @@ class References:
         return ((name,) for name in (block.items if block else ()))
 
     def finish(self) -> None:
-        """Report the values that nothing refers to, and the references to nothing; a pair of these is one mistake.
+        """Report values without a reader and references without a target; a matching pair is one mistake.
 
-        A packaged option may say more than a recipe asks: a camera needs the pitch of its sensor, a laboratory not.
+        A packaged option may set more values than a recipe uses: a camera needs the pixel pitch, a bench does not.
         """
         wanted = dict(self.lacking)
         misspelt = set()
@@ -162,7 +162,7 @@ class References:
                 self.diagnostics.append(Diagnostic(leaf.key, leaf.name, now))
                 continue
             shown = dotted(instead[-1:] if instead[:-1] == leaf.path[:-1] else instead)
-            hint = f"; did you mean {shown}?" if shown else ": no step refers to it"
+            hint = f"; did you mean {shown}?" if shown else ": no step refers to this value"
             asker = f" (needed at {wanted[instead].mark})" if instead in wanted else ""
             self.diagnostics.append(Diagnostic(leaf.key, leaf.name, f"unknown{hint}{asker}"))
         self.diagnostics += [problem for path, problem in self.lacking if path not in misspelt]
@@ -184,12 +184,12 @@ class References:
 
 
 def _is_packaged(leaf: Value) -> bool:
-    """Whether a value stands in an option that came with the program, and not in a recipe or an argument."""
+    """Return True if a value belongs to a packaged option, and not to a recipe or an argument."""
     return leaf.key.line > 0 and leaf.mark.line > 0 and Path(leaf.mark.folder).parent == packaged()
 
 
 def _nearest(path: Where, known: set[Where]) -> Where | None:
-    """The path whose last name is nearest, first among those beside it."""
+    """Return the path whose last name is nearest, first among the paths beside it."""
     beside = {str(other[-1]): other for other in known if other[:-1] == path[:-1]}
     for paths in (beside, {str(other[-1]): other for other in known}):
         close = difflib.get_close_matches(str(path[-1]), paths, 1, 0.75)
@@ -198,11 +198,11 @@ def _nearest(path: Where, known: set[Where]) -> Where | None:
     return None
 
 
-BROKEN = type("Broken", (), {"__repr__": lambda self: "?", "__doc__": "What a reference that fails leaves."})()
+BROKEN = type("Broken", (), {"__repr__": lambda self: "?", "__doc__": "The value of a failed reference."})()
 
 
 def broken(value: Value) -> bool:
-    """Whether a part of a value could not be found."""
+    """Return True if a part of a value could not be resolved."""
     return value.data is BROKEN or any(map(broken, value.items.values()))
 
 

@@ -1,6 +1,6 @@
-"""YAML 1.2 to plain values that know where they stand.
+"""Values of YAML 1.2 with their locations.
 
-``1e3`` is a number, ``on`` a word, ``010`` ten, and a key that stands twice is a mistake.
+``1e3`` is a number, ``on`` is a string, ``010`` is ten, and a key that occurs twice is a mistake.
 """
 
 from __future__ import annotations
@@ -25,12 +25,12 @@ _TAG = "tag:yaml.org,2002:"
 _INT = re.compile(r"[-+]?[0-9]+|0o[0-7]+|0x[0-9a-fA-F]+")
 _FLOAT = re.compile(r"[-+]?(?:\.[0-9]+|[0-9]+(?:\.[0-9]*)?)(?:[eE][-+]?[0-9]+)?")
 _MOST = 1_000_000  #: values in one file
-_MOST_AGAIN = 100_000  #: of them by aliases
+_MOST_AGAIN = 100_000  #: values made by aliases in one file
 
 
 @dataclass(frozen=True, slots=True)
 class Value:
-    """A scalar, a list of values or a mapping of values, with the place of its key and its own."""
+    """A scalar, a list of values or a mapping of values, with the location of its key and of itself."""
 
     data: Any  #: None, bool, int, float, str, list[Value] or dict[str | int, Value]
     mark: Location
@@ -43,20 +43,20 @@ class Value:
 
     @property
     def plain(self) -> Any:
-        """The value alone."""
+        """Return the value without locations."""
         if isinstance(self.data, dict):
             return {key: value.plain for key, value in self.data.items()}
         return [value.plain for value in self.data] if isinstance(self.data, list) else self.data
 
     @property
     def items(self) -> dict[Any, Value]:
-        """Its values by key or index; of a scalar, none."""
+        """Return the children by key or index; a scalar has none."""
         if isinstance(self.data, dict):
             return self.data
         return dict(enumerate(self.data)) if isinstance(self.data, list) else {}
 
     def leaves(self) -> Iterator[Value]:
-        """Scalars, lists and empty mappings below a mapping, in order."""
+        """Yield scalars, lists and empty mappings below a mapping, in order."""
         if not isinstance(self.data, dict) or not self.data:
             yield self
             return
@@ -66,7 +66,7 @@ class Value:
 
 @dataclass(frozen=True, slots=True)
 class Document:
-    """One file: its top mapping, and its first line where that is a comment."""
+    """One file: its top mapping, and its first line if that line is a comment."""
 
     root: Value
     title: str
@@ -77,7 +77,7 @@ def dotted(path: Where) -> str:
 
 
 def read(path: Path, shown: str) -> Document:
-    """Read a file known to the user as ``shown``; a `RecipeError` locates everything that is wrong with it."""
+    """Read a file known to the user as ``shown``; raise one `RecipeError` with the location of every mistake."""
     try:
         text = path.read_bytes().decode("utf-8-sig")
     except UnicodeDecodeError as error:
@@ -100,7 +100,7 @@ def _document(text: str, shown: str, folder: str) -> Document:
 
 
 def parse(text: str, start: Location, path: Where = ()) -> Value:
-    """Read YAML text. ``start`` says what it is called; an argument's values all stand at ``start`` (line 0)."""
+    """Read YAML text. ``start`` is the place of the text; the values of an argument share this place (line 0)."""
     builder = _Builder(start)
     try:
         node = YAML(typ="safe", pure=True).compose(text)
@@ -115,13 +115,13 @@ def parse(text: str, start: Location, path: Where = ()) -> Value:
 
 
 def kind(value: Value) -> str:
-    """What a value is, in words."""
-    names = {dict: "a mapping", list: "a list", str: "a text", bool: "true or false", type(None): "nothing"}
+    """Return the kind of a value in words."""
+    names = {dict: "a mapping", list: "a list", str: "a string", bool: "true or false", type(None): "nothing"}
     return names.get(type(value.data), "a number")
 
 
 class _Builder:
-    """Makes values of the nodes of one text; an alias is the same value again."""
+    """Builder of the values of one text; an alias gives the identical value again."""
 
     def __init__(self, start: Location) -> None:
         self.start = start
@@ -129,12 +129,12 @@ class _Builder:
         self.made: dict[int, Value] = {}
         self.open: set[int] = set()
         self.size: dict[int, int] = {}
-        self.again = 0  # values that aliases made
+        self.again = 0  # number of values made by aliases
 
     def value(self, node: Node, path: Where, key: Location) -> Value:
         mark, tag = self._mark(node), (node.tag or "").replace(_TAG, "!!")
         if tag not in _KNOWN:
-            return self._refuse(mark, path, f"the tag {tag} means nothing here: leave it out")
+            return self._refuse(mark, path, f"unknown tag {tag}: remove the tag")
         if isinstance(node, ScalarNode):
             return Value(_scalar(node), mark, key, path)
         if id(node) in self.made:
@@ -142,7 +142,7 @@ class _Builder:
             self._refuse_many(self.again, _MOST_AGAIN, mark, path)
             return replace(_moved(self.made[id(node)], path), key=key)
         if id(node) in self.open:
-            return self._refuse(mark, path, "an alias inside the very value that it stands for")
+            return self._refuse(mark, path, "an alias refers to the value that contains the alias")
         self.open.add(id(node))
         data = self._mapping(node, path) if isinstance(node, MappingNode) else self._list(node, path)
         self.open.discard(id(node))
@@ -155,12 +155,14 @@ class _Builder:
         for key_node, value_node in node.value:
             mark, key = self._mark(key_node), _key(key_node)
             if key == "<<":
-                self._refuse(mark, path, "merge keys (<<) are not YAML 1.2: refer to values with ${…}")
+                self._refuse(mark, path, "merge keys (<<) are not part of YAML 1.2: refer to values with ${…}")
             elif key is None:
                 self._refuse(mark, path, "a key must be a name or a whole number")
             elif key in data:
                 first = data[key].key
-                self._refuse(mark, (*path, key), f"stands twice; first in line {first.line}" if first.line else "twice")
+                self._refuse(
+                    mark, (*path, key), f"given twice, first in line {first.line}" if first.line else "given twice"
+                )
             else:
                 data[key] = self.value(value_node, (*path, key), mark)
         return data
@@ -169,14 +171,14 @@ class _Builder:
         return [self.value(child, (*path, i), self._mark(child)) for i, child in enumerate(node.value)]
 
     def _weigh(self, node: Node, made: Value) -> None:
-        """Refuse a small file that aliases blow up."""
+        """Raise `RecipeError` for a small file that aliases expand to too many values."""
         children = [v for pair in node.value for v in pair] if isinstance(node, MappingNode) else node.value
         self.size[id(node)] = 1 + sum(self.size.get(id(child), 1) for child in children)
         self._refuse_many(self.size[id(node)], _MOST, made.mark, made.path)
 
     def _refuse_many(self, count: int, most: int, mark: Location, path: Where) -> None:
         if count > most:
-            raise RecipeError([Diagnostic(mark, dotted(path), f"aliases make more than {most} values of this")])
+            raise RecipeError([Diagnostic(mark, dotted(path), f"aliases expand this to more than {most} values")])
 
     def _mark(self, node: Node) -> Location:
         if not self.start.line:
@@ -189,7 +191,7 @@ class _Builder:
 
 
 def _moved(value: Value, path: Where) -> Value:
-    """The same value at another place, and all below it."""
+    """Return the same value at another path, with all values below it."""
     data = value.data
     if isinstance(data, dict):
         data = {key: _moved(child, (*path, key)) for key, child in data.items()}
@@ -211,7 +213,7 @@ def _scalar(node: ScalarNode) -> Any:
 
 
 def number(text: str) -> int | float | str:
-    """A number as YAML 1.2 writes it, or the text itself."""
+    """Return a number as YAML 1.2 writes it, or the text itself."""
     if _INT.fullmatch(text):
         return int(text, 0 if text[:2] in ("0o", "0x") else 10)
     if _FLOAT.fullmatch(text):
@@ -223,7 +225,7 @@ def number(text: str) -> int | float | str:
 
 
 def _key(node: Node) -> str | int | None:
-    """A key as a name or a whole number; None if it is something else."""
+    """Return a key as a name or a whole number, or None for another kind of key."""
     if not isinstance(node, ScalarNode):
         return None
     key = _scalar(node)
@@ -231,10 +233,10 @@ def _key(node: Node) -> str | int | None:
 
 
 def _explain(error: Exception, text: str, start: Location, path: Where) -> Diagnostic:
-    """One located sentence for what the YAML reader could not read."""
+    """Return a located message for a text that is not YAML."""
     at = getattr(error, "problem_mark", None)
     line, column = (at.line, at.column) if at else _control(text)
-    problem = error.problem if isinstance(error, MarkedYAMLError) and error.problem else "a character that cannot stand"
+    problem = error.problem if isinstance(error, MarkedYAMLError) and error.problem else "an invalid character"
     lines = text.splitlines() or [""]
     here = lines[min(line, len(lines) - 1)]
     mark = Location(start.file, line + 1, column + 1, start.folder) if start.line else start
@@ -243,7 +245,7 @@ def _explain(error: Exception, text: str, start: Location, path: Where) -> Diagn
 
 def _fix(problem: str, here: str, column: int) -> str:
     if "\\t" in problem or "\t" in here[: column + 1]:
-        return "a tab: YAML is indented with spaces"
+        return "a tab: indent YAML with spaces"
     if re.search(r"[^\"']\$\{", here) and "expected" in problem:
         return 'inside { } or [ ], quote a reference: "${…}"'
     if re.search(r"\[[^\]]*\w\[", here) and "'['" in problem:
@@ -251,12 +253,12 @@ def _fix(problem: str, here: str, column: int) -> str:
     if "mapping values are not allowed" in problem:
         return "a second ':' on this line, or a wrong indent: quote the text, or begin a new line"
     if "but found another document" in problem:
-        return "a second document (---): a recipe is one"
+        return "a second document (---): a recipe must be a single document"
     return f"is not YAML: {problem}"
 
 
 def _control(text: str) -> tuple[int, int]:
-    """Line and column of the first control character."""
+    """Return line and column of the first control character."""
     found = re.search(r"[\x00-\x08\x0b\x0c\x0e-\x1f\x7f\ud800-\udfff\ufffe\uffff]", text)
     before = text[: found.start()] if found else ""
     return before.count("\n"), len(before.rpartition("\n")[2])

@@ -1,4 +1,4 @@
-"""The picture everyone looks at first: truth, plain lens, with mask, restored, error."""
+"""Camera overview: the pictures of truth, plain lens, mask and restoration, and the error of the restoration."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from neusee.workflows.report.figures.style import ORANGE, canvas, drawn, encoded
 def overview(
     *, truth: Tensor, plain: Tensor, mask: Tensor, restored: Tensor, spots: Mapping[str, Tensor] | None = None
 ) -> Any:
-    """Truth, plain lens, with mask, restored and |error|, all by one stretch, the laser ringed."""
+    """Draw truth, plain lens, with mask and restored with one common scale, then |error|; ring each laser."""
     white = high(truth)
     pictures = {"truth": truth, "plain lens": plain, "with mask": mask, "restored": restored}
     figure, axes = canvas(13.0, 3.4, 1, 5)
@@ -32,21 +32,21 @@ def overview(
 
 
 def high(values: Tensor) -> float:
-    """The level that only one value in 200 passes."""
+    """Return the level that only one value in 200 exceeds, at least 1e-9."""
     some = values.detach().flatten()[:: max(1, values.numel() // 200_000)].float()
     return max(float(torch.quantile(some, 0.995)), 1e-9)
 
 
 def centre(image: Tensor, like: Tensor) -> Tensor:
-    """The part of an image that ``like`` shows: both keep the axis at sample N // 2."""
+    """Return the central part of an image in the size of ``like``; the axis of both is at sample N // 2."""
     top, left = (image.shape[d] // 2 - like.shape[d] // 2 for d in (-2, -1))
     if top < 0 or left < 0:
-        raise ValueError(f"a picture of {tuple(image.shape)} does not cover the truth, {tuple(like.shape)}")
+        raise ValueError(f"a picture of {tuple(image.shape)} is smaller than the truth, {tuple(like.shape)}")
     return image[..., top : top + like.shape[-2], left : left + like.shape[-1]].float()
 
 
 def _ring(ax: Any, spots: Mapping[str, Tensor], like: Tensor) -> None:
-    """A ring round every laser's brightest pixel."""
+    """Draw a ring round the brightest pixel of every laser."""
     from matplotlib.patches import Circle
 
     radius = max(like.shape[-1] / 14, 3.0)

@@ -1,4 +1,4 @@
-"""What was planned and what came of it, as a Gantt chart: how busy each lane was, and when each step ran."""
+"""Gantt chart of the planned and the actual times of the steps, by lane and by step."""
 
 from __future__ import annotations
 
@@ -8,20 +8,20 @@ from typing import Any
 from neusee.workflows.placement.heft_and_cpop import Schedule
 from neusee.workflows.report.figures.style import BLACK, BLUE, GREEN, ORANGE, VERMILION, canvas, drawn
 
-Row = tuple[str, str, float, float]  #: step, lane, s since the run began, s that it took
-Span = tuple[str, float, float]  #: lane, from, seconds
+Row = tuple[str, str, float, float]  #: step, lane, start in s since the run began, duration in s
+Span = tuple[str, float, float]  #: lane, start in s, duration in s
 
 _COLOURS = (BLUE, ORANGE, GREEN, "#CC79A7", "#56B4E9", "#8C6D1F", "#6A51A3", "#5F6B6D")
-_MOST = 80  #: steps that have a row; beyond, the longest
-_TALL = 0.2  #: inches a step
-_LANE = 0.3  #: inches a lane
+_MOST = 80  #: rows of steps, at most; of more steps, the longest have a row
+_TALL = 0.2  #: inches, height of the row of a step
+_LANE = 0.3  #: inches, height of the row of a lane
 
 
 @drawn
 def timeline(*, schedule: Schedule, rows: Iterable[Row]) -> Any:
-    """Lanes above, steps below: hollow bars are the plan, solid ones what happened; both begin at 0 s.
+    """Draw lanes above and steps below: hollow bars show the plan, solid bars show the run; both begin at 0 s.
 
-    ``rows`` may lack steps of the plan, and have steps that it lacks.
+    ``rows`` may lack steps of the plan, and may have steps that the plan lacks.
     """
     ran = {step: (lane, began, seconds) for step, lane, began, seconds in rows}
     plan = {slot.task: (slot.device, slot.start, slot.end - slot.start) for slot in schedule.slots}
@@ -37,7 +37,7 @@ def timeline(*, schedule: Schedule, rows: Iterable[Row]) -> Any:
     critical = {slot.task for slot in schedule.critical_path()}
     _steps(axes[1, 0], steps, plan, ran, colour, scale, critical)
     left = len(plan.keys() | ran.keys()) - len(steps)
-    axes[1, 0].set_xlabel(f"time ({unit})" + (f"; {left} of the shortest have no row" if left else ""))
+    axes[1, 0].set_xlabel(f"time ({unit})" + (f"; the {left} shortest steps have no row" if left else ""))
     axes[1, 0].set_xlim(-0.004 * end * scale, end * scale * 1.01)
     axes[0, 0].set_title(_title(plan, ran), loc="left")
     _legend(figure)
@@ -45,7 +45,7 @@ def timeline(*, schedule: Schedule, rows: Iterable[Row]) -> Any:
 
 
 def _shown(plan: Mapping[str, Span], ran: Mapping[str, Span]) -> list[str]:
-    """Steps in the order in which they began, the shortest left out where there are too many."""
+    """Return the steps in the order of their start; of more than ``_MOST`` steps, return only the longest."""
     longest = sorted({**plan, **ran}, key=lambda s: -max(plan.get(s, ("", 0, 0))[2], ran.get(s, ("", 0, 0))[2]))
     return sorted(longest[:_MOST], key=lambda s: (ran.get(s) or plan[s])[1])
 
@@ -58,7 +58,7 @@ def _lanes(
     colour: Mapping[str, str],
     scale: float,
 ) -> None:
-    """Each lane twice: what it was to do, and under it what it did."""
+    """Draw two rows for each lane: the plan above, the run below."""
     for y, lane in enumerate(lanes):
         planned = [(start * scale, took * scale) for on, start, took in plan.values() if on == lane]
         done = [(start * scale, took * scale) for on, start, took in ran.values() if on == lane]
@@ -79,7 +79,7 @@ def _steps(
     scale: float,
     critical: set[str],
 ) -> None:
-    """One row a step, its seconds at the right."""
+    """Draw one row for each step, and write the planned and the actual duration at the right."""
     for y, step in enumerate(steps):
         if step in plan:
             lane, start, took = plan[step]
@@ -116,7 +116,7 @@ def _title(plan: Mapping[str, Span], ran: Mapping[str, Span]) -> str:
 
 
 def _time(seconds: float) -> str:
-    """Three digits, as ``12.3 ms``."""
+    """Return seconds with three digits and a fitting unit, such as ``12.3 ms``."""
     for least, scale, unit in ((1.0, 1.0, "s"), (1e-3, 1e3, "ms")):
         if seconds >= least:
             return f"{seconds * scale:.3g} {unit}"
@@ -129,7 +129,7 @@ def _legend(figure: Any) -> None:
 
     handles = [
         Patch(facecolor="white", edgecolor="#555555", label="planned"),
-        Patch(facecolor="#555555", edgecolor="#555555", label="what happened"),
+        Patch(facecolor="#555555", edgecolor="#555555", label="actual"),
         Line2D([], [], linestyle="none", marker="$\\mathrm{a}$", color=VERMILION, label="on the planned critical path"),
     ]
     figure.legend(handles=handles, loc="outside upper center", ncols=3, handlelength=1.4)

@@ -1,4 +1,4 @@
-"""What the numbers are worth: error against run time, and what a strong laser does to single precision."""
+"""Numerical accuracy: error against run time, and round-off error of a strong laser in single precision."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ WAYS = ("shifted PSF, added", "scene and laser\nin one convolution")
 
 @drawn
 def error_time(*, step: Callable[..., Any], pupil: Pupil) -> Any:
-    """Error of the PSF against its run time, by precision and window, one band, measured here."""
+    """Draw the error of the PSF of one band against the run time on this machine, by precision and window."""
     figure, axes = canvas(6.4, 4.2)
     ax = axes[0, 0]
     rows = precision_trial(step, pupil)
@@ -33,14 +33,14 @@ def error_time(*, step: Callable[..., Any], pupil: Pupil) -> Any:
             )
     ax.margins(x=0.25, y=0.35)
     ax.set_title("PSF of one band: error against run time")
-    ax.set_xlabel("run time (ms), fastest of three, window in pixels")
-    ax.set_ylabel("largest error over the peak")
+    ax.set_xlabel("run time (ms), fastest of three; labels: window in pixels")
+    ax.set_ylabel("largest error / peak")
     ax.legend(loc="center left")
     return figure
 
 
 def precision_trial(step: Callable[..., Any], pupil: Pupil) -> list[tuple[str, int, float, float]]:
-    """(precision, window, seconds, error against the plain float64 sum), for the band in the middle."""
+    """Return rows (precision, window, seconds, error from the direct float64 sum) for the middle band."""
     band = slice(len(pupil.wavelengths) // 2, len(pupil.wavelengths) // 2 + 1)
     one = pupil._replace(index=pupil.index[band], wavelengths=pupil.wavelengths[band])
     truth = step.reference(one, shape=(9, 9)).intensity.double()  # type: ignore[attr-defined]
@@ -65,7 +65,7 @@ def _timed(call: Callable[[], Any]) -> tuple[float, Any]:
 
 @drawn
 def stability(*, step: Callable[..., Any], psf: Psf) -> Any:
-    """How far a laser's glare is from float64, added as a shifted PSF or convolved with the scene."""
+    """Draw the float32 error of a laser's glare, added as a shifted PSF or convolved together with the scene."""
     errors = laser_trial(step, psf)
     figure, axes = canvas(6.4, 3.6)
     ax = axes[0, 0]
@@ -79,8 +79,8 @@ def stability(*, step: Callable[..., Any], psf: Psf) -> Any:
     ax.set_yticks(range(len(WAYS)), WAYS)
     ax.invert_yaxis()
     ax.grid(False)
-    ax.set_xlabel("laser over the scene's white")
-    ax.set_title("largest error far from the laser, of the scene's range, float32")
+    ax.set_xlabel("peak of the laser / white of the scene")
+    ax.set_title("largest float32 error far from the laser / range of the scene")
     return figure
 
 
@@ -89,7 +89,7 @@ def _verdict(error: float) -> tuple[str, str]:
 
 
 def laser_trial(step: Callable[..., Any], psf: Psf, size: int = 192) -> Tensor:
-    """Error against float64, (way, strength), of the band in the middle on a synthetic scene."""
+    """Return the error (way, strength) from float64 for the middle band and a random scene."""
     band, half = psf.intensity.shape[0] // 2, min(64, *(n // 2 for n in psf.intensity.shape[-2:]))
     top, left = (n // 2 - half for n in psf.intensity.shape[-2:])
     core = psf.intensity[band : band + 1, top : top + 2 * half, left : left + 2 * half]

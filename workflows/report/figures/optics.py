@@ -1,4 +1,4 @@
-"""Pictures of the optics: the mask's height and phase, the spot it makes, what it buys at each wavelength."""
+"""Pictures of the optics: height and phase of the mask, point-spread functions, suppression against wavelength."""
 
 from __future__ import annotations
 
@@ -28,7 +28,7 @@ _SHOWN = (450e-9, 550e-9, 638e-9)
 
 @drawn
 def height(*, pupil: Pupil) -> Any:
-    """Height of the mask and its wrapped phase at three wavelengths, over the clear aperture."""
+    """Draw the height of the mask, and its wrapped phase at three wavelengths, over the clear aperture."""
     figure, axes = canvas(13.0, 3.5, 1, 4)
     step = max(1, pupil.height.shape[-1] // 540)
     clear = pupil.aperture[::step, ::step] > 0
@@ -65,7 +65,7 @@ def _map(figure: Any, ax: Any, values: Tensor, title: str, unit: str, extent: tu
 
 @drawn
 def psf(*, plain: Psf, mask: Psf, bands: Bands, pixel_pitch: float) -> Any:
-    """Logarithm of the spread light at three wavelengths, and the energy within a radius."""
+    """Draw the logarithm of the PSF at three wavelengths, and the encircled energy, without and with the mask."""
     figure, axes = canvas(13.0, 6.6, 2, 4)
     shown: Any = None
     for row, (arm, each) in enumerate({"plain lens": plain, "with mask": mask}.items()):
@@ -73,7 +73,7 @@ def psf(*, plain: Psf, mask: Psf, bands: Bands, pixel_pitch: float) -> Any:
             shown = _spot(axes[row, column], each, nearest(bands.centres, wanted), bands, pixel_pitch, arm)
         _encircled(axes[row, 3], each, bands, pixel_pitch, arm)
     bar = figure.colorbar(shown, ax=axes[:, :3].ravel().tolist(), fraction=0.025, pad=0.01)
-    bar.set_label("log₁₀ of the pixel over the clear peak", fontsize=10)
+    bar.set_label("log₁₀ (pixel / peak of the clear lens)", fontsize=10)
     bar.ax.tick_params(labelsize=9)
     return figure
 
@@ -88,13 +88,13 @@ def _spot(ax: Any, psf: Psf, band: int, bands: Bands, pitch: float, arm: str) ->
 
 
 def _window(image: Tensor, size: int) -> Tensor:
-    """The middle ``size`` by ``size`` pixels, the axis kept at sample N // 2."""
+    """Return the middle ``size`` by ``size`` pixels; the axis stays at sample N // 2."""
     top, left = (n // 2 - size // 2 for n in image.shape[-2:])
     return image[top : top + size, left : left + size]
 
 
 def _encircled(ax: Any, psf: Psf, bands: Bands, pitch: float, arm: str) -> None:
-    """Share of the clear pupil's light within a radius, at three wavelengths."""
+    """Draw the share of the clear pupil's light within a radius, at three wavelengths."""
     for wanted in _SHOWN:
         band = nearest(bands.centres, wanted)
         share = metrics.encircled_curve(psf.intensity[band])
@@ -112,7 +112,7 @@ def _encircled(ax: Any, psf: Psf, bands: Bands, pitch: float, arm: str) -> None:
 
 @drawn
 def suppression(*, lsr: Tensor, bands: Bands, psf: Psf, bsr: Tensor | None = None) -> Any:
-    """Laser and background suppression against wavelength, with the floor that energy sets."""
+    """Draw laser and background suppression against wavelength, with the lower bound from energy conservation."""
     figure, axes = canvas(11.0, 4.2, 1, 2)
     nm, left, right = nanometres(bands.centres), axes[0, 0], axes[0, 1]
     left.axhline(1.0, color=BLACK, linewidth=0.8, linestyle=":", label="plain lens")

@@ -1,4 +1,4 @@
-"""The sensor, measured as a laboratory would: flat fields of rising light, mean against spread."""
+"""Photon-transfer curve of the sensor: standard deviation against mean of simulated flat fields."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from neusee.workflows.report.figures.style import BLACK, BLUE, GREEN, VERMILION,
 
 @drawn
 def transfer(*, measured: Tensor) -> Any:
-    """The photon-transfer curve: (level, signal DN | variance DN² | predicted variance DN²), the first level dark."""
+    """Draw the photon-transfer curve from rows (signal DN, variance DN², predicted variance DN²), the first dark."""
     signal, variance, predicted = measured.detach().double().cpu().unbind(1)
     figure, axes = canvas(6.6, 4.4)
     ax = axes[0, 0]

@@ -1,4 +1,4 @@
-"""The recipe as a graph: one box a step (items of one step share a box), coloured by what became of it."""
+"""Graph of a recipe: one box for each step, coloured by the state of the step. Items of one step share a box."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ from typing import Any
 from neusee.workflows.graph.recipe_graph import in_order
 from neusee.workflows.report.figures.style import canvas, drawn
 
-#: fill, and the word of the legend; a mark in the box says the same without colour
+#: fill colour and legend text of each state; a dashed outline marks a left-out step without colour
 LOOKS = {
     "run": ("#F7C9A9", "run"),
     "cached": ("#BFDDF0", "from the cache"),
@@ -20,7 +20,7 @@ _WIDE, _TALL = 1.75, 0.66
 
 @drawn
 def graph(*, sources: Mapping[str, Iterable[str]], states: Mapping[str, str]) -> Any:
-    """Steps in rows, each below what it reads; ``sources`` and ``states`` by instance, such as ``psf[mask]``."""
+    """Draw the steps in rows, each below its sources; ``sources`` and ``states`` have keys such as ``psf[mask]``."""
     wires, looks, counts = grouped(sources, states)
     places = layout(wires)
     columns = max((x for x, _ in places.values()), default=0.0) + 1
@@ -42,7 +42,7 @@ def graph(*, sources: Mapping[str, Iterable[str]], states: Mapping[str, str]) ->
 def grouped(
     sources: Mapping[str, Iterable[str]], states: Mapping[str, str]
 ) -> tuple[dict[str, list[str]], dict[str, str], Counter[str]]:
-    """The graph of families: ``psf[plain]`` and ``psf[mask]`` are both ``psf``; a family that ran at all, ran."""
+    """Merge the items of each step: sources, state and number by family; a family ran if any of its items ran."""
     family = {name: name.partition("[")[0] for name in sources}
     wires: dict[str, list[str]] = {f: [] for f in family.values()}
     looks: dict[str, str] = {}
@@ -56,7 +56,7 @@ def grouped(
 
 
 def layout(wires: Mapping[str, list[str]]) -> dict[str, tuple[float, int]]:
-    """Place of each family: the row is its longest way from a source, the order in a row that of what it reads."""
+    """Place each family: the row follows from its depth, the order within a row from the places of its sources."""
     depth = _depths(wires)
     rows: dict[int, list[str]] = {}
     for name, row in depth.items():
@@ -72,7 +72,7 @@ def layout(wires: Mapping[str, list[str]]) -> dict[str, tuple[float, int]]:
 
 
 def _depths(wires: Mapping[str, list[str]]) -> dict[str, int]:
-    """Longest way from a source; then each step that is read moves down to just above its first reader."""
+    """Return the row of each step: the longest path from a source, then moved down to just above its first reader."""
     order = in_order(wires, wires)
     depth: dict[str, int] = {}
     for name in order:

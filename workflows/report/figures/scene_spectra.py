@@ -1,4 +1,4 @@
-"""Spectra of three points of the scene: what the photograph says and what was made of it."""
+"""Spectra of three points of the scene, beside the RGB values from which the spectra are reconstructed."""
 
 from __future__ import annotations
 
@@ -36,7 +36,7 @@ def spectra(
     responses: Tensor,
     lines: Mapping[str, Bands] | None = None,
 ) -> Any:
-    """Three points of the scene: their RGB and their spectrum, the light on them and the sensor's channels."""
+    """Draw RGB values and spectra of three points of the scene, the illuminant, and the channels of the sensor."""
     figure, axes = canvas(13.0, 4.4, 1, 3, width_ratios=(1.0, 1.35, 1.35))
     places = _places(scene)
     _scene(axes[0, 0], scene, places)
@@ -51,7 +51,7 @@ def spectra(
 
 
 def _places(scene: Tensor) -> list[tuple[int, int]]:
-    """The reddest, the greenest and the bluest point that is neither dark nor clipped, away from the edge."""
+    """Return the reddest, the greenest and the bluest point that is neither dark nor clipped, after a local average."""
     inner = torch.nn.functional.avg_pool2d(scene[None].float(), 5, 1, 2)[0] if min(scene.shape[-2:]) >= 5 else scene
     lit = inner.amax(0)
     usable = (lit > 0.2 * lit.max()) & (lit < 0.9 * lit.max())
@@ -83,7 +83,7 @@ def _points(ax: Any, scene: Tensor, radiance: Tensor, bands: Bands, places: list
         label = f"{name}: RGB {rgb[0]:.2f} {rgb[1]:.2f} {rgb[2]:.2f}"
         colour = encoded(0.75 * scene[:, y : y + 1, x : x + 1] / max(*rgb, 1e-9))[0, 0]
         ax.plot(nm, radiance[:, row, column].cpu().numpy(), style, color=colour, label=label)
-    ax.set_title("their spectra, lifted from RGB")
+    ax.set_title("spectra reconstructed from RGB")
     ax.set_ylabel("relative spectral radiance")
 
 
@@ -97,7 +97,7 @@ def _channels(ax: Any, illuminant: Tensor, responses: Tensor, bands: Bands) -> N
 
 
 def _lasers(ax: Any, lines: Mapping[str, Bands]) -> None:
-    """An upright line at each laser's wavelength; more than two share a label."""
+    """Draw a vertical line at each laser's wavelength; more than two lasers share one label."""
     for number, (name, line) in enumerate(lines.items()):
         nm = mean_wavelength(line) * 1e9
         label = f"laser {name}, {nm:.0f} nm" if len(lines) < 3 else f"{len(lines)} lasers" if number == 0 else None

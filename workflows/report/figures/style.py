@@ -1,4 +1,4 @@
-"""One look for every figure: light, colour-blind-safe, nothing under 9 points, and PNG bytes at the end."""
+"""Common style of all figures: light, safe for colour-blind readers, at least 9 points, encoded as PNG."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from torch import Tensor
 
 P = ParamSpec("P")
 
-#: Okabe and Ito's eight colours, told apart by every common kind of colour vision.
+#: Colours of the palette of Okabe and Ito, which people with any common kind of colour vision can tell apart.
 BLUE, ORANGE, GREEN, VERMILION = "#0072B2", "#E69F00", "#009E73", "#D55E00"
 BLACK = "#000000"
 
@@ -35,7 +35,7 @@ _RC: Mapping[str, Any] = {
 
 
 def canvas(width: float, height: float, rows: int = 1, columns: int = 1, **how: Any) -> tuple[Any, Any]:
-    """A figure of ``width`` by ``height`` inches and its axes; no window system is touched."""
+    """Create a figure of ``width`` by ``height`` inches and its axes, without a window system."""
     from matplotlib.backends.backend_agg import FigureCanvasAgg
     from matplotlib.figure import Figure
 
@@ -45,7 +45,7 @@ def canvas(width: float, height: float, rows: int = 1, columns: int = 1, **how: 
 
 
 def drawn(draw: Callable[P, Any]) -> Callable[P, bytes]:
-    """Draw in the style of the house and give PNG bytes, the same bytes for the same picture."""
+    """Decorate a drawing function: apply the common style and return PNG bytes, the same bytes for the same picture."""
 
     @functools.wraps(draw)
     def inner(*args: P.args, **kwargs: P.kwargs) -> bytes:
@@ -61,7 +61,7 @@ def drawn(draw: Callable[P, Any]) -> Callable[P, bytes]:
 
 
 def picture(axes: Any, image: Any, title: str, **how: Any) -> Any:
-    """Show an image without ticks; the caller says the scale."""
+    """Show an image without ticks; the caller sets the scale."""
     shown = axes.imshow(image, **how)
     axes.set_title(title)
     axes.set_xticks([])
@@ -73,7 +73,7 @@ def picture(axes: Any, image: Any, title: str, **how: Any) -> Any:
 
 
 def encoded(linear: Tensor) -> Any:
-    """Linear sRGB (3, y, x) as what a screen wants: (y, x, 3), encoded, clipped to [0, 1]."""
+    """Encode linear sRGB (3, y, x) for a screen: gamma-encoded (y, x, 3), clipped to [0, 1]; NaN becomes 0."""
     from kornia.color import linear_rgb_to_rgb
 
     rgb = torch.nan_to_num(linear.detach().to("cpu", torch.float32)).clamp(0.0, 1.0)
@@ -81,16 +81,16 @@ def encoded(linear: Tensor) -> Any:
 
 
 def wavelength_colour(metres: float) -> str:
-    """A dark, readable colour that reminds of the wavelength."""
+    """Return a dark, readable colour similar to the colour of the wavelength."""
     stops = ((430e-9, "#4B2E9E"), (490e-9, BLUE), (575e-9, "#00785A"), (610e-9, "#B8730A"))
     return next((colour for limit, colour in stops if metres < limit), "#B3261E")
 
 
 def nanometres(metres: Tensor | float) -> Any:
-    """Metres as nanometres, ready to draw."""
+    """Convert metres to nanometres; return a NumPy array for a tensor."""
     return metres.detach().double().cpu().numpy() * 1e9 if isinstance(metres, Tensor) else metres * 1e9
 
 
 def nearest(centres: Tensor, metres: float) -> int:
-    """Index of the band nearest to a wavelength."""
+    """Return the index of the band nearest to a wavelength."""
     return int((centres - metres).abs().argmin())

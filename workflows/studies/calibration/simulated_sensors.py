@@ -87,7 +87,9 @@ class Bench:
         except KeyError:
             pass
         found = self._made(stream_seed(self.recipe.seed, f"calibration study {number}"))
-        self.store.jot(key, asdict(found), {"step": "study calibration", "seconds": found.seconds, "date": timestamp()})
+        self.store.put_small(
+            key, asdict(found), {"step": "study calibration", "seconds": found.seconds, "date": timestamp()}
+        )
         return found
 
     def truth(self, seed: int) -> dict[str, float]:

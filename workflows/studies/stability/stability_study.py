@@ -120,7 +120,7 @@ def _judged(chain: Chain, name: str, store: Store, key: Key) -> dict[str, Any]:
     except LookupError:
         cell = None
     fields = {} if cell is None else asdict(cell)
-    store.jot(key, fields, _about(chain, name, time.perf_counter() - began))
+    store.put_small(key, fields, _about(chain, name, time.perf_counter() - began))
     return fields
 
 

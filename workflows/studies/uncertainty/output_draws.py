@@ -134,7 +134,7 @@ class Draws:
         numbers = quantities(result)
         shown = [name for name, value in result.items() if _is_picture(value)]
         about = {"step": "study uncertainty", "seconds": self.seconds / max(1, self.computed), "date": timestamp()}
-        self.store.jot(key, {"numbers": numbers, "pictures": shown}, about)
+        self.store.put_small(key, {"numbers": numbers, "pictures": shown}, about)
         return numbers
 
     def _results(self, rows: Sequence[Places]) -> Iterator[dict[str, Any]]:

@@ -111,8 +111,8 @@ def test_no_descriptor_at_all(tmp_path):
 @pytest.mark.parametrize(
     ("old", "new", "message"),
     [
-        ("n 12 6 4", "n 12 4 6", r"set\.txt:4: images of \(4, 6\) where it says \(6, 4\)"),
-        ("n 12 6 4", "n 10 6 4", r"set\.txt:4: an image holds \d+ DN, more than 10 bits can"),
+        ("n 12 6 4", "n 12 4 6", r"set\.txt:4: images of \(4, 6\), descriptor says \(6, 4\)"),
+        ("n 12 6 4", "n 10 6 4", r"set\.txt:4: an image holds \d+ DN, more than 10 bits"),
     ],
 )
 def test_images_are_held_to_what_the_descriptor_says(folder, old, new, message):

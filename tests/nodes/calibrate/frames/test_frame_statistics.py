@@ -143,12 +143,12 @@ def test_fixed_patterns_alone_keep_no_histogram():
 def test_what_is_no_digital_number_is_refused(bad):
     frames = torch.full((2, 3, 3), 7.0)
     frames[1, 2, 0] = bad
-    with pytest.raises(ValueError, match="no digital number"):
+    with pytest.raises(ValueError, match="not a digital number"):
         one(frames)
 
 
 def test_negative_integers_are_refused():
-    with pytest.raises(ValueError, match="-3, which is no digital number"):
+    with pytest.raises(ValueError, match="-3, not a digital number"):
         one(torch.tensor([[[4, -3]]]))
 
 

@@ -132,7 +132,7 @@ def test_colour_and_loss_are_refused(tmp_path):
 
 @pytest.mark.parametrize("bad", [0.5, -1.0, float("nan"), float("inf"), 2.0**24])
 def test_numbers_that_no_converter_gives_are_refused(tmp_path, bad):
-    with pytest.raises(ValueError, match=r"a\.npy holds .*no digital number"):
+    with pytest.raises(ValueError, match=r"a\.npy holds .*not a digital number"):
         read(npy(tmp_path / "a.npy", np.array([[1.0, bad]])))
 
 

@@ -406,7 +406,7 @@ def test_a_constant_gate_of_amplitude_scales_the_picture_and_one_of_phase_turns_
 @pytest.mark.parametrize(
     ("option", "learnt", "said"),
     [
-        ("pyramid", True, "was learnt with pyramid: true, and this network has pyramid: false; write pyramid: true"),
+        ("pyramid", True, "was trained with pyramid: true, and this network has pyramid: false; write pyramid: true"),
         ("frequency", "amp_phase", "frequency: amp_phase, and this network has frequency: complex"),
         ("directions", 4, "directions: 4, and this network has directions: 2"),
         ("ssm", "ssd", "ssm: ssd, and this network has ssm: s6"),

@@ -317,7 +317,7 @@ def test_weights_of_another_network_are_refused_by_their_name(name, saved, tmp_p
         ("less", r"less.safetensors: last.bias is None, .* has \("),
         ("more", r"more.safetensors: more is \(1,\), .* has None"),
         ("other", r"other.safetensors: last.bias is \(7,\), .* has \("),
-        ("text", "text.safetensors is no safetensors file"),
+        ("text", "text.safetensors is not a safetensors file"),
     ):
         with pytest.raises(ParameterError, match=words):
             node.hooks.preflight(**PARAMS[name], weights=tmp_path / f"{file}.safetensors")

@@ -287,7 +287,9 @@ def test_on_a_gpu_what_is_installed_scans(monkeypatch, there, named, chosen):
     u = types.SimpleNamespace(device=torch.device("cuda"))
     assert _selective_scan._auto(u, torch.float64) == "torch"
     if chosen == "torch":
-        with pytest.warns(UserWarning, match=r"^neither Triton nor mamba_ssm is here.*: torch computes it") as said:
+        with pytest.warns(
+            UserWarning, match=r"^neither Triton nor mamba_ssm is installed.*: torch computes the scan"
+        ) as said:
             assert [_selective_scan._auto(u, torch.float32), _selective_scan._auto(u, torch.float32)] == ["torch"] * 2
         assert len(said) == 1
     else:
@@ -299,7 +301,7 @@ def test_without_a_compiler_torch_computes_and_it_is_said_once(monkeypatch, tmp_
     monkeypatch.setenv("CXX", str(tmp_path / "no-such-compiler"))
     _cpp_scan._say_once.cache_clear()
     values = draw(20, 3, 2)
-    with pytest.warns(UserWarning, match="not compiled, torch computes it") as said:
+    with pytest.warns(UserWarning, match="not compiled and torch computes the scan") as said:
         found = [selective_scan(*values), selective_scan(*values, backend="cpp")]
     assert len(said) == 1
     assert "\n" not in str(said[0].message)

@@ -65,7 +65,7 @@ def test_what_reaches_no_output_is_not_drawn():
 
 
 def test_a_recipe_that_is_sure_of_all_has_nothing_to_draw():
-    with pytest.raises(ValueError, match="nothing is uncertain: write a law"):
+    with pytest.raises(ValueError, match="no value is uncertain: write a distribution"):
         Inputs.of(small("raw"))
 
 

@@ -144,10 +144,10 @@ def test_what_is_not_a_number_stops_and_is_kept(tmp_path, monkeypatch):
     ("change", "said"),
     [
         ("train_lift.iterations=0", "train_lift.iterations"),
-        ("+train_lift.fish=1", "is not known here"),
+        ("+train_lift.fish=1", "unknown; "),
         ("train_lift.start=foo", "linear"),
         ("measured.files=nowhere.csv", "no such file"),
-        ("~train_lift.iterations", "lacks iterations"),
+        ("~train_lift.iterations", "needs iterations"),
     ],
 )
 def test_a_mistake_is_located(change, said):
