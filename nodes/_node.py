@@ -72,7 +72,7 @@ class Node:
     """A function with its typed parameters and its hooks: the reference, the bounds and the checks.
 
     Two cheaper forms may stand in for a node where a recipe's tolerance allows it: ``channel_sum_form`` gives
-    `Channels` instead of all bands, and ``low_rank_form`` gives a `Mixture` instead of a cube.
+    `Channels` instead of all bands, and ``low_rank_form`` gives a `LowRankCube` instead of a cube.
     """
 
     def __init__(
@@ -228,7 +228,7 @@ def node(
             stand beside it. Of a named tuple, only the fields in `values.BAND_FIELDS` have that axis.
         accepts_channel_sums: inputs that may be `Channels` instead of an image of all bands.
         needs_band_invariant: inputs that must then be the same for every band.
-        accepts_low_rank: inputs that may be a `Mixture` instead of a cube.
+        accepts_low_rank: inputs that may be a `LowRankCube` instead of a cube.
         additive_inputs: inputs that change nothing where they are zero, an optional input or a list; each with the
             inputs that belong to it.
     """

@@ -2,6 +2,7 @@
 
 A parameter with a dimension must carry a unit in the recipe, so that no reader mistakes
 micrometres for nanometres. Inside the program every quantity is in SI units, e- or DN.
+A gain is K of EMVA 1288 inside the program, DN/e-; a recipe may also give the reciprocal, ``0.37 e-/DN``.
 """
 
 from __future__ import annotations
@@ -21,7 +22,9 @@ _SCALE: dict[str, dict[str, float]] = {
     "K": {"K": 1.0},
     "e-": {"e-": 1.0, "ke-": 1e3},
     "waves": {"waves": 1.0, "wave": 1.0},
+    "DN/e-": {"DN/e-": 1.0, "e-/DN": 1.0},
 }
+_RECIPROCAL = {"e-/DN"}  #: units of 1 over the quantity
 _NUMBER = re.compile(r"([-+]?(?:\d+\.?\d*|\.\d+)(?:[eE][-+]?\d+)?)\s*(.*)")
 
 
@@ -38,16 +41,40 @@ def read_quantity(value: Any, si: str) -> float:
         raise ValueError(f"is not a quantity: write a number and a unit, such as '1 {_usual(si)}'")
     number, unit = float(match[1]), match[2].strip()
     if not unit:
-        raise ValueError(f"needs a unit: write {match[1]} {_usual(si)} (one of {units})")
+        raise ValueError(f"needs a unit: write {_with_unit(match[1], si)}")
     if unit not in _SCALE[si]:
         raise ValueError(f"has the wrong unit {unit!r}: write one of {units}")
     if not math.isfinite(number):
         raise ValueError("must be finite")
-    return number * _SCALE[si][unit]
+    return _in_si(number, si, unit)
+
+
+def _with_unit(number: str, si: str) -> str:
+    """Return what to write for a bare number; a gain has two units that are both usual."""
+    if si == "DN/e-":
+        return f"{number} e-/DN or {number} DN/e- (EMVA's K is DN/e-)"
+    return f"{number} {_usual(si)} (one of {', '.join(_SCALE[si])})"
+
+
+def _in_si(number: float, si: str, unit: str) -> float:
+    if unit not in _RECIPROCAL:
+        return number * _SCALE[si][unit]
+    if number == 0:
+        raise ValueError("must be greater than 0")
+    return 1.0 / number
 
 
 def read_any(text: Any) -> tuple[float, str]:
     """Read ``"550 nm"`` or ``0.56`` as a finite number and an SI unit, empty for a bare number, or raise ValueError."""
+    number, si, reciprocal = read_written(text)
+    return (_in_si(number, si, "e-/DN"), si) if reciprocal else (number, si)
+
+
+def read_written(text: Any) -> tuple[float, str, bool]:
+    """Read as `read_any` does, but keep a number in a reciprocal unit such as e-/DN: number, SI unit, is reciprocal.
+
+    A distribution of the reciprocal, such as a normal one of 0.37 e-/DN, is not of the same kind for the quantity.
+    """
     match = _NUMBER.fullmatch(str(text).strip())
     unit = match[2].strip() if match else ""
     si = next((si for si, known in _SCALE.items() if unit in known), "")
@@ -55,7 +82,7 @@ def read_any(text: Any) -> tuple[float, str]:
         raise ValueError(f"{text} is neither a number nor a quantity, such as 0.5 or '1 um'")
     if not math.isfinite(float(match[1])):
         raise ValueError(f"{text} is not finite")
-    return float(match[1]) * (_SCALE[si][unit] if si else 1.0), si
+    return float(match[1]) * (_SCALE[si][unit] if si else 1.0), si, unit in _RECIPROCAL
 
 
 def _reader(si: str) -> BeforeValidator:
@@ -76,6 +103,7 @@ Angle = Annotated[float, _reader("rad")]  #: radian
 Temperature = Annotated[float, Field(gt=0), _reader("K")]  #: kelvin
 Electrons = Annotated[float, Field(ge=0), _reader("e-")]  #: electron
 Waves = Annotated[float, _reader("waves")]  #: optical path in wavelengths
+Gain = Annotated[float, Field(gt=0, allow_inf_nan=False), _reader("DN/e-")]  #: K of EMVA 1288, DN per electron
 Fraction = Annotated[float, Field(ge=0, le=1)]  #: number in [0, 1]
 Count = Annotated[int, Field(ge=1)]  #: whole number from 1
 Real = Annotated[float, AfterValidator(_finite)]  #: finite number

@@ -51,14 +51,16 @@ class Psf(NamedTuple):
     clear_peak: Tensor  #: (band,) float64: the pixel on the axis of the same lens without element, dirt and aberration
 
 
-class Mixture(NamedTuple):
+class LowRankCube(NamedTuple):
     """A low-rank cube of many bands: band b is about ``sum_k basis[b, k] planes[k]``, the strongest plane first."""
 
     planes: Tensor  #: (k, y, x)
     basis: Tensor  #: (band, k) float64
-    rest: Tensor  #: (k + 1, band) float64: bound of max over pixels of |band b minus the first r planes|, r = 0 to k
-    spread: Tensor = torch.zeros(0, 0, dtype=torch.float64)  #: root mean square of the same error; empty: not known
-    off: Tensor = torch.zeros(
+    residual_max: (
+        Tensor  #: (k + 1, band) float64: bound of |band b minus the first r planes| over all pixels, r = 0 to k
+    )
+    residual_rms: Tensor = torch.zeros(0, 0, dtype=torch.float64)  #: root mean square of the same; empty: not known
+    residual_map: Tensor = torch.zeros(
         0, 0
     )  #: (y, x) bound of |band minus all planes|, the largest over all bands; empty: not known
 
@@ -85,10 +87,10 @@ class Levels(NamedTuple):
 
     photons: Tensor  #: (level,) float64, mean photons per pixel and exposure; 0 in the dark
     exposure: Tensor  #: (level,) float64, s
-    numbers: Tensor  #: (level,) float64, count of the pixels of all frames, from which `mean` is computed
+    pixels: Tensor  #: (level,) float64, count of the pixels of all frames, from which `mean` is computed
     mean: Tensor  #: (level,) float64, DN
     variance: Tensor  #: (level,) float64, DN2
-    freedom: Tensor  #: (level,) float64, degrees of freedom of the variance
+    degrees_of_freedom: Tensor  #: (level,) float64, of the variance
     cell_level: Tensor  #: (cell,) int64, index of the level, rising
     cell_value: Tensor  #: (cell,) float64, DN, rising within a level
     cell_count: Tensor  #: (cell,) float64

@@ -158,8 +158,8 @@ MUTANTS = (
     ),
     Mutant(
         "nodes/calibrate/_likelihood/_linear_sensor.py",
-        "((levels.freedom + 1) * variance.log()",
-        "(levels.freedom * variance.log()",
+        "(levels.degrees_of_freedom + 1) * variance.log()",
+        "levels.degrees_of_freedom * variance.log()",
         within(
             "nodes/calibrate/likelihood",
             "likelihood_node.py::test_what_it_says_of_two_sensors_is_what_every_pixel_says",

@@ -21,25 +21,25 @@ class LeastSquares(NamedTuple):
 
     gain: Tensor  #: K, DN/e-
     efficiency: Tensor  #: electrons per photon
-    dark_noise: Tensor  #: sigma_d, e-
+    temporal_dark_noise: Tensor  #: sigma_d, e-
     dark_signal: Tensor  #: dark signal of the shortest exposure, DN
     dark_current: Tensor  #: e-/s; NaN where all dark levels have the same exposure
     saturation: Tensor  #: electrons in the level of the largest variance, without the dark signal
     gain_error: Tensor
     efficiency_error: Tensor
-    dark_noise_error: Tensor
+    temporal_dark_noise_error: Tensor
     fitted: Tensor  #: number of lit levels in both fits
 
 
 @node(rtol=1e-9)
 def least_squares(levels: Levels, *, share: Share = 0.7) -> LeastSquares:
-    """Fit gain, quantum efficiency and dark noise: straight lines through the origin, up to a share of saturation.
+    """Fit gain, quantum efficiency and temporal dark noise: lines through the origin, up to a share of saturation.
 
     The level of the greatest variance marks saturation. The slope of mean over photons is the responsivity, and the
     slope of variance over mean is the gain, after subtraction of the dark level of the nearest exposure.
 
     Shapes: levels (level,) -> ten scalars.
-    Units:  K DN/e-; dark noise, saturation e-; dark current e-/s.
+    Units:  K DN/e-; temporal dark noise, saturation e-; dark current e-/s.
     Error:  valid as far as the camera is linear and the light is Poisson. Every level has the same weight, as in the
             standard, so that the brightest levels dominate. Rounding in the converter is assumed to add 1/12 DN2;
             dithered rounding adds up to 1/6. The errors omit the scatter of means in x, drift and non-linearity,
@@ -65,10 +65,10 @@ def least_squares(levels: Levels, *, share: Share = 0.7) -> LeastSquares:
     if not (float(gain) > 0 and float(response) > 0):
         raise ValueError(f"slopes {float(gain):.3g} DN/e- and {float(response):.3g} DN/photon: brighter frames must "
                          "be brighter and noisier; check that the light belongs to the levels")  # fmt: skip
-    scatter = 2 * lit.variance.square() / lit.freedom
-    dim = 2 * below.variance.square() / below.freedom
+    scatter = 2 * lit.variance.square() / lit.degrees_of_freedom
+    dim = 2 * below.variance.square() / below.degrees_of_freedom
     off = _error(mean[used], scatter[used], dim[used], nearest[used]) / gain
-    faint = lit.variance / lit.numbers, below.variance / below.numbers
+    faint = lit.variance / lit.pixels, below.variance / below.pixels
     weak = _error(lit.photons[used], faint[0][used], faint[1][used], nearest[used]) / response
     noise, doubt = _dark_noise(levels, dark)
     efficiency = response / gain
@@ -89,8 +89,8 @@ def least_squares(levels: Levels, *, share: Share = 0.7) -> LeastSquares:
 @least_squares.check
 def _(result: LeastSquares, levels: Levels, **params: float) -> list[Check]:
     text = (
-        f"K {float(result.gain):.4g} DN/e-, QE {float(result.efficiency):.3g}, dark noise "
-        f"{float(result.dark_noise):.4g} e-, from {int(result.fitted)} of {len(levels.mean)} levels"
+        f"K {float(result.gain):.4g} DN/e-, QE {float(result.efficiency):.3g}, temporal dark noise "
+        f"{float(result.temporal_dark_noise):.4g} e-, from {int(result.fitted)} of {len(levels.mean)} levels"
     )
     return [Check(text, 0.0 < float(result.efficiency) <= 1.0)]
 
@@ -117,8 +117,8 @@ def _first(levels: Levels, dark: Tensor) -> Tensor:
 
 
 def _dark_noise(levels: Levels, dark: Tensor) -> tuple[Tensor, Tensor]:
-    """Return the dark noise without rounding, and its standard error, DN; the error is infinite without other noise."""
-    variance, freedom = (x[_first(levels, dark)] for x in (levels.variance, levels.freedom))
+    """Return the temporal dark noise without rounding, and its standard error, DN; infinite without other noise."""
+    variance, freedom = (x[_first(levels, dark)] for x in (levels.variance, levels.degrees_of_freedom))
     noise = (variance - _QUANTIZATION).clamp_min(0.0).sqrt()
     return noise, torch.where(noise > 0, variance / (2 * freedom).sqrt() / noise, math.inf)
 

@@ -8,7 +8,7 @@ from pydantic import Field
 from torch import Tensor
 
 from neusee.nodes import node
-from neusee.nodes.doe._height_from_phase import relief, relief_checks
+from neusee.nodes.doe._height_from_phase import height_checks, height_from_phase
 from neusee.nodes.doe._refractive_index import Material
 from neusee.nodes.optics._pupil_grid import Aperture, Stop, axes, grid_notes, polar, stop
 from neusee.nodes.optics._zernike import surface
@@ -48,7 +48,7 @@ def vortex(
     Source: Watnik, Ruane, Swartzlander, Opt. Eng. 55, 123102 (2016).
     """
     grid = stop(samples, pitch, diameter, aperture)
-    return relief(charge * polar(grid)[1], grid, wavelength, material)
+    return height_from_phase(charge * polar(grid)[1], grid, wavelength, material)
 
 
 @node()
@@ -70,7 +70,7 @@ def axicon(
     Source: Watnik, Ruane, Swartzlander, Opt. Eng. 55, 123102 (2016).
     """
     grid = stop(samples, pitch, diameter, aperture)
-    return relief(2 * math.pi * waves * polar(grid)[0], grid, wavelength, material)
+    return height_from_phase(2 * math.pi * waves * polar(grid)[0], grid, wavelength, material)
 
 
 @node()
@@ -94,7 +94,7 @@ def spiral_axicon(
     """
     grid = stop(samples, pitch, diameter, aperture)
     radius, azimuth = polar(grid)
-    return relief(2 * math.pi * waves * radius + charge * azimuth, grid, wavelength, material)
+    return height_from_phase(2 * math.pi * waves * radius + charge * azimuth, grid, wavelength, material)
 
 
 @node()
@@ -117,7 +117,7 @@ def cubic(
     """
     grid = stop(samples, pitch, diameter, aperture)
     v, u = axes(grid)
-    return relief(2 * math.pi * waves * (u**3 + v**3), grid, wavelength, material)
+    return height_from_phase(2 * math.pi * waves * (u**3 + v**3), grid, wavelength, material)
 
 
 def _half_rings(grid: Stop, waves: tuple[float, ...], alternate: bool, orientation: float) -> Tensor:
@@ -153,7 +153,7 @@ def half_rings(
     Source: our reading of Wirth et al., Opt. Lett. 45, 2179 (2020), whose formula we could not consult.
     """
     grid = stop(samples, pitch, diameter, aperture)
-    return relief(_half_rings(grid, waves, alternate, orientation), grid, wavelength, material)
+    return height_from_phase(_half_rings(grid, waves, alternate, orientation), grid, wavelength, material)
 
 
 @node()
@@ -176,9 +176,9 @@ def zernike(
     """
     grid = stop(samples, pitch, diameter, aperture)
     phase = surface(coefficients, grid) * (2 * math.pi / wavelength)
-    return relief(phase, grid, wavelength, material)
+    return height_from_phase(phase, grid, wavelength, material)
 
 
 for _mask in (flat, vortex, axicon, spiral_axicon, cubic, half_rings, zernike):
     _mask.preflight(grid_notes)
-    _mask.check(relief_checks)
+    _mask.check(height_checks)

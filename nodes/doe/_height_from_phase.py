@@ -11,14 +11,14 @@ from neusee.nodes.doe._refractive_index import Material, wave_height
 from neusee.nodes.optics._pupil_grid import Stop, inside
 
 
-def relief(phase: Tensor, grid: Stop, wavelength: float, material: Material) -> Tensor:
+def height_from_phase(phase: Tensor, grid: Stop, wavelength: float, material: Material) -> Tensor:
     """Height, float32 in m, that delays ``wavelength`` by ``phase``: 0 at the lowest point and outside the stop."""
     open_ = inside(grid, phase.device)
     lifted = phase - phase[open_].min()
     return torch.where(open_, lifted * (wave_height(material, wavelength) / (2 * math.pi)), 0.0).to(torch.float32)
 
 
-def relief_checks(height: Tensor, *_: Any, **__: Any) -> list[Check]:
+def height_checks(height: Tensor, *_: Any, **__: Any) -> list[Check]:
     """How deep the relief is, and that it can be made at all: finite and nowhere below 0."""
     low, high = (float(value) for value in torch.aminmax(height))
     sound = math.isfinite(low) and math.isfinite(high) and low >= 0

@@ -8,7 +8,7 @@ from torch import Tensor
 
 from neusee.nodes import Check, node
 from neusee.nodes._half_precision import refuse_half
-from neusee.nodes.doe._height_from_phase import relief_checks
+from neusee.nodes.doe._height_from_phase import height_checks
 from neusee.nodes.optics._pupil_grid import Aperture, stop
 from neusee.nodes.units import Count, PositiveLength
 
@@ -83,4 +83,4 @@ def _(*, feature: float, samples: int, pitch: float, diameter: float, aperture: 
 def _(result: Tensor, height: Tensor, *_: Any, feature: float, **__: Any) -> list[Check]:
     moved = float((result - height).detach().double().square().mean().sqrt())
     text = f"features below {feature * 1e6:.3g} um smoothed: {moved * 1e9:.3g} nm root mean square"
-    return [Check(text), *relief_checks(result)]
+    return [Check(text), *height_checks(result)]

@@ -13,7 +13,7 @@ from torch import Tensor, nn
 
 from neusee.nodes.bicubic_resize import enlarge
 from neusee.nodes.doe._analytic_masks import axicon, cubic, half_rings, spiral_axicon, vortex, zernike
-from neusee.nodes.doe._height_from_phase import relief
+from neusee.nodes.doe._height_from_phase import height_from_phase
 from neusee.nodes.doe._minimum_feature import smooth
 from neusee.nodes.doe._refractive_index import Material
 from neusee.nodes.doe._sampled_height_map import pixelwise
@@ -88,7 +88,7 @@ class Modes(nn.Module):
         """Return the height (v, u)."""
         basis = self._basis(grid)
         phase = (2 * math.pi * self.waves) @ basis.flatten(1)
-        return relief(phase.view(grid.samples, grid.samples), grid, self.wavelength, self.material)
+        return height_from_phase(phase.view(grid.samples, grid.samples), grid, self.wavelength, self.material)
 
 
 class Rings(nn.Module):
@@ -119,7 +119,7 @@ class Rings(nn.Module):
         zone = self._zones(grid)
         phase = self.slopes.double()[zone] * torch.hypot(v, u) + self.steps.double()[zone]
         side = torch.sign(u) if self.sided else torch.ones_like(u)
-        return relief(2 * math.pi * phase * side, grid, self.wavelength, self.material)
+        return height_from_phase(2 * math.pi * phase * side, grid, self.wavelength, self.material)
 
 
 class Drawn(nn.Module):

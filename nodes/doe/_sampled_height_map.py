@@ -8,7 +8,7 @@ from pydantic import Field
 from torch import Tensor
 
 from neusee.nodes import ParameterError, node
-from neusee.nodes.doe._height_from_phase import relief_checks
+from neusee.nodes.doe._height_from_phase import height_checks
 from neusee.nodes.optics._phase_screen import screen
 from neusee.nodes.optics._pupil_grid import Aperture, grid_notes, stop
 from neusee.nodes.units import Count, DataFile, PositiveLength
@@ -127,4 +127,4 @@ def _(*, samples: int, file: Path | None, **rest: Any) -> list[str]:
     return grid_notes(samples=samples, **rest)
 
 
-pixelwise.check(relief_checks)
+pixelwise.check(height_checks)

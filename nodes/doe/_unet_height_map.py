@@ -11,7 +11,7 @@ from torch.nn import functional as F
 
 from neusee.nodes import node
 from neusee.nodes.bicubic_resize import enlarge
-from neusee.nodes.doe._height_from_phase import relief_checks
+from neusee.nodes.doe._height_from_phase import height_checks
 from neusee.nodes.network_weights import loaded, same_layout
 from neusee.nodes.optics._pupil_grid import Aperture, grid_notes
 from neusee.nodes.units import Count, DataFile, PositiveLength
@@ -114,4 +114,4 @@ def _(*, width: int, weights: Path | None, **rest: Any) -> list[str]:
     return grid_notes(**rest)
 
 
-unet.check(relief_checks)
+unet.check(height_checks)

@@ -24,15 +24,15 @@ def contrast(psf: Psf, *, floor: ContrastFloor = 1e-4, up_to: HighestFrequency |
     The mean is over the frequencies that the clear aperture passes, as in `metrics.mtf`, and the contrast is the
     modulus of the OTF over its value at frequency 0. A mean of logarithms is the logarithm of the geometric mean and
     follows the median, whereas a mean of squares follows the few frequencies near 0 with high contrast. A factor of
-    contrast counts alike at every contrast above ``floor``, as a factor of suppression does in ``losses.lsr`` with
-    ``log``, so that the weights of the two losses set the exchange rate. Below ``floor`` the loss hardly changes, so
-    that nulls at single frequencies do not dominate. ``up_to`` excludes finer frequencies, which a reduced picture
-    loses.
+    contrast counts alike at every contrast above ``floor``, as a factor of suppression does in
+    ``losses.suppression_loss`` with ``log``, so that the weights of the two losses set the exchange rate. Below
+    ``floor`` the loss hardly changes, so that nulls at single frequencies do not dominate. ``up_to`` excludes finer
+    frequencies, which a reduced picture loses.
 
     Shapes: psf.intensity (band, y, x) -> ().
     Units:  none; per band 0 at full contrast and -ln(floor) at none; up_to in cycles per pixel.
-    Error:  1e-5 in float32. Light outside the window is not counted; `losses.bsr` counts that light. A band without
-            light (1e-30) counts as contrast 0, and has no gradient.
+    Error:  1e-5 in float32. Light outside the window is not counted; `losses.background_loss` counts that light. A
+            band without light (1e-30) counts as contrast 0, and has no gradient.
     Source: Goodman, Introduction to Fourier Optics, 4th ed., ch. 7 (OTF, cut-off); the mean of logarithms is ours.
     """
     bands = zip(single(psf.intensity), psf.clear_peak.tolist(), strict=True)

@@ -14,7 +14,7 @@ _DARK = 1e-30  #: light, or a ratio, that counts as none
 
 
 @node()
-def lsr(psf: Psf, *, power: Annotated[float, Field(ge=8, le=64)] = 8.0, log: bool = False) -> Tensor:
+def suppression_loss(psf: Psf, *, power: Annotated[float, Field(ge=8, le=64)] = 8.0, log: bool = False) -> Tensor:
     """Sum the laser suppression ratio over the bands, with a peak that has a gradient everywhere.
 
     The peak of PSF / clear peak is the p-norm over pixels, whose gradient reaches every bright pixel, while the
@@ -39,7 +39,7 @@ def lsr(psf: Psf, *, power: Annotated[float, Field(ge=8, le=64)] = 8.0, log: boo
     return loss
 
 
-@lsr.reference
+@suppression_loss.reference
 def _(psf: Psf, *, power: float = 8.0, log: bool = False) -> Tensor:
     ratio = (psf.intensity.double() / psf.clear_peak[:, None, None]).flatten(1)
     dark = ratio.detach().amax(1, keepdim=True) <= _DARK
@@ -51,7 +51,7 @@ def _(psf: Psf, *, power: float = 8.0, log: bool = False) -> Tensor:
 
 
 @node()
-def bsr(image: Tensor, plain_image: Tensor) -> Tensor:
+def background_loss(image: Tensor, plain_image: Tensor) -> Tensor:
     """Sum, over the bands, the light of the scene through the plain lens over the light through the mask.
 
     Shapes: image and plain_image (..., band, y, x) -> ().

@@ -3,7 +3,7 @@
 from neusee.nodes.metrics._mask_limits import Limits, least_lsr, limits, most_contrast, most_unsuppressed
 from neusee.nodes.metrics._picture_quality import Quality, quality
 from neusee.nodes.metrics._psf_contrast import Mtf, encircled, encircled_curve, mtf, over_clear_peak
-from neusee.nodes.metrics._suppression import Peak, Saturated, bsr, lsr, peak, saturated
+from neusee.nodes.metrics._suppression import Peak, Saturated, bsr, lsr, peak_irradiance, saturated
 
 __all__ = [
     "Limits",
@@ -21,7 +21,7 @@ __all__ = [
     "most_unsuppressed",
     "mtf",
     "over_clear_peak",
-    "peak",
+    "peak_irradiance",
     "quality",
     "saturated",
 ]

@@ -10,9 +10,9 @@ from neusee.nodes import Check, node
 from neusee.nodes._half_precision import single
 from neusee.nodes.metrics._mask_limits import least_lsr
 from neusee.nodes.sensor._channel_sums import weighted
-from neusee.nodes.sensor._digitization import Bits, Gain, GainUnit, numbers_per_electron
+from neusee.nodes.sensor._digitization import Bits
 from neusee.nodes.sensor._saturation import Efficiency, Well, saturation
-from neusee.nodes.units import PositiveLength, Time
+from neusee.nodes.units import Gain, PositiveLength, Time
 from neusee.nodes.values import Bands, Channels, Psf
 
 _DARK = 1e-30  #: light that counts as none
@@ -84,7 +84,7 @@ def _(result: Tensor, *inputs: Tensor | Channels) -> list[Check]:
 
 
 @node(rtol=1e-6)
-def saturated(raw: Tensor, *, full_well: Well, gain: Gain, gain_unit: GainUnit = "e-/DN", bits: Bits = 16) -> Saturated:
+def saturated(raw: Tensor, *, full_well: Well, gain: Gain, bits: Bits = 16) -> Saturated:
     """Count the saturated pixels, with a channel at the full well or at the largest number of the converter.
 
     Shapes: raw (..., channel, y, x) -> two scalars, float64.
@@ -92,7 +92,7 @@ def saturated(raw: Tensor, *, full_well: Well, gain: Gain, gain_unit: GainUnit =
     Error:  a pixel within one DN of the full well counts as full, and so does one that is not a number.
     Source: NeuSee, Eq. (SensorImage).
     """
-    full = clipped(raw, full_well=full_well, gain=gain, gain_unit=gain_unit, bits=bits).any(-3)
+    full = clipped(raw, full_well=full_well, gain=gain, bits=bits).any(-3)
     pixels = full.sum().double()
     return Saturated(pixels, pixels / full.numel())
 
@@ -102,15 +102,15 @@ def _(result: Saturated, *inputs: Tensor, **params: Any) -> list[Check]:
     return [Check(f"{int(result.pixels)} saturated pixels, {float(result.share):.2%}")]
 
 
-def clipped(raw: Tensor, *, full_well: float, gain: float, gain_unit: str, bits: int) -> Tensor:
+def clipped(raw: Tensor, *, full_well: float, gain: float, bits: int) -> Tensor:
     """Mark the values at the full well, at the largest number of the converter, or NaN."""
-    full = int(full_well * numbers_per_electron(gain, gain_unit) - 0.5)
+    full = int(full_well * gain - 0.5)
     marked: Tensor = ~(raw < max(1, min(2**bits - 1, full)))  # NaN counts as clipped
     return marked
 
 
 @node(rtol=1e-6, accepts_channel_sums=("image",), needs_band_invariant=("level",), additive_inputs=[("spots", "lines")])
-def peak(
+def peak_irradiance(
     image: Tensor | Channels,
     bands: Bands,
     level: Tensor,
@@ -147,6 +147,6 @@ def _in_wells(irradiance: Tensor | Channels, saturating: Tensor) -> Tensor:
     return weighted(irradiance, (1.0 / saturating)[None])[0]
 
 
-@peak.check
+@peak_irradiance.check
 def _(result: Peak, *inputs: Any, **params: Any) -> list[Check]:
     return [Check(f"peak {float(result.irradiance):.3g} I_sat", not bool(result.damaged))]

@@ -3,7 +3,7 @@
 from neusee.nodes.optics._imaging._band_image import image
 from neusee.nodes.optics._imaging._channel_image import image_channels
 from neusee.nodes.optics._laser_direction import direction, field_of_view
-from neusee.nodes.optics._laser_spot import spot
+from neusee.nodes.optics._laser_spot import laser_irradiance
 from neusee.nodes.optics._psf import psf
 from neusee.nodes.optics._pupil import mask_turns, pupil
 from neusee.nodes.optics._pupil_grid import Stop, stop
@@ -14,9 +14,9 @@ __all__ = [
     "field_of_view",
     "image",
     "image_channels",
+    "laser_irradiance",
     "mask_turns",
     "psf",
     "pupil",
-    "spot",
     "stop",
 ]

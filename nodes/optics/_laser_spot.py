@@ -17,7 +17,7 @@ _LSR = 2.2  #: largest laser suppression ratio of a pupil that only absorbs and 
 
 
 @node()
-def spot(
+def laser_irradiance(
     psf: Psf,
     bands: Bands,
     *,
@@ -50,7 +50,7 @@ def spot(
     return intensity * energy.to(intensity)[:, None, None]
 
 
-@spot.zero_bound
+@laser_irradiance.zero_bound
 def _(
     psf: TensorStats,
     bands: TensorStats,
@@ -76,7 +76,7 @@ def _(
     return _LSR * strength * float(saturating)
 
 
-@spot.check
+@laser_irradiance.check
 def _(result: Tensor, psf: Psf, bands: Bands, **params: Any) -> list[Check]:
     sensor = {k: params[k] for k in ("full_well", "quantum_efficiency", "pixel_pitch", "exposure")}
     share = 1.0 / saturation(bands, **sensor)

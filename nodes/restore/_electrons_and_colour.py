@@ -6,34 +6,32 @@ from torch import Tensor
 from neusee.nodes import node
 from neusee.nodes._half_precision import single
 from neusee.nodes.metrics._suppression import clipped as at_the_end
-from neusee.nodes.sensor._digitization import Bits, Gain, GainUnit, numbers_per_electron
+from neusee.nodes.sensor._digitization import Bits
 from neusee.nodes.sensor._saturation import Well
-from neusee.nodes.units import Electrons
+from neusee.nodes.units import Electrons, Gain
 
 
 @node()
-def electrons(
-    raw: Tensor, *, gain: Gain, gain_unit: GainUnit = "e-/DN", pedestal: Electrons, pedestal_subtracted: bool = True
-) -> Tensor:
-    """Convert digital numbers to electrons: undo the gain of the sensor and subtract its pedestal.
+def electrons(raw: Tensor, *, gain: Gain, offset: Electrons, offset_subtracted: bool = True) -> Tensor:
+    """Convert digital numbers to electrons: undo the gain of the sensor and subtract its offset.
 
     Shapes: raw (..., y, x) -> (..., y, x).
-    Units:  raw DN; result e-, negative where read noise was negative.
+    Units:  raw DN; gain K, DN/e-; offset e-; result e-, negative where read noise was negative.
     Error:  the rounding of the converter, 0.29 DN rms; clipped pixels stay clipped.
     Source: NeuSee, Eq. (SensorImage), inverted.
     """
-    return single(raw) / numbers_per_electron(gain, gain_unit) - (pedestal if pedestal_subtracted else 0.0)
+    return single(raw) / gain - (offset if offset_subtracted else 0.0)
 
 
 @electrons.preflight
-def _(*, pedestal: float, pedestal_subtracted: bool = True, **params: object) -> list[str]:
-    if pedestal and not pedestal_subtracted:
-        return [f"a pedestal of {pedestal:g} e- stays in the picture: set pedestal_subtracted: true to remove it"]
+def _(*, offset: float, offset_subtracted: bool = True, **params: object) -> list[str]:
+    if offset and not offset_subtracted:
+        return [f"an offset of {offset:g} e- stays in the picture: set offset_subtracted: true to remove it"]
     return []
 
 
 @node(rtol=0.0)
-def clipped(raw: Tensor, *, full_well: Well, gain: Gain, gain_unit: GainUnit = "e-/DN", bits: Bits = 16) -> Tensor:
+def clipped(raw: Tensor, *, full_well: Well, gain: Gain, bits: Bits = 16) -> Tensor:
     """Mark clipped values, which give only a lower bound: at the full well, or at the largest number of the converter.
 
     Shapes: raw (..., y, x) -> (..., y, x) bool.
@@ -41,7 +39,7 @@ def clipped(raw: Tensor, *, full_well: Well, gain: Gain, gain_unit: GainUnit = "
     Error:  a value within one DN of the full well is marked too, and so is what is not a number (NaN).
     Source: NeuSee, Eq. (SensorImage).
     """
-    return at_the_end(raw, full_well=full_well, gain=gain, gain_unit=gain_unit, bits=bits)
+    return at_the_end(raw, full_well=full_well, gain=gain, bits=bits)
 
 
 @node()

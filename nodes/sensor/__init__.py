@@ -2,20 +2,20 @@
 
 from neusee.nodes.sensor._channel_sums import channel_sums
 from neusee.nodes.sensor._digitization import crop, digitize, full_well
-from neusee.nodes.sensor._exposure import expose, gather, level
+from neusee.nodes.sensor._exposure import add_photons, expose, level
 from neusee.nodes.sensor._noise import dark_current, photon_noise, read_noise
 from neusee.nodes.sensor._photon_transfer import photon_transfer
 from neusee.nodes.sensor._saturation import Limits, limits, photons_that_fill, saturation
 
 __all__ = [
     "Limits",
+    "add_photons",
     "channel_sums",
     "crop",
     "dark_current",
     "digitize",
     "expose",
     "full_well",
-    "gather",
     "level",
     "limits",
     "photon_noise",

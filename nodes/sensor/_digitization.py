@@ -10,17 +10,10 @@ from torch import Generator, Tensor
 from neusee.nodes import Check, ErrorBound, TensorStats, node
 from neusee.nodes._half_precision import single
 from neusee.nodes.sensor._saturation import Well
-from neusee.nodes.units import Shape
+from neusee.nodes.units import Gain, Shape
 
-Gain = Annotated[float, Field(gt=0, allow_inf_nan=False)]
-GainUnit = Literal["e-/DN", "DN/e-"]
 Rounding = Literal["nearest", "dithered_floor"]
 Bits = Annotated[int, Field(ge=1, le=16)]
-
-
-def numbers_per_electron(gain: float, gain_unit: str) -> float:
-    """The system gain K of EMVA 1288, DN/e-, however the recipe writes it."""
-    return gain if gain_unit == "DN/e-" else 1.0 / gain
 
 
 @node(rtol=0.0)
@@ -29,7 +22,7 @@ def full_well(electrons: Tensor, *, capacity: Well) -> Tensor:
 
     Shapes: electrons (..., y, x) -> (..., y, x).
     Units:  e-.
-    Error:  a hard edge: neither blooming into neighbours nor a soft knee. A pedestal added before takes its share
+    Error:  a hard edge: neither blooming into neighbours nor a soft knee. An offset added before takes its share
             of the well, as the paper prints it.
     Source: NeuSee, Eq. (SensorImage).
     """
@@ -65,7 +58,6 @@ def digitize(
     electrons: Tensor,
     *,
     gain: Gain,
-    gain_unit: GainUnit = "e-/DN",
     rounding: Rounding = "nearest",
     bits: Bits = 16,
     rng: Generator | None = None,
@@ -73,14 +65,15 @@ def digitize(
     """Convert electrons to whole digital numbers, clipped to the range of the converter.
 
     Shapes: electrons (..., y, x) -> (..., y, x), whole numbers in the dtype of the input (of half precision, float32).
-    Units:  electrons e-; gain as gain_unit says; result DN in [0, 2**bits - 1].
+    Units:  electrons e-; gain K of EMVA 1288, DN/e-, which a recipe may also write as e-/DN; result DN in
+            [0, 2**bits - 1].
     Error:  `nearest` is exact (half to even), with variance 1/12 DN2. `dithered_floor`, floor(x + U(-1/2, 1/2)) as
             printed, lies 1/2 DN low with up to 1/6 DN2 more variance. Integral nonlinearity is left out. The
             gradient is that of the line before rounding, and 0 where the converter clips.
     Raises: ValueError for `dithered_floor` without rng.
     Source: NeuSee, Eq. (SensorImage); EMVA Standard 1288, release 4.0 (quantization variance 1/12 DN2).
     """
-    line = single(electrons) * numbers_per_electron(gain, gain_unit)
+    line = single(electrons) * gain
     ideal = line.clamp(0, 2**bits - 1)
     if rounding == "nearest":  # the sum is exact; without a gradient, the rounded number is enough
         return ideal + (ideal.round() - ideal).detach() if ideal.requires_grad else ideal.round_()
@@ -96,13 +89,12 @@ def _(
     electrons: Tensor,
     *,
     gain: float,
-    gain_unit: GainUnit = "e-/DN",
     rounding: Rounding = "nearest",
     bits: int = 16,
     rng: Generator | None = None,
 ) -> Tensor:
-    top, slope, electrons = 2**bits - 1, numbers_per_electron(gain, gain_unit), single(electrons)
-    line = (electrons * slope).flatten().tolist()
+    top, electrons = 2**bits - 1, single(electrons)
+    line = (electrons * gain).flatten().tolist()
     if rounding == "nearest":
         whole = [round(min(max(x, 0.0), float(top))) for x in line]
     else:
@@ -112,17 +104,15 @@ def _(
 
 
 @digitize.propagate_error
-def _(
-    electrons: ErrorBound, *, result: TensorStats, gain: float, gain_unit: GainUnit = "e-/DN", **params: Any
-) -> float:
+def _(electrons: ErrorBound, *, result: TensorStats, gain: float, **params: Any) -> float:
     """Of the line before rounding: whatever is near the middle between two numbers may become the next one."""
-    return electrons.rms * numbers_per_electron(gain, gain_unit)
+    return electrons.rms * gain
 
 
 @digitize.preflight
-def _(*, gain: float, gain_unit: str = "e-/DN", bits: int = 16, **params: object) -> list[str]:
+def _(*, gain: float, bits: int = 16, **params: object) -> list[str]:
     top = 2**bits - 1
-    return [f"the converter ends at {top} DN = {top / numbers_per_electron(gain, gain_unit):.0f} e-"]
+    return [f"the converter ends at {top} DN = {top / gain:.0f} e-"]
 
 
 @digitize.check

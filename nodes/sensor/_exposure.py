@@ -159,7 +159,7 @@ def _(*, strength: float, rule: str = "channel_sum", **params: object) -> list[s
 
 
 @node(rtol=1e-6, additive_inputs=[("lasers",), ("ghosts",)])
-def gather(photons: Tensor, lasers: list[Tensor] | None = None, ghosts: list[Tensor] | None = None) -> Tensor:
+def add_photons(photons: Tensor, lasers: list[Tensor] | None = None, ghosts: list[Tensor] | None = None) -> Tensor:
     """Add the photons of the scene, of every laser and of every ghost: incoherent light adds.
 
     Shapes: photons (..., channel, y, x), each laser and ghost the same -> (..., channel, y, x).
@@ -179,7 +179,7 @@ def gather(photons: Tensor, lasers: list[Tensor] | None = None, ghosts: list[Ten
     return total
 
 
-@gather.propagate_error
+@add_photons.propagate_error
 def _(
     photons: ErrorBound,
     lasers: list[ErrorBound] | None = None,
@@ -189,7 +189,7 @@ def _(
     return math.fsum(part.rms for part in (photons, *(lasers or ()), *(ghosts or ())))
 
 
-@gather.check
+@add_photons.check
 def _(result: Tensor, photons: Tensor, *others: object, **params: object) -> list[Check]:
     scene, high = float(photons.max()), float(result.max())
     return [Check(f"brightest pixel {high:.4g} photons, scene alone {scene:.4g}", high >= 0)]

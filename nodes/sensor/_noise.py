@@ -159,25 +159,29 @@ def _(electrons: ErrorBound, **params: Any) -> float:
 
 @node()
 def read_noise(
-    electrons: Tensor, *, pedestal: Electrons, sigma: Electrons, full_well: Well | None = None, rng: Generator
+    electrons: Tensor, *, offset: Electrons, read_noise: Electrons, full_well: Well | None = None, rng: Generator
 ) -> Tensor:
-    """Add the pedestal of the amplifier and its Gaussian noise; ``full_well`` as for the dark current.
+    """Add the offset of the amplifier and its Gaussian noise; ``full_well`` as for the dark current.
+
+    The temporal dark noise that EMVA 1288 measures is that of read-out and dark current together:
+    sigma_d**2 = read_noise**2 + mean of the dark current. Its dark signal mu_d is offset + mean of the dark current.
 
     Shapes: electrons (..., y, x) -> (..., y, x).
-    Units:  e-; pedestal e-, the paper's "mean read noise"; sigma e- rms.
+    Units:  e-; offset e-, the paper's "mean read noise"; read_noise e- rms.
     Error:  white: row noise and telegraph noise are left out.
-    Source: NeuSee, section Sensor Image; Janesick, Photon Transfer, SPIE PM170 (2007).
+    Source: NeuSee, section Sensor Image; EMVA Standard 1288, release 4.0; Janesick, Photon Transfer, SPIE
+            PM170 (2007).
     """
 
     def read(some: Tensor) -> Tensor:
-        return some + normal(some, rng).mul_(sigma).add_(pedestal)
+        return some + normal(some, rng).mul_(read_noise).add_(offset)
 
     return _by_parts(read, single(electrons), rng)
 
 
 @read_noise.skip_bound
-def _(electrons: TensorStats, *, pedestal: float, sigma: float, full_well: float | None) -> float:
-    return _share(pedestal, sigma, electrons, full_well)
+def _(electrons: TensorStats, *, offset: float, read_noise: float, full_well: float | None) -> float:
+    return _share(offset, read_noise, electrons, full_well)
 
 
 @read_noise.skip_scale

@@ -6,12 +6,12 @@ import torch
 from torch import Generator, Tensor
 
 from neusee.nodes import Check, node
-from neusee.nodes.sensor._digitization import Bits, Gain, GainUnit, Rounding, digitize, full_well, numbers_per_electron
+from neusee.nodes.sensor._digitization import Bits, Rounding, digitize, full_well
 from neusee.nodes.sensor._noise import Distribution, dark_current, photon_noise, read_noise
 from neusee.nodes.sensor._saturation import Efficiency, Well
-from neusee.nodes.units import Count, Electrons
+from neusee.nodes.units import Count, Electrons, Gain
 
-well_of = full_well  # the parameter below has the same name
+well_of, read_of = full_well, read_noise  # parameters below have the same names
 
 
 @node()
@@ -20,11 +20,10 @@ def photon_transfer(
     full_well: Well,
     quantum_efficiency: Efficiency,
     gain: Gain,
-    gain_unit: GainUnit = "e-/DN",
     rounding: Rounding = "nearest",
     bits: Bits = 16,
-    pedestal: Electrons,
-    sigma: Electrons,
+    offset: Electrons,
+    read_noise: Electrons,
     dark: Electrons,
     distribution: Distribution = "gaussian",
     levels: Count = 24,
@@ -37,7 +36,7 @@ def photon_transfer(
     the same nodes as a picture. The prediction is K^2 sigma_d^2 + sigma_q^2 + K (mean - dark mean).
 
     Shapes: -> (level, 3) float64.
-    Units:  DN, DN2, DN2.
+    Units:  gain K, DN/e-; result DN, DN2, DN2.
     Error:  sampling: the variance of a pair is known to sqrt(2 / pixels), 1.1 % at 16384. The prediction knows
             neither the full well nor the end of the converter, which is where the two part.
     Source: EMVA Standard 1288, release 4.0 Linear (photon transfer method, difference of two frames).
@@ -46,17 +45,16 @@ def photon_transfer(
     def frame(photons: float) -> Tensor:
         flat = torch.full((pixels,), photons, dtype=torch.float64, device=rng.device)
         e = photon_noise(flat, quantum_efficiency=quantum_efficiency, distribution=distribution, rng=rng)
-        e = read_noise(dark_current(e, mean=dark, rng=rng), pedestal=pedestal, sigma=sigma, rng=rng)
+        e = read_of(dark_current(e, mean=dark, rng=rng), offset=offset, read_noise=read_noise, rng=rng)
         e = well_of(e, capacity=full_well)
-        dn: Tensor = digitize(e, gain=gain, gain_unit=gain_unit, rounding=rounding, bits=bits, rng=rng)
+        dn: Tensor = digitize(e, gain=gain, rounding=rounding, bits=bits, rng=rng)
         return dn
 
     light = _rise(full_well / quantum_efficiency, 1.0 / quantum_efficiency, levels)
     measured = torch.tensor([_pair(frame(p), frame(p)) for p in light], dtype=torch.float64)
     signal = measured[:, 0] - measured[0, 0]
-    slope = numbers_per_electron(gain, gain_unit)
-    floor = slope**2 * (sigma**2 + dark) + (1.0 / 12.0 if rounding == "nearest" else 1.0 / 6.0)
-    return torch.stack([signal, measured[:, 1], floor + slope * signal], 1)
+    floor = gain**2 * (read_noise**2 + dark) + (1.0 / 12.0 if rounding == "nearest" else 1.0 / 6.0)
+    return torch.stack([signal, measured[:, 1], floor + gain * signal], 1)
 
 
 def _rise(top: float, first: float, levels: int) -> list[float]:
@@ -71,9 +69,8 @@ def _pair(one: Tensor, two: Tensor) -> tuple[float, float]:
 
 
 @photon_transfer.check
-def _(result: Tensor, *, full_well: float, gain: float, gain_unit: str = "e-/DN", **params: Any) -> list[Check]:
-    slope = numbers_per_electron(gain, gain_unit)
-    middle = (result[:, 0] > 0.02 * full_well * slope) & (result[:, 0] < 0.7 * full_well * slope)
+def _(result: Tensor, *, full_well: float, gain: float, **params: Any) -> list[Check]:
+    middle = (result[:, 0] > 0.02 * full_well * gain) & (result[:, 0] < 0.7 * full_well * gain)
     if not bool(middle.any()):
         return [Check("too few levels to judge the slope")]
     ratio = float((result[middle, 1] / result[middle, 2]).mean())

@@ -9,7 +9,7 @@ from neusee.nodes import Check, ParameterError, node
 from neusee.nodes._half_precision import single
 from neusee.nodes.spectra._spectral_tables import daylight, light
 from neusee.nodes.units import Temperature
-from neusee.nodes.values import Bands, Mixture
+from neusee.nodes.values import Bands, LowRankCube
 
 Kind = Literal[
     "daylight", "D50", "D55", "D65", "D75", "A", "E", "FL2", "FL7", "FL11", "HP1",
@@ -61,11 +61,11 @@ def _(result: Tensor, bands: Bands, *, kind: str = "daylight", temperature: floa
 
 @node(bands={"reflectance": -3, "illuminant": 0, "return": -3}, accepts_low_rank=("reflectance",))
 def illuminate(
-    reflectance: Tensor | Mixture, illuminant: Tensor, *, times: Literal["once", "twice"] = "once"
-) -> Tensor | Mixture:
+    reflectance: Tensor | LowRankCube, illuminant: Tensor, *, times: Literal["once", "twice"] = "once"
+) -> Tensor | LowRankCube:
     """Multiply reflectance by the illuminant: once, as in nature, or twice, as in the paper's formulas.
 
-    In a low-rank cube, a `Mixture`, the planes stay and the basis spectra are multiplied.
+    In a low-rank cube, a `LowRankCube`, the planes stay and the basis spectra are multiplied.
 
     Shapes: reflectance (..., band, y, x), illuminant (band,) -> (..., band, y, x).
     Units:  relative spectral radiance; the radiance of a white scene has mean 1 over the bands.
@@ -75,16 +75,18 @@ def illuminate(
     """
     _same_bands(reflectance, illuminant)
     power = illuminant if times == "once" else illuminant.square()
-    if isinstance(reflectance, Mixture):
+    if isinstance(reflectance, LowRankCube):
         basis = reflectance.basis * power.to(reflectance.basis)[:, None]
-        by = power.detach().abs().to(reflectance.rest)
-        spread = reflectance.spread * by if reflectance.spread.numel() else reflectance.spread
-        return Mixture(reflectance.planes, basis, reflectance.rest * by, spread, reflectance.off * float(by.max()))
+        by = power.detach().abs().to(reflectance.residual_max)
+        spread = reflectance.residual_rms * by if reflectance.residual_rms.numel() else reflectance.residual_rms
+        return LowRankCube(
+            reflectance.planes, basis, reflectance.residual_max * by, spread, reflectance.residual_map * float(by.max())
+        )
     reflectance = single(reflectance)
     return reflectance * power.to(reflectance)[:, None, None]
 
 
-def _same_bands(reflectance: Tensor | Mixture, illuminant: Tensor) -> None:
+def _same_bands(reflectance: Tensor | LowRankCube, illuminant: Tensor) -> None:
     shape = tuple(reflectance.shape) if isinstance(reflectance, Tensor) else _shape(reflectance)
     if len(shape) < 3 or illuminant.ndim != 1 or shape[-3] != len(illuminant):
         raise ValueError(
@@ -93,19 +95,21 @@ def _same_bands(reflectance: Tensor | Mixture, illuminant: Tensor) -> None:
         )
 
 
-def _shape(mixture: Mixture) -> tuple[int, ...]:
+def _shape(mixture: LowRankCube) -> tuple[int, ...]:
     return len(mixture.basis), *mixture.planes.shape[1:]
 
 
 @illuminate.reference
-def _(reflectance: Tensor | Mixture, illuminant: Tensor, *, times: str = "once") -> Tensor | Mixture:
+def _(reflectance: Tensor | LowRankCube, illuminant: Tensor, *, times: str = "once") -> Tensor | LowRankCube:
     power = [float(p) ** (1 if times == "once" else 2) for p in illuminant]
-    if isinstance(reflectance, Mixture):
+    if isinstance(reflectance, LowRankCube):
         basis = torch.stack([row.double() * p for row, p in zip(reflectance.basis, power, strict=True)])
-        rest = torch.stack([column * p for column, p in zip(reflectance.rest.T, power, strict=True)], 1)
-        spread = [column * p for column, p in zip(reflectance.spread.T, power, strict=False)]
+        rest = torch.stack([column * p for column, p in zip(reflectance.residual_max.T, power, strict=True)], 1)
+        spread = [column * p for column, p in zip(reflectance.residual_rms.T, power, strict=False)]
         found = torch.stack(spread, 1) if spread else rest[:0, :0]
-        return Mixture(reflectance.planes.double(), basis, rest, found, reflectance.off.double() * max(power))
+        return LowRankCube(
+            reflectance.planes.double(), basis, rest, found, reflectance.residual_map.double() * max(power)
+        )
     return torch.stack([reflectance[..., b, :, :].double() * p for b, p in enumerate(power)], -3)
 
 
@@ -115,8 +119,8 @@ def _(*, times: str = "once") -> list[str]:
 
 
 @illuminate.check
-def _(result: Tensor | Mixture, *inputs: Any, **params: Any) -> list[Check]:
-    if isinstance(result, Mixture):
+def _(result: Tensor | LowRankCube, *inputs: Any, **params: Any) -> list[Check]:
+    if isinstance(result, LowRankCube):
         return [Check(f"{len(result.planes)} planes for {len(result.basis)} bands")]
     low = float(result.min())
     return [Check(f"radiance {low:.3g} to {float(result.max()):.4g}", low >= 0)]

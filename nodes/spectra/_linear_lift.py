@@ -10,7 +10,7 @@ from neusee.nodes._half_precision import single
 from neusee.nodes.spectra._low_rank_cube import Share, compress, mixture, said_of_planes
 from neusee.nodes.spectra._principal_planes import Source, few_planes
 from neusee.nodes.spectra._spectral_tables import mallett, paints, to_srgb
-from neusee.nodes.values import Bands, Mixture
+from neusee.nodes.values import Bands, LowRankCube
 
 _FIRST, _LAST = 380e-9, 780e-9  #: m, range of the measured reflectances and of the basis
 
@@ -40,11 +40,12 @@ def _(result: Tensor, rgb: Tensor, bands: Bands) -> list[Check]:
 
 
 @node(rtol=1e-6)
-def lift_mallett_mixture(rgb: Tensor, bands: Bands, *, within: Share = 1e-6) -> Mixture:
+def lift_mallett_mixture(rgb: Tensor, bands: Bands, *, within: Share = 1e-6) -> LowRankCube:
     """Compute the reflectance of `lift_mallett` as few planes, block by block: the cube is never in memory.
 
-    Shapes: rgb (3, y, x) -> planes (k, y, x), basis (band, k), rest and spread (k + 1, band) float64.
-    Units:  planes, rest and spread as reflectance; the basis has none.
+    Shapes: rgb (3, y, x) -> planes (k, y, x), basis (band, k), residual_max and residual_rms (k + 1, band)
+            float64.
+    Units:  planes and residuals as reflectance; the basis has none.
     Error:  that of `spectra.compress`, from the lift in float64; `lift_mallett` differs from that lift by round-off.
     Raises: ValueError where `lift_mallett` or `spectra.compress` raises ValueError.
     Source: as `lift_mallett`.
@@ -53,7 +54,7 @@ def lift_mallett_mixture(rgb: Tensor, bands: Bands, *, within: Share = 1e-6) -> 
 
 
 @lift_mallett_mixture.reference
-def _(rgb: Tensor, bands: Bands, *, within: float = 1e-6) -> Mixture:
+def _(rgb: Tensor, bands: Bands, *, within: float = 1e-6) -> LowRankCube:
     return _mixed_whole(lift_mallett, rgb, bands, within)
 
 
@@ -92,11 +93,12 @@ def _(result: Tensor, rgb: Tensor, bands: Bands) -> list[Check]:
 
 
 @node(rtol=1e-6)
-def lift_lmmse_mixture(rgb: Tensor, bands: Bands, *, within: Share = 1e-6) -> Mixture:
+def lift_lmmse_mixture(rgb: Tensor, bands: Bands, *, within: Share = 1e-6) -> LowRankCube:
     """Compute the reflectance of `lift_lmmse` as few planes, block by block: the cube is never in memory.
 
-    Shapes: rgb (3, y, x) -> planes (k, y, x), basis (band, k), rest and spread (k + 1, band) float64.
-    Units:  planes, rest and spread as reflectance; the basis has none.
+    Shapes: rgb (3, y, x) -> planes (k, y, x), basis (band, k), residual_max and residual_rms (k + 1, band)
+            float64.
+    Units:  planes and residuals as reflectance; the basis has none.
     Error:  that of `spectra.compress`, from the lift in float64; `lift_lmmse` differs from that lift by round-off.
     Raises: ValueError where `lift_lmmse` or `spectra.compress` raises ValueError.
     Source: as `lift_lmmse`.
@@ -105,7 +107,7 @@ def lift_lmmse_mixture(rgb: Tensor, bands: Bands, *, within: Share = 1e-6) -> Mi
 
 
 @lift_lmmse_mixture.reference
-def _(rgb: Tensor, bands: Bands, *, within: float = 1e-6) -> Mixture:
+def _(rgb: Tensor, bands: Bands, *, within: float = 1e-6) -> LowRankCube:
     return _mixed_whole(lift_lmmse, rgb, bands, within)
 
 
@@ -142,7 +144,7 @@ def _lifted(rgb: Tensor, matrix: Tensor) -> Tensor:
     return torch.relu_(matrix.to(rgb) @ rgb.flatten(1)).reshape(-1, *rgb.shape[1:])
 
 
-def _mixed(rgb: Tensor, matrix: Tensor, within: float) -> Mixture:
+def _mixed(rgb: Tensor, matrix: Tensor, within: float) -> LowRankCube:
     """Compute the planes; a picture that requires a gradient is lifted whole, so that the gradient flows."""
     needs_rgb(rgb)
     flat, exact = rgb.detach().flatten(1), matrix.to(rgb.device)
@@ -151,11 +153,11 @@ def _mixed(rgb: Tensor, matrix: Tensor, within: float) -> Mixture:
     return mixture(few_planes(source, within), _lifted(rgb, matrix) if rgb.requires_grad else rgb)
 
 
-def _mixed_whole(lift: Node, rgb: Tensor, bands: Bands, within: float) -> Mixture:
-    """Compute the reference of both mixtures: the principal components of the reference cube of the lift."""
+def _mixed_whole(lift: Node, rgb: Tensor, bands: Bands, within: float) -> LowRankCube:
+    """Compute the reference of both low-rank cubes: the principal components of the reference cube of the lift."""
     assert lift.hooks.reference is not None
     assert compress.hooks.reference is not None
-    found: Mixture = compress.hooks.reference(lift.hooks.reference(rgb, bands), within=within)
+    found: LowRankCube = compress.hooks.reference(lift.hooks.reference(rgb, bands), within=within)
     return found
 
 

@@ -8,22 +8,23 @@ from torch import Tensor
 
 from neusee.nodes import Check, node
 from neusee.nodes.spectra._principal_planes import Found, Source, few_planes
-from neusee.nodes.values import Mixture
+from neusee.nodes.values import LowRankCube
 
 Share = Annotated[float, Field(ge=0, allow_inf_nan=False)]  #: relative to the largest element
 
 
 @node(rtol=1e-6)
-def compress(cube: Tensor, *, within: Share = 1e-6) -> Mixture:
+def compress(cube: Tensor, *, within: Share = 1e-6) -> LowRankCube:
     """Approximate a cube within a bound by the fewest planes, the principal components of its spectra.
 
     A grey scene has one plane; a linear lift of three colours has three, and hardly more where few pixels are clipped.
 
-    Shapes: cube (band, y, x) -> planes (k, y, x), basis (band, k), rest and spread (k + 1, band) float64, off (y, x).
-    Units:  planes, rest, spread and off as the cube; the basis has none.
-    Error:  `spread[k]`, the root mean square error, is at most the largest of `within`, 2e-7 and eight round-off units
-            of the planes, times the largest element. `rest[k]` and `off` are the largest errors of a band and of a
-            pixel, measured on every pixel in float64. `rest[r]` for 0 < r < k is as a rule at most five times too
+    Shapes: cube (band, y, x) -> planes (k, y, x), basis (band, k), residual_max and residual_rms (k + 1, band)
+            float64, residual_map (y, x).
+    Units:  planes and residuals as the cube; the basis has none.
+    Error:  `residual_rms[k]` is at most the largest of `within`, 2e-7 and eight round-off units of the planes, times
+            the largest element. `residual_max[k]` and `residual_map` are the largest errors of a band and of a pixel,
+            measured on every pixel in float64. `residual_max[r]` for 0 < r < k is as a rule at most five times too
             large. The gradient treats the basis as constant.
     Raises: ValueError where the cube is not (band, y, x), has no pixels or holds NaN.
     Source: principal components, Pearson 1901; Maloney, J. Opt. Soc. Am. A 3, 1673 (1986) for spectra.
@@ -36,17 +37,18 @@ def compress(cube: Tensor, *, within: Share = 1e-6) -> Mixture:
     return mixture(few_planes(source, within), cube)
 
 
-def mixture(found: Found, cube: Tensor) -> Mixture:
+def mixture(found: Found, cube: Tensor) -> LowRankCube:
     """Return the planes as pictures; a cube that requires a gradient is projected here, so that the gradient flows."""
     if cube.requires_grad:
         planes = torch.tensordot(found.basis.T.to(cube), cube, 1)
     else:
         planes = found.planes.reshape(-1, *cube.shape[-2:])
-    return Mixture(planes, found.basis, found.rest, found.spread, found.off.reshape(cube.shape[-2:]))
+    left = found.residual_map.reshape(cube.shape[-2:])
+    return LowRankCube(planes, found.basis, found.residual_max, found.residual_rms, left)
 
 
 @compress.reference
-def _(cube: Tensor, *, within: float = 1e-6) -> Mixture:
+def _(cube: Tensor, *, within: float = 1e-6) -> LowRankCube:
     flat = cube.double().flatten(1)
     axes = torch.linalg.svd(flat, full_matrices=False)[0]
     errors = [flat - axes[:, :r] @ (axes[:, :r].T @ flat) for r in range(axes.shape[1] + 1)]
@@ -56,12 +58,15 @@ def _(cube: Tensor, *, within: float = 1e-6) -> Mixture:
     planes = (axes[:, :count].T @ flat).reshape(-1, *cube.shape[1:])
     rest = torch.stack([error.abs().amax(1) for error in errors])
     off = errors[count].abs().amax(0).reshape(cube.shape[1:])
-    return Mixture(planes, axes[:, :count], rest[: count + 1], spread[: count + 1], off)
+    return LowRankCube(planes, axes[:, :count], rest[: count + 1], spread[: count + 1], off)
 
 
 @compress.check
-def said_of_planes(result: Mixture, *inputs: object, **params: object) -> list[Check]:
-    """Report the number of planes and their distance from the cube, for any node that returns a `Mixture`."""
-    rms, most = (float(x[-1].max()) / max(float(result.rest[0].max()), 1e-300) for x in (result.spread, result.rest))
+def said_of_planes(result: LowRankCube, *inputs: object, **params: object) -> list[Check]:
+    """Report the number of planes and their distance from the cube, for any node that returns a `LowRankCube`."""
+    rms, most = (
+        float(x[-1].max()) / max(float(result.residual_max[0].max()), 1e-300)
+        for x in (result.residual_rms, result.residual_max)
+    )
     few = f"{len(result.planes)} planes for {len(result.basis)} bands"
     return [Check(f"{few}, within {rms:.2g} of the brightest, at worst {most:.2g}")]

@@ -25,13 +25,13 @@ class Source(NamedTuple):
 
 
 class Found(NamedTuple):
-    """The fields of a `Mixture`, with all pixels in one row."""
+    """The fields of a `LowRankCube`, with all pixels in one row."""
 
     planes: Tensor  #: (k, pixel)
     basis: Tensor  #: (band, k) float64
-    rest: Tensor  #: (k + 1, band) float64
-    spread: Tensor  #: (k + 1, band) float64
-    off: Tensor  #: (pixel,)
+    residual_max: Tensor  #: (k + 1, band) float64
+    residual_rms: Tensor  #: (k + 1, band) float64
+    residual_map: Tensor  #: (pixel,)
 
 
 def few_planes(source: Source, within: float) -> Found:

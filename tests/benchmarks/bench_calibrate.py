@@ -55,13 +55,13 @@ def by_pixel(problem, store, parameters):
     frames = run(recipe, store, names)
     light = [recipe.steps[name].params for name in names]
     pixels = [frames[name].double().flatten() for name in names]
-    k = 1.0 / p["gain"]
+    k = p["gain"]
 
     def once():
         for x, step in zip(pixels, light, strict=True):
             dark, lit = p["dark_current"] * step["exposure"] / 0.1, p["quantum_efficiency"] * step["photons"]
             numbers = (
-                k * (p["pedestal"] + dark + lit),
+                k * (p["offset"] + dark + lit),
                 k * (p["read_noise"] ** 2 + dark + lit) ** 0.5,
                 k * p["full_well"],
             )

@@ -113,7 +113,7 @@ DESIGNS = {
 }
 FOR_A_FILTER = "half-ring of 14 waves, then its samples, for a Wiener filter"
 DESIGNS[FOR_A_FILTER] = {
-    "kind": "element",
+    "kind": "recipe_mask",
     "iterations": 160,
     "learning_rate": 4e-3,
     "bands": None,

@@ -16,7 +16,7 @@ import torch
 from neusee.nodes.optics import image, image_channels
 from neusee.nodes.sensor import expose
 from neusee.nodes.spectra import bands, compress, lift_lmmse, responses, rows
-from neusee.nodes.values import Mixture, Psf
+from neusee.nodes.values import LowRankCube, Psf
 
 SCENE = bands(start=400e-9, stop=700e-9, count=31)
 RESPONSES = responses(SCENE)
@@ -34,7 +34,7 @@ def scene(rank, size):
     planes = rand(rank, *size, seed=2)
     each = basis.abs() * planes.abs().amax((1, 2)).double()
     rest = torch.cat([each.flip(1).cumsum(1).flip(1).T, torch.zeros(1, 31, dtype=torch.float64)])
-    return Mixture(planes, basis, rest), torch.tensordot(basis.float(), planes, 1)
+    return LowRankCube(planes, basis, rest), torch.tensordot(basis.float(), planes, 1)
 
 
 def psf(size):
@@ -105,7 +105,7 @@ def planes(repeats):
 
 def tell(size, what, done):
     wall, busy, found = done
-    left = float(found.rest[-1].max() / found.rest[0].max())
+    left = float(found.residual_max[-1].max() / found.residual_max[0].max())
     print(
         f"| {size[0]} x {size[1]} | {what} | {wall:.2f} ({busy:.2f}) | {len(found.planes)} | {left:.1e} |", flush=True
     )

@@ -78,7 +78,7 @@ def main(meshes: list[str]) -> None:
             for mesh in meshes:
                 found = done(Path(folder), mesh, case, "step", [*PLAIN, *words, *DOUBLE])
                 one = one or found
-                errors = " | ".join(f"{error(found, one, part):.1e}" for part in ("relief", "net", "critics"))
+                errors = " | ".join(f"{error(found, one, part):.1e}" for part in ("mask", "net", "critics"))
                 seconds = done(Path(folder), mesh, case, "timed", [*PLAIN, *words])["seconds"]
                 print(f"| {case} | {mesh} | {errors} | {seconds:.2f} |", flush=True)
 

@@ -23,7 +23,7 @@ from neusee.workflows.training.run_training import train
 SMALL = [
     "optics.samples=96", "optics.pitch=84.1 um", "optics.bands=9", "optics.window=[72, 72]", "scene.shape=[72, 72]",
     "sensor.shape=[48, 48]", "doe.grid=48", "train.network.kind=fft_mamba", "train.network.width=8",
-    "train.critics.width=8", "train.rates.weights=2e-3", "train.rates.biases=4e-3", "train.rates.element=2e-3",
+    "train.critics.width=8", "train.rates.weights=2e-3", "train.rates.biases=4e-3", "train.rates.mask=2e-3",
     "train.rates.halve=40", "train.rates.every=20", "train.stages.1.iterations=200", "train.stages.2.iterations=400",
     "train.stages.1.batch=2", "train.stages.2.batch=2", "train.keep=50", "train.show=200",
 ]  # fmt: skip

@@ -1,6 +1,6 @@
 """How much quicker a study of uncertainty is than as many runs: `python bench_uncertainty.py [RECIPE] [DRAWS]`.
 
-The sensor of RECIPE (paper_table1) is known as well as normal laws of 1 % say, but for the pedestal (1 e-). DRAWS (400)
+The sensor of RECIPE (paper_table1) is known as well as normal laws of 1 % say, but for the offset (1 e-). DRAWS (400)
 draws by the study, from an empty cache, with its page; against as many runs with the same outputs, from an empty cache
 each: in this process, median of three, and `neusee run` as a whole, once, which makes the page of a run too. Last, what
 the study takes when all its draws are there, and how it goes on when it is killed half way.
@@ -22,11 +22,11 @@ from neusee.workflows.store.result_store import Store
 
 OUTPUTS = "outputs=[saturated, lsr, transfer]"
 LAWS = [
-    "sensor.gain=lognormal(0.37, 1.01)",
+    "sensor.gain=lognormal(0.37 e-/DN, 1.01)",
     "sensor.quantum_efficiency=lognormal(0.56, 1.01)",
     "sensor.full_well=lognormal(25500 e-, 1.01)",
     "sensor.read_noise=lognormal(10.5 e-, 1.01)",
-    "sensor.pedestal=normal(390 e-, 1 e-)",
+    "sensor.offset=normal(390 e-, 1 e-)",
     "sensor.dark_current=lognormal(0.002 e-, 1.2)",
 ]
 

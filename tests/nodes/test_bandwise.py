@@ -143,6 +143,6 @@ def test_a_random_node_has_no_bands():
         node(bands={"light": 0, "return": 0})(noise)
 
 
-@pytest.mark.parametrize("path", ["optics.spot", "flare.ghosts", "spectra.illuminant"])
+@pytest.mark.parametrize("path", ["optics.laser_irradiance", "flare.ghosts", "spectra.illuminant"])
 def test_what_sums_over_the_bands_declares_none(path):
     assert next(n for n in NODES if n.path == path).bands is None

@@ -68,9 +68,9 @@ def dark(draw):
 
 def reading(draw):
     electrons, well = draw.electrons(), draw.often(None, draw.decades(10, 1e6))
-    noise = {"pedestal": draw.often(0.0, draw.decades(1e-6, 1e4)), "sigma": draw.often(0.0, draw.decades(1e-6, 1e4))}
+    noise = {"offset": draw.often(0.0, draw.decades(1e-6, 1e4)), "read_noise": draw.often(0.0, draw.decades(1e-6, 1e4))}
     bound = sensor.read_noise.hooks.skip_bound(TensorStats.of(electrons), **noise, full_well=well)
-    return bound, noise_change(electrons, noise["pedestal"], noise["sigma"] ** 2, well)
+    return bound, noise_change(electrons, noise["offset"], noise["read_noise"] ** 2, well)
 
 
 def largest_change(result, without):
@@ -138,8 +138,8 @@ def shining(draw):
     camera = {"focal_length": 0.1, "pixel_pitch": draw.decades(1e-6, 3e-5), "shape": (8, 8), "pixel": "zoh"}
     psf = optics.psf(pupil, **camera, sensor=draw.one_of("point", "integrated"))
     power = {"strength": draw.often(0.0, draw.decades(1e-9, 1e8)), **SENSOR, "exposure": draw.decades(1e-6, 1e3)}
-    found = optics.spot(psf, line, **power)
-    return optics.spot.hooks.zero_bound(Unread(), TensorStats.of(line), **power), float(found.max())
+    found = optics.laser_irradiance(psf, line, **power)
+    return optics.laser_irradiance.hooks.zero_bound(Unread(), TensorStats.of(line), **power), float(found.max())
 
 
 GHOSTS = {"focal_length": 0.1, "pixel_pitch": 3e-6, "count": 8, "energy": 1e-4, "spread": 2.0, "radius": 3e-4}
@@ -214,19 +214,21 @@ def test_what_is_not_added_is_no_brighter_than_stated(name, draws):
 def test_a_laser_without_light_needs_no_other_fact():
     nothing = TensorStats((3, 4, 4), "float32", 0.0, 0.0, 0.0, 0, True)
     assert sensor.expose.hooks.zero_bound(nothing, Unread(), Unread(), pixel_pitch=1e-6, exposure=1.0) == 0
-    assert optics.spot.hooks.zero_bound(Unread(), Unread(), strength=0.0, **SENSOR) == 0
+    assert optics.laser_irradiance.hooks.zero_bound(Unread(), Unread(), strength=0.0, **SENSOR) == 0
     assert flare.ghosts.hooks.zero_bound(nothing, Unread(), Unread(), **GHOSTS) == 0
 
 
 def test_noise_that_undoes_what_is_there_is_unbounded():
     found = TensorStats.of(torch.full((2, 2), -5.0))
-    assert sensor.read_noise.hooks.skip_bound(found, pedestal=5.0, sigma=0.0, full_well=None) == math.inf
+    assert sensor.read_noise.hooks.skip_bound(found, offset=5.0, read_noise=0.0, full_well=None) == math.inf
 
 
 @pytest.mark.parametrize("pedestal", [0.0, 30.0])
 def test_noise_of_numbers_below_zero_is_weighed_against_the_darkest(pedestal):
     electrons = torch.tensor([-100.0, 0.0], dtype=torch.float64)
-    found = sensor.read_noise.hooks.skip_bound(TensorStats.of(electrons), pedestal=pedestal, sigma=2.0, full_well=None)
+    found = sensor.read_noise.hooks.skip_bound(
+        TensorStats.of(electrons), offset=pedestal, read_noise=2.0, full_well=None
+    )
     assert found == pytest.approx(noise_change(electrons, pedestal, 4.0, None), rel=1e-12)
 
 

@@ -28,22 +28,25 @@ def slope_of(loss, x):
 @pytest.mark.parametrize("scale", [0.0, 1e-40, 1e-32])
 def test_an_opaque_mask_has_a_finite_loss_and_no_slope(log, scale):
     dark = torch.full((2, 5, 5), scale)
-    loss = float(losses.lsr(psf_of(dark), log=log))
+    loss = float(losses.suppression_loss(psf_of(dark), log=log))
     assert loss == pytest.approx(2 * math.log(1e-30) if log else 0.0, abs=1e-5 * abs(loss) + 1e-29)
-    assert float(slope_of(lambda x: losses.lsr(psf_of(x), log=log), dark).abs().max()) == 0
+    assert float(slope_of(lambda x: losses.suppression_loss(psf_of(x), log=log), dark).abs().max()) == 0
 
 
 def test_the_log_of_the_lsr_is_the_same_in_both_precisions_when_one_band_is_dark():
     psf = torch.rand(2, 5, 5, generator=torch.Generator().manual_seed(1))
     psf[0] = 0
-    single_, double = (float(losses.lsr(psf_of(x), log=True)) for x in (psf, psf.double()))
+    single_, double = (float(losses.suppression_loss(psf_of(x), log=True)) for x in (psf, psf.double()))
     assert single_ == pytest.approx(double, rel=1e-6)
 
 
 def test_the_reference_of_the_lsr_has_a_slope_where_some_pixels_are_black():
     psf = torch.rand(1, 5, 5, generator=torch.Generator().manual_seed(1), dtype=torch.float64)
     psf[0, :2] = 0
-    usual, truth = (slope_of(lambda x, f=f: f(psf_of(x)), psf) for f in (losses.lsr, losses.lsr.hooks.reference))
+    usual, truth = (
+        slope_of(lambda x, f=f: f(psf_of(x)), psf)
+        for f in (losses.suppression_loss, losses.suppression_loss.hooks.reference)
+    )
     torch.testing.assert_close(usual, truth)
 
 
@@ -110,10 +113,10 @@ def test_half_precision_is_computed_in_single(half):
     psf = psf_of(torch.rand(2, 16, 16, generator=torch.Generator().manual_seed(1)).to(half))
     wide = Psf(psf.intensity.float(), psf.clear_peak)
     one, two = (torch.rand(3, 16, 16, generator=torch.Generator().manual_seed(s)).to(half) for s in (1, 2))
-    for loss in (losses.charbonnier, losses.fft_l1, losses.bsr):
+    for loss in (losses.charbonnier, losses.fft_l1, losses.background_loss):
         assert loss(one, two).dtype == torch.float32
         assert float(loss(one, two)) == pytest.approx(float(loss(one.float(), two.float())), rel=1e-6)
-    assert float(losses.lsr(psf)) == pytest.approx(float(losses.lsr(wide)), rel=1e-6)
+    assert float(losses.suppression_loss(psf)) == pytest.approx(float(losses.suppression_loss(wide)), rel=1e-6)
     torch.testing.assert_close(metrics.mtf(psf).rms, metrics.mtf(wide).rms)
 
 
@@ -135,8 +138,8 @@ def test_a_ratio_of_what_is_no_number_is_none():
     broken = picture.clone()
     broken[0, 2, 2] = math.nan
     for pair in ((broken, picture), (picture, broken)):
-        assert math.isnan(float(losses.bsr(*pair)))
-    assert math.isnan(float(losses.lsr(psf_of(broken))))
+        assert math.isnan(float(losses.background_loss(*pair)))
+    assert math.isnan(float(losses.suppression_loss(psf_of(broken))))
     assert math.isnan(float(losses.gradient_penalty(broken)))
 
 
@@ -177,7 +180,7 @@ def test_the_light_of_what_is_no_number_is_not_left_out():
     assert math.isnan(float(metrics.bsr(image, image)[0]))
     raw = torch.zeros(3, 5, 5)
     raw[0, 2, 2] = math.nan
-    well = {"full_well": 25500.0, "gain": 0.37}
+    well = {"full_well": 25500.0, "gain": 1 / 0.37}
     assert int(restore.clipped(raw, **well).sum()) == 1
     assert float(metrics.saturated(raw, **well).pixels) == 1
 
@@ -199,12 +202,12 @@ def test_the_noise_of_the_dark_has_no_slope_without_end(photons):
 
 def test_half_precision_does_not_end_the_light_at_65504():
     half = torch.full((3, 4, 4), 60000.0, dtype=torch.float16)
-    assert float(sensor.gather(half, [half]).max()) == 120000
+    assert float(sensor.add_photons(half, [half]).max()) == 120000
     assert float(sensor.full_well(half, capacity=255000.0).max()) == 60000
-    assert float(sensor.digitize(half, gain=2.0, gain_unit="DN/e-").max()) == 65535
-    assert float(restore.electrons(half, gain=10.0, pedestal=0.0).max()) == 600000
-    reference = sensor.digitize.hooks.reference(half, gain=0.37)
-    torch.testing.assert_close(sensor.digitize(half, gain=0.37), reference, rtol=0, atol=0)
+    assert float(sensor.digitize(half, gain=2.0).max()) == 65535
+    assert float(restore.electrons(half, gain=0.1, offset=0.0).max()) == 600000
+    reference = sensor.digitize.hooks.reference(half, gain=1 / 0.37)
+    torch.testing.assert_close(sensor.digitize(half, gain=1 / 0.37), reference, rtol=0, atol=0)
 
 
 # --- reliefs ----------------------------------------------------------------------------------------------------------

@@ -13,7 +13,7 @@ from neusee.nodes.restore._networks._fft_mamba import FFTMamba
 from neusee.nodes.restore._networks._nafnet import NAFNet
 from neusee.nodes.restore._networks._restorer import started
 from neusee.nodes.restore._networks._unet import UNet
-from neusee.nodes.values import Channels, Dirt, Mixture, Psf, Pupil
+from neusee.nodes.values import Channels, Dirt, LowRankCube, Psf, Pupil
 
 HERE = Path(__file__).parent
 
@@ -49,7 +49,7 @@ DISC = torch.ones(16, 16)
 HEIGHT = rand(16, 16, dtype=torch.float32) * 1e-6
 PUPIL = Pupil(DISC, DISC, HEIGHT, 0 * HEIGHT, INDEX, BANDS.centres, torch.tensor(5e-4, dtype=torch.float64))
 DIRT = Dirt(rand(16, 16, dtype=torch.float32), HEIGHT)
-MIXTURE = Mixture(rand(2, 12, 12), rand(4, 2), torch.zeros(3, 4, dtype=torch.float64))
+LOW_RANK = LowRankCube(rand(2, 12, 12), rand(4, 2), torch.zeros(3, 4, dtype=torch.float64))
 ROWS = spectra.rows(BANDS, RESPONSES)
 CHANNELS = Channels(rand(3, 12, 12), rand(3, 4), rand(4), torch.tensor(0.0, dtype=torch.float64))
 LEVEL = 1e3 * rand(4)
@@ -59,9 +59,9 @@ GRID = {"samples": 16, "pitch": 5e-4, "diameter": 8e-3}
 LENS = {"focal_length": 0.11, "pixel_pitch": 2.9e-6}
 WELL = {"full_well": 25500.0, "quantum_efficiency": 0.56, "pixel_pitch": 2.9e-6, "exposure": 0.1}
 SHUTTER = {"pixel_pitch": 2.9e-6, "exposure": 0.1}
-ADC = {"full_well": 25500.0, "gain": 0.37}
-NOISE = {"quantum_efficiency": 0.56, "dark_current": 2.0, "dark_exposure": 0.1, "pedestal": 50.0, "full_well": 5e4}
-CAMERA = {"gain": 2.0, **NOISE, "sigma": 3.0, "bits": 12}
+ADC = {"full_well": 25500.0, "gain": 1 / 0.37}
+NOISE = {"quantum_efficiency": 0.56, "dark_current": 2.0, "dark_exposure": 0.1, "offset": 50.0, "full_well": 5e4}
+CAMERA = {"gain": 0.5, **NOISE, "read_noise": 3.0, "bits": 12}
 
 
 def _levels():
@@ -109,9 +109,11 @@ def _networks(folder):
 
 CASES = {
     "calibrate.camera": Case(
-        "gain", (LEVELS,), {"gain": number(2.0), "quantum_efficiency": 0.56, "dark_signal": 25.0, "dark_noise": 3.0}
+        "gain",
+        (LEVELS,),
+        {"gain": number(0.5), "quantum_efficiency": 0.56, "dark_signal": 25.0, "temporal_dark_noise": 3.0},
     ),
-    "calibrate.density": Case("gain", (SUFFICIENT,), {"gain": number(2.0), **NOISE, "read_noise": 3.0, "bits": 12}),
+    "calibrate.density": Case("gain", (SUFFICIENT,), {"gain": number(0.5), **NOISE, "read_noise": 3.0, "bits": 12}),
     "calibrate.expose": Case("photons", (), {"photons": number(500.0), "exposure": 0.1, "shape": (4, 4), **CAMERA}),
     "calibrate.least_squares": Case("0.variance", (LEVELS,)),
     "calibrate.levels": Case("0.0.mean", (EACH,)),
@@ -127,12 +129,12 @@ CASES = {
     "doe.zernike": Case("coefficients.4", (), {"coefficients": {4: number(0.3), 6: number(0.1)}, **GRID}),
     "flare.dirt": Case("grease", (), {"grease": number(1e-7), "dust": 3.0, **GRID}),
     "flare.ghosts": Case("0", (rand(3, 12, 12), LINE, DIRECTION), {**LENS, "count": 3, "radius": 3e-5}),
-    "losses.bsr": Case("0", (SCENE, PLAIN)),
+    "losses.background_loss": Case("0", (SCENE, PLAIN)),
     "losses.charbonnier": Case("0", (PICTURE, OTHER)),
     "losses.contrast": Case("0.intensity", (WIDE,)),
     "losses.fft_l1": Case("0", (PICTURE, OTHER)),
     "losses.gradient_penalty": Case("0", (rand(2, 3, 5),)),
-    "losses.lsr": Case("0.intensity", (PSF,)),
+    "losses.suppression_loss": Case("0.intensity", (PSF,)),
     "losses.mrae": Case("0", (SCENE, PLAIN)),
     "losses.wiener": Case("0.intensity", (WIDE, LIGHT, RESPONSES, BANDS)),
     "metrics.bsr": Case("0", (SCENE, PLAIN)),
@@ -140,29 +142,29 @@ CASES = {
     "metrics.limits": Case("0.clear_peak", (PSF,)),
     "metrics.lsr": Case("0.intensity", (PSF,)),
     "metrics.mtf": Case("0.intensity", (WIDE,)),
-    "metrics.peak": Case("0", (SCENE, BANDS, LEVEL), WELL),
+    "metrics.peak_irradiance": Case("0", (SCENE, BANDS, LEVEL), WELL),
     "metrics.quality": Case("0", (PICTURE.float(), OTHER.float())),
     "metrics.saturated": Case("0", (RAW,), ADC),
     "optics.direction": Case("focal_length", (), {**LENS, "focal_length": number(0.11), "shape": (64, 64)}),
     "optics.image": Case("1.intensity", (SCENE, PSF)),
-    "optics.image_channels": Case("1.intensity", (MIXTURE, PSF, ROWS)),
+    "optics.image_channels": Case("1.intensity", (LOW_RANK, PSF, ROWS)),
     "optics.psf": Case("0.height", (PUPIL,), {**LENS, "shape": (9, 9)}),
     "optics.pupil": Case("0", (HEIGHT, INDEX, BANDS, DIRT), {"pitch": 5e-4, "diameter": 8e-3}),
-    "optics.spot": Case("0.intensity", (Psf(rand(3, 9, 9), rand(3)), LINE), {"strength": 10.0, **WELL}),
+    "optics.laser_irradiance": Case("0.intensity", (Psf(rand(3, 9, 9), rand(3)), LINE), {"strength": 10.0, **WELL}),
     "restore.clipped": Case("0", (RAW,), ADC),
     "restore.colour": Case("0", (PICTURE, rand(3, 3))),
     "restore.colour_matrix": Case("1", (BANDS, LIGHT, RESPONSES, LEVEL), {**SHUTTER, "quantum_efficiency": 0.56}),
-    "restore.electrons": Case("0", (RAW,), {"gain": 0.37, "pedestal": 50.0}),
+    "restore.electrons": Case("0", (RAW,), {"gain": 1 / 0.37, "offset": 50.0}),
     "restore.wiener": Case(
         "0", (WIDE_RAW, PSF, LIGHT, RESPONSES, BANDS, torch.zeros(3, 48, 48, dtype=torch.bool)), {"read_noise": 5.0}
     ),
     "scene.targets": Case("high", (), {"kind": "siemens", "shape": (12, 12), "high": number(0.9)}),
     "sensor.crop": Case("0", (SCENE,), {"shape": (8, 8)}),
     "sensor.dark_current": Case("0", (RAW,), {"mean": 2.0, "full_well": 25500.0}),
-    "sensor.digitize": Case("0", (RAW,), {"gain": 0.37}),
+    "sensor.digitize": Case("0", (RAW,), {"gain": 1 / 0.37}),
     "sensor.expose": Case("0", (SCENE, BANDS, RESPONSES, LEVEL), SHUTTER),
     "sensor.full_well": Case("0", (RAW,), {"capacity": 3000.0}),
-    "sensor.gather": Case("0", (RAW, [RAW], [RAW])),
+    "sensor.add_photons": Case("0", (RAW, [RAW], [RAW])),
     "sensor.level": Case("0", (SCENE, BANDS, RESPONSES), {"strength": 0.7, **WELL}),
     "sensor.limits": Case(
         "read_noise", (), {"full_well": 25500.0, "quantum_efficiency": 0.56, "read_noise": number(5.0)}
@@ -175,14 +177,14 @@ CASES = {
             **ADC,
             "full_well": number(25500.0),
             "quantum_efficiency": 0.56,
-            "pedestal": 50.0,
-            "sigma": 3.0,
+            "offset": 50.0,
+            "read_noise": 3.0,
             "dark": 2.0,
             "levels": 3,
             "pixels": 64,
         },
     ),
-    "sensor.read_noise": Case("0", (RAW,), {"pedestal": 50.0, "sigma": 3.0}),
+    "sensor.read_noise": Case("0", (RAW,), {"offset": 50.0, "read_noise": 3.0}),
     "sensor.saturation": Case("0.centres", (BANDS,), WELL),
     "spectra.bands": Case("start", (), {"start": number(450e-9), "stop": 650e-9, "count": 4}),
     "spectra.compress": Case("0", (SCENE,)),

@@ -39,7 +39,7 @@ def step(job: dict[str, Any], mesh: Mesh) -> None:
     samples = TrainingStream(recipe, how, _photographs(recipe, how, True), Store(Path(job["store"])), "cpu", None, mesh)
     losses, _ = learner.iterate(samples, 1, 0)
     if mesh.first:
-        parts = {n: getattr(learner, n).named_parameters() for n in ("relief", "net", "critics")}
+        parts = {n: getattr(learner, n).named_parameters() for n in ("mask", "net", "critics")}
         grads = {f"{n}.{k}": p.grad for n, named in parts.items() for k, p in named}
         shared = {"steps": sorted(samples.shards.steps), "sums": sorted(samples.shards.rows), "cut": samples._each._cut}
         torch.save({"grads": grads, "losses": losses, "shared": shared}, Path(job["folder"], "step.pt"))

@@ -63,7 +63,7 @@ def _sensor(rng):
     return [
         f"sensor.read_noise={rng.choice((0, 2, 10.5, 100))} e-",
         f"sensor.dark_current={rng.choice((0, 0.002, 1, 30))} e-",
-        f"sensor.pedestal={rng.choice((0, 390))} e-",
+        f"sensor.offset={rng.choice((0, 390))} e-",
         f"sensor.background={rng.choice((0, 0.01, 0.7, 2))}",
         f"sensor.exposure={10 ** rng.uniform(-6, 2):.3g} s",
         f"sensor.full_well={rng.choice((100, 2000, 25500, 100000))} e-",

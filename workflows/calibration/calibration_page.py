@@ -98,7 +98,7 @@ def with_uncertainty(mean: float, sd: float) -> str:
 def unit_of(name: str, params: Mapping[str, Any]) -> str:
     """Return the unit of a parameter of `density` or of `camera`."""
     if name == "gain":
-        return str(params["gain_unit"])
+        return "DN/e-"
     if name == "dark_current":
         return f"e- in {params['dark_exposure']:g} s"
     return {"dark_signal": "DN", "drift": "DN", **dict.fromkeys(_PURE, "")}.get(name, "e-")
@@ -197,7 +197,7 @@ def _curve(result: CalibrationResult) -> Section:
     flat = result.chains.flat
     look = result.problem.likelihood(flat[rng.integers(len(flat), size=_PREDICTED)])
     levels = result.problem.levels
-    mean, variance, freedom = look.mean.numpy(), look.variance.numpy(), levels.freedom.numpy()
+    mean, variance, freedom = look.mean.numpy(), look.variance.numpy(), levels.degrees_of_freedom.numpy()
     chance = rng.standard_normal(variance.shape) * np.sqrt(2 / freedom.clip(1))
     whole: NDArray[np.bool_] = np.asarray((variance > 0).all(0))
     whole[levels.cell_level.numpy()] = False
@@ -214,7 +214,7 @@ def _moments(levels: Sufficient | Levels) -> tuple[FloatArray, FloatArray]:
     if isinstance(levels, Levels):
         return levels.mean.numpy(), levels.variance.numpy()
     at, value, count = (x.numpy() for x in levels[-3:])
-    total, mean, variance = (x.numpy() for x in (levels.numbers, levels.mean, levels.variance))
+    total, mean, variance = (x.numpy() for x in (levels.pixels, levels.mean, levels.variance))
     sums = [np.bincount(at, count * value**n, minlength=len(total)) for n in range(3)]
     every = total + sums[0]
     middle = (total * mean + sums[1]) / every
@@ -227,9 +227,7 @@ def _corner(result: CalibrationResult) -> Section:
     every = max(1, result.chains.flat.shape[0] // _CORNER)
     shown = np.stack([x.reshape(-1)[::every] for x in draws.values()], -1)
     names = [f"{r.name.replace('_', ' ')}\n{r.unit}" for r in result.rows()]
-    text = (
-        "Every pair of parameters; the recipe's own values are orange. Gain, pedestal, noise and efficiency correlate."
-    )
+    text = "Every pair of parameters; the recipe's own values are orange. Gain, offset, noise and efficiency correlate."
     picture = figures.corners(shown, names, [r.nominal for r in result.rows()])
     return Section("Parameters in pairs", text, picture=picture)
 

@@ -49,7 +49,7 @@ class SensorPosterior:
         density, prior, kind = _pair(recipe)
         source = str(density.wires["levels"])
         done = run(recipe, store, (density.name, prior.name, source))
-        coordinates = kind.of(done[prior.name], density.params, density.params["gain_unit"])
+        coordinates = kind.of(done[prior.name], density.params)
         free = [f"{density.name}.{name}" for name in coordinates.names]
         quick = replace(density, params={**density.params, "told": False})
 

@@ -160,7 +160,7 @@ def _of_peak(
 
 def _of_data(problem: SensorPosterior, mode: LaplaceFit, identifiability: Identifiability) -> Iterator[Check]:
     look = problem.likelihood(mode.theta[None])
-    if float(look.freedom.sum()) > len(identifiability.estimated):
+    if float(look.degrees_of_freedom.sum()) > len(identifiability.estimated):
         found = goodness_of_fit(look, len(identifiability.estimated))
         said = f"deviance {found.deviance:.1f} of {found.freedom:.0f} degrees of freedom, p = {found.p:.2g}"
         yield Check("the model of the sensor fits the levels", said, f"p above {MISFIT}", _mark(found.good))
@@ -178,13 +178,13 @@ def goodness_of_fit(likelihood: Likelihood, free: int = 0) -> GoodnessOfFit:
     """
     from scipy.special import chdtrc
 
-    if not len(likelihood.freedom):
+    if not len(likelihood.degrees_of_freedom):
         raise ValueError("this likelihood has no deviances: compute it with told: true")
-    if likelihood.deviance.numel() != len(likelihood.freedom):
+    if likelihood.deviance.numel() != len(likelihood.degrees_of_freedom):
         raise ValueError(
             f"deviances {tuple(likelihood.deviance.shape)} are not of one sensor: give one row of parameters"
         )
-    deviance, freedom = float(likelihood.deviance.sum()), float(likelihood.freedom.sum()) - free
+    deviance, freedom = float(likelihood.deviance.sum()), float(likelihood.degrees_of_freedom.sum()) - free
     if freedom <= 0:
         raise ValueError(f"{freedom + free:.0f} numbers cannot test {free} free parameters: give more levels")
     return GoodnessOfFit(deviance, freedom, float(chdtrc(freedom, deviance)))

@@ -26,6 +26,7 @@ _UNITS_IN_WORDS = {
     "Angle": "angle, such as 1 mrad",
     "Temperature": "temperature > 0, such as 6504 K",
     "Electrons": "charge >= 0, such as 390 e-",
+    "Gain": "gain > 0, such as 2.7 DN/e- or 0.37 e-/DN",
     "Waves": "wavelengths of path, such as 2 waves",
     "DataFile": "a file",
     "DataFiles": "files: a path, a folder, a pattern such as dark/*.png, or a list of these",
@@ -97,7 +98,7 @@ def node_lines(name: str) -> list[str]:
     if name == "glossary":
         return glossary_lines()
     if name == "reading":
-        return [line for row in READINGS for line in (*_reading(row.name), "")]
+        return [line for row in READINGS for line in (*_reading(row.path), "")]
     found = dict(all_nodes())
     if name not in found:
         raise LookupError(f"no node {name}: {nearest(name, found)}")
@@ -186,20 +187,23 @@ def _uses(name: str) -> Iterator[tuple[str, Any]]:
 
 
 def _readings_of(step: Any) -> Iterator[tuple[str, str]]:
+    from neusee.workflows.recipe.paper_readings import READINGS
+
     for name, value in (step.get("with") or {}).items():
-        if match := re.fullmatch(r"\$\{reading\.(\w+)\}", str(value)):
+        match = re.fullmatch(r"\$\{(\w+\.\w+)\}", str(value))
+        if match and (match[1].startswith("reading.") or any(row.path == match[1] for row in READINGS)):
             yield match[1], name
 
 
-def _reading(name: str) -> list[str]:
+def _reading(path: str) -> list[str]:
     """Return the lines of a contradiction of the paper: its text, the two readings, and the groups that choose them."""
     from neusee.workflows.recipe.paper_readings import READINGS
 
-    row = next((r for r in READINGS if r.name == name), None)
+    row = next((r for r in READINGS if r.path == path), None)
     if row is None:
-        return [f"reading.{name}"]
+        return [path]
     return [
-        f"reading.{row.name} ({row.number}): {row.matter}",
+        f"{row.path} ({row.number}): {row.matter}",
         f"  coherent (in force by default): {row.coherent}, because {row.reason}",
         f"  as printed (reading=as_printed): {row.as_printed}",
     ]

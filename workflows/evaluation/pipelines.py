@@ -26,7 +26,7 @@ CASES: dict[str, float | None] = {
     "red": 650e-9,
     NONE: None,
 }
-_PIPELINE = re.compile(r"(?P<mask>[\w-]+)(?:@(?P<relief>[^+]+))?\+(?P<restorer>[\w-]+)(?:@(?P<weights>.+))?")
+_PIPELINE = re.compile(r"(?P<mask>[\w-]+)(?:@(?P<height>[^+]+))?\+(?P<restorer>[\w-]+)(?:@(?P<weights>.+))?")
 _HOW = "write MASK+RESTORER, such as flat+none, five_half_rings+wiener or pixelwise@mask.npy+nafnet@net.safetensors"
 
 
@@ -40,7 +40,7 @@ class Pipeline:
 
     mask: str  #: an option of `doe`
     restorer: str  #: an option of `restore`, or none
-    relief: Path | None = None
+    height_file: Path | None = None
     weights: Path | None = None
 
     @property
@@ -51,7 +51,7 @@ class Pipeline:
     @property
     def front(self) -> str:
         """Return the mask with its file."""
-        return self.mask + (f"@{self.relief.name}" if self.relief else "")
+        return self.mask + (f"@{self.height_file.name}" if self.height_file else "")
 
     @property
     def back(self) -> str:
@@ -108,9 +108,9 @@ def read_pipelines(text: str, folder: Path) -> list[Pipeline]:
         if match is None:
             wrong.append(f"{word}: {_HOW}")
             continue
-        relief, weights = (folder / Path(x).expanduser() if (x := match[k]) else None for k in ("relief", "weights"))
-        found.append(Pipeline(match["mask"], match["restorer"], relief, weights))
-        wrong += [f"{word}: no file {path}" for path in (relief, weights) if path and not path.is_file()]
+        height, weights = (folder / Path(x).expanduser() if (x := match[k]) else None for k in ("height", "weights"))
+        found.append(Pipeline(match["mask"], match["restorer"], height, weights))
+        wrong += [f"{word}: no file {path}" for path in (height, weights) if path and not path.is_file()]
     twice = {p.name for p in found if [q.name for q in found].count(p.name) > 1}
     wrong += [f"{name}: stands twice" for name in sorted(twice)]
     if not found and not wrong:
@@ -150,8 +150,8 @@ def _one_line(problem: Diagnostic) -> str:
 def _words(pipeline: Pipeline) -> list[str]:
     """Return the changes of the recipe that make it this pipeline."""
     words = [f"doe={pipeline.mask}"]
-    if pipeline.relief:
-        words.append(f"doe.{_takes('doe', pipeline.mask)}={pipeline.relief.absolute()}")
+    if pipeline.height_file:
+        words.append(f"doe.{_takes('doe', pipeline.mask)}={pipeline.height_file.absolute()}")
     if pipeline.restorer != NONE:
         words.append(f"restore={pipeline.restorer}")
     if pipeline.weights:

@@ -2,9 +2,10 @@
 
 from __future__ import annotations
 
+import math
 import re
 from collections import defaultdict
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from contextlib import suppress
 from pathlib import Path
 from typing import Any
@@ -93,7 +94,7 @@ def _both(written: Any, old: Any, new: Any) -> tuple[str, str]:
     if isinstance(old, Mapping) and isinstance(new, Mapping):
         return _items(old, new)
     unit = _unit(written, new)
-    before = spoken(old / unit[0]) if unit and _is_number(old) else spoken(old)
+    before = spoken(unit[0](old)) if unit and _is_number(old) else spoken(old)
     if before in (spoken(new), after.partition(" ")[0]):  # they differ by less than is shown
         return repr(old), repr(new)
     return before, after
@@ -102,7 +103,7 @@ def _both(written: Any, old: Any, new: Any) -> tuple[str, str]:
 def _in_unit_of(written: Any, new: Any, old: Any) -> str:
     """Return an old number with the unit of the present one."""
     unit = _unit(written, new)
-    return f"{spoken(old / unit[0])} {unit[1]}" if unit and _is_number(old) else spoken(old)
+    return f"{spoken(unit[0](old))} {unit[1]}" if unit and _is_number(old) else spoken(old)
 
 
 def _is_number(value: Any) -> bool:
@@ -123,17 +124,23 @@ def _as_written(written: Any, new: Any) -> str:
     return spoken(new)
 
 
-def _unit(written: Any, new: Any) -> tuple[float, str] | None:
-    """Return the SI value of a written quantity's unit, and its name; None without a unit."""
+def _unit(written: Any, new: Any) -> tuple[Callable[[float], float], str] | None:
+    """Return the function from SI to a written quantity's unit, and the unit's name; None without a unit."""
     match = _QUANTITY.fullmatch(written.strip()) if isinstance(written, str) else None
     if match is None or not _is_number(new):
         return None
+    if match[2].strip() == "e-/DN":
+        return (lambda si: 1.0 / si if si else math.inf), match[2]
     if new and float(match[1]):
-        return new / float(match[1]), match[2]
-    for si in ("m", "s", "rad", "K", "e-", "waves"):
+        return _times(float(match[1]) / new), match[2]
+    for si in ("m", "s", "rad", "K", "e-", "waves", "DN/e-"):
         with suppress(ValueError):
-            return read_quantity(f"1 {match[2]}", si), match[2]
+            return _times(1.0 / read_quantity(f"1 {match[2]}", si)), match[2]
     return None
+
+
+def _times(factor: float) -> Callable[[float], float]:
+    return lambda si: si * factor
 
 
 def spoken(value: Any) -> str:

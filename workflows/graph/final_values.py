@@ -9,7 +9,7 @@ from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, field
 from typing import Any
 
-_BARE = re.compile(r"[A-Za-z_µ/][\w µ./+-]*(?<! )|[-+]?\d[\d.eE+-]* [A-Za-zµ][\w-]*")
+_BARE = re.compile(r"[A-Za-z_µ/][\w µ./+-]*(?<! )|[-+]?\d[\d.eE+-]* [A-Za-zµ][\w/-]*")
 _WORDS = {"true", "false", "null", "yes", "no", "on", "off"}
 
 

@@ -1,7 +1,7 @@
 """Readings of the paper where the paper contradicts itself: every choice, with its reason.
 
 The source is Peng et al., "Learning to See Through Flare", ICCV 2025 workshops. Each row is one
-parameter of the group ``reading``; no contradiction is corrected silently.
+parameter that the groups ``reading`` decide; no contradiction is corrected silently.
 """
 
 from __future__ import annotations
@@ -19,6 +19,12 @@ class Reading(NamedTuple):
     coherent: object
     as_printed: object
     reason: str
+    block: str = "reading"  #: of the recipe, in which the parameter stands
+
+    @property
+    def path(self) -> str:
+        """Where the parameter stands in a recipe."""
+        return f"{self.block}.{self.name}"
 
 
 READINGS = (
@@ -64,7 +70,7 @@ READINGS = (
         "detection is binomial, so electrons are Poisson; before it sigma is low by sqrt(0.56) = 0.748",
     ),
     Reading(
-        "pedestal_subtracted",
+        "offset_subtracted",
         "C15",
         "a read noise with a mean of 390 e-",
         True,
@@ -72,12 +78,13 @@ READINGS = (
         "a mean is an offset, known from calibration and subtracted before restoration",
     ),
     Reading(
-        "gain_unit",
+        "gain",
         "C17",
         "a gain of 0.37 without a unit",
-        "e-/DN",
-        "DN/e-",
+        "0.37 e-/DN",
+        "0.37 DN/e-",
         "25 500 e- / 0.37 = 68 919 DN fills 16 bit; 0.37 DN/e- never passes 9 435 DN",
+        "sensor",
     ),
     Reading(
         "rounding",
@@ -107,9 +114,9 @@ READINGS = (
 
 
 def in_force(values: dict[str, object]) -> Iterable[tuple[Reading, str]]:
-    """Yield each reading with its state: ``coherent``, ``as printed``, or another value."""
+    """Yield each reading with its state, from values by path: ``coherent``, ``as printed``, or another value."""
     for row in READINGS:
-        if row.name in values:
-            value = values[row.name]
+        if row.path in values:
+            value = values[row.path]
             known = {str(row.coherent): "coherent", str(row.as_printed): "as printed"}
             yield row, known.get(str(value), str(value))

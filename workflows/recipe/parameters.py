@@ -16,6 +16,7 @@ from neusee.nodes import Node, ParameterError
 from neusee.nodes.units import IsFile
 from neusee.workflows.graph.diagnostics import Diagnostic, Location, nearest
 from neusee.workflows.recipe.text.references import broken
+from neusee.workflows.recipe.text.renamed_keys import instead, new_name
 from neusee.workflows.recipe.text.yaml_values import Value, kind
 
 _LONGEST = 40  #: characters of a value that a message repeats
@@ -86,14 +87,15 @@ def _problems(
     details = error.errors(include_url=False)
     strangers = [str(e["loc"][0]) for e in details if e["type"] == "extra_forbidden"]
     meant = {nearest(name, node.params.model_fields) for name in strangers}
+    now = {new_name(f"{node.path}.{name}") for name in strangers}
     wrong: dict[tuple[Location, str], list[str]] = {}
     for e in details:
         name = str(e["loc"][0])
         if e["type"] == "extra_forbidden":
-            hint = nearest(name, node.params.model_fields)
-            yield Diagnostic(values[name].key, f"{given.name}.{name}", f"unknown to {node.path}; {hint}")
+            unknown = f"unknown to {node.path}; {nearest(name, node.params.model_fields)}"
+            yield Diagnostic(values[name].key, f"{given.name}.{name}", instead(f"{node.path}.{name}") or unknown)
         elif e["type"] == "missing" and len(e["loc"]) == 1:
-            if f"did you mean {name}?" not in meant:
+            if f"did you mean {name}?" not in meant and name not in now:
                 yield Diagnostic(step, f"{given.name}.{name}", f"is missing: {node.path} needs this parameter")
         else:
             value = _deepest(values[name], e["loc"][1:])

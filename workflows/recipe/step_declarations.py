@@ -15,6 +15,7 @@ import neusee.nodes
 from neusee.nodes import Node
 from neusee.workflows.graph.diagnostics import Diagnostic, nearest
 from neusee.workflows.recipe.text.references import References, Scope, broken
+from neusee.workflows.recipe.text.renamed_keys import instead
 from neusee.workflows.recipe.text.yaml_values import Value, kind
 
 _KEYS = ("node", "each", "from", "with", "device")
@@ -156,6 +157,8 @@ def _is_item_list(block: Value) -> bool:
 def find_node(name: str) -> Node:
     """Return the node of a name such as ``sensor.digitize``; raise `LookupError` with the nearest name."""
     family, _, attribute = name.partition(".")
+    if now := instead(name):
+        raise LookupError(f"{name} {now}")
     if not _is_family(family):
         raise LookupError(f"no family {family}; {_elsewhere(attribute) or nearest(family, families())}")
     nodes = nodes_of(family)

@@ -14,6 +14,7 @@ from neusee.workflows.graph.diagnostics import Diagnostic, Location, nearest
 from neusee.workflows.graph.recipe_graph import Step, Wire
 from neusee.workflows.recipe.step_declarations import Declared
 from neusee.workflows.recipe.text.references import BROKEN, References
+from neusee.workflows.recipe.text.renamed_keys import new_name
 from neusee.workflows.recipe.text.yaml_values import Value, kind
 
 _NAMED = 12  #: steps of a cycle that a message names
@@ -125,7 +126,9 @@ class Wiring:
         if name not in self.steps:
             hint = nearest(name, self.steps)
             hint = hint if hint.startswith("did you mean") else f"check the name{makers}"
-            return self._refuse(value, path, f"no step {name}; {hint}")
+            now = new_name(f"steps.{name}")
+            told = f"step {name} is called {now.removeprefix('steps.')} now" if now else f"no step {name}; {hint}"
+            return self._refuse(value, path, told)
         producer = self.steps[name]
         fixed = {dim: item for dim, item in here.items() if dim in producer.dims}
         if wanted is not None:

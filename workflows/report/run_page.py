@@ -185,13 +185,14 @@ def _sampling(recipe: Recipe) -> list[str]:
 
 
 def _readings(recipe: Recipe) -> list[dict[str, str]]:
-    values = {
-        p.removeprefix("reading."): s.value for p, s in recipe.config.settings.items() if p.startswith("reading.")
-    }
+    settings = recipe.config.settings
+    if not any(path.startswith("reading.") for path in settings):
+        return []
+    values = {path: setting.value for path, setting in settings.items()}
     keep = ("name", "number", "matter", "reason")
     rows = []
     for row, state in in_force(values):
-        rows.append({k: str(getattr(row, k)) for k in keep} | {"value": str(values[row.name]), "state": state})
+        rows.append({k: str(getattr(row, k)) for k in keep} | {"value": str(values[row.path]), "state": state})
     return rows
 
 

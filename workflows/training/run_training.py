@@ -201,7 +201,7 @@ class _TrainingLoop(ResumableLoop[Learner]):
         export(self.folder, "network", weights_of(net), file_metadata(self.learner.net))
 
     @property
-    def _mask(self) -> str:
+    def _mask_source(self) -> str:
         """Return where the mask comes from."""
         if self.settings.learn is None:
             return "the recipe's own"
@@ -213,7 +213,7 @@ class _TrainingLoop(ResumableLoop[Learner]):
             curves(rows),
             self.recipe.name,
             command,
-            element=self._mask,
+            mask=self._mask_source,
             train=self.settings.model_dump(mode="json"),
             photographs=len(self.photographs.paths),
             mesh=str(self.mesh),

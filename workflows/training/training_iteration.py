@@ -62,7 +62,7 @@ class Learner:
     ) -> None:
         self.settings, self.seed, self.device, self.mesh = settings, recipe.seed, device, mesh
         self._step = recipe.steps[settings.learn] if settings.learn else None
-        self.relief = nn.Module() if designed or self._step is None else self._start(self._step).to(settings.dtype)
+        self.mask = nn.Module() if designed or self._step is None else self._start(self._step).to(settings.dtype)
         net = start_network(lambda: _network_of(settings.network), self._rng("network"))
         self.net: Restorer = net.to(settings.dtype)
         self.critics = nn.ModuleList(critics(self._rng("critics"), settings.critics.width)).to(settings.dtype)
@@ -81,7 +81,7 @@ class Learner:
         """Return the height map (v, u) in m; raise ValueError where no mask learns."""
         if self._step is None:
             raise ValueError("train.learn: no mask learns")
-        made: Tensor = self.relief(stop(*(self._step.params[name] for name in GRID)))
+        made: Tensor = self.mask(stop(*(self._step.params[name] for name in GRID)))
         return made
 
     def _rng(self, *names: object) -> torch.Generator:
@@ -92,7 +92,7 @@ class Learner:
         rates, self.stage, self.learns = self.settings.rates, stage, learns
         groups = parameter_groups(self.net, rates.weights, rates.biases)
         if learns:
-            groups += [{"params": list(self.relief.parameters()), "lr": rates.element}]
+            groups += [{"params": list(self.mask.parameters()), "lr": rates.mask}]
         self.generator_optimizer = torch.optim.Adam(groups, betas=self.settings.betas)
         self.critic_optimizer = torch.optim.Adam(
             parameter_groups(self.critics, rates.weights, rates.biases), betas=self.settings.critics.betas
@@ -109,7 +109,7 @@ class Learner:
 
     def parts(self) -> dict[str, Any]:
         """Return everything on which a later iteration depends."""
-        found = {"relief": self.relief, "net": self.net, "critics": self.critics, "makers": self.generator_optimizer}
+        found = {"mask": self.mask, "net": self.net, "critics": self.critics, "makers": self.generator_optimizer}
         return {**found, "judges": self.critic_optimizer, **({"average": self.average} if self.average else {})}
 
     # --- one iteration ------------------------------------------------------------------------------------------------
@@ -134,7 +134,7 @@ class Learner:
         shared.back()
         found = self.mesh.numbers(found, self._names(), self.device)
         found["slope"] = self._move(
-            self.generator_optimizer, found, (self.net, self.relief) if self.learns else (self.net,)
+            self.generator_optimizer, found, (self.net, self.mask) if self.learns else (self.net,)
         )
         if self.average:
             self.average.update_parameters(self.net)
@@ -164,7 +164,9 @@ class Learner:
         return {"LSR": float(peaks.mean()) * (len(peaks) / count) / times}
 
     def _suppression(self, intensity: Tensor, clear: Tensor, band: int) -> Tensor:
-        one: Tensor = losses.lsr(Psf(intensity[band : band + 1], clear[band : band + 1]), log=self.settings.logarithm)
+        one: Tensor = losses.suppression_loss(
+            Psf(intensity[band : band + 1], clear[band : band + 1]), log=self.settings.logarithm
+        )
         return one
 
     def _restoration_terms(self, sample: Sample) -> tuple[dict[str, tuple[float, Tensor]], Scales, Scales]:

@@ -28,7 +28,7 @@ from neusee.workflows.training.parallel.picture_rounds import Pictures
 from neusee.workflows.training.parallel.process_mesh import ALONE, Mesh
 from neusee.workflows.training.parallel.shared_graph import Shared
 
-_LASER = ("optics.spot", "strength")  #: of a step, what is 0 where there is no laser
+_LASER = ("optics.laser_irradiance", "strength")  #: of a step, what is 0 where there is no laser
 _SEEDS = 2**31
 
 

@@ -9,13 +9,13 @@ from torch import Generator, Tensor
 
 from neusee.nodes import Check, node
 from neusee.nodes.calibrate._frames._frame_statistics import Photons
-from neusee.nodes.sensor._digitization import Bits, Gain, GainUnit, Rounding, digitize
+from neusee.nodes.sensor._digitization import Bits, Rounding, digitize
 from neusee.nodes.sensor._digitization import full_well as well_of
 from neusee.nodes.sensor._noise import Distribution, Spread, dark_current, photon_noise, read_noise
 from neusee.nodes.sensor._saturation import Efficiency, Well
-from neusee.nodes.units import Count, Electrons, Fraction, Shape, Time
+from neusee.nodes.units import Count, Electrons, Fraction, Gain, Shape, Time
 
-dark_of = dark_current  # the parameter below has the same name
+dark_of, read_of = dark_current, read_noise  # parameters below have the same names
 
 
 @node()
@@ -28,11 +28,10 @@ def expose(
     quantum_efficiency: Efficiency,
     dark_current: Electrons,
     dark_exposure: Time,
-    pedestal: Electrons,
-    sigma: Electrons,
+    offset: Electrons,
+    read_noise: Electrons,
     full_well: Well,
     gain: Gain,
-    gain_unit: GainUnit = "e-/DN",
     rounding: Rounding = "nearest",
     bits: Bits = 16,
     distribution: Distribution = "gaussian",
@@ -44,7 +43,7 @@ def expose(
 
     Shapes: -> (frame, y, x).
     Units:  result DN; photons per pixel and exposure; dark_current e- of one dark_exposure, in proportion to the
-            exposure; pedestal, sigma, full_well e-.
+            exposure; offset, read_noise, full_well e-; gain K, DN/e-.
     Error:  that of each step of the sensor. All pixels are alike: neither non-uniformity nor drift of the lamp.
     Source: NeuSee, section Sensor Image; EMVA Standard 1288, release 4.0 Linear (mathematical model).
     """
@@ -58,8 +57,8 @@ def expose(
         rng=rng,
     )
     e = dark_of(e, mean=dark_current * exposure / dark_exposure, rng=rng)
-    e = well_of(read_noise(e, pedestal=pedestal, sigma=sigma, rng=rng), capacity=full_well)
-    numbers: Tensor = digitize(e, gain=gain, gain_unit=gain_unit, rounding=rounding, bits=bits, rng=rng)
+    e = well_of(read_of(e, offset=offset, read_noise=read_noise, rng=rng), capacity=full_well)
+    numbers: Tensor = digitize(e, gain=gain, rounding=rounding, bits=bits, rng=rng)
     return numbers
 
 

@@ -11,9 +11,9 @@ from torch import Tensor
 from neusee.nodes import Check, node
 from neusee.nodes.calibrate._emva_fit import Share
 from neusee.nodes.calibrate._likelihood._linear_sensor import ROUNDED, Likelihood
-from neusee.nodes.sensor._digitization import Gain, GainUnit, Rounding
+from neusee.nodes.sensor._digitization import Rounding
 from neusee.nodes.sensor._saturation import Efficiency
-from neusee.nodes.units import Electrons, Real, Time
+from neusee.nodes.units import Electrons, Gain, Real, Time
 from neusee.nodes.values import Levels
 
 Scattered = Annotated[float, Field(ge=0, allow_inf_nan=False)]  #: a standard deviation; 0 for none
@@ -58,10 +58,9 @@ def camera(
     levels: Levels,
     *,
     gain: Gain,
-    gain_unit: GainUnit = "e-/DN",
     quantum_efficiency: Efficiency,
     dark_signal: Real,
-    dark_noise: Electrons,
+    temporal_dark_noise: Electrons,
     dark_current: Electrons = 0.0,
     dark_exposure: Time = 1.0,
     scatter: Scattered = 0.003,
@@ -76,32 +75,32 @@ def camera(
     """Compute the likelihood of a real camera's levels: variances given the means, and means given a drifting lamp.
 
     A mean of y DN above the dark stands for e electrons, y = K e (1 + bend x + twist x**2), where x is y over the y of
-    the brightest level used. Then ln(variance) is normal about ln((dy/de)**2 (dark_noise**2 + e) + rounding), however
-    the lamp drifts, and e is normal about quantum_efficiency * photons + dark_current * (exposure - shortest dark). A
-    dark level is a level without photons. Three standard deviations are not measured within a level: ``scatter`` of
-    every variance beyond chance (relative), ``lamp`` of the light (relative), and ``drift`` of the dark signal (DN).
-    Each stands for one normal distribution over all levels, and may be held or free like any parameter. Two kinds of
-    levels are excluded: levels brighter than ``share`` of saturation, where saturation is the level of the greatest
-    variance, and levels whose numbers pile up at an end. Any number may be a tensor (walker,).
+    the brightest level used. Then ln(variance) is normal about ln((dy/de)**2 (temporal_dark_noise**2 + e) + rounding),
+    however the lamp drifts, and e is normal about quantum_efficiency * photons + dark_current * (exposure - shortest
+    dark). A dark level is a level without photons. Three standard deviations are not measured within a level:
+    ``scatter`` of every variance beyond chance (relative), ``lamp`` of the light (relative), and ``drift`` of the dark
+    signal (DN). Each stands for one normal distribution over all levels, and may be held or free like any parameter.
+    Two kinds of levels are excluded: levels brighter than ``share`` of saturation, where saturation is the level of the
+    greatest variance, and levels whose numbers pile up at an end. Any number may be a tensor (walker,).
 
     Shapes: levels -> log (walker,), deviance (walker, level), scaled (walker, row).
-    Units:  gain in gain_unit, at no signal; dark_signal DN and dark_noise e- of the shortest dark; dark_current e- in
-            ``dark_exposure``; log in nats, for means in DN and logarithms of variances.
+    Units:  gain K, DN/e-, at no signal; dark_signal DN and temporal_dark_noise e- of the shortest dark; dark_current
+            e- in ``dark_exposure``; log in nats, for means in DN and logarithms of variances.
     Error:  levels count as independent, and photons as exact except for ``lamp``: a common error of all photons becomes
             an error of the efficiency. The variance must be temporal, without flicker of the lamp within a pair
             (`steady`). Pixels that differ by 1 % then shift the gain by 1e-4. A response that is not a parabola is left
-            to `spread` of the posterior. Below 0.24 DN2 rounding is not independent noise: a dark noise of 0.2 DN is
-            estimated wrongly.
+            to `spread` of the posterior. Below 0.24 DN2 rounding is not independent noise: a temporal dark noise of
+            0.2 DN is estimated wrongly.
     Raises: ValueError without a dark level, without two levels of different light below saturation, for a level
             without variance, and where more light does not raise the signal.
     Source: EMVA Standard 1288, release 4.0 Linear, sections 2 and 6.6 (photon transfer); Janesick, Photon Transfer.
     """
     seen, top, first = _used(levels, share)
-    given = (gain, quantum_efficiency, dark_signal, dark_noise, dark_current, scatter, lamp, drift, bend, twist)
+    dark = (dark_signal, temporal_dark_noise, dark_current)
+    given = (gain, quantum_efficiency, *dark, scatter, lamp, drift, bend, twist)
     columns = [torch.as_tensor(x, dtype=torch.float64)[..., None] for x in given]
     made = _Camera(*columns)
-    k = made.gain if gain_unit == "DN/e-" else 1.0 / made.gain
-    made = made._replace(gain=k, current=made.current / dark_exposure)
+    made = made._replace(current=made.current / dark_exposure)
     found = _told(_only(levels, seen), top, made, first, ROUNDED[rounding][1])
     each = found.variance[0].square() + found.mean[0].square()
     log = -0.5 * each - found.variance[1] - found.mean[1]
@@ -118,9 +117,9 @@ def camera(
 
 @camera.check
 def _(result: Likelihood, levels: Levels, **params: Any) -> list[Check]:
-    if not len(result.freedom):
+    if not len(result.degrees_of_freedom):
         return []
-    off, used = float(result.deviance.sum()), result.freedom > 0
+    off, used = float(result.deviance.sum()), result.degrees_of_freedom > 0
     count, coarse = int(used.sum()), int((levels.variance[used] < _QUIET).sum())
     said = [Check(f"deviance {off:.4g} of {2 * count} means and variances, {count} of {len(used)} levels")]
     if coarse:
@@ -133,12 +132,12 @@ def _told(levels: Levels, top: float, camera: _Camera, first: float, quantizatio
     law = seen.slope.square() * (camera.noise.square() + seen.electrons) + quantization
     possible = seen.possible & (law > quantization)
     law = law.where(possible, 1.0)
-    width = (2.0 / levels.freedom + camera.scatter.square()).sqrt()
+    width = (2.0 / levels.degrees_of_freedom + camera.scatter.square()).sqrt()
     # the mean log variance is below the log of the mean variance by one over the degrees of freedom
-    off = (levels.variance.log() - law.log() + 1.0 / levels.freedom) / width
+    off = (levels.variance.log() - law.log() + 1.0 / levels.degrees_of_freedom) / width
     light = camera.efficiency * levels.photons
     expected = light + camera.current * (levels.exposure - first)
-    error = levels.variance / levels.numbers + camera.drift.square() + (camera.lamp * light * seen.slope).square()
+    error = levels.variance / levels.pixels + camera.drift.square() + (camera.lamp * light * seen.slope).square()
     away = (seen.electrons - expected) * seen.slope / error.sqrt()
     parts = (off, width.log(), away, 0.5 * error.log(), possible, law)
     told = torch.broadcast_tensors(*parts)  # type: ignore[no-untyped-call]

@@ -9,10 +9,10 @@ import torch
 from neusee.nodes import Check, node
 from neusee.nodes.calibrate._likelihood._linear_sensor import Likelihood, Sensor, likelihood
 from neusee.nodes.calibrate._likelihood._sufficient_statistics import Sufficient
-from neusee.nodes.sensor._digitization import Bits, Gain, GainUnit, Rounding
+from neusee.nodes.sensor._digitization import Bits, Rounding
 from neusee.nodes.sensor._noise import Distribution, Spread
 from neusee.nodes.sensor._saturation import Efficiency, Well
-from neusee.nodes.units import Electrons, Fraction, Time
+from neusee.nodes.units import Electrons, Fraction, Gain, Time
 
 
 @node()
@@ -20,9 +20,8 @@ def density(
     levels: Sufficient,
     *,
     gain: Gain,
-    gain_unit: GainUnit = "e-/DN",
     quantum_efficiency: Efficiency,
-    pedestal: Electrons,
+    offset: Electrons,
     read_noise: Electrons,
     dark_current: Electrons,
     dark_exposure: Time,
@@ -44,17 +43,16 @@ def density(
     once. ``told`` adds deviances and the rows of the Fisher information, which a sampler does not need.
 
     Shapes: levels -> log (walker,), deviance (walker, level), scaled (walker, row).
-    Units:  gain in gain_unit; dark_current e- in ``dark_exposure``; log in nats, for numbers of 1 DN.
+    Units:  gain K, DN/e-; dark_current e- in ``dark_exposure``; log in nats, for numbers of 1 DN.
     Error:  the signal counts as Gaussian, except in coarse levels of up to 8 electrons: relative 1e-3 at 3 standard
             deviations of 100 Poisson electrons. All pixels are assumed alike; crosstalk of neighbours, lag and drift
             of the lamp, which real frames show, are neglected (see `camera`).
     Source: NeuSee, section Sensor Image; EMVA Standard 1288, release 4.0 Linear, section 3.
     """
-    given = (gain, quantum_efficiency, pedestal, read_noise, dark_current, full_well, mean_shift, spread)
+    given = (gain, quantum_efficiency, offset, read_noise, dark_current, full_well, mean_shift, spread)
     columns = [torch.as_tensor(x, dtype=torch.float64)[..., None] for x in given]
     alike = torch.broadcast_tensors(*columns)  # type: ignore[no-untyped-call]
-    written, efficiency, offset, read, dark, well, shift, c2 = alike
-    k = written if gain_unit == "DN/e-" else 1.0 / written
+    k, efficiency, bias, read, dark, well, shift, c2 = alike
     kept = shift + (mean == "additive")
     variance = c2.square() * (efficiency if drawn_in == "electrons" else efficiency.square())
     whole = arrivals == "poisson" and (mean, drawn_in) == ("additive", "electrons")
@@ -62,7 +60,7 @@ def density(
         gain=k,
         response=k * efficiency * kept,
         noise=k.square() * variance,
-        offset=k * offset,
+        offset=k * bias,
         read=k * read,
         dark=k * dark / dark_exposure,
         well=k * well,
@@ -73,7 +71,7 @@ def density(
 
 @density.check
 def _(result: Likelihood, *inputs: Sufficient, **params: Any) -> list[Check]:
-    if not len(result.freedom):
+    if not len(result.degrees_of_freedom):
         return []
-    off, freedom = float(result.deviance.sum()), float(result.freedom.sum())
+    off, freedom = float(result.deviance.sum()), float(result.degrees_of_freedom.sum())
     return [Check(f"deviance {off:.4g} of {freedom:.0f} degrees of freedom")]

@@ -37,7 +37,7 @@ class Likelihood(NamedTuple):
 
     log: Tensor  #: (...)
     deviance: Tensor  #: (..., level) twice the log-likelihood below that of a separate fit of each level
-    freedom: Tensor  #: (level,) degrees of freedom of each deviance; 0 for a level without deviance
+    degrees_of_freedom: Tensor  #: (level,) of each deviance; 0 for a level without deviance
     scaled: Tensor  #: (..., row) expected values in standard deviations: J^T J of these rows is the Fisher information
     mean: Tensor  #: (..., level) DN, of all numbers of a level, without clipping by well and converter
     variance: Tensor  #: (..., level) DN2, as `mean`
@@ -55,17 +55,21 @@ def likelihood(levels: Sufficient, sensor: Sensor, rounding: Rounding, bits: int
     """
     law, (shift, spread), top = _law(levels, sensor), ROUNDED[rounding], 2**bits - 1
     mean, variance = law.mean + shift, law.variance + spread
-    off = levels.numbers * (levels.mean - mean).square() / variance
-    log = -0.5 * ((levels.freedom + 1) * variance.log() + levels.freedom * levels.variance / variance + off)
-    celled, measured = _cells_in(levels), levels.numbers > 0
-    below = levels.numbers * log_ndtr((sensor.well - law.mean) / law.variance.sqrt())
+    off = levels.pixels * (levels.mean - mean).square() / variance
+    log = -0.5 * (
+        (levels.degrees_of_freedom + 1) * variance.log() + levels.degrees_of_freedom * levels.variance / variance + off
+    )
+    celled, measured = _cells_in(levels), levels.pixels > 0
+    below = levels.pixels * log_ndtr((sensor.well - law.mean) / law.variance.sqrt())
     cells = _log_cells(levels, law, sensor, rounding, top)
     total = (log + below.where(~celled, 0.0)).where(measured, 0.0).sum(-1) + (levels.cell_count * cells).sum(-1)
     if not told:
         none = torch.zeros(0, dtype=torch.float64)
         return Likelihood(total, none, none, none, none, none)
     ratio = levels.variance.where(measured, 1.0) / variance
-    deviance, freedom = _deviance(levels, levels.freedom * (ratio - 1 - ratio.log()) + off, cells, measured & ~celled)
+    deviance, freedom = _deviance(
+        levels, levels.degrees_of_freedom * (ratio - 1 - ratio.log()) + off, cells, measured & ~celled
+    )
     rows = [_scaled(levels, mean, variance).where(measured.repeat(2), 0.0)]
     rows.append(2.0 * (_of_level(levels)[levels.cell_level] * cells.exp()).sqrt())
     if rounding == "nearest":  # the well lies anywhere within one number, 1 DN wide
@@ -82,8 +86,10 @@ def _cut_off(levels: Sufficient, law: _Law, sensor: Sensor, top: int) -> Tensor:
 
 def _scaled(levels: Sufficient, mean: Tensor, variance: Tensor) -> Tensor:
     """Return the mean and the log variance of each level in standard deviations of the measured values."""
-    known = levels.variance.where(levels.numbers > 0, 1.0)
-    return torch.cat([(levels.numbers / known).sqrt() * mean, ((levels.freedom + 1) / 2).sqrt() * variance.log()], -1)
+    known = levels.variance.where(levels.pixels > 0, 1.0)
+    return torch.cat(
+        [(levels.pixels / known).sqrt() * mean, ((levels.degrees_of_freedom + 1) / 2).sqrt() * variance.log()], -1
+    )
 
 
 def _law(levels: Sufficient, sensor: Sensor) -> _Law:
@@ -94,12 +100,12 @@ def _law(levels: Sufficient, sensor: Sensor) -> _Law:
 
 def _cells_in(levels: Sufficient) -> Tensor:
     """Mark the levels that have cells."""
-    return torch.zeros_like(levels.numbers, dtype=torch.bool).index_fill_(0, levels.cell_level, True)
+    return torch.zeros_like(levels.pixels, dtype=torch.bool).index_fill_(0, levels.cell_level, True)
 
 
 def _of_level(levels: Sufficient) -> Tensor:
     """Count the pixels of each level, inside and outside of cells."""
-    return levels.numbers.index_add(0, levels.cell_level, levels.cell_count)
+    return levels.pixels.index_add(0, levels.cell_level, levels.cell_count)
 
 
 def _log_cells(levels: Sufficient, law: _Law, sensor: Sensor, rounding: Rounding, top: int) -> Tensor:
@@ -107,7 +113,7 @@ def _log_cells(levels: Sufficient, law: _Law, sensor: Sensor, rounding: Rounding
     at = levels.cell_level
     mean, variance = law.mean.index_select(-1, at), law.variance.index_select(-1, at)
     found = log_cell(levels.cell_value, mean, variance.sqrt(), sensor.well, rounding, top)
-    coarse = (levels.numbers == 0)[at]
+    coarse = (levels.pixels == 0)[at]
     electrons = (mean - sensor.offset if sensor.counted else sensor.dark * levels.exposure[at]) / sensor.gain
     few = coarse & (electrons <= _FEW) & (sensor.gain.square() * electrons > _GRAIN * variance)
     if not bool(few.any()):
@@ -131,11 +137,11 @@ def _counted_out(
 
 def _deviance(levels: Sufficient, moments: Tensor, cells: Tensor, measured: Tensor) -> tuple[Tensor, Tensor]:
     """Return the deviance of each level from its moments or from its cells, and 0 for a partly clipped level."""
-    whole = levels.numbers == 0
+    whole = levels.pixels == 0
     count, total = levels.cell_count, _of_level(levels)[levels.cell_level]
     each = 2.0 * count * ((count / total).log() - cells)
     summed = torch.zeros_like(moments).index_add(-1, levels.cell_level, each.expand(*moments.shape[:-1], -1))
-    distinct = torch.zeros_like(levels.numbers).index_add(0, levels.cell_level, torch.ones_like(count))
+    distinct = torch.zeros_like(levels.pixels).index_add(0, levels.cell_level, torch.ones_like(count))
     freedom = torch.where(measured, 2.0, torch.where(whole, (distinct - 1).clamp_min(0.0), 0.0))
     found = torch.where(measured, moments, torch.where(whole, summed, 0.0))
     return torch.where(freedom > 0, found, 0.0), freedom

@@ -20,10 +20,10 @@ class Sufficient(NamedTuple):
 
     photons: Tensor  #: (level,) float64, per pixel and exposure
     exposure: Tensor  #: (level,) float64, s
-    numbers: Tensor  #: (level,) float64, count of the pixels of `mean` and `variance`
+    pixels: Tensor  #: (level,) float64, count of the pixels of `mean` and `variance`
     mean: Tensor  #: (level,) float64, DN
     variance: Tensor  #: (level,) float64, DN2
-    freedom: Tensor  #: (level,) float64, degrees of freedom of the variance
+    degrees_of_freedom: Tensor  #: (level,) float64, of the variance
     cell_level: Tensor  #: (cell,) int64, rising
     cell_value: Tensor  #: (cell,) float64, DN
     cell_count: Tensor  #: (cell,) float64
@@ -41,7 +41,7 @@ def sufficient(levels: Levels) -> Sufficient:
     Error:  1e-12 of the moments. The pixels of a histogram are assumed alike.
     Source: Fisher, Phil. Trans. R. Soc. A 222, 309 (1922), sufficiency.
     """
-    moments = torch.stack([levels.numbers, levels.mean, levels.variance, levels.freedom], 1)
+    moments = torch.stack([levels.pixels, levels.mean, levels.variance, levels.degrees_of_freedom], 1)
     kept = torch.ones(len(levels.cell_level), dtype=torch.bool)
     for one in sorted(set(levels.cell_level.tolist())):
         at = levels.cell_level == one
@@ -61,7 +61,7 @@ def _(result: Sufficient, *inputs: Levels) -> list[Check]:
 @sufficient.reference
 def _(levels: Levels) -> Sufficient:
     cells = list(zip(levels.cell_level.tolist(), levels.cell_value.tolist(), levels.cell_count.tolist(), strict=True))
-    rows = torch.stack([levels.numbers, levels.mean, levels.variance, levels.freedom], 1).tolist()
+    rows = torch.stack([levels.pixels, levels.mean, levels.variance, levels.degrees_of_freedom], 1).tolist()
     left = []
     for level in range(len(rows)):
         own = [(v, n) for at, v, n in cells if at == level]

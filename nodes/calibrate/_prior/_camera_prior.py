@@ -11,15 +11,14 @@ from torch import Tensor
 
 from neusee.nodes import Check, node
 from neusee.nodes.calibrate._prior._free_parameters import Factor, Free, Positive, Prior, believed, freed
-from neusee.nodes.sensor._digitization import Gain
 from neusee.nodes.sensor._saturation import Efficiency
-from neusee.nodes.units import Electrons, Real
+from neusee.nodes.units import Electrons, Gain, Real
 
 CAMERA_NAMES = (
     "gain",
     "quantum_efficiency",
     "dark_signal",
-    "dark_noise",
+    "temporal_dark_noise",
     "dark_current",
     "scatter",
     "lamp",
@@ -36,7 +35,7 @@ def camera_prior(
     gain: tuple[Gain, Factor] | None = None,
     quantum_efficiency: tuple[Efficiency, Factor] | None = None,
     dark_signal: tuple[Real, Positive] | None = None,
-    dark_noise: tuple[Electrons, Factor] | None = None,
+    temporal_dark_noise: tuple[Electrons, Factor] | None = None,
     dark_current: tuple[Electrons, Factor] | None = None,
     scatter: tuple[Positive, Factor] | None = None,
     lamp: tuple[Positive, Factor] | None = None,
@@ -55,7 +54,8 @@ def camera_prior(
     Raises: ValueError where no parameter is free, or where a median or width is not positive.
     Source: log-normal and normal distributions.
     """
-    pairs = (gain, quantum_efficiency, dark_signal, dark_noise, dark_current, scatter, lamp, drift, bend, twist)
+    dark = (dark_signal, temporal_dark_noise, dark_current)
+    pairs = (gain, quantum_efficiency, *dark, scatter, lamp, drift, bend, twist)
     return believed(dict(zip(CAMERA_NAMES, pairs, strict=True)), _LINEAR)
 
 
@@ -72,8 +72,8 @@ class CameraCoordinates(Free):
     linear: ClassVar[frozenset[str]] = _LINEAR
 
     @classmethod
-    def of(cls, prior: Prior, nominal: Mapping[str, float], gain_unit: str) -> CameraCoordinates:
-        """Build coordinates from ``nominal``, all of `CAMERA_NAMES` in the units of `camera`, for any gain unit."""
+    def of(cls, prior: Prior, nominal: Mapping[str, float]) -> CameraCoordinates:
+        """Build coordinates from ``nominal``, all of `CAMERA_NAMES` in the units of `camera`."""
         free = freed(CAMERA_NAMES, prior)
         return cls(free, prior, {name: float(nominal[name]) for name in CAMERA_NAMES if name not in free})
 

@@ -26,22 +26,21 @@ def guess(levels: Sufficient, believed: Mapping[str, float], params: Mapping[str
     Source: EMVA Standard 1288, release 4.0 Linear, sections 6.6 to 6.8.
     """
     found = dict(believed)
-    numbers = params["gain_unit"] == "DN/e-"
-    lit = levels.numbers > 0
+    lit = levels.pixels > 0
     try:
         fit = least_squares(Levels(*(x[lit] for x in levels[:6]), *(x[:0] for x in levels[6:])))
     except ValueError:
         gain = float(believed["gain"])
-        return found | {"full_well": _well(levels, found, gain if numbers else 1.0 / gain, params)}
+        return found | {"full_well": _well(levels, found, gain, params)}
     gain = float(fit.gain)
     dark = float(fit.dark_current) * params["dark_exposure"]
     first = levels.exposure[levels.photons == 0].min()
     ahead = float(first) / params["dark_exposure"] * (dark if dark > 0 else 0.0)
     found |= {
-        "gain": gain if numbers else 1.0 / gain,
+        "gain": gain,
         "quantum_efficiency": float(fit.efficiency),
-        "pedestal": (float(fit.dark_signal) - ROUNDED[params["rounding"]][0]) / gain - ahead,
-        "read_noise": max(float(fit.dark_noise), _LEAST * believed["read_noise"]),
+        "offset": (float(fit.dark_signal) - ROUNDED[params["rounding"]][0]) / gain - ahead,
+        "read_noise": max(float(fit.temporal_dark_noise), _LEAST * believed["read_noise"]),
         "dark_current": dark if dark > 0 else _LEAST * believed["dark_current"],
     }
     return found | {"full_well": _well(levels, found, gain, params)}
@@ -59,10 +58,10 @@ def guess_camera(levels: Levels, believed: Mapping[str, float], params: Mapping[
     fit = least_squares(levels, share=params["share"])
     gain = float(fit.gain)
     found = {
-        "gain": gain if params["gain_unit"] == "DN/e-" else 1.0 / gain,
+        "gain": gain,
         "quantum_efficiency": float(fit.efficiency),
         "dark_signal": float(fit.dark_signal),
-        "dark_noise": float(fit.dark_noise),
+        "temporal_dark_noise": float(fit.temporal_dark_noise),
         "dark_current": float(fit.dark_current) * params["dark_exposure"],
     }
     usable = {name: x for name, x in found.items() if math.isfinite(x) and (x > 0 or name == "dark_signal")}
@@ -72,7 +71,7 @@ def guess_camera(levels: Levels, believed: Mapping[str, float], params: Mapping[
 def _well(levels: Sufficient, found: Mapping[str, float], gain: float, params: Mapping[str, Any]) -> float:
     """Return the well at which numbers pile up, or else a well above every number."""
     top, shift = 2 ** params["bits"] - 1, ROUNDED[params["rounding"]][0]
-    seen = levels.mean[levels.numbers > 0]
+    seen = levels.mean[levels.pixels > 0]
     brightest = max([*seen.tolist(), *levels.cell_value.tolist()], default=0.0)
     at = levels.cell_value >= brightest - 2
     piled = bool(at.any()) and float(levels.cell_count[at].sum()) > 0.5 * float(levels.cell_count.max())

@@ -12,27 +12,26 @@ from torch import Tensor
 
 from neusee.nodes import Check, node
 from neusee.nodes.calibrate._prior._free_parameters import Factor, Free, Positive, Prior, believed, freed
-from neusee.nodes.sensor._digitization import Gain
 from neusee.nodes.sensor._saturation import Efficiency, Well
-from neusee.nodes.units import Electrons
+from neusee.nodes.units import Electrons, Gain
 
 NAMES = (
     "gain",
-    "pedestal",
+    "offset",
     "read_noise",
     "dark_current",
     "full_well",
     "quantum_efficiency",
     "spread",
 )  #: the parameters of `density` that may be free
-_LINEAR = "pedestal"  #: the only parameter that may be 0 or negative
+_LINEAR = "offset"  #: the only parameter that may be 0 or negative
 
 
 @node()
 def prior(
     *,
     gain: tuple[Gain, Factor] | None = None,
-    pedestal: tuple[Electrons, Electrons] | None = None,
+    offset: tuple[Electrons, Electrons] | None = None,
     read_noise: tuple[Electrons, Factor] | None = None,
     dark_current: tuple[Electrons, Factor] | None = None,
     full_well: tuple[Well, Factor] | None = None,
@@ -42,7 +41,7 @@ def prior(
     """State the prior of each free parameter of the sensor; a parameter without a prior is held.
 
     A prior is a median and a factor: [0.37, 2] means half to twice the median with a probability of two thirds. The
-    prior of the pedestal is a mean and a standard deviation.
+    prior of the offset is a mean and a standard deviation.
 
     Shapes: -> (7,).
     Units:  those of `density`.
@@ -51,7 +50,7 @@ def prior(
     Source: log-normal and normal distributions.
     """
     given = dict(
-        zip(NAMES, (gain, pedestal, read_noise, dark_current, full_well, quantum_efficiency, spread), strict=True)
+        zip(NAMES, (gain, offset, read_noise, dark_current, full_well, quantum_efficiency, spread), strict=True)
     )
     return believed(given, frozenset({_LINEAR}))
 
@@ -66,33 +65,31 @@ def _(result: Prior, **params: object) -> list[Check]:
 class Coordinates(Free):
     """The free parameters in digital numbers, which do not depend on the gain.
 
-    Frames constrain the slope of the photon-transfer curve, the offset, the dark variance, the response and the
-    saturation level independently. Frames constrain gain, pedestal, read noise and well only jointly, with a
-    correlation of 1 - 1e-3. All coordinates except the offset are logarithms.
+    Frames constrain the slope of the photon-transfer curve, the offset in DN, the dark variance, the response and the
+    saturation level independently. Frames constrain gain, offset in electrons, read noise and well only jointly, with a
+    correlation of 1 - 1e-3. All coordinates except the offset in DN are logarithms.
     """
 
     linear: ClassVar[frozenset[str]] = frozenset({_LINEAR})
     edged: ClassVar[frozenset[str]] = frozenset({"full_well"})
 
-    inverse: bool  #: whether the gain is in e-/DN
-
     @classmethod
-    def of(cls, prior: Prior, nominal: Mapping[str, float], gain_unit: str) -> Coordinates:
+    def of(cls, prior: Prior, nominal: Mapping[str, float]) -> Coordinates:
         """Build coordinates from ``nominal``, all of `NAMES` in the units of `density`."""
         free = freed(NAMES, prior)
         held = {name: float(nominal[name]) for name in NAMES if name not in free}
-        return cls(free, prior, held, gain_unit == "e-/DN")
+        return cls(free, prior, held)
 
     @property
     def labels(self) -> tuple[str, ...]:
         """Return the name of each coordinate."""
-        of = {"gain": "ln slope of the photon-transfer curve", "pedestal": "offset, DN", "spread": "ln spread"}
+        of = {"gain": "ln slope of the photon-transfer curve", "offset": "offset, DN", "spread": "ln spread"}
         return tuple(of.get(name, f"ln {name.replace('_', ' ')} in numbers") for name in self.names)
 
     def place(self, parameters: Mapping[str, float | Tensor]) -> Tensor:
         """Return the coordinates (..., free) of parameters."""
         full = {name: torch.as_tensor(parameters.get(name, self.held.get(name)), dtype=torch.float64) for name in NAMES}
-        slope = self._numbers(full["gain"].log())
+        slope = full["gain"].log()
         return torch.stack([self._seen(name, full, slope) for name in self.names], -1)
 
     def parameters(self, place: Tensor) -> dict[str, Tensor]:
@@ -102,11 +99,11 @@ class Coordinates(Free):
         if "gain" in at:
             slope = at["gain"] - 2.0 * spread
         else:
-            slope = self._numbers(torch.tensor(math.log(self.held["gain"]), dtype=torch.float64))
+            slope = torch.tensor(math.log(self.held["gain"]), dtype=torch.float64)
         found = {}
         for name, x in at.items():
             if name == "gain":
-                found[name] = self._numbers(slope).exp()
+                found[name] = slope.exp()
             elif name == _LINEAR:
                 found[name] = x * (-slope).exp()
             else:
@@ -117,12 +114,8 @@ class Coordinates(Free):
         """Return the log density (...) per unit of the coordinates, up to a constant."""
         total = -0.5 * self.whitened(parameters).square().sum(-1)
         if _LINEAR in self.names and "gain" in self.names:
-            total = total - self._numbers(parameters["gain"].log())  # Jacobian from offset to pedestal
+            total = total - parameters["gain"].log()  # Jacobian from offset in DN to electrons
         return total
-
-    def _numbers(self, log_gain: Tensor) -> Tensor:
-        """Convert the logarithm of the gain, as given, to the logarithm of DN/e-, or back."""
-        return -log_gain if self.inverse else log_gain
 
     def _seen(self, name: str, full: Mapping[str, Tensor], slope: Tensor) -> Tensor:
         if name == "gain":

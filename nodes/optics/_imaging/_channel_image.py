@@ -13,7 +13,7 @@ from neusee.nodes.optics._imaging._collapsed_plan import Given, choose, with_win
 from neusee.nodes.optics._imaging._convolve_plan import bordered, convolved, guessed, majorant, rounding
 from neusee.nodes.optics._imaging._light_in_field import flux
 from neusee.nodes.optics._imaging._psf_energy import passed
-from neusee.nodes.values import Channels, Mixture, Psf
+from neusee.nodes.values import Channels, LowRankCube, Psf
 
 Share = Annotated[float, Field(ge=0, allow_inf_nan=False)]  #: as a share of the brightest pixel
 _TRIES = 3  #: plans tried: with the brightest pixels estimated, then measured, then with nothing omitted
@@ -21,23 +21,29 @@ _TRIES = 3  #: plans tried: with the brightest pixels estimated, then measured, 
 
 @node(rtol=1e-5)
 def image_channels(
-    radiance: Mixture, psf: Psf, rows: Tensor, *, border: Border = "zero", within: Share = 0.0, largest: bool = False
+    radiance: LowRankCube,
+    psf: Psf,
+    rows: Tensor,
+    *,
+    border: Border = "zero",
+    within: Share = 0.0,
+    largest: bool = False,
 ) -> Channels:
     """Sum the bands of the image by each row of weights, convolving few planes with few kernels instead of all bands.
 
     Plane i is the sum over k of planes[k] convolved with sum_b rows[i, b] basis[b, k] psf[b]: three planes and three
     rows take 15 transforms where 31 bands take 93. Planes, kernels, bands and the tails of the PSF are omitted as far
     as the root mean square error `within` allows, whichever saves the most time; 0 omits nothing. With `largest` only
-    the error of the mixture is allowed, and the error of the brightest pixel is bounded as well.
+    the error of the low-rank cube is allowed, and the error of the brightest pixel is bounded as well.
 
     Shapes: radiance k planes (y, x), psf.intensity (band, any, any), rows (row, band) -> planes (row, y, x).
     Units:  those of the radiance times those of the rows; flux those of the radiance.
-    Error:  `bound`, as a share of the brightest pixel of each row. Proved upper bounds: the residual of the mixture,
+    Error:  `bound`, as a share of the brightest pixel of each row. Proved upper bounds: the residual of the cube,
             by the sum of each PSF (Young's inequality, as for the root mean square; where the border reflects, three
             times that of the scene); of the brightest pixel, the image of the largest residual of each pixel;
             tails, by Young's inequality; kernels, by the sum of their residuals. Estimated, not proved: round-off of
             the transforms, from the powers of planes and kernels, never less than was measured. Flux: 1e-6, and the
-            residual of the mixture. Planes and PSF receive gradients; basis and rows are constants.
+            residual of the cube. Planes and PSF receive gradients; basis and rows are constants.
     Raises: ValueError where scene, PSF and rows have different bands, or the scene is a batch.
     Source: linearity of incoherent imaging, Goodman, Introduction to Fourier Optics, 4th ed., ch. 7.
     """
@@ -58,7 +64,13 @@ def image_channels(
 
 @image_channels.reference
 def _(
-    radiance: Mixture, psf: Psf, rows: Tensor, *, border: Border = "zero", within: float = 0.0, largest: bool = False
+    radiance: LowRankCube,
+    psf: Psf,
+    rows: Tensor,
+    *,
+    border: Border = "zero",
+    within: float = 0.0,
+    largest: bool = False,
 ) -> Channels:
     assert image.hooks.reference is not None
     cube = torch.tensordot(radiance.basis.double(), radiance.planes.double(), 1)
@@ -82,7 +94,7 @@ def _(result: Channels, *inputs: Any, within: float = 0.0, **params: Any) -> lis
     return [Check(text, within == 0 or float(result.bound) <= within)]
 
 
-def _fitted(radiance: Mixture, psf: Psf, rows: Tensor) -> tuple[Tensor, Tensor]:
+def _fitted(radiance: LowRankCube, psf: Psf, rows: Tensor) -> tuple[Tensor, Tensor]:
     """Return the planes, and the part of the PSF that reaches the scene, in one precision."""
     bands = {len(radiance.basis), len(psf.intensity), rows.shape[-1]}
     if len(bands) > 1 or radiance.planes.ndim != 3 or psf.intensity.ndim != 3 or rows.ndim != 2:
@@ -97,15 +109,15 @@ def _fitted(radiance: Mixture, psf: Psf, rows: Tensor) -> tuple[Tensor, Tensor]:
     return planes.to(dtype), kernel.to(dtype)
 
 
-def _given(radiance: Mixture, planes: Tensor, intensity: Tensor, rows: Tensor, border: Border) -> Given:
+def _given(radiance: LowRankCube, planes: Tensor, intensity: Tensor, rows: Tensor, border: Border) -> Given:
     flat = planes.detach().flatten(1)
     gram = (flat @ flat.T).double().cpu()
     copies = 9 if border == "reflect" else 1
-    if radiance.spread.numel():
-        rest = radiance.spread.double().cpu() * math.sqrt(copies)
+    if radiance.residual_rms.numel():
+        rest = radiance.residual_rms.double().cpu() * math.sqrt(copies)
         most = (gram.diagonal() * (1.001 * copies / flat.shape[1])).clamp_min(0).sqrt()
     else:
-        rest, most = radiance.rest.double().cpu(), torch.maximum(flat.amax(1), -flat.amin(1)).double().cpu()
+        rest, most = radiance.residual_max.double().cpu(), torch.maximum(flat.amax(1), -flat.amin(1)).double().cpu()
     return Given(
         rows,
         radiance.basis.detach().double().cpu(),
@@ -139,18 +151,18 @@ def _formed(planes: Tensor, intensity: Tensor, given: Given, within: float) -> t
     return result, torch.tensor(bound, dtype=torch.float64), torch.tensor(plan.kept)
 
 
-def _top(result: Tensor, radiance: Mixture, intensity: Tensor, given: Given) -> float:
+def _top(result: Tensor, radiance: LowRankCube, intensity: Tensor, given: Given) -> float:
     """Return the largest error of a row's brightest pixel, as a share of that pixel.
 
-    All bands together form the image of the mixture's largest residual at each pixel. The true image differs from the
+    All bands together form the image of the cube's largest residual at each pixel. The true image differs from the
     computed image by at most that image of the residual. The true maximum is therefore at most the maximum of computed
     image plus residual. The true maximum is at least the computed maximum less the residual at the same pixel, and this
     second error is never the larger one.
     """
-    if not radiance.off.numel():
+    if not radiance.residual_map.numel():
         return math.inf
     found = result.detach()
-    lacks = majorant(radiance.off.to(found), intensity.detach(), given)
+    lacks = majorant(radiance.residual_map.to(found), intensity.detach(), given)
     low, most = (torch.stack(ends).double().cpu() for ends in zip(*map(torch.aminmax, found), strict=True))
     room = torch.empty_like(lacks)
     above = torch.stack([torch.add(row, lacks, out=room).amax() for row in found]).double().cpu()

@@ -8,7 +8,7 @@ from neusee.nodes.calibrate import levels, reduce
 from neusee.nodes.values import Levels
 
 COLUMNS = ("photons", "exposure_s", "pixels", "mean", "variance")
-TRUTH = {"gain": 0.25, "quantum_efficiency": 0.5, "dark_noise": 12.0}  #: DN/e-, e- per photon, e-
+TRUTH = {"gain": 0.25, "quantum_efficiency": 0.5, "temporal_dark_noise": 12.0}  #: DN/e-, e- per photon, e-
 
 
 def measured(seed, *, lit=30, darks=6, lamp=0.015, prnu=0.01, bent=0.0, power=3, size=96, **changed):
@@ -30,7 +30,7 @@ def measured(seed, *, lit=30, darks=6, lamp=0.015, prnu=0.01, bent=0.0, power=3,
 
 def _frame(mean, rng, truth, bent, power):
     electrons = torch.poisson(mean, generator=rng)
-    electrons += truth["dark_noise"] * torch.randn(mean.shape, generator=rng, dtype=torch.float64)
+    electrons += truth["temporal_dark_noise"] * torch.randn(mean.shape, generator=rng, dtype=torch.float64)
     y = truth["gain"] * electrons
     y = y * (1 - bent * (y.clamp_min(0) / 4095) ** power)
     return (y + 60).round().clamp(0, 4095)
@@ -41,7 +41,7 @@ def written(found, file):
     with file.open("w", newline="") as opened:
         writer = csv.writer(opened, lineterminator="\n")
         writer.writerow(COLUMNS)
-        rows = torch.stack([found.photons, found.exposure, found.numbers / 2, found.mean, found.variance], 1)
+        rows = torch.stack([found.photons, found.exposure, found.pixels / 2, found.mean, found.variance], 1)
         for photons, exposure, pixels, mean, variance in rows.tolist():
             writer.writerow([f"{photons:.2f}", f"{exposure:.4g}", int(pixels), f"{mean:.6f}", f"{variance:.6f}"])
     return file
@@ -50,7 +50,7 @@ def written(found, file):
 def tabled(seed, file, *, pixels, lamp=0.015, bent=0.0, power=3, lit=26, darks=6):
     """A table of moments as frames of so many pixels would give them, drawn from their own laws."""
     rng = torch.Generator().manual_seed(seed)
-    gain, efficiency, noise = (TRUTH[name] for name in ("gain", "quantum_efficiency", "dark_noise"))
+    gain, efficiency, noise = (TRUTH[name] for name in ("gain", "quantum_efficiency", "temporal_dark_noise"))
     photons = torch.cat([torch.zeros(darks), torch.linspace(1000, 29000, lit)]).double()
     exposure = torch.cat([1e-3 + 1e-2 * torch.arange(darks), torch.full((lit,), 1e-3)]).double()
     normal = (torch.randn(darks + lit, generator=rng, dtype=torch.float64) for _ in range(3))

@@ -19,8 +19,8 @@ COLUMNS = {
     "variance": "temporal_var_DN2",
     "drift": "mean_diff",
 }
-SENSOR = {"dark_exposure": 0.1, "pedestal": 390.0, "full_well": 25500.0, "gain": 0.37, "gain_unit": "DN/e-"}
-SENSOR |= {"quantum_efficiency": 0.56, "dark_current": 5.0, "sigma": 10.5}
+SENSOR = {"dark_exposure": 0.1, "offset": 390.0, "full_well": 25500.0, "gain": 0.37}
+SENSOR |= {"quantum_efficiency": 0.56, "dark_current": 5.0, "read_noise": 10.5}
 LIGHT = [0.0, 300.0, 1000.0, 3000.0, 10000.0, 30000.0, 40000.0]
 
 
@@ -54,14 +54,14 @@ def test_the_published_figures_of_a_real_camera():
     found = measured("001_CCD")
     assert 1 / float(found.gain) == pytest.approx(3.56164, rel=1e-5)
     assert float(found.efficiency) == pytest.approx(0.451356, rel=1e-5)
-    assert float(found.dark_noise) == pytest.approx(10.8980, rel=1e-3)
+    assert float(found.temporal_dark_noise) == pytest.approx(10.8980, rel=1e-3)
 
 
 def test_a_simulated_set_lies_as_near_its_truth_as_is_known_of_this_method():
     found = measured("003_Simulation")  # 0.1 DN/e-, 0.5, 30 e-; a camera that is not quite linear
     assert float(found.gain) == pytest.approx(0.09786, rel=1e-4)
     assert float(found.efficiency) == pytest.approx(0.5037, rel=1e-4)
-    assert float(found.dark_noise) == pytest.approx(30.65, rel=1e-3)
+    assert float(found.temporal_dark_noise) == pytest.approx(30.65, rel=1e-3)
 
 
 @pytest.mark.parametrize("gain", [0.01, 0.37, 40.0])
@@ -70,7 +70,7 @@ def test_exact_levels_give_the_exact_camera(gain, efficiency):
     found = least_squares(synthetic(gain, efficiency))
     assert float(found.gain) == pytest.approx(gain, rel=1e-10)
     assert float(found.efficiency) == pytest.approx(efficiency, rel=1e-10)
-    assert float(found.dark_noise) == pytest.approx(4.0, rel=1e-9)
+    assert float(found.temporal_dark_noise) == pytest.approx(4.0, rel=1e-9)
     assert float(found.dark_signal) == 100.0
     assert float(found.saturation) == pytest.approx(40000 * efficiency, rel=1e-10)
     assert math.isnan(float(found.dark_current))
@@ -88,7 +88,7 @@ def test_each_level_is_taken_less_the_dark_of_its_exposure():
     assert float(found.gain) == pytest.approx(2.0, rel=1e-10)
     assert float(found.efficiency) == pytest.approx(0.5, rel=1e-10)
     assert float(found.dark_signal) == 100.0
-    assert float(found.dark_noise) == pytest.approx(4.0, rel=1e-9)
+    assert float(found.temporal_dark_noise) == pytest.approx(4.0, rel=1e-9)
     assert float(found.dark_current) == pytest.approx(40 / 2 / 2.0, rel=1e-10)  # 40 DN in 2 s at 2 DN/e-
 
 
@@ -97,7 +97,7 @@ def test_simulated_frames_give_their_sensor_within_the_stated_errors():
     pulls = []
     for seed in range(40):
         found = least_squares(simulated(LIGHT, [0.1] * len(LIGHT), seed, dark_current=0.0))
-        truth = {"gain": 0.37, "efficiency": 0.56, "dark_noise": 10.5}
+        truth = {"gain": 0.37, "efficiency": 0.56, "temporal_dark_noise": 10.5}
         pulls.append([float((found._asdict()[k] - v) / found._asdict()[f"{k}_error"]) for k, v in truth.items()])
     pulls = torch.tensor(pulls, dtype=torch.float64)
     assert float(pulls.mean(0).abs().max()) < 4 / math.sqrt(40)
@@ -112,8 +112,8 @@ def test_dark_current_is_found():
 def test_a_dark_that_rounding_swallows_has_an_endless_error():
     calm = synthetic(gain=0.01, noise=0.0)
     found = least_squares(calm._replace(variance=calm.variance - 1e-3))
-    assert float(found.dark_noise) == 0.0
-    assert float(found.dark_noise_error) == math.inf
+    assert float(found.temporal_dark_noise) == 0.0
+    assert float(found.temporal_dark_noise_error) == math.inf
 
 
 @pytest.mark.parametrize(

@@ -7,7 +7,7 @@ import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from neusee.nodes.losses import bsr, charbonnier, fft_l1, lsr, mrae
+from neusee.nodes.losses import background_loss, charbonnier, fft_l1, mrae, suppression_loss
 from neusee.nodes.values import Psf
 
 
@@ -23,43 +23,47 @@ def as_psf(kernel):
 @given(st.floats(8, 64), st.booleans(), st.floats(-12, 0))
 def test_lsr_agrees_with_its_reference(power, log, size):
     psf = as_psf(rand(2, 4, 5) * 10**size)
-    torch.testing.assert_close(lsr(psf, power=power, log=log), lsr.hooks.reference(psf, power=power, log=log))
+    torch.testing.assert_close(
+        suppression_loss(psf, power=power, log=log), suppression_loss.hooks.reference(psf, power=power, log=log)
+    )
 
 
 def test_lsr_lies_just_above_the_peak():
     kernel = 1e-9 * rand(2, 32, 32)
     kernel[:, 3, 3] = torch.tensor([0.5, 0.1])
-    assert float(lsr(as_psf(kernel))) == pytest.approx(2.0, rel=1e-6)
+    assert float(suppression_loss(as_psf(kernel))) == pytest.approx(2.0, rel=1e-6)
     even = torch.ones(2, 8, 8, dtype=torch.float64) * torch.tensor([0.5, 0.1])[:, None, None]
-    assert float(lsr(as_psf(even), power=16)) == pytest.approx(2 * 64 ** (1 / 16))
-    assert float(lsr(as_psf(even), power=16, log=True)) == pytest.approx(2 * math.log(64) / 16)
+    assert float(suppression_loss(as_psf(even), power=16)) == pytest.approx(2 * 64 ** (1 / 16))
+    assert float(suppression_loss(as_psf(even), power=16, log=True)) == pytest.approx(2 * math.log(64) / 16)
 
 
 def test_lsr_does_not_underflow_in_single_precision():
     kernel = torch.full((2, 4, 4), 1e-9)
-    found = lsr(as_psf(kernel), power=64)
-    assert float(found) == pytest.approx(float(lsr.hooks.reference(as_psf(kernel), power=64)), rel=1e-5)
-    assert torch.isfinite(lsr(as_psf(torch.zeros(2, 4, 4))))
+    found = suppression_loss(as_psf(kernel), power=64)
+    assert float(found) == pytest.approx(float(suppression_loss.hooks.reference(as_psf(kernel), power=64)), rel=1e-5)
+    assert torch.isfinite(suppression_loss(as_psf(torch.zeros(2, 4, 4))))
 
 
 @pytest.mark.parametrize("log", [False, True])
 def test_lsr_gradient(log):
     kernel = (1e-3 * rand(2, 4, 4)).requires_grad_()
-    assert torch.autograd.gradcheck(lambda k: lsr(as_psf(k), log=log), (kernel,), eps=1e-8, atol=1e-5)
-    assert torch.autograd.gradgradcheck(lambda k: lsr(as_psf(1e-3 * k), log=log), (rand(2, 2, 2).requires_grad_(),))
+    assert torch.autograd.gradcheck(lambda k: suppression_loss(as_psf(k), log=log), (kernel,), eps=1e-8, atol=1e-5)
+    assert torch.autograd.gradgradcheck(
+        lambda k: suppression_loss(as_psf(1e-3 * k), log=log), (rand(2, 2, 2).requires_grad_(),)
+    )
 
 
 def test_bsr_counts_lost_light():
     plain = rand(3, 4, 4)
-    assert float(bsr(plain, plain)) == pytest.approx(3.0)
-    assert float(bsr(plain / 2, plain)) == pytest.approx(6.0)
-    assert float(bsr(plain * 0, plain * 0)) == 3.0
+    assert float(background_loss(plain, plain)) == pytest.approx(3.0)
+    assert float(background_loss(plain / 2, plain)) == pytest.approx(6.0)
+    assert float(background_loss(plain * 0, plain * 0)) == 3.0
 
 
 def test_bsr_gradient():
     image, plain = rand(2, 3, 3).requires_grad_(), rand(2, 3, 3) + 1
-    assert torch.autograd.gradcheck(lambda x: bsr(x, plain), (image,))
-    (slope,) = torch.autograd.grad(bsr(image, plain), image)
+    assert torch.autograd.gradcheck(lambda x: background_loss(x, plain), (image,))
+    (slope,) = torch.autograd.grad(background_loss(image, plain), image)
     assert bool((slope < 0).all())  # more light, less loss
 
 

@@ -5,10 +5,11 @@ import torch
 from hypothesis import given
 from hypothesis import strategies as st
 
-from neusee.nodes.metrics import bsr, lsr, peak, saturated
-from neusee.nodes.optics import spot
+from neusee.nodes.metrics import bsr, lsr, peak_irradiance, saturated
+from neusee.nodes.optics import laser_irradiance
 from neusee.nodes.sensor import digitize, expose, full_well, level, saturation
 from neusee.nodes.spectra import rows
+from neusee.nodes.units import read_quantity
 from neusee.nodes.values import Bands, Channels, Psf
 
 SENSOR = {"full_well": 25500.0, "quantum_efficiency": 0.56, "pixel_pitch": 2.9e-6, "exposure": 0.1}
@@ -49,7 +50,7 @@ def test_bsr_is_a_ratio_of_energies():
     ("gain", "unit", "bits"), [(0.37, "e-/DN", 16), (0.37, "DN/e-", 16), (7.0, "e-/DN", 12), (1e4, "e-/DN", 1)]
 )
 def test_a_full_pixel_counts_whether_well_or_converter_ends_first(gain, unit, bits, rounding):
-    sensor = {"gain": gain, "gain_unit": unit, "bits": bits}
+    sensor = {"gain": read_quantity(f"{gain} {unit}", "DN/e-"), "bits": bits}
     electrons = torch.tensor([1e9, 25500.0, 100.0, 0.0]).reshape(1, 2, 2).expand(3, 2, 2)
     rng = torch.Generator().manual_seed(0)
     raw = digitize(full_well(electrons, capacity=25500.0), rounding=rounding, rng=rng, **sensor)
@@ -61,7 +62,7 @@ def test_a_full_pixel_counts_whether_well_or_converter_ends_first(gain, unit, bi
 def test_a_pixel_with_one_full_channel_counts_once():
     raw = torch.zeros(3, 2, 2)
     raw[0, 0, 0] = raw[1, 0, 0] = raw[2, 1, 1] = 65535.0
-    assert float(saturated(raw, full_well=25500.0, gain=0.37).pixels) == 2.0
+    assert float(saturated(raw, full_well=25500.0, gain=1 / 0.37).pixels) == 2.0
 
 
 @given(st.floats(0.0, 1e9))
@@ -71,8 +72,8 @@ def test_the_peak_of_a_laser_alone_is_its_strength(strength):
     kernel[:, 1, 1] = 0.12
     psf = Psf(kernel, torch.full((2,), 0.12, dtype=torch.float64))
     dark = torch.zeros(1, 3, 3)
-    laser = spot(psf, line, strength=strength, **SENSOR)
-    found = peak(dark, bands(550e-9), torch.ones(1), [laser], [line], **SENSOR)
+    laser = laser_irradiance(psf, line, strength=strength, **SENSOR)
+    found = peak_irradiance(dark, bands(550e-9), torch.ones(1), [laser], [line], **SENSOR)
     assert float(found.irradiance) == pytest.approx(strength, rel=1e-5)
     assert bool(found.damaged) == (float(found.irradiance) > 1e6)
 
@@ -80,23 +81,23 @@ def test_the_peak_of_a_laser_alone_is_its_strength(strength):
 def test_scene_and_lasers_add():
     scene, visible = torch.rand(2, 4, 4), bands(500e-9, 600e-9)
     factor = level(scene, visible, torch.ones(1, 2), strength=0.7, **SENSOR)
-    found = peak(scene, visible, factor, **SENSOR)
+    found = peak_irradiance(scene, visible, factor, **SENSOR)
     assert float(found.irradiance) == pytest.approx(0.7, rel=1e-5)
     electrons = 0.56 * expose(scene, visible, torch.ones(1, 2), factor, pixel_pitch=2.9e-6, exposure=0.1)
     assert float(electrons.max()) == pytest.approx(0.7 * 25500, rel=1e-5)
     even = saturation(visible, **SENSOR)[:, None, None].expand(2, 4, 4).float()
-    both = peak(scene, visible, factor, [even, even], [visible, visible], **SENSOR)
+    both = peak_irradiance(scene, visible, factor, [even, even], [visible, visible], **SENSOR)
     assert float(both.irradiance) == pytest.approx(4.7, rel=1e-5)
-    assert peak.hooks.check(both)[0].text == "peak 4.7 I_sat"
+    assert peak_irradiance.hooks.check(both)[0].text == "peak 4.7 I_sat"
 
 
 def test_every_spot_needs_its_line():
     with pytest.raises(ValueError, match="1 spots and 0 lines"):
-        peak(torch.ones(1, 2, 2), bands(5e-7), torch.ones(1), [torch.ones(1, 2, 2)], [], **SENSOR)
+        peak_irradiance(torch.ones(1, 2, 2), bands(5e-7), torch.ones(1), [torch.ones(1, 2, 2)], [], **SENSOR)
 
 
 def test_a_level_of_zero_is_dark():
-    assert float(peak(torch.ones(1, 2, 2), bands(5e-7), torch.zeros(1), **SENSOR).irradiance) == 0.0
+    assert float(peak_irradiance(torch.ones(1, 2, 2), bands(5e-7), torch.zeros(1), **SENSOR).irradiance) == 0.0
 
 
 def channels(light, weights):
@@ -110,15 +111,15 @@ def test_peak_and_bsr_of_channels_are_those_of_all_bands():
     both = [channels(x, rows(visible, seen)) for x in (scene, kept)]
     factor = level(scene, visible, seen, strength=0.7, **SENSOR)
     laser = torch.rand(3, 6, 7, dtype=torch.float64)
-    found = [peak(x, visible, factor, [laser], [visible], **SENSOR) for x in (scene, both[0])]
+    found = [peak_irradiance(x, visible, factor, [laser], [visible], **SENSOR) for x in (scene, both[0])]
     torch.testing.assert_close(*found, rtol=1e-12, atol=0)
     torch.testing.assert_close(bsr(both[1], both[0]), bsr(kept, scene), rtol=1e-12, atol=0)
     torch.testing.assert_close(bsr(kept, both[0]), bsr(kept, scene), rtol=1e-12, atol=0)
     with pytest.raises(ValueError, match="differ in shape"):
         bsr(both[0], scene[:, :3])
     with pytest.raises(ValueError, match="lies outside its rows"):
-        peak(channels(scene, rows(visible, seen)[:1]), visible, factor, **SENSOR)
-    assert (peak.accepts_channel_sums, peak.needs_band_invariant, bsr.accepts_channel_sums) == (
+        peak_irradiance(channels(scene, rows(visible, seen)[:1]), visible, factor, **SENSOR)
+    assert (peak_irradiance.accepts_channel_sums, peak_irradiance.needs_band_invariant, bsr.accepts_channel_sums) == (
         ("image",),
         ("level",),
         ("image", "plain_image"),

@@ -5,7 +5,7 @@ import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from neusee.nodes.optics import spot
+from neusee.nodes.optics import laser_irradiance
 from neusee.nodes.sensor import saturation
 from neusee.nodes.values import Bands, Psf
 
@@ -27,32 +27,34 @@ def clear_psf():
 @settings(max_examples=30, deadline=None)
 @given(st.floats(1e-6, 1e9))
 def test_the_clear_peak_is_strength_times_saturation(strength):
-    found = spot(clear_psf(), LINE, strength=strength, **SENSOR).double()
+    found = laser_irradiance(clear_psf(), LINE, strength=strength, **SENSOR).double()
     wells = (found / saturation(LINE, **SENSOR)[:, None, None]).sum(0)
     assert float(wells.max()) == pytest.approx(strength, rel=1e-6)
 
 
 def test_each_wavelength_sends_its_share_of_the_energy():
-    energy = spot(clear_psf(), LINE, strength=10.0, **SENSOR).double() / clear_psf().intensity
+    energy = laser_irradiance(clear_psf(), LINE, strength=10.0, **SENSOR).double() / clear_psf().intensity
     torch.testing.assert_close(energy[:, 2, 2] / energy[:, 2, 2].sum(), LINE.weights, rtol=1e-6, atol=0.0)
 
 
 def test_an_element_that_suppresses_by_a_thousand_does_so_here():
     weak = Psf(clear_psf().intensity / 1000, CLEAR)
-    found = spot(weak, LINE, strength=1e6, **SENSOR).double()
+    found = laser_irradiance(weak, LINE, strength=1e6, **SENSOR).double()
     assert float((found / saturation(LINE, **SENSOR)[:, None, None]).sum(0).max()) == pytest.approx(1e3, rel=1e-6)
-    assert spot.hooks.check(found, weak, LINE, strength=1e6, **SENSOR)[0].text == "peak 1e+03 I_sat of 1e+06"
+    assert (
+        laser_irradiance.hooks.check(found, weak, LINE, strength=1e6, **SENSOR)[0].text == "peak 1e+03 I_sat of 1e+06"
+    )
 
 
 def test_no_laser_is_no_light():
-    assert not spot(clear_psf(), LINE, strength=0.0, **SENSOR).any()
+    assert not laser_irradiance(clear_psf(), LINE, strength=0.0, **SENSOR).any()
 
 
 def test_gradient():
     kernel = clear_psf().intensity.double().requires_grad_()
-    assert torch.autograd.gradcheck(lambda k: spot(Psf(k, CLEAR), LINE, strength=3.0, **SENSOR), (kernel,))
+    assert torch.autograd.gradcheck(lambda k: laser_irradiance(Psf(k, CLEAR), LINE, strength=3.0, **SENSOR), (kernel,))
 
 
 def test_psf_and_line_must_agree():
     with pytest.raises(ValueError, match="PSF of 3 bands and line of 1"):
-        spot(clear_psf(), Bands(*(x[:1] for x in LINE)), strength=1.0, **SENSOR)
+        laser_irradiance(clear_psf(), Bands(*(x[:1] for x in LINE)), strength=1.0, **SENSOR)

@@ -8,7 +8,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from neusee.nodes import ErrorBound, TensorStats
-from neusee.nodes.sensor import expose, gather, level, saturation
+from neusee.nodes.sensor import add_photons, expose, level, saturation
 from neusee.nodes.spectra import rows
 from neusee.nodes.values import Bands, Channels
 
@@ -102,10 +102,10 @@ def test_a_dark_scene_has_a_finite_level(rule, value):
 
 def test_light_adds():
     one, two, three = (torch.full((3, 2, 2), float(n)) for n in (1, 2, 3))
-    assert gather(one) is one
-    torch.testing.assert_close(gather(one, [two, two], [three]), torch.full((3, 2, 2), 8.0))
+    assert add_photons(one) is one
+    torch.testing.assert_close(add_photons(one, [two, two], [three]), torch.full((3, 2, 2), 8.0))
     with pytest.raises(ValueError, match="cannot fall"):
-        gather(one, [torch.ones(3, 1, 1)])
+        add_photons(one, [torch.ones(3, 1, 1)])
 
 
 def test_bands_must_agree():
@@ -120,7 +120,7 @@ def test_bands_must_agree():
 def test_checks():
     assert expose.hooks.check(torch.ones(3, 2, 2))[0].ok
     assert not expose.hooks.check(torch.tensor([-1.0, 1.0]))[0].ok
-    assert "scene alone 1" in gather.hooks.check(torch.full((3, 1, 1), 4.0), torch.ones(3, 1, 1), [])[0].text
+    assert "scene alone 1" in add_photons.hooks.check(torch.full((3, 1, 1), 4.0), torch.ones(3, 1, 1), [])[0].text
 
 
 def channels(light, weights):

@@ -114,7 +114,7 @@ def test_dark_current_is_poisson():
 
 
 def test_read_noise_has_a_pedestal_and_a_spread():
-    found = read_noise(torch.zeros(N, dtype=torch.float64), pedestal=390.0, sigma=10.5, rng=seeded())
+    found = read_noise(torch.zeros(N, dtype=torch.float64), offset=390.0, read_noise=10.5, rng=seeded())
     assert float(found.mean()) == pytest.approx(390, abs=0.15)
     assert float(found.std()) == pytest.approx(10.5, rel=0.01)
 
@@ -133,8 +133,8 @@ def change(electrons, node, draws=400, **params):
     [
         (dark_current, {"mean": 0.002}),
         (dark_current, {"mean": 30.0}),
-        (read_noise, {"pedestal": 0.0, "sigma": 10.5}),
-        (read_noise, {"pedestal": 390.0, "sigma": 10.5}),
+        (read_noise, {"offset": 0.0, "read_noise": 10.5}),
+        (read_noise, {"offset": 390.0, "read_noise": 10.5}),
     ],
 )
 def test_bounds_are_true_and_not_far(node, params, scale):
@@ -151,9 +151,9 @@ def test_bounds_are_true_and_not_far(node, params, scale):
 def test_bounds_of_nothing():
     dark, any_well = TensorStats.of(torch.zeros(2, 2)), {"full_well": None}
     assert dark_current.hooks.skip_bound(dark, mean=0.0, **any_well) == 0.0
-    assert read_noise.hooks.skip_bound(dark, pedestal=0.0, sigma=0.0, **any_well) == 0.0
+    assert read_noise.hooks.skip_bound(dark, offset=0.0, read_noise=0.0, **any_well) == 0.0
     assert dark_current.hooks.skip_bound(dark, mean=0.1, **any_well) == 1.0
-    assert read_noise.hooks.skip_bound(dark, pedestal=0.0, sigma=1.0, **any_well) == 1.0
+    assert read_noise.hooks.skip_bound(dark, offset=0.0, read_noise=1.0, **any_well) == 1.0
 
 
 def test_what_a_reader_is_told():
@@ -165,7 +165,7 @@ def test_what_a_reader_is_told():
 
 def test_a_laser_above_the_well_hides_no_noise():
     dazzled = TensorStats.of(torch.tensor([[10.0, 1e7]]))
-    noise = {"pedestal": 390.0, "sigma": 10.5}
+    noise = {"offset": 390.0, "read_noise": 10.5}
     assert read_noise.hooks.skip_bound(dazzled, **noise, full_well=25500.0) > 0.01
     assert read_noise.hooks.skip_bound(dazzled, **noise, full_well=None) < 1e-4
     dark = dark_current.hooks.skip_bound(dazzled, mean=0.002, full_well=25500.0)
@@ -175,8 +175,8 @@ def test_a_laser_above_the_well_hides_no_noise():
 @pytest.mark.parametrize("dtype", [torch.float16, torch.float64])
 def test_another_precision_draws_the_same_numbers(dtype):
     electrons = torch.full((64,), 100.0)
-    single = read_noise(electrons, pedestal=0.0, sigma=1.0, rng=seeded())
-    other = read_noise(electrons.to(dtype), pedestal=0.0, sigma=1.0, rng=seeded())
+    single = read_noise(electrons, offset=0.0, read_noise=1.0, rng=seeded())
+    other = read_noise(electrons.to(dtype), offset=0.0, read_noise=1.0, rng=seeded())
     torch.testing.assert_close(other.double(), single.double(), rtol=torch.finfo(dtype).eps, atol=1e-4)
 
 
@@ -197,7 +197,7 @@ def test_parts_that_stay_in_cache_are_the_whole_to_the_last_bit(shape, dtype):
         lambda rng: photon_noise(x, quantum_efficiency=0.56, spread=1.2, mean_shift=0.1, rng=rng),
         lambda rng: photon_noise(x, quantum_efficiency=0.56, distribution="poisson", drawn_in="photons", rng=rng),
         lambda rng: dark_current(x.mT if x.ndim > 1 else x, mean=0.3, rng=rng),
-        lambda rng: read_noise(x.mT if x.ndim > 1 else x, pedestal=3.0, sigma=2.0, rng=rng),
+        lambda rng: read_noise(x.mT if x.ndim > 1 else x, offset=3.0, read_noise=2.0, rng=rng),
     ]
     for make in makers:
         whole = make(torch.Generator().manual_seed(2))

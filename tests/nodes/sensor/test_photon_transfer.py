@@ -6,8 +6,9 @@ import pytest
 import torch
 
 from neusee.nodes.sensor import photon_transfer
+from neusee.nodes.units import read_quantity
 
-TABLE = {"full_well": 25500.0, "quantum_efficiency": 0.56, "pedestal": 390.0, "sigma": 10.5, "dark": 0.002}
+TABLE = {"full_well": 25500.0, "quantum_efficiency": 0.56, "offset": 390.0, "read_noise": 10.5, "dark": 0.002}
 
 
 def curve(pixels=40_000, levels=40, **how):
@@ -30,8 +31,8 @@ def fit(points):
     [(0.37, "e-/DN", "nearest"), (0.37, "DN/e-", "nearest"), (2.0, "e-/DN", "dithered_floor")],
 )
 def test_slope_is_the_gain_and_intercept_the_read_noise(gain, unit, rounding, distribution):
-    slope = gain if unit == "DN/e-" else 1 / gain
-    points = curve(gain=gain, gain_unit=unit, rounding=rounding, distribution=distribution)
+    slope = read_quantity(f"{gain} {unit}", "DN/e-")
+    points = curve(gain=slope, rounding=rounding, distribution=distribution)
     below = points[:, 0] < 0.8 * min(25110 * slope, 65535 - 390 * slope)
     bright = below & (points[:, 0] / slope > 20) | (points[:, 0] == 0)  # under 20 e- a Gaussian is cut at 0
     best, error = fit(points[bright])
@@ -43,12 +44,12 @@ def test_slope_is_the_gain_and_intercept_the_read_noise(gain, unit, rounding, di
 
 @pytest.mark.parametrize("rounding", ["nearest", "dithered_floor"])
 def test_what_is_predicted_in_the_dark_is_measured_where_rounding_is_most_of_the_noise(rounding):
-    points = curve(gain=1.0, gain_unit="DN/e-", sigma=0.8, rounding=rounding, levels=2, pixels=1_000_000)
+    points = curve(gain=1.0, read_noise=0.8, rounding=rounding, levels=2, pixels=1_000_000)
     assert float(points[0, 1]) == pytest.approx(float(points[0, 2]), abs=0.01)
 
 
 def test_shape_dark_level_and_saturation():
-    points = curve(gain=0.37)
+    points = curve(gain=1 / 0.37)
     assert points.shape == (40, 3)
     assert points.dtype == torch.float64
     assert float(points[0, 0]) == 0.0
@@ -59,14 +60,14 @@ def test_shape_dark_level_and_saturation():
 
 @pytest.mark.parametrize(("levels", "pixels"), [(1, 1), (2, 1), (3, 2)])
 def test_the_smallest_experiment(levels, pixels):
-    points = curve(gain=0.37, levels=levels, pixels=pixels)
+    points = curve(gain=1 / 0.37, levels=levels, pixels=pixels)
     assert points.shape == (levels, 3)
     assert torch.isfinite(points).all()
-    assert "too few" in photon_transfer.hooks.check(points, full_well=25500.0, gain=0.37)[0].text or levels > 2
+    assert "too few" in photon_transfer.hooks.check(points, full_well=25500.0, gain=1 / 0.37)[0].text or levels > 2
 
 
 def test_check_judges_the_slope():
-    points = curve(gain=0.37)
-    assert photon_transfer.hooks.check(points, full_well=25500.0, gain=0.37)[0].ok
+    points = curve(gain=1 / 0.37)
+    assert photon_transfer.hooks.check(points, full_well=25500.0, gain=1 / 0.37)[0].ok
     points[:, 1] *= 2
-    assert not photon_transfer.hooks.check(points, full_well=25500.0, gain=0.37)[0].ok
+    assert not photon_transfer.hooks.check(points, full_well=25500.0, gain=1 / 0.37)[0].ok

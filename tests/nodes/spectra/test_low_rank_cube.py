@@ -9,7 +9,7 @@ from hypothesis import strategies as st
 
 from neusee.nodes.spectra import bands, compress, illuminate, lift_lmmse, lift_mallett, responses, rows
 from neusee.nodes.spectra._linear_lift import _estimator
-from neusee.nodes.values import Bands, Mixture
+from neusee.nodes.values import Bands, LowRankCube
 
 NM = 1e-9
 SCENE = bands(start=400 * NM, stop=700 * NM, count=31)
@@ -56,20 +56,20 @@ def looseness(seed):
     """Check every bound of a draw; give how much larger each is than what is left."""
     cube, within = drawn(seed), 10.0 ** -(seed % 6 + 1)
     found = compress(cube, within=within)
-    assert found.rest.shape == (len(found.planes) + 1, len(cube))
+    assert found.residual_max.shape == (len(found.planes) + 1, len(cube))
     target = max(within, 9 * torch.finfo(found.planes.dtype).eps) * float(cube.abs().max())
-    assert len(found.planes) == len(cube) or float(found.spread[-1].max()) <= target
-    assert bool((left(found, cube, len(found.planes), lambda x: x.abs().amax(0)) <= found.off.double()).all())
+    assert len(found.planes) == len(cube) or float(found.residual_rms[-1].max()) <= target
+    assert bool((left(found, cube, len(found.planes), lambda x: x.abs().amax(0)) <= found.residual_map.double()).all())
     ratios = []
     for r in range(len(found.planes) + 1):
         true = left(found, cube, r)
-        assert bool((true <= found.rest[r] * (1 + 1e-9)).all())
+        assert bool((true <= found.residual_max[r] * (1 + 1e-9)).all())
         lit = true > 1e-12 * float(cube.abs().max())
-        ratios += (found.rest[r][lit] / true[lit]).tolist()
+        ratios += (found.residual_max[r][lit] / true[lit]).tolist()
         rms = left(found, cube, r, lambda x: x.square().mean((1, 2)).sqrt())
-        assert bool((rms <= found.spread[r] * (1 + 1e-9)).all())
+        assert bool((rms <= found.residual_rms[r] * (1 + 1e-9)).all())
         floor = 1e-6 * float(cube.double().square().mean().sqrt()) * len(cube) ** 0.5  # the root of what float64 holds
-        assert bool((found.spread[r] <= 1.01 * rms + floor).all())
+        assert bool((found.residual_rms[r] <= 1.01 * rms + floor).all())
     return ratios
 
 
@@ -94,7 +94,7 @@ def test_a_product_of_few_planes_has_as_many(rank, dtype):
     assert len(found.planes) == rank
     assert found.planes.dtype == dtype
     rounding = 2 * len(cube) * torch.finfo(dtype).eps  # of a sum over the bands, there and back; 47 eps were seen
-    assert float(found.rest[-1].max()) < rounding * float(cube.abs().max())
+    assert float(found.residual_max[-1].max()) < rounding * float(cube.abs().max())
 
 
 def test_a_linear_lift_without_clipping_has_three_planes_and_a_grey_one_has_one():
@@ -111,7 +111,7 @@ def test_agrees_with_its_reference():
     for within in (1e-1, 1e-3, 1e-8):
         found, exact = compress(cube, within=within), compress.hooks.reference(cube, within=within)
         assert len(found.planes) == len(exact.planes)
-        assert bool((exact.rest <= found.rest * 1.05).all())
+        assert bool((exact.residual_max <= found.residual_max * 1.05).all())
         made, wanted = (torch.tensordot(m.basis, m.planes, 1) for m in (found, exact))
         torch.testing.assert_close(made, wanted, rtol=1e-9, atol=1e-12)
 
@@ -129,14 +129,14 @@ def test_noise_of_full_rank_keeps_all_planes():
     cube = rand(31, 33, 34)
     found = compress(cube, within=0.0)
     assert len(found.planes) == 31
-    assert float(found.rest[-1].max()) < 1e-6
+    assert float(found.residual_max[-1].max()) < 1e-6
 
 
 @pytest.mark.parametrize("shape", [(1, 1, 1), (31, 1, 1), (1, 7, 1), (2, 97, 89)])
 def test_small_and_odd_shapes(shape):
     cube = rand(*shape)
     found = compress(cube)
-    assert float(left(found, cube, len(found.planes)).max()) <= float(found.rest[-1].max()) <= 1e-6
+    assert float(left(found, cube, len(found.planes)).max()) <= float(found.residual_max[-1].max()) <= 1e-6
     assert found.planes.shape[1:] == shape[1:]
 
 
@@ -144,7 +144,7 @@ def test_darkness_is_one_plane_of_nothing():
     found = compress(torch.zeros(5, 3, 4))
     assert len(found.planes) == 1
     assert not bool(found.planes.any())
-    assert not bool(found.rest.any())
+    assert not bool(found.residual_max.any())
     assert "1 planes for 5 bands" in compress.hooks.check(found)[0].text
 
 
@@ -153,7 +153,7 @@ def test_squares_neither_vanish_nor_overflow(scale):
     cube = torch.tensordot(rand(5, 2, dtype=torch.float64), rand(2, 8, 9, dtype=torch.float64), 1) * scale
     found = compress(cube, within=1e-9)
     assert len(found.planes) == 2
-    assert float(found.rest[-1].max()) <= 1e-9 * float(cube.max())
+    assert float(found.residual_max[-1].max()) <= 1e-9 * float(cube.max())
 
 
 @pytest.mark.parametrize("bad", [float("nan"), float("inf")])
@@ -196,8 +196,8 @@ def test_the_check_says_how_many():
 def test_any_shape_keeps_its_bound(count, y, x, seed, within):
     cube = rand(count, y, x, seed=seed) - 0.2
     found = compress(cube, within=within)
-    assert bool((left(found, cube, len(found.planes)) <= found.rest[-1]).all())
-    assert float(found.spread[-1].max()) <= max(within, 1e-6) * float(cube.abs().max())
+    assert bool((left(found, cube, len(found.planes)) <= found.residual_max[-1]).all())
+    assert float(found.residual_rms[-1].max()) <= max(within, 1e-6) * float(cube.abs().max())
 
 
 @pytest.mark.parametrize("times", ["once", "twice"])
@@ -205,9 +205,9 @@ def test_light_falls_on_a_mixture_as_on_the_cube(times):
     cube, power = rand(5, 6, 7, dtype=torch.float64), rand(5, seed=4, dtype=torch.float64)
     mixed = compress(cube, within=1e-1)
     found, lit = illuminate(mixed, power, times=times), illuminate(cube, power, times=times)
-    assert isinstance(found, Mixture)
+    assert isinstance(found, LowRankCube)
     for r in range(len(found.planes) + 1):
-        assert bool((left(found, lit, r) <= found.rest[r] * (1 + 1e-9)).all())
+        assert bool((left(found, lit, r) <= found.residual_max[r] * (1 + 1e-9)).all())
     for one, exact in zip(found, illuminate.hooks.reference(mixed, power, times=times), strict=True):
         torch.testing.assert_close(one, exact)
     assert "planes for 5 bands" in illuminate.hooks.check(found)[0].text
@@ -244,8 +244,8 @@ def test_a_lift_to_planes_is_the_lift_whether_clipped_or_not(lift, within):
     for colours in (rand(3, 60, 61), 0.5 + 0.01 * rand(3, 60, 61)):
         cube, found = lift(colours, SCENE), lift.low_rank_form(colours, SCENE, within=within)
         lost = left(found, cube, len(found.planes))
-        assert bool((lost <= found.rest[-1] + 1e-6).all())
-        assert float(found.spread[-1].max()) <= within * float(cube.max())
+        assert bool((lost <= found.residual_max[-1] + 1e-6).all())
+        assert float(found.residual_rms[-1].max()) <= within * float(cube.max())
         assert len(found.planes) == len(compress(cube, within=within).planes)
         assert len(found.planes) == len(lift.low_rank_form.hooks.reference(colours, SCENE, within=within).planes)
     assert "planes for 31 bands" in lift.low_rank_form.hooks.check(found)[0].text

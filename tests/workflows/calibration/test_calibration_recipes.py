@@ -56,7 +56,7 @@ def states(result):
 def test_the_packaged_sensor_comes_back_from_its_frames(tmp_path):
     result = run(load("calibrate"), Store(tmp_path))
     found = result.values["least_squares"]
-    for name, truth in {"gain": 1 / 0.37, "efficiency": 0.56, "dark_noise": 10.5}.items():
+    for name, truth in {"gain": 1 / 0.37, "efficiency": 0.56, "temporal_dark_noise": 10.5}.items():
         got, error = (float(found._asdict()[n]) for n in (name, f"{name}_error"))
         assert abs(got - truth) < 4 * error
         assert error < 0.005 * truth

@@ -18,7 +18,7 @@ from neusee.workflows.studies.calibration.simulated_sensors import SensorSimulat
 
 pytestmark = pytest.mark.usefixtures("one_thread")
 
-SEEN = ["flats.shape=[64, 64]", "reading.gain_unit=DN/e-"]
+SEEN = ["flats.shape=[64, 64]", "sensor.gain=0.37 DN/e-"]
 PHOTONS = {  #: by level
     path.split(".")[1]: setting.value
     for path, setting in load("calibrate").config.settings.items()
@@ -101,7 +101,7 @@ def test_a_free_fano_factor_is_one_direction_that_frames_do_not_know(fitted):
     assert told.directions[0].startswith("dark current: only an upper limit")
     said = told.directions[1]
     assert "only together" in said
-    assert all(word in said for word in ("gain", "pedestal", "read noise", "full well", "quantum efficiency"))
+    assert all(word in said for word in ("gain", "offset", "read noise", "full well", "quantum efficiency"))
     both = mode.covariance.diagonal() ** 0.5
     assert both[problem.names.index("gain")] < 0.1  # the slope of the photon-transfer curve itself is known
     assert away(problem, truth, mode) < 5
@@ -128,7 +128,7 @@ QUIET = ("sensor.read_noise=0.05 e-", "sensor.dark_current=0.2 e-")  #: 0.02 DN
 def test_frames_too_coarse_for_the_read_noise_are_counted_number_by_number(fitted):
     problem, _, _, told = fitted(*QUIET)
     short = (problem.levels.photons == 0) & (problem.levels.exposure == 0.1)
-    assert problem.levels.numbers[short].tolist() == [0]
+    assert problem.levels.pixels[short].tolist() == [0]
     assert 1 <= int((problem.levels.cell_level == 0).sum()) <= 3
     assert told.kinds["read_noise"] != "estimate"
 
@@ -136,7 +136,7 @@ def test_frames_too_coarse_for_the_read_noise_are_counted_number_by_number(fitte
 def test_a_coarse_read_noise_lies_within_its_interval(fitted):
     problem, truth, mode, _ = fitted(*QUIET)
     found = problem.parameters(walk_draws(problem, mode, 1).samples)
-    for name in ("read_noise", "gain", "pedestal", "dark_current"):
+    for name in ("read_noise", "gain", "offset", "dark_current"):
         low, high = np.quantile(found[name].numpy(), [0.005, 0.995])
         assert low < truth[name] < high, name
 
@@ -154,7 +154,9 @@ def test_the_law_is_not_fooled_by_numbers_that_do_not_scatter(fitted, tmp_path):
     """By mean and variance alone the read noise would be 3 sigma off: one twelfth does not hold there."""
     problem, truth, _, _ = fitted(*QUIET)
     found = problem.likelihood(problem.theta(truth)[None])
-    assert float(found.deviance.sum()) < float(found.freedom.sum()) + 5 * math.sqrt(2 * float(found.freedom.sum()))
+    assert float(found.deviance.sum()) < float(found.degrees_of_freedom.sum()) + 5 * math.sqrt(
+        2 * float(found.degrees_of_freedom.sum())
+    )
     noisier = {**truth, "read_noise": 0.5}
     assert float(problem.likelihood(problem.theta(noisier)[None]).log) < float(found.log) - 20
 
@@ -193,7 +195,7 @@ def test_walkers_start_within_the_number_of_the_full_well(fitted, tmp_path):
 
 
 def test_numbers_at_the_end_of_the_converter_do_not_show_the_well(fitted):
-    _, _, _, told = fitted("reading.gain_unit=e-/DN", "sensor.gain=0.31", "sensor.full_well=30000 e-")
+    _, _, _, told = fitted("sensor.gain=0.31 e-/DN", "sensor.full_well=30000 e-")
     assert told.kinds["full_well"] == "lower"
 
 
@@ -222,14 +224,15 @@ def scaled(by, unit="DN/e-"):
 
     Not fewer: of a handful of electrons a level is no Gaussian.
     """
-    names = {"full_well": 25500, "read_noise": 10.5, "pedestal": 390, "dark_current": 0.2}
+    names = {"full_well": 25500, "read_noise": 10.5, "offset": 390, "dark_current": 0.2}
     levels = [f"levels.{name}.photons={photons * by!r}" for name, photons in PHOTONS.items()]
     sensor = [f"sensor.{name}={value * by!r} e-" for name, value in names.items()]
+    gain = 0.37 / by if unit == "DN/e-" else by / 0.37
     return [
         *levels,
         *sensor,
-        f"sensor.gain={0.37 / by!r}",
-        f"steps.prior.with.pedestal=[{390 * by!r} e-, {100 * by!r} e-]",
+        f"sensor.gain={gain!r} {unit}",
+        f"steps.prior.with.offset=[{390 * by!r} e-, {100 * by!r} e-]",
     ]
 
 

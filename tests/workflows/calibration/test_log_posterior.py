@@ -19,7 +19,7 @@ from neusee.workflows.recipe.loading import load
 from neusee.workflows.store.result_store import Store
 
 SMALL = "flats.shape=[64, 64]"
-SEEN = "reading.gain_unit=DN/e-"  # the well ends before the converter
+SEEN = "sensor.gain=0.37 DN/e-"  # the well ends before the converter
 
 
 @pytest.fixture(scope="module")
@@ -63,7 +63,7 @@ def test_what_no_frame_tells_is_said_in_words(store):
     well = "full well: only a lower limit: no frame is saturated by the well"
     dark = "dark current: only an upper limit: no dark was exposed for long enough"  # for so few pixels
     assert sorted(told.directions) == [dark, well]
-    assert told.estimated == ("gain", "pedestal", "read_noise", "quantum_efficiency")
+    assert told.estimated == ("gain", "offset", "read_noise", "quantum_efficiency")
     seen = problem(store, SEEN)
     assert list(identify(seen, mode(seen)).directions) == [dark]
 

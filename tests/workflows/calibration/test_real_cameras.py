@@ -95,14 +95,14 @@ def test_a_table_of_ones_own_is_taken_by_override(store, tmp_path):
 @pytest.mark.parametrize("unit", ["DN/e-", "e-/DN"])
 def test_the_peak_explains_its_levels_in_either_unit(store, unit):
     gain = 0.25 if unit == "DN/e-" else 4.0
-    problem = SensorPosterior.of(load("calibrate_camera", [f"camera.gain={gain}", f"camera.gain_unit={unit}"]), store)
+    problem = SensorPosterior.of(load("calibrate_camera", [f"camera.gain={gain} {unit}"]), store)
     mode = find_mode(problem, initial_theta(problem))
     assert mode.settled
     found = goodness_of_fit(problem.likelihood(mode.theta[None]), len(problem.names))
     assert found.good
     assert found.p > 0.01
     at = problem.names.index("gain")
-    assert float(problem.parameters(mode.theta)["gain"]) == pytest.approx(gain, rel=0.02)
+    assert float(problem.parameters(mode.theta)["gain"]) == pytest.approx(0.25, rel=0.02)
     assert mode.shares[at] < 0.01
     assert identify(problem, mode).kinds["gain"] == "estimate"
     assert not identify(problem, mode).refused
@@ -158,7 +158,7 @@ def test_emcee_draws_from_the_same_posterior(store, tmp_path):
     assert chains.long
     rows = {row.name: row for row in compare_models(problem.recipe, store)}
     for name, x in zip(problem.names, chains.flat.T, strict=True):
-        if name in ("gain", "quantum_efficiency", "dark_noise", "lamp"):
+        if name in ("gain", "quantum_efficiency", "temporal_dark_noise", "lamp"):
             model = rows[name].models[-1]
             width = math.log(model.high / model.low) / 2 / Z_90
             assert x.mean() == pytest.approx(math.log(model.value), abs=0.15 * width)
@@ -198,7 +198,7 @@ def test_a_model_that_is_wrong_does_not_make_the_statement_wrong(store, tmp_path
 def test_the_simulated_set_of_emva_holds_its_truth(store):
     rows = stated(real("003_Simulation"), store)
     assert rows["gain"].stated.holds(0.1)
-    assert rows["dark_noise"].stated.holds(30.0)
+    assert rows["temporal_dark_noise"].stated.holds(30.0)
     # 0.5 electrons a photon, of which the light of a frame falls by 3 % towards its corners as the square of the
     # distance: by 1 % in the mean. In the middle of these frames, 0.0499 DN a photon and 0.1 DN/e- are 0.5.
     assert rows["quantum_efficiency"].stated.holds(0.5 * (1 - 0.03 / 3))
@@ -210,7 +210,7 @@ def test_the_ccd_of_emva_is_not_linear_which_is_why_least_squares_gives_less(sto
     recipe = real("001_CCD")
     rows = stated(recipe, store)
     assert all(row.stated.low < row.stated.value < row.stated.high for row in rows.values())
-    assert rows["dark_noise"].stated.high < 10.898 / 0.97
+    assert rows["temporal_dark_noise"].stated.high < 10.898 / 0.97
     assert rows["gain"].stated.low > 0.280769  # of a straight line, through levels where each electron gives less
     problem = SensorPosterior.of(with_one_term(recipe), store)
     best = {name: float(x) for name, x in problem.parameters(find_mode(problem, initial_theta(problem)).theta).items()}
@@ -232,7 +232,7 @@ def as_expected(levels, best):
     used = (levels.photons > 0) & (signal <= 0.7 * (3905.7 - 14.7))
     curve = 1 + best["bend"] * signal / float(signal[used].max())
     slope = best["gain"] * curve**2
-    law = slope**2 * (best["dark_noise"] ** 2 + signal / (best["gain"] * curve)) + 1 / 12
+    law = slope**2 * (best["temporal_dark_noise"] ** 2 + signal / (best["gain"] * curve)) + 1 / 12
     return levels._replace(variance=torch.where(used | (levels.photons == 0), law, levels.variance))
 
 
@@ -247,19 +247,19 @@ steps:
   prior:
     node: calibrate.prior
     with:
-      gain: [0.3, 2]
-      pedestal: [50 e-, 50 e-]
+      gain: [0.3 DN/e-, 2]
+      offset: [50 e-, 50 e-]
       read_noise: [10 e-, 2]
       dark_current: [10 e-, 10]
       quantum_efficiency: [0.5, 2]
   density:
     node: calibrate.density
     from: {levels: sufficient}
-    with: {gain: 0.28, gain_unit: DN/e-, quantum_efficiency: 0.45, pedestal: 52 e-, read_noise: 11 e-, bits: 12,
+    with: {gain: 0.28 DN/e-, quantum_efficiency: 0.45, offset: 52 e-, read_noise: 11 e-, bits: 12,
            dark_current: 10 e-, dark_exposure: 1 s, full_well: 20000 e-}
 outputs: [density]
 """
-NEAR = {"gain": 0.28, "pedestal": 52.0, "read_noise": 11.0, "dark_current": 10.0, "quantum_efficiency": 0.45}
+NEAR = {"gain": 0.28, "offset": 52.0, "read_noise": 11.0, "dark_current": 10.0, "quantum_efficiency": 0.45}
 
 
 def test_pixels_taken_as_alike_are_sure_of_a_wrong_gain_and_that_is_a_misfit(store, tmp_path):

@@ -8,7 +8,7 @@ from neusee.workflows.cli import app
 
 RECIPE = """
 # A target through a small sensor.
-sensor: {gain: 0.5, capacity: 200 e-}
+sensor: {gain: 0.5 e-/DN, capacity: 200 e-}
 seed: 3
 tolerance: 0
 outputs: [raw, saturated]
@@ -43,9 +43,9 @@ def neusee(here, capfd):
 
 def test_why_names_the_value_and_its_place(neusee):
     assert neusee("run", "mine.yaml", "--quiet")[0] == 0
-    code, out, _ = neusee("why", "saturated", "mine.yaml", "sensor.gain=0.7")
+    code, out, _ = neusee("why", "saturated", "mine.yaml", "sensor.gain=0.7 e-/DN")
     assert code == 0
-    assert "saturated <- raw: sensor.gain 0.5 -> 0.7 (argument 3)" in out
+    assert "saturated <- raw: sensor.gain 0.5 -> 0.7 e-/DN (argument 3)" in out
 
 
 def test_why_of_no_step_names_the_nearest(neusee):
@@ -89,7 +89,7 @@ def test_a_damaged_result_fails_the_verification(neusee, here):
         (("run", "mine.yaml", "--device", "cpu,cpu"), "names a device twice"),
         (("run", "mine.yaml", "--device", "gpu"), "--device gpu"),
         (("run", "mine.yaml", "--memory", "lots"), "--memory"),
-        (("sweep", "mine.yaml", "sensor.gain=0.5,0.6", "--on-error", "ignore"), "--on-error ignore"),
+        (("sweep", "mine.yaml", "sensor.gain=0.5 e-/DN,0.6 e-/DN", "--on-error", "ignore"), "--on-error ignore"),
         (("sweep", "mine.yaml", "sensor.gian=0.5,0.6"), "did you mean sensor.gain?"),
         (("plan", "mine.yaml", "--devices", "nowhere.yaml"), "nowhere.yaml"),
     ],
@@ -110,8 +110,8 @@ def test_a_store_that_is_no_url_is_refused(neusee, monkeypatch):
 
 
 def test_a_sweep_writes_one_table_and_a_second_one_computes_nothing(neusee, here):
-    words = ("sweep", "mine.yaml", "sensor.gain=0.5,0.6,0.7", "sensor.capacity='linspace(100 e-, 200 e-, 2)'")
-    words = (*words[:3], "sensor.capacity=linspace(100 e-, 200 e-, 2)")
+    gains, wells = "sensor.gain=0.5 e-/DN,0.6 e-/DN,0.7 e-/DN", "sensor.capacity=linspace(100 e-, 200 e-, 2)"
+    words = ("sweep", "mine.yaml", gains, wells)
     code, out, _ = neusee(*words)
     assert code == 0, out
     table = (here / "runs" / "sweeps" / "latest" / "sweep.csv").read_text()
@@ -132,7 +132,7 @@ def test_two_lanes_of_the_cpu_give_what_one_gives(neusee, here):
 def test_a_plan_says_what_is_refused_and_a_run_refuses_it_first(neusee, here):
     big = ("mine.yaml", "steps.scene.with.shape=[2000, 2000]")
     assert neusee("run", *big, "--quiet")[0] == 0
-    more = (*big, "sensor.gain=0.6", "sensor.capacity=150 e-", "--memory", "9 MB")
+    more = (*big, "sensor.gain=0.6 e-/DN", "sensor.capacity=150 e-", "--memory", "9 MB")
     code, out, _ = neusee("plan", *more)
     assert code == 1
     assert "refused" in out

@@ -8,7 +8,7 @@ import torch
 from neusee.nodes import Node
 from neusee.nodes.optics import image, psf
 from neusee.nodes.spectra import illuminate
-from neusee.nodes.values import Mixture, Psf, Pupil
+from neusee.nodes.values import LowRankCube, Psf, Pupil
 from neusee.workflows import RunError, Store, load
 from neusee.workflows.engine import band_results
 from neusee.workflows.engine.band_results import call_by_band, plain_of
@@ -224,7 +224,9 @@ def test_a_node_without_bands_is_only_called(blobs):
 
 
 def test_a_scene_in_few_planes_has_no_band_to_compute_alone(blobs):
-    mixed = Mixture(rand(2, 64, 64), rand(BANDS, 2, dtype=torch.float64), torch.zeros(3, BANDS, dtype=torch.float64))
+    mixed = LowRankCube(
+        rand(2, 64, 64), rand(BANDS, 2, dtype=torch.float64), torch.zeros(3, BANDS, dtype=torch.float64)
+    )
     power = rand(BANDS, dtype=torch.float64)
     step = Step("radiance", illuminate, {"times": "once"}, {}, Location("test"), {})
     found = call_by_band(step, [mixed, power], lambda given: illuminate(*given), "code", blobs)

@@ -99,7 +99,7 @@ def test_what_a_recipe_has_laws_for_is_drawn_for_each_scene(tmp_path, store):
     laws = {
         "sensor.c1": "uniform(0, 0.25)",
         "sensor.background": "uniform(0.3, 0.7)",
-        "sensor.pedestal": "uniform(350 e-, 400 e-)",
+        "sensor.offset": "uniform(350 e-, 400 e-)",
     }
     each = pipelines(BARE, *(f"{name}={law}" for name, law in laws.items()))
     shown, _ = scenes(load("first_light", SMALL), store, tmp_path, 2)
@@ -109,7 +109,7 @@ def test_what_a_recipe_has_laws_for_is_drawn_for_each_scene(tmp_path, store):
             recipe = pipeline.recipes[scene.case]
             seen.append(scene.draw(Inputs.of(recipe, pipeline.pipeline.outputs)))
             units = {
-                name: f"{value!r} e-" if name == "sensor.pedestal" else repr(value) for name, value in seen[-1].items()
+                name: f"{value!r} e-" if name == "sensor.offset" else repr(value) for name, value in seen[-1].items()
             }
             wanted = by_hand(tmp_path, scene, pipeline, 1e4, [f"{name}={text}" for name, text in units.items()])
             found = bench.point(pipeline, PointRequest(scene, scene.case, 1e4))

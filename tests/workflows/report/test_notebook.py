@@ -117,7 +117,7 @@ def test_numbers_of_numpy_and_torch_and_paths_are_values(given, write):
 def test_groups_are_chosen_by_keyword():
     recipe = load("first_light", doe="axicon", sensor={"read_noise": "20 e-"}, lasers={"green": {"strength": 1e4}})
     assert recipe.steps["height"].node.path == "doe.axicon"
-    assert recipe.steps["read[mask]"].params["sigma"] == 20
+    assert recipe.steps["read[mask]"].params["read_noise"] == 20
     assert recipe.steps["spot[mask,green]"].params["strength"] == 1e4
     assert any("not compared" in note for note in recipe.notes)
 

@@ -280,7 +280,7 @@ def test_what_is_not_a_number_stops_and_is_kept(tmp_path, tiny, monkeypatch):
         trained(tiny, tmp_path)
     (folder,) = (tmp_path / "runs").iterdir()
     kept = torch.load(folder / "not_finite_1_0.pt", weights_only=True)
-    assert {"relief", "net", "critics"} <= kept["parts"].keys()
+    assert {"mask", "net", "critics"} <= kept["parts"].keys()
     assert kept["pictures"] == [0, 1]
     assert not (folder / "network.safetensors").exists()
 
@@ -391,7 +391,7 @@ def command(tmp_path, monkeypatch, capfd):
 
 def test_a_mask_is_designed_and_stage_2_learns_behind_it(command, tmp_path, photographs):
     words = ["train_small", *TINY, *MASK, f"train.photographs={photographs}", "train.mask.feature=300 um",
-             "element.levels=16", "element.max_height=3 um"]  # fmt: skip
+             "mask.levels=16", "mask.max_height=3 um"]  # fmt: skip
     code, out, err = command(*words, "--stage", "mask")
     assert (code, err) == (0, "")
     assert "levels 16, greatest height 3 um, least feature 300 um" in out
@@ -412,7 +412,7 @@ def test_a_mask_is_designed_and_stage_2_learns_behind_it(command, tmp_path, phot
     assert (code, Path(out.strip()), err) == (0, folder, "")
     assert (folder / "mask.safetensors").stat().st_mtime_ns == before
     assert [(row["stage"], row["iteration"]) for row in losses(folder)] == [("2", i) for i in "012"]
-    assert json.loads((folder / "training.json").read_text())["element"] == "designed without images"
+    assert json.loads((folder / "training.json").read_text())["mask"] == "designed without images"
     assert torch.equal(_element_of(words, folder), height)
 
 

@@ -13,8 +13,8 @@ from neusee.nodes.losses import ContrastFloor, HighestFrequency, NoiseVariance, 
 from neusee.nodes.units import Count, DataFile, PositiveLength, Wavelength
 
 Weight = Annotated[float, Field(ge=0, allow_inf_nan=False)]
-Kind = Literal["pixelwise", "element", "zernike", "rings", "unet", "five_half_rings"]
-_RATE = {"pixelwise": 0.05, "element": 4e-3, "zernike": 0.1, "rings": 0.1, "unet": 2e-3, "five_half_rings": 1.0}
+Kind = Literal["pixelwise", "recipe_mask", "zernike", "rings", "unet", "five_half_rings"]
+_RATE = {"pixelwise": 0.05, "recipe_mask": 4e-3, "zernike": 0.1, "rings": 0.1, "unet": 2e-3, "five_half_rings": 1.0}
 
 
 def half_cosine(angle: float) -> float:
@@ -27,8 +27,8 @@ class Weights(BaseModel):
 
     model_config = ConfigDict(extra="forbid", frozen=True)
 
-    lsr: Weight = 1.0  #: `losses.lsr`
-    bsr: Weight = 1.0  #: `losses.bsr` of a point on the axis: the light that left the field
+    lsr: Weight = 1.0  #: `losses.suppression_loss`
+    bsr: Weight = 1.0  #: `losses.background_loss` of a point on the axis: the light that left the field
     contrast: Weight = 0.0  #: `losses.contrast`
     wiener: Weight = 0.0  #: `losses.wiener`, of all bands at once: the error that a Wiener filter leaves
 
@@ -44,7 +44,7 @@ class MaskSettings(BaseModel):
 
     model_config = ConfigDict(extra="forbid", frozen=True)
 
-    kind: Kind = "pixelwise"  #: `element`: all samples of the recipe's own height map, from its formula or file
+    kind: Kind = "pixelwise"  #: `recipe_mask`: all samples of the recipe's own height map, from its formula or file
     iterations: Count = 300  #: of Adam; for five_half_rings generations
     learning_rate: Annotated[float, Field(gt=0, allow_inf_nan=False)] | None = None  #: None: the kind's own rate
     schedule: Literal["cosine", "step"] = "cosine"  #: `step`: halved at each fifth of the iterations

@@ -11,6 +11,7 @@ from pydantic import BaseModel, ConfigDict, Field, ValidationError, model_valida
 from neusee.workflows.graph.diagnostics import Diagnostic, Location, nearest
 from neusee.workflows.recipe.blocks.mask_design_block import MaskSettings, MaskTraining, Weights
 from neusee.workflows.recipe.text.composition import Composed
+from neusee.workflows.recipe.text.renamed_keys import instead
 from neusee.workflows.recipe.text.yaml_values import Value
 
 KEY = "train"  #: key of the block in a recipe
@@ -60,7 +61,7 @@ class Rates(_Block):
 
     weights: Annotated[float, Field(gt=0)] = 2e-4
     biases: Annotated[float, Field(gt=0)] = 4e-4
-    element: Annotated[float, Field(gt=0)] = 2e-4
+    mask: Annotated[float, Field(gt=0)] = 2e-4
     halve: Number = 2000
     every: Number = 1000
     factor: Annotated[float, Field(gt=0, le=1)] = 0.7
@@ -175,7 +176,10 @@ def _problem(block: Value, error: Any) -> Diagnostic:
     mark: Location = at.key if error["type"] == "extra_forbidden" else at.mark
     text = str(error["msg"])
     if error["type"] == "extra_forbidden":
-        text = f"unknown; {nearest(path[-1], _fields(error['loc'][:-1]))}"
+        unknown = f"unknown; {nearest(path[-1], _fields(error['loc'][:-1]))}"
+        text = instead(".".join(path)) or unknown
+    elif now := instead(f"{'.'.join(path)}={error['input']}"):
+        text = f"{error['input']} {now}"
     elif error["type"] == "missing":
         text = f"needs {error['loc'][-1]}"
     return Diagnostic(mark, ".".join(path), text)

@@ -3,8 +3,9 @@
 from __future__ import annotations
 
 import csv
+import re
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from glob import glob
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -12,15 +13,22 @@ from zipfile import BadZipFile
 
 import numpy as np
 
-from neusee.nodes.units import read_any
+from neusee.nodes.units import read_any, read_written
+from neusee.workflows.recipe.text.renamed_keys import POSTERIOR_NAMES
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray
 
     FloatArray = NDArray[np.float64]
 
+GAIN_UNIT = "DN/e-"  #: of K, EMVA 1288
+BARE_GAIN = (
+    "head its draws 'gain [DN/e-]' or 'gain [e-/DN]', or write its mean and sd with DN/e-; "
+    "the folder of `neusee calibrate` contains the unit"
+)
 Z_90 = 1.6448536269514722  #: standard deviations on either side that contain 90 % of a normal distribution
 _LEAST = 30  #: smallest number of draws from which a distribution is estimated
+_HEAD = re.compile(r"\s*(.*?)\s*\[([^\[\]]*)\]\s*")  #: ``gain [DN/e-]``
 _JITTER = 1e-10  #: added to the diagonal of a correlation so that its Cholesky factor exists
 _FILES = "the folder of `neusee calibrate`, its posterior.json, draws in .npz or .csv, or a mean and sd in .json, .yaml"
 
@@ -125,7 +133,7 @@ class Posterior:
 
     joint: Joint
     kinds: Mapping[str, str] = field(default_factory=dict)  #: of `neusee calibrate`: estimate, upper, lower, none
-    units: Mapping[str, str] = field(default_factory=dict)  #: of `neusee calibrate`, in words
+    units: Mapping[str, str] = field(default_factory=dict)  #: in words, as far as the file gives them
 
     def kind(self, name: str) -> str:
         """Return how a value is constrained; a value from another source is an estimate."""
@@ -142,9 +150,9 @@ def read_posterior(path: Path) -> Posterior:
         raise ValueError(f"no such file: {path}; give {_FILES}")
     try:
         if path.suffix == ".npz":
-            return Posterior(_drawn(_arrays(path)))
+            return _drawn(*_headed(_arrays(path)))
         if path.suffix == ".csv":
-            return Posterior(_drawn(_columns(path)))
+            return _drawn(*_headed(_columns(path)))
         if path.suffix in (".json", ".yaml", ".yml"):
             return _document(path)
     except (OSError, KeyError, TypeError, BadZipFile, UnicodeDecodeError) as error:
@@ -164,17 +172,39 @@ def _document(path: Path) -> Posterior:
     if not isinstance(doc, dict):
         raise ValueError(f"{path.name} must contain a mapping")
     if "parameters" not in doc:
-        return Posterior(summary(doc))
+        return summarised(doc)
     if doc.get("failed"):
         wrong = [check["name"] for check in doc.get("checks", ()) if check["mark"] == "fail"]
         raise ValueError(f"the calibration cannot be used: {doc['failed']} checks fail ({'; '.join(wrong)})")
     joint = read_posterior(path.with_name("draws.npz")).joint
-    kinds = {name: str(row["kind"]) for name, row in doc["parameters"].items()}
-    units = {name: str(row["unit"]) for name, row in doc["parameters"].items()}
-    return Posterior(joint, kinds, units)
+    assert joint.draws is not None
+    rows = {_renamed(name): row for name, row in doc["parameters"].items()}
+    columns = {_renamed(name): x for name, x in zip(joint.names, joint.draws.T, strict=True)}
+    found = _drawn(columns, {name: str(row["unit"]) for name, row in rows.items()})
+    return replace(found, kinds={name: str(row["kind"]) for name, row in rows.items()})
 
 
-def _drawn(columns: Mapping[str, FloatArray]) -> Joint:
+def _renamed(name: str) -> str:
+    """Return the present name of a parameter of a calibration by neusee 0.1."""
+    return POSTERIOR_NAMES.get(name, name)
+
+
+def _headed(columns: Mapping[str, FloatArray]) -> tuple[dict[str, FloatArray], dict[str, str]]:
+    """Return draws by name, and the units that headings contain: ``gain [DN/e-]``."""
+    heads = {head: _HEAD.fullmatch(head) for head in columns}
+    found = {m[1] if m else head: columns[head] for head, m in heads.items()}
+    return found, {m[1]: m[2].strip() for m in heads.values() if m}
+
+
+def _drawn(columns: Mapping[str, FloatArray], units: Mapping[str, str]) -> Posterior:
+    """Return the distribution of draws; draws in e-/DN become draws of K."""
+    with np.errstate(divide="ignore"):
+        si = {name: 1.0 / x if units.get(name) == "e-/DN" else x for name, x in columns.items()}
+    said = {name: GAIN_UNIT if unit == "e-/DN" else unit for name, unit in units.items()}
+    return Posterior(_of_columns(si), units=said)
+
+
+def _of_columns(columns: Mapping[str, FloatArray]) -> Joint:
     lengths = {len(x) for x in columns.values()}
     if len(lengths) != 1:
         raise ValueError("the values have different numbers of draws" if lengths else "the file contains no draws")
@@ -201,6 +231,12 @@ def _columns(path: Path) -> dict[str, FloatArray]:
     return {name.strip(): numbers[:, i] for i, name in enumerate(header)}
 
 
+def summarised(given: Mapping[str, Any]) -> Posterior:
+    """Return the distribution that `summary` reads, with the units of its means."""
+    joint = summary(given)
+    return Posterior(joint, units={str(name): read_any(x)[1] for name, x in given["mean"].items()})
+
+
 def summary(given: Mapping[str, Any]) -> Joint:
     """Return the joint distribution of a summary, in SI or with units: mean with sd or with covariance."""
     if strange := sorted(set(given) - {"mean", "sd", "correlation", "covariance"}):
@@ -208,7 +244,7 @@ def summary(given: Mapping[str, Any]) -> Joint:
     if not isinstance(given.get("mean"), dict) or ("sd" in given) == ("covariance" in given):
         raise ValueError("a summary needs mean: {name: value}, and either sd: {name: value} or covariance: [[…], …]")
     names = [str(name) for name in given["mean"]]
-    mean = np.array([read_any(x)[0] for x in given["mean"].values()])
+    mean = np.array([_si(x) for x in given["mean"].values()])
     if "covariance" in given:
         covariance = _matrix(given["covariance"])
         sd = np.sqrt(np.diag(covariance).clip(0)) if covariance.ndim == 2 else np.zeros(0)
@@ -217,9 +253,16 @@ def summary(given: Mapping[str, Any]) -> Joint:
         return Joint.of_normal(names, mean, sd, covariance / sd / sd[:, None])
     if not isinstance(given["sd"], dict) or set(map(str, given["sd"])) != set(names):
         raise ValueError("sd must have the same names as mean")
-    sd = np.array([read_any(given["sd"][name])[0] for name in given["mean"]])
+    sd = np.array([_si(given["sd"][name]) for name in given["mean"]])
     correlation = _matrix(given["correlation"]) if "correlation" in given else np.eye(len(names))
     return Joint.of_normal(names, mean, sd, correlation)
+
+
+def _si(text: Any) -> float:
+    number, _, reciprocal = read_written(text)
+    if reciprocal:
+        raise ValueError(f"{text}: the mean and sd of a gain are those of K; write both in DN/e-")
+    return number
 
 
 def _matrix(given: Any) -> FloatArray:

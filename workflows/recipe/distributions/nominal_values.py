@@ -12,10 +12,18 @@ from typing import Any
 
 from neusee.nodes.units import read_any
 from neusee.workflows.graph.diagnostics import Diagnostic, Location, nearest
-from neusee.workflows.recipe.distributions.joint import Joint, Posterior, read_posterior, summary
+from neusee.workflows.recipe.distributions.joint import (
+    BARE_GAIN,
+    GAIN_UNIT,
+    Joint,
+    Posterior,
+    read_posterior,
+    summarised,
+)
 from neusee.workflows.recipe.distributions.scalar import Law, is_law, read_law, written
 from neusee.workflows.recipe.text.composition import Composed
 from neusee.workflows.recipe.text.references import BROKEN
+from neusee.workflows.recipe.text.renamed_keys import POSTERIOR_NAMES
 from neusee.workflows.recipe.text.yaml_values import Value, Where, dotted
 
 KEY = "posterior"  #: key of the block in a recipe
@@ -160,7 +168,7 @@ class _Reader:
     def _posterior(self, given: Value, said: Mapping[Any, Value]) -> Posterior:
         if any(key in said for key in _SUMMARY):
             self.source = f"summary at {given.mark}"
-            return Posterior(summary({key: _flat(v) for key, v in said.items() if key in _SUMMARY}))
+            return summarised({key: _flat(v) for key, v in said.items() if key in _SUMMARY})
         file = said.get("file")
         if file is None or not isinstance(file.data, str):
             raise ValueError("write posterior: PATH, or posterior: {file: PATH, use: mean}")
@@ -186,7 +194,11 @@ class _Reader:
         if given is not None:
             pairs = {path: str(name) for path, name in _flat(given).items()}
             if wrong := [name for name in pairs.values() if name not in names]:
-                raise ValueError(f"values: {wrong[0]} is not in the posterior; {nearest(wrong[0], names)}")
+                now = POSTERIOR_NAMES.get(wrong[0])
+                hint = (
+                    f"is called {now} now" if now in names else f"is not in the posterior; {nearest(wrong[0], names)}"
+                )
+                raise ValueError(f"values: {wrong[0]} {hint}")
         else:
             all_pairs = {name if "." in name else f"{_BLOCK}.{name}": name for name in names}
             pairs = {path: name for path, name in all_pairs.items() if _at(self.root, path) is not None}
@@ -200,16 +212,20 @@ class _Reader:
         return pairs
 
     def _conventions(self, posterior: Posterior, pairs: Mapping[str, str]) -> None:
-        """Raise ValueError where the posterior uses another unit of gain or another exposure than the recipe."""
-        unit = _at(self.root, "reading.gain_unit")
-        if "gain" in pairs.values() and unit is not None and posterior.units.get("gain", unit.data) != unit.data:
-            raise ValueError(f"its gain is in {posterior.units['gain']}, not {unit.data}: set reading.gain_unit")
+        """Raise ValueError where the posterior's gain has no unit, or where its exposure is not the recipe's."""
+        for path, name in pairs.items():
+            if self._is_gain(path) and posterior.units.get(name) != GAIN_UNIT:
+                raise ValueError(f"its {name} has no unit: {BARE_GAIN}")
         exposure = _at(self.root, f"{_BLOCK}.exposure")
         words = posterior.units.get("dark_current", "")
         if "dark_current" in pairs.values() and exposure is not None and " in " in words:
             told, own = read_any(words.partition(" in ")[2])[0], read_any(exposure.data)[0]
             if abs(told - own) > 1e-9 * own:
                 raise ValueError(f"the posterior's dark current is for {told:g} s, the recipe's exposure is {own:g} s")
+
+    def _is_gain(self, path: str) -> bool:
+        value = _at(self.root, path)
+        return value is not None and isinstance(value.data, str) and value.data.strip().endswith(("e-/DN", GAIN_UNIT))
 
     def _apply(self, posterior: Posterior, pairs: Mapping[str, str], use: str | int, mark: Location) -> None:
         kept = {}

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from neusee.nodes.units import read_any
+from neusee.nodes.units import read_written
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray
@@ -28,20 +28,21 @@ _CALL = re.compile(rf"({'|'.join(KINDS)})\((.*)\)", re.DOTALL)
 
 @dataclass(frozen=True)
 class Law:
-    """A distribution of one number, with its two arguments in SI."""
+    """A distribution of one number or of its reciprocal (a gain in e-/DN), with its two arguments in SI."""
 
     kind: str
     text: str  #: as written in the recipe
     first: float
     second: float
     unit: str  #: SI unit of a draw; empty for a number without a unit
+    reciprocal: bool = False  #: whether the distribution is that of 1 over a draw
 
     def at(self, z: FloatArray) -> FloatArray:
         """Return the value at the quantile of ``z`` in the standard normal distribution."""
         from scipy.special import ndtr
 
         a, b = self.first, self.second
-        with np.errstate(over="ignore"):
+        with np.errstate(over="ignore", divide="ignore"):
             if self.kind == "normal":
                 found = a + b * z
             elif self.kind == "lognormal":
@@ -50,6 +51,7 @@ class Law:
                 found = a + (b - a) * ndtr(z)
             else:
                 found = a * np.exp(np.log(b / a) * ndtr(z))
+            found = 1.0 / found if self.reciprocal else found
         return np.asarray(found, np.float64)
 
     @property
@@ -71,15 +73,15 @@ def read_law(text: str) -> Law:
     kind, given = match[1], [part.strip() for part in match[2].split(",")]
     if len(given) != 2 or not all(given):
         raise ValueError(f"needs {' and '.join(KINDS[kind])}: write {kind}(…, …)")
-    (first, unit), (second, other) = read_any(given[0]), read_any(given[1])
+    (first, unit, reciprocal), (second, other, also) = read_written(given[0]), read_written(given[1])
     if kind == "lognormal":
         if other:
             raise ValueError(f"{KINDS[kind][1]} is a number without a unit, such as 1.1, not {given[1]}")
-    elif unit != other:
+    elif (unit, reciprocal) != (other, also):
         raise ValueError(f"{given[0]} and {given[1]} must have the same unit")
     if fault := _fault(kind, first, second):
         raise ValueError(fault)
-    return Law(kind, text.strip(), first, second, unit)
+    return Law(kind, text.strip(), first, second, unit, reciprocal)
 
 
 def _fault(kind: str, first: float, second: float) -> str:

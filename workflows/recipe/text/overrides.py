@@ -8,6 +8,7 @@ from collections.abc import Iterable, Iterator
 from dataclasses import dataclass, replace
 
 from neusee.workflows.graph.diagnostics import Diagnostic, Location, RecipeError
+from neusee.workflows.recipe.text.renamed_keys import instead
 from neusee.workflows.recipe.text.yaml_values import Value, parse
 
 RESERVED = frozenset(
@@ -90,7 +91,7 @@ def _fault(root: Value, o: Override, trail: Trail, missing: tuple[str, ...], gro
         return f"{here.name} has {len(here.data)} values: 0 to {len(here.data) - 1}"
     if o.sign == "+" or (o.sign == "" and _implied(root, o.path)):
         return None if isinstance(here.data, dict | None) else f"{here.name} is a single value, not a mapping"
-    return f"unknown; {_suggest(root, o.path, groups)}"
+    return instead(".".join(o.path)) or f"unknown; {_suggest(root, o.path, groups)}"
 
 
 def _implied(root: Value, path: tuple[str, ...]) -> bool:

@@ -10,8 +10,10 @@ from pathlib import Path
 from typing import Any
 
 from neusee.workflows.graph.diagnostics import UNREAD, Diagnostic
+from neusee.workflows.recipe.text import renamed_keys
 from neusee.workflows.recipe.text.composition import packaged
 from neusee.workflows.recipe.text.overrides import RESERVED
+from neusee.workflows.recipe.text.renamed_keys import new_name
 from neusee.workflows.recipe.text.yaml_values import Value, Where, dotted
 
 _REFERENCE = re.compile(r"\$\{([^${}]*)\}")
@@ -118,8 +120,10 @@ class References:
             problem = Diagnostic(start.key, start.name, f"has no {name}; steps.{scope.step} needs this value")
         else:
             near = _nearest(wanted, {leaf.path for leaf in self.root.leaves() if leaf.path[0] not in RESERVED})
-            hint = f"; did you mean {dotted(near)}?" if near else ""
-            problem = Diagnostic(origin.mark, origin.name, f"${{{dotted(wanted)}}} is unknown{hint}")
+            hint = f" is unknown; did you mean {dotted(near)}?" if near else " is unknown"
+            if now := renamed_keys.instead(dotted(wanted)):
+                hint = f": {now}" if new_name(dotted(wanted)) is None else f" {now}"
+            problem = Diagnostic(origin.mark, origin.name, f"${{{dotted(wanted)}}}{hint}")
         self.lacking.append((wanted, problem))
 
     def _fail(self, origin: Value, message: str) -> Value:
@@ -154,6 +158,9 @@ class References:
                 self.spare.add(leaf.path)
                 continue
             misspelt.add(instead)
+            if now := renamed_keys.instead(leaf.name):
+                self.diagnostics.append(Diagnostic(leaf.key, leaf.name, now))
+                continue
             shown = dotted(instead[-1:] if instead[:-1] == leaf.path[:-1] else instead)
             hint = f"; did you mean {shown}?" if shown else ": no step refers to this value"
             asker = f" (needed at {wanted[instead].mark})" if instead in wanted else ""
@@ -169,7 +176,9 @@ class References:
         return any(path[:n] in self.used for n in range(1, len(path) + 1))
 
     def _instead(self, leaf: Value) -> Where | None:
-        """Return the nearest path that steps refer to, first among the paths beside it."""
+        """Return the new name of an old path, or the nearest path that steps refer to, first among those beside it."""
+        if now := new_name(leaf.name):
+            return tuple(now.split("."))
         known = {*self.used, *(wanted for wanted, _ in self.lacking)}
         known |= {(name,) for name in (*RESERVED, "defaults")} if len(leaf.path) == 1 else set()
         return _nearest(leaf.path, known)

@@ -20,7 +20,7 @@ import torch
 from torch import Tensor
 
 from neusee.nodes import Node
-from neusee.nodes.values import BAND_FIELDS, Channels, Mixture, Psf
+from neusee.nodes.values import BAND_FIELDS, Channels, LowRankCube, Psf
 from neusee.workflows.engine.provenance import machine
 from neusee.workflows.engine.runner import run
 from neusee.workflows.graph.recipe_graph import Recipe, Step, needed
@@ -191,7 +191,7 @@ def _inner(psf: Psf, share: float) -> Psf:
 
 def _compared_value(value: Any) -> Any:
     """Return the values to compare: the cube of a mixture, the sums of channels."""
-    if isinstance(value, Mixture):
+    if isinstance(value, LowRankCube):
         return torch.einsum("bk,kyx->byx", value.basis.to(value.planes), value.planes)
     return (value.planes, value.flux) if isinstance(value, Channels) else value
 

@@ -176,7 +176,7 @@ def _ranks(found: CalibrationStudyResult, picture: bytes, pixels: int) -> Sectio
         biased.
 
         The prior is that of the recipe, but no wider than the standard deviations below (of the logarithm; in e- for
-        the pedestal), so that frames of the recipe's levels constrain every sensor that is drawn. The search for the
+        the offset), so that frames of the recipe's levels constrain every sensor that is drawn. The search for the
         mode starts near the truth: this study judges the posterior and the draws, not that search. A walker is lost
         if its median log posterior lies 20 nats below that of the others."""
     rows = [(_plain(name), width) for name, width in found.prior_widths.items()]

@@ -35,12 +35,11 @@ Sampler = Callable[
     [SensorPosterior, LaplaceFit, int], PosteriorDraws
 ]  #: draws from a posterior with this mode, by a seed
 _EXPOSE = "calibrate.expose"
-_TAKEN = {"read_noise": "sigma"}  #: parameters of `density` with another name in `expose`
-#: standard deviation of each logarithm, at most, and of the pedestal in e-: a whole lifetime of sensors in one study
+#: standard deviation of each logarithm, at most, and of the offset in e-: a whole lifetime of sensors in one study
 #: would meet frames that tell nothing
 WIDEST = {
     "gain": 0.1,
-    "pedestal": 20.0,
+    "offset": 20.0,
     "read_noise": 0.1,
     "dark_current": 0.5,
     "full_well": 0.1,
@@ -120,7 +119,7 @@ class SensorSimulator:
 
     def _levels(self, truth: Mapping[str, float], seed: int) -> Sufficient:
         """Return the statistics of frames of these parameters by the recipe's own steps; no frame is kept."""
-        values = {f"{step}.{_TAKEN.get(name, name)}": x for step in self.exposed for name, x in truth.items()}
+        values = {f"{step}.{name}": x for step in self.exposed for name, x in truth.items()}
         recipe = replace(self.recipe, seed=seed)
         with TemporaryDirectory(prefix="neusee-") as folder, torch.no_grad():
             frames = as_function(recipe, *values, outputs=[self._source], store=Store(folder))
@@ -169,12 +168,12 @@ def with_narrow_prior(recipe: Recipe, changed: Mapping[str, Mapping[str, Any]]) 
 def _capped(name: str, law: tuple[float, float] | None) -> tuple[float, float] | None:
     if law is None:
         return None
-    widest = WIDEST[name] if name == "pedestal" else float(np.exp(WIDEST[name]))
+    widest = WIDEST[name] if name == "offset" else float(np.exp(WIDEST[name]))
     return law[0], min(law[1], widest)
 
 
 def prior_widths(prior: Prior) -> dict[str, float]:
-    """Return the standard deviation of each free parameter: of its logarithm, but in e- for the pedestal."""
+    """Return the standard deviation of each free parameter: of its logarithm, but in e- for the offset."""
     both = zip(NAMES, prior.width.tolist(), strict=True)
     return {name: width for name, width in both if np.isfinite(width)}
 

@@ -18,8 +18,8 @@ from neusee.workflows.recipe.step_declarations import find_node
 from neusee.workflows.studies.stability.extreme_cases import Case, Size
 
 _COMPARES: dict[str, tuple[tuple[str, dict[str, Any]], ...]] = {  # a loss takes what the metric beside it takes
-    "metrics.lsr": (("losses.lsr", {}), ("losses.lsr", {"log": True})),
-    "metrics.bsr": (("losses.bsr", {}),),
+    "metrics.lsr": (("losses.suppression_loss", {}), ("losses.suppression_loss", {"log": True})),
+    "metrics.bsr": (("losses.background_loss", {}),),
     "metrics.mtf": (("losses.contrast", {}), ("metrics.limits", {})),
     "doe.fabricate": (("doe.smooth", {"feature": "400 um"}),),  # three samples of the small pupil
     "metrics.quality": (("losses.charbonnier", {}), ("losses.fft_l1", {}), ("losses.gradient_penalty", {})),
@@ -45,9 +45,9 @@ def _grid(recipe: Recipe, node: Node, step: Step) -> dict[str, Any]:
     """Return the grid of the pupil, that of the mask, for a node that has to know the grid."""
     if "samples" not in node.params.model_fields:
         return {}
-    relief = recipe.steps[step.sources[0]].params
-    lengths = {name: f"{relief[name]!r} m" for name in ("pitch", "diameter")}
-    return {"samples": relief["samples"], "aperture": relief["aperture"], **lengths}
+    grid = recipe.steps[step.sources[0]].params
+    lengths = {name: f"{grid[name]!r} m" for name in ("pitch", "diameter")}
+    return {"samples": grid["samples"], "aperture": grid["aperture"], **lengths}
 
 
 def with_size(steps: Mapping[str, Step], size: Size) -> dict[str, Step]:

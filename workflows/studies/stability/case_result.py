@@ -29,7 +29,7 @@ _NEAR = 0.5  #: share of a bound above which a cell warns
 _STEEPER = 10.0  #: the bound of a gradient over that of the result
 _LEAST = math.sqrt(torch.finfo(torch.float32).tiny)  #: the least scale of an error, a root above denormal numbers
 _DIM = 1e-3  #: share of the brightest element below which an element is dim
-_LIGHT = ("scene.", "spectra.", "optics.", "sensor.expose", "sensor.gather")  #: nodes that must keep dim parts
+_LIGHT = ("scene.", "spectra.", "optics.", "sensor.expose", "sensor.add_photons")  #: nodes that must keep dim parts
 _HUGE = 1e30  #: what infinity is compared with
 _HALVES = {torch.float16: 2.0**-11, torch.bfloat16: 2.0**-8}
 

@@ -123,16 +123,16 @@ def _scaled(name: str, by: float) -> Callable[[Params], float]:
     return lambda p: float(p[name] * by)
 
 
-_RELIEFS = ("doe.flat", "doe.vortex", "doe.axicon", "doe.spiral_axicon", "doe.cubic", "doe.half_rings", "doe.zernike",
+_MASKS = ("doe.flat", "doe.vortex", "doe.axicon", "doe.spiral_axicon", "doe.cubic", "doe.half_rings", "doe.zernike",
             "doe.pixelwise", "doe.unet")  # fmt: skip
 
 
-def _relief(change: Callable[[Tensor], Tensor]) -> dict[str, Callable[[Any], Any]]:
-    return dict.fromkeys(_RELIEFS, change)
+def _heights(change: Callable[[Tensor], Tensor]) -> dict[str, Callable[[Any], Any]]:
+    return dict.fromkeys(_MASKS, change)
 
 
 _BLACK: dict[str, Callable[[Any], Any]] = {"scene.": lambda scene: scene * 0}
-_LASER, _SCENE = "optics.spot.strength", "sensor.level.strength"
+_LASER, _SCENE = "optics.laser_irradiance.strength", "sensor.level.strength"
 
 USUAL = Case("usual", "the recipe as it is, at this small size", "usual")
 CASES: tuple[Case, ...] = (
@@ -161,13 +161,13 @@ CASES: tuple[Case, ...] = (
     Case("one band", "one band for the scene, one for the laser", "spectrum", {"spectra.line.count": 1},
          size=Size(bands=1)),
     Case("301 bands", "1 nm a band", "spectrum", size=Size(20, 24, 301)),
-    Case("height 0", "a flat element", "relief", values=_relief(torch.zeros_like)),
-    Case("height 100 um", "a random relief, 80 waves deep", "relief", values=_relief(_noise(100e-6))),
-    Case("steps past pi", "0.9 wave from sample to sample", "relief", values=_relief(_steps)),
-    Case("wrapped", "100 um wrapped at 550 nm", "relief", {"doe.fabricate.wrap_at": 550e-9},
-         _relief(_noise(100e-6))),
-    Case("two levels", "100 um wrapped at 550 nm, in two levels", "relief", {"doe.fabricate.wrap_at": 550e-9,
-         "doe.fabricate.levels": 2}, _relief(_noise(100e-6))),
+    Case("height 0", "a flat mask", "height", values=_heights(torch.zeros_like)),
+    Case("height 100 um", "a random height map, 80 waves deep", "height", values=_heights(_noise(100e-6))),
+    Case("steps past pi", "0.9 wave from sample to sample", "height", values=_heights(_steps)),
+    Case("wrapped", "100 um wrapped at 550 nm", "height", {"doe.fabricate.wrap_at": 550e-9},
+         _heights(_noise(100e-6))),
+    Case("two levels", "100 um wrapped at 550 nm, in two levels", "height", {"doe.fabricate.wrap_at": 550e-9,
+         "doe.fabricate.levels": 2}, _heights(_noise(100e-6))),
     Case("opaque pupil", "an amplitude of 0 everywhere", "pupil", values={"optics.pupil": _opaque}),
     Case("empty pupil", "an aperture of 0 everywhere", "pupil", values={"optics.pupil": _closed}),
     Case("defocus 100", "a hundred waves of defocus", "pupil", {"optics.pupil.defocus": 100.0}),

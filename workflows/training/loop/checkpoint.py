@@ -14,6 +14,7 @@ import torch
 from torch import nn
 
 _FORMAT = 1  #: of a state; a state of another format is refused
+_NAMES = {"relief": "mask"}  #: parts of a state that 0.1 calls otherwise
 
 
 def write_whole(path: Path, data: bytes) -> None:
@@ -54,6 +55,8 @@ class StateFile:
             found: dict[str, Any] = torch.load(self.path, map_location=device, weights_only=True)
             if found.get("edition", _FORMAT) != _FORMAT:
                 raise ValueError(f"edition {found['edition']}, not {_FORMAT}")
+            if "parts" in found:
+                found["parts"] = {_NAMES.get(name, name): part for name, part in found["parts"].items()}
         except (RuntimeError, KeyError, EOFError, OSError, ValueError, TypeError, AttributeError) as error:
             if not strict:
                 return {}

@@ -23,7 +23,7 @@ def pictures(terms: Terms, height: Tensor, learnt: LearntMask) -> dict[str, byte
     pupil, psf, plain = terms.pupil(height), terms.psf(height), terms.plain()
     pitch = terms.recipe.steps[terms.settings.psf].params["pixel_pitch"]
     shown = {
-        "relief": optics.height(pupil=pupil),
+        "height": optics.height(pupil=pupil),
         "psf": optics.psf(plain=plain, mask=psf, bands=terms.bands, pixel_pitch=pitch),
         "suppression": optics.suppression(lsr=metrics.lsr(psf), bands=terms.bands, psf=psf),
     }
@@ -54,7 +54,7 @@ def sections(found: Mapping[str, Any], limits: Fabrication, shown: Mapping[str, 
         "no PSF with this peak has more contrast than `at most`."
     )
     parts = [
-        Section("Mask", "Its height map, and its phase at three wavelengths.", picture=shown.get("relief")),
+        Section("Mask", "Its height map, and its phase at three wavelengths.", picture=shown.get("height")),
         Section("Fabrication", f"{limits}.", ("limit", "value"), [(name, text) for name, text in limits.rows()]),
         Section("Light", "The spread light beside the plain lens's.", picture=shown.get("psf")),
         Section("Suppression", "", picture=shown.get("suppression")),

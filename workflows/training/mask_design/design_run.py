@@ -38,7 +38,8 @@ __all__ = ["DesignError", "MaskTraining", "Weights", "design", "mask_figures"]
 
 MASK = 0  #: the number of this stage in a training: it comes before the first
 _LEARNT_WITH = {
-    used.__module__ for used in (half_rings, PARAMETRISATIONS["doe.pixelwise"], losses.contrast, losses.lsr)
+    used.__module__
+    for used in (half_rings, PARAMETRISATIONS["doe.pixelwise"], losses.contrast, losses.suppression_loss)
 }
 
 

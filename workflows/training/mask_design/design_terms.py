@@ -79,14 +79,14 @@ class Terms:
         return Fabrication.of(self.recipe, self.settings)
 
     @property
-    def relief(self) -> Step:
+    def mask_step(self) -> Step:
         """Return the step of the mask that is replaced."""
         return self.recipe.steps[self.settings.height]
 
     @cached_property
     def stop(self) -> Stop:
         """Return the grid of the pupil that the replaced step has."""
-        params = self.relief.params
+        params = self.mask_step.params
         if missing := [name for name in ("samples", "pitch", "diameter", "aperture") if name not in params]:
             raise DesignError(f"height: {self.settings.height} has no {missing[0]}: take a recipe whose mask is a doe")
         return stop(*(params[name] for name in ("samples", "pitch", "diameter", "aperture")))
@@ -123,7 +123,7 @@ class Terms:
         if weights.lsr:
             found["lsr"] = self._suppression(psf)
         if weights.bsr:
-            found["bsr"] = losses.bsr(psf.intensity, plain.intensity)
+            found["bsr"] = losses.background_loss(psf.intensity, plain.intensity)
         if weights.contrast:
             found["contrast"] = losses.contrast(psf, floor=settings.floor, up_to=settings.up_to)
         found = {name: term / len(psf.intensity) for name, term in found.items()}
@@ -134,7 +134,7 @@ class Terms:
     def _suppression(self, psf: Psf) -> Tensor:
         """Return the suppression summed over bands, clamped where its mean over bands is low enough."""
         settings, count = self.settings, len(psf.intensity)
-        found: Tensor = losses.lsr(psf, power=settings.power, log=settings.log)
+        found: Tensor = losses.suppression_loss(psf, power=settings.power, log=settings.log)
         if settings.enough is None:
             return found
         return found.clamp_min(count * (math.log(settings.enough) if settings.log else settings.enough))

@@ -58,7 +58,7 @@ def shape_of(settings: MaskTraining, start: int, step: Step) -> nn.Module:
 
 
 def _free(settings: MaskTraining, rng: torch.Generator, step: Step) -> nn.Module:
-    if settings.kind == "element":
+    if settings.kind == "recipe_mask":
         if step.node.path not in PARAMETRISATIONS:
             raise DesignError(f"kind: {step.name} is {step.node.path}, whose samples are not learnt")
         return PARAMETRISATIONS[step.node.path](step.params, rng)
@@ -95,7 +95,7 @@ def _descend(terms: Terms, file: StateFile, progress: Progress) -> LearntMask:
     if state["start"] or "shape" in state:
         progress(f"going on from start {state['start'] + 1}, iteration {state.get('iteration', 0)}")
     for start in range(state["start"], settings.starts):
-        shape = shape_of(settings, start, terms.relief).to(terms.device)
+        shape = shape_of(settings, start, terms.mask_step).to(terms.device)
         _one_start(terms, shape, start, state, file, progress)
         with torch.no_grad():
             loss = float(terms.total(terms.parts(shape(terms.stop))))
@@ -108,7 +108,7 @@ def _descend(terms: Terms, file: StateFile, progress: Progress) -> LearntMask:
             state.pop(name, None)
         state["start"] = start + 1
         file.write(state)
-    best = shape_of(settings, state["best"]["start"], terms.relief)
+    best = shape_of(settings, state["best"]["start"], terms.mask_step)
     best.load_state_dict(state["best"]["shape"])
     return LearntMask(best, state["best"]["loss"], _few(best), state["history"])
 
@@ -169,7 +169,7 @@ def _few(shape: nn.Module) -> dict[str, Any]:
 # --- by differential evolution ----------------------------------------------------------------------------------------
 
 
-def half_ring_relief(genes: Any, settings: MaskTraining) -> Callable[[Stop], Tensor]:
+def half_ring_height(genes: Any, settings: MaskTraining) -> Callable[[Stop], Tensor]:
     """Return the height map of five slopes, the side of every second ring and the orientation."""
     *slopes, side, turn = (float(gene) for gene in genes)
     given = {"waves": tuple(slopes), "alternate": side >= 0.5, "orientation": turn}
@@ -197,7 +197,7 @@ class _LossOfGenes:
     def __call__(self, genes: Any) -> float:
         if self.asked == len(self.known):
             with torch.no_grad():
-                height = half_ring_relief(genes, self.terms.settings)(self.terms.stop)
+                height = half_ring_height(genes, self.terms.settings)(self.terms.stop)
                 loss = float(self.terms.total(self.terms.parts(height.to(self.terms.device), self.chosen)))
             if not math.isfinite(loss):
                 raise DesignError(f"mask {self.asked}: the loss of slopes {list(genes[:-2])} is not finite")
@@ -225,7 +225,7 @@ def _evolve(terms: Terms, state: StateFile, progress: Progress) -> LearntMask:
     state.write({"values": loss.known})
     *waves, side, turn = (float(x) for x in best[1])
     numbers = {"waves": waves, "alternate": side >= 0.5, "orientation": turn}
-    return LearntMask(half_ring_relief(best[1], settings), best[0], numbers, history)
+    return LearntMask(half_ring_height(best[1], settings), best[0], numbers, history)
 
 
 def _population(

@@ -16,7 +16,7 @@ from torch import Tensor
 
 from neusee.nodes import spectra
 from neusee.nodes.sensor import channel_sums
-from neusee.nodes.values import Bands, Channels, Mixture
+from neusee.nodes.values import Bands, Channels, LowRankCube
 from neusee.workflows.engine.band_results import band_tensors, taken, with_band_tensors
 from neusee.workflows.engine.node_call import call
 from neusee.workflows.engine.runner import run
@@ -125,10 +125,10 @@ def _by_band(recipe: Recipe, name: str, spectral: set[str]) -> bool:
 
 def _mixed(recipe: Recipe, name: str) -> bool:
     """Return True if a step gives a mixture of planes, none of which is a single band."""
-    while (kind := recipe.steps[name].node.hints["return"]) is not Mixture:
+    while (kind := recipe.steps[name].node.hints["return"]) is not LowRankCube:
         step = recipe.steps[name]
         through = next((w for i in step.node.accepts_low_rank if isinstance(w := step.wires.get(i), str)), None)
-        if through is None or Mixture not in get_args(kind):
+        if through is None or LowRankCube not in get_args(kind):
             return False
         name = through
     return True

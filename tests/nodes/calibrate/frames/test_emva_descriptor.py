@@ -61,8 +61,8 @@ def test_levels_are_those_of_the_images(folder):
         assert float(found.variance[i]) == pytest.approx(stack.var(0, ddof=1).mean(), rel=1e-13)
     assert found.photons.tolist() == [120.0, 0.0, 0.0]
     assert found.exposure.tolist() == pytest.approx([4e-5, 4e-5, 1e-3], rel=1e-13)
-    assert found.numbers.tolist() == [48.0, 48.0, 72.0]
-    assert found.freedom.tolist() == [24.0, 24.0, 48.0]
+    assert found.pixels.tolist() == [48.0, 48.0, 72.0]
+    assert found.degrees_of_freedom.tolist() == [24.0, 24.0, 48.0]
 
 
 def test_a_path_will_do_where_no_recipe_is_read(folder):

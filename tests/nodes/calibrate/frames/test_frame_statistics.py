@@ -33,7 +33,7 @@ def test_all_pixels_alike_is_numpy_over_the_whole_stack(stack):
     found, numbers = one(torch.from_numpy(stack)), stack.astype(np.float64)
     assert float(found.mean) == pytest.approx(numbers.mean(), rel=1e-13)
     assert float(found.variance) == pytest.approx(numbers.var(ddof=1), rel=1e-12, abs=1e-12)
-    assert (float(found.numbers), float(found.freedom)) == (stack.size, stack.size - 1)
+    assert (float(found.pixels), float(found.degrees_of_freedom)) == (stack.size, stack.size - 1)
     assert (float(found.photons), float(found.exposure)) == (5.0, 0.1)
 
 
@@ -43,7 +43,7 @@ def test_temporal_is_numpy_within_each_pixel(stack):
     found, numbers = one(torch.from_numpy(stack), "temporal"), stack.astype(np.float64)
     assert float(found.mean) == pytest.approx(numbers.mean(), rel=1e-13)
     assert float(found.variance) == pytest.approx(numbers.var(axis=0, ddof=1).mean(), rel=1e-12, abs=1e-12)
-    assert (float(found.numbers), float(found.freedom)) == (stack.size, stack[0].size * (len(stack) - 1))
+    assert (float(found.pixels), float(found.degrees_of_freedom)) == (stack.size, stack[0].size * (len(stack) - 1))
 
 
 @given(STACKS.filter(lambda s: len(s) > 1 and s[0].size > 1), st.integers(-5, 5))
@@ -54,7 +54,7 @@ def test_steady_is_numpy_without_what_a_frame_has_in_common(stack, drift):
     apart = numbers - numbers.mean(0)
     apart -= apart.mean((1, 2), keepdims=True)
     found, freedom = one(torch.from_numpy(stack), "steady"), (stack[0].size - 1) * (len(stack) - 1)
-    assert float(found.freedom) == freedom
+    assert float(found.degrees_of_freedom) == freedom
     scale = float(np.square(numbers).sum())
     assert float(found.variance) == pytest.approx(np.square(apart).sum() / freedom, rel=1e-9, abs=1e-15 * scale)
 
@@ -112,7 +112,7 @@ def test_a_gaussian_needs_no_histogram(sigma, scatter):
 def test_coarse_numbers_keep_their_histogram(sigma, kept):
     found = one(noise(2, 64, 64, sigma=sigma))
     assert (len(found.cell_value) > 0) == kept
-    assert float(found.cell_count.sum()) == (float(found.numbers) if kept else 0.0)
+    assert float(found.cell_count.sum()) == (float(found.pixels) if kept else 0.0)
 
 
 @pytest.mark.parametrize("end", ["top", "bottom"])

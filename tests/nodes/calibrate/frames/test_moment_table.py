@@ -18,10 +18,10 @@ def test_columns_are_found_by_name(file):
     found = table(file=file)
     assert found.photons.tolist() == [0.0, 50.5]
     assert found.exposure.tolist() == [0.1, 0.2]
-    assert found.numbers.tolist() == [200.0, 200.0]
+    assert found.pixels.tolist() == [200.0, 200.0]
     assert found.mean.tolist() == [10.5, 99.0]
     assert found.variance.tolist() == [2.5, 7.0]
-    assert found.freedom.tolist() == [100.0, 100.0]
+    assert found.degrees_of_freedom.tolist() == [100.0, 100.0]
     assert [len(x) for x in found[6:]] == [0, 0, 0]
 
 

@@ -7,8 +7,8 @@ import torch
 
 from neusee.nodes.calibrate import expose
 
-SENSOR = {"quantum_efficiency": 0.5, "dark_current": 20.0, "dark_exposure": 0.1, "pedestal": 300.0, "sigma": 10.0}
-SENSOR |= {"full_well": 1e5, "gain": 2.0, "gain_unit": "DN/e-"}
+SENSOR = {"quantum_efficiency": 0.5, "dark_current": 20.0, "dark_exposure": 0.1, "offset": 300.0, "read_noise": 10.0}
+SENSOR |= {"full_well": 1e5, "gain": 2.0}
 
 
 def frames(photons=1000.0, exposure=0.1, seed=1, **how):
@@ -27,7 +27,7 @@ def test_mean_and_variance_are_those_of_the_model(distribution, photons, exposur
 
 
 def test_shape_and_whole_numbers():
-    found = frames(frames=3, gain=0.37, gain_unit="e-/DN")
+    found = frames(frames=3, gain=1 / 0.37)
     assert found.shape == (3, 200, 100)
     assert torch.equal(found, found.round())
     assert not torch.equal(found[0], found[1])

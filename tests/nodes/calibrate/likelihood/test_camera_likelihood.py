@@ -8,9 +8,10 @@ from scipy.optimize import brentq
 from scipy.stats import norm
 
 from neusee.nodes.calibrate import CAMERA_NAMES, CameraCoordinates, camera, camera_prior
+from neusee.nodes.units import read_quantity
 from neusee.nodes.values import Levels
 
-SENSOR = {"gain": 0.5, "gain_unit": "DN/e-", "quantum_efficiency": 0.4, "dark_signal": 50.0, "dark_noise": 8.0}
+SENSOR = {"gain": 0.5, "quantum_efficiency": 0.4, "dark_signal": 50.0, "temporal_dark_noise": 8.0}
 SENSOR |= {"dark_current": 30.0, "dark_exposure": 0.5, "scatter": 0.004, "lamp": 0.012, "drift": 0.05}
 BENT = {"bend": -0.03, "twist": 0.02}
 PHOTONS = [0.0, 0.0, 300.0, 1500.0, 4000.0, 7000.0, 10000.0, 13000.0]
@@ -66,8 +67,8 @@ def test_the_law_is_that_which_is_written_out(bent):
 def test_levels_on_the_law_leave_no_deviance_and_each_parameter_matters():
     at = camera(exact(), **SENSOR, share=1.0)
     assert float(at.deviance.sum()) < 1e-3
-    assert at.freedom.tolist() == [2.0] * 8
-    for name in ("gain", "quantum_efficiency", "dark_signal", "dark_noise", "dark_current"):
+    assert at.degrees_of_freedom.tolist() == [2.0] * 8
+    for name in ("gain", "quantum_efficiency", "dark_signal", "temporal_dark_noise", "dark_current"):
         assert float(camera(exact(), **{**SENSOR, name: 1.2 * SENSOR[name]}).deviance.sum()) > 5
     for name in ("bend", "twist"):
         assert float(camera(exact(), **SENSOR, **{name: 0.1}).deviance.sum()) > 5
@@ -86,11 +87,11 @@ def test_many_cameras_are_weighed_at_once_as_one_by_one():
             assert torch.equal(a[i] if a.ndim > b.ndim or a.ndim == 2 else a, b)
     quick = camera(around(), **{**given, **rows}, told=False)
     assert torch.equal(quick.log, together.log)
-    assert len(quick.freedom) == 0
+    assert len(quick.degrees_of_freedom) == 0
 
 
 def test_the_unit_of_the_gain_is_as_written():
-    written = camera(around(), **{**SENSOR, "gain": 2.0, "gain_unit": "e-/DN"})
+    written = camera(around(), **{**SENSOR, "gain": read_quantity("2.0 e-/DN", "DN/e-")})
     assert float(written.log) == float(camera(around(), **SENSOR).log)
 
 
@@ -114,7 +115,7 @@ def test_slopes_are_smooth(name):
 
 def test_what_levels_tell_is_the_information_of_the_law():
     """Over many measurements, slopes of the logarithm scatter as J^T J says."""
-    names, step = ("gain", "quantum_efficiency", "dark_noise", "scatter", "lamp"), 1e-4
+    names, step = ("gain", "quantum_efficiency", "temporal_dark_noise", "scatter", "lamp"), 1e-4
     moved = []
     for i in range(len(names)):
         for sign in (1, -1):
@@ -149,11 +150,11 @@ def test_levels_that_pile_up_are_left_out_and_coarse_ones_are_not():
     levels = around()
     cell = {"cell_level": torch.tensor([3]), "cell_value": torch.tensor([4095.0]), "cell_count": torch.tensor([9.0])}
     piled = levels._replace(**cell)
-    assert camera(piled, **SENSOR).freedom.tolist() == [2, 2, 2, 0, 2, 2, 0, 0]
+    assert camera(piled, **SENSOR).degrees_of_freedom.tolist() == [2, 2, 2, 0, 2, 2, 0, 0]
     coarse = piled._replace(variance=torch.where(torch.arange(8) == 3, 0.5, levels.variance))
-    assert camera(coarse, **SENSOR).freedom.tolist() == [2, 2, 2, 2, 2, 2, 0, 0]
+    assert camera(coarse, **SENSOR).degrees_of_freedom.tolist() == [2, 2, 2, 2, 2, 2, 0, 0]
     dark = levels._replace(**{**cell, "cell_level": torch.tensor([0]), "cell_value": torch.tensor([0.0])})
-    assert camera(dark, **SENSOR).freedom.tolist() == [0, 2, 2, 2, 2, 2, 0, 0]
+    assert camera(dark, **SENSOR).degrees_of_freedom.tolist() == [0, 2, 2, 2, 2, 2, 0, 0]
 
 
 def test_negative_signals_are_weighed_and_what_cannot_be_is_not():
@@ -210,7 +211,7 @@ PRIOR = {"gain": (0.5, 2.0), "dark_signal": (50.0, 10.0), "lamp": (0.01, 3.0), "
 
 
 def coordinates():
-    return CameraCoordinates.of(camera_prior(**PRIOR), {**SENSOR, **BENT}, "DN/e-")
+    return CameraCoordinates.of(camera_prior(**PRIOR), {**SENSOR, **BENT})
 
 
 def test_coordinates_go_there_and_back():
@@ -240,6 +241,6 @@ def test_one_standard_deviation_is_the_factor_or_the_deviation():
 def test_priors_that_are_none_are_refused():
     with pytest.raises(ValueError, match="no parameter is free: give a prior of one of gain, quantum_efficiency"):
         camera_prior()
-    with pytest.raises(ValueError, match=r"dark_noise: \[0, 2\] is not a prior"):
-        camera_prior(dark_noise=(0.0, 2.0))
+    with pytest.raises(ValueError, match=r"temporal_dark_noise: \[0, 2\] is not a prior"):
+        camera_prior(temporal_dark_noise=(0.0, 2.0))
     assert camera_prior.hooks.check(camera_prior(**PRIOR))[0].text == "4 free: gain, dark_signal, lamp, twist"

@@ -14,7 +14,7 @@ from neusee.nodes.calibrate._likelihood._quantised_gaussian import log_cell
 PAPER = {
     "gain": 0.37,
     "quantum_efficiency": 0.56,
-    "pedestal": 390.0,
+    "offset": 390.0,
     "read_noise": 10.5,
     "dark_current": 0.002,
     "full_well": 25500.0,
@@ -33,11 +33,10 @@ def frames(light=LIGHT, size=48, seed=0, rounding="nearest", distribution="gauss
             quantum_efficiency=p["quantum_efficiency"],
             dark_current=p["dark_current"],
             dark_exposure=0.1,
-            pedestal=p["pedestal"],
-            sigma=p["read_noise"],
+            offset=p["offset"],
+            read_noise=p["read_noise"],
             full_well=p["full_well"],
             gain=p["gain"],
-            gain_unit="DN/e-",
             rounding=rounding,
             distribution=distribution,
             rng=rng,
@@ -57,7 +56,7 @@ def below_the_well(seed):
 
 
 def weigh(data, **other):
-    how = {"gain_unit": "DN/e-", "dark_exposure": 0.1, **PAPER, **other}
+    how = {"dark_exposure": 0.1, **PAPER, **other}
     return density(data, **how)
 
 
@@ -67,7 +66,7 @@ def by_pixel(stacks, rounding, light=LIGHT, **other):
     k = p["gain"]
     for x, (photons, exposure) in zip(stacks, light, strict=True):
         electrons, dark = p["quantum_efficiency"] * photons, p["dark_current"] * exposure / 0.1
-        mean = torch.tensor(k * (p["pedestal"] + dark + electrons), dtype=torch.float64)
+        mean = torch.tensor(k * (p["offset"] + dark + electrons), dtype=torch.float64)
         sd = torch.tensor(k * math.sqrt(p["read_noise"] ** 2 + dark + electrons), dtype=torch.float64)
         well = torch.tensor(k * p["full_well"], dtype=torch.float64)
         total += float(log_cell(x.double().flatten(), mean, sd, well, rounding, 65535).sum())
@@ -80,7 +79,7 @@ def test_what_it_says_of_two_sensors_is_what_every_pixel_says(rounding):
     stacks = frames(rounding=rounding)
     data = sufficient(measured(stacks))
     assert 0 < len(data.cell_value) < 40
-    for other in ({"read_noise": 10.8}, {"quantum_efficiency": 0.5602}, {"pedestal": 391.0}, {"dark_current": 0.02}):
+    for other in ({"read_noise": 10.8}, {"quantum_efficiency": 0.5602}, {"offset": 391.0}, {"dark_current": 0.02}):
         exact = by_pixel(stacks, rounding, **other) - by_pixel(stacks, rounding)
         found = float(weigh(data, rounding=rounding, **other).log - weigh(data, rounding=rounding).log)
         assert found == pytest.approx(exact, abs=0.02 + 1e-3 * abs(exact)), other
@@ -128,7 +127,7 @@ def test_the_deviance_of_the_truth_is_chi_squared():
 
 def test_what_levels_tell_is_the_curvature_of_the_likelihood():
     """Over 30 measurements the mean second difference is Fisher's information."""
-    step = {"read_noise": 0.02, "quantum_efficiency": 1e-4, "pedestal": 0.05, "gain": 5e-5}
+    step = {"read_noise": 0.02, "quantum_efficiency": 1e-4, "offset": 0.05, "gain": 5e-5}
     for name, h in step.items():
         sides = [PAPER[name] - h, PAPER[name], PAPER[name] + h]
         curved, told = [], []
@@ -142,13 +141,13 @@ def test_what_levels_tell_is_the_curvature_of_the_likelihood():
 def test_few_electrons_are_counted_out():
     """A converter of 0.2 DN/e- and a noise of 0.4 e-: numbers of Poisson's electrons, which no Gaussian has."""
     light = [(0.0, 0.1), (2.0, 0.1), (5.0, 0.1)]
-    how = {"gain": 0.7, "read_noise": 0.15, "pedestal": 20.0, "quantum_efficiency": 0.5, "dark_current": 1e-6}
+    how = {"gain": 0.7, "read_noise": 0.15, "offset": 20.0, "quantum_efficiency": 0.5, "dark_current": 1e-6}
     stacks = frames(light, size=300, distribution="poisson", **how)
     data = sufficient(measured(stacks, light))
-    assert bool((data.numbers == 0)[:2].all())
+    assert bool((data.pixels == 0)[:2].all())
     found = weigh(data, arrivals="poisson", **how)
-    assert float(found.deviance[:2].sum()) < float(found.freedom[:2].sum()) + 5 * math.sqrt(
-        2 * float(found.freedom[:2].sum())
+    assert float(found.deviance[:2].sum()) < float(found.degrees_of_freedom[:2].sum()) + 5 * math.sqrt(
+        2 * float(found.degrees_of_freedom[:2].sum())
     )
     plain = weigh(data, arrivals="gaussian", **how)
     assert float(plain.deviance[:2].sum()) > 100 * float(found.deviance[:2].sum())
@@ -174,9 +173,9 @@ def test_at_any_size_of_anything_there_is_a_number_or_none(gain, noise, dark, we
 def test_levels_are_taken_apart_and_nothing_is_lost():
     whole = measured(frames())
     parts, reference = sufficient(whole), sufficient.hooks.reference(whole)
-    count = parts.numbers.index_add(0, parts.cell_level, parts.cell_count)
-    assert torch.equal(count, whole.numbers)
-    sums = (parts.numbers * parts.mean).index_add(0, parts.cell_level, parts.cell_count * parts.cell_value)
+    count = parts.pixels.index_add(0, parts.cell_level, parts.cell_count)
+    assert torch.equal(count, whole.pixels)
+    sums = (parts.pixels * parts.mean).index_add(0, parts.cell_level, parts.cell_count * parts.cell_value)
     torch.testing.assert_close(sums / count, whole.mean, rtol=1e-12, atol=0)
     assert isinstance(reference, Sufficient)
     for one, other in zip(parts, reference, strict=True):

@@ -8,10 +8,11 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from neusee.nodes.calibrate import NAMES, Coordinates, prior
+from neusee.nodes.units import read_quantity
 
 LAWS = {
     "gain": (0.37, 2.0),
-    "pedestal": (390.0, 100.0),
+    "offset": (390.0, 100.0),
     "read_noise": (10.5, 2.0),
     "dark_current": (0.002, 10.0),
     "full_well": (25500.0, 2.0),
@@ -24,7 +25,9 @@ some = st.sets(st.sampled_from(NAMES), min_size=1).map(sorted)
 
 
 def coordinates(free, unit="DN/e-"):
-    return Coordinates.of(prior(**{name: LAWS[name] for name in free}), NOMINAL, unit)
+    gain = read_quantity(f"0.37 {unit}", "DN/e-")
+    laws = LAWS | {"gain": (gain, 2.0)}
+    return Coordinates.of(prior(**{name: laws[name] for name in free}), NOMINAL | {"gain": gain})
 
 
 @settings(max_examples=60, deadline=None)
@@ -60,7 +63,7 @@ def test_the_draws_have_the_prior():
     c = coordinates(NAMES)
     drawn = c.draw(20000, torch.Generator().manual_seed(3))
     for name, (middle, width) in LAWS.items():
-        if name == "pedestal":
+        if name == "offset":
             assert float(drawn[name].mean()) == pytest.approx(middle, abs=4 * width / math.sqrt(20000))
         else:
             assert float(drawn[name].median()) == pytest.approx(middle, rel=5 * math.log(width) / math.sqrt(20000))
@@ -69,7 +72,7 @@ def test_the_draws_have_the_prior():
 
 def test_what_frames_know_does_not_move_along_the_ridge_of_the_gain():
     """A gain 10 % larger with 10 % less of all that is counted in electrons: only the gain's own coordinate moves."""
-    c = coordinates(["gain", "pedestal", "read_noise", "full_well", "quantum_efficiency"])
+    c = coordinates(["gain", "offset", "read_noise", "full_well", "quantum_efficiency"])
     more = {name: x * (1.1 if name == "gain" else 1 / 1.1) for name, x in NOMINAL.items() if name in c.names}
     moved = c.place(more) - c.place(NOMINAL)
     assert float(moved[0]) == pytest.approx(math.log(1.1))
@@ -80,7 +83,7 @@ def test_what_frames_know_does_not_move_along_the_ridge_of_the_gain():
     ("laws", "said"),
     [
         ({}, "no parameter is free"),
-        ({"pedestal": (390.0, 0.0)}, "pedestal"),
+        ({"offset": (390.0, 0.0)}, "offset"),
         ({"read_noise": (0.0, 2.0)}, "read_noise"),
     ],
 )

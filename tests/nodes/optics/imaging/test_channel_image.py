@@ -11,7 +11,7 @@ from hypothesis import strategies as st
 from neusee.nodes.optics import image, image_channels
 from neusee.nodes.optics._imaging._summed_convolution import Mix, Where, summed
 from neusee.nodes.spectra import bands, compress, illuminant, illuminate, lift_lmmse, responses, rows
-from neusee.nodes.values import Channels, Mixture, Psf
+from neusee.nodes.values import Channels, LowRankCube, Psf
 
 SCENE = bands(start=400e-9, stop=700e-9, count=31)
 ROWS = rows(SCENE, responses(SCENE))
@@ -33,7 +33,7 @@ def mixed(planes, basis):
     """A mixture that leaves nothing away."""
     each = basis.abs() * planes.abs().amax((1, 2)).double()
     rest = torch.cat([each.flip(1).cumsum(1).flip(1).T, torch.zeros(1, len(basis), dtype=torch.float64)])
-    return Mixture(planes, basis, rest)
+    return LowRankCube(planes, basis, rest)
 
 
 def spread(count, size, seed=0, power=1.5, dtype=torch.float64):

@@ -19,14 +19,14 @@ NOISE = "sensor.read_noise=normal(10.5 e-, 0.5 e-)"
 
 
 def drawn(count=4000, rho=0.9, seed=1):
-    """Gain and pedestal that go together, and a noise that does not; the gain is log-normal."""
+    """Gain and offset that go together, and a noise that does not; the gain is log-normal."""
     rng = np.random.default_rng(seed)
     z = rng.standard_normal((count, 3))
     tied = rho * z[:, 0] + math.sqrt(1 - rho**2) * z[:, 1]
     return np.stack([0.37 * np.exp(0.01 * z[:, 0]), 390 + 2 * tied, 10.5 + 0.1 * z[:, 2]], 1)
 
 
-NAMES = ("gain", "pedestal", "read_noise")
+NAMES = ("gain", "offset", "read_noise")
 
 
 @pytest.fixture
@@ -56,6 +56,7 @@ def calibrated(tmp_path):
     [
         ("normal(10.5 e-, 0.5 e-)", stats.norm(10.5, 0.5)),
         ("lognormal(0.37, 1.02)", stats.lognorm(math.log(1.02), scale=0.37)),
+        ("normal(2.7 DN/e-, 0.1 DN/e-)", stats.norm(2.7, 0.1)),
         ("uniform(1 um, 3 um)", stats.uniform(1e-6, 2e-6)),
         ("loguniform(1e-3, 1e3)", stats.loguniform(1e-3, 1e3)),
     ],
@@ -111,7 +112,7 @@ def test_a_law_of_the_wrong_unit_is_refused_by_what_reads_it():
 
 def test_a_run_takes_the_median_and_keeps_the_law_in_its_text():
     recipe = load("first_light", ["sensor.read_noise=lognormal(20 e-, 1.1)"])
-    assert recipe.steps["read[plain]"].params["sigma"] == pytest.approx(20.0)
+    assert recipe.steps["read[plain]"].params["read_noise"] == pytest.approx(20.0)
     assert "this run uses 20 e-" in " ".join(recipe.notes)
     assert "lognormal(20 e-, 1.1)" in recipe_text(recipe)
 
@@ -166,7 +167,7 @@ def test_values_that_are_one_and_the_same_are_drawn_as_such():
 @pytest.mark.parametrize(
     ("name", "content", "message"),
     [
-        ("a.csv", "gain,pedestal\n1,2\n3\n", "line 3"),
+        ("a.csv", "gain,offset\n1,2\n3\n", "line 3"),
         ("a.csv", "gain\n1\nx\n", "must contain numbers"),
         ("a.csv", "gain\n" + "1\n" * 50, "is the same"),
         ("a.csv", "gain\n1\n2\n", "2 draws"),
@@ -215,16 +216,16 @@ def gain_of(recipe):
 
 def test_a_run_takes_the_mean_of_what_is_told_and_no_value_of_what_is_not(calibrated):
     recipe = load("first_light", [f"posterior={calibrated(kinds=('estimate', 'estimate', 'upper'))}"])
-    assert gain_of(recipe) == pytest.approx(drawn()[:, 0].mean())
-    assert recipe.steps["read[plain]"].params["sigma"] == 10.5
+    assert gain_of(recipe) == pytest.approx((1 / drawn()[:, 0]).mean())
+    assert recipe.steps["read[plain]"].params["read_noise"] == 10.5
     used = {s.path: s.why for s in recipe.uncertain.standings}
-    assert used == {"sensor.gain": "mean", "sensor.pedestal": "mean", "sensor.read_noise": "recipe"}
+    assert used == {"sensor.gain": "mean", "sensor.offset": "mean", "sensor.read_noise": "recipe"}
 
 
 def test_a_run_takes_a_draw_with_all_that_goes_with_it(calibrated):
     recipe = load("first_light", posterior={"file": str(calibrated()), "use": 17})
     read = recipe.steps["read[mask]"].params
-    assert (gain_of(recipe), read["pedestal"], read["sigma"]) == pytest.approx(tuple(drawn()[17]))
+    assert (1 / gain_of(recipe), read["offset"], read["read_noise"]) == pytest.approx(tuple(drawn()[17]))
 
 
 def test_a_run_may_keep_its_own(calibrated):
@@ -234,8 +235,8 @@ def test_a_run_may_keep_its_own(calibrated):
 
 
 def test_an_argument_is_stronger_than_the_posterior(calibrated):
-    recipe = load("first_light", [f"posterior={calibrated()}", "sensor.gain=0.5"])
-    assert gain_of(recipe) == 0.5
+    recipe = load("first_light", [f"posterior={calibrated()}", "sensor.gain=0.5 e-/DN"])
+    assert gain_of(recipe) == 2.0
     assert "sensor.gain" not in recipe.uncertain.names
     assert "sensor.gain comes from the argument, not" in " ".join(recipe.notes)
 
@@ -263,8 +264,10 @@ def test_a_calibration_that_is_not_fit_for_use_is_refused(calibrated):
 
 
 def test_numbers_of_another_convention_are_refused(calibrated):
-    with pytest.raises(RecipeError, match="its gain is in DN/e-"):
-        load("first_light", [f"posterior={calibrated(units=('DN/e-', 'e-', 'e-'))}"])
+    with pytest.raises(RecipeError, match=r"its gain has no unit: head its draws 'gain \[DN/e-\]'"):
+        load("first_light", [f"posterior={calibrated(units=('', 'e-', 'e-'))}"])
+    recipe = load("first_light", [f"posterior={calibrated(units=('DN/e-', 'e-', 'e-'))}"])
+    assert gain_of(recipe) == pytest.approx(drawn()[:, 0].mean())
     with pytest.raises(RecipeError, match=r"the posterior.s dark current is for 1 s, the recipe.s exposure is 0.1 s"):
         load("first_light", [f"posterior={calibrated(extra=[('dark_current', 'e- in 1 s')])}"])
 
@@ -274,7 +277,13 @@ def test_a_law_and_a_posterior_of_one_value_are_refused(calibrated, tmp_path):
     groups = "camera: neusee, scene: china, illuminant: daylight, lift: lmmse, laser: green, optics: small"
     groups += ", sensor: small, doe: five_half_rings, flare: clean, restore: wiener, reading: coherent"
     lines = [f"  - {group}" for group in groups.split(", ")]
-    text = ["defaults:", *lines, "sensor: {gain: 'normal(0.37, 0.01)'}", f"posterior: {calibrated()}", "outputs: [raw]"]
+    text = [
+        "defaults:",
+        *lines,
+        "sensor: {gain: 'normal(0.37 e-/DN, 0.01 e-/DN)'}",
+        f"posterior: {calibrated()}",
+        "outputs: [raw]",
+    ]
     own.write_text("\n".join(text))
     with pytest.raises(RecipeError, match=r"own.yaml:13.*sensor.gain +has a distribution here and in the posterior"):
         load(own)
@@ -282,12 +291,109 @@ def test_a_law_and_a_posterior_of_one_value_are_refused(calibrated, tmp_path):
 
 def test_values_may_have_other_names_and_a_summary_may_stand_in_the_recipe():
     said = {
-        "mean": {"dark_noise": "12 e-"},
-        "sd": {"dark_noise": "0.5 e-"},
-        "values": {"sensor.read_noise": "dark_noise"},
+        "mean": {"temporal_dark_noise": "12 e-"},
+        "sd": {"temporal_dark_noise": "0.5 e-"},
+        "values": {"sensor.read_noise": "temporal_dark_noise"},
     }
     recipe = load("first_light", posterior=said)
-    assert recipe.steps["read[plain]"].params["sigma"] == 12.0
+    assert recipe.steps["read[plain]"].params["read_noise"] == 12.0
     assert recipe.uncertain.standings[0].below == pytest.approx(stats.norm.cdf(-3.0))
     assert recipe.uncertain.standings[0].far
     assert "far from its posterior, 12 ± 0.5 e-" in " ".join(recipe.notes)
+
+
+# --- gains, and what 0.1 wrote ----------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(
+    ("text", "law"),
+    [
+        ("normal(0.37 e-/DN, 0.01 e-/DN)", stats.norm(0.37, 0.01)),
+        ("lognormal(0.37 e-/DN, 1.02)", stats.lognorm(math.log(1.02), scale=0.37)),
+        ("uniform(0.3 e-/DN, 0.4 e-/DN)", stats.uniform(0.3, 0.1)),
+        ("loguniform(0.3 e-/DN, 0.4 e-/DN)", stats.loguniform(0.3, 0.4)),
+    ],
+)
+def test_a_law_in_electrons_a_number_is_drawn_as_written_and_read_as_k(text, law):
+    z = np.linspace(-4, 4, 41)
+    assert 1 / read_law(text).at(z) == pytest.approx(law.ppf(stats.norm.cdf(z)), rel=1e-9)
+    recipe = load("first_light", [f"sensor.gain={text}"])
+    assert gain_of(recipe) == read_law(text).median
+    assert recipe.uncertain.laws["sensor.gain"].unit == "DN/e-"
+
+
+def test_a_median_in_electrons_a_number_is_to_the_last_bit_the_value_itself():
+    assert gain_of(load("first_light", ["sensor.gain=lognormal(0.37 e-/DN, 1.02)"])) == gain_of(load("first_light"))
+
+
+@pytest.mark.parametrize(
+    ("law", "message"),
+    [
+        ("normal(0.37, 0.01)", "needs a unit: write 0.37 e-/DN or 0.37 DN/e-"),
+        ("normal(0.37 e-/DN, 0.1 DN/e-)", "must have the same unit"),
+    ],
+)
+def test_a_law_of_a_gain_says_its_unit(law, message):
+    with pytest.raises(RecipeError, match=message):
+        load("first_light", [f"sensor.gain={law}"])
+
+
+def test_a_summary_of_a_gain_is_of_k():
+    said = {"mean": {"gain": "0.37 e-/DN"}, "sd": {"gain": "0.01 e-/DN"}}
+    with pytest.raises(RecipeError, match=r"0.37 e-/DN: the mean and sd of a gain are those of K; write both in DN/e-"):
+        load("first_light", posterior=said)
+    with pytest.raises(RecipeError, match="its gain has no unit"):
+        load("first_light", posterior={"mean": {"gain": 2.7}, "sd": {"gain": 0.01}})
+    said = {"mean": {"gain": "2.6 DN/e-"}, "sd": {"gain": "0.01 DN/e-"}}
+    assert gain_of(load("first_light", posterior=said)) == 2.6
+
+
+@pytest.mark.parametrize(("unit", "k"), [("DN/e-", lambda x: x), ("e-/DN", lambda x: 1 / x)])
+@pytest.mark.parametrize("suffix", [".csv", ".npz"])
+def test_draws_of_a_gain_have_a_unit_in_their_heading(tmp_path, suffix, unit, k):
+    draws, head = drawn()[:, :1], f"gain [{unit}]"
+    if suffix == ".npz":
+        np.savez(tmp_path / "a.npz", **{head: draws[:, 0]})
+    else:
+        (tmp_path / "a.csv").write_text("\n".join([head, *map(repr, draws[:, 0].tolist())]))
+    recipe = load("first_light", [f"posterior={tmp_path / ('a' + suffix)}"])
+    assert gain_of(recipe) == pytest.approx(k(draws).mean(), rel=1e-12)
+
+
+@pytest.fixture
+def by_0_1(tmp_path):
+    """The folder of a calibration as 0.1 wrote it: of a sensor, or of a camera."""
+
+    def make(names, units):
+        folder = tmp_path / "by 0.1"
+        folder.mkdir()
+        np.savez(folder / "draws.npz", **dict(zip(names, drawn().T, strict=True)))
+        rows = {name: {"name": name, "unit": u, "kind": "estimate"} for name, u in zip(names, units, strict=True)}
+        doc = {"study": "calibrate", "failed": 0, "parameters": rows, "checks": [{"name": "fit", "mark": "pass"}]}
+        (folder / "posterior.json").write_text(json.dumps(doc))
+        return folder
+
+    return make
+
+
+def test_the_posterior_of_a_sensor_by_0_1_is_read(by_0_1):
+    recipe = load("first_light", [f"posterior={by_0_1(('gain', 'pedestal', 'read_noise'), ('e-/DN', 'e-', 'e-'))}"])
+    assert recipe.uncertain.joint.names == ("sensor.gain", "sensor.offset", "sensor.read_noise")
+    assert gain_of(recipe) == pytest.approx((1 / drawn()[:, 0]).mean())
+    assert recipe.steps["read[plain]"].params["offset"] == pytest.approx(drawn()[:, 1].mean())
+
+
+def test_the_posterior_of_a_camera_by_0_1_is_read(by_0_1):
+    folder = by_0_1(("gain", "dark_signal", "dark_noise"), ("DN/e-", "DN", "e-"))
+    values = {"sensor.gain": "gain", "sensor.read_noise": "temporal_dark_noise"}
+    recipe = load("first_light", posterior={"file": str(folder), "values": values})
+    assert gain_of(recipe) == pytest.approx(drawn()[:, 0].mean())
+    assert recipe.steps["read[plain]"].params["read_noise"] == pytest.approx(drawn()[:, 2].mean())
+    with pytest.raises(RecipeError, match="dark_noise is called temporal_dark_noise now"):
+        load("first_light", posterior={"file": str(folder), "values": {"sensor.read_noise": "dark_noise"}})
+
+
+def test_the_draws_of_0_1_alone_say_no_unit_and_are_refused(by_0_1):
+    folder = by_0_1(("gain", "pedestal", "read_noise"), ("e-/DN", "e-", "e-"))
+    with pytest.raises(RecipeError, match=r"its gain has no unit.*the folder of `neusee calibrate` contains the unit"):
+        load("first_light", [f"posterior={folder / 'draws.npz'}"])

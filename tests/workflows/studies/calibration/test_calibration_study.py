@@ -32,7 +32,7 @@ from neusee.workflows.studies.run_study import count_failures, study_recipe
 
 pytestmark = pytest.mark.usefixtures("one_thread")
 
-SEEN = ["reading.gain_unit=DN/e-"]  #: 9435 DN fill the well, and the converter goes on
+SEEN = ["sensor.gain=0.37 DN/e-"]  #: 9435 DN fill the well, and the converter goes on
 DITHERED = [*SEEN, "reading.rounding=dithered_floor"]
 OPEN = ["~levels.full", "~steps.prior.with.full_well"]  #: nothing is full
 PIXELS = 64
@@ -86,9 +86,9 @@ def test_a_right_posterior_passes(tmp_path):
 def test_a_forgotten_floor_is_found(tmp_path, monkeypatch):
     forget_the_floor(monkeypatch)
     _, found = simulated(tmp_path, 60, [*DITHERED, *OPEN], pixels=128)
-    assert {"pedestal", "read_noise"} <= failing(found)
+    assert {"offset", "read_noise"} <= failing(found)
     z = {v.name: v.z_mean for v in rank_tests(found)}
-    assert z["pedestal"] < -0.7  # half a number too low
+    assert z["offset"] < -0.7  # half a number too low
     assert z["read_noise"] > 0.7  # a twelfth of a number squared too much
 
 
@@ -204,7 +204,7 @@ def test_a_simulation_is_by_the_parameters_that_were_drawn(tmp_path):
     truth = simulator.truth(5)
     levels = simulator.problem(truth, 5).levels
     assert truth["gain"] != pytest.approx(0.37, rel=1e-3)
-    flat = truth["gain"] * (truth["pedestal"] + truth["quantum_efficiency"] * 9820)
+    flat = truth["gain"] * (truth["offset"] + truth["quantum_efficiency"] * 9820)
     assert float(levels.mean[11]) == pytest.approx(flat, rel=1e-3)
     dark = truth["gain"] * truth["read_noise"]
     assert float(levels.variance[0]) ** 0.5 == pytest.approx(math.hypot(dark, 12**-0.5), rel=0.02)
@@ -220,10 +220,10 @@ def test_a_simulation_is_by_the_parameters_that_were_drawn(tmp_path):
 
 
 def test_the_prior_is_no_wider_than_is_sensible():
-    recipe = load("calibrate", ["steps.prior.with.gain=[0.37, 1.01]"])
+    recipe = load("calibrate", ["steps.prior.with.gain=[0.37 DN/e-, 1.01]"])
     found = with_narrow_prior(recipe, {}).steps["prior"].params
     assert found["gain"] == (0.37, 1.01)
-    assert found["pedestal"] == (390, 20)
+    assert found["offset"] == (390, 20)
     assert found["dark_current"][1] == pytest.approx(math.exp(0.5))
     assert found["spread"] is None
 
@@ -298,7 +298,7 @@ def test_another_prior_size_or_sampler_is_another_study(tmp_path, monkeypatch):
     real = SensorSimulator._simulate
     monkeypatch.setattr(SensorSimulator, "_simulate", lambda self, seed: made.append(seed) or real(self, seed))
     simulated(tmp_path, 1, SEEN, pixels=33)
-    simulated(tmp_path, 1, [*SEEN, "steps.prior.with.gain=[0.37, 1.05]"], pixels=32)
+    simulated(tmp_path, 1, [*SEEN, "steps.prior.with.gain=[0.37 DN/e-, 1.05]"], pixels=32)
     assert len(made) == 2
     SensorSimulator(load("calibrate", SEEN), Store(tmp_path / "store"), 32, resampled, "other").simulation(0)
     assert len(made) == 3
@@ -367,7 +367,7 @@ def test_a_prior_matters_where_the_frames_tell_little(sensitive):
     kinds = dict.fromkeys(problem.names, "estimate") | {"full_well": "lower"}
     found = sensitivity(problem, drawn_of(problem, truth), kinds)
     assert found.left["full_well"] < ENOUGH  # its posterior is the prior, cut off
-    assert all(found.left[name] > 0.99 for name in ("gain", "pedestal", "read_noise", "quantum_efficiency"))
+    assert all(found.left[name] > 0.99 for name in ("gain", "offset", "read_noise", "quantum_efficiency"))
     for finding in found.findings:
         assert finding.doubled["full_well"] is None
         assert abs(finding.doubled["gain"] - finding.value) < 0.05 * finding.sd

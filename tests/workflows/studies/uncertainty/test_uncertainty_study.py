@@ -24,7 +24,7 @@ from neusee.workflows.studies.uncertainty.sobol_indices import indices
 
 SMALL = ["optics.samples=96", "optics.pitch=84.15 um", "optics.bands=7", "optics.window=[24, 24]"]
 SMALL += ["scene.shape=[32, 32]", "sensor.shape=[24, 24]", "lasers.green.strength=1e6"]
-LAWS = ["sensor.read_noise=normal(10.5 e-, 0.5 e-)", "sensor.gain=lognormal(0.37, 1.02)"]
+LAWS = ["sensor.read_noise=normal(10.5 e-, 0.5 e-)", "sensor.gain=lognormal(0.37 e-/DN, 1.02)"]
 NOISE = ["outputs=[transfer, lsr]", *SMALL, LAWS[0]]  #: which moves the dark noise of a curve and nothing of an LSR
 
 
@@ -58,7 +58,7 @@ def test_what_a_draw_changes_is_what_a_recipe_with_its_values_says():
 
 
 def test_what_reaches_no_output_is_not_drawn():
-    inputs = Inputs.of(small("lsr, saturated", *LAWS, "element.wrap_at=normal(500 nm, 1 nm)"))
+    inputs = Inputs.of(small("lsr, saturated", *LAWS, "mask.wrap_at=normal(500 nm, 1 nm)"))
     assert "sensor.gain" in inputs.names
     with pytest.raises(ValueError, match=r"no output depends on sensor\.read_noise"):
         Inputs.of(small("lsr", LAWS[0]))
@@ -107,12 +107,12 @@ _CHEAP = load("first_light", NOISE)
 
 def test_joint_draws_are_taken_whole(tmp_path):
     rng = np.random.default_rng(1)
-    draws = {"gain": 0.37 + 0.01 * rng.standard_normal(200), "read_noise": 10 + rng.standard_normal(200)}
+    draws = {"gain [e-/DN]": 0.37 + 0.01 * rng.standard_normal(200), "read_noise": 10 + rng.standard_normal(200)}
     np.savez(tmp_path / "draws.npz", **draws)
-    inputs = Inputs.of(small("transfer", f"posterior={tmp_path / 'draws.npz'}", "sensor.pedestal=normal(390 e-, 1 e-)"))
+    inputs = Inputs.of(small("transfer", f"posterior={tmp_path / 'draws.npz'}", "sensor.offset=normal(390 e-, 1 e-)"))
     assert inputs.most == 200
     found = inputs.independent(200, 3).values[:, 1:]
-    rows = np.stack([draws["gain"], draws["read_noise"]], 1)
+    rows = np.stack([1 / draws["gain [e-/DN]"], draws["read_noise"]], 1)
     assert (found[np.argsort(found[:, 0])] == rows[np.argsort(rows[:, 0])]).all()
 
 
@@ -330,15 +330,15 @@ def test_pictures_alone_are_no_numbers(tmp_path, store):
 
 
 def test_a_run_with_a_posterior_says_where_the_recipe_lies(tmp_path, store):
-    said = {"mean": {"gain": 0.38}, "sd": {"gain": 0.002}}
+    said = {"mean": {"gain": "2.63 DN/e-"}, "sd": {"gain": "0.014 DN/e-"}}
     recipe = load("first_light", ["outputs=[transfer]", *SMALL], posterior=said)
     done = simulate(recipe, store, tmp_path, ["neusee"])
     (row,) = done.document["posterior"]
-    assert (row["path"], row["own"], row["used"], row["far"]) == ("sensor.gain", "0.37", "0.38", True)
+    assert (row["path"], row["own"], row["used"], row["far"]) == ("sensor.gain", "2.7027 DN/e-", "2.63 DN/e-", True)
     text = done.page.read_text()
     assert "The sensor beside its posterior" in text
-    assert "sensor.gain = 0.37 is far from its posterior, 0.38 ± 0.002" in text
-    assert "gain: 0.38" in (done.folder / "recipe.yaml").read_text()
+    assert "sensor.gain = 2.7027 DN/e- is far from its posterior, 2.63 ± 0.014 DN/e-" in text
+    assert "gain: 2.63 DN/e-" in (done.folder / "recipe.yaml").read_text()
 
 
 def test_what_is_not_finite_fails_and_is_said(tmp_path, store, monkeypatch):

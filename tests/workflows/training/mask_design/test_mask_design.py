@@ -60,7 +60,7 @@ def read(folder):
 def test_every_kind_lowers_its_loss_on_all_bands(kind, recipe, store, tmp_path):
     given = how(kind=kind, iterations=15)
     terms = Terms(recipe, given, store)
-    before = loss_of(terms, optimizers.shape_of(given, 0, terms.relief)(terms.stop))
+    before = loss_of(terms, optimizers.shape_of(given, 0, terms.mask_step)(terms.stop))
     folder = design(recipe, given, store, tmp_path, quiet)
     found = read(folder)
     assert found["loss"] < before - 0.1
@@ -85,7 +85,7 @@ def test_the_file_is_the_mask_and_the_bounds_hold_on_it(recipe, store, tmp_path)
     assert not list(tmp_path.glob(".*state*"))
     assert (tmp_path / "latest").exists()
     assert {path.name for path in (folder / "figures").iterdir()} == {
-        "relief.png", "psf.png", "suppression.png", "history.png"
+        "height.png", "psf.png", "suppression.png", "history.png"
     }  # fmt: skip
     text = (folder / "report.html").read_text()
     assert "median MTF" in text
@@ -172,7 +172,9 @@ def test_the_recipes_own_relief_is_learnt_sample_by_sample_until_it_is_enough(st
     """From a half-ring on: what a filter leaves wrong falls, and an LSR that is enough pulls no more."""
     ring = load("half_ring", [*SMALL, "doe.waves=[2]"])
     weights = {"lsr": 2.0, "bsr": 1.0, "wiener": 1.0}
-    given = how(kind="element", iterations=12, weights=weights, up_to=0.1, enough=0.3, bands=None, learning_rate=0.02)
+    given = how(
+        kind="recipe_mask", iterations=12, weights=weights, up_to=0.1, enough=0.3, bands=None, learning_rate=0.02
+    )
     terms = Terms(ring, given, store)
     start = ring.run(store, outputs=["height"])["height"]
     before, after = (
@@ -201,7 +203,7 @@ def test_a_filter_leaves_the_same_wrong_of_all_bands_chosen_or_not(recipe, store
 def test_a_relief_that_is_not_learnt_is_refused(store, tmp_path):
     flat = load("plain_lens", SMALL)
     with pytest.raises(DesignError, match=r"kind: height is doe.flat, whose samples are not learnt"):
-        design(flat, how(kind="element", iterations=1), store, tmp_path, quiet)
+        design(flat, how(kind="recipe_mask", iterations=1), store, tmp_path, quiet)
 
 
 @pytest.mark.parametrize(("values", "said"), [

@@ -73,7 +73,7 @@ def errors(folder):
 def apart(found, expected):
     """By part, how far gradients are from the expected ones, as a share of their norm."""
     parts = {}
-    for part in ("relief", "net", "critics"):
+    for part in ("mask", "net", "critics"):
         names = [name for name in expected["grads"] if name.startswith(f"{part}.")]
         assert all(expected["grads"][n].dtype == torch.float64 for n in names)
         off, all_of_it = (

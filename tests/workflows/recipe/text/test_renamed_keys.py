@@ -1,0 +1,124 @@
+"""What was called otherwise in 0.1: one located line says the new name, wherever the old one is written."""
+
+import functools
+import re
+from pathlib import Path
+
+import pytest
+
+from neusee import recipes
+from neusee.workflows.graph.diagnostics import RecipeError
+from neusee.workflows.recipe.loading import load
+from neusee.workflows.recipe.step_declarations import families
+from neusee.workflows.recipe.text.renamed_keys import instead, new_name, old_names
+
+RECIPES = ("first_light", "calibrate", "calibrate_camera")
+BLOCKS = {"camera": "calibrate_camera"}  #: by the block of a key, the recipe that has it; else first_light
+BLOCKS_OF_KEYS = ("sensor", "reading", "camera")
+ELEMENT = [old for old in old_names() if "element" in old]  #: a block, a step, words of `train`
+KEYS = [old for old in old_names() if old.count(".") == 1 and old.partition(".")[0] in BLOCKS_OF_KEYS]
+KEYS.remove("sensor.gather")  # a node of the family `sensor`, not a key of the block
+KEYS += [f"element.{name}" for name in ("material", "wrap_at", "levels", "max_height")]
+NODES = [old for old in old_names() if old.count(".") == 1 and old not in (*KEYS, *ELEMENT)]
+PARAMETERS = [old for old in old_names() if old.count(".") == 2 and old not in ELEMENT]
+
+
+def refused(name, *arguments, folder=None):
+    with pytest.raises(RecipeError) as caught:
+        load(name, arguments, folder) if folder else load(name, arguments)
+    return [(str(p.mark), p.path, p.message) for p in caught.value.diagnostics]
+
+
+@functools.cache
+def using(node):
+    """A recipe that has a step of this node, and that step."""
+    steps = ((name, step) for name in RECIPES for step in load(name).steps.values())
+    return next((name, step.name.partition("[")[0]) for name, step in steps if step.node.path == node)
+
+
+def test_every_old_name_is_of_one_kind_and_is_one_no_more():
+    kinds = (*(old for old in KEYS if not old.startswith("element.")), *NODES, *PARAMETERS, *ELEMENT)
+    assert sorted(kinds) == sorted(old_names())
+    assert sorted(ELEMENT) == ["element", "steps.element", "train.mask.kind=element", "train.rates.element"]
+    assert all(old.partition(".")[0] in families() for old in (*NODES, *PARAMETERS))
+    assert not [old for old in old_names() if new_name(old) in old_names()]
+
+
+@pytest.mark.parametrize("old", KEYS)
+def test_an_old_key_in_an_argument(old):
+    name = BLOCKS.get(old.partition(".")[0], "first_light")
+    assert refused(name, f"{old}=1 e-") == [("argument 1", f"{old}=1 e-", instead(old))]
+
+
+@pytest.mark.parametrize("old", KEYS)
+def test_an_old_key_in_a_file(old, tmp_path):
+    """Beside the new one, and in its place: in both cases the old one alone is the mistake."""
+    block, _, key = old.partition(".")
+    name = BLOCKS.get(block, "first_light")
+    folder = Path(recipes.__path__[0])
+    text = (folder / f"{name}.yaml").read_text().replace("samples/", f"{folder}/samples/")
+    beside, there = re.subn(rf"\n{block}:.*\n", f"\n{block}:\n  {key}: 1 e-\n", text, count=1)
+    beside += "" if there else f"{block}:\n  {key}: 1 e-\n"
+    now = (new_name(old) or "").rpartition(".")[2]
+    for n, written in enumerate(
+        (beside, re.sub(rf"\n  {now}: .*", "", beside, count=1) if now not in ("", key) else beside)
+    ):
+        (tmp_path / f"{n}.yaml").write_text(written)
+        ((where, path, message),) = refused(f"{n}.yaml", folder=tmp_path)
+        assert where.startswith(f"{n}.yaml:")
+        assert (path, message) == (old, instead(old))
+
+
+@pytest.mark.parametrize("old", KEYS)
+def test_an_old_key_that_a_reference_names(old):
+    name = BLOCKS.get(old.partition(".")[0], "first_light")
+    found = refused(name, f"seed=${{{old}}}")
+    assert len(found) == 1
+    assert found[0][0] == "argument 1"
+    assert instead(old) in found[0][2]
+
+
+@pytest.mark.parametrize("old", NODES)
+def test_an_old_node(old):
+    found = refused("first_light", f"+steps.old={{node: {old}}}")
+    assert [message for _, _, message in found] == [f"{old} {instead(old)}"]
+    assert found[0][0] == "argument 1"
+
+
+@pytest.mark.parametrize("old", PARAMETERS)
+def test_an_old_parameter(old):
+    node, _, parameter = old.rpartition(".")
+    name, step = using(node)
+    ((where, path, message),) = refused(name, f"+steps.{step}.with.{parameter}=1 e-")
+    assert (where, path, message) == ("argument 1", f"steps.{step}.with.{parameter}", instead(old))
+
+
+@pytest.mark.parametrize("old", [old for old in PARAMETERS if new_name(old)])
+def test_an_old_parameter_in_place_of_the_new_one_is_one_mistake(old):
+    node, _, parameter = old.rpartition(".")
+    name, step = using(node)
+    found = refused(name, f"~steps.{step}.with.{new_name(old)}", f"+steps.{step}.with.{parameter}=1 e-")
+    assert [message for _, _, message in found] == [instead(old)]
+
+
+@pytest.mark.parametrize("words", [("outputs=[element]",), ("steps.pupil.from.height=element",)])
+def test_an_old_step(words):
+    found = refused("first_light", *words)
+    assert {message for _, _, message in found} == {"step element is called fabricated now"}
+    assert {where for where, _, _ in found} == {"argument 1"}
+
+
+def test_an_old_step_in_an_argument():
+    word = "steps.element.with.levels=4"
+    assert refused("first_light", word) == [("argument 1", word, "is called steps.fabricated.with.levels now")]
+
+
+@pytest.mark.parametrize(
+    ("word", "path", "message"),
+    [
+        ("+train.rates.element=1e-3", "train.rates.element", "is called train.rates.mask now"),
+        ("train.mask.kind=element", "train.mask.kind", "element is called recipe_mask now"),
+    ],
+)
+def test_an_old_word_of_training(word, path, message):
+    assert refused("train_small", word) == [("argument 1", path, message)]

@@ -1,0 +1,73 @@
+"""Old names of recipe keys, nodes and parameters, and what each is called now: one table, for messages."""
+
+from __future__ import annotations
+
+_CALLED = {
+    "element": "mask",
+    "steps.element": "steps.fabricated",
+    "train.rates.element": "train.rates.mask",
+    "train.mask.kind=element": "recipe_mask",
+    "sensor.pedestal": "sensor.offset",
+    "reading.pedestal_subtracted": "reading.offset_subtracted",
+    "camera.dark_noise": "camera.temporal_dark_noise",
+    "sensor.gather": "sensor.add_photons",
+    "metrics.peak": "metrics.peak_irradiance",
+    "optics.spot": "optics.laser_irradiance",
+    "losses.bsr": "losses.background_loss",
+    "losses.lsr": "losses.suppression_loss",
+    "sensor.read_noise.pedestal": "offset",
+    "sensor.read_noise.sigma": "read_noise",
+    "sensor.photon_transfer.pedestal": "offset",
+    "sensor.photon_transfer.sigma": "read_noise",
+    "calibrate.expose.pedestal": "offset",
+    "calibrate.expose.sigma": "read_noise",
+    "calibrate.density.pedestal": "offset",
+    "calibrate.prior.pedestal": "offset",
+    "calibrate.camera.dark_noise": "temporal_dark_noise",
+    "calibrate.camera_prior.dark_noise": "temporal_dark_noise",
+    "restore.electrons.pedestal": "offset",
+    "restore.electrons.pedestal_subtracted": "offset_subtracted",
+}  #: a key of a recipe by its path, a node by its name, a parameter by its node and name
+
+_UNIT = "a gain says its unit: write {}.gain: 0.37 e-/DN, or 2.7 DN/e-"
+_GONE = {
+    "reading.gain_unit": _UNIT.format("sensor"),
+    "camera.gain_unit": _UNIT.format("camera"),
+    **dict.fromkeys(
+        (
+            "sensor.digitize.gain_unit",
+            "sensor.photon_transfer.gain_unit",
+            "metrics.saturated.gain_unit",
+            "restore.electrons.gain_unit",
+            "restore.clipped.gain_unit",
+            "calibrate.expose.gain_unit",
+            "calibrate.density.gain_unit",
+            "calibrate.camera.gain_unit",
+        ),
+        "a gain says its unit: write gain: 0.37 e-/DN, or 2.7 DN/e-, and leave this out",
+    ),
+}  #: what to write instead of a key or a parameter that is gone
+
+#: of parameters in a posterior of 0.1
+POSTERIOR_NAMES = {"pedestal": "offset", "dark_noise": "temporal_dark_noise"}
+
+
+def new_name(old: str) -> str | None:
+    """Return what an old path, or a path below one, is called now; None for a path that was never renamed."""
+    parts = old.split(".")
+    for n in range(len(parts), 0, -1):
+        if now := _CALLED.get(".".join(parts[:n])):
+            return ".".join([now, *parts[n:]])
+    return None
+
+
+def instead(old: str) -> str:
+    """Return what to write instead of an old path; empty for a path that was never renamed."""
+    if now := new_name(old):
+        return f"is called {now} now"
+    return _GONE.get(old, "")
+
+
+def old_names() -> tuple[str, ...]:
+    """Return all old paths."""
+    return (*_CALLED, *_GONE)
