@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import json
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, Any
 
 import typer
 
@@ -34,19 +34,10 @@ def calibrate(
     from neusee.workflows.graph.run_error import RunError
 
     progress = (lambda line: None) if quiet else (lambda line: say([line]))
-    how = {"walkers": walkers, "move": move, "draws": draws}
+    how: dict[str, Any] = {"walkers": walkers, "move": move, "draws": draws}
     command = ["neusee", "calibrate", *command[2:], *(f"--{name} {value}" for name, value in how.items())]
     try:
-        folder = verbs.calibrate(
-            recipe,
-            store=the_store(),
-            out=out,
-            command=command,
-            progress=progress,
-            walkers=walkers,
-            move=move,
-            draws=draws,
-        )
+        folder = verbs.calibrate(recipe, store=the_store(), out=out, command=command, progress=progress, **how)
     except CalibrationRefused as error:
         fail(f"refused, nothing was drawn: {error}", FAILED)
     except (RunError, ValueError, ImportError) as error:

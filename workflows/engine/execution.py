@@ -123,9 +123,8 @@ class Execution:
 
     def asleep(self, name: str) -> StepRecord:
         """Return the record of a step that was not needed."""
-        key, why = self.keys[name], "nothing that ran needed it"
-        error = error_in(self.store.about(key))
-        return StepRecord(name, "not needed", why, 0.0, key, bound=self._bound(name), error=error)
+        key, error = self.keys[name], error_in(self.store.about(self.keys[name]))
+        return StepRecord(name, "not needed", "nothing needed it", 0.0, key, bound=self._bound(name), error=error)
 
     def missing(self, names: Iterable[str]) -> set[Key]:
         """Return the keys to compute for the values of ``names``."""

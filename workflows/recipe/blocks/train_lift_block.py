@@ -10,6 +10,7 @@ from pydantic import BaseModel, ConfigDict, Field, ValidationError
 from neusee.workflows.graph.diagnostics import Diagnostic, nearest
 from neusee.workflows.recipe.blocks.mask_design_block import half_cosine
 from neusee.workflows.recipe.text.composition import Composed
+from neusee.workflows.recipe.text.renamed_keys import instead
 from neusee.workflows.recipe.text.yaml_values import Value
 
 KEY = "train_lift"  #: key of the block in a recipe
@@ -64,7 +65,7 @@ def _problem(block: Value, error: Any) -> Diagnostic:
     at = below.get(names[0], block) if names else block
     path = ".".join([KEY, *names[: at is not block]])
     if error["type"] == "extra_forbidden":
-        return Diagnostic(at.key, path, f"unknown; {nearest(names[0], LiftTraining.model_fields)}")
+        return Diagnostic(at.key, path, instead(path) or f"unknown; {nearest(names[0], LiftTraining.model_fields)}")
     if error["type"] == "missing":
         return Diagnostic(at.mark, path, f"needs {names[-1]}")
     return Diagnostic(at.mark, path, str(error["msg"]))

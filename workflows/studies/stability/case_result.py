@@ -120,8 +120,7 @@ def _in_double(step: Step, inputs: Sequence[Any], seed: int) -> Any:
 
 def _compared(step: Step, inputs: list[Any], case: Case, seed: int) -> Cell:
     with torch.no_grad():
-        value = _as_used(step, inputs, seed)
-        own = step.node.hooks.reference
+        value, own = _as_used(step, inputs, seed), step.node.hooks.reference
         truth = _run(step, own, inputs, seed) if own else _in_double(step, inputs, seed)
     if not _finite(value):
         return Cell("pass", "overflows in the open, as its reference in single") if not _fits(truth) else Cell(

@@ -19,7 +19,8 @@ ELEMENT = [old for old in old_names() if "element" in old]  #: a block, a step, 
 KEYS = [old for old in old_names() if old.count(".") == 1 and old.partition(".")[0] in BLOCKS_OF_KEYS]
 KEYS.remove("sensor.gather")  # a node of the family `sensor`, not a key of the block
 KEYS += [f"element.{name}" for name in ("material", "wrap_at", "levels", "max_height")]
-NODES = [old for old in old_names() if old.count(".") == 1 and old not in (*KEYS, *ELEMENT)]
+LIFT = [old for old in old_names() if old.startswith("train_lift.")]
+NODES = [old for old in old_names() if old.count(".") == 1 and old not in (*KEYS, *ELEMENT, *LIFT)]
 PARAMETERS = [old for old in old_names() if old.count(".") == 2 and old not in ELEMENT]
 
 
@@ -37,7 +38,7 @@ def using(node):
 
 
 def test_every_old_name_is_of_one_kind_and_is_one_no_more():
-    kinds = (*(old for old in KEYS if not old.startswith("element.")), *NODES, *PARAMETERS, *ELEMENT)
+    kinds = (*(old for old in KEYS if not old.startswith("element.")), *NODES, *PARAMETERS, *ELEMENT, *LIFT)
     assert sorted(kinds) == sorted(old_names())
     assert sorted(ELEMENT) == ["element", "steps.element", "train.mask.kind=element", "train.rates.element"]
     assert all(old.partition(".")[0] in families() for old in (*NODES, *PARAMETERS))
@@ -122,3 +123,15 @@ def test_an_old_step_in_an_argument():
 )
 def test_an_old_word_of_training(word, path, message):
     assert refused("train_small", word) == [("argument 1", path, message)]
+
+
+@pytest.mark.parametrize("old", LIFT)
+def test_an_old_key_of_training_a_lift(old, tmp_path):
+    assert refused("train_lift", f"{old}=1") == [("argument 1", f"{old}=1", instead(old))]
+    text = (Path(recipes.__path__[0]) / "train_lift.yaml").read_text()
+    key, now = old.rpartition(".")[2], new_name(old).rpartition(".")[2]
+    (tmp_path / "lift.yaml").write_text(re.sub(rf"\n  {now}:", f"\n  {key}:", text) if f"\n  {now}:" in text else
+                                        text.replace("train_lift:\n", f"train_lift:\n  {key}: 1\n"))  # fmt: skip
+    ((where, path, message),) = refused("lift.yaml", folder=tmp_path)
+    assert where.startswith("lift.yaml:")
+    assert (path, message) == (old, instead(old))
