@@ -158,7 +158,7 @@ def test_unet_loads_its_own_weights_and_no_others(tmp_path):
         doe.unet.hooks.preflight(**params, width=8)
     assert caught.value.parameter == "weights"
     (tmp_path / "text.safetensors").write_text("no")
-    with pytest.raises(ParameterError, match="no safetensors file"):
+    with pytest.raises(ParameterError, match="is not a safetensors file"):
         doe.unet.hooks.preflight(**params | {"weights": tmp_path / "text.safetensors"}, width=4)
 
 

@@ -90,7 +90,7 @@ def test_a_dark_band_and_a_blind_channel_stay_finite():
 
 def test_bands_that_differ_are_refused():
     psf, light, responses, bands = given(kernels(3, 6, 6))
-    with pytest.raises(ValueError, match="bands: give one"):
+    with pytest.raises(ValueError, match="bands: use one"):
         wiener(psf, light[:2], responses, bands)
 
 

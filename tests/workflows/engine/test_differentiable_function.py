@@ -254,11 +254,11 @@ def test_torch_func_follows_a_parameter(store):
 @pytest.mark.parametrize("output", ["lsr[mask]", "raw[mask]"])
 def test_torch_func_follows_the_camera(output, store):
     recipe = load("laser_free", SMALL, doe="axicon")
-    function = as_function(recipe, "element", outputs=[output], store=store)
-    height = run(recipe, store, ["element"])["element"]
+    function = as_function(recipe, "fabricated", outputs=[output], store=store)
+    height = run(recipe, store, ["fabricated"])["fabricated"]
 
     def result(height):
-        return function({"element": height})[output]
+        return function({"fabricated": height})[output]
 
     found, pull = torch.func.vjp(result, height)
     weight = torch.rand(found.shape, dtype=found.dtype, generator=torch.Generator().manual_seed(1))

@@ -244,7 +244,7 @@ def test_every_mistake_is_said_before_anything_runs(tmp_path):
         "flat+wener: argument 8 restore=wener no option wener",
         "is not a safetensors file",
         "flat+unet:",
-        "untrained",
+        "needs trained weights",
         "flat takes no file",
     ):
         assert part in said, said

@@ -340,7 +340,7 @@ def test_a_network_with_options_is_learnt_and_restores_only_with_them(tmp_path, 
                                   f"train.photographs={photographs}"])  # fmt: skip
     folder = trained(recipe, tmp_path, [1])
     run = ["restore=fft_mamba", "restore.width=4", f"restore.weights={folder / 'network.safetensors'}"]
-    with pytest.raises(RecipeError, match="learnt with directions: 4"):
+    with pytest.raises(RecipeError, match="trained with directions: 4"):
         load("first_light", run)
     load("first_light", [*run, *(f"restore.{x}" for x in options)])
 
