@@ -11,7 +11,7 @@ from safetensors.torch import save_file
 from neusee.nodes import calibrate, doe, spectra
 from neusee.nodes.restore._networks._fft_mamba import FFTMamba
 from neusee.nodes.restore._networks._nafnet import NAFNet
-from neusee.nodes.restore._networks._restorer import started
+from neusee.nodes.restore._networks._restorer import start_network
 from neusee.nodes.restore._networks._unet import UNet
 from neusee.nodes.values import Channels, Dirt, LowRankCube, Psf, Pupil
 
@@ -82,7 +82,7 @@ def number(x):
 
 def saved(folder, name, make):
     """A network's file, with weights that are not those of its start."""
-    network = started(make, seeded())
+    network = start_network(make, seeded())
     with torch.no_grad():
         for i, p in enumerate(network.parameters()):
             p.add_(0.05 * torch.randn(p.shape, generator=seeded(i)))

@@ -4,7 +4,7 @@ import pytest
 import torch
 from torch import nn
 
-from neusee.workflows.training.checkpoint import restore, unpacked
+from neusee.workflows.training.loop.checkpoint import StateFile
 
 
 def written(path, parts, edition=1):
@@ -14,9 +14,9 @@ def written(path, parts, edition=1):
 
 def test_a_state_of_0_1_is_read(tmp_path):
     old = nn.Linear(2, 1)
-    found = unpacked(written(tmp_path / "state.pt", {"relief": old.state_dict(), "net": {}}), "cpu")
+    found = StateFile(written(tmp_path / "state.pt", {"relief": old.state_dict(), "net": {}})).read()
     now = nn.Linear(2, 1)
-    restore({"mask": now}, found)
+    now.load_state_dict(found["parts"]["mask"])
     assert torch.equal(now.weight, old.weight)
     assert (found["stage"], found["iteration"]) == (1, 3)
 
@@ -24,4 +24,4 @@ def test_a_state_of_0_1_is_read(tmp_path):
 @pytest.mark.parametrize(("parts", "edition"), [({}, 0), ([], 1), (None, 1)])
 def test_what_is_no_state_is_refused_with_what_to_do(tmp_path, parts, edition):
     with pytest.raises(ValueError, match=r"state.pt cannot be gone on from .*: remove its folder to begin anew"):
-        unpacked(written(tmp_path / "state.pt", parts, edition), "cpu")
+        StateFile(written(tmp_path / "state.pt", parts, edition)).read()
