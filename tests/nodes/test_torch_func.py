@@ -54,6 +54,7 @@ def test_what_the_table_says_is_so(path, transform, every_case):
     if said == "yes":
         compare(function, x)
     elif said == "no":
+        function(x)  # the case itself computes, so that what fails below is the transform
         with pytest.raises((Differs, RuntimeError, NotImplementedError, ValueError, TypeError)):
             compare(function, x)
     else:
