@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import ast
 import functools
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from pathlib import Path
 
 from neusee.workflows.keys.cache_key import digest
@@ -36,15 +36,21 @@ def engine(*modules: str) -> str:
         path = _source(name)
         if path is None:
             raise LookupError(f"{_ROOT}.{name} has no source file below {_HERE}, so its results cannot be keyed")
-        source = path.read_bytes()
-        seen[name] = summarise(source).tree
-        todo += imported(ast.parse(source))
+        seen[name], imports = _parsed(path.read_bytes())
+        todo += imported(imports)
     return digest(seen)
 
 
-def imported(tree: ast.Module) -> Iterator[str]:
-    """Yield the modules of neusee.workflows that are imported at the top, by their names below it."""
-    for item in tree.body:
+@functools.cache
+def _parsed(source: bytes) -> tuple[str, list[ast.stmt]]:
+    """Return the digest of a source and its statements at the top that import; kept, since most digests share files."""
+    imports = [item for item in ast.parse(source).body if isinstance(item, ast.Import | ast.ImportFrom)]
+    return summarise(source).tree, imports
+
+
+def imported(statements: Iterable[ast.stmt]) -> Iterator[str]:
+    """Yield the modules of neusee.workflows that the statements import, by their names below it."""
+    for item in statements:
         if isinstance(item, ast.Import):
             yield from (_below(alias.name) for alias in item.names if alias.name.startswith(f"{_ROOT}."))
         elif isinstance(item, ast.ImportFrom) and f"{item.module}.".startswith(f"{_ROOT}."):

@@ -516,6 +516,7 @@ def chain(n):
     return recipe(f"s{n}", s0=(source,), **{f"s{i}": (add, {"x": f"s{i - 1}"}, {"k": 1.0}) for i in range(1, n + 1)})
 
 
+@pytest.mark.slow
 def test_a_chain_of_ten_thousand_steps_runs(store):
     steps = chain(10_000)
     assert run(steps, store).values["s10000"][0] == 10_001

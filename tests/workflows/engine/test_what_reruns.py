@@ -244,6 +244,7 @@ def test_equal_tensors_of_two_processes_make_equal_keys(lab, others, tmp_path):
     assert found[3]["network"] != found[0]["network"]
 
 
+@pytest.mark.slow
 def test_a_moved_project_keeps_its_results(lab, tmp_path):
     """No path of the code or of a file is part of a key."""
     for name in ("nodes", "offset.txt", "weights.pt"):

@@ -39,6 +39,15 @@ def store(tmp_path):
     return Store(tmp_path / "cache")
 
 
+@pytest.fixture(scope="module")
+def warm(recipe, tmp_path_factory):
+    """A store with the run of the recipe and, of the same scene and light, the run in full."""
+    store = Store(tmp_path_factory.mktemp("warm") / "cache")
+    for each in (recipe, replace(recipe, exact=True)):
+        run(each, store)
+    return store
+
+
 def test_sums_over_bands_stand_in_for_images_that_nobody_asks_for(recipe):
     found = with_substitutions(recipe, recipe.outputs)
     assert {e.step for e in found.substitutions} == {"image[plain]", "image[mask]"}
@@ -55,10 +64,10 @@ def test_the_well_is_summed_only_where_it_is_asked_for(recipe):
         assert found.steps[rows].params["well"] == (rows == "responses.wells")
 
 
-def test_an_image_that_is_asked_for_is_whole(recipe, store):
+def test_an_image_that_is_asked_for_is_whole(recipe, warm):
     found = with_substitutions(recipe, [*recipe.outputs, "image[mask]"])
     assert {e.step for e in found.substitutions} == {"image[plain]"}
-    result = run(recipe, store)
+    result = run(recipe, warm)
     assert result["image[mask]"].shape == (7, 64, 64)
 
 
@@ -80,24 +89,24 @@ def test_a_scene_that_is_learnt_is_whole(recipe):
     assert with_substitutions(recipe, recipe.outputs, {"height"}).substitutions
 
 
-def test_the_errors_are_within_their_bounds_and_these_within_the_tolerance(recipe, store):
-    result, full = run(recipe, store), run(replace(recipe, exact=True), store)
+def test_the_errors_are_within_their_bounds_and_these_within_the_tolerance(recipe, warm):
+    result, full = run(recipe, warm), run(replace(recipe, exact=True), warm)
     assert set(result.proof.held) >= {"raw[plain]", "raw[mask]"}
     assert 0 < result.proof.worst <= recipe.tolerance
     for name in ("raw[plain]", "raw[mask]"):
         assert error_of(result[name], full[name]) <= result.proof.worst
 
 
-def test_a_large_tolerance_spoils_no_figure_of_merit(recipe, store):
+def test_a_large_tolerance_spoils_no_figure_of_merit(recipe, warm):
     wide = replace(recipe, tolerance=0.1)
-    result, full = run(wide, store), run(replace(recipe, exact=True), store)
+    result, full = run(wide, warm), run(replace(recipe, exact=True), warm)
     assert "read[plain]" in result.done
     assert result.done["read[plain]"].state != "left out"
     assert (spent(result)["held"], spent(full)["held"]) == (1e-3, recipe.tolerance)
     assert result.proof.worst <= 1e-3
     for arm in ("plain", "mask"):
         assert error_of(result[f"developed_quality[{arm}]"], full[f"developed_quality[{arm}]"]) <= 0.1
-    assert run(wide, store, ["raw[plain]"]).recipe.limit("raw[plain]") == 0.1
+    assert run(wide, warm, ["raw[plain]"]).recipe.limit("raw[plain]") == 0.1
 
 
 def test_measured_errors_stand_where_the_full_run_is_stored(recipe, store):
@@ -115,8 +124,8 @@ def test_measured_errors_stand_where_the_full_run_is_stored(recipe, store):
     assert "measured" not in said_of_economies(before)
 
 
-def test_the_command_line_shows_what_stands_in(tmp_path, monkeypatch):
-    monkeypatch.setenv("NEUSEE_CACHE", str(tmp_path / "cache"))
+def test_the_command_line_shows_what_stands_in(warm, tmp_path, monkeypatch):
+    monkeypatch.setenv("NEUSEE_CACHE", str(warm.root))
     done = CliRunner().invoke(app, ["run", "first_light", *SMALL, "--out", str(tmp_path / "runs")])
     assert done.exit_code == 0, done.output
     assert "cube.mixture" in done.output
@@ -133,12 +142,12 @@ def test_the_command_line_shows_a_run_that_could_not_prove_its_tolerance(tmp_pat
     assert "\n  cube  " in done.output
 
 
-def test_the_page_says_it(recipe, store, tmp_path):
-    done = simulate(recipe, store, tmp_path / "runs", ["neusee"])
+def test_the_page_says_it(recipe, warm, tmp_path):
+    done = simulate(recipe, warm, tmp_path / "runs", ["neusee"])
     page, doc = done.page.read_text(), json.loads((done.folder / "provenance.json").read_text())
     assert "image[mask].channels" in page
     assert doc["spent"]["economies"][0]["bound"] <= recipe.tolerance
     assert max(doc["spent"]["bounds"].values()) <= recipe.tolerance
-    whole = simulate(replace(recipe, exact=True), store, tmp_path / "runs", ["neusee"])
+    whole = simulate(replace(recipe, exact=True), warm, tmp_path / "runs", ["neusee"])
     assert "every step was computed in full" in whole.page.read_text()
-    assert "measured beside --exact" in run_page.page({**doc, "spent": spent(run(recipe, store))}, {})
+    assert "measured beside --exact" in run_page.page({**doc, "spent": spent(run(recipe, warm))}, {})

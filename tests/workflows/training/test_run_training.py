@@ -71,6 +71,7 @@ def losses(folder):
         return list(csv.DictReader(file))
 
 
+@pytest.mark.slow
 def test_both_stages_at_64_pixels_and_31_bands(tmp_path, photographs):
     small = ["train.stages.1.iterations=3", "train.stages.2.iterations=3", "train.stages.1.batch=2"]
     recipe = load("train_small", [*small, f"train.photographs={photographs}"])
@@ -196,6 +197,7 @@ def test_a_pool_comes_again_where_the_element_is_still(tmp_path, photographs):
     assert torch.equal(again.picture, first.picture)
 
 
+@pytest.mark.slow
 def test_a_network_is_learnt_behind_the_recipes_own_restorer(tmp_path, photographs):
     """It sees what the Wiener filter made, and in stage 1 the element is learnt through the filter."""
     words = [*STILL, "doe=half_ring", "doe.waves=[2]", "laser=none", "restore=wiener", "train.stages.1.iterations=1",

@@ -83,6 +83,7 @@ def test_a_right_posterior_passes(tmp_path):
     assert not failing(found)
 
 
+@pytest.mark.slow
 def test_a_forgotten_floor_is_found(tmp_path, monkeypatch):
     forget_the_floor(monkeypatch)
     _, found = simulated(tmp_path, 60, [*DITHERED, *OPEN], pixels=128)

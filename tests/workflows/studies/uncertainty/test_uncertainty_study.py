@@ -260,6 +260,7 @@ def test_deviations_are_those_of_the_closed_form(tmp_path, store):
     assert doc["still"] == ["lsr[plain]", "lsr[mask]"]
 
 
+@pytest.mark.slow
 def test_points_of_sobol_find_the_same_with_fewer(tmp_path, store):
     folder = study_recipe(
         "uncertainty", load("first_light", NOISE), store, tmp_path, most=512, points="sobol", error=0.02
