@@ -44,7 +44,7 @@ def engine(*modules: str) -> str:
 @functools.cache
 def _parsed(source: bytes) -> tuple[str, list[ast.stmt]]:
     """Return the digest of a source and its statements at the top that import; kept, since most digests share files."""
-    imports = [item for item in ast.parse(source).body if isinstance(item, ast.Import | ast.ImportFrom)]
+    imports: list[ast.stmt] = [item for item in ast.parse(source).body if isinstance(item, ast.Import | ast.ImportFrom)]
     return summarise(source).tree, imports
 
 
