@@ -20,6 +20,14 @@ class Bands(NamedTuple):
     weights: Tensor  #: (band,) float64; for a scene all 1; for a laser line the shares of the energy, sum 1
 
 
+class Stop(NamedTuple):
+    """The round stop, and the square pupil grid whose sample j lies at (j - (samples - 1) / 2) * pitch on each axis."""
+
+    samples: Tensor  #: () int64, number of samples along each axis
+    pitch: Tensor  #: () float64, m between samples
+    diameter: Tensor  #: () float64, m, of the clear aperture
+
+
 class Dirt(NamedTuple):
     """Dirt on the window, in the plane of the pupil."""
 

@@ -8,10 +8,10 @@ from torch import Tensor
 
 from neusee.nodes import Check
 from neusee.nodes.doe._refractive_index import Material, wave_height
-from neusee.nodes.optics._pupil_grid import Stop, inside
+from neusee.nodes.optics._pupil_grid import PupilGrid, inside
 
 
-def height_from_phase(phase: Tensor, grid: Stop, wavelength: float, material: Material) -> Tensor:
+def height_from_phase(phase: Tensor, grid: PupilGrid, wavelength: float, material: Material) -> Tensor:
     """Height, float32 in m, that delays ``wavelength`` by ``phase``: 0 at the lowest point and outside the stop."""
     open_ = inside(grid, phase.device)
     lifted = phase - phase[open_].min()

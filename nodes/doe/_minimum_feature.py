@@ -9,22 +9,15 @@ from torch import Tensor
 from neusee.nodes import Check, node
 from neusee.nodes._half_precision import refuse_half
 from neusee.nodes.doe._height_from_phase import height_checks
-from neusee.nodes.optics._pupil_grid import Aperture, stop
-from neusee.nodes.units import Count, PositiveLength
+from neusee.nodes.optics._pupil_grid import grid_of, refuse_other_grid
+from neusee.nodes.units import PositiveLength
+from neusee.nodes.values import Stop
 
 _REACH = 6.0  #: standard deviations beyond which the spot holds 1e-9 of its dose
 
 
 @node(rtol=1e-5)
-def smooth(
-    height: Tensor,
-    *,
-    feature: PositiveLength,
-    samples: Count,
-    pitch: PositiveLength,
-    diameter: PositiveLength,
-    aperture: Aperture = "inscribed",
-) -> Tensor:
+def smooth(height: Tensor, stop: Stop, *, feature: PositiveLength) -> Tensor:
     """Write the relief with a round Gaussian spot whose full width at half maximum is ``feature``.
 
     Depth follows dose, and dose is the wanted relief averaged over the spot: steps get flanks of ``feature``, pillars
@@ -33,16 +26,16 @@ def smooth(
     samples inside the grid. The spot is a Gaussian and not a disc, whose transfer function has negative lobes: with a
     Gaussian, features that are too small fade, and no feature is inverted.
 
-    Shapes: (v, u) -> (v, u).
+    Shapes: (v, u), stop -> (v, u).
     Units:  m.
     Error:  1e-6 of the deepest height (float32). A spot below 1.5 samples is not resolved by the grid.
     Raises: ValueError for a height in half precision, or of another shape than the pupil grid.
     Source: Gaussian spot of laser lithography: Gale et al., Opt. Eng. 33, 3556 (1994).
     """
     refuse_half(height=height)
-    if tuple(height.shape) != (samples, samples):
-        raise ValueError(f"height is {tuple(height.shape)}, not the pupil grid ({samples}, {samples}): resample it")
-    spread = _spread(samples, feature / stop(samples, pitch, diameter, aperture).pitch).to(height)
+    grid = grid_of(stop)
+    refuse_other_grid(height, grid)
+    spread = _spread(grid.samples, feature / grid.pitch).to(height)
     return spread @ height @ spread.T
 
 
@@ -56,11 +49,10 @@ def _spread(samples: int, feature: float) -> Tensor:
 
 
 @smooth.reference
-def _(
-    height: Tensor, *, feature: float, samples: int, pitch: float, diameter: float, aperture: Aperture = "inscribed"
-) -> Tensor:
+def _(height: Tensor, stop: Stop, *, feature: float) -> Tensor:
     """Compute the weighted average over all places, for one place after another."""
-    sigma = feature / stop(samples, pitch, diameter, aperture).pitch / math.sqrt(8 * math.log(2))
+    samples, pitch, _ = grid_of(stop)
+    sigma = feature / pitch / math.sqrt(8 * math.log(2))
     x, place = height.double(), torch.arange(samples, dtype=torch.float64)
     made = torch.empty_like(x)
     for v in range(samples):
@@ -72,10 +64,10 @@ def _(
 
 
 @smooth.preflight
-def _(*, feature: float, samples: int, pitch: float, diameter: float, aperture: Aperture) -> list[str]:
-    own = stop(samples, pitch, diameter, aperture).pitch
-    if feature < 1.5 * own:
-        return [f"feature {feature * 1e6:.3g} um is less than 1.5 samples of {own * 1e6:.3g} um: not resolved"]
+def _(*, stop: Stop | None, feature: float) -> list[str]:
+    if stop is not None and feature < 1.5 * float(stop.pitch):
+        pitch = f"{float(stop.pitch) * 1e6:.3g} um"
+        return [f"feature {feature * 1e6:.3g} um is less than 1.5 samples of {pitch}: not resolved"]
     return []
 
 

@@ -10,8 +10,9 @@ from torch import Tensor
 from neusee.nodes import ParameterError, node
 from neusee.nodes.doe._height_from_phase import height_checks
 from neusee.nodes.optics._phase_screen import screen
-from neusee.nodes.optics._pupil_grid import Aperture, grid_notes, stop
-from neusee.nodes.units import Count, DataFile, PositiveLength
+from neusee.nodes.optics._pupil_grid import grid_of
+from neusee.nodes.units import DataFile, PositiveLength
+from neusee.nodes.values import Stop
 
 if TYPE_CHECKING:
     from PIL.Image import Image
@@ -82,11 +83,8 @@ def read_height_map(file: Path, depth: float) -> Tensor:
 
 @node()
 def pixelwise(
+    stop: Stop,
     *,
-    samples: Count,
-    pitch: PositiveLength,
-    diameter: PositiveLength,
-    aperture: Aperture = "inscribed",
     file: DataFile | None = None,
     depth: PositiveLength = 1.2e-6,
     scale: Scale = 0.1,
@@ -96,7 +94,7 @@ def pixelwise(
 
     The random relief is a start for training: a flat relief is a saddle point, where suppression has no gradient.
 
-    Shapes: -> (v, u).
+    Shapes: stop -> (v, u).
     Units:  m; of a .png, levels, of which the whitest is ``depth``.
     Error:  exact.
     Raises: ParameterError for a file without a relief; ValueError for a relief that does not fit the grid, or with a
@@ -104,9 +102,9 @@ def pixelwise(
     Source: by definition.
     """
     if file is None:
-        noise = screen(stop(samples, pitch, diameter, aperture), scale, rng)
+        noise = screen(grid_of(stop), scale, rng)
         return (depth * torch.sigmoid(1.5 * noise)).to(torch.float32)
-    _fits(file, _header(file), samples)
+    _fits(file, _header(file), stop)
     height = read_height_map(file, depth)
     if not bool(torch.isfinite(height).all()) or float(height.min()) < 0:
         low = float(height.min())
@@ -114,17 +112,19 @@ def pixelwise(
     return height
 
 
-def _fits(file: Path, shape: tuple[int, ...], samples: int) -> None:
+def _fits(file: Path, shape: tuple[int, ...], stop: Stop) -> None:
+    samples = int(stop.samples)
     if shape != (samples, samples):
-        fix = f"resample the relief, or set samples to {shape[-1] if shape else 1}"
+        fix = f"resample the height map, or set samples to {shape[-1] if shape else 1}"
         raise ParameterError("file", f"{file.name} is {shape}, not the pupil grid ({samples}, {samples}): {fix}")
 
 
 @pixelwise.preflight
-def _(*, samples: int, file: Path | None, **rest: Any) -> list[str]:
-    if file is not None:
-        _fits(file, _header(file), samples)
-    return grid_notes(samples=samples, **rest)
+def _(*, stop: Stop | None, file: Path | None, **_: Any) -> list[str]:
+    shape = None if file is None else _header(file)
+    if file is not None and shape is not None and stop is not None:
+        _fits(file, shape, stop)
+    return []
 
 
 pixelwise.check(height_checks)

@@ -13,8 +13,8 @@ from neusee.nodes import node
 from neusee.nodes.bicubic_resize import enlarge
 from neusee.nodes.doe._height_from_phase import height_checks
 from neusee.nodes.network_weights import loaded, same_layout
-from neusee.nodes.optics._pupil_grid import Aperture, grid_notes
 from neusee.nodes.units import Count, DataFile, PositiveLength
+from neusee.nodes.values import Stop
 
 PITCH = 15.0  #: frequency of the first layer's sines: about four periods across the pupil at the start
 
@@ -83,11 +83,8 @@ def fresh(width: int, grid: int, rng: torch.Generator) -> HeightNet:
 
 @node()
 def unet(
+    stop: Stop,
     *,
-    samples: Count,
-    pitch: PositiveLength,
-    diameter: PositiveLength,
-    aperture: Aperture = "inscribed",
     max_height: PositiveLength = 1.2e-6,
     grid: Count = 270,
     width: Count = 32,
@@ -98,20 +95,21 @@ def unet(
 
     The network has ``grid`` samples. The bicubic resampling precedes the sigmoid, which keeps the relief in its range.
 
-    Shapes: -> (v, u).
+    Shapes: stop -> (v, u).
     Units:  m.
     Error:  1e-6 of max_height (float32).
     Source: "Learning to See Through Flare", "Neural Representation of the DOE"; the layer widths are ours.
     """
+    samples = int(stop.samples)
     net = fresh(width, min(grid, samples), rng) if weights is None else loaded(partial(HeightNet, width), weights)
     return height_of(net, samples, grid, max_height).detach()
 
 
 @unet.preflight
-def _(*, width: int, weights: Path | None, **rest: Any) -> list[str]:
+def _(*, width: int, weights: Path | None, **_: Any) -> list[str]:
     if weights is not None:
         same_layout(partial(HeightNet, width), weights, width)
-    return grid_notes(**rest)
+    return []
 
 
 unet.check(height_checks)

@@ -6,13 +6,13 @@ from typing import Annotated, Any
 import torch
 from pydantic import Field
 
-from neusee.nodes import Check, node
+from neusee.nodes import Check, TensorStats, node
 from neusee.nodes.flare._grains_and_scratches import Grain, Scratch, stamp
 from neusee.nodes.optics._phase_screen import factors
-from neusee.nodes.optics._pupil_grid import Aperture, Stop, grid_notes, inside, stop, stripes
+from neusee.nodes.optics._pupil_grid import PupilGrid, grid_of, inside, stripes
 from neusee.nodes.optics._zernike import surface
-from neusee.nodes.units import Count, Fraction, PositiveLength, Waves
-from neusee.nodes.values import Dirt
+from neusee.nodes.units import Fraction, Waves
+from neusee.nodes.values import Dirt, Stop
 
 Mean = Annotated[float, Field(ge=0, le=10_000)]  #: expected number
 Part = Annotated[float, Field(gt=0, le=1)]  #: relative to the diameter of the pupil
@@ -25,11 +25,8 @@ DENT_TERMS = range(4, 16)  #: Noll numbers from defocus to the fourth radial ord
 
 @node()
 def dirt(
+    stop: Stop,
     *,
-    samples: Count,
-    pitch: PositiveLength,
-    diameter: PositiveLength,
-    aperture: Aperture = "inscribed",
     dust: Mean = 0.0,
     dust_radius: Part = 1 / 60,
     scratches: Mean = 0.0,
@@ -51,19 +48,19 @@ def dirt(
     smudges: opacity of the field under the thickest of the soft patches, whose size is ``smudge_scale``.
     dents: root mean square of Zernike terms 4 to 15 (0.1 to 2 waves). With all five at zero the glass is clean.
 
-    Shapes: -> Dirt (v, u).
+    Shapes: stop -> Dirt (v, u).
     Units:  grease, dents waves at 550 nm; result amplitude 1, path m.
     Error:  covered area of a mark: 1 % from 3 samples across, 10 % at 1 sample, unbiased at any size.
     Source: numbers, sizes and opacities of dust and scratches: Wu et al., ICCV 2021 (arXiv 2011.12485), relative to
         their 6000 samples; grease, smudges and dents are ours.
     """
-    grid = stop(samples, pitch, diameter, aperture)
+    grid = grid_of(stop)
     grains_rng, lines_rng, film_rng, patches_rng, dents_rng = _streams(5, rng)
     grains = _grains(dust, dust_radius, grains_rng)
     lines = _scratches(scratches, scratch_length, scratch_width, lines_rng)
     film, patches = factors(grid, grease_scale, film_rng), factors(grid, smudge_scale, patches_rng)
     bends = _dents(WAVE * dents, dents_rng)
-    amplitude, path = (torch.empty(samples, samples) for _ in range(2))
+    amplitude, path = (torch.empty(grid.samples, grid.samples) for _ in range(2))
     for rows in stripes(grid):
         amplitude[rows] = 1 - smudges * torch.sigmoid(3 * (patches[0][rows] @ patches[1])) if smudges else 1.0
         path[rows] = WAVE * grease * (film[0][rows] @ film[1]) if grease else 0.0
@@ -119,7 +116,9 @@ def _dents(rms: float, rng: torch.Generator) -> dict[int, float]:
 
 
 @dirt.zero_bound
-def _(*, dust: float, scratches: float, grease: float, smudges: float, dents: float, **_: Any) -> float:
+def _(
+    stop: TensorStats, *, dust: float, scratches: float, grease: float, smudges: float, dents: float, **_: Any
+) -> float:
     """Bound the change of the field against clear glass, at 400 nm or longer; a clean window gives 0.
 
     A grain or a scratch may be black. A film is a sum of normal numbers, which the generator keeps below 8.6, so that
@@ -133,18 +132,15 @@ def _(*, dust: float, scratches: float, grease: float, smudges: float, dents: fl
     return min(2.0, _ROUNDING + blocked + 2 * math.pi * waves)
 
 
-dirt.preflight(grid_notes)
-
-
 @dirt.check
-def _(result: Dirt, *, samples: int, pitch: float, diameter: float, aperture: Aperture, **_: Any) -> list[Check]:
-    passed, rms = _effect(result, stop(samples, pitch, diameter, aperture))
+def _(result: Dirt, stop: Stop, **_: Any) -> list[Check]:
+    passed, rms = _effect(result, grid_of(stop))
     text = f"dirt passes {passed:.4f} of the light, bends it by {rms:.3g} waves root mean square at 550 nm"
     low, high = (float(x) for x in torch.aminmax(result.amplitude))
     return [Check(text, passed > 0), Check(f"amplitude from {low:.3g} to {high:.3g}", low >= 0 and high <= 1)]
 
 
-def _effect(dirt: Dirt, grid: Stop) -> tuple[float, float]:
+def _effect(dirt: Dirt, grid: PupilGrid) -> tuple[float, float]:
     """Return the share of the light that passes, and the root mean square path in waves."""
     sums = torch.zeros(4, dtype=torch.float64)
     for rows in stripes(grid):

@@ -7,7 +7,7 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
-from neusee.nodes.optics._pupil_grid import Stop
+from neusee.nodes.optics._pupil_grid import PupilGrid
 
 
 class Grain(NamedTuple):
@@ -27,7 +27,7 @@ class Scratch(NamedTuple):
     opacity: float
 
 
-def stamp(amplitude: Tensor, marks: Sequence[Grain | Scratch], grid: Stop) -> Tensor:
+def stamp(amplitude: Tensor, marks: Sequence[Grain | Scratch], grid: PupilGrid) -> Tensor:
     """Multiply each mark into an amplitude (v, u), in place."""
     scale, middle = grid.diameter / grid.pitch, (grid.samples - 1) / 2
     for mark in marks:

@@ -5,17 +5,17 @@ import math
 import torch
 from torch import Tensor
 
-from neusee.nodes.optics._pupil_grid import Stop, axes
+from neusee.nodes.optics._pupil_grid import PupilGrid, axes
 
 
-def screen(grid: Stop, scale: float, rng: torch.Generator, device: torch.device | None = None) -> Tensor:
+def screen(grid: PupilGrid, scale: float, rng: torch.Generator, device: torch.device | None = None) -> Tensor:
     """Draw Gaussian noise of mean 0, variance 1 and correlation exp(-(d / scale)**2), float64 (v, u)."""
     rows, columns = factors(grid, scale, rng, device)
     return rows @ columns
 
 
 def factors(
-    grid: Stop, scale: float, rng: torch.Generator, device: torch.device | None = None
+    grid: PupilGrid, scale: float, rng: torch.Generator, device: torch.device | None = None
 ) -> tuple[Tensor, Tensor]:
     """Return two matrices (v, few) and (few, u) whose product is the screen, so that single rows can be computed.
 

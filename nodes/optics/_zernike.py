@@ -6,7 +6,7 @@ from collections.abc import Mapping
 import torch
 from torch import Tensor
 
-from neusee.nodes.optics._pupil_grid import Stop, axes, inside
+from neusee.nodes.optics._pupil_grid import PupilGrid, axes, inside
 
 _ALL = slice(None)
 
@@ -68,7 +68,7 @@ def combine(coefficients: Mapping[int, float], v: Tensor, u: Tensor) -> Tensor:
 
 
 def surface(
-    coefficients: Mapping[int, float], grid: Stop, device: torch.device | None = None, rows: slice = _ALL
+    coefficients: Mapping[int, float], grid: PupilGrid, device: torch.device | None = None, rows: slice = _ALL
 ) -> Tensor:
     """Return the sum of polynomials over the stop, float64 (v, u), 0 outside; ``rows`` selects some rows."""
     v, u = axes(grid, device)
