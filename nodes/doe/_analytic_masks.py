@@ -18,25 +18,18 @@ from neusee.nodes.values import Stop
 
 @node()
 def flat(stop: Stop) -> Tensor:
-    """Leave the pupil flat: the plain lens.
+    """Return the height map of a lens without a mask: 0 everywhere.
 
     Shapes: stop -> (v, u).
     Units:  m.
     Error:  exact.
     Source: by definition.
     """
-    samples = int(stop.samples)
-    return torch.zeros(samples, samples)
+    return torch.zeros(int(stop.samples), int(stop.samples))
 
 
 @node()
-def vortex(
-    stop: Stop,
-    *,
-    charge: int,
-    wavelength: Wavelength = 550e-9,
-    material: Material = "fused silica",
-) -> Tensor:
+def vortex(stop: Stop, *, charge: int, wavelength: Wavelength = 550e-9, material: Material = "fused silica") -> Tensor:
     """Wind the phase ``charge`` times round the axis: phi = charge * theta, one ramp with its step on -u.
 
     Shapes: stop -> (v, u).
@@ -49,13 +42,7 @@ def vortex(
 
 
 @node()
-def axicon(
-    stop: Stop,
-    *,
-    waves: Real,
-    wavelength: Wavelength = 550e-9,
-    material: Material = "fused silica",
-) -> Tensor:
+def axicon(stop: Stop, *, waves: Real, wavelength: Wavelength = 550e-9, material: Material = "fused silica") -> Tensor:
     """Tilt the phase away from the axis: phi = 2 pi waves r, which turns the focus into a ring.
 
     Shapes: stop -> (v, u).
@@ -69,12 +56,7 @@ def axicon(
 
 @node()
 def spiral_axicon(
-    stop: Stop,
-    *,
-    waves: Real,
-    charge: int,
-    wavelength: Wavelength = 550e-9,
-    material: Material = "fused silica",
+    stop: Stop, *, waves: Real, charge: int, wavelength: Wavelength = 550e-9, material: Material = "fused silica"
 ) -> Tensor:
     """Add a vortex to an axicon: phi = 2 pi waves r + charge * theta.
 
@@ -89,13 +71,7 @@ def spiral_axicon(
 
 
 @node()
-def cubic(
-    stop: Stop,
-    *,
-    waves: Real,
-    wavelength: Wavelength = 550e-9,
-    material: Material = "fused silica",
-) -> Tensor:
+def cubic(stop: Stop, *, waves: Real, wavelength: Wavelength = 550e-9, material: Material = "fused silica") -> Tensor:
     """Make the phase cubic: phi = 2 pi waves (u**3 + v**3), which gives an MTF without zeros over a long focus.
 
     Shapes: stop -> (v, u).
@@ -109,12 +85,13 @@ def cubic(
 
 
 def _half_rings(grid: PupilGrid, waves: tuple[float, ...], alternate: bool, orientation: float) -> Tensor:
+    """Return the phase of half rings, in rad."""
     v, u = axes(grid)
     square = v.square() + u.square()
-    zone = (square * len(waves)).floor().long().clamp(max=len(waves) - 1)
-    signed = [-slope if alternate and place % 2 else slope for place, slope in enumerate(waves)]
+    annulus = (square * len(waves)).floor().long().clamp(max=len(waves) - 1)
+    signed = [-slope if alternate and index % 2 else slope for index, slope in enumerate(waves)]
     side = torch.sign(u * math.cos(orientation) + v * math.sin(orientation))
-    return 2 * math.pi * torch.tensor(signed, dtype=torch.float64, device=v.device)[zone] * square.sqrt() * side
+    return 2 * math.pi * torch.tensor(signed, dtype=torch.float64, device=v.device)[annulus] * square.sqrt() * side
 
 
 @node()
@@ -127,7 +104,7 @@ def half_rings(
     wavelength: Wavelength = 550e-9,
     material: Material = "fused silica",
 ) -> Tensor:
-    """Send both halves of each annulus to the same half ring: phi = 2 pi a r sgn(cos(theta - orientation)).
+    """Send the light of each annulus into one half of a ring: phi = 2 pi a r sgn(cos(theta - orientation)).
 
     Each annulus of equal area has one slope a, from the axis outwards; ``alternate`` flips the side of every second
     annulus. The phase is odd about the axis, so the amplitude of the point-spread function is real.
@@ -149,7 +126,7 @@ def zernike(
     wavelength: Wavelength = 550e-9,
     material: Material = "fused silica",
 ) -> Tensor:
-    """Shape the wave with Zernike polynomials: coefficients are root mean square optical paths by Noll's number.
+    """Shape the wave with Zernike polynomials, whose coefficients are root mean square optical paths by Noll's number.
 
     Shapes: stop -> (v, u).
     Units:  m of optical path at ``wavelength``; result m of height.

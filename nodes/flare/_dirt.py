@@ -1,4 +1,4 @@
-"""Dirt on the window in front of the lens, with statistics that do not depend on the sampling."""
+"""Dirt on the window in front of the lens, with statistics that do not depend on the sampling of the pupil."""
 
 import math
 from typing import Annotated, Any
@@ -39,7 +39,7 @@ def dirt(
     dents: Rms = 0.0,
     rng: torch.Generator,
 ) -> Dirt:
-    """Soil the pupil: grains of dust, scratches, a greasy film, smudges and dents of a windshield.
+    """Add the dirt of a windshield to the pupil: grains of dust, scratches, a greasy film, smudges and dents.
 
     dust, scratches: expected numbers (Wu et al.: 30 each). The radius of the largest grain is drawn about
         ``dust_radius``, the width of the widest scratch about ``scratch_width``. A scratch has up to 16 steps, none
@@ -80,7 +80,7 @@ def _uniform(rng: torch.Generator, low: float = 0.0, high: float = 1.0) -> float
 
 
 def _about(mean: float, spread: float, rng: torch.Generator) -> float:
-    """Draw a normal number, clipped at 0."""
+    """Draw a normally distributed number, and replace a negative number by 0."""
     return max(mean + spread * float(torch.randn((), generator=rng, device=rng.device, dtype=torch.float64)), 0.0)
 
 
@@ -98,7 +98,7 @@ def _scratches(mean: float, length: float, width: float, rng: torch.Generator) -
 
 
 def _scratch(length: float, widest: float, rng: torch.Generator) -> Scratch:
-    """Draw a walk of 1 to 16 steps in random directions, with steps of at most a random share of ``length``."""
+    """Draw a scratch: a random walk of 1 to 16 steps, each no longer than ``length``."""
     points = [(_uniform(rng, -0.5, 0.5), _uniform(rng, -0.5, 0.5))]
     stride = length * _uniform(rng)
     for _ in range(1 + int(16 * _uniform(rng))):
@@ -109,7 +109,7 @@ def _scratch(length: float, widest: float, rng: torch.Generator) -> Scratch:
 
 
 def _dents(rms: float, rng: torch.Generator) -> dict[int, float]:
-    """Draw coefficients of the given root sum of squares, with a uniform direction."""
+    """Draw Zernike coefficients whose root sum of squares is ``rms``."""
     draw = torch.randn(len(DENT_TERMS), generator=rng, device=rng.device, dtype=torch.float64)
     parts = (rms * draw / draw.norm()).tolist()
     return dict(zip(DENT_TERMS, parts, strict=True)) if rms else {}
@@ -119,7 +119,7 @@ def _dents(rms: float, rng: torch.Generator) -> dict[int, float]:
 def _(
     stop: TensorStats, *, dust: float, scratches: float, grease: float, smudges: float, dents: float, **_: Any
 ) -> float:
-    """Bound the change of the field against clear glass, at 400 nm or longer; a clean window gives 0.
+    """Return an upper bound of the change of the field by the dirt, at 400 nm or longer; 0 for a clean window.
 
     A grain or a scratch may be black. A film is a sum of normal numbers, which the generator keeps below 8.6, so that
     the film stays below 31 times its root mean square. The twelve terms of a dent together reach sqrt(50) times their
@@ -141,7 +141,7 @@ def _(result: Dirt, stop: Stop, **_: Any) -> list[Check]:
 
 
 def _effect(dirt: Dirt, grid: PupilGrid) -> tuple[float, float]:
-    """Return the share of the light that passes, and the root mean square path in waves."""
+    """Return the share of the light that passes the dirt, and the root mean square of the path in waves."""
     sums = torch.zeros(4, dtype=torch.float64)
     for rows in stripes(grid):
         open_ = inside(grid, dirt.path.device, rows)

@@ -1,4 +1,4 @@
-"""Optical nodes: pupil function, point-spread function, image and laser spot."""
+"""Optical nodes: stop, pupil function, point-spread function, image and laser spot."""
 
 from neusee.nodes.optics._imaging._band_image import image
 from neusee.nodes.optics._imaging._channel_image import image_channels

@@ -1,4 +1,4 @@
-"""The pupil function, kept as factors: stop, element, aberrations and dirt."""
+"""The pupil function, stored as factors: stop, mask, aberrations and dirt."""
 
 from collections.abc import Mapping
 from typing import Any
@@ -14,7 +14,7 @@ from neusee.nodes.units import Count, Length, Waves
 from neusee.nodes.values import Bands, Dirt, Pupil, Stop
 
 DEFOCUS_WAVELENGTH = 550e-9  #: m; the wavelength in which waves of defocus are counted
-_ROWS = 512  #: the least number of pupil rows in which phase steps are measured
+_ROWS = 512  #: least number of pupil rows in which phase steps are measured
 
 
 @node(additive_inputs=[("dirt",)])
@@ -28,7 +28,7 @@ def pupil(
     defocus: Waves = 0.0,
     aberrations: dict[Count, Length] = {},  # noqa: B006 (read only)
 ) -> Pupil:
-    """Build the pupil function from stop, element, defocus, aberrations and dirt, all in one plane.
+    """Build the pupil function from stop, mask, defocus, aberrations and dirt, all in one plane.
 
     Field of band b: amplitude * exp(2 pi i (index[b] * height + path) / wavelength[b]). Defocus adds the path
     W * 550 nm * r**2 with r = 1 at the rim, so W is the peak-to-valley defocus in waves at 550 nm. The stop passes a
@@ -91,11 +91,11 @@ def _light(amplitude: Tensor) -> float:
 
 
 def phase_steps(pupil: Pupil) -> tuple[float, float]:
-    """Return the phase steps between neighbours inside the stop: median in turns, and share above one half.
+    """Return the median phase step between neighbouring samples, in turns, and the share of steps above half a turn.
 
-    Both numbers are from the band with the largest phase steps. In a large pupil only every k-th row is measured, 512
-    rows or more. A wrapped or split element has steps at its edges by design, so a few large steps mean nothing. Many
-    large steps mean that the samples cannot follow the phase.
+    Both numbers are from the band with the largest phase steps, inside the stop. In a large pupil only every k-th row
+    is measured, 512 rows or more. A wrapped or split mask has steps at its edges by design, so a few large steps mean
+    nothing. Many large steps mean that the samples cannot follow the phase.
     """
     worst = int((pupil.index / pupil.wavelengths).argmax())
     every = max(1, len(pupil.height) // _ROWS)
@@ -112,6 +112,6 @@ def phase_steps(pupil: Pupil) -> tuple[float, float]:
 
 
 def mask_turns(pupil: Pupil, band: int, step: int = 1) -> Tensor:
-    """Return the phase in turns that the height of the mask gives in a band, at every ``step``-th sample: float64."""
+    """Return the phase of the mask in a band, in turns, float64, at every ``step``-th sample."""
     turns: Tensor = pupil.index[band] * pupil.height[::step, ::step].double() / pupil.wavelengths[band]
     return turns

@@ -1,4 +1,4 @@
-"""The pupil grid in plain numbers, and the coordinates and the stop on this grid."""
+"""The pupil grid in plain numbers: its coordinates, and its samples inside the stop."""
 
 import math
 from collections.abc import Iterator
@@ -16,7 +16,7 @@ Aperture = Literal["inscribed", "clipped", "stretched"]
 
 
 class PupilGrid(NamedTuple):
-    """The values of a `Stop` as plain numbers."""
+    """The pupil grid of a `Stop` in plain numbers, for the functions that compute coordinates."""
 
     samples: int  #: number of samples along each axis
     pitch: float  #: m between samples
@@ -47,14 +47,14 @@ def pupil_grid(samples: int, pitch: float, diameter: float, aperture: Aperture =
 
 
 def axes(grid: PupilGrid, device: torch.device | None = None) -> tuple[Tensor, Tensor]:
-    """Return coordinates in units of the stop's radius, float64: v (samples, 1) and u (1, samples)."""
+    """Return the coordinates v (samples, 1) and u (1, samples) in units of the stop's radius, float64."""
     steps = torch.arange(grid.samples, dtype=torch.float64, device=device) - (grid.samples - 1) / 2
     line = steps * (2 * grid.pitch / grid.diameter)
     return line[:, None], line[None, :]
 
 
 def polar(grid: PupilGrid, device: torch.device | None = None) -> tuple[Tensor, Tensor]:
-    """Return radius in units of the stop's radius and azimuth from +u towards +v, both float64 (v, u)."""
+    """Return the radius in units of the stop's radius, and the azimuth from +u towards +v, both float64 (v, u)."""
     v, u = axes(grid, device)
     return torch.hypot(v, u), torch.atan2(v.expand(grid.samples, -1), u.expand(grid.samples, -1))
 
@@ -66,7 +66,7 @@ def inside(grid: PupilGrid, device: torch.device | None = None, rows: slice = _A
 
 
 def opening(grid: PupilGrid, dtype: torch.dtype, device: torch.device | None = None) -> Tensor:
-    """Return the stop as numbers (v, u): 1 inside, 0 outside."""
+    """Return the transmission (v, u) of the stop: 1 inside, 0 outside."""
     clear = torch.empty(grid.samples, grid.samples, dtype=dtype, device=device)
     for rows in stripes(grid):
         clear[rows] = inside(grid, device, rows)
@@ -74,7 +74,7 @@ def opening(grid: PupilGrid, dtype: torch.dtype, device: torch.device | None = N
 
 
 def stripes(grid: PupilGrid) -> Iterator[slice]:
-    """Yield slices of a few pupil rows, so that float64 temporaries of each slice fit in the cache."""
+    """Yield slices of a few pupil rows, short enough that float64 temporaries fit in the CPU's cache."""
     step = max(1, _STRIPE // grid.samples)
     return (slice(first, first + step) for first in range(0, grid.samples, step))
 

@@ -125,7 +125,7 @@ def test_noll_counts_as_noll_does():
     ]
     assert [noll(j) for j in range(1, 14)] == table
     assert noll(22) == (6, 0)
-    with pytest.raises(ValueError, match="from 1"):
+    with pytest.raises(ValueError, match="begin at 1"):
         noll(0)
 
 
