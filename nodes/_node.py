@@ -85,6 +85,7 @@ class Node:
         needs_band_invariant: Sequence[str] = (),
         accepts_low_rank: Sequence[str] = (),
         additive_inputs: Sequence[tuple[str, ...]] = (),
+        before_run: bool = False,
     ) -> None:
         functools.update_wrapper(self, fn)
         self.fn, self.device, self.rtol = fn, device, rtol
@@ -99,9 +100,13 @@ class Node:
         data = [p for p in pars if p.kind is p.POSITIONAL_OR_KEYWORD]
         self.inputs = tuple(p.name for p in data)
         self.optional = frozenset(p.name for p in data if p.default is not p.empty)
+        self.preflight_inputs: tuple[str, ...] = ()
         self.random = any(p.name == "rng" for p in pars)
         self._keyword_only = [p for p in pars if p.kind is p.KEYWORD_ONLY and p.name != "rng"]
         self.bands = bands and self._declared(bands)
+        self.before_run = before_run
+        if before_run and (self.inputs or self.random):
+            raise ValueError(f"{self.path}: before_run is for a node of parameters alone, without inputs and rng")
 
     def __call__(self, *inputs: Any, **params: Any) -> Any:
         """Call the function itself: no validation, no cache; gradients flow."""
@@ -195,8 +200,13 @@ class Node:
         return fn
 
     def preflight(self, fn: Fn) -> Fn:
-        """Attach ``(*, parameters) -> notes``; it may raise `ParameterError`."""
+        """Attach ``(*, parameters) -> notes``, called before anything runs; ``fn`` may raise `ParameterError`.
+
+        An argument with the name of an input receives the value of this input where a node with ``before_run``
+        computes it; the argument is None where the value is known only during the run.
+        """
         self.hooks.preflight = fn
+        self.preflight_inputs = tuple(name for name in inspect.signature(fn).parameters if name in self.inputs)
         return fn
 
     def check(self, fn: Fn) -> Fn:
@@ -219,6 +229,7 @@ def node(
     needs_band_invariant: Sequence[str] = (),
     accepts_low_rank: Sequence[str] = (),
     additive_inputs: Sequence[tuple[str, ...]] = (),
+    before_run: bool = False,
 ) -> Callable[[Callable[..., Any]], Node]:
     """Make a node of a function. ``rtol`` is the agreed error against its reference.
 
@@ -231,9 +242,19 @@ def node(
         accepts_low_rank: inputs that may be a `LowRankCube` instead of a cube.
         additive_inputs: inputs that change nothing where they are zero, an optional input or a list; each with the
             inputs that belong to it.
+        before_run: True for a node of few numbers without inputs, which the check of a recipe computes too, so that
+            the preflight of another node can use the result.
     """
     return lambda fn: Node(
-        fn, device, rtol, bands, accepts_channel_sums, needs_band_invariant, accepts_low_rank, additive_inputs
+        fn,
+        device,
+        rtol,
+        bands,
+        accepts_channel_sums,
+        needs_band_invariant,
+        accepts_low_rank,
+        additive_inputs,
+        before_run,
     )
 
 

@@ -13,22 +13,30 @@ from torch import Tensor
 
 
 class Bands(NamedTuple):
-    """Spectral samples of a scene (31 bands) or of one laser line (a few bands of its own)."""
+    """The spectral bands of a scene (such as 31) or of one laser line (such as 5)."""
 
     centres: Tensor  #: (band,) float64, m
     widths: Tensor  #: (band,) float64, m
-    weights: Tensor  #: (band,) float64; for a scene all 1; for a laser line the shares of the energy, sum 1
+    weights: Tensor  #: (band,) float64; for a scene all 1; for a laser line the share of the energy in each band
+
+
+class Stop(NamedTuple):
+    """The round stop, and the square pupil grid whose sample j lies at (j - (samples - 1) / 2) * pitch on each axis."""
+
+    samples: Tensor  #: () int64, number of samples along each axis
+    pitch: Tensor  #: () float64, m between samples
+    diameter: Tensor  #: () float64, m, of the clear aperture
 
 
 class Dirt(NamedTuple):
-    """Dirt on the window, in the plane of the pupil."""
+    """The effect of dirt on the window, as transmission and path in the plane of the pupil."""
 
     amplitude: Tensor  #: (v, u) transmission of the field in [0, 1]
     path: Tensor  #: (v, u) added optical path, m
 
 
 class Pupil(NamedTuple):
-    """The pupil function of all bands, as factors.
+    """The pupil function of all bands, stored as factors.
 
     The field of band b is ``amplitude * exp(2 pi i (index[b] * height + path) / wavelengths[b])``.
     The factors are stored because 31 complex fields of 2160 x 2160 take 1.2 GB and the factors 75 MB.
@@ -36,10 +44,10 @@ class Pupil(NamedTuple):
 
     aperture: Tensor  #: (v, u) clear aperture: 1 inside, 0 outside
     amplitude: Tensor  #: (v, u) aperture times dirt
-    height: Tensor  #: (v, u) height of the diffractive element, m
+    height: Tensor  #: (v, u) height map of the mask, m
     path: Tensor  #: (v, u) aberrations and dirt, m of optical path
     index: Tensor  # type: ignore[assignment]  # hides tuple.index, which no caller uses
-    #: (band,) float64, refractive index of the element minus the index of air
+    #: (band,) float64, refractive index of the mask minus the index of air
     wavelengths: Tensor  #: (band,) float64, m
     pitch: Tensor  #: () float64, m between samples, both axes
 
@@ -48,7 +56,7 @@ class Psf(NamedTuple):
     """Point-spread functions: the share of the light through the clear pupil that reaches each pixel."""
 
     intensity: Tensor  #: (band, y, x); the sum over an infinite plane is the transmitted share
-    clear_peak: Tensor  #: (band,) float64: the pixel on the axis of the same lens without element, dirt and aberration
+    clear_peak: Tensor  #: (band,) float64: the pixel on the axis of the same lens without mask, dirt and aberrations
 
 
 class LowRankCube(NamedTuple):
@@ -56,13 +64,9 @@ class LowRankCube(NamedTuple):
 
     planes: Tensor  #: (k, y, x)
     basis: Tensor  #: (band, k) float64
-    residual_max: (
-        Tensor  #: (k + 1, band) float64: bound of |band b minus the first r planes| over all pixels, r = 0 to k
-    )
-    residual_rms: Tensor = torch.zeros(0, 0, dtype=torch.float64)  #: root mean square of the same; empty: not known
-    residual_map: Tensor = torch.zeros(
-        0, 0
-    )  #: (y, x) bound of |band minus all planes|, the largest over all bands; empty: not known
+    residual_max: Tensor  #: (k + 1, band) float64: bound of |band b minus the first r planes|, r = 0 to k
+    residual_rms: Tensor = torch.zeros(0, 0, dtype=torch.float64)  #: root mean square of this difference, or empty
+    residual_map: Tensor = torch.zeros(0, 0)  #: (y, x) bound of |band minus all planes| in any band, or empty
 
 
 class Channels(NamedTuple):
@@ -73,13 +77,11 @@ class Channels(NamedTuple):
     flux: Tensor  #: (band,) float64, sum of image[b] over all pixels
     bound: Tensor  #: () float64, upper bound of the root mean square error over max |plane|, for the worst row
     kept: Tensor = torch.zeros(5, dtype=torch.int64)  #: counts of planes, kernels, bands, PSF rows and PSF columns
-    largest: Tensor = torch.tensor(
-        torch.inf, dtype=torch.float64
-    )  #: upper bound of the relative error of max |plane|, or inf
+    largest: Tensor = torch.tensor(torch.inf, dtype=torch.float64)  #: upper bound of the relative error of max |plane|
 
 
 class Levels(NamedTuple):
-    """Frames of several flat illuminations, reduced to all that a fit of the sensor needs.
+    """Statistics of frames under several flat illuminations, as a fit of the sensor needs them.
 
     A level whose numbers are clipped, or too coarse to count as continuous, keeps a histogram: one cell counts how
     often one number occurs in one level.

@@ -1,4 +1,4 @@
-"""Diffractive optical elements: height maps and materials."""
+"""Masks (diffractive optical elements): height maps and materials."""
 
 from neusee.nodes.doe._analytic_masks import axicon, cubic, flat, half_rings, spiral_axicon, vortex, zernike
 from neusee.nodes.doe._fabrication_limits import fabricate

@@ -10,175 +10,133 @@ from torch import Tensor
 from neusee.nodes import node
 from neusee.nodes.doe._height_from_phase import height_checks, height_from_phase
 from neusee.nodes.doe._refractive_index import Material
-from neusee.nodes.optics._pupil_grid import Aperture, Stop, axes, grid_notes, polar, stop
+from neusee.nodes.optics._pupil_grid import PupilGrid, axes, grid_of, polar
 from neusee.nodes.optics._zernike import surface
-from neusee.nodes.units import Angle, Count, Length, PositiveLength, Real, Wavelength
+from neusee.nodes.units import Angle, Count, Length, Real, Wavelength
+from neusee.nodes.values import Stop
 
 
 @node()
-def flat(
-    *, samples: Count, pitch: PositiveLength, diameter: PositiveLength, aperture: Aperture = "inscribed"
-) -> Tensor:
-    """Leave the pupil flat: the plain lens.
+def flat(stop: Stop) -> Tensor:
+    """Return the height map of a lens without a mask: 0 everywhere.
 
-    Shapes: -> (v, u).
+    Shapes: stop -> (v, u).
     Units:  m.
     Error:  exact.
     Source: by definition.
     """
-    return torch.zeros(samples, samples)
+    return torch.zeros(int(stop.samples), int(stop.samples))
 
 
 @node()
-def vortex(
-    *,
-    charge: int,
-    samples: Count,
-    pitch: PositiveLength,
-    diameter: PositiveLength,
-    aperture: Aperture = "inscribed",
-    wavelength: Wavelength = 550e-9,
-    material: Material = "fused silica",
-) -> Tensor:
+def vortex(stop: Stop, *, charge: int, wavelength: Wavelength = 550e-9, material: Material = "fused silica") -> Tensor:
     """Wind the phase ``charge`` times round the axis: phi = charge * theta, one ramp with its step on -u.
 
-    Shapes: -> (v, u).
+    Shapes: stop -> (v, u).
     Units:  m.
     Error:  1e-7 of the height (float32).
     Source: Watnik, Ruane, Swartzlander, Opt. Eng. 55, 123102 (2016).
     """
-    grid = stop(samples, pitch, diameter, aperture)
+    grid = grid_of(stop)
     return height_from_phase(charge * polar(grid)[1], grid, wavelength, material)
 
 
 @node()
-def axicon(
-    *,
-    waves: Real,
-    samples: Count,
-    pitch: PositiveLength,
-    diameter: PositiveLength,
-    aperture: Aperture = "inscribed",
-    wavelength: Wavelength = 550e-9,
-    material: Material = "fused silica",
-) -> Tensor:
+def axicon(stop: Stop, *, waves: Real, wavelength: Wavelength = 550e-9, material: Material = "fused silica") -> Tensor:
     """Tilt the phase away from the axis: phi = 2 pi waves r, which turns the focus into a ring.
 
-    Shapes: -> (v, u).
+    Shapes: stop -> (v, u).
     Units:  waves at the rim; result m.
     Error:  1e-7 of the height (float32).
     Source: Watnik, Ruane, Swartzlander, Opt. Eng. 55, 123102 (2016).
     """
-    grid = stop(samples, pitch, diameter, aperture)
+    grid = grid_of(stop)
     return height_from_phase(2 * math.pi * waves * polar(grid)[0], grid, wavelength, material)
 
 
 @node()
 def spiral_axicon(
-    *,
-    waves: Real,
-    charge: int,
-    samples: Count,
-    pitch: PositiveLength,
-    diameter: PositiveLength,
-    aperture: Aperture = "inscribed",
-    wavelength: Wavelength = 550e-9,
-    material: Material = "fused silica",
+    stop: Stop, *, waves: Real, charge: int, wavelength: Wavelength = 550e-9, material: Material = "fused silica"
 ) -> Tensor:
     """Add a vortex to an axicon: phi = 2 pi waves r + charge * theta.
 
-    Shapes: -> (v, u).
+    Shapes: stop -> (v, u).
     Units:  waves at the rim; result m.
     Error:  1e-7 of the height (float32).
     Source: Luo et al., Curr. Opt. Photon. 8, 355 (2024).
     """
-    grid = stop(samples, pitch, diameter, aperture)
+    grid = grid_of(stop)
     radius, azimuth = polar(grid)
     return height_from_phase(2 * math.pi * waves * radius + charge * azimuth, grid, wavelength, material)
 
 
 @node()
-def cubic(
-    *,
-    waves: Real,
-    samples: Count,
-    pitch: PositiveLength,
-    diameter: PositiveLength,
-    aperture: Aperture = "inscribed",
-    wavelength: Wavelength = 550e-9,
-    material: Material = "fused silica",
-) -> Tensor:
+def cubic(stop: Stop, *, waves: Real, wavelength: Wavelength = 550e-9, material: Material = "fused silica") -> Tensor:
     """Make the phase cubic: phi = 2 pi waves (u**3 + v**3), which gives an MTF without zeros over a long focus.
 
-    Shapes: -> (v, u).
+    Shapes: stop -> (v, u).
     Units:  waves at the rim on an axis; result m.
     Error:  1e-7 of the height (float32).
     Source: Dowski, Cathey, Appl. Opt. 34, 1859 (1995).
     """
-    grid = stop(samples, pitch, diameter, aperture)
+    grid = grid_of(stop)
     v, u = axes(grid)
     return height_from_phase(2 * math.pi * waves * (u**3 + v**3), grid, wavelength, material)
 
 
-def _half_rings(grid: Stop, waves: tuple[float, ...], alternate: bool, orientation: float) -> Tensor:
+def _half_rings(grid: PupilGrid, waves: tuple[float, ...], alternate: bool, orientation: float) -> Tensor:
+    """Return the phase of half rings, in rad."""
     v, u = axes(grid)
     square = v.square() + u.square()
-    zone = (square * len(waves)).floor().long().clamp(max=len(waves) - 1)
-    signed = [-slope if alternate and place % 2 else slope for place, slope in enumerate(waves)]
+    annulus = (square * len(waves)).floor().long().clamp(max=len(waves) - 1)
+    signed = [-slope if alternate and index % 2 else slope for index, slope in enumerate(waves)]
     side = torch.sign(u * math.cos(orientation) + v * math.sin(orientation))
-    return 2 * math.pi * torch.tensor(signed, dtype=torch.float64, device=v.device)[zone] * square.sqrt() * side
+    return 2 * math.pi * torch.tensor(signed, dtype=torch.float64, device=v.device)[annulus] * square.sqrt() * side
 
 
 @node()
 def half_rings(
+    stop: Stop,
     *,
     waves: Annotated[tuple[Real, ...], Field(min_length=1)],
     alternate: bool = True,
     orientation: Angle = 0.0,
-    samples: Count,
-    pitch: PositiveLength,
-    diameter: PositiveLength,
-    aperture: Aperture = "inscribed",
     wavelength: Wavelength = 550e-9,
     material: Material = "fused silica",
 ) -> Tensor:
-    """Send both halves of each annulus to the same half ring: phi = 2 pi a r sgn(cos(theta - orientation)).
+    """Send the light of each annulus into one half of a ring: phi = 2 pi a r sgn(cos(theta - orientation)).
 
     Each annulus of equal area has one slope a, from the axis outwards; ``alternate`` flips the side of every second
     annulus. The phase is odd about the axis, so the amplitude of the point-spread function is real.
 
-    Shapes: -> (v, u).
+    Shapes: stop -> (v, u).
     Units:  waves at the rim; orientation rad; result m.
     Error:  1e-7 of the height (float32).
     Source: our reading of Wirth et al., Opt. Lett. 45, 2179 (2020), whose formula we could not consult.
     """
-    grid = stop(samples, pitch, diameter, aperture)
+    grid = grid_of(stop)
     return height_from_phase(_half_rings(grid, waves, alternate, orientation), grid, wavelength, material)
 
 
 @node()
 def zernike(
+    stop: Stop,
     *,
     coefficients: dict[Count, Length],
-    samples: Count,
-    pitch: PositiveLength,
-    diameter: PositiveLength,
-    aperture: Aperture = "inscribed",
     wavelength: Wavelength = 550e-9,
     material: Material = "fused silica",
 ) -> Tensor:
-    """Shape the wave with Zernike polynomials: coefficients are root mean square optical paths by Noll's number.
+    """Shape the wave with Zernike polynomials, whose coefficients are root mean square optical paths by Noll's number.
 
-    Shapes: -> (v, u).
+    Shapes: stop -> (v, u).
     Units:  m of optical path at ``wavelength``; result m of height.
     Error:  1e-7 of the height (float32) up to radial order 20.
     Source: Noll, J. Opt. Soc. Am. 66, 207 (1976).
     """
-    grid = stop(samples, pitch, diameter, aperture)
+    grid = grid_of(stop)
     phase = surface(coefficients, grid) * (2 * math.pi / wavelength)
     return height_from_phase(phase, grid, wavelength, material)
 
 
 for _mask in (flat, vortex, axicon, spiral_axicon, cubic, half_rings, zernike):
-    _mask.preflight(grid_notes)
     _mask.check(height_checks)

@@ -1,7 +1,7 @@
-"""Fabrication limits of a relief: wrapping, limited depth, discrete levels."""
+"""Fabrication limits of a mask: wrapping, limited depth, discrete levels."""
 
 import math
-from typing import Annotated
+from typing import Annotated, Any
 
 import torch
 from pydantic import Field
@@ -17,11 +17,11 @@ _VIOLET = 400e-9  #: m, wavelength at which a change of height is converted to a
 
 
 def _quantize(height: Tensor, step: float, levels: int, cyclic: bool) -> Tensor:
-    """Round to the nearest step; the gradient passes through unchanged."""
+    """Round each height to the nearest step; the gradient passes through unchanged."""
     with torch.no_grad():
-        place = (height / step).round()
-        place = place.remainder(levels) if cyclic else place.clamp(0, levels - 1)
-        change = place * step - height
+        level = (height / step).round()
+        level = level.remainder(levels) if cyclic else level.clamp(0, levels - 1)
+        change = level * step - height
     return height + change
 
 
@@ -31,7 +31,7 @@ def _refuse(material: Material, wrap_at: float | None, levels: int | None, max_h
         text = f"{max_height * 1e6:.3g} um is less than one wave of wrap_at in {material}: needs at least {wave}"
         raise ParameterError("max_height", text)
     if levels is not None and wrap_at is None and max_height is None:
-        raise ParameterError("levels", f"{levels} steps of what depth? Set wrap_at or max_height")
+        raise ParameterError("levels", f"{levels} levels have no depth to divide: set wrap_at or max_height")
 
 
 @node(rtol=1e-5)
@@ -43,10 +43,10 @@ def fabricate(
     levels: Levels | None = None,
     max_height: PositiveLength | None = None,
 ) -> Tensor:
-    """Make the relief: wrap it at one wave of ``wrap_at``, or cut it flat at ``max_height``; then quantise it.
+    """Wrap the height map at one wave of ``wrap_at``, or cut it flat at ``max_height``; then round to ``levels``.
 
-    Wrapped, ``levels`` steps divide one wave, whose top is its bottom again; limited, they run from 0 to
-    ``max_height`` inclusive. The gradient of wrapping and of the steps is 1, of what is cut off 0.
+    The levels of a wrapped height map divide one wave, whose top equals its bottom. The levels of a limited height map
+    run from 0 to ``max_height`` inclusive. Wrapping and rounding have the gradient 1; a height that is cut off has 0.
 
     Shapes: (v, u) -> (v, u).
     Units:  m.
@@ -71,7 +71,7 @@ def fabricate(
 def _(
     height: Tensor, *, material: Material, wrap_at: float | None, levels: int | None, max_height: float | None
 ) -> Tensor:
-    """Return the nearest of all allowed heights, found by comparing each."""
+    """Compare each height with every allowed height, and return the nearest."""
     wave = None if wrap_at is None else wave_height(material, wrap_at)
     x = height.to(torch.float64)
     x = x if wave is None else x - wave * (x / wave).floor()
@@ -89,28 +89,28 @@ def _(
 def _(
     height: TensorStats, *, material: Material, wrap_at: float | None, levels: int | None, max_height: float | None
 ) -> float:
-    """Return the largest change of height, relative to the deepest height that is made; 0 if every height fits.
+    """Return the largest change of height as a share of the deepest fabricated height; 0 if every height fits.
 
-    A small change of height may be a large phase: the bound is never below the phase, in radians at 400 nm, that
-    the move turns. Wrapping turns no phase at ``wrap_at``, and counts in full all the same.
+    A small change of height may be a large phase: the bound is never below the phase, in radians at 400 nm, of that
+    change. Wrapping turns no phase at ``wrap_at``, and counts in full all the same.
     """
     top = max_height if wrap_at is None else wave_height(material, wrap_at)
     if not height.finite or top is None:
         return 0.0 if height.finite else math.inf
     ends = torch.tensor([height.min, height.max], dtype=getattr(torch, height.dtype))
-    moved = _moved(ends, top, levels, cyclic=wrap_at is not None)
-    if moved == 0:
+    change = _largest_change(ends, top, levels, cyclic=wrap_at is not None)
+    if change == 0:
         return 0.0
-    made = fabricate(ends, material=material, wrap_at=wrap_at, levels=levels, max_height=max_height)
-    deepest, turned = float(made.abs().max()), 2 * math.pi * moved / wave_height(material, _VIOLET)
-    return max(turned, moved / deepest if deepest > 0 else math.inf)
+    fabricated = fabricate(ends, material=material, wrap_at=wrap_at, levels=levels, max_height=max_height)
+    deepest, phase = float(fabricated.abs().max()), 2 * math.pi * change / wave_height(material, _VIOLET)
+    return max(phase, change / deepest if deepest > 0 else math.inf)
 
 
-def _moved(ends: Tensor, top: float, levels: int | None, cyclic: bool) -> float:
-    """Return an upper bound of the change of any height between two ends, m; exact without steps."""
+def _largest_change(ends: Tensor, top: float, levels: int | None, cyclic: bool) -> float:
+    """Return an upper bound, in m, of the change of any height between two ends; exact without levels."""
     low, high = (float(end) for end in ends)
     if not cyclic:
-        top = float(torch.tensor(top, dtype=ends.dtype))  # the cut in the precision of the relief
+        top = float(torch.tensor(top, dtype=ends.dtype))  # the limit in the precision of the height map
         return max(high - top, -low, 0.0 if levels is None else top / (levels - 1) / 2)
     waves = max(abs(math.floor(low / top)), abs(math.floor(high / top)))
     if levels is None:
@@ -123,21 +123,15 @@ def _moved(ends: Tensor, top: float, levels: int | None, cyclic: bool) -> float:
 def _(*, material: Material, wrap_at: float | None, levels: int | None, max_height: float | None) -> list[str]:
     _refuse(material, wrap_at, levels, max_height)
     if max_height is not None and wrap_at is None:
-        return [f"relief above max_height {max_height * 1e6:.3g} um is cut flat: set wrap_at to wrap it instead"]
+        return [
+            f"heights above max_height {max_height * 1e6:.3g} um are cut flat: set wrap_at to wrap the heights instead"
+        ]
     return []
 
 
 @fabricate.check
-def _(
-    result: Tensor,
-    height: Tensor,
-    *,
-    material: Material,
-    wrap_at: float | None,
-    levels: int | None,
-    max_height: float | None,
-) -> list[Check]:
-    checks = [Check(f"relief {float(height.max()) * 1e6:.4g} um deep, {float(result.max()) * 1e6:.4g} um as made")]
+def _(result: Tensor, height: Tensor, *, wrap_at: float | None, max_height: float | None, **_: Any) -> list[Check]:
+    checks = [Check(f"{float(height.max()) * 1e6:.4g} um deep, {float(result.max()) * 1e6:.4g} um as fabricated")]
     if max_height is not None and wrap_at is None:
         share = float((height > max_height).double().mean())
         checks.append(Check(f"cut flat at max_height: {share:.2%} of the grid", share == 0))

@@ -1,4 +1,4 @@
-"""Conversion of a phase to the relief that produces this phase, and the check of a relief."""
+"""The height map of a mask that produces a given phase, and the check of a height map."""
 
 import math
 from typing import Any
@@ -8,18 +8,21 @@ from torch import Tensor
 
 from neusee.nodes import Check
 from neusee.nodes.doe._refractive_index import Material, wave_height
-from neusee.nodes.optics._pupil_grid import Stop, inside
+from neusee.nodes.optics._pupil_grid import PupilGrid, inside
 
 
-def height_from_phase(phase: Tensor, grid: Stop, wavelength: float, material: Material) -> Tensor:
-    """Height, float32 in m, that delays ``wavelength`` by ``phase``: 0 at the lowest point and outside the stop."""
+def height_from_phase(phase: Tensor, grid: PupilGrid, wavelength: float, material: Material) -> Tensor:
+    """Return the height map (float32, m) that delays ``wavelength`` by ``phase``; the least height is 0.
+
+    The height outside the stop is 0 too.
+    """
     open_ = inside(grid, phase.device)
-    lifted = phase - phase[open_].min()
-    return torch.where(open_, lifted * (wave_height(material, wavelength) / (2 * math.pi)), 0.0).to(torch.float32)
+    raised = phase - phase[open_].min()
+    return torch.where(open_, raised * (wave_height(material, wavelength) / (2 * math.pi)), 0.0).to(torch.float32)
 
 
 def height_checks(height: Tensor, *_: Any, **__: Any) -> list[Check]:
-    """How deep the relief is, and that it can be made at all: finite and nowhere below 0."""
+    """Check that all heights are finite and at least 0, and state the least and the greatest height."""
     low, high = (float(value) for value in torch.aminmax(height))
     sound = math.isfinite(low) and math.isfinite(high) and low >= 0
-    return [Check(f"relief from {low * 1e6:.3g} to {high * 1e6:.4g} um", sound)]
+    return [Check(f"height map from {low * 1e6:.3g} to {high * 1e6:.4g} um", sound)]

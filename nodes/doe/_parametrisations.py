@@ -1,11 +1,12 @@
-"""Trainable reliefs: pixels, Zernike polynomials, rings and a network, each for any sampling of the pupil.
+"""Trainable height maps: pixels, Zernike polynomials, rings and a network, each for any sampling of the pupil.
 
-A module is called with the stop and returns the height, float32 in m, at least 0. The trained numbers do not depend on
-the sampling, so that a relief that was trained on few samples can be evaluated on many samples.
+A module is called with the stop and returns the height map (v, u), float32 in m, at least 0. The trained numbers do not
+depend on the sampling, so that a mask that was trained on few samples can be evaluated on many samples.
 """
 
 import math
 from collections.abc import Callable, Mapping
+from functools import lru_cache
 from typing import Any
 
 import torch
@@ -20,30 +21,20 @@ from neusee.nodes.doe._sampled_height_map import pixelwise
 from neusee.nodes.doe._unet_height_map import HeightNet, fresh, height_of
 from neusee.nodes.network_weights import loaded
 from neusee.nodes.optics._phase_screen import screen
-from neusee.nodes.optics._pupil_grid import Stop, axes, inside, stop
+from neusee.nodes.optics._pupil_grid import PupilGrid, axes, grid_of, inside, pupil_grid
 from neusee.nodes.optics._zernike import combine
+from neusee.nodes.values import Stop
 
 Make = Callable[[Stop], Tensor]
+Start = Callable[[Stop, Mapping[str, Any], torch.Generator], nn.Module]  #: from a stop and parameters of a node
 _END = 0.01  #: share of the depth at both ends that a start avoids, because the sigmoid has almost no slope there
-_ROOM = 0.05  #: share of a formula's depth that is free above and below the relief
-
-
-class _Kept:
-    """A function of the stop that keeps its last value, so that equal stops are computed once."""
-
-    def __init__(self, make: Make) -> None:
-        self._make, self._found = make, dict[Stop, Tensor]()
-
-    def __call__(self, grid: Stop) -> Tensor:
-        if grid not in self._found:
-            self._found = {grid: self._make(grid)}
-        return self._found[grid]
+_ROOM = 0.05  #: share of a formula's depth that is free above and below its height map
 
 
 class Pixels(nn.Module):
-    """A height for each of ``grid`` x ``grid`` places, a sigmoid between 0 and ``max_height``; smooth between them.
+    """A height for each of ``grid`` x ``grid`` pixels: a sigmoid between 0 and ``max_height``, resampled smoothly.
 
-    It starts from a smooth random relief with features of ``scale`` diameters, or from ``start``.
+    The heights start from a smooth random height map with features of ``scale`` diameters, or from ``start``.
     """
 
     def __init__(
@@ -52,24 +43,26 @@ class Pixels(nn.Module):
         super().__init__()
         self.max_height = max_height
         if start is None:
-            logits = 1.5 * screen(stop(grid, 1.0, float(grid)), scale, rng)
+            logits = 1.5 * screen(pupil_grid(grid, 1.0, float(grid)), scale, rng)
         else:
             share = enlarge(start.double() / max_height, grid, grid)
             logits = torch.logit(share.clamp(_END, 1 - _END))
         self.logits = nn.Parameter(logits.to(torch.float32))
 
-    def forward(self, grid: Stop) -> Tensor:
-        """Return the height (v, u)."""
+    def forward(self, stop: Stop) -> Tensor:
+        """Return the height map (v, u)."""
         logits: Tensor = self.logits
-        if grid.samples != logits.shape[-1]:
-            logits = enlarge(logits, grid.samples, grid.samples)
+        samples = int(stop.samples)
+        if samples != logits.shape[-1]:
+            logits = enlarge(logits, samples, samples)
         return self.max_height * torch.sigmoid(logits)
 
 
 class Modes(nn.Module):
-    """Zernike polynomials from Noll's number 4 on, ``count`` of them; coefficients in waves, root mean square.
+    """The ``count`` Zernike polynomials from Noll's number 4 on; coefficients in waves, root mean square.
 
-    Piston changes nothing, and tilt only shifts the spot. The start is a random sum, ``waves`` root mean square in all.
+    Numbers 1 to 3 are absent: piston changes nothing, and tilt only shifts the spot. The start is a random sum of
+    ``waves`` root mean square.
     """
 
     def __init__(self, count: int, waves: float, wavelength: float, material: Material, rng: torch.Generator) -> None:
@@ -77,22 +70,23 @@ class Modes(nn.Module):
         self.wavelength, self.material = wavelength, material
         drawn = torch.randn(count, generator=rng, dtype=torch.float64)
         self.waves = nn.Parameter((waves * drawn / drawn.norm()).to(torch.float32))
-        self._basis = _Kept(self._polynomials)
+        self._polynomials = lru_cache(maxsize=1)(self._polynomials_on)
 
-    def _polynomials(self, grid: Stop) -> Tensor:
+    def _polynomials_on(self, grid: PupilGrid) -> Tensor:
         v, u = axes(grid, self.waves.device)
         each = [combine({4 + k: 1.0}, v, u).expand(grid.samples, grid.samples) for k in range(len(self.waves))]
         return torch.stack(each).where(inside(grid, v.device), 0.0).to(torch.float32)
 
-    def forward(self, grid: Stop) -> Tensor:
-        """Return the height (v, u)."""
-        basis = self._basis(grid)
+    def forward(self, stop: Stop) -> Tensor:
+        """Return the height map (v, u)."""
+        grid = grid_of(stop)
+        basis = self._polynomials(grid)
         phase = (2 * math.pi * self.waves) @ basis.flatten(1)
         return height_from_phase(phase.view(grid.samples, grid.samples), grid, self.wavelength, self.material)
 
 
 class Rings(nn.Module):
-    """A slope and a step for each of ``count`` annuli of equal area, in waves at the rim; odd about the axis or not.
+    """A slope a and a step c, in waves at the rim, for each of ``count`` annuli of equal area.
 
     phi = 2 pi (a r + c), times the sign of u if ``sided``. If ``count`` is a multiple of five, five half-rings are a
     special case. The start has the slopes of the half-rings, alternating by fifths, plus ``noise`` random waves.
@@ -107,23 +101,24 @@ class Rings(nn.Module):
         start = (12.0 + 6.0 * fifth) * (1 - 2 * (fifth % 2))
         self.slopes = nn.Parameter(start + noise * torch.randn(count, generator=rng))
         self.steps = nn.Parameter(torch.zeros(count))
-        self._zones = _Kept(self._zone)
+        self._annuli = lru_cache(maxsize=1)(self._annuli_on)
 
-    def _zone(self, grid: Stop) -> Tensor:
+    def _annuli_on(self, grid: PupilGrid) -> Tensor:
         v, u = axes(grid, self.slopes.device)
         return ((v.square() + u.square()) * len(self.slopes)).floor().long().clamp(max=len(self.slopes) - 1)
 
-    def forward(self, grid: Stop) -> Tensor:
-        """Return the height (v, u)."""
+    def forward(self, stop: Stop) -> Tensor:
+        """Return the height map (v, u)."""
+        grid = grid_of(stop)
         v, u = axes(grid, self.slopes.device)
-        zone = self._zones(grid)
-        phase = self.slopes.double()[zone] * torch.hypot(v, u) + self.steps.double()[zone]
+        annulus = self._annuli(grid)
+        phase = self.slopes.double()[annulus] * torch.hypot(v, u) + self.steps.double()[annulus]
         side = torch.sign(u) if self.sided else torch.ones_like(u)
         return height_from_phase(2 * math.pi * phase * side, grid, self.wavelength, self.material)
 
 
 class Drawn(nn.Module):
-    """The network of `doe.unet` on ``grid`` samples, with the weights of ``net`` or with new random weights."""
+    """The height map of the network ``net`` of `doe.unet`, or of a new random network, on ``grid`` samples."""
 
     def __init__(
         self, width: int, grid: int, max_height: float, rng: torch.Generator, net: HeightNet | None = None
@@ -131,55 +126,53 @@ class Drawn(nn.Module):
         super().__init__()
         self.grid, self.max_height, self.net = grid, max_height, net or fresh(width, grid, rng)
 
-    def forward(self, grid: Stop) -> Tensor:
-        """Return the height (v, u)."""
-        return height_of(self.net, grid.samples, self.grid, self.max_height)
+    def forward(self, stop: Stop) -> Tensor:
+        """Return the height map (v, u)."""
+        return height_of(self.net, int(stop.samples), self.grid, self.max_height)
 
 
 class Written(nn.Module):
-    """A relief after `doe.smooth` with ``feature``, so that training cannot use details too fine for the tool."""
+    """A height map after `doe.smooth` with ``feature``, so that training cannot use details too fine for the tool."""
 
     def __init__(self, shape: Make, feature: float) -> None:
         super().__init__()
         self.shape, self.feature = shape, feature
 
-    def forward(self, grid: Stop) -> Tensor:
-        """Return the height (v, u)."""
-        made: Tensor = smooth(
-            self.shape(grid), feature=self.feature, samples=grid.samples, pitch=grid.pitch, diameter=grid.diameter,
-            aperture="clipped",
-        )  # fmt: skip
-        return made
+    def forward(self, stop: Stop) -> Tensor:
+        """Return the height map (v, u)."""
+        height: Tensor = smooth(self.shape(stop), stop, feature=self.feature)
+        return height
 
 
 # --- the start, from a step -------------------------------------------------------------------------------------------
 
 
-def _pixels(params: Mapping[str, Any], rng: torch.Generator) -> Pixels:
-    start: Tensor = pixelwise(**params, rng=rng)
-    return Pixels(params["samples"], params["depth"], params["scale"], rng, start.to(rng.device))
+def _pixels(stop: Stop, params: Mapping[str, Any], rng: torch.Generator) -> Pixels:
+    start: Tensor = pixelwise(stop, **params, rng=rng)
+    return Pixels(int(stop.samples), params["depth"], params["scale"], rng, start.to(rng.device))
 
 
-def _freed(make: Callable[..., Tensor]) -> Callable[[Mapping[str, Any], torch.Generator], Pixels]:
-    """Return a function that starts pixels at a formula's relief, plus a piston that keeps off the sigmoid's ends."""
+def _freed(mask: Callable[..., Tensor]) -> Start:
+    """Return a function that starts pixels at a formula's height map, raised so that no pixel is at a sigmoid's end."""
 
-    def start(params: Mapping[str, Any], rng: torch.Generator) -> Pixels:
-        height = make(**params)
+    def start(stop: Stop, params: Mapping[str, Any], rng: torch.Generator) -> Pixels:
+        height = mask(stop, **params)
         room = _ROOM * float(height.amax())
-        return Pixels(params["samples"], float(height.amax()) + 2 * room, 1.0, rng, (height + room).to(rng.device))
+        return Pixels(int(stop.samples), float(height.amax()) + 2 * room, 1.0, rng, (height + room).to(rng.device))
 
     return start
 
 
-def _drawn(params: Mapping[str, Any], rng: torch.Generator) -> Drawn:
-    width, grid, weights = params["width"], min(params["grid"], params["samples"]), params["weights"]
+def _drawn(stop: Stop, params: Mapping[str, Any], rng: torch.Generator) -> Drawn:
+    width, grid, weights = params["width"], min(params["grid"], int(stop.samples)), params["weights"]
     net = None if weights is None else loaded(lambda: HeightNet(width), weights).to(rng.device)
     return Drawn(width, grid, params["max_height"], rng, net)
 
 
-#: By node: a function that returns a trainable relief, started at the node's relief. A flat relief has no gradient.
-PARAMETRISATIONS: dict[str, Callable[[Mapping[str, Any], torch.Generator], nn.Module]] = {
+#: For each node, a function that returns a trainable height map, started at the height map of the node.
+#: `doe.flat` is absent because the suppression has no gradient at a flat height map.
+PARAMETRISATIONS: dict[str, Start] = {
     "doe.pixelwise": _pixels,
     "doe.unet": _drawn,
-    **{make.path: _freed(make) for make in (half_rings, axicon, spiral_axicon, vortex, cubic, zernike)},
+    **{mask.path: _freed(mask) for mask in (half_rings, axicon, spiral_axicon, vortex, cubic, zernike)},
 }

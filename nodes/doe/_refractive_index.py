@@ -1,4 +1,4 @@
-"""Materials of the element, and their refractive indices relative to air."""
+"""Materials of the mask, and their refractive indices relative to air."""
 
 from typing import Literal, NamedTuple
 
@@ -42,13 +42,13 @@ def excess_index(name: Material, wavelengths: Tensor) -> Tensor:
 
 
 def wave_height(name: Material, wavelength: float) -> float:
-    """Return the height, in m, of the element that delays light of ``wavelength`` by one wave."""
+    """Return the height of the mask, in m, that delays light of ``wavelength`` by one wave."""
     return wavelength / float(excess_index(name, torch.tensor(wavelength, dtype=torch.float64)))
 
 
 @node(rtol=1e-12)
 def material(bands: Bands, *, material: Material = "fused silica") -> Tensor:
-    """Compute the refractive index of the element minus the refractive index of air, taken as 1.
+    """Compute the refractive index of the mask minus the refractive index of air, which is taken as 1.
 
     Shapes: bands -> (band,), float64.
     Units:  wavelengths m; result 1.

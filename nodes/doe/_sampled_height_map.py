@@ -1,4 +1,4 @@
-"""Relief given by its samples: from a file, or a smooth random relief as the start of a training."""
+"""Height map given sample by sample: from a file, or a smooth random one as the start of a training."""
 
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
@@ -10,29 +10,30 @@ from torch import Tensor
 from neusee.nodes import ParameterError, node
 from neusee.nodes.doe._height_from_phase import height_checks
 from neusee.nodes.optics._phase_screen import screen
-from neusee.nodes.optics._pupil_grid import Aperture, grid_notes, stop
-from neusee.nodes.units import Count, DataFile, PositiveLength
+from neusee.nodes.optics._pupil_grid import grid_of
+from neusee.nodes.units import DataFile, PositiveLength
+from neusee.nodes.values import Stop
 
 if TYPE_CHECKING:
     from PIL.Image import Image
 
 _GREYS = {"L": 255, "I;16": 65535, "I;16B": 65535, "I": 65535}  #: the level of white in each mode of a grey picture
-Scale = Annotated[float, Field(gt=0, le=1)]  #: part of the pupil's diameter
+Scale = Annotated[float, Field(gt=0, le=1)]  #: share of the pupil's diameter
 
 
 def _header(file: Path) -> tuple[int, ...]:
-    """Return the shape of the relief in a file without reading the heights."""
+    """Return the shape of the height map in a file without reading the heights."""
     from safetensors import SafetensorError
 
     try:
-        return _stated(file)
+        return _shape_in(file)
     except ParameterError:
         raise
     except (SafetensorError, OSError, ValueError, EOFError) as error:
-        raise ParameterError("file", f"{file.name} cannot be read as a relief: {error}") from error
+        raise ParameterError("file", f"{file.name} cannot be read as a height map: {error}") from error
 
 
-def _stated(file: Path) -> tuple[int, ...]:
+def _shape_in(file: Path) -> tuple[int, ...]:
     if file.suffix == ".npy":
         import numpy as np
 
@@ -45,7 +46,7 @@ def _stated(file: Path) -> tuple[int, ...]:
     if file.suffix == ".png":
         with _levels(file) as picture:
             return picture.height, picture.width
-    raise ParameterError("file", f"{file.name}: a relief is read from .npy, .safetensors or grey .png")
+    raise ParameterError("file", f"{file.name}: a height map is read from .npy, .safetensors or grey .png")
 
 
 def _levels(file: Path) -> "Image":
@@ -55,17 +56,21 @@ def _levels(file: Path) -> "Image":
     picture = Image.open(file)
     if picture.mode not in _GREYS:
         picture.close()
-        raise ParameterError("file", f"{file.name} is {picture.mode}, not grey: store one level a sample, 8 or 16 bit")
+        raise ParameterError(
+            "file", f"{file.name} is {picture.mode}, not grey: store one grey level per sample, in 8 or 16 bits"
+        )
     return picture
 
 
 def _name(file: Path, names: list[str]) -> str:
     if "height" in names or len(names) == 1:
         return "height" if "height" in names else names[0]
-    raise ParameterError("file", f"{file.name} holds {', '.join(sorted(names)) or 'nothing'}: name the relief 'height'")
+    found = ", ".join(sorted(names)) or "nothing"
+    raise ParameterError("file", f"{file.name} holds {found}: name the tensor of the height map 'height'")
 
 
 def read_height_map(file: Path, depth: float) -> Tensor:
+    """Read a height map in m from a file; ``depth`` is the height of white in a picture."""
     import numpy as np
 
     if file.suffix == ".png":
@@ -82,49 +87,50 @@ def read_height_map(file: Path, depth: float) -> Tensor:
 
 @node()
 def pixelwise(
+    stop: Stop,
     *,
-    samples: Count,
-    pitch: PositiveLength,
-    diameter: PositiveLength,
-    aperture: Aperture = "inscribed",
     file: DataFile | None = None,
     depth: PositiveLength = 1.2e-6,
     scale: Scale = 0.1,
     rng: torch.Generator,
 ) -> Tensor:
-    """Read a relief from ``file``, or draw a smooth one between 0 and ``depth`` with features of ``scale`` diameters.
+    """Read a height map from ``file``, or draw a smooth random one between 0 and ``depth``.
 
-    The random relief is a start for training: a flat relief is a saddle point, where suppression has no gradient.
+    The features of the random height map are ``scale`` diameters wide. It is a start for training: a flat height map
+    is a saddle point, where the suppression has no gradient.
 
-    Shapes: -> (v, u).
-    Units:  m; of a .png, levels, of which the whitest is ``depth``.
+    Shapes: stop -> (v, u).
+    Units:  m; a .png holds grey levels, of which white is ``depth``.
     Error:  exact.
-    Raises: ParameterError for a file without a relief; ValueError for a relief that does not fit the grid, or with a
+    Raises: ParameterError for a file without a height map, or of another shape than the pupil grid; ValueError for a
             height that is negative or not finite.
     Source: by definition.
     """
     if file is None:
-        noise = screen(stop(samples, pitch, diameter, aperture), scale, rng)
+        noise = screen(grid_of(stop), scale, rng)
         return (depth * torch.sigmoid(1.5 * noise)).to(torch.float32)
-    _fits(file, _header(file), samples)
+    _fits(file, _header(file), stop)
     height = read_height_map(file, depth)
     if not bool(torch.isfinite(height).all()) or float(height.min()) < 0:
         low = float(height.min())
-        raise ValueError(f"{file.name}: lowest height {low:.3g} m, but a relief must be finite and at least 0")
+        raise ValueError(f"{file.name}: lowest height {low:.3g} m, but every height must be finite and at least 0")
     return height
 
 
-def _fits(file: Path, shape: tuple[int, ...], samples: int) -> None:
+def _fits(file: Path, shape: tuple[int, ...], stop: Stop) -> None:
+    samples = int(stop.samples)
     if shape != (samples, samples):
-        fix = f"resample the relief, or set samples to {shape[-1] if shape else 1}"
+        fix = f"resample the height map, or set samples to {shape[-1] if shape else 1}"
         raise ParameterError("file", f"{file.name} is {shape}, not the pupil grid ({samples}, {samples}): {fix}")
 
 
 @pixelwise.preflight
-def _(*, samples: int, file: Path | None, **rest: Any) -> list[str]:
+def _(*, stop: Stop | None, file: Path | None, **_: Any) -> list[str]:
     if file is not None:
-        _fits(file, _header(file), samples)
-    return grid_notes(samples=samples, **rest)
+        shape = _header(file)
+        if stop is not None:
+            _fits(file, shape, stop)
+    return []
 
 
 pixelwise.check(height_checks)

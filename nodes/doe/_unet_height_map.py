@@ -1,4 +1,4 @@
-"""Relief computed by a network from the pupil coordinates alone: a smooth prior with a million parameters."""
+"""Height map computed by a network from the pupil coordinates alone: smooth, with a million parameters."""
 
 from functools import partial
 from itertools import pairwise
@@ -13,8 +13,8 @@ from neusee.nodes import node
 from neusee.nodes.bicubic_resize import enlarge
 from neusee.nodes.doe._height_from_phase import height_checks
 from neusee.nodes.network_weights import loaded, same_layout
-from neusee.nodes.optics._pupil_grid import Aperture, grid_notes
 from neusee.nodes.units import Count, DataFile, PositiveLength
+from neusee.nodes.values import Stop
 
 PITCH = 15.0  #: frequency of the first layer's sines: about four periods across the pupil at the start
 
@@ -22,7 +22,7 @@ PITCH = 15.0  #: frequency of the first layer's sines: about four periods across
 class HeightNet(nn.Module):
     """A network of eight convolutions, four down and four up, from (u, v) to one logit for each sample.
 
-    Sines follow the first convolution, so that the relief can be less smooth than the coordinates.
+    Sines follow the first convolution, so that the height map can be less smooth than the coordinates.
     """
 
     def __init__(self, width: int = 32) -> None:
@@ -46,27 +46,30 @@ class HeightNet(nn.Module):
 
 
 def _edged(x: Tensor) -> Tensor:
-    """Repeat the outermost rows and columns: zeros would draw a frame around the relief."""
+    """Repeat the outermost rows and columns: zeros would draw a frame around the height map."""
     x = torch.cat([x[..., :1, :], x, x[..., -1:, :]], dim=-2)
     return torch.cat([x[..., :1], x, x[..., -1:]], dim=-1)
 
 
 def coordinates(grid: int, device: torch.device | None = None) -> Tensor:
-    """Return the input of the network: u and v from -1 to 1 across the pupil grid, (2, grid, grid)."""
+    """Return the input of the network (2, grid, grid): u and v from -1 to 1 across the pupil grid."""
     line = (torch.arange(grid, dtype=torch.float64, device=device) - (grid - 1) / 2) * (2 / grid)
     v, u = torch.meshgrid(line, line, indexing="ij")
     return torch.stack([u, v]).to(torch.float32)
 
 
 def height_of(net: nn.Module, samples: int, grid: int, max_height: float) -> Tensor:
-    """Return the relief (samples, samples) between 0 and ``max_height``, differentiable in the weights."""
+    """Return the height map (samples, samples) between 0 and ``max_height``, differentiable in the weights."""
     like = next(net.parameters())
     logits = net(coordinates(min(grid, samples), like.device).to(like))
     return max_height * torch.sigmoid(enlarge(logits, samples, samples))
 
 
 def fresh(width: int, grid: int, rng: torch.Generator) -> HeightNet:
-    """Draw a network with orthogonal weights and zero biases; scale the last layer, far from a flat relief."""
+    """Draw a network with orthogonal weights and zero biases.
+
+    The last layer is scaled to logits of mean 0 and standard deviation 1, so that the height map is far from flat.
+    """
     net = HeightNet(width).to(rng.device)
     with torch.no_grad():
         for name, parameter in net.named_parameters():
@@ -83,35 +86,33 @@ def fresh(width: int, grid: int, rng: torch.Generator) -> HeightNet:
 
 @node()
 def unet(
+    stop: Stop,
     *,
-    samples: Count,
-    pitch: PositiveLength,
-    diameter: PositiveLength,
-    aperture: Aperture = "inscribed",
     max_height: PositiveLength = 1.2e-6,
     grid: Count = 270,
     width: Count = 32,
     weights: DataFile | None = None,
     rng: torch.Generator,
 ) -> Tensor:
-    """Draw the relief with a UNet of the pupil coordinates: max_height * sigmoid(UNet(u, v)).
+    """Compute the height map by a UNet of the pupil coordinates: max_height * sigmoid(UNet(u, v)).
 
-    The network has ``grid`` samples. The bicubic resampling precedes the sigmoid, which keeps the relief in its range.
+    The network has ``grid`` samples. The bicubic resampling precedes the sigmoid, which keeps all heights in range.
 
-    Shapes: -> (v, u).
+    Shapes: stop -> (v, u).
     Units:  m.
     Error:  1e-6 of max_height (float32).
     Source: "Learning to See Through Flare", "Neural Representation of the DOE"; the layer widths are ours.
     """
+    samples = int(stop.samples)
     net = fresh(width, min(grid, samples), rng) if weights is None else loaded(partial(HeightNet, width), weights)
     return height_of(net, samples, grid, max_height).detach()
 
 
 @unet.preflight
-def _(*, width: int, weights: Path | None, **rest: Any) -> list[str]:
+def _(*, width: int, weights: Path | None, **_: Any) -> list[str]:
     if weights is not None:
         same_layout(partial(HeightNet, width), weights, width)
-    return grid_notes(**rest)
+    return []
 
 
 unet.check(height_checks)

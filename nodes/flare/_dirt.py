@@ -1,4 +1,4 @@
-"""Dirt on the window in front of the lens, with statistics that do not depend on the sampling."""
+"""Dirt on the window in front of the lens, with statistics that do not depend on the sampling of the pupil."""
 
 import math
 from typing import Annotated, Any
@@ -6,13 +6,13 @@ from typing import Annotated, Any
 import torch
 from pydantic import Field
 
-from neusee.nodes import Check, node
+from neusee.nodes import Check, TensorStats, node
 from neusee.nodes.flare._grains_and_scratches import Grain, Scratch, stamp
 from neusee.nodes.optics._phase_screen import factors
-from neusee.nodes.optics._pupil_grid import Aperture, Stop, grid_notes, inside, stop, stripes
+from neusee.nodes.optics._pupil_grid import PupilGrid, grid_of, inside, stripes
 from neusee.nodes.optics._zernike import surface
-from neusee.nodes.units import Count, Fraction, PositiveLength, Waves
-from neusee.nodes.values import Dirt
+from neusee.nodes.units import Fraction, Waves
+from neusee.nodes.values import Dirt, Stop
 
 Mean = Annotated[float, Field(ge=0, le=10_000)]  #: expected number
 Part = Annotated[float, Field(gt=0, le=1)]  #: relative to the diameter of the pupil
@@ -25,11 +25,8 @@ DENT_TERMS = range(4, 16)  #: Noll numbers from defocus to the fourth radial ord
 
 @node()
 def dirt(
+    stop: Stop,
     *,
-    samples: Count,
-    pitch: PositiveLength,
-    diameter: PositiveLength,
-    aperture: Aperture = "inscribed",
     dust: Mean = 0.0,
     dust_radius: Part = 1 / 60,
     scratches: Mean = 0.0,
@@ -42,7 +39,7 @@ def dirt(
     dents: Rms = 0.0,
     rng: torch.Generator,
 ) -> Dirt:
-    """Soil the pupil: grains of dust, scratches, a greasy film, smudges and dents of a windshield.
+    """Add the dirt of a windshield to the pupil: grains of dust, scratches, a greasy film, smudges and dents.
 
     dust, scratches: expected numbers (Wu et al.: 30 each). The radius of the largest grain is drawn about
         ``dust_radius``, the width of the widest scratch about ``scratch_width``. A scratch has up to 16 steps, none
@@ -51,19 +48,19 @@ def dirt(
     smudges: opacity of the field under the thickest of the soft patches, whose size is ``smudge_scale``.
     dents: root mean square of Zernike terms 4 to 15 (0.1 to 2 waves). With all five at zero the glass is clean.
 
-    Shapes: -> Dirt (v, u).
+    Shapes: stop -> Dirt (v, u).
     Units:  grease, dents waves at 550 nm; result amplitude 1, path m.
     Error:  covered area of a mark: 1 % from 3 samples across, 10 % at 1 sample, unbiased at any size.
     Source: numbers, sizes and opacities of dust and scratches: Wu et al., ICCV 2021 (arXiv 2011.12485), relative to
         their 6000 samples; grease, smudges and dents are ours.
     """
-    grid = stop(samples, pitch, diameter, aperture)
+    grid = grid_of(stop)
     grains_rng, lines_rng, film_rng, patches_rng, dents_rng = _streams(5, rng)
     grains = _grains(dust, dust_radius, grains_rng)
     lines = _scratches(scratches, scratch_length, scratch_width, lines_rng)
     film, patches = factors(grid, grease_scale, film_rng), factors(grid, smudge_scale, patches_rng)
     bends = _dents(WAVE * dents, dents_rng)
-    amplitude, path = (torch.empty(samples, samples) for _ in range(2))
+    amplitude, path = (torch.empty(grid.samples, grid.samples) for _ in range(2))
     for rows in stripes(grid):
         amplitude[rows] = 1 - smudges * torch.sigmoid(3 * (patches[0][rows] @ patches[1])) if smudges else 1.0
         path[rows] = WAVE * grease * (film[0][rows] @ film[1]) if grease else 0.0
@@ -83,7 +80,7 @@ def _uniform(rng: torch.Generator, low: float = 0.0, high: float = 1.0) -> float
 
 
 def _about(mean: float, spread: float, rng: torch.Generator) -> float:
-    """Draw a normal number, clipped at 0."""
+    """Draw a normally distributed number, and replace a negative number by 0."""
     return max(mean + spread * float(torch.randn((), generator=rng, device=rng.device, dtype=torch.float64)), 0.0)
 
 
@@ -101,7 +98,7 @@ def _scratches(mean: float, length: float, width: float, rng: torch.Generator) -
 
 
 def _scratch(length: float, widest: float, rng: torch.Generator) -> Scratch:
-    """Draw a walk of 1 to 16 steps in random directions, with steps of at most a random share of ``length``."""
+    """Draw a scratch: a random walk of 1 to 16 steps, each no longer than ``length``."""
     points = [(_uniform(rng, -0.5, 0.5), _uniform(rng, -0.5, 0.5))]
     stride = length * _uniform(rng)
     for _ in range(1 + int(16 * _uniform(rng))):
@@ -112,15 +109,17 @@ def _scratch(length: float, widest: float, rng: torch.Generator) -> Scratch:
 
 
 def _dents(rms: float, rng: torch.Generator) -> dict[int, float]:
-    """Draw coefficients of the given root sum of squares, with a uniform direction."""
+    """Draw Zernike coefficients whose root sum of squares is ``rms``."""
     draw = torch.randn(len(DENT_TERMS), generator=rng, device=rng.device, dtype=torch.float64)
     parts = (rms * draw / draw.norm()).tolist()
     return dict(zip(DENT_TERMS, parts, strict=True)) if rms else {}
 
 
 @dirt.zero_bound
-def _(*, dust: float, scratches: float, grease: float, smudges: float, dents: float, **_: Any) -> float:
-    """Bound the change of the field against clear glass, at 400 nm or longer; a clean window gives 0.
+def _(
+    stop: TensorStats, *, dust: float, scratches: float, grease: float, smudges: float, dents: float, **_: Any
+) -> float:
+    """Return an upper bound of the change of the field by the dirt, at 400 nm or longer; 0 for a clean window.
 
     A grain or a scratch may be black. A film is a sum of normal numbers, which the generator keeps below 8.6, so that
     the film stays below 31 times its root mean square. The twelve terms of a dent together reach sqrt(50) times their
@@ -133,19 +132,16 @@ def _(*, dust: float, scratches: float, grease: float, smudges: float, dents: fl
     return min(2.0, _ROUNDING + blocked + 2 * math.pi * waves)
 
 
-dirt.preflight(grid_notes)
-
-
 @dirt.check
-def _(result: Dirt, *, samples: int, pitch: float, diameter: float, aperture: Aperture, **_: Any) -> list[Check]:
-    passed, rms = _effect(result, stop(samples, pitch, diameter, aperture))
+def _(result: Dirt, stop: Stop, **_: Any) -> list[Check]:
+    passed, rms = _effect(result, grid_of(stop))
     text = f"dirt passes {passed:.4f} of the light, bends it by {rms:.3g} waves root mean square at 550 nm"
     low, high = (float(x) for x in torch.aminmax(result.amplitude))
     return [Check(text, passed > 0), Check(f"amplitude from {low:.3g} to {high:.3g}", low >= 0 and high <= 1)]
 
 
-def _effect(dirt: Dirt, grid: Stop) -> tuple[float, float]:
-    """Return the share of the light that passes, and the root mean square path in waves."""
+def _effect(dirt: Dirt, grid: PupilGrid) -> tuple[float, float]:
+    """Return the share of the light that passes the dirt, and the root mean square of the path in waves."""
     sums = torch.zeros(4, dtype=torch.float64)
     for rows in stripes(grid):
         open_ = inside(grid, dirt.path.device, rows)

@@ -36,7 +36,7 @@ def ghosts(
     radius: PositiveLength = 300e-6,
     rng: torch.Generator,
 ) -> Tensor:
-    """Reflect the spot into discs on the line through the source and the axis.
+    """Add reflections of the spot: discs on the line through the spot and the optical axis.
 
     Ghost j is a defocused image of the round stop: a disc of radius r_j (U(0.1, 1) * ``radius``), centred at s_j times
     the position of the source, with s_j from U(-``spread``, ``spread``), and coloured by two quarter-wave coatings.
@@ -52,14 +52,14 @@ def ghosts(
         single quarter-wave layer.
     """
     if spot.ndim != 3 or spot.shape[0] != bands.centres.numel():
-        raise ValueError(f"spot is {tuple(spot.shape)}, bands {bands.centres.numel()}: give both of one laser")
+        raise ValueError(f"spot is {tuple(spot.shape)}, bands {bands.centres.numel()}: compute both from one `line`")
     drawn = _draw(count, spread, radius, rng)
     spot = single(spot)
     flux = spot.sum(-1).sum(-1, dtype=torch.float64)  # a float64 copy of the spot would be twice as large
-    place = tuple(focal_length * n / pixel_pitch for n in direction.tolist())
+    y, x = (focal_length * n / pixel_pitch for n in direction.tolist())
     total = torch.zeros_like(spot)
     for ghost, colour in zip(drawn, _colours(drawn, bands.centres, flux), strict=True):
-        centre = (ghost.magnification * place[0], ghost.magnification * place[1])
+        centre = (ghost.magnification * y, ghost.magnification * x)
         _add(total, (energy * colour * flux).to(spot.dtype), centre, _in_pixels(ghost.radius, pixel_pitch))
     return total
 
@@ -68,23 +68,20 @@ def _draw(count: int, spread: float, radius: float, rng: torch.Generator) -> lis
     draw = torch.rand(count, 5, generator=rng, device=rng.device, dtype=torch.float64).tolist()
     sizes = [math.exp(2 * row[2]) for row in draw]
     found = []
-    for (place, r, _, *coats), size in zip(draw, sizes, strict=True):
+    for (position, r, _, *coats), size in zip(draw, sizes, strict=True):
         first, second = (400e-9 + 300e-9 * coat for coat in coats)
-        found.append(
-            _Ghost(
-                spread * (2 * place - 1), radius * (_SMALLEST + (1 - _SMALLEST) * r), size / sum(sizes), (first, second)
-            )
-        )
+        magnification, drawn_radius = spread * (2 * position - 1), radius * (_SMALLEST + (1 - _SMALLEST) * r)
+        found.append(_Ghost(magnification, drawn_radius, size / sum(sizes), (first, second)))
     return found
 
 
 def _reflected(wavelengths: Tensor, tuned: float) -> Tensor:
-    """Return the reflectance of a quarter-wave layer: least at the tuned wavelength, never quite 0, at most 1."""
+    """Return the reflectance of a quarter-wave layer: 0.05 at the tuned wavelength, at most 1 elsewhere."""
     return 0.05 + 0.95 * torch.cos(torch.pi / 2 * tuned / wavelengths).square()
 
 
 def _colours(drawn: list[_Ghost], wavelengths: Tensor, flux: Tensor) -> list[Tensor]:
-    """Return the gain of each ghost in each band, scaled so that all ghosts together move exactly the whole flux."""
+    """Return the gain of each ghost in each band; the gains times the flux add up to the whole flux of the spot."""
     raw = [g.share * _reflected(wavelengths, g.tuned[0]) * _reflected(wavelengths, g.tuned[1]) for g in drawn]
     moved = torch.stack(raw).sum(0).mul(flux).sum() if raw else flux.sum()
     dark = moved <= 0  # false for NaN, so that NaN reaches the result
@@ -93,12 +90,12 @@ def _colours(drawn: list[_Ghost], wavelengths: Tensor, flux: Tensor) -> list[Ten
 
 
 def _in_pixels(radius: float, pixel_pitch: float) -> float:
-    """Return a radius in pixels, large enough that a disc at any position covers a sample."""
+    """Return a radius in pixels, at least 0.5, so that a disc at any position covers the centre of a pixel."""
     return max(radius / pixel_pitch, 0.5)
 
 
 def _add(total: Tensor, energy: Tensor, centre: tuple[float, float], radius: float) -> None:
-    """Add the part of one disc that lies in the window; the disc has unit sum over the infinite plane."""
+    """Add the part of a disc inside the window to ``total``; the whole disc has unit sum."""
     height, width = total.shape[-2:]
     y, x = centre[0] + height // 2, centre[1] + width // 2
     rows, columns = _reach(y, radius), _reach(x, radius)
@@ -110,31 +107,20 @@ def _add(total: Tensor, energy: Tensor, centre: tuple[float, float], radius: flo
 
 
 def _reach(middle: float, radius: float) -> Tensor:
-    """Return the indices, float64, of the samples that a disc can touch on one axis, inside the window or outside."""
+    """Return the indices, float64, of all pixels along one axis that a disc can touch, also outside the window."""
     first, last = math.floor(middle - radius) - 1, math.ceil(middle + radius) + 1
     return torch.arange(first, last + 1, dtype=torch.float64)
 
 
 def _part(numbers: Tensor, samples: int) -> slice:
-    """Return the slice of these sample indices that lies in the window, or an empty slice."""
+    """Return the slice of the pixel indices that lies in the window, or an empty slice."""
     first = int(numbers[0])
     return slice(min(max(-first, 0), len(numbers)), max(samples - first, 0))
 
 
 @ghosts.zero_bound
-def _(
-    spot: TensorStats,
-    bands: TensorStats,
-    direction: TensorStats,
-    *,
-    focal_length: float,
-    pixel_pitch: float,
-    count: int,
-    energy: float,
-    spread: float,
-    radius: float,
-) -> float:
-    """Bound the ghosts: all reflected light in one band and in the smallest ghost, from the sum of the spot alone.
+def _(spot: TensorStats, *_: Any, pixel_pitch: float, count: int, energy: float, radius: float, **__: Any) -> float:
+    """Return an upper bound of the brightest pixel: all reflected light in one band and in the smallest ghost.
 
     The samples of a disc of half a pixel or more sum to the area of the disc, pi (r^2 + 1 / 12), within 16 %.
     """
@@ -149,4 +135,4 @@ def _(result: Tensor, spot: Tensor, *_: Any, energy: float, **__: Any) -> list[C
     whole, moved = (float(x.sum(-1).sum(dtype=torch.float64)) for x in (spot, result))
     seen = moved / whole if whole > 0 else 0.0
     bounded = seen <= energy * (1 + 1e-3)
-    return [Check(f"ghosts bring {seen:.3g} of the spot's energy into the window, of {energy:.3g} reflected", bounded)]
+    return [Check(f"ghosts in the window have {seen:.3g} of the spot's energy; {energy:.3g} is reflected", bounded)]

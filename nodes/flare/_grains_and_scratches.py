@@ -1,4 +1,4 @@
-"""Opaque marks on glass, with the correct area at any sampling: round grains and scratched lines."""
+"""Round grains and scratches on glass, drawn with their correct area at any sampling of the pupil."""
 
 import math
 from collections.abc import Sequence
@@ -7,11 +7,11 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
-from neusee.nodes.optics._pupil_grid import Stop
+from neusee.nodes.optics._pupil_grid import PupilGrid
 
 
 class Grain(NamedTuple):
-    """A round grain; positions and lengths are in diameters of the stop, from its centre."""
+    """A round grain; position (from the centre) and radius are in diameters of the stop."""
 
     v: float
     u: float
@@ -20,15 +20,15 @@ class Grain(NamedTuple):
 
 
 class Scratch(NamedTuple):
-    """A scratched line through points; positions and lengths are in diameters of the stop, from its centre."""
+    """A scratched line through points; positions (from the centre) and width are in diameters of the stop."""
 
     points: Sequence[tuple[float, float]]  #: (v, u)
     width: float
     opacity: float
 
 
-def stamp(amplitude: Tensor, marks: Sequence[Grain | Scratch], grid: Stop) -> Tensor:
-    """Multiply each mark into an amplitude (v, u), in place."""
+def stamp(amplitude: Tensor, marks: Sequence[Grain | Scratch], grid: PupilGrid) -> Tensor:
+    """Darken an amplitude (v, u) in place by each grain and scratch, and return the amplitude."""
     scale, middle = grid.diameter / grid.pitch, (grid.samples - 1) / 2
     for mark in marks:
         points = [(mark.v, mark.u)] if isinstance(mark, Grain) else list(mark.points)
@@ -57,7 +57,7 @@ def _darken(amplitude: Tensor, places: list[tuple[float, float]], size: float, o
 
 
 def _window(places: list[tuple[float, float]], margin: float, samples: int) -> tuple[slice, slice] | None:
-    """Return the rows and columns that a mark can touch, or None for a mark outside the grid."""
+    """Return the rows and columns of samples that a mark can touch, or None for a mark outside the grid."""
     spans = []
     for axis in (0, 1):
         low = max(int(min(place[axis] for place in places) - margin), 0)
@@ -69,7 +69,7 @@ def _window(places: list[tuple[float, float]], margin: float, samples: int) -> t
 
 
 def _distance(y: Tensor, x: Tensor, start: tuple[float, float], end: tuple[float, float]) -> Tensor:
-    """Return the distance, in samples, to the line from start to end."""
+    """Return the distance of each sample, in samples, from the line between two points."""
     along_y, along_x = end[0] - start[0], end[1] - start[1]
     length = along_y**2 + along_x**2
     share = ((y - start[0]) * along_y + (x - start[1]) * along_x) / length if length > 0 else torch.zeros_like(y + x)
@@ -78,7 +78,7 @@ def _distance(y: Tensor, x: Tensor, start: tuple[float, float], end: tuple[float
 
 
 def _cover(distance: Tensor, size: float, round_: bool) -> Tensor:
-    """Return the covered share of each sample for a mark ``size`` samples wide; the sum is the area of any mark."""
+    """Return the covered share of each sample for a mark that is ``size`` samples wide, so that the sum is the area."""
     if round_:
         square = size**2 / 4
         edge = math.sqrt(max(square - 1 / 12, 1 / 4))

@@ -1,4 +1,4 @@
-"""Optical nodes: pupil function, point-spread function, image and laser spot."""
+"""Optical nodes: stop, pupil function, point-spread function, image and laser spot."""
 
 from neusee.nodes.optics._imaging._band_image import image
 from neusee.nodes.optics._imaging._channel_image import image_channels
@@ -6,10 +6,9 @@ from neusee.nodes.optics._laser_direction import direction, field_of_view
 from neusee.nodes.optics._laser_spot import laser_irradiance
 from neusee.nodes.optics._psf import psf
 from neusee.nodes.optics._pupil import mask_turns, pupil
-from neusee.nodes.optics._pupil_grid import Stop, stop
+from neusee.nodes.optics._stop import stop
 
 __all__ = [
-    "Stop",
     "direction",
     "field_of_view",
     "image",

@@ -1,4 +1,4 @@
-"""The direction of a laser, either given or drawn at random as in the paper."""
+"""The direction of a laser: given by the recipe, or drawn at random as in the paper."""
 
 import math
 from typing import Any, Literal
@@ -47,7 +47,7 @@ def field_of_view(focal_length: float, pixel_pitch: float, shape: tuple[int, int
 
 
 def _inside(sigma: float, edge: float, rng: Generator) -> Tensor:
-    """Return a normal draw of standard deviation ``sigma``, repeated until its absolute value is at most ``edge``."""
+    """Draw a normal number of standard deviation ``sigma`` until its absolute value is at most ``edge``; return it."""
     while True:
         drawn = sigma * torch.randn((), generator=rng, device=rng.device, dtype=torch.float64)
         if float(drawn.abs()) <= edge:
@@ -78,8 +78,8 @@ def _(
 
 @direction.check
 def _(result: Tensor, *, focal_length: float, pixel_pitch: float, shape: tuple[int, int], **_: Any) -> list[Check]:
-    place = [float(n) * focal_length / pixel_pitch for n in result]
-    seen = all(abs(p) <= side / 2 for p, side in zip(place, shape, strict=True))
+    y, x = (float(n) * focal_length / pixel_pitch for n in result)
+    seen = abs(y) <= shape[0] / 2 and abs(x) <= shape[1] / 2
     off = math.degrees(math.hypot(*(float(n) for n in result)))
     beyond = "" if seen else ": beyond the sensor, where only glare reaches the picture"
-    return [Check(f"spot {place[0]:+.1f}, {place[1]:+.1f} px (y, x) off the axis, {off:.3g} deg{beyond}")]
+    return [Check(f"spot {y:+.1f}, {x:+.1f} px (y, x) off the axis, {off:.3g} deg{beyond}")]

@@ -1,7 +1,7 @@
 """The laser spot on the sensor: a PSF scaled by the irradiance that saturates a pixel behind the clear lens."""
 
 import math
-from typing import Annotated, Any
+from typing import Annotated
 
 import torch
 from pydantic import Field
@@ -42,8 +42,8 @@ def laser_irradiance(
         raise ValueError(
             f"PSF of {psf.intensity.shape[0]} bands and line of {len(bands.centres)}: compute both from one `line` step"
         )
-    sensor = {"full_well": full_well, "quantum_efficiency": quantum_efficiency}
-    saturating: Tensor = saturation(bands, **sensor, pixel_pitch=pixel_pitch, exposure=exposure)
+    sensor = {"full_well": full_well, "quantum_efficiency": quantum_efficiency, "pixel_pitch": pixel_pitch}
+    saturating: Tensor = saturation(bands, **sensor, exposure=exposure)
     unit = (bands.weights * psf.clear_peak / saturating).sum()
     energy = strength * bands.weights / unit
     intensity = single(psf.intensity)
@@ -51,16 +51,7 @@ def laser_irradiance(
 
 
 @laser_irradiance.zero_bound
-def _(
-    psf: TensorStats,
-    bands: TensorStats,
-    *,
-    strength: float,
-    full_well: float,
-    quantum_efficiency: float,
-    pixel_pitch: float,
-    exposure: float,
-) -> float:
+def _(psf: TensorStats, bands: TensorStats, *, strength: float, **sensor: float) -> float:
     """Return an upper bound of the spot: saturation irradiance x strength x largest laser suppression ratio (LSR).
 
     The bound needs no PSF, so no PSF is computed for it. A pixel that samples a point is at most as bright as the clear
@@ -71,14 +62,12 @@ def _(
     if strength == 0:
         return 0.0
     ends = torch.tensor([bands.min], dtype=torch.float64)  # the saturation irradiance falls with wavelength
-    sensor = {"full_well": full_well, "quantum_efficiency": quantum_efficiency}
-    saturating: Tensor = saturation(Bands(ends, ends, ends), **sensor, pixel_pitch=pixel_pitch, exposure=exposure)
+    saturating: Tensor = saturation(Bands(ends, ends, ends), **sensor)
     return _LSR * strength * float(saturating)
 
 
 @laser_irradiance.check
-def _(result: Tensor, psf: Psf, bands: Bands, **params: Any) -> list[Check]:
-    sensor = {k: params[k] for k in ("full_well", "quantum_efficiency", "pixel_pitch", "exposure")}
+def _(result: Tensor, psf: Psf, bands: Bands, *, strength: float, **sensor: float) -> list[Check]:
     share = 1.0 / saturation(bands, **sensor)
     peak = float(torch.tensordot(share.to(result), result, 1).max())
-    return [Check(f"peak {peak:.3g} I_sat of {params['strength']:g}", math.isfinite(peak))]
+    return [Check(f"peak {peak:.3g} I_sat of {strength:g}", math.isfinite(peak))]

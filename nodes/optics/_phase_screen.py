@@ -1,23 +1,23 @@
-"""Smooth random screens over the pupil, independent of the sampling."""
+"""Smooth random phase screens over the pupil, the same at every sampling of the pupil."""
 
 import math
 
 import torch
 from torch import Tensor
 
-from neusee.nodes.optics._pupil_grid import Stop, axes
+from neusee.nodes.optics._pupil_grid import PupilGrid, axes
 
 
-def screen(grid: Stop, scale: float, rng: torch.Generator, device: torch.device | None = None) -> Tensor:
-    """Draw Gaussian noise of mean 0, variance 1 and correlation exp(-(d / scale)**2), float64 (v, u)."""
+def screen(grid: PupilGrid, scale: float, rng: torch.Generator, device: torch.device | None = None) -> Tensor:
+    """Draw a screen (v, u), float64: Gaussian noise of mean 0, variance 1 and correlation exp(-(d / scale)**2)."""
     rows, columns = factors(grid, scale, rng, device)
     return rows @ columns
 
 
 def factors(
-    grid: Stop, scale: float, rng: torch.Generator, device: torch.device | None = None
+    grid: PupilGrid, scale: float, rng: torch.Generator, device: torch.device | None = None
 ) -> tuple[Tensor, Tensor]:
-    """Return two matrices (v, few) and (few, u) whose product is the screen, so that single rows can be computed.
+    """Return two matrices, (v, n) and (n, u), whose product is the screen, so that single rows can be computed.
 
     ``scale`` is in units of the diameter. Gaussians of width scale / 2 smooth white noise on a lattice. The lattice
     does not depend on the sampling of the pupil, so the screen does not depend on the sampling either.

@@ -1,8 +1,8 @@
-"""The point-spread function: lens, element and pixel sampling in one scaled Fourier transform."""
+"""The point-spread function: lens, mask and pixel sampling in one scaled Fourier transform."""
 
 import math
 from dataclasses import replace
-from typing import Literal, NamedTuple
+from typing import Any, Literal, NamedTuple
 
 import torch
 from torch import Tensor
@@ -18,14 +18,19 @@ from neusee.nodes.values import Psf, Pupil
 
 
 class _Camera(NamedTuple):
-    """The geometry behind the pupil, in metres, radians and pixels."""
+    """The geometry of lens, sensor and source, in metres, radians and pixels."""
 
     focal_length: float
     pixel_pitch: float
     shape: tuple[int, int]
-    angle: tuple[float, float]
-    zoh: bool
-    integrated: bool
+    angle: tuple[float, float] = (0.0, 0.0)
+    pixel: str = "point"
+    sensor: str = "point"
+
+    def towards(self, direction: Tensor | None) -> "_Camera":
+        """Return the camera with ``direction`` added to the angle of the source."""
+        y, x = (0.0, 0.0) if direction is None else direction.tolist()
+        return self._replace(angle=(self.angle[0] + y, self.angle[1] + x))
 
 
 @node(rtol=2e-6, bands={"pupil": 0, "return": 0})
@@ -45,7 +50,7 @@ def psf(
 
     A source at ``angle`` (n_y, n_x) has its spot at (f n_y, f n_x), to a fraction of a pixel. An input ``direction`` is
     added to ``angle``. The window stays centred on the axis for every angle.
-    ``pixel="zoh"`` holds the element constant over each square pupil pixel, which gives a sinc envelope.
+    ``pixel="zoh"`` holds the height map constant over each square pupil pixel, which gives a sinc envelope.
     ``sensor="integrated"`` averages over the square of each sensor pixel; ``"point"`` samples its middle.
     Amplitude, height and path receive a first derivative; a second derivative raises an error.
 
@@ -57,34 +62,13 @@ def psf(
         for a closed aperture, for heights or paths that are not finite, and for a pupil in half precision.
     Source: Goodman, Introduction to Fourier Optics, 3rd edition, eq. 5-14 (field in the focal plane of a lens).
     """
-    camera = _Camera(
-        focal_length, pixel_pitch, shape, _towards(angle, direction), pixel == "zoh", sensor == "integrated"
-    )
+    camera = _Camera(focal_length, pixel_pitch, shape, angle, pixel, sensor).towards(direction)
     return _focus(pupil, camera, torch.float64 if precision == "double" else torch.float32, "auto")
 
 
 @psf.reference
-def _(
-    pupil: Pupil,
-    direction: Tensor | None = None,
-    *,
-    focal_length: PositiveLength,
-    pixel_pitch: PositiveLength,
-    shape: Shape,
-    angle: tuple[Angle, Angle] = (0.0, 0.0),
-    pixel: Literal["point", "zoh"] = "point",
-    sensor: Literal["point", "integrated"] = "point",
-    precision: Literal["single", "double"] = "single",
-) -> Psf:
-    camera = _Camera(
-        focal_length, pixel_pitch, shape, _towards(angle, direction), pixel == "zoh", sensor == "integrated"
-    )
-    return _focus(pupil, camera, torch.float64, "direct")
-
-
-def _towards(angle: tuple[float, float], direction: Tensor | None) -> tuple[float, float]:
-    y, x = (0.0, 0.0) if direction is None else direction.tolist()
-    return angle[0] + y, angle[1] + x
+def _(pupil: Pupil, direction: Tensor | None = None, *, precision: str = "single", **camera: Any) -> Psf:
+    return _focus(pupil, _Camera(**camera).towards(direction), torch.float64, "direct")
 
 
 @psf.check
@@ -114,7 +98,7 @@ def _focus(pupil: Pupil, camera: _Camera, dtype: torch.dtype, method: Method) ->
 
 
 def _area(pupil: Pupil) -> tuple[float, float]:
-    """Return the light through the clear pupil and its field on the axis, both in samples."""
+    """Return the sums, over the samples of the clear pupil, of the light and of the field."""
     rows = pupil.aperture.detach()
     light, field = torch.bmm(rows[:, None, :], rows[:, :, None]), rows.sum(dim=1)
     return float(light.sum(dtype=torch.float64)), float(field.sum(dtype=torch.float64))
@@ -125,16 +109,16 @@ def _alpha(pupil: Pupil, camera: _Camera, band: int) -> float:
 
 
 def _views(pupil: Pupil, camera: _Camera, band: int, scale: float, dtype: torch.dtype) -> list[View]:
-    """Return the windows of point samples that make up the pixels of one band: one window per quadrature node."""
+    """Return one window of point samples for each quadrature node within a pixel of one band."""
     alpha, wavelength = _alpha(pupil, camera, band), float(pupil.wavelengths[band])
-    nodes, weights = _nodes(max(pupil.height.shape) * alpha) if camera.integrated else ([0.0], [1.0])
+    nodes, weights = _nodes(max(pupil.height.shape) * alpha) if camera.sensor == "integrated" else ([0.0], [1.0])
     axes = [Axis(n, k, alpha) for n, k in zip(pupil.height.shape, camera.shape, strict=True)]
     views = []
     for y, wy in zip(nodes, weights, strict=True):
         for x, wx in zip(nodes, weights, strict=True):
             middle = [(n - 1) / 2 - c + s for n, c, s in zip(camera.shape, _spot(camera), (y, x), strict=True)]
             tilt = (-alpha * middle[0], -alpha * middle[1])
-            envelope = _envelopes(camera, alpha, middle, dtype, pupil.height.device) if camera.zoh else None
+            envelope = _envelopes(camera, alpha, middle, dtype, pupil.height.device) if camera.pixel == "zoh" else None
             turns_height, turns_path = float(pupil.index[band]) / wavelength, 1 / wavelength
             weight = wy * wx * scale * alpha**2
             views.append(View(band, axes[0], axes[1], turns_height, turns_path, tilt, weight, envelope))
@@ -142,7 +126,7 @@ def _views(pupil: Pupil, camera: _Camera, band: int, scale: float, dtype: torch.
 
 
 def _spot(camera: _Camera) -> list[float]:
-    """Return the position of the spot on the sensor's grid, in samples."""
+    """Return the position (y, x) of the spot on the sensor, in pixels."""
     return [
         n // 2 + camera.focal_length * a / camera.pixel_pitch for n, a in zip(camera.shape, camera.angle, strict=True)
     ]
@@ -159,10 +143,10 @@ def _envelopes(
 
 
 def _nodes(bandwidth: float) -> tuple[list[float], list[float]]:
-    """Return the fewest Gauss-Legendre nodes over one pixel that integrate its fastest fringe to 5e-6.
+    """Return the fewest Gauss-Legendre nodes that integrate the fastest fringe over a pixel to 5e-6, and their weights.
 
     ``bandwidth`` is the number of fringes per pixel from opposite rims of the pupil. The clear pupil's
-    optical transfer function bounds every other one, so the error is below 1e-5 of the clear peak.
+    optical transfer function bounds every other transfer function, so the error is below 1e-5 of the clear peak.
     """
     import numpy as np
 
@@ -175,9 +159,9 @@ def _nodes(bandwidth: float) -> tuple[list[float], list[float]]:
 
 
 def _clear_peak(pupil: Pupil, camera: _Camera, band: int, area: float, total: float) -> float:
-    """Return the pixel on the axis behind the clear aperture alone, sampled like the other pixels."""
+    """Return the value of the PSF on the axis behind the clear aperture alone, sampled as the PSF is."""
     alpha = _alpha(pupil, camera, band)
-    if not camera.integrated:
+    if camera.sensor == "point":
         return total**2 * alpha**2 / area
     centre = camera._replace(shape=(1, 1), angle=(0.0, 0.0))
     nothing = torch.zeros_like(pupil.height)
@@ -189,7 +173,7 @@ def _clear_peak(pupil: Pupil, camera: _Camera, band: int, area: float, total: fl
 def _agree(pupil: Pupil) -> None:
     shapes = {name: tuple(getattr(pupil, name).shape) for name in ("aperture", "amplitude", "height", "path")}
     if len(set(shapes.values())) != 1 or pupil.height.dim() != 2:
-        raise ValueError(f"the pupil's parts differ in shape: {shapes}; give each the same (v, u)")
+        raise ValueError(f"the factors of the pupil differ in shape: {shapes}; give all the same (v, u)")
     refuse_half(amplitude=pupil.amplitude, height=pupil.height, path=pupil.path)
     if pupil.index.shape != pupil.wavelengths.shape or pupil.index.dim() != 1:
         raise ValueError(
@@ -206,7 +190,7 @@ def _refuse_aliases(pupil: Pupil, camera: _Camera) -> None:
 
     With ``pixel="zoh"`` the repeated light is real, because square pillars do send light there.
     """
-    if camera.zoh:
+    if camera.pixel == "zoh":
         return
     shortest = float(pupil.wavelengths.min())
     limit = shortest * camera.focal_length / (2 * float(pupil.pitch))

@@ -1,4 +1,4 @@
-"""The pupil function, kept as factors: stop, element, aberrations and dirt."""
+"""The pupil function, stored as factors: stop, mask, aberrations and dirt."""
 
 from collections.abc import Mapping
 from typing import Any
@@ -8,13 +8,13 @@ from torch import Tensor
 
 from neusee.nodes import Check, node
 from neusee.nodes._half_precision import refuse_half
-from neusee.nodes.optics._pupil_grid import Aperture, Stop, axes, inside, opening, stop, stripes
+from neusee.nodes.optics._pupil_grid import PupilGrid, axes, grid_of, inside, opening, refuse_other_grid, stripes
 from neusee.nodes.optics._zernike import surface
-from neusee.nodes.units import Count, Length, PositiveLength, Waves
-from neusee.nodes.values import Bands, Dirt, Pupil
+from neusee.nodes.units import Count, Length, Waves
+from neusee.nodes.values import Bands, Dirt, Pupil, Stop
 
 DEFOCUS_WAVELENGTH = 550e-9  #: m; the wavelength in which waves of defocus are counted
-_ROWS = 512  #: the least number of pupil rows in which phase steps are measured
+_ROWS = 512  #: least number of pupil rows in which phase steps are measured
 
 
 @node(additive_inputs=[("dirt",)])
@@ -22,28 +22,26 @@ def pupil(
     height: Tensor,
     index: Tensor,
     bands: Bands,
+    stop: Stop,
     dirt: Dirt | None = None,
     *,
-    pitch: PositiveLength,
-    diameter: PositiveLength,
-    aperture: Aperture = "inscribed",
     defocus: Waves = 0.0,
     aberrations: dict[Count, Length] = {},  # noqa: B006 (read only)
 ) -> Pupil:
-    """Build the pupil function from stop, element, defocus, aberrations and dirt, all in one plane.
+    """Build the pupil function from stop, mask, defocus, aberrations and dirt, all in one plane.
 
     Field of band b: amplitude * exp(2 pi i (index[b] * height + path) / wavelength[b]). Defocus adds the path
     W * 550 nm * r**2 with r = 1 at the rim, so W is the peak-to-valley defocus in waves at 550 nm. The stop passes a
     sample if the centre of the sample lies inside the stop.
 
-    Shapes: height (v, u), index (band,), bands, dirt (v, u) -> Pupil.
+    Shapes: height (v, u), index (band,), bands, stop, dirt (v, u) -> Pupil.
     Units:  height m; defocus waves at 550 nm; aberrations m of path, root mean square, by Noll index.
     Error:  path 1e-7 relative (float32); area of the staircase rim 2 / samples.
     Raises: ValueError where the shapes do not belong together, and for a height in half precision.
     Source: Goodman, Introduction to Fourier Optics, 3rd ed., section 6.4; Noll, J. Opt. Soc. Am. 66, 207 (1976).
     """
-    _shapes(height, index, bands, dirt)
-    grid = stop(height.shape[-1], pitch, diameter, aperture)
+    grid = grid_of(stop)
+    _shapes(height, index, bands, grid, dirt)
     clear = opening(grid, height.dtype, height.device)
     path = _lens_path(grid, defocus, aberrations, height)
     if dirt is not None:
@@ -51,11 +49,10 @@ def pupil(
     if path is None:
         path = torch.zeros_like(height)
     amplitude = clear if dirt is None else clear * dirt.amplitude
-    spacing = torch.tensor(grid.pitch, dtype=torch.float64, device=height.device)
-    return Pupil(clear, amplitude, height, path, index, bands.centres, spacing)
+    return Pupil(clear, amplitude, height, path, index, bands.centres, stop.pitch.to(height.device))
 
 
-def _lens_path(grid: Stop, defocus: float, aberrations: Mapping[int, float], like: Tensor) -> Tensor | None:
+def _lens_path(grid: PupilGrid, defocus: float, aberrations: Mapping[int, float], like: Tensor) -> Tensor | None:
     """Return the path of defocus and aberrations, or None for a lens without either."""
     if not defocus and not any(aberrations.values()):
         return None
@@ -67,26 +64,24 @@ def _lens_path(grid: Stop, defocus: float, aberrations: Mapping[int, float], lik
     return path
 
 
-def _shapes(height: Tensor, index: Tensor, bands: Bands, dirt: Dirt | None) -> None:
+def _shapes(height: Tensor, index: Tensor, bands: Bands, grid: PupilGrid, dirt: Dirt | None) -> None:
     refuse_half(height=height)
-    if height.ndim != 2 or height.shape[0] != height.shape[1]:
-        raise ValueError(f"height is {tuple(height.shape)}: give a square pupil grid, (samples, samples)")
+    refuse_other_grid(height, grid)
     if index.shape != bands.centres.shape:
         raise ValueError(f"index {tuple(index.shape)}, bands {tuple(bands.centres.shape)}: compute both from one step")
     if dirt is not None and dirt.amplitude.shape != height.shape:
         found, wanted = tuple(dirt.amplitude.shape), tuple(height.shape)
-        raise ValueError(f"dirt is {found} and height is {wanted}: give both the same samples")
+        raise ValueError(f"dirt is {found} and height is {wanted}: compute both from one `stop` step")
 
 
 @pupil.check
-def _(result: Pupil, *_: Any, pitch: float, diameter: float, aperture: Aperture, **__: Any) -> list[Check]:
-    used = float(result.pitch) * result.height.shape[-1]
+def _(result: Pupil, height: Tensor, index: Tensor, bands: Bands, stop: Stop, *_: Any, **__: Any) -> list[Check]:
+    samples, pitch, diameter = grid_of(stop)
     passed = _light(result.amplitude) / _light(result.aperture)
     median, share = phase_steps(result)
     text = f"phase step {median:.3f} turn between samples (median), {share:.1%} above half a turn"
-    held = f", {aperture} instead of the requested {diameter * 1e3:#.3g} mm" if used < diameter * (1 - 1e-9) else ""
     return [
-        Check(f"throughput {passed:.4f} of the clear pupil {min(used, diameter) * 1e3:#.3g} mm{held}", passed > 0),
+        Check(f"throughput {passed:.4f} of the clear pupil {min(samples * pitch, diameter) * 1e3:#.3g} mm", passed > 0),
         Check(text if share <= 0.1 else f"{text}: aliased, use a finer pupil pitch", share <= 0.1),
     ]
 
@@ -96,11 +91,11 @@ def _light(amplitude: Tensor) -> float:
 
 
 def phase_steps(pupil: Pupil) -> tuple[float, float]:
-    """Return the phase steps between neighbours inside the stop: median in turns, and share above one half.
+    """Return the median phase step between neighbouring samples, in turns, and the share of steps above half a turn.
 
-    Both numbers are from the band with the largest phase steps. In a large pupil only every k-th row is measured, 512
-    rows or more. A wrapped or split element has steps at its edges by design, so a few large steps mean nothing. Many
-    large steps mean that the samples cannot follow the phase.
+    Both numbers are from the band with the largest phase steps, inside the stop. In a large pupil only every k-th row
+    is measured, 512 rows or more. A wrapped or split mask has steps at its edges by design, so a few large steps mean
+    nothing. Many large steps mean that the samples cannot follow the phase.
     """
     worst = int((pupil.index / pupil.wavelengths).argmax())
     every = max(1, len(pupil.height) // _ROWS)
@@ -117,6 +112,6 @@ def phase_steps(pupil: Pupil) -> tuple[float, float]:
 
 
 def mask_turns(pupil: Pupil, band: int, step: int = 1) -> Tensor:
-    """Return the phase in turns that the height of the mask gives in a band, at every ``step``-th sample: float64."""
+    """Return the phase of the mask in a band, in turns, float64, at every ``step``-th sample."""
     turns: Tensor = pupil.index[band] * pupil.height[::step, ::step].double() / pupil.wavelengths[band]
     return turns

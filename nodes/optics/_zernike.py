@@ -6,23 +6,23 @@ from collections.abc import Mapping
 import torch
 from torch import Tensor
 
-from neusee.nodes.optics._pupil_grid import Stop, axes, inside
+from neusee.nodes.optics._pupil_grid import PupilGrid, axes, inside
 
 _ALL = slice(None)
 
 
 def noll(index: int) -> tuple[int, int]:
-    """Return radial order n and signed azimuthal order m: m > 0 for the cosine, m < 0 for the sine."""
+    """Return the radial order n and the signed azimuthal order m (positive: cosine) of a Noll number."""
     if index < 1:
-        raise ValueError(f"Zernike index {index}: Noll counts from 1 (piston)")
+        raise ValueError(f"Zernike index {index}: Noll numbers begin at 1 (piston)")
     n = (math.isqrt(8 * index - 7) - 1) // 2
-    place = index - n * (n + 1) // 2 - 1
-    m = 2 * ((place + (n + 1) % 2) // 2) + n % 2
+    position = index - n * (n + 1) // 2 - 1
+    m = 2 * ((position + (n + 1) % 2) // 2) + n % 2
     return n, (m if index % 2 == 0 else -m)
 
 
 def _radial(n: int, m: int) -> list[float]:
-    """Return the coefficients of the orthonormal R(n, m)(r) / r**m in rising powers of r squared."""
+    """Return the coefficients of the orthonormal radial polynomial R(n, m)(r) / r**m in rising powers of r squared."""
     low, high, factorial = (n - m) // 2, (n + m) // 2, math.factorial
     norm = math.sqrt((n + 1) * (1 if m == 0 else 2))
     terms = reversed(range(low + 1))
@@ -51,7 +51,7 @@ def _horner(coefficients: list[float], x: Tensor) -> Tensor:
 
 
 def combine(coefficients: Mapping[int, float], v: Tensor, u: Tensor) -> Tensor:
-    """Return the sum of polynomials at (v, u) in units of the radius, each polynomial with its root mean square.
+    """Return the sum of Zernike polynomials at (v, u), in units of the radius, from root mean squares by Noll number.
 
     The sum is written in powers of u + iv, so neither the centre nor the cut of the azimuth needs special treatment.
     Source: Noll, J. Opt. Soc. Am. 66, 207 (1976), Eqs. 1 and 2.
@@ -68,8 +68,8 @@ def combine(coefficients: Mapping[int, float], v: Tensor, u: Tensor) -> Tensor:
 
 
 def surface(
-    coefficients: Mapping[int, float], grid: Stop, device: torch.device | None = None, rows: slice = _ALL
+    coefficients: Mapping[int, float], grid: PupilGrid, device: torch.device | None = None, rows: slice = _ALL
 ) -> Tensor:
-    """Return the sum of polynomials over the stop, float64 (v, u), 0 outside; ``rows`` selects some rows."""
+    """Return the sum of Zernike polynomials over the stop, float64 (v, u), 0 outside; ``rows`` selects some rows."""
     v, u = axes(grid, device)
     return torch.where(inside(grid, device, rows), combine(coefficients, v[rows], u), 0.0)

@@ -23,6 +23,7 @@ import torch
 from safetensors.torch import load_file
 
 from neusee.nodes import doe, losses, metrics
+from neusee.nodes.values import Stop
 from neusee.workflows import load
 from neusee.workflows.store.result_store import Store
 from neusee.workflows.training.mask_design.design_run import MaskTraining, design, mask_figures
@@ -127,17 +128,16 @@ DESIGNS[FOR_A_FILTER] = {
 OWN = {FOR_A_FILTER: ("half_ring", ["doe.waves=[14]"])}  #: the recipe whose own relief it starts from
 
 
-def known(samples: int, pitch: float, diameter: float) -> dict[str, torch.Tensor]:
+def known(stop: Stop) -> dict[str, torch.Tensor]:
     """Reliefs of a formula, fused silica, waves at 550 nm."""
-    grid = {"samples": samples, "pitch": pitch, "diameter": diameter}
     return {
-        "plain": doe.flat(**grid),
-        "vortex, charge 8": doe.vortex(charge=8, **grid),
-        "axicon, 20 waves": doe.axicon(waves=20.0, **grid),
-        "spiral axicon, 20 waves, charge 8": doe.spiral_axicon(waves=20.0, charge=8, **grid),
-        "half-ring, 20 waves": doe.half_rings(waves=(20.0,), **grid),
-        "five half-rings, (12, 18, 24, 30, 36)": doe.half_rings(waves=(12.0, 18.0, 24.0, 30.0, 36.0), **grid),
-        "five half-rings, (16, 28, 40, 52, 64)": doe.half_rings(waves=(16.0, 28.0, 40.0, 52.0, 64.0), **grid),
+        "plain": doe.flat(stop),
+        "vortex, charge 8": doe.vortex(stop, charge=8),
+        "axicon, 20 waves": doe.axicon(stop, waves=20.0),
+        "spiral axicon, 20 waves, charge 8": doe.spiral_axicon(stop, waves=20.0, charge=8),
+        "half-ring, 20 waves": doe.half_rings(stop, waves=(20.0,)),
+        "five half-rings, (12, 18, 24, 30, 36)": doe.half_rings(stop, waves=(12.0, 18.0, 24.0, 30.0, 36.0)),
+        "five half-rings, (16, 28, 40, 52, 64)": doe.half_rings(stop, waves=(16.0, 28.0, 40.0, 52.0, 64.0)),
     }
 
 
@@ -165,7 +165,7 @@ def one(name: str, folder: Path) -> None:
 def formulas(folder: Path) -> None:
     """Judge the masks of a formula."""
     terms = Terms(load("first_light"), MaskTraining(), Store(folder / "cache"))
-    for name, height in known(*terms.stop).items():
+    for name, height in known(terms.stop).items():
         (folder / f"{name}.json").write_text(json.dumps(mask_figures(terms, height) | {"seconds": 0.0}))
 
 
@@ -173,9 +173,9 @@ def filtered(folder: Path) -> None:
     """What a Wiener filter leaves wrong of a picture seen at an eighth: by noise alone, and by colour too."""
     how = MaskTraining.model_validate(DESIGNS[FOR_A_FILTER] | {"weights": {"wiener": 1.0}})
     terms = Terms(load("half_ring"), how, Store(folder / "cache"))
-    masks = {f"half-ring, {waves} waves": doe.half_rings(waves=(waves,), **grid(terms)) for waves in HALF_RINGS}
+    masks = {f"half-ring, {waves} waves": doe.half_rings(terms.stop, waves=(waves,)) for waves in HALF_RINGS}
     made = folder / "runs" / read(folder, FOR_A_FILTER)["folder"] / "mask.safetensors"
-    masks |= {"five half-rings, (12, 18, 24, 30, 36)": doe.half_rings(waves=FIVE, **grid(terms))}
+    masks |= {"five half-rings, (12, 18, 24, 30, 36)": doe.half_rings(terms.stop, waves=FIVE)}
     masks |= {FOR_A_FILTER: load_file(made)["height"]}
     print("| mask | mean LSR | contrast to 0.0625 | wrong by noise | and by colour |")
     print("|---|---|---|---|---|")
@@ -186,11 +186,6 @@ def filtered(folder: Path) -> None:
             wrong = [math.exp(float(Terms.parts(_as(terms, colour), height)["wiener"])) for colour in (0.0, 1.0)]
         cells = [f"{float(metrics.lsr(psf).mean()):.3g}", f"{kept:.3g}", *(f"{x:.2e}" for x in wrong)]
         print(f"| {name} | {' | '.join(cells)} |")
-
-
-def grid(terms: Terms) -> dict[str, Any]:
-    """The pupil's grid, as masks of a formula take it."""
-    return {"samples": terms.stop.samples, "pitch": terms.stop.pitch, "diameter": terms.stop.diameter}
 
 
 def _as(terms: Terms, colour: float) -> Terms:

@@ -13,8 +13,8 @@ import torch
 from neusee.nodes import doe, optics
 from neusee.nodes.values import Bands
 
-GRID = {"samples": 2160, "pitch": 3.74e-6, "diameter": 11e-3}
-LENS = {"pitch": 3.74e-6, "diameter": 11e-3}
+STOP = optics.stop(samples=2160, pitch=3.74e-6, diameter=11e-3)
+SMALL = optics.stop(samples=32, pitch=1e-5, diameter=3.2e-4)
 CAMERA = {"focal_length": 0.11, "pixel_pitch": 2.9e-6}
 AREA = math.pi * (2160 * 3.74e-6) ** 2 / 4  #: m2, of the pupil
 slow = pytest.mark.slow
@@ -23,7 +23,7 @@ slow = pytest.mark.slow
 def psf(height, wavelength, window=1024):
     centre = torch.tensor([wavelength], dtype=torch.float64)
     bands = Bands(centre, torch.full_like(centre, 1e-9), torch.ones_like(centre))
-    pupil = optics.pupil(height, doe.material(bands), bands, **LENS)
+    pupil = optics.pupil(height, doe.material(bands), bands, STOP)
     return optics.psf(pupil, **CAMERA, shape=(window, window))
 
 
@@ -51,12 +51,12 @@ MASKS = [
 
 @pytest.mark.parametrize(("mask", "params", "wanted"), MASKS)
 def test_mask_suppresses_as_computed_elsewhere(mask, params, wanted):
-    assert lsr(mask(**params, **GRID)) == pytest.approx(wanted, rel=0.03)
+    assert lsr(mask(STOP, **params)) == pytest.approx(wanted, rel=0.03)
 
 
 @functools.cache
 def five_half_rings():
-    return doe.half_rings(waves=(12.0, 18.0, 24.0, 30.0, 36.0), **GRID)
+    return doe.half_rings(STOP, waves=(12.0, 18.0, 24.0, 30.0, 36.0))
 
 
 @pytest.mark.parametrize(
@@ -98,7 +98,7 @@ def random_relief(seed):
     rng = torch.Generator().manual_seed(seed)
     draw = torch.rand(2, generator=rng)
     depth, scale = 10 ** float(-8 + 3 * draw[0]), 10 ** float(-1.7 + 1.7 * draw[1])
-    return doe.pixelwise(samples=32, pitch=1e-5, diameter=3.2e-4, depth=depth, scale=scale, rng=rng)
+    return doe.pixelwise(SMALL, depth=depth, scale=scale, rng=rng)
 
 
 def test_two_hundred_masks_obey_the_floor_and_the_parseval_bound():
@@ -111,7 +111,7 @@ def test_two_hundred_masks_obey_the_floor_and_the_parseval_bound():
     for seed in range(200):
         centre = torch.tensor([550e-9], dtype=torch.float64)
         bands = Bands(centre, centre, centre)
-        pupil = optics.pupil(random_relief(seed).double(), doe.material(bands), bands, pitch=1e-5, diameter=3.2e-4)
+        pupil = optics.pupil(random_relief(seed).double(), doe.material(bands), bands, SMALL)
         phase = 2 * math.pi / 550e-9 * float(pupil.index) * pupil.height
         light = torch.fft.fft2(torch.polar(pupil.amplitude, phase), s=(size, size)).abs().square()
         spread = light / light.sum()

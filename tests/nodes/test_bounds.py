@@ -132,9 +132,10 @@ SENSOR = {"full_well": 25500.0, "quantum_efficiency": 0.56, "pixel_pitch": 2.9e-
 
 def shining(draw):
     line, samples = laser(draw), int(draw.uniform(1, 25))
-    lens = {"pitch": draw.decades(2e-5, 4e-4), "diameter": 1.0, "aperture": draw.one_of("inscribed", "clipped")}
+    pitch, aperture = draw.decades(2e-5, 4e-4), draw.one_of("inscribed", "clipped")
+    stop = optics.stop(samples=samples, pitch=pitch, diameter=1.0, aperture=aperture)
     height = relief(draw, samples)
-    pupil = optics.pupil(height, spectra_index(line), line, **lens)
+    pupil = optics.pupil(height, spectra_index(line), line, stop)
     camera = {"focal_length": 0.1, "pixel_pitch": draw.decades(1e-6, 3e-5), "shape": (8, 8), "pixel": "zoh"}
     psf = optics.psf(pupil, **camera, sensor=draw.one_of("point", "integrated"))
     power = {"strength": draw.often(0.0, draw.decades(1e-9, 1e8)), **SENSOR, "exposure": draw.decades(1e-6, 1e3)}
@@ -176,11 +177,11 @@ def soiling(draw):
     marks = {"dust": draw.one_of(0.0, 0.0, draw.decades(0.1, 10)), "scratches": draw.one_of(0.0, 0.0, 3.0)}
     film = {"grease": draw.one_of(0.0, draw.decades(1e-9, 1.0)), "grease_scale": draw.uniform(0.02, 1)}
     soft = {"smudges": draw.one_of(0.0, draw.decades(1e-9, 1.0)), "dents": draw.one_of(0.0, draw.decades(1e-9, 1.0))}
-    grid = {"samples": int(draw.uniform(8, 33)), "pitch": 1e-4, "diameter": 3e-3}
-    dirt = flare.dirt(**grid, **marks, **film, **soft, rng=draw.rng)
+    stop = optics.stop(samples=int(draw.uniform(8, 33)), pitch=1e-4, diameter=3e-3)
+    dirt = flare.dirt(stop, **marks, **film, **soft, rng=draw.rng)
     turns = dirt.path.double() / draw.uniform(400e-9, 700e-9)
     field = torch.polar(dirt.amplitude.double(), 2 * torch.pi * turns)
-    return flare.dirt.hooks.zero_bound(**grid, **marks, **film, **soft), float((field - 1).abs().max())
+    return flare.dirt.hooks.zero_bound(Unread(), **marks, **film, **soft), float((field - 1).abs().max())
 
 
 LARGEST = {"spot": shining, "ghosts": reflecting, "expose": counting, "dirt": soiling}
@@ -249,7 +250,7 @@ def test_the_moments_are_those_that_the_node_draws(mean):
 
 def test_a_clean_window_is_exactly_nothing_and_a_grain_may_be_all():
     clean = dict.fromkeys(("dust", "scratches", "grease", "smudges", "dents"), 0.0)
-    assert flare.dirt.hooks.zero_bound(**clean) == 0.0
-    assert flare.dirt.hooks.zero_bound(**clean | {"dust": 1.0}) >= 1.0
-    dirt = flare.dirt(samples=16, pitch=1e-4, diameter=1e-3, rng=torch.Generator(), **clean)
+    assert flare.dirt.hooks.zero_bound(Unread(), **clean) == 0.0
+    assert flare.dirt.hooks.zero_bound(Unread(), **clean | {"dust": 1.0}) >= 1.0
+    dirt = flare.dirt(optics.stop(samples=16, pitch=1e-4, diameter=1e-3), rng=torch.Generator(), **clean)
     assert bool((dirt.amplitude == 1).all() and (dirt.path == 0).all())

@@ -8,7 +8,7 @@ from typing import Any
 import torch
 from safetensors.torch import save_file
 
-from neusee.nodes import calibrate, doe, spectra
+from neusee.nodes import calibrate, doe, optics, spectra
 from neusee.nodes.restore._networks._fft_mamba import FFTMamba
 from neusee.nodes.restore._networks._nafnet import NAFNet
 from neusee.nodes.restore._networks._restorer import start_network
@@ -55,7 +55,7 @@ CHANNELS = Channels(rand(3, 12, 12), rand(3, 4), rand(4), torch.tensor(0.0, dtyp
 LEVEL = 1e3 * rand(4)
 DIRECTION = torch.tensor([1e-4, -2e-4], dtype=torch.float64)
 
-GRID = {"samples": 16, "pitch": 5e-4, "diameter": 8e-3}
+STOP = optics.stop(samples=16, pitch=5e-4, diameter=8e-3)
 LENS = {"focal_length": 0.11, "pixel_pitch": 2.9e-6}
 WELL = {"full_well": 25500.0, "quantum_efficiency": 0.56, "pixel_pitch": 2.9e-6, "exposure": 0.1}
 SHUTTER = {"pixel_pitch": 2.9e-6, "exposure": 0.1}
@@ -119,15 +119,15 @@ CASES = {
     "calibrate.levels": Case("0.0.mean", (EACH,)),
     "calibrate.reduce": Case("0", (FRAMES,), {"photons": 500.0, "exposure": 0.1}),
     "calibrate.sufficient": Case("0.mean", (LEVELS,)),
-    "doe.axicon": Case("waves", (), {"waves": number(2.0), **GRID}),
-    "doe.cubic": Case("waves", (), {"waves": number(2.0), **GRID}),
+    "doe.axicon": Case("waves", (STOP,), {"waves": number(2.0)}),
+    "doe.cubic": Case("waves", (STOP,), {"waves": number(2.0)}),
     "doe.fabricate": Case("0", (HEIGHT,), {"wrap_at": 550e-9, "levels": 4}),
-    "doe.half_rings": Case("waves.0", (), {"waves": [number(2.0), number(1.0)], **GRID}),
+    "doe.half_rings": Case("waves.0", (STOP,), {"waves": [number(2.0), number(1.0)]}),
     "doe.material": Case("0.centres", (BANDS,)),
-    "doe.smooth": Case("0", (HEIGHT,), {"feature": 1e-3, **GRID}),
-    "doe.spiral_axicon": Case("waves", (), {"waves": number(2.0), "charge": 1, **GRID}),
-    "doe.zernike": Case("coefficients.4", (), {"coefficients": {4: number(0.3), 6: number(0.1)}, **GRID}),
-    "flare.dirt": Case("grease", (), {"grease": number(1e-7), "dust": 3.0, **GRID}),
+    "doe.smooth": Case("0", (HEIGHT, STOP), {"feature": 1e-3}),
+    "doe.spiral_axicon": Case("waves", (STOP,), {"waves": number(2.0), "charge": 1}),
+    "doe.zernike": Case("coefficients.4", (STOP,), {"coefficients": {4: number(0.3), 6: number(0.1)}}),
+    "flare.dirt": Case("grease", (STOP,), {"grease": number(1e-7), "dust": 3.0}),
     "flare.ghosts": Case("0", (rand(3, 12, 12), LINE, DIRECTION), {**LENS, "count": 3, "radius": 3e-5}),
     "losses.background_loss": Case("0", (SCENE, PLAIN)),
     "losses.charbonnier": Case("0", (PICTURE, OTHER)),
@@ -149,7 +149,7 @@ CASES = {
     "optics.image": Case("1.intensity", (SCENE, PSF)),
     "optics.image_channels": Case("1.intensity", (LOW_RANK, PSF, ROWS)),
     "optics.psf": Case("0.height", (PUPIL,), {**LENS, "shape": (9, 9)}),
-    "optics.pupil": Case("0", (HEIGHT, INDEX, BANDS, DIRT), {"pitch": 5e-4, "diameter": 8e-3}),
+    "optics.pupil": Case("0", (HEIGHT, INDEX, BANDS, STOP, DIRT)),
     "optics.laser_irradiance": Case("0.intensity", (Psf(rand(3, 9, 9), rand(3)), LINE), {"strength": 10.0, **WELL}),
     "restore.clipped": Case("0", (RAW,), ADC),
     "restore.colour": Case("0", (PICTURE, rand(3, 3))),
@@ -212,10 +212,11 @@ NOTHING_TO_FOLLOW = {
     "calibrate.frames": "reads files",
     "calibrate.prior": "states the prior that a recipe writes",
     "calibrate.table": "reads a file",
-    "doe.flat": "has no parameter but its grid",
-    "doe.pixelwise": "reads a file, or draws heights that are to be learnt",
-    "doe.unet": "draws a network that is to be learnt",
+    "doe.flat": "is 0 on every grid",
+    "doe.pixelwise": "reads a file, or draws heights that are to be trained",
+    "doe.unet": "draws a network that is to be trained",
     "doe.vortex": "has a whole charge alone",
+    "optics.stop": "states the pupil grid, which other nodes read as plain numbers",
     "scene.exr": "reads a file",
     "scene.hyperspectral": "reads a file",
     "scene.photograph": "reads a file",

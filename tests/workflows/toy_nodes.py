@@ -8,6 +8,7 @@ from torch import Tensor
 
 from neusee.nodes import ParameterError, node
 from neusee.nodes.units import Count, DataFile, Electrons, Fraction, Length, PositiveLength, Real, Shape, Wavelength
+from neusee.nodes.values import Stop
 
 
 class Lens(NamedTuple):
@@ -36,6 +37,12 @@ def _(*, pitch: float, diameter: float) -> list[str]:
     if pitch > 1e-3:
         raise ValueError("one sample is wider than the aperture")
     return ["aperture 11.0 mm > pupil grid 8.08 mm: clipped"] if diameter > 10e-3 else []
+
+
+@node()
+def stop_of(height: Tensor) -> Stop:
+    """Give the grid of a height map, which is known only during the run."""
+    return Stop(torch.tensor(len(height)), torch.tensor(1e-5).double(), torch.tensor(1e-3).double())
 
 
 @node()

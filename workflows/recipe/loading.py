@@ -110,6 +110,7 @@ def _bind(
     known: Mapping[str, Mapping[str, Wire]],
 ) -> Iterator[Step]:
     """Yield every copy of every step that can be bound; ``known`` are wires that were checked before."""
+    checked: list[tuple[Step, Value, Value]] = []
     for step in steps.values():
         if not step.items:
             for part in ("from", "with", "device"):
@@ -123,10 +124,22 @@ def _bind(
             if step.node is None:
                 continue
             params = checker.read(step.node, given, step.value.key)
-            if params is not None:
-                checker.preflight(step.node, params, given.items, step.value)
             marks = {str(name): value.mark for name, value in given.items.items()}
-            yield Step(name, step.node, params or {}, wires, step.value.key, marks, device)
+            found = Step(name, step.node, params or {}, wires, step.value.key, marks, device)
+            if params is not None:
+                checked.append((found, given, step.value))
+            yield found
+    early = {found.name: _value_before_run(found) for found, *_ in checked if found.node.before_run}
+    for found, given, value in checked:
+        checker.preflight(found, early, given.items, value)
+
+
+def _value_before_run(step: Step) -> Any:
+    """Return the result of a step without inputs, or None for parameters that the step's own preflight reports."""
+    try:
+        return step.node(**step.params)
+    except ValueError:
+        return None
 
 
 def _config(

@@ -15,6 +15,7 @@ from pydantic_core import ErrorDetails
 from neusee.nodes import Node, ParameterError
 from neusee.nodes.units import IsFile
 from neusee.workflows.graph.diagnostics import Diagnostic, Location, nearest
+from neusee.workflows.graph.recipe_graph import Step
 from neusee.workflows.recipe.text.references import broken
 from neusee.workflows.recipe.text.renamed_keys import instead, new_name
 from neusee.workflows.recipe.text.yaml_values import Value, kind
@@ -48,12 +49,13 @@ class Checker:
             return None
         return {name: getattr(model, name) for name in node.params.model_fields}
 
-    def preflight(self, node: Node, params: Mapping[str, Any], values: Mapping[str, Value], step: Value) -> None:
-        """Call the node's own check of its parameters before the run."""
+    def preflight(self, bound: Step, early: Mapping[str, Any], values: Mapping[str, Value], step: Value) -> None:
+        """Call the node's own check before the run; ``early`` holds the results, by step, that are known already."""
+        node, inputs = bound.node, {name: early.get(str(bound.wires.get(name))) for name in bound.node.preflight_inputs}
         if node.hooks.preflight is None:
             return
         try:
-            self.notes.update(dict.fromkeys(node.hooks.preflight(**params)))
+            self.notes.update(dict.fromkeys(node.hooks.preflight(**bound.params, **inputs)))
         except ParameterError as error:
             value = values.get(error.parameter)
             if value is None:
@@ -89,17 +91,20 @@ def _problems(
     meant = {nearest(name, node.params.model_fields) for name in strangers}
     now = {new_name(f"{node.path}.{name}") for name in strangers}
     wrong: dict[tuple[Location, str], list[str]] = {}
+    gone: dict[str, Diagnostic] = {}
     for e in details:
         name = str(e["loc"][0])
         if e["type"] == "extra_forbidden":
             unknown = f"unknown to {node.path}; {nearest(name, node.params.model_fields)}"
-            yield Diagnostic(values[name].key, f"{given.name}.{name}", instead(f"{node.path}.{name}") or unknown)
+            message = instead(f"{node.path}.{name}") or unknown
+            gone.setdefault(message, Diagnostic(values[name].key, f"{given.name}.{name}", message))
         elif e["type"] == "missing" and len(e["loc"]) == 1:
             if f"did you mean {name}?" not in meant and name not in now:
                 yield Diagnostic(step, f"{given.name}.{name}", f"is missing: {node.path} needs this parameter")
         else:
             value = _deepest(values[name], e["loc"][1:])
             wrong.setdefault((value.mark, _said(value)), []).append(_message(e) + _in_si(e, value))
+    yield from gone.values()  # parameters that moved to the same place need one message
     for (mark, path), messages in wrong.items():
         yield Diagnostic(mark, path, ", or ".join(dict.fromkeys(messages)))
 

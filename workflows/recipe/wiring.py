@@ -14,7 +14,7 @@ from neusee.workflows.graph.diagnostics import Diagnostic, Location, nearest
 from neusee.workflows.graph.recipe_graph import Step, Wire
 from neusee.workflows.recipe.step_declarations import Declared
 from neusee.workflows.recipe.text.references import BROKEN, References
-from neusee.workflows.recipe.text.renamed_keys import new_name
+from neusee.workflows.recipe.text.renamed_keys import became_input, new_name
 from neusee.workflows.recipe.text.yaml_values import Value, kind
 
 _NAMED = 12  #: steps of a cycle that a message names
@@ -73,8 +73,8 @@ class Wiring:
 
     def _unwired(self, step: Declared, node: Node, name: str, given: Value) -> Wire:
         """Return the wire of an input that ``from`` does not name, and report a required one."""
-        if name in node.optional:
-            return None
+        if name in node.optional or (name == "stop" and became_input(node.path, map(str, step.part("with").items))):
+            return None  # the parameters of an old recipe are reported with the step that replaces them
         if not (isinstance(given.data, dict) and _misspelt(name, node, given)):
             mark = given.mark if given.items else step.value.key
             fix = f"write from: {{{name}: STEP}}{self._makers(needs(node, name))}"

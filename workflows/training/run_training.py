@@ -14,7 +14,7 @@ from neusee.nodes.scene import Photographs
 from neusee.workflows.graph.recipe_graph import Recipe
 from neusee.workflows.keys.cache_key import digest
 from neusee.workflows.recipe.blocks.mask_design_block import MaskSettings
-from neusee.workflows.recipe.blocks.train_block import GRID, KEY, Stage, Training
+from neusee.workflows.recipe.blocks.train_block import KEY, Stage, Training
 from neusee.workflows.store.result_store import Store
 from neusee.workflows.training.loop.checkpoint import export, weights_of
 from neusee.workflows.training.loop.resumable_loop import Losses, Progress, ResumableLoop, Watch
@@ -231,6 +231,6 @@ def frozen(recipe: Recipe, settings: Training, folder: Path) -> Recipe:
     if not file.is_file():
         raise ValueError(f"{file} is not there: --stage 1 or mask makes it")
     step = recipe.steps[settings.learn]
-    grid = {name: step.params[name] for name in GRID}
-    params = {**grid, "file": file, "depth": 1e-6, "scale": 0.1}
-    return replace(recipe, steps={**recipe.steps, settings.learn: replace(step, node=doe.pixelwise, params=params)})
+    params, wires = {"file": file, "depth": 1e-6, "scale": 0.1}, {"stop": step.wires["stop"]}
+    learnt = replace(step, node=doe.pixelwise, params=params, wires=wires)
+    return replace(recipe, steps={**recipe.steps, settings.learn: learnt})

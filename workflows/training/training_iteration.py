@@ -13,7 +13,6 @@ from torch.utils.checkpoint import checkpoint
 from neusee.nodes import losses, metrics
 from neusee.nodes.bicubic_resize import resize
 from neusee.nodes.doe import PARAMETRISATIONS
-from neusee.nodes.optics import stop
 from neusee.nodes.restore import (
     FFTMamba,
     NAFNet,
@@ -25,11 +24,12 @@ from neusee.nodes.restore import (
     skip_critic_draws,
     start_network,
 )
-from neusee.nodes.values import Psf
+from neusee.nodes.values import Psf, Stop
+from neusee.workflows.engine.node_call import call
 from neusee.workflows.graph.diagnostics import nearest
-from neusee.workflows.graph.recipe_graph import Recipe, Step
+from neusee.workflows.graph.recipe_graph import Recipe
 from neusee.workflows.keys.cache_key import device_kind, stream_seed
-from neusee.workflows.recipe.blocks.train_block import GRID, Network, Stage, Training
+from neusee.workflows.recipe.blocks.train_block import Network, Stage, Training
 from neusee.workflows.training.loop.resumable_loop import STEEPEST, Losses, averaged, require_finite
 from neusee.workflows.training.parallel.process_mesh import ALONE, Mesh
 from neusee.workflows.training.parallel.shared_graph import Shared
@@ -61,28 +61,31 @@ class Learner:
         self, recipe: Recipe, settings: Training, device: str, designed: bool = False, mesh: Mesh = ALONE
     ) -> None:
         self.settings, self.seed, self.device, self.mesh = settings, recipe.seed, device, mesh
-        self._step = recipe.steps[settings.learn] if settings.learn else None
-        self.mask = nn.Module() if designed or self._step is None else self._start(self._step).to(settings.dtype)
+        self._stop: Stop | None = None
+        self.mask = nn.Module() if designed or not settings.learn else self._start(recipe, settings.learn)
         net = start_network(lambda: _network_of(settings.network), self._rng("network"))
         self.net: Restorer = net.to(settings.dtype)
         self.critics = nn.ModuleList(critics(self._rng("critics"), settings.critics.width)).to(settings.dtype)
         self.average = averaged(self.net, settings.average)
         self.begin(Stage(iterations=0), learns=True)
 
-    def _start(self, step: Step) -> nn.Module:
+    def _start(self, recipe: Recipe, learn: str) -> nn.Module:
         """Return the parameters of the mask that learns."""
+        step = recipe.steps[learn]
         path = step.node.path
         if path not in PARAMETRISATIONS:
-            text = f"{self.settings.learn} is {path}, of which nothing is learnt; {nearest(path, PARAMETRISATIONS)}"
+            text = f"{learn} is {path}, of which nothing is learnt; {nearest(path, PARAMETRISATIONS)}"
             raise ValueError(f"train: {text}; or design it without images: --stage mask")
-        return PARAMETRISATIONS[path](step.params, self._rng("element"))
+        stop = recipe.steps[str(step.wires["stop"])]
+        self._stop = call(stop, [], stop.params, recipe.seed, "cpu")
+        return PARAMETRISATIONS[path](self._stop, step.params, self._rng("element")).to(self.settings.dtype)
 
     def height(self) -> Tensor:
         """Return the height map (v, u) in m; raise ValueError where no mask learns."""
-        if self._step is None:
+        if self._stop is None:
             raise ValueError("train.learn: no mask learns")
-        made: Tensor = self.mask(stop(*(self._step.params[name] for name in GRID)))
-        return made
+        height: Tensor = self.mask(self._stop)
+        return height
 
     def _rng(self, *names: object) -> torch.Generator:
         return torch.Generator(self.device).manual_seed(stream_seed(self.seed, " ".join(map(str, ("train", *names)))))

@@ -1,4 +1,4 @@
-"""The image of a scene summed over its bands before the convolution: few planes in, few planes out."""
+"""The image of a scene summed over bands before the convolution: few planes in, few planes out."""
 
 import math
 from typing import Annotated, Any
@@ -63,15 +63,7 @@ def image_channels(
 
 
 @image_channels.reference
-def _(
-    radiance: LowRankCube,
-    psf: Psf,
-    rows: Tensor,
-    *,
-    border: Border = "zero",
-    within: float = 0.0,
-    largest: bool = False,
-) -> Channels:
+def _(radiance: LowRankCube, psf: Psf, rows: Tensor, *, border: Border = "zero", **_: Any) -> Channels:
     assert image.hooks.reference is not None
     cube = torch.tensordot(radiance.basis.double(), radiance.planes.double(), 1)
     bands = image.hooks.reference(cube, psf, border=border)
@@ -95,7 +87,7 @@ def _(result: Channels, *inputs: Any, within: float = 0.0, **params: Any) -> lis
 
 
 def _fitted(radiance: LowRankCube, psf: Psf, rows: Tensor) -> tuple[Tensor, Tensor]:
-    """Return the planes, and the part of the PSF that reaches the scene, in one precision."""
+    """Return the planes and the part of the PSF that reaches the scene, both in the same precision."""
     bands = {len(radiance.basis), len(psf.intensity), rows.shape[-1]}
     if len(bands) > 1 or radiance.planes.ndim != 3 or psf.intensity.ndim != 3 or rows.ndim != 2:
         raise ValueError(
@@ -132,7 +124,7 @@ def _given(radiance: LowRankCube, planes: Tensor, intensity: Tensor, rows: Tenso
 
 
 def _formed(planes: Tensor, intensity: Tensor, given: Given, within: float) -> tuple[Tensor, Tensor, Tensor]:
-    """Return rows of the image, their error bound and the sizes of the first plan that satisfies ``within``."""
+    """Return the planes of the image, their error bound and the sizes of the first plan that satisfies ``within``."""
     eps = torch.finfo(planes.dtype).eps
     brightest, allowed = given.rows.new_zeros(len(given.rows)), within / (1 + within) - 16 * eps
     if within > 0:
@@ -171,7 +163,7 @@ def _top(result: Tensor, radiance: LowRankCube, intensity: Tensor, given: Given)
 
 
 def _share(off: Tensor, found: Tensor) -> float:
-    """Return the largest ratio, over the rows, of ``off`` to the true brightest pixel, at least ``found - off``."""
+    """Return the largest ratio of the error ``off`` to the true brightest pixel, which is at least ``found - off``."""
     share = torch.where(off > 0, torch.where(off < found, off / (found - off), math.inf), 0.0)
     worst = float(share.amax()) if bool(torch.isfinite(off + found).all()) else math.inf
     return worst

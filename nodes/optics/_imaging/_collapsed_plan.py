@@ -7,9 +7,9 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
-from neusee.nodes.optics._imaging._band_image import smooth
 from neusee.nodes.optics._imaging._psf_energy import Passed, by_window
 from neusee.nodes.optics._imaging._summed_convolution import Mix
+from neusee.nodes.optics._transform._chirp_transform import smooth
 
 _SMALL = 0.05  #: share of the error bound that is spent on omitting weak bands
 _FARTHER = 6  #: numbers of planes that are tried, from the least sufficient number on
@@ -31,7 +31,7 @@ class Given(NamedTuple):
 
 
 class Plan(NamedTuple):
-    """The planes, kernels, bands and window of one way to convolve, with its error bound and cost."""
+    """A way to convolve: numbers of planes, kernels and bands, a PSF window, the error bound and the cost."""
 
     planes: int
     bands: Tensor  #: indices of the bands that are not omitted
@@ -50,7 +50,7 @@ class Plan(NamedTuple):
 
 
 class Fewer(NamedTuple):
-    """Kernels in order of the light that they contribute, and the weights that mix the first few into all others."""
+    """Kernels in order of the light that they contribute, and weights that mix the first kernels into the others."""
 
     kernels: Tensor  #: (q, band)
     mixed: Tensor  #: (row x plane, q)
@@ -58,7 +58,7 @@ class Fewer(NamedTuple):
 
 
 def with_windows(given: Given, intensity: Tensor, brightest: Tensor, within: float) -> Given:
-    """Add the losses of smaller PSF windows, unless a sample of the bands already shows that each loses too much."""
+    """Return the properties with the losses of smaller PSF windows, unless some bands show that each loses too much."""
     few, signed = slice(_EVERY // 2, None, _EVERY), given.passed.signed
     if len(intensity) > _EVERY:
         some = given._replace(rows=given.rows[:, few], basis=given.basis[few], rest=given.rest[:, few])
@@ -103,7 +103,7 @@ def _strong(given: Given, brightest: Tensor, within: float) -> tuple[Tensor, Ten
 
 
 def _enough(given: Given, bands: Tensor, lost: Tensor, brightest: Tensor, within: float) -> list[int]:
-    """Return the numbers of planes that can satisfy ``within``, the smallest numbers first."""
+    """Return the smallest numbers of planes whose omitted light is at most ``within`` of each row."""
     off = lost + (given.rest[:, bands] * given.passed.total[bands]) @ given.rows[:, bands].abs().T
     fits = [k for k in range(1, len(given.most) + 1) if bool((off[k] <= within * brightest).all())]
     return fits[:_FARTHER]
@@ -112,7 +112,7 @@ def _enough(given: Given, bands: Tensor, lost: Tensor, brightest: Tensor, within
 def _plans(
     given: Given, bands: Tensor, lost: Tensor, k: int, j: int, within: tuple[Tensor, Fewer] | None = None
 ) -> Iterator[Plan]:
-    """Yield plans for k planes in a window.
+    """Yield up to three plans with the first ``k`` planes and the window number ``j``.
 
     The kernels of the three plans are one for each plane and row, one for each band, and fewer kernels to mix.
     """
@@ -138,7 +138,7 @@ def _plans(
 
 
 def _fewer(given: Given, bands: Tensor, k: int, brightest: Tensor) -> Fewer:
-    """Return singular vectors of the wanted sums, weighted by the light that each plane and each band contributes."""
+    """Return the singular vectors of the sums over bands, weighted by the light of each plane and each band."""
     rows, band = given.rows[:, bands], given.passed.total[bands]
     plane = torch.where(brightest[:, None] > 0, given.most[:k] / brightest[:, None], 0.0).flatten()
     scaled = plane[:, None] * _sums(rows, given.basis[bands, :k]) * band
@@ -151,12 +151,15 @@ def _fewer(given: Given, bands: Tensor, k: int, brightest: Tensor) -> Fewer:
 
 
 def _sums(rows: Tensor, basis: Tensor) -> Tensor:
-    """Return the weights of the bands in the kernel of each row and plane."""
+    """Return the weights of the bands in the kernel of each row and each plane."""
     return (rows[:, None, :] * basis.T).flatten(0, 1)
 
 
 def _tail(given: Given, bands: Tensor, k: int, j: int) -> Tensor:
-    """Bound, by band, the light that the PSF outside the window adds to a pixel: Young's inequality in three norms."""
+    """Return a bound, for each band, of the light that the PSF outside the window adds to a pixel.
+
+    The bound is Young's inequality in three norms.
+    """
     basis = given.basis[bands, :k]
     beyond, above = given.passed.beyond[j, bands], given.passed.above[j, bands]
     top = given.rest[0, bands] + given.rest[k, bands]
@@ -165,7 +168,7 @@ def _tail(given: Given, bands: Tensor, k: int, j: int) -> Tensor:
 
 
 def _cost(given: Given, window: tuple[int, int], k: int, bands: int, kernels: Tensor | None, mix: Mix) -> float:
-    """Return estimated seconds for transforms, products of spectra and sums of kernels, fitted on two cores."""
+    """Return the estimated seconds of a plan: transforms, products of spectra, sums of kernels; fitted on two cores."""
     area = math.prod(transform(given, window))
     count = bands if kernels is None else len(kernels)
     terms = len(mix.x) if mix.x is not None else k
@@ -175,7 +178,7 @@ def _cost(given: Given, window: tuple[int, int], k: int, bands: int, kernels: Te
 
 
 def transform(given: Given, window: tuple[int, int]) -> tuple[int, int]:
-    """Return the shortest lengths of the transform from which nothing wraps into the field."""
+    """Return the shortest lengths of a transform without wrap-around in the image."""
     if given.reflect:
         y, x = (smooth(s + w - 1) for s, w in zip(given.size, window, strict=True))
     else:

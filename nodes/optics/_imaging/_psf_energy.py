@@ -1,4 +1,4 @@
-"""The light of a stack of PSFs inside and outside of windows about its centre."""
+"""The light of PSFs inside and outside of windows about their centre."""
 
 from itertools import pairwise
 from typing import NamedTuple
@@ -11,9 +11,9 @@ _ROUNDED = 4e-6  #: relative round-off of a float32 sum: a few nested sums of a 
 
 
 class Passed(NamedTuple):
-    """Sums and maxima of a stack of PSFs by window (the largest first) and band; on the CPU, float64."""
+    """Sums and maxima of the PSFs of all bands inside and outside of windows; on the CPU, float64."""
 
-    windows: list[tuple[int, int]]
+    windows: list[tuple[int, int]]  #: the largest first
     total: Tensor  #: (band,) sum of |PSF|
     peak: Tensor  #: (band,) maximum of |PSF|
     beyond: Tensor  #: (window, band) sum of |PSF| outside the window
@@ -22,7 +22,7 @@ class Passed(NamedTuple):
 
 
 def passed(intensity: Tensor) -> Passed:
-    """Measure (band, y, x) with the whole PSF as the only window."""
+    """Return the sums and maxima of PSFs (band, y, x), with the whole PSF as the only window."""
     ends = [torch.aminmax(band) for band in intensity]  # a maximum over several dimensions takes three times as long
     low, high = (torch.stack(found).double().cpu() for found in zip(*ends, strict=True))
     signed = not bool((low >= 0).all())  # True for NaN too
@@ -34,7 +34,10 @@ def passed(intensity: Tensor) -> Passed:
 
 
 def by_window(intensity: Tensor, signed: bool) -> Passed:
-    """Measure (band, y, x) by nested windows, whose edges cut the PSF into pieces; each piece is read once."""
+    """Return the sums and maxima of PSFs (band, y, x) for nested windows.
+
+    The edges of the windows cut each PSF into pieces, and each piece is read once.
+    """
     m, n = intensity.shape[1:]
     windows = list(dict.fromkeys((max(1, round(m * f)), max(1, round(n * f))) for f in _LADDER))
     tall, wide = ([_inside(whole, w[axis]) for w in windows] for axis, whole in enumerate((m, n)))
@@ -48,7 +51,7 @@ def by_window(intensity: Tensor, signed: bool) -> Passed:
 
 
 def centred(stack: Tensor, window: tuple[int, int]) -> Tensor:
-    """Return the samples of a window about the centre, sample n // 2, which is also the centre of the window."""
+    """Return the samples of each PSF in a window about the central sample n // 2."""
     (top, bottom), (left, right) = (_inside(n, w) for n, w in zip(stack.shape[1:], window, strict=True))
     return stack[:, top:bottom, left:right]
 
@@ -63,12 +66,12 @@ def _cuts(spans: list[tuple[int, int]]) -> list[int]:
 
 
 def _covered(span: tuple[int, int], cuts: list[int]) -> Tensor:
-    """Return True for each piece between the cuts that lies in the span."""
+    """Return True for each piece between two cuts that lies in the span."""
     return torch.tensor([span[0] <= cut < span[1] for cut in cuts[:-1]])
 
 
 def _pieces(size: Tensor, rows: list[int], columns: list[int]) -> tuple[Tensor, Tensor]:
-    """Return the sum (rounded up by its largest round-off) and the maximum of each piece: (band, rows, columns).
+    """Return the sum, rounded up, and the maximum of each piece of a PSF, both (band, rows, columns).
 
     A few large calls are faster than many small calls, each of which waits for other work on the machine.
     """

@@ -17,7 +17,7 @@ _COLUMNS = 16  #: columns of each spectrum at a time; on a GPU all columns
 
 
 class Mix(NamedTuple):
-    """The matrices that assign planes to kernels and both to results; None stands for the identity."""
+    """The matrices that mix planes and kernels into products, and products into results; None is the identity."""
 
     u: Tensor | None  #: (result, s)
     x: Tensor | None  #: (s, plane)
@@ -25,13 +25,13 @@ class Mix(NamedTuple):
     results: int = 0  #: number of results, where each has its own kernel for each plane, in this order
 
     def to(self, like: Tensor) -> "Mix":
-        """Return the matrices in the precision and on the device of the planes."""
+        """Return the matrices in the precision and on the device of a tensor."""
         u, x, y = (m if m is None else m.to(like) for m in self[:3])
         return Mix(u, x, y, self.results)
 
 
 class Where(NamedTuple):
-    """The positions of planes and kernels in the zero padding, and the window of the transform that is the result."""
+    """The positions of planes and kernels in the zero padding, and the window of the transform to return."""
 
     at_a: Corner
     at_b: Corner
@@ -42,7 +42,7 @@ class Where(NamedTuple):
 
 
 class Summed(torch.autograd.Function):
-    """A sum of convolutions whose gradients are such sums: only inputs are stored, and all derivatives exist."""
+    """A sum of convolutions. Its gradients are sums of convolutions too, so that derivatives of all orders exist."""
 
     @staticmethod
     def forward(a: Tensor, b: Tensor, mix: Mix, where: Where) -> Tensor:
@@ -50,7 +50,7 @@ class Summed(torch.autograd.Function):
 
     @staticmethod
     def setup_context(ctx: Any, inputs: tuple[Any, ...], output: Tensor) -> None:
-        """Keep the inputs, as `torch.func` asks it: apart from `forward`."""
+        """Save the inputs apart from `forward`, as `torch.func` requires."""
         ctx.save_for_backward(*inputs[:2])
         ctx.how = inputs[2:]
 
@@ -73,7 +73,7 @@ class Summed(torch.autograd.Function):
 
 
 def summed(a: Tensor, b: Tensor, mix: Mix, where: Where) -> Tensor:
-    """Convolve planes (k, y, x) with kernels (q, y, x) and sum them into results (r, y, x)."""
+    """Return sums (r, y, x) of convolutions of planes (k, y, x) with kernels (q, y, x)."""
     result: Tensor = Summed.apply(a, b, mix, where)  # type: ignore[no-untyped-call]
     return result
 
@@ -99,7 +99,7 @@ def _results(mix: Mix, a: Tensor) -> int:
 
 
 def _mixed(mix: Mix, x: Tensor, y: Tensor) -> Tensor:
-    """Return the spectra of the results."""
+    """Return the spectra of the results from the spectra ``x`` of the planes and ``y`` of the kernels."""
     if not mix.results:
         return _times(mix.u, _times(mix.x, x) * y)
     each = y.view(mix.results, len(x), *y.shape[1:])
@@ -110,7 +110,7 @@ def _mixed(mix: Mix, x: Tensor, y: Tensor) -> Tensor:
 
 
 def _rows(x: Tensor, left: int, wide: int, step: int) -> Tensor:
-    """Transform the rows, padded by ``left`` zeros in front, into (plane, block, row, ``step`` columns).
+    """Return the spectra of the rows, after ``left`` zeros, as (plane, block, row, ``step`` columns).
 
     A block of columns is contiguous: in rows 12 kB apart, each element would lie in another memory page.
     """
@@ -130,7 +130,7 @@ def _rows(x: Tensor, left: int, wide: int, step: int) -> Tensor:
 
 
 class _Columns:
-    """Blocks of columns, each contiguous, in memory used again, because allocation costs more than the transforms."""
+    """Contiguous blocks of columns, transformed in reused memory: allocation takes longer than the transforms."""
 
     def __init__(self, blocks: Tensor, top: int, high: int) -> None:
         self.blocks = blocks
@@ -139,7 +139,7 @@ class _Columns:
         self.found = torch.empty_like(self.room)
 
     def spectra(self, block: int) -> Tensor:
-        """Transform the columns of a block: (plane, column, frequency)."""
+        """Return the spectra (plane, column, frequency) of the columns of a block."""
         self.inside.copy_(self.blocks[:, block].transpose(1, 2))
         torch.fft.fft(self.room, out=self.found)
         return self.found

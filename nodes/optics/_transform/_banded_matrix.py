@@ -1,4 +1,4 @@
-"""Banded matrices as batches of small dense matrices: interpolation and gridding at the speed of a matrix product."""
+"""Banded matrices stored as batches of small dense matrices, so that interpolation is a matrix product."""
 
 import copy
 import math
@@ -12,7 +12,7 @@ _SLACK = 8  #: columns of zeros that let blocks of unequal spacing share one str
 
 
 class _Run(NamedTuple):
-    """A range of blocks, from ``first`` on, whose columns begin at start, start + stride, ..."""
+    """A range of ``blocks`` blocks from number ``first`` on, whose columns begin at start, start + stride and so on."""
 
     first: int
     blocks: int
@@ -25,7 +25,7 @@ class _Run(NamedTuple):
 
 
 class Banded:
-    """A matrix whose row ``i`` weighs the columns within ``reach`` of ``origin + step i``; rows form whole blocks.
+    """A banded matrix: row ``i`` has weights in the columns within ``reach`` of ``origin + step i``.
 
     ``n_rows`` is rounded up to whole blocks; the extra rows are finite and meaningless. The other factor of a product
     needs ``margin`` zeros before and behind its ``n_columns`` samples, so that all blocks have the same size.
@@ -49,7 +49,7 @@ class Banded:
         return self.origin + self.step * row
 
     def fill(self, weigh: Callable[[Tensor, Tensor], Tensor]) -> "Banded":
-        """Set the weights to ``weigh(row, column)`` of float64 indices that broadcast, and to zero out of reach."""
+        """Set the weights to ``weigh(row, column)``, called with float64 indices, and to zero out of reach."""
         starts = [start for run in self.runs for start in run.starts]
         columns = torch.tensor(starts, dtype=torch.float64)[:, None, None] + torch.arange(self.width)
         rows = torch.arange(self.n_rows, dtype=torch.float64).view(self.count, self.block, 1)
@@ -63,7 +63,7 @@ class Banded:
         return self
 
     def part(self, first: int, last: int) -> "Banded":
-        """Return the matrix of the blocks first..last only."""
+        """Return the matrix of the blocks from ``first`` up to ``last``, without ``last``."""
         part = copy.copy(self)
         part.count, part.n_rows = last - first, (last - first) * self.block
         part.weights, part.runs = self.weights[first:last], []
@@ -92,7 +92,7 @@ class Banded:
 
 
 def _multiply(a: Tensor, b: Tensor, out: Tensor) -> None:
-    """Multiply two batches of matrices; a few large products run one after another, each on all threads."""
+    """Multiply two batches of matrices; fewer than 8 products run one after another, each on all threads."""
     if len(a) >= 8:
         torch.bmm(a, b, out=out)
         return
@@ -101,7 +101,7 @@ def _multiply(a: Tensor, b: Tensor, out: Tensor) -> None:
 
 
 def _runs(low: list[int], high: list[int], pace: float) -> list[_Run]:
-    """Cover all blocks with few arithmetic sequences of starts within ``low <= start <= high``."""
+    """Return a few runs of equally spaced starts that cover all blocks, each with ``low <= start <= high``."""
     runs: list[_Run] = []
     first = 0
     while first < len(low):

@@ -1,4 +1,4 @@
-"""The scaled Fourier transform by chirps: two FFTs for each line, exact, with no parameter."""
+"""The scaled Fourier transform by chirps (Bluestein): two FFTs for each line, exact up to round-off."""
 
 import functools
 from typing import NamedTuple
@@ -34,7 +34,7 @@ def _chirps(axis: Axis, dtype: torch.dtype, device: torch.device) -> _Chirps:
 
 
 def bluestein(rows: Axis, columns: Axis, source: Source, sink: Sink, work: Workspace) -> None:
-    """Transform row by row and then column by column, in chunks that fit in the cache."""
+    """Transform the rows and then the columns of a field, in chunks that fit in the CPU's cache."""
     kind = work.dtype.to_complex()
     along_x, along_y = (_chirps(axis, work.dtype, work.device) for axis in (columns, rows))
     half = work.take("half", columns.n_out, rows.n_in, dtype=kind)
@@ -49,7 +49,7 @@ def bluestein(rows: Axis, columns: Axis, source: Source, sink: Sink, work: Works
 
 
 def _convolve(lines: Tensor, chirps: _Chirps, axis: Axis, work: Workspace) -> Tensor:
-    """Return one axis of the transform, on the last dimension; the result is valid until the next call."""
+    """Return the transform along the last dimension; the next call overwrites the result."""
     padded = work.take("padded", lines.shape[0], chirps.length, dtype=lines.dtype)
     torch.mul(lines, chirps.before, out=padded[:, : axis.n_in])
     padded[:, axis.n_in :] = 0
@@ -60,7 +60,7 @@ def _convolve(lines: Tensor, chirps: _Chirps, axis: Axis, work: Workspace) -> Te
 
 @functools.lru_cache(maxsize=256)
 def smooth(n: int, even: bool = False) -> int:
-    """Return the least 2-3-5-smooth number from ``n`` on; an FFT of another length is up to three times slower."""
+    """Return the least number from ``n`` on without a prime factor above 5; other lengths make FFTs slower."""
     n += even and n % 2
     while _rough(n):
         n += 1 + even

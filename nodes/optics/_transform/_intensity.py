@@ -1,4 +1,4 @@
-"""Intensity from pupil with a hand-written gradient, which computes the field in the pupil again to save memory."""
+"""Intensity of the PSF with a hand-written gradient, which computes the field in the pupil again to save memory."""
 
 import math
 from collections.abc import Sequence
@@ -27,14 +27,14 @@ class Sampling:
 
 
 def intensity_of(amplitude: Tensor, height: Tensor, path: Tensor, sampling: Sampling) -> Tensor:
-    """Return the intensity, by the form that keeps its fields, or by the one that `torch.func` can follow."""
+    """Return the intensity; inside a transform of `torch.func`, by an autograd function that `torch.func` accepts."""
     form = _Transformed if torch._C._are_functorch_transforms_active() else PupilIntensity
     result: Tensor = form.apply(amplitude, height, path, sampling)  # type: ignore[no-untyped-call]
     return result
 
 
 class PupilIntensity(torch.autograd.Function):
-    """The ``sum over views of weight * envelope * |U|^2``, with the adjoint transform of g U as its gradient."""
+    """The intensity ``sum over views of weight * envelope * |U|^2``; its gradient is an adjoint transform."""
 
     @staticmethod
     def forward(ctx: Any, amplitude: Tensor, height: Tensor, path: Tensor, sampling: Sampling) -> Tensor:
@@ -53,7 +53,7 @@ class PupilIntensity(torch.autograd.Function):
 
 
 class _Transformed(torch.autograd.Function):
-    """The same for `torch.func`: no field is kept, and the gradient is a function that has no derivative itself."""
+    """The intensity for `torch.func`: no field is kept, and the gradient itself has no derivative."""
 
     @staticmethod
     def forward(amplitude: Tensor, height: Tensor, path: Tensor, sampling: Sampling) -> Tensor:
@@ -70,7 +70,7 @@ class _Transformed(torch.autograd.Function):
 
 
 class _Gradient(torch.autograd.Function):
-    """The gradients of amplitude, height and path. Behind it nothing is differentiated in silence."""
+    """The gradients with respect to amplitude, height and path; a second derivative raises an error."""
 
     @staticmethod
     def forward(weight: Tensor, amplitude: Tensor, height: Tensor, path: Tensor, sampling: Sampling) -> Any:
@@ -87,7 +87,7 @@ class _Gradient(torch.autograd.Function):
 
 
 def _computed(screens: Screens, sampling: Sampling, keep: bool) -> tuple[Tensor, list[Tensor | None]]:
-    """Return the intensity, and the focal field of each view where they are kept and not too large."""
+    """Return the intensity, and the focal field of each view, or None where no fields are kept."""
     views, shape = sampling.views, (sampling.views[0].rows.n_out, sampling.views[0].columns.n_out)
     device, fields, done = screens.height.device, list[Tensor | None](), -1
     intensity = torch.empty(views[-1].band + 1, *shape, dtype=sampling.dtype, device=device)
@@ -109,7 +109,7 @@ def _adjoint(
     fields: Sequence[Tensor | None],
     needs: Sequence[bool],
 ) -> list[Tensor | None]:
-    """Return the gradients of amplitude, height and path that are needed; a field that was not kept is made again."""
+    """Return the needed gradients of amplitude, height and path; a field that was not kept is computed again."""
     grads = [torch.zeros_like(x) if need else None for x, need in zip(screens[:3], needs, strict=True)]
     with borrowed(weight.dtype, weight.device) as work:
         for view, kept in zip(sampling.views, fields, strict=True):
@@ -120,7 +120,7 @@ def _adjoint(
 
 
 def _scaled(view: View, values: Tensor, rows: slice, columns: slice) -> Tensor:
-    """Multiply ``values``, on one patch, by the weight and the envelope of the view's |U|^2."""
+    """Multiply ``values`` of one patch, in place, by the weight and the envelope of the view."""
     if view.envelope is None:
         return values.mul_(view.weight)
     y, x = view.envelope
@@ -128,7 +128,7 @@ def _scaled(view: View, values: Tensor, rows: slice, columns: slice) -> Tensor:
 
 
 def _power(field: Field, out: Tensor, add: bool, kept: Tensor | None, method: Method, work: Workspace) -> None:
-    """Write the weighted |U|^2 of one view to ``out``, or add it there."""
+    """Write the weighted |U|^2 of one view to ``out``, or add the values to ``out``."""
 
     def sink(rows: slice, columns: slice, patch: Tensor) -> None:
         if kept is not None:
@@ -141,12 +141,12 @@ def _power(field: Field, out: Tensor, add: bool, kept: Tensor | None, method: Me
 
 
 def _keep(kept: Tensor, rows: slice, columns: slice, patch: Tensor) -> None:
-    """Store a patch transposed: the fast method returns patches, and its adjoint takes patches, in this layout."""
+    """Store a patch transposed, which is the layout of patches in the fastest method and its adjoint."""
     patch_of(kept.transpose(1, 2), rows, columns, patch).copy_(patch)
 
 
 def _focal(field: Field, sampling: Sampling, work: Workspace) -> Tensor:
-    """Compute the focal field again, transposed."""
+    """Return the focal field of a view, computed again, transposed."""
     view = field.view
     planes = work.take("focal", 2, view.columns.n_out, view.rows.n_out)
 
@@ -160,7 +160,7 @@ def _focal(field: Field, sampling: Sampling, work: Workspace) -> Tensor:
 def _add_gradient(
     field: Field, planes: Tensor, weight: Tensor, grads: list[Tensor | None], method: Method, work: Workspace
 ) -> None:
-    """Add the gradients of ``sum(weight * scaled |U|^2)``: the adjoint transform of 2 weight U.
+    """Add the gradients of ``sum(weight * |U|^2)`` to ``grads`` by the adjoint transform of 2 weight U.
 
     The transform runs on the transposed problem, so that its result comes back in rows of the pupil.
     """
@@ -182,7 +182,7 @@ def _add_gradient(
 def _chain(
     field: Field, rows: slice, columns: slice, patch: Tensor, grads: list[Tensor | None], work: Workspace
 ) -> None:
-    """Turn ``patch``, the gradient with respect to the field, into gradients of amplitude, height and path."""
+    """Add the gradients of amplitude, height and path that follow from ``patch``, the gradient of the field."""
     unit = work.take("unit", *patch.shape)
     field.phasor(rows, columns, unit, work)
     if grads[0] is not None:

@@ -26,7 +26,7 @@ class _Kernel(NamedTuple):
 
     @property
     def peak(self) -> float:
-        """Return the scale that keeps weights near one."""
+        """Return the factor by which weights are divided so that they are near one."""
         return self.width * math.sinh(self.beta) / self.beta
 
     @property
@@ -50,7 +50,7 @@ _SINGLE, _DOUBLE = _Kernel(8, 1.75), _Kernel(18, 2.0)
 
 
 class Plan(NamedTuple):
-    """The steps along one axis: gather (n_in -> points), FFT of ``length``, crop to ``kept``, spread to n_out."""
+    """The steps along one axis: gather the input to ``points``, FFT of ``length``, crop to ``kept``, spread."""
 
     gather: Banded
     spread: Banded
@@ -87,7 +87,7 @@ def plan(axis: Axis, dtype: torch.dtype, device: torch.device) -> Plan:
 
 
 def _gather(axis: Axis, kernel: _Kernel, pitch: float, points: int, length: int) -> Banded:
-    """Return the matrix from field to grid points, divided by the factor of the interpolation behind the FFT."""
+    """Return the matrix from the field to the grid points, corrected for the interpolation after the FFT."""
     j0, l0 = (axis.n_in - 1) / 2, (points - 1) // 2
     band = Banded(points, axis.n_in, j0 - pitch * l0, pitch, pitch * kernel.width / 2, _BLOCK)
 
@@ -100,7 +100,7 @@ def _gather(axis: Axis, kernel: _Kernel, pitch: float, points: int, length: int)
 
 
 def _spread(axis: Axis, kernel: _Kernel, pitch: float, length: int) -> Banded:
-    """Return the matrix from kept frequencies to the window, divided by the transform of the gathering kernel."""
+    """Return the matrix from the kept frequencies to the window, corrected for the gathering kernel."""
     k0, fine = (axis.n_out - 1) / 2, axis.alpha * pitch * length
     kept = _odd(math.ceil((axis.n_out - 1) * fine) + kernel.width)
     q0 = (kept - 1) // 2
@@ -123,7 +123,7 @@ def _odd(n: int) -> int:
 
 
 def kaiser_bessel(rows: Axis, columns: Axis, source: Source, sink: Sink, work: Workspace) -> None:
-    """Gather, transform by a short FFT and interpolate: along u first, in chunks of rows that fit in the cache."""
+    """Transform a field by gathering, a short FFT and interpolation, in chunks that fit in the CPU's cache."""
     along_x, along_y = (plan(axis, work.dtype, work.device) for axis in (columns, rows))
     half = _rows_to_frequencies(along_x, along_y.gather.margin, rows.n_in, source, work)
     spectrum = _columns_to_frequencies(along_y, half, work)
@@ -153,7 +153,7 @@ def _zero_margins(x: Tensor, dim: int, margin: int) -> Tensor:
 
 
 def _place(blocks: Tensor, line: Tensor, x: Plan) -> None:
-    """Put gathered (re, im) blocks in the middle of zeroed complex lines."""
+    """Copy gathered (re, im) blocks into the middle of complex lines, and zero the rest of the lines."""
     count, block, n = x.gather.count, x.gather.block, line.shape[0]
     line[:, : x.padded] = 0
     parts = blocks.view(count, 2, n, block).permute(1, 2, 0, 3)
@@ -163,7 +163,7 @@ def _place(blocks: Tensor, line: Tensor, x: Plan) -> None:
 
 
 def _columns_to_frequencies(y: Plan, half: Tensor, work: Workspace) -> Tensor:
-    """Gather along v into the zero-padded columns and transform the columns; the result is transposed."""
+    """Gather along v into zero-padded columns, transform the columns, and return the frequencies transposed."""
     wide = half.shape[1]
     columns = work.take("columns", y.length, wide, dtype=half.dtype)
     y.gather.left(_flat(half), _flat(columns[y.padded : y.padded + y.gather.n_rows]))
@@ -177,7 +177,7 @@ def _columns_to_frequencies(y: Plan, half: Tensor, work: Workspace) -> Tensor:
 
 
 def _interpolate(x: Plan, y: Plan, shape: tuple[int, int], spectrum: Tensor, sink: Sink, work: Workspace) -> None:
-    """Interpolate the frequencies (x, y), with their margins, onto the window, a few columns at a time."""
+    """Interpolate the frequencies (x, y) onto the window, a few columns at a time, and pass them to ``sink``."""
     for first in range(0, x.spread.count, _COLUMN_BLOCKS):
         part = x.spread.part(first, min(first + _COLUMN_BLOCKS, x.spread.count))
         line = work.take("stripe", part.n_rows, spectrum.shape[1], dtype=spectrum.dtype)
@@ -191,7 +191,7 @@ def _interpolate(x: Plan, y: Plan, shape: tuple[int, int], spectrum: Tensor, sin
 
 
 def _deliver(tiles: Tensor, columns: slice, n_rows: int, sink: Sink) -> None:
-    """Pass whole blocks of rows to ``sink``, then the remaining rows of the last block."""
+    """Pass all whole blocks of rows to ``sink``, then the remaining rows of the last block."""
     block = tiles.shape[2]
     whole = n_rows // block
     if whole:
@@ -201,7 +201,7 @@ def _deliver(tiles: Tensor, columns: slice, n_rows: int, sink: Sink) -> None:
 
 
 def _flat(x: Tensor) -> Tensor:
-    """Return a complex (r, c) as real (r, 2 c), which a real matrix can multiply from the left."""
+    """Return a complex tensor (r, c) as a real tensor (r, 2 c), so that a real matrix can multiply from the left."""
     return torch.view_as_real(x).flatten(1)
 
 

@@ -8,7 +8,7 @@ from neusee.nodes.optics._transform._workspace import Workspace
 
 
 def direct(rows: Axis, columns: Axis, source: Source, sink: Sink, work: Workspace) -> None:
-    """Transform by complex matrix products with the full kernel, without any symmetry."""
+    """Transform the field by complex matrix products with the full kernel, without use of symmetry."""
     along_x, along_y = _kernel(columns, work), _kernel(rows, work)
     half = torch.empty(rows.n_in, columns.n_out, dtype=along_x.dtype, device=work.device)
     for start, stop in row_chunks(rows.n_in, columns.n_in):
@@ -21,7 +21,7 @@ def direct(rows: Axis, columns: Axis, source: Source, sink: Sink, work: Workspac
 
 
 def folded(rows: Axis, columns: Axis, source: Source, sink: Sink, work: Workspace) -> None:
-    """Transform by real products of half length on the even and odd parts: exact, in a quarter of the operations."""
+    """Transform the even and the odd part of the field by real matrix products: a quarter of the operations."""
     turn_x, turn_y = _half_kernels(columns, work), _half_kernels(rows, work)
     half = work.take("half", 2, rows.n_in, columns.n_out)
     for start, stop in row_chunks(rows.n_in, columns.n_in):
@@ -42,7 +42,10 @@ def _kernel(axis: Axis, work: Workspace) -> Tensor:
 
 
 def _half_kernels(axis: Axis, work: Workspace) -> tuple[Tensor, Tensor]:
-    """Return cosine and signed sine on the half grids j >= 0, k >= 0; a sample on the axis counts once."""
+    """Return the cosines and signed sines of the kernel on the half grids j >= 0, k >= 0.
+
+    The cosine is halved at a sample on the axis, which both halves of the field contain.
+    """
     j, k = centred(axis.n_in, work.device)[axis.n_in // 2 :], centred(axis.n_out, work.device)[axis.n_out // 2 :]
     angle = radians(torch.outer(k, j).mul_(axis.alpha))
     cosine, sine = angle.cos().to(work.dtype), angle.sin().mul_(axis.sign).to(work.dtype)
@@ -57,7 +60,7 @@ def _fold(field: Tensor, n: int) -> tuple[Tensor, Tensor]:
 
 
 def _unfold(even: Tensor, odd: Tensor, axis: Axis, out: Tensor) -> None:
-    """Write even(k) ± i odd(k) to both halves of ``out``; all arguments are (re, im) planes."""
+    """Write even(k) + i odd(k) and its mirror image to the halves of ``out``; all tensors are (re, im) planes."""
     n = axis.n_out
     low = (n + 1) // 2
     mirrored = torch.stack((even[0] + odd[1], even[1] - odd[0]))

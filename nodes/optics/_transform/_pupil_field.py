@@ -1,4 +1,4 @@
-"""The field in the pupil, computed patch by patch from its factors and never stored as a whole."""
+"""The field in the pupil, computed patch by patch from the factors of the pupil and never stored as a whole."""
 
 import math
 from dataclasses import dataclass
@@ -16,7 +16,7 @@ _FEW_TURNS = 2.0  #: below this many turns a float32 phase is exact to 5e-7 rad,
 
 @dataclass(frozen=True, slots=True)
 class View:
-    """One window of point samples in one band, whose |U|^2 is multiplied by ``weight`` and by the two envelopes."""
+    """A window of point samples in one band; its |U|^2 is multiplied by ``weight`` and by two envelopes."""
 
     band: int
     rows: Axis
@@ -39,14 +39,14 @@ class Screens(NamedTuple):
 
     @classmethod
     def of(cls, amplitude: Tensor, height: Tensor, path: Tensor) -> "Screens":
-        """Measure the largest height and path once for each call; raise ValueError where one is not finite."""
+        """Return the factors with the largest height and path; raise ValueError where one of these is not finite."""
         extents = [float(torch.stack(x.detach().aminmax()).abs().max()) for x in (height, path)]
         refuse_not_finite("no light has such a phase", height=extents[0], path=extents[1])
         return cls(amplitude, height, path, *extents)
 
 
 class Field:
-    """The field in the pupil for one view, row by row: amplitude * exp(2 pi i (height + path + tilt))."""
+    """The field in the pupil for one view: amplitude * exp(2 pi i (height + path + tilt)), phases in turns."""
 
     def __init__(self, screens: Screens, view: View, dtype: torch.dtype) -> None:
         self.screens, self.view = screens, view
@@ -58,7 +58,7 @@ class Field:
         self.tilt_v, self.tilt_u = v.to(kind)[:, None], u.to(kind)
 
     def phasor(self, rows: slice, columns: slice, planes: Tensor, work: Workspace) -> None:
-        """Write cosine and sine of one patch; more than a few turns are computed in float64, reduced to half a turn."""
+        """Write the cosine and sine of the phase of one patch; a phase of more turns than two is reduced in float64."""
         angle = work.take("angle", *planes.shape[1:])
         turns = angle if self.few else work.take("turns", *planes.shape[1:], dtype=torch.float64)
         unit = 2 * math.pi if self.few else 1.0
@@ -72,7 +72,7 @@ class Field:
         torch.sin(angle, out=planes[1])
 
     def rows(self, work: Workspace) -> Source:
-        """Return the field as the source of a transform."""
+        """Return a function that writes rows of the field, as a transform reads them."""
         everywhere = slice(0, self.screens.height.shape[1])
 
         def fill(start: int, stop: int, planes: Tensor) -> None:

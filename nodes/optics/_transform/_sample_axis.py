@@ -1,4 +1,4 @@
-"""One axis of the scaled Fourier transform, and phasors whose phase stays exact."""
+"""The axes of the scaled Fourier transform, and phasors with an exact phase."""
 
 import math
 from collections.abc import Callable
@@ -16,7 +16,7 @@ Sink = Callable[[slice, slice, Tensor], None]
 
 @dataclass(frozen=True, slots=True)
 class Axis:
-    """An axis of ``U[k] = sum_j P[j] exp(sign 2 pi i alpha (j - j0) (k - k0))``, where j0 and k0 are the middles."""
+    """An axis of ``U[k] = sum_j P[j] exp(sign 2 pi i alpha (j - j0) (k - k0))``; j0 and k0 are the centres."""
 
     n_in: int
     n_out: int
@@ -24,7 +24,7 @@ class Axis:
     sign: int = -1
 
     def adjoint(self) -> "Axis":
-        """Return the axis of the conjugate transpose."""
+        """Return the axis of the adjoint transform."""
         return Axis(self.n_out, self.n_in, self.alpha, -self.sign)
 
     @property
@@ -34,12 +34,12 @@ class Axis:
 
 
 def centred(n: int, device: torch.device) -> Tensor:
-    """Return the coordinates ``j - (n - 1) / 2``, float64."""
+    """Return the coordinates ``j - (n - 1) / 2`` of n samples about their centre, float64."""
     return torch.arange(n, dtype=torch.float64, device=device) - (n - 1) / 2
 
 
 def radians(turns: Tensor) -> Tensor:
-    """Return the phase of float64 ``turns`` less its whole turns, so that a cast to float32 costs 2e-7 rad."""
+    """Return the phase of float64 ``turns`` without whole turns, so that a cast to float32 is exact to 2e-7 rad."""
     return (turns - turns.round()).mul_(2 * math.pi)
 
 
@@ -50,12 +50,12 @@ def unit_phasor(turns: Tensor, dtype: torch.dtype) -> Tensor:
 
 
 def patch_of(x: Tensor, rows: slice, columns: slice, like: Tensor) -> Tensor:
-    """Return a view of ``x[..., rows, columns]`` with rows split as in ``like``, a patch given to a sink."""
+    """Return a view of ``x[..., rows, columns]`` in the shape of the patch ``like``."""
     part = x[..., rows, columns]
     return part.view(*x.shape[:-2], *like.shape[1:])
 
 
 def row_chunks(rows: int, columns: int, elements: int = 1 << 19) -> list[tuple[int, int]]:
-    """Return ranges of rows that are short enough to fit in the cache."""
+    """Return ranges of rows, each short enough to fit in the CPU's cache."""
     step = max(1, min(rows, elements // max(columns, 1)))
     return [(start, min(start + step, rows)) for start in range(0, rows, step)]

@@ -1,4 +1,4 @@
-"""The scaled Fourier transform between two grids of any pitch: the choice of method, and the plain call."""
+"""The scaled Fourier transform between two grids of any pitch, and the choice of the fastest method."""
 
 from typing import Literal
 
@@ -17,13 +17,13 @@ _METHODS = {"direct": direct, "folded": folded, "bluestein": bluestein, "kaiser_
 
 
 def propagate(rows: Axis, columns: Axis, source: Source, sink: Sink, work: Workspace, method: Method = "auto") -> None:
-    """Transform the field that ``source`` writes, in chunks that fit in the cache, and pass each result to ``sink``."""
+    """Transform the field that ``source`` writes, chunk by chunk, and pass each part of the result to ``sink``."""
     name = cheapest(rows, columns, work.device) if method == "auto" else method
     _METHODS[name](rows, columns, source, sink, work)
 
 
 def cheapest(rows: Axis, columns: Axis, device: torch.device) -> str:
-    """Return the method of least expected time; on a GPU matrix products are fastest at every size that fits."""
+    """Return the fastest method by expected time; on a GPU that is the folded matrix product at every size."""
     if device.type != "cpu":
         return "folded"
     expected = _expected_seconds(rows, columns)
@@ -31,7 +31,7 @@ def cheapest(rows: Axis, columns: Axis, device: torch.device) -> str:
 
 
 def _expected_seconds(rows: Axis, columns: Axis) -> dict[str, float]:
-    """Return times fitted on two cores with AVX-512 (tests/benchmarks/bench_psf.py); only their ratios matter."""
+    """Return the time of each method, fitted on two cores with AVX-512 (tests/benchmarks/bench_psf.py)."""
     n_in, n_out = rows.n_in * columns.n_in, rows.n_out * columns.n_out
     products = rows.n_in * columns.n_out * (columns.n_in + rows.n_out)
     chirped = rows.n_in * smooth(columns.n_in + columns.n_out) + columns.n_out * smooth(rows.n_in + rows.n_out)
@@ -83,7 +83,7 @@ def _tilts(
     real: torch.dtype,
     device: torch.device,
 ) -> tuple[list[Tensor], list[Tensor]]:
-    """Return phasors along each axis that shift the centres of a transform from the middles to the given centres."""
+    """Return the phasors along each axis that shift the centres of a transform to the given centres."""
     before, after = [], []
     for axis, c_in, c_out in zip(axes, centre_in, centre_out, strict=True):
         d_in, d_out = (axis.n_in - 1) / 2 - c_in, (axis.n_out - 1) / 2 - c_out

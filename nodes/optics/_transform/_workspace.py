@@ -1,4 +1,4 @@
-"""Reusable buffers: page faults of a fresh 100 MB temporary cost more than the transform that fills it."""
+"""Reusable buffers: the page faults of a new 100 MB buffer take longer than the transform that fills the buffer."""
 
 import contextlib
 import threading
@@ -14,7 +14,7 @@ _lock = threading.Lock()
 
 
 class Workspace:
-    """Named buffers for one caller at a time; a name always returns the same memory, enlarged when needed."""
+    """Named buffers for one thread at a time; a name returns the same memory each time, enlarged when needed."""
 
     def __init__(self, dtype: torch.dtype, device: torch.device) -> None:
         self.dtype, self.device = dtype, device

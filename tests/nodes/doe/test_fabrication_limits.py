@@ -100,7 +100,7 @@ def test_preflight_refuses_what_cannot_be_made():
     with pytest.raises(ParameterError, match=r"at least 1\.196 um") as caught:
         doe.fabricate.hooks.preflight(**PLAIN | {"wrap_at": 550e-9, "max_height": 1e-6})
     assert caught.value.parameter == "max_height"
-    with pytest.raises(ParameterError, match="Set wrap_at or max_height"):
+    with pytest.raises(ParameterError, match="set wrap_at or max_height"):
         doe.fabricate.hooks.preflight(**PLAIN | {"levels": 8})
     (note,) = doe.fabricate.hooks.preflight(**PLAIN | {"max_height": 1e-6})
     assert "cut flat" in note

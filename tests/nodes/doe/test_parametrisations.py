@@ -9,13 +9,12 @@ from PIL import Image
 from safetensors.torch import save_file
 from torch.testing import assert_close
 
-from neusee.nodes import ParameterError, doe
+from neusee.nodes import ParameterError, doe, optics
 from neusee.nodes.bicubic_resize import enlarge
 from neusee.nodes.doe._parametrisations import PARAMETRISATIONS
 from neusee.nodes.doe._unet_height_map import HeightNet, coordinates, fresh, height_of
-from neusee.nodes.optics._pupil_grid import stop
 
-GRID = {"samples": 64, "pitch": 5e-6, "diameter": 320e-6}
+STOP = optics.stop(samples=64, pitch=5e-6, diameter=320e-6)
 
 
 def seeded(seed=1):
@@ -33,10 +32,10 @@ def suppression(height):
 
 @pytest.mark.parametrize("name", ["pixelwise", "unet"])
 def test_start_is_seeded_bounded_and_far_from_flat(name):
-    node, params = getattr(doe, name), GRID if name == "pixelwise" else GRID | {"width": 8, "grid": 32}
-    height = node(**params, rng=seeded())
-    assert_close(height, node(**params, rng=seeded()), rtol=0, atol=0)
-    assert not torch.equal(height, node(**params, rng=seeded(2)))
+    node, params = getattr(doe, name), {} if name == "pixelwise" else {"width": 8, "grid": 32}
+    height = node(STOP, **params, rng=seeded())
+    assert_close(height, node(STOP, **params, rng=seeded()), rtol=0, atol=0)
+    assert not torch.equal(height, node(STOP, **params, rng=seeded(2)))
     assert height.dtype == torch.float32
     assert height.shape == (64, 64)
     assert float(height.min()) >= 0
@@ -46,20 +45,20 @@ def test_start_is_seeded_bounded_and_far_from_flat(name):
 
 
 def test_start_from_a_random_relief_has_a_slope_and_a_flat_one_has_none():
-    steep = doe.pixelwise(**GRID, rng=seeded()).requires_grad_()
+    steep = doe.pixelwise(STOP, rng=seeded()).requires_grad_()
     flat = torch.zeros(64, 64, requires_grad=True)
     found = [torch.autograd.grad(suppression(height), height)[0].abs().max() for height in (steep, flat)]
     assert float(found[0]) > 1e3 * float(found[1])
 
 
 def test_pixelwise_start_is_the_same_at_every_sampling():
-    coarse = doe.pixelwise(samples=27, pitch=9e-6, diameter=1.0, rng=seeded())
-    fine = doe.pixelwise(samples=81, pitch=3e-6, diameter=1.0, rng=seeded())
+    coarse = doe.pixelwise(optics.stop(samples=27, pitch=9e-6, diameter=1.0), rng=seeded())
+    fine = doe.pixelwise(optics.stop(samples=81, pitch=3e-6, diameter=1.0), rng=seeded())
     assert_close(fine[1::3, 1::3], coarse, rtol=1e-4, atol=1e-12)
 
 
 def test_pixelwise_features_have_the_asked_scale():
-    fields = torch.stack([doe.pixelwise(**GRID, depth=1.0, scale=0.2, rng=seeded(k)).double() for k in range(200)])
+    fields = torch.stack([doe.pixelwise(STOP, depth=1.0, scale=0.2, rng=seeded(k)).double() for k in range(200)])
     fields = torch.logit(fields) / 1.5
     assert float(fields.square().mean()) == pytest.approx(1, rel=0.1)
     step = 10
@@ -75,30 +74,30 @@ def test_pixelwise_reads_a_file(tmp_path, suffix):
         np.save(file, relief)
     else:
         save_file({"height": torch.from_numpy(relief), "other": torch.zeros(2)}, file)
-    params = GRID | {"aperture": "inscribed", "file": file, "depth": 1.2e-6, "scale": 0.1}
-    assert doe.pixelwise.hooks.preflight(**params) == []
-    assert_close(doe.pixelwise(**params, rng=seeded()), torch.from_numpy(relief), rtol=0, atol=0)
+    params = {"file": file, "depth": 1.2e-6, "scale": 0.1}
+    assert doe.pixelwise.hooks.preflight(stop=STOP, **params) == []
+    assert_close(doe.pixelwise(STOP, **params, rng=seeded()), torch.from_numpy(relief), rtol=0, atol=0)
 
 
 def test_pixelwise_refuses_a_file_that_does_not_fit(tmp_path):
     np.save(tmp_path / "small.npy", np.zeros((32, 32)))
-    params = GRID | {"aperture": "inscribed", "depth": 1.2e-6, "scale": 0.1}
+    params = {"depth": 1.2e-6, "scale": 0.1}
     with pytest.raises(ParameterError, match=r"\(32, 32\).*\(64, 64\).*samples to 32") as caught:
-        doe.pixelwise.hooks.preflight(**params, file=tmp_path / "small.npy")
+        doe.pixelwise.hooks.preflight(stop=STOP, **params, file=tmp_path / "small.npy")
     assert caught.value.parameter == "file"
     np.save(tmp_path / "low.npy", np.full((64, 64), -1e-9))
     with pytest.raises(ValueError, match="must be finite and at least 0"):
-        doe.pixelwise(**params, file=tmp_path / "low.npy", rng=seeded())
+        doe.pixelwise(STOP, **params, file=tmp_path / "low.npy", rng=seeded())
     (tmp_path / "relief.txt").write_text("0")
     with pytest.raises(ParameterError, match=r"npy, \.safetensors or grey"):
-        doe.pixelwise.hooks.preflight(**params, file=tmp_path / "relief.txt")
+        doe.pixelwise.hooks.preflight(stop=STOP, **params, file=tmp_path / "relief.txt")
     for name in ("bad.npy", "bad.safetensors"):
         (tmp_path / name).write_text("no relief")
         with pytest.raises(ParameterError, match="cannot be read"):
-            doe.pixelwise.hooks.preflight(**params, file=tmp_path / name)
+            doe.pixelwise.hooks.preflight(stop=STOP, **params, file=tmp_path / name)
     save_file({"a": torch.zeros(1), "b": torch.zeros(1)}, tmp_path / "two.safetensors")
     with pytest.raises(ParameterError, match="a, b"):
-        doe.pixelwise.hooks.preflight(**params, file=tmp_path / "two.safetensors")
+        doe.pixelwise.hooks.preflight(stop=STOP, **params, file=tmp_path / "two.safetensors")
 
 
 def test_unet_has_eight_convolutions_and_the_paper_inputs():
@@ -118,7 +117,7 @@ def test_unet_starts_orthogonal_with_zero_biases():
 
 @pytest.mark.parametrize("samples", [1, 7, 64])
 def test_unet_works_at_any_sampling(samples):
-    height = doe.unet(samples=samples, pitch=1e-6, diameter=samples * 1e-6, width=2, grid=9, rng=seeded())
+    height = doe.unet(optics.stop(samples=samples, pitch=1e-6, diameter=samples * 1e-6), width=2, grid=9, rng=seeded())
     assert height.shape == (samples, samples)
     assert bool(torch.isfinite(height).all())
 
@@ -150,9 +149,9 @@ def test_unet_suppresses_after_a_few_steps():
 def test_unet_loads_its_own_weights_and_no_others(tmp_path):
     net = fresh(4, 32, seeded(9))
     save_file(net.state_dict(), tmp_path / "net.safetensors")
-    params = GRID | {"aperture": "inscribed", "max_height": 1.2e-6, "grid": 32, "weights": tmp_path / "net.safetensors"}
+    params = {"max_height": 1.2e-6, "grid": 32, "weights": tmp_path / "net.safetensors"}
     assert doe.unet.hooks.preflight(**params, width=4) == []
-    loaded = doe.unet(**params, width=4, rng=seeded())
+    loaded = doe.unet(STOP, **params, width=4, rng=seeded())
     assert_close(loaded, height_of(net, 64, 32, 1.2e-6).detach(), rtol=0, atol=0)
     with pytest.raises(ParameterError, match="width 8") as caught:
         doe.unet.hooks.preflight(**params, width=8)
@@ -169,26 +168,23 @@ def test_pixelwise_reads_levels_of_a_grey_picture(tmp_path):
     Image.fromarray(np.zeros((64, 64, 3), np.uint8)).save(tmp_path / "coloured.png")
     (tmp_path / "broken.png").write_bytes((tmp_path / "deep.png").read_bytes()[:30])
     for name, top in (("deep", 65535), ("shallow", 255)):
-        found = doe.pixelwise(**GRID, file=tmp_path / f"{name}.png", depth=5e-6, rng=seeded())
+        found = doe.pixelwise(STOP, file=tmp_path / f"{name}.png", depth=5e-6, rng=seeded())
         wanted = torch.from_numpy((levels if top > 255 else levels >> 8).astype(np.float64)) * 5e-6 / top
         assert_close(found.double(), wanted, rtol=1e-6, atol=0)
     for name, said in (("coloured", "not grey"), ("broken", "cannot be read")):
         with pytest.raises(ParameterError, match=said):
-            doe.pixelwise.hooks.preflight(
-                **GRID, aperture="inscribed", depth=5e-6, scale=0.1, file=tmp_path / f"{name}.png"
-            )
+            doe.pixelwise.hooks.preflight(stop=STOP, depth=5e-6, scale=0.1, file=tmp_path / f"{name}.png")
 
 
 @pytest.mark.parametrize(("name", "params"), [("half_rings", {"waves": (9.0,)}), ("cubic", {"waves": 3.0})])
 def test_every_sample_of_a_formula_can_be_freed(name, params):
-    start = getattr(doe, name)(**GRID, **params)
-    freed = PARAMETRISATIONS[f"doe.{name}"]({**GRID, **params}, seeded())
-    grid = stop(**GRID)
-    moved = freed(grid).detach() - start
+    start = getattr(doe, name)(STOP, **params)
+    freed = PARAMETRISATIONS[f"doe.{name}"](STOP, params, seeded())
+    moved = freed(STOP).detach() - start
     assert_close(moved, torch.full_like(moved, float(moved.mean())), rtol=1e-3, atol=1e-10)  # a piston
-    slope = torch.autograd.grad(suppression(freed(grid)), freed.logits)[0]
+    slope = torch.autograd.grad(suppression(freed(STOP)), freed.logits)[0]
     assert float(slope.abs().max()) > 0
-    height = freed(grid).detach()
+    height = freed(STOP).detach()
     assert float(height.min()) > 0
     assert float(height.max()) < freed.max_height
 

@@ -139,7 +139,7 @@ def test_ghosts_are_linear_in_the_spot_and_learn():
 
 
 def test_bands_of_another_laser_are_refused():
-    with pytest.raises(ValueError, match="of one laser"):
+    with pytest.raises(ValueError, match="from one `line`"):
         flare.ghosts(spot(bands=2), bands(), towards(0.0, 0.0), **LENS, rng=seeded())
 
 
@@ -147,7 +147,7 @@ def test_check_reports_the_share():
     light = spot()
     (line,) = flare.ghosts.hooks.check(ghosts(light, energy=1e-3), light, bands(), towards(0.0, 0.0), energy=1e-3)
     assert line.ok
-    assert "bring 0.001 of" in line.text
+    assert "have 0.001 of" in line.text
     assert not flare.ghosts.hooks.check(light, light, bands(), towards(0.0, 0.0), energy=1e-3)[0].ok
 
 

@@ -10,7 +10,7 @@ from neusee.nodes.losses import contrast
 from neusee.nodes.metrics import limits, mtf
 from neusee.nodes.values import Bands, Psf
 
-LENS = {"pitch": 59.84e-6, "diameter": 11e-3}
+STOP = optics.stop(samples=135, pitch=59.84e-6, diameter=11e-3)
 
 
 def rand(*shape, seed=1):
@@ -25,7 +25,7 @@ def behind(height, window=128):
     """PSFs at three wavelengths."""
     centres = torch.tensor([450e-9, 550e-9, 650e-9], dtype=torch.float64)
     bands = Bands(centres, torch.full_like(centres, 10e-9), torch.ones_like(centres))
-    pupil = optics.pupil(height, doe.material(bands), bands, **LENS)
+    pupil = optics.pupil(height, doe.material(bands), bands, STOP)
     return optics.psf(pupil, focal_length=0.11, pixel_pitch=2.9e-6, shape=(window, window))
 
 
@@ -92,9 +92,8 @@ def test_half_precision_is_computed_in_single():
 
 
 def test_it_orders_masks_as_their_median_contrast_does():
-    grid = {"samples": 135, **LENS}
-    heights = [doe.flat(**grid), doe.vortex(charge=4, **grid), doe.half_rings(waves=(8.0,), **grid),
-               doe.axicon(waves=8.0, **grid)]  # fmt: skip
+    heights = [doe.flat(STOP), doe.vortex(STOP, charge=4), doe.half_rings(STOP, waves=(8.0,)),
+               doe.axicon(STOP, waves=8.0)]  # fmt: skip
     found = [behind(height) for height in heights]
     lost = [float(contrast(psf, floor=1e-5)) for psf in found]
     medians = [float(mtf(psf).median.log().sum()) for psf in found]
@@ -114,7 +113,7 @@ def test_limits_hold_and_meet_at_even_light():
     even = limits(as_psf(torch.full((1, 16, 16), 1e-3, dtype=torch.float64)))
     assert float(even.floor) == pytest.approx(1e-3 / 0.1)
     assert float(even.rms) == pytest.approx(float(even.bound)) == pytest.approx(1 / 16)
-    for height in (doe.flat(samples=135, **LENS), doe.axicon(waves=8.0, samples=135, **LENS)):
+    for height in (doe.flat(STOP), doe.axicon(STOP, waves=8.0)):
         psf = behind(height)
         found, measured = limits(psf), mtf(psf)
         lsr = psf.intensity.amax((-2, -1)).double() / psf.clear_peak

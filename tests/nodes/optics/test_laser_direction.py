@@ -53,9 +53,10 @@ def test_the_check_says_where_the_spot_is():
 
 def test_a_wired_direction_moves_the_spot_like_an_angle():
     band = spectra.bands(start=550e-9, stop=560e-9, count=2)
-    height = doe.flat(samples=32, pitch=1e-4, diameter=3.2e-3)
+    stop = optics.stop(samples=32, pitch=1e-4, diameter=3.2e-3)
+    height = doe.flat(stop)
     glass = doe.material(band, material="fused silica")
-    pupil = optics.pupil(height, glass, band, pitch=1e-4, diameter=3.2e-3)
+    pupil = optics.pupil(height, glass, band, stop)
     camera = {"focal_length": 0.11, "pixel_pitch": 2.9e-6, "shape": (24, 24)}
     towards = torch.tensor([1.3e-4, -0.7e-4], dtype=torch.float64)
     wired = optics.psf(pupil, towards, **camera)

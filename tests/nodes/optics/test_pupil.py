@@ -12,7 +12,7 @@ from torch.testing import assert_close
 from neusee.nodes import doe, optics
 from neusee.nodes.optics._phase_screen import screen
 from neusee.nodes.optics._pupil import phase_steps
-from neusee.nodes.optics._pupil_grid import Stop, axes, inside, polar, stop
+from neusee.nodes.optics._pupil_grid import PupilGrid, axes, inside, polar, pupil_grid
 from neusee.nodes.optics._zernike import combine, noll, surface
 from neusee.nodes.values import Bands, Dirt
 
@@ -24,10 +24,14 @@ def bands(*nanometres):
     return Bands(centres, torch.full_like(centres, 10e-9), torch.ones_like(centres))
 
 
-def pupil(height=None, dirt=None, wavelengths=(450, 550, 650), **params):
+def stop(samples, **params):
+    return optics.stop(samples=samples, **LENS | params)
+
+
+def pupil(height=None, dirt=None, wavelengths=(450, 550, 650), pitch=10e-6, diameter=2e-3, **params):
     height = torch.zeros(200, 200) if height is None else height
-    line = bands(*wavelengths)
-    return optics.pupil(height, doe.material(line), line, dirt, **LENS | params)
+    line, grid = bands(*wavelengths), stop(len(height), pitch=pitch, diameter=diameter)
+    return optics.pupil(height, doe.material(line), line, grid, dirt, **params)
 
 
 def field(p):
@@ -42,7 +46,7 @@ def on_axis(p):
 
 @pytest.mark.parametrize("samples", [1, 2, 15, 64, 2160])
 def test_stop_is_round_centred_and_inscribed(samples):
-    open_ = inside(stop(samples, 3.74e-6, 11e-3))
+    open_ = inside(pupil_grid(samples, 3.74e-6, 11e-3))
     assert bool(open_.any())
     assert torch.equal(open_, open_.flip(0))
     assert torch.equal(open_, open_.T)
@@ -60,15 +64,14 @@ def test_stop_is_round_centred_and_inscribed(samples):
 )
 def test_every_user_of_the_stop_sees_the_same_one(samples, pitch, diameter, aperture):
     try:
-        grid = stop(samples, pitch, diameter, aperture)
+        grid = pupil_grid(samples, pitch, diameter, aperture)
     except ValueError:
         assert diameter < math.sqrt(2) * pitch
         return
     assert aperture == "clipped" or grid.diameter <= grid.samples * grid.pitch * (1 + 1e-12)
     line = bands(550)
-    p = optics.pupil(
-        torch.zeros(samples, samples), doe.material(line), line, pitch=pitch, diameter=diameter, aperture=aperture
-    )
+    at = optics.stop(samples=samples, pitch=pitch, diameter=diameter, aperture=aperture)
+    p = optics.pupil(torch.zeros(samples, samples), doe.material(line), line, at)
     assert float(p.pitch) == grid.pitch
     assert torch.equal(p.aperture > 0, inside(grid))
     assert bool(inside(grid).any())
@@ -98,7 +101,7 @@ def test_small_aberrations_follow_marechal(index):
 
 def test_tilt_is_a_slope_of_four_rms_across():
     p = pupil(aberrations={3: 100e-9})
-    v = axes(stop(200, **LENS))[0].expand(200, 200)
+    v = axes(pupil_grid(200, **LENS))[0].expand(200, 200)
     open_ = p.aperture > 0
     assert_close(p.path.double()[open_], (200e-9 * v)[open_], rtol=1e-6, atol=1e-14)
     assert not p.path[~open_].any()
@@ -122,7 +125,7 @@ def test_noll_counts_as_noll_does():
     ]
     assert [noll(j) for j in range(1, 14)] == table
     assert noll(22) == (6, 0)
-    with pytest.raises(ValueError, match="from 1"):
+    with pytest.raises(ValueError, match="begin at 1"):
         noll(0)
 
 
@@ -137,8 +140,8 @@ def test_zernikes_are_orthonormal():
 
 
 def test_zernikes_are_those_of_the_textbook():
-    radius, azimuth = polar(Stop(31, 1.0, 31.0))
-    v, u = axes(Stop(31, 1.0, 31.0))
+    radius, azimuth = polar(PupilGrid(31, 1.0, 31.0))
+    v, u = axes(PupilGrid(31, 1.0, 31.0))
     wanted = {
         4: math.sqrt(3) * (2 * radius**2 - 1),
         5: math.sqrt(6) * radius**2 * torch.sin(2 * azimuth),
@@ -152,7 +155,7 @@ def test_zernikes_are_those_of_the_textbook():
 
 def test_coefficients_add_up_in_root_sum_of_squares():
     parts = {4: 30e-9, 6: -40e-9, 11: 120e-9}
-    grid = stop(400, 10e-6, 4e-3)
+    grid = pupil_grid(400, 10e-6, 4e-3)
     total = surface(parts, grid)[inside(grid)]
     assert float(total.std()) == pytest.approx(130e-9, rel=0.01)
 
@@ -170,7 +173,7 @@ def test_relief_learns_through_the_pupil():
     line = bands(500, 600)
 
     def axis(h):
-        p = optics.pupil(h * 1e-6, doe.material(line), line, pitch=1e-4, diameter=8e-4, defocus=0.3)
+        p = optics.pupil(h * 1e-6, doe.material(line), line, stop(8, pitch=1e-4, diameter=8e-4), defocus=0.3)
         return on_axis(p)
 
     assert torch.autograd.gradcheck(axis, (height,))
@@ -181,15 +184,17 @@ def test_shapes_that_do_not_belong_together_are_refused():
     line = bands(500, 600)
     index = doe.material(line)
     with pytest.raises(ValueError, match="square"):
-        optics.pupil(torch.zeros(4, 5), index, line, **LENS)
+        optics.pupil(torch.zeros(4, 5), index, line, stop(4))
+    with pytest.raises(ValueError, match=r"\(8, 8\), not the square pupil grid \(4, 4\) of `stop`"):
+        optics.pupil(torch.zeros(8, 8), index, line, stop(4))
     with pytest.raises(ValueError, match="from one step"):
-        optics.pupil(torch.zeros(4, 4), index[:1], line, **LENS)
-    with pytest.raises(ValueError, match="same samples"):
-        optics.pupil(torch.zeros(4, 4), index, line, Dirt(torch.ones(5, 5), torch.zeros(5, 5)), **LENS)
+        optics.pupil(torch.zeros(4, 4), index[:1], line, stop(4))
+    with pytest.raises(ValueError, match="from one `stop` step"):
+        optics.pupil(torch.zeros(4, 4), index, line, stop(4), Dirt(torch.ones(5, 5), torch.zeros(5, 5)))
 
 
 def check(p, **params):
-    return optics.pupil.hooks.check(p, **LENS | {"aperture": "inscribed"} | params)
+    return optics.pupil.hooks.check(p, p.height, p.index, None, stop(len(p.height), **params), None)
 
 
 def test_check_measures_throughput_and_clipping():
@@ -199,32 +204,39 @@ def test_check_measures_throughput_and_clipping():
     assert "asked" not in throughput.text
     wide = pupil(diameter=11e-3)
     throughput, _ = check(wide, diameter=11e-3)
-    assert "2.00 mm, inscribed instead of the requested 11.0 mm" in throughput.text
+    assert "of the clear pupil 2.00 mm" in throughput.text
+    for aperture in ("inscribed", "clipped"):
+        asked = {"samples": 200, "pitch": 10e-6, "diameter": 11e-3, "aperture": aperture}
+        (clear,) = optics.stop.hooks.check(optics.stop(**asked), **asked)
+        assert f"2.00 mm, {aperture} instead of the requested 11.0 mm" in clear.text
+    (clear,) = optics.stop.hooks.check(stop(200), **LENS, samples=200, aperture="inscribed")
+    assert "asked" not in clear.text
+    assert "requested" not in clear.text
     black = Dirt(torch.zeros(200, 200), torch.zeros(200, 200))
     assert not check(pupil(dirt=black))[0].ok
 
 
 @pytest.mark.parametrize(("waves", "ok"), [(20.0, True), (90.0, False)])
 def test_check_warns_of_phase_that_the_samples_cannot_follow(waves, ok):
-    p = pupil(height=doe.axicon(waves=waves, samples=200, **LENS), wavelengths=(550,))
+    p = pupil(height=doe.axicon(stop(200), waves=waves), wavelengths=(550,))
     _, step = check(p)
     assert step.ok is ok
     median, _ = phase_steps(p)
-    radius, azimuth = polar(stop(200, **LENS))
+    radius, azimuth = polar(pupil_grid(200, **LENS))
     slopes = torch.cat([azimuth.cos().abs()[radius <= 1], azimuth.sin().abs()[radius <= 1]])
     assert median == pytest.approx(waves / 100 * float(slopes.median()), rel=0.03)
 
 
 def test_wrapped_elements_are_not_called_aliased():
     slopes = (12.0, 18.0, 24.0, 30.0, 36.0)
-    height = doe.half_rings(waves=slopes, samples=1000, pitch=2e-6, diameter=2e-3)
+    height = doe.half_rings(stop(1000, pitch=2e-6), waves=slopes)
     p = pupil(height=doe.fabricate(height, wrap_at=550e-9), pitch=2e-6)
     assert check(p, pitch=2e-6)[1].ok
 
 
 def test_a_large_pupil_is_made_and_checked_by_parts_as_a_whole():
     """More rows than one stripe has, and more than are looked at one by one."""
-    grid = stop(1100, 10e-6, 11e-3)
+    grid = pupil_grid(1100, 10e-6, 11e-3)
     height = screen(grid, 0.02, torch.Generator().manual_seed(0)).float() * 2e-6
     p = pupil(height=height, wavelengths=(550,), diameter=11e-3, defocus=2.0, aberrations={5: 1e-7})
     v, u = axes(grid)
@@ -246,7 +258,7 @@ def test_one_sample_is_a_pupil():
 
 
 def test_screen_is_standard_noise_with_the_asked_correlation():
-    grid = stop(61, 1.0, 61.0)
+    grid = pupil_grid(61, 1.0, 61.0)
     draws = torch.stack([screen(grid, 0.15, torch.Generator().manual_seed(k)) for k in range(400)])
     assert float(draws.mean()) == pytest.approx(0, abs=0.03)
     assert float(draws.square().mean()) == pytest.approx(1, abs=0.03)
@@ -259,9 +271,9 @@ def test_screen_is_standard_noise_with_the_asked_correlation():
 def test_everything_is_made_where_the_relief_is():
     """A device without memory shows where tensors are made; mixing two devices would raise."""
     line = Bands(*(x.to("meta") for x in bands(500, 600)))
-    p = optics.pupil(
-        torch.zeros(8, 8, device="meta"), doe.material(line), line, **LENS, defocus=1.0, aberrations={5: 1e-8, 8: 1e-8}
-    )
+    aberrations = {5: 1e-8, 8: 1e-8}
+    height = torch.zeros(8, 8, device="meta")
+    p = optics.pupil(height, doe.material(line), line, stop(8), defocus=1.0, aberrations=aberrations)
     assert {x.device.type for x in p} == {"meta"}
 
 

@@ -18,9 +18,13 @@ seed: 3
 tolerance: 1e-3
 mask: {waves: 2, samples: 24, max_height: 1.2 um}
 steps:
+  stop:
+    node: optics.stop
+    with: {samples: "${mask.samples}", pitch: 10 um, diameter: 240 um}
   cone:
     node: doe.axicon
-    with: {samples: "${mask.samples}", pitch: 10 um, diameter: 240 um, waves: "${mask.waves}"}
+    from: stop
+    with: {waves: "${mask.waves}"}
   made:
     node: doe.fabricate
     from: cone
@@ -79,7 +83,7 @@ def test_run_prints_steps_numbers_verdict_path_and_three_commands(neusee, here):
     assert (code, err) == (0, "")
     lines = out.splitlines()
     assert "An axicon" in lines[0]
-    assert lines[1].startswith("checked  2 steps of 2 nodes")
+    assert lines[1].startswith("checked  3 steps of 3 nodes")
     rows = {line.split()[0]: line.split() for line in lines if line.startswith("  ")}
     assert rows["cone"][1:3] == ["cpu", "run"]
     assert rows["made"][1:3] == ["cpu", "run"]
@@ -94,15 +98,15 @@ def test_a_second_run_is_cached_and_says_what_slept(neusee):
     neusee("run", "mine.yaml")
     _, out, _ = neusee("run", "mine.yaml")
     assert "cached" in next(line for line in out.splitlines() if line.startswith("  made"))
-    assert "1 steps were not needed" in out
-    assert "2 cached" in out
+    assert "2 steps were not needed" in out
+    assert "3 cached" in out
 
 
 def test_a_changed_value_runs_only_what_follows(neusee):
     neusee("run", "mine.yaml")
     _, out, _ = neusee("run", "mine.yaml", "mask.max_height=1.3 um", "--json")
     states = {s["step"]: s["state"] for s in json.loads(out)["steps"]}
-    assert states == {"cone": "cached", "made": "run"}
+    assert states == {"stop": "not needed", "cone": "cached", "made": "run"}
 
 
 def test_a_row_says_why_it_ran(neusee):
@@ -207,11 +211,11 @@ def test_a_failure_while_running_is_exit_code_one_and_has_no_stack(neusee, monke
 def test_plan_computes_nothing_and_knows_what_is_stored(neusee, here):
     code, out, _ = neusee("plan", "mine.yaml")
     assert code == 0
-    assert "2 of 2 steps would run" in out
+    assert "3 of 3 steps would run" in out
     assert not (here / "runs").exists()
     neusee("run", "mine.yaml", "--quiet")
     _, out, _ = neusee("plan", "mine.yaml")
-    assert "0 of 2 steps would run" in out
+    assert "0 of 3 steps would run" in out
     _, out, _ = neusee("plan", "mine.yaml", "mask.max_height=1.3 um")
     rows = {line.split()[0]: line.split() for line in out.splitlines()}
     assert rows["cone"][2] == "stored"
@@ -228,7 +232,7 @@ def test_plan_follows_what_would_be_left_out(neusee, here):
     _, out, _ = neusee("plan", "mine.yaml")
     rows = {line.split()[0]: line for line in out.splitlines()}
     assert "left out" in rows["near"]
-    assert "0 of 3 steps would run" in out
+    assert "0 of 4 steps would run" in out
 
 
 def test_config_can_be_run_again(neusee, here):
@@ -259,7 +263,7 @@ def test_recipes_nodes_schema_and_cache_say_what_there_is(neusee, here):
     _, out, _ = neusee("nodes", "doe.fabricate")
     assert "max_height  length > 0" in out
     assert "Source:" in out
-    _, out, _ = neusee("nodes", "optics.pupil")
+    _, out, _ = neusee("nodes", "optics.stop")
     assert "reading.aperture" in out
     neusee("run", "mine.yaml", "--quiet")
     _, out, _ = neusee("cache", "ls")

@@ -254,8 +254,9 @@ steps:
   cube: {node: spectra.lift_mallett, from: {rgb: scene, bands: bands}}
   radiance: {node: spectra.illuminate, from: {reflectance: cube, illuminant: light}}
   index: {node: doe.material, from: bands}
-  height: {node: doe.axicon, with: {waves: 1, samples: 32, pitch: 250 um, diameter: 8 mm}}
-  pupil: {node: optics.pupil, from: {height: height, index: index, bands: bands}, with: {pitch: 250 um, diameter: 8 mm}}
+  stop: {node: optics.stop, with: {samples: 32, pitch: 250 um, diameter: 8 mm}}
+  height: {node: doe.axicon, from: stop, with: {waves: 1}}
+  pupil: {node: optics.pupil, from: {height: height, index: index, bands: bands, stop: stop}}
   psf: {node: optics.psf, from: pupil, with: {focal_length: 0.1 m, pixel_pitch: 2.9 um, shape: [32, 32], pixel: zoh}}
   image: {node: optics.image, from: {radiance: radiance, psf: psf}}
 """

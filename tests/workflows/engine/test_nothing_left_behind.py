@@ -15,9 +15,13 @@ RECIPE = """\
 # An axicon, cut off at half its height.
 mask: {waves: 2, samples: 192}
 steps:
+  stop:
+    node: optics.stop
+    with: {samples: "${mask.samples}", pitch: 10 um, diameter: 1.9 mm}
   cone:
     node: doe.axicon
-    with: {samples: "${mask.samples}", pitch: 10 um, diameter: 1.9 mm, waves: "${mask.waves}"}
+    from: stop
+    with: {waves: "${mask.waves}"}
   made:
     node: doe.fabricate
     from: cone

@@ -1,11 +1,14 @@
 import sys
 from pathlib import Path
 
+import numpy as np
 import pytest
 
 from neusee.workflows.graph.diagnostics import Location
+from neusee.workflows.graph.run_error import RunError
 from neusee.workflows.recipe.loading import groups, load, recipes
 from neusee.workflows.recipe.text.yaml_values import parse
+from neusee.workflows.store.result_store import Store
 
 CAMERA = """\
 # A camera of toys.
@@ -140,6 +143,57 @@ def test_notes_come_once(read):
         "  psf:", "  other: {node: toy.pupil, from: height, with: {pitch: 3 um, diameter: 11 mm}}\n  psf:"
     )
     assert read(text).notes == ("aperture 11.0 mm > pupil grid 8.08 mm: clipped",)
+
+
+ON_A_GRID = """\
+steps:
+  height: {node: toy.height}
+  late: {node: toy.stop_of, from: height}
+  stop: {node: optics.stop, with: {samples: 4, pitch: 10 um, diameter: 40 um}}
+  mask: {node: doe.pixelwise, from: stop, with: {file: mask.npy}}
+  written: {node: doe.smooth, from: {height: mask, stop: stop}, with: {feature: 12 um}}
+outputs: [written]
+"""
+
+
+def _heights(folder, side):
+    np.save(folder / "mask.npy", np.zeros((side, side), np.float32))
+
+
+def test_a_preflight_sees_an_input_that_parameters_alone_decide(read, mistakes, tmp_path, monkeypatch):
+    monkeypatch.setenv("NEUSEE_CACHE", str(tmp_path / "cache"))
+    _heights(tmp_path, 4)
+    (note,) = read(ON_A_GRID).notes
+    assert note == "feature 12 um is less than 1.5 samples of 10 um: not resolved"
+    assert read(ON_A_GRID, "steps.written.with.feature=15 um").notes == ()
+    assert not (tmp_path / "cache").exists()  # nothing is stored
+    _heights(tmp_path, 8)
+    message = "mask.npy is (8, 8), not the pupil grid (4, 4): resample the height map, or set samples to 8"
+    assert mistakes(ON_A_GRID) == [f"mine.yaml:5:56 | steps.mask.with.file = mask.npy | {message}"]
+    assert read(ON_A_GRID, "steps.stop.with.samples=8", "steps.stop.with.diameter=80 um")
+
+
+def test_a_preflight_without_its_input_leaves_the_question_to_the_run(read, tmp_path):
+    store = Store(tmp_path / "store")
+    _heights(tmp_path, 8)
+    text = ON_A_GRID.replace("from: stop", "from: late").replace("stop: stop", "stop: late")
+    recipe = read(text)
+    assert recipe.notes == ()
+    with pytest.raises(RunError, match=r"mask .*mask.npy is \(8, 8\), not the pupil grid \(4, 4\)"):
+        recipe.run(store)
+    _heights(tmp_path, 4)
+    assert recipe.run(store)["written"].shape == (4, 4)
+
+
+def test_an_input_with_wrong_parameters_is_one_mistake(mistakes, tmp_path):
+    _heights(tmp_path, 8)
+    for old, new, said in (
+        ("diameter: 40 um", "diameter: 1 um", "holds no pupil sample"),
+        ("samples: 4", "samples: -4", "must be greater than or equal to 1"),
+    ):
+        (problem,) = mistakes(ON_A_GRID.replace(old, new))
+        assert "| steps.stop.with." in problem
+        assert said in problem
 
 
 def test_only_the_families_that_are_named_are_imported(read, monkeypatch):

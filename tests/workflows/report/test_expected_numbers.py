@@ -13,8 +13,9 @@ expect:
 steps:
   bands: {node: spectra.bands, with: {start: 400 nm, stop: 700 nm, count: 3}}
   index: {node: doe.material, from: bands}
-  height: {node: doe.axicon, with: {waves: "${optics.waves}", samples: 8, pitch: 1 mm, diameter: 8 mm}}
-  pupil: {node: optics.pupil, from: {height: height, index: index, bands: bands}, with: {pitch: 1 mm, diameter: 8 mm}}
+  stop: {node: optics.stop, with: {samples: 8, pitch: 1 mm, diameter: 8 mm}}
+  height: {node: doe.axicon, from: stop, with: {waves: "${optics.waves}"}}
+  pupil: {node: optics.pupil, from: {height: height, index: index, bands: bands, stop: stop}}
   psf: {node: optics.psf, from: pupil, with: {focal_length: 0.1 m, pixel_pitch: "${optics.pitch}", shape: [4, 4]}}
 """
 

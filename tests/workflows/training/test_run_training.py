@@ -17,12 +17,12 @@ import torch
 from PIL import Image
 from safetensors.torch import load_file
 
+from neusee.nodes import optics
 from neusee.nodes.doe._parametrisations import PARAMETRISATIONS
-from neusee.nodes.optics._pupil_grid import stop
 from neusee.nodes.scene import Photographs
 from neusee.workflows import RecipeError, Store, as_function, load
 from neusee.workflows.cli import app
-from neusee.workflows.recipe.blocks.train_block import GRID, MaskSettings, Rates
+from neusee.workflows.recipe.blocks.train_block import MaskSettings, Rates
 from neusee.workflows.training.mask_design import design_page
 from neusee.workflows.training.parallel.shared_graph import Shared
 from neusee.workflows.training.run_training import frozen, train
@@ -63,7 +63,12 @@ def trained(recipe, folder, stages=(1, 2), watch=None):
 
 
 def pupil(recipe):
-    return stop(*(recipe.steps["height"].params[name] for name in GRID))
+    return optics.stop(**recipe.steps["stop"].params)
+
+
+def relief_of(recipe):
+    start = PARAMETRISATIONS["doe.unet"]
+    return start(pupil(recipe), recipe.steps["height"].params, torch.Generator().manual_seed(3))
 
 
 def losses(folder):
@@ -122,7 +127,7 @@ train(recipe, Store(here / "store"), here / "runs", [], print, watch=watch)
 def test_a_picture_is_the_same_in_whatever_order(tmp_path, tiny):
     sources = Photographs.under(tiny.training.photographs)
     samples = TrainingStream(tiny, tiny.training, sources, Store(tmp_path), "cpu")
-    height = PARAMETRISATIONS["doe.unet"](tiny.steps["height"].params, torch.Generator().manual_seed(3))(pupil(tiny))
+    height = relief_of(tiny)(pupil(tiny))
     shared = Shared.of(samples.shared({"height": height})).values
     first = [samples(shared, 1, number) for number in (0, 1, 2)]
     again = [samples(shared, 1, number) for number in (2, 0, 1)]
@@ -136,7 +141,7 @@ def test_the_gradient_through_the_cut_is_the_whole_one(tmp_path):
     recipe = load("train_small", [*TINY, "laser=green", "sensor.read_noise=10 e-", "tolerance=0"])
     how = recipe.training
     samples = TrainingStream(recipe, how, Photographs((recipe.steps["scene"].params["file"],)), Store(tmp_path), "cpu")
-    relief = PARAMETRISATIONS["doe.unet"](recipe.steps["height"].params, torch.Generator().manual_seed(3))
+    relief = relief_of(recipe)
     shared = Shared.of(samples.shared({"height": relief(pupil(recipe))}))
     for number in (0, 1):
         sample = samples(shared.values, 1, number)

@@ -15,7 +15,6 @@ from neusee.workflows.recipe.text.renamed_keys import instead
 from neusee.workflows.recipe.text.yaml_values import Value
 
 KEY = "train"  #: key of the block in a recipe
-GRID = ("samples", "pitch", "diameter", "aperture")  #: parameters that every mask has
 
 Weight = Annotated[float, Field(ge=0, allow_inf_nan=False)]
 Share = Annotated[float, Field(ge=0, le=1)]

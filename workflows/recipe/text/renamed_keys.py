@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterable
+
 _CALLED = {
     "element": "mask",
     "steps.element": "steps.fabricated",
@@ -34,7 +36,17 @@ _CALLED = {
 }  #: a key of a recipe by its path, a node by its name, a parameter by its node and name
 
 _UNIT = "a gain says its unit: write {}.gain: 0.37 e-/DN, or 2.7 DN/e-"
+_GRID = ("samples", "pitch", "diameter", "aperture")
+_ON_A_GRID = (
+    *(f"doe.{mask}" for mask in ("flat", "vortex", "axicon", "spiral_axicon", "cubic", "half_rings", "zernike")),
+    *("doe.pixelwise", "doe.unet", "doe.smooth", "flare.dirt", "optics.pupil"),
+)  #: nodes that had parameters of the pupil grid in 0.1
+_STOP = (
+    "is set by the step of the pupil grid: write stop: {node: optics.stop, with: {samples: …, pitch: …, diameter: …, "
+    "aperture: …}}, add stop: stop to `from` here, and remove these parameters here"
+)
 _GONE = {
+    **{f"{node}.{name}": _STOP for node in _ON_A_GRID for name in _GRID},
     "reading.gain_unit": _UNIT.format("sensor"),
     "camera.gain_unit": _UNIT.format("camera"),
     **dict.fromkeys(
@@ -70,6 +82,11 @@ def instead(old: str) -> str:
     if now := new_name(old):
         return f"is called {now} now"
     return _GONE.get(old, "")
+
+
+def became_input(node: str, parameters: Iterable[str]) -> bool:
+    """Return True if a node is given parameters of the pupil grid, which are an input now."""
+    return node in _ON_A_GRID and not set(_GRID).isdisjoint(parameters)
 
 
 def old_names() -> tuple[str, ...]:

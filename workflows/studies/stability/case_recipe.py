@@ -8,7 +8,6 @@ from typing import Any
 
 import torch
 
-from neusee.nodes import Node
 from neusee.workflows.engine.node_call import call
 from neusee.workflows.graph.recipe_graph import Recipe, Step, in_order
 from neusee.workflows.graph.run_error import RunError
@@ -34,20 +33,13 @@ def with_losses(recipe: Recipe) -> dict[str, Step]:
         for path, params in _COMPARES.get(step.node.path, ()):
             node = find_node(path)
             wires = {given: step.wires[own] for given, own in zip(node.inputs, step.node.inputs, strict=False)}
+            if "stop" in node.inputs:  # of the mask before this step
+                wires["stop"] = recipe.steps[step.sources[0]].wires["stop"]
             room, _, what = path.partition(".")
             own = f"{'loss ' if room == 'losses' else ''}{what}{' log' if 'log' in params else ''} of {name}"
-            given = node.params(**params, **_grid(recipe, node, step)).model_dump()
+            given = node.params(**params).model_dump()
             steps[own] = Step(own, node, given, wires, step.mark, {})
     return steps
-
-
-def _grid(recipe: Recipe, node: Node, step: Step) -> dict[str, Any]:
-    """Return the grid of the pupil, that of the mask, for a node that has to know the grid."""
-    if "samples" not in node.params.model_fields:
-        return {}
-    grid = recipe.steps[step.sources[0]].params
-    lengths = {name: f"{grid[name]!r} m" for name in ("pitch", "diameter")}
-    return {"samples": grid["samples"], "aperture": grid["aperture"], **lengths}
 
 
 def with_size(steps: Mapping[str, Step], size: Size) -> dict[str, Step]:
@@ -64,26 +56,11 @@ def _smaller(step: Step, size: Size, part: float) -> dict[str, Any]:
     if "samples" in params:
         params["pitch"] *= params["samples"] / size.samples
         params["samples"] = size.samples
-    elif "pitch" in params and "diameter" in params:
-        params["pitch"] = None  # of a pupil: as of its relief, see `with_matched_pupils`
     if step.node.path == "spectra.bands":
         params["count"] = size.bands
     if params.get("angle"):
         params["angle"] = tuple(a * min(part, 1.0) for a in params["angle"])
     return params | {k: min(v, params[k]) for k, v in _SMALLER.items() if step.node.random and k in params}
-
-
-def with_matched_pupils(steps: Mapping[str, Step]) -> dict[str, Step]:
-    """Return the steps with pupils sampled as the masks are."""
-    pitches = [s.params["pitch"] for s in steps.values() if s.params.get("pitch") and "samples" in s.params]
-    return {
-        name: replace(step, params={**step.params, "pitch": pitches[0]}) if _open(step) else step
-        for name, step in steps.items()
-    }
-
-
-def _open(step: Step) -> bool:
-    return "pitch" in step.params and step.params["pitch"] is None
 
 
 def with_parameters(steps: Mapping[str, Step], case: Case) -> dict[str, Step]:
@@ -115,7 +92,7 @@ class CaseRecipe:
     @classmethod
     def of(cls, recipe: Recipe, case: Case, code: Code) -> CaseRecipe:
         """Return the case with the key of each step; a result that the case replaces has a key of its own."""
-        steps = with_parameters(with_matched_pupils(with_size(with_losses(recipe), case.size)), case)
+        steps = with_parameters(with_size(with_losses(recipe), case.size), case)
         chain = cls(recipe, case, steps)
         for name in in_order({n: s.sources for n, s in steps.items()}, steps):
             key, _ = key_of(steps[name], chain.keys, recipe.seed, code)

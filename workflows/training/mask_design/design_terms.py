@@ -5,15 +5,13 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
-from functools import cached_property
 from typing import Any
 
 import torch
 from torch import Tensor
 
 from neusee.nodes import losses
-from neusee.nodes.optics import Stop, stop
-from neusee.nodes.values import BAND_FIELDS, Bands, Psf, Pupil
+from neusee.nodes.values import BAND_FIELDS, Bands, Psf, Pupil, Stop
 from neusee.workflows.engine.differentiable_function import as_function
 from neusee.workflows.engine.runner import run
 from neusee.workflows.graph.recipe_graph import Recipe, Step, needed
@@ -67,10 +65,13 @@ class Terms:
             self.recipe, settings.height, self._bands, outputs=[settings.psf], store=store, device=device
         )
         seen = [settings.illuminant, settings.responses] if settings.weights.wiener else []
-        done = run(self.recipe, store, [self._bands, settings.plain, *seen], device=device)
+        stop = self.mask_step.wires.get("stop")
+        stops = [stop] if isinstance(stop, str) else []
+        done = run(self.recipe, store, [self._bands, settings.plain, *seen, *stops], device=device)
         self._seen: list[Tensor] = [done[name] for name in seen]
         self.bands: Bands = done[self._bands]
         self._plain: Psf = done[settings.plain]
+        self._stop: Stop | None = done[stops[0]] if stops else None
         self.device = self._plain.intensity.device
 
     @property
@@ -83,13 +84,12 @@ class Terms:
         """Return the step of the mask that is replaced."""
         return self.recipe.steps[self.settings.height]
 
-    @cached_property
+    @property
     def stop(self) -> Stop:
-        """Return the grid of the pupil that the replaced step has."""
-        params = self.mask_step.params
-        if missing := [name for name in ("samples", "pitch", "diameter", "aperture") if name not in params]:
-            raise DesignError(f"height: {self.settings.height} has no {missing[0]}: take a recipe whose mask is a doe")
-        return stop(*(params[name] for name in ("samples", "pitch", "diameter", "aperture")))
+        """Return the stop, with the pupil grid, that the replaced step reads."""
+        if self._stop is None:
+            raise DesignError(f"height: {self.settings.height} has no stop: take a recipe whose mask is a doe")
+        return self._stop
 
     @property
     def count(self) -> int:

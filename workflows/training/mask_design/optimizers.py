@@ -21,8 +21,7 @@ from neusee.nodes.doe import (
     read_height_map,
     wave_height,
 )
-from neusee.nodes.optics import Stop
-from neusee.workflows.graph.recipe_graph import Step
+from neusee.nodes.values import Stop
 from neusee.workflows.recipe.blocks.mask_design_block import DesignError, MaskTraining, half_cosine
 from neusee.workflows.training.loop.checkpoint import StateFile
 from neusee.workflows.training.loop.resumable_loop import Progress
@@ -51,17 +50,19 @@ def learn(terms: Terms, state: StateFile, progress: Progress) -> LearntMask:
 # --- by gradients -----------------------------------------------------------------------------------------------------
 
 
-def shape_of(settings: MaskTraining, start: int, step: Step) -> nn.Module:
-    """Return the parameters to learn, as they are at a start; ``step`` is the step of the mask."""
-    shape = _free(settings, torch.Generator().manual_seed(settings.seed + _APART * start), step)
+def shape_of(terms: Terms, start: int) -> nn.Module:
+    """Return the mask with its trainable parameters as they are at the beginning of a start."""
+    settings = terms.settings
+    shape = _free(terms, torch.Generator().manual_seed(settings.seed + _APART * start))
     return shape if settings.feature is None else Written(shape, settings.feature)
 
 
-def _free(settings: MaskTraining, rng: torch.Generator, step: Step) -> nn.Module:
+def _free(terms: Terms, rng: torch.Generator) -> nn.Module:
+    settings, step = terms.settings, terms.mask_step
     if settings.kind == "recipe_mask":
         if step.node.path not in PARAMETRISATIONS:
             raise DesignError(f"kind: {step.name} is {step.node.path}, whose samples are not learnt")
-        return PARAMETRISATIONS[step.node.path](step.params, rng)
+        return PARAMETRISATIONS[step.node.path](terms.stop, step.params, rng)
     if settings.kind == "pixelwise":
         return Pixels(settings.grid, settings.max_height, settings.scale, rng, _start(settings))
     if settings.kind == "zernike":
@@ -95,7 +96,7 @@ def _descend(terms: Terms, file: StateFile, progress: Progress) -> LearntMask:
     if state["start"] or "shape" in state:
         progress(f"going on from start {state['start'] + 1}, iteration {state.get('iteration', 0)}")
     for start in range(state["start"], settings.starts):
-        shape = shape_of(settings, start, terms.mask_step).to(terms.device)
+        shape = shape_of(terms, start).to(terms.device)
         _one_start(terms, shape, start, state, file, progress)
         with torch.no_grad():
             loss = float(terms.total(terms.parts(shape(terms.stop))))
@@ -108,7 +109,7 @@ def _descend(terms: Terms, file: StateFile, progress: Progress) -> LearntMask:
             state.pop(name, None)
         state["start"] = start + 1
         file.write(state)
-    best = shape_of(settings, state["best"]["start"], terms.mask_step)
+    best = shape_of(terms, state["best"]["start"])
     best.load_state_dict(state["best"]["shape"])
     return LearntMask(best, state["best"]["loss"], _few(best), state["history"])
 
@@ -174,11 +175,8 @@ def half_ring_height(genes: Any, settings: MaskTraining) -> Callable[[Stop], Ten
     *slopes, side, turn = (float(gene) for gene in genes)
     given = {"waves": tuple(slopes), "alternate": side >= 0.5, "orientation": turn}
 
-    def height(grid: Stop) -> Tensor:
-        made: Tensor = half_rings(
-            **given, samples=grid.samples, pitch=grid.pitch, diameter=grid.diameter, aperture="clipped",
-            wavelength=settings.wavelength, material=settings.material,
-        )  # fmt: skip
+    def height(stop: Stop) -> Tensor:
+        made: Tensor = half_rings(stop, **given, wavelength=settings.wavelength, material=settings.material)
         return made
 
     return height if settings.feature is None else Written(height, settings.feature)
@@ -271,7 +269,7 @@ def _steepest(terms: Terms) -> float:
     """Return the slope, in waves at the rim, that turns half a wave a sample in the first band: Nyquist's limit."""
     material, wavelength = terms.settings.material, terms.settings.wavelength
     turned = wave_height(material, wavelength) / wave_height(material, float(terms.bands.centres.min()))
-    return terms.stop.diameter / (4 * terms.stop.pitch * turned)
+    return float(terms.stop.diameter / (4 * terms.stop.pitch * turned))
 
 
 def _holds_usual(settings: MaskTraining) -> bool:

@@ -1,6 +1,7 @@
 """What was called otherwise in 0.1: one located line says the new name, wherever the old one is written."""
 
 import functools
+import json
 import re
 from pathlib import Path
 
@@ -21,7 +22,16 @@ KEYS.remove("sensor.gather")  # a node of the family `sensor`, not a key of the 
 KEYS += [f"element.{name}" for name in ("material", "wrap_at", "levels", "max_height")]
 LIFT = [old for old in old_names() if old.startswith("train_lift.")]
 NODES = [old for old in old_names() if old.count(".") == 1 and old not in (*KEYS, *ELEMENT, *LIFT)]
-PARAMETERS = [old for old in old_names() if old.count(".") == 2 and old not in ELEMENT]
+GRID = [old for old in old_names() if instead(old) == instead("doe.flat.samples")]
+PARAMETERS = [old for old in old_names() if old.count(".") == 2 and old not in (*ELEMENT, *GRID)]
+ON_A_GRID = {  #: a step of 0.1 by its node, without the parameters of the pupil grid
+    "doe.flat": {}, "doe.vortex": {"with": {"charge": 1}}, "doe.axicon": {"with": {"waves": 1}},
+    "doe.spiral_axicon": {"with": {"waves": 1, "charge": 1}}, "doe.cubic": {"with": {"waves": 1}},
+    "doe.half_rings": {"with": {"waves": [1]}}, "doe.zernike": {"with": {"coefficients": {4: "1 nm"}}},
+    "doe.pixelwise": {}, "doe.unet": {}, "flare.dirt": {},
+    "doe.smooth": {"from": {"height": "flat"}, "with": {"feature": "1 mm"}},
+    "optics.pupil": {"from": {"height": "flat", "index": "index", "bands": "bands"}},
+}  # fmt: skip
 
 
 def refused(name, *arguments, folder=None):
@@ -38,7 +48,7 @@ def using(node):
 
 
 def test_every_old_name_is_of_one_kind_and_is_one_no_more():
-    kinds = (*(old for old in KEYS if not old.startswith("element.")), *NODES, *PARAMETERS, *ELEMENT, *LIFT)
+    kinds = (*(old for old in KEYS if not old.startswith("element.")), *NODES, *PARAMETERS, *GRID, *ELEMENT, *LIFT)
     assert sorted(kinds) == sorted(old_names())
     assert sorted(ELEMENT) == ["element", "steps.element", "train.mask.kind=element", "train.rates.element"]
     assert all(old.partition(".")[0] in families() for old in (*NODES, *PARAMETERS))
@@ -100,6 +110,22 @@ def test_an_old_parameter_in_place_of_the_new_one_is_one_mistake(old):
     name, step = using(node)
     found = refused(name, f"~steps.{step}.with.{new_name(old)}", f"+steps.{step}.with.{parameter}=1 e-")
     assert [message for _, _, message in found] == [instead(old)]
+
+
+@pytest.mark.parametrize("node", ON_A_GRID)
+@pytest.mark.parametrize("new", [False, True], ids=["old", "with the new input"])
+def test_a_step_with_its_own_pupil_grid_is_one_mistake(node, new):
+    """However many parameters of the grid are given, and whether or not the step of the grid is wired."""
+    assert {old.rpartition(".")[0] for old in GRID} == set(ON_A_GRID)
+    grid = {"samples": 8, "pitch": "1 mm", "diameter": "8 mm", "aperture": "clipped"}
+    step = ON_A_GRID[node]
+    wires = {**step.get("from", {}), **({"stop": "stop"} if new else {})}
+    for given in (grid, {"diameter": "8 mm"}):
+        old = {"node": node, "from": wires, "with": {**step.get("with", {}), **given}}
+        ((where, path, message),) = refused("first_light", f"+steps.old={json.dumps(old)}")
+        assert (where, path) == ("argument 1", f"steps.old.with.{next(iter(given))}")
+        assert message == instead(f"{node}.pitch")
+        assert "stop: {node: optics.stop, with:" in message
 
 
 @pytest.mark.parametrize("words", [("outputs=[element]",), ("steps.pupil.from.height=element",)])

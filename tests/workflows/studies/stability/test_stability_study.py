@@ -107,8 +107,8 @@ def test_names_and_groups_of_the_catalogue_are_in_order():
 def test_small_chains_keep_the_pupil_and_know_what_a_case_touches(tmp_path):
     recipe, code = load("first_light", []), Code(tmp_path / "code.json")
     usual = CaseRecipe.of(recipe, USUAL, code)
-    pupil = usual.steps["pupil[mask]"].params
-    whole = recipe.steps["flat"].params
+    pupil = usual.steps["stop"].params
+    whole = recipe.steps["stop"].params
     assert pupil["pitch"] * USUAL.size.samples == pytest.approx(whole["pitch"] * whole["samples"])
     dim = CaseRecipe.of(recipe, BY_NAME["exposure 1 us"], code)
     same = set(unchanged_steps(dim, usual))

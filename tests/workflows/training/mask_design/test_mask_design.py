@@ -60,7 +60,7 @@ def read(folder):
 def test_every_kind_lowers_its_loss_on_all_bands(kind, recipe, store, tmp_path):
     given = how(kind=kind, iterations=15)
     terms = Terms(recipe, given, store)
-    before = loss_of(terms, optimizers.shape_of(given, 0, terms.mask_step)(terms.stop))
+    before = loss_of(terms, optimizers.shape_of(terms, 0)(terms.stop))
     folder = design(recipe, given, store, tmp_path, quiet)
     found = read(folder)
     assert found["loss"] < before - 0.1
@@ -132,8 +132,7 @@ def test_a_damaged_state_begins_again(recipe, store, tmp_path):
 def test_evolved_half_rings_beat_those_that_nobody_optimised(recipe, store, tmp_path):
     given = how(kind="five_half_rings", iterations=4, population=10, slopes=(1.0, 40.0))
     terms = Terms(recipe, given, store)
-    grid = terms.stop
-    usual = half_rings(waves=(12, 18, 24, 30, 36), samples=64, pitch=grid.pitch, diameter=grid.diameter)
+    usual = half_rings(terms.stop, waves=(12, 18, 24, 30, 36))
     found = read(design(recipe, given, store, tmp_path, quiet))
     assert found["loss"] < loss_of(terms, usual) - 0.05
     assert len(found["numbers"]["waves"]) == 5
