@@ -32,11 +32,11 @@ class ToleranceChoice:
 
 def pareto_front(points: Points) -> list[WorkPrecisionPoint]:
     """Return the points that no other point beats in both time and error, the quickest first."""
-    front: list[WorkPrecisionPoint] = []
+    line: list[WorkPrecisionPoint] = []
     for point in sorted(points, key=lambda p: (p.seconds, p.most)):
-        if not front or point.most < front[-1].most:
-            front.append(point)
-    return front
+        if not line or point.most < line[-1].most:
+            line.append(point)
+    return line
 
 
 def cheapest(points: Points, tolerance: float) -> WorkPrecisionPoint | None:
