@@ -1,4 +1,4 @@
-"""Studies of a recipe: how accurate its numbers are, where it breaks, and what it need not compute.
+"""Studies of a recipe: accuracy, stability, omissions, calibration and uncertainty.
 
     study_recipe("accuracy", load("first_light"))       error against run time, over tolerances and knobs
     study_recipe("stability", load("first_light"))      stiff and extreme cases against float64
@@ -45,6 +45,6 @@ def study_recipe(
 
 
 def count_failures(folder: Path) -> int:
-    """Return how many cells, bounds or bars of a finished study do not hold."""
+    """Return the number of failed tests of a finished study, from its ``provenance.json``."""
     found: dict[str, Any] = json.loads((folder / "provenance.json").read_text())
     return int(found.get("failed", 0))

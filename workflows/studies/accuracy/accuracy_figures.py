@@ -38,7 +38,7 @@ Diagram = tuple[Any, Sequence["Line"], Styles, float]  #: axes, lines, their sty
 
 @dataclass(frozen=True)
 class Line:
-    """The points of one parameter, which a line connects."""
+    """A line of a diagram: the points at all settings of one parameter."""
 
     name: str
     dots: Sequence[Dot]
@@ -55,7 +55,7 @@ def work_precision(
     styles = _styles(line.name for line in lines)
     diagram = (ax, lines, styles, EXACT)
     _draw_diagram(diagram, errors=[tolerance])
-    _ring(ax, lines)
+    _ring_own_setting(ax, lines)
     if pareto_front:
         x, y = zip(*pareto_front, strict=True)
         style = {"color": BLACK, "linewidth": 5.0, "alpha": 0.16, "zorder": 0}
@@ -136,7 +136,7 @@ def _draw_diagram(diagram: Diagram, errors: Sequence[float] = (), seconds: Seque
 
 
 def _axis_limits(values: Sequence[float], least: float, margin: float) -> tuple[float, float]:
-    """Return limits with a margin around all values; the upper limit is at least ``least`` times the lower limit."""
+    """Return axis limits with a margin around all values; their ratio is at least ``least``."""
     low, high = min(values) / margin, max(values) * margin
     wider = math.sqrt(max(1.0, least / (high / low)))
     return low / wider, high * wider
@@ -152,8 +152,7 @@ def _draw(ax: Any, line: Line, colour: str, mark: str, exact: float) -> None:
     ax.errorbar([d.seconds for d in line.dots], y, yerr=np.maximum([y - least, most - y], 0.0), **{"zorder": 2} | style)
 
 
-def _ring(ax: Any, lines: Sequence[Line]) -> None:
-    """Draw a ring around the first point that is the recipe's own setting."""
+def _ring_own_setting(ax: Any, lines: Sequence[Line]) -> None:
     ring = {"marker": "o", "markersize": 17, "markerfacecolor": "none", "markeredgecolor": BLACK, "linestyle": ""}
     for dot in [d for line in lines for d in line.dots if d.own][:1]:
         at = [dot.seconds], [max(dot.error, EXACT)]
@@ -161,7 +160,6 @@ def _ring(ax: Any, lines: Sequence[Line]) -> None:
 
 
 def _tick_seconds(ax: Any) -> None:
-    """Set plain ticks at 1, 2 and 5 times each power of ten, or at the powers of ten if the axis is long."""
     from matplotlib.ticker import FuncFormatter, LogLocator, NullFormatter
 
     low, high = ax.get_xlim()
@@ -172,7 +170,6 @@ def _tick_seconds(ax: Any) -> None:
 
 
 def _draw_exact_level(ax: Any, errors: Iterable[float], exact: float) -> None:
-    """Draw a dotted line at the level ``exact`` if any error is smaller, and so drawn at this level."""
     if any(e < exact for e in errors):
         ax.axhline(exact, color=_GREY, linewidth=0.8, linestyle=":")
         at = ax.get_yaxis_transform()
@@ -180,7 +177,7 @@ def _draw_exact_level(ax: Any, errors: Iterable[float], exact: float) -> None:
 
 
 def _place_labels(figure: Any, diagrams: Sequence[Diagram]) -> None:
-    """Write the label of each point where it covers no mark and no other label; leave out labels without room."""
+    """Label each point where the label covers no marker and no other label; leave out labels without free space."""
     from matplotlib.transforms import Bbox
 
     figure.canvas.draw()
@@ -194,7 +191,7 @@ def _place_labels(figure: Any, diagrams: Sequence[Diagram]) -> None:
 
 
 def _label(figure: Any, ax: Any, dot: Dot, colour: str, taken: list[Any]) -> None:
-    """Write a label at the first offset where its box overlaps none of ``taken``, and add its box to ``taken``."""
+    """Write a label at the first offset where it overlaps no box in ``taken``, and add its own box to ``taken``."""
     from matplotlib.patheffects import withStroke
 
     inside, at = ax.get_window_extent(), (dot.seconds, dot.error)

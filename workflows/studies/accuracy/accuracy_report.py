@@ -114,7 +114,7 @@ def _whole(points: Points) -> WorkPrecisionPoint | None:
 
 
 def _beyond_rounding(choice: ToleranceChoice, points: Points) -> bool:
-    """Return True if a tolerance is exceeded by at most the rounding error that remains with everything kept."""
+    """Return True if a tolerance is exceeded by at most the rounding error of the full computation."""
     whole = _whole(points)
     rounding = _NO_WORSE * whole.most if whole else 0.0
     return not choice.held and choice.chosen.most <= choice.tolerance + rounding
@@ -236,7 +236,6 @@ def table(result: AccuracyResult) -> Iterator[tuple[Any, ...]]:
 
 
 def _lines(recipe: Recipe, points: Points) -> list[Line]:
-    """Return one line for each parameter that has another setting than the recipe's own."""
     varied = dict.fromkeys(p.trial.line for p in points if p.trial.recipe is not recipe)
     of_line = {name: [_dot(p, recipe) for p in points if p.trial.line == name] for name in varied}
     return [Line(name, dots, strong=name == TOLERANCE) for name, dots in of_line.items()]

@@ -1,9 +1,4 @@
-"""`neusee study accuracy`: error against run time, for the whole recipe and for its steps.
-
-The reference is the recipe at its own sampling with nothing left out and every step in its best precision. The points
-are the tolerances, for which the engine chooses the steps to leave out, and the other settings of each parameter that
-trades accuracy for time, one at a time. The store keeps each point, so that an interrupted study continues.
-"""
+"""The study of accuracy: error against run time, for tolerances, for settings of the recipe, and for its steps."""
 
 from __future__ import annotations
 
@@ -25,13 +20,7 @@ from neusee.workflows.studies.accuracy import accuracy_report
 from neusee.workflows.studies.accuracy.accuracy_report import KEEP_ALL, TOLERANCE, AccuracyResult, power_of_ten
 from neusee.workflows.studies.accuracy.recipe_knobs import Knobs, finest, knobs
 from neusee.workflows.studies.accuracy.single_steps import steps_that_matter, try_step
-from neusee.workflows.studies.accuracy.work_precision_points import (
-    TIMES,
-    PointCache,
-    PointMeasurement,
-    Trial,
-    WorkPrecisionPoint,
-)
+from neusee.workflows.studies.accuracy.work_precision_points import TIMES, PointCache, Trial, WorkPrecisionPoint
 from neusee.workflows.tolerance.cheaper_steps import with_substitutions
 
 TOLERANCES = (1e-1, 1e-2, 1e-3, 1e-4, 1e-5, 1e-6)
@@ -69,7 +58,7 @@ def study(
 
 
 def trials(recipe: Recipe, turned: Knobs, quick: bool) -> Iterator[Trial]:
-    """Yield the settings to evaluate: the tolerances, everything kept, and each setting of each parameter."""
+    """Yield the settings to evaluate: each tolerance, the full computation, and each setting of each parameter."""
     asked = sorted({*(_FEWER if quick else TOLERANCES), recipe.tolerance}, reverse=True)
     for tolerance in asked:
         other = replace(recipe, tolerance=tolerance, exact=False)
@@ -94,7 +83,7 @@ def _measure(recipe: Recipe, cache: PointCache, progress: Progress, quick: bool,
     points = []
     for number, trial in enumerate(todo, 1):
         left = time.monotonic() > until and _may_wait(trial, cache)
-        points.append(WorkPrecisionPoint(trial, PointMeasurement(refused=_LEFT)) if left else cache.point(trial))
+        points.append(cache.point(replace(trial, recipe=None, refused=_LEFT) if left else trial))
         progress(f"{number}/{len(todo)}  {accuracy_report.summary_line(points[-1])}")
     for number in range(2, TIMES + 1):  # in turn, so that other work of the machine disturbs all points alike
         points = [cache.time_again(point, number) for point in points]
@@ -107,19 +96,14 @@ def _measure(recipe: Recipe, cache: PointCache, progress: Progress, quick: bool,
 
 
 def _may_wait(trial: Trial, cache: PointCache) -> bool:
-    """Return True if a setting is neither a tolerance nor everything kept, and the store has no measurement of it."""
-    return (
-        trial.line not in (TOLERANCE, KEEP_ALL)
-        and trial.recipe is not None
-        and not cache.store.has(cache.key(trial.recipe))
-    )
+    """Return True if a setting is neither a tolerance nor the full computation, and is not measured yet."""
+    if trial.recipe is None or trial.line in (TOLERANCE, KEEP_ALL):
+        return False
+    return not cache.store.has(cache.key(trial.recipe))
 
 
 def _slow_steps(recipe: Recipe, points: Sequence[WorkPrecisionPoint]) -> Iterator[tuple[Recipe, str, float]]:
-    """Yield each step that takes a large share of the run time: its recipe, its name and its share.
-
-    The steps are those with everything kept, and the cheaper steps that the recipe runs instead.
-    """
+    """Yield (recipe, name, share of the run time) of each slow step, in the full computation and in the recipe."""
     whole = next((p.found.steps for p in points if p.trial.line == KEEP_ALL), {})
     for name, share in steps_that_matter(recipe, whole):
         yield recipe, name, share
@@ -131,7 +115,6 @@ def _slow_steps(recipe: Recipe, points: Sequence[WorkPrecisionPoint]) -> Iterato
 
 
 def _document(result: AccuracyResult, cache: PointCache, quick: bool) -> dict[str, Any]:
-    """Return the values that ``provenance.json`` holds in this kind of study only."""
     return {
         "tolerance": result.recipe.tolerance,
         "seed": result.recipe.seed,

@@ -1,4 +1,4 @@
-"""The Pareto line of points, and the engine's choice against the cheapest point that holds a tolerance."""
+"""The Pareto line of points, and the engine's choice against the cheapest point within a tolerance."""
 
 from __future__ import annotations
 
@@ -45,6 +45,6 @@ def cheapest(points: Points, tolerance: float) -> WorkPrecisionPoint | None:
 
 
 def median_ratio(choices: Iterable[ToleranceChoice]) -> float | None:
-    """Return the median ratio of run times of chosen and cheapest point, over the choices with a cheapest point."""
+    """Return the median ratio of the chosen run time to the cheapest run time, over all possible tolerances."""
     ratios = [c.ratio for c in choices if c.ratio is not None]
     return median(ratios) if ratios else None

@@ -121,7 +121,7 @@ def _windows(recipe: Recipe, quick: bool) -> Iterator[Knob | str]:
 
 
 def _precisions(recipe: Recipe) -> Iterator[Knob | str]:
-    """Yield one knob for all precisions together, since one step alone gains nothing from double precision."""
+    """Yield one knob for the precisions of all steps, because double precision in one step alone gains nothing."""
     if places := _places(recipe, "precision"):
         words = allowed_words(places[0].steps[0], "precision")
         path = ", ".join(p.path for p in places)
@@ -176,7 +176,7 @@ def _written(recipe: Recipe, step: Step, parameter: str) -> str | None:
 
 
 def _others(recipe: Recipe, parameter: str, place: _Place) -> list[str]:
-    """Return the other steps that read the value at ``place``, or for a pitch, the steps that keep an equal pitch."""
+    """Return the other steps that read the value at ``place``, or for a pitch, steps with an equal pitch elsewhere."""
     mine = {step.name for step in place.steps}
     if parameter == "pitch":
         apart = (s for s in recipe.steps.values() if parameter in s.params and s.params[parameter] == place.value)

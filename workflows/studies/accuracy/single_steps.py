@@ -1,9 +1,8 @@
-"""Run time and error of single steps: the variants in which a node can compute, against the node's reference.
+"""Run time and error of single steps: each variant of a node's computation, against the node's reference.
 
 A variant is the step as used, in another precision, with another allowed error, with a smaller window of the PSF, or
-left out. Every step that takes more than a hundredth of the time and whose node has a reference is tried on its own
-inputs. Where the reference would take too long, all variants are tried on the middle of the pictures and on fewer
-bands, and the page says so.
+left out. Where the reference would take too long, all variants are tried on the middle of the pictures and on fewer
+bands.
 """
 
 from __future__ import annotations
@@ -82,7 +81,7 @@ class StepTried:
 
 
 def steps_that_matter(recipe: Recipe, seconds: Mapping[str, float]) -> list[tuple[str, float]]:
-    """Return the slowest item of each step that takes more than `SHARE` of the time, and the share of its items."""
+    """Return (slowest item, share of the time) of each step whose items together take more than `SHARE` of the time."""
     items: dict[str, list[str]] = defaultdict(list)
     for name in seconds:
         if name in recipe.steps:
@@ -93,10 +92,7 @@ def steps_that_matter(recipe: Recipe, seconds: Mapping[str, float]) -> list[tupl
 
 
 def try_step(recipe: Recipe, name: str, share: float, store: Store, patience: float) -> StepTried:
-    """Return the measured variants of a step of ``recipe``, from the store or measured now.
-
-    ``patience`` is the longest time in seconds that the reference of the step may take.
-    """
+    """Return the measured variants of a step, on inputs that its reference computes in ``patience`` seconds."""
     step = recipe.steps[name]
     if step.node.hooks.reference is None:
         return StepTried(name, step.node.path, share, StepMeasurement(refused="its node has no reference"))
@@ -136,7 +132,7 @@ def _gathered(wire: str | tuple[str, ...] | None, values: Mapping[str, Any]) -> 
 
 
 def _largest(step: Step, inputs: list[Any], seed: int, patience: float) -> tuple[Cut, Any, float] | None:
-    """Return the largest cut of the inputs that the reference computes within ``patience``, its result and seconds."""
+    """Return the largest part of the inputs that the reference computes within ``patience``, its result and seconds."""
     best: tuple[Cut, Any, float] | None = None
     for size in _CUTS:
         if best is not None and best[2] * _GROWTH > patience:
@@ -200,7 +196,6 @@ def _compared_value(value: Any) -> Any:
 
 
 def _call(step: Step, function: Any, inputs: list[Any], seed: int, **other: Any) -> Any:
-    """Call ``function`` with the step's parameters and random stream, and with ``other`` parameters instead."""
     rng = {"rng": torch.Generator().manual_seed(stream_seed(seed, step.name))} if step.node.random else {}
     return function(*inputs, **{**step.params, **other}, **rng)
 
@@ -224,7 +219,7 @@ def _median_time(compute: Callable[[], Any]) -> tuple[Any, float]:
 
 
 def cut_inputs(node: Node, inputs: list[Any], size: Cut) -> list[Any]:
-    """Return ``inputs`` cut to the side of ``size``, and to its number of bands where the node names the band axis."""
+    """Return the middle of each picture in ``inputs``, with fewer bands where the node names the axis of bands."""
     side, bands = size
     parts = []
     for name, value in zip(node.inputs, inputs, strict=True):
@@ -235,7 +230,6 @@ def cut_inputs(node: Node, inputs: list[Any], size: Cut) -> list[Any]:
 
 
 def _cut_text(node: Node, size: Cut) -> str:
-    """Return the cut in words, or an empty text if nothing is cut."""
     side, bands = size
     fewer = bands and (node.bands or {}).keys() - {"return"}
     parts = [f"the middle {side} × {side}"] * bool(side) + [f"{bands} bands"] * bool(fewer)

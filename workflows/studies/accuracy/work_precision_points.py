@@ -1,7 +1,4 @@
-"""The points of a work-precision diagram: the time of a cold run, and the errors of its outputs.
-
-The study's store keeps each point, so that an interrupted study continues.
-"""
+"""The points of a work-precision diagram: the time of a cold run, and the errors of its outputs."""
 
 from __future__ import annotations
 
@@ -17,12 +14,12 @@ from neusee.workflows.engine.runner import run
 from neusee.workflows.graph.recipe_graph import Recipe, needed
 from neusee.workflows.graph.run_error import RunError
 from neusee.workflows.graph.step_record import Event
-from neusee.workflows.keys.cache_key import digest, key_of
+from neusee.workflows.keys.cache_key import digest
 from neusee.workflows.keys.code_digest import Code
 from neusee.workflows.keys.engine_digest import engine
 from neusee.workflows.store.memo import compute_once
 from neusee.workflows.store.result_store import Store
-from neusee.workflows.studies.cold_run import cold
+from neusee.workflows.studies.cold_run import cold, key_parts, run_cold
 from neusee.workflows.tolerance.cheaper_steps import with_substitutions
 from neusee.workflows.tolerance.error_norm import error_of
 
@@ -84,21 +81,22 @@ class WorkPrecisionPoint:
 
     @property
     def most(self) -> float:
-        """Return the greatest error of any output and seed, which a tolerance must hold."""
+        """Return the greatest error over all outputs and seeds, which is compared with the tolerance."""
         return max(self.by_seed, default=float("inf"))
 
     @property
     def sound(self) -> bool:
-        """Return True if the recipe was run and compared."""
+        """Return True if the recipe was run and compared with the reference."""
         return bool(self.found.errors and self.found.seconds)
 
 
 class PointCache:
-    """Points of a diagram: each recipe is measured against the reference once, and then read from the store."""
+    """A cache of points: each recipe is compared with the reference once, and the store keeps the point."""
 
     def __init__(self, reference: Recipe, store: Store, seeds: int, device: str = "cpu") -> None:
         self.reference, self.store, self.device = reference, store, device
-        self.seeds = seeds if is_random(reference) else 1
+        random = any(reference.steps[name].node.random for name in needed(reference, reference.outputs))
+        self.seeds = seeds if random else 1
         self._truth: dict[int, dict[str, Any]] = {}
         self._code = Code(store.code_memo)
         self._warm = False
@@ -113,7 +111,7 @@ class PointCache:
         return WorkPrecisionPoint(trial, found)
 
     def time_again(self, point: WorkPrecisionPoint, number: int) -> WorkPrecisionPoint:
-        """Return the point with one more cold run, if its first run was quick; ``number`` is that of the run."""
+        """Return the point with the time of cold run ``number`` added, if its first run was quick."""
         recipe, seconds = point.trial.recipe, point.found.seconds
         if recipe is None or not seconds or seconds[0] >= _QUICK:
             return point
@@ -122,12 +120,11 @@ class PointCache:
 
     def _time(self, recipe: Recipe) -> float:
         self._warm_up(recipe)
-        with cold(self.store) as store:
-            return run(recipe, store, device=self.device).seconds
+        return run_cold(recipe, self.store, self.device).seconds
 
     def key(self, recipe: Recipe) -> str:
         """Return the store key of a point: a digest of both recipes, the engine, the seeds and the machine."""
-        both = [self._key_parts(r) for r in (recipe, self.reference)]
+        both = [key_parts(r, self._code, self.device) for r in (recipe, self.reference)]
         return digest("accuracy", both, self.seeds, self.device, engine(), machine())
 
     def truth(self, seed: int) -> dict[str, Any]:
@@ -138,13 +135,6 @@ class PointCache:
             self._truth[seed] = result.values
             self._warm |= sum(done.state == "run" for done in result.done.values()) > len(result.done) / 2
         return self._truth[seed]
-
-    def _key_parts(self, recipe: Recipe) -> list[Any]:
-        """Return the keys of the outputs, the tolerance, and whether everything is kept."""
-        keys: dict[str, str] = {}
-        for name in needed(recipe, recipe.outputs):
-            keys[name], _ = key_of(recipe.steps[name], keys, recipe.seed, self._code, self.device)
-        return [[keys[name] for name in recipe.outputs], recipe.tolerance, recipe.exact]
 
     def _measure(self, recipe: Recipe) -> PointMeasurement:
         load = os.getloadavg()[0] / (os.cpu_count() or 1) if hasattr(os, "getloadavg") else 0.0
@@ -164,14 +154,13 @@ class PointCache:
         return PointMeasurement(errors, [result.seconds], sum(ran.values()), load, result.proof.worst, ran)
 
     def _warm_up(self, recipe: Recipe) -> None:
-        """Import libraries, read code and run the recipe once in this process, so that no timed run has to."""
+        """Import libraries, read code and run the recipe once, because the first run of a process takes longer."""
         self.truth(0)
         for step in with_substitutions(recipe, recipe.outputs).steps.values():
             self._code.digest(step.node.fn.__module__)
         self._code.save()
         if not self._warm:
-            with cold(self.store) as store:
-                run(recipe, store, device=self.device)
+            run_cold(recipe, self.store, self.device)
             self._warm = True
 
     def _errors(self, recipe: Recipe, values: Mapping[str, Any], store: Store) -> dict[str, list[float]]:
@@ -191,8 +180,3 @@ def compare_outputs(values: Mapping[str, Any], truth: Mapping[str, Any]) -> dict
         with suppress(ValueError):
             found[name] = [error_of(value, truth[name])]
     return found
-
-
-def is_random(recipe: Recipe) -> bool:
-    """Return True if a step that the outputs need is random."""
-    return any(recipe.steps[name].node.random for name in needed(recipe, recipe.outputs))

@@ -1,4 +1,4 @@
-"""The study of a calibration: whether its posterior is right, and how far it depends on the prior."""
+"""The study of a calibration: tests of its posterior by simulations, and its sensitivity to the prior."""
 
 from __future__ import annotations
 
@@ -20,35 +20,25 @@ from neusee.workflows.report.study_folder import CsvTable, Progress, StudyReport
 from neusee.workflows.report.study_page import Mark, Section
 from neusee.workflows.store.result_store import Store
 from neusee.workflows.studies.calibration.independent_draws import DRAWS, walk_draws
-from neusee.workflows.studies.calibration.prior_sensitivity import (
-    ENOUGH,
-    ParameterSensitivity,
-    Sensitivity,
-    sensitivity,
-)
+from neusee.workflows.studies.calibration.prior_sensitivity import ENOUGH, Sensitivity, sensitivity
 from neusee.workflows.studies.calibration.rank_uniformity import RankTest, rank_tests, ranks
-from neusee.workflows.studies.calibration.simulated_sensors import (
-    Sampler,
-    SensorSimulation,
-    SensorSimulator,
-    prior_widths,
-)
+from neusee.workflows.studies.calibration.simulated_sensors import Sampler, SensorSimulation, SensorSimulator
 
 PIXELS = 128
-_EVERY = 20  #: simulations by line
+_EVERY = 20  #: simulations for each line of progress
 _WEIGHED = 1000  #: draws for the sensitivity
 _COLUMNS = ("parameter", "simulations", "p", "least p", "coverage", "from", "to", "z mean", "z sd", "holds")
 
 
 @dataclass(frozen=True)
 class CalibrationStudyResult:
-    """All that the study measured."""
+    """The simulations, the test of each parameter, and the sensitivity to the prior."""
 
     simulations: Sequence[SensorSimulation]
     rank_tests: Sequence[RankTest]
     prior_widths: Mapping[str, float]
     sensitivity: Sensitivity | None
-    untold: str  #: why there is no sensitivity
+    no_sensitivity: str  #: the reason if there is no sensitivity
 
     @property
     def refused(self) -> Sequence[str]:
@@ -56,20 +46,19 @@ class CalibrationStudyResult:
 
     @property
     def short(self) -> int:
-        """Return how many simulations have a chain that ended before it was long enough."""
+        """Return how many simulations have a chain that is too short for its autocorrelation time."""
         return sum(not s.refused and not s.independent for s in self.simulations)
 
     @property
     def stranded(self) -> int:
-        """Return how many simulations have walkers that stay where the posterior is next to nothing."""
+        """Return how many simulations have walkers that stay where the posterior is almost 0."""
         return sum(s.stranded > 0 for s in self.simulations)
 
     @property
     def failed(self) -> int:
-        """Return how many bars do not hold.
+        """Return how many criteria fail: two for each parameter, and three for the simulations.
 
-        Three of the bars are that all simulations have a posterior, a chain that is long enough, and no stranded
-        walker.
+        All simulations must have a posterior, a chain that is long enough, and no stranded walker.
         """
         return sum(v.failed for v in self.rank_tests) + bool(self.refused) + bool(self.short) + bool(self.stranded)
 
@@ -85,15 +74,13 @@ def study(
     pixels: int = PIXELS,
     sampler: Sampler | None = None,
 ) -> Path:
-    """Simulate, fit and rank ``simulations`` times; ``sampler`` replaces the walkers that move by ``move``."""
+    """Simulate and calibrate sensors, with draws by ``sampler`` or by walkers with the move ``move``."""
     study_run = StudyRun("calibration", recipe, command)
     with one_thread():
         simulator = SensorSimulator(recipe, store, pixels, sampler or partial(walk_draws, how=move), move)
-        made = list(_simulate_all(simulator, simulations, progress))
-        weighed, untold = _sensitivity(recipe, move)
-    found = CalibrationStudyResult(
-        made, rank_tests(made), prior_widths(simulator.nominal.coordinates.prior), weighed, untold
-    )
+        simulated = list(_simulate_all(simulator, simulations, progress))
+        sensitive, reason = _sensitivity(recipe, move)
+    found = CalibrationStudyResult(simulated, rank_tests(simulated), simulator.prior_widths(), sensitive, reason)
     document = study_run.document(_document(found))
     return study_run.write(runs, digest(document["verdicts"]), document, _report(recipe, found, pixels))
 
@@ -109,28 +96,27 @@ def _simulate_all(simulator: SensorSimulator, count: int, progress: Progress) ->
 
 
 def _sensitivity(recipe: Recipe, move: str) -> tuple[Sensitivity | None, str]:
-    """Return the sensitivity of the recipe as it is, with all its pixels and its own prior, or the reason for none."""
+    """Return the sensitivity of the recipe's own posterior to its prior, or the reason why there is none."""
     with TemporaryDirectory(prefix="neusee-") as folder:
         problem = SensorPosterior.of(recipe, Store(folder))
     mode = find_mode(problem, initial_theta(problem))
-    told = identify(problem, mode)
-    if told.refused:
-        return None, told.refused
+    identified = identify(problem, mode)
+    if identified.refused:
+        return None, identified.refused
     drawn = walk_draws(problem, mode, recipe.seed, move, _WEIGHED)
     if not drawn.independent:
         return None, f"its chain is too short for its autocorrelation time of {drawn.tau:.0f} steps"
-    return sensitivity(problem, drawn.samples, told.kinds), ""
+    return sensitivity(problem, drawn.samples, identified.kinds), ""
 
 
 def _document(found: CalibrationStudyResult) -> dict[str, Any]:
-    """Return what the folder says of the study, beside what every study says."""
     return {
         "failed": found.failed,
         "simulations": len(found.simulations),
         "refused": list(found.refused),
-        "verdicts": [asdict(v) for v in found.rank_tests],
+        "verdicts": [asdict(test) for test in found.rank_tests],
         "widths": dict(found.prior_widths),
-        "sensitivity": asdict(found.sensitivity) if found.sensitivity else found.untold,
+        "sensitivity": asdict(found.sensitivity) if found.sensitivity else found.no_sensitivity,
     }
 
 
@@ -207,31 +193,29 @@ def _count_kinds(found: CalibrationStudyResult, name: str) -> str:
 def _weighed(found: CalibrationStudyResult) -> Section:
     heading = "What the prior does"
     if found.sensitivity is None:
-        return Section(heading, f"Nothing can be said of the recipe's own frames: {found.untold}.")
-    names = [f.name for f in found.sensitivity.findings]
+        return Section(heading, f"Nothing can be said of the recipe's own frames: {found.no_sensitivity}.")
+    names, left = list(found.sensitivity.left), found.sensitivity.left
     text = f"""Draws from the posterior of the recipe's own frames and prior, reweighted as if one prior had been twice
         as wide. Value: the mean, or the limit of 95 % of a parameter that is only limited. Under each prior: how far
         the value moves, in posterior standard deviations. Last row: the effective sample size as a share of the draws.
         Below {ENOUGH:g} reweighting is unreliable, and there is a dash: the prior of that parameter constrains it about
         as much as the frames do, or more."""
     columns = ("parameter", "from these frames", "value", "sd", *(f"{_plain(name)} x 2" for name in names))
-    rows = [_sensitivity_row(f) for f in found.sensitivity.findings]
-    left: list[Any] = ["draws left", "", None, None, *(found.sensitivity.left[name] for name in names)]
+    rows: list[list[Any]] = []
+    for f in found.sensitivity.findings:
+        moved = [None if x is None else (x - f.value) / f.sd for x in f.doubled.values()]
+        rows.append([_plain(f.name), KINDS[f.kind] or "estimate", f.value, f.sd, *moved])
     marks: dict[tuple[int, int], Mark] = {
-        (len(rows), 4 + i): "warn" for i, name in enumerate(names) if found.sensitivity.left[name] < ENOUGH
+        (len(rows), 4 + i): "warn" for i, share in enumerate(left.values()) if share < ENOUGH
     }
-    return Section(heading, text, columns, [*rows, left], marks=marks)
-
-
-def _sensitivity_row(f: ParameterSensitivity) -> list[Any]:
-    moved = [None if x is None else (x - f.value) / f.sd for x in f.doubled.values()]
-    return [_plain(f.name), KINDS[f.kind] or "estimate", f.value, f.sd, *moved]
+    rows.append(["draws left", "", None, None, *left.values()])
+    return Section(heading, text, columns, rows, marks=marks)
 
 
 def _refusals(found: CalibrationStudyResult) -> list[Section]:
     if not found.refused:
         return []
-    rows = [(text, count) for text, count in Counter(found.refused).most_common()]
+    rows = Counter(found.refused).most_common()
     return [Section("Simulations without a posterior", "They are left out of the ranks.", ("why", "count"), rows)]
 
 

@@ -34,7 +34,7 @@ class LeaveOutResult:
     @property
     def failed(self) -> int:
         """Return how many outputs and omissions exceed their bound."""
-        return sum(not row.holds for row in (*self.output_errors, *self.rows))
+        return sum(not output.holds for output in self.output_errors) + sum(not row.holds for row in self.rows)
 
 
 def study(
@@ -79,7 +79,6 @@ def _output_line(p: OutputError) -> Sequence[Any]:
 
 
 def _cells(r: OmissionRow) -> tuple[Any, ...]:
-    """Return the values that table and page have in common for an omission."""
     worst = max(r.outputs.values(), default=0.0)
     return r.name, r.kind, r.taken, r.bound, r.rms, r.largest, worst, r.back, r.seconds
 
@@ -136,7 +135,6 @@ def _scenes(found: LeaveOutResult) -> Section:
 
 @drawn
 def _bars(costs: Sequence[SceneCost]) -> Any:
-    """Draw the run time of each scene: the seconds in its steps, and the other seconds of the engine."""
     figure, axes = canvas(8.0, 0.42 * len(costs) + 1.0)
     ax = axes[0, 0]
     names = [cost.scene for cost in costs]

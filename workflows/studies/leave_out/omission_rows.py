@@ -1,8 +1,7 @@
 """The comparison of each omission with the full computation: its bound, its measured change, and the time it saves.
 
 The full computation is the recipe with everything kept. It is compared with the recipe as the engine chooses its
-omissions, and with one omission alone. The recipe as chosen is also compared with one of its omissions put back. The
-store keeps each measured row.
+omissions, and with one omission alone. The recipe as chosen is also compared with one of its omissions put back.
 """
 
 from __future__ import annotations
@@ -129,7 +128,7 @@ class OmissionComparison:
         return largest_error(*pair) <= bound * (1 + 1e-5) + (_ROUNDING if bound else 0.0)
 
     def _back(self, omission: Omission) -> float:
-        """Return the largest change of a chosen output when one omission is put back."""
+        """Return the largest change of an output when the recipe computes one of its chosen omissions in full."""
         recipe = self.full
         for other in reversed(self.found):  # the last first, because the input that is handed on may be left out too
             if other.taken and other is not omission:
@@ -137,13 +136,12 @@ class OmissionComparison:
         return max(_errors(self.recipe.outputs, recipe.outputs, run(recipe, self.store), self.chosen).values())
 
     def _seconds(self, one: Recipe, other: Recipe) -> float:
-        """Return the seconds of the steps that only ``one`` needs."""
+        """Return the run time of the steps that recipe ``one`` needs and recipe ``other`` does not need."""
         keys = resolve(one, order := needed(one, one.outputs), self.store).keys
         only = [keys[name] for name in order if name not in set(needed(other, other.outputs))]
         return sum(float((self.store.about(key) or {}).get("seconds", 0.0)) for key in only)
 
     def _key(self, omission: Omission, alone: Recipe) -> Key:
-        """Return the store key of a row: a digest of both recipes, the chosen run, the omission and the code."""
         outputs = [
             [resolve(r, needed(r, r.outputs), self.store).keys[n] for n in r.outputs] for r in (self.full, alone)
         ]
@@ -153,7 +151,7 @@ class OmissionComparison:
 
 
 def _errors(names: Sequence[str], others: Sequence[str], result: Result, truth: Result) -> dict[str, float]:
-    """Return the error of each output in ``names``, which is called as in ``others`` in ``result``."""
+    """Return the error of each output by name; ``others`` are the names of the same outputs in ``result``."""
     pairs = zip(names, others, strict=True)
     return {name: error_of(result.values[other], truth.values[name]) for name, other in pairs}
 

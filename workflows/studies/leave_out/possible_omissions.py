@@ -1,4 +1,4 @@
-"""The possible omissions of a recipe: each is a change of the recipe that computes everything in full.
+"""The possible omissions of a recipe: each omission is a change of the full computation.
 
 There are three kinds. A step whose node bounds its effect is left out, and its first input is handed on. Light or dirt
 whose largest element is bounded is not added. Sums over bands stand in for an image of all bands. Each omission can be
@@ -96,7 +96,7 @@ def _not_added(recipe: Recipe, order: list[str], name: str, facts_of: FactsOf) -
 
 
 def _stand_ins(full: Recipe, order: list[str], chosen: Result) -> Iterator[Omission]:
-    """Yield one omission for all images together, because a step that compares two images needs the same kind twice."""
+    """Yield one omission that replaces all images by sums over bands, because two compared images must be alike."""
     sparse = with_substitutions(replace(full, exact=False), full.outputs)
     exchange = {economy.step: economy.instead for economy in sparse.substitutions if economy.instead}
     if not exchange:
@@ -109,13 +109,12 @@ def _stand_ins(full: Recipe, order: list[str], chosen: Result) -> Iterator[Omiss
 
 
 def _adding(recipe: Recipe, order: list[str], name: str) -> tuple[str, ...]:
-    """Return the steps that read the result of step ``name`` if each of them only adds it, else an empty tuple."""
+    """Return the steps that read the result of step ``name``, if each of them only adds the result; else no step."""
     readers = [recipe.steps[n] for n in order if name in recipe.steps[n].sources]
     return tuple(reader.name for reader in readers) if all(_only_adds(reader, name) for reader in readers) else ()
 
 
 def _only_adds(reader: Step, name: str) -> bool:
-    """Return True if ``reader`` reads the result of step ``name`` only in order to add it."""
     read = {i for i, wire in reader.wires.items() if name == wire or (isinstance(wire, tuple) and name in wire)}
     return read <= {light for light, *_ in reader.node.additive_inputs}
 
@@ -135,7 +134,7 @@ def _facts(wire: Wire, facts_of: FactsOf) -> TensorStats | list[TensorStats | No
 
 
 def _share(largest: float, recipe: Recipe, at: tuple[str, ...], facts_of: FactsOf) -> float:
-    """Return ``largest`` over the largest element of the sum at the steps ``at``, or infinity if it is no tensor."""
+    """Return ``largest`` relative to the largest element at the steps ``at``, or infinity if these give no tensor."""
     if largest == 0:
         return 0.0
     if any(recipe.steps[name].node.hints.get("return") is not Tensor for name in at):

@@ -1,8 +1,4 @@
-"""The run time of simpler scenes: the recipe without its laser, in one colour, or behind a clean window.
-
-A simpler scene takes less time if the engine does not compute the parts that the scene lacks. All scenes run in one
-process, each from an empty store, after one run that imports the libraries.
-"""
+"""The run time of simpler scenes: the recipe without its laser, in one colour, or behind a clean window."""
 
 from __future__ import annotations
 
@@ -10,17 +6,17 @@ from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 
 from neusee.workflows.engine.provenance import machine
-from neusee.workflows.engine.runner import Result, run
+from neusee.workflows.engine.runner import Result
 from neusee.workflows.graph.diagnostics import UNREAD, RecipeError
-from neusee.workflows.graph.recipe_graph import Recipe, needed
+from neusee.workflows.graph.recipe_graph import Recipe
 from neusee.workflows.graph.run_error import RunError
-from neusee.workflows.keys.cache_key import Key, digest, key_of
+from neusee.workflows.keys.cache_key import digest
 from neusee.workflows.keys.code_digest import Code
 from neusee.workflows.keys.engine_digest import engine
 from neusee.workflows.recipe.changed_recipe import changed
 from neusee.workflows.store.memo import compute_once
 from neusee.workflows.store.result_store import Store
-from neusee.workflows.studies.cold_run import cold
+from neusee.workflows.studies.cold_run import key_parts, run_cold
 
 _TIMES = 3  #: cold runs, of which the median counts
 _QUICK = 5.0  #: s; a scene that takes longer is run once
@@ -51,10 +47,11 @@ def measure_scenes(recipe: Recipe, store: Store, progress: Callable[[str], None]
 
         def compute(scene: str = scene, recipe: Recipe = changed_recipe) -> SceneCost:
             if not warm:  # libraries are imported and code is read by the first run of a process
-                warm.append(_cold(recipe, store))
+                warm.append(run_cold(recipe, store))
             return _cost(scene, recipe, store)
 
-        key = _key(changed_recipe, code)
+        decided = engine("studies.leave_out.scene_costs", "engine.runner"), machine()
+        key = digest("content", key_parts(changed_recipe, code), *decided)
         cost = replace(compute_once(store, key, SceneCost, compute, {"step": "study leave-out"}), scene=scene)
         progress(f"{scene}: {cost.refused or f'{cost.seconds:.3g} s'}")
         yield cost
@@ -119,7 +116,7 @@ def _cost(scene: str, recipe: Recipe, store: Store) -> SceneCost:
     results: list[Result] = []
     try:
         while not results or (max(r.seconds for r in results) < _QUICK and len(results) < _TIMES):
-            results.append(_cold(recipe, store))
+            results.append(run_cold(recipe, store))
     except RunError as error:
         return SceneCost(scene, float("nan"), 0.0, 0, (), f"{error.step}: {error.cause}")
     result = sorted(results, key=lambda r: r.seconds)[len(results) // 2]
@@ -127,17 +124,3 @@ def _cost(scene: str, recipe: Recipe, store: Store) -> SceneCost:
     left_out = [done.step for done in result.done.values() if done.state == "left out"]
     replaced = [economy.step for economy in result.recipe.substitutions]
     return SceneCost(scene, result.seconds, sum(ran), len(ran), (*left_out, *replaced))
-
-
-def _cold(recipe: Recipe, store: Store) -> Result:
-    with cold(store) as empty:
-        return run(recipe, empty)
-
-
-def _key(recipe: Recipe, code: Code) -> Key:
-    """Return the store key of a run time: a digest of the output keys, the tolerance, the engine and the machine."""
-    keys: dict[str, Key] = {}
-    for name in needed(recipe, recipe.outputs):
-        keys[name], _ = key_of(recipe.steps[name], keys, recipe.seed, code)
-    parts = [[keys[name] for name in recipe.outputs], recipe.tolerance, recipe.exact]
-    return digest("content", parts, engine("studies.leave_out.scene_costs", "engine.runner"), machine())
