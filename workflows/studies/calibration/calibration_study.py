@@ -80,9 +80,9 @@ def study(
         simulator = SensorSimulator(recipe, store, pixels, sampler or partial(walk_draws, how=move), move)
         simulated = list(_simulate_all(simulator, simulations, progress))
         sensitive, reason = _sensitivity(recipe, move)
-    found = CalibrationStudyResult(simulated, rank_tests(simulated), simulator.prior_widths(), sensitive, reason)
-    document = study_run.document(_document(found))
-    return study_run.write(runs, digest(document["verdicts"]), document, _report(recipe, found, pixels))
+    result = CalibrationStudyResult(simulated, rank_tests(simulated), simulator.prior_widths(), sensitive, reason)
+    document = study_run.document(_document(result))
+    return study_run.write(runs, digest(document["verdicts"]), document, _report(recipe, result, pixels))
 
 
 def _simulate_all(simulator: SensorSimulator, count: int, progress: Progress) -> Iterator[SensorSimulation]:
@@ -109,52 +109,52 @@ def _sensitivity(recipe: Recipe, move: str) -> tuple[Sensitivity | None, str]:
     return sensitivity(problem, drawn.samples, identified.kinds), ""
 
 
-def _document(found: CalibrationStudyResult) -> dict[str, Any]:
+def _document(result: CalibrationStudyResult) -> dict[str, Any]:
     return {
-        "failed": found.failed,
-        "simulations": len(found.simulations),
-        "refused": list(found.refused),
-        "verdicts": [asdict(test) for test in found.rank_tests],
-        "widths": dict(found.prior_widths),
-        "sensitivity": asdict(found.sensitivity) if found.sensitivity else found.no_sensitivity,
+        "failed": result.failed,
+        "simulations": len(result.simulations),
+        "refused": list(result.refused),
+        "verdicts": [asdict(test) for test in result.rank_tests],
+        "widths": dict(result.prior_widths),
+        "sensitivity": asdict(result.sensitivity) if result.sensitivity else result.no_sensitivity,
     }
 
 
 # --- the page ---------------------------------------------------------------------------------------------------------
 
 
-def _report(recipe: Recipe, found: CalibrationStudyResult, pixels: int) -> StudyReport:
-    picture = ranks(found.rank_tests)
-    sections = [_ranks(found, picture, pixels), _intervals(found), _weighed(found), *_refusals(found)]
+def _report(recipe: Recipe, result: CalibrationStudyResult, pixels: int) -> StudyReport:
+    picture = ranks(result.rank_tests)
+    sections = [_ranks(result, picture, pixels), _intervals(result), _weighed(result), *_refusals(result)]
     tables: dict[str, CsvTable] = {
-        "table.csv": (_COLUMNS, map(_line, found.rank_tests)),
-        "simulations.csv": (("parameter", "truth", "rank", "inside", "z", "told"), _each(found)),
+        "table.csv": (_COLUMNS, map(_line, result.rank_tests)),
+        "simulations.csv": (("parameter", "truth", "rank", "inside", "z", "told"), _each(result)),
     }
-    return StudyReport(f"{recipe.name}: is the posterior right?", _lead(found), sections, {"ranks": picture}, tables)
+    return StudyReport(f"{recipe.name}: is the posterior right?", _lead(result), sections, {"ranks": picture}, tables)
 
 
 def _line(v: RankTest) -> Sequence[Any]:
     return v.name, sum(v.counts), v.p, v.least_p, v.coverage, *v.bar, v.z_mean, v.z_sd, not v.failed
 
 
-def _each(found: CalibrationStudyResult) -> Iterator[Sequence[Any]]:
-    for s in found.simulations:
+def _each(result: CalibrationStudyResult) -> Iterator[Sequence[Any]]:
+    for s in result.simulations:
         for name in s.rank:
             yield name, s.truth[name], s.rank[name], s.inside[name], s.z[name], s.kinds[name]
 
 
-def _lead(found: CalibrationStudyResult) -> str:
-    held = "All bars hold" if not found.failed else f"{found.failed} bars do not hold"
-    seconds = sum(s.seconds for s in found.simulations) / len(found.simulations)
-    taus = max((s.tau for s in found.simulations), default=0.0)
-    short = f"{found.short} a chain that is too short, {found.stranded} a walker that is lost"
+def _lead(result: CalibrationStudyResult) -> str:
+    held = "All bars hold" if not result.failed else f"{result.failed} bars do not hold"
+    seconds = sum(s.seconds for s in result.simulations) / len(result.simulations)
+    taus = max((s.tau for s in result.simulations), default=0.0)
+    short = f"{result.short} a chain that is too short, {result.stranded} a walker that is lost"
     return (
-        f"{held}, of {len(found.simulations)} simulations of {seconds:.2g} s each: {len(found.refused)} have no "
+        f"{held}, of {len(result.simulations)} simulations of {seconds:.2g} s each: {len(result.refused)} have no "
         f"posterior, {short}. The longest autocorrelation time is {taus:.0f} steps."
     )
 
 
-def _ranks(found: CalibrationStudyResult, picture: bytes, pixels: int) -> Section:
+def _ranks(result: CalibrationStudyResult, picture: bytes, pixels: int) -> Section:
     text = f"""Parameters are drawn from the prior, frames of {pixels} x {pixels} pixels are taken with them by the
         recipe's own steps, and {DRAWS} nearly independent draws are made from the posterior of these frames. Where
         the posterior is right, the number of draws below the truth is uniform. Grey: the band of 99 of 100 bins of
@@ -165,11 +165,11 @@ def _ranks(found: CalibrationStudyResult, picture: bytes, pixels: int) -> Sectio
         the offset), so that frames of the recipe's levels constrain every sensor that is drawn. The search for the
         mode starts near the truth: this study judges the posterior and the draws, not that search. A walker is lost
         if its median log posterior lies 20 nats below that of the others."""
-    rows = [(_plain(name), width) for name, width in found.prior_widths.items()]
+    rows = [(_plain(name), width) for name, width in result.prior_widths.items()]
     return Section("Ranks of the truth", text, ("parameter", "width of the prior"), rows, picture)
 
 
-def _intervals(found: CalibrationStudyResult) -> Section:
+def _intervals(result: CalibrationStudyResult) -> Section:
     text = """p: the probability that uniform ranks, in ten bins, are as uneven as these or more; the least is 0.01 over
         the number of parameters. Coverage: how often the central 90 % of the draws hold the truth; a right posterior
         is within the bar in 999 of 1000 studies. z: posterior mean minus truth, in posterior standard deviations; a
@@ -177,24 +177,24 @@ def _intervals(found: CalibrationStudyResult) -> Section:
         simulations the frames estimate, or only limit, the parameter."""
     columns = ("parameter", "p", "at least", "coverage", "bar", "z mean", "z sd", "told")
     rows, marks = [], dict[tuple[int, int], Mark]()
-    for i, v in enumerate(found.rank_tests):
+    for i, v in enumerate(result.rank_tests):
         bar = f"{v.bar[0]:.3f} to {v.bar[1]:.3f}"
-        rows.append((_plain(v.name), v.p, v.least_p, v.coverage, bar, v.z_mean, v.z_sd, _count_kinds(found, v.name)))
+        rows.append((_plain(v.name), v.p, v.least_p, v.coverage, bar, v.z_mean, v.z_sd, _count_kinds(result, v.name)))
         marks[i, 1] = "pass" if v.uniform else "fail"
         marks[i, 3] = "pass" if v.covered else "fail"
     return Section("Coverage", text, columns, rows, marks=marks)
 
 
-def _count_kinds(found: CalibrationStudyResult, name: str) -> str:
-    count = Counter(s.kinds[name] for s in found.simulations if not s.refused)
+def _count_kinds(result: CalibrationStudyResult, name: str) -> str:
+    count = Counter(s.kinds[name] for s in result.simulations if not s.refused)
     return ", ".join(f"{n} {KINDS[kind] or 'estimated'}" for kind, n in count.most_common())
 
 
-def _weighed(found: CalibrationStudyResult) -> Section:
+def _weighed(result: CalibrationStudyResult) -> Section:
     heading = "What the prior does"
-    if found.sensitivity is None:
-        return Section(heading, f"Nothing can be said of the recipe's own frames: {found.no_sensitivity}.")
-    names, left = list(found.sensitivity.left), found.sensitivity.left
+    if result.sensitivity is None:
+        return Section(heading, f"Nothing can be said of the recipe's own frames: {result.no_sensitivity}.")
+    names, left = list(result.sensitivity.left), result.sensitivity.left
     text = f"""Draws from the posterior of the recipe's own frames and prior, reweighted as if one prior had been twice
         as wide. Value: the mean, or the limit of 95 % of a parameter that is only limited. Under each prior: how far
         the value moves, in posterior standard deviations. Last row: the effective sample size as a share of the draws.
@@ -202,7 +202,7 @@ def _weighed(found: CalibrationStudyResult) -> Section:
         as much as the frames do, or more."""
     columns = ("parameter", "from these frames", "value", "sd", *(f"{_plain(name)} x 2" for name in names))
     rows: list[list[Any]] = []
-    for f in found.sensitivity.findings:
+    for f in result.sensitivity.findings:
         moved = [None if x is None else (x - f.value) / f.sd for x in f.doubled.values()]
         rows.append([_plain(f.name), KINDS[f.kind] or "estimate", f.value, f.sd, *moved])
     marks: dict[tuple[int, int], Mark] = {
@@ -212,10 +212,10 @@ def _weighed(found: CalibrationStudyResult) -> Section:
     return Section(heading, text, columns, rows, marks=marks)
 
 
-def _refusals(found: CalibrationStudyResult) -> list[Section]:
-    if not found.refused:
+def _refusals(result: CalibrationStudyResult) -> list[Section]:
+    if not result.refused:
         return []
-    rows = Counter(found.refused).most_common()
+    rows = Counter(result.refused).most_common()
     return [Section("Simulations without a posterior", "They are left out of the ranks.", ("why", "count"), rows)]
 
 

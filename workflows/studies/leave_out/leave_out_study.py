@@ -61,17 +61,17 @@ def _document(result: LeaveOutResult) -> dict[str, Any]:
     return {name: [asdict(row) for row in rows] for name, rows in parts.items()}
 
 
-def _report(recipe: Recipe, found: LeaveOutResult) -> StudyReport:
-    lines = [*map(_output_line, found.output_errors), *(("omission", *_cells(r), r.holds) for r in found.rows)]
+def _report(recipe: Recipe, result: LeaveOutResult) -> StudyReport:
+    lines = [*map(_output_line, result.output_errors), *(("omission", *_cells(r), r.holds) for r in result.rows)]
     tables: dict[str, CsvTable] = {"table.csv": (_COLUMNS, lines)}
-    sections, picture = [_outputs(recipe, found), _omissions(found)], None
-    if found.costs:
-        scenes = [(c.scene, c.seconds, c.computing, c.steps, "; ".join(c.left_out), c.refused) for c in found.costs]
+    sections, picture = [_outputs(recipe, result), _omissions(result)], None
+    if result.costs:
+        scenes = [(c.scene, c.seconds, c.computing, c.steps, "; ".join(c.left_out), c.refused) for c in result.costs]
         tables["costs.csv"] = (("scene", "seconds", "computing", "steps", "left out", "refused"), scenes)
-        sections.append(_scenes(found))
+        sections.append(_scenes(result))
         picture = sections[-1].picture
     title, shown = f"{recipe.name}: what is left out", (*SHOWN, "tolerance")
-    return StudyReport(title, _lead(recipe, found), sections, {"content": picture}, tables, shown=shown)
+    return StudyReport(title, _lead(recipe, result), sections, {"content": picture}, tables, shown=shown)
 
 
 def _output_line(p: OutputError) -> Sequence[Any]:
@@ -83,27 +83,27 @@ def _cells(r: OmissionRow) -> tuple[Any, ...]:
     return r.name, r.kind, r.taken, r.bound, r.rms, r.largest, worst, r.back, r.seconds
 
 
-def _lead(recipe: Recipe, found: LeaveOutResult) -> str:
-    chosen = [row for row in found.rows if row.taken]
-    worst = max((p.rms for p in found.output_errors), default=0.0)
-    held = "All bounds hold" if not found.failed else f"{found.failed} bounds do not hold"
+def _lead(recipe: Recipe, result: LeaveOutResult) -> str:
+    chosen = [row for row in result.rows if row.taken]
+    worst = max((p.rms for p in result.output_errors), default=0.0)
+    held = "All bounds hold" if not result.failed else f"{result.failed} bounds do not hold"
     return (
-        f"{held}. Of {len(found.rows)} steps that could be left out or made cheaper with a known bound, the recipe "
+        f"{held}. Of {len(result.rows)} steps that could be left out or made cheaper with a known bound, the recipe "
         f"does so with {len(chosen)} at its tolerance of {recipe.tolerance:.2g}; its worst output is then {worst:.2g} "
         "from the one with everything in full."
     )
 
 
-def _outputs(recipe: Recipe, found: LeaveOutResult) -> Section:
-    rows = [(p.output, p.bound, p.rms, p.largest, recipe.tolerance, _HELD[p.holds]) for p in found.output_errors]
+def _outputs(recipe: Recipe, result: LeaveOutResult) -> Section:
+    rows = [(p.output, p.bound, p.rms, p.largest, recipe.tolerance, _HELD[p.holds]) for p in result.output_errors]
     text = """Each output of the recipe as it chooses, against the same with everything in full (--exact). The
         error is the root mean square of the difference over the largest element, which the tolerance limits. The
         proved bound is what the nodes propagate from the omissions, where they have a bound."""
     columns = ("output", "proved bound", "error", "largest difference", "tolerance", "holds")
-    return Section("The outputs", text, columns, rows, marks=_marks(found.output_errors, 5))
+    return Section("The outputs", text, columns, rows, marks=_marks(result.output_errors, 5))
 
 
-def _omissions(found: LeaveOutResult) -> Section:
+def _omissions(result: LeaveOutResult) -> Section:
     text = """Each omission alone, with everything else in full. A step that is left out passes its input on. Light
         may be not added. For a summed image, only the sums over bands that its readers need are convolved. The stated
         bound and the change are shares of the largest element: of the step's full result; for light that is not added,
@@ -115,21 +115,21 @@ def _omissions(found: LeaveOutResult) -> Section:
         recipe as it chooses computes this one step in full. Saved: the seconds of its steps. A bound that the tolerance
         does not allow is tested too."""
     columns = ("step", "how", "chosen", "bound", "error", "largest", "outputs", "put back", "saved s", "holds")
-    cells = [(_cells(row), row) for row in found.rows]
+    cells = [(_cells(row), row) for row in result.rows]
     rows = [(name, _HOW[kind], *rest, _HELD[row.holds]) for (name, kind, *rest), row in cells]
-    return Section("Each omission", text, columns, rows, marks=_marks(found.rows, len(columns) - 1))
+    return Section("Each omission", text, columns, rows, marks=_marks(result.rows, len(columns) - 1))
 
 
-def _scenes(found: LeaveOutResult) -> Section:
+def _scenes(result: LeaveOutResult) -> Section:
     text = """The run time from an empty store, in one process: the median of up to three runs. The first row
         computes everything in full; the others may leave out what their scene does not need."""
-    full = found.costs[0].seconds
+    full = result.costs[0].seconds
     rows = []
-    for c in found.costs:
+    for c in result.costs:
         seconds = (None, None) if c.refused else (c.seconds, c.seconds / full)
         rows.append((c.scene, *seconds, c.steps, c.refused or ", ".join(c.left_out) or "nothing"))
     columns = ("scene", "seconds", "share of full", "steps", "left out or made cheaper")
-    timed = [c for c in found.costs if math.isfinite(c.seconds)]
+    timed = [c for c in result.costs if math.isfinite(c.seconds)]
     return Section("Cost follows content", text, columns, rows, _bars(timed) if timed else None)
 
 

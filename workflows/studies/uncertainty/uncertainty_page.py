@@ -74,33 +74,33 @@ class UncertaintyResult:
         return list(self.swings)
 
 
-def draw_pictures(found: UncertaintyResult) -> dict[str, bytes]:
+def draw_pictures(result: UncertaintyResult) -> dict[str, bytes]:
     """Return the pictures of the page as PNG, by name."""
     shown = {}
-    numbers = found.numbers[:_MOST]
+    numbers = result.numbers[:_MOST]
     if numbers:
-        middle = {name: found.middle[name][0] for name in numbers}
-        shown["tornado"] = figures.tornado({name: found.swings[name] for name in numbers}, middle)
-        shown["numbers"] = figures.histograms({name: found.values[name][:, 0] for name in numbers}, middle)
-    if curves := _curves(found):
+        middle = {name: result.middle[name][0] for name in numbers}
+        shown["tornado"] = figures.tornado({name: result.swings[name] for name in numbers}, middle)
+        shown["numbers"] = figures.histograms({name: result.values[name][:, 0] for name in numbers}, middle)
+    if curves := _curves(result):
         shown["bands"] = figures.bands(*curves)
-    for name, values in found.values.items():
-        if _node_of(found, name) == _TRANSFER and np.isfinite(values).all():
+    for name, values in result.values.items():
+        if _node_of(result, name) == _TRANSFER and np.isfinite(values).all():
             shown["transfer"] = figures.transfer(values.reshape(len(values), -1, 3))
-    if found.pictures:
-        shown["pictures"] = figures.pictures(found.pictures)
+    if result.pictures:
+        shown["pictures"] = figures.pictures(result.pictures)
     return shown
 
 
-def _curves(found: UncertaintyResult) -> tuple[dict[str, tuple[FloatArray, dict[str, FloatArray]]], str] | None:
+def _curves(result: UncertaintyResult) -> tuple[dict[str, tuple[FloatArray, dict[str, FloatArray]]], str] | None:
     """Return the abscissa and the draws of each varying curve, by its step, and the name of the abscissa."""
-    wavelengths = _wavelengths_nm(found)
+    wavelengths = _wavelengths_nm(result)
     curves: dict[str, tuple[FloatArray, dict[str, FloatArray]]] = {}
     spectral = True
-    for name, values in found.values.items():
+    for name, values in result.values.items():
         count = values.shape[1]
-        known = np.isfinite(values).all() and not found.scatter[name].is_constant
-        if count < 3 or not known or _node_of(found, name) == _TRANSFER:
+        known = np.isfinite(values).all() and not result.scatter[name].is_constant
+        if count < 3 or not known or _node_of(result, name) == _TRANSFER:
             continue
         over_bands = len(wavelengths) == count
         spectral &= over_bands
@@ -110,37 +110,37 @@ def _curves(found: UncertaintyResult) -> tuple[dict[str, tuple[FloatArray, dict[
     return (curves, "wavelength (nm)" if spectral else "element") if curves else None
 
 
-def _wavelengths_nm(found: UncertaintyResult) -> FloatArray:
-    recipe = found.inputs.recipe
+def _wavelengths_nm(result: UncertaintyResult) -> FloatArray:
+    recipe = result.inputs.recipe
     if BANDS not in recipe.steps:
         return np.zeros(0)
     centres: FloatArray = run(recipe, None, [BANDS])[BANDS].centres.double().numpy()
     return centres * 1e9
 
 
-def _node_of(found: UncertaintyResult, quantity: str) -> str:
-    steps = found.inputs.recipe.steps
+def _node_of(result: UncertaintyResult, quantity: str) -> str:
+    steps = result.inputs.recipe.steps
     name = quantity if quantity in steps else quantity.rpartition(".")[0]
     return steps[name].node.path if name in steps else ""
 
 
-def lead(found: UncertaintyResult) -> str:
+def lead(result: UncertaintyResult) -> str:
     """Return the result of the study in a few sentences."""
-    count, kind = len(found.points.z), "points of Sobol" if found.sequences else "independent draws"
-    known = f"every standard deviation is known to {found.error:.1%}"
-    if found.error > found.wanted:
-        known = f"the standard deviation of {found.worst} is known to {found.error:.1%} only"
-        known += f", {found.wanted:.1%} was asked"
-    numbers = {name: found.scatter[name] for name in found.numbers[:_MOST]}
+    count, kind = len(result.points.z), "points of Sobol" if result.sequences else "independent draws"
+    known = f"every standard deviation is known to {result.error:.1%}"
+    if result.error > result.wanted:
+        known = f"the standard deviation of {result.worst} is known to {result.error:.1%} only"
+        known += f", {result.wanted:.1%} was asked"
+    numbers = {name: result.scatter[name] for name in result.numbers[:_MOST]}
     values = [f"{name} {float(s.mean[0]):.5g} ± {float(s.sd[0]):.2g}" for name, s in numbers.items()]
-    strange = f" Not finite in some draw: {', '.join(found.strange)}." if found.strange else ""
-    return f"{count} {kind} of {', '.join(found.inputs.names)}: {known}.{strange}\n\n{'; '.join(values)}."
+    strange = f" Not finite in some draw: {', '.join(result.strange)}." if result.strange else ""
+    return f"{count} {kind} of {', '.join(result.inputs.names)}: {known}.{strange}\n\n{'; '.join(values)}."
 
 
-def sections(found: UncertaintyResult, shown: Mapping[str, bytes]) -> list[Section]:
+def sections(result: UncertaintyResult, shown: Mapping[str, bytes]) -> list[Section]:
     """Return the sections of the page; ``shown`` has the pictures by name."""
-    parts = [_inputs(found), *_posterior(found), _numbers(found, shown.get("numbers"))]
-    parts += _moves(found, shown.get("tornado"))
+    parts = [_inputs(result), *_posterior(result), _numbers(result, shown.get("numbers"))]
+    parts += _moves(result, shown.get("tornado"))
     if "bands" in shown:
         text = "The middle 90 % of the draws, element by element."
         parts.append(Section("Curves", text, picture=shown["bands"]))
@@ -153,19 +153,19 @@ def sections(found: UncertaintyResult, shown: Mapping[str, bytes]) -> list[Secti
         text = """Mean and standard deviation of each pixel over the first 32 draws, the deviation known to 13 %. The
             noise is the same in all draws, so only the inputs matter; pictures.npz has the numbers."""
         parts.append(Section("Pictures", text, picture=shown["pictures"]))
-    return [*parts, *_rest(found)]
+    return [*parts, *_rest(result)]
 
 
-def _inputs(found: UncertaintyResult) -> Section:
+def _inputs(result: UncertaintyResult) -> Section:
     text = """The drawn values, in SI. In a joint distribution the first value moves together with the others as far as
         they correlate, and each further one by what is left of it, so that all inputs are independent. The same noise
         is drawn every time, so that only the inputs make a difference."""
-    rows = [(r["name"], r["label"], r["law"], f"{r['mean']:.6g}", r["sd"]) for r in found.input_rows]
+    rows = [(r["name"], r["label"], r["law"], f"{r['mean']:.6g}", r["sd"]) for r in result.input_rows]
     return Section("Inputs", text, ("value", "drawn as", "law", "mean", "sd"), rows)
 
 
-def _posterior(found: UncertaintyResult) -> list[Section]:
-    standings = [s for s in found.inputs.uncertain.standings if s.path in found.inputs.names]
+def _posterior(result: UncertaintyResult) -> list[Section]:
+    standings = [s for s in result.inputs.uncertain.standings if s.path in result.inputs.names]
     if not standings:
         return []
     text = """Where the recipe's own value lies in the posterior. A value that the frames only limit, or do not
@@ -181,21 +181,21 @@ def _posterior(found: UncertaintyResult) -> list[Section]:
     return [Section("The recipe beside its posterior", text, columns, rows, marks=marks)]
 
 
-def _numbers(found: UncertaintyResult, picture: bytes | None) -> Section:
-    how = f"by how {found.sequences} scrambled sequences differ" if found.sequences else "by the jackknife"
+def _numbers(result: UncertaintyResult, picture: bytes | None) -> Section:
+    how = f"by how {result.sequences} scrambled sequences differ" if result.sequences else "by the jackknife"
     text = f"Error: of the standard deviation, relative, {how}. Of a curve, the worst element."
     columns = ("quantity", "at the medians", "mean", "sd", "error", "5 %", "95 %")
     rows, marks = list[Sequence[Any]](), dict[tuple[int, int], Mark]()
-    for name, s in found.scatter.items():
+    for name, s in result.scatter.items():
         i = int(s.sd.argmax())
         label = name if len(s.sd) == 1 else f"{name}, element {i}"
-        numbers = (f"{found.middle[name][i]:.6g}", f"{s.mean[i]:.6g}", float(s.sd[i]))
-        marks[len(rows), 4] = "pass" if s.error <= found.wanted and name not in found.strange else "fail"
+        numbers = (f"{result.middle[name][i]:.6g}", f"{s.mean[i]:.6g}", float(s.sd[i]))
+        marks[len(rows), 4] = "pass" if s.error <= result.wanted and name not in result.strange else "fail"
         rows.append((label, *numbers, f"{s.error:.1%}", f"{s.low[i]:.6g}", f"{s.high[i]:.6g}"))
     return Section("Numbers", text, columns, rows, picture, marks)
 
 
-def _moves(found: UncertaintyResult, picture: bytes | None) -> list[Section]:
+def _moves(result: UncertaintyResult, picture: bytes | None) -> list[Section]:
     if picture is None:
         return []
     text = f"""Each input by itself at its 5 and its 95 %, all others at their median. The table: shares of the variance
@@ -206,11 +206,11 @@ def _moves(found: UncertaintyResult, picture: bytes | None) -> list[Section]:
     columns = ("quantity", "input", "first", "±", "total", "±", "explained")
     rows: list[Sequence[Any]] = []
     marks: dict[tuple[int, int], Mark] = {}
-    for name, shares in found.shares.items():
+    for name, shares in result.shares.items():
         before = len(rows)
         first = zip(shares.first, shares.first_error, strict=True)
         total = zip(shares.total, shares.total_error, strict=True)
-        for label, alone, together in zip(found.inputs.labels, first, total, strict=True):
+        for label, alone, together in zip(result.inputs.labels, first, total, strict=True):
             share, error = together if shares.explains_enough else alone
             if share > max(_LITTLE, error / 2):
                 shown = together if shares.explains_enough else (None, None)
@@ -220,10 +220,10 @@ def _moves(found: UncertaintyResult, picture: bytes | None) -> list[Section]:
     return [Section("What moves them", text, columns, rows, picture, marks)]
 
 
-def _rest(found: UncertaintyResult) -> list[Section]:
+def _rest(result: UncertaintyResult) -> list[Section]:
     sentences = (
-        [f"No input reaches {', '.join(found.is_constant)}: these are as in a run."] if found.is_constant else []
+        [f"No input reaches {', '.join(result.is_constant)}: these are as in a run."] if result.is_constant else []
     )
-    if found.inputs.idle:
-        sentences.append(f"{', '.join(found.inputs.idle)} reach no output, and were not drawn.")
+    if result.inputs.idle:
+        sentences.append(f"{', '.join(result.inputs.idle)} reach no output, and were not drawn.")
     return [Section("What does not vary", "\n\n".join(sentences))] if sentences else []

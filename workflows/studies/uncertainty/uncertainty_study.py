@@ -50,9 +50,9 @@ def study(
     at = _points(inputs, recipe.seed, most, points)
     inputs.checked(np.concatenate([at.values, _ends(inputs)]))
     draws = OutputDraws(inputs, store, device, workers)
-    found = _measure(inputs, draws, at, progress, error, SCRAMBLES if points == "sobol" else 0)
-    document = study_run.document(_document(found, draws))
-    return study_run.write(runs, digest(document["quantities"]), document, _report(found))
+    result = _measure(inputs, draws, at, progress, error, SCRAMBLES if points == "sobol" else 0)
+    document = study_run.document(_document(result, draws))
+    return study_run.write(runs, digest(document["quantities"]), document, _report(result))
 
 
 def _points(inputs: Inputs, seed: int, most: int, points: str) -> InputDraws:
@@ -119,54 +119,54 @@ def _proportional(x: FloatArray, y: FloatArray) -> bool:
 # --- the folder -------------------------------------------------------------------------------------------------------
 
 
-def _document(found: UncertaintyResult, draws: OutputDraws) -> dict[str, Any]:
+def _document(result: UncertaintyResult, draws: OutputDraws) -> dict[str, Any]:
     return {
-        "draws": len(found.points.z),
-        "points": "sobol" if found.sequences else "draws",
+        "draws": len(result.points.z),
+        "points": "sobol" if result.sequences else "draws",
         "computed": draws.computed,
         "seconds a draw": draws.seconds / draws.computed if draws.computed else None,
-        "failed": found.failed,
-        "error": found.error,
-        "wanted": found.wanted,
-        "inputs": found.input_rows,
-        "posterior": told(found.inputs.uncertain.standings),
-        "idle": list(found.inputs.idle),
-        "still": list(found.is_constant),
-        "quantities": {name: _plain(found, name) for name in found.values},
-        "sensitivity": {name: asdict(shares) for name, shares in found.shares.items()},
+        "failed": result.failed,
+        "error": result.error,
+        "wanted": result.wanted,
+        "inputs": result.input_rows,
+        "posterior": told(result.inputs.uncertain.standings),
+        "idle": list(result.inputs.idle),
+        "still": list(result.is_constant),
+        "quantities": {name: _plain(result, name) for name in result.values},
+        "sensitivity": {name: asdict(shares) for name, shares in result.shares.items()},
     }
 
 
-def _plain(found: UncertaintyResult, name: str) -> dict[str, Any]:
-    s = found.scatter[name]
+def _plain(result: UncertaintyResult, name: str) -> dict[str, Any]:
+    s = result.scatter[name]
     arrays = {"mean": s.mean, "sd": s.sd, "low": s.low, "high": s.high}
-    return {"error": s.error, "middle": list(found.middle[name]), **{k: x.tolist() for k, x in arrays.items()}}
+    return {"error": s.error, "middle": list(result.middle[name]), **{k: x.tolist() for k, x in arrays.items()}}
 
 
-def _report(found: UncertaintyResult) -> StudyReport:
-    pictures = draw_pictures(found)
-    draws = zip(found.inputs.names, found.points.values.T, strict=True)
-    files: dict[str, Content] = {"draws.npz": _npz({**dict(draws), **found.values})}
+def _report(result: UncertaintyResult) -> StudyReport:
+    pictures = draw_pictures(result)
+    draws = zip(result.inputs.names, result.points.values.T, strict=True)
+    files: dict[str, Content] = {"draws.npz": _npz({**dict(draws), **result.values})}
     arrays: dict[str, Any] = {}
-    for name, (mean, sd) in found.pictures.items():
+    for name, (mean, sd) in result.pictures.items():
         arrays |= {f"{name} mean": mean.numpy(), f"{name} sd": sd.numpy()}
     if arrays:
         files["pictures.npz"] = _npz(arrays)
     return StudyReport(
-        f"{found.inputs.recipe.name}: how certain it is",
-        lead(found),
-        sections(found, pictures),
+        f"{result.inputs.recipe.name}: how certain it is",
+        lead(result),
+        sections(result, pictures),
         pictures,
-        tables={"table.csv": (_COLUMNS, _rows(found))},
+        tables={"table.csv": (_COLUMNS, _rows(result))},
         files=files,
         shown=("command", "date", "seconds", "draws", "computed", "seconds a draw", "versions"),
     )
 
 
-def _rows(found: UncertaintyResult) -> list[Sequence[Any]]:
+def _rows(result: UncertaintyResult) -> list[Sequence[Any]]:
     rows: list[Sequence[Any]] = []
-    for name, s in found.scatter.items():
-        columns = zip(found.middle[name], s.mean, s.sd, s.low, s.high, strict=True)
+    for name, s in result.scatter.items():
+        columns = zip(result.middle[name], s.mean, s.sd, s.low, s.high, strict=True)
         rows += [(name, i if len(s.mean) > 1 else "", *row) for i, row in enumerate(columns)]
     return rows
 
