@@ -33,11 +33,11 @@ def with_losses(recipe: Recipe) -> dict[str, Step]:
     for name, step in recipe.steps.items():
         for path, params in _COMPARES.get(step.node.path, ()):
             node = find_node(path)
-            wires = {given: step.wires[own] for given, own in zip(node.inputs, step.node.inputs, strict=False)}
-            room, _, what = path.partition(".")
-            own = f"{'loss ' if room == 'losses' else ''}{what}{' log' if 'log' in params else ''} of {name}"
-            given = node.params(**params, **_grid(recipe, node, step)).model_dump()
-            steps[own] = Step(own, node, given, wires, step.mark, {})
+            wires = {to: step.wires[source] for to, source in zip(node.inputs, step.node.inputs, strict=False)}
+            family, _, title = path.partition(".")
+            label = f"{'loss ' if family == 'losses' else ''}{title}{' log' if 'log' in params else ''} of {name}"
+            values = node.params(**params, **_grid(recipe, node, step)).model_dump()
+            steps[label] = Step(label, node, values, wires, step.mark, {})
     return steps
 
 
@@ -94,9 +94,9 @@ def with_parameters(steps: Mapping[str, Step], case: Case) -> dict[str, Step]:
 def _changed(step: Step, case: Case) -> dict[str, Any]:
     params = dict(step.params)
     for name in step.params:
-        for asked in (f"*.{name}", f"{step.node.path}.{name}"):
-            if asked in case.params and (params[name] is not None or asked[0] != "*"):
-                new = case.params[asked]
+        for path in (f"*.{name}", f"{step.node.path}.{name}"):
+            if path in case.params and (params[name] is not None or path[0] != "*"):
+                new = case.params[path]
                 params[name] = new(step.params) if callable(new) else new
     return params
 
