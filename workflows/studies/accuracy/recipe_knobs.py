@@ -8,7 +8,7 @@ which other steps depend on the value.
 from __future__ import annotations
 
 import re
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 from typing import Any, Literal, get_args, get_origin
 
@@ -59,10 +59,7 @@ class _Place:
 
 
 def knobs(recipe: Recipe, quick: bool = False) -> Knobs:
-    """Return the values that trade accuracy for run time in the steps that the outputs of ``recipe`` need.
-
-    ``quick`` asks for fewer settings of each value.
-    """
+    """Return the values of ``recipe`` that trade accuracy for run time, with their settings; fewer if ``quick``."""
     found: list[Knob] = []
     without: list[str] = []
     for what, turned in (
@@ -117,7 +114,7 @@ def _windows(recipe: Recipe, quick: bool) -> Iterator[Knob | str]:
             continue
         own, scales = tuple(place.value), (1.0, *(_FEWER_SCALES if quick else _SCALES))
         sizes = sorted({tuple(max(1, round(n * f)) for n in own) for f in scales})
-        yield _knob(place.path, [(s, _size(s), (f"{place.path}={list(s)}",)) for s in sizes], own)
+        yield _knob(place.path, [(s, "×".join(map(str, s)), (f"{place.path}={list(s)}",)) for s in sizes], own)
 
 
 def _precisions(recipe: Recipe) -> Iterator[Knob | str]:
@@ -133,10 +130,6 @@ def _knob(path: str, settings: Sequence[tuple[Any, str, tuple[str, ...]]], own: 
     return Knob(path, "", tuple(Change(label, () if value == own else how) for value, label, how in settings))
 
 
-def _size(shape: Iterable[int]) -> str:
-    return "×".join(map(str, shape))
-
-
 def allowed_words(step: Step, parameter: str) -> tuple[str, ...]:
     """Return the words that a parameter accepts, in the order of the node: the coarsest word first."""
     hint = step.node.hints[parameter]
@@ -144,10 +137,7 @@ def allowed_words(step: Step, parameter: str) -> tuple[str, ...]:
 
 
 def _places(recipe: Recipe, parameter: str, gives: type | None = None, beside: str = "") -> list[_Place]:
-    """Return each path in the recipe at which ``parameter`` of a needed step is written, unless it varies by item.
-
-    Only nodes with a result of type ``gives``, and with the parameter ``beside``, are considered.
-    """
+    """Return each path at which ``parameter`` is written, for steps that return ``gives`` and also have ``beside``."""
     found: dict[str, _Place] = {}
     for name in needed(recipe, recipe.outputs):
         step = recipe.steps[name]

@@ -119,7 +119,7 @@ def _measure(recipe: Recipe, step: Step, store: Store, patience: float) -> StepM
     with torch.no_grad():
         afforded = _largest(step, inputs, recipe.seed, patience)
         if afforded is None:
-            return StepMeasurement(refused="its reference runs neither on its inputs in time nor on a part of them")
+            return StepMeasurement(refused="its reference fails on its inputs and on every part of them")
         size, truth, seconds = afforded
         part = cut_inputs(step.node, inputs, size)
         variants = [asdict(variant) for variant in _variants(step, part, truth, recipe.seed)]

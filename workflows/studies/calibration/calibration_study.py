@@ -56,10 +56,7 @@ class CalibrationStudyResult:
 
     @property
     def failed(self) -> int:
-        """Return how many criteria fail: two for each parameter, and three for the simulations.
-
-        All simulations must have a posterior, a chain that is long enough, and no stranded walker.
-        """
+        """Return how many criteria fail: two for each parameter, and three for all simulations together."""
         return sum(v.failed for v in self.rank_tests) + bool(self.refused) + bool(self.short) + bool(self.stranded)
 
 

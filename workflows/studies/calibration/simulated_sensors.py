@@ -1,8 +1,7 @@
 """Simulation-based calibration: sensors drawn from a recipe's prior, simulated frames, and the posterior of each.
 
-Where posterior and simulation agree, the true parameters rank uniformly among draws from the posterior. Each simulation
-depends on the recipe and its number only, and the store keeps it: an interrupted study continues, and the first 200 of
-1000 simulations are those of a shorter study.
+Each simulation depends on the recipe and its number only, and the store keeps the result: an interrupted study
+continues, and the first 200 of 1000 simulations are those of a shorter study.
 """
 
 from __future__ import annotations
