@@ -1,4 +1,4 @@
-"""What are the numbers of a recipe worth?
+"""How accurate, stable and certain are the numbers of a recipe?
 
 Studies of a recipe, each with a page, a table and pictures, and what they share.
 A kind of study has its own room, which imports no other kind.

@@ -1,12 +1,12 @@
-"""Studies of a recipe: how accurate its numbers are, where it breaks, and what it need not compute.
+"""Studies of a recipe: accuracy, stability, omissions, calibration and uncertainty.
 
-    study_recipe("accuracy", load("first_light"))       error against run time, over tolerances and knobs
+    study_recipe("accuracy", load("first_light"))       error against run time, over tolerances and settings
     study_recipe("stability", load("first_light"))      stiff and extreme cases against float64
-    study_recipe("leave-out", load("first_light"))      each omission beside the full computation
-    study_recipe("calibration", load("calibrate"))      whether the posterior of a sensor is right, by simulations
-    study_recipe("uncertainty", load("first_light", ["sensor.read_noise=normal(10.5 e-, 0.5 e-)"]))  how outputs scatter
+    study_recipe("leave-out", load("first_light"))      each omission against the full computation
+    study_recipe("calibration", load("calibrate"))      the posterior of simulated sensors against the truth
+    study_recipe("uncertainty", load("first_light", ["sensor.read_noise=normal(10.5 e-, 0.5 e-)"]))  scatter of outputs
 
-Each writes a folder with a page, a table and pictures, and goes on where it was interrupted.
+Each study writes a folder with a page, a table and pictures, and continues after an interruption.
 """
 
 from __future__ import annotations
@@ -33,9 +33,9 @@ def study_recipe(
     progress: Callable[[str], None] = lambda line: None,
     **options: Any,
 ) -> Path:
-    """Run the study of one of `KINDS` and return its folder.
+    """Run a study of ``recipe`` and return the folder of the study; ``kind`` is one of `KINDS`.
 
-    Args: store: where the study keeps its points, so that an interrupted study goes on. runs: where the folder is made.
+    Args: store: keeps the points of the study, so that an interrupted study continues. runs: the parent of the folder.
     progress: receives a line for each point that is done. options: of the kind of study.
     """
     room = kind.replace("-", "_")
@@ -45,6 +45,6 @@ def study_recipe(
 
 
 def count_failures(folder: Path) -> int:
-    """Return how many cells, bounds or bars of a finished study do not hold."""
+    """Return the number of failed tests of a finished study, from its ``provenance.json``."""
     found: dict[str, Any] = json.loads((folder / "provenance.json").read_text())
     return int(found.get("failed", 0))

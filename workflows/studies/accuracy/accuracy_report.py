@@ -5,6 +5,7 @@ from __future__ import annotations
 import os
 import platform
 from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass
 from typing import Any
 
 import torch
@@ -12,7 +13,7 @@ import torch
 from neusee.workflows.graph.recipe_graph import Recipe
 from neusee.workflows.report.study_page import Mark, Section
 from neusee.workflows.studies.accuracy.accuracy_figures import Dot, Line, promises, steps, work_precision
-from neusee.workflows.studies.accuracy.pareto_line import ToleranceChoice, cheapest, median_ratio, pareto_front
+from neusee.workflows.studies.accuracy.pareto_line import Points, ToleranceChoice, cheapest, median_ratio, pareto_front
 from neusee.workflows.studies.accuracy.single_steps import USED, StepTried
 from neusee.workflows.studies.accuracy.work_precision_points import WorkPrecisionPoint
 
@@ -20,19 +21,33 @@ TOLERANCE, KEEP_ALL = "tolerance", "everything kept"
 HEADER = ("part", "line", "setting", "output", "seed", "error", "seconds", "computing", "proved", "refused")
 _BUSY = 1.5  #: processes for each core, above which times are not reliable
 _NO_WORSE = 2.0  #: factor over the error of everything kept, which is one draw of its rounding
-_FACTOR = 2.0  #: the most that the choice may cost over the cheapest
+_FACTOR = 2.0  #: the largest accepted ratio of the chosen run time to the cheapest
 
 _REFERENCE = """The reference is the recipe at its own sampling (bands, pupil samples, window), nothing left out,
 every step in the best precision that it has. So a coarser setting shows what it loses, a finer one what the recipe's
 own sampling leaves open. The error of an output is the root mean square of its difference from the reference over
-the reference's largest element; the worst output counts. Outputs whose shape a knob changes are not
+the reference's largest element; the worst output counts. Outputs whose shape a parameter changes are not
 compared at its settings and stand as a dash."""
 _TIME = """Run time is what the engine takes for a cold run of the outputs, choosing and writing results included: an
 empty store in a temporary folder, in a process that has imported its libraries. It is the median of three, taken in
 turn with the other points, where one takes less than 5 s, and a single one otherwise."""
-
+_ONE_SEED = "One seed: errors have no range."
+_SEEDS = """Noise was drawn with {} seeds, the same ones for every point: the error is the median over them,
+and least to most stand beside it. The names of its streams are the same at every point, so that noise
+itself is no error."""
 _POISSON = """But the Poisson law takes as many numbers from its stream as the light asks for: light that differs by
 rounding alone can shift the rest of the stream, and the errors then hold the noise."""
+
+
+@dataclass(frozen=True)
+class AccuracyResult:
+    """The measured points and steps of a recipe."""
+
+    recipe: Recipe
+    points: tuple[WorkPrecisionPoint, ...]
+    steps: tuple[StepTried, ...]
+    without: tuple[str, ...]  #: parameters that are not varied, and why
+    seeds: int
 
 
 def power_of_ten(tolerance: float) -> str:
@@ -40,245 +55,209 @@ def power_of_ten(tolerance: float) -> str:
     return f"{tolerance:.2g}" if tolerance >= 1 else f"{tolerance:.0e}".replace("e-0", "e-")
 
 
-def short_path(path: str) -> str:
-    """Return the path of a knob without the parts that every path has: ``line.count``, ``optics.bands``."""
-    return ", ".join(p.strip().removeprefix("steps.").replace(".with.", ".") for p in path.split(","))
-
-
 def machine_line() -> str:
-    """Return the machine in words, without its name."""
+    """Return one line on the machine: system, processor, cores and threads, without the name of the machine."""
     return f"{platform.system()} {platform.machine()}, {os.cpu_count()} cores, {torch.get_num_threads()} threads"
 
 
 def summary_line(point: WorkPrecisionPoint) -> str:
-    """Return one line of progress for a point."""
-    name = f"{point.trial.line} {point.trial.label}".strip()
-    if point.found.refused:
-        return f"{name}: {point.found.refused}"
-    return f"{name}: {point.seconds:.3g} s, error {point.error:.2g}"
+    """Return one line of progress: the parameter and setting of a point, its run time and its error."""
+    return f"{point.trial.name}: {point.found.refused or f'{point.seconds:.3g} s, error {point.error:.2g}'}"
 
 
-def choices(points: Sequence[WorkPrecisionPoint]) -> list[ToleranceChoice]:
-    """Return for each tolerance the point that the engine chose, and the cheapest point that holds the tolerance."""
+def choices(points: Points) -> list[ToleranceChoice]:
+    """Return for each tolerance the point that the engine chose, and the cheapest point within the tolerance."""
     sound = [p for p in points if p.sound]
-    asked = [p for p in sound if p.trial.value is not None]
-    return [
-        ToleranceChoice(float(p.trial.value or 0.0), p, cheapest(sound, float(p.trial.value or 0.0))) for p in asked
-    ]
+    asked = ((p.trial.value, p) for p in sound)
+    return [ToleranceChoice(value, p, cheapest(sound, value)) for value, p in asked if value is not None]
 
 
-def count_missed(points: Sequence[WorkPrecisionPoint]) -> int:
-    """Return how many tolerances were not held although they could be held."""
-    return sum(not c.held and not _beyond(c, points) for c in choices(points))
+def count_missed(points: Points) -> int:
+    """Return how many tolerances were exceeded although the arithmetic of the recipe is precise enough for them."""
+    return sum(not c.held and not _beyond_rounding(c, points) for c in choices(points))
 
 
-def lead(recipe: Recipe, points: Sequence[WorkPrecisionPoint]) -> str:
-    """Return the result in a few sentences."""
-    own = next((p for p in points if p.trial.own and p.sound), None)
-    whole = next((p for p in points if p.trial.line == KEEP_ALL and p.sound), None)
-    said = []
+def lead(recipe: Recipe, points: Points) -> str:
+    """Return the result of the study in a few sentences."""
+    own, whole, chosen = _own(points), _whole(points), choices(points)
+    sentences = []
     if own is not None:
-        said.append(
+        sentences.append(
             f"As it is written, with a tolerance of {power_of_ten(recipe.tolerance)}, the recipe takes "
-            f"{own.seconds:.3g} s and is off by {own.most:.2g} at most, {_worst(own)} being the worst."
+            f"{own.seconds:.3g} s and is off by {own.most:.2g} at most, {_worst_output(own)} being the worst."
         )
     if own is not None and whole is not None:
-        said.append(f"Everything in full takes {whole.seconds:.3g} s, {whole.seconds / own.seconds:.1f} times as long.")
-    made = choices(points)
-    held, ratio = sum(c.held for c in made), median_ratio(made)
-    said.append(f"{held} of {len(made)} tolerances were held.")
-    if whole is not None and any(_beyond(c, points) for c in made):
-        said.append(
-            f"{sum(_beyond(c, points) for c in made)} cannot be told: everything kept is off by {whole.most:.1g} "
-            "itself, by its arithmetic."
+        ratio = whole.seconds / own.seconds
+        sentences.append(f"Everything in full takes {whole.seconds:.3g} s, {ratio:.1f} times as long.")
+    sentences.append(f"{sum(c.held for c in chosen)} of {len(chosen)} tolerances were held.")
+    if whole is not None and (beyond := sum(_beyond_rounding(c, points) for c in chosen)):
+        sentences.append(
+            f"{beyond} cannot be told: everything kept is off by {whole.most:.1g} itself, by its arithmetic."
         )
-    if ratio is not None:
-        said.append(f"The engine's choice costs {ratio:.2f} times the cheapest setting that holds, at the median.")
+    if (ratio_of_times := median_ratio(chosen)) is not None:
+        sentences.append(
+            f"The engine's choice costs {ratio_of_times:.2f} times the cheapest setting that holds, at the median."
+        )
     load = max((p.found.load for p in points), default=0.0)
     if load > _BUSY:
-        said.append(f"The machine was busy with other work ({load:.1f} processes a core): times are long and scatter.")
-    return " ".join(said)
+        busy = f"The machine was busy with other work ({load:.1f} processes a core)"
+        sentences.append(f"{busy}: times are long and scatter.")
+    return " ".join(sentences)
 
 
-def _beyond(choice: ToleranceChoice, points: Sequence[WorkPrecisionPoint]) -> bool:
-    """Return True if a tolerance was missed by no more than the error of everything kept in the recipe's precision."""
-    whole = next((p.most for p in points if p.trial.line == KEEP_ALL and p.sound), 0.0)
-    return not choice.held and choice.chosen.most <= choice.tolerance + _NO_WORSE * whole
+def _own(points: Points) -> WorkPrecisionPoint | None:
+    return next((p for p in points if p.trial.own and p.sound), None)
 
 
-def pictures(recipe: Recipe, points: Sequence[WorkPrecisionPoint], tried: Sequence[StepTried]) -> dict[str, bytes]:
-    """Return the diagrams that can be drawn of the points and steps, by name."""
-    sound = [p for p in points if p.sound]
-    found = {}
+def _whole(points: Points) -> WorkPrecisionPoint | None:
+    return next((p for p in points if p.trial.line == KEEP_ALL and p.sound), None)
+
+
+def _beyond_rounding(choice: ToleranceChoice, points: Points) -> bool:
+    """Return True if a tolerance is exceeded by at most the rounding error of the full computation."""
+    whole = _whole(points)
+    rounding = _NO_WORSE * whole.most if whole else 0.0
+    return not choice.held and choice.chosen.most <= choice.tolerance + rounding
+
+
+def pictures(result: AccuracyResult) -> dict[str, bytes]:
+    """Return the diagrams of the measured points and steps, as PNG by name."""
+    drawn = {}
+    sound = [p for p in result.points if p.sound]
     if sound:
-        line = [(p.seconds, p.error) for p in pareto_front(sound)]
-        title = f"{recipe.name}: error against run time"
-        found["work_precision"] = work_precision(_lines(recipe, sound), line, recipe.tolerance, title)
-    asked = [p for p in sound if p.trial.value is not None]
-    if asked:
-        names = asked[0].found.errors
-        measured = {name: [max(p.found.errors[name]) for p in asked] for name in names}
-        found["promises"] = promises(
-            [float(p.trial.value or 0.0) for p in asked], measured, [p.found.bound for p in asked]
-        )
-    with_forms = [s for s in tried if s.forms]
-    if with_forms:
-        found["steps"] = steps([_diagram(s) for s in with_forms])
-    return found
+        front = [(p.seconds, p.error) for p in pareto_front(sound)]
+        title = f"{result.recipe.name}: error against run time"
+        drawn["work_precision"] = work_precision(_lines(result.recipe, sound), front, result.recipe.tolerance, title)
+    if asked := choices(sound):
+        chosen = [choice.chosen.found for choice in asked]
+        measured = {name: [max(point.errors[name]) for point in chosen] for name in chosen[0].errors}
+        drawn["promises"] = promises([c.tolerance for c in asked], measured, [point.bound for point in chosen])
+    if measured_steps := [s for s in result.steps if s.variants]:
+        drawn["steps"] = steps([_diagram(s) for s in measured_steps])
+    return drawn
 
 
-def sections(
-    recipe: Recipe,
-    points: Sequence[WorkPrecisionPoint],
-    tried: Sequence[StepTried],
-    without: Sequence[str],
-    seeds: int,
-    drawn: Mapping[str, bytes],
-) -> list[Section]:
-    """Return the parts of the page."""
-    many = f"Noise was drawn with {seeds} seeds, the same ones for every point: the error is the median over them, "
-    many += "and least to most stand beside it. The names of its streams are the same at every point, so that noise "
-    many += "itself is no error."
-    if any("poisson" in step.params.values() for step in recipe.steps.values()):
-        many += " " + _POISSON
-    text = f"{_REFERENCE}\n\n{_TIME}\n\n{many if seeds > 1 else 'One seed: errors have no range.'}"
-    once = [p for p in points if p.trial.recipe is not recipe]  # the recipe's own setting of a knob is the recipe
+def sections(result: AccuracyResult, drawn: Mapping[str, bytes]) -> list[Section]:
+    """Return the sections of the page; ``drawn`` has the pictures by name."""
+    seeds = _SEEDS.format(result.seeds) if result.seeds > 1 else _ONE_SEED
+    if result.seeds > 1 and any("poisson" in step.params.values() for step in result.recipe.steps.values()):
+        seeds += " " + _POISSON
+    # the recipe's own setting of a parameter is the recipe itself
+    once = [p for p in result.points if p.trial.recipe is not result.recipe]
     return [
-        _whole(once, text, drawn.get("work_precision")),
-        _chosen(points),
+        _all_points(once, f"{_REFERENCE}\n\n{_TIME}\n\n{seeds}", drawn.get("work_precision")),
+        _chosen(result.points),
         _outputs(once, drawn.get("promises")),
-        _steps(tried, drawn.get("steps")),
-        _not_turned(points, without),
+        _steps(result.steps, drawn.get("steps")),
+        _not_varied(result),
     ]
 
 
-def _whole(points: Sequence[WorkPrecisionPoint], text: str, picture: bytes | None) -> Section:
-    columns = (
-        "knob",
-        "setting",
-        "run time, s",
-        "of it computing, s",
-        "error",
-        "least",
-        "most",
-        "proved",
-        "worst output",
-    )
-    best = {id(p) for p in pareto_front([p for p in points if p.sound])}
+def _all_points(points: Points, text: str, picture: bytes | None) -> Section:
+    columns = ["parameter", "setting", "run time, s", "of it computing, s"]
+    columns += ["error", "least", "most", "proved", "worst output"]
+    sound = [p for p in points if p.sound]
+    best = {id(p) for p in pareto_front(sound)}
     rows, marks = [], {}
-    for p in (p for p in points if p.sound):
-        found = p.found
-        row = (p.seconds, found.computing, p.error, min(p.by_seed), p.most, found.bound, _worst(p))
+    for p in sound:
+        row = (p.seconds, p.found.computing, p.error, min(p.by_seed), p.most, p.found.bound, _worst_output(p))
         rows.append((p.trial.line, f"{p.trial.label}{' (the recipe)' * p.trial.own}{' *' * (id(p) in best)}", *row))
         if p.trial.value is not None:
             marks[len(rows) - 1, 6] = _mark(ToleranceChoice(p.trial.value, p, None), points)
-    text += "\n\nA star: on the Pareto line, no other point is as quick and as right. Marks: whether a tolerance was "
-    text += "held with every seed; an exclamation mark where only arithmetic, that of everything kept, misses it."
+    text += """\n\nA star: on the Pareto line, no other point is as quick and as right. Marks: whether a tolerance was
+        held with every seed; an exclamation mark where only arithmetic, that of everything kept, misses it."""
     return Section("Error against run time", text, columns, rows, picture, marks)
 
 
-def _chosen(points: Sequence[WorkPrecisionPoint]) -> Section:
+def _chosen(points: Points) -> Section:
     columns = ("tolerance", "chosen: error", "s", "cheapest that holds", "error", "s", "chosen over cheapest")
     rows: list[tuple[Any, ...]] = []
     marks: dict[tuple[int, int], Mark] = {}
     for i, c in enumerate(choices(points)):
-        other = c.cheapest
-        assert other is None or isinstance(other, WorkPrecisionPoint)
-        name = f"{other.trial.line} {other.trial.label}".strip() if other else None
-        price = (other.most, other.seconds) if other else (None, None)
-        rows.append((power_of_ten(c.tolerance), c.chosen.most, c.chosen.seconds, name, *price, c.ratio))
+        best = (c.cheapest.trial.name, c.cheapest.most, c.cheapest.seconds) if c.cheapest else (None, None, None)
+        rows.append((power_of_ten(c.tolerance), c.chosen.most, c.chosen.seconds, *best, c.ratio))
         marks[i, 1] = _mark(c, points)
         if c.ratio is not None:
             marks[i, 6] = "pass" if c.ratio <= _FACTOR else "warn"
-    text = "For each tolerance, the engine's choice against the quickest of all points above whose error it would also "
-    text += f"have allowed. Marked: up to {_FACTOR:g} times."
+    text = f"""For each tolerance, the engine's choice against the quickest of all points above whose error it would
+        also have allowed. Marked: up to {_FACTOR:g} times."""
     return Section("Chosen against cheapest", text, columns, rows, None, marks)
 
 
-def _outputs(points: Sequence[WorkPrecisionPoint], picture: bytes | None) -> Section:
+def _outputs(points: Points, picture: bytes | None) -> Section:
     names = list(dict.fromkeys(name for p in points for name in p.found.errors))
     rows = [
         (p.trial.line, p.trial.label, *(max(p.found.errors[n]) if n in p.found.errors else None for n in names))
         for p in points
         if p.sound
     ]
-    text = "The greatest error over the seeds of every output; a dash where the knob changes its shape."
-    return Section("Every output", text, ("knob", "setting", *names), rows, picture)
+    text = "The greatest error over the seeds of every output; a dash where the parameter changes its shape."
+    return Section("Every output", text, ("parameter", "setting", *names), rows, picture)
 
 
 def _steps(tried: Sequence[StepTried], picture: bytes | None) -> Section:
-    columns = ("step", "node", "share of time", "form", "error", "run time, s", "reference, s", "tried on")
+    columns = ("step", "node", "share of time", "variant", "error", "run time, s", "reference, s", "tried on")
     rows: list[tuple[Any, ...]] = []
     for s in tried:
         head = (s.step, s.node, f"{100 * s.share:.1f} %")
         on = s.found.cut_inputs or "its own inputs"
-        rows += [(*head, f"{f.line} {f.label}".strip(), f.error, f.seconds, s.found.reference, on) for f in s.forms]
+        rows += [(*head, f"{f.line} {f.label}".strip(), f.error, f.seconds, s.found.reference, on) for f in s.variants]
         if s.found.refused:
             rows.append((*head, f"not tried: {s.found.refused}", None, None, None, None))
-    text = "Steps that take more than a hundredth of the time with everything kept; of several items, the slowest. "
-    text += "Each form of a step is compared with its reference, float64 and direct, on the step's own inputs; where "
-    text += "that would take too long, on a part of them, with the times of that part. `left out` hands on the first "
-    text += "input. Times are medians of repeated calls."
+    text = """Steps that take more than a hundredth of the time with everything kept; of several items, the slowest.
+        Each variant of a step is compared with its reference, float64 and direct, on the step's own inputs; where
+        that would take too long, on a part of them, with the times of that part. `left out` hands on the first
+        input. Times are medians of repeated calls."""
     return Section("Step by step", text, columns, rows, picture)
 
 
-def _not_turned(points: Sequence[WorkPrecisionPoint], without: Sequence[str]) -> Section:
-    rows = [(why.partition(": ")[0], "", why.partition(": ")[2]) for why in without]
-    rows += [(p.trial.line, p.trial.label, p.found.refused) for p in points if p.found.refused]
-    text = "Knobs that this recipe has not, and settings that cannot be." if rows else "Every knob could be turned."
-    return Section("Not turned", text, ("knob", "setting", "why"), rows)
+def _not_varied(result: AccuracyResult) -> Section:
+    rows = [(what, "", why) for what, _, why in (text.partition(": ") for text in result.without)]
+    rows += [(p.trial.line, p.trial.label, p.found.refused) for p in result.points if p.found.refused]
+    missing = "Parameters that this recipe does not have, and settings that are not possible."
+    text = missing if rows else "Every parameter could be varied."
+    return Section("Not varied", text, ("parameter", "setting", "why"), rows)
 
 
-def table(points: Sequence[WorkPrecisionPoint], tried: Sequence[StepTried]) -> Iterator[tuple[Any, ...]]:
-    """Yield the rows of the tidy table: one for each number."""
-    for p in points:
+def table(result: AccuracyResult) -> Iterator[tuple[Any, ...]]:
+    """Yield the rows of ``table.csv``, one for each measured error and each refusal."""
+    for p in result.points:
         head = ("recipe", p.trial.line, p.trial.label)
         if p.found.refused:
-            yield (*head, "", "", "", "", "", "", p.found.refused)
+            yield (*head, *[""] * 6, p.found.refused)
         for name, errors in p.found.errors.items():
             for seed, error in enumerate(errors):
                 yield (*head, name, seed, error, p.seconds, p.found.computing, p.found.bound, "")
-    for s in tried:
-        for form in s.forms:
-            yield (
-                f"step {s.step}",
-                form.line,
-                form.label,
-                s.found.cut_inputs,
-                "",
-                form.error,
-                form.seconds,
-                "",
-                "",
-                "",
-            )
+    for s in result.steps:
+        for f in s.variants:
+            yield (f"step {s.step}", f.line, f.label, s.found.cut_inputs, "", f.error, f.seconds, "", "", "")
         if s.found.refused:
-            yield (f"step {s.step}", s.node, "", "", "", "", "", "", "", s.found.refused)
+            yield (f"step {s.step}", s.node, *[""] * 7, s.found.refused)
 
 
-def _lines(recipe: Recipe, points: Sequence[WorkPrecisionPoint]) -> list[Line]:
-    names = dict.fromkeys(p.trial.line for p in points)
-    lines = {name: [_dot(p, p.trial.recipe is recipe) for p in points if p.trial.line == name] for name in names}
-    turned = (n for n in names if any(p.trial.recipe is not recipe for p in points if p.trial.line == n))
-    return [Line(name, lines[name], strong=name == TOLERANCE) for name in turned]
+def _lines(recipe: Recipe, points: Points) -> list[Line]:
+    varied = dict.fromkeys(p.trial.line for p in points if p.trial.recipe is not recipe)
+    of_line = {name: [_dot(p, recipe) for p in points if p.trial.line == name] for name in varied}
+    return [Line(name, dots, strong=name == TOLERANCE) for name, dots in of_line.items()]
 
 
-def _dot(p: WorkPrecisionPoint, own: bool) -> Dot:
+def _dot(p: WorkPrecisionPoint, recipe: Recipe) -> Dot:
     """Return a point of a diagram; the point of the recipe's own setting, where all lines meet, has no label."""
-    return Dot(p.seconds, p.error, "" if own else p.trial.label, min(p.by_seed), p.most, p.trial.own)
+    label = "" if p.trial.recipe is recipe else p.trial.label
+    return Dot(p.seconds, p.error, label, min(p.by_seed), p.most, p.trial.own)
 
 
 def _diagram(s: StepTried) -> tuple[str, list[Line], float]:
-    """Return the forms of a step by what is changed; the line of the form that is used is drawn thicker."""
-    names = dict.fromkeys(f.line for f in s.forms)
-    lines = [Line(n, [Dot(f.seconds, f.error, f.label) for f in s.forms if f.line == n], n == USED) for n in names]
+    """Return the title of a step's diagram, a line for each kind of variant, and the seconds of the reference."""
+    names = dict.fromkeys(f.line for f in s.variants)
+    lines = [Line(n, [Dot(f.seconds, f.error, f.label) for f in s.variants if f.line == n], n == USED) for n in names]
     on = f"\non {s.found.cut_inputs}" if s.found.cut_inputs else ""
     return f"{s.step}\n{s.node}{on}", lines, s.found.reference
 
 
-def _worst(p: WorkPrecisionPoint) -> str:
+def _worst_output(p: WorkPrecisionPoint) -> str:
     return max(p.found.errors, key=lambda name: max(p.found.errors[name]))
 
 
-def _mark(choice: ToleranceChoice, points: Sequence[WorkPrecisionPoint]) -> Mark:
-    return "pass" if choice.held else "warn" if _beyond(choice, points) else "fail"
+def _mark(choice: ToleranceChoice, points: Points) -> Mark:
+    return "pass" if choice.held else "warn" if _beyond_rounding(choice, points) else "fail"

@@ -1,16 +1,11 @@
-"""`neusee study accuracy`: error against run time, for the whole recipe and for its steps.
-
-The reference is the recipe at its own sampling with nothing left out and every step in the best precision that it
-has. The points are the tolerances, for which the engine chooses what to leave out, and the knobs of the recipe, turned
-one at a time. The store keeps each point, so that an interrupted study goes on.
-"""
+"""The study of accuracy: error against run time, for tolerances, for settings of the recipe, and for its steps."""
 
 from __future__ import annotations
 
 import math
 import time
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -22,31 +17,16 @@ from neusee.workflows.recipe.changed_recipe import changed
 from neusee.workflows.report.study_folder import Progress, StudyReport, StudyRun
 from neusee.workflows.store.result_store import Store
 from neusee.workflows.studies.accuracy import accuracy_report
+from neusee.workflows.studies.accuracy.accuracy_report import KEEP_ALL, TOLERANCE, AccuracyResult, power_of_ten
 from neusee.workflows.studies.accuracy.recipe_knobs import Knobs, finest, knobs
-from neusee.workflows.studies.accuracy.single_steps import StepTried, steps_that_matter, try_step
-from neusee.workflows.studies.accuracy.work_precision_points import (
-    TIMES,
-    PointCache,
-    PointMeasurement,
-    Trial,
-    WorkPrecisionPoint,
-)
+from neusee.workflows.studies.accuracy.single_steps import steps_that_matter, try_step
+from neusee.workflows.studies.accuracy.work_precision_points import TIMES, PointCache, Trial, WorkPrecisionPoint
 from neusee.workflows.tolerance.cheaper_steps import with_substitutions
 
 TOLERANCES = (1e-1, 1e-2, 1e-3, 1e-4, 1e-5, 1e-6)
 _FEWER = (1e-1, 1e-2, 1e-3, 1e-4)
 _PATIENCE, _LITTLE = 4.0, 1.0  #: s that the reference of a step may take
-
-
-@dataclass(frozen=True)
-class AccuracyResult:
-    """All that the study measured."""
-
-    recipe: Recipe
-    points: tuple[WorkPrecisionPoint, ...]
-    steps: tuple[StepTried, ...]
-    without: tuple[str, ...]  #: knobs that are not turned, and why
-    seeds: int
+_LEFT = "left for another time: run the study again to go on"
 
 
 def study(
@@ -64,30 +44,31 @@ def study(
     """Measure error against run time, write ``runs/<date>_<recipe>_accuracy_<key>/`` and return that folder.
 
     Args: seeds: of the noise, for the range of each error. quick: fewer settings. budget: seconds after which the study
-    begins no other setting of a knob; the page names the settings that are left, and the next study measures them.
+    measures no other setting of a parameter; the page names these settings, and the next study measures them.
     Raises: `ValueError` for no seed.
     """
     if seeds < 1:
-        raise ValueError(f"seeds={seeds}: a study needs one at least")
+        raise ValueError(f"seeds={seeds}: the study of accuracy needs at least one seed, such as seeds=3")
     study_run = StudyRun("accuracy", recipe, command)
     cache = PointCache(finest(recipe), store, seeds, device)
-    found = _measure(recipe, cache, progress, quick, math.inf if budget is None else time.monotonic() + budget)
-    key = digest("accuracy", cache.key(recipe), [_line_and_label(p) for p in found.points], quick)
-    document = study_run.document(_document(found, cache, quick))
-    return study_run.write(runs, key, document, _report(found, document))
+    result = _measure(recipe, cache, progress, quick, math.inf if budget is None else time.monotonic() + budget)
+    key = digest("accuracy", cache.key(recipe), [[p.trial.line, p.trial.label] for p in result.points], quick)
+    document = study_run.document(_document(result, cache, quick))
+    return study_run.write(runs, key, document, _report(result, document))
 
 
 def trials(recipe: Recipe, turned: Knobs, quick: bool) -> Iterator[Trial]:
-    """Yield the tolerances, everything kept, and each setting of each knob of the recipe."""
+    """Yield the settings to evaluate: each tolerance, the full computation, and each setting of each parameter."""
     asked = sorted({*(_FEWER if quick else TOLERANCES), recipe.tolerance}, reverse=True)
     for tolerance in asked:
         other = replace(recipe, tolerance=tolerance, exact=False)
         own = tolerance == recipe.tolerance and not recipe.exact
-        yield Trial(accuracy_report.TOLERANCE, accuracy_report.power_of_ten(tolerance), other, value=tolerance, own=own)
-    yield Trial(accuracy_report.KEEP_ALL, "", replace(recipe, exact=True), own=recipe.exact)
+        yield Trial(TOLERANCE, power_of_ten(tolerance), other, value=tolerance, own=own)
+    yield Trial(KEEP_ALL, "", replace(recipe, exact=True), own=recipe.exact)
     for knob in turned.found:
+        paths = (path.strip().removeprefix("steps.").replace(".with.", ".") for path in knob.name.split(","))
+        name = f"{knob.what} ({', '.join(paths)})"
         for change in knob.changes:
-            name = f"{knob.what} ({accuracy_report.short_path(knob.name)})"
             try:
                 yield Trial(name, change.label, changed(recipe, change.overrides) if change.overrides else recipe)
             except RecipeError as error:
@@ -101,31 +82,29 @@ def _measure(recipe: Recipe, cache: PointCache, progress: Progress, quick: bool,
     cache.truth(0)
     points = []
     for number, trial in enumerate(todo, 1):
-        points.append(_leave(trial) if time.monotonic() > until and _may_wait(trial, cache) else cache.point(trial))
+        left = time.monotonic() > until and _may_wait(trial, cache)
+        points.append(cache.point(replace(trial, recipe=None, refused=_LEFT) if left else trial))
         progress(f"{number}/{len(todo)}  {accuracy_report.summary_line(points[-1])}")
     for number in range(2, TIMES + 1):  # in turn, so that other work of the machine disturbs all points alike
         points = [cache.time_again(point, number) for point in points]
         progress(f"timed again: {number} of {TIMES}")
     steps = []
-    for stage, name, share in _matter(recipe, points):
+    for stage, name, share in _slow_steps(recipe, points):
         steps.append(try_step(stage, name, share, cache.store, _LITTLE if quick else _PATIENCE))
-        progress(f"step {name}: {steps[-1].found.refused or f'{len(steps[-1].forms)} forms'}")
+        progress(f"step {name}: {steps[-1].found.refused or f'{len(steps[-1].variants)} variants'}")
     return AccuracyResult(recipe, tuple(points), tuple(steps), turned.without, cache.seeds)
 
 
 def _may_wait(trial: Trial, cache: PointCache) -> bool:
-    """Return True if a trial is a setting of a knob and the store has no measurement of it."""
-    knob = trial.line not in (accuracy_report.TOLERANCE, accuracy_report.KEEP_ALL)
-    return knob and trial.recipe is not None and not cache.store.has(cache.key(trial.recipe))
+    """Return True if a setting is neither a tolerance nor the full computation, and is not measured yet."""
+    if trial.recipe is None or trial.line in (TOLERANCE, KEEP_ALL):
+        return False
+    return not cache.store.has(cache.key(trial.recipe))
 
 
-def _leave(trial: Trial) -> WorkPrecisionPoint:
-    return WorkPrecisionPoint(trial, PointMeasurement(refused="left for another time: run the study again to go on"))
-
-
-def _matter(recipe: Recipe, points: Sequence[WorkPrecisionPoint]) -> Iterator[tuple[Recipe, str, float]]:
-    """Yield the steps that matter where everything is kept, and the cheaper steps that the recipe runs instead."""
-    whole = next((p.found.steps for p in points if p.trial.line == accuracy_report.KEEP_ALL), {})
+def _slow_steps(recipe: Recipe, points: Sequence[WorkPrecisionPoint]) -> Iterator[tuple[Recipe, str, float]]:
+    """Yield (recipe, name, share of the run time) of each slow step, in the full computation and in the recipe."""
+    whole = next((p.found.steps for p in points if p.trial.line == KEEP_ALL), {})
     for name, share in steps_that_matter(recipe, whole):
         yield recipe, name, share
     own = next((p.found.steps for p in points if p.trial.own), {})
@@ -135,34 +114,27 @@ def _matter(recipe: Recipe, points: Sequence[WorkPrecisionPoint]) -> Iterator[tu
             yield cheaper, name, share
 
 
-def _line_and_label(point: WorkPrecisionPoint) -> list[Any]:
-    return [point.trial.line, point.trial.label]
-
-
-def _document(found: AccuracyResult, cache: PointCache, quick: bool) -> dict[str, Any]:
-    """Return what the folder says of the study, beside what every study says."""
+def _document(result: AccuracyResult, cache: PointCache, quick: bool) -> dict[str, Any]:
     return {
-        "tolerance": found.recipe.tolerance,
-        "seed": found.recipe.seed,
-        "seeds": found.seeds,
+        "tolerance": result.recipe.tolerance,
+        "seed": result.recipe.seed,
+        "seeds": result.seeds,
         "quick": quick,
         "device": cache.device,
         "machine": accuracy_report.machine_line(),
-        "failed": accuracy_report.count_missed(found.points),  # tolerances
+        "failed": accuracy_report.count_missed(result.points),  # tolerances
         "engine": engine(),
     }
 
 
-def _report(found: AccuracyResult, document: Mapping[str, Any]) -> StudyReport:
-    pictures = accuracy_report.pictures(found.recipe, found.points, found.steps)
-    sections = accuracy_report.sections(found.recipe, found.points, found.steps, found.without, found.seeds, pictures)
-    table = (accuracy_report.HEADER, accuracy_report.table(found.points, found.steps))
+def _report(result: AccuracyResult, document: Mapping[str, Any]) -> StudyReport:
+    pictures = accuracy_report.pictures(result)
     return StudyReport(
-        f"Accuracy of {found.recipe.name}",
-        accuracy_report.lead(found.recipe, found.points),
-        sections,
+        f"Accuracy of {result.recipe.name}",
+        accuracy_report.lead(result.recipe, result.points),
+        accuracy_report.sections(result, pictures),
         pictures,
-        tables={"table.csv": table},
-        files={"recipe.yaml": found.recipe.config.to_yaml()},
+        tables={"table.csv": (accuracy_report.HEADER, accuracy_report.table(result))},
+        files={"recipe.yaml": result.recipe.config.to_yaml()},
         shown=[name for name in document if name != "config"],
     )

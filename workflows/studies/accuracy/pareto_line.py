@@ -1,33 +1,23 @@
-"""The Pareto line of points, and the engine's choice against the cheapest point that holds a tolerance."""
+"""The Pareto line of points, and the engine's choice against the cheapest point within a tolerance."""
 
 from __future__ import annotations
 
-from collections.abc import Iterable
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from statistics import median
-from typing import Protocol, TypeVar
 
+from neusee.workflows.studies.accuracy.work_precision_points import WorkPrecisionPoint
 
-class Priced(Protocol):
-    """A thing with a price and an error."""
-
-    @property
-    def seconds(self) -> float: ...
-
-    @property
-    def most(self) -> float: ...
-
-
-P = TypeVar("P", bound=Priced)
+Points = Sequence[WorkPrecisionPoint]
 
 
 @dataclass(frozen=True)
 class ToleranceChoice:
-    """The engine's choice for a tolerance, and the cheapest point that holds it."""
+    """The engine's choice for a tolerance, and the cheapest point within the tolerance."""
 
     tolerance: float
-    chosen: Priced
-    cheapest: Priced | None  #: None where no point holds it
+    chosen: WorkPrecisionPoint
+    cheapest: WorkPrecisionPoint | None  #: None where no point is within the tolerance
 
     @property
     def held(self) -> bool:
@@ -40,21 +30,21 @@ class ToleranceChoice:
         return None if self.cheapest is None else self.chosen.seconds / self.cheapest.seconds
 
 
-def pareto_front(points: Iterable[P]) -> list[P]:
+def pareto_front(points: Points) -> list[WorkPrecisionPoint]:
     """Return the points that no other point beats in both time and error, the quickest first."""
-    line: list[P] = []
+    line: list[WorkPrecisionPoint] = []
     for point in sorted(points, key=lambda p: (p.seconds, p.most)):
         if not line or point.most < line[-1].most:
             line.append(point)
     return line
 
 
-def cheapest(points: Iterable[P], tolerance: float) -> P | None:
+def cheapest(points: Points, tolerance: float) -> WorkPrecisionPoint | None:
     """Return the quickest point with no error above ``tolerance``."""
     return min((p for p in points if p.most <= tolerance), key=lambda p: p.seconds, default=None)
 
 
 def median_ratio(choices: Iterable[ToleranceChoice]) -> float | None:
-    """Return the median ratio of the choices whose tolerance some point holds."""
+    """Return the median ratio of the chosen run time to the cheapest run time, over all possible tolerances."""
     ratios = [c.ratio for c in choices if c.ratio is not None]
     return median(ratios) if ratios else None

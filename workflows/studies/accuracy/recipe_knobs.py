@@ -1,14 +1,14 @@
-"""The knobs of a recipe: the values that trade accuracy for time, found by their role in the nodes.
+"""The knobs of a recipe: its values that trade accuracy for run time, found by the parameters of its nodes.
 
 A node that makes bands has a ``count``, a pupil has ``samples`` and a ``pitch``, a node that gives a PSF has the
-``shape`` of its window, and a ``precision`` is a choice of words. The recipe shows where such a value is written and
+``shape`` of its window, and a ``precision`` is a choice of words. The recipe shows where each value is written and
 which other steps depend on the value.
 """
 
 from __future__ import annotations
 
 import re
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 from typing import Any, Literal, get_args, get_origin
 
@@ -17,7 +17,7 @@ from neusee.workflows.graph.recipe_graph import Recipe, Step, needed
 from neusee.workflows.recipe.changed_recipe import changed
 
 _REFERENCE = re.compile(r"\$\{([\w.-]+)\}")
-_ONE_BY_ONE = ("item", "each")  #: begin what differs from item to item
+_ONE_BY_ONE = ("item", "each")  #: first names of paths whose value differs from item to item
 _FACTORS = (0.2, 1 / 3, 0.5, 2.0)  #: of the spaces between bands
 _FEWER = (1 / 3, 2.0)
 _SCALES = (0.5, 0.75, 0.9, 1.5, 2.0)  #: of samples, and of the side of a window
@@ -26,7 +26,7 @@ _FEWER_SCALES = (0.75, 1.5)
 
 @dataclass(frozen=True)
 class Change:
-    """One setting of a knob; without overrides, the recipe's own setting."""
+    """One setting of a recipe value; without overrides, the recipe's own setting."""
 
     label: str
     overrides: tuple[str, ...]
@@ -34,16 +34,16 @@ class Change:
 
 @dataclass(frozen=True)
 class Knob:
-    """A value, or several values that change together, and the settings to try, in order, with the recipe's own."""
+    """A recipe value that trades accuracy for run time, or several values together, and the settings to measure."""
 
-    name: str  #: as the recipe writes it: ``optics.bands``
+    name: str  #: path in the recipe, such as ``optics.bands``
     what: str
     changes: tuple[Change, ...]
 
 
 @dataclass(frozen=True)
 class Knobs:
-    """The knobs that a recipe has, and the reasons why others are not turned."""
+    """The values of a recipe that can be varied, and the reasons why other values cannot."""
 
     found: tuple[Knob, ...]
     without: tuple[str, ...]
@@ -51,7 +51,7 @@ class Knobs:
 
 @dataclass(frozen=True)
 class _Place:
-    """The path at which the value of a parameter is written, and the steps that read the value there."""
+    """A path in the recipe at which a parameter value is written, and the steps that read the value."""
 
     path: str
     value: Any
@@ -59,7 +59,7 @@ class _Place:
 
 
 def knobs(recipe: Recipe, quick: bool = False) -> Knobs:
-    """Return the knobs of the steps that the outputs of ``recipe`` need; ``quick``: with fewer settings of each."""
+    """Return the values of ``recipe`` that trade accuracy for run time, with their settings; fewer if ``quick``."""
     found: list[Knob] = []
     without: list[str] = []
     for what, turned in (
@@ -78,7 +78,7 @@ def knobs(recipe: Recipe, quick: bool = False) -> Knobs:
 
 def finest(recipe: Recipe) -> Recipe:
     """Return the recipe at its own sampling, with nothing left out and every step in its best precision."""
-    best = [f"{place.path}={_words(place.steps[0], 'precision')[-1]}" for place in _places(recipe, "precision")]
+    best = [f"{place.path}={allowed_words(place.steps[0], 'precision')[-1]}" for place in _places(recipe, "precision")]
     return replace(changed(recipe, best) if best else recipe, exact=True)
 
 
@@ -114,34 +114,30 @@ def _windows(recipe: Recipe, quick: bool) -> Iterator[Knob | str]:
             continue
         own, scales = tuple(place.value), (1.0, *(_FEWER_SCALES if quick else _SCALES))
         sizes = sorted({tuple(max(1, round(n * f)) for n in own) for f in scales})
-        yield _knob(place.path, [(s, _size(s), (f"{place.path}={list(s)}",)) for s in sizes], own)
+        yield _knob(place.path, [(s, "×".join(map(str, s)), (f"{place.path}={list(s)}",)) for s in sizes], own)
 
 
 def _precisions(recipe: Recipe) -> Iterator[Knob | str]:
-    """Yield one knob for the precision of all steps: one step in double after one in single shows nothing."""
+    """Yield one knob for the precisions of all steps, because double precision in one step alone gains nothing."""
     if places := _places(recipe, "precision"):
-        words = _words(places[0].steps[0], "precision")
+        words = allowed_words(places[0].steps[0], "precision")
         path = ", ".join(p.path for p in places)
         yield _knob(path, [(w, w, tuple(f"{p.path}={w}" for p in places)) for w in words], places[0].value)
 
 
 def _knob(path: str, settings: Sequence[tuple[Any, str, tuple[str, ...]]], own: Any) -> Knob:
-    """Return a knob of the value at ``path`` from the value, label and overrides of each setting."""
+    """Return a knob for the value at ``path``; each setting has a value, a label and overrides."""
     return Knob(path, "", tuple(Change(label, () if value == own else how) for value, label, how in settings))
 
 
-def _size(shape: Iterable[int]) -> str:
-    return "×".join(map(str, shape))
-
-
-def _words(step: Step, parameter: str) -> tuple[str, ...]:
-    """Return the words that a parameter may be, the coarsest first, as its node lists them."""
+def allowed_words(step: Step, parameter: str) -> tuple[str, ...]:
+    """Return the words that a parameter accepts, in the order of the node: the coarsest word first."""
     hint = step.node.hints[parameter]
     return tuple(map(str, get_args(hint))) if get_origin(hint) is Literal else (str(step.params[parameter]),)
 
 
 def _places(recipe: Recipe, parameter: str, gives: type | None = None, beside: str = "") -> list[_Place]:
-    """Return where a parameter of the needed steps is written, each path once, without values that vary by item."""
+    """Return each path at which ``parameter`` is written, for steps that return ``gives`` and also have ``beside``."""
     found: dict[str, _Place] = {}
     for name in needed(recipe, recipe.outputs):
         step = recipe.steps[name]
@@ -157,7 +153,7 @@ def _places(recipe: Recipe, parameter: str, gives: type | None = None, beside: s
 
 
 def _written(recipe: Recipe, step: Step, parameter: str) -> str | None:
-    """Return the path of the value that a parameter has: in a block of the recipe, or at the step itself."""
+    """Return the path at which the value of a step's parameter is written, or None if the value varies by item."""
     path = f"steps.{step.name.partition('[')[0]}.with.{parameter}"
     while True:
         setting = recipe.config.settings.get(path)
@@ -170,7 +166,7 @@ def _written(recipe: Recipe, step: Step, parameter: str) -> str | None:
 
 
 def _others(recipe: Recipe, parameter: str, place: _Place) -> list[str]:
-    """Return other steps that read the value of a place; for a pitch, steps with the same pitch from elsewhere."""
+    """Return the other steps that read the value at ``place``, or for a pitch, steps with an equal pitch elsewhere."""
     mine = {step.name for step in place.steps}
     if parameter == "pitch":
         apart = (s for s in recipe.steps.values() if parameter in s.params and s.params[parameter] == place.value)

@@ -1,8 +1,8 @@
-"""Work and precision of single steps: the forms that a node has, against its reference.
+"""Run time and error of single steps: each variant of a node's computation, against the node's reference.
 
-Every step that takes more than a hundredth of the time and whose node has a reference is tried on its own
-inputs. Where the reference would take too long on them, all forms are tried on the middle of the
-pictures and on fewer bands, and the page says so.
+A variant is the step as used, in another precision, with another allowed error, with a smaller window of the PSF, or
+left out. Where the reference would take too long, all variants are tried on the middle of the pictures and on fewer
+bands.
 """
 
 from __future__ import annotations
@@ -11,10 +11,11 @@ import re
 import time
 from collections import defaultdict
 from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import suppress
 from dataclasses import asdict, dataclass, field, replace
 from functools import partial
 from statistics import median
-from typing import Any, Literal, get_args, get_origin
+from typing import Any
 
 import torch
 from torch import Tensor
@@ -31,42 +32,43 @@ from neusee.workflows.keys.engine_digest import engine
 from neusee.workflows.store.memo import compute_once
 from neusee.workflows.store.result_store import Store
 from neusee.workflows.store.serialization import each_tensor, tensors_in
+from neusee.workflows.studies.accuracy.recipe_knobs import allowed_words
 from neusee.workflows.tolerance.error_norm import error_of
 
-Cut = tuple[int, int]  #: the longest side, and the most bands; 0 for all
-SHARE = 0.01  #: of the time, below which a step does not matter
+Cut = tuple[int, int]  #: the longest side and the largest number of bands; 0 for no limit
+SHARE = 0.01  #: of the run time; steps with a smaller share are not tried
 _ITEM = re.compile(r"\[.*?\]")
 _CUTS: Sequence[Cut] = ((32, 2), (64, 2), (128, 3), (256, 3), (512, 3), (1024, 3), (0, 3), (0, 0))
-_GROWTH = 16.0  #: how much longer the reference may take from one cut to the next, as a direct convolution does
+_GROWTH = 16.0  #: expected ratio of the reference's times on two successive cuts, as of a direct convolution
 USED, _PRECISION = "as used", "precision"
 _WINDOWS = (0.75, 0.5, 0.25)  #: of the side of a PSF
-_ALLOWANCES = (1e3, 1e2, 1e1, 1e-1, 1e-2, 1e-3)  #: times what a step that chooses its own form is allowed
-_LONG_ENOUGH, _TIMES = 0.5, 5  #: s, times: a form is called again until one of them is reached
+_ALLOWANCES = (1e3, 1e2, 1e1, 1e-1, 1e-2, 1e-3)  #: factors on the error that a step may choose
+_LONG_ENOUGH, _TIMES = 0.5, 5  #: seconds and calls; a variant is called again until one of the two is reached
 
 
 @dataclass(frozen=True)
-class Form:
-    """One way to compute a step."""
+class Variant:
+    """One way to compute a step, with its error and run time."""
 
-    line: str  #: what is changed
-    label: str  #: to what
+    line: str  #: the property that is changed
+    label: str  #: its new value
     error: float
     seconds: float
 
 
 @dataclass(frozen=True)
 class StepMeasurement:
-    """The forms of a step with their errors and times; plain values, so that the store can keep them."""
+    """The variants of a step with their errors and times, as plain values that the store can keep."""
 
-    forms: list[dict[str, Any]] = field(default_factory=list)
+    variants: list[dict[str, Any]] = field(default_factory=list)
     reference: float = 0.0  #: s
-    cut_inputs: str = ""  #: what it was tried on; empty: on all
+    cut_inputs: str = ""  #: the part of the inputs that was used; empty for all of them
     refused: str = ""
 
 
 @dataclass(frozen=True)
 class StepTried:
-    """A step that matters, and its measurement or the reason why it was not tried."""
+    """A step with a large share of the run time, and its measurement or the reason why the step was not tried."""
 
     step: str  #: the slowest of its items
     node: str
@@ -74,12 +76,12 @@ class StepTried:
     found: StepMeasurement
 
     @property
-    def forms(self) -> list[Form]:
-        return [Form(**form) for form in self.found.forms]
+    def variants(self) -> list[Variant]:
+        return [Variant(**variant) for variant in self.found.variants]
 
 
 def steps_that_matter(recipe: Recipe, seconds: Mapping[str, float]) -> list[tuple[str, float]]:
-    """Return the slowest item of each step that takes more than `SHARE` of the time, and the share of all its items."""
+    """Return (slowest item, share of the time) of each step whose items together take more than `SHARE` of the time."""
     items: dict[str, list[str]] = defaultdict(list)
     for name in seconds:
         if name in recipe.steps:
@@ -90,15 +92,13 @@ def steps_that_matter(recipe: Recipe, seconds: Mapping[str, float]) -> list[tupl
 
 
 def try_step(recipe: Recipe, name: str, share: float, store: Store, patience: float) -> StepTried:
-    """Return the forms of a step of ``recipe``, from the store or tried now.
-
-    ``patience`` is the longest time in seconds that the reference of the step may take.
-    """
+    """Return the measured variants of a step, on inputs that its reference computes in ``patience`` seconds."""
     step = recipe.steps[name]
     if step.node.hooks.reference is None:
         return StepTried(name, step.node.path, share, StepMeasurement(refused="its node has no reference"))
-    key, about = _key(recipe, name, patience, store), {"step": f"study accuracy: {name}"}
-    found = compute_once(store, key, StepMeasurement, lambda: _try_forms(recipe, step, store, patience), about)
+    key = _key(recipe, name, patience, store)
+    compute = partial(_measure, recipe, step, store, patience)
+    found = compute_once(store, key, StepMeasurement, compute, {"step": f"study accuracy: {name}"})
     return StepTried(name, step.node.path, share, found)
 
 
@@ -110,7 +110,7 @@ def _key(recipe: Recipe, name: str, patience: float, store: Store) -> str:
     return digest("accuracy of a step", keys[name], patience, engine("studies.accuracy.single_steps"), machine())
 
 
-def _try_forms(recipe: Recipe, step: Step, store: Store, patience: float) -> StepMeasurement:
+def _measure(recipe: Recipe, step: Step, store: Store, patience: float) -> StepMeasurement:
     try:
         values = run(replace(recipe, exact=True), store, step.sources).values
     except RunError as error:
@@ -119,12 +119,12 @@ def _try_forms(recipe: Recipe, step: Step, store: Store, patience: float) -> Ste
     with torch.no_grad():
         afforded = _largest(step, inputs, recipe.seed, patience)
         if afforded is None:
-            return StepMeasurement(refused="its reference runs neither on its inputs in time nor on a part of them")
+            return StepMeasurement(refused="its reference fails on its inputs and on every part of them")
         size, truth, seconds = afforded
         part = cut_inputs(step.node, inputs, size)
-        forms = [asdict(form) for form in _forms(step, part, truth, recipe.seed)]
+        variants = [asdict(variant) for variant in _variants(step, part, truth, recipe.seed)]
     whole = all(a.shape == b.shape for a, b in zip(tensors_in(inputs), tensors_in(part), strict=True))
-    return StepMeasurement(forms, seconds, "" if whole else _words_of(step.node, size))
+    return StepMeasurement(variants, seconds, "" if whole else _cut_text(step.node, size))
 
 
 def _gathered(wire: str | tuple[str, ...] | None, values: Mapping[str, Any]) -> Any:
@@ -132,93 +132,86 @@ def _gathered(wire: str | tuple[str, ...] | None, values: Mapping[str, Any]) -> 
 
 
 def _largest(step: Step, inputs: list[Any], seed: int, patience: float) -> tuple[Cut, Any, float] | None:
-    """Return the largest part of the inputs on which the reference is within the patience, its result and seconds."""
+    """Return the largest part of the inputs that the reference computes within ``patience``, its result and seconds."""
     best: tuple[Cut, Any, float] | None = None
-    assert step.node.hooks.reference is not None
     for size in _CUTS:
         if best is not None and best[2] * _GROWTH > patience:
             break
         part = cut_inputs(step.node, inputs, size)
         try:
-            truth, seconds = _time_once(lambda part=part: _call(step, step.node.hooks.reference, part, seed))  # type: ignore[misc]
-        except Exception:  # a part of a picture may be no input for it: a larger one may
+            best = (size, *_time_once(partial(_call, step, step.node.hooks.reference, part, seed)))
+        except Exception:  # a part of a picture may be too small an input; a larger part may be possible
             continue
-        best = (size, truth, seconds)
     return best
 
 
-def _forms(step: Step, inputs: list[Any], truth: Any, seed: int) -> Iterator[Form]:
-    """Yield every way to compute the step whose result can be compared with that of the reference."""
-    for (line, label), way in _ways(step, inputs, seed).items():
-        try:
-            value, seconds = _median_time(way)
-            yield Form(line, label, error_of(_compared_value(value), _compared_value(truth)), seconds)
-        except (ValueError, RuntimeError):  # another shape, or a dtype that the form does not take
-            continue
+def _variants(step: Step, inputs: list[Any], truth: Any, seed: int) -> Iterator[Variant]:
+    """Yield every variant of the step whose result can be compared with the result ``truth`` of the reference."""
+    for (line, label), compute in _calls(step, inputs, seed).items():
+        with suppress(ValueError, RuntimeError):  # another shape, or a dtype that the variant does not take
+            value, seconds = _median_time(compute)
+            yield Variant(line, label, error_of(_compared_value(value), _compared_value(truth)), seconds)
 
 
-def _ways(step: Step, inputs: list[Any], seed: int) -> dict[tuple[str, str], Callable[[], Any]]:
-    """Return calls of the step: as used, in each other precision, allowance and window, and left out."""
+def _calls(step: Step, inputs: list[Any], seed: int) -> dict[tuple[str, str], Callable[[], Any]]:
+    """Return a function for each variant of the step, by the changed property and its new value."""
     node = step.node
-    ways: dict[tuple[str, str], Callable[[], Any]] = {(USED, ""): lambda: _call(step, node, inputs, seed)}
-    for word in _others(step, "precision"):
-        ways[_PRECISION, word] = partial(_call, step, node, inputs, seed, precision=word)
+    calls: dict[tuple[str, str], Callable[[], Any]] = {(USED, ""): partial(_call, step, node, inputs, seed)}
+    own = step.params.get("precision")
+    for word in allowed_words(step, "precision") if own is not None else ():
+        if word != own:
+            calls[_PRECISION, word] = partial(_call, step, node, inputs, seed, precision=word)
     if "precision" not in step.params and any(x.dtype == torch.float32 for x in tensors_in(inputs)):
         double = each_tensor(lambda x: x.double() if x.dtype == torch.float32 else x, inputs)
-        ways[_PRECISION, "double"] = partial(_call, step, node, double, seed)
+        calls[_PRECISION, "double"] = partial(_call, step, node, double, seed)
     for factor in _ALLOWANCES if "within" in step.params else ():
         within = step.params["within"] * factor
-        ways["error it may choose", f"{within:.0e}".replace("e-0", "e-")] = partial(
-            _call, step, node, inputs, seed, within=within
-        )
+        label = f"{within:.0e}".replace("e-0", "e-")
+        calls["error it may choose", label] = partial(_call, step, node, inputs, seed, within=within)
     for share in _WINDOWS if any(isinstance(x, Psf) for x in inputs) else ():
         smaller = [_inner(x, share) if isinstance(x, Psf) else x for x in inputs]
-        ways["window of the PSF", f"{share:g}"] = partial(_call, step, node, smaller, seed)
+        calls["window of the PSF", f"{share:g}"] = partial(_call, step, node, smaller, seed)
     if node.hooks.skip_bound is not None:
-        ways["left out", ""] = lambda: inputs[0]
-    return ways
+        calls["left out", ""] = lambda: inputs[0]
+    return calls
 
 
 def _inner(psf: Psf, share: float) -> Psf:
-    """Return the middle of a PSF; its centre stays at N // 2."""
+    """Return the middle of a PSF; the centre stays at N // 2."""
     x = psf.intensity
     for axis in (-2, -1):
-        size = x.shape[axis]
-        kept = max(1, round(share * size))
-        x = x.narrow(axis, size // 2 - kept // 2, kept)
+        x = _centred(x, axis, max(1, round(share * x.shape[axis])))
     return psf._replace(intensity=x)
 
 
+def _centred(x: Tensor, axis: int, count: int) -> Tensor:
+    return x.narrow(axis, x.shape[axis] // 2 - count // 2, count)
+
+
 def _compared_value(value: Any) -> Any:
-    """Return the values to compare: the cube of a mixture, the sums of channels."""
+    """Return the tensors to compare: the full cube of a low-rank cube, the planes and flux of channels."""
     if isinstance(value, LowRankCube):
         return torch.einsum("bk,kyx->byx", value.basis.to(value.planes), value.planes)
     return (value.planes, value.flux) if isinstance(value, Channels) else value
 
 
-def _others(step: Step, parameter: str) -> tuple[str, ...]:
-    hint = step.node.hints.get(parameter)
-    words = get_args(hint) if get_origin(hint) is Literal else ()
-    return tuple(w for w in words if w != step.params.get(parameter))
-
-
-def _call(step: Step, form: Any, inputs: list[Any], seed: int, **other: Any) -> Any:
+def _call(step: Step, function: Any, inputs: list[Any], seed: int, **other: Any) -> Any:
     rng = {"rng": torch.Generator().manual_seed(stream_seed(seed, step.name))} if step.node.random else {}
-    return form(*inputs, **{**step.params, **other}, **rng)
+    return function(*inputs, **{**step.params, **other}, **rng)
 
 
-def _time_once(way: Callable[[], Any]) -> tuple[Any, float]:
+def _time_once(compute: Callable[[], Any]) -> tuple[Any, float]:
     began = time.perf_counter()
-    value = way()
+    value = compute()
     return value, time.perf_counter() - began
 
 
-def _median_time(way: Callable[[], Any]) -> tuple[Any, float]:
-    """Return the result, and the median time of some calls after the first one, which computes tables."""
-    value, seconds = _time_once(way)
+def _median_time(compute: Callable[[], Any]) -> tuple[Any, float]:
+    """Return the result, and the median time of several calls without a short first call, which computes tables."""
+    value, seconds = _time_once(compute)
     times = [] if seconds < _LONG_ENOUGH else [seconds]
     while len(times) < _TIMES and sum(times) < _LONG_ENOUGH:
-        times.append(_time_once(way)[1])
+        times.append(_time_once(compute)[1])
     return value, median(times)
 
 
@@ -226,18 +219,17 @@ def _median_time(way: Callable[[], Any]) -> tuple[Any, float]:
 
 
 def cut_inputs(node: Node, inputs: list[Any], size: Cut) -> list[Any]:
-    """Return ``inputs`` with no picture wider and no more bands than ``size``, where the node names the band axis."""
+    """Return the middle of each picture in ``inputs``, with fewer bands where the node names the axis of bands."""
     side, bands = size
-    found = []
+    parts = []
     for name, value in zip(node.inputs, inputs, strict=True):
         axis = (node.bands or {}).get(name)
-        fewer = value if axis is None or not bands else _fewer(value, axis, bands)
-        found.append(each_tensor(lambda x: _middle(x, side), fewer) if side else fewer)
-    return found
+        fewer = value if axis is None or not bands else _fewer_bands(value, axis, bands)
+        parts.append(each_tensor(lambda x: _middle(x, side), fewer) if side else fewer)
+    return parts
 
 
-def _words_of(node: Node, size: Cut) -> str:
-    """Return the cut in words; an empty text where nothing is cut."""
+def _cut_text(node: Node, size: Cut) -> str:
     side, bands = size
     fewer = bands and (node.bands or {}).keys() - {"return"}
     parts = [f"the middle {side} × {side}"] * bool(side) + [f"{bands} bands"] * bool(fewer)
@@ -246,17 +238,17 @@ def _words_of(node: Node, size: Cut) -> str:
 
 def _middle(x: Tensor, side: int) -> Tensor:
     for axis in (-2, -1) if x.ndim >= 2 and min(x.shape[-2:]) > side else ():
-        x = x.narrow(axis, x.shape[axis] // 2 - side // 2, side)
+        x = _centred(x, axis, side)
     return x
 
 
-def _fewer(value: Any, axis: int, bands: int) -> Any:
-    """Return bands that are spread evenly over all bands."""
+def _fewer_bands(value: Any, axis: int, bands: int) -> Any:
+    """Return ``value`` with only ``bands`` bands, spread evenly over all bands."""
     if isinstance(value, Tensor):
         count = value.shape[axis]
         if count <= bands:
             return value
-        places = value.new_tensor([round((i + 0.5) * count / bands - 0.5) for i in range(bands)]).long()
-        return value.index_select(axis, places)
-    fields = BAND_FIELDS.get(type(value), ())
-    return value._replace(**{name: _fewer(getattr(value, name), axis, bands) for name in fields}) if fields else value
+        indices = value.new_tensor([round((i + 0.5) * count / bands - 0.5) for i in range(bands)]).long()
+        return value.index_select(axis, indices)
+    fields = {name: getattr(value, name) for name in BAND_FIELDS.get(type(value), ())}
+    return value._replace(**{n: _fewer_bands(x, axis, bands) for n, x in fields.items()}) if fields else value

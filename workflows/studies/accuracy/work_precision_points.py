@@ -1,12 +1,10 @@
-"""The points of a work-precision diagram: a cold run, timed, and its outputs against those of the reference.
-
-The study's store keeps each point, so that an interrupted study goes on.
-"""
+"""The points of a work-precision diagram: the time of a cold run, and the errors of its outputs."""
 
 from __future__ import annotations
 
 import os
 from collections.abc import Mapping
+from contextlib import suppress
 from dataclasses import dataclass, field, replace
 from statistics import median
 from typing import Any
@@ -16,49 +14,53 @@ from neusee.workflows.engine.runner import run
 from neusee.workflows.graph.recipe_graph import Recipe, needed
 from neusee.workflows.graph.run_error import RunError
 from neusee.workflows.graph.step_record import Event
-from neusee.workflows.keys.cache_key import digest, key_of
+from neusee.workflows.keys.cache_key import digest
 from neusee.workflows.keys.code_digest import Code
 from neusee.workflows.keys.engine_digest import engine
 from neusee.workflows.store.memo import compute_once
 from neusee.workflows.store.result_store import Store
-from neusee.workflows.studies.cold_run import cold
+from neusee.workflows.studies.cold_run import cold, key_parts, run_cold
 from neusee.workflows.tolerance.cheaper_steps import with_substitutions
 from neusee.workflows.tolerance.error_norm import error_of
 
 TIMES = 3  #: cold runs of a point, of which the median counts
-_QUICK = 5.0  #: s; what takes longer is run once
-_WITHIN = ("tolerance", "exact")  #: fields of a recipe that stand in no key
+_QUICK = 5.0  #: s; a recipe that takes longer is run once
 _ABOUT = {"step": "study accuracy"}
 
 
 @dataclass(frozen=True)
 class Trial:
-    """A setting to try: the recipe with the setting, or the reason why the recipe cannot have it."""
+    """A setting to evaluate: the recipe with the setting, or the reason why the setting is not possible."""
 
-    line: str  #: the knob
+    line: str  #: the parameter that is set
     label: str
     recipe: Recipe | None
     refused: str = ""
     value: float | None = None  #: of a tolerance
-    own: bool = False  #: whether it is what the recipe itself says
+    own: bool = False  #: whether the recipe itself has this setting
+
+    @property
+    def name(self) -> str:
+        """Return the parameter and its setting as text."""
+        return f"{self.line} {self.label}".strip()
 
 
 @dataclass(frozen=True)
 class PointMeasurement:
-    """Errors and run times of a recipe; plain values, so that the store can keep them."""
+    """Errors and run times of a recipe, as plain values that the store can keep."""
 
-    errors: dict[str, list[float]] = field(default_factory=dict)  #: by output, one a seed
-    seconds: list[float] = field(default_factory=list)  #: of the engine, one a cold run
-    computing: float = 0.0  #: s in the steps, of the first of them
-    load: float = 0.0  #: runnable processes for each core, this one included, as the machine said before
-    bound: float | None = None  #: what the engine proved of the worst output
-    steps: dict[str, float] = field(default_factory=dict)  #: s by step
+    errors: dict[str, list[float]] = field(default_factory=dict)  #: by output, one for each seed
+    seconds: list[float] = field(default_factory=list)  #: of the engine, one for each cold run
+    computing: float = 0.0  #: s in the steps of the first cold run
+    load: float = 0.0  #: runnable processes for each core before the run, this process included
+    bound: float | None = None  #: error of the worst output that the engine proved
+    steps: dict[str, float] = field(default_factory=dict)  #: s by step, in the first cold run
     refused: str = ""
 
 
 @dataclass(frozen=True)
 class WorkPrecisionPoint:
-    """A trial and its measurement."""
+    """A setting to evaluate and its measurement."""
 
     trial: Trial
     found: PointMeasurement
@@ -79,36 +81,37 @@ class WorkPrecisionPoint:
 
     @property
     def most(self) -> float:
-        """Return the greatest error of any output and seed, which a tolerance must hold."""
+        """Return the greatest error over all outputs and seeds, which is compared with the tolerance."""
         return max(self.by_seed, default=float("inf"))
 
     @property
     def sound(self) -> bool:
-        """Return True if the recipe was run and compared."""
+        """Return True if the recipe was run and compared with the reference."""
         return bool(self.found.errors and self.found.seconds)
 
 
 class PointCache:
-    """Points of a diagram: each recipe is measured once against the reference, and then read from the store."""
+    """A cache of points: each recipe is compared with the reference once, and the store keeps the point."""
 
     def __init__(self, reference: Recipe, store: Store, seeds: int, device: str = "cpu") -> None:
         self.reference, self.store, self.device = reference, store, device
-        self.seeds = seeds if is_random(reference) else 1
+        random = any(reference.steps[name].node.random for name in needed(reference, reference.outputs))
+        self.seeds = seeds if random else 1
         self._truth: dict[int, dict[str, Any]] = {}
         self._code = Code(store.code_memo)
         self._warm = False
 
     def point(self, trial: Trial) -> WorkPrecisionPoint:
-        """Return the point of a trial, from the store or measured now."""
-        if trial.recipe is None:
-            return WorkPrecisionPoint(trial, PointMeasurement(refused=trial.refused))
+        """Return the point of a setting, from the store or measured now."""
         recipe = trial.recipe
-        return WorkPrecisionPoint(
-            trial, compute_once(self.store, self.key(recipe), PointMeasurement, lambda: self._measure(recipe), _ABOUT)
-        )
+        if recipe is None:
+            return WorkPrecisionPoint(trial, PointMeasurement(refused=trial.refused))
+        key = self.key(recipe)
+        found = compute_once(self.store, key, PointMeasurement, lambda: self._measure(recipe), _ABOUT)
+        return WorkPrecisionPoint(trial, found)
 
     def time_again(self, point: WorkPrecisionPoint, number: int) -> WorkPrecisionPoint:
-        """Return the point with one more cold run, if its runs are quick; ``number`` distinguishes the runs."""
+        """Return the point with the time of cold run ``number`` added, if its first run was quick."""
         recipe, seconds = point.trial.recipe, point.found.seconds
         if recipe is None or not seconds or seconds[0] >= _QUICK:
             return point
@@ -116,18 +119,16 @@ class PointCache:
         return WorkPrecisionPoint(point.trial, replace(point.found, seconds=[*seconds, *one]))
 
     def _time(self, recipe: Recipe) -> float:
-        """Return the seconds of a cold run."""
         self._warm_up(recipe)
-        with cold(self.store) as store:
-            return run(recipe, store, device=self.device).seconds
+        return run_cold(recipe, self.store, self.device).seconds
 
     def key(self, recipe: Recipe) -> str:
-        """Return what decides a point: both recipes with code and files, the engine, the seeds and the machine."""
-        both = [self._says(r) for r in (recipe, self.reference)]
+        """Return the store key of a point: a digest of both recipes, the engine, the seeds and the machine."""
+        both = [key_parts(r, self._code, self.device) for r in (recipe, self.reference)]
         return digest("accuracy", both, self.seeds, self.device, engine(), machine())
 
     def truth(self, seed: int) -> dict[str, Any]:
-        """Return the outputs of the reference; the store keeps them as those of any run."""
+        """Return the outputs of the reference with the noise of ``seed``, from the store where it has them."""
         if seed not in self._truth:
             recipe = replace(self.reference, seed=self.reference.seed + seed)
             result = run(recipe, self.store, device=self.device)
@@ -135,18 +136,12 @@ class PointCache:
             self._warm |= sum(done.state == "run" for done in result.done.values()) > len(result.done) / 2
         return self._truth[seed]
 
-    def _says(self, recipe: Recipe) -> list[Any]:
-        keys: dict[str, str] = {}
-        for name in needed(recipe, recipe.outputs):
-            keys[name], _ = key_of(recipe.steps[name], keys, recipe.seed, self._code, self.device)
-        return [[keys[name] for name in recipe.outputs], *(getattr(recipe, name) for name in _WITHIN)]
-
     def _measure(self, recipe: Recipe) -> PointMeasurement:
         load = os.getloadavg()[0] / (os.cpu_count() or 1) if hasattr(os, "getloadavg") else 0.0
         ran: dict[str, float] = {}
 
         def watch(event: Event) -> None:
-            if event.done is not None and event.done.state == "run":  # again where the engine tries again
+            if event.done is not None and event.done.state == "run":  # several times where the engine tries again
                 ran[event.step] = ran.get(event.step, 0.0) + event.done.seconds
 
         try:
@@ -159,18 +154,17 @@ class PointCache:
         return PointMeasurement(errors, [result.seconds], sum(ran.values()), load, result.proof.worst, ran)
 
     def _warm_up(self, recipe: Recipe) -> None:
-        """Do what a process does only once, such as importing libraries and reading code, before a time is measured."""
+        """Import libraries, read code and run the recipe once, because the first run of a process takes longer."""
         self.truth(0)
         for step in with_substitutions(recipe, recipe.outputs).steps.values():
             self._code.digest(step.node.fn.__module__)
         self._code.save()
         if not self._warm:
-            with cold(self.store) as store:
-                run(recipe, store, device=self.device)
+            run_cold(recipe, self.store, self.device)
             self._warm = True
 
     def _errors(self, recipe: Recipe, values: Mapping[str, Any], store: Store) -> dict[str, list[float]]:
-        """Return the errors of every output that keeps its shape, for each seed; steps without noise run once."""
+        """Return the errors, one for each seed, of every output that has the shape of the reference."""
         found = compare_outputs(values, self.truth(0))
         for seed in range(1, self.seeds):
             again = run(replace(recipe, seed=recipe.seed + seed), store, device=self.device)
@@ -180,16 +174,9 @@ class PointCache:
 
 
 def compare_outputs(values: Mapping[str, Any], truth: Mapping[str, Any]) -> dict[str, list[float]]:
-    """Return the error of each output, without the outputs whose shape differs from that of the reference."""
+    """Return the error of each output, except of outputs whose shape differs from the reference."""
     found: dict[str, list[float]] = {}
     for name, value in values.items():
-        try:
+        with suppress(ValueError):
             found[name] = [error_of(value, truth[name])]
-        except ValueError:
-            continue
     return found
-
-
-def is_random(recipe: Recipe) -> bool:
-    """Return True if anything that the outputs need is random."""
-    return any(recipe.steps[name].node.random for name in needed(recipe, recipe.outputs))

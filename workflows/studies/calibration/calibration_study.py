@@ -1,4 +1,4 @@
-"""The study of a calibration: whether its posterior is right, and how far it depends on the prior."""
+"""The study of a calibration: tests of its posterior by simulations, and its sensitivity to the prior."""
 
 from __future__ import annotations
 
@@ -20,35 +20,25 @@ from neusee.workflows.report.study_folder import CsvTable, Progress, StudyReport
 from neusee.workflows.report.study_page import Mark, Section
 from neusee.workflows.store.result_store import Store
 from neusee.workflows.studies.calibration.independent_draws import DRAWS, walk_draws
-from neusee.workflows.studies.calibration.prior_sensitivity import (
-    ENOUGH,
-    ParameterSensitivity,
-    Sensitivity,
-    sensitivity,
-)
+from neusee.workflows.studies.calibration.prior_sensitivity import ENOUGH, Sensitivity, sensitivity
 from neusee.workflows.studies.calibration.rank_uniformity import RankTest, rank_tests, ranks
-from neusee.workflows.studies.calibration.simulated_sensors import (
-    Sampler,
-    SensorSimulation,
-    SensorSimulator,
-    prior_widths,
-)
+from neusee.workflows.studies.calibration.simulated_sensors import Sampler, SensorSimulation, SensorSimulator
 
 PIXELS = 128
-_EVERY = 20  #: simulations by line
+_EVERY = 20  #: simulations for each line of progress
 _WEIGHED = 1000  #: draws for the sensitivity
 _COLUMNS = ("parameter", "simulations", "p", "least p", "coverage", "from", "to", "z mean", "z sd", "holds")
 
 
 @dataclass(frozen=True)
 class CalibrationStudyResult:
-    """All that the study measured."""
+    """The simulations, the test of each parameter, and the sensitivity to the prior."""
 
     simulations: Sequence[SensorSimulation]
     rank_tests: Sequence[RankTest]
     prior_widths: Mapping[str, float]
     sensitivity: Sensitivity | None
-    untold: str  #: why there is no sensitivity
+    no_sensitivity: str  #: the reason if there is no sensitivity
 
     @property
     def refused(self) -> Sequence[str]:
@@ -56,21 +46,17 @@ class CalibrationStudyResult:
 
     @property
     def short(self) -> int:
-        """Return how many simulations have a chain that ended before it was long enough."""
+        """Return how many simulations have a chain that is too short for its autocorrelation time."""
         return sum(not s.refused and not s.independent for s in self.simulations)
 
     @property
     def stranded(self) -> int:
-        """Return how many simulations have walkers that stay where the posterior is next to nothing."""
+        """Return how many simulations have walkers that stay where the posterior is almost 0."""
         return sum(s.stranded > 0 for s in self.simulations)
 
     @property
     def failed(self) -> int:
-        """Return how many bars do not hold.
-
-        Three of the bars are that all simulations have a posterior, a chain that is long enough, and no stranded
-        walker.
-        """
+        """Return how many criteria fail: two for each parameter, and three for all simulations together."""
         return sum(v.failed for v in self.rank_tests) + bool(self.refused) + bool(self.short) + bool(self.stranded)
 
 
@@ -85,17 +71,15 @@ def study(
     pixels: int = PIXELS,
     sampler: Sampler | None = None,
 ) -> Path:
-    """Simulate, fit and rank ``simulations`` times; ``sampler`` replaces the walkers that move by ``move``."""
+    """Simulate and calibrate sensors, with draws by ``sampler`` or by walkers with the move ``move``."""
     study_run = StudyRun("calibration", recipe, command)
     with one_thread():
         simulator = SensorSimulator(recipe, store, pixels, sampler or partial(walk_draws, how=move), move)
-        made = list(_simulate_all(simulator, simulations, progress))
-        weighed, untold = _sensitivity(recipe, move)
-    found = CalibrationStudyResult(
-        made, rank_tests(made), prior_widths(simulator.nominal.coordinates.prior), weighed, untold
-    )
-    document = study_run.document(_document(found))
-    return study_run.write(runs, digest(document["verdicts"]), document, _report(recipe, found, pixels))
+        simulated = list(_simulate_all(simulator, simulations, progress))
+        sensitive, reason = _sensitivity(recipe, move)
+    result = CalibrationStudyResult(simulated, rank_tests(simulated), simulator.prior_widths(), sensitive, reason)
+    document = study_run.document(_document(result))
+    return study_run.write(runs, digest(document["verdicts"]), document, _report(recipe, result, pixels))
 
 
 def _simulate_all(simulator: SensorSimulator, count: int, progress: Progress) -> Iterator[SensorSimulation]:
@@ -109,66 +93,65 @@ def _simulate_all(simulator: SensorSimulator, count: int, progress: Progress) ->
 
 
 def _sensitivity(recipe: Recipe, move: str) -> tuple[Sensitivity | None, str]:
-    """Return the sensitivity of the recipe as it is, with all its pixels and its own prior, or the reason for none."""
+    """Return the sensitivity of the recipe's own posterior to its prior, or the reason why there is none."""
     with TemporaryDirectory(prefix="neusee-") as folder:
         problem = SensorPosterior.of(recipe, Store(folder))
     mode = find_mode(problem, initial_theta(problem))
-    told = identify(problem, mode)
-    if told.refused:
-        return None, told.refused
+    identified = identify(problem, mode)
+    if identified.refused:
+        return None, identified.refused
     drawn = walk_draws(problem, mode, recipe.seed, move, _WEIGHED)
     if not drawn.independent:
         return None, f"its chain is too short for its autocorrelation time of {drawn.tau:.0f} steps"
-    return sensitivity(problem, drawn.samples, told.kinds), ""
+    return sensitivity(problem, drawn.samples, identified.kinds), ""
 
 
-def _document(found: CalibrationStudyResult) -> dict[str, Any]:
-    """Return what the folder says of the study, beside what every study says."""
+def _document(result: CalibrationStudyResult) -> dict[str, Any]:
     return {
-        "failed": found.failed,
-        "simulations": len(found.simulations),
-        "refused": list(found.refused),
-        "verdicts": [asdict(v) for v in found.rank_tests],
-        "widths": dict(found.prior_widths),
-        "sensitivity": asdict(found.sensitivity) if found.sensitivity else found.untold,
+        "failed": result.failed,
+        "simulations": len(result.simulations),
+        "refused": list(result.refused),
+        "verdicts": [asdict(test) for test in result.rank_tests],
+        "widths": dict(result.prior_widths),
+        "sensitivity": asdict(result.sensitivity) if result.sensitivity else result.no_sensitivity,
     }
 
 
 # --- the page ---------------------------------------------------------------------------------------------------------
 
 
-def _report(recipe: Recipe, found: CalibrationStudyResult, pixels: int) -> StudyReport:
-    picture = ranks(found.rank_tests)
-    sections = [_ranks(found, picture, pixels), _intervals(found), _weighed(found), *_refusals(found)]
+def _report(recipe: Recipe, result: CalibrationStudyResult, pixels: int) -> StudyReport:
+    picture = ranks(result.rank_tests)
+    sections = [_ranks(result, picture, pixels), _intervals(result), _weighed(result), *_refusals(result)]
     tables: dict[str, CsvTable] = {
-        "table.csv": (_COLUMNS, map(_line, found.rank_tests)),
-        "simulations.csv": (("parameter", "truth", "rank", "inside", "z", "told"), _each(found)),
+        "table.csv": (_COLUMNS, map(_line, result.rank_tests)),
+        "simulations.csv": (("parameter", "truth", "rank", "inside", "z", "told"), _each(result)),
     }
-    return StudyReport(f"{recipe.name}: is the posterior right?", _lead(found), sections, {"ranks": picture}, tables)
+    return StudyReport(f"{recipe.name}: is the posterior right?", _lead(result), sections, {"ranks": picture}, tables)
 
 
 def _line(v: RankTest) -> Sequence[Any]:
     return v.name, sum(v.counts), v.p, v.least_p, v.coverage, *v.bar, v.z_mean, v.z_sd, not v.failed
 
 
-def _each(found: CalibrationStudyResult) -> Iterator[Sequence[Any]]:
-    for s in found.simulations:
+def _each(result: CalibrationStudyResult) -> Iterator[Sequence[Any]]:
+    for s in result.simulations:
         for name in s.rank:
             yield name, s.truth[name], s.rank[name], s.inside[name], s.z[name], s.kinds[name]
 
 
-def _lead(found: CalibrationStudyResult) -> str:
-    held = "All bars hold" if not found.failed else f"{found.failed} bars do not hold"
-    seconds = sum(s.seconds for s in found.simulations) / len(found.simulations)
-    taus = max((s.tau for s in found.simulations), default=0.0)
-    short = f"{found.short} a chain that is too short, {found.stranded} a walker that is lost"
+def _lead(result: CalibrationStudyResult) -> str:
+    held = "All bars hold" if not result.failed else f"{result.failed} bars do not hold"
+    seconds = sum(s.seconds for s in result.simulations) / len(result.simulations)
+    taus = max((s.tau for s in result.simulations), default=0.0)
+    short = f"{result.short} a chain that is too short, {result.stranded} a walker that is lost"
     return (
-        f"{held}, of {len(found.simulations)} simulations of {seconds:.2g} s each: {len(found.refused)} have no "
+        f"{held}, of {len(result.simulations)} simulations of {seconds:.2g} s each: {len(result.refused)} have no "
         f"posterior, {short}. The longest autocorrelation time is {taus:.0f} steps."
     )
 
 
-def _ranks(found: CalibrationStudyResult, picture: bytes, pixels: int) -> Section:
+def _ranks(result: CalibrationStudyResult, picture: bytes, pixels: int) -> Section:
     text = f"""Parameters are drawn from the prior, frames of {pixels} x {pixels} pixels are taken with them by the
         recipe's own steps, and {DRAWS} nearly independent draws are made from the posterior of these frames. Where
         the posterior is right, the number of draws below the truth is uniform. Grey: the band of 99 of 100 bins of
@@ -179,11 +162,11 @@ def _ranks(found: CalibrationStudyResult, picture: bytes, pixels: int) -> Sectio
         the offset), so that frames of the recipe's levels constrain every sensor that is drawn. The search for the
         mode starts near the truth: this study judges the posterior and the draws, not that search. A walker is lost
         if its median log posterior lies 20 nats below that of the others."""
-    rows = [(_plain(name), width) for name, width in found.prior_widths.items()]
+    rows = [(_plain(name), width) for name, width in result.prior_widths.items()]
     return Section("Ranks of the truth", text, ("parameter", "width of the prior"), rows, picture)
 
 
-def _intervals(found: CalibrationStudyResult) -> Section:
+def _intervals(result: CalibrationStudyResult) -> Section:
     text = """p: the probability that uniform ranks, in ten bins, are as uneven as these or more; the least is 0.01 over
         the number of parameters. Coverage: how often the central 90 % of the draws hold the truth; a right posterior
         is within the bar in 999 of 1000 studies. z: posterior mean minus truth, in posterior standard deviations; a
@@ -191,47 +174,45 @@ def _intervals(found: CalibrationStudyResult) -> Section:
         simulations the frames estimate, or only limit, the parameter."""
     columns = ("parameter", "p", "at least", "coverage", "bar", "z mean", "z sd", "told")
     rows, marks = [], dict[tuple[int, int], Mark]()
-    for i, v in enumerate(found.rank_tests):
+    for i, v in enumerate(result.rank_tests):
         bar = f"{v.bar[0]:.3f} to {v.bar[1]:.3f}"
-        rows.append((_plain(v.name), v.p, v.least_p, v.coverage, bar, v.z_mean, v.z_sd, _count_kinds(found, v.name)))
+        rows.append((_plain(v.name), v.p, v.least_p, v.coverage, bar, v.z_mean, v.z_sd, _count_kinds(result, v.name)))
         marks[i, 1] = "pass" if v.uniform else "fail"
         marks[i, 3] = "pass" if v.covered else "fail"
     return Section("Coverage", text, columns, rows, marks=marks)
 
 
-def _count_kinds(found: CalibrationStudyResult, name: str) -> str:
-    count = Counter(s.kinds[name] for s in found.simulations if not s.refused)
+def _count_kinds(result: CalibrationStudyResult, name: str) -> str:
+    count = Counter(s.kinds[name] for s in result.simulations if not s.refused)
     return ", ".join(f"{n} {KINDS[kind] or 'estimated'}" for kind, n in count.most_common())
 
 
-def _weighed(found: CalibrationStudyResult) -> Section:
+def _weighed(result: CalibrationStudyResult) -> Section:
     heading = "What the prior does"
-    if found.sensitivity is None:
-        return Section(heading, f"Nothing can be said of the recipe's own frames: {found.untold}.")
-    names = [f.name for f in found.sensitivity.findings]
+    if result.sensitivity is None:
+        return Section(heading, f"Nothing can be said of the recipe's own frames: {result.no_sensitivity}.")
+    names, left = list(result.sensitivity.left), result.sensitivity.left
     text = f"""Draws from the posterior of the recipe's own frames and prior, reweighted as if one prior had been twice
         as wide. Value: the mean, or the limit of 95 % of a parameter that is only limited. Under each prior: how far
         the value moves, in posterior standard deviations. Last row: the effective sample size as a share of the draws.
         Below {ENOUGH:g} reweighting is unreliable, and there is a dash: the prior of that parameter constrains it about
         as much as the frames do, or more."""
     columns = ("parameter", "from these frames", "value", "sd", *(f"{_plain(name)} x 2" for name in names))
-    rows = [_sensitivity_row(f) for f in found.sensitivity.findings]
-    left: list[Any] = ["draws left", "", None, None, *(found.sensitivity.left[name] for name in names)]
+    rows: list[list[Any]] = []
+    for f in result.sensitivity.findings:
+        moved = [None if x is None else (x - f.value) / f.sd for x in f.doubled.values()]
+        rows.append([_plain(f.name), KINDS[f.kind] or "estimate", f.value, f.sd, *moved])
     marks: dict[tuple[int, int], Mark] = {
-        (len(rows), 4 + i): "warn" for i, name in enumerate(names) if found.sensitivity.left[name] < ENOUGH
+        (len(rows), 4 + i): "warn" for i, share in enumerate(left.values()) if share < ENOUGH
     }
-    return Section(heading, text, columns, [*rows, left], marks=marks)
+    rows.append(["draws left", "", None, None, *left.values()])
+    return Section(heading, text, columns, rows, marks=marks)
 
 
-def _sensitivity_row(f: ParameterSensitivity) -> list[Any]:
-    moved = [None if x is None else (x - f.value) / f.sd for x in f.doubled.values()]
-    return [_plain(f.name), KINDS[f.kind] or "estimate", f.value, f.sd, *moved]
-
-
-def _refusals(found: CalibrationStudyResult) -> list[Section]:
-    if not found.refused:
+def _refusals(result: CalibrationStudyResult) -> list[Section]:
+    if not result.refused:
         return []
-    rows = [(text, count) for text, count in Counter(found.refused).most_common()]
+    rows = Counter(result.refused).most_common()
     return [Section("Simulations without a posterior", "They are left out of the ranks.", ("why", "count"), rows)]
 
 

@@ -1,44 +1,42 @@
-"""A few nearly independent draws from a posterior: one ensemble, as long as that takes."""
+"""A few nearly independent draws from a posterior, by one ensemble of walkers."""
 
 from __future__ import annotations
 
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING
 
 import numpy as np
+from numpy.typing import NDArray
 
 from neusee.workflows.calibration import emcee_sampler
 from neusee.workflows.calibration.ensembles import walk_until
 from neusee.workflows.calibration.log_posterior import SensorPosterior
 from neusee.workflows.calibration.posterior_mode import LaplaceFit
 
-if TYPE_CHECKING:
-    from neusee.workflows.calibration.log_posterior import FloatArray
-
+FloatArray = NDArray[np.float64]
 WALKERS, DRAWS = 64, 99
-_FIRST, _GROWTH, _LONGEST = 320, 1.5, 4000  #: steps of the first round; more by round; when a chain is given up
-_APART = 6.0  #: autocorrelation times that are thrown away, and as many again that are drawn from
-_ALIKE = 1.25  #: ratio of two standard deviations that chance gives at most, of 64 walkers by three tau each
-_NOT_KEPT = Path("/dev/null/not kept")  #: a file that never exists: a simulation is over before it could be stopped
+_FIRST, _GROWTH, _LONGEST = 320, 1.5, 4000  #: steps of the first round, growth for each round, and largest number
+_APART = 6.0  #: least length of a chain in autocorrelation times; its first half is discarded
+_ALIKE = 1.25  #: ratio of two standard deviations that chance exceeds rarely, for 64 walkers by three tau each
+_NOT_KEPT = Path("/dev/null/not kept")  #: a file that never exists, because a simulation is too short to be resumed
 
 
 @dataclass(frozen=True)
 class PosteriorDraws:
-    """Draws, and whether they count as independent."""
+    """Draws from a posterior, and the quality of their chain."""
 
-    samples: FloatArray  #: (draw, free)
+    samples: FloatArray  #: (draw, free parameter)
     tau: float = 0.0  #: steps, the longest autocorrelation time of any coordinate
-    independent: bool = True
-    stranded: int = 0  #: walkers that stay where the posterior is none
+    independent: bool = True  #: whether the chain was long enough
+    stranded: int = 0  #: walkers that stay where the posterior is almost 0
 
 
 def walk_draws(
     problem: SensorPosterior, mode: LaplaceFit, seed: int, how: str = "de", count: int = DRAWS
 ) -> PosteriorDraws:
-    """Return ``count`` draws by the move ``how``, at random from walkers that are looked at once each tau.
+    """Return ``count`` random draws from a chain with the move ``how``, thinned to one step per autocorrelation time.
 
-    The chain starts and walks as that of `emcee_sampler.sample`. It ends sooner, because a simulation needs few draws.
+    The chain starts and walks as in `emcee_sampler.sample`. It ends sooner, because a simulation needs few draws.
     """
     run = emcee_sampler.start_ensemble(problem, mode, _NOT_KEPT, 0, seed, WALKERS, emcee_sampler.move(how))
     steps = _FIRST
@@ -58,6 +56,6 @@ def walk_draws(
 
 
 def _steady(chain: FloatArray) -> bool:
-    """Return True if walkers (step, walker, free) no longer spread: a start at an edge can be far too narrow."""
+    """Return True if the walkers (step, walker, free parameter) spread equally far in both halves of the chain."""
     early, late = (half.reshape(-1, half.shape[-1]).std(0) for half in np.array_split(chain, 2))
     return bool(((late < _ALIKE * early) & (early < _ALIKE * late)).all())

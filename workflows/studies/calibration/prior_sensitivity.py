@@ -1,31 +1,28 @@
-"""Sensitivity to the prior: the same draws, reweighted as if one prior had been twice as wide."""
+"""Sensitivity of a posterior to its prior: the same draws, reweighted as if one prior had been twice as wide."""
 
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from typing import TYPE_CHECKING
 
 import numpy as np
 
 from neusee.workflows.calibration.log_posterior import SensorPosterior
-
-if TYPE_CHECKING:
-    from neusee.workflows.calibration.log_posterior import FloatArray
+from neusee.workflows.studies.calibration.independent_draws import FloatArray
 
 ENOUGH = 0.5  #: least effective sample fraction; a parameter that only its prior constrains has a quarter or less
-_TAIL = 0.05  #: beyond a limit
+_TAIL = 0.05  #: probability beyond a limit
 
 
 @dataclass(frozen=True)
 class ParameterSensitivity:
-    """The value of a parameter, in its unit, and its value under wider priors."""
+    """The estimate of a parameter in its unit, and its estimates under wider priors."""
 
     name: str
-    kind: str  #: of `identifiability.KINDS`; of `upper` and `lower` the value is a limit of 95 %
+    kind: str  #: one of `identifiability.KINDS`; for `upper` and `lower` the value is a limit of 95 %
     value: float
     sd: float
-    doubled: Mapping[str, float | None]  #: by the prior that is made twice as wide; None where reweighing cannot tell
+    doubled: Mapping[str, float | None]  #: by the prior that is twice as wide; None where reweighting is unreliable
 
 
 @dataclass(frozen=True)
@@ -33,11 +30,11 @@ class Sensitivity:
     """The sensitivity of all parameters to the width of each prior."""
 
     findings: Sequence[ParameterSensitivity]
-    left: Mapping[str, float]  #: effective sample fraction after reweighting for each prior
+    left: Mapping[str, float]  #: effective sample fraction with each prior twice as wide
 
 
 def sensitivity(problem: SensorPosterior, samples: FloatArray, kinds: Mapping[str, str]) -> Sensitivity:
-    """Return the sensitivity from nearly independent draws (draw, free)."""
+    """Return the sensitivity of each parameter, from nearly independent draws ``samples`` (draw, free parameter)."""
     values = {name: x.numpy() for name, x in problem.parameters(samples).items()}
     z = problem.whitened(samples)
     weights = {name: _weights(z[:, i]) for i, name in enumerate(problem.names)}
@@ -53,15 +50,15 @@ def sensitivity(problem: SensorPosterior, samples: FloatArray, kinds: Mapping[st
 
 
 def _weights(z: FloatArray) -> FloatArray:
-    """Return weights that sum to one: a normal distribution of twice the width over one of the width, at z."""
+    """Return normalised weights at ``z``: the ratio of normal densities of standard deviations 2 and 1."""
     log = 0.5 * (1.0 - 0.25) * z**2
-    weights = np.exp(log - log.max())
-    found: FloatArray = weights / weights.sum()
-    return found
+    ratios = np.exp(log - log.max())
+    weights: FloatArray = ratios / ratios.sum()
+    return weights
 
 
 def _value(x: FloatArray, weights: FloatArray, kind: str) -> float:
-    """Return the mean; for a parameter that is only limited, the limit."""
+    """Return the weighted mean of ``x``, or the limit of 95 % if the frames only limit the parameter."""
     if kind not in ("upper", "lower"):
         return float(weights @ x)
     order = np.argsort(x)

@@ -1,4 +1,4 @@
-"""Tests of a posterior: whether ranks are uniform and intervals cover the truth, beyond what chance explains."""
+"""Tests of a posterior: uniform ranks of the truth, and coverage of the truth by 90 % intervals."""
 
 from __future__ import annotations
 
@@ -15,23 +15,23 @@ from neusee.workflows.studies.calibration.simulated_sensors import SensorSimulat
 
 BINS, SHARE = 10, 0.9
 _CHANCE = 0.01  #: probability of a false alarm by the ranks, over all parameters together
-_DRAWN = 0.99  #: share of the bins of uniform ranks that lie in the band
+_DRAWN = 0.99  #: share of the bins of uniform ranks inside the drawn band
 _GREY = "#777777"
 _CERTAIN = 0.999  #: probability that the coverage of a right posterior is within its limits
-#: exact but for the last digit; of 1000 it is .868 to .930
+#: limits of the coverage by number of simulations, rounded; the exact limits for 1000 are 0.868 and 0.930
 _ROUNDED = {200: (0.825, 0.960), 1000: (0.870, 0.930)}
 
 
 @dataclass(frozen=True)
 class RankTest:
-    """The ranks and the coverage of one parameter over all simulations."""
+    """The ranks and the coverage of one parameter over all simulations, and their limits."""
 
     name: str
     counts: tuple[int, ...]  #: ranks by bin
     p: float  #: probability that uniform ranks are as uneven as these
     least_p: float
     coverage: float  #: share of the simulations whose central 90 % hold the truth
-    bar: tuple[float, float]  #: that it must lie in
+    bar: tuple[float, float]  #: limits of the coverage
     z_mean: float
     z_sd: float
 
@@ -52,11 +52,11 @@ def rank_tests(simulations: Sequence[SensorSimulation]) -> list[RankTest]:
     """Return one test for each parameter, from the simulations that gave a posterior."""
     sound = [s for s in simulations if not s.refused]
     if not sound:
-        raise ValueError(f"no simulation has a posterior; the first: {simulations[0].refused}")
-    return [_verdict(name, sound, len(sound[0].rank)) for name in sound[0].rank]
+        raise ValueError(f"no simulation has a posterior; reason of the first simulation: {simulations[0].refused}")
+    return [_rank_test(name, sound, len(sound[0].rank)) for name in sound[0].rank]
 
 
-def _verdict(name: str, sound: Sequence[SensorSimulation], parameters: int) -> RankTest:
+def _rank_test(name: str, sound: Sequence[SensorSimulation], parameters: int) -> RankTest:
     from scipy.stats import chisquare
 
     counts, _ = np.histogram([s.rank[name] for s in sound], BINS, (-0.5, DRAWS + 0.5))
@@ -74,7 +74,7 @@ def _verdict(name: str, sound: Sequence[SensorSimulation], parameters: int) -> R
 
 
 def coverage_limits(count: int) -> tuple[float, float]:
-    """Return the limits of the coverage of ``count`` simulations; a right posterior keeps to them in 999 of 1000."""
+    """Return the coverage limits of ``count`` simulations that a right posterior exceeds in one of 1000 studies."""
     if count in _ROUNDED:
         return _ROUNDED[count]
     low, high = chance_band(count, SHARE, _CERTAIN)
@@ -82,7 +82,7 @@ def coverage_limits(count: int) -> tuple[float, float]:
 
 
 def chance_band(count: int, share: float, certain: float) -> tuple[float, float]:
-    """Return the limits between which a share of ``count`` lies by chance."""
+    """Return limits between which a binomial count lies with the probability ``certain``."""
     from scipy.stats import binom
 
     low, high = binom.interval(certain, count, share)
@@ -91,12 +91,12 @@ def chance_band(count: int, share: float, certain: float) -> tuple[float, float]
 
 @drawn
 def ranks(rank_tests: Sequence[RankTest]) -> Any:
-    """Draw a histogram for each parameter; the band holds 99 of 100 bins of uniform ranks."""
+    """Draw a histogram of the ranks of each parameter, with a band that holds 99 of 100 bins of uniform ranks."""
     columns = min(3, len(rank_tests))
     rows = -(-len(rank_tests) // columns)
     figure, axes = canvas(3.4 * columns, 2.4 * rows + 0.4, rows, columns, sharex=True)
-    for ax, verdict in zip(axes.flat, rank_tests, strict=False):
-        _histogram(ax, verdict)
+    for ax, test in zip(axes.flat, rank_tests, strict=False):
+        _histogram(ax, test)
     for ax in list(axes.flat)[len(rank_tests) :]:
         ax.set_axis_off()
     figure.supxlabel(f"draws below the truth, of {DRAWS}", fontsize=10)
@@ -104,14 +104,14 @@ def ranks(rank_tests: Sequence[RankTest]) -> Any:
     return figure
 
 
-def _histogram(ax: Any, verdict: RankTest) -> None:
-    total, width = sum(verdict.counts), (DRAWS + 1) / BINS
+def _histogram(ax: Any, test: RankTest) -> None:
+    total, width = sum(test.counts), (DRAWS + 1) / BINS
     low, high = chance_band(total, 1.0 / BINS, _DRAWN)
     ax.axhspan(low, high, color="#cccccc", alpha=0.6, linewidth=0)
     ax.axhline(total / BINS, color=_GREY, linewidth=0.8)
-    colour = BLUE if verdict.uniform else VERMILION
-    ax.bar([(i + 0.5) * width for i in range(BINS)], verdict.counts, 0.92 * width, color=colour, alpha=0.85)
-    ax.set_title(f"{verdict.name.replace('_', ' ')}: p = {verdict.p:.2g}")
-    ax.set_ylim(0, 1.15 * max(high, *verdict.counts))
+    colour = BLUE if test.uniform else VERMILION
+    ax.bar([(i + 0.5) * width for i in range(BINS)], test.counts, 0.92 * width, color=colour, alpha=0.85)
+    ax.set_title(f"{test.name.replace('_', ' ')}: p = {test.p:.2g}")
+    ax.set_ylim(0, 1.15 * max(high, *test.counts))
     ax.grid(False, axis="x")
     ax.set_axisbelow(True)

@@ -1,6 +1,6 @@
-"""Does every omission keep its bound, and what does it save?
+"""Does every omission keep its bound, and how much time does it save?
 
-Runs with and without each omission, and what simpler scenes cost.
+Runs with and without each omission, and the run time of simpler scenes.
 No other study belongs here.
 Offers: `leave_out_study.study`.
 """

@@ -1,14 +1,14 @@
-"""The possible omissions of a recipe: each as a change of the recipe that computes everything in full.
+"""The possible omissions of a recipe: each omission is a change of the full computation.
 
-There are three kinds. A step whose node bounds what it changes is left out, and its first input handed on. Light or
-dirt whose largest element is bounded is not added. Sums over bands stand in for an image of all bands. Each
-omission can be tried alone, whether the engine chose it or not.
+There are three kinds. A step whose node bounds its effect is left out, and its first input is handed on. Light or dirt
+whose largest element is bounded is not added. Sums over bands stand in for an image of all bands. Each omission can be
+measured alone, whether the engine chose it or not.
 """
 
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, replace
 from typing import Literal
 
@@ -19,11 +19,10 @@ from neusee.workflows.engine.runner import Result
 from neusee.workflows.graph.recipe_graph import Recipe, Step, Wire, in_order, needed
 from neusee.workflows.graph.run_error import RunError
 from neusee.workflows.tolerance.cheaper_steps import with_substitutions
-from neusee.workflows.tolerance.skip_decision import judge
+from neusee.workflows.tolerance.skip_decision import FactsOf, judge
 from neusee.workflows.tolerance.zero_effect_steps import without
 
 Kind = Literal["handed on", "not added", "stands in"]
-FactsOf = Callable[[str], TensorStats | None]
 
 
 @dataclass(frozen=True)
@@ -32,15 +31,15 @@ class Omission:
 
     name: str
     kind: Kind
-    exchange: Mapping[str, str]  #: step -> what stands in for it; empty where nothing does
-    bound: float  #: what it changes at most, as a share of the largest element there; nan where only a run tells
+    exchange: Mapping[str, str]  #: by step, the step that replaces it, or an empty text
+    bound: float  #: largest relative change at the compared steps; NaN if only a run can determine the bound
     why: str
-    taken: bool  #: whether the recipe's own run does so
-    at: tuple[str, ...]  #: where the change is looked at: the step itself, or what reads it
-    beside: tuple[Step, ...] = ()  #: steps that stand in and are not in the recipe
+    taken: bool  #: whether the recipe's own run has this omission
+    at: tuple[str, ...]  #: the steps whose results are compared: the step itself, or the steps that read it
+    beside: tuple[Step, ...] = ()  #: replacing steps that are not in the recipe
 
     def applied_to(self, recipe: Recipe) -> Recipe:
-        """Return ``recipe`` with this omission; everything else stays as it is there."""
+        """Return ``recipe`` with this omission as its only change."""
         readers = set(recipe.steps) if self.kind != "stands in" else set(self.at)
         steps = {**recipe.steps, **{step.name: step for step in self.beside}}
         for name in readers & recipe.steps.keys():
@@ -81,9 +80,9 @@ def omissions(full: Recipe, chosen: Result, facts_of: FactsOf) -> Iterator[Omiss
 def _handed_on(step: Step, facts_of: FactsOf) -> Omission | None:
     if step.node.hooks.skip_bound is None:
         return None
-    verdict = judge(step, step.params, facts_of, math.inf)
-    why = f"changes at most {verdict.bound:.2g}"
-    return Omission(step.name, "handed on", {step.name: verdict.instead}, verdict.bound, why, False, (step.name,))
+    decision = judge(step, step.params, facts_of, math.inf)
+    why = f"changes at most {decision.bound:.2g}"
+    return Omission(step.name, "handed on", {step.name: decision.instead}, decision.bound, why, False, (step.name,))
 
 
 def _not_added(recipe: Recipe, order: list[str], name: str, facts_of: FactsOf) -> Omission | None:
@@ -97,7 +96,7 @@ def _not_added(recipe: Recipe, order: list[str], name: str, facts_of: FactsOf) -
 
 
 def _stand_ins(full: Recipe, order: list[str], chosen: Result) -> Iterator[Omission]:
-    """Yield one omission for all images of a recipe: a step that compares two images must get both in one form."""
+    """Yield one omission that replaces all images by sums over bands, because two compared images must be alike."""
     sparse = with_substitutions(replace(full, exact=False), full.outputs)
     exchange = {economy.step: economy.instead for economy in sparse.substitutions if economy.instead}
     if not exchange:
@@ -110,19 +109,18 @@ def _stand_ins(full: Recipe, order: list[str], chosen: Result) -> Iterator[Omiss
 
 
 def _adding(recipe: Recipe, order: list[str], name: str) -> tuple[str, ...]:
-    """Return the steps that add a result, if every reader only adds it; else nothing."""
+    """Return the steps that read the result of step ``name``, if each of them only adds the result; else no step."""
     readers = [recipe.steps[n] for n in order if name in recipe.steps[n].sources]
-    return tuple(reader.name for reader in readers) if all(_spares(reader, name) for reader in readers) else ()
+    return tuple(reader.name for reader in readers) if all(_only_adds(reader, name) for reader in readers) else ()
 
 
-def _spares(reader: Step, name: str) -> bool:
-    """Return True if a step reads a result only to add the result to something."""
+def _only_adds(reader: Step, name: str) -> bool:
     read = {i for i, wire in reader.wires.items() if name == wire or (isinstance(wire, tuple) and name in wire)}
     return read <= {light for light, *_ in reader.node.additive_inputs}
 
 
 def _largest(step: Step, facts_of: FactsOf) -> float:
-    """Return the node's bound of the largest element of a step, from the statistics of its inputs."""
+    """Return the node's bound of the largest element of a step's result, from the statistics of its inputs."""
     assert step.node.hooks.zero_bound is not None
     facts = [_facts(step.wires.get(name), facts_of) for name in step.node.inputs]
     try:
@@ -136,7 +134,7 @@ def _facts(wire: Wire, facts_of: FactsOf) -> TensorStats | list[TensorStats | No
 
 
 def _share(largest: float, recipe: Recipe, at: tuple[str, ...], facts_of: FactsOf) -> float:
-    """Return the bound over the largest element of the sum; infinity where the sum is no tensor, 0 for no light."""
+    """Return ``largest`` relative to the largest element at the steps ``at``, or infinity if these give no tensor."""
     if largest == 0:
         return 0.0
     if any(recipe.steps[name].node.hints.get("return") is not Tensor for name in at):

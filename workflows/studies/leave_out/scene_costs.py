@@ -1,8 +1,4 @@
-"""The cost of simpler scenes: the recipe without its laser, in one colour, behind a clean window.
-
-Cost follows content where the engine does not compute what the scene lacks. Each scene is run in one process from an
-empty store, after a run that does what a process does only once.
-"""
+"""The run time of simpler scenes: the recipe without its laser, in one colour, or behind a clean window."""
 
 from __future__ import annotations
 
@@ -10,20 +6,20 @@ from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 
 from neusee.workflows.engine.provenance import machine
-from neusee.workflows.engine.runner import Result, run
+from neusee.workflows.engine.runner import Result
 from neusee.workflows.graph.diagnostics import UNREAD, RecipeError
-from neusee.workflows.graph.recipe_graph import Recipe, needed
+from neusee.workflows.graph.recipe_graph import Recipe
 from neusee.workflows.graph.run_error import RunError
-from neusee.workflows.keys.cache_key import Key, digest, key_of
+from neusee.workflows.keys.cache_key import digest
 from neusee.workflows.keys.code_digest import Code
 from neusee.workflows.keys.engine_digest import engine
 from neusee.workflows.recipe.changed_recipe import changed
 from neusee.workflows.store.memo import compute_once
 from neusee.workflows.store.result_store import Store
-from neusee.workflows.studies.cold_run import cold
+from neusee.workflows.studies.cold_run import key_parts, run_cold
 
 _TIMES = 3  #: cold runs, of which the median counts
-_QUICK = 5.0  #: s; what takes longer is run once
+_QUICK = 5.0  #: s; a scene that takes longer is run once
 _WINDOW = ("flare.dirt", "flare.ghosts")
 _LIFT = "steps.cube={node: spectra.lift_mallett, from: {rgb: scene, bands: bands}}"  #: of as few bands as one
 _GREY = "steps.scene={node: scene.targets, with: {kind: siemens, shape: '${scene.shape}'}}"
@@ -31,42 +27,40 @@ _GREY = "steps.scene={node: scene.targets, with: {kind: siemens, shape: '${scene
 
 @dataclass(frozen=True)
 class SceneCost:
-    """The time that one scene took."""
+    """The run time of one scene."""
 
     scene: str
-    seconds: float  #: median of the engine's cold runs; nan where it could not be run
-    computing: float  #: s of it in the steps
-    steps: int  #: that were computed
-    left_out: tuple[str, ...]  #: steps that the engine left out, or replaced by cheaper ones
+    seconds: float  #: median of the engine's cold runs; NaN if the scene could not be run
+    computing: float  #: s in the steps
+    steps: int  #: number of computed steps
+    left_out: tuple[str, ...]  #: steps that the engine left out, or replaced by cheaper steps
     refused: str = ""
 
 
 def measure_scenes(recipe: Recipe, store: Store, progress: Callable[[str], None]) -> Iterator[SceneCost]:
-    """Yield the cost of each scene that ``recipe`` can be changed to, from the store or measured on this machine."""
+    """Yield the run time of each scene that ``recipe`` can be changed to, from the store or measured now."""
     code, warm = Code(store.code_memo), list[Result]()
-    for scene, made in scenes(recipe).items():
-        if isinstance(made, str):
-            yield SceneCost(scene, float("nan"), 0.0, 0, (), made)
+    for scene, changed_recipe in scenes(recipe).items():
+        if isinstance(changed_recipe, str):
+            yield SceneCost(scene, float("nan"), 0.0, 0, (), changed_recipe)
             continue
 
-        def compute(scene: str = scene, made: Recipe = made) -> SceneCost:
+        def compute(scene: str = scene, recipe: Recipe = changed_recipe) -> SceneCost:
             if not warm:  # libraries are imported and code is read by the first run of a process
-                warm.append(_cold(made, store))
-            return _cost(scene, made, store)
+                warm.append(run_cold(recipe, store))
+            return _cost(scene, recipe, store)
 
-        cost = replace(
-            compute_once(store, _key(made, code), SceneCost, compute, {"step": "study leave-out"}), scene=scene
-        )
-        progress(f"{scene}: {cost.seconds:.3g} s" if not cost.refused else f"{scene}: {cost.refused}")
+        decided = engine("studies.leave_out.scene_costs", "engine.runner"), machine()
+        key = digest("content", key_parts(changed_recipe, code), *decided)
+        cost = replace(compute_once(store, key, SceneCost, compute, {"step": "study leave-out"}), scene=scene)
+        progress(f"{scene}: {cost.refused or f'{cost.seconds:.3g} s'}")
         yield cost
 
 
 def scenes(recipe: Recipe) -> dict[str, Recipe | str]:
-    """Return other scenes for the same camera, or the reason why a scene is not possible."""
-    found: dict[str, Recipe | str] = {
-        "everything in full": replace(recipe, exact=True),
-        "as the recipe chooses": recipe,
-    }
+    """Return the recipe of each simpler scene by name, or the reason why the scene is not possible."""
+    found: dict[str, Recipe | str] = {"everything in full": replace(recipe, exact=True)}
+    found["as the recipe chooses"] = recipe
     for scene, overrides in _overrides(recipe).items():
         try:
             found[scene] = _changed(recipe, overrides)
@@ -76,7 +70,7 @@ def scenes(recipe: Recipe) -> dict[str, Recipe | str]:
 
 
 def _changed(recipe: Recipe, overrides: Sequence[str]) -> Recipe:
-    """Return ``recipe`` with other values, and without the values that no step refers to any more."""
+    """Return ``recipe`` with the overrides, and without the values that no step refers to any more."""
     try:
         return changed(recipe, overrides)
     except RecipeError as error:
@@ -89,7 +83,7 @@ def _changed(recipe: Recipe, overrides: Sequence[str]) -> Recipe:
 def _overrides(recipe: Recipe) -> Mapping[str, Sequence[str]]:
     settings = recipe.config.settings
     lasers = [name for name in settings if name.startswith("lasers.")]
-    window = sorted({name.partition("[")[0] for name in _behind_the_window(recipe)})
+    window = sorted({name.partition("[")[0] for name in _window_steps(recipe)})
     every = {
         "no laser": ["lasers={}"] if lasers else [],
         "clean window": [f"steps.{name}=null" for name in window],
@@ -101,14 +95,14 @@ def _overrides(recipe: Recipe) -> Mapping[str, Sequence[str]]:
     return {name: o for name, o in {**every, "one wavelength, no laser, clean window": least}.items() if o}
 
 
-def _behind_the_window(recipe: Recipe) -> Iterator[str]:
-    """Return the steps of light on the window or reflected by it, and the steps that only make photons of it."""
+def _window_steps(recipe: Recipe) -> set[str]:
+    """Return the steps of dirt and ghosts, and the steps that need their results."""
     window = {name for name, step in recipe.steps.items() if step.node.path in _WINDOW}
     for name, step in recipe.steps.items():
         needs = {w for i, w in step.wires.items() if isinstance(w, str) and i not in step.node.optional}
         if name in window or not needs.isdisjoint(window):
             window.add(name)
-    return iter(window)
+    return window
 
 
 def _bands(recipe: Recipe, start: str, stop: str, count: int) -> list[str]:
@@ -119,28 +113,14 @@ def _bands(recipe: Recipe, start: str, stop: str, count: int) -> list[str]:
 
 
 def _cost(scene: str, recipe: Recipe, store: Store) -> SceneCost:
-    found: list[Result] = []
+    results: list[Result] = []
     try:
-        while not found or (max(r.seconds for r in found) < _QUICK and len(found) < _TIMES):
-            found.append(_cold(recipe, store))
+        while not results or (max(r.seconds for r in results) < _QUICK and len(results) < _TIMES):
+            results.append(run_cold(recipe, store))
     except RunError as error:
         return SceneCost(scene, float("nan"), 0.0, 0, (), f"{error.step}: {error.cause}")
-    result = sorted(found, key=lambda r: r.seconds)[len(found) // 2]
+    result = sorted(results, key=lambda r: r.seconds)[len(results) // 2]
     ran = [done.seconds for done in result.done.values() if done.state == "run"]
     left_out = [done.step for done in result.done.values() if done.state == "left out"]
     replaced = [economy.step for economy in result.recipe.substitutions]
     return SceneCost(scene, result.seconds, sum(ran), len(ran), (*left_out, *replaced))
-
-
-def _cold(recipe: Recipe, store: Store) -> Result:
-    with cold(store) as empty:
-        return run(recipe, empty)
-
-
-def _key(recipe: Recipe, code: Code) -> Key:
-    """Return what decides a time: all that the outputs need, what may be left out, the engine and the machine."""
-    keys: dict[str, Key] = {}
-    for name in needed(recipe, recipe.outputs):
-        keys[name], _ = key_of(recipe.steps[name], keys, recipe.seed, code)
-    said = [[keys[name] for name in recipe.outputs], recipe.tolerance, recipe.exact]
-    return digest("content", said, engine("studies.leave_out.scene_costs", "engine.runner"), machine())

@@ -1,4 +1,4 @@
-"""A recipe at a small size with one case in it: its steps and losses, their keys, and what each step is given."""
+"""A recipe at a small size with the changes of one case: its steps and losses, their keys, and their inputs."""
 
 from __future__ import annotations
 
@@ -16,34 +16,33 @@ from neusee.workflows.keys.code_digest import Code
 from neusee.workflows.recipe.step_declarations import find_node
 from neusee.workflows.studies.stability.extreme_cases import Case, Size
 
-_COMPARES: dict[str, tuple[tuple[str, dict[str, Any]], ...]] = {  # a loss takes what the metric beside it takes
+_COMPARES: dict[str, tuple[tuple[str, dict[str, Any]], ...]] = {  # a loss has the inputs of its metric
     "metrics.lsr": (("losses.suppression_loss", {}), ("losses.suppression_loss", {"log": True})),
     "metrics.bsr": (("losses.background_loss", {}),),
     "metrics.mtf": (("losses.contrast", {}), ("metrics.limits", {})),
     "doe.fabricate": (("doe.smooth", {"feature": "400 um"}),),  # three samples of the small pupil
     "metrics.quality": (("losses.charbonnier", {}), ("losses.fft_l1", {}), ("losses.gradient_penalty", {})),
 }
-_SMALLER = {"pixels": 256, "levels": 6, "grid": 16, "width": 4}  #: what else makes a step long
+_SMALLER = {"pixels": 256, "levels": 6, "grid": 16, "width": 4}  #: limits of other parameters that make a step slow
 
 
 def with_losses(recipe: Recipe) -> dict[str, Step]:
-    """Return every step of the recipe, the losses of what it measures, and other steps that take the same inputs."""
+    """Return the steps of the recipe, the losses that belong to its metrics, and related steps with equal inputs."""
     steps = dict(recipe.steps)
     for name, step in recipe.steps.items():
         for path, params in _COMPARES.get(step.node.path, ()):
             node = find_node(path)
-            wires = {given: step.wires[own] for given, own in zip(node.inputs, step.node.inputs, strict=False)}
+            wires = {to: step.wires[source] for to, source in zip(node.inputs, step.node.inputs, strict=False)}
             if "stop" in node.inputs:  # of the mask before this step
                 wires["stop"] = recipe.steps[step.sources[0]].wires["stop"]
-            room, _, what = path.partition(".")
-            own = f"{'loss ' if room == 'losses' else ''}{what}{' log' if 'log' in params else ''} of {name}"
-            given = node.params(**params).model_dump()
-            steps[own] = Step(own, node, given, wires, step.mark, {})
+            family, _, title = path.partition(".")
+            label = f"{'loss ' if family == 'losses' else ''}{title}{' log' if 'log' in params else ''} of {name}"
+            steps[label] = Step(label, node, node.params(**params).model_dump(), wires, step.mark, {})
     return steps
 
 
 def with_size(steps: Mapping[str, Step], size: Size) -> dict[str, Step]:
-    """Return the steps with fewer pixels, pupil samples and bands; a pupil keeps its diameter, a spot its place."""
+    """Return the steps with fewer pixels, pupil samples and bands, at the same pupil diameters and spot positions."""
     sides = [side for step in steps.values() for name in ("shape",) for side in step.params.get(name) or ()]
     part = size.pixels / max(sides, default=size.pixels)
     return {name: replace(step, params=_smaller(step, size, part)) for name, step in steps.items()}
@@ -71,27 +70,27 @@ def with_parameters(steps: Mapping[str, Step], case: Case) -> dict[str, Step]:
 def _changed(step: Step, case: Case) -> dict[str, Any]:
     params = dict(step.params)
     for name in step.params:
-        for asked in (f"*.{name}", f"{step.node.path}.{name}"):
-            if asked in case.params and (params[name] is not None or asked[0] != "*"):
-                new = case.params[asked]
+        for path in (f"*.{name}", f"{step.node.path}.{name}"):
+            if path in case.params and (params[name] is not None or path[0] != "*"):
+                new = case.params[path]
                 params[name] = new(step.params) if callable(new) else new
     return params
 
 
 @dataclass
 class CaseRecipe:
-    """The recipe of one case; a value is computed when it is first asked for."""
+    """The recipe of one case, whose results are computed when they are first needed."""
 
     recipe: Recipe
     case: Case
     steps: dict[str, Step]
     keys: dict[str, Key] = field(default_factory=dict)
     values: dict[str, Any] = field(default_factory=dict)
-    refused: dict[str, str] = field(default_factory=dict)  #: why a step gave no value, by step
+    refused: dict[str, str] = field(default_factory=dict)  #: reasons of steps that gave no value
 
     @classmethod
     def of(cls, recipe: Recipe, case: Case, code: Code) -> CaseRecipe:
-        """Return the case with the key of each step; a result that the case replaces has a key of its own."""
+        """Return the recipe of a case with the key of each step; a result that the case changes has another key."""
         steps = with_parameters(with_size(with_losses(recipe), case.size), case)
         chain = cls(recipe, case, steps)
         for name in in_order({n: s.sources for n, s in steps.items()}, steps):
@@ -108,13 +107,13 @@ class CaseRecipe:
             return wire and self._value(wire)
         return [self._value(name) for name in wire]
 
-    def _value(self, wanted: str) -> Any:
-        for name in in_order({n: s.sources for n, s in self.steps.items()}, [wanted]):
+    def _value(self, step: str) -> Any:
+        for name in in_order({n: s.sources for n, s in self.steps.items()}, [step]):
             if name not in self.values and name not in self.refused:
                 self._compute(name)
-        if wanted not in self.values:
-            raise LookupError(wanted)
-        return self.values[wanted]
+        if step not in self.values:
+            raise LookupError(step)
+        return self.values[step]
 
     def _compute(self, name: str) -> None:
         step = self.steps[name]
@@ -129,7 +128,8 @@ class CaseRecipe:
             self.refused[name] = str(error.cause)
             if not step.node.path.startswith("spectra.lift"):
                 return
-            value = inputs[0].mean(0).expand(len(inputs[1].centres), -1, -1).clone()  # grey, so that the rest is seen
+            # a grey cube, so that later steps are tested
+            value = inputs[0].mean(0).expand(len(inputs[1].centres), -1, -1).clone()
             del self.refused[name]
         put = _put(step, self.case)
         self.values[name] = put(value) if put else value
@@ -140,7 +140,7 @@ def _put(step: Step, case: Case) -> Any:
 
 
 def unchanged_steps(chain: CaseRecipe, usual: CaseRecipe) -> Iterator[str]:
-    """Yield the steps of a case whose inputs and parameters are those of the usual case."""
+    """Yield the steps whose inputs and parameters are the same in a case as in the usual case."""
     if chain.case is usual.case or chain.case.inputs or chain.case.alike:
         return
     for name, step in chain.steps.items():

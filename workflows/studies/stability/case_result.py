@@ -1,8 +1,8 @@
-"""One cell of the grid: a step on the inputs of a case, against float64, forward and gradient.
+"""One cell of the grid: the errors of a step's result and of its gradient in one case, against float64.
 
-The reference is the node's own, or the same function on the same inputs in float64; random numbers are the same.
-The bound is the node's ``rtol``, over the reference's largest element; for a gradient 1e-4 of its largest, or ten
-times ``rtol`` where that is more.
+The reference is that of the node, or the same function on the same inputs in float64; random numbers are the same.
+The bound of the result is the node's ``rtol`` times the largest element of the reference. The bound of the gradient is
+1e-4 of its largest element, or ten times ``rtol`` where that is more.
 """
 
 from __future__ import annotations
@@ -26,17 +26,17 @@ from neusee.workflows.tolerance.error_norm import largest_error
 ROUNDING = 2.0**-23  #: the least bound of a result in single precision
 SLOPE = 1e-4  #: the least bound of a gradient in single precision
 _NEAR = 0.5  #: share of a bound above which a cell warns
-_STEEPER = 10.0  #: the bound of a gradient over that of the result
-_LEAST = math.sqrt(torch.finfo(torch.float32).tiny)  #: the least scale of an error, a root above denormal numbers
+_STEEPER = 10.0  #: ratio of the bound of a gradient to the bound of the result
+_LEAST = math.sqrt(torch.finfo(torch.float32).tiny)  #: the least scale of an error, far above denormal numbers
 _DIM = 1e-3  #: share of the brightest element below which an element is dim
 _LIGHT = ("scene.", "spectra.", "optics.", "sensor.expose", "sensor.add_photons")  #: nodes that must keep dim parts
-_HUGE = 1e30  #: what infinity is compared with
+_HUGE = 1e30  #: the large number with which infinity is compared
 _HALVES = {torch.float16: 2.0**-11, torch.bfloat16: 2.0**-8}
 
 
 @dataclass(frozen=True)
 class Cell:
-    """The result of one step in one case."""
+    """The mark of one step in one extreme case, with the errors of its result and gradient, and their bounds."""
 
     mark: Mark
     note: str
@@ -47,11 +47,11 @@ class Cell:
 
 
 class _Refused(Exception):
-    """A step's own error for inputs that it cannot use."""
+    """The error of a step that refuses its inputs."""
 
 
 class _CountedInSingle(TorchFunctionMode):
-    """Poisson counts of the mean rounded to single precision: a mean with another last digit gives other counts."""
+    """A PyTorch mode that draws Poisson counts in float64 from the mean rounded to single precision."""
 
     def __torch_function__(self, func: Any, types: Any, args: Any = (), kwargs: Any = None) -> Any:
         if func is torch.poisson and args[0].dtype == torch.float64:
@@ -60,8 +60,8 @@ class _CountedInSingle(TorchFunctionMode):
 
 
 def judge_step(step: Step, inputs: Sequence[Any], case: Case, seed: int) -> Cell | None:
-    """Return whether a step passes, warns or fails; None where the case changes nothing of the step."""
-    given = _given(step, inputs, case)
+    """Return the cell of a step: pass, warn or fail; None if the case changes no input of the step."""
+    given = _changed_inputs(inputs, case)
     if given is None:
         return None
     try:
@@ -72,15 +72,15 @@ def judge_step(step: Step, inputs: Sequence[Any], case: Case, seed: int) -> Cell
         return Cell("fail", f"{type(error).__name__}: {str(error).splitlines()[0]}")
 
 
-def _given(step: Step, inputs: Sequence[Any], case: Case) -> list[Any] | None:
-    """Return the inputs with the change of the case; None where the case changes none."""
+def _changed_inputs(inputs: Sequence[Any], case: Case) -> list[Any] | None:
+    """Return the inputs with the change of the case, or None if the case cannot change an input."""
     given = list(inputs)
     if case.alike:
         if len(given) < 2 or not all(isinstance(x, Tensor) and _is_picture(x) for x in given[:2]):
             return None
         given[1] = given[0].clone()
     if case.inputs is not None:
-        if not any(map(_is_picture, tensors_in(given))):
+        if not _pictures(given):
             return None
         change = case.inputs
         given = each_tensor(lambda x: change(x) if _is_picture(x) else x, given)
@@ -88,11 +88,11 @@ def _given(step: Step, inputs: Sequence[Any], case: Case) -> list[Any] | None:
 
 
 def _is_picture(x: Tensor) -> bool:
-    return (x.is_floating_point() and x.ndim >= 2 and x.dtype != torch.float64) or _is_half(x)
+    return (x.is_floating_point() and x.ndim >= 2 and x.dtype != torch.float64) or x.dtype in _HALVES
 
 
-def _is_half(x: Tensor) -> bool:
-    return x.dtype in _HALVES
+def _pictures(values: Sequence[Any]) -> list[Tensor]:
+    return [x for x in tensors_in(list(values)) if _is_picture(x)]
 
 
 def _run(step: Step, fn: Any, inputs: Sequence[Any], seed: int, **params: Any) -> Any:
@@ -101,7 +101,7 @@ def _run(step: Step, fn: Any, inputs: Sequence[Any], seed: int, **params: Any) -
 
 
 def _as_used(step: Step, inputs: Sequence[Any], seed: int) -> Any:
-    """Return the result of the step as a run computes it; raise `_Refused` for the step's own `ValueError`."""
+    """Return the result of the step as in a run; raise `_Refused` if the step raises `ValueError`."""
     try:
         return _run(step, step.node.fn, inputs, seed)
     except ValueError as error:
@@ -120,57 +120,55 @@ def _in_double(step: Step, inputs: Sequence[Any], seed: int) -> Any:
 
 def _compared(step: Step, inputs: list[Any], case: Case, seed: int) -> Cell:
     with torch.no_grad():
-        value, own = _as_used(step, inputs, seed), step.node.hooks.reference
-        truth = _run(step, own, inputs, seed) if own else _in_double(step, inputs, seed)
+        value, reference = _as_used(step, inputs, seed), step.node.hooks.reference
+        truth = _run(step, reference, inputs, seed) if reference else _in_double(step, inputs, seed)
     if not _finite(value):
-        return Cell("pass", "overflows in the open, as its reference in single") if not _fits(truth) else Cell(
-            "fail", "not finite")  # fmt: skip
+        overflows = Cell("pass", "overflows in the open, as its reference in single")
+        return Cell("fail", "not finite") if _fits_single_precision(truth) else overflows
     bound = max([step.node.rtol, ROUNDING, *(_HALVES.get(x.dtype, 0.0) for x in tensors_in(value))])
     dim = case.expect == "dim part" and step.node.path.startswith(_LIGHT)
     error = _dim_error(value, truth) if dim else _error(value, truth)
     if isinstance(truth, Tensor) and truth.ndim == 0 and error > bound:
         error *= _cancelled(step, inputs, truth, seed)
-    slope = _slope_error(step, inputs, seed)
     coarse = max(
         (_HALVES.get(x.dtype, 0.0) for x in tensors_in(inputs)), default=0.0
     )  # a gradient has the input's type
-    return _verdict(error, bound, slope, max(SLOPE, _STEEPER * bound, 2 * coarse))
+    slope_bound = max(SLOPE, _STEEPER * bound, 2 * coarse)
+    return _marked(error, bound, _slope_error(step, inputs, seed), slope_bound)
 
 
-def _verdict(error: float, bound: float, slope: float | None, steeper: float) -> Cell:
-    """Return a cell that passes within its bound, warns above half of the bound, and fails beyond."""
+def _marked(error: float, bound: float, slope: float | None, steeper: float) -> Cell:
+    """Return a cell that passes up to half of its bounds, warns up to the bounds, and fails beyond."""
     used = [error / bound] if slope is None else [error / bound, slope / steeper]
-    limit = None if slope is None else steeper
-    if not all(share <= 1.0 for share in used):  # NaN is not within its bound
-        return Cell("fail", "", error, bound, slope, limit)
-    if max(used) > _NEAR:
-        return Cell("warn", "near its bound", error, bound, slope, limit)
-    return Cell("pass", "", error, bound, slope, limit)
+    within = all(share <= 1.0 for share in used)  # NaN is not within its bound
+    near = within and max(used) > _NEAR
+    mark: Mark = "warn" if near else "pass" if within else "fail"
+    return Cell(mark, "near its bound" * near, error, bound, slope, None if slope is None else steeper)
 
 
 def _error(value: Any, truth: Any) -> float:
-    """Return the largest difference over the largest element."""
+    """Return the largest difference between a result and its reference, over the largest element."""
     pairs = list(zip(tensors_in(value), tensors_in(truth), strict=True))
     return max((_over(a, b, _LEAST) for a, b in pairs), default=0.0)
 
 
 def _cancelled(step: Step, inputs: list[Any], truth: Tensor, seed: int) -> float:
-    """Return by how much a sum of terms that cancel is less exact: |f| over sum |x df/dx|, at most 1."""
+    """Return the relative loss of precision where terms of a sum f(x) cancel: |f| over sum |x df/dx|, at most 1."""
     with torch.enable_grad():
         slopes = _true_slopes(step, inputs, seed) or []
-    pictures = [x for x in tensors_in(inputs) if _is_picture(x)]
-    moved = sum(float((x.double() * g).abs().sum()) for x, g in zip(pictures, slopes, strict=False))
+    moved = sum(float((x.double() * g).abs().sum()) for x, g in zip(_pictures(inputs), slopes, strict=False))
     weight = float(_weight(truth))
     return min(1.0, weight * abs(float(truth)) / moved) if moved > 0 else 1.0
 
 
 def _over(a: Tensor, b: Tensor, floor: float) -> float:
-    found, top = largest_error(a, b), float(b.detach().double().abs().max()) if b.numel() else 0.0
-    return found if top >= floor else found * (top or 1.0) / floor
+    """Return the largest difference over the largest ``|b|``, or over ``floor`` if that is larger."""
+    error, top = largest_error(a, b), float(b.detach().double().abs().max()) if b.numel() else 0.0
+    return error if top >= floor else error * (top or 1.0) / floor
 
 
 def _dim_error(value: Any, truth: Any) -> float:
-    """Return the largest relative difference among the elements far below the brightest."""
+    """Return the largest error among the elements far below the brightest element."""
     worst = 0.0
     for a, b in zip(tensors_in(value), tensors_in(truth), strict=True):
         dim = b.abs() < _DIM * b.abs().max() if b.is_floating_point() and b.ndim >= 2 else None
@@ -183,8 +181,7 @@ def _finite(value: Any) -> bool:
     return all(bool(x.isfinite().all()) for x in tensors_in(value) if x.is_floating_point())
 
 
-def _fits(truth: Any) -> bool:
-    """Return True if single precision can hold every element."""
+def _fits_single_precision(truth: Any) -> bool:
     top = torch.finfo(torch.float32).max
     return all(bool((x.abs() < top).all()) for x in tensors_in(truth) if x.is_floating_point())
 
@@ -193,10 +190,7 @@ def _fits(truth: Any) -> bool:
 
 
 def _slope_error(step: Step, inputs: list[Any], seed: int) -> float | None:
-    """Return the error of the gradient of a weighted sum of the result with respect to every picture.
-
-    Return None where no gradient flows.
-    """
+    """Return the error of the gradient of a weighted sum of the result, or None if the result has no gradient."""
     with torch.enable_grad():
         usual = _slopes(inputs, lambda given: _run(step, step.node.fn, given, seed))
         if usual is None:
@@ -204,15 +198,15 @@ def _slope_error(step: Step, inputs: list[Any], seed: int) -> float | None:
         truth = _true_slopes(step, inputs, seed)
     if truth is None or not _finite(truth):
         return math.inf
-    pictures = [x for x in tensors_in(inputs) if _is_picture(x)]
+    pictures = _pictures(inputs)
     tops = [torch.finfo(torch.float32 if x.dtype == torch.float64 else x.dtype).max for x in pictures]
     if any(bool((g.abs() >= top).any()) for g, top in zip(truth, tops, strict=True)):
-        return 0.0  # steeper than the type of the picture, which is that of its gradient, can hold
+        return 0.0  # beyond the range of the gradient's type, which is that of the picture
     return max(_over(a, b, _slight(x)) for a, b, x in zip(usual, truth, pictures, strict=True))
 
 
 def _slight(picture: Tensor) -> float:
-    """Return the floor of a gradient: that of a mean, or the least number that the type holds in full precision."""
+    """Return the least scale of a gradient: that of a mean's gradient, or the least normal number of the type."""
     top = float(picture.detach().double().abs().max())
     return max(1.0 / (picture.numel() * max(top, _LEAST)), torch.finfo(picture.dtype).tiny)
 
@@ -220,17 +214,17 @@ def _slight(picture: Tensor) -> float:
 def _true_slopes(step: Step, inputs: list[Any], seed: int) -> list[Tensor] | None:
     wide = each_tensor(lambda x: x.double() if _is_picture(x) else x, inputs)
     leaves = [id(w) for w, x in zip(tensors_in(wide), tensors_in(inputs), strict=True) if _is_picture(x)]
-    own = step.node.hooks.reference
-    found = None if own is None else _slopes(wide, lambda given: _run(step, own, given, seed), leaves)
-    return found or _slopes(wide, lambda given: _in_double(step, given, seed), leaves)
+    reference = step.node.hooks.reference
+    slopes = None if reference is None else _slopes(wide, lambda given: _run(step, reference, given, seed), leaves)
+    return slopes or _slopes(wide, lambda given: _in_double(step, given, seed), leaves)
 
 
-def _slopes(inputs: list[Any], fn: Any, wanted: list[int] | None = None) -> list[Tensor] | None:
-    """Return gradients with respect to the pictures, or to the tensors whose identities are ``wanted``."""
+def _slopes(inputs: list[Any], fn: Any, ids: list[int] | None = None) -> list[Tensor] | None:
+    """Return the gradients of ``fn(inputs)`` with respect to the pictures, or to the tensors with these ``ids``."""
     leaves: list[Tensor] = []
 
     def leaf(x: Tensor) -> Tensor:
-        if _is_picture(x) if wanted is None else id(x) in wanted:
+        if _is_picture(x) if ids is None else id(x) in ids:
             leaves.append(x.detach().clone().requires_grad_())
             return leaves[-1]
         return x
@@ -243,7 +237,7 @@ def _slopes(inputs: list[Any], fn: Any, wanted: list[int] | None = None) -> list
 
 
 def _weighed(value: Any) -> Tensor | None:
-    """Return the sum of every result with a gradient, over a power of ten near its largest, times fixed weights."""
+    """Return the sum of all results with a gradient, each scaled to about 1 and times fixed weights."""
     parts = [(x.double() * _weight(x) / _near(x)).sum() for x in tensors_in(value) if x.requires_grad]
     return torch.stack(parts).sum() if parts else None
 
@@ -253,7 +247,7 @@ def _weight(x: Tensor) -> Tensor:
 
 
 def _near(x: Tensor) -> float:
-    """Return a power of ten near the largest element, the same in every precision; 1 for a scalar or tiny elements."""
+    """Return a power of ten near the largest element of ``x``, or 1 if ``x`` is a scalar or tiny."""
     top = float(x.detach().double().abs().max()) if x.ndim else 0.0
     return 10.0 ** round(math.log10(top) + 0.123) if _LEAST < top < math.inf else 1.0
 
@@ -262,10 +256,8 @@ def _near(x: Tensor) -> float:
 
 
 def _seen(step: Step, inputs: Sequence[Any], given: list[Any], case: Case, seed: int) -> Cell:
-    """Judge whether NaN or infinity in a picture is refused, shows in the result, or gives the limit of large ones."""
-    notes, count = [], sum(_is_picture(x) for x in tensors_in(list(inputs)))
-    for i in range(count):
-        notes.append(_one_seen(step, _only(i, inputs, given), seed))
+    """Return a cell that fails if a step hides NaN or infinity in one of its pictures."""
+    notes = [_one_seen(step, _with_one_changed(i, inputs, given), seed) for i in range(len(_pictures(inputs)))]
     hidden = [note for note in notes if note.startswith("hidden")]
     stated = stated_words(step.node, case.name)
     if hidden and stated is None:
@@ -274,6 +266,7 @@ def _seen(step: Step, inputs: Sequence[Any], given: list[Any], case: Case, seed:
 
 
 def _one_seen(step: Step, given: list[Any], seed: int) -> str:
+    """Return whether NaN or infinity is refused, seen in the result, treated as a large number, or hidden."""
     with torch.no_grad():
         try:
             value = _as_used(step, given, seed)
@@ -281,7 +274,7 @@ def _one_seen(step: Step, given: list[Any], seed: int) -> str:
             return f"refused: {refused}"
         if not _finite(value):
             return "seen"
-        bad = next(float(x[~x.isfinite()][0]) for x in tensors_in(given) if _is_picture(x) and not _finite(x))
+        bad = next(float(x[~x.isfinite()][0]) for x in _pictures(given) if not _finite(x))
         if math.isnan(bad):
             return "hidden: a finite result of NaN"
         large = each_tensor(lambda x: x.nan_to_num(posinf=_HUGE, neginf=-_HUGE), given)
@@ -290,10 +283,7 @@ def _one_seen(step: Step, given: list[Any], seed: int) -> str:
         return "as its limit" if same else "hidden: a finite result that is no limit"
 
 
-def _only(which: int, inputs: Sequence[Any], given: Sequence[Any]) -> list[Any]:
-    """Return the inputs with the change in one picture only."""
-    old = [x for x in tensors_in(list(inputs)) if _is_picture(x)]
-    new = [x for x in tensors_in(list(given)) if _is_picture(x)]
-    swap = {id(old[which]): new[which]}
+def _with_one_changed(which: int, inputs: Sequence[Any], given: Sequence[Any]) -> list[Any]:
+    swap = {id(_pictures(inputs)[which]): _pictures(given)[which]}
     only: list[Any] = each_tensor(lambda x: swap.get(id(x), x), list(inputs))
     return only

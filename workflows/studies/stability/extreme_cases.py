@@ -1,8 +1,8 @@
-"""The catalogue of stiff and extreme cases: what is changed of a recipe, or of what each of its steps is given.
+"""The catalogue of stiff and extreme cases: the changes of a recipe's parameters, results or inputs.
 
-A case changes parameters by ``node.parameter`` (``*.exposure`` of every node), results by the path of the node
-that made them, or, step by step, the inputs. The expected result is not written here: it is that of the node's own
-reference, within the node's own documented error (`case_result`).
+A case changes parameters by ``node.parameter`` (``*.exposure`` of every node), results by the path of their node, or
+the inputs of each step. The expected result is not written here: it is that of the node's own reference, within the
+documented error of the node (`case_result`).
 """
 
 from __future__ import annotations
@@ -25,7 +25,7 @@ Expect = Literal["accurate", "dim part", "seen"]
 
 @dataclass(frozen=True)
 class Size:
-    """The size of the small recipe."""
+    """The reduced size of a recipe: its pixels, pupil samples and bands."""
 
     pixels: int = 24  #: side of the scene; the rest in proportion
     samples: int = 64  #: side of the pupil
@@ -34,20 +34,20 @@ class Size:
 
 @dataclass(frozen=True)
 class Case:
-    """One row of the grid."""
+    """One row of the grid: an extreme case and its changes of a recipe."""
 
     name: str
-    what: str  #: what is extreme about it
+    what: str  #: the extreme property
     group: str
     params: Mapping[str, Any] = field(default_factory=dict)  #: a value, or a function of the step's parameters
     values: Mapping[str, Callable[[Any], Any]] = field(default_factory=dict)  #: by the start of a node's path
-    inputs: Callable[[Tensor], Tensor] | None = None  #: changes one picture that a step is given
-    alike: bool = False  #: a step that compares two pictures is given the same twice
+    inputs: Callable[[Tensor], Tensor] | None = None  #: changes one picture among the inputs of a step
+    alike: bool = False  #: whether a step that compares two pictures gets the same picture twice
     size: Size = field(default_factory=Size)
     expect: Expect = "accurate"
 
 
-#: by node and case, the words of its docstring that say what becomes of NaN where the result cannot show it
+#: by node and case, the words of its docstring on NaN in its inputs, where the result cannot show NaN
 _STATED = {
     ("restore.clipped", "NaN"): "so is what is not a number",
     ("metrics.saturated", "NaN"): "so does one that is not a number",
@@ -55,17 +55,13 @@ _STATED = {
 
 
 def stated_words(node: Node, case: str) -> str | None:
-    """Return the words with which a node says what becomes of NaN; None where its docstring has no such words."""
+    """Return the words on NaN in the docstring of a node, or None if the docstring does not have them."""
     words = _STATED.get((node.path, case))
-    return words if words is not None and _says(node, words) else None
-
-
-def _says(node: Node, words: str) -> bool:
-    return words in " ".join((node.__doc__ or "").split())
+    return words if words is not None and words in " ".join((node.__doc__ or "").split()) else None
 
 
 def middle(value: float) -> Callable[[Tensor], Tensor]:
-    """Return a function that changes the element in the middle of a picture."""
+    """Return a function that sets the middle element of a picture to ``value``."""
 
     def change(x: Tensor) -> Tensor:
         changed = x.clone()
@@ -84,7 +80,7 @@ def _peak_of(top: float) -> Callable[[Tensor], Tensor]:
 
 
 def _lamp(scene: Tensor) -> Tensor:
-    """Return the scene a million times darker than one lamp in it."""
+    """Return the scene with one lamp in its middle that is a million times brighter than the scene."""
     return middle(1.0)(scene * (1e-6 / scene.max()))
 
 
@@ -97,7 +93,7 @@ def _noise(depth: float) -> Callable[[Tensor], Tensor]:
 
 
 def _steps(height: Tensor) -> Tensor:
-    """Return a height of 0.9 waves at 550 nm in fused silica on every second sample: every step is aliased."""
+    """Return a checkerboard height map with steps of 0.9 waves at 550 nm in fused silica, which are aliased."""
     v, u = (torch.arange(n) for n in height.shape)
     return ((v[:, None] + u) % 2 * 1.076e-6).to(height.dtype)
 
@@ -111,7 +107,7 @@ def _closed(pupil: Pupil) -> Pupil:
 
 
 def _off_axis(share: float) -> Callable[[Params], tuple[float, float]]:
-    """Return a function for the direction whose spot lies ``share`` sides of the sensor from its middle along x."""
+    """Return a function for the angle of a laser whose spot is ``share`` sensor widths from the middle along x."""
     return lambda p: (0.0, share * field_of_view(p["focal_length"], p["pixel_pitch"], p["shape"])[1])
 
 

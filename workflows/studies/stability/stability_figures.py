@@ -1,4 +1,4 @@
-"""The grid of the stability study: each cell has a colour, a sign and the number that is nearest its bound."""
+"""Picture of the stability study: a grid of cells, each with a colour, a sign and the error nearest to its bound."""
 
 from __future__ import annotations
 
@@ -11,14 +11,14 @@ from neusee.workflows.studies.stability.case_result import Cell
 
 _COLOURS = {"pass": "#9AD6C1", "warn": "#F6D58A", "fail": "#F2B08A"}
 _WIDE, _TALL = 0.52, 0.23  #: inches of a cell
-_ACROSS = 22  #: nodes side by side; the others stand below
+_ACROSS = 22  #: largest number of nodes side by side; further nodes are drawn in a panel below
 
 Entry = tuple[str, str, str, Cell]  #: group, case, node, cell
 
 
 @drawn
 def grid_picture(entries: Sequence[Entry]) -> Any:
-    """Draw the grid: cases down, nodes across, the losses last."""
+    """Draw the grid: a row for each case, a column for each node, the losses last."""
     cases = list(dict.fromkeys((group, case) for group, case, _, _ in entries))
     nodes = sorted({node for _, _, node, _ in entries}, key=lambda n: (n.startswith("losses."), n))
     panels = max(1, -(-len(nodes) // _ACROSS))
@@ -50,7 +50,7 @@ def _panel(ax: Any, entries: Sequence[Entry], cases: list[tuple[str, str]], node
 
 
 def cell_text(cell: Cell) -> str:
-    """Return the text of a cell: a sign where the cell does not pass, and its number."""
+    """Return the text of a cell: a sign if the cell does not pass, and the error nearest to its bound."""
     sign = {"pass": "", "warn": "!", "fail": "×"}[cell.mark]
     if cell.error is None:
         short = "r" if cell.note.startswith("refused") else "s" if "seen" in cell.note else "–"
@@ -64,7 +64,7 @@ def _share(value: float, bound: float | None) -> float:
 
 
 def short_number(value: float) -> str:
-    """Return a number such as ``2e-7`` in as few characters as show the order of magnitude."""
+    """Return a number with one digit and its exponent, such as ``2e-7``."""
     if value == 0:
         return "0"
     if not math.isfinite(value):

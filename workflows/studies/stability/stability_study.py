@@ -1,4 +1,4 @@
-"""The study of stability: a grid of extreme cases and steps, each cell with a bound and a measured error."""
+"""The study of stability: the errors of each step in extreme cases, against their bounds."""
 
 from __future__ import annotations
 
@@ -40,7 +40,7 @@ error names the cause. Empty: the step has the inputs of the usual case, or none
 
 @dataclass(frozen=True)
 class GridCell:
-    """One cell with its case, step and node."""
+    """One cell of the grid with its case, step and node."""
 
     case: Case
     step: str
@@ -49,10 +49,11 @@ class GridCell:
 
     @property
     def severity(self) -> tuple[int, float]:
-        """Return the order by which the worst cell of several steps of one node is chosen."""
-        shares = [e / b for e, b in ((self.cell.error, self.cell.bound), (self.cell.slope, self.cell.slope_bound))
-                  if e is not None and b]  # fmt: skip
-        return ("pass", "warn", "fail").index(self.cell.mark), max(shares, default=-1.0)
+        """Return a sort key that is largest for the worst cell: its mark, then its largest share of a bound."""
+        cell = self.cell
+        pairs = ((cell.error, cell.bound), (cell.slope, cell.slope_bound))
+        shares = [error / bound for error, bound in pairs if error is not None and bound]
+        return ("pass", "warn", "fail").index(cell.mark), max(shares, default=-1.0)
 
 
 def study(
@@ -63,7 +64,7 @@ def study(
     progress: Progress,
     cases: Sequence[Case] = CASES,
 ) -> Path:
-    """Judge every step of ``recipe``, and its losses, in every case; read the cells that the store has."""
+    """Test every step of ``recipe`` and its losses in every case; write the folder of the study and return it."""
     study_run = StudyRun("stability", recipe, command)
     with one_thread():
         rows = list(_rows(recipe, store, cases, progress))
@@ -96,7 +97,7 @@ def _row(chain: CaseRecipe, same: set[str], store: Store, own: str) -> Iterator[
 
 
 def _judge(chain: CaseRecipe, name: str) -> dict[str, Any]:
-    """Return the fields of a cell; none where an earlier step refused or the case changes nothing of the step."""
+    """Return the fields of a cell, or an empty dict if an earlier step refused or the case changes no input."""
     try:
         inputs = chain.inputs(name)
         with warnings.catch_warnings():
@@ -111,13 +112,12 @@ def _judge(chain: CaseRecipe, name: str) -> dict[str, Any]:
 
 
 def _document(rows: Sequence[GridCell]) -> dict[str, Any]:
-    """Return what the folder says of the study, beside what every study says."""
     count = {mark: sum(row.cell.mark == mark for row in rows) for mark in ("pass", "warn", "fail")}
     return {"cells": len(rows), "passed": count["pass"], "warned": count["warn"], "failed": count["fail"]}
 
 
 def _report(recipe: Recipe, rows: Sequence[GridCell], document: Mapping[str, Any]) -> StudyReport:
-    worst = _worst(rows)
+    worst = _worst_by_case_and_node(rows)
     picture = grid_picture([(row.case.group, row.case.name, row.node, row.cell) for row in worst])
     lead = (
         f"{document['cells']} cells, {len({r.case.name for r in rows})} cases by {len({r.node for r in rows})} nodes: "
@@ -133,24 +133,18 @@ def _report(recipe: Recipe, rows: Sequence[GridCell], document: Mapping[str, Any
     )
 
 
-def _worst(rows: Sequence[GridCell]) -> list[GridCell]:
-    """Return the worst row for each case and node."""
+def _worst_by_case_and_node(rows: Sequence[GridCell]) -> list[GridCell]:
     ordered = sorted(rows, key=lambda r: (CASES.index(r.case) if r.case in CASES else 0, r.node))
     groups = itertools.groupby(ordered, key=lambda r: (r.case.name, r.node))
     return [max(group, key=lambda r: r.severity) for _, group in groups]
 
 
 def _tables(rows: Sequence[GridCell]) -> Iterator[Section]:
-    told: tuple[tuple[Mark, str, str], ...] = (
-        ("fail", "What fails", "Nothing."),
-        ("warn", "What holds by less than twice", "Nothing."),
-    )
-    for mark, heading, nothing in told:
-        found = [row for row in rows if row.cell.mark == mark]
-        marks = {(i, _COLUMNS.index("mark")): mark for i in range(len(found))}
-        yield Section(
-            heading, "" if found else nothing, _COLUMNS if found else (), [_line(r) for r in found], marks=marks
-        )
+    headings: dict[Mark, str] = {"fail": "What fails", "warn": "What holds by less than twice"}
+    for mark, heading in headings.items():
+        lines = [_line(row) for row in rows if row.cell.mark == mark]
+        marks = {(i, _COLUMNS.index("mark")): mark for i in range(len(lines))}
+        yield Section(heading, "" if lines else "Nothing.", _COLUMNS if lines else (), lines, marks=marks)
     cases = {row.case.name: row.case for row in rows}.values()
     yield Section("The cases", "", ("case", "group", "what"), [(c.name, c.group, c.what) for c in cases])
 

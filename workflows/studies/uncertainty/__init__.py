@@ -1,4 +1,4 @@
-"""How do outputs scatter over what the recipe is not sure of?
+"""How far do outputs scatter because of uncertain values in the recipe?
 
 Draws of uncertain values, runs at each, scatter, sensitivities and the page.
 Distributions are read in `recipe.distributions`.

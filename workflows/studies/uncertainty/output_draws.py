@@ -1,4 +1,4 @@
-"""Outputs of a recipe at draws of its inputs: only the steps that an input reaches, several draws at once."""
+"""The outputs of a recipe at draws of its inputs; only the steps that an input reaches are computed for each draw."""
 
 from __future__ import annotations
 
@@ -11,9 +11,8 @@ from concurrent.futures import ThreadPoolExecutor
 from contextlib import suppress
 from dataclasses import replace
 from functools import cache, cached_property
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
-import numpy as np
 import torch
 from torch import Tensor
 
@@ -29,42 +28,38 @@ from neusee.workflows.recipe.distributions.uncertain_inputs import Inputs
 from neusee.workflows.report.result_numbers import numbers_of
 from neusee.workflows.store.memo import compute_once
 from neusee.workflows.store.result_store import Store
+from neusee.workflows.studies.uncertainty.scatter_estimate import FloatArray
 
-if TYPE_CHECKING:
-    from numpy.typing import NDArray
-
-    FloatArray = NDArray[np.float64]
-
-Numbers = dict[str, list[float]]  #: by quantity, such as ``restored_quality.psnr``, its elements
+Numbers = dict[str, list[float]]  #: elements of each quantity, such as ``restored_quality.psnr``
 _ARENAS, _MAPPED, _TRIM = -8, -4, -1  #: M_ARENA_MAX, M_MMAP_MAX and M_TRIM_THRESHOLD of glibc's mallopt
 _ABOUT = {"step": "study uncertainty"}
-_NARROW = 8  #: columns that a table has at most; what has more of both is a picture
+_NARROW = 8  #: a tensor of two axes counts as a picture if both are longer
 
 
 class OutputDraws:
-    """Outputs at draws of the inputs; the store keeps their numbers, draw by draw."""
+    """The outputs at draws of the inputs; the store keeps the numbers of each draw."""
 
     def __init__(self, inputs: Inputs, store: Store, device: str = "cpu", workers: int = 0) -> None:
         self.inputs, self.store, self.device = inputs, store, device
         self.workers = 1 if device != "cpu" else workers or os.cpu_count() or 1
         recipe = inputs.recipe
         self._order = needed(recipe, recipe.outputs)
-        self._live = _reached(inputs, self._order)
+        self._live = _reached_steps(inputs, self._order)
         self.outputs = tuple(name for name in recipe.outputs if name in self._live)
         self.is_constant = tuple(name for name in recipe.outputs if name not in self._live)
         self._code = Code(store.root / "code.json")
         self._fixed = self._keys({})
         self.computed = 0  #: draws that were not in the store
-        self.seconds = 0.0  #: of them
+        self.seconds = 0.0  #: that these draws took
 
     @cached_property
     def _function(self) -> Any:
-        """Return the recipe as a function of the inputs; this computes once what no input reaches."""
+        """Return the recipe as a function of the inputs; compute the steps that no input reaches first."""
         free = tuple(self.inputs.readers)
         return as_function(self.inputs.recipe, *free, outputs=self.outputs, store=self.store, device=self.device)
 
     def ready(self) -> float:
-        """Compute what no input reaches; return the seconds that this took."""
+        """Compute the steps that no input reaches; return the seconds that this took."""
         began = time.perf_counter()
         _ = self._function
         return time.perf_counter() - began
@@ -79,37 +74,34 @@ class OutputDraws:
         return [numbers for numbers in found if numbers is not None]
 
     def pictures(self, values: FloatArray) -> dict[str, tuple[Tensor, Tensor]]:
-        """Return mean and standard deviation of every output that is a picture, by pixel; keep the numbers too."""
+        """Return the mean and the standard deviation of every picture among the outputs; keep the numbers too."""
         keys = [self.key(row) for row in values]
         whole = digest("uncertainty pictures", keys)
         if (first := self._kept(keys[0])) is not None and not first["pictures"]:
             return {}
-        return _pairs(compute_once(self.store, whole, dict, lambda: self._sums(keys, values), _ABOUT))
+        found: dict[str, tuple[Tensor, Tensor]]
+        found = compute_once(self.store, whole, dict, lambda: self._sums(keys, values), _ABOUT)
+        return found
 
-    def _sums(self, keys: Sequence[str], values: FloatArray) -> dict[str, Tensor]:
-        """Return mean and standard deviation of every picture over the draws, by name."""
+    def _sums(self, keys: Sequence[str], values: FloatArray) -> dict[str, tuple[Tensor, Tensor]]:
         sums = dict[str, _Sum]()
         for key, result in zip(keys, self._results(list(values)), strict=True):
             self._keep(key, result)
             for name, value in result.items():
                 if _is_picture(value):
                     sums.setdefault(name, _Sum()).add(value)
-        return {part: x for name, s in sums.items() for part, x in ((f"{name} mean", s.mean), (f"{name} sd", s.sd))}
+        return {name: (total.mean, total.sd) for name, total in sums.items()}
 
     def key(self, row: FloatArray) -> str:
-        """Return what decides the outputs at a draw: the keys of a run with these values."""
+        """Return the store key of a draw: a digest of the keys that a run with these values gives its outputs."""
         recipe = self.inputs.recipe
         keys = self._keys(self.inputs.theta(self._named(row)))
+        outputs = [[name, keys[name]] for name in self.outputs]
         within = [recipe.tolerance, recipe.exact, device_kind(self.device)]
-        return digest(
-            "uncertainty draw",
-            engine("studies.uncertainty.output_draws"),
-            [[name, keys[name]] for name in self.outputs],
-            within,
-        )
+        return digest("uncertainty draw", engine("studies.uncertainty.output_draws"), outputs, within)
 
     def _keys(self, theta: Mapping[str, Any]) -> dict[str, str]:
-        """Return the key of each step; without ``theta``, only of the steps that no input reaches."""
+        """Return the key of each step with parameters ``theta``, or if empty, of the steps that no input reaches."""
         recipe, keys = self.inputs.recipe, dict(self._fixed) if theta else {}
         by_step: dict[str, dict[str, Any]] = {}
         for reader, value in theta.items():
@@ -138,7 +130,7 @@ class OutputDraws:
         return numbers
 
     def _results(self, rows: Sequence[FloatArray]) -> Iterator[dict[str, Any]]:
-        """Yield the outputs at each draw, in order: as many at once as there are cores, each on one thread."""
+        """Yield the outputs at each draw in order; ``self.workers`` draws are computed at once, each on one thread."""
         if not rows:
             return
         self.ready()
@@ -159,7 +151,7 @@ class OutputDraws:
                 found: dict[str, Any] = self._function(self.inputs.theta(values))
         except (RuntimeError, ValueError) as error:
             at = ", ".join(f"{name} = {value:.6g}" for name, value in values.items())
-            raise ValueError(f"at {at}: {error}") from error
+            raise ValueError(f"the recipe fails with {at}: {error}") from error
         return found
 
     def _named(self, row: FloatArray) -> dict[str, float]:
@@ -167,7 +159,7 @@ class OutputDraws:
 
 
 def quantities(result: Mapping[str, Any]) -> Numbers:
-    """Return every small result by the name of its step and field."""
+    """Return the numbers in ``result`` by step and field; pictures are ignored."""
     found: Numbers = {}
     for step, value in result.items():
         for _, field, _, number in () if _is_picture(value) else numbers_of(step, value):
@@ -175,7 +167,7 @@ def quantities(result: Mapping[str, Any]) -> Numbers:
     return found
 
 
-def _reached(inputs: Inputs, order: Sequence[str]) -> set[str]:
+def _reached_steps(inputs: Inputs, order: Sequence[str]) -> set[str]:
     live = {reader.rpartition(".")[0] for reader in inputs.readers}
     for name in order:
         if any(source in live for source in inputs.recipe.steps[name].sources):
@@ -187,13 +179,8 @@ def _is_picture(value: Any) -> bool:
     return isinstance(value, Tensor) and (value.ndim > 2 or (value.ndim == 2 and min(value.shape) > _NARROW))
 
 
-def _pairs(found: Mapping[str, Tensor]) -> dict[str, tuple[Tensor, Tensor]]:
-    names = dict.fromkeys(name.removesuffix(" mean").removesuffix(" sd") for name in found)
-    return {name: (found[f"{name} mean"], found[f"{name} sd"]) for name in names}
-
-
 class _Sum:
-    """Mean and standard deviation of pictures that come one after another (Welford)."""
+    """The mean and the standard deviation of pictures that are added one after another (Welford)."""
 
     def __init__(self) -> None:
         self.count = 0
@@ -202,12 +189,9 @@ class _Sum:
     def add(self, picture: Tensor) -> None:
         x = picture.detach().cpu().float()
         self.count += 1
-        if self.count == 1:
-            self.mean, self._squares = x.clone(), torch.zeros_like(x)
-            return
         apart = x - self.mean
-        self.mean += apart / self.count
-        self._squares += apart * (x - self.mean)
+        self.mean = self.mean + apart / self.count
+        self._squares = self._squares + apart * (x - self.mean)
 
     @property
     def sd(self) -> Tensor:
@@ -216,9 +200,9 @@ class _Sum:
 
 @cache
 def _keep_memory() -> None:
-    """Let the process keep the memory of a draw for the next one; asking the system again takes longer than computing.
+    """Let the process reuse the memory of a draw for the next draw, because a new allocation takes too long.
 
-    This works with glibc only, and lasts for the rest of the process.
+    The setting works with glibc only, and lasts for the rest of the process.
     """
     if sys.platform.startswith("linux"):
         with suppress(OSError, AttributeError):

@@ -1,31 +1,27 @@
-"""The scatter of numbers over draws, and the standard error of that scatter."""
+"""The scatter of quantities over draws, and the standard error of their standard deviations."""
 
 from __future__ import annotations
 
 import math
 from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import TYPE_CHECKING
 
 import numpy as np
+from numpy.typing import NDArray
 
-if TYPE_CHECKING:
-    from numpy.typing import NDArray
-
-    FloatArray = NDArray[np.float64]
-
-_STILL = 1e-12  #: of the largest value: what varies by no more does not vary
+FloatArray = NDArray[np.float64]
+_CONSTANT = 1e-12  #: share of the largest value; a quantity with a smaller standard deviation is constant
 
 
 @dataclass(frozen=True)
 class Scatter:
-    """The scatter of one quantity, element by element."""
+    """The scatter of one quantity over the draws, for each of its elements."""
 
     mean: FloatArray
     sd: FloatArray
     low: FloatArray  #: 5 %
     high: FloatArray  #: 95 %
-    error: float  #: relative, of the greatest standard deviation; 0 where nothing varies
+    error: float  #: relative error of the greatest standard deviation; 0 if the quantity is constant
 
     @property
     def is_constant(self) -> bool:
@@ -34,21 +30,21 @@ class Scatter:
 
 
 def scatter(values: FloatArray, sequences: int = 0) -> Scatter:
-    """Return the scatter of values (draw, element).
+    """Return the scatter of ``values`` (draw, element) over the draws.
 
     With ``sequences``, draw i belongs to the scrambled sequence i % sequences.
     """
-    with np.errstate(invalid="ignore"):  # what is infinite in a draw has no deviation
+    with np.errstate(invalid="ignore"):  # a quantity that is infinite in a draw has no standard deviation
         mean, sd = values.mean(0), values.std(0, ddof=1)
         low, high = np.quantile(values, [0.05, 0.95], axis=0)
-    sd = np.where(sd > _STILL * np.abs(values).max(0), sd, 0.0)
+    sd = np.where(sd > _CONSTANT * np.abs(values).max(0), sd, 0.0)
     worst = values[:, int(sd.argmax())]
     error = 0.0 if not sd.max() > 0 else _of_sequences(worst, sequences) if sequences else _jackknife(worst)
     return Scatter(mean, sd, low, high, error)
 
 
 def _jackknife(x: FloatArray) -> float:
-    """Return the relative standard error of the standard deviation of independent draws, by the jackknife."""
+    """Return the relative standard error of the standard deviation of independent draws ``x``, by the jackknife."""
     n = len(x)
     apart = (x - x.mean()) ** 2
     without = np.sqrt((apart.sum() - apart * n / (n - 1)).clip(0.0) / (n - 2))
@@ -57,13 +53,13 @@ def _jackknife(x: FloatArray) -> float:
 
 
 def _of_sequences(x: FloatArray, count: int) -> float:
-    """Return the relative standard error from how the mean squares of independent sequences differ."""
+    """Return the relative standard error of the standard deviation, from the mean squares of each sequence."""
     squares = (x - x.mean()) ** 2
     each = np.array([squares[i::count].mean() for i in range(count)])
     return float(each.std(ddof=1) / math.sqrt(count) / each.mean() / 2)
 
 
 def worst_known(found: Mapping[str, Scatter]) -> tuple[str, float]:
-    """Return the quantity whose standard deviation is known worst, and the relative error of it."""
+    """Return the quantity whose standard deviation has the largest relative error, and this error."""
     name = max(found, key=lambda each: found[each].error)
     return name, found[name].error

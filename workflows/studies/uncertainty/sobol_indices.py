@@ -1,4 +1,4 @@
-"""The share of each input in the scatter of a number: variance-based indices by SALib, for independent inputs."""
+"""The Sobol indices of independent inputs: the share of each input in the variance of a number, by SALib."""
 
 from __future__ import annotations
 
@@ -6,38 +6,35 @@ import warnings
 from collections.abc import Sequence
 from dataclasses import dataclass
 from itertools import combinations_with_replacement
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 
-if TYPE_CHECKING:
-    from numpy.typing import NDArray
+from neusee.workflows.studies.uncertainty.scatter_estimate import FloatArray
 
-    FloatArray = NDArray[np.float64]
-
-EXPLAINED = 0.9  #: share of the variance that the polynomial must tell of draws that it has not seen
-_SALTELLI = 1024  #: points of the polynomial by input
-_BY_TERM = 3  #: draws that a term of the polynomial asks for
+EXPLAINED = 0.9  #: least share of the variance that the polynomial must predict for draws outside the fit
+_SALTELLI = 1024  #: points of the polynomial for each input
+_BY_TERM = 3  #: least number of draws for each term of the polynomial
 
 
 @dataclass(frozen=True)
 class SobolIndices:
-    """Shares of a variance, by input."""
+    """The shares of a variance that each input causes, alone and together with other inputs."""
 
-    first: Sequence[float]  #: what the input does by itself, from the draws
-    first_error: Sequence[float]  #: half of its 95 % interval
-    total: Sequence[float]  #: with what it does together with others, of a polynomial
+    first: Sequence[float]  #: share of each input alone, from the draws
+    first_error: Sequence[float]  #: half of the 95 % interval
+    total: Sequence[float]  #: share of each input alone and together with other inputs, from a polynomial
     total_error: Sequence[float]
-    explained: float  #: share of the variance that the polynomial tells of draws that it has not seen
+    explained: float  #: share of the variance that the polynomial predicts for draws outside the fit
 
     @property
     def explains_enough(self) -> bool:
-        """Return True if the polynomial explains enough of the variance for its indices to mean anything."""
+        """Return True if the polynomial explains enough of the variance for its indices to be meaningful."""
         return self.explained >= EXPLAINED
 
 
 def require_salib() -> None:
-    """Raise `ImportError` with the command that installs SALib, where SALib is missing."""
+    """Raise `ImportError` with the command that installs SALib if SALib is missing."""
     try:
         import SALib  # noqa: F401
     except ImportError:
@@ -45,24 +42,20 @@ def require_salib() -> None:
 
 
 def indices(names: Sequence[str], z: FloatArray, y: FloatArray, seed: int) -> SobolIndices:
-    """Return the shares of the variance of a number ``y`` (draw,) by standard normal inputs ``z`` (draw, input).
+    """Return the shares of the variance of ``y`` (draw,) that the standard normal inputs ``z`` (draw, input) cause.
 
-    First-order indices are those of RBD-FAST, from the draws only; total ones those of Saltelli's points (Sobol,
+    First-order indices are those of RBD-FAST, from the draws only; total indices are those of Saltelli's points (Sobol,
     Jansen) on a polynomial of second order that is fitted to the draws.
     """
     from SALib.analyze import rbd_fast, sobol
     from SALib.sample import sobol as points
 
     count = len(names)
-    problem: dict[str, Any] = {
-        "num_vars": count,
-        "names": list(names),
-        "bounds": [[0.0, 1.0]] * count,
-        "dists": ["norm"] * count,
-    }
+    problem: dict[str, Any] = {"num_vars": count, "names": list(names)}
+    problem |= {"bounds": [[0.0, 1.0]] * count, "dists": ["norm"] * count}
     fitted, explained = _fit(z, y)
     with warnings.catch_warnings():
-        warnings.simplefilter("ignore")  # pandas warns, and so do indices next to nothing
+        warnings.simplefilter("ignore")  # pandas and very small indices cause warnings
         first = rbd_fast.analyze(problem, z, y, seed=seed)
         at = points.sample(problem, _SALTELLI, calc_second_order=False, seed=seed)
         total = sobol.analyze(problem, _terms(at, len(fitted)) @ fitted, calc_second_order=False, seed=seed)
@@ -73,7 +66,7 @@ def indices(names: Sequence[str], z: FloatArray, y: FloatArray, seed: int) -> So
 
 
 def _fit(z: FloatArray, y: FloatArray) -> tuple[FloatArray, float]:
-    """Return the coefficients, and the share of the variance that the polynomial predicts of draws left out (PRESS)."""
+    """Return the coefficients of the polynomial, and the share of the variance that it predicts (PRESS)."""
     many = _count(z.shape[1], 2)
     terms = _terms(z, many if many * _BY_TERM <= len(z) else _count(z.shape[1], 1))
     fitted = np.asarray(np.linalg.lstsq(terms, y, rcond=None)[0], np.float64)
@@ -87,7 +80,7 @@ def _count(inputs: int, order: int) -> int:
 
 
 def _terms(z: FloatArray, count: int) -> FloatArray:
-    """Return Hermite's polynomials: one, each input, and products of two inputs where ``count`` has room for them."""
+    """Return the Hermite polynomials of each draw: 1, each input, and for a larger ``count`` products of two inputs."""
     columns = [np.ones(len(z)), *z.T]
     if count > len(columns):
         pairs = combinations_with_replacement(range(z.shape[1]), 2)

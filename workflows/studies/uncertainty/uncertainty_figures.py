@@ -1,32 +1,28 @@
-"""Pictures of the study of uncertainty: tornado, bands, histograms, and the uncertain parts of a picture."""
+"""Pictures of the study of uncertainty: influence of inputs, bands of curves, histograms, and uncertain images."""
 
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 from torch import Tensor
 
 from neusee.workflows.report.figures.camera_overview import high
 from neusee.workflows.report.figures.style import BLACK, BLUE, GREEN, ORANGE, VERMILION, canvas, drawn, encoded, picture
-
-if TYPE_CHECKING:
-    from numpy.typing import NDArray
-
-    FloatArray = NDArray[np.float64]
+from neusee.workflows.studies.uncertainty.scatter_estimate import FloatArray
 
 _GREY = "#777777"
 _COLOURS = (BLUE, VERMILION, GREEN, ORANGE)
-_WIDE = 30.0  #: ratio of a curve's ends from which its axis is logarithmic
+_WIDE = 30.0  #: ratio of the largest to the least value of curves above which their axis is logarithmic
 _BINS = 24
-_SLIGHT = 1e-6  #: share of a curve's largest element: nothing is said relative to less
+_SLIGHT = 1e-6  #: share of a curve's largest element; no ratio to a smaller median is drawn
 _ALONG = 200  #: signals of a photon-transfer curve
 
 
 @drawn
 def tornado(swings: Mapping[str, Sequence[tuple[str, float, float]]], middles: Mapping[str, float]) -> Any:
-    """Draw for each number how far an input alone moves it: (input, at its 5 %, at its 95 %), the widest on top."""
+    """Draw a tornado diagram of each number: its value with one input at 5 % and at 95 %, the widest bar on top."""
     columns = min(2, len(swings))
     rows = -(-len(swings) // columns)
     most = max(map(len, swings.values()))
@@ -55,9 +51,9 @@ def _bars(ax: Any, bars: Sequence[tuple[str, float, float]], middle: float) -> N
 
 @drawn
 def bands(curves: Mapping[str, tuple[FloatArray, Mapping[str, FloatArray]]], axis: str) -> Any:
-    """Draw the middle 90 % of each family of curves; below, the same over the median.
+    """Draw the middle 90 % of each family of curves, and below the same band relative to the median.
 
-    A family is the abscissa and the draws (draw, element) by name.
+    A family is its abscissa and its draws (draw, element) by name.
     """
     figure, axes = canvas(5.6 * len(curves), 5.4, 2, len(curves), sharex="col", height_ratios=[2, 1])
     for (ax, below), (family, (x, members)) in zip(axes.T, curves.items(), strict=True):
@@ -75,7 +71,7 @@ def bands(curves: Mapping[str, tuple[FloatArray, Mapping[str, FloatArray]]], axi
 
 @drawn
 def transfer(draws: FloatArray) -> Any:
-    """Draw the photon-transfer curve of (draw, level, signal | variance | predicted): deviation over signal, in DN."""
+    """Draw photon-transfer curves in DN; ``draws`` is an array (draw, level, signal | variance | predicted)."""
     figure, axes = canvas(6.6, 5.8, 2, 1, sharex=True, height_ratios=[2, 1])
     ax, below = axes[:, 0]
     for column, colour, name in ((2, BLUE, "predicted"), (1, ORANGE, "flat fields")):
@@ -91,7 +87,7 @@ def transfer(draws: FloatArray) -> Any:
 
 
 def _band(ax: Any, below: Any, x: FloatArray, draws: FloatArray, colour: str, name: str) -> None:
-    """Draw median and middle 90 %; below, the same over the median, where the median is not next to nothing."""
+    """Draw the median and the middle 90 % of the draws, and below the same band relative to the median."""
     low, middle, up = np.quantile(draws, [0.05, 0.5, 0.95], axis=0)
     ax.fill_between(x, low, up, color=colour, alpha=0.35, linewidth=0, label=name)
     ax.plot(x, middle, color=colour, linewidth=1.0)
@@ -101,7 +97,7 @@ def _band(ax: Any, below: Any, x: FloatArray, draws: FloatArray, colour: str, na
 
 
 def _at_one_signal(draws: FloatArray, column: int) -> tuple[FloatArray, FloatArray]:
-    """Return each draw's curve at the same signals, which all draws reach; the levels of each draw differ."""
+    """Return signals that all draws reach, and the curve of each draw interpolated at these signals."""
     lit = draws[:, 1:]
     ends = float(lit[..., 0].clip(1e-9).min(1).max()), float(lit[..., 0].max(1).min())
     signal = np.geomspace(*ends, _ALONG)
@@ -114,7 +110,7 @@ def _at_one_signal(draws: FloatArray, column: int) -> tuple[FloatArray, FloatArr
 
 @drawn
 def histograms(draws: Mapping[str, FloatArray], middles: Mapping[str, float]) -> Any:
-    """Draw every number over all draws; the line is the number with all inputs at their median."""
+    """Draw a histogram of each number over all draws, and a line at its value with all inputs at their median."""
     columns = min(3, len(draws))
     rows = -(-len(draws) // columns)
     figure, axes = canvas(3.6 * columns, 2.5 * rows, rows, columns)
@@ -133,7 +129,7 @@ def histograms(draws: Mapping[str, FloatArray], middles: Mapping[str, float]) ->
 
 @drawn
 def pictures(found: Mapping[str, tuple[Tensor, Tensor]]) -> Any:
-    """Draw mean and standard deviation, pixel by pixel; for three channels the mean of the three deviations."""
+    """Draw the mean and the standard deviation of each picture; the deviation is averaged over the channels."""
     figure, axes = canvas(9.6, 4.2 * len(found), len(found), 2)
     for (left, right), (name, (mean, sd)) in zip(axes, found.items(), strict=True):
         white = high(mean.clamp_min(0))

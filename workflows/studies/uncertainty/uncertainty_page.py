@@ -1,107 +1,146 @@
-"""The page of the study of uncertainty."""
+"""The result of the study of uncertainty, and its page: sections, pictures and lead."""
 
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from typing import TYPE_CHECKING, Any
+from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
+from torch import Tensor
 
 from neusee.workflows.engine.runner import run
+from neusee.workflows.recipe.distributions.uncertain_inputs import InputDraws, Inputs
 from neusee.workflows.report.contents import BANDS
 from neusee.workflows.report.study_page import Mark, Section
 from neusee.workflows.studies.uncertainty import uncertainty_figures as figures
-from neusee.workflows.studies.uncertainty.sobol_indices import EXPLAINED
+from neusee.workflows.studies.uncertainty.scatter_estimate import FloatArray, Scatter, worst_known
+from neusee.workflows.studies.uncertainty.sobol_indices import EXPLAINED, SobolIndices
 
-if TYPE_CHECKING:
-    from numpy.typing import NDArray
-
-    from neusee.workflows.studies.uncertainty.uncertainty_result import UncertaintyResult
-
-    FloatArray = NDArray[np.float64]
-
-_MOST = 12  #: numbers that are drawn
-_LITTLE = 0.01  #: share of a variance that is not worth a row
+_MOST = 12  #: numbers in the pictures and in the lead
+_LITTLE = 0.01  #: share of a variance; inputs with a smaller share have no row
 _TRANSFER = "sensor.photon_transfer"
-_NOT_TOLD = {"upper": "only an upper limit", "lower": "only a lower limit", "none": "nothing"}
+_CONSTRAINT = {"upper": "only an upper limit", "lower": "only a lower limit", "none": "nothing"}
 
 
-def draw_pictures(found: UncertaintyResult) -> dict[str, bytes]:
-    """Return the pictures, by name."""
+@dataclass(frozen=True)
+class UncertaintyResult:
+    """The draws of all inputs, and the values and statistics of each quantity."""
+
+    inputs: Inputs
+    points: InputDraws  #: the used draws
+    values: Mapping[str, FloatArray]  #: by quantity (draw, element)
+    scatter: Mapping[str, Scatter]
+    middle: Mapping[str, Sequence[float]]  #: by quantity, with every input at its median
+    swings: Mapping[str, Sequence[tuple[str, float, float]]]  #: by number: input, at its 5 %, at its 95 %
+    shares: Mapping[str, SobolIndices]  #: by number
+    pictures: Mapping[str, tuple[Tensor, Tensor]]  #: mean and standard deviation by output
+    is_constant: tuple[str, ...]  #: outputs that depend on no input
+    wanted: float  #: the requested relative error
+    sequences: int  #: number of Sobol sequences; 0 for independent draws
+
+    @property
+    def error(self) -> float:
+        """Return the greatest relative error of a standard deviation."""
+        return worst_known(self.scatter)[1]
+
+    @property
+    def worst(self) -> str:
+        """Return the quantity whose standard deviation has the greatest relative error."""
+        return worst_known(self.scatter)[0]
+
+    @property
+    def strange(self) -> list[str]:
+        """Return the quantities that are not finite in some draw."""
+        return [name for name, x in self.values.items() if not np.isfinite(x).all()]
+
+    @property
+    def failed(self) -> int:
+        """Return the number of quantities that are not finite, plus one if the requested error is exceeded."""
+        return len(self.strange) + (not self.error <= self.wanted)
+
+    @property
+    def input_rows(self) -> list[dict[str, Any]]:
+        """Return the name, label, distribution, mean and standard deviation of each input."""
+        rows = []
+        for name, label, x in zip(self.inputs.names, self.inputs.labels, self.points.values.T, strict=True):
+            row = {"name": name, "label": label, "law": self.inputs.uncertain.said(name)}
+            rows.append({**row, "mean": float(x.mean()), "sd": float(x.std(ddof=1))})
+        return rows
+
+    @property
+    def numbers(self) -> list[str]:
+        """Return the varying quantities of one element, without quantities that are proportional to another one."""
+        return list(self.swings)
+
+
+def draw_pictures(result: UncertaintyResult) -> dict[str, bytes]:
+    """Return the pictures of the page as PNG, by name."""
     shown = {}
-    numbers = found.numbers[:_MOST]
+    numbers = result.numbers[:_MOST]
     if numbers:
-        middle = {name: found.middle[name][0] for name in numbers}
-        shown["tornado"] = figures.tornado({name: found.swings[name] for name in numbers}, middle)
-        shown["numbers"] = figures.histograms({name: found.values[name][:, 0] for name in numbers}, middle)
-    if curves := _curves(found):
+        middle = {name: result.middle[name][0] for name in numbers}
+        shown["tornado"] = figures.tornado({name: result.swings[name] for name in numbers}, middle)
+        shown["numbers"] = figures.histograms({name: result.values[name][:, 0] for name in numbers}, middle)
+    if curves := _curves(result):
         shown["bands"] = figures.bands(*curves)
-    for name, values in found.values.items():
-        if _node(found, name) == _TRANSFER and np.isfinite(values).all():
+    for name, values in result.values.items():
+        if _node_of(result, name) == _TRANSFER and np.isfinite(values).all():
             shown["transfer"] = figures.transfer(values.reshape(len(values), -1, 3))
-    if found.pictures:
-        shown["pictures"] = figures.pictures(found.pictures)
+    if result.pictures:
+        shown["pictures"] = figures.pictures(result.pictures)
     return shown
 
 
-def _curves(found: UncertaintyResult) -> tuple[dict[str, tuple[FloatArray, dict[str, FloatArray]]], str] | None:
-    """Return families of curves, such as that of both arms, by the name of their step."""
-    wavelengths = _wavelengths(found)
+def _curves(result: UncertaintyResult) -> tuple[dict[str, tuple[FloatArray, dict[str, FloatArray]]], str] | None:
+    """Return the abscissa and the draws of each varying curve, by its step, and the name of the abscissa."""
+    wavelengths = _wavelengths_nm(result)
     curves: dict[str, tuple[FloatArray, dict[str, FloatArray]]] = {}
     spectral = True
-    for name, values in found.values.items():
+    for name, values in result.values.items():
         count = values.shape[1]
-        if (
-            count < 3
-            or found.scatter[name].is_constant
-            or _node(found, name) == _TRANSFER
-            or not np.isfinite(values).all()
-        ):
+        known = np.isfinite(values).all() and not result.scatter[name].is_constant
+        if count < 3 or not known or _node_of(result, name) == _TRANSFER:
             continue
-        here = wavelengths is not None and len(wavelengths) == count
-        spectral &= here
-        x = wavelengths if here and wavelengths is not None else np.arange(count, dtype=np.float64)
+        over_bands = len(wavelengths) == count
+        spectral &= over_bands
+        x = wavelengths if over_bands else np.arange(count, dtype=np.float64)
         family, _, arm = name.partition("[")
         curves.setdefault(family, (x, {}))[1][arm.rstrip("]") or family] = values
     return (curves, "wavelength (nm)" if spectral else "element") if curves else None
 
 
-def _wavelengths(found: UncertaintyResult) -> FloatArray | None:
-    recipe = found.inputs.recipe
+def _wavelengths_nm(result: UncertaintyResult) -> FloatArray:
+    recipe = result.inputs.recipe
     if BANDS not in recipe.steps:
-        return None
+        return np.zeros(0)
     centres: FloatArray = run(recipe, None, [BANDS])[BANDS].centres.double().numpy()
     return centres * 1e9
 
 
-def _node(found: UncertaintyResult, quantity: str) -> str:
-    steps = found.inputs.recipe.steps
+def _node_of(result: UncertaintyResult, quantity: str) -> str:
+    steps = result.inputs.recipe.steps
     name = quantity if quantity in steps else quantity.rpartition(".")[0]
     return steps[name].node.path if name in steps else ""
 
 
-def lead(found: UncertaintyResult) -> str:
-    """Return the result in a few sentences."""
-    count, kind = len(found.points.z), "points of Sobol" if found.sequences else "independent draws"
-    held = f"every standard deviation is known to {found.error:.1%}"
-    if found.error > found.wanted:
-        held = (
-            f"the standard deviation of {found.worst} is known to {found.error:.1%} only, {found.wanted:.1%} was asked"
-        )
-    values = [f"{name} {_beside(found, name)}" for name in found.numbers[:_MOST]]
-    strange = f" Not finite in some draw: {', '.join(found.strange)}." if found.strange else ""
-    return f"{count} {kind} of {', '.join(found.inputs.names)}: {held}.{strange}\n\n{'; '.join(values)}."
+def lead(result: UncertaintyResult) -> str:
+    """Return the result of the study in a few sentences."""
+    count, kind = len(result.points.z), "points of Sobol" if result.sequences else "independent draws"
+    known = f"every standard deviation is known to {result.error:.1%}"
+    if result.error > result.wanted:
+        known = f"the standard deviation of {result.worst} is known to {result.error:.1%} only"
+        known += f", {result.wanted:.1%} was asked"
+    numbers = {name: result.scatter[name] for name in result.numbers[:_MOST]}
+    values = [f"{name} {float(s.mean[0]):.5g} ± {float(s.sd[0]):.2g}" for name, s in numbers.items()]
+    strange = f" Not finite in some draw: {', '.join(result.strange)}." if result.strange else ""
+    return f"{count} {kind} of {', '.join(result.inputs.names)}: {known}.{strange}\n\n{'; '.join(values)}."
 
 
-def _beside(found: UncertaintyResult, name: str) -> str:
-    s = found.scatter[name]
-    return f"{float(s.mean[0]):.5g} ± {float(s.sd[0]):.2g}"
-
-
-def sections(found: UncertaintyResult, shown: Mapping[str, bytes]) -> list[Section]:
-    """Return the parts of the page: inputs, numbers, what moves them, curves, pictures, and what is constant."""
-    parts = [_inputs(found), *_posterior(found), _numbers(found, shown.get("numbers"))]
-    parts += _moves(found, shown.get("tornado"))
+def sections(result: UncertaintyResult, shown: Mapping[str, bytes]) -> list[Section]:
+    """Return the sections of the page; ``shown`` has the pictures by name."""
+    parts = [_inputs(result), *_posterior(result), _numbers(result, shown.get("numbers"))]
+    parts += _moves(result, shown.get("tornado"))
     if "bands" in shown:
         text = "The middle 90 % of the draws, element by element."
         parts.append(Section("Curves", text, picture=shown["bands"]))
@@ -114,29 +153,26 @@ def sections(found: UncertaintyResult, shown: Mapping[str, bytes]) -> list[Secti
         text = """Mean and standard deviation of each pixel over the first 32 draws, the deviation known to 13 %. The
             noise is the same in all draws, so only the inputs matter; pictures.npz has the numbers."""
         parts.append(Section("Pictures", text, picture=shown["pictures"]))
-    return [*parts, *_rest(found)]
+    return [*parts, *_rest(result)]
 
 
-def _inputs(found: UncertaintyResult) -> Section:
+def _inputs(result: UncertaintyResult) -> Section:
     text = """The drawn values, in SI. In a joint distribution the first value moves together with the others as far as
         they correlate, and each further one by what is left of it, so that all inputs are independent. The same noise
         is drawn every time, so that only the inputs make a difference."""
-    rows = []
-    for name, label, x in zip(found.inputs.names, found.inputs.labels, found.points.values.T, strict=True):
-        law = found.inputs.uncertain.said(name)
-        rows.append((name, label, law, f"{x.mean():.6g}", float(x.std(ddof=1))))
+    rows = [(r["name"], r["label"], r["law"], f"{r['mean']:.6g}", r["sd"]) for r in result.input_rows]
     return Section("Inputs", text, ("value", "drawn as", "law", "mean", "sd"), rows)
 
 
-def _posterior(found: UncertaintyResult) -> list[Section]:
-    standings = [s for s in found.inputs.uncertain.standings if s.path in found.inputs.names]
+def _posterior(result: UncertaintyResult) -> list[Section]:
+    standings = [s for s in result.inputs.uncertain.standings if s.path in result.inputs.names]
     if not standings:
         return []
     text = """Where the recipe's own value lies in the posterior. A value that the frames only limit, or do not
         determine, is drawn mostly from the prior of the calibration."""
     rows, marks = [], dict[tuple[int, int], Mark]()
     for i, s in enumerate(standings):
-        rows.append((s.path, s.own, f"{s.mean:.6g}", s.sd, s.below, _NOT_TOLD.get(s.kind, "estimate")))
+        rows.append((s.path, s.own, f"{s.mean:.6g}", s.sd, s.below, _CONSTRAINT.get(s.kind, "estimate")))
         if s.kind == "estimate":
             marks[i, 4] = "warn" if s.far else "pass"
         else:
@@ -145,26 +181,21 @@ def _posterior(found: UncertaintyResult) -> list[Section]:
     return [Section("The recipe beside its posterior", text, columns, rows, marks=marks)]
 
 
-def _numbers(found: UncertaintyResult, picture: bytes | None) -> Section:
-    text = f"""Error: of the standard deviation, relative, {_how(found)}. Of a curve, the worst element."""
+def _numbers(result: UncertaintyResult, picture: bytes | None) -> Section:
+    how = f"by how {result.sequences} scrambled sequences differ" if result.sequences else "by the jackknife"
+    text = f"Error: of the standard deviation, relative, {how}. Of a curve, the worst element."
     columns = ("quantity", "at the medians", "mean", "sd", "error", "5 %", "95 %")
     rows, marks = list[Sequence[Any]](), dict[tuple[int, int], Mark]()
-    for name, s in found.scatter.items():
+    for name, s in result.scatter.items():
         i = int(s.sd.argmax())
         label = name if len(s.sd) == 1 else f"{name}, element {i}"
-        numbers = (f"{found.middle[name][i]:.6g}", f"{s.mean[i]:.6g}", float(s.sd[i]))
-        marks[len(rows), 4] = "pass" if s.error <= found.wanted and name not in found.strange else "fail"
+        numbers = (f"{result.middle[name][i]:.6g}", f"{s.mean[i]:.6g}", float(s.sd[i]))
+        marks[len(rows), 4] = "pass" if s.error <= result.wanted and name not in result.strange else "fail"
         rows.append((label, *numbers, f"{s.error:.1%}", f"{s.low[i]:.6g}", f"{s.high[i]:.6g}"))
     return Section("Numbers", text, columns, rows, picture, marks)
 
 
-def _how(found: UncertaintyResult) -> str:
-    if found.sequences:
-        return f"by how {found.sequences} scrambled sequences differ"
-    return "by the jackknife"
-
-
-def _moves(found: UncertaintyResult, picture: bytes | None) -> list[Section]:
+def _moves(result: UncertaintyResult, picture: bytes | None) -> list[Section]:
     if picture is None:
         return []
     text = f"""Each input by itself at its 5 and its 95 %, all others at their median. The table: shares of the variance
@@ -175,20 +206,24 @@ def _moves(found: UncertaintyResult, picture: bytes | None) -> list[Section]:
     columns = ("quantity", "input", "first", "±", "total", "±", "explained")
     rows: list[Sequence[Any]] = []
     marks: dict[tuple[int, int], Mark] = {}
-    for name, shares in found.shares.items():
+    for name, shares in result.shares.items():
         before = len(rows)
-        each = zip(found.inputs.labels, shares.first, shares.first_error, shares.total, shares.total_error, strict=True)
-        for label, first, about, total, beside in each:
-            share, error = (total, beside) if shares.explains_enough else (first, about)
+        first = zip(shares.first, shares.first_error, strict=True)
+        total = zip(shares.total, shares.total_error, strict=True)
+        for label, alone, together in zip(result.inputs.labels, first, total, strict=True):
+            share, error = together if shares.explains_enough else alone
             if share > max(_LITTLE, error / 2):
-                both = (total, beside) if shares.explains_enough else (None, None)
-                rows.append((name, label, first, about, *both, shares.explained))
+                shown = together if shares.explains_enough else (None, None)
+                rows.append((name, label, *alone, *shown, shares.explained))
         if len(rows) > before and not shares.explains_enough:
             marks[before, 6] = "warn"
     return [Section("What moves them", text, columns, rows, picture, marks)]
 
 
-def _rest(found: UncertaintyResult) -> list[Section]:
-    said = [f"No input reaches {', '.join(found.is_constant)}: these are as in a run."] if found.is_constant else []
-    said += [f"{', '.join(found.inputs.idle)} reach no output, and were not drawn."] if found.inputs.idle else []
-    return [Section("What does not vary", "\n\n".join(said))] if said else []
+def _rest(result: UncertaintyResult) -> list[Section]:
+    sentences = (
+        [f"No input reaches {', '.join(result.is_constant)}: these are as in a run."] if result.is_constant else []
+    )
+    if result.inputs.idle:
+        sentences.append(f"{', '.join(result.inputs.idle)} reach no output, and were not drawn.")
+    return [Section("What does not vary", "\n\n".join(sentences))] if sentences else []

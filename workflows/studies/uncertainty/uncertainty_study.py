@@ -1,4 +1,4 @@
-"""The study of uncertainty: how far a recipe's outputs scatter when its uncertain values do."""
+"""The study of uncertainty: the scatter of a recipe's outputs over its uncertain input values."""
 
 from __future__ import annotations
 
@@ -6,7 +6,7 @@ import io
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 
@@ -18,18 +18,13 @@ from neusee.workflows.recipe.distributions.uncertain_inputs import SCRAMBLES, In
 from neusee.workflows.report.study_folder import Content, Progress, StudyReport, StudyRun
 from neusee.workflows.store.result_store import Store
 from neusee.workflows.studies.uncertainty.output_draws import Numbers, OutputDraws
-from neusee.workflows.studies.uncertainty.scatter_estimate import Scatter, scatter, worst_known
+from neusee.workflows.studies.uncertainty.scatter_estimate import FloatArray, Scatter, scatter, worst_known
 from neusee.workflows.studies.uncertainty.sobol_indices import indices, require_salib
-from neusee.workflows.studies.uncertainty.uncertainty_result import UncertaintyResult
+from neusee.workflows.studies.uncertainty.uncertainty_page import UncertaintyResult, draw_pictures, lead, sections
 
-if TYPE_CHECKING:
-    from numpy.typing import NDArray
-
-    FloatArray = NDArray[np.float64]
-
-LEAST = 64  #: draws before any stop
-_ROUND = 16  #: independent draws by round
-PICTURED = 32  #: draws that pictures are made of: a deviation to 13 %
+LEAST = 64  #: draws before the first decision to stop
+_ROUND = 16  #: independent draws in each further round
+PICTURED = 32  #: draws for the mean and deviation of pictures; the deviation is known to 13 %
 _COLUMNS = ("quantity", "element", "at the medians", "mean", "sd", "5 %", "95 %")
 
 
@@ -45,10 +40,9 @@ def study(
     workers: int = 0,
     device: str = "cpu",
 ) -> Path:
-    """Draw until every standard deviation is known to a relative ``error``, or ``most`` draws are made.
+    """Draw inputs until every standard deviation is known to a relative ``error``, but at most ``most`` times.
 
-    ``workers`` draws are made at once; 0 means one for each core of the CPU. Another ``device`` makes one after
-    another.
+    On the CPU, ``workers`` draws are computed at once; 0 means one for each core.
     """
     study_run = StudyRun("uncertainty", recipe, command)
     require_salib()
@@ -56,9 +50,9 @@ def study(
     at = _points(inputs, recipe.seed, most, points)
     inputs.checked(np.concatenate([at.values, _ends(inputs)]))
     draws = OutputDraws(inputs, store, device, workers)
-    found = _measure(inputs, draws, at, progress, error, SCRAMBLES if points == "sobol" else 0)
-    document = study_run.document(_document(found, draws))
-    return study_run.write(runs, digest(document["quantities"]), document, _report(found))
+    result = _measure(inputs, draws, at, progress, error, SCRAMBLES if points == "sobol" else 0)
+    document = study_run.document(_document(result, draws))
+    return study_run.write(runs, digest(document["quantities"]), document, _report(result))
 
 
 def _points(inputs: Inputs, seed: int, most: int, points: str) -> InputDraws:
@@ -68,7 +62,7 @@ def _points(inputs: Inputs, seed: int, most: int, points: str) -> InputDraws:
 
 
 def _ends(inputs: Inputs) -> FloatArray:
-    """Return all inputs at their median, and each one by itself at its 5 % and at its 95 %."""
+    """Return the inputs for one run at all medians, and for two runs of each input at its 5 % and its 95 %."""
     count = len(inputs.names)
     z = np.concatenate([np.zeros((1, count)), *(np.stack([-Z_90 * e, Z_90 * e]) for e in np.eye(count))])
     return inputs.at(z)
@@ -77,18 +71,17 @@ def _ends(inputs: Inputs) -> FloatArray:
 def _measure(
     inputs: Inputs, draws: OutputDraws, at: InputDraws, progress: Progress, wanted: float, sequences: int
 ) -> UncertaintyResult:
-    names = ", ".join(inputs.names)
-    progress(f"{len(inputs.names)} inputs: {names}; {len(draws.outputs)} outputs depend on them")
-    seconds = draws.ready()
-    progress(f"steps that no input reaches: {seconds:.1f} s")
-    pictures = draws.pictures(at.values[: min(PICTURED, len(at.values))])
+    progress(f"{len(inputs.names)} inputs: {', '.join(inputs.names)}; {len(draws.outputs)} outputs depend on them")
+    progress(f"steps that no input reaches: {draws.ready():.1f} s")
+    pictures = draws.pictures(at.values[:PICTURED])
     ends = draws.numbers(_ends(inputs))
     if not ends[0]:
         raise ValueError("the outputs are pictures only: ask for a number too, such as saturated or restored_quality")
     numbers: list[Numbers] = []
     used = 0
     while used < len(at.values):
-        used = _next(used, len(at.values), sequences)
+        # points of Sobol are even only after a power of two
+        used = min(len(at.values), max(LEAST, 2 * used if sequences else used + _ROUND))
         numbers += draws.numbers(at.values[len(numbers) : used])
         values = {name: np.array([n[name] for n in numbers]) for name in ends[0]}
         scattered = {name: scatter(x, sequences) for name, x in values.items()}
@@ -103,29 +96,22 @@ def _measure(
     return UncertaintyResult(inputs, InputDraws(z, at.values[:used]), values, scattered, middle, swings, shares, *rest)
 
 
-def _next(used: int, most: int, sequences: int) -> int:
-    """Return the next number of draws; points of Sobol are even only after a power of two."""
-    more = max(LEAST, 2 * used) if sequences else max(LEAST, used + _ROUND)
-    return min(more, most)
-
-
 def _swings(
     inputs: Inputs, ends: Sequence[Numbers], values: Mapping[str, FloatArray], scattered: Mapping[str, Scatter]
 ) -> dict[str, list[tuple[str, float, float]]]:
+    """Return each number's values with one input at its 5 % and at its 95 %; skip numbers proportional to another."""
     found: dict[str, list[tuple[str, float, float]]] = {}
     for name, x in values.items():
         known = np.isfinite(x).all() and np.isfinite([end[name] for end in ends]).all()
         if x.shape[1] > 1 or scattered[name].is_constant or not known:
             continue
-        if not any(_one_is_the_other(x[:, 0], values[other][:, 0]) for other in found):
-            pairs = zip(ends[1::2], ends[2::2], strict=True)
-            each = zip(inputs.labels, pairs, strict=True)
-            found[name] = [(label, low[name][0], high[name][0]) for label, (low, high) in each]
+        if not any(_proportional(x[:, 0], values[other][:, 0]) for other in found):
+            each = zip(inputs.labels, ends[1::2], ends[2::2], strict=True)
+            found[name] = [(label, low[name][0], high[name][0]) for label, low, high in each]
     return found
 
 
-def _one_is_the_other(x: FloatArray, y: FloatArray) -> bool:
-    """Return True if two numbers are proportional in every draw, such as pixels and their share of all."""
+def _proportional(x: FloatArray, y: FloatArray) -> bool:
     at = int(np.abs(y).argmax())
     return y[at] != 0 and bool(np.allclose(x * y[at], y * x[at], rtol=1e-9, atol=0.0))
 
@@ -133,80 +119,59 @@ def _one_is_the_other(x: FloatArray, y: FloatArray) -> bool:
 # --- the folder -------------------------------------------------------------------------------------------------------
 
 
-def _document(found: UncertaintyResult, draws: OutputDraws) -> dict[str, Any]:
-    """Return what the folder says of the study, beside what every study says."""
-    computed, spent = draws.computed, draws.seconds
+def _document(result: UncertaintyResult, draws: OutputDraws) -> dict[str, Any]:
     return {
-        "draws": len(found.points.z),
-        "points": "sobol" if found.sequences else "draws",
-        "computed": computed,
-        "seconds a draw": spent / computed if computed else None,
-        "failed": found.failed,
-        "error": found.error,
-        "wanted": found.wanted,
-        "inputs": _inputs(found),
-        "posterior": told(found.inputs.uncertain.standings),
-        "idle": list(found.inputs.idle),
-        "still": list(found.is_constant),
-        "quantities": {name: _plain(found, name) for name in found.values},
-        "sensitivity": {name: asdict(shares) for name, shares in found.shares.items()},
+        "draws": len(result.points.z),
+        "points": "sobol" if result.sequences else "draws",
+        "computed": draws.computed,
+        "seconds a draw": draws.seconds / draws.computed if draws.computed else None,
+        "failed": result.failed,
+        "error": result.error,
+        "wanted": result.wanted,
+        "inputs": result.input_rows,
+        "posterior": told(result.inputs.uncertain.standings),
+        "idle": list(result.inputs.idle),
+        "still": list(result.is_constant),
+        "quantities": {name: _plain(result, name) for name in result.values},
+        "sensitivity": {name: asdict(shares) for name, shares in result.shares.items()},
     }
 
 
-def _inputs(found: UncertaintyResult) -> list[dict[str, Any]]:
-    inputs, values = found.inputs, found.points.values
-    return [
-        {
-            "name": name,
-            "label": label,
-            "law": inputs.uncertain.said(name),
-            "mean": float(x.mean()),
-            "sd": float(x.std(ddof=1)),
-        }
-        for name, label, x in zip(inputs.names, inputs.labels, values.T, strict=True)
-    ]
-
-
-def _plain(found: UncertaintyResult, name: str) -> dict[str, Any]:
-    s = found.scatter[name]
+def _plain(result: UncertaintyResult, name: str) -> dict[str, Any]:
+    s = result.scatter[name]
     arrays = {"mean": s.mean, "sd": s.sd, "low": s.low, "high": s.high}
-    return {"error": s.error, "middle": list(found.middle[name]), **{k: x.tolist() for k, x in arrays.items()}}
+    return {"error": s.error, "middle": list(result.middle[name]), **{k: x.tolist() for k, x in arrays.items()}}
 
 
-def _report(found: UncertaintyResult) -> StudyReport:
-    from neusee.workflows.studies.uncertainty.uncertainty_page import draw_pictures, lead, sections
-
-    pictures = draw_pictures(found)
-    files: dict[str, Content] = {"draws.npz": _arrays(found)}
-    if found.pictures:
-        files["pictures.npz"] = _packed({f"{n} {part}": x.numpy() for n, both in found.pictures.items()
-                                         for part, x in zip(("mean", "sd"), both, strict=True)})  # fmt: skip
+def _report(result: UncertaintyResult) -> StudyReport:
+    pictures = draw_pictures(result)
+    draws = zip(result.inputs.names, result.points.values.T, strict=True)
+    files: dict[str, Content] = {"draws.npz": _npz({**dict(draws), **result.values})}
+    arrays: dict[str, Any] = {}
+    for name, (mean, sd) in result.pictures.items():
+        arrays |= {f"{name} mean": mean.numpy(), f"{name} sd": sd.numpy()}
+    if arrays:
+        files["pictures.npz"] = _npz(arrays)
     return StudyReport(
-        f"{found.inputs.recipe.name}: how certain it is",
-        lead(found),
-        sections(found, pictures),
+        f"{result.inputs.recipe.name}: how certain it is",
+        lead(result),
+        sections(result, pictures),
         pictures,
-        tables={"table.csv": (_COLUMNS, _rows(found))},
+        tables={"table.csv": (_COLUMNS, _rows(result))},
         files=files,
         shown=("command", "date", "seconds", "draws", "computed", "seconds a draw", "versions"),
     )
 
 
-def _rows(found: UncertaintyResult) -> list[Sequence[Any]]:
+def _rows(result: UncertaintyResult) -> list[Sequence[Any]]:
     rows: list[Sequence[Any]] = []
-    for name, s in found.scatter.items():
-        columns = zip(found.middle[name], s.mean, s.sd, s.low, s.high, strict=True)
+    for name, s in result.scatter.items():
+        columns = zip(result.middle[name], s.mean, s.sd, s.low, s.high, strict=True)
         rows += [(name, i if len(s.mean) > 1 else "", *row) for i, row in enumerate(columns)]
     return rows
 
 
-def _arrays(found: UncertaintyResult) -> bytes:
-    """Return inputs and quantities by name, draw by draw, as the bytes of an npz file."""
-    columns = dict(zip(found.inputs.names, found.points.values.T, strict=True))
-    return _packed({**columns, **found.values})
-
-
-def _packed(arrays: Mapping[str, Any]) -> bytes:
+def _npz(arrays: Mapping[str, Any]) -> bytes:
     out = io.BytesIO()
     np.savez(out, **arrays)
     return out.getvalue()

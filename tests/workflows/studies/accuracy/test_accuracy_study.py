@@ -228,11 +228,11 @@ def test_steps_that_matter_are_the_slowest_items(recipe):
 
 def test_a_step_is_tried_in_its_forms_against_its_reference(nodes, recipe, store):
     found = try_step(recipe, "cube", 0.5, store, patience=10.0)
-    errors = {(form.line, form.label): form.error for form in found.forms}
+    errors = {(form.line, form.label): form.error for form in found.variants}
     assert 0 < errors["as used", ""] < 1e-7
     assert errors["precision", "double"] == 0
     assert ("window of the PSF", "0.5") not in errors  # its result has another shape
-    assert all(form.seconds >= 0.01 for form in found.forms)
+    assert all(form.seconds >= 0.01 for form in found.variants)
     assert found.found.cut_inputs == ""
     nodes.CALLS.clear()
     assert try_step(recipe, "cube", 0.5, store, patience=10.0) == found
@@ -276,7 +276,7 @@ def test_a_study_that_was_stopped_goes_on_and_writes_its_folder(nodes, recipe, s
     points = len(list(trials(recipe, knobs(recipe, True), True)))
     words = [line.partition(" ")[0] for line in lines]
     assert words[: points + 3] == [str(points), *(f"{i + 1}/{points}" for i in range(points)), "timed", "timed"]
-    assert "step cube: 2 forms" in lines
+    assert "step cube: 2 variants" in lines
     _look_at(folder)
 
 

@@ -193,7 +193,7 @@ def test_ranks_count_from_none_to_all(tmp_path):
 
 
 def test_without_any_posterior_there_is_no_verdict():
-    with pytest.raises(ValueError, match="no simulation has a posterior; the first: too dark"):
+    with pytest.raises(ValueError, match="no simulation has a posterior; reason of the first simulation: too dark"):
         rank_tests([SensorSimulation({"a": 1.0}, refused="too dark")])
 
 

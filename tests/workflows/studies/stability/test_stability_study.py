@@ -171,7 +171,7 @@ def test_what_is_stated_counts_only_as_long_as_the_docstring_states_it(monkeypat
     ],
 )
 def test_what_holds_by_less_than_twice_warns(error, slope, mark):
-    cell = case_result._verdict(error, 1.0, slope, 4.0)
+    cell = case_result._marked(error, 1.0, slope, 4.0)
     assert cell.mark == mark
     assert (cell.bound, cell.slope_bound) == (1.0, None if slope is None else 4.0)
     assert [cell.error, cell.slope] == pytest.approx([error, slope], nan_ok=True)
