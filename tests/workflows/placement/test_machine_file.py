@@ -131,7 +131,7 @@ ONE = "devices: {a: {kind: cpu, memory: 1 GB}}\n"
         ),
         (
             "devices: {a: {kind: cpu, memory: 1 GB, count: 4000, node: [x, y]}}",
-            "1:10 devices: are 8000; the maximum is 4096",
+            "1:10 devices: must be 4096 devices or fewer, not 8000",
         ),
         (
             "devices: {a: {kind: cpu, memory: true}}",
