@@ -25,12 +25,12 @@ __all__ = ["Cluster", "Device", "Link", "Schedule", "Slot", "Task", "TooLarge", 
 def heft(tasks: Sequence[Task], cluster: Cluster, keep: Collection[str] = ()) -> Schedule:
     """Return the HEFT schedule: tasks with the longest remaining path first, each on the device where it ends first.
 
-    ``keep`` names the results that are held to the end. Where memory is short, orders that hold less at
-    once are tried too. If one device alone would finish all tasks sooner, this device runs all tasks; tasks
-    that one device could run alone are never refused.
+    ``keep`` names the results that are held to the end. Where memory is short, orders that hold less at once are tried
+    too. If one device alone would finish all tasks sooner, this device runs all tasks; tasks that one device could run
+    alone are never refused.
 
-    Raises: `TooLarge` where no such plan fits, with the need of the plan that comes closest; ValueError
-    for tasks that no device runs, and for cyclic dependencies.
+    Raises: `TooLarge` where no such plan fits, with the need of the plan that comes closest; ValueError for tasks that
+    no device runs, and for cyclic dependencies.
     """
     graph = Graph(tasks, cluster, keep)
     if len(cluster.devices) == 1:

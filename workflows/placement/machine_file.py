@@ -7,9 +7,8 @@
       cuda-cuda: {bandwidth: 300 GB/s, latency: 5 us}
     network: {bandwidth: 25 GB/s, latency: 5 us}
 
-``speed`` is the ratio to the machine on which the costs were measured, for all nodes or by family of
-nodes. ``node: [a, b]`` puts a group of devices on each machine of these names; the network links the
-machines.
+``speed`` is the ratio to the machine on which the costs were measured, for all nodes or by family of nodes.
+``node: [a, b]`` puts a group of devices on each machine of these names; the network links the machines.
 """
 
 from __future__ import annotations

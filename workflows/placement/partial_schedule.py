@@ -27,7 +27,7 @@ class PartialSchedule:
         most = sum(graph.own) + max((graph.work(i, 1) for i in range(count)), default=0.0)
         sent = sum(max(0.0, math.ceil(s)) for t, sizes in enumerate(graph.sizes) for s in sizes if graph.tasks[t].takes)
         self.rooms = [MemoryProfile(d.memory) if bounded and d.memory < most + sent else None for d in devices]
-        self.links = [[graph.cluster.link(a.name, b.name) for b in devices] for a in devices]
+        self.links = [[graph.cluster.link(a.name, b.name) for b in devices] for a in devices]  # 0 s to itself
         self.least = [own + graph.work(i, graph.tasks[i].parts) for i, own in enumerate(graph.own)]
         self.copies: dict[Of, list[Copy]] = {}
         self.placed: list[int] = []
@@ -68,15 +68,12 @@ class PartialSchedule:
 
     def _ready(self, i: int, d: int) -> float:
         """Return the time at which the last input of task ``i`` can be on device ``d``."""
-        return max((self.end[j] + self._transfer(j, d, size) for j, size in self._inputs(i)), default=0.0)
+        end, where, links = self.end, self.where, self.links
+        return max((end[j] + links[where[j]][d].seconds(size) for j, size in self._inputs(i)), default=0.0)
 
     def _inputs(self, i: int) -> Iterator[tuple[int, float]]:
         """Yield each source of task ``i`` with the bytes that another device must send."""
         return zip(self.graph.sources[i], self.graph.sizes[i], strict=True)
-
-    def _transfer(self, j: int, d: int, size: float) -> float:
-        """Return the seconds for sending ``size`` bytes of the result of task ``j`` to device ``d``."""
-        return 0.0 if self.where[j] == d else self.links[self.where[j]][d].seconds(size)
 
     def _slot(self, i: int, d: int, ready: float, seconds: float, best: float) -> float:
         """Return the first start of task ``i`` in a gap of device ``d``, or infinity if it ends after ``best``."""
@@ -118,7 +115,7 @@ class PartialSchedule:
         """Yield each input from another device with the latest time at which the device must send the input."""
         for j, size in self._inputs(i):
             if self.where[j] != d:
-                yield (j, size, d), max(start - self._transfer(j, d, size), self.end[j])
+                yield (j, size, d), max(start - self.links[self.where[j]][d].seconds(size), self.end[j])
 
     def _needs(self, i: int, d: int) -> float:
         """Return the bytes that device ``d`` must have to run task ``i`` after all tasks placed before."""
@@ -237,7 +234,7 @@ class PartialSchedule:
         """Return the task that delayed task ``i``: a source, the previous task, or a task that freed memory."""
         start, d = self.start[i], self.where[i]
         for j, size in self._inputs(i):
-            if self.end[j] + self._transfer(j, d, size) == start:
+            if self.end[j] + self.links[self.where[j]][d].seconds(size) == start:
                 return j
         if start == 0.0 or (before >= 0 and self.end[before] == start):
             return before

@@ -63,10 +63,6 @@ class Cluster:
         pair = (one.kind, other.kind)
         return self.links.get(pair) or self.links.get((pair[1], pair[0])) or self.bus
 
-    def seconds(self, a: str, b: str, size: float) -> float:
-        """Return the seconds for sending ``size`` bytes from ``a`` to ``b``; 0 on the same device."""
-        return self.link(a, b).seconds(size)
-
     @cached_property
     def _by_name(self) -> dict[str, Device]:
         return {d.name: d for d in self.devices}
@@ -156,6 +152,5 @@ class TooLarge(ValueError):
 
 
 def _size(count: float) -> str:
-    """Return a number of bytes as text, also in GB from one million bytes."""
     exact = f"{count:,.0f} B"
     return exact if count < 1e6 else f"{exact} ({count / 1e9:.3g} GB)"

@@ -240,7 +240,6 @@ def _reserve(size: int) -> Any:
 
 
 def _map(file: int, address: int, size: int) -> None:
-    """Map the beginning of a file to an address inside a range that `_reserve` returned."""
     assert _LIBC is not None
     access = mmap.PROT_READ | mmap.PROT_WRITE
     if _LIBC.mmap(address, size, access, mmap.MAP_PRIVATE | _FIXED, file, 0) != address:

@@ -1,8 +1,8 @@
 """Eviction of values from a store beyond its budget: values that save the fewest seconds per byte go first.
 
-The weight of a value halves for every week between its last use and the newest use in the
-store, whatever today's date is. Pinned values stay. An evicted value leaves its receipt, so
-that its origin and its cost stay known; a process that reads the value at that moment keeps its map.
+The weight of a value halves for every week between its last use and the newest use in the store, whatever today's
+date is. Pinned values stay. The metadata of an evicted value stay as its receipt, so that origin and cost remain known;
+a process that reads the value at that moment keeps its memory map.
 """
 
 from __future__ import annotations

@@ -11,7 +11,6 @@ import json
 import os
 import re
 import threading
-from collections import defaultdict
 from collections.abc import Callable, Collection, Iterable, Iterator
 from contextlib import suppress
 from typing import Any
@@ -59,8 +58,7 @@ class Journal:
 
     def of_step(self, name: str) -> list[Row]:
         """Return the journal lines of the step ``name``, the newest line last."""
-        self._read()
-        return self._by_step.get(name, [])
+        return [row for row in self.rows() if row["step"] == name]
 
     def mark_evicted(self, keys: Collection[str]) -> None:
         """Record in the journal that the values of these keys are no longer stored."""
@@ -82,7 +80,6 @@ class Journal:
 
     def _forget(self) -> None:
         self._rows: list[Row] = []
-        self._by_step: dict[str, list[Row]] = defaultdict(list)
         self._head, self._offset, self._fileless = b"", 0, False
 
     def _read(self) -> None:
@@ -106,14 +103,9 @@ class Journal:
         if not _HEAD.fullmatch(head):
             return self._rebuild()
         self._head, self._offset = head, (self._offset or len(head)) + len(raw)
-        for row in _parsed(raw):
-            self._add(row)
+        self._rows += _parsed(raw)
         if len(self._rows) > _SPARE and len(self._rows) > 2 * len({row["key"] for row in self._rows}):
             self._replace(list({row["key"]: row for row in self._rows}.values()))
-
-    def _add(self, row: Row) -> None:
-        self._rows.append(row)
-        self._by_step[row["step"]].append(row)
 
     def _each(self) -> Iterator[tuple[str, Row]]:
         return itertools.chain(metadata.each(self._disk), self._others())
@@ -125,8 +117,7 @@ class Journal:
     def _replace(self, rows: list[Row]) -> None:
         """Replace the file by one with the lines ``rows``; a line that another process adds meanwhile may be lost."""
         self._forget()
-        for row in rows:
-            self._add(row)
+        self._rows = rows
         self._head = f'{{"journal":"{os.urandom(8).hex()}"}}'.encode()
         raw = b"".join([self._head, *(b"\n" + _encode(row).encode() for row in rows)])
         self._offset = len(raw)

@@ -1,12 +1,10 @@
 """Leases: only the process that holds the lease of a key computes the result of the key.
 
-A lease is a second hard link to the badge of a process, a file that names the process. Taking
-a lease is therefore one atomic step, and one heartbeat serves all leases of a process. On the
-same machine, an observer looks up the owner by process number and start time: after
-``kill -9`` the next process takes over at once. An owner on another machine must be seen to
-change its badge. The observer measures the time without a change by its own monotonic clock,
-so that no clock that jumps makes a live owner dead. A lease is advice: if two processes held
-the same lease, they would do the same work twice and do no other harm.
+A lease is a second hard link to the badge of a process, a file that names the process: one atomic step takes a lease,
+and one heartbeat serves all leases of a process. On the same machine, an observer looks up the owner by process number
+and start time, so that the next process takes over at once after ``kill -9``. An owner on another machine must change
+its badge in time. The observer measures this time by its own monotonic clock, so that no clock that jumps makes a live
+owner dead. A lease is advice: two processes with the same lease would do the same work twice and no other harm.
 """
 
 from __future__ import annotations

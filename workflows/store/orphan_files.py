@@ -91,6 +91,5 @@ def _damaged(disk: Disk) -> Iterator[os.DirEntry[str]]:
 
 
 def _age(entry: os.DirEntry[str]) -> float:
-    """Return the seconds since a file was last written or moved."""
     stat = entry.stat(follow_symlinks=False)
     return time.time() - max(stat.st_mtime, stat.st_ctime)

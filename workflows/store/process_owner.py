@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import hashlib
 import os
+from contextlib import suppress
 from dataclasses import dataclass
 from functools import cache
 from typing import Literal
@@ -63,12 +64,10 @@ def _me(pid: int) -> Owner:
 def host() -> str:
     """Return a digest of this machine and its present boot; two containers of the same name have different digests."""
     parts = [os.uname().nodename]
-    try:
+    with suppress(OSError):  # a system without these files
         with open("/proc/sys/kernel/random/boot_id") as file:
             parts.append(file.read())
         parts.append(str(os.stat("/proc/self/ns/pid").st_ino))
-    except OSError:
-        pass  # a system that gives neither number
     return hashlib.blake2b("\n".join(parts).encode(), digest_size=6).hexdigest()
 
 
@@ -83,9 +82,8 @@ def _process(pid: int) -> tuple[str, str]:
 
 def _signalled(pid: int) -> State:
     try:
-        os.kill(pid, 0)
+        with suppress(PermissionError):  # a process of another user
+            os.kill(pid, 0)
     except ProcessLookupError:
         return "dead"
-    except PermissionError:
-        pass  # a process of another user
     return "alive"

@@ -1,10 +1,9 @@
 """A store at a URL that many machines share, on any file system of fsspec, with a local folder in front.
 
-A value that is read is kept in the local folder (the local layer), an ordinary `Store`; a value that is
-written goes to both. At the remote, a payload carries its checksum in its name and is complete before
-the metadata that name the payload, so that two writers of one key cannot mix their halves.
-Leases, pins and the size budget belong to the local layer alone: two machines may compute the
-same key, and the first result stays. A remote that fails costs one warning; the run goes on
+A value that is read is kept in the local folder (the local layer), an ordinary `Store`; a value that is written goes to
+both. At the URL, a payload has its checksum in its name and is complete before the metadata that name the payload, so
+that two writers of one key cannot mix their halves. Leases, pins and the size budget belong to the local layer alone:
+two machines may compute the same key, and the first result stays. A URL that fails costs one warning; the run goes on
 with the local layer.
 """
 
@@ -37,8 +36,7 @@ _NAME = re.compile("[0-9a-f]{32}")
 def open_store(where: str | Path | None = None) -> Store:
     """Open the store at a folder or a URL (``s3://bucket/name``); None means ``$NEUSEE_CACHE`` or the default folder.
 
-    Raises `ValueError` for an unknown scheme, and `ModuleNotFoundError` with the fix where the
-    package for the scheme is missing.
+    Raises `ValueError` for an unknown scheme, and `ModuleNotFoundError` where the package for the scheme is missing.
     """
     where = os.environ.get("NEUSEE_CACHE") or None if where is None else where
     if isinstance(where, str) and "://" in where:
@@ -115,11 +113,11 @@ class RemoteStore(Store):
 
     def _remote_metadata(self, key: Key, look: bool = False) -> Metadata | None:
         """Return the metadata of a result at the URL; with ``look``, read the file whatever the last listing says."""
-        value = f"{key}.json"
+        value, note = f"{key}.json", _receipt_name(key)
         if key not in self._broken and (look or self._remote.exists(value)) and not is_kept(self._seen.get(key)):
             self._read_metadata(key, value)
-        if key not in self._seen and self._remote.exists(_receipt_name(key)):
-            self._read_metadata(key, _receipt_name(key))
+        if key not in self._seen and self._remote.exists(note):
+            self._read_metadata(key, note)
         return self._seen.get(key)
 
     def _read_metadata(self, key: Key, name: str) -> None:

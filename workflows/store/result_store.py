@@ -1,11 +1,10 @@
 """Store of results: a folder with the files ``<key>.json`` and ``<key>.safetensors`` of each result.
 
-The JSON holds the metadata of a result: the recipe of its key, its layout, statistics, checks, seconds
-and versions. The JSON contains the whole value of a small result; of an evicted or unsaved value
-the JSON alone remains, called a receipt. A checksum covers every byte and is compared at each
-load. A result that fails the comparison is put aside with one warning and counts as missing.
-A result is renamed to its final name only when it is complete, so that a killed process leaves
-no half result. Where the folder cannot be written, a run warns once and goes on.
+The JSON holds the metadata of a result (the recipe of its key, layout, statistics, checks, seconds, versions) and the
+whole value of a small result. Of an evicted or unsaved value only the metadata remain, called a receipt. A checksum
+covers every byte and is compared at each load. A result that fails the comparison is moved away with one warning and
+counts as missing. A result gets its final name when it is complete, so that a killed process leaves no half result.
+Where the folder cannot be written, a run warns once and goes on.
 """
 
 from __future__ import annotations
@@ -48,10 +47,9 @@ class Store(Maintained):
     ) -> None:
         """Open the store in ``root``; an argument that is None comes from the environment, such as $NEUSEE_CACHE.
 
-        ``verify="always"`` compares the checksum of every payload that is loaded. ``"sampled"``
-        compares a checksum where the file was touched after it was written, and otherwise one load in
-        twenty. ``"never"`` compares none. The checksum of the JSON and the size of every payload are
-        always compared.
+        ``verify="always"`` compares the checksum of every payload that is loaded. ``"sampled"`` compares the checksum
+        of a file that was touched after its last write, and otherwise at one load in twenty. ``"never"`` compares no
+        such checksum. The checksum of the JSON and the size of every payload are always compared.
         """
         self.root = default_root() if root is None else Path(root)
         self.verify: Verify = verify_mode(verify)

@@ -1,9 +1,8 @@
 """A folder to which many processes and many users write at the same time.
 
-A file is complete before it is renamed to its final name, and until then its temporary name
-contains the owner. The next writer removes the temporary files of killed processes, whatever
-the clock says. Folders, and the few files to which all processes write, copy the permissions
-of the root.
+A file is complete before it gets its final name; until then its temporary name contains the owner. The next writer
+removes the temporary files of killed processes, whatever the clock says. Folders, and the few files to which all
+processes write, copy the permissions of the root.
 """
 
 from __future__ import annotations

@@ -1,9 +1,8 @@
 """Cheaper steps: substitutes for full steps where the error in the outputs stays below the tolerance.
 
-The sensor sums bands into a few channels before any random step. Where the steps after an image
-read only such sums, the sums are convolved instead of the bands. The substitutes are added beside
-the full steps, and only the wires of their readers change. A value requested by name is therefore
-always computed in full.
+The sensor sums bands into a few channels before any random step. Where the steps after an image read only such sums,
+the sums are convolved instead of the bands. The substitutes are added beside the full steps, and only the wires of
+their readers change. A value requested by name is therefore always computed in full.
 """
 
 from __future__ import annotations
@@ -188,7 +187,6 @@ def _well(readers: Iterable[Step]) -> bool:
 
 
 def _exchanged(wire: Wire, old: str, new: str) -> Wire:
-    """Return a wire with the step ``new`` in place of the step ``old``."""
     if isinstance(wire, tuple):
         return tuple(new if name == old else name for name in wire)
     return new if wire == old else wire

@@ -10,8 +10,6 @@ from neusee.workflows.graph.recipe_graph import Recipe, Step
 from neusee.workflows.tolerance.cheaper_steps import CHANNELS
 from neusee.workflows.tolerance.skip_decision import FactsOf, SkipDecision, judge
 
-_NOTHING: dict[str, float] = {}
-
 
 class ErrorBudget:
     """Error bounds of the omitted steps before each step: an omission leaves less tolerance for later steps.
@@ -43,13 +41,13 @@ class ErrorBudget:
     def leave_out(self, step: Step, bound: float) -> None:
         """Add the error bound of an omitted step to the budget."""
         if bound > 0:
-            self._spent[step.name] = {**self._spent.get(step.name, _NOTHING), step.name: bound}
+            self._spent[step.name] = {**self._spent.get(step.name, {}), step.name: bound}
 
     def pass_on(self, step: Step) -> dict[str, float]:
         """Return the bounds of all omitted steps on which ``step`` depends, by the name of the omitted step."""
         parts = [spent for name in dict.fromkeys(step.sources) if (spent := self._spent.get(name))]
         if not parts:
-            return _NOTHING
+            return {}
         first, *others = parts
         if any(other is not first for other in others):
             first = {omitted: bound for part in parts for omitted, bound in part.items()}

@@ -1,8 +1,7 @@
 """Error norm: the distance of a result from its reference, as all tolerances and studies measure the distance.
 
-The norm is the root mean square of the difference over the reference's largest element; 1e-3 is a
-peak signal-to-noise ratio of 60 dB. Every bound of a node bounds the largest difference, and
-therefore also this norm.
+The norm is the root mean square of the difference over the reference's largest element; 1e-3 is a peak signal-to-noise
+ratio of 60 dB. Every bound of a node bounds the largest difference, and therefore also this norm.
 """
 
 from __future__ import annotations
@@ -19,10 +18,9 @@ _PART = 1 << 22  #: elements that are compared at once in float64
 def error_of(value: Any, reference: Any) -> float:
     """Return the root mean square of ``value - reference`` over the largest ``|reference|``.
 
-    For tuples, lists and mappings the worst member counts. Where the reference is 0 everywhere, the
-    root mean square itself is returned. Elements that are the same infinity, or both NaN, agree; an
-    element that is not finite where the other is finite makes the error infinite. Raises
-    `ValueError` where the two values differ in kind or shape.
+    For tuples, lists and mappings the worst member counts. Where the reference is 0 everywhere, the root mean square
+    itself is returned. Elements that are the same infinity, or both NaN, agree; an element that is not finite where the
+    other element is finite makes the error infinite. Raises `ValueError` where the values differ in kind or shape.
     """
     return _errors(value, reference)[0]
 
