@@ -97,7 +97,7 @@ def fouls(tasks: list[Task], cluster: Cluster, schedule: Schedule, keep: list[st
         if one.device == other.device and max(one.start, other.start) < min(one.end, other.end):
             found.append(f"{one} overlaps {other}")
     for move in schedule.moves:
-        needs = cluster.seconds(move.source, move.device, move.bytes)
+        needs = cluster.link(move.source, move.device).seconds(move.bytes)
         made = slots[move.task]
         if move.source != made.device or move.start < made.end:
             found.append(f"{move}: leaves too early")
@@ -177,10 +177,7 @@ class Exact:
         self.least = [min(row) for row in self.cost]
         self.sources = [[index[s] for s in task.sources] for task in tasks]
         self.sent = [
-            [
-                cluster.seconds(self.devices[0], self.devices[1], t.takes.get(s, tasks[index[s]].bytes))
-                for s in t.sources
-            ]
+            [cluster.link(*self.devices[:2]).seconds(t.takes.get(s, tasks[index[s]].bytes)) for s in t.sources]
             for t in tasks
         ]
         self.tail = list(self.least)

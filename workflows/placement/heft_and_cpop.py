@@ -1,6 +1,6 @@
 """Placement of tasks on devices in time: HEFT with insertion and CPOP, with memory as a hard constraint.
 
-A pure function of tasks, costs and devices, for this machine and for machines described in a file.
+A schedule is a pure function of tasks, costs and devices, for this machine and for machines described in a file.
 A result leaves a device after its last use. A task that does not fit is cut into parts of bands, waits
 or runs elsewhere; a task that fits nowhere is refused with the number of bytes that it needs.
 
@@ -17,30 +17,20 @@ from dataclasses import replace
 
 from neusee.workflows.placement.partial_schedule import PartialSchedule
 from neusee.workflows.placement.task_priorities import Graph, downward, frugal, ranked, upward
-from neusee.workflows.placement.tasks_and_devices import (
-    BUS,
-    Cluster,
-    Device,
-    Link,
-    Move,
-    Schedule,
-    Slot,
-    Task,
-    TooLarge,
-)
+from neusee.workflows.placement.tasks_and_devices import Cluster, Device, Link, Schedule, Slot, Task, TooLarge
 
-__all__ = ["BUS", "Cluster", "Device", "Link", "Move", "Schedule", "Slot", "Task", "TooLarge", "cpop", "heft"]
+__all__ = ["Cluster", "Device", "Link", "Schedule", "Slot", "Task", "TooLarge", "cpop", "heft"]
 
 
 def heft(tasks: Sequence[Task], cluster: Cluster, keep: Collection[str] = ()) -> Schedule:
-    """Place the task with the longest remaining path first, each where it ends first.
+    """Return the HEFT schedule: tasks with the longest remaining path first, each on the device where it ends first.
 
-    ``keep`` names the results that are held to the end. Where memory is short, orders that hold less at
-    once are tried too. If one device alone would finish all tasks sooner, it runs them all; tasks that one
-    device could run alone are never refused.
+    ``keep`` names the results that are held to the end. Where memory is short, orders that hold less at once are tried
+    too. If one device alone would finish all tasks sooner, this device runs all tasks; tasks that one device could run
+    alone are never refused.
 
-    Raises: `TooLarge` where no such plan fits, with the need of the plan that comes closest; ValueError
-    for tasks that no device runs, and for cyclic dependencies.
+    Raises: `TooLarge` where no such plan fits, with the need of the plan that comes closest; ValueError for tasks that
+    no device runs, and for cyclic dependencies.
     """
     graph = Graph(tasks, cluster, keep)
     if len(cluster.devices) == 1:
@@ -58,7 +48,7 @@ def heft(tasks: Sequence[Task], cluster: Cluster, keep: Collection[str] = ()) ->
 
 
 def cpop(tasks: Sequence[Task], cluster: Cluster, keep: Collection[str] = ()) -> Schedule:
-    """Place the critical path on the one device that runs it fastest, and every other task where it ends first.
+    """Return the CPOP schedule: the critical path on its fastest device, every other task where the task ends first.
 
     Raises: as `heft`.
     """
@@ -71,29 +61,29 @@ def cpop(tasks: Sequence[Task], cluster: Cluster, keep: Collection[str] = ()) ->
 
 
 def _best(graph: Graph, orders: Sequence[Sequence[int]], pinned: Mapping[int, int] | None = None) -> Schedule:
-    """Return the schedule of the first order if it fits without limits, else the shortest that fits the memory."""
+    """Return the schedule of the first order of tasks if the memory suffices, else the shortest schedule that fits."""
     pinned = pinned or {}
     memory = {device.name: device.memory for device in graph.cluster.devices}
-    best, refused = _placed(PartialSchedule(graph, bounded=False), orders[0], pinned).schedule(), list[TooLarge]()
-    if all(peak <= memory[name] for name, peak in best.peak.items()):
-        return best
-    found: list[Schedule] = []
+    schedule = _placed(PartialSchedule(graph, bounded=False), orders[0], pinned).schedule()
+    if all(peak <= memory[name] for name, peak in schedule.peak.items()):
+        return schedule
+    best, refused = None, list[TooLarge]()
     for order in (*orders[1:], orders[0]):
-        below = min((schedule.makespan for schedule in found), default=math.inf)
-        board = _placed(PartialSchedule(graph), order, pinned, below)
+        board = _placed(PartialSchedule(graph), order, pinned, best.makespan if best else math.inf)
         if board.refused:
             refused.append(board.too_large())
         elif len(board.placed) == len(order):
-            found.append(board.schedule())
-    if not found:
+            schedule = board.schedule()
+            best = schedule if best is None or schedule.makespan < best.makespan else best
+    if best is None:
         raise min(refused, key=lambda error: error.short)
-    return min(found, key=lambda schedule: schedule.makespan)
+    return best
 
 
 def _placed(
     board: PartialSchedule, order: Sequence[int], pinned: Mapping[int, int], below: float = math.inf
 ) -> PartialSchedule:
-    """Place tasks in an order; those of ``pinned`` on their device, if they ever fit there.
+    """Place tasks on ``board`` in an order, ``pinned`` tasks on their device if they fit there; return ``board``.
 
     A task that does not fit into memory lets later tasks go first that may free memory. The placement
     stops half-way where it cannot end before ``below``.
@@ -126,7 +116,7 @@ def _placed(
 
 
 def _critical(graph: Graph, through: Sequence[float]) -> list[int]:
-    """Return the critical path: from the first task of the longest path, always on to the reader with the longest."""
+    """Return the critical path: the source with the longest path, then always the reader with the longest path."""
     at = max((i for i, sources in enumerate(graph.sources) if not sources), key=through.__getitem__, default=-1)
     path = []
     while at >= 0:
@@ -139,14 +129,14 @@ def _critical(graph: Graph, through: Sequence[float]) -> list[int]:
 
 
 def _able(graph: Graph) -> list[int]:
-    """Return the devices that can run every task, those with most memory first."""
+    """Return the devices that can run every task, the device with most memory first."""
     devices = graph.cluster.devices
-    able = [d for d in range(len(devices)) if all(d in a for a in graph.able)]
-    return sorted(able, key=lambda d: -devices[d].memory)
+    able = set(range(len(devices))).intersection(*graph.able)
+    return sorted(able, key=lambda d: (-devices[d].memory, d))
 
 
 def _alone(graph: Graph, devices: Sequence[int], *refused: TooLarge) -> Schedule:
-    """Return the first schedule that fits on one device: tasks in their order, or in the order that holds least."""
+    """Return the first schedule that fits on one device, with the tasks as given or in the order of least memory."""
     for d in devices:
         for order in (graph.by(range(len(graph.tasks))), frugal(graph)):
             try:
@@ -157,17 +147,13 @@ def _alone(graph: Graph, devices: Sequence[int], *refused: TooLarge) -> Schedule
 
 
 def _sequence(graph: Graph, d: int, order: Sequence[int]) -> Schedule:
-    """Return the schedule of tasks one after another on device ``d``; a refusal names the memory that suffices."""
-    board, name, limit = (
-        PartialSchedule(graph, bounded=False),
-        graph.cluster.devices[d].name,
-        graph.cluster.devices[d].memory,
-    )
+    """Return the schedule of tasks in sequence on device ``d``; raise `TooLarge` with the memory that suffices."""
+    board, device = PartialSchedule(graph, bounded=False), graph.cluster.devices[d]
     left, held, peak, at = [len(readers) for readers in graph.readers], 0.0, 0.0, 0.0
     needed, largest = 0.0, 0
     for i in order:
         held += graph.own[i]
-        board.parts[i] = _fewest(graph, i, limit - held)
+        board.parts[i] = _fewest(graph, i, device.memory - held)
         peak = max(peak, held + graph.work(i, board.parts[i]))
         least = held + graph.work(i, graph.tasks[i].parts)
         needed, largest = (least, i) if least > needed else (needed, largest)
@@ -176,14 +162,14 @@ def _sequence(graph: Graph, d: int, order: Sequence[int]) -> Schedule:
         for j in graph.sources[i]:
             left[j] -= 1
         held -= sum(graph.own[j] for j in (*graph.sources[i], i) if not left[j] and j not in graph.kept)
-    if needed > limit:
+    if needed > device.memory:
         task = graph.tasks[largest]
-        raise TooLarge(task.name, name, needed, limit, task.parts)
+        raise TooLarge(task.name, device.name, needed, device.memory, task.parts)
     schedule = board.schedule()
-    return replace(schedule, peak={**schedule.peak, name: peak})
+    return replace(schedule, peak={**schedule.peak, device.name: peak})
 
 
 def _fewest(graph: Graph, i: int, room: float) -> int:
-    """Return the smallest number of parts whose work fits into ``room``, or the largest allowed number."""
+    """Return the smallest number of parts with which task ``i`` needs at most ``room`` bytes, or the maximum."""
     most = graph.tasks[i].parts
     return 1 + bisect_left(range(1, most), True, key=lambda parts: graph.work(i, parts) <= room)

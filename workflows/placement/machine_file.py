@@ -7,9 +7,8 @@
       cuda-cuda: {bandwidth: 300 GB/s, latency: 5 us}
     network: {bandwidth: 25 GB/s, latency: 5 us}
 
-``speed`` is the ratio to the machine on which the costs were measured, for all nodes or by family of
-nodes. ``node: [a, b]`` puts a group of devices on each machine of these names; the network links the
-machines.
+``speed`` is the ratio to the machine on which the costs were measured, for all nodes or by family of nodes.
+``node: [a, b]`` puts a group of devices on each machine of these names; the network links the machines.
 """
 
 from __future__ import annotations
@@ -20,6 +19,7 @@ import re
 from collections import Counter
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
+from functools import partial
 from importlib.resources import files
 from importlib.util import find_spec
 from pathlib import Path
@@ -40,7 +40,7 @@ _Reader = Callable[[Value, "list[Diagnostic]"], Any]
 
 @dataclass(frozen=True)
 class Machines:
-    """A cluster, and the speed of each device relative to the measured machine, by family of nodes."""
+    """A cluster, with the speed of each device relative to the machine on which the costs were measured."""
 
     title: str
     cluster: Cluster
@@ -57,8 +57,8 @@ class Machines:
 
 
 def read_machines(path: Path | str) -> Machines:
-    """Return the machines of a file, or of an example by its name; raise one `RecipeError` with all mistakes."""
-    document = read(_found(path), str(path))
+    """Return the machines in a file, or in the example of this name; raise one `RecipeError` with all mistakes."""
+    document = read(_path(path), str(path))
     diagnostics: list[Diagnostic] = []
     root = _fields(document.root, {"devices": _groups, "links": _links, "network": _link}, ("devices",), diagnostics)
     groups, links = root.get("devices") or [], root.get("links") or {}
@@ -68,39 +68,40 @@ def read_machines(path: Path | str) -> Machines:
         raise RecipeError(diagnostics)
     devices = _devices(groups)
     if len(devices) > _MOST:
-        raise RecipeError([_problem(document.root.items["devices"], f"are {len(devices)}; the maximum is {_MOST}")])
+        message = f"must be {_MOST} devices or fewer, not {len(devices)}"
+        raise RecipeError([_problem(document.root.items["devices"], message)])
     speeds = {device.name: group["speed"] for device, group in devices.items()}
     network = root.get("network") or Cluster.network
     return Machines(document.title, Cluster(tuple(devices), links, BUS, network), speeds)
 
 
 def examples() -> dict[str, Path]:
-    """Return the examples that come with the program, by name."""
+    """Return the paths of the example files of the program, by the names of the examples."""
     folder = Path(str(files("neusee.recipes"))) / "samples" / "clusters"
     return {path.stem: path for path in sorted(folder.glob("*.yaml"))}
 
 
-def _found(path: Path | str) -> Path:
+def _path(path: Path | str) -> Path:
+    if Path(path).is_file():
+        return Path(path)
     packaged = examples()
-    if str(path) in packaged and not Path(path).is_file():
-        return packaged[str(path)]
-    if not Path(path).is_file():
+    if str(path) not in packaged:
         message = f"no such file, and no example of that name; {nearest(str(path), packaged)}"
         raise RecipeError([Diagnostic(Location("--devices"), str(path), message)])
-    return Path(path)
+    return packaged[str(path)]
 
 
 def _devices(groups: list[dict[str, Any]]) -> dict[Device, dict[str, Any]]:
-    """Return every single device with its group: ``cpu``, ``cuda:0``, or ``a/cuda:0`` on a machine with a name."""
+    """Return each device of the groups with its group, named ``cpu``, ``cuda:0`` or, on machine a, ``a/cuda:0``."""
     rows = [(machine, group) for group in groups for machine in group["node"] for _ in range(group["count"])]
     total, seen = Counter((machine, group["kind"]) for machine, group in rows), Counter[tuple[str, str]]()
-    found = {}
+    devices = {}
     for machine, group in rows:
         of = (machine, group["kind"])
-        name = group["kind"] if of[1] == "cpu" and total[of] == 1 else f"{of[1]}:{seen[of]}"
+        name = "cpu" if of[1] == "cpu" and total[of] == 1 else f"{of[1]}:{seen[of]}"
         seen[of] += 1
-        found[Device(f"{machine}/{name}" if machine else name, of[1], group["memory"])] = group
-    return found
+        devices[Device(f"{machine}/{name}" if machine else name, of[1], group["memory"])] = group
+    return devices
 
 
 # --- values ---------------------------------------------------------------------------------------------------------
@@ -110,7 +111,7 @@ def _groups(value: Value, diagnostics: list[Diagnostic]) -> list[dict[str, Any]]
     if not isinstance(value.data, dict) or not value.data:
         diagnostics.append(_problem(value, "must be a mapping of groups, such as `a100: {kind: cuda, memory: 80 GB}`"))
         return []
-    readers = {"kind": _kind, "count": _count, "memory": _size, "speed": _speed, "node": _names}
+    readers: dict[str, _Reader] = {"kind": _kind, "count": _count, "memory": _size, "speed": _speed, "node": _names}
     usual: dict[str, Any] = {"count": 1, "speed": {"default": 1.0}, "node": [""]}
     return [usual | _fields(group, readers, ("kind", "memory"), diagnostics) for group in value.data.values()]
 
@@ -119,15 +120,15 @@ def _links(value: Value, diagnostics: list[Diagnostic]) -> dict[tuple[str, str],
     if not isinstance(value.data, dict):
         diagnostics.append(_problem(value, "must be a mapping such as `cuda-cuda: {bandwidth: 300 GB/s}`"))
         return {}
-    found = {}
+    links = {}
     for name, link in value.data.items():
         one, dash, other = str(name).partition("-")
         if not dash:
             diagnostics.append(_problem(link, "must name two kinds, such as cuda-cuda or cpu-cuda", link.key))
-        if (other, one) in found:
+        if (other, one) in links:
             diagnostics.append(_problem(link, f"is the same as {other}-{one}", link.key))
-        found[one, other or one] = _link(link, diagnostics)
-    return found
+        links[one, other or one] = _link(link, diagnostics)
+    return links
 
 
 def _link(value: Value, diagnostics: list[Diagnostic]) -> Link:
@@ -137,19 +138,18 @@ def _link(value: Value, diagnostics: list[Diagnostic]) -> Link:
 def _fields(
     value: Value, readers: Mapping[str, _Reader], required: tuple[str, ...], diagnostics: list[Diagnostic]
 ) -> dict[str, Any]:
-    """Return the fields of a mapping, each read by its reader; report unknown and missing fields."""
+    """Return the fields of a mapping, each read by its function in ``readers``; report unknown and missing fields."""
     if not isinstance(value.data, dict):
         diagnostics.append(_problem(value, f"must be a mapping of {', '.join(readers)}, not {kind(value)}"))
         return {}
-    found = {}
+    fields = {}
     for name, item in value.data.items():
         if name in readers:
-            found[name] = readers[name](item, diagnostics)
+            fields[name] = readers[name](item, diagnostics)
         else:
             diagnostics.append(_problem(item, f"unknown; {nearest(name, readers)}", item.key))
-    missing = [name for name in required if name not in value.data]
-    diagnostics += [_problem(value, f"needs {name}", value.key) for name in missing]
-    return found
+    diagnostics += [_problem(value, f"needs {name}", value.key) for name in required if name not in value.data]
+    return fields
 
 
 def _kind(value: Value, diagnostics: list[Diagnostic]) -> str:
@@ -179,7 +179,9 @@ def _names(value: Value, diagnostics: list[Diagnostic]) -> list[str]:
 def _speed(value: Value, diagnostics: list[Diagnostic]) -> dict[str, float]:
     if not isinstance(value.data, dict):
         return {"default": _factor(value, diagnostics)}
-    families = ["default", *_families()]
+    spec = find_spec("neusee.nodes")  # names the families of nodes without the import of a node
+    packages = pkgutil.iter_modules(spec.submodule_search_locations if spec else [])
+    families = ["default", *(package.name for package in packages if package.ispkg)]
     return _fields(value, dict.fromkeys(families, _factor), ("default",), diagnostics)
 
 
@@ -191,26 +193,14 @@ def _factor(value: Value, diagnostics: list[Diagnostic]) -> float:
     return float(value.data)
 
 
-def _size(value: Value, diagnostics: list[Diagnostic]) -> float:
-    return _quantity(value, UNITS, "80 GB", diagnostics)
-
-
-def _rate(value: Value, diagnostics: list[Diagnostic]) -> float:
-    return _quantity(value, _RATES, "25 GB/s", diagnostics)
-
-
-def _time(value: Value, diagnostics: list[Diagnostic]) -> float:
-    return _quantity(value, _SECONDS, "10 us", diagnostics)
-
-
-def _quantity(value: Value, units: Mapping[str, float], such: str, diagnostics: list[Diagnostic]) -> float:
-    """Return a number times its unit in SI; report a missing unit, and a zero except for a time."""
+def _quantity(value: Value, diagnostics: list[Diagnostic], units: Mapping[str, float], such: str) -> float:
+    """Return a number with a unit in SI units; report a missing or unknown unit, and a zero except for a time."""
     match = _QUANTITY.fullmatch(str(value.data).strip())
     if isinstance(value.data, bool) or match is None:
         diagnostics.append(_problem(value, f"must be a number and a unit, such as {such}"))
     elif match[2] not in units:
-        said = f"has the wrong unit {match[2]!r}" if match[2] else "needs a unit"
-        diagnostics.append(_problem(value, f"{said}: write a number and one of {', '.join(units)}"))
+        mistake = f"has the wrong unit {match[2]!r}" if match[2] else "needs a unit"
+        diagnostics.append(_problem(value, f"{mistake}: write a number and one of {', '.join(units)}"))
     elif units is not _SECONDS and not 0 < float(match[1]) < math.inf:
         diagnostics.append(_problem(value, f"must be above 0, such as {such}"))
     else:
@@ -218,18 +208,19 @@ def _quantity(value: Value, units: Mapping[str, float], such: str, diagnostics: 
     return 1.0
 
 
-def _families() -> list[str]:
-    """Return the families of nodes, without importing a node."""
-    spec = find_spec("neusee.nodes")
-    return [m.name for m in pkgutil.iter_modules(spec.submodule_search_locations if spec else []) if m.ispkg]
+_size = partial(_quantity, units=UNITS, such="80 GB")
+_rate = partial(_quantity, units=_RATES, such="25 GB/s")
+_time = partial(_quantity, units=_SECONDS, such="10 us")
 
 
 def _absent(links: Value | None, kinds: set[str]) -> list[Diagnostic]:
-    """Return a diagnostic for each kind in ``links`` of which no device exists."""
-    items = links.items.items() if links else ()
-    pairs = [(item, name) for pair, item in items for name in dict.fromkeys(pair.split("-"))]
-    said = "there is no device of kind"
-    return [_problem(i, f"{said} {name}; {nearest(name, kinds)}", i.key) for i, name in pairs if name not in kinds]
+    """Return a diagnostic for each kind in the names of ``links`` that no device has."""
+    return [
+        _problem(link, f"there is no device of kind {name}; {nearest(name, kinds)}", link.key)
+        for pair, link in (links.items.items() if links else ())
+        for name in dict.fromkeys(pair.split("-"))
+        if name not in kinds
+    ]
 
 
 def _problem(value: Value, message: str, mark: Location | None = None) -> Diagnostic:

@@ -1,9 +1,10 @@
-"""Memory profile of one device: the bytes promised to the tasks placed so far, over all time."""
+"""Memory profile of one device: the bytes that the tasks placed so far will hold, as a function of time."""
 
 from __future__ import annotations
 
 import math
 from bisect import bisect_left, bisect_right
+from collections import defaultdict
 from collections.abc import Iterable, Iterator
 from itertools import pairwise
 
@@ -27,7 +28,7 @@ class MemoryProfile:
         self.kept = 0.0  # bytes at the end of time
 
     def add(self, start: float, end: float, size: float) -> None:
-        """Hold ``size`` bytes (free them, if negative) from ``start`` until ``end``."""
+        """Hold ``size`` bytes from ``start`` until ``end``; free held bytes if ``size`` is negative."""
         if size and start < end:
             first = self._cut(start)
             self.level[first : self._cut(end) if end < math.inf else len(self.times)] += size
@@ -42,7 +43,7 @@ class MemoryProfile:
         return self.limit - self.kept
 
     def wait(self, holds: Iterable[Hold]) -> float:
-        """Return the least delay (s) with which all holds fit: 0 if they fit without a delay."""
+        """Return the least delay (s) with which all ``holds`` fit into the memory: 0 if no delay is needed."""
         shift = 0.0
         for start, end, size in stacked(holds):
             span = self._within(start, end)
@@ -57,7 +58,7 @@ class MemoryProfile:
         return slice(first, len(self.times) if end == math.inf else max(bisect_left(self.times, end), first + 1))
 
     def _cut(self, time: float) -> int:
-        """Return the index of the step that begins at ``time``; insert the step if needed."""
+        """Return the index of the interval that begins at ``time``; split an interval there if needed."""
         at, count = bisect_left(self.times, time), len(self.times)
         if at < count and self.times[at] == time:
             return at
@@ -70,12 +71,12 @@ class MemoryProfile:
 
 
 def stacked(holds: Iterable[Hold]) -> Iterator[Hold]:
-    """Yield overlapping holds as consecutive spans, each with the sum of its bytes."""
-    steps: dict[float, float] = {}
+    """Yield the sum of the bytes that ``holds`` reserve at the same time, as consecutive time spans."""
+    steps = defaultdict[float, float](float)
     for start, end, size in holds:
         if start < end and size:
-            steps[start] = steps.get(start, 0.0) + size
-            steps[end] = steps.get(end, 0.0) - size
+            steps[start] += size
+            steps[end] -= size
     times, now = sorted(steps), 0.0
     for start, end in pairwise(times):
         now += steps[start]
@@ -84,7 +85,7 @@ def stacked(holds: Iterable[Hold]) -> Iterator[Hold]:
 
 
 def without(start: float, end: float, taken: Iterable[tuple[float, float]]) -> Iterator[tuple[float, float]]:
-    """Yield the parts of [start, end) that the ``taken`` spans, sorted and disjoint, leave uncovered."""
+    """Yield the parts of [start, end) outside the ``taken`` spans, which are sorted and disjoint."""
     for first, last in taken:
         if first < end and last > start:
             if start < first:

@@ -1,4 +1,4 @@
-"""Partial schedule: the tasks placed so far, the gaps of each device and the memory promised to each task."""
+"""Partial schedule: the tasks placed so far, the free times of each device and the memory that each task will hold."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ Of = tuple[int, float, int]  #: task of the result, bytes of the result, device
 
 
 class PartialSchedule:
-    """An unfinished schedule: each task is placed after its sources, and never moves again."""
+    """An unfinished schedule, in which each task is placed after its sources and never moves again."""
 
     def __init__(self, graph: Graph, bounded: bool = True) -> None:
         self.graph, devices, count = graph, graph.cluster.devices, len(graph.tasks)
@@ -27,7 +27,7 @@ class PartialSchedule:
         most = sum(graph.own) + max((graph.work(i, 1) for i in range(count)), default=0.0)
         sent = sum(max(0.0, math.ceil(s)) for t, sizes in enumerate(graph.sizes) for s in sizes if graph.tasks[t].takes)
         self.rooms = [MemoryProfile(d.memory) if bounded and d.memory < most + sent else None for d in devices]
-        self.links = [[graph.cluster.link(a.name, b.name) for b in devices] for a in devices]
+        self.links = [[graph.cluster.link(a.name, b.name) for b in devices] for a in devices]  # 0 s to itself
         self.least = [own + graph.work(i, graph.tasks[i].parts) for i, own in enumerate(graph.own)]
         self.copies: dict[Of, list[Copy]] = {}
         self.placed: list[int] = []
@@ -36,7 +36,7 @@ class PartialSchedule:
     # --- where and when -------------------------------------------------------------------------------------------
 
     def place(self, i: int, among: Sequence[int]) -> bool:
-        """Give task ``i`` the slot of ``among`` in which the task ends first; return False if none has the memory."""
+        """Place task ``i`` on the device of ``among`` where the task ends first; return False if no device has room."""
         best, on, begin = math.inf, -1, 0.0
         for d in among:
             room = self.rooms[d]
@@ -53,14 +53,13 @@ class PartialSchedule:
         return on >= 0
 
     def gave_back(self, i: int) -> bool:
-        """Return True if placing task ``i`` freed memory for waiting tasks."""
+        """Return True if the placement of task ``i`` freed memory for waiting tasks."""
         return any(not self.left[j] for j in self.graph.sources[i]) or bool(self.refused)
 
     def force(self, i: int) -> None:
-        """Place a task that fits nowhere as if one device had the memory, and note the needed bytes."""
-        able = [d for d in self.graph.able[i] if self.rooms[d] is not None]
-        needs = {d: self._needs(i, d) for d in able}
-        d = min(able, key=lambda d: (needs[d] - self.graph.cluster.devices[d].memory, d))
+        """Place a task that fits nowhere as if one device had enough memory, and record the needed bytes."""
+        needs = {d: self._needs(i, d) for d in self.graph.able[i] if self.rooms[d] is not None}
+        d = min(needs, key=lambda d: (needs[d] - self.graph.cluster.devices[d].memory, d))
         room = self.rooms[d]
         assert room is not None
         self.refused.append((i, d, needs[d]))
@@ -68,17 +67,16 @@ class PartialSchedule:
         self.place(i, [d])
 
     def _ready(self, i: int, d: int) -> float:
-        """Return the time at which the last input of ``i`` can be on device ``d``."""
-        ready = 0.0
-        for j, size in zip(self.graph.sources[i], self.graph.sizes[i], strict=True):
-            at = self.end[j]
-            if self.where[j] != d:
-                at += self.links[self.where[j]][d].seconds(size)
-            ready = max(ready, at)
-        return ready
+        """Return the time at which the last input of task ``i`` can be on device ``d``."""
+        end, where, links = self.end, self.where, self.links
+        return max((end[j] + links[where[j]][d].seconds(size) for j, size in self._inputs(i)), default=0.0)
+
+    def _inputs(self, i: int) -> Iterator[tuple[int, float]]:
+        """Yield each source of task ``i`` with the bytes that another device must send."""
+        return zip(self.graph.sources[i], self.graph.sizes[i], strict=True)
 
     def _slot(self, i: int, d: int, ready: float, seconds: float, best: float) -> float:
-        """Return the first start in a gap of ``d`` with enough time and memory; infinity if not before ``best``."""
+        """Return the first start of task ``i`` in a gap of device ``d``, or infinity if it ends after ``best``."""
         starts, ends = self.gaps[d]
         for gap in range(bisect_left(ends, ready + seconds), len(ends)):
             start = max(starts[gap], ready)
@@ -93,7 +91,7 @@ class PartialSchedule:
         return math.inf
 
     def _fitting(self, i: int, d: int, start: float, seconds: float, end: float) -> float:
-        """Return the first time from ``start`` on with enough memory, or a time too late for the gap."""
+        """Return the first time from ``start`` on with enough memory, or a time that is too late for the gap."""
         room, parts = self.rooms[d], self.graph.tasks[i].parts
         if room is None:
             return start
@@ -105,7 +103,7 @@ class PartialSchedule:
         return start
 
     def _holds(self, i: int, d: int, start: float, end: float, parts: int) -> list[Hold]:
-        """Return all memory that ``i`` adds on ``d``: result, work, and copies of its inputs."""
+        """Return all memory that task ``i`` adds on device ``d``: result, work, and copies of the inputs."""
         graph = self.graph
         holds = [(start, math.inf if graph.held(i) else end, graph.own[i]), (start, end, graph.work(i, parts))]
         for of, leaves in self._arriving(i, d, start):
@@ -114,21 +112,19 @@ class PartialSchedule:
         return holds
 
     def _arriving(self, i: int, d: int, start: float) -> Iterator[tuple[Of, float]]:
-        """Yield the inputs from other devices, and the latest time at which they must be sent."""
-        for j, size in zip(self.graph.sources[i], self.graph.sizes[i], strict=True):
+        """Yield each input from another device with the latest time at which the device must send the input."""
+        for j, size in self._inputs(i):
             if self.where[j] != d:
-                leaves = start - self.links[self.where[j]][d].seconds(size)
-                yield (j, size, d), max(leaves, self.end[j])
+                yield (j, size, d), max(start - self.links[self.where[j]][d].seconds(size), self.end[j])
 
     def _needs(self, i: int, d: int) -> float:
-        """Return the bytes that ``d`` must have for ``i`` to run there after all tasks placed before."""
-        graph, room = self.graph, self.rooms[d]
+        """Return the bytes that device ``d`` must have to run task ``i`` after all tasks placed before."""
+        room = self.rooms[d]
         assert room is not None
-        pairs = zip(graph.sources[i], graph.sizes[i], strict=True)
-        copies = sum(math.ceil(size) for j, size in pairs if self.where[j] != d)
+        copies = sum(math.ceil(size) for j, size in self._inputs(i) if self.where[j] != d)
         return room.limit - room.free() + self.least[i] + copies
 
-    # --- what that takes ------------------------------------------------------------------------------------------
+    # --- records of a placement -----------------------------------------------------------------------------------
 
     def _commit(self, i: int, d: int, start: float, end: float) -> None:
         graph, room = self.graph, self.rooms[d]
@@ -152,7 +148,7 @@ class PartialSchedule:
         self.placed.append(i)
 
     def _fewest(self, i: int, d: int, start: float, end: float, room: MemoryProfile) -> int:
-        """Return the smallest number of parts with which ``i`` fits into its slot; the largest number always fits."""
+        """Return the smallest number of parts with which task ``i`` fits; the largest allowed number always fits."""
 
         def fits(parts: int) -> bool:
             return not room.wait(self._holds(i, d, start, end, parts))
@@ -160,7 +156,7 @@ class PartialSchedule:
         return 1 + bisect_left(range(1, self.graph.tasks[i].parts), True, key=fits)
 
     def _fill(self, d: int, start: float, end: float) -> None:
-        """Remove a slot from its gap."""
+        """Remove the time from ``start`` to ``end`` from the gap of device ``d`` that contains this time."""
         starts, ends = self.gaps[d]
         gap = bisect_left(ends, end)
         left = [(a, b) for a, b in ((starts[gap], start), (end, ends[gap])) if a < b]
@@ -170,31 +166,31 @@ class PartialSchedule:
     # --- the end --------------------------------------------------------------------------------------------------
 
     def too_large(self) -> TooLarge:
-        """Return the error of the first task that had to be forced, with the need of all forced tasks on its device."""
+        """Return the error for the first task that fits nowhere, with the bytes that its device needs for all tasks."""
         graph, (i, d, _) = self.graph, self.refused[0]
         needed, device = max(n for _, on, n in self.refused if on == d), graph.cluster.devices[d]
         return TooLarge(graph.tasks[i].name, device.name, needed, device.memory, graph.tasks[i].parts)
 
     def schedule(self) -> Schedule:
-        """Return the complete schedule."""
+        """Return the schedule after all tasks are placed."""
         devices = self.graph.cluster.devices
         self._bridge()
         moves = sorted(self._moves(), key=lambda m: (m.start, m.task, m.device))
         slots = sorted(self._slots(), key=lambda slot: (slot.start, slot.end))
-        held = self._held()
-        peak = {device.name: _highest(held[d]) for d, device in enumerate(devices)}
+        holds = zip(devices, self._held(), strict=True)
+        peak = {device.name: max((size for _, _, size in stacked(held)), default=0.0) for device, held in holds}
         return Schedule(tuple(slots), max(self.end, default=0.0), peak, sum(m.bytes for m in moves), tuple(moves))
 
     def _bridge(self) -> None:
-        """Keep a copy for its next use instead of sending it again, where the memory allows this."""
+        """Keep the copy of a result until its next use on a device, instead of a second transfer, if memory allows."""
         for (j, size, d), copies in self.copies.items():
             room, kept = self.rooms[d], copies[:1]
             for copy in copies[1:]:
-                leaves, arrives, until = kept[-1]
+                until = kept[-1][2]
                 if room is None or room.highest(until, copy[0]) + math.ceil(size) <= room.limit:
                     if room is not None:
                         room.add(until, copy[0], math.ceil(size))
-                    kept[-1] = (leaves, arrives, max(until, copy[2]))
+                    kept[-1] = (*kept[-1][:2], max(until, copy[2]))
                 else:
                     kept.append(copy)
             self.copies[j, size, d] = kept
@@ -207,7 +203,7 @@ class PartialSchedule:
                 yield Move(task, size, source, devices[d].name, leaves, arrives, until)
 
     def _held(self) -> list[list[Hold]]:
-        """Return every span of memory that the finished schedule uses, by device."""
+        """Return all memory that the finished schedule holds, one list of holds for each device."""
         graph, held = self.graph, list[list[Hold]]([] for _ in self.rooms)
         until, over = list(self.end), max(self.end, default=0.0)
         for (j, size, d), copies in self.copies.items():
@@ -223,12 +219,10 @@ class PartialSchedule:
         return held
 
     def _slots(self) -> Iterator[Slot]:
-        """Yield every slot, with the task that delayed its start."""
-        tasks, devices, turn = self.graph.tasks, self.graph.cluster.devices, [0] * len(self.where)
-        for number, i in enumerate(self.placed):
-            turn[i] = number
+        """Yield the slot of every task, with the task that delayed the start."""
+        tasks, devices = self.graph.tasks, self.graph.cluster.devices
         before, ended = [-1] * len(devices), dict[float, int]()
-        for i in sorted(self.placed, key=lambda i: (self.start[i], turn[i])):
+        for i in sorted(self.placed, key=self.start.__getitem__):
             d, start = self.where[i], self.start[i]
             after = self._waited(i, before[d], ended.get(start, -1))
             name = tasks[after].name if after >= 0 else ""
@@ -237,11 +231,10 @@ class PartialSchedule:
             ended[self.end[i]] = i
 
     def _waited(self, i: int, before: int, other: int) -> int:
-        """Return the task that delayed ``i``: the maker of an input, the task before, or a task that freed memory."""
+        """Return the task that delayed task ``i``: a source, the previous task, or a task that freed memory."""
         start, d = self.start[i], self.where[i]
-        for j, size in zip(self.graph.sources[i], self.graph.sizes[i], strict=True):
-            sent = 0.0 if self.where[j] == d else self.links[self.where[j]][d].seconds(size)
-            if self.end[j] + sent == start:
+        for j, size in self._inputs(i):
+            if self.end[j] + self.links[self.where[j]][d].seconds(size) == start:
                 return j
         if start == 0.0 or (before >= 0 and self.end[before] == start):
             return before
@@ -249,18 +242,12 @@ class PartialSchedule:
         return other if other >= 0 else max(candidates, key=self.end.__getitem__, default=-1)
 
 
-def _highest(holds: list[Hold]) -> float:
-    """Return the maximum of the bytes held at the same time."""
-    return max((size for _, _, size in stacked(holds)), default=0.0)
-
-
 def _joined(copies: list[Copy]) -> list[Copy]:
-    """Return the copies in order of time; copies that touch are joined."""
+    """Return the copies of a result on a device in order of time, with overlapping copies joined to one copy."""
     joined: list[Copy] = []
-    for leaves, arrives, until in sorted(copies):
-        if joined and leaves <= joined[-1][2]:
-            first = joined[-1]
-            joined[-1] = (first[0], first[1], max(first[2], until))
+    for copy in sorted(copies):
+        if joined and copy[0] <= joined[-1][2]:
+            joined[-1] = (*joined[-1][:2], max(joined[-1][2], copy[2]))
         else:
-            joined.append((leaves, arrives, until))
+            joined.append(copy)
     return joined

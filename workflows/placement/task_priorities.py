@@ -1,4 +1,4 @@
-"""Priorities of tasks: the orders of placement by rank, as given, or with little memory in use."""
+"""Priorities of tasks: the order in which tasks are placed, by rank or for little memory in use."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from neusee.workflows.placement.tasks_and_devices import Cluster, Task
 
 
 class Graph:
-    """Tasks by number: their sources and readers, the bytes sent, and the devices that can run them."""
+    """A graph of numbered tasks: sources and readers of each task, bytes to send, and devices that can run the task."""
 
     def __init__(self, tasks: Sequence[Task], cluster: Cluster, keep: Collection[str] = ()) -> None:
         self.tasks, self.cluster = tuple(tasks), cluster
@@ -29,21 +29,24 @@ class Graph:
             for j in sources:
                 self.readers[j].append(i)
         self.kept = {index[name] for name in keep}
-        self.sizes = [[t.takes.get(self.tasks[j].name, self.tasks[j].bytes) for j in s] for t, s in self._rows()]
+        self.sizes = [
+            [task.takes.get(self.tasks[j].name, self.tasks[j].bytes) for j in sources]
+            for task, sources in zip(self.tasks, self.sources, strict=True)
+        ]
         self.own = [float(math.ceil(task.bytes)) for task in self.tasks]  # whole bytes add up without round-off
         self.able = [[d for d, device in enumerate(cluster.devices) if device.name in t.seconds] for t in self.tasks]
         self.seconds = [[t.seconds.get(device.name, math.inf) for device in cluster.devices] for t in self.tasks]
         self._check()
 
     def held(self, i: int) -> bool:
-        """Return True if the result of task ``i`` is needed after the task."""
+        """Return True if a later task reads the result of task ``i``, or the result is held to the end."""
         return bool(self.readers[i]) or i in self.kept
 
     def work(self, i: int, parts: int) -> float:
         return float(math.ceil(self.tasks[i].work / parts))
 
     def by(self, keys: Sequence[Any]) -> list[int]:
-        """Return every task after its sources; among the ready tasks the one with the least key comes first."""
+        """Return the tasks in an order with sources first; of the ready tasks, the task with the least key is next."""
         missing = [len(sources) for sources in self.sources]
         ready = [(keys[i], i) for i, count in enumerate(missing) if not count]
         heapq.heapify(ready)
@@ -57,9 +60,6 @@ class Graph:
                     heapq.heappush(ready, (keys[reader], reader))
         return order
 
-    def _rows(self) -> zip[tuple[Task, list[int]]]:
-        return zip(self.tasks, self.sources, strict=True)
-
     def _check(self) -> None:
         there = ", ".join(device.name for device in self.cluster.devices)
         for task, able in zip(self.tasks, self.able, strict=True):
@@ -72,12 +72,12 @@ class Graph:
 
 
 def ranked(graph: Graph, ranks: Sequence[float]) -> list[int]:
-    """Return the tasks by falling rank; ranks that differ by round-off count as equal, and then the name decides."""
+    """Return the tasks by falling rank, and by name where two ranks differ by no more than round-off."""
     return graph.by([(-float(f"{rank:.9g}"), graph.tasks[i].name) for i, rank in enumerate(ranks)])
 
 
 def upward(graph: Graph) -> list[float]:
-    """Return rank_u: seconds from the start of each task to the end of the graph, with mean costs.
+    """Return rank_u, the seconds from the start of each task to the end of the graph, with mean costs.
 
     Source: Topcuoglu, Hariri, Wu, IEEE TPDS 13 (2002) 260, eq. 8.
     """
@@ -91,7 +91,7 @@ def upward(graph: Graph) -> list[float]:
 
 
 def downward(graph: Graph) -> list[float]:
-    """Return rank_d: seconds from the start of the graph to the start of each task, with mean costs (eq. 10)."""
+    """Return rank_d, the seconds from the start of the graph to the start of each task, with mean costs (eq. 10)."""
     ranks, wait, cost = [0.0] * len(graph.tasks), _mean_transfer(graph), _mean_seconds(graph)
     for i in graph.by(range(len(graph.tasks))):
         pairs = zip(graph.sources[i], graph.sizes[i], strict=True)
@@ -100,7 +100,7 @@ def downward(graph: Graph) -> list[float]:
 
 
 def frugal(graph: Graph) -> list[int]:
-    """Return a depth-first order in which the input that frees most of its memory comes first.
+    """Return a depth-first order of the tasks, which places first the input that frees most of its peak memory.
 
     Of all depth-first orders of a tree this order has the smallest peak memory (Liu, ACM TOMS 12 (1986) 249).
     """
@@ -119,7 +119,7 @@ def frugal(graph: Graph) -> list[int]:
 
 
 def _needs(graph: Graph) -> tuple[list[float], list[list[int]]]:
-    """Return the peak bytes of each task with all its predecessors, and its sources in the best order."""
+    """Return for each task the peak bytes of a run with all predecessors, and the sources in the best order."""
     need, befores = [0.0] * len(graph.tasks), list[list[int]]([] for _ in graph.tasks)
     for i in graph.by(range(len(graph.tasks))):
         befores[i] = sorted(graph.sources[i], key=lambda j: (graph.own[j] - need[j], j))
@@ -136,7 +136,7 @@ def _mean_seconds(graph: Graph) -> list[float]:
 
 
 def _mean_transfer(graph: Graph) -> tuple[float, float]:
-    """Return the mean latency and the mean seconds per byte over all pairs of devices."""
+    """Return the mean latency (s) and the mean seconds per byte over all pairs of devices."""
     names = [device.name for device in graph.cluster.devices]
     links = [graph.cluster.link(a, b) for a in names for b in names if a != b]
     count = max(len(links), 1)

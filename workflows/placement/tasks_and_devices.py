@@ -1,4 +1,4 @@
-"""Data of a schedule: devices and the links between them, tasks and their costs, and the place of each task.
+"""Data of a schedule: devices with their links, tasks with their costs, and the device and the times of each task.
 
 All times are in s and all sizes in bytes. No code here runs a task or reads a tensor.
 """
@@ -41,7 +41,7 @@ BUS = Link(20e9, 10e-6)
 
 @dataclass(frozen=True)
 class Cluster:
-    """Devices, and the links between them."""
+    """The devices of one or more machines, with the links between the devices."""
 
     devices: tuple[Device, ...]
     links: Mapping[tuple[str, str], Link] = field(default_factory=dict)  #: by kinds in either order, within one machine
@@ -54,7 +54,7 @@ class Cluster:
             raise ValueError(f"a cluster needs one device or more, with different names: {names or 'none'}")
 
     def link(self, a: str, b: str) -> Link:
-        """Return the link between two devices; a device has a link of no delay to itself."""
+        """Return the link between two devices, without delay if both are the same device."""
         if a == b:
             return Link()
         one, other = self._by_name[a], self._by_name[b]
@@ -63,10 +63,6 @@ class Cluster:
         pair = (one.kind, other.kind)
         return self.links.get(pair) or self.links.get((pair[1], pair[0])) or self.bus
 
-    def seconds(self, a: str, b: str, size: float) -> float:
-        """Return the seconds for sending ``size`` bytes from ``a`` to ``b``; 0 on the same device."""
-        return self.link(a, b).seconds(size)
-
     @cached_property
     def _by_name(self) -> dict[str, Device]:
         return {d.name: d for d in self.devices}
@@ -74,7 +70,7 @@ class Cluster:
 
 @dataclass(frozen=True, slots=True)
 class Task:
-    """A task and its costs."""
+    """A task, with its costs in seconds and bytes."""
 
     name: str
     sources: tuple[str, ...]
@@ -87,7 +83,7 @@ class Task:
 
 @dataclass(frozen=True, slots=True)
 class Slot:
-    """A task with its device and its times."""
+    """The place of a task in a schedule: its device and its times."""
 
     task: str
     device: str
@@ -99,7 +95,7 @@ class Slot:
 
 @dataclass(frozen=True, slots=True)
 class Move:
-    """A transfer of a result to another device, where the copy stays ``until`` its last use."""
+    """A transfer of a result to another device, which holds the copy ``until`` the last use there."""
 
     task: str
     bytes: float
@@ -112,7 +108,7 @@ class Move:
 
 @dataclass(frozen=True, slots=True)
 class Schedule:
-    """Device and times of each task, in order of time, with the makespan, the memory and the transfers."""
+    """A schedule: device and times of each task, in order of time, with makespan, memory and transfers."""
 
     slots: tuple[Slot, ...]
     makespan: float
@@ -121,41 +117,40 @@ class Schedule:
     moves: tuple[Move, ...] = ()
 
     def utilisation(self) -> dict[str, float]:
-        """Return the share of the makespan during which each device works."""
+        """Return the fraction of the makespan during which each device works, by the name of the device."""
         busy = dict.fromkeys(self.peak, 0.0)
         for slot in self.slots:
             busy[slot.device] += slot.end - slot.start
         return {name: time / self.makespan if self.makespan else 0.0 for name, time in busy.items()}
 
     def critical_path(self) -> tuple[Slot, ...]:
-        """Return the critical path: slots of which each delays the next, up to the slot that ends last."""
+        """Return the critical path: the slots of which each delays the next, up to the slot that ends last."""
         by_name = {slot.task: slot for slot in self.slots}
         at = max(self.slots, key=lambda slot: slot.end, default=None)
         path = []
         while at is not None:
             path.append(at)
             at = by_name.get(at.after)
-        return tuple(reversed(path))
+        return tuple(path[::-1])
 
 
 class TooLarge(ValueError):
-    """Error for a task that fits nowhere: ``needed`` bytes at once on ``device``, which has ``memory``."""
+    """Error for a task that fits on no device: it needs ``needed`` bytes on ``device``, which has ``memory`` bytes."""
 
     def __init__(self, task: str, device: str, needed: float, memory: float, parts: int = 1) -> None:
         self.task, self.device, self.needed, self.memory = task, device, needed, memory
-        how = f" in {parts} parts" if parts > 1 else ""
+        cut = f" in {parts} parts" if parts > 1 else ""
         super().__init__(
-            f"{task} does not fit: its inputs, result and results held there need {_size(needed)} on {device}{how}, "
+            f"{task} does not fit: its inputs, result and results held there need {_size(needed)} on {device}{cut}, "
             f"which has {_size(memory)}"
         )
 
     @property
     def short(self) -> float:
-        """Return the number of missing bytes."""
+        """Return the number of bytes that the device lacks."""
         return self.needed - self.memory
 
 
 def _size(count: float) -> str:
-    """Return a size in bytes, and in GB if large."""
     exact = f"{count:,.0f} B"
     return exact if count < 1e6 else f"{exact} ({count / 1e9:.3g} GB)"

@@ -1,4 +1,4 @@
-"""Which results are kept, where, are they whole, and which go first?
+"""Which results are stored, where, are the files undamaged, and which results are removed first?
 
 The folder of results by key: files, checksums, leases, the budget, other machines, and what is derived from results.
 Nothing here knows of recipes or decides what is computed.

@@ -1,8 +1,8 @@
 """Band files: one file for each slice of a stack of bands, shared by every result that contains the slice.
 
-A blob holds the bytes of a slice and a trailer: type and shape, checksum and the trailer's length. The bytes begin
-at the start of the file, so that slices of whole memory pages are mapped side by side into one address range, which
-gives a contiguous tensor without a copy. The maps are private: a write to the tensor changes no file.
+A band file (a blob) holds the bytes of a slice and a trailer: type and shape, checksum and the trailer's length. The
+bytes begin at the start of the file, so that slices of whole memory pages are mapped side by side into one address
+range, which gives a contiguous tensor without a copy. The maps are private: a write to the tensor changes no file.
 """
 
 from __future__ import annotations
@@ -17,6 +17,7 @@ from collections.abc import Sequence
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import suppress
 from dataclasses import dataclass
+from io import BufferedReader
 from math import prod
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -40,19 +41,19 @@ if _LIBC is not None:
 
 
 class Damaged(ValueError):
-    """Error for a blob that is missing or differs from the blob that was written; the band must be recomputed."""
+    """Error for a band file that is missing, or whose content has changed; the band must be computed again."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Stacked:
-    """A tensor whose slices along the first axis are stored as one blob each."""
+    """A tensor whose slices along the first axis are stored in one band file each."""
 
     tensor: Tensor
     names: tuple[str, ...]  #: one name for each slice; equal names are equal slices
 
 
 class Blob(NamedTuple):
-    """Content of the trailer of a blob."""
+    """Type, shape and checksum of a slice, as the trailer of its band file names them."""
 
     dtype: torch.dtype
     shape: tuple[int, ...]
@@ -64,28 +65,28 @@ class Blob(NamedTuple):
 
 
 class Blobs:
-    """The folder ``bands`` of a store, ``<2>/<name>``. A name stands for one content: written once, never changed."""
+    """The folder ``bands`` of a store, with files ``<first two letters>/<name>`` that never change."""
 
     def __init__(self, root: Path) -> None:
         self.root = root
         self._folder = os.fspath(root)
         self._disk = Disk(root.parent)
-        self._lost: set[str] = set()  # damaged blobs, which the user may not be allowed to move away
+        self._lost: set[str] = set()  # damaged files, which the user may not be allowed to move away
 
     def has(self, name: str) -> bool:
-        """Return True if a blob of this name exists, without reading its bytes."""
-        return name not in self._lost and os.path.exists(self._path(name))
+        """Return True if the band file of this name exists, without reading the file."""
+        return name not in self._lost and os.path.exists(self.path(name))
 
     def about(self, name: str) -> Blob:
-        """Return type, shape and checksum of a blob; raise `Damaged` where the trailer cannot be read."""
+        """Return type, shape and checksum of a band; raise `Damaged` where the trailer of its file cannot be read."""
         try:
-            with open(self._path(name), "rb") as file:
+            with open(self.path(name), "rb") as file:
                 return _trailer(file.fileno())[0]
         except (OSError, *_UNREADABLE) as error:
             raise self._damaged(name, error) from None
 
     def write(self, name: str, x: Tensor) -> str:
-        """Write ``x`` unless the blob exists; return the xxh3 of the stored blob. Raises `OSError` on a full disk."""
+        """Write the band ``x`` unless its file exists; return the checksum (xxh3) of the stored band."""
         if self.has(name):
             with suppress(Damaged):
                 return self.about(name).xxh3
@@ -100,18 +101,18 @@ class Blobs:
             return self._named(name, part) or xxh3
 
     def write_all(self, names: Sequence[str], slices: Sequence[Tensor]) -> list[str]:
-        """Write several blobs in parallel: a disk syncs many files in little more time than one file."""
+        """Write several bands in parallel, because a disk syncs many files in little more time than one file."""
         with ThreadPoolExecutor(_WRITERS) as pool:
             return list(pool.map(self.write, names, slices))
 
     def _named(self, name: str, part: str) -> str | None:
-        """Rename a complete blob to its name; return the checksum of an existing blob of that name, else None."""
+        """Rename a complete file to its band; if the band has a file already, return the checksum of that file."""
         self._disk.make_folder(self._folder)
-        if name in self._lost or not self._disk.link(part, self._path(name)):
+        if name in self._lost or not self._disk.link(part, self.path(name)):
             if name not in self._lost:
                 with suppress(Damaged):
                     return self.about(name).xxh3
-            self._disk.rename(part, self._path(name))
+            self._disk.rename(part, self.path(name))
             self._lost.discard(name)
         return None
 
@@ -123,51 +124,50 @@ class Blobs:
         verify: bool = True,
         xxh3: Sequence[str] | None = None,
     ) -> Tensor:
-        """Return one contiguous tensor of ``shape`` whose slices along the first axis are the blobs ``names``.
+        """Return one contiguous tensor of ``shape`` whose slices along the first axis are the bands ``names``.
 
-        The blobs are mapped where a slice is whole memory pages, else copied. ``verify`` compares the checksum of every
-        byte; ``xxh3`` lists the expected checksums. Raises `Damaged`; a damaged blob then counts as missing.
+        The files are mapped where a slice is whole memory pages, else copied. ``verify`` compares the checksum of every
+        byte; ``xxh3`` lists the expected checksums. Raises `Damaged`; a damaged file then counts as missing.
         """
-        wanted = [Blob(dtype, tuple(shape[1:]), xxh3[i] if xxh3 else "") for i in range(len(names))]
-        size = wanted[0].nbytes if wanted else 0
+        expected = [Blob(dtype, tuple(shape[1:]), xxh3[i] if xxh3 else "") for i in range(len(names))]
+        size = expected[0].nbytes if expected else 0
         if not size:
             return torch.empty(*shape, dtype=dtype)
         if _LIBC is not None and size % mmap.PAGESIZE == 0:
             with suppress(OSError):  # a file system or a limit that allows no maps
                 space = _reserve(len(names) * size)
-                self._fill(names, wanted, memoryview(space).cast("B"), ctypes.addressof(space), verify)
+                self._fill(names, expected, memoryview(space).cast("B"), ctypes.addressof(space), verify)
                 return torch.frombuffer(space, dtype=dtype).reshape(*shape)
         x = torch.empty(*shape, dtype=dtype)
-        self._fill(names, wanted, bytes_of(x), None, verify)
+        self._fill(names, expected, bytes_of(x), None, verify)
         return x
 
     def _fill(
-        self, names: Sequence[str], wanted: Sequence[Blob], into: memoryview, address: int | None, verify: bool
+        self, names: Sequence[str], expected: Sequence[Blob], into: memoryview, address: int | None, verify: bool
     ) -> None:
-        """Place blobs side by side: map the files where an ``address`` is given, else read them."""
-        size = wanted[0].nbytes
-        for i, (name, want) in enumerate(zip(names, wanted, strict=True)):
+        """Load bands side by side into memory: map the files where an ``address`` is given, else read the files."""
+        size = expected[0].nbytes
+        for i, (name, blob) in enumerate(zip(names, expected, strict=True)):
             try:
-                with open(self._path(name), "rb", buffering=0) as file:
+                with open(self.path(name), "rb") as file:
                     at = address and address + i * size
-                    _load(file.fileno(), want, into[i * size : (i + 1) * size], at, verify)
-            except _UNREADABLE as error:
+                    _load(file, blob, into[i * size : (i + 1) * size], at, verify)
+            except (OSError, *_UNREADABLE) as error:
+                if address is not None and not isinstance(error, _UNREADABLE):
+                    raise
                 raise self._damaged(name, error) from None
-            except OSError as error:
-                if address is None:
-                    raise self._damaged(name, error) from None
-                raise
 
-    def _path(self, name: str) -> str:
+    def path(self, name: str) -> str:
+        """Return the path of a band's file."""
         return f"{self._folder}/{name[:2]}/{name}"
 
     def _damaged(self, name: str, error: Exception) -> Damaged:
-        """Move a damaged blob to the folder ``bad/`` of the store for inspection; return the error to raise."""
+        """Move a damaged band file to the folder ``bad/`` of the store for inspection; return the error to raise."""
         self._lost.add(name)
         if not isinstance(error, OSError):
             with suppress(OSError):
                 self._disk.make_folder(f"{self._disk.folder}/bad")
-                os.replace(self._path(name), f"{self._disk.folder}/bad/{name}")
+                os.replace(self.path(name), f"{self._disk.folder}/bad/{name}")
         return Damaged(f"the band {name} is damaged or missing: {error}")
 
 
@@ -181,10 +181,10 @@ def bytes_of(x: Tensor) -> memoryview:
 
 def dtype_of(name: str) -> torch.dtype:
     """Return ``torch.float32`` for ``"float32"``; raise `ValueError` for a name that torch does not know."""
-    found = getattr(torch, name, None)
-    if not isinstance(found, torch.dtype):
+    dtype = getattr(torch, name, None)
+    if not isinstance(dtype, torch.dtype):
         raise ValueError(f"{name!r} is not a dtype of torch")
-    return found
+    return dtype
 
 
 def _kind(dtype: torch.dtype, shape: tuple[int, ...]) -> bytes:
@@ -192,19 +192,19 @@ def _kind(dtype: torch.dtype, shape: tuple[int, ...]) -> bytes:
 
 
 def _checksum(data: memoryview, kind: bytes) -> str:
-    found = xxhash.xxh3_128(data)
-    found.update(kind)
-    return found.hexdigest()
+    digest = xxhash.xxh3_128(data)
+    digest.update(kind)
+    return digest.hexdigest()
 
 
 def _trailer(file: int) -> tuple[Blob, bytes]:
-    """Return the content of a blob's trailer after comparing the file size; raise `ValueError` where they disagree."""
+    """Return the trailer of a band file, decoded and as bytes; raise `ValueError` where the file size is wrong."""
     size = os.fstat(file).st_size
     tail = os.pread(file, 512, max(0, size - 512))
     length = int.from_bytes(tail[-4:], "little")
     body = tail[-36 - length : -4]
     if len(body) != length + 32:
-        raise ValueError("the trailer is missing or cut short")
+        raise ValueError("the trailer of the file is missing or cut short")
     dtype, shape = json.loads(body[:length])
     blob = Blob(dtype_of(dtype), tuple(int(n) for n in shape), body[length:].decode())
     if size != blob.nbytes + length + 36:
@@ -212,45 +212,35 @@ def _trailer(file: int) -> tuple[Blob, bytes]:
     return blob, body[:length]
 
 
-def _load(file: int, want: Blob, into: memoryview, address: int | None, verify: bool) -> None:
-    """Load the slice of a file into its place; raise `ValueError` where the file holds another slice."""
-    blob, kind = _trailer(file)
-    if blob[:2] != want[:2]:
-        raise ValueError(f"the file holds {blob.dtype} {blob.shape} instead of {want.dtype} {want.shape}")
-    if want.xxh3 and blob.xxh3 != want.xxh3:
-        raise ValueError("the file holds another band than the one written with this result")
-    if address is None:
-        _read_all(file, into)
-    else:
-        _map(file, address, blob.nbytes)
+def _load(file: BufferedReader, expected: Blob, into: memoryview, address: int | None, verify: bool) -> None:
+    """Load the band of a file into memory; raise `ValueError` where the file holds another band or damaged bytes."""
+    blob, kind = _trailer(file.fileno())
+    if blob[:2] != expected[:2]:
+        raise ValueError(f"the file holds {blob.dtype} {blob.shape} instead of {expected.dtype} {expected.shape}")
+    if expected.xxh3 and blob.xxh3 != expected.xxh3:
+        raise ValueError("the file holds another band than the band that was written with this result")
+    if address is not None:
+        _map(file.fileno(), address, blob.nbytes)
+    elif file.readinto(into) != len(into):
+        raise ValueError("the file was truncated while being read")
     if verify and _checksum(into, kind) != blob.xxh3:
         raise ValueError("checksum mismatch: the stored bytes have changed since they were written")
 
 
-def _read_all(file: int, into: memoryview) -> None:
-    done = 0
-    while done < len(into):
-        read = os.preadv(file, [into[done:]], done)
-        if not read:
-            raise ValueError("the file was truncated while being read")
-        done += read
-
-
 def _reserve(size: int) -> Any:
-    """Return an array over a reserved address range of ``size`` bytes, which is released with the array."""
+    """Reserve an address range of ``size`` bytes, which is released when the returned array is deleted."""
     assert _LIBC is not None
     flags = mmap.MAP_PRIVATE | mmap.MAP_ANON
     address = _LIBC.mmap(None, size, 0, flags, -1, 0)
     if address in (None, ctypes.c_void_p(-1).value):
-        raise OSError(ctypes.get_errno(), "no address range is free")
+        raise OSError(ctypes.get_errno(), "no free address range for the bands of a stack")
     space = (ctypes.c_char * size).from_address(address)
     weakref.finalize(space, _LIBC.munmap, address, size).atexit = False  # a thread may use it until the very end
     return space
 
 
 def _map(file: int, address: int, size: int) -> None:
-    """Map the beginning of a file to an address inside a range of `_reserve`."""
     assert _LIBC is not None
     access = mmap.PROT_READ | mmap.PROT_WRITE
     if _LIBC.mmap(address, size, access, mmap.MAP_PRIVATE | _FIXED, file, 0) != address:
-        raise OSError(ctypes.get_errno(), "the file cannot be mapped")
+        raise OSError(ctypes.get_errno(), "the file of a band cannot be mapped into memory")

@@ -1,15 +1,15 @@
-"""Read and write speed of a store: measured at its own transfers and kept in a file beside them."""
+"""Read and write speed of a store, measured while the store reads and writes, and kept in a file of the store."""
 
 from __future__ import annotations
 
 import json
-import os
 from contextlib import suppress
 from typing import Literal
 
 from neusee.workflows.store.shared_folder import Disk
 
 Direction = Literal["read", "write"]
+_FILE = "speeds.json"
 LARGE = 1_000_000  #: bytes from which a transfer updates the speed
 _USUAL: dict[Direction, float] = {"read": 8e9, "write": 0.4e9}  #: bytes / s
 _SETUP: dict[Direction, float] = {"read": 5e-5, "write": 2e-4}  #: s for each transfer, whatever its size
@@ -18,11 +18,10 @@ _NEWS = 1.25  #: factor by which a speed must differ from the stored speed to be
 
 
 class Speeds:
-    """Bytes a second of one store in each direction."""
+    """Read and write speed of one store in bytes per second."""
 
     def __init__(self, disk: Disk) -> None:
         self._disk = disk
-        self._path = f"{disk.folder}/speeds.json"
         self._now: dict[Direction, float] = {}
         self._written: dict[Direction, float] = {}
 
@@ -34,31 +33,24 @@ class Speeds:
         """Update the speed with the measured ``seconds`` of one transfer."""
         if size < LARGE:
             return
-        found = size / max(seconds - _SETUP[way], 1e-6)
-        before = self._speed(way)
-        self._now[way] = before ** (1 - _LEARN) * found**_LEARN
+        newest = size / max(seconds - _SETUP[way], 1e-6)
+        self._now[way] = self._speed(way) ** (1 - _LEARN) * newest**_LEARN
         written = self._written.get(way, _USUAL[way])
         if not written / _NEWS < self._now[way] < written * _NEWS:
-            self._remember()
+            self._written = dict(self._now)
+            with suppress(OSError):
+                self._disk.replace(_FILE, json.dumps(self._now).encode())
 
     def _speed(self, way: Direction) -> float:
         if not self._now:
-            self._written = self._remembered()
+            self._written = self._stored()
             self._now = {**_USUAL, **self._written}
         return self._now[way]
 
-    def _remembered(self) -> dict[Direction, float]:
+    def _stored(self) -> dict[Direction, float]:
         try:
-            with open(self._path, "rb") as file:
-                found = json.load(file)
-            return {way: float(found[way]) for way in _USUAL if 1e3 < found[way] < 1e13}
+            with open(f"{self._disk.folder}/{_FILE}", "rb") as file:
+                speeds = json.load(file)
+            return {way: float(speeds[way]) for way in _USUAL if 1e3 < speeds[way] < 1e13}
         except (OSError, ValueError, LookupError, TypeError):
             return {}
-
-    def _remember(self) -> None:
-        self._written = dict(self._now)
-        with suppress(OSError), self._disk.temporary("speeds") as (part, file):
-            file.write(json.dumps(self._now).encode())
-            file.flush()
-            self._disk.share(part)
-            os.replace(part, self._path)

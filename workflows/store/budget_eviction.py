@@ -1,8 +1,8 @@
-"""Eviction of a store beyond its budget: the values that save the fewest seconds per byte are evicted first.
+"""Eviction of values from a store beyond its budget: values that save the fewest seconds per byte go first.
 
-The weight of a value halves for every week between its last use and the newest use in the
-store, whatever today's date is. Pinned values stay. An evicted value leaves its receipt, so
-that its origin and its cost stay known; a process that reads the value at that moment keeps its map.
+The weight of a value halves for every week between its last use and the newest use in the store, whatever today's
+date is. Pinned values stay. The metadata of an evicted value stay as its receipt, so that origin and cost remain known;
+a process that reads the value at that moment keeps its memory map.
 """
 
 from __future__ import annotations
@@ -26,7 +26,7 @@ _FULL = (errno.ENOSPC, errno.EDQUOT, errno.EFBIG)
 
 @dataclass(frozen=True, slots=True)
 class Candidate:
-    """A value that may be evicted."""
+    """A stored value that may be evicted."""
 
     key: str
     size: int  #: bytes that the eviction frees
@@ -35,26 +35,26 @@ class Candidate:
 
 
 def chosen(candidates: Iterable[Candidate], excess: float) -> list[Candidate]:
-    """Return the values to evict so that at least ``excess`` bytes become free, the least valuable value first."""
-    all_ = [c for c in candidates if c.size > 0]
-    newest = max((c.used for c in all_), default=0.0)
-    all_.sort(key=lambda c: (max(c.seconds, 0.0) / c.size * 2 ** ((c.used - newest) / _HALF), c.used, c.key))
-    going, freed = [], 0
-    for candidate in all_:
+    """Return the values whose eviction frees ``excess`` bytes or more, the least valuable value first."""
+    evictable = [c for c in candidates if c.size > 0]
+    newest = max((c.used for c in evictable), default=0.0)
+    evictable.sort(key=lambda c: (max(c.seconds, 0.0) / c.size * 2 ** ((c.used - newest) / _HALF), c.used, c.key))
+    going, freed = list[Candidate](), 0
+    for candidate in evictable:
         if freed >= excess:
             break
         going.append(candidate)
         freed += candidate.size
-    for candidate in reversed(list(going)):
+    for candidate in going[::-1]:
         if freed - candidate.size >= excess:
             going.remove(candidate)
             freed -= candidate.size
     return going
 
 
-def evict(disk: Disk, found: Iterable[Candidate], excess: float, dry: bool) -> tuple[list[Candidate], list[Candidate]]:
-    """Evict values until ``excess`` bytes are free; return the evicted values and those that we may not remove."""
-    left, gone, refused = {c.key: c for c in found}, list[Candidate](), list[Candidate]()
+def evict(disk: Disk, among: Iterable[Candidate], excess: float, dry: bool) -> tuple[list[Candidate], list[Candidate]]:
+    """Evict values until ``excess`` bytes are free; return the evicted values and the values of other users."""
+    left, gone, refused = {c.key: c for c in among}, list[Candidate](), list[Candidate]()
     while excess > 0 and (batch := chosen(left.values(), excess)):
         for candidate in batch:
             del left[candidate.key]
@@ -67,32 +67,32 @@ def evict(disk: Disk, found: Iterable[Candidate], excess: float, dry: bool) -> t
 
 
 class CacheBudget:
-    """Check of the store's bytes against its budget, without counting all bytes at each write."""
+    """Comparison of a store's bytes with its budget, without a count of all bytes at each write."""
 
     def __init__(self, disk: Disk, budget: int) -> None:
         self._disk, self.budget = disk, budget
         self._spare = 0.0  # bytes that may be written before all bytes are counted again
 
     def excess(self, size: int) -> float:
-        """Return the bytes to evict after a write of ``size``; writes of others are noticed after 5 % of the budget."""
+        """Return the bytes to evict after a write of ``size`` bytes; recount all after writes of 5 % of the budget."""
         self._spare -= size
         if self._spare > 0:
             return 0.0
-        found = total(self._disk)
+        stored = total(self._disk)
         self._spare = self.budget / 20
-        if found > self.budget:
-            return found - LOW * self.budget
-        self._spare = min(self._spare, self.budget - found)
+        if stored > self.budget:
+            return stored - LOW * self.budget
+        self._spare = min(self._spare, self.budget - stored)
         return 0.0
 
 
 def total(disk: Disk) -> int:
-    """Return the bytes of all results, with the files and bands that belong to them."""
+    """Return the bytes of all results of a store, with their files and bands."""
     return sum(size for _, size, _ in files(disk))
 
 
 def candidates(disk: Disk, pinned: Collection[str], read_seconds: Callable[[float], float]) -> Iterator[Candidate]:
-    """Yield every value that is not pinned; the bytes of a band are divided among the values that share the band."""
+    """Yield every value that may be evicted, with its share of the bytes of bands that several values use."""
     stats = {os.path.basename(path): (size, changed) for path, size, changed in files(disk)}
     kept = {key: about for key, about in metadata.each(disk) if metadata.is_kept(about)}
     bands = {key: set(metadata.bands(about)) for key, about in kept.items()}
@@ -107,34 +107,31 @@ def candidates(disk: Disk, pinned: Collection[str], read_seconds: Callable[[floa
 
 
 def drop(disk: Disk, key: str) -> bool:
-    """Reduce a value to its receipt; return False where we have no permission."""
+    """Delete a value and keep its metadata as a receipt; return False where we may not delete the value."""
     try:
         with disk.lock():
             about = metadata.read(disk, key)
             if metadata.is_kept(about):
                 _write_receipt(disk, key, about)
-                _unlink(disk, key, about)
+                _delete_files(disk, key, about)
     except FileNotFoundError:
-        return True  # another process was first
+        pass  # another process was first
     except UNREADABLE:
         return False
     return True
 
 
 def _write_receipt(disk: Disk, key: str, about: Metadata) -> None:
-    """Write the receipt of an evicted value; on a full disk delete the metadata instead."""
+    """Replace the metadata of an evicted value by its receipt; on a full disk delete the metadata instead."""
     try:
-        with disk.temporary(key) as (part, file):
-            file.write(metadata.seal(metadata.receipt(about)))
-            file.flush()
-            disk.rename(part, disk.path(key, "json"))
+        metadata.write(disk, key, metadata.receipt(about), over=True)
     except OSError as error:
         if error.errno not in _FULL:
             raise
         os.unlink(disk.path(key, "json"))
 
 
-def _unlink(disk: Disk, key: str, about: Metadata) -> None:
+def _delete_files(disk: Disk, key: str, about: Metadata) -> None:
     paths = [disk.path(key, "safetensors")] if about.get("payload") else []
     if name := about.get("file"):
         paths.append(f"{disk.folder}/files/{key[:2]}/{os.path.basename(name)}")
@@ -146,17 +143,23 @@ def _unlink(disk: Disk, key: str, about: Metadata) -> None:
 def files(disk: Disk) -> Iterator[tuple[str, int, float]]:
     """Yield path, bytes and last change of every file that counts against the budget."""
     for base in (disk.folder, f"{disk.folder}/files", f"{disk.folder}/bands"):
-        for folder in entries(base):
-            if len(folder.name) == 2 and folder.is_dir(follow_symlinks=False):
-                for entry in entries(folder.path):
-                    with suppress(OSError):
-                        stat = entry.stat(follow_symlinks=False)
-                        yield entry.path, stat.st_size, stat.st_mtime
+        for entry in below(base):
+            with suppress(OSError):
+                stat = entry.stat(follow_symlinks=False)
+                yield entry.path, stat.st_size, stat.st_mtime
+
+
+def below(base: str) -> Iterator[os.DirEntry[str]]:
+    """Yield the files in all subfolders of ``base`` whose names have two letters."""
+    for folder in entries(base):
+        if len(folder.name) == 2 and folder.is_dir(follow_symlinks=False):
+            yield from entries(folder.path)
 
 
 def entries(folder: str) -> list[os.DirEntry[str]]:
+    """Return the files and folders in a folder, or an empty list where the folder cannot be read."""
     try:
-        with os.scandir(folder) as found:
-            return list(found)
+        with os.scandir(folder) as listing:
+            return list(listing)
     except OSError:
         return []

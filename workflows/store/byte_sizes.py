@@ -1,4 +1,4 @@
-"""Numbers of bytes as text: ``20 GB`` read into a number, and a number written as ``20 GB``."""
+"""Conversion between numbers of bytes and texts such as ``20 GB``."""
 
 from __future__ import annotations
 
@@ -10,16 +10,15 @@ _SIZE = re.compile(r"\s*(\d+(?:\.\d+)?)\s*((?:[kmgt]i?)?b?)\s*", re.IGNORECASE)
 
 
 def parse_size(text: str) -> int:
-    """Return the bytes that a text such as ``20 GB`` or ``1.5 TiB`` names; raise `ValueError` for any other text."""
-    found = _SIZE.fullmatch(text)
-    if not found:
+    """Return the number of bytes of a text such as ``20 GB`` or ``1.5 TiB``; raise `ValueError` for any other text."""
+    match = _SIZE.fullmatch(text)
+    if not match:
         raise ValueError(f"{text!r} is not a size: write a number of bytes, such as 20 GB")
-    unit = found[2].lower().removesuffix("b") + "b"
-    return int(float(found[1]) * _ANY_CASE[unit])
+    unit = match[2].lower().removesuffix("b") + "b"
+    return int(float(match[1]) * _ANY_CASE[unit])
 
 
 def format_size(count: float) -> str:
-    """Return a number of bytes with three digits and the unit that suits it."""
-    units = ("B", "kB", "MB", "GB", "TB")
-    unit = next((unit for unit in units if count < 1000 * UNITS[unit]), units[-1])
+    """Return a number of bytes as text with three digits and the largest fitting unit, such as ``20 GB``."""
+    unit = next((unit for unit in ("B", "kB", "MB", "GB") if count < 1000 * UNITS[unit]), "TB")
     return f"{count / UNITS[unit]:.3g} {unit}"

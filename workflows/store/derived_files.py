@@ -1,11 +1,13 @@
-"""Derived files by key, such as pictures and spectral EXR: a second run takes each file and draws nothing.
+"""Files derived from results, such as pictures and spectral EXR, kept by key so that a second run draws nothing.
 
-The bytes lie in ``files/`` of the store's folder; the store itself keeps their checksum.
+The bytes are in the folder ``files/`` of the store; the store itself keeps their checksum.
 """
 
 from __future__ import annotations
 
+import hashlib
 import os
+from contextlib import suppress
 from datetime import UTC, datetime
 from pathlib import Path
 from tempfile import TemporaryDirectory
@@ -17,7 +19,7 @@ from neusee.workflows.store.result_store import Store
 
 
 class DerivedFiles:
-    """Files beside a store; where the store's folder cannot be written, the files live as long as this object."""
+    """Derived files beside the results of a store, or in a temporary folder where the store cannot be written."""
 
     def __init__(self, store: Store) -> None:
         self.store = store
@@ -25,18 +27,15 @@ class DerivedFiles:
         self._spare: TemporaryDirectory[str] | None = None
 
     def find(self, key: str, suffix: str) -> Path | None:
-        """Return the file of a key if the file exists and its checksum matches, else None."""
+        """Return the path of a key's file if the file exists and its checksum matches, else None."""
         path = self._path(key, suffix)
-        if not path.is_file() or not self.store.has(key):
-            return None
-        try:
-            known = bytes(self.store.get(key).tolist())
-        except KeyError:
-            return None
-        return path if known == _checksum(path) else None
+        with suppress(KeyError):
+            if path.is_file() and self.store.has(key) and bytes(self.store.get(key).tolist()) == _checksum(path):
+                return path
+        return None
 
     def keep(self, key: str, suffix: str, what: str, content: bytes) -> Path:
-        """Write a read-only file by atomic rename and put its checksum into the store; return the path of the file."""
+        """Write a read-only file by atomic rename and store its checksum; return the path of the file."""
         try:
             path = self._written(key, suffix, content)
         except PermissionError:
@@ -70,8 +69,5 @@ class DerivedFiles:
 
 
 def _checksum(path: Path) -> bytes:
-    found = xxhash.xxh3_128()
     with path.open("rb") as file:
-        while block := file.read(1 << 20):
-            found.update(block)
-    return found.digest()
+        return hashlib.file_digest(file, xxhash.xxh3_128).digest()

@@ -1,4 +1,4 @@
-"""Settings of the store from the environment: its folder, its verify mode and its budget."""
+"""Settings of a store from environment variables: its folder, how often checksums are compared, and its budget."""
 
 from __future__ import annotations
 
@@ -12,14 +12,14 @@ Verify = Literal["always", "sampled", "never"]
 
 
 def default_root() -> Path:
-    """Return ``$NEUSEE_CACHE``, else ``cache/`` of the surrounding checkout, else ``~/.cache/neusee``.
+    """Return the folder ``$NEUSEE_CACHE``, else ``cache/`` of the surrounding checkout, else ``~/.cache/neusee``.
 
-    Raises `ValueError` where the variable names a URL.
+    Raises `ValueError` where the variable holds a URL.
     """
-    if named := os.environ.get("NEUSEE_CACHE"):
-        if "://" in named:
-            raise ValueError(f"NEUSEE_CACHE is {named!r}, which is not a folder: `open_store` takes URLs too")
-        return Path(named)
+    if value := os.environ.get("NEUSEE_CACHE"):
+        if "://" in value:
+            raise ValueError(f"NEUSEE_CACHE is {value!r}, which is not a folder: `open_store` takes URLs too")
+        return Path(value)
     here = Path.cwd()
     for folder in (here, *here.parents):
         project = folder / "pyproject.toml"
@@ -28,21 +28,21 @@ def default_root() -> Path:
     return Path.home() / ".cache" / "neusee"
 
 
-def verify_mode(wanted: str | None) -> Verify:
-    """Return ``wanted``, else ``$NEUSEE_CACHE_VERIFY``, else ``always``; raise `ValueError` for any other word."""
-    name = "verify" if wanted else "NEUSEE_CACHE_VERIFY"
-    found = wanted or os.environ.get("NEUSEE_CACHE_VERIFY") or "always"
-    if found not in get_args(Verify):
-        raise ValueError(f"{name} is {found!r}: write always, sampled or never")
-    return cast(Verify, found)
+def verify_mode(mode: str | None) -> Verify:
+    """Return ``mode``, else ``$NEUSEE_CACHE_VERIFY``, else ``always``; raise `ValueError` for any other word."""
+    name = "verify" if mode else "NEUSEE_CACHE_VERIFY"
+    mode = mode or os.environ.get("NEUSEE_CACHE_VERIFY") or "always"
+    if mode not in get_args(Verify):
+        raise ValueError(f"{name} is {mode!r}: write always, sampled or never")
+    return cast(Verify, mode)
 
 
-def budget_bytes(wanted: int | None) -> int | None:
-    """Return ``wanted``, else ``$NEUSEE_CACHE_BUDGET`` such as ``20 GB``, else None; raise `ValueError` for no size."""
-    named = os.environ.get("NEUSEE_CACHE_BUDGET")
-    if wanted is not None or not named:
-        return wanted
+def budget_bytes(budget: int | None) -> int | None:
+    """Return ``budget``, else ``$NEUSEE_CACHE_BUDGET`` in bytes, else None; raise `ValueError` for a bad size."""
+    text = os.environ.get("NEUSEE_CACHE_BUDGET")
+    if budget is not None or not text:
+        return budget
     try:
-        return parse_size(named)
+        return parse_size(text)
     except ValueError as error:
         raise ValueError(f"NEUSEE_CACHE_BUDGET: {error}") from None

@@ -1,4 +1,4 @@
-"""Journal of a store: one line for every finished result, so that a query need not read all results.
+"""Journal of a store: one line for every finished result, so that a query reads one file instead of all results.
 
 The journal is advice. Each line is one write, and a torn line is skipped. A journal that is
 missing or damaged is rebuilt from the metadata of the results.
@@ -11,13 +11,12 @@ import json
 import os
 import re
 import threading
-from collections import defaultdict
 from collections.abc import Callable, Collection, Iterable, Iterator
 from contextlib import suppress
 from typing import Any
 
 from neusee.workflows.store import metadata
-from neusee.workflows.store.shared_folder import Disk
+from neusee.workflows.store.shared_folder import Disk, append
 
 Row = dict[str, Any]
 _FIELDS = ("step", "recipe", "seconds", "bytes", "device", "peak", "date")
@@ -29,83 +28,67 @@ _SPARE = 20_000  #: superseded lines from which the file is rewritten
 
 
 def row_of(key: str, about: Row) -> Row:
-    """Return the journal's line of a result."""
+    """Return the journal line for the result ``key`` with the metadata ``about``."""
     node = (about.get("origin") or {}).get("node")
     return {"key": key, **{f: about.get(f) for f in _FIELDS}, "node": node, "kept": metadata.is_kept(about)}
 
 
 class Journal:
-    """The lines of one store, the newest last."""
+    """The lines of the journal of one store, the newest line last."""
 
     def __init__(self, disk: Disk, others: Callable[[], Iterable[tuple[str, Row]]] = tuple) -> None:
-        """Open the journal of ``disk``; ``others`` yields the results that have no files of their own."""
+        """Open the journal of a store; ``others`` yields key and metadata of results without files of their own."""
         self._disk, self._others, self._guard = disk, others, threading.RLock()
         self._path = f"{disk.folder}/journal.jsonl"
         self._forget()
 
     def append(self, key: str, about: Row) -> None:
-        """Append a line; a line that cannot be written is lost, which costs time and no result."""
+        """Append the line of a result to the file; ignore a failure, because a lost line costs time and no result."""
         with suppress(OSError):
             try:
-                self._write(b"\n" + _encode(row_of(key, about)).encode())
+                append(self._path, b"\n" + _encode(row_of(key, about)).encode())
             except FileNotFoundError:
                 with self._guard:
                     self._rebuild()
 
     def rows(self) -> list[Row]:
-        """Return every line: key, step, recipe, node, seconds, bytes, device, peak, date, kept. Do not change them."""
+        """Return every line: key, step, recipe, node, seconds, bytes, device, peak, date, kept. Change no line."""
         self._read()
         return self._rows
 
     def of_step(self, name: str) -> list[Row]:
-        """Return the lines of a step, the newest last."""
-        self._read()
-        return self._by_step.get(name, [])
-
-    def of_node(self, path: str) -> list[Row]:
-        """Return the lines of a node, the newest last."""
-        self._read()
-        return self._by_node.get(path, [])
+        """Return the journal lines of the step ``name``, the newest line last."""
+        return [row for row in self.rows() if row["step"] == name]
 
     def mark_evicted(self, keys: Collection[str]) -> None:
-        """Mark the values of these keys as no longer kept."""
+        """Record in the journal that the values of these keys are no longer stored."""
         with self._guard:
             self._read()
             self._replace([{**row, "kept": False} if row["key"] in keys else row for row in self._rows])
 
     def compact(self) -> None:
-        """Rewrite the journal with the newest line of each result that exists, and with whether its value is kept."""
+        """Rewrite the journal with the newest line of each existing result, corrected for evicted values."""
         self._read()
         known = {row["key"]: (i, row) for i, row in enumerate(self._rows)}
-        found = []
+        lines = []
         for key, about in self._each():
             at, row = known.get(key, (-1, row_of(key, about)))
-            found.append((at, {**row, "kept": metadata.is_kept(about)}))
-        found.sort(key=lambda item: (item[0], str(item[1].get("date"))))
+            lines.append((at, {**row, "kept": metadata.is_kept(about)}))
+        lines.sort(key=lambda line: (line[0], str(line[1].get("date"))))
         with self._guard:
-            self._replace([row for _, row in found])
-
-    def _write(self, line: bytes) -> None:
-        file = os.open(self._path, os.O_WRONLY | os.O_APPEND)
-        try:
-            os.write(file, line)
-        finally:
-            os.close(file)
+            self._replace([row for _, row in lines])
 
     def _forget(self) -> None:
         self._rows: list[Row] = []
-        self._by_step: dict[str, list[Row]] = defaultdict(list)
-        self._by_node: dict[str, list[Row]] = defaultdict(list)
         self._head, self._offset, self._fileless = b"", 0, False
 
     def _read(self) -> None:
         with self._guard:
-            self._take_in()
+            if not self._fileless:
+                self._read_new_lines()
 
-    def _take_in(self) -> None:
-        """Read the lines added since the last call; skip the file where none can be written."""
-        if self._fileless:
-            return None
+    def _read_new_lines(self) -> None:
+        """Read the lines that were added to the file since the last call; rebuild a missing or damaged file."""
         try:
             with open(self._path, "rb") as file:
                 head = file.readline(100).strip()
@@ -116,20 +99,13 @@ class Journal:
         except FileNotFoundError:
             return self._rebuild()
         except OSError:
-            return None
+            return
         if not _HEAD.fullmatch(head):
             return self._rebuild()
         self._head, self._offset = head, (self._offset or len(head)) + len(raw)
-        for row in _parsed(raw):
-            self._take(row)
+        self._rows += _parsed(raw)
         if len(self._rows) > _SPARE and len(self._rows) > 2 * len({row["key"] for row in self._rows}):
             self._replace(list({row["key"]: row for row in self._rows}.values()))
-        return None
-
-    def _take(self, row: Row) -> None:
-        self._rows.append(row)
-        self._by_step[row["step"]].append(row)
-        self._by_node[row["node"]].append(row)
 
     def _each(self) -> Iterator[tuple[str, Row]]:
         return itertools.chain(metadata.each(self._disk), self._others())
@@ -139,32 +115,27 @@ class Journal:
         self._replace(sorted(rows, key=lambda row: str(row["date"])))
 
     def _replace(self, rows: list[Row]) -> None:
-        """Replace the file by one with these rows; a line that another process adds meanwhile may be lost."""
+        """Replace the file by one with the lines ``rows``; a line that another process adds meanwhile may be lost."""
         self._forget()
-        for row in rows:
-            self._take(row)
+        self._rows = rows
         self._head = f'{{"journal":"{os.urandom(8).hex()}"}}'.encode()
         raw = b"".join([self._head, *(b"\n" + _encode(row).encode() for row in rows)])
         self._offset = len(raw)
         try:
             if rows:
-                with self._disk.temporary("journal") as (part, file):
-                    file.write(raw)
-                    file.flush()
-                    self._disk.share(part)
-                    os.replace(part, self._path)
+                self._disk.replace("journal.jsonl", raw)
         except OSError:
             self._fileless = True
 
 
 def _parsed(raw: bytes) -> Iterator[Row]:
-    """Yield the rows in the lines of ``raw``: parse all at once, or one by one where some lines are damaged."""
+    """Yield the valid lines in the text ``raw``; parse all lines at once, or one by one where a line is damaged."""
     lines = [line for line in raw.split(b"\n") if line]
     try:
-        found = json.loads(b"[" + b",".join(lines) + b"]")
+        rows = json.loads(b"[" + b",".join(lines) + b"]")
     except ValueError:
-        found = [_row(line) for line in lines]
-    for row in found:
+        rows = [_row(line) for line in lines]
+    for row in rows:
         if isinstance(row, dict) and all(isinstance(row.get(name, ...), kind) for name, kind in _KINDS.items()):
             yield row
 

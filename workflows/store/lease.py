@@ -1,12 +1,10 @@
-"""Leases: a process that holds the lease of a key computes the key, so that no second process does the same.
+"""Leases: only the process that holds the lease of a key computes the result of the key.
 
-A lease is a second hard link to the badge of a process, a file that names the process. Taking
-a lease is therefore one atomic step, and one heartbeat serves all leases of a process. On the
-same machine, an observer looks up the owner by process number and start time: after
-``kill -9`` the next process takes over at once. An owner on another machine must be seen to
-change its badge. The observer measures the time without a change by its own monotonic clock,
-so that no clock that jumps makes a live owner dead. A lease is advice: if two processes held
-the same lease, they would do the same work twice and do no other harm.
+A lease is a second hard link to the badge of a process, a file that names the process: one atomic step takes a lease,
+and one heartbeat serves all leases of a process. On the same machine, an observer looks up the owner by process number
+and start time, so that the next process takes over at once after ``kill -9``. An owner on another machine must change
+its badge in time. The observer measures this time by its own monotonic clock, so that no clock that jumps makes a live
+owner dead. A lease is advice: two processes with the same lease would do the same work twice and no other harm.
 """
 
 from __future__ import annotations
@@ -16,10 +14,9 @@ import os
 import threading
 import time
 from contextlib import suppress
-from types import TracebackType
 
 from neusee.workflows.store.process_owner import me, owner_of
-from neusee.workflows.store.shared_folder import Disk
+from neusee.workflows.store.shared_folder import Disk, append
 
 BEAT = 2.0  #: s between heartbeats
 WINDOW = 10.0  #: s without a heartbeat after which an owner on another machine counts as dead
@@ -30,7 +27,7 @@ _thread: threading.Thread | None = None
 
 
 class Lease:
-    """The right to compute a key until `release`; a lease without a path stands for a folder that takes no files."""
+    """The right to compute the result of a key until `release`; ``path`` is None where no file can be written."""
 
     __slots__ = ("_inode", "_path")
 
@@ -39,7 +36,7 @@ class Lease:
         self._inode = os.stat(path).st_ino if path else 0
 
     def release(self) -> None:
-        """Give the lease back; a lease that was taken over, or inherited by a forked child, stays unchanged."""
+        """Delete the file of the lease, unless another process took the lease over or this is a forked child."""
         with _guard:
             if self not in _held:
                 return
@@ -52,14 +49,12 @@ class Lease:
     def __enter__(self) -> Lease:
         return self
 
-    def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
-    ) -> None:
+    def __exit__(self, *error: object) -> None:
         self.release()
 
 
 class Leases:
-    """The leases of one store, as seen by one observer."""
+    """The leases of one store, as seen by this process."""
 
     def __init__(self, disk: Disk) -> None:
         self._disk = disk
@@ -79,16 +74,16 @@ class Leases:
         try:
             return self._taken(path)
         except FileExistsError:
-            found = _look(path)
-        if found is not None and not self._dead(path, found):
+            seen = _look(path)
+        if seen is not None and not self._dead(path, seen):
             return None
         try:
-            return self._taken_over(key, path, found)
+            return self._taken_over(key, path, seen)
         except FileExistsError:
             return None
 
     def _taken(self, path: str) -> Lease:
-        """Take a free lease; try twice, because the folder may not exist yet or a sweep may have removed our badge."""
+        """Take a free lease; try twice, because the folder or the badge of this process may be missing."""
         with _guard:
             try:
                 os.link(_badge(self._disk), path)
@@ -98,12 +93,12 @@ class Leases:
                 os.link(_badge(self._disk), path)
         return self._kept(path)
 
-    def _taken_over(self, key: str, path: str, found: tuple[object, ...] | None) -> Lease:
-        """Take over the lease of a dead owner under the lock; raise `FileExistsError` if another observer was first."""
+    def _taken_over(self, key: str, path: str, seen: tuple[object, ...] | None) -> Lease:
+        """Take over the lease of a dead owner under the lock; raise `FileExistsError` if another process was first."""
         part = f"{self._disk.folder}/tmp/{key}.{me()}.{threading.get_ident()}"
         with self._disk.lock():
             now = _look(path)
-            if now is not None and (found is None or now[:2] != found[:2]):
+            if now is not None and (seen is None or now[:2] != seen[:2]):
                 raise FileExistsError(path)
             with _guard:
                 os.link(_badge(self._disk), path if now is None else part)  # one of two observers is first
@@ -117,26 +112,29 @@ class Leases:
         return self._kept(path)
 
     def _kept(self, path: str) -> Lease:
+        global _thread
         lease = Lease(path)
         self._seen.pop(path, None)
         with _guard:
             _held.add(lease)
-            _start()
+            if _thread is None:
+                _thread = threading.Thread(target=_beat, name="neusee-leases", daemon=True)
+                _thread.start()
         return lease
 
-    def _dead(self, path: str, found: tuple[object, ...]) -> bool:
-        owner = owner_of(str(found[0]).partition(" ")[0])
+    def _dead(self, path: str, seen: tuple[object, ...]) -> bool:
+        owner = owner_of(str(seen[0]).partition(" ")[0])
         state = owner.state if owner else "foreign"
         if state != "foreign":
             return state == "dead"
         now = time.monotonic()
         before, since = self._seen.get(path, (None, now))
-        self._seen[path] = (found, since if before == found else now)
-        return before == found and now - since > WINDOW
+        self._seen[path] = (seen, since if before == seen else now)
+        return before == seen and now - since > WINDOW
 
 
 def _look(path: str) -> tuple[object, ...] | None:
-    """Return the content of a lease, its inode and the numbers that a heartbeat changes; None if there is no lease."""
+    """Return content, inode, size and change time of the file of a lease, or None where no such file exists."""
     try:
         with open(path, "rb") as file:
             stat, text = os.fstat(file.fileno()), file.readline(200).decode(errors="replace")
@@ -148,7 +146,7 @@ def _look(path: str) -> tuple[object, ...] | None:
 
 
 def _badge(disk: Disk) -> str:
-    """Return the path of this process's badge; write the badge when it is first needed."""
+    """Return the path of this process's badge, a file that names the process; write the file at the first call."""
     if disk.folder not in _badges:
         disk.prepare()
         path = f"{disk.folder}/tmp/badge.{me()}"
@@ -165,15 +163,8 @@ def _badge(disk: Disk) -> str:
     return _badges[disk.folder]
 
 
-def _start() -> None:
-    global _thread
-    if _thread is None:
-        _thread = threading.Thread(target=_beat, name="neusee-leases", daemon=True)
-        _thread.start()
-
-
 def _beat() -> None:
-    """Change the badges from time to time while leases are held, to show that their owner is alive."""
+    """Change the badges of this process from time to time while leases are held, to show that the process lives."""
     global _thread
     while True:
         time.sleep(BEAT)
@@ -185,20 +176,11 @@ def _beat() -> None:
             badges = list(_badges.values())
         for path in badges:
             with suppress(OSError):
-                beat(path)
-
-
-def beat(path: str) -> None:
-    """Append a byte to a file, so that other processes see a change whatever their clocks say."""
-    file = os.open(path, os.O_WRONLY | os.O_APPEND)
-    try:
-        os.write(file, b".")
-    finally:
-        os.close(file)
+                append(path, b".")  # a change that other processes see whatever their clocks say
 
 
 def _retire() -> None:
-    """Remove all badges of this process; also called at exit, perhaps at the same time as `_beat`."""
+    """Delete all badges of this process; two threads may do so at the same time."""
     with suppress(KeyError):
         while True:
             _, path = _badges.popitem()
@@ -207,7 +189,7 @@ def _retire() -> None:
 
 
 def _forked() -> None:
-    """Forget all leases in a forked child, which holds none of its parent's leases."""
+    """Forget all leases in a forked child, because the leases belong to the parent process."""
     global _guard, _thread
     _guard, _thread = threading.Lock(), None
     _held.clear()

@@ -1,4 +1,4 @@
-"""Maintenance of a store: pins, eviction and the check for damage."""
+"""Maintenance of a store: pins, eviction, removal of orphan files and the check for damage."""
 
 from __future__ import annotations
 
@@ -15,21 +15,9 @@ from neusee.workflows.store.metadata import UNREADABLE, Metadata, is_kept
 from neusee.workflows.store.shared_folder import Disk
 
 
-class Upkept(Protocol):
-    """The part of a store that its upkeep needs."""
-
-    disk: Disk
-    journal: Journal
-
-    def pinned(self) -> set[str]: ...
-    def read_seconds(self, size: float) -> float: ...
-    def load(self, about: Metadata, verify: str) -> Any: ...
-    def put_aside(self, key: str, error: Exception) -> None: ...
-
-
 @dataclass(frozen=True, slots=True)
 class Swept:
-    """Summary of a clean-up, or with ``dry`` of the clean-up that would be done."""
+    """Summary of a clean-up of a store, done or simulated."""
 
     evicted: tuple[str, ...]  #: keys whose values were evicted
     refused: tuple[str, ...]  #: keys whose values only another user can remove
@@ -40,84 +28,79 @@ class Swept:
 
 @dataclass(frozen=True, slots=True)
 class Checked:
-    """A result whose bytes were all read and compared."""
+    """A result whose bytes were all read and compared with their checksums."""
 
     key: str
     about: Metadata | None
     problem: str  #: empty where the result is undamaged
 
 
-def gc(store: Upkept, budget: int | None, dry: bool) -> Swept:
-    """Remove orphan files and, if a ``budget`` is given, evict the values beyond it."""
-    before = total(store.disk)
-    orphans = dict(orphan_files.sweep(store.disk, dry))
-    left = sum(size for path, size, _ in files(store.disk) if path not in orphans)
-    gone, refused = make_room(store, left - budget, dry) if budget is not None else ([], [])
-    after = left - sum(c.size for c in gone) if dry else total(store.disk)
-    if not dry:
-        store.journal.compact()
-    freed = max(before - after, 0) + sum(size for path, size in orphans.items() if _beside(store.disk, path))
-    return Swept(tuple(c.key for c in gone), tuple(c.key for c in refused), freed, len(orphans), after)
+class Maintained(Protocol):
+    """The part of a store that cleans up and checks results; `Store` defines the members that are declared first."""
 
+    disk: Disk
+    journal: Journal
+    budget: int | None
+    _known: dict[str, Metadata]
 
-def make_room(store: Upkept, excess: float, dry: bool = False) -> tuple[list[Candidate], list[Candidate]]:
-    """Evict values until ``excess`` bytes are free; return the evicted values and those that we may not remove."""
-    if excess <= 0:
-        return [], []
-    found = candidates(store.disk, store.pinned(), store.read_seconds)
-    gone, refused = evict(store.disk, found, excess, dry)
-    if gone and not dry:
-        orphan_files.removed(store.disk, orphan_files.bands, dry)
-    return gone, refused
+    def read_seconds(self, size: float) -> float: ...
+    def load(self, about: Metadata, verify: str) -> Any: ...
+    def put_aside(self, key: str, error: Exception) -> None: ...
 
+    def gc(self, budget: int | None = None, dry: bool = False) -> Swept:
+        """Remove orphan files, and evict values beyond ``budget`` or, if None, beyond the budget of the store."""
+        budget = self.budget if budget is None else budget
+        before = total(self.disk)
+        orphans = dict(orphan_files.sweep(self.disk, dry))
+        left = sum(size for path, size, _ in files(self.disk) if path not in orphans)
+        gone, refused = self.make_room(left - budget, dry) if budget is not None else ([], [])
+        after = left - sum(c.size for c in gone) if dry else total(self.disk)
+        if not dry:
+            self.journal.compact()
+        uncounted = (f"{self.disk.folder}/tmp/", f"{self.disk.folder}/bad/")  # files outside the budget
+        freed = max(before - after, 0) + sum(size for path, size in orphans.items() if path.startswith(uncounted))
+        return Swept(tuple(c.key for c in gone), tuple(c.key for c in refused), freed, len(orphans), after)
 
-def check(store: Upkept) -> Iterator[Checked]:
-    """Read every value, compare every checksum and put damaged results aside."""
-    for key in metadata.names(store.disk):
-        about, problem = None, ""
+    def make_room(self, excess: float, dry: bool = False) -> tuple[list[Candidate], list[Candidate]]:
+        """Evict values until ``excess`` bytes are free; return the evicted values and the values of other users."""
+        if excess <= 0:
+            return [], []
+        gone, refused = evict(self.disk, candidates(self.disk, self.pinned(), self.read_seconds), excess, dry)
+        if gone and not dry:
+            orphan_files.removed(self.disk, orphan_files.bands, dry)
+            for candidate in gone:
+                self._known.pop(candidate.key, None)
+        return gone, refused
+
+    def check(self) -> Iterator[Checked]:
+        """Read every value, compare every checksum whatever ``verify`` says, and move damaged results to ``bad/``."""
+        for key in metadata.names(self.disk):
+            about, problem = None, ""
+            try:
+                about = metadata.read(self.disk, key)
+                if is_kept(about):
+                    self.load(about, "always")
+            except UNREADABLE as error:
+                if not metadata.has_value(self.disk, key):
+                    continue  # another process evicted the value meanwhile
+                self.put_aside(key, error)
+                problem = str(error) or type(error).__name__
+            yield Checked(key, about, problem)
+
+    def pin(self, key: str) -> None:
+        """Protect the value of ``key`` from eviction. Raises `OSError` where the folder cannot be written."""
+        self.disk.prepare()
+        self.disk.make_folder(f"{self.disk.folder}/pins")
+        open(f"{self.disk.folder}/pins/{key}", "wb").close()
+
+    def unpin(self, key: str) -> None:
+        """Allow the eviction of the value of ``key`` again."""
+        with suppress(FileNotFoundError):
+            os.unlink(f"{self.disk.folder}/pins/{key}")
+
+    def pinned(self) -> set[str]:
+        """Return the keys of the values that are protected from eviction."""
         try:
-            about = metadata.read(store.disk, key)
-            if is_kept(about):
-                store.load(about, "always")
-        except UNREADABLE as error:
-            if _is_gone(store.disk, key):
-                continue
-            store.put_aside(key, error)
-            problem = str(error) or type(error).__name__
-        yield Checked(key, about, problem)
-
-
-def pin(disk: Disk, key: str) -> None:
-    """Exempt a value from eviction."""
-    disk.prepare()
-    disk.make_folder(f"{disk.folder}/pins")
-    open(f"{disk.folder}/pins/{key}", "wb").close()
-
-
-def unpin(disk: Disk, key: str) -> None:
-    """Allow the eviction of a value again."""
-    with suppress(FileNotFoundError):
-        os.unlink(f"{disk.folder}/pins/{key}")
-
-
-def pinned(disk: Disk) -> set[str]:
-    """Return the keys that are pinned."""
-    try:
-        return set(os.listdir(f"{disk.folder}/pins"))
-    except OSError:
-        return set()
-
-
-def _is_gone(disk: Disk, key: str) -> bool:
-    """Return True if another process evicted a value while this process was about to read it."""
-    try:
-        return not is_kept(metadata.read(disk, key))
-    except FileNotFoundError:
-        return True
-    except UNREADABLE:
-        return False
-
-
-def _beside(disk: Disk, path: str) -> bool:
-    """Return True if a file is temporary or damaged, and so does not count against the budget."""
-    return path.startswith((f"{disk.folder}/tmp/", f"{disk.folder}/bad/"))
+            return set(os.listdir(f"{self.disk.folder}/pins"))
+        except OSError:
+            return set()

@@ -4,10 +4,9 @@ from __future__ import annotations
 
 import json
 import os
-import time
 from collections.abc import Iterator
 from contextlib import suppress
-from typing import Any
+from typing import Any, TypeGuard
 
 import xxhash
 
@@ -17,14 +16,13 @@ Metadata = dict[str, Any]
 INLINE = 4096  #: bytes of tensors up to which a result is stored inside its JSON
 UNREADABLE = (OSError, ValueError, LookupError, TypeError, AttributeError, ImportError)
 _OF_THE_VALUE = ("layout", "payload", "tensors", "bands")
-_USED = 3600.0  #: s between two records of the use of a value
 _SEAL = ',"seal":"'
 _SEAL_SIZE = len(_SEAL) + 32 + 2
 _encode = json.JSONEncoder(separators=(",", ":")).encode
 
 
 def seal(about: Metadata) -> bytes:
-    """Return JSON whose last field is the checksum of all bytes before that field."""
+    """Return metadata as JSON whose last field is the checksum of all bytes before that field."""
     body = _encode(about)[:-1].encode()
     return body + f'{_SEAL}{xxhash.xxh3_128_hexdigest(body)}"}}'.encode()
 
@@ -39,16 +37,33 @@ def unseal(raw: bytes) -> Metadata:
 
 
 def read(disk: Disk, key: str) -> Metadata:
-    """Return the metadata of ``key``; raise one of `UNREADABLE` where the file cannot be trusted."""
+    """Return the metadata of ``key``; raise one of the errors in `UNREADABLE` where the file cannot be trusted."""
     with open(disk.path(key, "json"), "rb") as file:
-        about = unseal(file.read())
+        return unseal_of(key, file.read())
+
+
+def unseal_of(key: str, raw: bytes) -> Metadata:
+    """Return the metadata that `seal` wrote for ``key``; raise `ValueError` for the metadata of another key."""
+    about = unseal(raw)
     if about["key"] != key:
         raise ValueError(f"the metadata belong to the key {about['key']}")
     return about
 
 
-def read_whole(disk: Disk, key: str) -> Metadata:
-    """Return the metadata of ``key``, whose payload exists and has its size; raise one of `UNREADABLE` otherwise."""
+def write(disk: Disk, key: str, about: Metadata, over: bool) -> bool:
+    """Write the metadata of ``key``; unless ``over``, keep an existing file and return False."""
+    path = disk.path(key, "json")
+    with disk.temporary(key) as (part, file):
+        file.write(seal(about))
+        file.flush()  # without a sync to disk, because torn metadata fail their checksum
+        linked = disk.link(part, path)
+        if over and not linked:
+            disk.rename(part, path)
+    return over or linked
+
+
+def _read_whole(disk: Disk, key: str) -> Metadata:
+    """Return the metadata of ``key`` if the payload has the right size; raise an error in `UNREADABLE` otherwise."""
     about = read(disk, key)
     payload = about.get("payload")
     try:
@@ -64,14 +79,14 @@ def read_whole(disk: Disk, key: str) -> Metadata:
 
 
 def find(disk: Disk, key: str) -> Metadata | None:
-    """Return the result of `read_whole`, or None where no file has the name.
+    """Return the metadata of ``key``, or None where no metadata exist; raise an error in `UNREADABLE` if damaged.
 
     Metadata that cannot be trusted are read a second time before the result counts as damaged,
     because another process may be renaming the file at that moment.
     """
     for _ in range(2):
         try:
-            return read_whole(disk, key)
+            return _read_whole(disk, key)
         except UNREADABLE as error:
             if not os.path.exists(disk.path(key, "json")):
                 return None
@@ -80,35 +95,26 @@ def find(disk: Disk, key: str) -> Metadata | None:
 
 
 def has_value(disk: Disk, key: str) -> bool:
-    """Return True if ``key`` has a value, or a file that cannot be read."""
+    """Return True if the store has a value for ``key``, or metadata of ``key`` that cannot be read."""
     try:
         return is_kept(read(disk, key))
     except UNREADABLE:
         return os.path.exists(disk.path(key, "json"))
 
 
-def is_kept(about: Metadata) -> bool:
-    """Return True if the value is stored, and not the receipt alone."""
-    return bool(about.get("kept", True))
+def is_kept(about: Metadata | None) -> TypeGuard[Metadata]:
+    """Return True if metadata describe a stored value, not an evicted or unsaved value."""
+    return about is not None and bool(about.get("kept", True))
 
 
 def bands(about: Metadata) -> list[str]:
-    """Return the names of the bands that the value keeps in files of their own."""
-    names: list[str] = (about.get("bands") or {}).get("names", [])
-    return names
+    """Return the names of the bands of a value that are stored in one file each."""
+    return list((about.get("bands") or {}).get("names", []))
 
 
 def receipt(about: Metadata) -> Metadata:
-    """Return the metadata of a result without the fields that describe the stored value."""
+    """Return the receipt of a result: its metadata without the fields that describe the stored value."""
     return {k: v for k, v in about.items() if k not in _OF_THE_VALUE} | {"kept": False}
-
-
-def note_use(disk: Disk, key: str) -> None:
-    """Record the use of a value as the change time of its JSON file, at most once an hour."""
-    path = disk.path(key, "json")
-    with suppress(OSError):
-        if abs(time.time() - os.stat(path).st_mtime) > _USED:
-            os.utime(path)
 
 
 def names(disk: Disk) -> Iterator[str]:

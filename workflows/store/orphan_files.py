@@ -1,4 +1,4 @@
-"""Orphan files: files of a store that belong to no result, removed by `neusee cache gc`.
+"""Orphan files: files of a store that belong to no result and are removed by `neusee cache gc`.
 
 Whether a file is in use is decided under the lock and from the present metadata, not from the
 file's age. Only a file whose owner cannot be determined is left alone for an hour.
@@ -12,31 +12,31 @@ from collections.abc import Callable, Iterator
 from contextlib import suppress
 
 from neusee.workflows.store import metadata
-from neusee.workflows.store.budget_eviction import entries
+from neusee.workflows.store.budget_eviction import below, entries
 from neusee.workflows.store.metadata import UNREADABLE
 from neusee.workflows.store.shared_folder import OLD, Disk
 
+Find = Callable[[Disk], Iterator[os.DirEntry[str]]]
 _WEEK = 7 * 86400.0  #: s for which a damaged entry is kept for inspection
 
 
 def sweep(disk: Disk, dry: bool = False) -> list[tuple[str, int]]:
-    """Remove the files that belong to no result; return path and bytes of each file (``dry``: remove nothing)."""
+    """Remove the files that belong to no result, or only list them if ``dry``; return path and bytes of each file."""
     if not os.path.isdir(disk.folder):
         return []
     gone = disk.sweep(dry, _WEEK) if os.path.isdir(f"{disk.folder}/tmp") else []
-    finders: tuple[Callable[[Disk], Iterator[os.DirEntry[str]]], ...] = (_payloads, bands, _files, _damaged)
-    for find in finders:
+    for find in (_payloads, bands, _files, _damaged):
         gone += removed(disk, find, dry)
     return gone
 
 
-def removed(disk: Disk, find: Callable[[Disk], Iterator[os.DirEntry[str]]], dry: bool) -> list[tuple[str, int]]:
-    """Remove the files that ``find`` yields: look without the lock first, and once more under the lock."""
+def removed(disk: Disk, find: Find, dry: bool) -> list[tuple[str, int]]:
+    """Remove the files that ``find`` yields, or only list them if ``dry``; return path and bytes of each file."""
     gone = []
     with suppress(OSError):
-        found = list(find(disk))
-        if dry or not found:
-            return [(entry.path, entry.stat(follow_symlinks=False).st_size) for entry in found]
+        orphans = list(find(disk))  # without the lock; ``find`` decides again under the lock
+        if dry or not orphans:
+            return [(entry.path, entry.stat(follow_symlinks=False).st_size) for entry in orphans]
         with disk.lock():
             for entry in find(disk):
                 with suppress(OSError):
@@ -47,59 +47,49 @@ def removed(disk: Disk, find: Callable[[Disk], Iterator[os.DirEntry[str]]], dry:
 
 
 def _payloads(disk: Disk) -> Iterator[os.DirEntry[str]]:
-    """Yield payloads without metadata; a payload whose metadata cannot be read is kept for its reader."""
-    for entry in _below(disk.folder):
+    """Yield the payload files that no metadata name, except where the metadata cannot be read."""
+    for entry in below(disk.folder):
         key, _, suffix = entry.name.partition(".")
         if suffix == "safetensors":
-            try:
-                about = metadata.read(disk, key)
-            except FileNotFoundError:
-                yield entry
-            except UNREADABLE:
-                continue
-            else:
-                if not about.get("payload"):
+            with suppress(*UNREADABLE):
+                try:
+                    orphan = not metadata.read(disk, key).get("payload")
+                except FileNotFoundError:
+                    orphan = True
+                if orphan:
                     yield entry
 
 
 def bands(disk: Disk) -> Iterator[os.DirEntry[str]]:
-    """Yield bands that no value needs; yield none if the metadata of another user's values cannot be read."""
-    found, needed = list(_below(f"{disk.folder}/bands")), set[str]()
-    for key in metadata.names(disk) if found else ():
+    """Yield the band files that no value needs; yield none if the metadata of another user's values cannot be read."""
+    files, needed = list(below(f"{disk.folder}/bands")), set[str]()
+    for key in metadata.names(disk) if files else ():
         try:
             needed.update(metadata.bands(metadata.read(disk, key)))
         except PermissionError:
             return
         except UNREADABLE:
             continue
-    yield from (entry for entry in found if entry.name not in needed)
+    yield from (entry for entry in files if entry.name not in needed)
 
 
 def _files(disk: Disk) -> Iterator[os.DirEntry[str]]:
-    """Yield pictures whose entry is gone, and half-written pictures."""
-    for entry in _below(f"{disk.folder}/files"):
+    """Yield the derived files that no metadata name, and half-written derived files."""
+    for entry in below(f"{disk.folder}/files"):
         try:
-            wanted = not entry.name.startswith(".") and metadata.read(disk, entry.name[:32]).get("file") == entry.name
+            needed = not entry.name.startswith(".") and metadata.read(disk, entry.name[:32]).get("file") == entry.name
         except UNREADABLE:
-            wanted = False
-        if not wanted and _age(entry) > OLD:
+            needed = False
+        if not needed and _age(entry) > OLD:
             yield entry
 
 
 def _damaged(disk: Disk) -> Iterator[os.DirEntry[str]]:
-    """Yield damaged entries that were put aside more than a week ago."""
+    """Yield the damaged files that were moved to ``bad/`` more than a week ago."""
     for folder in (f"{disk.folder}/bad", f"{disk.folder}/bands/bad"):
         yield from (entry for entry in entries(folder) if _age(entry) > _WEEK)
 
 
-def _below(base: str) -> Iterator[os.DirEntry[str]]:
-    """Yield the files in the folders with names of two letters."""
-    for folder in entries(base):
-        if len(folder.name) == 2 and folder.is_dir(follow_symlinks=False):
-            yield from entries(folder.path)
-
-
 def _age(entry: os.DirEntry[str]) -> float:
-    """Return the seconds since a file was last written or moved."""
     stat = entry.stat(follow_symlinks=False)
     return time.time() - max(stat.st_mtime, stat.st_ctime)

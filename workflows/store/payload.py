@@ -1,4 +1,4 @@
-"""Load the payload of a result and compare its checksum as often as the verify mode asks."""
+"""Values and their metadata: the metadata of a new value, and a stored value from its metadata."""
 
 from __future__ import annotations
 
@@ -7,27 +7,36 @@ import random
 from collections.abc import Iterable
 from typing import TYPE_CHECKING, Any
 
-from neusee.workflows.store.metadata import Metadata
+from neusee.workflows.store.metadata import INLINE, Metadata
 from neusee.workflows.store.shared_folder import Disk
 
 if TYPE_CHECKING:
+    from torch import Tensor
+
     from neusee.workflows.store.band_files import Blobs
 
 _SAMPLED = 1 / 20  #: fraction of the loads that mode ``sampled`` verifies although the file has not been touched
 _draw = random.Random()  # a generator of the store's own: loads do not change the random numbers of a user
 
 
-def blobs_of(disk: Disk) -> Blobs:
-    """Return the band files of the store in ``disk``."""
-    from neusee.workflows.store.band_files import Blobs
+def described(key: str, value: Any, about: Metadata, blobs: Blobs | None = None) -> tuple[Metadata, list[Tensor]]:
+    """Return the metadata of a new value, with small tensors inside, and the tensors that need a payload file."""
+    from neusee.workflows.store import serialization
 
-    return Blobs(disk.root / "bands")
+    layout, tensors = serialization.pack(value, blobs)
+    size = inline = sum(t.nbytes for t in tensors)
+    if serialization.blobs_in(layout):
+        size = max(inline, about.get("bytes") or 0)
+    entry = {"key": key, **about, "layout": layout, "bytes": size, "payload": None, "kept": True}
+    if inline <= INLINE:
+        entry["tensors"], tensors = [serialization.to_text(t) for t in tensors], []
+    return entry, tensors
 
 
 def load(disk: Disk, about: Metadata, verify: str, blobs: Blobs) -> tuple[Any, int]:
-    """Return the value that ``about`` describes and the number of payload bytes whose checksum was compared.
+    """Return the value that ``about`` describes, and the number of payload bytes whose checksum was compared.
 
-    Raises one of `UNREADABLE` where the value cannot be trusted.
+    Raises one of the errors in `UNREADABLE` where the value cannot be trusted.
     """
     from neusee.workflows.store import serialization
 
@@ -42,17 +51,17 @@ def load(disk: Disk, about: Metadata, verify: str, blobs: Blobs) -> tuple[Any, i
         due = check or (verify == "sampled" and stamp != payload.get("stamp"))
         tensors, compared = serialization.read(path, payload["xxh3"] if due else None), payload["size"] if due else 0
     if bands and verify == "sampled" and not check:
-        check = newest(disk, bands["names"]) > bands["newest"]
+        check = newest(blobs, bands["names"]) > bands["newest"]
     return serialization.unpack(about["layout"], tensors, blobs, check), compared
 
 
 def stamp_of(path: str) -> list[int]:
-    """Return inode, bytes and times (ns) of a file; one of these numbers changes when a process writes to the file."""
+    """Return inode, size and times (ns) of a file; any write to the file changes one of these numbers."""
     stat = os.stat(path)
     return [stat.st_ino, stat.st_size, stat.st_mtime_ns, stat.st_ctime_ns]
 
 
-def newest(disk: Disk, bands: Iterable[str]) -> int:
-    """Return the time (ns) of the last write to the files of these bands."""
-    stats = [os.stat(f"{disk.folder}/bands/{name[:2]}/{name}") for name in bands]
+def newest(blobs: Blobs, names: Iterable[str]) -> int:
+    """Return the time (ns) of the last write to the files of the bands ``names``."""
+    stats = [os.stat(blobs.path(name)) for name in names]
     return max((max(stat.st_mtime_ns, stat.st_ctime_ns) for stat in stats), default=0)

@@ -1,9 +1,10 @@
-"""Owner of a file: a process of a machine, and whether the process still runs. No clock is used."""
+"""Owner of a file: a process on a machine, with a check that the process still runs. The check uses no clock."""
 
 from __future__ import annotations
 
 import hashlib
 import os
+from contextlib import suppress
 from dataclasses import dataclass
 from functools import cache
 from typing import Literal
@@ -14,7 +15,7 @@ _IDLE = "ZTtXx"  #: states in /proc of a process that has ended or is stopped
 
 @dataclass(frozen=True, slots=True)
 class Owner:
-    """A process, told apart by its start time from a later process with the same number."""
+    """A process on a machine; the start time distinguishes the process from a later process of the same number."""
 
     host: str  #: digest of the machine, its present boot and its namespace of process numbers
     pid: int
@@ -25,7 +26,7 @@ class Owner:
 
     @property
     def state(self) -> State:
-        """Return whether the process runs: ``foreign`` on another machine; a stopped process counts as ``dead``."""
+        """Return ``alive``, ``dead`` or, for another machine, ``foreign``; a stopped process counts as ``dead``."""
         if self.host != host():
             return "foreign"
         if self.pid == os.getpid():
@@ -40,14 +41,14 @@ class Owner:
 
 
 def owner_of(text: str) -> Owner | None:
-    """Return the owner that ``text`` names, or None where ``text`` names no owner."""
+    """Return the `Owner` that was written as ``text``, or None for any other text."""
     host, _, rest = text.partition("-")
     pid, _, began = rest.partition("-")
     return Owner(host, int(pid), began) if len(host) == 12 and pid.isdecimal() and len(pid) < 12 else None
 
 
 def me() -> Owner:
-    """Return this process."""
+    """Return the running process as an `Owner`."""
     return _me(os.getpid())
 
 
@@ -61,21 +62,19 @@ def _me(pid: int) -> Owner:
 
 @cache
 def host() -> str:
-    """Return a digest of this machine until its next boot; two containers with the same name differ."""
+    """Return a digest of this machine and its present boot; two containers of the same name have different digests."""
     parts = [os.uname().nodename]
-    try:
+    with suppress(OSError):  # a system without these files
         with open("/proc/sys/kernel/random/boot_id") as file:
             parts.append(file.read())
         parts.append(str(os.stat("/proc/self/ns/pid").st_ino))
-    except OSError:
-        pass  # a system that gives neither number
     return hashlib.blake2b("\n".join(parts).encode(), digest_size=6).hexdigest()
 
 
 def _process(pid: int) -> tuple[str, str]:
-    """Return state and start time of a process, the fields behind the name, which may hold any character."""
+    """Return state and start time of a process from ``/proc``."""
     with open(f"/proc/{pid}/stat", "rb") as file:
-        fields = file.read().rpartition(b")")[2].split()
+        fields = file.read().rpartition(b")")[2].split()  # behind the name, which may hold any character
     if len(fields) < 20:
         raise ValueError(f"/proc/{pid}/stat is cut short")
     return fields[0].decode(), fields[19].decode()
@@ -83,9 +82,8 @@ def _process(pid: int) -> tuple[str, str]:
 
 def _signalled(pid: int) -> State:
     try:
-        os.kill(pid, 0)
+        with suppress(PermissionError):  # a process of another user
+            os.kill(pid, 0)
     except ProcessLookupError:
         return "dead"
-    except PermissionError:
-        pass
     return "alive"

@@ -1,4 +1,4 @@
-"""Files by name behind fsspec: a failing remote counts as empty, after one warning.
+"""Files by name at a URL, through fsspec: a URL that fails counts as empty, after one warning.
 
 Whether a file exists is read from listings of its folder, which count as valid for a while: a
 cold run of a thousand steps sends 256 requests in parallel instead of a thousand in a row.
@@ -20,6 +20,7 @@ from neusee.workflows.graph.diagnostics import nearest
 
 T = TypeVar("T")
 Direction = Literal["down", "up"]
+_DIRECTIONS: tuple[Direction, ...] = ("down", "up")
 _FRESH = 20.0  #: s for which a listing counts as valid
 _FEW = 3  #: folders that are listed one by one; a request for a further folder lists all folders
 _PAUSE = 60.0  #: s for which a failed remote is not used; doubled at each failure
@@ -31,28 +32,28 @@ _NEAR = frozenset({"file", "local", "memory"})
 
 
 class RemoteFiles:
-    """A folder at a URL, with files in ``<first two letters>/`` by name."""
+    """A folder at a URL, in which each file is at ``<first two letters of the name>/<name>``."""
 
     def __init__(self, url: str) -> None:
         self.url = url
         self._fs, self._root = _file_system(url)
         kinds = {self._fs.protocol} if isinstance(self._fs.protocol, str) else set(self._fs.protocol)
         self._renames, near = bool(kinds & _RENAMES), bool(kinds & _NEAR)
-        self._latency = {"down": 5e-4 if near else 0.05, "up": 5e-4 if near else 0.05}
-        self._rate = {"down": 4e8 if near else 5e7, "up": 4e8 if near else 5e7}
-        self._resume: dict[Direction, float] = {"down": 0.0, "up": 0.0}
-        self._pause: dict[Direction, float] = {"down": _PAUSE, "up": _PAUSE}
+        self._latency = dict.fromkeys(_DIRECTIONS, 5e-4 if near else 0.05)
+        self._rate = dict.fromkeys(_DIRECTIONS, 4e8 if near else 5e7)
+        self._resume = dict.fromkeys(_DIRECTIONS, 0.0)
+        self._pause = dict.fromkeys(_DIRECTIONS, _PAUSE)
         self._warned = False
         self._listed: dict[str, tuple[float, set[str]]] = {}
         self._made: set[str] = set()
         self._lock = threading.Lock()
 
     def seconds(self, direction: Direction, size: float) -> float:
-        """Return the predicted seconds for moving ``size`` bytes and the metadata that name them."""
+        """Return the predicted seconds for moving a result of ``size`` bytes with its metadata."""
         return 2 * self._latency[direction] + size / self._rate[direction]
 
     def exists(self, name: str) -> bool:
-        """Return True if the file existed when its folder was last listed."""
+        """Return True if the file ``name`` existed at the last listing of its folder, which may be some seconds old."""
         with self._lock:
             if not self._fresh(name[:2]):
                 few = sum(map(self._fresh, self._listed)) < _FEW
@@ -60,7 +61,7 @@ class RemoteFiles:
             return name in self._listed[name[:2]][1]
 
     def names(self) -> set[str]:
-        """Return the names of all files in the folders."""
+        """Return the names of all files at the URL."""
         with self._lock:
             self._list_folders(_FOLDERS)
             return set().union(*(names for _, names in self._listed.values()))
@@ -70,7 +71,7 @@ class RemoteFiles:
         return self._attempt("down", lambda: bytes(self._fs.cat_file(self._path(name))), len)
 
     def fetch(self, name: str, path: str) -> bool:
-        """Copy a remote file to ``path``; return False where the copy fails."""
+        """Copy a file from the URL to the local ``path``; return False where the copy fails."""
 
         def get() -> int:
             self._fs.get_file(self._path(name), path)
@@ -79,7 +80,7 @@ class RemoteFiles:
         return self._attempt("down", get, int) is not None
 
     def send(self, path: str, name: str) -> bool:
-        """Copy the file at ``path`` to the remote; return False where the copy fails or ``path`` is gone."""
+        """Copy the local file at ``path`` to the URL; return False where the copy fails or the local file is gone."""
 
         def put(to: str) -> int:
             try:
@@ -93,7 +94,7 @@ class RemoteFiles:
         return self._write(name, put)
 
     def write(self, name: str, raw: bytes, over: bool = False) -> bool:
-        """Write a small file; keep an existing file unless ``over``, as far as the file system can tell."""
+        """Write a small file; return False on failure. Without ``over``, an existing file stays where possible."""
 
         def pipe(to: str) -> int:
             try:
@@ -104,10 +105,12 @@ class RemoteFiles:
                 self._fs.pipe_file(to, raw)
             return len(raw)
 
-        return (not over and self._renames and self._exists(name)) or self._write(name, pipe)
+        looks = not over and self._renames
+        exists = looks and self._attempt("down", lambda: self._fs.exists(self._path(name)))
+        return bool(exists) or self._write(name, pipe)
 
     def warn(self, text: str) -> None:
-        """Give the warning ``text`` unless a warning was given before."""
+        """Issue the warning ``text``, unless this object has issued a warning before."""
         if not self._warned:
             self._warned = True
             warnings.warn(text, stacklevel=5)
@@ -119,24 +122,21 @@ class RemoteFiles:
         return folder in self._listed and time.monotonic() - self._listed[folder][0] < _FRESH
 
     def _list_folders(self, folders: Sequence[str]) -> None:
-        """List the outdated ones of ``folders`` in parallel."""
+        """List in parallel those ``folders`` whose last listing is too old."""
         old = [folder for folder in folders if not self._fresh(folder)]
         with suppress(AttributeError):
             self._fs.invalidate_cache()
         now = time.monotonic()
         with ThreadPoolExecutor(min(16, max(1, len(old)))) as pool:
-            for folder, found in zip(old, pool.map(self._listing, old), strict=True):
-                self._listed[folder] = (now, found)
+            for folder, names in zip(old, pool.map(self._listing, old), strict=True):
+                self._listed[folder] = (now, names)
 
     def _listing(self, folder: str) -> set[str]:
-        found = self._attempt("down", lambda: self._fs.ls(f"{self._root}/{folder}", detail=False))
-        return {str(path).rpartition("/")[2] for path in found or ()}
-
-    def _exists(self, name: str) -> bool:
-        return bool(self._attempt("down", lambda: self._fs.exists(self._path(name))))
+        paths = self._attempt("down", lambda: self._fs.ls(f"{self._root}/{folder}", detail=False))
+        return {str(path).rpartition("/")[2] for path in paths or ()}
 
     def _write(self, name: str, put: Callable[[str], int]) -> bool:
-        """Let ``put`` write a file that gets its name only when the file is complete."""
+        """Let ``put`` write a file, and give the file its name only when it is complete; return False on failure."""
 
         def whole() -> int:
             if not self._renames:
@@ -165,38 +165,38 @@ class RemoteFiles:
                 self._sweep(path)
 
     def _sweep(self, path: str) -> None:
-        """Remove the half-written files of killed processes; keep them where the file system gives no times."""
+        """Remove the half-written files of killed processes, if the file system gives the times of files."""
         with suppress(OSError, LookupError, TypeError):
             for entry in self._fs.ls(path, detail=True):
                 if time.time() - entry["mtime"] > _ORPHAN:
                     self._fs.rm_file(entry["name"])
 
     def _attempt(self, direction: Direction, do: Callable[[], T], size: Callable[[T], int] | None = None) -> T | None:
-        """Return the result of ``do``; return None where the file does not exist, and while the remote is not used."""
+        """Return the result of ``do``, or None if ``do`` fails or the URL is out of use after an earlier failure."""
         if time.monotonic() < self._resume[direction]:
             return None
         began = time.perf_counter()
         try:
-            found = do()
+            result = do()
         except Exception as error:  # each file system raises its own errors, which share no narrower base class
             if not (direction == "down" and isinstance(error, FileNotFoundError)):
                 self._failed(direction, error)
             return None
         self._pause[direction] = _PAUSE
         if size is not None:
-            self._update_speed(direction, size(found), time.perf_counter() - began)
-        return found
+            self._update_speed(direction, size(result), time.perf_counter() - began)
+        return result
 
     def _failed(self, direction: Direction, error: Exception) -> None:
         alone = isinstance(error, PermissionError | FileNotFoundError)  # what cannot be written may be readable
-        for each in (direction,) if alone else ("down", "up"):
+        for each in (direction,) if alone else _DIRECTIONS:
             self._resume[each] = time.monotonic() + self._pause[each]
             self._pause[each] *= 2
         what = "read" if direction == "down" else "written"
         self.warn(f"{self.url} cannot be {what} ({type(error).__name__}: {error}): results stay local")
 
     def _update_speed(self, direction: Direction, size: int, seconds: float) -> None:
-        """Move the prediction a third of the way towards the measured value."""
+        """Move the predicted latency or rate a third of the way towards the measured value."""
         if size < _LEARN:
             self._latency[direction] += (seconds - self._latency[direction]) / 3
         else:
@@ -205,14 +205,14 @@ class RemoteFiles:
 
 
 def _file_system(url: str) -> tuple[Any, str]:
-    """Return the file system of a URL and the path in it; raise errors that name the package or the nearest scheme."""
+    """Return the file system of a URL and the path there; errors name the missing package or the nearest scheme."""
     try:
         import fsspec
     except ImportError as error:
         text = f'a store at {url} needs fsspec: pip install "neusee[distributed]"'
         raise ModuleNotFoundError(text) from error
     try:
-        found, path = fsspec.core.url_to_fs(url)
+        file_system, path = fsspec.core.url_to_fs(url)
     except ImportError as error:
         raise ModuleNotFoundError(f"a store at {url} needs one more package: {error}") from error
     except ValueError as error:
@@ -220,4 +220,4 @@ def _file_system(url: str) -> tuple[Any, str]:
         if scheme in known:
             raise
         raise ValueError(f"no file system has the scheme {scheme}:// of {url}; {nearest(scheme, known)}") from error
-    return found, str(path).rstrip("/")
+    return file_system, str(path).rstrip("/")

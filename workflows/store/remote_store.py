@@ -1,15 +1,15 @@
-"""A store shared by many machines on any file system that fsspec supports, with a local layer in front.
+"""A store at a URL that many machines share, on any file system of fsspec, with a local folder in front.
 
-A value that is read is kept in the local layer, an ordinary `Store`; a value that is written
-goes to both. At the remote, a payload carries its checksum in its name and is complete before
-the metadata that name the payload, so that two writers of one key cannot mix their halves.
-Leases, pins and the size budget belong to the local layer alone: two machines may compute the
-same key, and the first result stays. A remote that fails costs one warning; the run goes on
+A value that is read is kept in the local folder (the local layer), an ordinary `Store`; a value that is written goes to
+both. At the URL, a payload has its checksum in its name and is complete before the metadata that name the payload, so
+that two writers of one key cannot mix their halves. Leases, pins and the size budget belong to the local layer alone:
+two machines may compute the same key, and the first result stays. A URL that fails costs one warning; the run goes on
 with the local layer.
 """
 
 from __future__ import annotations
 
+import hashlib
 import os
 import re
 import warnings
@@ -25,7 +25,7 @@ import xxhash
 
 from neusee.workflows.keys.cache_key import Key, digest
 from neusee.workflows.store.environment import Verify
-from neusee.workflows.store.metadata import Metadata, is_kept, receipt, seal, unseal
+from neusee.workflows.store.metadata import Metadata, is_kept, receipt, seal, unseal, unseal_of
 from neusee.workflows.store.payload import newest, stamp_of
 from neusee.workflows.store.remote_files import RemoteFiles
 from neusee.workflows.store.result_store import Store
@@ -34,10 +34,9 @@ _NAME = re.compile("[0-9a-f]{32}")
 
 
 def open_store(where: str | Path | None = None) -> Store:
-    """Return the store at a folder or a URL (``s3://bucket/name``); None means ``$NEUSEE_CACHE`` or the usual folder.
+    """Open the store at a folder or a URL (``s3://bucket/name``); None means ``$NEUSEE_CACHE`` or the default folder.
 
-    Raises `ValueError` for an unknown scheme, and `ModuleNotFoundError` with the fix where the
-    package for the scheme is missing.
+    Raises `ValueError` for an unknown scheme, and `ModuleNotFoundError` where the package for the scheme is missing.
     """
     where = os.environ.get("NEUSEE_CACHE") or None if where is None else where
     if isinstance(where, str) and "://" in where:
@@ -46,14 +45,14 @@ def open_store(where: str | Path | None = None) -> Store:
 
 
 def local_layer(url: str) -> Path:
-    """Return ``$NEUSEE_CACHE_LOCAL``, else a folder of the URL's own in ``~/.cache/neusee``."""
-    if named := os.environ.get("NEUSEE_CACHE_LOCAL"):
-        return Path(named)
+    """Return the local folder for copies from ``url``: ``$NEUSEE_CACHE_LOCAL``, else one in ``~/.cache/neusee``."""
+    if folder := os.environ.get("NEUSEE_CACHE_LOCAL"):
+        return Path(folder)
     return Path.home() / ".cache" / "neusee" / digest(url.rstrip("/"))[:16]
 
 
 class RemoteStore(Store):
-    """A `Store` that looks up its misses at ``url`` and also writes its results there."""
+    """A local `Store` that reads missing results from ``url`` and also writes its results there."""
 
     def __init__(
         self, url: str, root: Path | str | None = None, *, verify: Verify | None = None, budget: int | None = None
@@ -67,44 +66,41 @@ class RemoteStore(Store):
         return partial(type(self), self.url, self.root, verify=self.verify, budget=self.budget), ()
 
     def about(self, key: Key) -> Metadata | None:
-        """Return the metadata of a result from the local layer or the remote, without reading the value."""
+        """Return the metadata of a result from the local layer or the URL, without reading the value."""
         here = super().about(key)
-        if here is not None and is_kept(here):
-            return here
-        return self._remote_metadata(key) or here
+        return here if is_kept(here) else self._remote_metadata(key) or here
 
     def get(self, key: Key) -> Any:
-        """Return the value; raise `KeyError` where neither the local layer nor the remote has a trustworthy value."""
+        """Return the value of ``key``; raise `KeyError` where neither the local layer nor the URL has the value."""
         if not self._is_local(key):
             self._fetch_value(key)
         return super().get(key)
 
     def put(self, key: Key, value: Any, about: Metadata) -> bool:
-        """Store a value locally and at the remote; return False where the local layer does not take the value."""
-        if not super().put(key, value, about):
-            return False
-        self._send(key)
-        return True
+        """Store a value locally and at the URL; return False where the local layer does not take the value."""
+        stored = super().put(key, value, about)
+        if stored:
+            self._send(key)
+        return stored
 
     def put_receipt(self, key: Key, about: Metadata) -> bool:
-        """Store the metadata of a result without its value, locally and at the remote."""
-        if not super().put_receipt(key, about):
-            return False
-        if not self._remote.exists(_receipt_name(key)) and not self._remote.exists(f"{key}.json"):
+        """Store the metadata of a result without its value, locally and at the URL."""
+        stored = super().put_receipt(key, about)
+        if stored and not self._remote.exists(_receipt_name(key)) and not self._remote.exists(f"{key}.json"):
             self._remote.write(_receipt_name(key), seal(receipt({"key": key, **about})))
-        return True
+        return stored
 
     def entries(self) -> Iterator[tuple[Key, Metadata]]:
-        """Yield every key with its metadata: the local ones, then those only at the remote; receipts are included."""
+        """Yield every key with its metadata: first the local results, then the results that are only at the URL."""
         here = set()
         for key, about in super().entries():
             here.add(key)
             yield key, about
         there = sorted({name.partition(".")[0] for name in self._remote.names() if ".json" in name} - here)
         with ThreadPoolExecutor(16) as pool:
-            for key, found in zip(there, pool.map(self._remote_metadata, there), strict=True):
-                if found is not None:
-                    yield key, found
+            for key, remote in zip(there, pool.map(self._remote_metadata, there), strict=True):
+                if remote is not None:
+                    yield key, remote
 
     def write_seconds(self, size: float) -> float:
         return super().write_seconds(size) + self._remote.seconds("up", size)
@@ -113,42 +109,31 @@ class RemoteStore(Store):
         return super().read_seconds(size) + self._remote.seconds("down", size)
 
     def _is_local(self, key: Key) -> bool:
-        here = super().about(key)
-        return here is not None and is_kept(here)
+        return is_kept(super().about(key))
 
     def _remote_metadata(self, key: Key, look: bool = False) -> Metadata | None:
-        """Return the remote metadata of a value, else of a receipt; ``look`` reads them whatever the listing says."""
-        value = f"{key}.json"
-        if key not in self._broken and (look or self._remote.exists(value)) and not self._has_remote_value(key):
+        """Return the metadata of a result at the URL; with ``look``, read the file whatever the last listing says."""
+        value, note = f"{key}.json", _receipt_name(key)
+        if key not in self._broken and (look or self._remote.exists(value)) and not is_kept(self._seen.get(key)):
             self._read_metadata(key, value)
-        if key not in self._seen and self._remote.exists(_receipt_name(key)):
-            self._read_metadata(key, _receipt_name(key))
+        if key not in self._seen and self._remote.exists(note):
+            self._read_metadata(key, note)
         return self._seen.get(key)
 
-    def _has_remote_value(self, key: Key) -> bool:
-        return key in self._seen and is_kept(self._seen[key])
-
     def _read_metadata(self, key: Key, name: str) -> None:
-        """Read metadata from the remote; damaged metadata count as missing."""
+        """Read the metadata file ``name`` at the URL; damaged metadata count as missing, after a warning."""
         raw = self._remote.read(name)
-        if raw is None:
-            return
-        try:
-            about = unseal(raw)
-            if about["key"] != key:
-                raise ValueError(f"the metadata belong to the key {about['key']}")
-        except (ValueError, LookupError, TypeError) as error:
-            self._distrust(key, error)
-        else:
-            self._seen[key] = about
+        if raw is not None:
+            try:
+                self._seen[key] = unseal_of(key, raw)
+            except (ValueError, LookupError, TypeError) as error:
+                self._distrust(key, error)
 
     def _fetch_value(self, key: Key) -> None:
-        """Fetch a value into the local layer; a value that cannot be fetched is not tried again."""
+        """Copy a value from the URL into the local layer; after a failure, do not try this key again."""
         about = self._remote_metadata(key, look=True)
-        if about is None or not is_kept(about):
-            return
         try:
-            if not self._value_fetched(key, about):
+            if is_kept(about) and not self._value_fetched(key, about):
                 self._give_up(key)
         except ValueError as error:
             self._distrust(key, error)
@@ -157,7 +142,7 @@ class RemoteStore(Store):
             self._remote.warn(f"{self.root} cannot keep copies of {self.url} ({error}): set NEUSEE_CACHE_LOCAL")
 
     def _value_fetched(self, key: Key, about: Metadata) -> bool:
-        """Return True if the value was fetched and every byte matches its checksum."""
+        """Copy a value into the local layer after a check of every byte; return False where the URL fails."""
         payload, bands = about["payload"], _bands(about["layout"])
         missing = {name: xxh3 for name, xxh3 in bands.items() if not self.blobs.has(name)}
         with ExitStack() as files:
@@ -180,42 +165,39 @@ class RemoteStore(Store):
         return part
 
     def _named(self, parts: dict[str, str], bands: dict[str, str]) -> None:
-        """Move bands to their places; raise `ValueError` where a band differs from the written one."""
+        """Give fetched band files their final names; raise `ValueError` where a band has a wrong checksum."""
         for name, part in parts.items():
             self.disk.make_folder(str(self.blobs.root))
-            self.disk.link(part, f"{self.blobs.root}/{name[:2]}/{name}")
+            self.disk.link(part, self.blobs.path(name))
         for name, xxh3 in bands.items():
             blob = self.blobs.about(name)
             self.blobs.read([name], (1, *blob.shape), blob.dtype, xxh3=[xxh3])
 
     def _described(self, key: Key, about: Metadata, part: str) -> None:
-        """Move a payload to its place and write its metadata with the time stamps of the local files."""
+        """Give a fetched payload its final name, and write its metadata with the time stamps of the local files."""
         about = dict(about)
         if about["payload"]:
             path = self.disk.path(key, "safetensors")
             self.disk.rename(part, path)
             about["payload"] = {**about["payload"], "stamp": stamp_of(path)}
         if names := about.get("bands", {}).get("names"):
-            about["bands"] = {"names": names, "newest": newest(self.disk, names)}
+            about["bands"] = {"names": names, "newest": newest(self.blobs, names)}
         self._write_about(key, about)
         self._lost.discard(key)
 
     def _fetched(self, name: str, part: str, payload: Metadata) -> bool:
-        """Return True if the file ``name`` was fetched; raise `ValueError` where its checksum differs."""
+        """Copy the file ``name`` to ``part``; return False on failure, raise `ValueError` for a wrong checksum."""
         if not self._remote.fetch(name, part):
             return False
-        found, size = xxhash.xxh3_128(), 0
         with open(part, "rb") as file:
-            while block := file.read(1 << 20):
-                found.update(block)
-                size += len(block)
+            xxh3, size = hashlib.file_digest(file, xxhash.xxh3_128).hexdigest(), file.tell()
             os.fsync(file.fileno())
-        if (size, found.hexdigest()) != (payload["size"], payload["xxh3"]):
+        if (size, xxh3) != (payload["size"], payload["xxh3"]):
             raise ValueError("checksum mismatch: the stored bytes have changed since they were written")
         return True
 
     def _send(self, key: Key) -> None:
-        """Send the large files first and then the metadata that name them; send nothing where the value was evicted."""
+        """Send a local value to the URL, the large files before the metadata; send nothing for an evicted value."""
         name, over = f"{key}.json", key in self._broken
         if not over and self._remote.exists(name):
             return
@@ -235,13 +217,13 @@ class RemoteStore(Store):
             self._broken.discard(key)
 
     def _files(self, key: Key, about: Metadata) -> dict[str, str]:
-        """Return, by name at the remote, the path of each file that a value needs beside its metadata."""
-        found = {}
+        """Return the local path of each file of a value beside its metadata, by the name of the file at the URL."""
+        paths = {}
         if payload := about["payload"]:
-            found[_payload_name(key, payload["xxh3"])] = self.disk.path(key, "safetensors")
+            paths[_payload_name(key, payload["xxh3"])] = self.disk.path(key, "safetensors")
         for name, xxh3 in _bands(about["layout"]).items():
-            found[_band_name(name, xxh3)] = f"{self.blobs.root}/{name[:2]}/{name}"
-        return found
+            paths[_band_name(name, xxh3)] = self.blobs.path(name)
+        return paths
 
     def _give_up(self, key: Key) -> None:
         self._seen.pop(key, None)
@@ -265,14 +247,10 @@ def _band_name(name: str, xxh3: str) -> str:
 
 
 def _bands(layout: Any) -> dict[str, str]:
-    """Return the checksum of every band that a layout needs, by name."""
-    found: dict[str, str] = {}
-    todo = [layout]
-    while todo:
-        item = todo.pop()
-        if "stacked" in item:
-            found |= zip(item["stacked"]["names"], item["stacked"]["xxh3"], strict=True)
-        todo += item.get("items", item.get("list", item.get("dict", {}).values()))
-    if bad := [name for name in found if not _NAME.fullmatch(name)]:
+    """Return the checksum of every band that a layout names; raise `ValueError` for a name that may be a path."""
+    from neusee.workflows.store.serialization import blobs_in
+
+    checksums = blobs_in(layout)
+    if bad := [name for name in checksums if not _NAME.fullmatch(name)]:
         raise ValueError(f"{bad[0]!r} is not the name of a band (32 hexadecimal digits)")
-    return found
+    return checksums

@@ -1,11 +1,10 @@
-"""Store of results: a folder of results by key, ``<2>/<key>.safetensors`` beside ``<key>.json``.
+"""Store of results: a folder with the files ``<key>.json`` and ``<key>.safetensors`` of each result.
 
-The JSON describes a result: the recipe of its key, its layout, statistics, checks, seconds and
-versions. The JSON contains the whole value of a small result; of an evicted or unsaved value
-the JSON alone remains, called a receipt. A checksum covers every byte and is compared at each
-load. A result that fails the comparison is put aside with one warning and counts as missing.
-A result is renamed to its final name only when it is complete, so that a killed process leaves
-no half result. Where the folder cannot be written, a run warns once and goes on.
+The JSON holds the metadata of a result (the recipe of its key, layout, statistics, checks, seconds, versions) and the
+whole value of a small result. Of an evicted or unsaved value only the metadata remain, called a receipt. A checksum
+covers every byte and is compared at each load. A result that fails the comparison is moved away with one warning and
+counts as missing. A result gets its final name when it is complete, so that a killed process leaves no half result.
+Where the folder cannot be written, a run warns once and goes on.
 """
 
 from __future__ import annotations
@@ -14,20 +13,20 @@ import heapq
 import os
 import time
 import warnings
-from collections.abc import Callable, Collection, Iterator
+from collections.abc import Callable, Iterator
 from contextlib import suppress
 from functools import cached_property, partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from neusee.workflows.store import maintenance, metadata, payload
+from neusee.workflows.store import metadata, payload
 from neusee.workflows.store.bandwidth import Speeds
 from neusee.workflows.store.budget_eviction import LOW, CacheBudget
 from neusee.workflows.store.environment import Verify, budget_bytes, default_root, verify_mode
 from neusee.workflows.store.journal import Journal
 from neusee.workflows.store.lease import Lease, Leases
-from neusee.workflows.store.maintenance import Checked, Swept
-from neusee.workflows.store.metadata import INLINE, UNREADABLE, Metadata, is_kept
+from neusee.workflows.store.maintenance import Maintained
+from neusee.workflows.store.metadata import UNREADABLE, Metadata, is_kept
 from neusee.workflows.store.shared_folder import Disk
 from neusee.workflows.store.small_results import SmallResults
 
@@ -37,18 +36,20 @@ if TYPE_CHECKING:
     from neusee.workflows.store.band_files import Blobs
 
 
-class Store:
-    """Results by key. Every failure of the folder leads to a missing result, never to a wrong result."""
+_USED = 3600.0  #: s between two records of the use of a value
+
+
+class Store(Maintained):
+    """A folder of results by key. Every failure of the folder leads to a missing result, never to a wrong result."""
 
     def __init__(
         self, root: Path | str | None = None, *, verify: Verify | None = None, budget: int | None = None
     ) -> None:
-        """Open the store in ``root``; None takes ``$NEUSEE_CACHE_VERIFY`` and ``$NEUSEE_CACHE_BUDGET`` (bytes).
+        """Open the store in ``root``; an argument that is None comes from the environment, such as $NEUSEE_CACHE.
 
-        ``verify="always"`` compares the checksum of every payload that is loaded. ``"sampled"``
-        compares a checksum where the file was touched after it was written, and otherwise one load in
-        twenty. ``"never"`` compares none. The checksum of the JSON and the size of every payload are
-        always compared.
+        ``verify="always"`` compares the checksum of every payload that is loaded. ``"sampled"`` compares the checksum
+        of a file that was touched after its last write, and otherwise at one load in twenty. ``"never"`` compares no
+        such checksum. The checksum of the JSON and the size of every payload are always compared.
         """
         self.root = default_root() if root is None else Path(root)
         self.verify: Verify = verify_mode(verify)
@@ -65,27 +66,29 @@ class Store:
         self._used: set[str] = set()
         self._warned = False
 
-    def __reduce__(self) -> tuple[Any, ...]:  # it travels to another process as its place, and is opened there
+    def __reduce__(self) -> tuple[Any, ...]:  # another process receives the path and opens the store
         return partial(type(self), self.root, verify=self.verify, budget=self.budget), ()
 
     @cached_property
     def blobs(self) -> Blobs:
-        """Return the folder of the bands of stacks."""
-        return payload.blobs_of(self.disk)
+        """Return the folder of the band files."""
+        from neusee.workflows.store.band_files import Blobs
+
+        return Blobs(self.root / "bands")
 
     def has(self, key: str) -> bool:
-        """Return True if the value is stored, without reading its payload."""
-        about = self.about(key)
-        return about is not None and is_kept(about)
+        """Return True if the value of ``key`` is stored, without reading the value."""
+        return is_kept(self.about(key))
 
     def about(self, key: str) -> Metadata | None:
         """Return the metadata of a result, or None; the field ``kept`` tells whether the value is stored as well."""
-        if key in self._known and is_kept(self._known[key]):
-            return self._known[key]
+        about = self._known.get(key)
+        if is_kept(about):
+            return about
         if key in self._lost:
             return None
         about = self.brief.find(key)
-        if about is None or not is_kept(about):
+        if not is_kept(about):
             try:
                 about = metadata.find(self.disk, key) or about
             except UNREADABLE as error:
@@ -95,9 +98,9 @@ class Store:
         return about
 
     def get(self, key: str) -> Any:
-        """Return the value; raise `KeyError` where no value exists that can be trusted."""
+        """Return the value of ``key``; raise `KeyError` where no undamaged value is stored."""
         about = self.about(key)
-        while about is not None and is_kept(about):
+        while is_kept(about):
             try:
                 value = self.load(about, self.verify)
             except UNREADABLE as error:
@@ -111,87 +114,67 @@ class Store:
         raise KeyError(key)
 
     def put(self, key: str, value: Any, about: Metadata) -> bool:
-        """Store a value with its metadata; return False where the folder (one warning) or the budget forbids it."""
+        """Store a value and its metadata; return False where the folder is not writable or the budget is too small."""
         return self._try(self._write, key, value, about)
 
     def put_receipt(self, key: str, about: Metadata) -> bool:
         """Store the metadata of a result without its value, unless the value or its receipt is stored already."""
         return self._try(self._write_receipt, key, about)
 
-    def pin(self, key: str) -> None:
-        """Exempt a value from eviction. Raises `OSError` where the folder cannot be written."""
-        maintenance.pin(self.disk, key)
-
-    def unpin(self, key: str) -> None:
-        """Allow the eviction of a value again."""
-        maintenance.unpin(self.disk, key)
-
-    def pinned(self) -> set[str]:
-        """Return the keys that are pinned."""
-        return maintenance.pinned(self.disk)
-
-    def gc(self, budget: int | None = None, dry: bool = False) -> Swept:
-        """Remove orphan files and evict values beyond ``budget`` (or the store's own), the cheapest per byte first."""
-        swept = maintenance.gc(self, self.budget if budget is None else budget, dry)
-        if not dry:
-            self._forget(swept.evicted)
-        return swept
-
-    def check(self) -> Iterator[Checked]:
-        """Read every value, compare every checksum whatever ``verify`` says, and put damaged results aside."""
-        return maintenance.check(self)
-
     def put_small(self, key: str, value: Any, about: Metadata) -> bool:
         """Store a small value without a file of its own; store only the metadata of a larger value."""
         return self._try(self._write_small, key, value, about)
 
     def entries(self) -> Iterator[tuple[str, Metadata]]:
-        """Yield every key with its metadata, receipts included, in the order of the keys."""
+        """Yield every key with its metadata, in the order of the keys; also the keys whose values are not stored."""
         for key in heapq.merge(metadata.names(self.disk), (key for key, _ in self.brief.each())):
             about = self.about(key)
             if about is not None:
                 yield key, about
 
     def claim(self, key: str) -> Lease | None:
-        """Return the lease to compute ``key``, or None while another process has it; look up again after a wait."""
+        """Return the lease for computing ``key``, or None while another process holds the lease; see `Leases.claim`."""
         return self._leases.claim(key)
 
     def read_seconds(self, size: float) -> float:
-        """Return the predicted seconds for loading ``size`` bytes, from the loads of this store."""
+        """Return the predicted seconds for loading ``size`` bytes, from earlier loads of this store."""
         return self._speeds.seconds("read", size)
 
     def write_seconds(self, size: float) -> float:
-        """Return the predicted seconds for storing ``size`` bytes, from the writes of this store."""
+        """Return the predicted seconds for storing ``size`` bytes, from earlier writes of this store."""
         return self._speeds.seconds("write", size)
 
     def _again(self, key: str) -> Metadata | None:
-        """Return the present metadata of a result, or None where another process has removed them."""
+        """Read the metadata of a result again; return None where another process has removed the metadata."""
         self._known.pop(key, None)
-        try:
+        with suppress(*UNREADABLE):
             return metadata.read(self.disk, key)
-        except UNREADABLE:
-            return None
+        return None
 
     def load(self, about: Metadata, verify: str) -> Any:
-        """Return the value that ``about`` describes; raise one of `UNREADABLE` where the value cannot be trusted."""
+        """Return the value that ``about`` describes; raise an error in `UNREADABLE` where the value is damaged."""
         began = time.perf_counter()
         value, size = payload.load(self.disk, about, verify, self.blobs)
         self._speeds.learn("read", size, time.perf_counter() - began)
         return value
 
     def _use(self, key: str) -> None:
+        """Record the use of a value as the change time of its JSON file, at most once an hour."""
         if key not in self._used:
             self._used.add(key)
-            metadata.note_use(self.disk, key)
+            path = self.disk.path(key, "json")
+            with suppress(OSError):
+                if abs(time.time() - os.stat(path).st_mtime) > _USED:
+                    os.utime(path)
 
-    def _try(self, write: Callable[..., bool], key: str, *what: Any) -> bool:
-        """Write; try once more where another process removed a needed folder or file meanwhile."""
+    def _try(self, write: Callable[..., bool], key: str, *arguments: Any) -> bool:
+        """Call ``write``, again if another process removed a folder; on failure, warn once and return False."""
         try:
             try:
-                return write(key, *what)
+                return write(key, *arguments)
             except FileNotFoundError:
                 self.disk.forget()
-                return write(key, *what)
+                return write(key, *arguments)
         except OSError as error:
             if not self._warned:
                 warnings.warn(f"{self.root} cannot be written ({error}): results are not kept", stacklevel=4)
@@ -199,35 +182,35 @@ class Store:
             return False
 
     def _write(self, key: str, value: Any, about: Metadata) -> bool:
-        from neusee.workflows.store import serialization
+        from neusee.workflows.store.serialization import blobs_in
 
         began = time.perf_counter()
-        layout, tensors = serialization.pack(value, self.blobs)
-        apart, inline = serialization.blobs_in(layout), sum(t.nbytes for t in tensors)
-        size = max(inline, about.get("bytes") or 0) if apart else inline
-        entry = {"key": key, **about, "layout": layout, "bytes": size, "payload": None, "kept": True}
-        if self._room and size > LOW * self._room.budget:
+        entry, tensors = payload.described(key, value, about, self.blobs)
+        if self._room and entry["bytes"] > LOW * self._room.budget:
             self._write_receipt(key, entry)
             return False
-        if inline <= INLINE:
-            entry["tensors"], tensors = [serialization.to_text(t) for t in tensors], []
-        if tensors or apart:
-            self._write_parts(key, entry, tensors, value if apart else None)
-            self._speeds.learn("write", inline, time.perf_counter() - began)
+        bands = blobs_in(entry["layout"])
+        if tensors or bands:
+            self._write_parts(key, entry, tensors, value if bands else None)
+            self._speeds.learn("write", sum(t.nbytes for t in tensors), time.perf_counter() - began)
         else:
             self._write_about(key, entry)
         self._lost.discard(key)
         self.journal.append(key, entry)
-        self._make_room(size)
+        self._make_room(entry["bytes"])
         return True
 
     def _write_small(self, key: str, value: Any, about: Metadata) -> bool:
-        entry = self._known[key] = self.brief.put(key, value, about)
+        entry, tensors = payload.described(key, value, about)
+        if tensors:
+            entry = metadata.receipt(entry)
+        self.brief.append(entry)
+        self._known[key] = entry
         self.journal.append(key, entry)
         return is_kept(entry)
 
     def _write_parts(self, key: str, entry: Metadata, tensors: list[Tensor], banded: Any) -> None:
-        """Write the large files first, then the metadata that name them; of two writers the first one stays."""
+        """Write the large files first, then the metadata that name the files; keep the value of an earlier writer."""
         from neusee.workflows.store import serialization
 
         with self.disk.temporary(key) as (part, file):
@@ -240,8 +223,8 @@ class Store:
                 if key not in self._lost and metadata.has_value(self.disk, key):
                     return
                 if banded is not None:  # a sweep may have removed bands that no value names yet
-                    names = serialization.blobs_in(serialization.pack(banded, self.blobs)[0])
-                    entry["bands"] = {"names": names, "newest": payload.newest(self.disk, names)}
+                    names = list(serialization.blobs_in(serialization.pack(banded, self.blobs)[0]))
+                    entry["bands"] = {"names": names, "newest": payload.newest(self.blobs, names)}
                 if tensors:
                     path = self.disk.path(key, "safetensors")
                     self.disk.rename(part, path)
@@ -249,44 +232,28 @@ class Store:
                 self._write_about(key, entry)
 
     def _write_about(self, key: str, entry: Metadata) -> None:
-        """Write the metadata without a sync to disk, because torn metadata fail their checksum."""
-        path = self.disk.path(key, "json")
-        with self.disk.temporary(key) as (part, file):
-            file.write(metadata.seal(entry))
-            file.flush()
-            if not self.disk.link(part, path):
-                self.disk.rename(part, path)
+        metadata.write(self.disk, key, entry, over=True)
         self._known[key] = entry
 
     def _write_receipt(self, key: str, about: Metadata) -> bool:
-        """Write a receipt unless the name is taken: an existing file tells no less than a receipt."""
+        """Write the metadata of a result without its value, unless metadata of the result exist."""
         entry = metadata.receipt({"key": key, **about})
-        if self.about(key) is None:
-            with self.disk.temporary(key) as (part, file):
-                file.write(metadata.seal(entry))
-                file.flush()
-                if self.disk.link(part, self.disk.path(key, "json")):
-                    self._known[key] = entry
+        if self.about(key) is None and metadata.write(self.disk, key, entry, over=False):
+            self._known[key] = entry
         self.journal.append(key, entry)
         return True
 
     def _make_room(self, size: int) -> None:
-        """Evict values where ``size`` more bytes exceed the budget."""
+        """Evict values if a write of ``size`` bytes has exceeded the budget."""
         if self._room and (excess := self._room.excess(size)) > 0:
-            gone = {candidate.key for candidate in maintenance.make_room(self, excess)[0]}
-            self._forget(gone)
-            self.journal.mark_evicted(gone)
-
-    def _forget(self, keys: Collection[str]) -> None:
-        for key in keys:
-            self._known.pop(key, None)
+            self.journal.mark_evicted({candidate.key for candidate in self.make_room(excess)[0]})
 
     def _put_aside(self, key: str, error: Exception) -> None:
         self.put_aside(key, error)
         warnings.warn(f"the stored result {key} is damaged ({error}) and is put aside", stacklevel=5)
 
     def put_aside(self, key: str, error: Exception) -> None:
-        """Move a damaged result to ``bad/`` for inspection; a file of another user stays."""
+        """Move the files of a damaged result to ``bad/`` for inspection; a file of another user stays."""
         self._known.pop(key, None)
         self._lost.add(key)
         unreadable = isinstance(error, OSError) and not isinstance(error, FileNotFoundError)

@@ -1,9 +1,8 @@
-"""Format of a result on disk: a layout in JSON and the tensors in one safetensors file.
+"""Format of a stored value: a layout in JSON, and the tensors in one safetensors file.
 
-The file is written from the memory of the tensors and read through a memory map, so that
-neither direction makes a copy. Each tensor begins at a multiple of 64 bytes, as a newly
-allocated tensor does: a kernel then takes the same path for a stored value as for a computed
-value. A `Stacked` tensor is not in the safetensors file: its layout names one blob for each slice.
+The file is written from the memory of the tensors and read through a memory map, so that neither direction makes a
+copy. Each tensor begins at a multiple of 64 bytes, as a newly allocated tensor does: a kernel then takes the same path
+for a stored value as for a computed value. The layout of a `Stacked` tensor names one band file for each slice.
 """
 
 from __future__ import annotations
@@ -11,6 +10,7 @@ from __future__ import annotations
 import base64
 import importlib
 import json
+import math
 import mmap
 from collections.abc import Callable
 from typing import IO, Any
@@ -44,16 +44,12 @@ _NAMES = {name: dtype for dtype, name in _DTYPES.items()}
 
 
 def each_tensor(change: Callable[[Tensor], Tensor], value: Any) -> Any:
-    """Return ``value`` with ``change`` applied to every tensor; a tensor that occurs twice is changed once."""
-    return change(value) if isinstance(value, Tensor) else _change(value, change, {})
+    """Return ``value`` with ``change`` applied to every tensor in it; change a repeated tensor once."""
+    return _change(value, change, {})
 
 
 def _change(item: Any, change: Callable[[Tensor], Tensor], done: dict[int, Tensor]) -> Any:
-    """Change one item recursively.
-
-    This is a function of the module because a nested recursive function would hold its tensors until
-    the next garbage collection.
-    """
+    """Apply ``change`` to the tensors in an item; a nested function would hold the tensors until garbage collection."""
     if isinstance(item, Tensor):
         if id(item) not in done:
             done[id(item)] = change(item)
@@ -67,49 +63,43 @@ def _change(item: Any, change: Callable[[Tensor], Tensor], done: dict[int, Tenso
 
 
 def tensors_in(value: Any) -> list[Tensor]:
-    """Return every tensor in ``value``, each of them once."""
-    if isinstance(value, Tensor):
-        return [value]
-    found: list[Tensor] = []
-    each_tensor(lambda t: found.append(t) or t, value)  # type: ignore[func-returns-value]
-    return found
+    """Return the tensors in ``value``, a repeated tensor once."""
+    tensors: list[Tensor] = []
+    each_tensor(lambda t: tensors.append(t) or t, value)  # type: ignore[func-returns-value]
+    return tensors
 
 
 def settle(value: Any) -> Any:
-    """Return ``value`` as the store would return it: contiguous tensors that hold no memory beyond their own."""
+    """Return ``value`` as if read from the store: contiguous tensors that hold no memory beyond their own elements."""
     return each_tensor(_settled, value)
 
 
 def _settled(x: Tensor) -> Tensor:
     x = x.resolve_conj().resolve_neg().contiguous()
-    return x.clone(memory_format=torch.contiguous_format) if _held(x) > x.nbytes else x
-
-
-def _held(x: Tensor) -> int:
-    """Return the bytes of the memory behind a tensor; its own for one that `torch.func` follows, which has none."""
     try:
-        return x.untyped_storage().nbytes()
-    except NotImplementedError:
-        return x.nbytes
+        spare = x.untyped_storage().nbytes() > x.nbytes
+    except NotImplementedError:  # a tensor inside a transform of torch.func has no memory of its own
+        spare = False
+    return x.clone(memory_format=torch.contiguous_format) if spare else x
 
 
 class _Listed:
-    """Tensors in the order of a file; memory that two tensors share is listed once."""
+    """Tensors in the order of a file, in which tensors that share memory and shape are stored once."""
 
     def __init__(self) -> None:
         self.tensors: list[Tensor] = []
         self._known: dict[tuple[Any, ...], int] = {}
 
     def add(self, x: Tensor) -> int:
-        same = (x.data_ptr() or id(x), x.dtype, x.shape, x.stride(), x.is_conj(), x.is_neg())
-        if same not in self._known:
-            self._known[same] = len(self.tensors)
+        identity = (x.data_ptr() or id(x), x.dtype, x.shape, x.stride(), x.is_conj(), x.is_neg())
+        if identity not in self._known:
+            self._known[identity] = len(self.tensors)
             self.tensors.append(x.detach())
-        return self._known[same]
+        return self._known[identity]
 
 
 def pack(value: Any, blobs: Blobs | None = None) -> tuple[Any, list[Tensor]]:
-    """Return the layout of ``value`` as JSON and its tensors; write each `Stacked` tensor to ``blobs`` if given.
+    """Return the layout of ``value`` and its tensors; write each `Stacked` tensor to the folder ``blobs`` if given.
 
     Raises `TypeError` for a value that cannot be stored, and `OSError` where ``blobs`` cannot be written.
     """
@@ -142,7 +132,7 @@ def _stack_layout(item: Stacked, blobs: Blobs) -> dict[str, Any]:
 
 
 def unpack(layout: Any, tensors: list[Tensor], blobs: Blobs | None = None, verify: bool = True) -> Any:
-    """Return the value that `pack` took apart; raise `ValueError` where a band of the value is lost."""
+    """Return the value for which `pack` returned layout and tensors; raise `ValueError` where a band is damaged."""
     ((kind, body),) = ((k, v) for k, v in layout.items() if k != "items")
     if kind == "tensor":
         return tensors[body]
@@ -160,20 +150,20 @@ def unpack(layout: Any, tensors: list[Tensor], blobs: Blobs | None = None, verif
     return {k: unpack(v, tensors, blobs, verify) for k, v in body.items()} if kind == "dict" else body
 
 
-def blobs_in(layout: Any) -> list[str]:
-    """Return the names of all blobs that a layout needs."""
-    found: list[str] = []
+def blobs_in(layout: Any) -> dict[str, str]:
+    """Return the checksum (xxh3) of every band that a layout names, by the name of the band."""
+    checksums: dict[str, str] = {}
     todo = [layout]
     while todo:
         item = todo.pop()
         if "stacked" in item:
-            found += item["stacked"]["names"]
+            checksums |= zip(item["stacked"]["names"], item["stacked"]["xxh3"], strict=True)
         todo += item.get("items", item.get("list", item.get("dict", {}).values()))
-    return found
+    return checksums
 
 
 def _class_path(item: tuple[Any, ...]) -> str:
-    """Return module and name of a named tuple's class, or an empty string for a plain tuple."""
+    """Return module and name of the class of a named tuple, or an empty string for a plain tuple."""
     kind = type(item)
     if kind is tuple:
         return ""
@@ -186,22 +176,22 @@ def _class(path: str) -> Callable[..., Any]:
     module, _, name = path.partition(":")
     if not module.startswith("neusee.nodes."):
         raise ValueError(f"{path} is not a class of neusee.nodes")
-    found: Callable[..., Any] = getattr(importlib.import_module(module), name)
-    return found
+    named_tuple: Callable[..., Any] = getattr(importlib.import_module(module), name)
+    return named_tuple
 
 
 def to_text(x: Tensor) -> list[Any]:
-    """Return a small tensor as JSON: type, shape, complex or real, and bytes."""
+    """Return a small tensor as values for JSON: type, shape, whether the tensor is complex, and bytes as text."""
     return [*_kind(x), base64.b64encode(bytes_of(x)).decode()]
 
 
 def from_text(kind: str, shape: list[int], is_complex: bool, text: str) -> Tensor:
-    """Return the tensor that `to_text` wrote."""
+    """Return the tensor for which `to_text` returned these four values."""
     return _tensor(bytearray(base64.b64decode(text)), 0, kind, shape, is_complex)
 
 
 def write(file: IO[bytes], tensors: list[Tensor]) -> str:
-    """Write a safetensors file; return the xxh3 checksum of all its bytes."""
+    """Write tensors to a safetensors file; return the checksum (xxh3) of all bytes."""
     header: dict[str, Any] = {"__metadata__": {}}
     end = 0
     for i, x in enumerate(tensors):
@@ -214,19 +204,19 @@ def write(file: IO[bytes], tensors: list[Tensor]) -> str:
             end += pad
     text = json.dumps(header, separators=(",", ":")).encode()
     text += b" " * (-(8 + len(text)) % _ALIGN)
-    found = xxhash.xxh3_128()
+    digest = xxhash.xxh3_128()
     for block in (len(text).to_bytes(8, "little"), text):
         file.write(block)
-        found.update(block)
+        digest.update(block)
     for x in tensors:
         for part in (bytes_of(x), bytes(-x.nbytes % _ALIGN)):
             file.write(part)
-            found.update(part)
-    return found.hexdigest()
+            digest.update(part)
+    return digest.hexdigest()
 
 
 def read(path: str, expected: str | None) -> list[Tensor]:
-    """Return the tensors of a file that `write` made, mapped into memory; check the xxh3 if ``expected`` is given."""
+    """Map the tensors of a file of `write` into memory; compare the checksum of the file with ``expected`` if given."""
     with open(path, "rb") as file:
         data = mmap.mmap(file.fileno(), 0, access=mmap.ACCESS_COPY)
     if expected is not None and xxhash.xxh3_128_hexdigest(data) != expected:
@@ -248,10 +238,7 @@ def _kind(x: Tensor) -> tuple[str, list[int], bool]:
 
 
 def _tensor(data: Any, offset: int, kind: str, shape: list[int], is_complex: bool) -> Tensor:
-    count = 1
-    for n in shape:
-        count *= n
-    dtype = _NAMES[kind]
+    dtype, count = _NAMES[kind], math.prod(shape)
     flat = torch.frombuffer(data, dtype=dtype, count=count, offset=offset) if count else torch.empty(0, dtype=dtype)
     x = flat.reshape(shape)
     return torch.view_as_complex(x) if is_complex else x

@@ -1,9 +1,8 @@
-"""A folder to which many processes and users write at the same time.
+"""A folder to which many processes and many users write at the same time.
 
-A file is complete before it is renamed to its final name, and until then its temporary name
-contains the owner. The next writer removes the temporary files of killed processes, whatever
-the clock says. Folders, and the few files to which all processes write, copy the permissions
-of the root.
+A file is complete before it gets its final name; until then its temporary name contains the owner. The next writer
+removes the temporary files of killed processes, whatever the clock says. Folders, and the few files to which all
+processes write, copy the permissions of the root.
 """
 
 from __future__ import annotations
@@ -28,7 +27,7 @@ _count = itertools.count()
 
 
 class Disk:
-    """The root folder of a store, and the ways to write below the root."""
+    """The root folder of a store, with the operations that write below the root."""
 
     def __init__(self, root: Path) -> None:
         self.root = root
@@ -36,11 +35,11 @@ class Disk:
         self._ready = False
 
     def path(self, key: str, suffix: str) -> str:
-        """Return the path of a result's file."""
+        """Return the path of the file with this suffix of the result ``key``."""
         return f"{self.folder}/{key[:2]}/{key}.{suffix}"
 
     def prepare(self) -> None:
-        """Make the folder of temporary files, and remove the files of killed processes."""
+        """Make the folder of temporary files, and remove the temporary files of killed processes."""
         if not self._ready:
             self.root.mkdir(parents=True, exist_ok=True)
             self.make_folder(f"{self.folder}/tmp")
@@ -48,12 +47,12 @@ class Disk:
             self._ready = True
 
     def forget(self) -> None:
-        """Look at the folder again before the next write, because another process has removed it."""
+        """Let the next write make the folder of temporary files again, because another process has removed it."""
         self._ready = False
 
     @contextmanager
     def temporary(self, name: str) -> Iterator[tuple[str, IO[bytes]]]:
-        """Yield path and handle of a new temporary file, which is deleted at the end unless it was renamed."""
+        """Yield path and handle of a new temporary file; delete the file at the end unless the caller renamed it."""
         self.prepare()
         part = f"{self.folder}/tmp/{name}.{me()}.{next(_count)}"
         try:
@@ -62,6 +61,14 @@ class Disk:
         finally:
             with suppress(OSError):
                 os.unlink(part)
+
+    def replace(self, name: str, raw: bytes) -> None:
+        """Replace the shared file ``name`` in the root by a file with the content ``raw``."""
+        with self.temporary(name) as (part, file):
+            file.write(raw)
+            file.flush()
+            self.share(part)
+            os.replace(part, f"{self.folder}/{name}")
 
     def rename(self, part: str, path: str) -> None:
         """Rename a complete file to its final name, replacing an existing file."""
@@ -72,7 +79,7 @@ class Disk:
             os.replace(part, path)
 
     def link(self, part: str, path: str) -> bool:
-        """Link a complete file to its final name; return False where the name is already taken."""
+        """Link a complete file to its final name; return False where a file of that name exists."""
         try:
             try:
                 os.link(part, path)
@@ -90,21 +97,21 @@ class Disk:
         return True
 
     def make_folder(self, folder: str) -> None:
-        """Make a folder in which every user may write who may write in the root."""
+        """Make a folder with write permission for every user who may write in the root."""
         with suppress(FileExistsError):
             os.mkdir(folder)
             self.share(folder, 0o7777)
 
     def share(self, path: str, mask: int = 0o666) -> None:
         """Give other users the permissions on ``path`` that they have on the root."""
-        wanted, found = os.stat(self.folder).st_mode & mask, os.stat(path).st_mode
-        if wanted & ~found:
+        due, mode = os.stat(self.folder).st_mode & mask, os.stat(path).st_mode
+        if due & ~mode:
             with suppress(OSError):
-                os.chmod(path, (found | wanted) & 0o7777)
+                os.chmod(path, (mode | due) & 0o7777)
 
     @contextmanager
     def lock(self) -> Iterator[None]:
-        """Hold the lock of the folder; go on without the lock if the file system has none or the holder is stopped."""
+        """Hold the lock of the folder; continue without a lock if the file system has none or the owner is stopped."""
         self.prepare()
         file = self._lock_file()
         try:
@@ -127,7 +134,7 @@ class Disk:
             return os.open(path, os.O_RDONLY)
 
     def sweep(self, dry: bool = False, patience: float = math.inf) -> list[tuple[str, int]]:
-        """Remove the temporary files of dead processes; return the removed paths with their bytes.
+        """Remove the temporary files of dead processes; return the path and the bytes of each file.
 
         Leases and badges of other machines stay for ``patience`` seconds, so that no jump of a clock makes them old.
         """
@@ -141,6 +148,15 @@ class Disk:
         return gone
 
 
+def append(path: str, raw: bytes, flags: int = 0) -> int:
+    """Append bytes to a file in one write; return the number of written bytes. ``flags`` are flags of `os.open`."""
+    file = os.open(path, os.O_WRONLY | os.O_APPEND | flags, 0o666)
+    try:
+        return os.write(file, raw)
+    finally:
+        os.close(file)
+
+
 def _locked(file: int) -> bool:
     try:
         fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
@@ -152,14 +168,14 @@ def _locked(file: int) -> bool:
 
 
 def _abandoned(entry: os.DirEntry[str], patience: float) -> bool:
-    """Return True if the owner of a temporary file is dead, or is unknown and the file is old."""
+    """Return True if the owner of a temporary file is dead, or if the owner is unknown and the file is old."""
     words = entry.name.split(".")
-    presence = words[-1] == "lease" or words[0] == "badge"
+    shows_owner = words[-1] == "lease" or words[0] == "badge"
     if words[-1] == "lease":
         with open(entry.path, "rb") as file:
             words = file.readline(200).decode(errors="replace").split()
     owner = next(filter(None, map(owner_of, words)), None)
     state = owner.state if owner else "foreign"
     if state == "foreign":
-        return time.time() - entry.stat(follow_symlinks=False).st_mtime > (patience if presence else OLD)
+        return time.time() - entry.stat(follow_symlinks=False).st_mtime > (patience if shows_owner else OLD)
     return state == "dead"

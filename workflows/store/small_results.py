@@ -1,4 +1,4 @@
-"""Small results as sealed lines of one file, for results that take less time to compute than to write to a file.
+"""Small results as lines of one file, for results that take less time to compute than to write to a file each.
 
 A line is one write. A line that is torn or fails its checksum is ignored; the loss of a line
 costs less than a millisecond of computation. All processes see the lines of each other,
@@ -11,11 +11,10 @@ import os
 import threading
 from collections.abc import Iterator
 from contextlib import suppress
-from typing import Any
 
 from neusee.workflows.store import metadata
-from neusee.workflows.store.metadata import INLINE, UNREADABLE, Metadata
-from neusee.workflows.store.shared_folder import Disk
+from neusee.workflows.store.metadata import UNREADABLE, Metadata
+from neusee.workflows.store.shared_folder import Disk, append
 
 MOST = 64 << 20  #: bytes of the file above which the older half is dropped
 _HEAD = b'{"key":"'
@@ -23,7 +22,7 @@ _KEY = slice(len(_HEAD), len(_HEAD) + 32)
 
 
 class SmallResults:
-    """The lines of one store."""
+    """The results of one store without files of their own: each result is one line of a common file."""
 
     def __init__(self, disk: Disk) -> None:
         self._disk, self._guard = disk, threading.Lock()
@@ -32,75 +31,49 @@ class SmallResults:
         self._file, self._offset = 0, 0
 
     def find(self, key: str) -> Metadata | None:
-        """Return the content of the line of ``key``, or None where no line can be trusted."""
+        """Return the metadata in the line of ``key``, or None where no line can be trusted."""
         if key not in self._lines:
-            self._take_in()
-        raw = self._lines.get(key)
-        if raw is None:
-            return None
-        try:
-            about = metadata.unseal(raw)
-            return about if about["key"] == key else None
-        except UNREADABLE:
-            return None
-
-    def put(self, key: str, value: Any, about: Metadata) -> Metadata:
-        """Append a value if it is small, else its receipt; return the line. Raises `OSError` or `TypeError`."""
-        from neusee.workflows.store import serialization
-
-        layout, tensors = serialization.pack(value)
-        size = sum(t.nbytes for t in tensors)
-        entry = {"key": key, **about, "layout": layout, "bytes": size, "payload": None, "kept": True}
-        if size <= INLINE:
-            entry["tensors"] = [serialization.to_text(t) for t in tensors]
-        else:
-            entry = metadata.receipt(entry)
-        self.append(entry)
-        return entry
+            self._read_new_lines()
+        with suppress(*UNREADABLE):  # also a KeyError where the key has no line
+            return metadata.unseal_of(key, self._lines[key])
+        return None
 
     def append(self, about: Metadata) -> None:
-        """Append a line. Raises `OSError` where the line cannot be written."""
+        """Append a line with the metadata ``about``. Raises `OSError` where the line cannot be written."""
         raw = metadata.seal(about)
         try:
-            self._write(raw, os.O_APPEND | os.O_WRONLY)
+            self._write(raw)
         except FileNotFoundError:
             self._disk.prepare()
-            self._write(raw, os.O_APPEND | os.O_WRONLY | os.O_CREAT)
+            self._write(raw, os.O_CREAT)
             self._disk.share(self._path)
 
     def each(self) -> Iterator[tuple[str, Metadata]]:
-        """Yield every key with the content of its newest line."""
-        self._take_in()
+        """Yield every key with the metadata in the newest line of the key."""
+        self._read_new_lines()
         for key in sorted(self._lines):
             if (about := self.find(key)) is not None:
                 yield key, about
 
     def compact(self) -> None:
         """Keep the newest lines, up to half of `MOST` bytes; a line that is added meanwhile may be lost."""
-        self._take_in()
+        self._read_new_lines()
         kept, size = list[bytes](), 0
         for raw in reversed(self._lines.values()):
             size += len(raw) + 1
             if size > MOST // 2:
                 break
             kept.append(raw)
-        with suppress(OSError), self._disk.temporary("brief") as (part, file):
-            file.write(b"".join(b"\n" + raw for raw in reversed(kept)))
-            file.flush()
-            self._disk.share(part)
-            os.replace(part, self._path)
+        with suppress(OSError):
+            self._disk.replace("brief.jsonl", b"".join(b"\n" + raw for raw in reversed(kept)))
 
-    def _write(self, raw: bytes, flags: int) -> None:
+    def _write(self, raw: bytes, flags: int = 0) -> None:
         """Write a line with its line end first, so that a torn line of a killed process stays separate."""
-        file = os.open(self._path, flags, 0o666)
-        try:
-            if os.write(file, b"\n" + raw) != len(raw) + 1:
-                raise OSError(f"{self._path}: no space left for a line")
-        finally:
-            os.close(file)
+        if append(self._path, b"\n" + raw, flags) != len(raw) + 1:
+            raise OSError(f"{self._path}: no space left for a line")
 
-    def _take_in(self) -> None:
-        """Read the lines added since the last call, or the whole file where the file was replaced."""
+    def _read_new_lines(self) -> None:
+        """Read the lines that were added since the last call, or the whole file where the file was replaced."""
         try:
             stat = os.stat(self._path)
         except OSError:
@@ -115,8 +88,9 @@ class SmallResults:
             whole = raw.rfind(b"\n") if not raw.endswith(b"}") else len(raw)
             for line in raw[:whole].split(b"\n"):
                 if line.startswith(_HEAD):
-                    self._lines.pop(line[_KEY].decode(errors="replace"), None)  # keep the newest line last
-                    self._lines[line[_KEY].decode(errors="replace")] = line
+                    key = line[_KEY].decode(errors="replace")
+                    self._lines.pop(key, None)  # keep the newest line last
+                    self._lines[key] = line
             self._file, self._offset = os.fstat(file.fileno()).st_ino, self._offset + max(0, whole)
         if self._offset > MOST:
             self.compact()

@@ -1,14 +1,14 @@
 """Cheaper steps: substitutes for full steps where the error in the outputs stays below the tolerance.
 
-The sensor sums bands into a few channels before any random step. Where the steps after an image
-read only such sums, the sums are convolved instead of the bands. The substitutes are added beside
-the full steps, and only the wires of their readers change. A value requested by name is therefore
-always the full one.
+The sensor sums bands into a few channels before any random step. Where the steps after an image read only such sums,
+the sums are convolved instead of the bands. The substitutes are added beside the full steps, and only the wires of
+their readers change. A value requested by name is therefore always computed in full.
 """
 
 from __future__ import annotations
 
 import math
+from collections import defaultdict
 from collections.abc import Collection, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from typing import TYPE_CHECKING, Any
@@ -26,7 +26,7 @@ _MIXTURE = 0.1  #: share for a low-rank cube, rounded down to a power of ten so 
 
 
 def with_substitutions(recipe: Recipe, wanted: Iterable[str], pinned: Collection[str] = ()) -> Recipe:
-    """Return ``recipe`` with cheaper steps where only ``wanted`` needs them; unchanged with ``exact``.
+    """Return ``recipe`` with cheaper steps that suffice for the outputs ``wanted``, or unchanged if it is exact.
 
     The scene of an image that follows a step in ``pinned`` stays whole, because a cube that is being
     optimised has no low-rank form yet. A recipe with substitutions does not change again.
@@ -40,42 +40,42 @@ def with_substitutions(recipe: Recipe, wanted: Iterable[str], pinned: Collection
     images = [recipe.steps[n] for n in order if recipe.steps[n].node.channel_sum_form is not None and n not in wanted]
     if not images or recipe.tolerance * recipe.tolerance_scale <= _LEAST:
         return recipe
-    behind = _behind(recipe, order, pinned)
+    dependent = _dependent(recipe, order, pinned)
     draft = _Draft(recipe, wanted, _readers(recipe, order))
     for image in images:
-        if image.name not in pinned and image.wires.get("radiance") not in behind:
+        if image.name not in pinned and image.wires.get("radiance") not in dependent:
             draft.collapse(image)
-    found = draft.finished()
-    return _limited(found, needed(found, sorted(wanted)))
+    recipe = draft.finished()
+    return _limited(recipe, needed(recipe, sorted(wanted)))
 
 
 def _limited(recipe: Recipe, order: Sequence[str]) -> Recipe:
-    """Return the recipe with its unbounded steps noted, if its tolerance exceeds `METRIC_TOLERANCE`."""
+    """Return the recipe with a list of its steps without error bound, if the tolerance exceeds `METRIC_TOLERANCE`."""
     steps = unbounded_steps(recipe, order) if recipe.tolerance > METRIC_TOLERANCE else frozenset[str]()
     return recipe if steps == recipe.unbounded else replace(recipe, unbounded=steps)
 
 
-def _behind(recipe: Recipe, order: Iterable[str], pinned: Collection[str]) -> set[str]:
-    """Return the pinned steps and all steps that depend on them."""
-    found = set(pinned)
-    for name in order if found else ():
-        if not found.isdisjoint(recipe.steps[name].sources):
-            found.add(name)
-    return found
+def _dependent(recipe: Recipe, order: Iterable[str], pinned: Collection[str]) -> set[str]:
+    """Return the pinned steps and all steps that depend on a pinned step."""
+    dependent = set(pinned)
+    for name in order:
+        if not dependent.isdisjoint(recipe.steps[name].sources):
+            dependent.add(name)
+    return dependent
 
 
 def _readers(recipe: Recipe, order: Iterable[str]) -> dict[str, list[str]]:
-    """Return the readers of each step."""
-    found: dict[str, list[str]] = {}
+    """Return the steps that read the result of each step, by the name of the step that is read."""
+    readers = defaultdict[str, list[str]](list)
     for name in order:
         for source in dict.fromkeys(recipe.steps[name].sources):
-            found.setdefault(source, []).append(name)
-    return found
+            readers[source].append(name)
+    return readers
 
 
 @dataclass(frozen=True)
 class Asked:
-    """What the readers of an image need: sums over its bands with the weights of channels, and perhaps of the well."""
+    """The sums over the bands of an image that later steps need: one for each channel, and perhaps one for the well."""
 
     bands: str
     responses: str
@@ -84,16 +84,16 @@ class Asked:
 
 
 def asked_of(recipe: Recipe, image: str, wanted: Iterable[str]) -> Asked | None:
-    """Return what the steps for ``wanted`` read of an image; None where they read more than sums over its bands."""
+    """Return the sums over the bands of ``image`` that the outputs ``wanted`` need, or None if outputs need more."""
     names = _readers(recipe, needed(recipe, wanted)).get(image, [])
     readers = [recipe.steps[name] for name in names]
-    found = _Draft(recipe, frozenset(wanted), {}).spectral(image, readers)
-    return found and Asked(*found, tuple(names), _well(readers))
+    weights = _Draft(recipe, frozenset(wanted), {}).spectral(image, readers)
+    return weights and Asked(*weights, tuple(names), _well(readers))
 
 
 @dataclass
 class _Draft:
-    """A recipe with the substitutes collected so far."""
+    """A recipe, with the cheaper steps that are to replace some of its steps."""
 
     recipe: Recipe
     wanted: frozenset[str]
@@ -103,25 +103,17 @@ class _Draft:
     substitutions: list[Substitution] = field(default_factory=list)
 
     def collapse(self, image: Step) -> None:
-        """Add the channel sums of an image, if all its readers need only sums over its bands."""
+        """Add a step for the channel sums of an image, if all readers of the image need only sums over its bands."""
         readers = [self.rewired.get(name, self.recipe.steps[name]) for name in self.readers.get(image.name, ())]
-        node, radiance, spectral = (
-            image.node.channel_sum_form,
-            image.wires.get("radiance"),
-            self.spectral(image.name, readers),
-        )
-        if node is None or spectral is None or not isinstance(radiance, str):
+        node, radiance = image.node.channel_sum_form, image.wires.get("radiance")
+        weights = self.spectral(image.name, readers)
+        if node is None or weights is None or not isinstance(radiance, str):
             return
-        bands, responses = spectral
         name, within = f"{image.name}.channels", self.recipe.allowed(image.name) * CHANNELS
-        wires = {
-            "radiance": self._mixture(radiance, image),
-            "psf": image.wires.get("psf"),
-            "rows": self._rows(bands, responses, readers, image),
-        }
-        largest = any(
-            reader.node.hooks.band_invariant is not None for reader in readers
-        )  # the level follows the brightest pixel
+        cube, rows = self._mixture(radiance, image), self._rows(*weights, readers, image)
+        wires = {"radiance": cube, "psf": image.wires.get("psf"), "rows": rows}
+        # the level follows the brightest pixel
+        largest = any(reader.node.hooks.band_invariant is not None for reader in readers)
         self._add(name, node, wires, {**image.params, "within": within, "largest": largest}, image)
         for reader in readers:
             changed = {i: _exchanged(wire, image.name, name) for i, wire in reader.wires.items()}
@@ -129,43 +121,40 @@ class _Draft:
         self.substitutions.append(Substitution(image.name, name, within, "only sums over its bands are needed"))
 
     def spectral(self, image: str, readers: Sequence[Step]) -> tuple[str, str] | None:
-        """Return the bands and responses with which all ``readers`` sum an image, or None where one needs more."""
-        found = {(r.wires.get("bands"), r.wires.get("responses")) for r in readers if "responses" in r.node.inputs}
-        if len(found) != 1 or not all(self._sums(r, image) for r in readers):
+        """Return the bands and responses with which all ``readers`` sum an image, or None if a reader needs more."""
+        pairs = {(r.wires.get("bands"), r.wires.get("responses")) for r in readers if "responses" in r.node.inputs}
+        if len(pairs) != 1 or not all(self._sums(r, image) for r in readers):
             return None
-        bands, responses = found.pop()
+        bands, responses = pairs.pop()
         return (bands, responses) if isinstance(bands, str) and isinstance(responses, str) else None
 
     def finished(self) -> Recipe:
-        """Return the recipe with the substitutes."""
+        """Return the recipe with the cheaper steps and the changed wires."""
         if not self.substitutions:
             return self.recipe
         steps = {**self.recipe.steps, **self.added, **self.rewired}
         order = in_order({name: step.sources for name, step in steps.items()}, steps)
-        found = (*self.recipe.substitutions, *self.substitutions)
-        steps = {name: steps[name] for name in order}
-        return replace(
-            self.recipe, steps=steps, substitutions=found, unsubstituted=self.recipe.unsubstituted or self.recipe
-        )
+        steps, whole = {name: steps[name] for name in order}, self.recipe.unsubstituted or self.recipe
+        substitutions = (*self.recipe.substitutions, *self.substitutions)
+        return replace(self.recipe, steps=steps, substitutions=substitutions, unsubstituted=whole)
 
     def _sums(self, reader: Step, image: str) -> bool:
-        """Return True if a step needs nothing of the image but sums over its bands."""
+        """Return True if a step reads from the image only sums over the bands."""
+        node, band_invariant = reader.node, reader.node.hooks.band_invariant
         reads = {i for i, wire in reader.wires.items() if image == wire or (isinstance(wire, tuple) and image in wire)}
-        if not reads <= set(reader.node.accepts_channel_sums) or (
-            reader.node.hooks.band_invariant and not reader.node.hooks.band_invariant(reader.params)
-        ):
+        if not reads <= set(node.accepts_channel_sums) or (band_invariant and not band_invariant(reader.params)):
             return False
-        return all(self._even(reader.wires.get(i)) for i in reader.node.needs_band_invariant)
+        return all(self._even(reader.wires.get(i)) for i in node.needs_band_invariant)
 
     def _even(self, wire: Wire) -> bool:
-        """Return True if a result is the same for every band, as its own node states."""
+        """Return True if the result at a wire is the same for every band, as its node states, or the wire is empty."""
         if not isinstance(wire, str):
             return wire is None
         step = self.recipe.steps[wire]
         return step.node.hooks.band_invariant is not None and step.node.hooks.band_invariant(step.params)
 
     def _rows(self, bands: str, responses: str, readers: list[Step], image: Step) -> str:
-        """Return the step that gives the weights of the bands, with those of the well where a step needs them."""
+        """Add a step for the weights of the bands in each channel, and in the well if needed; return its name."""
         from neusee.nodes import spectra
 
         well = _well(readers)
@@ -173,7 +162,7 @@ class _Draft:
         return self._add(name, spectra.rows, wires, {"well": well}, image)
 
     def _mixture(self, name: str, image: Step) -> str:
-        """Return the step that gives a cube in low-rank form, converted as early as the nodes accept the form."""
+        """Add a step for the cube ``name`` in low-rank form, converted as early as nodes allow; return its name."""
         from neusee.nodes import spectra
 
         step, new = self.recipe.steps[name], f"{name}.mixture"
@@ -187,18 +176,17 @@ class _Draft:
         return self._add(new, spectra.compress, {"cube": name}, within, step)
 
     def _add(self, name: str, node: Node, wires: Mapping[str, Wire], params: Mapping[str, Any], like: Step) -> str:
-        """Add a step with the place of ``like``; return its name."""
+        """Add a step with the location in the recipe and the device of ``like``; return the name of the new step."""
         self.added[name] = Step(name, node, params, wires, like.mark, {}, like.device)
         return name
 
 
 def _well(readers: Iterable[Step]) -> bool:
-    """Return True if a step reads bands but no responses."""
+    """Return True if one of the steps reads bands but no responses, as a step for the well of a pixel does."""
     return any("bands" in r.node.inputs and "responses" not in r.node.inputs for r in readers)
 
 
 def _exchanged(wire: Wire, old: str, new: str) -> Wire:
-    """Return a wire with one step in place of another."""
     if isinstance(wire, tuple):
         return tuple(new if name == old else name for name in wire)
     return new if wire == old else wire

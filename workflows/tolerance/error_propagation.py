@@ -1,49 +1,50 @@
 """Error propagation: upper bounds on the effect of omitted and approximated steps, from node to node.
 
 A node computes the error of its result from the errors of its inputs (`Node.propagate_error`).
-Behind a node without this hook nothing is known, and its inputs are held to the tolerance instead.
+Behind a node without this hook no error is known; the errors of its inputs must meet the tolerance instead.
 """
 
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 
 from neusee.nodes import ErrorBound, TensorStats
 from neusee.workflows.graph.recipe_graph import Recipe, Step, Wire
 from neusee.workflows.graph.run_error import RunError
 from neusee.workflows.graph.step_record import StepRecord
+from neusee.workflows.tolerance.skip_decision import FactsOf
 
-FactsOf = Callable[[str], TensorStats | None]
+_Input = ErrorBound | list[ErrorBound] | None
 _EXACT = ErrorBound(0.0)
 
 
 @dataclass(frozen=True, slots=True)
 class ErrorBounds:
-    """Upper bounds, each relative to the largest element of a result."""
+    """Upper bounds on the errors of results, each relative to the largest element of the result."""
 
     shares: Mapping[str, float] = field(default_factory=dict)  #: by step; infinite where a node gives no bound
-    held: Mapping[str, float] = field(default_factory=dict)  #: of outputs, and of what feeds nodes without bounds
+    held: Mapping[str, float] = field(default_factory=dict)  #: of outputs, and of the inputs of nodes without bounds
 
     def of(self, step: str) -> float | None:
-        """Return the bound of a step; None where no bound is known."""
+        """Return the error bound of a step's result, or None where no bound is known."""
         share = self.shares.get(step, 0.0)
         return share if math.isfinite(share) else None
 
     @property
     def worst(self) -> float:
-        """Return the greatest bound among the steps held to the tolerance."""
+        """Return the largest error bound of the results that must meet the tolerance."""
         return max(self.held.values(), default=0.0)
 
     def over(self, recipe: Recipe) -> float:
-        """Return the greatest ratio of a bound to its limit; infinite where the limit is 0."""
+        """Return the largest ratio of an error bound to the limit that ``recipe`` sets; infinite for a limit of 0."""
         shares = [(share, recipe.limit(name)) for name, share in self.held.items() if share > 0]
         return max((share / limit if limit > 0 else math.inf for share, limit in shares), default=0.0)
 
 
 class ToleranceNotProven(Exception):
-    """Error of a run whose bounds exceed the tolerance ``over`` times."""
+    """Error for a run whose error bound is ``over`` times the tolerance."""
 
     def __init__(self, over: float) -> None:
         super().__init__(f"the error bound is {over:.2g} times the tolerance")
@@ -51,25 +52,25 @@ class ToleranceNotProven(Exception):
 
 
 def tolerance_frontier(recipe: Recipe, order: Iterable[str], wanted: Iterable[str]) -> list[str]:
-    """Return the steps held to the tolerance: inexact ones that are wanted or feed a node without an error bound."""
-    off, found = set[str](), dict[str, None]()
+    """Return the inexact steps that must meet the tolerance: outputs, and inputs of nodes without an error bound."""
+    inexact, frontier = set[str](), dict[str, None]()
     for name in order:
         step = recipe.steps[name]
-        reads = [source for source in step.sources if source in off]
+        reads = [source for source in step.sources if source in inexact]
         if reads and not _bounds_its_error(step):
-            found |= dict.fromkeys(reads)
+            frontier |= dict.fromkeys(reads)
         elif reads or step.node.hooks.approximation_error is not None or step.node.hooks.skip_bound is not None:
-            off.add(name)
-    return [*found, *(name for name in wanted if name in off and name not in found)]
+            inexact.add(name)
+    return list(frontier | dict.fromkeys(name for name in wanted if name in inexact))
 
 
 def unbounded_steps(recipe: Recipe, order: Sequence[str]) -> frozenset[str]:
-    """Return the steps whose errors reach a node that does not bound its error."""
-    found = set[str]()
+    """Return the steps whose errors reach a node that gives no bound on the error of its result."""
+    unbounded = set[str]()
     for name in reversed(order):
-        if name in found or not _bounds_its_error(recipe.steps[name]):
-            found.update(recipe.steps[name].sources)
-    return frozenset(found)
+        if name in unbounded or not _bounds_its_error(recipe.steps[name]):
+            unbounded.update(recipe.steps[name].sources)
+    return frozenset(unbounded)
 
 
 def _bounds_its_error(step: Step) -> bool:
@@ -79,28 +80,28 @@ def _bounds_its_error(step: Step) -> bool:
 def proof(
     recipe: Recipe, order: Iterable[str], wanted: Iterable[str], done: Callable[[str], StepRecord], facts_of: FactsOf
 ) -> ErrorBounds:
-    """Return the bounds of a run, carried from step to step in running order; nothing is computed."""
-    found: dict[str, ErrorBound] = {}
+    """Return the error bounds of all results of a run, from bounds and statistics alone; no step is computed."""
+    bounds: dict[str, ErrorBound] = {}
     held: dict[str, float] = {}
     for name in order:
         step = recipe.steps[name]
-        inputs = [_gathered(step.wires.get(i), found) for i in step.node.inputs]
+        inputs = [_gathered(step.wires.get(i), bounds) for i in step.node.inputs]
         own = _own(step, done(name), facts_of)
-        if own is None and not any(d.rms for part in inputs for d in _each(part)):
+        if own is None and not any(bound.rms for bound in _flat(inputs)):
             continue  # exact, like almost every step
-        carried, facts = _carried(step, inputs, facts_of(name)), facts_of(name)
+        facts, error = facts_of(name), done(name).error
+        carried = _carried(step, inputs, facts)
         if math.isinf(carried):
-            told = {source: found[source].share for source in step.sources if source in found}
-            held |= {source: share for source, share in told.items() if math.isfinite(share)}
-        error = done(name).error
-        found[name] = ErrorBound(carried + (own or 0.0), facts, error[1] if error else None)
-    shares = {name: deviation.share for name, deviation in found.items()}
+            shares = {source: bounds[source].share for source in step.sources if source in bounds}
+            held |= {source: share for source, share in shares.items() if math.isfinite(share)}
+        bounds[name] = ErrorBound(carried + (own or 0.0), facts, error[1] if error else None)
+    shares = {name: bound.share for name, bound in bounds.items()}
     held |= {name: shares[name] for name in wanted if math.isfinite(shares.get(name, math.inf))}
     return ErrorBounds(shares, held)
 
 
 def _own(step: Step, done: StepRecord, facts_of: FactsOf) -> float | None:
-    """Return the error that a step itself adds, in the unit of its result: by approximation or by omission."""
+    """Return the error that a step adds by its own approximation or omission, in the unit of its result."""
     share = done.bound if done.state == "left out" else done.error and done.error[0]
     facts = facts_of(done.step)
     if not share or facts is None:
@@ -111,28 +112,25 @@ def _own(step: Step, done: StepRecord, facts_of: FactsOf) -> float | None:
     return share * largest / max(1.0 - share, 1e-3)
 
 
-def _carried(step: Step, inputs: list[ErrorBound | list[ErrorBound] | None], result: TensorStats | None) -> float:
-    if not any(d.rms for part in inputs for d in _each(part)):
+def _carried(step: Step, inputs: list[_Input], result: TensorStats | None) -> float:
+    """Return the error that a step passes on from its inputs to its result; infinite where no bound is known."""
+    errors, hooks = [bound.rms for bound in _flat(inputs)], step.node.hooks
+    if not any(errors) or hooks.approximation_error is not None:  # this hook covers all errors of the result
         return 0.0
-    if step.node.hooks.approximation_error is not None:
-        return 0.0  # the hook covers all errors of the result
-    if (
-        step.node.hooks.propagate_error is None
-        or result is None
-        or any(math.isinf(d.rms) for part in inputs for d in _each(part))
-    ):
+    if hooks.propagate_error is None or result is None or math.inf in errors:
         return math.inf
     try:
-        return float(step.node.hooks.propagate_error(*inputs, result=result, **step.params))
+        return float(hooks.propagate_error(*inputs, result=result, **step.params))
     except Exception as error:
         raise RunError(step, [], error) from error
 
 
-def _gathered(wire: Wire, found: Mapping[str, ErrorBound]) -> ErrorBound | list[ErrorBound] | None:
+def _gathered(wire: Wire, bounds: Mapping[str, ErrorBound]) -> _Input:
     if wire is None or isinstance(wire, str):
-        return None if wire is None else found.get(wire, _EXACT)
-    return [found.get(name, _EXACT) for name in wire]
+        return None if wire is None else bounds.get(wire, _EXACT)
+    return [bounds.get(name, _EXACT) for name in wire]
 
 
-def _each(part: ErrorBound | list[ErrorBound] | None) -> list[ErrorBound]:
-    return part if isinstance(part, list) else [part] if part else []
+def _flat(inputs: Iterable[_Input]) -> Iterator[ErrorBound]:
+    for part in inputs:
+        yield from part if isinstance(part, list) else [part] if part else []

@@ -1,4 +1,4 @@
-"""Decision to leave out a step: its error bound, from the statistics of its inputs, against the tolerance."""
+"""Decision to leave out a step, by comparing an error bound from the statistics of its inputs with the tolerance."""
 
 from __future__ import annotations
 
@@ -13,20 +13,21 @@ from neusee.workflows.graph.recipe_graph import Step
 from neusee.workflows.graph.run_error import RunError
 
 FactsOf = Callable[[str], TensorStats | None]
+_NO_BOUND = float("inf")
 
 
 @dataclass(frozen=True, slots=True)
 class SkipDecision:
-    """Upper bound on the effect of leaving a step out, and the step that replaces its result."""
+    """Decision on leaving a step out: the bound on the effect, the reason, and the step that replaces the result."""
 
     bound: float
     left_out: bool
     why: str
-    instead: str  #: the step that feeds its first input
+    instead: str  #: the step at the first input, whose result replaces the result of the step
 
 
 class _Later:
-    """Statistics that are looked up, or computed, only when a bound reads one of them."""
+    """Statistics of a result that are looked up or computed only when a bound reads one of the statistics."""
 
     __slots__ = ("_find", "_seen")
 
@@ -41,10 +42,10 @@ class _Later:
 
 
 def judge(step: Step, params: Mapping[str, Any], facts_of: FactsOf, tolerance: float) -> SkipDecision:
-    """Return the decision on a step with a bound; ``facts_of`` is called only for statistics that the bound reads."""
+    """Decide whether ``step`` may be left out; ``facts_of`` returns the statistics of a step's result by name."""
     node, first = step.node, step.wires.get(step.node.inputs[0])
     if node.hooks.skip_bound is None or not isinstance(first, str):
-        return SkipDecision(float("inf"), False, "the step has no input that could replace its result", "")
+        return SkipDecision(_NO_BOUND, False, "the step has no input that could replace its result", "")
     seen: list[TensorStats] = []
     facts = [_facts(step.wires.get(name), facts_of, seen) for name in node.inputs]
     try:
@@ -54,12 +55,10 @@ def judge(step: Step, params: Mapping[str, Any], facts_of: FactsOf, tolerance: f
     except Exception as error:
         raise RunError(step, [], error) from error
     if not all(f.finite for f in seen):
-        return SkipDecision(float("inf"), False, "its input is not finite, so its effect has no bound", first)
-    left_out = bound <= tolerance
-    why = (
-        f"changes at most {bound:.2g}, tolerance {tolerance:.2g}" if bound < float("inf") else "its effect has no bound"
-    )
-    return SkipDecision(bound, left_out, why, first)
+        return SkipDecision(_NO_BOUND, False, "its input is not finite, so its effect has no bound", first)
+    known = bound < _NO_BOUND
+    why = f"changes at most {bound:.2g}, tolerance {tolerance:.2g}" if known else "its effect has no bound"
+    return SkipDecision(bound, bound <= tolerance, why, first)
 
 
 def _facts(wire: str | tuple[str, ...] | None, facts_of: FactsOf, seen: list[TensorStats]) -> Any:

@@ -1,12 +1,11 @@
-"""Steps of zero effect: a laser without power, ghosts without energy, a clean window.
+"""Removal of steps with zero effect: a laser without power, ghosts without energy, a clean window.
 
-They are found from parameters alone, before the run: a step whose node bounds its result by 0
+Such steps are found from parameters alone, before the run: a step whose node bounds its result by 0
 (`Node.zero_bound`) is removed from the inputs to which it would add nothing.
 """
 
 from __future__ import annotations
 
-import math
 from collections.abc import Iterable, Mapping
 from dataclasses import replace
 from typing import Any
@@ -18,39 +17,40 @@ _DARK = TensorStats((), "float32", 0.0, 0.0, 0.0, 0, True)  #: statistics of a r
 
 
 class _Unknown:
-    """Statistics of a step that has not run; reading one of them raises `LookupError`."""
+    """Statistics of a step that has not run: every read of an attribute raises `LookupError`."""
 
     def __getattr__(self, name: str) -> Any:
         raise LookupError(name)
 
 
 def without_nothing(recipe: Recipe, order: Iterable[str]) -> Recipe:
-    """Return ``recipe`` without the inputs from steps of zero effect; ``order`` lists its steps after their sources."""
+    """Return ``recipe`` without the inputs from steps whose result is 0; ``order`` lists the steps in running order."""
     dark: dict[str, None] = {}
     changed: dict[str, Step] = {}
     for name in order:
         step = recipe.steps[name]
-        if step.node.hooks.zero_bound is not None and _nothing(step, dark):
-            dark.setdefault(name)
+        if _nothing(step, dark):
+            dark[name] = None
         elif step.node.additive_inputs and not dark.keys().isdisjoint(step.sources):
             changed[name] = replace(step, wires=without(step, dark))
     if not changed:
         return recipe
-    told = {e.step for e in recipe.substitutions}
+    known = {substitution.step for substitution in recipe.substitutions}
     why = "its parameters make its result 0"
-    found = tuple(Substitution(name, "", 0.0, why) for name in dark if name not in told)
+    new = tuple(Substitution(name, "", 0.0, why) for name in dark if name not in known)
     steps, whole = {**recipe.steps, **changed}, recipe.unsubstituted or recipe
-    return replace(recipe, steps=steps, substitutions=(*recipe.substitutions, *found), unsubstituted=whole)
+    return replace(recipe, steps=steps, substitutions=(*recipe.substitutions, *new), unsubstituted=whole)
 
 
 def _nothing(step: Step, dark: Mapping[str, None]) -> bool:
-    """Return True if a step's result is 0, from its parameters and the known zero inputs."""
+    """Return True if the node of a step bounds its result by 0, given that the results of the steps ``dark`` are 0."""
+    if step.node.hooks.zero_bound is None:
+        return False
     inputs = [_known(step.wires.get(name), dark) for name in step.node.inputs]
     try:
-        bound = float(step.node.hooks.zero_bound(*inputs, **step.params)) if step.node.hooks.zero_bound else math.inf
+        return float(step.node.hooks.zero_bound(*inputs, **step.params)) == 0.0
     except LookupError:
         return False
-    return bound == 0.0
 
 
 def _known(wire: Wire, dark: Mapping[str, None]) -> Any:
@@ -62,15 +62,15 @@ def _known(wire: Wire, dark: Mapping[str, None]) -> Any:
 
 
 def without(step: Step, dark: Mapping[str, None]) -> dict[str, Wire]:
-    """Return the wires of a step without its zero inputs and the inputs that belong to them."""
+    """Return the wires of a step without its inputs from the steps ``dark``, and without their companion inputs."""
     wires = dict(step.wires)
-    for light, *others in step.node.additive_inputs:
-        wire = wires.get(light)
+    for group in step.node.additive_inputs:
+        wire = wires.get(group[0])
         if isinstance(wire, str) and wire in dark:
-            wires |= dict.fromkeys((light, *others))
+            wires |= dict.fromkeys(group)
         elif isinstance(wire, tuple):
             kept = [i for i, name in enumerate(wire) if name not in dark]
-            for name in (light, *others):
+            for name in group:
                 listed = wires.get(name)
                 wires[name] = tuple(listed[i] for i in kept) if isinstance(listed, tuple) else listed
     return wires

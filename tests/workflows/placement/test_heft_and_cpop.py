@@ -348,10 +348,10 @@ def test_where_memory_is_short_a_copy_is_sent_again():
 def test_links_go_by_kind_within_a_machine_and_by_network_between():
     devices = tuple(Device(f"{m}/{n}", n[:4]) for m in ("a", "b") for n in ("cpu", "cuda:0", "cuda:1"))
     cluster = Cluster(devices, {("cuda", "cuda"): Link(300.0)}, Link(20.0), Link(10.0, 1.0))
-    assert cluster.seconds("a/cuda:0", "a/cuda:0", 600) == 0
-    assert cluster.seconds("a/cuda:0", "a/cuda:1", 600) == 2
+    assert cluster.link("a/cuda:0", "a/cuda:0").seconds(600) == 0
+    assert cluster.link("a/cuda:0", "a/cuda:1").seconds(600) == 2
     assert cluster.link("a/cpu", "a/cuda:1") == Link(20.0)
-    assert cluster.seconds("a/cuda:0", "b/cuda:1", 600) == 61
+    assert cluster.link("a/cuda:0", "b/cuda:1").seconds(600) == 61
 
 
 def test_a_slow_link_keeps_a_chain_together():

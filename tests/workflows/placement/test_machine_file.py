@@ -76,7 +76,7 @@ def test_links_lie_within_a_machine_and_the_network_between(read):
     assert cluster.link("a/cpu", "a/cuda:0") == Link(25e9, pytest.approx(1e-5))
     assert cluster.link("b/cuda:2", "b/cuda:0") == Link(300e9, 0.0)
     assert cluster.link("a/cuda:0", "b/cuda:0") == Link(12.5e9, pytest.approx(1e-4))
-    assert cluster.seconds("a/cuda:0", "a/cuda:1", 600e9) == 2
+    assert cluster.link("a/cuda:0", "a/cuda:1").seconds(600e9) == 2
 
 
 def test_a_machine_without_a_name_is_this_one(read):
@@ -131,7 +131,7 @@ ONE = "devices: {a: {kind: cpu, memory: 1 GB}}\n"
         ),
         (
             "devices: {a: {kind: cpu, memory: 1 GB, count: 4000, node: [x, y]}}",
-            "1:10 devices: are 8000; the maximum is 4096",
+            "1:10 devices: must be 4096 devices or fewer, not 8000",
         ),
         (
             "devices: {a: {kind: cpu, memory: true}}",

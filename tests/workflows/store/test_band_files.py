@@ -247,7 +247,7 @@ def test_a_layout_names_its_blobs_and_gives_the_stack_back(blobs):
 def test_without_blobs_a_stack_is_a_tensor_like_any_other():
     x = stack(*PAGES)
     layout, tensors = serialization.pack([Stacked(x, ("aa.0",) * 4), 3])
-    assert serialization.blobs_in(layout) == []
+    assert serialization.blobs_in(layout) == {}
     assert torch.equal(serialization.unpack(layout, tensors)[0], x)
 
 

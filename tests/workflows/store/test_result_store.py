@@ -21,7 +21,8 @@ from safetensors.torch import load_file
 from neusee.nodes.values import Bands, Pupil
 from neusee.workflows.store import band_files, metadata, serialization
 from neusee.workflows.store import payload as payload_module
-from neusee.workflows.store.result_store import INLINE, Store, default_root
+from neusee.workflows.store.metadata import INLINE
+from neusee.workflows.store.result_store import Store, default_root
 
 KEY = "ab" + "0" * 30
 SUM = xxhash.xxh3_128_hexdigest
