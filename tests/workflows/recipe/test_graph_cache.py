@@ -32,7 +32,7 @@ def forget(monkeypatch):
     def forget():
         for name in ("_graphs", "_written"):
             monkeypatch.setattr(graph_cache, name, {})
-        monkeypatch.setattr(composition, "_known", {})
+        composition._merged.cache_clear()
 
     forget()
     return forget
@@ -127,4 +127,4 @@ def test_files_are_looked_at_every_time(read, write, forget):
 def test_little_is_remembered(read, forget):
     for pitch in range(1, 60):
         read(RECIPE.replace("pitch: 3 um", f"pitch: {pitch} um"), "sensor.gain=2")
-    assert max(len(graph_cache._graphs), len(graph_cache._written), len(composition._known)) <= 16
+    assert max(len(graph_cache._graphs), len(graph_cache._written), composition._merged.cache_info().currsize) <= 16
