@@ -145,14 +145,14 @@ def test_points_of_draws_have_their_laws_and_their_correlation():
 @given(st.floats(-0.99999, 0.99999), st.floats(1e-6, 1e6), st.floats(1e-6, 1e6))
 def test_a_normal_law_has_its_covariance(rho, a, b):
     covariance = [[a * a, rho * a * b], [rho * a * b, b * b]]
-    joint = summary({"mean": {"x": 0.0, "y": 1.0}, "covariance": covariance})
+    joint = summary({"mean": {"x": 0.0, "y": 1.0}, "covariance": covariance}).joint
     factor = joint.factor * joint.sd[:, None]
     assert factor @ factor.T == pytest.approx(np.array(covariance), rel=1e-6)
 
 
 def test_some_of_a_normal_law_is_that_of_all():
     covariance = np.cov(drawn().T)
-    joint = summary({"mean": dict.fromkeys(NAMES, 1.0), "covariance": covariance.tolist()}).only(NAMES[1:])
+    joint = summary({"mean": dict.fromkeys(NAMES, 1.0), "covariance": covariance.tolist()}).joint.only(NAMES[1:])
     factor = joint.factor * joint.sd[:, None]
     assert factor @ factor.T == pytest.approx(covariance[1:, 1:], rel=1e-6, abs=1e-12)
 
