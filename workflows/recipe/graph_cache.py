@@ -9,23 +9,19 @@ from __future__ import annotations
 import sys
 from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import TypeVar
 
 import neusee.nodes
-from neusee.workflows.graph.recipe_graph import Recipe, Wire
+from neusee.workflows.graph.recipe_graph import Wire
 from neusee.workflows.recipe.step_declarations import Declared
 from neusee.workflows.recipe.text.yaml_values import Value
 
-K = TypeVar("K")
-V = TypeVar("V")
 Names = tuple[tuple[str, tuple[str, ...] | None], ...]  #: name and items of each block, or None for the items
 
-_MOST = 16
+_MOST = 16  #: graphs in the cache
 _graphs: dict[tuple[Value | None, Names], CachedGraph] = {}  #: by ``steps`` and the names of the items
-_written: dict[Value, Recipe] = {}  #: by the top mapping
 
 
-@dataclass(frozen=True, slots=True)
+@dataclass(frozen=True, slots=True, eq=False)
 class CachedGraph:
     """Steps and wires of a recipe without mistakes."""
 
@@ -48,25 +44,10 @@ def cache_graph(
         return
     fixed = [name for step in steps.values() if not _refers(step.value.items.get("from")) for name in step.instances]
     graph = CachedGraph(steps, absent, {name: wires[name] for name in fixed})
-    _memoise(_graphs, (root.items["steps"], _names(root)), graph)
-
-
-def cached_recipe(root: Value) -> Recipe | None:
-    """Return the recipe of a top mapping that was checked before, or None."""
-    return _written.get(root) if cached_graph(root) is not None else None
-
-
-def cache_recipe(root: Value, recipe: Recipe) -> Recipe:
-    """Add the recipe of a top mapping to the cache, and return the recipe."""
-    _memoise(_written, root, recipe)
-    return recipe
-
-
-def _memoise(cache: dict[K, V], key: K, value: V) -> None:
-    """Add a value to a cache of limited size, and drop the oldest values."""
-    while len(cache) >= _MOST:
-        cache.pop(next(iter(cache), key), None)
-    cache[key] = value
+    key = root.items["steps"], _names(root)
+    while len(_graphs) >= _MOST:
+        _graphs.pop(next(iter(_graphs), key), None)
+    _graphs[key] = graph
 
 
 def _names(root: Value) -> Names:

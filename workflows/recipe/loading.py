@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import functools
 import os
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
@@ -17,7 +18,7 @@ from neusee.workflows.recipe.blocks.train_lift_block import KEY as LIFTING
 from neusee.workflows.recipe.blocks.train_lift_block import read_lift_training
 from neusee.workflows.recipe.distributions.nominal_values import Uncertain, settle
 from neusee.workflows.recipe.global_settings import expectations, outputs_of, seed_and_tolerance
-from neusee.workflows.recipe.graph_cache import cache_graph, cache_recipe, cached_graph, cached_recipe
+from neusee.workflows.recipe.graph_cache import CachedGraph, cache_graph, cached_graph
 from neusee.workflows.recipe.parameters import Checker
 from neusee.workflows.recipe.step_declarations import Declared, declare, device_of
 from neusee.workflows.recipe.text.composition import Composed, compose, groups_of, packaged
@@ -64,7 +65,14 @@ def load(
 def _as_written(name: str, folder: Path) -> Recipe:
     """Return a recipe without overrides, from the cache while its files and nodes are unchanged."""
     composed = compose(name, (), folder)
-    return cached_recipe(composed.root) or cache_recipe(composed.root, check(composed))
+    graph = cached_graph(composed.root)
+    return check(composed) if graph is None else _checked(composed, graph)
+
+
+@functools.lru_cache(maxsize=16)
+def _checked(composed: Composed, graph: CachedGraph) -> Recipe:
+    """Return a checked recipe from the cache, as long as its graph is the same."""
+    return check(composed)
 
 
 def check(composed: Composed) -> Recipe:

@@ -185,8 +185,9 @@ def _is_packaged(leaf: Value) -> bool:
 
 def _nearest(path: Where, known: set[Where]) -> Where | None:
     """Return the known path with the most similar last name, if possible in the same block."""
+    paths_by_name = {str(other[-1]): other for other in sorted(known, key=str)}
     beside = {str(other[-1]): other for other in known if other[:-1] == path[:-1]}
-    for paths in (beside, {str(other[-1]): other for other in known}):
+    for paths in (beside, paths_by_name):
         close = difflib.get_close_matches(str(path[-1]), paths, 1, 0.75)
         if close:
             return paths[close[0]]
