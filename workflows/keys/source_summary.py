@@ -55,7 +55,7 @@ def summarise(source: bytes) -> Summary:
 
 
 def module_file(folder: str | Path, names: Sequence[str]) -> Path | None:
-    """Return the file of a module or package from the names of its path below a folder, or None without a file."""
+    """Return the file of a module or a package below a folder, or None without a file; ``names`` is its path."""
     stem = os.path.join(folder, *names)
     files = (f"{stem}.py", os.path.join(stem, "__init__.py"))
     return next((Path(file) for file in files if os.path.isfile(file)), None)

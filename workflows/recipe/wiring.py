@@ -136,7 +136,7 @@ class Wiring:
         return f"no step {name}; {hint if hint.startswith('did you mean') else f'check the name{makers}'}"
 
     def _chosen(self, producer: Declared, items: Sequence[str], value: Value, path: str) -> dict[str, str] | None:
-        """Return the items in brackets by list of items; a single item of two may be of either list."""
+        """Return the item in brackets for each list of items; a single item may belong to any of the lists."""
         if not producer.dims:
             self.refuse(value, path, f"{producer.name} has no items: leave out the brackets")
             return None

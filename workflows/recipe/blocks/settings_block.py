@@ -28,7 +28,7 @@ Settings = TypeVar("Settings", bound=SettingsBlock)
 
 
 def read_block(composed: Composed, key: str, model: type[Settings], plain: Any) -> tuple[Composed, Settings | None]:
-    """Return the recipe without the block of a key, and the settings that ``plain``, the data of the block, gives.
+    """Return the recipe without the block of a key, and the settings that the plain data of the block give.
 
     The settings are None for a block with mistakes, which become diagnostics of the recipe.
     """
@@ -56,7 +56,7 @@ def _problem(block: Value, model: type[BaseModel], error: Any) -> Diagnostic:
 
 
 def _fields(model: type[BaseModel], path: Sequence[int | str]) -> list[str]:
-    """Return the names of the settings beside a path in a block."""
+    """Return the names of the settings that a block allows at a path."""
     for key in path:
         if key in model.model_fields:
             annotation: Any = model.model_fields[str(key)].annotation

@@ -19,7 +19,7 @@ from neusee.workflows.recipe.text.renamed_keys import POSTERIOR_NAMES
 
 GAIN_UNIT = "DN/e-"  #: of K, EMVA 1288
 BARE_GAIN = (
-    "head its draws 'gain [DN/e-]' or 'gain [e-/DN]', or write its mean and sd with DN/e-; "
+    "name its draws 'gain [DN/e-]' or 'gain [e-/DN]', or write its mean and sd with DN/e-; "
     "the folder of `neusee calibrate` contains the unit"
 )
 Z_90 = 1.6448536269514722  #: standard deviations around the mean that contain 90 % of a normal distribution
@@ -242,7 +242,7 @@ def _normal(given: Mapping[str, Any]) -> Joint:
 def _si(text: Any) -> float:
     number, _, reciprocal = read_written(text)
     if reciprocal:
-        raise ValueError(f"{text}: the mean and sd of a gain are those of K; write both in DN/e-")
+        raise ValueError(f"{text}: write the mean and the sd of a gain in DN/e-, the unit of K")
     return number
 
 

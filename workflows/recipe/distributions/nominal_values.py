@@ -200,7 +200,7 @@ class _Reader:
             value = self._value(path)
             is_gain = value and isinstance(value.data, str) and value.data.strip().endswith(("e-/DN", GAIN_UNIT))
             if is_gain and posterior.units.get(name) != GAIN_UNIT:
-                raise ValueError(f"its {name} has no unit: {BARE_GAIN}")
+                raise ValueError(f"the {name} of the posterior has no unit: {BARE_GAIN}")
         exposure = self._value(f"{_BLOCK}.exposure")
         words = posterior.units.get("dark_current", "")
         if "dark_current" in pairs.values() and exposure is not None and " in " in words:

@@ -125,7 +125,7 @@ class Inputs:
 
 
 def _only(uncertain: Uncertain, names: Collection[str]) -> Uncertain:
-    """Return the uncertain values with distributions only for ``names``."""
+    """Return the uncertain values of a recipe that are among ``names``."""
     laws = {name: law for name, law in uncertain.laws.items() if name in names}
     joint = uncertain.joint
     kept = [name for name in joint.names if name in names] if joint else []

@@ -95,7 +95,7 @@ def shown(path: Path, folder: Path) -> str:
 
 
 def merge(below: Value, above: Value) -> Value:
-    """Return ``below`` with the values of ``above``; a value that is no mapping, and a new step, replace the whole."""
+    """Return ``below`` with the values of ``above``; a list, a scalar and a step with ``node`` replace all."""
     if not isinstance(below.data, dict) or not isinstance(above.data, dict) or _new_step(above):
         return above
     data = dict(below.data)

@@ -70,7 +70,7 @@ def _override(named: Override, path: tuple[str, ...], given: Any) -> Override:
 
 
 def _value(given: Any, mark: Location, path: Where) -> Value:
-    """Return a Python value as the value that a file with the same content gives."""
+    """Return a `Value` with the data of a Python value and the location of its argument."""
     if isinstance(given, Mapping):
         data = {_key(key, mark, path): _value(item, mark, (*path, str(key))) for key, item in given.items()}
         return Value(data, mark, mark, path)

@@ -16,7 +16,7 @@ from neusee.workflows.recipe.text.renamed_keys import instead, new_name
 from neusee.workflows.recipe.text.yaml_values import Value, Where, dotted
 
 _REFERENCE = re.compile(r"\$\{([^${}]*)\}")
-_DEEPEST = 50  #: depth of references to references
+_DEEPEST = 50  #: longest chain of references
 
 
 @dataclass(frozen=True, slots=True)
@@ -101,7 +101,7 @@ class References:
             self._fail(origin, f"refers to itself: {' -> '.join(map(dotted, loop))}")
             return None
         if len(self.open) > _DEEPEST:
-            self._fail(origin, f"more than {_DEEPEST} references to references")
+            self._fail(origin, f"a chain of more than {_DEEPEST} references")
             return None
         self.open.append(target.path)
         value = self.resolve(target, scope if target.path[0] == "steps" else Scope({}, dotted(target.path)))

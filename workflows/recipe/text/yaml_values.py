@@ -191,7 +191,7 @@ class _Builder:
 
     def _refuse_many(self, count: int, most: int, mark: Location, path: Where) -> None:
         if count > most:
-            raise RecipeError([Diagnostic(mark, dotted(path), f"aliases expand this to more than {most} values")])
+            raise RecipeError([Diagnostic(mark, dotted(path), f"aliases expand this value to more than {most} values")])
 
     def _mark(self, node: Node) -> Location:
         if not self.start.line:

@@ -264,7 +264,7 @@ def test_a_calibration_that_is_not_fit_for_use_is_refused(calibrated):
 
 
 def test_numbers_of_another_convention_are_refused(calibrated):
-    with pytest.raises(RecipeError, match=r"its gain has no unit: head its draws 'gain \[DN/e-\]'"):
+    with pytest.raises(RecipeError, match=r"the gain of the posterior has no unit: name its draws 'gain \[DN/e-\]'"):
         load("first_light", [f"posterior={calibrated(units=('', 'e-', 'e-'))}"])
     recipe = load("first_light", [f"posterior={calibrated(units=('DN/e-', 'e-', 'e-'))}"])
     assert gain_of(recipe) == pytest.approx(drawn()[:, 0].mean())
@@ -340,9 +340,9 @@ def test_a_law_of_a_gain_says_its_unit(law, message):
 
 def test_a_summary_of_a_gain_is_of_k():
     said = {"mean": {"gain": "0.37 e-/DN"}, "sd": {"gain": "0.01 e-/DN"}}
-    with pytest.raises(RecipeError, match=r"0.37 e-/DN: the mean and sd of a gain are those of K; write both in DN/e-"):
+    with pytest.raises(RecipeError, match=r"0.37 e-/DN: write the mean and the sd of a gain in DN/e-, the unit of K"):
         load("first_light", posterior=said)
-    with pytest.raises(RecipeError, match="its gain has no unit"):
+    with pytest.raises(RecipeError, match="the gain of the posterior has no unit"):
         load("first_light", posterior={"mean": {"gain": 2.7}, "sd": {"gain": 0.01}})
     said = {"mean": {"gain": "2.6 DN/e-"}, "sd": {"gain": "0.01 DN/e-"}}
     assert gain_of(load("first_light", posterior=said)) == 2.6
@@ -395,5 +395,6 @@ def test_the_posterior_of_a_camera_by_0_1_is_read(by_0_1):
 
 def test_the_draws_of_0_1_alone_say_no_unit_and_are_refused(by_0_1):
     folder = by_0_1(("gain", "pedestal", "read_noise"), ("e-/DN", "e-", "e-"))
-    with pytest.raises(RecipeError, match=r"its gain has no unit.*the folder of `neusee calibrate` contains the unit"):
+    message = r"the gain of the posterior has no unit.*the folder of `neusee calibrate` contains the unit"
+    with pytest.raises(RecipeError, match=message):
         load("first_light", [f"posterior={folder / 'draws.npz'}"])
