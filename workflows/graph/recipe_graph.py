@@ -128,10 +128,10 @@ def needed(recipe: Recipe, outputs: Iterable[str]) -> list[str]:
     return in_order({name: step.sources for name, step in recipe.steps.items()}, outputs)
 
 
-def in_order(sources: Mapping[str, Iterable[str]], wanted: Iterable[str]) -> list[str]:
-    """Return the wanted names and all their sources, each name after its sources; the graph must have no cycle."""
+def in_order(sources: Mapping[str, Iterable[str]], names: Iterable[str]) -> list[str]:
+    """Return ``names`` and all their sources, each name after its sources; the graph must have no cycle."""
     order: dict[str, None] = {}
-    stack = [(name, iter(sources[name])) for name in reversed(list(wanted))]
+    stack = [(name, iter(sources[name])) for name in reversed(list(names))]
     while stack:
         name, rest = stack[-1]
         below = next((s for s in rest if s not in order), None)

@@ -63,12 +63,12 @@ def module_file(folder: str | Path, names: Sequence[str]) -> Path | None:
 
 def _uses(tree: ast.Module, bound: dict[str, set[Import]]) -> list[Use]:
     """Return each attribute chain that begins with an imported name, and each package that is used as a whole."""
-    found: dict[tuple[int, str, str, str], int] = {}
+    lines: dict[tuple[int, str, str, str], int] = {}
     for name, attributes, line in _chains(tree):
         for way in bound.get(name, ()):
             if attributes or ".".join(filter(None, way[1:])) in ("neusee", ROOT, "nodes"):
-                found.setdefault((*way, ".".join(attributes)), line)
-    return sorted((*use, line) for use, line in found.items())
+                lines.setdefault((*way, ".".join(attributes)), line)
+    return sorted((*use, line) for use, line in lines.items())
 
 
 def _chains(tree: ast.Module) -> Iterator[tuple[str, list[str], int]]:
@@ -89,12 +89,12 @@ def _chains(tree: ast.Module) -> Iterator[tuple[str, list[str], int]]:
 
 def _definitions(tree: ast.Module) -> dict[str, str]:
     """Return the digest of each top-level definition by its label; definitions with one label share a digest."""
-    found: dict[str, list[str]] = defaultdict(list)
+    dumps: dict[str, list[str]] = defaultdict(list)
     for item in tree.body:
         dump = ast.dump(item)
         for label in _labels(item):
-            found[label].append(dump)
-    return {label: digest(dumps)[:_SHORT] for label, dumps in found.items()}
+            dumps[label].append(dump)
+    return {label: digest(parts)[:_SHORT] for label, parts in dumps.items()}
 
 
 def _labels(item: ast.stmt) -> Iterable[str]:

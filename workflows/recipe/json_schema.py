@@ -127,8 +127,8 @@ class _Generator(GenerateJsonSchema):
     """Generator of schemas that also allow quantities with units, and references."""
 
     def generate_inner(self, schema: Any) -> JsonSchemaValue:
-        found = super().generate_inner(schema)
-        return {"anyOf": [found, REFERENCE]} if schema["type"] in _REFERABLE else found
+        inner = super().generate_inner(schema)
+        return {"anyOf": [inner, REFERENCE]} if schema["type"] in _REFERABLE else inner
 
     def function_before_schema(self, schema: core_schema.BeforeValidatorFunctionSchema) -> JsonSchemaValue:
         """Return the schema of a quantity, which is a number with one of the units of the parameter."""

@@ -197,8 +197,8 @@ def _arrays(path: Path) -> dict[str, FloatArray]:
     with path.open("rb") as file:
         if file.read(2) != b"PK":
             raise ValueError(f"{path.name} cannot be read: the file is not in .npz format")
-    with np.load(path) as found:
-        return {name: np.asarray(found[name], np.float64).reshape(-1) for name in found}
+    with np.load(path) as arrays:
+        return {name: np.asarray(arrays[name], np.float64).reshape(-1) for name in arrays}
 
 
 def _columns(path: Path) -> dict[str, FloatArray]:

@@ -119,10 +119,7 @@ def put(root: Value, path: Where, data: Any, mark: Location | None = None) -> Va
     if not path:
         return replace(root, data=data, mark=mark or root.mark)
     key = next(key for key in root.items if str(key) == str(path[0]))
-    child = put(root.items[key], path[1:], data, mark)
-    if isinstance(root.data, list):
-        return replace(root, data=[child if i == key else value for i, value in enumerate(root.data)])
-    return replace(root, data={**root.data, key: child})
+    return root.replaced(key, put(root.items[key], path[1:], data, mark))
 
 
 class _Reader:

@@ -5,7 +5,7 @@ from __future__ import annotations
 import difflib
 import re
 from collections.abc import Iterable, Iterator
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 from neusee.workflows.graph.diagnostics import Diagnostic, Location, RecipeError
 from neusee.workflows.recipe.text.renamed_keys import instead
@@ -123,7 +123,8 @@ def _rebuild(trail: Trail, missing: tuple[str, ...], o: Override) -> Value:
         assert value is not None
         value = Value({_key(missing[n]): value}, o.mark, o.mark, o.path[: len(o.path) - len(missing) + n])
     for here, key in reversed(trail):
-        value = _with(here, _key(key) if missing and here is trail[-1][0] else key, value, o.mark)
+        key = _key(key) if missing and here is trail[-1][0] else key
+        value = Value({key: value}, o.mark, here.key, here.path) if here.data is None else here.replaced(key, value)
     assert value is not None
     return value
 
@@ -137,15 +138,6 @@ def _parsed_again(trail: Trail, missing: tuple[str, ...], o: Override) -> Value 
 
 def _key(part: str | int) -> str | int:
     return int(part) if isinstance(part, str) and part.isdecimal() else part
-
-
-def _with(here: Value, key: str | int, child: Value | None, mark: Location) -> Value:
-    items = {k: v for k, v in here.items.items() if child is not None or k != key}
-    if child is not None:
-        items[key] = child
-    if isinstance(here.data, list):
-        return replace(here, data=[replace(v, path=(*here.path, i)) for i, v in enumerate(items.values())])
-    return replace(here, data=items) if here.data is not None else Value(items, mark, here.key, here.path)
 
 
 def arguments_in(value: Value) -> Iterator[Location]:

@@ -54,7 +54,7 @@ class References:
         """Return a value with all its references resolved; report a failed reference, whose value becomes `BROKEN`."""
         if isinstance(value.data, dict):
             children = ((key, child, self.resolve(child, scope)) for key, child in value.data.items())
-            return replace(value, data={key: replace(found, key=child.key) for key, child, found in children})
+            return replace(value, data={key: replace(resolved, key=child.key) for key, child, resolved in children})
         if isinstance(value.data, list):
             return replace(value, data=[self.resolve(child, scope) for child in value.data])
         if not isinstance(value.data, str) or "${" not in value.data:

@@ -66,9 +66,18 @@ class Value:
             value = value.child(name) if value else None
         return value
 
+    def replaced(self, key: str | int, child: Value | None) -> Value:
+        """Return a mapping or a list with another child at a key, or without the key if ``child`` is None."""
+        items = {k: v for k, v in self.items.items() if child is not None or k != key}
+        if child is not None:
+            items[key] = child
+        if isinstance(self.data, list):
+            return replace(self, data=[replace(v, path=(*self.path, i)) for i, v in enumerate(items.values())])
+        return replace(self, data=items)
+
     def without(self, key: str) -> Value:
         """Return a mapping without one of its keys; return the same mapping where it does not have the key."""
-        return replace(self, data={k: v for k, v in self.data.items() if k != key}) if key in self.items else self
+        return self.replaced(key, None) if key in self.items else self
 
     def leaves(self) -> Iterator[Value]:
         """Yield the scalars, lists and empty mappings in a mapping, at any depth and in order."""
@@ -272,6 +281,6 @@ def _fix(problem: str, here: str, column: int) -> str:
 
 def _control(text: str) -> tuple[int, int]:
     """Return the line and column of the first control character in a text."""
-    found = re.search(r"[\x00-\x08\x0b\x0c\x0e-\x1f\x7f\ud800-\udfff\ufffe\uffff]", text)
-    before = text[: found.start()] if found else ""
+    match = re.search(r"[\x00-\x08\x0b\x0c\x0e-\x1f\x7f\ud800-\udfff\ufffe\uffff]", text)
+    before = text[: match.start()] if match else ""
     return before.count("\n"), len(before.rpartition("\n")[2])
