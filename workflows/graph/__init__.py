@@ -1,4 +1,4 @@
-"""What is a checked recipe, and what became of its steps?
+"""What is a checked recipe, and what happened to each of its steps in a run?
 
 The graph of steps and wires, its final values and where each was written, and the records and errors of a run.
 Nothing here reads a file, asks a cache or runs a step.

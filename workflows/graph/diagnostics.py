@@ -1,4 +1,4 @@
-"""Diagnostics: the location of a value in a recipe, and one located line for each mistake."""
+"""Mistakes in a recipe: the location of each mistake, and a message with the fix."""
 
 from __future__ import annotations
 
@@ -11,12 +11,12 @@ UNREAD = "unread"  #: code of a value to which no step refers
 
 @dataclass(frozen=True, slots=True, order=True)
 class Location:
-    """A place in a file (lines and columns count from 1), or an argument such as ``argument 2`` (line 0)."""
+    """Location of a value: line and column in a file, both counted from 1, or an argument of a command (line 0)."""
 
-    file: str  #: as the user knows the file: ``first_light.yaml``, ``sensor/neusee.yaml``
+    file: str  #: as shown to the user: ``first_light.yaml``, ``sensor/neusee.yaml``, ``argument 2``
     line: int = 0
     column: int = 0
-    folder: str = field(default=".", compare=False)  #: folder to which a relative path written here is relative
+    folder: str = field(default=".", compare=False)  #: folder in which relative paths of the file begin
 
     def __str__(self) -> str:
         return f"{self.file}:{self.line}:{self.column}" if self.line else self.file
@@ -24,7 +24,7 @@ class Location:
 
 @dataclass(frozen=True, slots=True, order=True)
 class Diagnostic:
-    """One mistake: its location, the path of the value, and the message with the fix."""
+    """One mistake in a recipe: its location, the path of the wrong value, and a message with the fix."""
 
     mark: Location
     path: str
@@ -33,7 +33,7 @@ class Diagnostic:
 
 
 class RecipeError(ValueError):
-    """Error for a recipe that cannot be run; ``str`` gives one line for each mistake, in the order of the files."""
+    """Error for a recipe that cannot be run; the text of the error has one line for each mistake, in file order."""
 
     def __init__(self, diagnostics: Iterable[Diagnostic]) -> None:
         self.diagnostics = tuple(sorted(set(diagnostics)))
@@ -41,13 +41,13 @@ class RecipeError(ValueError):
 
 
 def _table(diagnostics: tuple[Diagnostic, ...]) -> str:
-    where = max((len(str(p.mark)) for p in diagnostics), default=0)
-    what = min(max((len(p.path) for p in diagnostics), default=0), 40)
-    return "\n".join(f"{p.mark!s:<{where}}   {p.path:<{what}}   {p.message}" for p in diagnostics)
+    left = max((len(str(d.mark)) for d in diagnostics), default=0)
+    middle = min(max((len(d.path) for d in diagnostics), default=0), 40)
+    return "\n".join(f"{d.mark!s:<{left}}   {d.path:<{middle}}   {d.message}" for d in diagnostics)
 
 
 def nearest(name: str, among: Iterable[str]) -> str:
-    """Return ``did you mean gain?``, else a list of the names, else ``there are none``."""
+    """Return ``did you mean gain?`` with the most similar of the names, or a list of the names if none is similar."""
     names = sorted(set(map(str, among)))
     close = difflib.get_close_matches(str(name), names, 1, 0.6)
     if close:

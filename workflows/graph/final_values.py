@@ -1,4 +1,4 @@
-"""Final values of a recipe, each with its source, and the same values as YAML that can be run again."""
+"""Final values of a recipe, each with its source, and a YAML file of these values that can be run again."""
 
 from __future__ import annotations
 
@@ -15,17 +15,17 @@ _WORDS = {"true", "false", "null", "yes", "no", "on", "off"}
 
 @dataclass(frozen=True, slots=True)
 class Setting:
-    """A final value and its source: ``file:line:column``, ``argument n`` or a node's default."""
+    """Final value of a recipe key, and its source: ``file:line:column``, ``argument 2`` or the default of a node."""
 
     value: Any
     source: str
-    path: tuple[str | int, ...] = ()  #: keys from the top
+    path: tuple[str | int, ...]  #: keys from the top of the recipe
     default: bool = False  #: whether the value is the node's default
 
 
 @dataclass(frozen=True, slots=True)
 class Config:
-    """Every final value by its dotted path, in the order of the recipe."""
+    """All final values of a recipe by dotted path, in the order of the recipe."""
 
     settings: Mapping[str, Setting] = field(default_factory=dict)
 
@@ -33,14 +33,16 @@ class Config:
         return self.settings[path]
 
     def to_yaml(self) -> str:
-        """Return a recipe of these values without groups; sources and defaults (in SI) are comments."""
+        """Return a recipe with these values and no groups as YAML; comments give the sources, and defaults in SI."""
         tree: dict[str | int, Any] = {}
-        for name, setting in self.settings.items():
-            *parents, last = setting.path or tuple(name.split("."))
-            here = tree
+        for setting in self.settings.values():
+            *parents, last = setting.path
+            branch = tree
             for key in parents:
-                here = here.setdefault(key, {})
-            here[last] = setting
+                if not isinstance(branch.get(key), dict):  # `with: {}` has only defaults below it
+                    branch[key] = {}
+                branch = branch[key]
+            branch[last] = setting
         return "".join(f"{line}\n" for line in _lines(tree, 0))
 
 

@@ -1,4 +1,4 @@
-"""The graph of a checked recipe: steps, their wires and the order in which they run."""
+"""Graph of a checked recipe: its steps, the wires between them, and the order in which the steps run."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ if TYPE_CHECKING:
 
 __all__ = ["Config", "Expectation", "Recipe", "Setting", "Step", "Substitution", "Wire", "in_order", "needed"]
 
-Wire = str | tuple[str, ...] | None  #: one step, the steps of all items, or an optional input that is absent
+Wire = str | tuple[str, ...] | None  #: one step, the steps of all items, or no step for an optional input
 
 
 @dataclass(frozen=True, slots=True)
@@ -38,17 +38,14 @@ class Step:
 
     @property
     def sources(self) -> tuple[str, ...]:
-        """Return every step that feeds this one, in the order of the inputs."""
-        return tuple(name for wire in self.wires.values() for name in _names(wire))
-
-
-def _names(wire: Wire) -> tuple[str, ...]:
-    return () if wire is None else (wire,) if isinstance(wire, str) else wire
+        """Return the names of all steps that feed this step, in the order of the inputs."""
+        wires = ((wire,) if isinstance(wire, str) else wire for wire in self.wires.values())
+        return tuple(name for names in wires for name in names or ())
 
 
 @dataclass(frozen=True, slots=True)
 class Substitution:
-    """A cheaper step that replaces a full step."""
+    """Replacement of a step by a cheaper step, with a bound on the error."""
 
     step: str  #: the full step
     instead: str  #: the step that is computed
@@ -58,7 +55,7 @@ class Substitution:
 
 @dataclass(frozen=True, slots=True)
 class Expectation:
-    """A number that the recipe promises: ``step`` at ``at`` is ``value`` within ``rtol``."""
+    """Expected number: the result of ``step`` at the indices ``at`` equals ``value`` within ``rtol``."""
 
     name: str
     step: str
@@ -68,13 +65,13 @@ class Expectation:
     mark: Location
 
 
-_ARMS = 8  #: arms of a step that a message names
-METRIC_TOLERANCE = 1e-3  #: error limit for inputs of figures of merit, which may depend on a small difference
+_COPIES = 8  #: copies of a step that a message lists
+METRIC_TOLERANCE = 1e-3  #: largest error of an input of a figure of merit, which may depend on a small difference
 
 
 @dataclass(frozen=True, slots=True, repr=False)
 class Recipe:
-    """A recipe with checked values, wires and files; no step has run yet."""
+    """Checked recipe: its steps, wires and values are valid, and no step has run yet."""
 
     name: str
     title: str
@@ -85,7 +82,7 @@ class Recipe:
     expect: tuple[Expectation, ...] = ()
     config: Config = field(default_factory=Config)
     notes: tuple[str, ...] = ()
-    absent: Mapping[str, str] = field(default_factory=dict)  #: step that is null -> location of the null
+    absent: Mapping[str, str] = field(default_factory=dict)  #: step that is null -> where the null was written
     exact: bool = False  #: compute every step in full, whatever the tolerance allows
     substitutions: tuple[Substitution, ...] = ()  #: cheaper steps in place of full steps; empty when read
     tolerance_scale: float = 1.0  #: share of the tolerance in use; below 1 after a failed proof
@@ -96,11 +93,11 @@ class Recipe:
     unbounded: frozenset[str] = frozenset()  #: steps whose errors reach a node without an error bound
 
     def limit(self, step: str) -> float:
-        """Return the error allowed for a step: the tolerance, at most `METRIC_TOLERANCE` where nothing bounds it."""
+        """Return the error allowed for a step: the tolerance, or less where a later node has no bound of its error."""
         return min(self.tolerance, METRIC_TOLERANCE) if step in self.unbounded else self.tolerance
 
     def allowed(self, step: str) -> float:
-        """Return the total error that omissions and approximations up to a step may cause."""
+        """Return the error that all omissions and approximations up to a step may cause together."""
         return self.limit(step) * self.tolerance_scale
 
     def run(
@@ -112,7 +109,7 @@ class Recipe:
         executor: Executor | None = None,
         memory: int | None = None,
     ) -> Result:
-        """Run the recipe; see `neusee.workflows.run`. Several threads may call this at once, on one store."""
+        """Run the recipe as `neusee.workflows.run` does; several threads may do so at once with the same store."""
         from neusee.workflows.engine.runner import run
 
         return run(self, store, outputs, watch, device, executor, memory)
@@ -127,14 +124,14 @@ class Recipe:
 
 
 def needed(recipe: Recipe, outputs: Iterable[str]) -> list[str]:
-    """Return the steps that ``outputs`` need, each after its sources."""
+    """Return the names of the steps that ``outputs`` need, each step after the steps that feed it."""
     return in_order({name: step.sources for name, step in recipe.steps.items()}, outputs)
 
 
-def in_order(sources: Mapping[str, Iterable[str]], wanted: Iterable[str]) -> list[str]:
-    """Return names after their sources, without recursion; the graph must have no cycle."""
+def in_order(sources: Mapping[str, Iterable[str]], names: Iterable[str]) -> list[str]:
+    """Return ``names`` and all their sources, each name after its sources; the graph must have no cycle."""
     order: dict[str, None] = {}
-    stack = [(name, iter(sources[name])) for name in reversed(list(wanted))]
+    stack = [(name, iter(sources[name])) for name in reversed(list(names))]
     while stack:
         name, rest = stack[-1]
         below = next((s for s in rest if s not in order), None)
@@ -147,20 +144,20 @@ def in_order(sources: Mapping[str, Iterable[str]], wanted: Iterable[str]) -> lis
 
 
 def unknown_step(name: str, steps: Collection[str]) -> str:
-    """Return a message for a missing step ``name``, with the step's arms or the nearest name."""
-    arms = sorted(step for step in steps if step.startswith(f"{name}["))
-    if not arms:
+    """Return a message that a step does not exist, with the copies of that step or the most similar name."""
+    copies = sorted(step for step in steps if step.startswith(f"{name}["))
+    if not copies:
         return f"no step {name!r}; {nearest(name, steps)}"
-    more = f" and {len(arms) - _ARMS} more" if len(arms) > _ARMS else ""
-    return f"no output {name}: this recipe has {', '.join(arms[:_ARMS])}{more}"
+    more = f" and {len(copies) - _COPIES} more" if len(copies) > _COPIES else ""
+    return f"no output {name}: this recipe has {', '.join(copies[:_COPIES])}{more}"
 
 
 def kept_promises(recipe: Recipe, written: Recipe) -> Recipe:
-    """Return ``recipe`` with those expected numbers whose steps are unchanged from ``written``."""
-    same = {name for name in recipe.steps if _alike(recipe, written, name)}
-    for name in in_order({n: s.sources for n, s in recipe.steps.items()}, recipe.steps):
-        if not same.issuperset(recipe.steps[name].sources):
-            same.discard(name)
+    """Return ``recipe`` without the expected numbers of steps that differ from the steps of ``written``."""
+    same: set[str] = set()
+    for name in needed(recipe, recipe.steps):
+        if same.issuperset(recipe.steps[name].sources) and _alike(recipe, written, name):
+            same.add(name)
     lost = [e for e in recipe.expect if e in written.expect and e.step not in same]
     if not lost:
         return recipe
@@ -171,9 +168,6 @@ def kept_promises(recipe: Recipe, written: Recipe) -> Recipe:
 
 def _alike(recipe: Recipe, written: Recipe, name: str) -> bool:
     one, other = recipe.steps[name], written.steps.get(name)
-    seeded = one.node.random and recipe.seed != written.seed
-    return (
-        other is not None
-        and not seeded
-        and (one.node, one.params, one.wires) == (other.node, other.params, other.wires)
-    )
+    if other is None or (one.node.random and recipe.seed != written.seed):
+        return False
+    return (one.node, one.params, one.wires) == (other.node, other.params, other.wires)

@@ -1,4 +1,4 @@
-"""Error of a failed step."""
+"""The error that a run raises for a failed step."""
 
 from __future__ import annotations
 
@@ -11,22 +11,22 @@ from neusee.workflows.graph.recipe_graph import Step
 
 
 class RunError(RuntimeError):
-    """Error of a failed step: names the step, its node, its place in the recipe, its inputs and the cause."""
+    """Error of a failed step, with the step, its node, its location in the recipe, its inputs and the cause."""
 
     def __init__(self, step: Step, inputs: Sequence[Any], cause: BaseException) -> None:
         self.step, self.cause = step.name, cause
-        given = ", ".join(f"{name} {_shape(value)}" for name, value in zip(step.node.inputs, inputs, strict=False))
+        shapes = ", ".join(f"{name} {_shape(value)}" for name, value in zip(step.node.inputs, inputs, strict=False))
         super().__init__(
             f"{step.mark}   {step.name} ({step.node.path}): {type(cause).__name__}: {cause}"
-            + (f"\n  inputs: {given}" if given else "")
+            + (f"\n  inputs: {shapes}" if shapes else "")
         )
 
     def __reduce__(self) -> tuple[Any, ...]:
-        return _remade, (self.step, str(self), repr(self.cause))
+        return _unpickled, (self.step, str(self), repr(self.cause))
 
 
-def _remade(step: str, text: str, cause: str) -> RunError:
-    """Return the unpickled error in another process: its text, without the traceback of the cause."""
+def _unpickled(step: str, text: str, cause: str) -> RunError:
+    """Return the error in another process: with its text, but without the traceback of the cause."""
     error = RunError.__new__(RunError, text)
     RuntimeError.__init__(error, text)
     error.step, error.cause = step, RuntimeError(cause)

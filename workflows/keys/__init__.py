@@ -1,4 +1,4 @@
-"""What decides a result?
+"""What decides the result of a step?
 
 Keys of the cache, from parameters, inputs and files, and digests of the code of nodes and of the program itself.
 Nothing here reads or writes a result, and no tensor is read to make a key.

@@ -1,9 +1,7 @@
-"""Cache keys: a digest of everything that determines a result, and of nothing else.
+"""Cache keys: the key of a result is a digest of everything that determines the result, and of nothing else.
 
-A key covers the node and its code, the parameters, the content of input files, the keys of the
-inputs and the random stream. No tensor is read to compute a key. A key does not contain the
-thread count, the versions of libraries or the device (except for random nodes), because these
-are not physics.
+A key covers the node with its code, the parameters, the content of input files, the keys of the inputs and the random
+stream; a key covers no tensor, number of threads, version of a library or (but for random nodes) device.
 """
 
 from __future__ import annotations
@@ -19,16 +17,16 @@ from typing import TYPE_CHECKING, Any
 import xxhash
 
 if TYPE_CHECKING:
-    from neusee.workflows.graph.recipe_graph import Step
+    from neusee.workflows.graph.recipe_graph import Step, Wire
     from neusee.workflows.keys.code_digest import Code
 
 Key = str
-_SETTLED = 2_000_000_000  #: age in ns from which a file's time stamp distinguishes its contents
+_SETTLED = 2_000_000_000  #: ns after a change of a file within which a second change may leave the same time stamp
 _files: dict[tuple[int, ...], str] = {}
 
 
 def digest(*parts: Any) -> str:
-    """Return 32 hexadecimal digits of ``parts``, which must be plain JSON; floats count to the last bit."""
+    """Return the digest of ``parts`` (plain JSON) as 32 hexadecimal digits; floats count to the last bit."""
     text = json.dumps(parts, sort_keys=True, separators=(",", ":"))
     return hashlib.blake2b(text.encode(), digest_size=16).hexdigest()
 
@@ -36,37 +34,37 @@ def digest(*parts: Any) -> str:
 def key_of(
     step: Step, keys: Mapping[str, Key], seed: int, code: Code, device: str = "cpu"
 ) -> tuple[Key, dict[str, Any]]:
-    """Return the key of ``step``, given the keys of its sources, and all parts of that key."""
+    """Return the cache key of ``step``, and the parts of the key; ``keys`` are the keys of the steps before."""
     node = step.node
-    recipe: dict[str, Any] = {
+    parts: dict[str, Any] = {
         "node": node.path,
         "code": code.digest(node.fn.__module__),
         "params": {name: plain(value) for name, value in step.params.items()},
-        "inputs": [_input(step.wires.get(name), keys) for name in node.inputs],
+        "inputs": [_keys_of(step.wires.get(name), keys) for name in node.inputs],
     }
     if node.random:
-        recipe["stream"] = [seed, step.name, device_kind(device)]
-    return digest(recipe), recipe
+        parts["stream"] = [seed, step.name, device_kind(device)]
+    return digest(parts), parts
 
 
 def stream_seed(seed: int, step: str) -> int:
-    """Return the seed of a step's random stream, which depends on the recipe's seed and the step's name only."""
+    """Return the seed of a step's random stream, which depends only on the recipe's seed and the step's name."""
     return int(digest(seed, step)[:15], 16)
 
 
 def device_kind(device: str) -> str:
-    """Return the kind of a device: ``cuda`` of ``cuda:1``."""
+    """Return the kind of a device, such as ``cuda`` for ``cuda:1``."""
     return device.partition(":")[0]
 
 
-def _input(wire: str | tuple[str, ...] | None, keys: Mapping[str, Key]) -> Any:
+def _keys_of(wire: Wire, keys: Mapping[str, Key]) -> Any:
     if wire is None or isinstance(wire, str):
         return wire and keys[wire]
     return [keys[name] for name in wire]
 
 
 def plain(value: Any) -> Any:
-    """Return a parameter as JSON that is equal in every process; a file becomes its content digest and suffix."""
+    """Return a parameter as JSON that is the same in every process; a file becomes the digest of its content."""
     if value is None or isinstance(value, bool | int | str):
         return value
     if isinstance(value, float):
@@ -83,15 +81,13 @@ def plain(value: Any) -> Any:
 
 
 def file_digest(path: Path) -> str:
-    """Return the xxh3 of a file's bytes; read the file again only if its time stamp is new or too young."""
+    """Return the xxh3 digest of a file; read the file again only if its time stamp is new or very recent."""
     stat = os.stat(path)
     stamp = (stat.st_dev, stat.st_ino, stat.st_size, stat.st_mtime_ns, stat.st_ctime_ns)
     if stamp in _files:
         return _files[stamp]
-    found = xxhash.xxh3_128()
     with open(path, "rb") as file:
-        while block := file.read(1 << 20):
-            found.update(block)
+        digits = hashlib.file_digest(file, xxhash.xxh3_128).hexdigest()
     if time.time_ns() - max(stat.st_mtime_ns, stat.st_ctime_ns) > _SETTLED:
-        _files[stamp] = found.hexdigest()
-    return found.hexdigest()
+        _files[stamp] = digits
+    return digits

@@ -1,14 +1,13 @@
-"""Digests of code: of a node's module and of every `neusee.nodes` module that it imports.
+"""Digests of code: of the module of a node, and of all modules of `neusee.nodes` that this module imports.
 
-Comments, layout and docstrings do not count, so that better words keep the cache. Helpers and
-constants count, so that a changed constant never leads to an old result. The digests of syntax
-trees are kept in a file by the digest of the source, so that a cached run parses nothing. The
-files ``code/<digest>.json`` keep the digests of the single definitions behind each digest: no
-key needs them, but they tell which function has changed.
+Helpers and constants affect a digest; comments, layout and docstrings do not. A file keeps the summaries of sources,
+so that a cached run parses no source. The files ``code/<digest>.json`` keep the digests of single definitions: cache
+keys do not need these files, but reports of changes name the changed function by them.
 """
 
 from __future__ import annotations
 
+import functools
 import json
 import os
 import sys
@@ -20,34 +19,36 @@ from pathlib import Path
 from typing import Any
 
 import xxhash
+from pydantic import TypeAdapter
 
 from neusee.workflows.keys.cache_key import digest
-from neusee.workflows.keys.source_summary import ROOT, Summary, Use, summarise
+from neusee.workflows.keys.source_summary import ROOT, Summary, Use, module_file, summarise
 
 _LEFT_OUT = frozenset({ROOT, f"{ROOT}._node"})  #: modules that do not affect what a node computes
 _KEPT = 1000  #: number of summaries in the file
+_SUMMARIES = TypeAdapter(dict[str, Summary])
 _PYTHON = "{}.{}".format(*sys.version_info)  #: the text of a syntax tree depends on the version of Python
 _THIS_PROCESS = os.urandom(8).hex()
 
-_edited_since: set[str] = set()  #: loaded modules whose source has been edited since the import
-_frozen: dict[str, tuple[Any, str]] = {}  #: module -> its spec, and the digest of its source when first seen
+_edited_since: set[str] = set()  #: loaded modules whose source was edited after the import
+_frozen: dict[str, tuple[Any, str]] = {}  #: module -> its spec, and the digest of its source at the first reading
 
 
 class Code:
-    """Digests of modules, for the length of one run."""
+    """Digests of the modules of nodes, which stay the same during one run."""
 
     def __init__(self, memo: Path) -> None:
         self._memo = memo
         self._summaries: dict[str, Summary] = _read(memo)
         self._new = False
         self._digests: dict[str, str] = {}
-        self._parts: dict[str, dict[str, dict[str, str]]] = {}  # definitions by module behind each digest
-        self._paths: dict[str, Path | None] = {}
+        self._parts: dict[str, dict[str, dict[str, str]]] = {}  # definitions by digest and module
+        self._path = functools.cache(source_file)
 
     def digest(self, module: str) -> str:
-        """Return the digest of ``module`` and of every `neusee.nodes` module that it imports, directly or not.
+        """Return the digest of a module and of all modules of `neusee.nodes` that it imports, directly or not.
 
-        Raises `LookupError` where the imported modules or their source cannot be determined.
+        Raises `LookupError` where an imported module or its source cannot be determined.
         """
         if module not in self._digests:
             seen: dict[str, str] = {}
@@ -58,18 +59,18 @@ class Code:
                 if name not in seen:
                     seen[name], parts[name], imports = self._look(name)
                     todo += imports
-            found = self._digests[module] = digest(seen)
+            code = self._digests[module] = digest(seen)
             if _edited_since.isdisjoint(seen):  # otherwise the digest is valid in this process only
-                self._parts[found] = parts
+                self._parts[code] = parts
         return self._digests[module]
 
     def save(self) -> None:
-        """Save the new summaries and definitions; ignore a folder that cannot be written."""
+        """Write the new summaries and definitions to files; skip a folder that cannot be written."""
         if self._new:
             self._new = False
             _write(self._memo, dict(list(self._summaries.items())[-_KEPT:]), self._memo.parent / "tmp")
-        for found, parts in self._parts.items():
-            path = parts_file(self._memo.parent, found)
+        for code, parts in self._parts.items():
+            path = parts_file(self._memo.parent, code)
             if not os.path.exists(path):
                 _write(path, parts, self._memo.parent / "tmp")
         self._parts = {}
@@ -92,39 +93,30 @@ class Code:
         return tree, summary.definitions, [n for n in names if n.startswith(f"{ROOT}.") and n not in _LEFT_OUT]
 
     def _imported(self, level: int, base: str, name: str, package: str) -> Iterator[str]:
-        """Yield the modules that one import reads: a submodule alone, or the module that defines the name."""
+        """Yield the modules that an import reads: a submodule, or the module that defines the imported name."""
         base = _absolute(level, base, package)
-        below = f"{base}.{name}"
-        if name and below.startswith(ROOT) and self._path(below) is not None:
-            yield below
+        submodule = f"{base}.{name}"
+        if name and submodule.startswith(ROOT) and self._path(submodule) is not None:
+            yield submodule
             path = None if base in _LEFT_OUT else self._path(base)
             if path is None or name not in self._summary(base, path).binds:
                 return
         yield base
 
     def _used(self, use: Use, package: str) -> list[str] | None:
-        """Return the modules that ``name.a.b`` passes through, or None if the chain ends at the whole of the nodes."""
+        """Return the modules that a chain such as ``name.a.b`` reads, or None if it ends at the package of nodes."""
         level, base, name, chain, _ = use
-        found = [".".join(filter(None, (_absolute(level, base, package), name)))]
+        modules = [".".join(filter(None, (_absolute(level, base, package), name)))]
         rest = chain.split(".") if chain else []
-        while rest and self._holds(found[-1], rest[0]):
-            found.append(f"{found[-1]}.{rest.pop(0)}")
-        whole = found[-1] in ("neusee", ROOT) and (not rest or rest[0].startswith("__"))
-        return None if whole else found[1:]
+        while rest and self._has_submodule(modules[-1], rest[0]):
+            modules.append(f"{modules[-1]}.{rest.pop(0)}")
+        whole = modules[-1] in ("neusee", ROOT) and (not rest or rest[0].startswith("__"))
+        return None if whole else modules[1:]
 
-    def _holds(self, module: str, name: str) -> bool:
-        """Return True if a name in a module is a submodule."""
-        below = f"{module}.{name}"
-        return below == ROOT or (self._is_package(module) and self._path(below) is not None)
-
-    def _is_package(self, module: str) -> bool:
-        path = self._path(module) if module.startswith(ROOT) else None
-        return path is not None and path.name == "__init__.py"
-
-    def _path(self, module: str) -> Path | None:
-        if module not in self._paths:
-            self._paths[module] = source_file(module)
-        return self._paths[module]
+    def _has_submodule(self, module: str, name: str) -> bool:
+        submodule, path = f"{module}.{name}", self._path(module) if module.startswith(ROOT) else None
+        is_package = path is not None and path.name == "__init__.py"
+        return submodule == ROOT or (is_package and self._path(submodule) is not None)
 
     def _summary(self, module: str, path: Path) -> Summary:
         source = _source_digest(module, path)
@@ -135,13 +127,13 @@ class Code:
         return self._summaries[name]
 
 
-def parts_file(root: Path, found: str) -> Path:
-    """Return the file in which a store keeps the definitions behind a digest of code."""
-    return root / "code" / f"{found}.json"
+def parts_file(root: Path, code: str) -> Path:
+    """Return the file in which a store keeps the digests of the definitions behind a digest of code."""
+    return root / "code" / f"{code}.json"
 
 
 def _absolute(level: int, base: str, package: str) -> str:
-    """Return the full name of the module of a ``from`` import."""
+    """Return the full name of the module that a ``from`` import names."""
     if not level:
         return base
     above = package.split(".")
@@ -149,7 +141,7 @@ def _absolute(level: int, base: str, package: str) -> str:
 
 
 def _write(path: Path, content: Any, folder: Path) -> None:
-    """Write JSON by atomic rename; do nothing where the folder cannot be written."""
+    """Write a JSON file by atomic rename; do nothing where the folder cannot be written."""
     part = folder / f"{path.name}.{os.getpid()}.{threading.get_ident()}"
     with suppress(OSError):
         folder.mkdir(parents=True, exist_ok=True)
@@ -159,54 +151,41 @@ def _write(path: Path, content: Any, folder: Path) -> None:
 
 
 def _read(memo: Path) -> dict[str, Summary]:
-    """Return the summaries of earlier runs; an empty dict where the file is damaged or has an older format."""
+    """Return the summaries that earlier runs saved, or an empty dict if the file is damaged or has an older format."""
     try:
-        return {name: _summary_of(*fields) for name, fields in json.loads(memo.read_bytes()).items()}
-    except (OSError, ValueError, TypeError, AttributeError):
+        return _SUMMARIES.validate_json(memo.read_bytes())
+    except (OSError, ValueError):
         return {}
 
 
-def _summary_of(tree: Any, imports: Any, binds: Any, uses: Any, definitions: Any) -> Summary:
-    return Summary(
-        str(tree),
-        [(int(level), str(base), str(name)) for level, base, name in imports],
-        list(binds),
-        [(int(level), str(base), str(name), str(chain), int(line)) for level, base, name, chain, line in uses],
-        {str(label): str(found) for label, found in definitions.items()},
-    )
-
-
 def source_file(module: str) -> Path | None:
-    """Return the source file of a module, without importing the module."""
+    """Return the source file of a module without importing the module, or None without such a file."""
     if module in sys.modules:
         file = getattr(sys.modules[module], "__file__", None)
         return Path(file) if file and os.path.isfile(file) else None
-    inside = module.startswith(f"{ROOT}.")
-    for folder in getattr(sys.modules.get(ROOT), "__path__", ()) if inside else ():
-        stem = os.path.join(folder, *module.split(".")[2:])
-        for file in (f"{stem}.py", os.path.join(stem, "__init__.py")):
-            if os.path.isfile(file):
-                return Path(file)
-    return None
+    if not module.startswith(f"{ROOT}."):
+        return None
+    folders = getattr(sys.modules.get(ROOT), "__path__", ())
+    return next(filter(None, (module_file(folder, module.split(".")[2:]) for folder in folders)), None)
 
 
 def _source_digest(module: str, path: Path) -> str:
-    """Return the xxh3 of a source file; for a loaded module that of its first reading, because that code runs."""
+    """Return the xxh3 digest of a source file; for a loaded module at its first reading, because that code runs."""
     spec = getattr(sys.modules.get(module), "__spec__", None)
     if spec is not None and module in _frozen and _frozen[module][0] is spec:
         return _frozen[module][1]
-    found = xxhash.xxh3_128_hexdigest(path.read_bytes())
+    source = xxhash.xxh3_128_hexdigest(path.read_bytes())
     _edited_since.discard(module)
     if spec is not None:
-        _frozen[module] = (spec, found)
+        _frozen[module] = (spec, source)
         if _edited(spec, path):
             _edited_since.add(module)
             warnings.warn(f"{path} was edited after its import: restart Python to keep its results", stacklevel=2)
-    return found
+    return source
 
 
 def _edited(spec: Any, path: Path) -> bool:
-    """Return True if the byte code that Python wrote at the import belongs to another source than ``path``."""
+    """Return True if the byte code that Python wrote at the import belongs to another version of the source file."""
     try:
         with open(spec.cached or "", "rb") as file:
             head = file.read(16)

@@ -1,7 +1,7 @@
-"""Digest of the program itself: of some of its modules, and of all `neusee.workflows` modules that they import.
+"""Digest of the program's own code: of some modules, and of all modules of `neusee.workflows` that they import.
 
-A stored study, design or posterior has this digest in its key, so that a change of the code never leads to an old
-result. This digest is the only identity of code outside the nodes; `Code` digests the nodes.
+The key of a stored study, design or posterior has this digest, so that changed code never leads to an old result.
+`code_digest.Code` has the digests of nodes.
 """
 
 from __future__ import annotations
@@ -12,7 +12,7 @@ from collections.abc import Iterable, Iterator
 from pathlib import Path
 
 from neusee.workflows.keys.cache_key import digest
-from neusee.workflows.keys.source_summary import summarise
+from neusee.workflows.keys.source_summary import module_file, summarise
 
 _HERE = Path(__file__).parents[1]
 _ROOT = "neusee.workflows"
@@ -20,12 +20,9 @@ _ROOT = "neusee.workflows"
 
 @functools.cache
 def engine(*modules: str) -> str:
-    """Return the digest of ``modules`` of neusee.workflows (default ``engine.runner``) and of their imports.
+    """Return the digest of some modules of neusee.workflows (default ``engine.runner``) and of all that they import.
 
-    Only imports at the top of a module count: by them a run is decided.
-
-    Raises: `LookupError` where a module, or one that it imports, has no source file. A digest that passed over it
-    would not change when that module does.
+    Only imports at the top of a module count. Raises `LookupError` for a module without a source file.
     """
     seen: dict[str, str] = {}
     todo = list(modules or ("engine.runner",))
@@ -35,7 +32,7 @@ def engine(*modules: str) -> str:
             continue
         path = _source(name)
         if path is None:
-            raise LookupError(f"{_ROOT}.{name} has no source file below {_HERE}, so its results cannot be keyed")
+            raise LookupError(f"{_ROOT}.{name} has no source file below {_HERE}, so its results can have no cache key")
         seen[name], imports = _parsed(path.read_bytes())
         todo += imported(imports)
     return digest(seen)
@@ -43,13 +40,13 @@ def engine(*modules: str) -> str:
 
 @functools.cache
 def _parsed(source: bytes) -> tuple[str, list[ast.stmt]]:
-    """Return the digest of a source and its statements at the top that import; kept, since most digests share files."""
+    """Return the digest of a source file and the import statements at its top, kept because programs share files."""
     imports: list[ast.stmt] = [item for item in ast.parse(source).body if isinstance(item, ast.Import | ast.ImportFrom)]
     return summarise(source).tree, imports
 
 
 def imported(statements: Iterable[ast.stmt]) -> Iterator[str]:
-    """Yield the modules of neusee.workflows that the statements import, by their names below it."""
+    """Yield the modules of neusee.workflows that import statements name, such as ``engine.runner``."""
     for item in statements:
         if isinstance(item, ast.Import):
             yield from (_below(alias.name) for alias in item.names if alias.name.startswith(f"{_ROOT}."))
@@ -65,6 +62,4 @@ def _below(module: str) -> str:
 
 
 def _source(name: str) -> Path | None:
-    """Return the file of a module or a package, or None."""
-    stem = _HERE.joinpath(*name.split("."))
-    return next((p for p in (stem.with_suffix(".py"), stem / "__init__.py") if p.is_file()), None)
+    return module_file(_HERE, name.split("."))

@@ -1,25 +1,27 @@
-"""Summary of a module's source: a digest of the whole, a digest of each definition, and the used `neusee` names."""
+"""Summary of a source file: digests of the file and of its definitions, and the names of `neusee` that it uses."""
 
 from __future__ import annotations
 
 import ast
+import os
 import threading
 from collections import defaultdict
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterable, Iterator, Sequence
+from pathlib import Path
 from typing import NamedTuple
 
 from neusee.workflows.keys.cache_key import digest
 
 ROOT = "neusee.nodes"
-_parsing = threading.Lock()  #: the parser of Python 3.11 miscounts its recursion depth if two threads use it
-_SHORT = 16  #: digits of a definition's digest, which is compared with its earlier versions only
+_parsing = threading.Lock()  #: for one thread at a time: the parser of Python 3.11 miscounts the depth of two
+_SHORT = 16  #: digits of the digest of a definition
 
-Import = tuple[int, str, str]  #: level, module, name (empty for the module itself)
-Use = tuple[int, str, str, str, int]  #: an imported name: its import, the attributes after the name, the line
+Import = tuple[int, str, str]  #: level of a relative import, module, name (empty for ``import module``)
+Use = tuple[int, str, str, str, int]  #: use of an imported name: its import, the attributes after the name, the line
 
 
 class Summary(NamedTuple):
-    """The parts of a module's source that keys and reports of changes need."""
+    """Summary of the source of a module, for cache keys and for reports of changed code."""
 
     tree: str  #: digest of the syntax tree without docstrings
     imports: list[Import]
@@ -29,7 +31,7 @@ class Summary(NamedTuple):
 
 
 def summarise(source: bytes) -> Summary:
-    """Return the digests of a syntax tree and its definitions, without docstrings, and the `neusee` names in use."""
+    """Return the summary of a source file; comments, layout and docstrings do not affect its digests."""
     with _parsing:
         tree = ast.parse(source)
     imports: list[Import] = []
@@ -52,19 +54,26 @@ def summarise(source: bytes) -> Summary:
     return Summary(digest(ast.dump(tree)), imports, binds, _uses(tree, bound), _definitions(tree))
 
 
+def module_file(folder: str | Path, names: Sequence[str]) -> Path | None:
+    """Return the file of a module or a package below a folder, or None without a file; ``names`` is its path."""
+    stem = os.path.join(folder, *names)
+    files = (f"{stem}.py", os.path.join(stem, "__init__.py"))
+    return next((Path(file) for file in files if os.path.isfile(file)), None)
+
+
 def _uses(tree: ast.Module, bound: dict[str, set[Import]]) -> list[Use]:
-    """Return the attribute chains that begin with an imported name, and packages used as a whole, each once."""
-    found: dict[tuple[int, str, str, str], int] = {}
+    """Return each attribute chain that begins with an imported name, and each package that is used as a whole."""
+    lines: dict[tuple[int, str, str, str], int] = {}
     for name, attributes, line in _chains(tree):
         for way in bound.get(name, ()):
             if attributes or ".".join(filter(None, way[1:])) in ("neusee", ROOT, "nodes"):
-                found.setdefault((*way, ".".join(attributes)), line)
-    return sorted((*use, line) for use, line in found.items())
+                lines.setdefault((*way, ".".join(attributes)), line)
+    return sorted((*use, line) for use, line in lines.items())
 
 
 def _chains(tree: ast.Module) -> Iterator[tuple[str, list[str], int]]:
-    """Yield ``a.b.c`` as a, [b, c] and its line, for the longest chains, and also names alone."""
-    inner: set[int] = set()  # parts of chains already seen: a walk meets a chain before its parts
+    """Yield the first name, the attributes and the line of each chain such as ``a.b.c``, and of each single name."""
+    inner: set[int] = set()  # parts of earlier chains, because a walk meets a chain before its parts
     for item in ast.walk(tree):
         if id(item) in inner or not isinstance(item, ast.Attribute | ast.Name):
             continue
@@ -79,17 +88,17 @@ def _chains(tree: ast.Module) -> Iterator[tuple[str, list[str], int]]:
 
 
 def _definitions(tree: ast.Module) -> dict[str, str]:
-    """Return a digest for each top-level definition; definitions with the same label share a digest."""
-    found: dict[str, list[str]] = defaultdict(list)
+    """Return the digest of each top-level definition by its label; definitions with one label share a digest."""
+    dumps: dict[str, list[str]] = defaultdict(list)
     for item in tree.body:
         dump = ast.dump(item)
         for label in _labels(item):
-            found[label].append(dump)
-    return {label: digest(dumps)[:_SHORT] for label, dumps in found.items()}
+            dumps[label].append(dump)
+    return {label: digest(parts)[:_SHORT] for label, parts in dumps.items()}
 
 
 def _labels(item: ast.stmt) -> Iterable[str]:
-    """Return the labels of the definitions in a top-level statement."""
+    """Return the labels of the definitions in a top-level statement, such as ``psf()`` or ``constant _FALL``."""
     if isinstance(item, ast.FunctionDef | ast.AsyncFunctionDef):
         return [f"{_owner(item)}()"]
     if isinstance(item, ast.ClassDef):
@@ -102,7 +111,7 @@ def _labels(item: ast.stmt) -> Iterable[str]:
 
 
 def _owner(function: ast.FunctionDef | ast.AsyncFunctionDef) -> str:
-    """Return a function's name, or ``psf.check`` for a function ``_`` that is a hook of the node ``psf``."""
+    """Return the name of a function, or ``psf.check`` for a function ``_`` that is a hook of the node ``psf``."""
     for mark in function.decorator_list:
         if function.name == "_" and isinstance(mark, ast.Attribute) and isinstance(mark.value, ast.Name):
             return f"{mark.value.id}.{mark.attr}"

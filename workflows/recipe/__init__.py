@@ -1,4 +1,4 @@
-"""What did the user write, and is it right?
+"""Which recipe did the user write, and which values in it are mistakes?
 
 From the name or file of a recipe to a graph that is checked: parameters, steps, wires, seed and tolerance.
 Nothing here runs a step or asks the cache for a result.

@@ -1,4 +1,4 @@
-"""A recipe with other values: its final values as a file, the changes over them, and all of it checked again."""
+"""Changes of a recipe that was loaded: its final values are written to a file, changed and checked again."""
 
 from __future__ import annotations
 
@@ -12,10 +12,10 @@ from neusee.workflows.recipe.loading import load
 
 
 def changed(recipe: Recipe, overrides: Sequence[str]) -> Recipe:
-    """Return ``recipe`` with other values, checked again; raise `RecipeError` where a value cannot be used."""
+    """Return a recipe with some values changed by overrides; raise `RecipeError` for a value that is a mistake."""
     with TemporaryDirectory(prefix="neusee-") as folder:
         path = Path(folder) / "recipe.yaml"
         path.write_text(recipe.config.to_yaml(), encoding="utf-8")
-        found = load(path, overrides)
-    found = replace(found, name=recipe.name, title=recipe.title, seed=recipe.seed, outputs=recipe.outputs, expect=())
-    return replace(found, tolerance=recipe.tolerance, exact=recipe.exact)
+        loaded = load(path, overrides)
+    loaded = replace(loaded, name=recipe.name, title=recipe.title, seed=recipe.seed, outputs=recipe.outputs, expect=())
+    return replace(loaded, tolerance=recipe.tolerance, exact=recipe.exact)

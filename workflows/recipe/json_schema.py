@@ -1,7 +1,7 @@
-"""JSON schema of a recipe file, for editors: they complete names and mark mistakes during typing.
+"""JSON schema of recipe files, with which an editor completes names and marks mistakes.
 
-The schema of a step depends on its ``node``, so that a wrong name under ``with`` is one error and
-not one error for every node. A file may be incomplete (groups are merged), so no key is required.
+The schema of a step depends on its ``node``, so that a wrong name under ``with`` is one mistake and not one for each
+node. The schema requires no key, because groups may complete a file.
 """
 
 from __future__ import annotations
@@ -16,24 +16,25 @@ from pydantic_core import core_schema
 
 from neusee.nodes import Node, units
 from neusee.workflows.recipe.blocks.train_block import Training
-from neusee.workflows.recipe.distributions.scalar import KINDS as LAWS
+from neusee.workflows.recipe.distributions.scalar import KINDS
 from neusee.workflows.recipe.loading import groups
 from neusee.workflows.recipe.step_declarations import all_nodes
 from neusee.workflows.recipe.wiring import takes_many
 
 Schema = dict[str, Any]
 
-#: a reference ``${a.b}`` or a distribution, which may replace every value
-REFERENCE: Schema = {"type": "string", "pattern": rf"\$\{{.+\}}|^({'|'.join(LAWS)})\(.+\)$"}
+#: schema of a reference such as ``${a.b}`` or a distribution, which may replace any value
+REFERENCE: Schema = {"type": "string", "pattern": rf"\$\{{.+\}}|^({'|'.join(KINDS)})\(.+\)$"}
 _WIRE: Schema = {"type": ["string", "null"], "pattern": r"^[^\[\]\s]+(\[[^\[\]]+\])?$|\$\{"}
 _DEVICE: Schema = {"type": ["string", "null"], "pattern": r"^(any|cpu|gpu|mps|cuda(:\d+)?)$|\$\{"}
 _ANY: Schema = {}
-_REFERABLE = {"float", "int", "bool", "literal", "tuple", "list", "dict", "function-before"}  #: all but plain strings
+#: types of values that a reference may replace
+_REFERABLE = {"float", "int", "bool", "literal", "tuple", "list", "dict", "function-before"}
 _NUMBER = r"(\d+\.?\d*|\.\d+)([eE][-+]?\d+)?"
 
 
 def schema() -> Schema:
-    """Return the schema of recipes and of the options of groups."""
+    """Return the JSON schema of recipes and of the options of groups."""
     nodes = dict(all_nodes())
     return {
         "$schema": "https://json-schema.org/draft/2020-12/schema",
@@ -56,16 +57,14 @@ def schema() -> Schema:
 
 
 def _defaults() -> Schema:
-    """Return the schema of one entry of ``defaults``: packaged options are offered, other names are allowed."""
-    options = {
-        group: {"anyOf": [{"enum": [option.name for option in found]}, {"type": ["string", "null"]}]}
-        for group, found in groups().items()
-    }
+    """Return the schema of an entry of ``defaults``, which offers the packaged options and allows other names."""
+    offered = {group: {"enum": [option.name for option in options]} for group, options in groups().items()}
+    options = {group: {"anyOf": [names, {"type": ["string", "null"]}]} for group, names in offered.items()}
     return {"type": "object", "properties": options, "minProperties": 1, "maxProperties": 1}
 
 
 def _step(nodes: Mapping[str, Node]) -> Schema:
-    """Return the schema of a step: its general keys, and for each node the inputs and parameters."""
+    """Return the schema of a step: the keys of all steps, and for each node its inputs and parameters."""
     each: Schema = {"type": ["string", "array", "null"], "items": {"type": "string"}, "maxItems": 2}
     names: Schema = {"anyOf": [{"enum": list(nodes)}, REFERENCE]}
     return {
@@ -77,7 +76,7 @@ def _step(nodes: Mapping[str, Node]) -> Schema:
                 "if": {"properties": {"node": {"const": name}}, "required": ["node"]},
                 "then": {
                     "title": name,
-                    "description": _first_sentence(node),
+                    "description": inspect.cleandoc(node.__doc__ or "").partition("\n")[0],
                     "properties": {"from": _inputs(node), "with": {"$ref": f"#/$defs/{name}"}},
                 },
             }
@@ -87,11 +86,11 @@ def _step(nodes: Mapping[str, Node]) -> Schema:
 
 
 def _inputs(node: Node) -> Schema:
-    """Return the schema of ``from`` for a node."""
+    """Return the schema of the key ``from`` in a step with a node."""
     if not node.inputs:
         return {"type": "null"}
-    lists = [name for name in node.inputs if takes_many(node, name)]
-    wires = {name: {**_WIRE, "description": "all items"} if name in lists else _WIRE for name in node.inputs}
+    all_items = {**_WIRE, "description": "all items"}
+    wires = {name: all_items if takes_many(node, name) else _WIRE for name in node.inputs}
     return {"type": ["string", "object", "null"], "properties": wires, "additionalProperties": False}
 
 
@@ -104,19 +103,19 @@ def _expectation() -> Schema:
 
 
 def _parameters(nodes: Mapping[str, Node]) -> Schema:
-    """Return the schema of the parameters of every node, by the node's name."""
-    found = {}
+    """Return the schema of the parameters of each node, by the name of the node."""
+    schemas = {}
     for name, node in nodes.items():
         model = node.params.model_json_schema(schema_generator=_Generator)
         for field in model.get("properties", {}).values():
             field.pop("title", None)
         allowed = {"type": ["object", "null"], "properties": model.get("properties", {}), "additionalProperties": False}
-        found[name] = allowed | ({"$defs": model["$defs"]} if "$defs" in model else {})
-    return found
+        schemas[name] = allowed | ({"$defs": model["$defs"]} if "$defs" in model else {})
+    return schemas
 
 
 def _training() -> Schema:
-    """Return the schema of the ``train`` block; every key is optional."""
+    """Return the schema of the block ``train``, in which every key is optional."""
     model = Training.model_json_schema(schema_generator=_Generator, ref_template="#/$defs/train.{model}")
     blocks = {f"train.{name}": block for name, block in model.pop("$defs").items()}
     for block in (model, *blocks.values()):
@@ -125,25 +124,21 @@ def _training() -> Schema:
 
 
 class _Generator(GenerateJsonSchema):
-    """Pydantic's schema extended by quantities with units, and by references."""
+    """Generator of schemas that also allow quantities with units, and references."""
 
     def generate_inner(self, schema: Any) -> JsonSchemaValue:
-        found = super().generate_inner(schema)
-        return {"anyOf": [found, REFERENCE]} if schema["type"] in _REFERABLE else found
+        inner = super().generate_inner(schema)
+        return {"anyOf": [inner, REFERENCE]} if schema["type"] in _REFERABLE else inner
 
     def function_before_schema(self, schema: core_schema.BeforeValidatorFunctionSchema) -> JsonSchemaValue:
-        """Return the schema of a quantity: a number and one of the units that its reader accepts."""
+        """Return the schema of a quantity, which is a number with one of the units of the parameter."""
         read = schema["function"]["function"]
-        found = [unit for unit in _all_units() if _takes(read, unit)]
-        if not found:
+        known = [unit for scale in units._SCALE.values() for unit in scale if _takes(read, unit)]
+        if not known:
             return super().function_before_schema(schema)
         sign = "[+]?" if {"gt", "ge"} & schema["schema"].keys() else "[-+]?"
-        pattern = rf"^\s*{sign}{_NUMBER}\s*({'|'.join(map(re.escape, found))})\s*$"
+        pattern = rf"^\s*{sign}{_NUMBER}\s*({'|'.join(map(re.escape, known))})\s*$"
         return {"type": "string", "pattern": pattern}
-
-
-def _all_units() -> list[str]:
-    return [unit for scale in units._SCALE.values() for unit in scale]
 
 
 def _takes(read: Any, unit: str) -> bool:
@@ -152,7 +147,3 @@ def _takes(read: Any, unit: str) -> bool:
     except (ValueError, TypeError):
         return False
     return True
-
-
-def _first_sentence(node: Node) -> str:
-    return inspect.cleandoc(node.__doc__ or "").partition("\n")[0]

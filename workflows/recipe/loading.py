@@ -1,39 +1,37 @@
-"""Loading of a recipe: from its name or file, and arguments, to checked steps that are ready to run.
-
-All checks are made before the run, and every mistake is reported at once.
-"""
+"""Loading of a recipe: a name or a file and arguments become checked steps; all mistakes are reported at once."""
 
 from __future__ import annotations
 
+import functools
 import os
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
 from neusee.workflows.graph.diagnostics import RecipeError
 from neusee.workflows.graph.final_values import Config, Setting
-from neusee.workflows.graph.recipe_graph import Expectation, Recipe, Step, Wire, kept_promises
+from neusee.workflows.graph.recipe_graph import Recipe, Step, Wire, kept_promises
 from neusee.workflows.recipe.blocks.train_block import KEY as TRAINING
 from neusee.workflows.recipe.blocks.train_block import read_training
 from neusee.workflows.recipe.blocks.train_lift_block import KEY as LIFTING
 from neusee.workflows.recipe.blocks.train_lift_block import read_lift_training
 from neusee.workflows.recipe.distributions.nominal_values import Uncertain, settle
 from neusee.workflows.recipe.global_settings import expectations, outputs_of, seed_and_tolerance
-from neusee.workflows.recipe.graph_cache import cache_graph, cache_recipe, cached_graph, cached_recipe
+from neusee.workflows.recipe.graph_cache import CachedGraph, cache_graph, cached_graph
 from neusee.workflows.recipe.parameters import Checker
 from neusee.workflows.recipe.step_declarations import Declared, declare, device_of
 from neusee.workflows.recipe.text.composition import Composed, compose, groups_of, packaged
 from neusee.workflows.recipe.text.overrides import Override, arguments_in
 from neusee.workflows.recipe.text.python_overrides import overrides_of
 from neusee.workflows.recipe.text.references import References
-from neusee.workflows.recipe.text.yaml_values import Value, Where
+from neusee.workflows.recipe.text.yaml_values import Value
 from neusee.workflows.recipe.wiring import Wiring, cycles
 
 
 @dataclass(frozen=True, slots=True)
 class Titled:
-    """A packaged recipe or an option of a group, with the first line of its file."""
+    """Name of a packaged recipe or of an option, with the title in the first line of its file."""
 
     name: str
     title: str
@@ -47,32 +45,39 @@ def load(
     first: int = 1,
     **values: Any,
 ) -> Recipe:
-    """Read and check a packaged recipe, or a file whose name ends in ``.yaml``.
+    """Return a packaged recipe, or the recipe in a file whose name ends in ``.yaml``, after a check of all its values.
 
         load("first_light", ["sensor.read_noise=20 e-"])
         load("first_light", doe="axicon", sensor={"read_noise": "20 e-"}, lasers={"green": {"strength": 1e4}})
         load("first_light", **{"sensor.read_noise": "20 e-", "+lasers.red": {"wavelength": "638 nm", …}})
 
-    ``values`` are changes as Python values, made after ``overrides``; a mapping changes the values that
-    it names and leaves the others. Paths are relative to ``folder`` (the working folder), and messages
-    count ``overrides`` from ``first``. An expected number is dropped if a change affects its step, and
-    a note says so. Raises `RecipeError` with every mistake.
+    ``values`` are overrides as Python values, which follow ``overrides``; a mapping changes only the values that it
+    names. Paths are relative to ``folder`` (default: the working folder), and messages number ``overrides`` from
+    ``first``. A note names the expected numbers that overrides affect, because these are not compared.
+    Raises `RecipeError` with all mistakes.
     """
-    name, place = os.fspath(name_or_path), Path(folder or ".").absolute()
-    changes: tuple[str | Override, ...] = (*overrides, *overrides_of(values, place))
-    recipe = check(compose(name, changes, place, first))
-    return kept_promises(recipe, _as_written(name, place)) if recipe.expect and changes else recipe
+    name, beside = os.fspath(name_or_path), Path(folder or ".").absolute()
+    changes: tuple[str | Override, ...] = (*overrides, *overrides_of(values, beside))
+    recipe = check(compose(name, changes, beside, first))
+    return kept_promises(recipe, _as_written(name, beside)) if recipe.expect and changes else recipe
 
 
-def _as_written(name: str, place: Path) -> Recipe:
-    """Return a recipe without changes; a recipe is not checked again while its files and nodes are unchanged."""
-    composed = compose(name, (), place)
-    return cached_recipe(composed.root) or cache_recipe(composed.root, check(composed))
+def _as_written(name: str, folder: Path) -> Recipe:
+    """Return a recipe without overrides, from the cache while its files and nodes are unchanged."""
+    composed = compose(name, (), folder)
+    graph = cached_graph(composed.root)
+    return check(composed) if graph is None else _checked(composed, graph)
+
+
+@functools.lru_cache(maxsize=16)
+def _checked(composed: Composed, graph: CachedGraph) -> Recipe:
+    """Return a checked recipe from the cache, as long as its graph is the same."""
+    return check(composed)
 
 
 def check(composed: Composed) -> Recipe:
-    """Return a composed recipe with its steps bound; raise `RecipeError` with every mistake."""
-    learnt = [composed.root.items[key] for key in (TRAINING, LIFTING) if key in composed.root.items]
+    """Return the checked recipe of composed values; raise `RecipeError` with all mistakes."""
+    blocks = [composed.root.items[key] for key in (TRAINING, LIFTING) if key in composed.root.items]
     composed, training = read_training(composed)
     composed, lifting = read_lift_training(composed)
     composed, uncertain = settle(composed)
@@ -81,7 +86,7 @@ def check(composed: Composed) -> Recipe:
     graph = cached_graph(root)
     steps, absent = (graph.steps, graph.absent) if graph else declare(root, references, diagnostics)
     wiring, checker = Wiring(root, steps, absent, references, diagnostics), Checker([])
-    bound = {step.name: step for step in _bind(root, steps, wiring, checker, graph.wires if graph else {})}
+    bound = {step.name: step for step in _bind(wiring, checker, graph.wires if graph else {})}
     diagnostics += cycles(bound, {name: step.value.key for name, step in steps.items()})
     seed, tolerance = seed_and_tolerance(root, references, checker.diagnostics)
     outputs = outputs_of(root, wiring)
@@ -93,30 +98,22 @@ def check(composed: Composed) -> Recipe:
         raise RecipeError([*diagnostics, *checker.diagnostics])
     if graph is None:
         cache_graph(root, steps, absent, {name: step.wires for name, step in bound.items()})
-    config = _config(root, bound, steps, checker, references.spare, uncertain)
-    for block in learnt:
-        config = Config({**config.settings, **dict(_settings(block, checker))})
+    config = Config(_final_values(wiring, bound, checker, uncertain) | dict(_settings(blocks, checker)))
     nulls = {name: f"null ({value.mark})" for name, value in absent.items()}
     notes = (*checker.notes, *(uncertain.notes if uncertain else ()))
-    told = composed.name, composed.title, seed, tolerance, outputs, bound, expect, config, notes, nulls
-    return Recipe(*told, uncertain=uncertain, training=training, lifting=lifting)
+    checked = composed.name, composed.title, seed, tolerance, outputs, bound, expect, config, notes, nulls
+    return Recipe(*checked, uncertain=uncertain, training=training, lifting=lifting)
 
 
-def _bind(
-    root: Value,
-    steps: Mapping[str, Declared],
-    wiring: Wiring,
-    checker: Checker,
-    known: Mapping[str, Mapping[str, Wire]],
-) -> Iterator[Step]:
-    """Yield every copy of every step that can be bound; ``known`` are wires that were checked before."""
+def _bind(wiring: Wiring, checker: Checker, known: Mapping[str, Mapping[str, Wire]]) -> Iterator[Step]:
+    """Yield all copies of all steps with their parameters and wires; ``known`` are wires from the cache."""
     checked: list[tuple[Step, Value, Value]] = []
-    for step in steps.values():
+    for step in wiring.steps.values():
         if not step.items:
             for part in ("from", "with", "device"):
                 wiring.references.touch(step.part(part), step.dims)
         for items in step.items:
-            scope = step.scope(root, items)
+            scope = step.scope(wiring.root, items)
             given = wiring.references.resolve(step.part("with"), scope)
             name = step.instance(items)
             wires = known[name] if name in known else wiring.wires(step, items)
@@ -142,39 +139,35 @@ def _value_before_run(step: Step) -> Any:
         return None
 
 
-def _config(
-    root: Value,
-    bound: dict[str, Step],
-    steps: dict[str, Declared],
-    checker: Checker,
-    spare: set[Where],
-    uncertain: Uncertain | None,
-) -> Config:
-    """Return the final values by path: the written ones, and after each step the defaults of its node."""
+def _final_values(
+    wiring: Wiring, bound: dict[str, Step], checker: Checker, uncertain: Uncertain | None
+) -> dict[str, Setting]:
+    """Return the final values by path: the written values, and after each step the defaults of its node."""
     settings: dict[str, Setting] = {}
-    for key, block in root.items.items():
+    spare = wiring.references.spare
+    for key, block in wiring.root.items.items():
         if key != "steps":
-            settings |= {name: found for name, found in _settings(block, checker) if found.path not in spare}
+            settings |= {name: value for name, value in _settings([block], checker) if value.path not in spare}
             continue
         for name, step in block.items.items():
-            settings |= dict(_settings(step, checker))
-            if str(name) in steps:
-                settings |= _defaults(steps[str(name)], bound)
+            settings |= dict(_settings([step], checker))
+            if str(name) in wiring.steps:
+                settings |= _defaults(wiring.steps[str(name)], bound)
     for name, law in uncertain.laws.items() if uncertain else ():
         if name in settings:
             settings[name] = replace(settings[name], value=law.text)
-    return Config(settings)
+    return settings
 
 
-def _settings(block: Value, checker: Checker) -> Iterator[tuple[str, Setting]]:
-    for leaf in block.leaves():
+def _settings(blocks: Iterable[Value], checker: Checker) -> Iterator[tuple[str, Setting]]:
+    for leaf in (leaf for block in blocks for leaf in block.leaves()):
         value: Any = checker.files.get(leaf.path, leaf.plain)
         sources = dict.fromkeys(map(str, (leaf.mark, *arguments_in(leaf))))
         yield leaf.name, Setting(value, ", ".join(sources), leaf.path)
 
 
 def _defaults(step: Declared, bound: dict[str, Step]) -> Iterator[tuple[str, Setting]]:
-    """Yield the parameters of a step that have their default value, in SI."""
+    """Yield the parameters of a step that the recipe does not set, with the default values in SI."""
     first = bound.get(step.instances[0]) if step.instances else None
     for name, value in (first.params if first else {}).items():
         if first and name not in first.param_marks:
@@ -186,12 +179,12 @@ def _defaults(step: Declared, bound: dict[str, Step]) -> Iterator[tuple[str, Set
 
 
 def recipes() -> list[Titled]:
-    """Return the packaged recipes."""
+    """Return the names and titles of the packaged recipes."""
     return [_titled(path) for path in sorted(packaged().glob("*.yaml"))]
 
 
 def groups(beside: Path | None = None) -> dict[str, list[Titled]]:
-    """Return the options of every group: packaged ones, and those in folders beside a user's recipe."""
+    """Return the options of all groups, which are packaged or in folders ``beside`` the recipe of a user."""
     folders = [folder for folder in (beside, packaged()) if folder]
     return {
         group: [_titled(next(p for f in folders if (p := f / group / f"{name}.yaml").is_file())) for name in names]
@@ -203,6 +196,3 @@ def _titled(path: Path) -> Titled:
     with path.open(encoding="utf-8") as file:
         first = file.readline().strip()
     return Titled(path.stem, first.lstrip("# ") if first.startswith("#") else "")
-
-
-__all__ = ["Expectation", "Recipe", "RecipeError", "Titled", "check", "groups", "load", "recipes"]

@@ -1,7 +1,6 @@
-"""Readings of the paper where the paper contradicts itself: every choice, with its reason.
+"""Readings of the paper where the paper contradicts itself: the choice of the recipes, with its reason.
 
-The source is Peng et al., "Learning to See Through Flare", ICCV 2025 workshops. Each row is one
-parameter that the groups ``reading`` decide; no contradiction is corrected silently.
+Source: Peng et al., "Learning to See Through Flare", ICCV 2025 workshops. The group ``reading`` makes each choice.
 """
 
 from __future__ import annotations
@@ -11,25 +10,23 @@ from typing import NamedTuple
 
 
 class Reading(NamedTuple):
-    """One contradiction: the parameter, the coherent and the printed value, and the reason for the choice."""
+    """Contradiction of the paper: the recipe key, its coherent and its printed value, and the reason for the choice."""
 
-    name: str
+    path: str  #: of the recipe key
     number: str
     matter: str
     coherent: object
     as_printed: object
     reason: str
-    block: str = "reading"  #: of the recipe, in which the parameter stands
 
     @property
-    def path(self) -> str:
-        """Where the parameter stands in a recipe."""
-        return f"{self.block}.{self.name}"
+    def name(self) -> str:
+        return self.path.partition(".")[2]
 
 
 READINGS = (
     Reading(
-        "aperture",
+        "reading.aperture",
         "C1",
         "an aperture of 11 mm on a pupil of 2160 x 3.74 um = 8.078 mm",
         "inscribed",
@@ -38,7 +35,7 @@ READINGS = (
         "`stretched` widens the pitch to 5.093 um instead",
     ),
     Reading(
-        "illuminant",
+        "reading.illuminant",
         "C5, C23",
         "the daylight curve is multiplied in twice",
         "once",
@@ -46,7 +43,7 @@ READINGS = (
         "the lift gives reflectance, so light enters once",
     ),
     Reading(
-        "level",
+        "reading.level",
         "C6",
         "each of 31 bands peaks at alpha_b times the saturation irradiance",
         "channel_sum",
@@ -54,7 +51,7 @@ READINGS = (
         "the well fills with the sum over bands; per band the scene would be 31 times over-exposed",
     ),
     Reading(
-        "photon_mean",
+        "reading.photon_mean",
         "C12",
         "photons ~ N(c1 mu, c2 sigma)",
         "additive",
@@ -62,7 +59,7 @@ READINGS = (
         "read to the letter the image vanishes at c1 = 0; as added noise, p + N(c1 p, c2 sqrt p), it does not",
     ),
     Reading(
-        "drawn_in",
+        "reading.drawn_in",
         "C13",
         "noise is drawn before the quantum efficiency",
         "electrons",
@@ -70,7 +67,7 @@ READINGS = (
         "detection is binomial, so electrons are Poisson; before it sigma is low by sqrt(0.56) = 0.748",
     ),
     Reading(
-        "offset_subtracted",
+        "reading.offset_subtracted",
         "C15",
         "a read noise with a mean of 390 e-",
         True,
@@ -78,16 +75,15 @@ READINGS = (
         "a mean is an offset, known from calibration and subtracted before restoration",
     ),
     Reading(
-        "gain",
+        "sensor.gain",
         "C17",
         "a gain of 0.37 without a unit",
         "0.37 e-/DN",
         "0.37 DN/e-",
         "25 500 e- / 0.37 = 68 919 DN fills 16 bit; 0.37 DN/e- never passes 9 435 DN",
-        "sensor",
     ),
     Reading(
-        "rounding",
+        "reading.rounding",
         "C18",
         "floor(x + U(-1/2, 1/2))",
         "nearest",
@@ -95,7 +91,7 @@ READINGS = (
         "the printed form is half a DN low and adds 1/6 DN^2 of variance",
     ),
     Reading(
-        "direction",
+        "reading.direction",
         "C20",
         "laser directions drawn with 3 sigma = 0.36 f / W",
         "width_over_focal_length",
@@ -103,7 +99,7 @@ READINGS = (
         "0.36 W / f = 0.0194 rad keeps the spot on the sensor; as printed, 6.7 rad puts it 0.73 m away and is refused",
     ),
     Reading(
-        "line",
+        "reading.line",
         "C22",
         "a 10 nm line sampled every 10 nm",
         "integrated",
@@ -114,7 +110,7 @@ READINGS = (
 
 
 def in_force(values: dict[str, object]) -> Iterable[tuple[Reading, str]]:
-    """Yield each reading with its state, from values by path: ``coherent``, ``as printed``, or another value."""
+    """Yield each reading in a recipe with its state: ``coherent``, ``as printed``, or another value."""
     for row in READINGS:
         if row.path in values:
             value = values[row.path]

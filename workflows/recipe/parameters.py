@@ -1,4 +1,4 @@
-"""Parameters of steps: the values of a recipe checked against the signature of the node."""
+"""Check of the parameters of steps against the signatures of their nodes."""
 
 from __future__ import annotations
 
@@ -20,20 +20,20 @@ from neusee.workflows.recipe.text.references import broken
 from neusee.workflows.recipe.text.renamed_keys import instead, new_name
 from neusee.workflows.recipe.text.yaml_values import Value, kind
 
-_LONGEST = 40  #: characters of a value that a message repeats
+_LONGEST = 40  #: most characters of a value in a message
 
 
 @dataclass(slots=True)
 class Checker:
-    """Check of the parameters of all steps, which collects diagnostics and notes."""
+    """Checker of the parameters of all steps, which collects diagnostics and notes."""
 
     diagnostics: list[Diagnostic]
     notes: dict[str, None] = field(default_factory=dict)
-    #: path of a value -> full path of its file or files
+    #: full path of a file, or of several files, by the path of the value in the recipe
     files: dict[tuple[str | int, ...], str | list[str]] = field(default_factory=dict)
 
     def read(self, node: Node, given: Value, step: Location) -> dict[str, Any] | None:
-        """Return the validated parameters with the node's defaults, or None if there are mistakes."""
+        """Return the validated parameters of a step with the defaults of its node, or None for a mistake."""
         if given.data is not None and not isinstance(given.data, dict):
             message = f"must be a mapping of parameters, not {kind(given)}"
             self.diagnostics.append(Diagnostic(given.mark, given.name, message))
@@ -66,18 +66,18 @@ class Checker:
             self.diagnostics.append(Diagnostic(step.key, step.name, str(error)))
 
     def _plain(self, node: Node, name: str, value: Value) -> Any:
-        """Return a plain value; the path of a file is relative to the folder of the YAML file that names the path."""
-        given = value.data if isinstance(value.data, list) else [value]
-        if name not in node.hints or not _is_file(node.hints[name]) or not all(isinstance(v.data, str) for v in given):
+        """Return a value as plain data; a path is relative to the folder of the YAML file that has the path."""
+        parts = value.data if isinstance(value.data, list) else [value]
+        if not _is_file(node.hints.get(name)) or not all(isinstance(part.data, str) for part in parts):
             return value.plain
-        paths = [os.path.normpath(Path(v.mark.folder) / Path(v.data).expanduser()) for v in given]
+        paths = [os.path.normpath(Path(part.mark.folder) / Path(part.data).expanduser()) for part in parts]
         full = [os.path.abspath(path) for path in paths]
         self.files[value.path] = full if isinstance(value.data, list) else full[0]
         return paths if isinstance(value.data, list) else paths[0]
 
 
 def _is_file(hint: Any) -> bool:
-    """Return True if an annotation contains `IsFile` at any depth."""
+    """Return True if an annotation contains `IsFile` at any depth, so that the parameter is a path."""
     extras = getattr(hint, "__metadata__", ())
     return any(isinstance(extra, IsFile) for extra in extras) or any(map(_is_file, get_args(hint)))
 
@@ -85,7 +85,7 @@ def _is_file(hint: Any) -> bool:
 def _problems(
     error: ValidationError, node: Node, values: Mapping[str, Value], given: Value, step: Location
 ) -> Iterator[Diagnostic]:
-    """Yield one diagnostic for each value that is wrong, unknown or missing."""
+    """Yield a diagnostic for each parameter that is wrong, unknown or missing."""
     details = error.errors(include_url=False)
     strangers = [str(e["loc"][0]) for e in details if e["type"] == "extra_forbidden"]
     meant = {nearest(name, node.params.model_fields) for name in strangers}
@@ -110,23 +110,20 @@ def _problems(
 
 
 def _deepest(value: Value, path: tuple[int | str, ...]) -> Value:
-    """Return the part of a value to which an error refers."""
-    for part in path:
-        by_name = {str(key): child for key, child in value.items.items()}
-        if str(part) not in by_name:
-            break
-        value = by_name[str(part)]
+    """Return the value at a path, or the last value on the way that exists."""
+    while path and (child := value.child(path[0])):
+        value, path = child, path[1:]
     return value
 
 
 def _said(value: Value) -> str:
-    """Return a value with its name, such as ``sensor.gain = -1``."""
+    """Return the name and the text of a value, such as ``sensor.gain = -1``."""
     text = str(value.plain)
     return f"{value.name} = {text if len(text) <= _LONGEST else text[: _LONGEST - 1] + '…'}"
 
 
 def _message(error: ErrorDetails) -> str:
-    """Return pydantic's message as one line that says what to write."""
+    """Return the message of pydantic in other words, which say what to write."""
     if error["type"] == "missing":
         return f"must have at least {int(error['loc'][-1]) + 1} values"
     text = error["msg"].removeprefix("Value error, ")
@@ -136,7 +133,8 @@ def _message(error: ErrorDetails) -> str:
     text = re.sub(r"^must be a (?=[aeiou])", "must be an ", text)
     text = text.replace("must be a tuple", "must be a list, such as [1, 2]").replace("a dictionary", "a mapping")
     text = text.replace("must be an integer, got a number with a fractional part", "must be a whole number")
-    text = re.sub(r"must be an? (integer|number), unable to parse .*", _number_wanted, text)
+    text = re.sub(r"must be an integer, unable to parse .*", "must be a whole number", text)
+    text = re.sub(r"must be a number, unable to parse .*", "must be a number", text)
     if error["type"] == "literal_error":
         options = re.findall(r"'([^']*)'", error.get("ctx", {}).get("expected", ""))
         hint = nearest(str(error["input"]), options)
@@ -145,10 +143,6 @@ def _message(error: ErrorDetails) -> str:
 
 
 def _in_si(error: ErrorDetails, value: Value) -> str:
-    """Return the SI value of a quantity that exceeds a limit given in SI."""
+    """Return the value in SI of a quantity beyond a limit, because the message gives the limit in SI."""
     limit = next((v for key, v in error.get("ctx", {}).items() if key in ("gt", "ge", "lt", "le")), 0)
     return f" in SI, not {error['input']:.4g}" if limit and isinstance(value.data, str) else ""
-
-
-def _number_wanted(match: re.Match[str]) -> str:
-    return "must be a whole number" if match[1] == "integer" else "must be a number"

@@ -1,14 +1,14 @@
-"""Declarations of steps in a recipe: the keys of each step, its node and its items."""
+"""Declarations of steps in a recipe: the node of each step, and the items for which the step is copied."""
 
 from __future__ import annotations
 
-import importlib
+import functools
+import importlib.util
 import itertools
-import os
 import pkgutil
 import re
 import sys
-from collections.abc import Iterator, Mapping
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 
 import neusee.nodes
@@ -26,13 +26,13 @@ _ITEM = re.compile(r"[^\[\],\s]+")
 
 @dataclass(frozen=True, slots=True)
 class Declared:
-    """A step before it is copied for its items."""
+    """Declaration of a step, from which one copy of the step is made for each item."""
 
     name: str
     value: Value
-    node: Node | None  #: None where the node does not exist; the wires are checked all the same
-    dims: tuple[str, ...]
-    items: tuple[tuple[str, ...], ...]  #: one empty tuple without ``each``; no tuple where ``each`` is wrong
+    node: Node | None  #: None where the node does not exist; the wires are checked even so
+    dims: tuple[str, ...]  #: lists of items that ``each`` names
+    items: tuple[tuple[str, ...], ...]  #: items of each copy; one empty tuple without ``each``
 
     def instance(self, items: tuple[str, ...]) -> str:
         return f"{self.name}[{','.join(items)}]" if items else self.name
@@ -42,7 +42,7 @@ class Declared:
         return tuple(map(self.instance, self.items))
 
     def part(self, key: str) -> Value:
-        """Return the value under ``from``, ``with`` or ``device``; an empty mapping if the key is absent."""
+        """Return the value of the step's key ``from``, ``with`` or ``device``, or an empty mapping without the key."""
         given = self.value.items.get(key)
         return Value({}, self.value.key, self.value.key, (*self.value.path, key)) if given is None else given
 
@@ -54,7 +54,7 @@ class Declared:
 def declare(
     root: Value, references: References, diagnostics: list[Diagnostic]
 ) -> tuple[dict[str, Declared], dict[str, Value]]:
-    """Return the steps that can be read, and those that are null."""
+    """Return the declared steps, and the steps that are null; report the mistakes in the declarations."""
     given = root.items.get("steps")
     if given is None or not isinstance(given.data, dict) or not given.data:
         mark = root.mark if given is None else given.mark
@@ -62,14 +62,13 @@ def declare(
         return {}, {}
     absent = {str(name): value for name, value in given.data.items() if value.data is None}
     steps = {}
-    nodes: dict[str, Node] = {}
-    for name, value in given.data.items():
-        if value.data is not None and _well_formed(str(name), value, diagnostics):
-            node, dims = _node(value, nodes, references, diagnostics), _dims(value, root, diagnostics)
+    find = functools.cache(find_node)
+    for name, value in ((str(name), value) for name, value in given.data.items() if value.data is not None):
+        steps[name] = Declared(name, value, None, (), ())
+        if _well_formed(name, value, diagnostics):
+            node, dims = _node(value, find, references, diagnostics), _dims(value, root, diagnostics)
             items = tuple(itertools.product(*(map(str, root.items[dim].items) for dim in dims or ())))
-            steps[str(name)] = Declared(str(name), value, node, dims or (), () if dims is None else items)
-        elif value.data is not None:
-            steps[str(name)] = Declared(str(name), value, None, (), ())
+            steps[name] = Declared(name, value, node, dims or (), () if dims is None else items)
     return steps, absent
 
 
@@ -86,8 +85,10 @@ def _well_formed(name: str, value: Value, diagnostics: list[Diagnostic]) -> bool
     return True
 
 
-def _node(step: Value, nodes: dict[str, Node], references: References, diagnostics: list[Diagnostic]) -> Node | None:
-    """Return the node that a step names; ``nodes`` are those found before."""
+def _node(
+    step: Value, find: Callable[[str], Node], references: References, diagnostics: list[Diagnostic]
+) -> Node | None:
+    """Return the node that a step names, or None for a mistake; ``find`` returns the node of a name."""
     given = step.items.get("node")
     if given is None:
         diagnostics.append(Diagnostic(step.key, step.name, "has no node: write `node: family.name`"))
@@ -96,24 +97,22 @@ def _node(step: Value, nodes: dict[str, Node], references: References, diagnosti
     if broken(given):
         return None
     try:
-        if str(given.data) not in nodes:
-            nodes[str(given.data)] = find_node(str(given.data))
-        return nodes[str(given.data)]
+        return find(str(given.plain))
     except LookupError as error:
         diagnostics.append(Diagnostic(given.mark, f"{step.name}.node", str(error.args[0])))
         return None
 
 
 def _dims(step: Value, root: Value, diagnostics: list[Diagnostic]) -> tuple[str, ...] | None:
-    """Return the item lists of ``each``: none, one or two; None if ``each`` has a mistake."""
+    """Return the names of at most two lists of items that ``each`` names, or None for a mistake."""
     given = step.items.get("each")
     if given is None or given.data is None:
         return ()
-    named = list(given.items.values()) if isinstance(given.data, list) else [given]
+    values = given.data if isinstance(given.data, list) else [given]
     lists = [key for key, block in root.items.items() if key != "steps" and _is_item_list(block)]
     dims: list[str] = []
     before = len(diagnostics)
-    for value in named:
+    for value in values:
         block = root.items.get(value.data) if isinstance(value.data, str) else None
         if block is None or value.data not in lists:
             hint = nearest(str(value.data), map(str, lists))
@@ -131,7 +130,7 @@ def _dims(step: Value, root: Value, diagnostics: list[Diagnostic]) -> tuple[str,
 
 
 def device_of(step: Declared, references: References, scope: Scope, diagnostics: list[Diagnostic]) -> str:
-    """Return the device that a copy of a step requests; empty for any device."""
+    """Return the device that a copy of a step requests, or an empty string for any device."""
     given = references.resolve(step.part("device"), scope)
     if broken(given) or given.data in ({}, None, "any"):
         return ""
@@ -147,7 +146,7 @@ def device_of(step: Declared, references: References, scope: Scope, diagnostics:
 
 
 def _is_item_list(block: Value) -> bool:
-    """Return True for a mapping of mappings, which may be empty."""
+    """Return True if a block is a list of items, which is a mapping of mappings."""
     return isinstance(block.data, dict) and all(isinstance(item.data, dict) for item in block.data.values())
 
 
@@ -155,58 +154,42 @@ def _is_item_list(block: Value) -> bool:
 
 
 def find_node(name: str) -> Node:
-    """Return the node of a name such as ``sensor.digitize``; raise `LookupError` with the nearest name."""
+    """Return the node with a name such as ``sensor.digitize``; raise `LookupError` with the most similar name."""
     family, _, attribute = name.partition(".")
     if now := instead(name):
         raise LookupError(f"{name} {now}")
-    if not _is_family(family):
+    module = f"{neusee.nodes.__name__}.{family}"
+    exists = family.isidentifier() and (module in sys.modules or importlib.util.find_spec(module) is not None)
+    nodes = nodes_of(family) if exists else {}
+    if not nodes:
         raise LookupError(f"no family {family}; {_elsewhere(attribute) or nearest(family, families())}")
-    nodes = nodes_of(family)
     if attribute not in nodes:
-        raise LookupError(f"no node {name}; {_elsewhere(attribute) or _in_family(family, attribute, nodes)}")
+        hint = nearest(attribute, nodes).replace("did you mean ", f"did you mean {family}.")
+        raise LookupError(f"no node {name}; {_elsewhere(attribute) or hint}")
     return nodes[attribute]
 
 
-def _is_family(name: str) -> bool:
-    """Return True if the family exists, by one look-up, because a list of all families reads folders."""
-    if f"{neusee.nodes.__name__}.{name}" not in sys.modules:
-        folders = neusee.nodes.__path__ if name.isidentifier() else []
-        if not any(os.path.isfile(os.path.join(folder, name, "__init__.py")) for folder in folders):
-            return False
-    return bool(nodes_of(name))
-
-
-def _in_family(family: str, attribute: str, nodes: Mapping[str, Node]) -> str:
-    hint = nearest(attribute, nodes)
-    return hint.replace("did you mean ", f"did you mean {family}.")
-
-
 def _elsewhere(attribute: str) -> str:
-    """Return a hint to the nodes of the same name in other families."""
-    found = [f"{family}.{attribute}" for family in families() if attribute in nodes_of(family)]
-    return f"did you mean {' or '.join(found)}?" if found else ""
+    """Return a hint with the nodes of the same name in other families."""
+    names = [f"{family}.{attribute}" for family in families() if attribute in nodes_of(family)]
+    return f"did you mean {' or '.join(names)}?" if names else ""
 
 
 def families() -> list[str]:
-    """Return the packages of nodes by name, without importing one, and the modules of nodes already imported."""
-    names = {info.name for info in pkgutil.iter_modules(neusee.nodes.__path__) if info.ispkg}
-    return sorted(names | {name for name in map(_inner, list(sys.modules)) if name and nodes_of(name)})
-
-
-def _inner(module: str) -> str:
-    """Return ``optics`` for ``neusee.nodes.optics``, and an empty string for other modules."""
-    inner = module.removeprefix(f"{neusee.nodes.__name__}.")
-    return inner if inner != module and re.fullmatch(r"[a-z]\w*", inner) else ""
+    """Return the names of the families of nodes; no family is imported."""
+    packages = {info.name for info in pkgutil.iter_modules(neusee.nodes.__path__) if info.ispkg}
+    loaded = (re.fullmatch(rf"{neusee.nodes.__name__}\.([a-z]\w*)", module) for module in list(sys.modules))
+    return sorted(packages | {match[1] for match in loaded if match and nodes_of(match[1])})
 
 
 def nodes_of(family: str) -> dict[str, Node]:
-    """Return the public nodes of a family by name."""
+    """Return the nodes of a family by name."""
     module = importlib.import_module(f"{neusee.nodes.__name__}.{family}")
     return {name: value for name, value in vars(module).items() if isinstance(value, Node)}
 
 
 def all_nodes() -> Iterator[tuple[str, Node]]:
-    """Yield every node with the name that a recipe uses."""
+    """Yield the name in recipes and the node, for all nodes of all families."""
     for family in families():
         for name, node in nodes_of(family).items():
             yield f"{family}.{name}", node

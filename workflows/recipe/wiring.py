@@ -1,11 +1,11 @@
-"""Wiring of a recipe: the steps that feed each step, item by item, and the check of their types."""
+"""Wiring of a recipe: the steps that feed each step, and a check of the types that steps return."""
 
 from __future__ import annotations
 
 import itertools
 import re
 import types
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Annotated, Any, Union, get_args, get_origin
 
@@ -18,52 +18,56 @@ from neusee.workflows.recipe.text.renamed_keys import became_input, new_name
 from neusee.workflows.recipe.text.yaml_values import Value, kind
 
 _NAMED = 12  #: steps of a cycle that a message names
+_LISTS = (list, tuple, Sequence)  #: annotations of an input that takes a list of steps
 _WIRE = re.compile(r"\s*([^\[\]\s]+)\s*(?:\[([^\[\]]*)\])?\s*")
 
 
 @dataclass(frozen=True, slots=True)
 class Wiring:
-    """Wires of all steps of a recipe."""
+    """The steps of a recipe, and the wires between them."""
 
     root: Value
     steps: Mapping[str, Declared]
-    absent: Mapping[str, Value]
+    absent: Mapping[str, Value]  #: steps that are null
     references: References
     diagnostics: list[Diagnostic]
 
     def wires(self, step: Declared, items: tuple[str, ...]) -> dict[str, Wire]:
-        """Return the wires of one copy of a step, in the order of the node's inputs."""
+        """Return the wires of one copy of a step by input, in the order of the node's inputs."""
         given = self.references.resolve(step.part("from"), step.scope(self.root, items))
-        if step.node is None:
+        values = self._by_input(step.node, given) if step.node else None
+        if step.node is None or values is None:
             return {}
-        named = self._by_input(step.node, given)
-        if named is None:
-            return {}
-        found: dict[str, Wire] = {}
+        wires: dict[str, Wire] = {}
         for name in step.node.inputs:
-            if name not in named:
-                found[name] = self._unwired(step, step.node, name, given)
-            elif named[name].data is not BROKEN:
-                found[name] = self._wire(step, step.node, items, name, named[name])
-        return found
+            if name not in values:
+                wires[name] = None
+                self._require(step, step.node, name, given)
+            elif values[name].data is not BROKEN:
+                wires[name] = self._wire(step, step.node, items, name, values[name])
+        return wires
 
     def outputs(self, value: Value, path: str) -> tuple[str, ...]:
-        """Return the steps named by an output or an expectation."""
+        """Return the names of the steps that an output or an expected number names."""
         return self._producers(value, path, {}) or ()
 
+    def refuse(self, value: Value, path: str, message: str) -> None:
+        """Add a diagnostic at the location of a value."""
+        self.diagnostics.append(Diagnostic(value.mark, path, message))
+
     def _by_input(self, node: Node, given: Value) -> dict[str, Value] | None:
-        """Return the values of ``from`` by input; a single name feeds the first input. None if ``from`` is wrong."""
+        """Return the values of ``from`` by input, or None for a mistake; a single name feeds the first input."""
         if given.data is BROKEN:
             return None
         if given.data is None:
             return {}
         if isinstance(given.data, list):
-            self._refuse(given, given.name, "must be a step's name, or a mapping of inputs to names, not a list")
+            self.refuse(given, given.name, "must be a step's name, or a mapping of inputs to names, not a list")
             return None
         if not isinstance(given.data, dict):
             if node.inputs:
                 return {node.inputs[0]: given}
-            self._refuse(given, given.name, f"{node.path} takes no inputs: leave `from` out")
+            self.refuse(given, given.name, f"{node.path} takes no inputs: leave `from` out")
             return None
         for name, value in given.data.items():
             if name not in node.inputs:
@@ -71,125 +75,108 @@ class Wiring:
                 self.diagnostics.append(Diagnostic(value.key, value.name, f"{node.path} has no input {name}; {hint}"))
         return {str(name): value for name, value in given.data.items()}
 
-    def _unwired(self, step: Declared, node: Node, name: str, given: Value) -> Wire:
-        """Return the wire of an input that ``from`` does not name, and report a required one."""
+    def _require(self, step: Declared, node: Node, name: str, given: Value) -> None:
+        """Report an input that ``from`` does not name, unless the input is optional."""
         if name in node.optional or (name == "stop" and became_input(node.path, map(str, step.part("with").items))):
-            return None  # the parameters of an old recipe are reported with the step that replaces them
+            return  # the parameters of an old recipe are reported with the step that replaces them
         if not (isinstance(given.data, dict) and _misspelt(name, node, given)):
             mark = given.mark if given.items else step.value.key
             fix = f"write from: {{{name}: STEP}}{self._makers(needs(node, name))}"
             self.diagnostics.append(Diagnostic(mark, given.name, f"{node.path} needs {name}: {fix}"))
-        return None
 
     def _wire(self, step: Declared, node: Node, items: tuple[str, ...], name: str, value: Value) -> Wire:
-        many = takes_many(node, name)
-        path = f"{step.value.name}.from.{name}"
-        if value.data is None:
-            return self._nothing(node, name, value, path, "null")
-        parsed = _parse(value)
-        if parsed and parsed[0] in self.absent:
-            null = self.absent[parsed[0]]
-            return self._nothing(node, name, value, path, f"{parsed[0]}, which is null ({null.mark})")
+        """Return the wire of an input from its value in ``from``, or None for a mistake."""
+        many, path, parsed = takes_many(node, name), f"{step.value.name}.from.{name}", _parse(value)
+        null = self.absent.get(parsed[0]) if parsed else None
+        if value.data is None or null:
+            if not many and name not in node.optional:
+                what = f"{parsed[0]}, which is null ({null.mark})" if parsed and null else "null"
+                self.refuse(value, path, f"{node.path} needs {name}, but it is wired to {what}")
+            return () if many else None
         here = dict(zip(step.dims, items, strict=True))
-        found = self._producers(value, path, here, self._makers(needs(node, name)))
-        if found is None or parsed is None:
+        names = self._producers(value, path, here, self._makers(needs(node, name)))
+        if names is None or parsed is None:
             return None
         producer = self.steps[parsed[0]]
         self._agree(node, name, producer, value, path)
-        single = set(producer.dims) <= set(here) or (parsed[1] is not None and len(parsed[1]) == len(producer.dims))
         if many:
-            return found
-        if single:
-            return found[0]
+            return names
+        if set(producer.dims) <= set(here) or (parsed[1] is not None and len(parsed[1]) == len(producer.dims)):
+            return names[0]
         left = ", ".join(dim for dim in producer.dims if dim not in here)
         example = f"{parsed[0]}[{producer.items[0][0]}]" if producer.items else f"{parsed[0]}[…]"
         message = f"{node.path} takes one step as {name}; {parsed[0]} is a step for each of {left}: write {example}"
-        self._refuse(value, path, message)
-        return None
-
-    def _nothing(self, node: Node, name: str, value: Value, path: str, what: str) -> Wire:
-        if takes_many(node, name):
-            return ()
-        if name not in node.optional:
-            self._refuse(value, path, f"{node.path} needs {name}, but it is wired to {what}")
+        self.refuse(value, path, message)
         return None
 
     def _producers(self, value: Value, path: str, here: Mapping[str, str], makers: str = "") -> tuple[str, ...] | None:
-        """Return the copies of a step that a wire names; ``here`` are the items of the reading step."""
+        """Return the copies of a step that a wire names; ``here`` are the items of the step that reads the wire."""
         parsed = _parse(value)
-        if parsed is None:
-            what = value.data if isinstance(value.data, str) else kind(value)
-            return self._refuse(value, path, f"must be a step's name such as psf or psf[mask], not {what}")
-        name, wanted = parsed
-        if name in self.absent:
-            return self._refuse(value, path, f"step {name} is null ({self.absent[name].mark})")
-        if name not in self.steps:
-            hint = nearest(name, self.steps)
-            hint = hint if hint.startswith("did you mean") else f"check the name{makers}"
-            now = new_name(f"steps.{name}")
-            told = f"step {name} is called {now.removeprefix('steps.')} now" if now else f"no step {name}; {hint}"
-            return self._refuse(value, path, told)
-        producer = self.steps[name]
-        fixed = {dim: item for dim, item in here.items() if dim in producer.dims}
-        if wanted is not None:
-            chosen = self._chosen(producer, wanted, value, path)
-            if chosen is None:
-                return None
-            fixed |= chosen
+        if parsed is None or parsed[0] not in self.steps:
+            self.refuse(value, path, self._unknown(value, makers))
+            return None
+        producer, items = self.steps[parsed[0]], parsed[1]
+        chosen = {} if items is None else self._chosen(producer, items, value, path)
+        if chosen is None:
+            return None
+        fixed = {**here, **chosen}
         choices = [[fixed[dim]] if dim in fixed else self._items(dim) for dim in producer.dims]
         return tuple(producer.instance(items) for items in itertools.product(*choices))
 
-    def _chosen(self, producer: Declared, wanted: Sequence[str], value: Value, path: str) -> dict[str, str] | None:
-        """Return the items in brackets by dimension: in order if all are given, else each in the list that has it."""
+    def _unknown(self, value: Value, makers: str) -> str:
+        """Return the message for a value that does not name a step."""
+        parsed = _parse(value)
+        if parsed is None:
+            what = value.data if isinstance(value.data, str) else kind(value)
+            return f"must be a step's name such as psf or psf[mask], not {what}"
+        name = parsed[0]
+        if name in self.absent:
+            return f"step {name} is null ({self.absent[name].mark})"
+        if now := new_name(f"steps.{name}"):
+            return f"step {name} is called {now.removeprefix('steps.')} now"
+        hint = nearest(name, self.steps)
+        return f"no step {name}; {hint if hint.startswith('did you mean') else f'check the name{makers}'}"
+
+    def _chosen(self, producer: Declared, items: Sequence[str], value: Value, path: str) -> dict[str, str] | None:
+        """Return the item in brackets for each list of items; a single item may belong to any of the lists."""
         if not producer.dims:
-            self._refuse(value, path, f"{producer.name} has no items: leave out the brackets")
+            self.refuse(value, path, f"{producer.name} has no items: leave out the brackets")
             return None
         left = list(producer.dims)
         chosen: dict[str, str] = {}
-        for item in wanted:
-            among = left[:1] if len(wanted) == len(producer.dims) else left
-            place = next((dim for dim in among if item in self._items(dim)), None)
-            if place is None:
+        for item in items:
+            among = left[:1] if len(items) == len(producer.dims) else left
+            dim = next((dim for dim in among if item in self._items(dim)), None)
+            if dim is None:
                 names = [name for dim in among for name in self._items(dim)]
-                self._refuse(value, path, f"{producer.name} has no item {item}; {nearest(item, names)}")
+                self.refuse(value, path, f"{producer.name} has no item {item}; {nearest(item, names)}")
                 return None
-            chosen[place] = item
-            left.remove(place)
+            chosen[dim] = item
+            left.remove(dim)
         return chosen
 
     def _items(self, dim: str) -> list[str]:
         return [str(name) for name in self.root.items[dim].items]
 
     def _agree(self, node: Node, name: str, producer: Declared, value: Value, path: str) -> None:
-        """Report a step that returns another type than the input needs."""
-        needed = needs(node, name)
-        if producer.node is None:
-            return
-        made = _kinds(producer.node.hints.get("return"))
-        if not made or not needed or any(issubclass(m, n) for m in made for n in needed):
-            return
-        message = f"{node.path} needs {_a(needed)}; {producer.name} returns {_a(made)}{self._makers(needed)}"
-        self._refuse(value, path, message)
+        """Report a step whose result has another type than the input needs."""
+        needed, returned = needs(node, name), _returned(producer)
+        if returned and needed and not _fits(returned, needed):
+            message = f"{node.path} needs {_a(needed)}; {producer.name} returns {_a(returned)}{self._makers(needed)}"
+            self.refuse(value, path, message)
 
     def _makers(self, needed: Sequence[type]) -> str:
-        """Return a hint with the steps of the needed type, where that type is specific."""
+        """Return a hint with the steps that return a type, or an empty hint for a tensor."""
         if not needed or all(n.__name__ == "Tensor" for n in needed):
             return ""
-        found = [
-            name
-            for step in self.steps.values()
-            if step.node and any(issubclass(m, n) for m in _kinds(step.node.hints.get("return")) for n in needed)
-            for name in step.instances
-        ]
-        return f"; steps returning {_a(needed)}: {', '.join(found[:6])}" if found else f"; no step returns {_a(needed)}"
-
-    def _refuse(self, value: Value, path: str, message: str) -> tuple[str, ...] | None:
-        self.diagnostics.append(Diagnostic(value.mark, path, message))
-        return None
+        makers = [name for s in self.steps.values() if _fits(_returned(s), needed) for name in s.instances]
+        if not makers:
+            return f"; no step returns {_a(needed)}"
+        return f"; steps returning {_a(needed)}: {', '.join(makers[:6])}"
 
 
 def _parse(value: Value) -> tuple[str, list[str] | None] | None:
-    """Return the step and the items of a wire such as ``spot[mask,green]``."""
+    """Return the step and the items that a wire such as ``spot[mask,green]`` names, or None for another value."""
     match = _WIRE.fullmatch(value.data) if isinstance(value.data, str) else None
     if match is None:
         return None
@@ -197,27 +184,32 @@ def _parse(value: Value) -> tuple[str, list[str] | None] | None:
 
 
 def _misspelt(name: str, node: Node, given: Value) -> bool:
-    """Return True if an input is given under a misspelt name, which is already reported."""
+    """Return True if ``from`` has an input under a misspelt name, which is reported elsewhere."""
     strangers = [str(key) for key in given.items if key not in node.inputs]
     return any(nearest(stranger, node.inputs) == f"did you mean {name}?" for stranger in strangers)
 
 
 def takes_many(node: Node, name: str) -> bool:
-    """Return True if an input takes a list of steps."""
-    return any(get_origin(hint) in (list, tuple, Sequence) for hint in _options(node.hints.get(name)))
+    """Return True if an input of a node takes a list of steps."""
+    return any(get_origin(hint) in _LISTS for hint in _options(node.hints.get(name)))
 
 
 def needs(node: Node, name: str) -> tuple[type, ...]:
-    """Return the classes that an input accepts; none if its annotation cannot be compared."""
-    found: list[type] = []
-    for hint in _options(node.hints.get(name)):
-        inner = get_args(hint)[0] if get_origin(hint) in (list, tuple, Sequence) else hint
-        found += _kinds(inner)
-    return tuple(found)
+    """Return the classes that an input of a node accepts; return none for an annotation without classes."""
+    hints = _options(node.hints.get(name))
+    return tuple(k for h in hints for k in _kinds(get_args(h)[0] if get_origin(h) in _LISTS else h))
+
+
+def _returned(step: Declared) -> list[type]:
+    return _kinds(step.node.hints.get("return")) if step.node else []
+
+
+def _fits(returned: Iterable[type], needed: Iterable[type]) -> bool:
+    return any(issubclass(r, n) for r, n in itertools.product(returned, needed))
 
 
 def _options(hint: Any) -> list[Any]:
-    """Return the members of a union, without None and without the extras of ``Annotated``."""
+    """Return the types in a union without None and ``Annotated``; another type is returned alone."""
     if get_origin(hint) is Annotated:
         return _options(get_args(hint)[0])
     if get_origin(hint) in (Union, types.UnionType):
@@ -237,7 +229,7 @@ def _a(kinds: Sequence[type]) -> str:
 
 
 def cycles(steps: Mapping[str, Step], marks: Mapping[str, Location]) -> Iterator[Diagnostic]:
-    """Yield one diagnostic for each cycle, with the lines of its steps."""
+    """Yield one diagnostic for each cycle of steps, with the lines of these steps."""
     seen: set[frozenset[str]] = set()
     for loop in _loops({name: [s for s in step.sources if s in steps] for name, step in steps.items()}):
         names = list(dict.fromkeys(name.partition("[")[0] for name in loop))
@@ -258,7 +250,7 @@ def _lines_of(marks: list[Location]) -> str:
 
 
 def _loops(sources: Mapping[str, list[str]]) -> Iterator[list[str]]:
-    """Yield each cycle that a walk from sink to source closes, in the direction of the data; without recursion."""
+    """Yield the names of the steps in each cycle, in the direction of the data."""
     done: set[str] = set()
     for root in sources:
         path: dict[str, Iterator[str]] = {} if root in done else {root: iter(sources[root])}

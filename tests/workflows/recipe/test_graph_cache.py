@@ -30,9 +30,9 @@ def forget(monkeypatch):
     """Read as a fresh process would."""
 
     def forget():
-        for name in ("_graphs", "_written"):
-            monkeypatch.setattr(graph_cache, name, {})
-        monkeypatch.setattr(composition, "_known", {})
+        monkeypatch.setattr(graph_cache, "_graphs", {})
+        loading._checked.cache_clear()
+        composition._merged.cache_clear()
 
     forget()
     return forget
@@ -127,4 +127,5 @@ def test_files_are_looked_at_every_time(read, write, forget):
 def test_little_is_remembered(read, forget):
     for pitch in range(1, 60):
         read(RECIPE.replace("pitch: 3 um", f"pitch: {pitch} um"), "sensor.gain=2")
-    assert max(len(graph_cache._graphs), len(graph_cache._written), len(composition._known)) <= 16
+    sizes = (cache.cache_info().currsize for cache in (loading._checked, composition._merged))
+    assert max(len(graph_cache._graphs), *sizes) <= 16

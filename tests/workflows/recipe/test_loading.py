@@ -66,6 +66,13 @@ def test_a_step_and_its_parameters_know_where_they_stand(read):
     assert "diameter" not in recipe.steps["pupil"].param_marks
 
 
+def test_a_step_whose_parameters_are_all_removed_is_written_with_its_defaults(read):
+    given = swap("height: {node: toy.height}", "height: {node: toy.height, with: {samples: 8}}")
+    text = read(given, "~steps.height.with.samples").config.to_yaml()
+    assert "    with:\n      # samples: 4 " in text
+    assert read(text).steps["height"].params == {"samples": 4}
+
+
 def test_final_values_have_their_sources(read):
     config = read(CAMERA, "sensor.gain=3", "optics.window.0=16", "steps.raw.with.bits=8", "~sensor.bits").config
     assert (config["sensor.gain"].value, config["sensor.gain"].source) == (3, "argument 1")

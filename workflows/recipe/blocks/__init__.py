@@ -1,6 +1,6 @@
-"""What may the blocks `train`, `train.mask` and `train_lift` say?
+"""Which settings do the blocks `train`, `train.mask` and `train_lift` of a recipe have?
 
-The settings of training and of the design of a mask, read and checked where they stand.
+The settings of training and of the design of a mask, which are read and checked with their locations.
 Nothing here trains.
 Offers: `train_block.Training`, `train_lift_block.LiftTraining`, `mask_design_block.MaskTraining`.
 """

@@ -1,4 +1,4 @@
-"""Mask design block: the settings of the training stage that needs no images."""
+"""Settings of the mask design, which trains a mask without images."""
 
 from __future__ import annotations
 
@@ -6,13 +6,14 @@ import math
 from pathlib import Path
 from typing import Annotated, Any, Literal, Self
 
-from pydantic import BaseModel, ConfigDict, Field, model_validator
+from pydantic import Field, model_validator
 
 from neusee.nodes.doe import Material
 from neusee.nodes.losses import ContrastFloor, HighestFrequency, NoiseVariance, OneBandShare
 from neusee.nodes.units import Count, DataFile, PositiveLength, Wavelength
+from neusee.workflows.graph.diagnostics import nearest
+from neusee.workflows.recipe.blocks.settings_block import SettingsBlock, Weight
 
-Weight = Annotated[float, Field(ge=0, allow_inf_nan=False)]
 Kind = Literal["pixelwise", "recipe_mask", "zernike", "rings", "unet", "five_half_rings"]
 _RATE = {"pixelwise": 0.05, "recipe_mask": 4e-3, "zernike": 0.1, "rings": 0.1, "unet": 2e-3, "five_half_rings": 1.0}
 
@@ -22,10 +23,8 @@ def half_cosine(angle: float) -> float:
     return 0.5 * (1 + math.cos(angle))
 
 
-class Weights(BaseModel):
-    """Weight of each term of the loss; every term is a mean over the bands."""
-
-    model_config = ConfigDict(extra="forbid", frozen=True)
+class Weights(SettingsBlock):
+    """Weights of the terms of the loss; each term is a mean over the bands."""
 
     lsr: Weight = 1.0  #: `losses.suppression_loss`
     bsr: Weight = 1.0  #: `losses.background_loss` of a point on the axis: the light that left the field
@@ -39,10 +38,8 @@ class Weights(BaseModel):
         return self
 
 
-class MaskSettings(BaseModel):
-    """Settings of the mask design, ``train.mask`` of a recipe: kind of mask, loss and duration."""
-
-    model_config = ConfigDict(extra="forbid", frozen=True)
+class MaskSettings(SettingsBlock):
+    """Settings of the mask design, which are ``train.mask`` in a recipe: kind of mask, loss and duration."""
 
     kind: Kind = "pixelwise"  #: `recipe_mask`: all samples of the recipe's own height map, from its formula or file
     iterations: Count = 300  #: of Adam; for five_half_rings generations
@@ -59,7 +56,7 @@ class MaskSettings(BaseModel):
     bands: Count | None = 7  #: number of the recipe's bands in one iteration; None: all
     seed: int = 0
     starts: Count = 1  #: independent starts, of which the best on all bands is kept
-    at: dict[str, Any] = {}  #: recipe values that differ during training, such as a coarser pupil
+    at: dict[str, Any] = Field(default={})  #: recipe values that differ during training, such as a coarser pupil
     save_every: Count = 50  #: iterations
 
     # parameters of the kinds
@@ -92,31 +89,29 @@ class MaskSettings(BaseModel):
 
     @property
     def rate(self) -> float:
-        """Return the learning rate, or the kind's own: logits 0.05, near a formula 4e-3, waves 0.1, weights 2e-3."""
+        """Return the learning rate that the recipe sets, or the default of the kind of mask."""
         return _RATE[self.kind] if self.learning_rate is None else self.learning_rate
 
 
 class MaskTraining(MaskSettings):
-    """Settings of the mask design with the names of its steps."""
+    """Settings of the mask design, with the names of the steps that it uses."""
 
-    height: str = "height"  #: the step that is replaced
+    height: str = "height"  #: the step whose height map is designed
     psf: str = "psf[mask]"
 
 
 class DesignError(ValueError):
-    """Error for a mask that cannot be designed as requested; names the setting and the change."""
+    """Error for settings with which no mask can be designed; the text names the setting and the fix."""
 
 
-def need_steps(recipe_steps: Any, how: MaskTraining) -> None:
-    """Raise `DesignError` for a step that the recipe does not have, with the setting that names the step."""
-    from neusee.workflows.graph.diagnostics import nearest
-
-    asked = ["height", "psf", "plain", *(["illuminant", "responses"] if how.weights.wiener else [])]
-    for setting, name in ((setting, getattr(how, setting)) for setting in asked):
+def need_steps(recipe_steps: Any, settings: MaskTraining) -> None:
+    """Raise `DesignError` where a setting names a step that the recipe does not have."""
+    for setting in ("height", "psf", "plain", *(("illuminant", "responses") if settings.weights.wiener else ())):
+        name = getattr(settings, setting)
         if name not in recipe_steps:
             raise DesignError(f"{setting}: the recipe has no step {name!r}; {nearest(name, recipe_steps)}")
 
 
 def state_file(out: Path, recipe: str, key: str) -> Path:
-    """Return the file of an unfinished design; its suffix differs from those that a run sweeps away."""
+    """Return the file that keeps the state of an unfinished design; no run removes a file with this suffix."""
     return out / f".{recipe}_mask_{key[:16]}.state"

@@ -1,4 +1,4 @@
-"""Training block of a recipe: the settings under ``train``, read and checked with their locations."""
+"""Settings of the training of a network and a mask, which are the block ``train`` of a recipe."""
 
 from __future__ import annotations
 
@@ -6,28 +6,19 @@ from pathlib import Path
 from typing import Annotated, Any, Literal
 
 import torch
-from pydantic import BaseModel, ConfigDict, Field, ValidationError, model_validator
+from pydantic import Field, model_validator
 
-from neusee.workflows.graph.diagnostics import Diagnostic, Location, nearest
-from neusee.workflows.recipe.blocks.mask_design_block import MaskSettings, MaskTraining, Weights
+from neusee.workflows.graph.diagnostics import Diagnostic
+from neusee.workflows.recipe.blocks.mask_design_block import MaskSettings, MaskTraining
+from neusee.workflows.recipe.blocks.settings_block import Beta, Number, SettingsBlock, Share, Weight, read_block
 from neusee.workflows.recipe.text.composition import Composed
-from neusee.workflows.recipe.text.renamed_keys import instead
 from neusee.workflows.recipe.text.yaml_values import Value
 
 KEY = "train"  #: key of the block in a recipe
 
-Weight = Annotated[float, Field(ge=0, allow_inf_nan=False)]
-Share = Annotated[float, Field(ge=0, le=1)]
-Beta = Annotated[float, Field(ge=0, lt=1)]
-Number = Annotated[int, Field(ge=1)]
 
-
-class _Block(BaseModel):
-    model_config = ConfigDict(extra="forbid", frozen=True)
-
-
-class Network(_Block):
-    """Restoration network: its kind, width and options."""
+class Network(SettingsBlock):
+    """Settings of the restoration network: its kind, width and options."""
 
     kind: Literal["fft_mamba", "unet", "nafnet"] = "fft_mamba"
     width: Annotated[int, Field(ge=2)] = 64
@@ -38,7 +29,7 @@ class Network(_Block):
 
     @property
     def options(self) -> dict[str, Any]:
-        """Return the options that differ from their defaults, without kind and width."""
+        """Return the options of the network that differ from their defaults, without its kind and width."""
         return self.model_dump(exclude={"kind", "width"}, exclude_defaults=True)
 
     @model_validator(mode="after")
@@ -48,15 +39,15 @@ class Network(_Block):
         return self
 
 
-class Critics(_Block):
-    """Width and momenta of the two critics."""
+class Critics(SettingsBlock):
+    """Settings of the two critics: their width and the momenta of their optimiser."""
 
     width: Annotated[int, Field(ge=2)] = 64
     betas: tuple[Beta, Beta] = (0.0, 0.9)
 
 
-class Rates(_Block):
-    """Learning rates and their decay: halved once, then multiplied by a factor at intervals, down to a minimum."""
+class Rates(SettingsBlock):
+    """Learning rates, which are halved once and then multiplied by a factor at intervals, down to a minimum."""
 
     weights: Annotated[float, Field(gt=0)] = 2e-4
     biases: Annotated[float, Field(gt=0)] = 4e-4
@@ -67,14 +58,14 @@ class Rates(_Block):
     least: Weight = 1e-6
 
     def share(self, iteration: int) -> float:
-        """Return the factor on the learning rate at an iteration of a stage, counted from 0."""
+        """Return the factor on the learning rates at an iteration of a stage; iterations count from 0."""
         if iteration < self.halve:
             return 1.0
         return float(0.5 * self.factor ** ((iteration - self.halve) // self.every))
 
 
-class Stage(_Block):
-    """Duration, batch size and loss weights of a stage; a weight of 0 leaves a term out."""
+class Stage(SettingsBlock):
+    """Settings of a training stage: its duration, batch size and loss weights; a weight of 0 omits a term."""
 
     iterations: Annotated[int, Field(ge=0)]
     batch: Number = 8
@@ -85,8 +76,8 @@ class Stage(_Block):
     reconstruction: Weight = 1.0
 
 
-class Training(_Block):
-    """Settings of a recipe's ``train`` block."""
+class Training(SettingsBlock):
+    """Settings of the training of a network and a mask."""
 
     photographs: Path | None = None
     learn: str | None = "height"  #: None: the recipe's own mask stays fixed, and stage 1 is skipped
@@ -115,77 +106,38 @@ class Training(_Block):
 
     @property
     def learnt(self) -> tuple[int, ...]:
-        """Return the numbers of the stages to train."""
+        """Return the numbers of the stages that are trained."""
         return tuple(sorted(n for n in self.stages if self.learn or n != 1))
 
     @property
     def design(self) -> MaskTraining:
-        """Return the settings of the mask design without images, on the steps that the stages train on."""
+        """Return the settings of the mask design, with the steps that the stages of training use."""
         return MaskTraining.model_construct(**dict(self.mask), height=self.learn, psf=self.psf)
 
     @property
     def dtype(self) -> torch.dtype:
-        """Return the dtype of parameters and scenes; bfloat16 applies only inside the network."""
+        """Return the dtype of parameters and scenes; bfloat16 is used only inside the network."""
         return torch.float64 if self.precision == "float64" else torch.float32
 
 
 def read_training(composed: Composed) -> tuple[Composed, Training | None]:
-    """Return the recipe without its ``train`` block, and the block; mistakes become diagnostics of the recipe."""
+    """Return the recipe without its block ``train``, and the settings; mistakes become diagnostics of the recipe."""
     block = composed.root.items.get(KEY)
     if block is None:
         return composed, None
-    composed = composed.without(KEY)
-    try:
-        found = Training.model_validate(_placed(block))
-    except ValidationError as error:
-        return composed.with_problems(_problem(block, each) for each in error.errors()), None
-    return _with_folder(composed, block, found)
+    composed, training = read_block(composed, KEY, Training, _plain(block))
+    if training is None or training.photographs is None or training.photographs.is_dir():
+        return composed, training
+    value = block.items["photographs"]
+    problem = Diagnostic(value.mark, value.name, f"{training.photographs} is not a folder")
+    return composed.with_problems([problem]), None
 
 
-def _placed(block: Value) -> Any:
-    """Return the block with the path of a start height map relative to the file that names the path."""
-    plain, mask = block.plain, block.items.get("mask")
-    start = mask.items.get("start") if mask else None
-    if start is None or not isinstance(start.plain, str):
-        return plain
-    path = Path(start.mark.folder) / Path(start.plain).expanduser()
-    return {**plain, "mask": {**plain["mask"], "start": path}}
-
-
-def _with_folder(composed: Composed, block: Value, found: Training) -> tuple[Composed, Training | None]:
-    """Return the block with its folder of photographs relative to the file that names the folder."""
-    if found.photographs is None:
-        return composed, found
-    mark = block.items["photographs"].mark
-    path = Path(mark.folder) / found.photographs.expanduser()
-    if not path.is_dir():
-        problem = Diagnostic(mark, f"{KEY}.photographs", f"{path} is not a folder")
-        return composed.with_problems([problem]), None
-    return composed, found.model_copy(update={"photographs": path})
-
-
-def _problem(block: Value, error: Any) -> Diagnostic:
-    """Return a diagnostic at the innermost location that pydantic names, with the fix."""
-    at, path = block, [KEY]
-    for key in error["loc"]:
-        below = {str(k): v for k, v in at.items.items()}
-        if str(key) in below:
-            at = below[str(key)]
-            path.append(str(key))
-    mark: Location = at.key if error["type"] == "extra_forbidden" else at.mark
-    text = str(error["msg"])
-    if error["type"] == "extra_forbidden":
-        unknown = f"unknown; {nearest(path[-1], _fields(error['loc'][:-1]))}"
-        text = instead(".".join(path)) or unknown
-    elif now := instead(f"{'.'.join(path)}={error['input']}"):
-        text = f"{error['input']} {now}"
-    elif error["type"] == "missing":
-        text = f"needs {error['loc'][-1]}"
-    return Diagnostic(mark, ".".join(path), text)
-
-
-def _fields(where: tuple[int | str, ...]) -> list[str]:
-    blocks: dict[str, type[BaseModel]] = {"network": Network, "critics": Critics, "rates": Rates, "stages": Stage,
-                                          "mask": MaskSettings, "mask.weights": Weights}  # fmt: skip
-    name = ".".join(map(str, where if where[:1] == ("mask",) else where[:1]))
-    return list((blocks[name] if where else Training).model_fields)
+def _plain(block: Value) -> Any:
+    """Return the block as plain data; a path is relative to the folder of the YAML file that has the path."""
+    plain = block.plain
+    for outer, key in ((block, "photographs"), (block.items.get("mask"), "start")):
+        value = outer.items.get(key) if outer else None
+        if value is not None and isinstance(value.data, str):
+            (plain if outer is block else plain["mask"])[key] = Path(value.mark.folder) / Path(value.data).expanduser()
+    return plain

@@ -1,6 +1,6 @@
-"""Which values are distributions, and what is a draw of them?
+"""Which values of a recipe are probability distributions, and how are they drawn?
 
-Scalar and joint distributions in the place of values, and the steps that read what is drawn.
+Distributions of one or several values, written in place of the values, and the parameters that read drawn values.
 Nothing here runs a recipe at a draw, or infers a distribution from data.
 Offers: `nominal_values.settle`, `nominal_values.Uncertain`, `scalar.Law`, `joint.Joint`, `uncertain_inputs.Inputs`.
 """

@@ -1,4 +1,4 @@
-"""Joint distributions of several values: draws, or a mean with a covariance, and the files that contain them."""
+"""Joint distributions of several values, given by draws or by a mean and a covariance, and the files of posteriors."""
 
 from __future__ import annotations
 
@@ -8,25 +8,21 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from glob import glob
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 from zipfile import BadZipFile
 
 import numpy as np
 
 from neusee.nodes.units import read_any, read_written
+from neusee.workflows.recipe.distributions.scalar import FloatArray
 from neusee.workflows.recipe.text.renamed_keys import POSTERIOR_NAMES
-
-if TYPE_CHECKING:
-    from numpy.typing import NDArray
-
-    FloatArray = NDArray[np.float64]
 
 GAIN_UNIT = "DN/e-"  #: of K, EMVA 1288
 BARE_GAIN = (
-    "head its draws 'gain [DN/e-]' or 'gain [e-/DN]', or write its mean and sd with DN/e-; "
+    "name its draws 'gain [DN/e-]' or 'gain [e-/DN]', or write its mean and sd with DN/e-; "
     "the folder of `neusee calibrate` contains the unit"
 )
-Z_90 = 1.6448536269514722  #: standard deviations on either side that contain 90 % of a normal distribution
+Z_90 = 1.6448536269514722  #: standard deviations around the mean that contain 90 % of a normal distribution
 _LEAST = 30  #: smallest number of draws from which a distribution is estimated
 _HEAD = re.compile(r"\s*(.*?)\s*\[([^\[\]]*)\]\s*")  #: ``gain [DN/e-]``
 _JITTER = 1e-10  #: added to the diagonal of a correlation so that its Cholesky factor exists
@@ -35,11 +31,10 @@ _FILES = "the folder of `neusee calibrate`, its posterior.json, draws in .npz or
 
 @dataclass(frozen=True)
 class Joint:
-    """A joint distribution of values as a function of independent standard normal numbers.
+    """Joint distribution of several values, computed from independent standard normal numbers.
 
-    The first number moves the first value and the values correlated with it, the second number moves the rest of the
-    second value, and so on: the Cholesky factor of the correlation. Values given by draws keep their own marginal
-    distributions, and their correlation is that of their normal scores (a Gaussian copula).
+    The Cholesky factor of the correlation maps the numbers to the values. Values that draws describe keep the marginal
+    distributions of the draws, and the correlation of their normal scores (a Gaussian copula).
     """
 
     names: tuple[str, ...]
@@ -62,7 +57,7 @@ class Joint:
 
     @classmethod
     def of_normal(cls, names: Sequence[str], mean: FloatArray, sd: FloatArray, correlation: FloatArray) -> Joint:
-        """Return a normal joint distribution; raise ValueError for an invalid correlation or standard deviation."""
+        """Return a joint normal distribution; raise ValueError for an invalid correlation or standard deviation."""
         count = len(names)
         if correlation.shape != (count, count) or not np.allclose(correlation, correlation.T):
             raise ValueError(f"the correlation must be a symmetric matrix of {count} x {count}")
@@ -73,7 +68,7 @@ class Joint:
         return cls(tuple(names), mean, sd, _factor(correlation))
 
     def at(self, z: FloatArray) -> FloatArray:
-        """Return (…, name) values at (…, name) standard normal numbers."""
+        """Return the values (…, name) at standard normal numbers (…, name)."""
         score = z @ self.factor.T
         if self.draws is None:
             return np.asarray(self.mean + self.sd * score, np.float64)
@@ -84,12 +79,12 @@ class Joint:
         return np.stack(columns, -1)
 
     def numbers(self) -> FloatArray:
-        """Return (draw, name) standard normal numbers that reproduce the draws."""
+        """Return the standard normal numbers (draw, name) at which `at` reproduces the draws."""
         assert self.draws is not None
         return np.asarray(np.linalg.solve(self.factor, _scores(self.draws).T).T, np.float64)
 
     def below(self, name: str, value: float) -> float:
-        """Return the probability that ``name`` lies below ``value``."""
+        """Return the probability that the value of a name is less than ``value``."""
         i = self.names.index(name)
         if self.draws is not None:
             return float((self.draws[:, i] < value).mean())
@@ -98,7 +93,7 @@ class Joint:
         return float(ndtr((value - self.mean[i]) / self.sd[i]))
 
     def interval(self, name: str) -> tuple[float, float]:
-        """Return the 5 % and the 95 % quantile."""
+        """Return the 5 % and the 95 % quantile of the value of a name."""
         i = self.names.index(name)
         if self.draws is not None:
             low, high = np.quantile(self.draws[:, i], [0.05, 0.95])
@@ -106,7 +101,7 @@ class Joint:
         return float(self.mean[i] - Z_90 * self.sd[i]), float(self.mean[i] + Z_90 * self.sd[i])
 
     def only(self, names: Sequence[str]) -> Joint:
-        """Return the joint distribution of some of the values; the other values are marginalised."""
+        """Return the joint distribution of some of the values, marginalised over all other values."""
         at = [self.names.index(name) for name in names]
         if self.draws is not None:
             return Joint.of_draws(names, self.draws[:, at])
@@ -116,7 +111,7 @@ class Joint:
 
 
 def _scores(draws: FloatArray) -> FloatArray:
-    """Return (draw, name) normal scores of the ranks; equal draws share one rank."""
+    """Return the normal scores (draw, name) of the ranks of draws; equal draws have the same rank."""
     from scipy.special import ndtri
     from scipy.stats import rankdata
 
@@ -129,19 +124,15 @@ def _factor(correlation: FloatArray) -> FloatArray:
 
 @dataclass(frozen=True)
 class Posterior:
-    """A joint distribution with the remarks of its file."""
+    """Joint distribution from a file, with the kinds and the units of its values in that file."""
 
     joint: Joint
     kinds: Mapping[str, str] = field(default_factory=dict)  #: of `neusee calibrate`: estimate, upper, lower, none
     units: Mapping[str, str] = field(default_factory=dict)  #: in words, as far as the file gives them
 
-    def kind(self, name: str) -> str:
-        """Return how a value is constrained; a value from another source is an estimate."""
-        return self.kinds.get(name, "estimate")
-
 
 def read_posterior(path: Path) -> Posterior:
-    """Read a posterior, the newest file for a pattern; raise ValueError with the fault of the file."""
+    """Return the posterior in a file, or in the newest file of a pattern; raise ValueError for an invalid file."""
     if any(sign in str(path) for sign in "*?["):
         path = max(map(Path, glob(str(path))), key=lambda each: (each.stat().st_mtime, each), default=path)
     if path.is_dir():
@@ -161,7 +152,7 @@ def read_posterior(path: Path) -> Posterior:
 
 
 def _document(path: Path) -> Posterior:
-    """Read the file of `neusee calibrate`, or a summary by mean and standard deviation."""
+    """Return the posterior of a file that `neusee calibrate` wrote, or of a summary by mean and standard deviation."""
     from ruamel.yaml import YAML
     from ruamel.yaml.error import YAMLError
 
@@ -172,51 +163,42 @@ def _document(path: Path) -> Posterior:
     if not isinstance(doc, dict):
         raise ValueError(f"{path.name} must contain a mapping")
     if "parameters" not in doc:
-        return summarised(doc)
+        return summary(doc)
     if doc.get("failed"):
-        wrong = [check["name"] for check in doc.get("checks", ()) if check["mark"] == "fail"]
-        raise ValueError(f"the calibration cannot be used: {doc['failed']} checks fail ({'; '.join(wrong)})")
+        failed = [check["name"] for check in doc.get("checks", ()) if check["mark"] == "fail"]
+        raise ValueError(f"the calibration cannot be used: {doc['failed']} checks fail ({'; '.join(failed)})")
     joint = read_posterior(path.with_name("draws.npz")).joint
     assert joint.draws is not None
-    rows = {_renamed(name): row for name, row in doc["parameters"].items()}
-    columns = {_renamed(name): x for name, x in zip(joint.names, joint.draws.T, strict=True)}
-    found = _drawn(columns, {name: str(row["unit"]) for name, row in rows.items()})
-    return replace(found, kinds={name: str(row["kind"]) for name, row in rows.items()})
-
-
-def _renamed(name: str) -> str:
-    """Return the present name of a parameter of a calibration by neusee 0.1."""
-    return POSTERIOR_NAMES.get(name, name)
+    rows = {POSTERIOR_NAMES.get(name, name): row for name, row in doc["parameters"].items()}
+    columns = {POSTERIOR_NAMES.get(name, name): x for name, x in zip(joint.names, joint.draws.T, strict=True)}
+    posterior = _drawn(columns, {name: str(row["unit"]) for name, row in rows.items()})
+    return replace(posterior, kinds={name: str(row["kind"]) for name, row in rows.items()})
 
 
 def _headed(columns: Mapping[str, FloatArray]) -> tuple[dict[str, FloatArray], dict[str, str]]:
-    """Return draws by name, and the units that headings contain: ``gain [DN/e-]``."""
+    """Return the draws by name, and the units in headings such as ``gain [DN/e-]``."""
     heads = {head: _HEAD.fullmatch(head) for head in columns}
-    found = {m[1] if m else head: columns[head] for head, m in heads.items()}
-    return found, {m[1]: m[2].strip() for m in heads.values() if m}
+    named = {m[1] if m else head: columns[head] for head, m in heads.items()}
+    return named, {m[1]: m[2].strip() for m in heads.values() if m}
 
 
 def _drawn(columns: Mapping[str, FloatArray], units: Mapping[str, str]) -> Posterior:
-    """Return the distribution of draws; draws in e-/DN become draws of K."""
+    """Return the posterior that draws describe; draws of a gain in e-/DN become draws in DN/e-."""
     with np.errstate(divide="ignore"):
-        si = {name: 1.0 / x if units.get(name) == "e-/DN" else x for name, x in columns.items()}
-    said = {name: GAIN_UNIT if unit == "e-/DN" else unit for name, unit in units.items()}
-    return Posterior(_of_columns(si), units=said)
-
-
-def _of_columns(columns: Mapping[str, FloatArray]) -> Joint:
-    lengths = {len(x) for x in columns.values()}
+        draws = [1.0 / x if units.get(name) == "e-/DN" else x for name, x in columns.items()]
+    lengths = {len(x) for x in draws}
     if len(lengths) != 1:
         raise ValueError("the values have different numbers of draws" if lengths else "the file contains no draws")
-    return Joint.of_draws(tuple(columns), np.stack(list(columns.values()), 1))
+    joint = Joint.of_draws(tuple(columns), np.stack(draws, 1))
+    return Posterior(joint, units={name: GAIN_UNIT if unit == "e-/DN" else unit for name, unit in units.items()})
 
 
 def _arrays(path: Path) -> dict[str, FloatArray]:
     with path.open("rb") as file:
         if file.read(2) != b"PK":
             raise ValueError(f"{path.name} cannot be read: the file is not in .npz format")
-    with np.load(path) as found:
-        return {name: np.asarray(found[name], np.float64).reshape(-1) for name in found}
+    with np.load(path) as arrays:
+        return {name: np.asarray(arrays[name], np.float64).reshape(-1) for name in arrays}
 
 
 def _columns(path: Path) -> dict[str, FloatArray]:
@@ -231,14 +213,13 @@ def _columns(path: Path) -> dict[str, FloatArray]:
     return {name.strip(): numbers[:, i] for i, name in enumerate(header)}
 
 
-def summarised(given: Mapping[str, Any]) -> Posterior:
-    """Return the distribution that `summary` reads, with the units of its means."""
-    joint = summary(given)
+def summary(given: Mapping[str, Any]) -> Posterior:
+    """Return the normal posterior of a summary, which is a mean with sd or with covariance, in SI or with units."""
+    joint = _normal(given)
     return Posterior(joint, units={str(name): read_any(x)[1] for name, x in given["mean"].items()})
 
 
-def summary(given: Mapping[str, Any]) -> Joint:
-    """Return the joint distribution of a summary, in SI or with units: mean with sd or with covariance."""
+def _normal(given: Mapping[str, Any]) -> Joint:
     if strange := sorted(set(given) - {"mean", "sd", "correlation", "covariance"}):
         raise ValueError(f"{strange[0]} is unknown: give mean with sd and perhaps correlation, or mean with covariance")
     if not isinstance(given.get("mean"), dict) or ("sd" in given) == ("covariance" in given):
@@ -261,7 +242,7 @@ def summary(given: Mapping[str, Any]) -> Joint:
 def _si(text: Any) -> float:
     number, _, reciprocal = read_written(text)
     if reciprocal:
-        raise ValueError(f"{text}: the mean and sd of a gain are those of K; write both in DN/e-")
+        raise ValueError(f"{text}: write the mean and the sd of a gain in DN/e-, the unit of K")
     return number
 
 

@@ -1,25 +1,18 @@
-"""Nominal values of a recipe's uncertain inputs: distributions in place of values, and a ``posterior`` over several.
+"""Nominal values of uncertain inputs: the values that a run uses in place of distributions and of a ``posterior``.
 
-A run uses the median of a distribution, and the value that ``posterior`` chooses; the study of uncertainty draws both.
+A run uses the median of a distribution and the value that ``posterior`` chooses; the study of uncertainty draws values.
 """
 
 from __future__ import annotations
 
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
 from neusee.nodes.units import read_any
 from neusee.workflows.graph.diagnostics import Diagnostic, Location, nearest
-from neusee.workflows.recipe.distributions.joint import (
-    BARE_GAIN,
-    GAIN_UNIT,
-    Joint,
-    Posterior,
-    read_posterior,
-    summarised,
-)
+from neusee.workflows.recipe.distributions.joint import BARE_GAIN, GAIN_UNIT, Joint, Posterior, read_posterior, summary
 from neusee.workflows.recipe.distributions.scalar import Law, is_law, read_law, written
 from neusee.workflows.recipe.text.composition import Composed
 from neusee.workflows.recipe.text.references import BROKEN
@@ -28,14 +21,14 @@ from neusee.workflows.recipe.text.yaml_values import Value, Where, dotted
 
 KEY = "posterior"  #: key of the block in a recipe
 _BLOCK = "sensor"  #: block of the values that a calibration names without a block
-_SAID = ("file", "use", "values")
+_KEYS = ("file", "use", "values")
 _SUMMARY = ("mean", "sd", "correlation", "covariance")
-_FAR = 0.005  #: tail probability of a posterior beyond which a recipe's own value counts as far off
+_FAR = 0.005  #: tail probability of a posterior in which a recipe's own value counts as far off
 
 
 @dataclass(frozen=True)
 class Standing:
-    """A value of the recipe compared with its posterior."""
+    """Comparison of a value of the recipe with its posterior."""
 
     path: str
     own: str  #: the recipe's own value
@@ -57,9 +50,9 @@ class Standing:
 
 @dataclass(frozen=True)
 class Uncertain:
-    """The uncertain inputs of a recipe, and the recipe itself."""
+    """The uncertain values of a recipe, with their distributions."""
 
-    composed: Composed  #: with a value in place of every distribution
+    composed: Composed  #: the recipe with a value in place of every distribution
     laws: Mapping[str, Law]  #: by path
     joint: Joint | None  #: its names are paths
     standings: tuple[Standing, ...] = ()
@@ -73,11 +66,11 @@ class Uncertain:
         return (*self.laws, *(self.joint.names if self.joint else ()))
 
     def said(self, name: str) -> str:
-        """Return the distribution of a value as text, or the source of its posterior."""
+        """Return the text of the distribution of a value, or the source of its posterior."""
         return self.laws[name].text if name in self.laws else f"posterior {self.source}"
 
     def at(self, values: Mapping[str, float]) -> Any:
-        """Return the recipe checked with these values, in SI; raise `RecipeError` for a bad value."""
+        """Return the checked recipe with these values in SI; raise `RecipeError` for a value that is a mistake."""
         from neusee.workflows.recipe.loading import check
 
         root = self.composed.root
@@ -88,7 +81,7 @@ class Uncertain:
 
 
 def settle(composed: Composed) -> tuple[Composed, Uncertain | None]:
-    """Return the recipe with a value in place of every distribution; return a recipe without them unchanged."""
+    """Return the recipe with a value in place of every distribution, and its uncertain values if there are any."""
     laws, root = dict[str, Law](), composed.root
     diagnostics = list(composed.diagnostics)
     for path, leaf in _laws(root):
@@ -102,17 +95,17 @@ def settle(composed: Composed) -> tuple[Composed, Uncertain | None]:
     given = root.items.get(KEY)
     if given is None and not laws and len(diagnostics) == len(composed.diagnostics):
         return composed, None
-    notes = [f"{path} is {law.text}: this run uses {_said(law.median, law.unit)}" for path, law in laws.items()]
-    found = _Reader(replace(root, data={key: v for key, v in root.data.items() if key != KEY}), laws, diagnostics)
+    notes = [f"{path} is {law.text}: this run uses {_rounded(law.median, law.unit)}" for path, law in laws.items()]
+    reader = _Reader(root.without(KEY), laws, diagnostics)
     if given is not None:
-        found.read(given)
-    settled = replace(composed, root=found.root, diagnostics=tuple(diagnostics))
-    rest = (tuple(found.standings), (*notes, *found.notes), found.source, found.units)
-    return settled, Uncertain(replace(settled, diagnostics=()), laws, found.joint, *rest)
+        reader.read(given)
+    settled = replace(composed, root=reader.root, diagnostics=tuple(diagnostics))
+    rest = (tuple(reader.standings), (*notes, *reader.notes), reader.source, reader.units)
+    return settled, Uncertain(replace(settled, diagnostics=()), laws, reader.joint, *rest)
 
 
 def _laws(root: Value) -> Iterator[tuple[Where, Value]]:
-    """Yield every scalar that is written as a distribution, by its keys; an alias occurs at several places."""
+    """Yield the path and the value of every distribution in a recipe, once for each alias of the value."""
     stack: list[tuple[Where, Value]] = [((key,), value) for key, value in root.items.items() if key != KEY]
     while stack:
         path, value = stack.pop()
@@ -122,25 +115,15 @@ def _laws(root: Value) -> Iterator[tuple[Where, Value]]:
 
 
 def put(root: Value, path: Where, data: Any, mark: Location | None = None) -> Value:
-    """Return ``root`` with another scalar at ``path``, which must exist."""
+    """Return the recipe with other data at a path, which must exist."""
     if not path:
         return replace(root, data=data, mark=mark or root.mark)
     key = next(key for key in root.items if str(key) == str(path[0]))
-    child = put(root.items[key], path[1:], data, mark)
-    if isinstance(root.data, list):
-        return replace(root, data=[child if i == key else value for i, value in enumerate(root.data)])
-    return replace(root, data={**root.data, key: child})
-
-
-def _at(root: Value, path: str) -> Value | None:
-    here: Value | None = root
-    for part in path.split("."):
-        here = next((value for key, value in here.items.items() if str(key) == part), None) if here else None
-    return here
+    return root.replaced(key, put(root.items[key], path[1:], data, mark))
 
 
 class _Reader:
-    """Reader of a recipe's ``posterior``, which puts the chosen values into the recipe."""
+    """Reader of the recipe key ``posterior``, which puts the values that a run uses into the recipe."""
 
     def __init__(self, root: Value, laws: Mapping[str, Law], diagnostics: list[Diagnostic]) -> None:
         self.root, self.laws, self.diagnostics = root, laws, diagnostics
@@ -151,43 +134,42 @@ class _Reader:
         self.source = ""
 
     def read(self, given: Value) -> None:
-        """Read the posterior and apply it; report each mistake at the place where it was written."""
+        """Read the posterior, and put its values into the recipe; report each mistake with its location."""
         if given.data is None:
             return
-        said = given.items if isinstance(given.data, dict) else {"file": given}
-        if strange := [v for key, v in said.items() if key not in (*_SAID, *_SUMMARY)]:
-            return self._fail(strange[0].key, strange[0].name, f"unknown; {nearest(strange[0].name, _SAID)}")
+        items = given.items if isinstance(given.data, dict) else {"file": given}
+        if strange := [v for key, v in items.items() if key not in (*_KEYS, *_SUMMARY)]:
+            return self._fail(strange[0].key, strange[0].name, f"unknown; {nearest(strange[0].name, _KEYS)}")
         try:
-            posterior = self._posterior(given, said)
-            use = self._use(said.get("use"), posterior)
-            pairs = self._pairs(said.get("values"), posterior, given)
+            posterior = self._posterior(given, items)
+            use = self._use(items.get("use"), posterior)
+            pairs = self._pairs(items.get("values"), posterior)
         except ValueError as error:
             return self._fail(given.mark, KEY, str(error))
         self._apply(posterior, pairs, use, given.mark)
 
-    def _posterior(self, given: Value, said: Mapping[Any, Value]) -> Posterior:
-        if any(key in said for key in _SUMMARY):
+    def _posterior(self, given: Value, items: Mapping[Any, Value]) -> Posterior:
+        if any(key in items for key in _SUMMARY):
             self.source = f"summary at {given.mark}"
-            return summarised({key: _flat(v) for key, v in said.items() if key in _SUMMARY})
-        file = said.get("file")
+            return summary({key: _flat(v) for key, v in items.items() if key in _SUMMARY})
+        file = items.get("file")
         if file is None or not isinstance(file.data, str):
             raise ValueError("write posterior: PATH, or posterior: {file: PATH, use: mean}")
-        path = Path(file.mark.folder) / Path(file.data).expanduser()
-        self.source = str(file.data)
-        return read_posterior(path)
+        self.source = file.data
+        return read_posterior(Path(file.mark.folder) / Path(file.data).expanduser())
 
     def _use(self, given: Value | None, posterior: Posterior) -> str | int:
         use = "mean" if given is None else given.data
-        drawn = posterior.joint.draws
+        draws = posterior.joint.draws
         if use in ("mean", "nominal"):
             return str(use)
-        if isinstance(use, int) and not isinstance(use, bool) and drawn is not None and 0 <= use < len(drawn):
+        if isinstance(use, int) and not isinstance(use, bool) and draws is not None and 0 <= use < len(draws):
             return use
-        some = f", or the number of a draw, 0 to {len(drawn) - 1}" if drawn is not None else ""
-        raise ValueError(f"use = {use}: write mean, nominal (the recipe's own value){some}")
+        number = f", or the number of a draw, 0 to {len(draws) - 1}" if draws is not None else ""
+        raise ValueError(f"use = {use}: write mean, nominal (the recipe's own value){number}")
 
-    def _pairs(self, given: Value | None, posterior: Posterior, whole: Value) -> dict[str, str]:
-        """Return the names in the posterior by the path of the recipe's value."""
+    def _pairs(self, given: Value | None, posterior: Posterior) -> dict[str, str]:
+        """Return the name in the posterior of each value of the recipe, by the path of the value."""
         names = posterior.joint.names
         if given is not None and not isinstance(given.data, dict):
             raise ValueError("values: write {path of the recipe: name in the posterior}")
@@ -195,16 +177,14 @@ class _Reader:
             pairs = {path: str(name) for path, name in _flat(given).items()}
             if wrong := [name for name in pairs.values() if name not in names]:
                 now = POSTERIOR_NAMES.get(wrong[0])
-                hint = (
-                    f"is called {now} now" if now in names else f"is not in the posterior; {nearest(wrong[0], names)}"
-                )
-                raise ValueError(f"values: {wrong[0]} {hint}")
+                hint = f"called {now} now" if now in names else f"not in the posterior; {nearest(wrong[0], names)}"
+                raise ValueError(f"values: {wrong[0]} is {hint}")
         else:
             all_pairs = {name if "." in name else f"{_BLOCK}.{name}": name for name in names}
-            pairs = {path: name for path, name in all_pairs.items() if _at(self.root, path) is not None}
+            pairs = {path: name for path, name in all_pairs.items() if self._value(path) is not None}
             if lost := [name for path, name in all_pairs.items() if path not in pairs]:
                 self.notes.append(f"this recipe does not have these values of the posterior: {', '.join(lost)}")
-        if wrong := [path for path in pairs if _at(self.root, path) is None]:
+        if wrong := [path for path in pairs if self._value(path) is None]:
             raise ValueError(f"values: the recipe has no value {wrong[0]}")
         if not pairs:
             raise ValueError(f"no value of the recipe is in the posterior, which contains {', '.join(names)}")
@@ -212,25 +192,26 @@ class _Reader:
         return pairs
 
     def _conventions(self, posterior: Posterior, pairs: Mapping[str, str]) -> None:
-        """Raise ValueError where the posterior's gain has no unit, or where its exposure is not the recipe's."""
+        """Raise ValueError for a gain without a unit, or for a posterior of another exposure than the recipe's."""
         for path, name in pairs.items():
-            if self._is_gain(path) and posterior.units.get(name) != GAIN_UNIT:
-                raise ValueError(f"its {name} has no unit: {BARE_GAIN}")
-        exposure = _at(self.root, f"{_BLOCK}.exposure")
+            value = self._value(path)
+            is_gain = value and isinstance(value.data, str) and value.data.strip().endswith(("e-/DN", GAIN_UNIT))
+            if is_gain and posterior.units.get(name) != GAIN_UNIT:
+                raise ValueError(f"the {name} of the posterior has no unit: {BARE_GAIN}")
+        exposure = self._value(f"{_BLOCK}.exposure")
         words = posterior.units.get("dark_current", "")
         if "dark_current" in pairs.values() and exposure is not None and " in " in words:
-            told, own = read_any(words.partition(" in ")[2])[0], read_any(exposure.data)[0]
-            if abs(told - own) > 1e-9 * own:
-                raise ValueError(f"the posterior's dark current is for {told:g} s, the recipe's exposure is {own:g} s")
+            other, own = read_any(words.partition(" in ")[2])[0], read_any(exposure.data)[0]
+            if abs(other - own) > 1e-9 * own:
+                raise ValueError(f"the posterior's dark current is for {other:g} s, the recipe's exposure is {own:g} s")
 
-    def _is_gain(self, path: str) -> bool:
-        value = _at(self.root, path)
-        return value is not None and isinstance(value.data, str) and value.data.strip().endswith(("e-/DN", GAIN_UNIT))
+    def _value(self, path: str) -> Value | None:
+        return self.root.below(path.split("."))
 
     def _apply(self, posterior: Posterior, pairs: Mapping[str, str], use: str | int, mark: Location) -> None:
         kept = {}
         for path, name in pairs.items():
-            value = _at(self.root, path)
+            value = self._value(path)
             assert value is not None
             if path in self.laws or value.mark.line == 0:
                 if path in self.laws and value.mark.line:
@@ -250,21 +231,20 @@ class _Reader:
             self.joint = replace(joint, names=tuple(kept))
 
     def _stand(self, posterior: Posterior, path: str, name: str, own: float, use: str | int, mark: Location) -> None:
-        """Compare the recipe's own value with its posterior, and put the value for a run into the recipe."""
-        joint, unit, kind = posterior.joint, self.units[path], posterior.kind(name)
+        """Compare a value of the recipe with its posterior, and put the value that a run uses into the recipe."""
+        joint, unit, kind = posterior.joint, self.units[path], posterior.kinds.get(name, "estimate")
         i = joint.names.index(name)
-        taken, why = own, "recipe"
+        used, why = own, "recipe"
         if isinstance(use, int):
             assert joint.draws is not None
-            taken, why = float(joint.draws[use, i]), f"draw {use}"
+            used, why = float(joint.draws[use, i]), f"draw {use}"
         elif kind == "estimate" and use == "mean":
-            taken, why = float(joint.mean[i]), "mean"
-        if taken != own:
-            self.root = put(self.root, tuple(path.split(".")), written(taken, unit), mark)
-        low, high = joint.interval(name)
-        numbers = (float(joint.mean[i]), float(joint.sd[i]), low, high)
-        words = (unit, joint.below(name, own), _said(taken, unit), why)
-        standing = Standing(path, _said(own, unit), kind, *numbers, *words)
+            used, why = float(joint.mean[i]), "mean"
+        if used != own:
+            self.root = put(self.root, tuple(path.split(".")), written(used, unit), mark)
+        numbers = (float(joint.mean[i]), float(joint.sd[i]), *joint.interval(name))
+        words = (unit, joint.below(name, own), _rounded(used, unit), why)
+        standing = Standing(path, _rounded(own, unit), kind, *numbers, *words)
         self.standings.append(standing)
         if standing.far:
             law = f"{standing.mean:.6g} ± {standing.sd:.2g} {unit}".rstrip()
@@ -275,16 +255,16 @@ class _Reader:
 
 
 def _flat(value: Value) -> Any:
-    """Return a mapping by dotted paths, however deep; return the plain value of anything else."""
+    """Return the values in a mapping at any depth by dotted path; return another value as plain data."""
     if not isinstance(value.data, dict):
         return value.plain
     return {dotted(leaf.path[len(value.path) :]): leaf.plain for leaf in value.leaves() if leaf is not value}
 
 
-def _said(value: float, unit: str) -> str:
+def _rounded(value: float, unit: str) -> str:
     return f"{value:.6g} {unit}".rstrip()
 
 
 def told(standings: Sequence[Standing]) -> list[dict[str, Any]]:
-    """Return the comparisons as plain JSON."""
-    return [{**{name: getattr(s, name) for name in Standing.__dataclass_fields__}, "far": s.far} for s in standings]
+    """Return comparisons of values with their posteriors as plain JSON."""
+    return [{**asdict(standing), "far": standing.far} for standing in standings]

@@ -1,21 +1,19 @@
-"""Distribution of one scalar: ``normal(10.5 e-, 0.5 e-)`` in place of ``10.5 e-``."""
+"""Probability distribution of one value: ``normal(10.5 e-, 0.5 e-)`` in place of ``10.5 e-``."""
 
 from __future__ import annotations
 
 import re
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
 from neusee.nodes.units import read_written
 
-if TYPE_CHECKING:
-    from numpy.typing import NDArray
+FloatArray = NDArray[np.float64]
 
-    FloatArray = NDArray[np.float64]
-
-#: by kind, the meaning of its two arguments
+#: meaning of the two arguments of each kind of distribution
 KINDS = {
     "normal": ("the mean", "the standard deviation"),
     "lognormal": ("the median", "the factor of one standard deviation"),
@@ -28,7 +26,7 @@ _CALL = re.compile(rf"({'|'.join(KINDS)})\((.*)\)", re.DOTALL)
 
 @dataclass(frozen=True)
 class Law:
-    """A distribution of one number or of its reciprocal (a gain in e-/DN), with its two arguments in SI."""
+    """Probability distribution of one value, or of the reciprocal of a gain in e-/DN, with its two arguments in SI."""
 
     kind: str
     text: str  #: as written in the recipe
@@ -38,47 +36,46 @@ class Law:
     reciprocal: bool = False  #: whether the distribution is that of 1 over a draw
 
     def at(self, z: FloatArray) -> FloatArray:
-        """Return the value at the quantile of ``z`` in the standard normal distribution."""
+        """Return the values of this distribution at the quantiles of standard normal numbers ``z``."""
         from scipy.special import ndtr
 
         a, b = self.first, self.second
         with np.errstate(over="ignore", divide="ignore"):
             if self.kind == "normal":
-                found = a + b * z
+                x = a + b * z
             elif self.kind == "lognormal":
-                found = a * np.exp(np.log(b) * z)
+                x = a * np.exp(np.log(b) * z)
             elif self.kind == "uniform":
-                found = a + (b - a) * ndtr(z)
+                x = a + (b - a) * ndtr(z)
             else:
-                found = a * np.exp(np.log(b / a) * ndtr(z))
-            found = 1.0 / found if self.reciprocal else found
-        return np.asarray(found, np.float64)
+                x = a * np.exp(np.log(b / a) * ndtr(z))
+            return np.asarray(1.0 / x if self.reciprocal else x, np.float64)
 
     @property
     def median(self) -> float:
-        """Return the median, which a run without draws uses."""
+        """Return the median of the distribution, which a run without draws uses."""
         return float(self.at(np.zeros(())))
 
 
 def is_law(text: Any) -> bool:
-    """Return True if a value is written as a distribution, or begins like one."""
+    """Return True if a value begins like a distribution, such as ``normal(``."""
     return isinstance(text, str) and _BEGIN.match(text) is not None
 
 
 def read_law(text: str) -> Law:
-    """Read a distribution; raise ValueError with the correct form."""
+    """Return the distribution that a text means; raise ValueError with the correct form."""
     match = _CALL.fullmatch(text.strip())
     if match is None:
         raise ValueError("is not a complete distribution: write kind(…, …), in quotes inside [ ] or { }")
-    kind, given = match[1], [part.strip() for part in match[2].split(",")]
-    if len(given) != 2 or not all(given):
+    kind, arguments = match[1], [part.strip() for part in match[2].split(",")]
+    if len(arguments) != 2 or not all(arguments):
         raise ValueError(f"needs {' and '.join(KINDS[kind])}: write {kind}(…, …)")
-    (first, unit, reciprocal), (second, other, also) = read_written(given[0]), read_written(given[1])
+    (first, unit, reciprocal), (second, other, also) = map(read_written, arguments)
     if kind == "lognormal":
         if other:
-            raise ValueError(f"{KINDS[kind][1]} is a number without a unit, such as 1.1, not {given[1]}")
+            raise ValueError(f"{KINDS[kind][1]} is a number without a unit, such as 1.1, not {arguments[1]}")
     elif (unit, reciprocal) != (other, also):
-        raise ValueError(f"{given[0]} and {given[1]} must have the same unit")
+        raise ValueError(f"{arguments[0]} and {arguments[1]} must have the same unit")
     if fault := _fault(kind, first, second):
         raise ValueError(fault)
     return Law(kind, text.strip(), first, second, unit, reciprocal)
@@ -95,5 +92,5 @@ def _fault(kind: str, first: float, second: float) -> str:
 
 
 def written(value: float, unit: str) -> str | float:
-    """Return a value in SI as a recipe writes the value."""
+    """Return a value in SI as a recipe contains it: a number, or a text with the unit."""
     return f"{value!r} {unit}" if unit else value

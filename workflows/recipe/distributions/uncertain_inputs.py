@@ -1,33 +1,29 @@
-"""Uncertain inputs of a recipe: the parameters that read the uncertain values, and draws of these values."""
+"""Uncertain inputs of a recipe: draws of the uncertain values, and the parameters of steps that read these values."""
 
 from __future__ import annotations
 
 from collections.abc import Collection, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 
 from neusee.workflows.graph.diagnostics import RecipeError
 from neusee.workflows.graph.recipe_graph import Recipe, needed
 from neusee.workflows.recipe.distributions.nominal_values import Uncertain
+from neusee.workflows.recipe.distributions.scalar import FloatArray
 
-if TYPE_CHECKING:
-    from numpy.typing import NDArray
+SCRAMBLES = 8  #: number of independently scrambled Sobol sequences, whose differences give the error
+_PROBE = 0.3  #: standard deviations by which a value is changed to find the parameters that read the value
+_CORRELATED = 0.1  #: smallest correlation of two values that count as correlated
+_EDGE = 1e-12  #: smallest distance of the probability of a point from 0 and 1
 
-    FloatArray = NDArray[np.float64]
-
-SCRAMBLES = 8  #: independent scramblings of Sobol's points, whose differences give the error
-_PROBE = 0.3  #: standard deviations from the median at which a value is traced to the parameters
-_TIED = 0.1  #: correlation from which two values count as correlated
-_EDGE = 1e-12  #: probability next to 0 and 1 that no point may reach
-
-Index = tuple[int | str, ...]
+Index = tuple[int | str, ...]  #: path of a number in a parameter; empty for the parameter itself
 
 
 @dataclass(frozen=True)
 class InputDraws:
-    """Draws of all inputs."""
+    """Draws of all uncertain inputs of a recipe."""
 
     z: FloatArray  #: (draw, input) independent standard normal numbers
     values: FloatArray  #: (draw, input) in SI
@@ -35,19 +31,19 @@ class InputDraws:
 
 @dataclass(frozen=True)
 class Inputs:
-    """The inputs that are drawn, in the order of `names`."""
+    """The uncertain inputs of a recipe that are drawn, in the order of `names`."""
 
     recipe: Recipe
     uncertain: Uncertain
     names: tuple[str, ...]  #: paths of the recipe that affect an output
     idle: tuple[str, ...]  #: paths that affect no output
-    readers: Mapping[str, tuple[tuple[Index, str], ...]]  #: by ``step.parameter``: index in the parameter, and input
+    readers: Mapping[str, tuple[tuple[Index, str], ...]]  #: indices and inputs by ``step.parameter``
 
     @classmethod
     def of(cls, recipe: Recipe, outputs: Sequence[str] | None = None) -> Inputs:
-        """Return the uncertain values that affect the outputs (the recipe's own, if None).
+        """Return the uncertain inputs that affect some outputs, by default the outputs of the recipe.
 
-        Raises ValueError for a recipe without uncertain values, or where no output depends on one.
+        Raises ValueError for a recipe without uncertain values, and where no output depends on an uncertain value.
         """
         outputs = recipe.outputs if outputs is None else outputs
         uncertain = recipe.uncertain
@@ -56,47 +52,46 @@ class Inputs:
                 "no value is uncertain: write a distribution in place of a value, such as "
                 'sensor.read_noise="normal(10.5 e-, 0.5 e-)", or posterior: PATH'
             )
-        found: dict[str, list[tuple[Index, str]]] = {}
+        readers: dict[str, tuple[tuple[Index, str], ...]] = {}
         for name in uncertain.names:
             for reader, index in _readers(recipe, uncertain, name, outputs):
-                found.setdefault(reader, []).append((index, name))
-        reached = {name for places in found.values() for _, name in places}
-        if not reached:
+                readers[reader] = (*readers.get(reader, ()), (index, name))
+        used = {name for inputs in readers.values() for _, name in inputs}
+        if not used:
             raise ValueError(f"no output depends on {', '.join(uncertain.names)}")
-        idle = tuple(name for name in uncertain.names if name not in reached)
-        known = _only(uncertain, reached)
-        return cls(recipe, known, known.names, idle, {name: tuple(places) for name, places in found.items()})
+        idle = tuple(name for name in uncertain.names if name not in used)
+        drawn = _only(uncertain, used)
+        return cls(recipe, drawn, drawn.names, idle, readers)
 
     @property
     def labels(self) -> list[str]:
-        """Return the label of each standard normal number."""
+        """Return the label of each input, which says when the input is correlated with other inputs."""
         return [_label(self.uncertain, name) for name in self.names]
 
     @property
     def most(self) -> int | None:
-        """Return the number of independent draws, or None where the number is unlimited."""
+        """Return the largest number of independent draws, or None where there is no limit."""
         joint = self.uncertain.joint
         return None if joint is None or joint.draws is None else len(joint.draws)
 
     def theta(self, values: Mapping[str, float]) -> dict[str, Any]:
-        """Return the parameters that read the inputs, by ``step.parameter``."""
-        found = {}
-        for reader, places in self.readers.items():
+        """Return the parameters that read the inputs, by ``step.parameter``, at some values of the inputs."""
+        parameters = {}
+        for reader, inputs in self.readers.items():
             step, _, param = reader.rpartition(".")
-            value = self.recipe.steps[step].params[param]
-            for index, name in places:
-                value = _put(value, index, values[name])
-            found[reader] = value
-        return found
+            parameters[reader] = self.recipe.steps[step].params[param]
+            for index, name in inputs:
+                parameters[reader] = _put(parameters[reader], index, values[name])
+        return parameters
 
     def at(self, z: FloatArray) -> FloatArray:
-        """Return (draw, input) values at standard normal numbers."""
+        """Return the values (draw, input) of the inputs at standard normal numbers."""
         columns = [law.at(z[:, i]) for i, law in enumerate(self.uncertain.laws.values())]
         joint = self.uncertain.joint
         return np.stack([*columns, *(joint.at(z[:, len(columns) :]).T if joint else ())], 1)
 
     def independent(self, count: int, seed: int) -> InputDraws:
-        """Return independent draws; a larger count begins with the same draws."""
+        """Return independent draws of the inputs; a larger count begins with the same draws."""
         z = np.random.default_rng([seed, 1]).standard_normal((count, len(self.names)))
         values, joint = self.at(z), self.uncertain.joint
         if joint is None or joint.draws is None:
@@ -107,7 +102,7 @@ class Inputs:
         return InputDraws(z, np.concatenate([values[: len(rows), :first], joint.draws[rows]], 1))
 
     def sobol(self, count: int, seed: int) -> InputDraws:
-        """Return points of `SCRAMBLES` scrambled Sobol sequences in turn: point i belongs to sequence i % SCRAMBLES."""
+        """Return draws from `SCRAMBLES` scrambled Sobol sequences; draw i comes from sequence i % SCRAMBLES."""
         from scipy.special import ndtri
         from scipy.stats import qmc
 
@@ -119,18 +114,18 @@ class Inputs:
         return InputDraws(z, self.at(z))
 
     def checked(self, values: FloatArray) -> None:
-        """Check the least and the greatest value of each input before a run; raise `RecipeError`."""
+        """Check the smallest and the largest value of each input; raise `RecipeError` for a value that is a mistake."""
         for name, column in zip(self.names, values.T, strict=True):
             for value in (float(column.min()), float(column.max())):
                 try:
                     self.uncertain.at({name: value})
                 except RecipeError as error:
-                    said = [replace(p, message=f"is drawn, but {p.message}") for p in error.diagnostics]
-                    raise RecipeError(said) from None
+                    drawn = [replace(d, message=f"is drawn, but {d.message}") for d in error.diagnostics]
+                    raise RecipeError(drawn) from None
 
 
 def _only(uncertain: Uncertain, names: Collection[str]) -> Uncertain:
-    """Return the uncertain values with only ``names`` drawn."""
+    """Return the uncertain values of a recipe that are among ``names``."""
     laws = {name: law for name, law in uncertain.laws.items() if name in names}
     joint = uncertain.joint
     kept = [name for name in joint.names if name in names] if joint else []
@@ -138,13 +133,13 @@ def _only(uncertain: Uncertain, names: Collection[str]) -> Uncertain:
 
 
 def _readers(recipe: Recipe, uncertain: Uncertain, name: str, outputs: Sequence[str]) -> Iterator[tuple[str, Index]]:
-    """Yield the parameters of needed steps that read the value of ``name``, with the index in the parameter."""
+    """Yield the parameters that read the value of ``name``, as ``step.parameter``, and the index in each parameter."""
     if name in uncertain.laws:
         probe = float(uncertain.laws[name].at(np.array(_PROBE)))
     else:
         assert uncertain.joint is not None
-        at = uncertain.joint.names.index(name)
-        probe = float(uncertain.joint.mean[at] + _PROBE * uncertain.joint.sd[at])
+        i = uncertain.joint.names.index(name)
+        probe = float(uncertain.joint.mean[i] + _PROBE * uncertain.joint.sd[i])
     changed: Recipe = uncertain.at({name: probe})
     if changed.steps.keys() != recipe.steps.keys() or changed.outputs != recipe.outputs:
         raise ValueError(f"{name} changes the list of steps and therefore cannot be drawn")
@@ -158,7 +153,7 @@ def _readers(recipe: Recipe, uncertain: Uncertain, name: str, outputs: Sequence[
 
 
 def _changed(before: Any, after: Any) -> Iterator[tuple[Index, Any]]:
-    """Yield the index of each difference between two parameters, and the second value there."""
+    """Yield the index of each difference between two parameters, and the value of the second parameter there."""
     if isinstance(after, list | tuple) and isinstance(before, list | tuple) and len(after) == len(before):
         for i, (a, b) in enumerate(zip(before, after, strict=True)):
             yield from (((i, *rest), new) for rest, new in _changed(a, b))
@@ -183,10 +178,7 @@ def _label(uncertain: Uncertain, name: str) -> str:
         return name
     i = joint.names.index(name)
     whole: FloatArray = joint.factor @ joint.factor.T
-    if _tied(whole[i, :i]):
+    correlated = np.abs(whole[i]) > _CORRELATED
+    if correlated[:i].any():
         return f"rest of {name}"
-    return f"{name} and what goes with it" if _tied(whole[i, i + 1 :]) else name
-
-
-def _tied(correlations: Sequence[float] | FloatArray) -> bool:
-    return bool((np.abs(correlations) > _TIED).any())
+    return f"{name} and what goes with it" if correlated[i + 1 :].any() else name

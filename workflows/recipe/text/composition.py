@@ -1,10 +1,10 @@
-"""Composition of a recipe from several files: its groups first, then its own text, then the arguments."""
+"""Composition of a recipe: first the options of its groups, then its own file, then the arguments."""
 
 from __future__ import annotations
 
 import functools
 import re
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from importlib.resources import files
 from pathlib import Path
@@ -14,13 +14,11 @@ from neusee.workflows.recipe.text.overrides import Override, apply, read_overrid
 from neusee.workflows.recipe.text.yaml_values import Value, kind, read
 
 _NAME = re.compile(r"[\w-]+")
-_MOST_KNOWN = 16
-_known: dict[tuple[int, ...], tuple[tuple[Value, ...], Value]] = {}  #: ids of the parts -> the parts, merged
 
 
 @dataclass(frozen=True, slots=True)
 class Composed:
-    """The final values of a recipe, read as YAML and not yet checked."""
+    """A recipe composed from its files and arguments, with values that are not yet checked."""
 
     name: str
     title: str
@@ -29,32 +27,32 @@ class Composed:
     whole: bool = True  #: whether every named group could be read
 
     def without(self, key: str) -> Composed:
-        """Return the recipe without one block, which is read separately."""
-        return replace(self, root=replace(self.root, data={k: v for k, v in self.root.data.items() if k != key}))
+        """Return the recipe without the block of one key."""
+        return replace(self, root=self.root.without(key))
 
     def with_problems(self, diagnostics: Iterable[Diagnostic]) -> Composed:
-        """Return the recipe with further diagnostics."""
+        """Return the recipe with more diagnostics."""
         return replace(self, diagnostics=(*self.diagnostics, *diagnostics))
 
 
 @dataclass(frozen=True, slots=True)
 class Choice:
-    """An entry of ``defaults``: the option of a group, or no option."""
+    """Entry of ``defaults`` in a recipe: a group and its option, or None for no option."""
 
     group: str
     option: str | None
     mark: Location
-    shown: str  #: the user's text, for a message
+    shown: str  #: the entry as the user wrote it, for a message
 
 
 @functools.cache
 def packaged() -> Path:
-    """Return the folder of the recipes that are installed with the program."""
+    """Return the folder of the recipes that are installed with neusee."""
     return Path(str(files("neusee.recipes")))
 
 
 def locate(recipe: str | Path, folder: Path) -> Path:
-    """Return the file of a packaged recipe's name, or of a path that ends in ``.yaml``."""
+    """Return the file of a recipe, which is the name of a packaged recipe or a path that ends in ``.yaml``."""
     if str(recipe).endswith((".yaml", ".yml")):
         path = folder / Path(recipe).expanduser()
         if path.is_file():
@@ -69,15 +67,15 @@ def locate(recipe: str | Path, folder: Path) -> Path:
 
 
 def compose(recipe: str | Path, arguments: Sequence[str | Override], folder: Path, first: int = 1) -> Composed:
-    """Compose ``recipe``; ``arguments`` count from ``first``, and their paths are relative to ``folder``."""
+    """Return a recipe composed of its files and arguments; messages number the arguments from ``first``."""
     path = locate(recipe, folder)
     document = read(path, shown(path, folder))
     diagnostics: list[Diagnostic] = []
     overrides: list[Override] = []
-    for number, given in enumerate(arguments, first):
+    for number, argument in enumerate(arguments, first):
         mark = Location(f"argument {number}", folder=str(folder))
         try:
-            overrides.append(given if isinstance(given, Override) else read_override(given, mark))
+            overrides.append(argument if isinstance(argument, Override) else read_override(argument, mark))
         except RecipeError as error:
             diagnostics += error.diagnostics
     choices, rest = _choose(document.root, overrides, path.parent, diagnostics)
@@ -89,7 +87,7 @@ def compose(recipe: str | Path, arguments: Sequence[str | Override], folder: Pat
 
 
 def shown(path: Path, folder: Path) -> str:
-    """Return a file's name as its user knows it: relative to the packaged recipes or the working folder, or in full."""
+    """Return the path of a file relative to the packaged recipes or to the working folder, or else the full path."""
     for above in (packaged(), folder):
         if path.is_relative_to(above):
             return path.relative_to(above).as_posix()
@@ -97,7 +95,7 @@ def shown(path: Path, folder: Path) -> str:
 
 
 def merge(below: Value, above: Value) -> Value:
-    """Merge ``above`` over ``below``: mappings by key, other values and steps with their own ``node`` as a whole."""
+    """Return ``below`` with the values of ``above``; a list, a scalar and a step with ``node`` replace all."""
     if not isinstance(below.data, dict) or not isinstance(above.data, dict) or _new_step(above):
         return above
     data = dict(below.data)
@@ -106,99 +104,84 @@ def merge(below: Value, above: Value) -> Value:
     return replace(below, data=data)
 
 
+@functools.lru_cache(maxsize=16)
 def _merged(parts: tuple[Value, ...]) -> Value:
-    """Merge the groups' options and the recipe; equal parts give the identical value again."""
-    name = tuple(map(id, parts))  # no other value takes an id while `_known` holds the parts
-    found = _known.get(name)
-    if found is None:
-        root = Value({}, parts[-1].mark, parts[-1].mark, ())
-        for part in parts:
-            root = merge(root, _without_defaults(part))
-        found = (parts, root)
-        while len(_known) >= _MOST_KNOWN:
-            _known.pop(next(iter(_known), name), None)
-        _known[name] = found
-    return found[1]
+    """Return the options of the groups and the recipe merged in order; the same parts give the identical value."""
+    mark = parts[-1].mark
+    return functools.reduce(merge, (part.without("defaults") for part in parts), Value({}, mark, mark, ()))
 
 
 def _new_step(value: Value) -> bool:
     return len(value.path) == 2 and value.path[0] == "steps" and "node" in value.items
 
 
-def _without_defaults(root: Value) -> Value:
-    if "defaults" not in root.items:
-        return root
-    return replace(root, data={key: value for key, value in root.data.items() if key != "defaults"})
-
-
 # --- groups ---------------------------------------------------------------------------------------------------------
 
 
 def groups_of(*folders: Path) -> dict[str, list[str]]:
-    """Return options by group: the folders of YAML files beside a recipe and among the packaged ones."""
-    found: dict[str, set[str]] = {}
+    """Return the names of the options by group: each folder of YAML files in one of ``folders`` is a group."""
+    options: dict[str, set[str]] = {}
     for folder in folders:
         for path in folder.glob("*/*.yaml"):
-            found.setdefault(path.parent.name, set()).add(path.stem)
-    return {group: sorted(found[group]) for group in sorted(found)}
+            options.setdefault(path.parent.name, set()).add(path.stem)
+    return {group: sorted(options[group]) for group in sorted(options)}
 
 
 def _choose(
     root: Value, overrides: list[Override], beside: Path, diagnostics: list[Diagnostic]
 ) -> tuple[list[Choice], list[Override]]:
-    """Return the defaults after ``group=option``, and the overrides of values."""
+    """Return the options of the groups after overrides such as ``laser=six``, and the overrides of values."""
     choices = {choice.group: choice for choice in _defaults(root, diagnostics)}
     groups = groups_of(beside, packaged())
     rest = []
     for o in overrides:
-        group = o.path[0]
+        group, data = o.path[0], o.value.data if o.value else None
         of_values = group not in choices and (group in root.items or group not in groups)
-        if len(o.path) > 1 or o.value_is_collection or of_values:
+        if len(o.path) > 1 or isinstance(data, dict | list) or of_values:
             rest.append(o)
-        elif o.sign == "+" and group in choices:
-            diagnostics.append(
-                Diagnostic(o.mark, o.text, f"{group} is already set to {choices[group].option}: remove the +")
-            )
-        elif o.sign == "" and group not in choices:
-            diagnostics.append(
-                Diagnostic(o.mark, o.text, f"this recipe has no group {group}; to add the group, write +{o.text}")
-            )
-        elif o.sign == "~" and group not in choices:
-            diagnostics.append(Diagnostic(o.mark, o.text, f"is not a group of this recipe; {nearest(group, choices)}"))
+        elif message := _group_fault(o, choices):
+            diagnostics.append(Diagnostic(o.mark, o.text, message))
         elif o.sign == "~":
             del choices[group]
         else:
-            option = None if o.value is None or o.value.data is None else str(o.value.data)
-            choices[group] = Choice(group, option, o.mark, o.text)
+            choices[group] = Choice(group, None if data is None else str(data), o.mark, o.text)
     return list(choices.values()), rest
 
 
+def _group_fault(o: Override, choices: Mapping[str, Choice]) -> str:
+    group = o.path[0]
+    if group in choices:
+        return f"{group} is already set to {choices[group].option}: remove the +" if o.sign == "+" else ""
+    if o.sign == "~":
+        return f"is not a group of this recipe; {nearest(group, choices)}"
+    return "" if o.sign else f"this recipe has no group {group}; to add the group, write +{o.text}"
+
+
 def _defaults(root: Value, diagnostics: list[Diagnostic]) -> Iterator[Choice]:
-    """Yield the entries of the ``defaults`` list that can be read."""
+    """Yield the entries of the ``defaults`` list; report the entries that cannot be read."""
     given = root.items.get("defaults")
     if given is None:
         return
     if not isinstance(given.data, list):
         diagnostics.append(Diagnostic(given.mark, "defaults", f"must be a list of `group: option`, not {kind(given)}"))
         return
-    seen: dict[str, Location] = {}
+    lines: dict[str, int] = {}
     for entry in given.data:
         pair = list(entry.items.items()) if isinstance(entry.data, dict) else []
         if len(pair) != 1 or isinstance(pair[0][1].data, dict | list):
             diagnostics.append(Diagnostic(entry.mark, entry.name, "must be one `group: option`, such as `doe: axicon`"))
             continue
         group, option = str(pair[0][0]), pair[0][1]
-        if group in seen:
-            diagnostics.append(
-                Diagnostic(entry.mark, f"defaults.{group}", f"given twice, first in line {seen[group].line}")
-            )
+        if group in lines:
+            message = f"given twice, first in line {lines[group]}"
+            diagnostics.append(Diagnostic(entry.mark, f"defaults.{group}", message))
             continue
-        seen[group] = entry.mark
+        lines[group] = entry.mark.line
         yield Choice(group, None if option.data is None else str(option.data), option.mark, f"{group}: {option.data}")
 
 
 def _option(choice: Choice, beside: Path, folder: Path, diagnostics: list[Diagnostic]) -> Value | None:
-    """Return the values of an option; the folder beside the recipe precedes the packaged one."""
+    """Return the values of an option; a file in the folder of the recipe takes precedence over a packaged file."""
     names = (choice.group, str(choice.option))
     for above in dict.fromkeys((beside, packaged())):
         path = above / choice.group / f"{names[1]}.yaml"
@@ -222,4 +205,4 @@ def _read_option(path: Path, folder: Path, diagnostics: list[Diagnostic]) -> Val
     if "defaults" in root.items:
         message = "belongs in a recipe: an option of a group cannot name other groups"
         diagnostics.append(Diagnostic(root.items["defaults"].key, "defaults", message))
-    return _without_defaults(root)
+    return root

@@ -1,21 +1,20 @@
-"""Overrides of a recipe as arguments: ``a.b=1``, ``+a.b=1``, ``~a.b``."""
+"""Overrides of a recipe by arguments: ``a.b=1`` changes a value, ``+a.b=1`` adds a value, ``~a.b`` removes a value."""
 
 from __future__ import annotations
 
 import difflib
 import re
 from collections.abc import Iterable, Iterator
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 from neusee.workflows.graph.diagnostics import Diagnostic, Location, RecipeError
 from neusee.workflows.recipe.text.renamed_keys import instead
 from neusee.workflows.recipe.text.yaml_values import Value, parse
 
-RESERVED = frozenset(
-    {"steps", "seed", "tolerance", "outputs", "expect", "posterior"}
-)  #: keys that are not parameter blocks
+#: recipe keys that are not blocks of parameters
+RESERVED = frozenset({"steps", "seed", "tolerance", "outputs", "expect", "posterior"})
 
-Trail = list[tuple[Value, str | int]]  #: values along a path, each with the key to the next one
+Trail = list[tuple[Value, str | int]]  #: values along a path, each with the key of the next value
 
 _SYNTAX = re.compile(r"(?P<sign>[+~]?)(?P<path>[^\s=+~.]+(?:\.[^\s=.]+)*)(?:=(?P<value>.*))?", re.DOTALL)
 _HELP = "is not an override: write path=value, +path=value, ~path or group=option"
@@ -23,7 +22,7 @@ _HELP = "is not an override: write path=value, +path=value, ~path or group=optio
 
 @dataclass(frozen=True, slots=True)
 class Override:
-    """One parsed argument."""
+    """An override of a recipe, parsed from one argument."""
 
     text: str
     sign: str  #: ``""`` changes a value, ``+`` adds one, ``~`` removes one
@@ -31,13 +30,9 @@ class Override:
     value: Value | None
     mark: Location
 
-    @property
-    def value_is_collection(self) -> bool:
-        return self.value is not None and isinstance(self.value.data, dict | list)
-
 
 def read_override(text: str, mark: Location) -> Override:
-    """Read one argument; its value is YAML, so that ``20 e-`` stays a string."""
+    """Return the override that an argument means; the value is read as YAML, so that ``20 e-`` stays a string."""
     match = _SYNTAX.fullmatch(text)
     if match is None:
         raise RecipeError([Diagnostic(mark, text, _HELP)])
@@ -57,7 +52,7 @@ def read_override(text: str, mark: Location) -> Override:
 
 
 def apply(root: Value, override: Override, diagnostics: list[Diagnostic], groups: Iterable[str] = ()) -> Value:
-    """Return ``root`` with one value changed, added or removed; a mistake leaves ``root`` unchanged."""
+    """Return a recipe after an override; for a mistake, add a diagnostic and return the recipe unchanged."""
     trail, missing = _follow(root, override.path)
     fault = _fault(root, override, trail, missing, groups)
     if fault:
@@ -67,7 +62,7 @@ def apply(root: Value, override: Override, diagnostics: list[Diagnostic], groups
 
 
 def _follow(root: Value, path: tuple[str, ...]) -> tuple[Trail, tuple[str, ...]]:
-    """Return the values along ``path`` with the key to the next one, and the part of the path that does not exist."""
+    """Return the values along a path with their keys, and the end of the path that does not exist."""
     trail: Trail = []
     here = root
     for n, part in enumerate(path):
@@ -81,7 +76,7 @@ def _follow(root: Value, path: tuple[str, ...]) -> tuple[Trail, tuple[str, ...]]
 
 
 def _fault(root: Value, o: Override, trail: Trail, missing: tuple[str, ...], groups: Iterable[str]) -> str | None:
-    """Return the mistake of an override, or None."""
+    """Return the message for an override that is a mistake, or None."""
     here = trail[-1][0]
     if not missing:
         return "exists already: remove the + to change the value" if o.sign == "+" else None
@@ -95,7 +90,7 @@ def _fault(root: Value, o: Override, trail: Trail, missing: tuple[str, ...], gro
 
 
 def _implied(root: Value, path: tuple[str, ...]) -> bool:
-    """Return True if a path may be set without being written: a key of the recipe, or of one of its steps."""
+    """Return True if a path may be set without a + although the recipe lacks it: a global key, or a key of a step."""
     if path[0] != "steps":
         return path[0] in RESERVED and (len(path) == 1 or path[0] in ("expect", "posterior"))
     steps = root.items.get("steps")
@@ -103,62 +98,50 @@ def _implied(root: Value, path: tuple[str, ...]) -> bool:
 
 
 def _suggest(root: Value, path: tuple[str, ...], groups: Iterable[str]) -> str:
-    """Return the nearest path that exists, because a new path is often a typo."""
-    here, found = root, list[str]()
+    """Return a hint with the most similar path in the recipe, because an unknown path is often a typing error."""
+    here, similar = root, list[str]()
     for part in path:
-        names = {str(key): value for key, value in here.items.items()}
-        also = (*RESERVED, *groups) if here is root else ()
-        close = difflib.get_close_matches(part, {*names, *also}, 1)
+        names = {*map(str, here.items), *((*RESERVED, *groups) if here is root else ())}
+        close = difflib.get_close_matches(part, names, 1)
         if not close:
             break
-        found += close
-        here = names.get(close[0], Value(None, here.mark, here.key, ()))
-    if len(found) == len(path):
-        return f"did you mean {'.'.join(found)}?"
-    same = {leaf.name for leaf in root.leaves() if leaf.path[0] not in RESERVED and _close(path[-1], leaf.path[-1])}
+        similar += close
+        here = here.child(close[0]) or Value(None, here.mark, here.key, ())
+    if len(similar) == len(path):
+        return f"did you mean {'.'.join(similar)}?"
+    leaves = [leaf for leaf in root.leaves() if leaf.path[0] not in RESERVED]
+    same = {leaf.name for leaf in leaves if difflib.get_close_matches(path[-1], [str(leaf.path[-1])], 1, 0.75)}
     if same:
         return f"did you mean {' or '.join(sorted(same)[:3])}?"
     return f"{here.name or 'the recipe'} has {', '.join(map(str, here.items)) or 'no such value'}"
 
 
-def _close(name: str, other: str | int) -> bool:
-    return bool(difflib.get_close_matches(name, [str(other)], 1, 0.75))
-
-
 def _rebuild(trail: Trail, missing: tuple[str, ...], o: Override) -> Value:
-    """Return the values along the trail with the change, rebuilt from the inside out."""
-    made = _placed(trail, missing, o)
+    """Return the recipe with the changed value, rebuilt from the innermost value of the trail outwards."""
+    value = _parsed_again(trail, missing, o)
     for n in range(len(missing) - 1, 0, -1):
-        assert made is not None
-        made = Value({_key(missing[n]): made}, o.mark, o.mark, o.path[: len(o.path) - len(missing) + n])
+        assert value is not None
+        value = Value({_key(missing[n]): value}, o.mark, o.mark, o.path[: len(o.path) - len(missing) + n])
     for here, key in reversed(trail):
-        made = _with(here, _key(key) if missing and here is trail[-1][0] else key, made, o.mark)
-    assert made is not None
-    return made
+        key = _key(key) if missing and here is trail[-1][0] else key
+        value = Value({key: value}, o.mark, here.key, here.path) if here.data is None else here.replaced(key, value)
+    assert value is not None
+    return value
 
 
-def _placed(trail: Trail, missing: tuple[str, ...], o: Override) -> Value | None:
-    """Return the value parsed for its final place: a digit string is a number as a key there, as in the file."""
-    there = tuple(key for _, key in trail)
-    where = (*there[:-1], *map(_key, missing)) if missing else there
-    return o.value if o.value is None or where == o.path else parse(o.text.partition("=")[2], o.mark, where)
+def _parsed_again(trail: Trail, missing: tuple[str, ...], o: Override) -> Value | None:
+    """Return the value of an override with its final path, in which a key of digits is a number as in a file."""
+    keys = tuple(key for _, key in trail)
+    path = (*keys[:-1], *map(_key, missing)) if missing else keys
+    return o.value if o.value is None or path == o.path else parse(o.text.partition("=")[2], o.mark, path)
 
 
 def _key(part: str | int) -> str | int:
     return int(part) if isinstance(part, str) and part.isdecimal() else part
 
 
-def _with(here: Value, key: str | int, made: Value | None, mark: Location) -> Value:
-    items = {k: v for k, v in here.items.items() if made is not None or k != key}
-    if made is not None:
-        items[key] = made
-    if isinstance(here.data, list):
-        return replace(here, data=[replace(v, path=(*here.path, i)) for i, v in enumerate(items.values())])
-    return replace(here, data=items) if here.data is not None else Value(items, mark, here.key, here.path)
-
-
 def arguments_in(value: Value) -> Iterator[Location]:
-    """Yield the arguments that changed a part of a value."""
+    """Yield the arguments that changed a value within a list or a mapping."""
     for child in value.items.values():
         if not child.mark.line:
             yield child.mark

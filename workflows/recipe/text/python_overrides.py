@@ -1,7 +1,7 @@
-"""Overrides of a recipe as Python values: ``sensor={"read_noise": "20 e-"}`` is ``sensor.read_noise=20 e-``.
+"""Overrides of a recipe by Python values: ``sensor={"read_noise": "20 e-"}`` means ``sensor.read_noise=20 e-``.
 
-A mapping changes the values that it names and leaves the others. An empty mapping, and a step
-with its ``node``, replace the whole. A string is used unchanged and is not read as YAML.
+A mapping changes only the values that it names, but an empty mapping and a step with its ``node`` replace the whole
+value. A string is not read as YAML.
 """
 
 from __future__ import annotations
@@ -15,29 +15,29 @@ from typing import Any
 from neusee.workflows.graph.diagnostics import Diagnostic, Location, RecipeError
 from neusee.workflows.graph.final_values import flow
 from neusee.workflows.recipe.text.overrides import Override, read_override
-from neusee.workflows.recipe.text.yaml_values import Value, Where
+from neusee.workflows.recipe.text.yaml_values import Value, Where, dotted
 
 _ALLOWED = "give a number, a string, True or False, None, a list or a mapping"
 _LONGEST = 40  #: characters of a value that a message repeats
 
 
 def overrides_of(values: Mapping[str, Any], folder: Path) -> list[Override]:
-    """Return the overrides of keyword arguments; raise one `RecipeError` for all values that cannot be in a recipe."""
-    found: list[Override] = []
+    """Return the overrides that keyword arguments mean; raise one `RecipeError` for all values that are mistakes."""
+    overrides: list[Override] = []
     diagnostics: list[Diagnostic] = []
     for key, value in values.items():
         mark = Location(f"argument {key}", folder=str(folder))
         try:
-            found += _read(key, value, mark)
+            overrides += _read(key, value, mark)
         except RecipeError as error:
             diagnostics += error.diagnostics
     if diagnostics:
         raise RecipeError(diagnostics)
-    return found
+    return overrides
 
 
 def _read(key: str, given: Any, mark: Location) -> Iterator[Override]:
-    """Yield the overrides of one keyword: its sign and path as on the command line, then each value below."""
+    """Yield the overrides that one keyword means: one override for each value in a mapping."""
     if key.startswith("~") and given is not None:
         raise RecipeError([Diagnostic(mark, key, f"~ removes a value and cannot set one: write {{{key!r}: None}}")])
     try:
@@ -70,7 +70,7 @@ def _override(named: Override, path: tuple[str, ...], given: Any) -> Override:
 
 
 def _value(given: Any, mark: Location, path: Where) -> Value:
-    """Return a Python value as the reader of a file would return it."""
+    """Return a `Value` with the data of a Python value and the location of its argument."""
     if isinstance(given, Mapping):
         data = {_key(key, mark, path): _value(item, mark, (*path, str(key))) for key, item in given.items()}
         return Value(data, mark, mark, path)
@@ -83,11 +83,11 @@ def _value(given: Any, mark: Location, path: Where) -> Value:
     listed = given.tolist() if hasattr(given, "tolist") else given  # a number or an array of numpy or torch
     if not isinstance(listed, bool | int | float | str | list):
         message = f"a recipe cannot contain a value of type {type(given).__name__}: {_ALLOWED}"
-        raise RecipeError([Diagnostic(mark, ".".join(map(str, path)), message)])
+        raise RecipeError([Diagnostic(mark, dotted(path), message)])
     return _value(listed, mark, path)
 
 
 def _key(key: Any, mark: Location, path: Where) -> str | int:
     if isinstance(key, str | int) and not isinstance(key, bool) and key != "":
         return key
-    raise RecipeError([Diagnostic(mark, ".".join(map(str, path)), f"a key must be a name or an integer, not {key!r}")])
+    raise RecipeError([Diagnostic(mark, dotted(path), f"a key must be a name or an integer, not {key!r}")])

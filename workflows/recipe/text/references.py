@@ -1,4 +1,4 @@
-"""References ``${a.b}``: values that copy other values, resolved from the steps that use them."""
+"""References such as ``${sensor.gain}``: a value that copies another value of the recipe."""
 
 from __future__ import annotations
 
@@ -10,25 +10,24 @@ from pathlib import Path
 from typing import Any
 
 from neusee.workflows.graph.diagnostics import UNREAD, Diagnostic
-from neusee.workflows.recipe.text import renamed_keys
 from neusee.workflows.recipe.text.composition import packaged
 from neusee.workflows.recipe.text.overrides import RESERVED
-from neusee.workflows.recipe.text.renamed_keys import new_name
+from neusee.workflows.recipe.text.renamed_keys import instead, new_name
 from neusee.workflows.recipe.text.yaml_values import Value, Where, dotted
 
 _REFERENCE = re.compile(r"\$\{([^${}]*)\}")
-_DEEPEST = 50  #: depth of references to references
+_DEEPEST = 50  #: longest chain of references
 
 
 @dataclass(frozen=True, slots=True)
 class Scope:
-    """Meaning of ``${item.x}`` and ``${each.lasers.x}`` in one copy of a step."""
+    """The items of one copy of a step, to which ``${item.x}`` and ``${each.lasers.x}`` refer."""
 
-    items: Mapping[str, Value]  #: by dimension
+    items: Mapping[str, Value]  #: by the name of the list of items
     step: str
 
     def find(self, parts: list[str]) -> tuple[Value | None, list[str], str]:
-        """Return the start, the path to follow and, where no start exists, the mistake."""
+        """Return the item to which a reference refers, the path below the item, and a message where no item fits."""
         dims = list(self.items)
         if parts[0] == "item" and len(dims) == 1:
             return self.items[dims[0]], parts[1:], ""
@@ -41,21 +40,21 @@ class Scope:
 
 
 class References:
-    """Resolution of the references in one recipe, which records the values in use."""
+    """References of one recipe, with a record of the values that steps use."""
 
     def __init__(self, root: Value, diagnostics: list[Diagnostic]) -> None:
         self.root, self.diagnostics = root, diagnostics
         self.used: set[Where] = set()
-        self.known: dict[Where, Value] = {}
-        self.open: list[Where] = []
-        self.lacking: list[tuple[Where, Diagnostic]] = []
+        self.known: dict[Where, Value] = {}  #: resolved values
+        self.open: list[Where] = []  #: values that are being resolved
+        self.lacking: list[tuple[Where, Diagnostic]] = []  #: targets that do not exist
         self.spare: set[Where] = set()  #: unused values of packaged options
 
     def resolve(self, value: Value, scope: Scope) -> Value:
-        """Return ``value`` with every reference resolved; report a failed one and return `BROKEN` in its place."""
+        """Return a value with all its references resolved; report a failed reference, whose value becomes `BROKEN`."""
         if isinstance(value.data, dict):
             children = ((key, child, self.resolve(child, scope)) for key, child in value.data.items())
-            return replace(value, data={key: replace(found, key=child.key) for key, child, found in children})
+            return replace(value, data={key: replace(resolved, key=child.key) for key, child, resolved in children})
         if isinstance(value.data, list):
             return replace(value, data=[self.resolve(child, scope) for child in value.data])
         if not isinstance(value.data, str) or "${" not in value.data:
@@ -63,7 +62,7 @@ class References:
         return self._text(value, scope)
 
     def _text(self, value: Value, scope: Scope) -> Value:
-        """Return a string with its references resolved, the innermost first."""
+        """Return a string with its references resolved, beginning with the innermost reference."""
         text = value.data
         while match := _REFERENCE.search(text):
             target = self._target(match[1], value, scope)
@@ -80,14 +79,13 @@ class References:
 
     def _target(self, text: str, origin: Value, scope: Scope) -> Value | None:
         parts, start = text.strip().split("."), self.root
-        item = parts[0] in ("item", "each") and parts[0] not in self.root.items
-        if item:
-            found, parts, wrong = scope.find(parts)
-            if found is None:
-                self._fail(origin, wrong)
+        if parts[0] in ("item", "each") and parts[0] not in self.root.items:
+            item, parts, fault = scope.find(parts)
+            if item is None:
+                self._fail(origin, fault)
                 return None
-            start = found
-        target = _follow(start, parts)
+            start = item
+        target = start.below(parts)
         if target is None:
             self._missing(start, parts, origin, scope)
             return None
@@ -95,7 +93,7 @@ class References:
         return self._followed(target, scope, origin)
 
     def _followed(self, target: Value, scope: Scope, origin: Value) -> Value | None:
-        """Return a target with its own references resolved, once; report a cycle."""
+        """Return a target with its own references resolved; report a reference that leads back to itself."""
         if target.path in self.known:
             return self.known[target.path]
         if target.path in self.open:
@@ -103,7 +101,7 @@ class References:
             self._fail(origin, f"refers to itself: {' -> '.join(map(dotted, loop))}")
             return None
         if len(self.open) > _DEEPEST:
-            self._fail(origin, f"more than {_DEEPEST} references to references")
+            self._fail(origin, f"a chain of more than {_DEEPEST} references")
             return None
         self.open.append(target.path)
         value = self.resolve(target, scope if target.path[0] == "steps" else Scope({}, dotted(target.path)))
@@ -114,24 +112,25 @@ class References:
 
     def _missing(self, start: Value, parts: list[str], origin: Value, scope: Scope) -> None:
         """Report a missing target: as a mistake of the item if other items have the target, else of the reference."""
-        name, wanted = ".".join(parts), (*start.path, *parts)
+        path = (*start.path, *parts)
+        name = dotted(path)
         siblings = self.root.items[str(start.path[0])].items.values() if start.path else ()
-        if any(_follow(other, parts) for other in siblings):
-            problem = Diagnostic(start.key, start.name, f"has no {name}; steps.{scope.step} needs this value")
-        else:
-            near = _nearest(wanted, {leaf.path for leaf in self.root.leaves() if leaf.path[0] not in RESERVED})
-            hint = f" is unknown; did you mean {dotted(near)}?" if near else " is unknown"
-            if now := renamed_keys.instead(dotted(wanted)):
-                hint = f": {now}" if new_name(dotted(wanted)) is None else f" {now}"
-            problem = Diagnostic(origin.mark, origin.name, f"${{{dotted(wanted)}}}{hint}")
-        self.lacking.append((wanted, problem))
+        if any(other.below(parts) for other in siblings):
+            message = f"has no {'.'.join(parts)}; steps.{scope.step} needs this value"
+            self.lacking.append((path, Diagnostic(start.key, start.name, message)))
+            return
+        near = _nearest(path, {leaf.path for leaf in self.root.leaves() if leaf.path[0] not in RESERVED})
+        hint = f" is unknown; did you mean {dotted(near)}?" if near else " is unknown"
+        if now := instead(name):
+            hint = f": {now}" if new_name(name) is None else f" {now}"
+        self.lacking.append((path, Diagnostic(origin.mark, origin.name, f"${{{name}}}{hint}")))
 
     def _fail(self, origin: Value, message: str) -> Value:
         self.diagnostics.append(Diagnostic(origin.mark, origin.name, message))
         return replace(origin, data=BROKEN)
 
     def touch(self, value: Value, dims: Sequence[str]) -> None:
-        """Mark the values that a step without items would read as used, so that they are not reported."""
+        """Mark the values to which a step with an empty list of items refers as used, so that none is reported."""
         for text in _texts(value):
             for match in _REFERENCE.finditer(text.data):
                 parts = match[1].strip().split(".")
@@ -139,71 +138,67 @@ class References:
                     self._target(match[1], text, Scope({}, ""))
                     continue
                 rest = parts[1 if parts[0] == "item" else 2 :]
-                self.used |= {(dim, *item, *rest) for dim in dims or self.root.items for item in self._names(str(dim))}
-
-    def _names(self, dim: str) -> Iterator[tuple[str | int]]:
-        block = self.root.items.get(dim)
-        return ((name,) for name in (block.items if block else ()))
+                blocks = ((dim, self.root.items[dim].items) for dim in dims or self.root.items)
+                self.used |= {(dim, name, *rest) for dim, block in blocks for name in block}
 
     def finish(self) -> None:
-        """Report values without a reader and references without a target; a matching pair is one mistake.
+        """Report values that no step uses and references without a target; a value and a reference may be one mistake.
 
         A packaged option may set more values than a recipe uses: a camera needs the pixel pitch, a bench does not.
         """
-        wanted = dict(self.lacking)
+        targets = dict(self.lacking)
         misspelt = set()
-        for leaf in [leaf for leaf in self._block_leaves() if not self._is_used(leaf.path)]:
-            instead = self._instead(leaf) or ()
-            if _is_packaged(leaf) and instead not in wanted:
+        for leaf in self._unused():
+            meant = self._meant(leaf) or ()
+            if _is_packaged(leaf) and meant not in targets:
                 self.spare.add(leaf.path)
                 continue
-            misspelt.add(instead)
-            if now := renamed_keys.instead(leaf.name):
+            misspelt.add(meant)
+            if now := instead(leaf.name):
                 self.diagnostics.append(Diagnostic(leaf.key, leaf.name, now))
                 continue
-            shown = dotted(instead[-1:] if instead[:-1] == leaf.path[:-1] else instead)
+            shown = dotted(meant[-1:] if meant[:-1] == leaf.path[:-1] else meant)
             hint = f"; did you mean {shown}?" if shown else ": no step refers to this value"
-            asker = f" (needed at {wanted[instead].mark})" if instead in wanted else ""
+            user = f" (needed at {targets[meant].mark})" if meant in targets else ""
             code = "" if shown else UNREAD
-            self.diagnostics.append(Diagnostic(leaf.key, leaf.name, f"unknown{hint}{asker}", code))
+            self.diagnostics.append(Diagnostic(leaf.key, leaf.name, f"unknown{hint}{user}", code))
         self.diagnostics += [problem for path, problem in self.lacking if path not in misspelt]
 
-    def _block_leaves(self) -> Iterator[Value]:
+    def _unused(self) -> list[Value]:
         blocks = (block for key, block in self.root.items.items() if key not in RESERVED)
-        return (leaf for block in blocks for leaf in block.leaves() if leaf.data != {})
+        leaves = (leaf for block in blocks for leaf in block.leaves() if leaf.data != {})
+        return [v for v in leaves if not any(v.path[:n] in self.used for n in range(1, len(v.path) + 1))]
 
-    def _is_used(self, path: Where) -> bool:
-        return any(path[:n] in self.used for n in range(1, len(path) + 1))
-
-    def _instead(self, leaf: Value) -> Where | None:
-        """Return the new name of an old path, or the nearest path that steps refer to, first among those beside it."""
+    def _meant(self, leaf: Value) -> Where | None:
+        """Return the path that an unused path probably means: its new name, or a similar path to which steps refer."""
         if now := new_name(leaf.name):
             return tuple(now.split("."))
-        known = {*self.used, *(wanted for wanted, _ in self.lacking)}
+        known = {*self.used, *(path for path, _ in self.lacking)}
         known |= {(name,) for name in (*RESERVED, "defaults")} if len(leaf.path) == 1 else set()
         return _nearest(leaf.path, known)
 
 
 def _is_packaged(leaf: Value) -> bool:
-    """Return True if a value belongs to a packaged option, and not to a recipe or an argument."""
+    """Return True if a value comes from a packaged option, and not from a recipe or an argument."""
     return leaf.key.line > 0 and leaf.mark.line > 0 and Path(leaf.mark.folder).parent == packaged()
 
 
 def _nearest(path: Where, known: set[Where]) -> Where | None:
-    """Return the path whose last name is nearest, first among the paths beside it."""
+    """Return the known path with the most similar last name, if possible in the same block."""
+    paths_by_name = {str(other[-1]): other for other in sorted(known, key=str)}
     beside = {str(other[-1]): other for other in known if other[:-1] == path[:-1]}
-    for paths in (beside, {str(other[-1]): other for other in known}):
+    for paths in (beside, paths_by_name):
         close = difflib.get_close_matches(str(path[-1]), paths, 1, 0.75)
         if close:
             return paths[close[0]]
     return None
 
 
-BROKEN = type("Broken", (), {"__repr__": lambda self: "?", "__doc__": "The value of a failed reference."})()
+BROKEN = type("Broken", (), {"__repr__": lambda self: "?", "__doc__": "Value of a failed reference."})()
 
 
 def broken(value: Value) -> bool:
-    """Return True if a part of a value could not be resolved."""
+    """Return True if a value, or a value within it, is `BROKEN`."""
     return value.data is BROKEN or any(map(broken, value.items.values()))
 
 
@@ -216,11 +211,3 @@ def _texts(value: Value) -> Iterator[Value]:
         yield value
     for child in value.items.values():
         yield from _texts(child)
-
-
-def _follow(start: Value, parts: list[str]) -> Value | None:
-    here: Value | None = start
-    for part in parts:
-        items = here.items if here else {}
-        here = items.get(part) if part in items else items.get(int(part)) if part.isdecimal() else None
-    return here

@@ -1,4 +1,4 @@
-"""Old names of recipe keys, nodes and parameters, and what each is called now: one table, for messages."""
+"""Table of the old names of recipe keys, nodes and parameters with their present names, for messages."""
 
 from __future__ import annotations
 
@@ -69,7 +69,7 @@ POSTERIOR_NAMES = {"pedestal": "offset", "dark_noise": "temporal_dark_noise"}
 
 
 def new_name(old: str) -> str | None:
-    """Return what an old path, or a path below one, is called now; None for a path that was never renamed."""
+    """Return the present name of an old path or of a path below it, or None for a path that was never renamed."""
     parts = old.split(".")
     for n in range(len(parts), 0, -1):
         if now := _CALLED.get(".".join(parts[:n])):
@@ -78,7 +78,7 @@ def new_name(old: str) -> str | None:
 
 
 def instead(old: str) -> str:
-    """Return what to write instead of an old path; empty for a path that was never renamed."""
+    """Return a message that says what to write instead of an old path, or an empty text for another path."""
     if now := new_name(old):
         return f"is called {now} now"
     return _GONE.get(old, "")
@@ -90,5 +90,5 @@ def became_input(node: str, parameters: Iterable[str]) -> bool:
 
 
 def old_names() -> tuple[str, ...]:
-    """Return all old paths."""
+    """Return all old paths in the table."""
     return (*_CALLED, *_GONE)

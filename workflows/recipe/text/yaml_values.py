@@ -1,13 +1,10 @@
-"""Values of YAML 1.2 with their locations.
-
-``1e3`` is a number, ``on`` is a string, ``010`` is ten, and a key that occurs twice is a mistake.
-"""
+"""Values of YAML 1.2 with their locations: ``1e3`` is a number, ``on`` a string, and ``010`` ten."""
 
 from __future__ import annotations
 
 import math
 import re
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from dataclasses import dataclass, replace
 from functools import lru_cache
 from pathlib import Path
@@ -19,18 +16,18 @@ from ruamel.yaml.nodes import MappingNode, Node, ScalarNode
 
 from neusee.workflows.graph.diagnostics import Diagnostic, Location, RecipeError
 
-Where = tuple[str | int, ...]  #: keys and indices from the top of a recipe
+Where = tuple[str | int, ...]  #: path of a value: keys and indices from the top of a recipe
 
 _TAG = "tag:yaml.org,2002:"
 _INT = re.compile(r"[-+]?[0-9]+|0o[0-7]+|0x[0-9a-fA-F]+")
 _FLOAT = re.compile(r"[-+]?(?:\.[0-9]+|[0-9]+(?:\.[0-9]*)?)(?:[eE][-+]?[0-9]+)?")
 _MOST = 1_000_000  #: values in one file
-_MOST_AGAIN = 100_000  #: values made by aliases in one file
+_MOST_ALIASED = 100_000  #: values in one file that come from aliases
 
 
-@dataclass(frozen=True, slots=True)
+@dataclass(frozen=True, slots=True, eq=False)
 class Value:
-    """A scalar, a list of values or a mapping of values, with the location of its key and of itself."""
+    """A scalar, a list or a mapping from YAML, with the locations of its key and of the value."""
 
     data: Any  #: None, bool, int, float, str, list[Value] or dict[str | int, Value]
     mark: Location
@@ -43,20 +40,47 @@ class Value:
 
     @property
     def plain(self) -> Any:
-        """Return the value without locations."""
+        """Return the value as plain Python data, without locations."""
         if isinstance(self.data, dict):
             return {key: value.plain for key, value in self.data.items()}
         return [value.plain for value in self.data] if isinstance(self.data, list) else self.data
 
     @property
     def items(self) -> dict[Any, Value]:
-        """Return the children by key or index; a scalar has none."""
+        """Return the children of a mapping or a list by key or index; return an empty dict for a scalar."""
         if isinstance(self.data, dict):
             return self.data
         return dict(enumerate(self.data)) if isinstance(self.data, list) else {}
 
+    def child(self, name: str | int) -> Value | None:
+        """Return the child with a key or an index, also for a number that is written as a string."""
+        items = self.items
+        if name not in items and isinstance(name, str) and name.isdecimal():
+            name = int(name)
+        return items[name] if name in items else next((v for key, v in items.items() if str(key) == str(name)), None)
+
+    def below(self, path: Iterable[str | int]) -> Value | None:
+        """Return the value at a path below this value, or None where the path does not exist."""
+        value: Value | None = self
+        for name in path:
+            value = value.child(name) if value else None
+        return value
+
+    def replaced(self, key: str | int, child: Value | None) -> Value:
+        """Return a mapping or a list with another child at a key, or without the key if ``child`` is None."""
+        items = {k: v for k, v in self.items.items() if child is not None or k != key}
+        if child is not None:
+            items[key] = child
+        if isinstance(self.data, list):
+            return replace(self, data=[replace(v, path=(*self.path, i)) for i, v in enumerate(items.values())])
+        return replace(self, data=items)
+
+    def without(self, key: str) -> Value:
+        """Return a mapping without one of its keys; return the same mapping where it does not have the key."""
+        return self.replaced(key, None) if key in self.items else self
+
     def leaves(self) -> Iterator[Value]:
-        """Yield scalars, lists and empty mappings below a mapping, in order."""
+        """Yield the scalars, lists and empty mappings in a mapping, at any depth and in order."""
         if not isinstance(self.data, dict) or not self.data:
             yield self
             return
@@ -66,7 +90,7 @@ class Value:
 
 @dataclass(frozen=True, slots=True)
 class Document:
-    """One file: its top mapping, and its first line if that line is a comment."""
+    """A YAML file: its top mapping, and as title its first line if that line is a comment."""
 
     root: Value
     title: str
@@ -77,7 +101,7 @@ def dotted(path: Where) -> str:
 
 
 def read(path: Path, shown: str) -> Document:
-    """Read a file known to the user as ``shown``; raise one `RecipeError` with the location of every mistake."""
+    """Read a YAML file; messages name the file as ``shown``. Raises one `RecipeError` with all mistakes of the file."""
     try:
         text = path.read_bytes().decode("utf-8-sig")
     except UnicodeDecodeError as error:
@@ -100,7 +124,7 @@ def _document(text: str, shown: str, folder: str) -> Document:
 
 
 def parse(text: str, start: Location, path: Where = ()) -> Value:
-    """Read YAML text. ``start`` is the place of the text; the values of an argument share this place (line 0)."""
+    """Read YAML text that begins at a location; all values of an argument (line 0) have the same location."""
     builder = _Builder(start)
     try:
         node = YAML(typ="safe", pure=True).compose(text)
@@ -115,21 +139,21 @@ def parse(text: str, start: Location, path: Where = ()) -> Value:
 
 
 def kind(value: Value) -> str:
-    """Return the kind of a value in words."""
+    """Return the kind of a value in words, such as ``a list``."""
     names = {dict: "a mapping", list: "a list", str: "a string", bool: "true or false", type(None): "nothing"}
     return names.get(type(value.data), "a number")
 
 
 class _Builder:
-    """Builder of the values of one text; an alias gives the identical value again."""
+    """Builder of the values in one YAML text, in which aliases copy values."""
 
     def __init__(self, start: Location) -> None:
         self.start = start
         self.diagnostics: list[Diagnostic] = []
-        self.made: dict[int, Value] = {}
+        self.built: dict[int, Value] = {}
         self.open: set[int] = set()
         self.size: dict[int, int] = {}
-        self.again = 0  # number of values made by aliases
+        self.aliased = 0  # number of values that come from aliases
 
     def value(self, node: Node, path: Where, key: Location) -> Value:
         mark, tag = self._mark(node), (node.tag or "").replace(_TAG, "!!")
@@ -137,18 +161,18 @@ class _Builder:
             return self._refuse(mark, path, f"unknown tag {tag}: remove the tag")
         if isinstance(node, ScalarNode):
             return Value(_scalar(node), mark, key, path)
-        if id(node) in self.made:
-            self.again += self.size[id(node)]
-            self._refuse_many(self.again, _MOST_AGAIN, mark, path)
-            return replace(_moved(self.made[id(node)], path), key=key)
+        if id(node) in self.built:
+            self.aliased += self.size[id(node)]
+            self._refuse_many(self.aliased, _MOST_ALIASED, mark, path)
+            return replace(_moved(self.built[id(node)], path), key=key)
         if id(node) in self.open:
             return self._refuse(mark, path, "an alias refers to the value that contains the alias")
         self.open.add(id(node))
         data = self._mapping(node, path) if isinstance(node, MappingNode) else self._list(node, path)
         self.open.discard(id(node))
-        made = self.made[id(node)] = Value(data, mark, key, path)
-        self._weigh(node, made)
-        return made
+        value = self.built[id(node)] = Value(data, mark, key, path)
+        self._weigh(node, value)
+        return value
 
     def _mapping(self, node: MappingNode, path: Where) -> dict[str | int, Value]:
         data: dict[str | int, Value] = {}
@@ -159,10 +183,8 @@ class _Builder:
             elif key is None:
                 self._refuse(mark, path, "a key must be a name or a whole number")
             elif key in data:
-                first = data[key].key
-                self._refuse(
-                    mark, (*path, key), f"given twice, first in line {first.line}" if first.line else "given twice"
-                )
+                line = data[key].key.line
+                self._refuse(mark, (*path, key), f"given twice, first in line {line}" if line else "given twice")
             else:
                 data[key] = self.value(value_node, (*path, key), mark)
         return data
@@ -170,15 +192,15 @@ class _Builder:
     def _list(self, node: Node, path: Where) -> list[Value]:
         return [self.value(child, (*path, i), self._mark(child)) for i, child in enumerate(node.value)]
 
-    def _weigh(self, node: Node, made: Value) -> None:
-        """Raise `RecipeError` for a small file that aliases expand to too many values."""
+    def _weigh(self, node: Node, value: Value) -> None:
+        """Count the values in a list or a mapping; raise `RecipeError` where aliases make too many values."""
         children = [v for pair in node.value for v in pair] if isinstance(node, MappingNode) else node.value
         self.size[id(node)] = 1 + sum(self.size.get(id(child), 1) for child in children)
-        self._refuse_many(self.size[id(node)], _MOST, made.mark, made.path)
+        self._refuse_many(self.size[id(node)], _MOST, value.mark, value.path)
 
     def _refuse_many(self, count: int, most: int, mark: Location, path: Where) -> None:
         if count > most:
-            raise RecipeError([Diagnostic(mark, dotted(path), f"aliases expand this to more than {most} values")])
+            raise RecipeError([Diagnostic(mark, dotted(path), f"aliases expand this value to more than {most} values")])
 
     def _mark(self, node: Node) -> Location:
         if not self.start.line:
@@ -191,7 +213,7 @@ class _Builder:
 
 
 def _moved(value: Value, path: Where) -> Value:
-    """Return the same value at another path, with all values below it."""
+    """Return a copy of a value, and of all values in it, at another path."""
     data = value.data
     if isinstance(data, dict):
         data = {key: _moved(child, (*path, key)) for key, child in data.items()}
@@ -213,7 +235,7 @@ def _scalar(node: ScalarNode) -> Any:
 
 
 def number(text: str) -> int | float | str:
-    """Return a number as YAML 1.2 writes it, or the text itself."""
+    """Return the number that a text means in YAML 1.2, or the text if it is no number."""
     if _INT.fullmatch(text):
         return int(text, 0 if text[:2] in ("0o", "0x") else 10)
     if _FLOAT.fullmatch(text):
@@ -225,7 +247,7 @@ def number(text: str) -> int | float | str:
 
 
 def _key(node: Node) -> str | int | None:
-    """Return a key as a name or a whole number, or None for another kind of key."""
+    """Return the key of a mapping as a name or a whole number, or None for another kind of key."""
     if not isinstance(node, ScalarNode):
         return None
     key = _scalar(node)
@@ -233,7 +255,7 @@ def _key(node: Node) -> str | int | None:
 
 
 def _explain(error: Exception, text: str, start: Location, path: Where) -> Diagnostic:
-    """Return a located message for a text that is not YAML."""
+    """Return the diagnostic for a text that is not YAML."""
     at = getattr(error, "problem_mark", None)
     line, column = (at.line, at.column) if at else _control(text)
     problem = error.problem if isinstance(error, MarkedYAMLError) and error.problem else "an invalid character"
@@ -258,7 +280,7 @@ def _fix(problem: str, here: str, column: int) -> str:
 
 
 def _control(text: str) -> tuple[int, int]:
-    """Return line and column of the first control character."""
-    found = re.search(r"[\x00-\x08\x0b\x0c\x0e-\x1f\x7f\ud800-\udfff\ufffe\uffff]", text)
-    before = text[: found.start()] if found else ""
+    """Return the line and column of the first control character in a text."""
+    match = re.search(r"[\x00-\x08\x0b\x0c\x0e-\x1f\x7f\ud800-\udfff\ufffe\uffff]", text)
+    before = text[: match.start()] if match else ""
     return before.count("\n"), len(before.rpartition("\n")[2])

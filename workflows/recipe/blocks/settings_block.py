@@ -1,0 +1,64 @@
+"""Blocks of settings in a recipe: their base class, the types of their values, and a reader that reports mistakes."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Annotated, Any, TypeVar, get_args
+
+from pydantic import BaseModel, ConfigDict, Field, ValidationError
+
+from neusee.workflows.graph.diagnostics import Diagnostic, nearest
+from neusee.workflows.recipe.text.composition import Composed
+from neusee.workflows.recipe.text.renamed_keys import instead
+from neusee.workflows.recipe.text.yaml_values import Value
+
+Weight = Annotated[float, Field(ge=0, allow_inf_nan=False)]
+Share = Annotated[float, Field(ge=0, le=1)]
+Beta = Annotated[float, Field(ge=0, lt=1)]
+Number = Annotated[int, Field(ge=1)]
+
+
+class SettingsBlock(BaseModel):
+    """Block of settings in which an unknown key is a mistake."""
+
+    model_config = ConfigDict(extra="forbid", frozen=True)
+
+
+Settings = TypeVar("Settings", bound=SettingsBlock)
+
+
+def read_block(composed: Composed, key: str, model: type[Settings], plain: Any) -> tuple[Composed, Settings | None]:
+    """Return the recipe without the block of a key, and the settings that the plain data of the block give.
+
+    The settings are None for a block with mistakes, which become diagnostics of the recipe.
+    """
+    block, rest = composed.root.items[key], composed.without(key)
+    try:
+        return rest, model.model_validate(plain)
+    except ValidationError as error:
+        return rest.with_problems(_problem(block, model, each) for each in error.errors()), None
+
+
+def _problem(block: Value, model: type[BaseModel], error: Any) -> Diagnostic:
+    """Return a diagnostic with the fix, at the innermost value of the block that pydantic names."""
+    value = block
+    for key in error["loc"]:
+        value = value.child(key) or value
+    text = str(error["msg"])
+    if error["type"] == "extra_forbidden":
+        names = _fields(model, error["loc"])
+        return Diagnostic(value.key, value.name, instead(value.name) or f"unknown; {nearest(error['loc'][-1], names)}")
+    if now := instead(f"{value.name}={error['input']}"):
+        text = f"{error['input']} {now}"
+    elif error["type"] == "missing":
+        text = f"needs {error['loc'][-1]}"
+    return Diagnostic(value.mark, value.name, text)
+
+
+def _fields(model: type[BaseModel], path: Sequence[int | str]) -> list[str]:
+    """Return the names of the settings that a block allows at a path."""
+    for key in path:
+        if key in model.model_fields:
+            annotation: Any = model.model_fields[str(key)].annotation
+            model = (get_args(annotation) or (annotation,))[-1]
+    return list(model.model_fields)
