@@ -1,4 +1,4 @@
-"""``neusee run``: a recipe from the cache where it can, its report, and one line for each step."""
+"""The command ``neusee run``: run a recipe and write its report."""
 
 from __future__ import annotations
 
@@ -8,7 +8,6 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from neusee.workflows.cli.command_frame import (
-    MISSED,
     Debug,
     Device,
     Exact,
@@ -19,10 +18,11 @@ from neusee.workflows.cli.command_frame import (
     executor_of,
     fail,
     load,
-    parse_memory,
+    memory_limit,
     say,
     the_store,
 )
+from neusee.workflows.cli.command_list import MISSED
 
 if TYPE_CHECKING:
     from neusee.workflows.engine.step_job import Executor
@@ -51,18 +51,18 @@ def run(
     Steps whose results are in the cache are not computed again. Without a name the recipe is first_light. The folder
     of results holds report.html, the numbers, the pictures and the recipe with every final value.
     """
-    recipe, command = load(words, exact=exact)
+    recipe, command = load(words, "run", exact=exact)
     from neusee.workflows.report import console
 
     check_device(device)
-    room = parse_memory(memory, "--memory") if memory else None
+    limit = memory_limit(memory)
     if not (as_json or quiet):
         say(console.opening(recipe, " ".join(command[1:])))
     store = the_store()
-    if room is not None:
-        _refuse_too_large(recipe, store, device, room)
-    with executor_of(executor, store) as carries_out:
-        done = _simulate(recipe, store, command, device, out, as_json or quiet, carries_out, room)
+    if limit is not None:
+        _refuse_too_large(recipe, store, device, limit)
+    with executor_of(executor, store) as computes:
+        done = _simulate(recipe, store, command, device, out, as_json or quiet, computes, limit)
     if as_json:
         import json
 
@@ -76,7 +76,7 @@ def run(
 
 
 def _refuse_too_large(recipe: Recipe, store: Store, device: str, memory: int) -> None:
-    """Stop before anything runs where, as far as earlier runs tell, the memory cannot do."""
+    """End the command before anything runs if earlier runs show that the memory is too small."""
     from neusee.workflows.engine.local_executor import lanes_of
     from neusee.workflows.explain.run_forecast import planned
 

@@ -8,7 +8,19 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from neusee.workflows.cli.command_frame import FAILED, Debug, Out, Words, check_device, fail, load, say, the_store
+from neusee.workflows.cli.command_frame import (
+    Debug,
+    Out,
+    Words,
+    check_device,
+    fail,
+    failing,
+    load,
+    progress_lines,
+    say,
+    the_store,
+)
+from neusee.workflows.cli.command_list import FAILED
 
 if TYPE_CHECKING:
     from collections.abc import Mapping
@@ -17,7 +29,7 @@ if TYPE_CHECKING:
 
 
 class Stages(StrEnum):
-    """The stages that are learnt."""
+    """The choices of ``--stage``: which stages of the training run."""
 
     FIRST = "1"
     SECOND = "2"
@@ -27,7 +39,7 @@ class Stages(StrEnum):
 
 _STAGES = "1: mask and network; 2: network alone; both: 1, then 2; mask: mask alone, without images."
 _MESH = "DATAxBAND processes of torchrun: 4x2, four groups that share the bands by two; else all share the data."
-_NUMBERS = {Stages.FIRST: (1,), Stages.SECOND: (2,), Stages.BOTH: (1, 2), Stages.MASK: (0,)}  #: of `train`
+_NUMBERS = {Stages.FIRST: (1,), Stages.SECOND: (2,), Stages.MASK: (0,)}  #: the `stages` that `verbs.train` takes
 
 
 def train(
@@ -49,12 +61,12 @@ def train(
     Several processes share one training: torchrun --nproc-per-node 8 --no-python neusee train RECIPE --device cuda
     --mesh 4x2.
     """
-    recipe, command = load(words or ["train_small"])
+    recipe, command = load(words or ["train_small"], "train")
     if recipe.lifting is not None:
         if stage is not Stages.BOTH or mesh:
             fail(f"{recipe.name} learns a lift, which has neither stages nor a mesh: leave --stage and --mesh out")
         check_device(device)
-        return _lift(recipe, ["neusee", "train", *command[2:]], out, device, quiet)
+        return _lift(recipe, command, out, device, quiet)
     from neusee.workflows.api import verbs
     from neusee.workflows.graph.run_error import RunError
     from neusee.workflows.training.parallel.process_mesh import MeshError, device_here, joined, processes
@@ -62,37 +74,33 @@ def train(
     device, (rank, world) = device_here(device), processes()
     check_device(device)
     quiet, who = quiet or rank > 0, f"process {rank}: " if world > 1 else ""
-    stages = _NUMBERS[stage] if stage is not Stages.BOTH else recipe.training.learnt if recipe.training else ()
-    progress = (lambda line: None) if quiet else (lambda line: say([line]))
-    again = ["neusee", "train", *command[2:], "--stage", stage.value, *(["--mesh", mesh] if mesh else [])]
+    stages = _NUMBERS.get(stage, recipe.training.learnt if recipe.training else ())
+    command += ["--stage", stage.value, *(["--mesh", mesh] if mesh else [])]
     lengths = {s: recipe.training.stages[s].iterations for s in stages if s} if recipe.training else {}
-    try:
-        with joined(mesh, device) as processes_here, _LossBar(quiet, lengths) as bar:
-            folder = verbs.train(recipe, store=the_store(), device=device, out=out, progress=progress, command=again,
-                                 stages=stages, watch=bar.watch, mesh=processes_here)  # fmt: skip
-    except MeshError as error:
-        fail(f"{who}{error}")
-    except (RunError, ValueError, ArithmeticError) as error:
-        fail(f"{who}{error}", FAILED)
+    with (
+        failing(RunError, ValueError, ArithmeticError, code=FAILED, before=who),
+        failing(MeshError, before=who),
+        joined(mesh, device) as processes_here,
+        _LossBar(quiet, lengths) as bar,
+    ):
+        folder = verbs.train(recipe, store=the_store(), device=device, out=out, progress=progress_lines(quiet),
+                             command=command, stages=stages, watch=bar.watch, mesh=processes_here)  # fmt: skip
     if not quiet:
         say(_next(folder, stage))
     if rank == 0:
         say([str(folder)])
 
 
-def _lift(recipe: Recipe, again: list[str], out: Path, device: str, quiet: bool) -> None:
-    """Learn a lift from RGB to spectra."""
+def _lift(recipe: Recipe, command: list[str], out: Path, device: str, quiet: bool) -> None:
+    """Train the network of a recipe from RGB to spectra."""
     from neusee.workflows.api import verbs
     from neusee.workflows.graph.run_error import RunError
 
     assert recipe.lifting is not None
-    progress = (lambda line: None) if quiet else (lambda line: say([line]))
-    try:
-        with _LossBar(quiet, {0: recipe.lifting.iterations}) as bar:
-            folder = verbs.train(recipe, store=the_store(), device=device, out=out, progress=progress, command=again,
-                                 watch=bar.watch)  # fmt: skip
-    except (RunError, ValueError, ArithmeticError) as error:
-        fail(str(error), FAILED)
+    lengths = {0: recipe.lifting.iterations}
+    with failing(RunError, ValueError, ArithmeticError, code=FAILED), _LossBar(quiet, lengths) as bar:
+        folder = verbs.train(recipe, store=the_store(), device=device, out=out, progress=progress_lines(quiet),
+                             command=command, watch=bar.watch)  # fmt: skip
     if not quiet:
         weights = folder / "mst_plus_plus.safetensors"
         say([f"weights: {weights}", f"curves:  {folder / 'curves.png'}", f"judged:  {folder / 'training.json'}",
@@ -109,7 +117,7 @@ def _next(folder: Path, stage: Stages) -> list[str]:
 
 
 class _LossBar:
-    """A progress bar with the losses, on a terminal."""
+    """A progress bar with the losses of a training, shown on a terminal alone."""
 
     def __init__(self, quiet: bool, lengths: Mapping[int, int]) -> None:
         from rich.console import Console
@@ -130,9 +138,8 @@ class _LossBar:
     def __exit__(self, *error: object) -> None:
         self._shown.stop()
 
-    def watch(self, stage: int, done: int, found: Mapping[str, float]) -> None:
-        """Show the losses of an iteration."""
-        losses = " ".join(
-            f"{name} {found[name]:.3g}" for name in ("LSR", "L1", "critics", "MRAE", "RMSE") if name in found
-        )
-        self._shown.update(self._tasks[stage], completed=done, losses=losses)
+    def watch(self, stage: int, done: int, losses: Mapping[str, float]) -> None:
+        """Show the losses of iteration ``done`` of a stage."""
+        names = ("LSR", "L1", "critics", "MRAE", "RMSE")
+        text = " ".join(f"{name} {losses[name]:.3g}" for name in names if name in losses)
+        self._shown.update(self._tasks[stage], completed=done, losses=text)
