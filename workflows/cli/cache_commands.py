@@ -115,9 +115,7 @@ def verify_lines(store: Store) -> tuple[list[str], int]:
             sizes.append(_size(about))
     last = f"{_count(len(sizes), 'result')}, {format_size(sum(sizes))}, as written"
     if damaged:
-        last += (
-            f"; {len(damaged)} damaged, put aside in {store.root / 'bad'}: the next run computes those it needs"
-        )
+        last += f"; {len(damaged)} damaged, put aside in {store.root / 'bad'}: the next run computes those it needs"
     return [*damaged, last], len(damaged)
 
 

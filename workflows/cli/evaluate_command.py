@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, Any
 
 import typer
 
@@ -53,30 +53,31 @@ def evaluate(
     """
     name, changes, _ = split(words)
     check_device(device)
-    multiples = _numbers(strengths)
     options = {"data": data, "scenes": scenes, "strengths": strengths, "small": small, "reference": reference}
-    command = ["neusee", "evaluate", name, *changes, f'--pipelines "{pipelines}"', *option_words(options)]
+    folder = _evaluate(
+        name,
+        changes=changes,
+        pipelines=pipelines,
+        data=data or None,
+        scenes=scenes,
+        strengths=_numbers(strengths),
+        small=small,
+        reference=reference.replace(" ", ""),
+        device=device,
+        out=out,
+        progress=progress_lines(quiet),
+        command=["neusee", "evaluate", name, *changes, f'--pipelines "{pipelines}"', *option_words(options)],
+    )
+    say([str(folder / "report.html")])
+
+
+def _evaluate(name: str, **options: Any) -> Path:
     from neusee.workflows.api import verbs
     from neusee.workflows.evaluation.pipelines import EvaluationRefused
     from neusee.workflows.graph.run_error import RunError
 
     with failing(EvaluationRefused), failing(RunError, code=FAILED):
-        folder = verbs.evaluate(
-            name,
-            pipelines=pipelines,
-            changes=changes,
-            store=the_store(),
-            device=device,
-            out=out,
-            progress=progress_lines(quiet),
-            command=command,
-            data=data or None,
-            scenes=scenes,
-            strengths=multiples,
-            small=small,
-            reference=reference.replace(" ", ""),
-        )
-    say([str(folder / "report.html")])
+        return verbs.evaluate(name, store=the_store(), **options)
 
 
 def _numbers(text: str) -> list[float]:
