@@ -1,4 +1,4 @@
-"""The frame of every command: options that commands share, and how a command reads a recipe, prints and fails."""
+"""The frame of every command: how a command reads a recipe, checks its options, prints and fails."""
 
 from __future__ import annotations
 
@@ -7,8 +7,7 @@ import sys
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import replace
-from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any, NoReturn
+from typing import TYPE_CHECKING, Any, NoReturn
 
 import typer
 
@@ -21,24 +20,6 @@ if TYPE_CHECKING:
     from neusee.workflows.store.result_store import Store
 
 DEFAULT = "first_light"
-
-Words = Annotated[
-    list[str] | None,
-    typer.Argument(
-        metavar="[RECIPE] [OVERRIDE]...",
-        help="A recipe's name or file, then changes: a.b=1, +a.b=1, ~a.b, laser=six.",
-        show_default=False,
-    ),
-]
-Debug = Annotated[bool, typer.Option("--debug", help="Show where in the code an error arose.")]
-Device = Annotated[str, typer.Option("--device", help="Where to compute: cpu, cuda, or several: cuda:0,cuda:1,cpu.")]
-OneDevice = Annotated[str, typer.Option("--device", help="Where to compute: cpu or cuda.")]
-Quiet = Annotated[bool, typer.Option("--quiet", help="Print only the path of the page.")]
-Exact = Annotated[bool, typer.Option("--exact", help="Compute every step in full; omit nothing.")]
-Memory = Annotated[
-    str, typer.Option("--memory", help="Limit of a device's memory, such as 6 GB, as far as earlier runs tell.")
-]
-Out = Annotated[Path, typer.Option("--out", help="Folder in which to make the folder of results.")]
 
 
 def split(words: list[str] | None, before: int = 0) -> tuple[str, list[str], int]:

@@ -18,7 +18,7 @@ EXIT_CODES = (
 
 #: from the name of each command to the module that defines the command, and to the first line of the command's help
 COMMANDS = {
-    "run": ("run_command", "Run a recipe and write its report."),
+    "run": ("recipe_commands", "Run a recipe and write its report."),
     "validate": ("recipe_commands", "Check a recipe without running it."),
     "plan": ("recipe_commands", "Say what a run would compute, where and for how long."),
     "why": ("recipe_commands", "Say why a step differs from its nearest earlier result."),

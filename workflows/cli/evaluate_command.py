@@ -8,11 +8,6 @@ from typing import Annotated, Any
 import typer
 
 from neusee.workflows.cli.command_frame import (
-    Debug,
-    OneDevice,
-    Out,
-    Quiet,
-    Words,
     check_device,
     fail,
     failing,
@@ -23,6 +18,7 @@ from neusee.workflows.cli.command_frame import (
     the_store,
 )
 from neusee.workflows.cli.command_list import FAILED
+from neusee.workflows.cli.command_options import Debug, OneDevice, Out, Quiet, Words
 
 
 def evaluate(

@@ -9,11 +9,6 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 
 from neusee.workflows.cli.command_frame import (
-    Debug,
-    OneDevice,
-    Out,
-    Quiet,
-    Words,
     check_device,
     fail,
     failing,
@@ -24,6 +19,7 @@ from neusee.workflows.cli.command_frame import (
     the_store,
 )
 from neusee.workflows.cli.command_list import FAILED
+from neusee.workflows.cli.command_options import Debug, OneDevice, Out, Quiet, Words
 
 if TYPE_CHECKING:
     from neusee.workflows.api.verbs import Kind

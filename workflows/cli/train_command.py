@@ -8,19 +8,9 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from neusee.workflows.cli.command_frame import (
-    Debug,
-    Out,
-    Words,
-    check_device,
-    fail,
-    failing,
-    load,
-    progress_lines,
-    say,
-    the_store,
-)
+from neusee.workflows.cli.command_frame import check_device, fail, failing, load, progress_lines, say, the_store
 from neusee.workflows.cli.command_list import FAILED
+from neusee.workflows.cli.command_options import Debug, Out, Words
 
 if TYPE_CHECKING:
     from collections.abc import Mapping
