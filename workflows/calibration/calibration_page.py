@@ -91,7 +91,7 @@ class CalibrationResult:
 
 
 def with_uncertainty(mean: float, sd: float) -> str:
-    """Return a mean and its standard deviation, both with the digits that give two to the standard deviation."""
+    """Return a mean and its standard deviation as text, with two significant digits of the standard deviation."""
     if not sd > 0:
         return f"{mean:.6g} ± {sd:g}"
     digits = 1 - math.floor(math.log10(sd))

@@ -100,7 +100,7 @@ def _longest_time(runs: Sequence[Walk], steps: int | None = None) -> float:
 
 
 def _round(iteration: int) -> tuple[int, int]:
-    """Return the last steps of two successive rounds, of which the second ends at ``iteration`` or later."""
+    """Return the lengths in steps of two successive rounds; the second is the first round to reach ``iteration``."""
     before, steps = 0, _FIRST
     while steps < iteration:
         before, steps = steps, int(_GROWTH * steps)

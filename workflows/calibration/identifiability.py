@@ -48,7 +48,7 @@ class Identifiability:
 
 
 def identify(problem: SensorPosterior, mode: LaplaceFit) -> Identifiability:
-    """Return the identifiability by singular values of the slopes of levels per standard deviation of the prior."""
+    """Return the parameters that the levels determine, by singular values of the slopes of the levels."""
     _, s, v = np.linalg.svd(mode.scaled_slopes)
     s = np.concatenate([s, np.zeros(len(v) - len(s))])
     kinds = {n: "estimate" if own else "none" for n, own in zip(problem.names, _own(s, v), strict=True)}

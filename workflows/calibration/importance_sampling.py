@@ -39,7 +39,7 @@ def draw_samples(problem: SensorPosterior, mode: LaplaceFit, rng: np.random.Gene
     if best < _LEAST:
         raise ValueError(
             f"{DRAWS} draws of {', '.join(problem.names)} have an effective sample size of {best * DRAWS:.0f}: "
-            "hold the parameters that the levels do not determine"
+            "hold the parameters that the levels do not determine at fixed values"
         )
     return kept
 

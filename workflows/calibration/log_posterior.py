@@ -101,7 +101,7 @@ class SensorPosterior:
 
 
 def only_step(recipe: Recipe, *paths: str) -> Step:
-    """Return the only step of the nodes ``paths``; raise `ValueError` where a recipe has none or several."""
+    """Return the only step whose node is in ``paths``; raise `ValueError` for no such step or several."""
     steps = [step for step in recipe.steps.values() if step.node.path in paths]
     if len(steps) != 1:
         count = f"{len(steps)} steps" if steps else "no step"

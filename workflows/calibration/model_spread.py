@@ -43,7 +43,7 @@ _Posterior = dict[str, tuple[float, float]]  #: mean and standard deviation of e
 
 
 def compare_models(recipe: Recipe, store: Store, seed: int = 0) -> list[ModelSpread]:
-    """Return the posterior by each model and the interval to state, for each parameter that is free in all models.
+    """Return each parameter that is free in all models, with its posterior by each model and the interval to state.
 
     The stated value is the middle of the two richest models; its width is the wider of both and half their distance, in
     quadrature.
@@ -59,8 +59,9 @@ def compare_models(recipe: Recipe, store: Store, seed: int = 0) -> list[ModelSpr
     """
     full = SensorPosterior.of(recipe, store)
     if not isinstance(full.levels, Levels):
-        raise ValueError(f"{recipe.name} weighs pixels that are all alike: for models of the response, use the node "
-                         "calibrate.camera")  # fmt: skip
+        raise ValueError(
+            f"{recipe.name} has a likelihood of identical pixels: models of the response need calibrate.camera"
+        )
     terms = [name for name in TERMS if name in full.names]
     _check_levels(full, full.levels, terms)
     rng = np.random.default_rng(seed)

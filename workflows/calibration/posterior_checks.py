@@ -39,7 +39,7 @@ class Check:
 
 @dataclass(frozen=True)
 class GoodnessOfFit:
-    """The deviance of all levels, and the probability that chance alone makes it as large."""
+    """The deviance of all levels, and the probability of a deviance as large by chance alone."""
 
     deviance: float
     freedom: float  #: degrees of freedom
@@ -108,12 +108,14 @@ def _of_chains(chains: Chains) -> Iterator[Check]:
     from neusee.workflows.calibration import emcee_sampler
 
     taus = chains.steps / chains.tau
-    yield Check("chains are long", f"{taus:.0f} autocorrelation times", "50, tau settled", _mark(chains.long))
+    yield Check(
+        "chains are long", f"{taus:.0f} autocorrelation times", "at least 50, and tau has settled", _mark(chains.long)
+    )
     coordinates = np.moveaxis(chains.draws, -1, 0)
     rhat = max(map(_rhat, coordinates))
     yield Check("ensembles agree", f"R-hat {rhat:.4f}", f"at most {_RHAT}", _mark(rhat <= _RHAT))
     bulk, tail = (min(_effective_sample_size(draws, part) for draws in coordinates) for part in ("bulk", "tail"))
-    size, enough = f"effective sample size {bulk:.0f}, of the tails {tail:.0f}", min(bulk, tail) >= _INDEPENDENT
+    size, enough = f"effective sample size {bulk:.0f}, {tail:.0f} in the tails", min(bulk, tail) >= _INDEPENDENT
     yield Check("draws are enough", size, f"{_INDEPENDENT:.0f} each", _mark(enough))
     low, high = _ACCEPTED
     well = low <= chains.accepted <= high
@@ -130,7 +132,7 @@ def _of_peak(
     yield Check("the mode was found", search, "settled", _mark(mode.settled))
     below = mode.log - float(chains.log.max())
     distance = f"{abs(below):.2g} nats {'below' if below > 0 else 'above'} the mode"
-    yield Check("draws reach the mode", distance, f"within {_BELOW:.0f}", _mark(abs(below) <= _BELOW))
+    yield Check("draws reach the mode", distance, f"within {_BELOW:.0f} nats", _mark(abs(below) <= _BELOW))
     at = [i for i, name in enumerate(problem.names) if identifiability.kinds[name] == "estimate"]
     if not at:
         return
@@ -154,7 +156,7 @@ def _of_data(problem: SensorPosterior, mode: LaplaceFit, identifiability: Identi
     count = len(identifiability.directions)
     weak = f"{count} of {len(identifiability.strengths)} directions are not determined"
     text = weak if count else "all parameters are determined"
-    yield Check("the levels determine the parameters", text, "all, else no value is given", _mark(not count, "warn"))
+    yield Check("the levels determine the parameters", text, "all directions are determined", _mark(not count, "warn"))
 
 
 def goodness_of_fit(likelihood: Likelihood, free: int = 0) -> GoodnessOfFit:
@@ -165,7 +167,7 @@ def goodness_of_fit(likelihood: Likelihood, free: int = 0) -> GoodnessOfFit:
     from scipy.special import chdtrc
 
     if not len(likelihood.degrees_of_freedom):
-        raise ValueError("this likelihood has no deviances: compute it with told: true")
+        raise ValueError("this likelihood has no deviances: compute the likelihood with told: true")
     if likelihood.deviance.numel() != len(likelihood.degrees_of_freedom):
         shape = tuple(likelihood.deviance.shape)
         raise ValueError(f"deviances {shape} are not of one sensor: give one row of parameters")

@@ -106,9 +106,9 @@ def find_mode(problem: SensorPosterior, initial_theta: FloatArray) -> LaplaceFit
 
 
 def _climb(problem: SensorPosterior, theta: FloatArray, log: float, step: FloatArray) -> tuple[FloatArray, float, bool]:
-    """Return the best point along shorter and shorter steps, its log posterior, and True if the point is higher.
+    """Return the best of many points along ``step``, its log posterior, and True if the point is higher than ``theta``.
 
-    The steps change all coordinates, or all except one, which may be at an edge.
+    The points change all coordinates, or all except one, which may be at an edge.
     """
     ways = np.concatenate([step[None], step * (1 - np.eye(len(step)))])
     tries = (theta + ways[:, None] * 0.5 ** np.arange(24)[:, None]).reshape(-1, len(theta))
@@ -120,7 +120,7 @@ def _climb(problem: SensorPosterior, theta: FloatArray, log: float, step: FloatA
 def _differences(
     function: Callable[[FloatArray], FloatArray], theta: FloatArray, step: FloatArray, sides: FloatArray
 ) -> FloatArray:
-    """Return slopes (value, free) of ``function``, by differences to the ``sides`` of each coordinate that are 1."""
+    """Return the slopes (value, free) of ``function`` by differences; ``sides`` (2, free) is 1 for each side to use."""
     apart = np.diag(step)
     high, low = np.split(function(np.concatenate([theta + apart * sides[0], theta - apart * sides[1]])), 2)
     slopes: FloatArray = (high - low).T / (step * sides.sum(0).clip(1))
@@ -128,7 +128,7 @@ def _differences(
 
 
 def _sides(problem: SensorPosterior, theta: FloatArray, step: FloatArray) -> FloatArray:
-    """Return 1 (2, free) where a step up, or down, crosses no edge, such as a full well or an end of the converter."""
+    """Return 1 (2, free) where a step up or down in a coordinate crosses no edge, such as a full well; 0 elsewhere."""
     apart = np.diag(step)
     log = problem.log_posterior(np.concatenate([theta[None], theta + apart, theta - apart]))
     possible: FloatArray = (log[1:] > log[0] - _EDGE).reshape(2, -1).astype(np.float64)

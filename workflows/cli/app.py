@@ -25,7 +25,7 @@ def __getattr__(name: str) -> Any:
 
 
 def main(arguments: list[str] | None = None) -> None:
-    """Run the command line and exit; print an error as one line, or with its traceback for ``--debug``."""
+    """Run the command line and exit; print an error as one line, or its whole traceback with ``--debug``."""
     arguments = sys.argv[1:] if arguments is None else arguments
     gc.disable()  # imported modules stay: a search for garbage among them costs a tenth of the start
     try:
@@ -53,7 +53,7 @@ def _run(arguments: list[str]) -> int:
 
 
 def _explained(error: Exception) -> int:
-    """Print an error as one line; return the exit code, which tells a wrong argument from a failed run."""
+    """Print an error as one line; return the exit code for a wrong argument or for a failed run."""
     message = getattr(error, "format_message", None)
     if message is not None:
         print(f"{message()} (try `neusee --help`)", file=sys.stderr)

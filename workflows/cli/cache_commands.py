@@ -101,7 +101,7 @@ def ls_lines(store: Store) -> list[str]:
 
 
 def verify_lines(store: Store) -> tuple[list[str], int]:
-    """Read every stored value and picture; return a line for each damaged result, and the number of these."""
+    """Read every stored value and picture; return a line for each damaged result, and their number."""
     from neusee.workflows.store.derived_files import DerivedFiles
 
     files = DerivedFiles(store)

@@ -1,4 +1,4 @@
-"""The command ``neusee calibrate``: the posterior of a sensor from its calibration frames."""
+"""The command ``neusee calibrate``: find the posterior of a sensor from calibration frames."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""The frame of every command: how a command reads a recipe, checks its options, prints and fails."""
+"""The functions with which every command reads a recipe, checks options, prints lines and fails."""
 
 from __future__ import annotations
 
@@ -55,7 +55,7 @@ def load(words: list[str] | None, *command: str, before: int = 0, exact: bool = 
 
 @contextmanager
 def refusing() -> Iterator[None]:
-    """End the command with a line for every mistake where the block raises `RecipeError`."""
+    """Print every mistake of a recipe and end the command if the block raises `RecipeError`."""
     from neusee.workflows.graph.diagnostics import RecipeError
 
     try:
@@ -67,7 +67,7 @@ def refusing() -> Iterator[None]:
 
 @contextmanager
 def failing(*errors: type[Exception], code: int = BAD, before: str = "") -> Iterator[None]:
-    """End the command with ``before``, the message and ``code`` where the block raises one of ``errors``."""
+    """Print ``before`` and the message, and end the command with ``code``, if the block raises one of ``errors``."""
     try:
         yield
     except errors as error:
@@ -99,7 +99,7 @@ def progress_lines(quiet: bool) -> Callable[[str], None]:
 
 
 def option_words(options: Mapping[str, Any]) -> list[str]:
-    """Return options as they are written on the command line, without those that are False, empty or zero."""
+    """Return ``--name value`` for each option, and ``--name`` for True; leave out False, zero and empty values."""
     return [f"--{name}" if value is True else f"--{name} {value}" for name, value in options.items() if value]
 
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
@@ -22,9 +23,7 @@ from neusee.workflows.cli.command_list import FAILED, MISSED
 from neusee.workflows.cli.command_options import Debug, Device, Exact, Memory, Out, Words
 
 if TYPE_CHECKING:
-    from neusee.workflows.engine.step_job import Executor
     from neusee.workflows.graph.recipe_graph import Recipe
-    from neusee.workflows.simulation.simulate_recipe import Simulation
     from neusee.workflows.store.result_store import Store
 
 Where = Annotated[
@@ -49,20 +48,22 @@ def run(
     of results holds report.html, the numbers, the pictures and the recipe with every final value.
     """
     recipe, command = load(words, "run", exact=exact)
-    from neusee.workflows.report import console
+    from neusee.workflows.report import console, contents
+    from neusee.workflows.simulation.simulate_recipe import simulate
+    from neusee.workflows.tolerance.cheaper_steps import with_substitutions
 
     check_device(device)
-    limit = memory_limit(memory)
-    if not (as_json or quiet):
+    limit, silent = memory_limit(memory), as_json or quiet
+    if not silent:
         say(console.opening(recipe, " ".join(command[1:])))
     store = the_store()
     if limit is not None:
         _refuse_too_large(recipe, store, device, limit)
-    with executor_of(executor, store) as computes:
-        done = _simulate(recipe, store, command, device, out, as_json or quiet, computes, limit)
+    cheaper = with_substitutions(recipe, contents.wanted(recipe))
+    table = console.RunTable(cheaper, contents.steps_of(cheaper), console.mode_for(silent))
+    with executor_of(executor, store) as cluster, table:
+        done = simulate(cheaper, store, out, command, device, table.watch, cluster, limit)
     if as_json:
-        import json
-
         say([json.dumps({"report": str(done.page), **done.document}, ensure_ascii=False)])
     elif quiet:
         say([str(done.page)])
@@ -79,26 +80,6 @@ def _refuse_too_large(recipe: Recipe, store: Store, device: str, memory: int) ->
 
     if refused := planned(recipe, store, lanes_of(device.split(","), memory)).refused:
         fail(f"--memory: {refused}")
-
-
-def _simulate(
-    recipe: Recipe,
-    store: Store,
-    command: list[str],
-    device: str,
-    out: Path,
-    silent: bool,
-    executor: Executor | None,
-    memory: int | None,
-) -> Simulation:
-    from neusee.workflows.report.console import RunTable, mode_for
-    from neusee.workflows.report.contents import steps_of, wanted
-    from neusee.workflows.simulation.simulate_recipe import simulate
-    from neusee.workflows.tolerance.cheaper_steps import with_substitutions
-
-    recipe = with_substitutions(recipe, wanted(recipe))
-    with RunTable(recipe, steps_of(recipe), mode_for(silent)) as shown:
-        return simulate(recipe, store, out, command, device, shown.watch, executor, memory)
 
 
 def validate(words: Words = None, debug: Debug = False) -> None:

@@ -1,4 +1,4 @@
-"""The commands ``neusee study``: accuracy, stability, leave-out, calibration and uncertainty."""
+"""The commands of ``neusee study``: accuracy, stability, leave-out, calibration and uncertainty."""
 
 from __future__ import annotations
 
@@ -32,14 +32,14 @@ study = typer.Typer(
 
 
 class Move(StrEnum):
-    """The moves of the walkers of `calibrate`."""
+    """The choices of ``--move``: how the walkers of a calibration move."""
 
     DE = "de"
     STRETCH = "stretch"
 
 
 class Points(StrEnum):
-    """The ways to draw uncertain inputs."""
+    """The choices of ``--points``: how uncertain inputs are drawn."""
 
     DRAWS = "draws"
     SOBOL = "sobol"

@@ -1,7 +1,9 @@
-"""The command ``neusee train``: learn the mask and the restoration of a recipe."""
+"""The command ``neusee train``: train the mask and the networks of a recipe."""
 
 from __future__ import annotations
 
+from collections.abc import Callable, Iterator, Mapping
+from contextlib import contextmanager
 from enum import StrEnum
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
@@ -13,8 +15,6 @@ from neusee.workflows.cli.command_list import FAILED
 from neusee.workflows.cli.command_options import Debug, Out, Words
 
 if TYPE_CHECKING:
-    from collections.abc import Mapping
-
     from neusee.workflows.graph.recipe_graph import Recipe
 
 
@@ -71,10 +71,10 @@ def train(
         failing(RunError, ValueError, ArithmeticError, code=FAILED, before=who),
         failing(MeshError, before=who),
         joined(mesh, device) as processes_here,
-        _LossBar(quiet, lengths) as bar,
+        _loss_bar(quiet, lengths) as watch,
     ):
         folder = verbs.train(recipe, store=the_store(), device=device, out=out, progress=progress_lines(quiet),
-                             command=command, stages=stages, watch=bar.watch, mesh=processes_here)  # fmt: skip
+                             command=command, stages=stages, watch=watch, mesh=processes_here)  # fmt: skip
     if not quiet:
         say(_next(folder, stage))
     if rank == 0:
@@ -88,9 +88,9 @@ def _lift(recipe: Recipe, command: list[str], out: Path, device: str, quiet: boo
 
     assert recipe.lifting is not None
     lengths = {0: recipe.lifting.iterations}
-    with failing(RunError, ValueError, ArithmeticError, code=FAILED), _LossBar(quiet, lengths) as bar:
+    with failing(RunError, ValueError, ArithmeticError, code=FAILED), _loss_bar(quiet, lengths) as watch:
         folder = verbs.train(recipe, store=the_store(), device=device, out=out, progress=progress_lines(quiet),
-                             command=command, watch=bar.watch)  # fmt: skip
+                             command=command, watch=watch)  # fmt: skip
     if not quiet:
         weights = folder / "mst_plus_plus.safetensors"
         say([f"weights: {weights}", f"curves:  {folder / 'curves.png'}", f"judged:  {folder / 'training.json'}",
@@ -106,30 +106,22 @@ def _next(folder: Path, stage: Stages) -> list[str]:
     return [*lines, f"network: {network}", f"curves:  {folder / 'curves.png'}"]
 
 
-class _LossBar:
-    """A progress bar with the losses of a training, shown on a terminal alone."""
+@contextmanager
+def _loss_bar(quiet: bool, lengths: Mapping[int, int]) -> Iterator[Callable[[int, int, Mapping[str, float]], None]]:
+    """Show a progress bar on a terminal; yield the function that shows the losses of an iteration of a stage."""
+    from rich.console import Console
+    from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
 
-    def __init__(self, quiet: bool, lengths: Mapping[int, int]) -> None:
-        from rich.console import Console
-        from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
+    columns = TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn(), TimeRemainingColumn()
+    console = Console(stderr=True)
+    hidden = quiet or not console.is_terminal
+    bar = Progress(*columns, TextColumn("{task.fields[losses]}"), console=console, disable=hidden)
+    tasks = {s: bar.add_task(f"stage {s}" if s else "lift", total=n, losses="") for s, n in lengths.items()}
 
-        columns = TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn(), TimeRemainingColumn()
-        console = Console(stderr=True)
-        self._shown = Progress(*columns, TextColumn("{task.fields[losses]}"), console=console,
-                               disable=quiet or not console.is_terminal)  # fmt: skip
-        self._tasks = {
-            s: self._shown.add_task(f"stage {s}" if s else "lift", total=n, losses="") for s, n in lengths.items()
-        }
+    def watch(stage: int, done: int, losses: Mapping[str, float]) -> None:
+        names = [name for name in ("LSR", "L1", "critics", "MRAE", "RMSE") if name in losses]
+        text = " ".join(f"{name} {losses[name]:.3g}" for name in names)
+        bar.update(tasks[stage], completed=done, losses=text)
 
-    def __enter__(self) -> _LossBar:
-        self._shown.start()
-        return self
-
-    def __exit__(self, *error: object) -> None:
-        self._shown.stop()
-
-    def watch(self, stage: int, done: int, losses: Mapping[str, float]) -> None:
-        """Show the losses of iteration ``done`` of a stage."""
-        names = ("LSR", "L1", "critics", "MRAE", "RMSE")
-        text = " ".join(f"{name} {losses[name]:.3g}" for name in names if name in losses)
-        self._shown.update(self._tasks[stage], completed=done, losses=text)
+    with bar:
+        yield watch

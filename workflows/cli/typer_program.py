@@ -1,4 +1,4 @@
-"""The program as typer sees it: its options, and its commands, each imported only where the command line names it."""
+"""The typer program: its options, and its commands, each imported only if the command line names the command."""
 
 from __future__ import annotations
 
@@ -56,7 +56,10 @@ def _nothing() -> None:
 
 
 def run_program(arguments: list[str], completes: bool) -> int:
-    """Run the command that ``arguments`` name and return the exit code; a shell that completes needs all commands."""
+    """Run the command that ``arguments`` name and return its exit code.
+
+    ``completes`` is True if a shell asks for completions, which need the options of all commands.
+    """
     try:
         return program(COMMANDS if completes else arguments)(arguments, standalone_mode=False, prog_name="neusee") or 0
     except typer.Abort:
