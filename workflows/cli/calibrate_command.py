@@ -8,9 +8,9 @@ from typing import Annotated, Any
 
 import typer
 
-from neusee.workflows.cli.command_frame import fail, failing, load, option_words, progress_lines, say, the_store
+from neusee.workflows.cli.command_frame import fail, failing, load, say, the_store
 from neusee.workflows.cli.command_list import FAILED, MISSED
-from neusee.workflows.cli.command_options import Debug, Out, Quiet, Words
+from neusee.workflows.cli.command_options import Debug, Out, Quiet, Words, option_words, progress_lines
 
 
 def calibrate(

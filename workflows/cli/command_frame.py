@@ -4,10 +4,10 @@ from __future__ import annotations
 
 import gc
 import sys
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import replace
-from typing import TYPE_CHECKING, Any, NoReturn
+from typing import TYPE_CHECKING, NoReturn
 
 import typer
 
@@ -91,16 +91,6 @@ def check_device(device: str) -> None:
 def say(lines: list[str]) -> None:
     """Print lines to stdout."""
     print(*lines, sep="\n", flush=True)
-
-
-def progress_lines(quiet: bool) -> Callable[[str], None]:
-    """Return a function that prints a line of progress, or ignores that line for ``quiet``."""
-    return (lambda line: None) if quiet else (lambda line: say([line]))
-
-
-def option_words(options: Mapping[str, Any]) -> list[str]:
-    """Return ``--name value`` for each option, and ``--name`` for True; leave out False, zero and empty values."""
-    return [f"--{name}" if value is True else f"--{name} {value}" for name, value in options.items() if value]
 
 
 def fail(message: str, code: int = BAD) -> NoReturn:

@@ -1,9 +1,11 @@
-"""The arguments and options that several commands share."""
+"""The arguments and options that several commands share, and two functions that read options."""
 
 from __future__ import annotations
 
+from collections.abc import Callable, Mapping
+from functools import partial
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, Any
 
 import typer
 
@@ -24,3 +26,13 @@ Memory = Annotated[
     str, typer.Option("--memory", help="Limit of a device's memory, such as 6 GB, as far as earlier runs tell.")
 ]
 Out = Annotated[Path, typer.Option("--out", help="Folder in which to make the folder of results.")]
+
+
+def progress_lines(quiet: bool) -> Callable[[str], None]:
+    """Return a function that prints a line of progress, or ignores that line for ``quiet``."""
+    return (lambda line: None) if quiet else partial(print, flush=True)
+
+
+def option_words(options: Mapping[str, Any]) -> list[str]:
+    """Return ``--name value`` for each option, and ``--name`` for True; leave out False, zero and empty values."""
+    return [f"--{name}" if value is True else f"--{name} {value}" for name, value in options.items() if value]
