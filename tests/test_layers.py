@@ -57,6 +57,7 @@ DYNAMIC = {
     "report/run_pictures.py": "report.contents names the function that draws each picture",
     "studies/run_study.py": "a kind of study names its room",
     "recipe/step_declarations.py": "a recipe names the family of a node",
+    "cli/typer_program.py": "a command line names the command, whose module alone is imported",
     "cli/catalogue.py": "a family of nodes is listed with its own words",
     "store/serialization.py": "a stored result names the class of its values",
     "training/tensorboard_log.py": "TensorBoard is optional, and has no types",

@@ -7,19 +7,19 @@
     result.metrics()["lsr[mask]"], result.numpy("raw[mask]")
     table = neusee.sweep("laser_free", axes={"doe": ["axicon", "vortex"]}, changes={"outputs": ["lsr[mask]"]}).table()
 
-Every verb takes a recipe's name or file first, and options by name after it: `run` gives values, `sweep` a table over
-values of parameters, `train` learns a mask and its restoration, `evaluate` judges masks and restorers, `calibrate`
-finds the posterior of a sensor, and `study` tells what the numbers of a recipe are worth. `run`, `train`, `calibrate`
-and `study` also take what `load` returned.
+The first argument of every verb is the name or the file of a recipe, and all options are given by name. `run` returns
+values, `sweep` a table over values of parameters, `train` trains a mask and its restoration, `evaluate` compares masks
+and restorers, `calibrate` finds the posterior of a sensor, and `study` measures how accurate the numbers of a recipe
+are. `run`, `train`, `calibrate` and `study` also take a recipe that `load` returned.
 
-A caller may want to catch: `RecipeError` (a mistake in a recipe, before anything runs), `RunError` (a step failed) and
-`ParameterError` (a node refuses a parameter). ``recipes/guide/exceptions.md`` lists every exception and who raises it,
-``recipes/guide/torch_func.md`` the nodes that work under `torch.func`; ``neusee --help`` lists the commands.
+A caller may want to catch `RecipeError` (a mistake in a recipe, before anything runs), `RunError` (a step failed) and
+`ParameterError` (a node refuses a parameter). ``recipes/guide/exceptions.md`` lists every exception with the functions
+that raise it, ``recipes/guide/torch_func.md`` the nodes that work under `torch.func`, ``neusee --help`` the commands.
 
-Names are imported when they are first used: ``import neusee`` takes no time, and loads neither torch nor pydantic.
+A name is imported when a caller first uses the name, so ``import neusee`` is fast and loads neither torch nor pydantic.
 """
 
-TYPE_CHECKING = False  # as in `typing`, whose import would take longer than all else here
+TYPE_CHECKING = False  # as in `typing`, whose import takes longer than the rest of this file
 if TYPE_CHECKING:
     from typing import Any
 
@@ -62,7 +62,7 @@ __all__ = [
 
 
 def __getattr__(name: str) -> "Any":
-    """Import a public name when it is first used."""
+    """Import and return a public name when a caller first uses the name."""
     if name not in _HOME:
         raise AttributeError(f"module 'neusee' has no attribute {name!r}")
     import importlib

@@ -1,10 +1,9 @@
-"""The verbs of `neusee`: a recipe or its name first, then options by name, the same words in every verb.
+"""The functions `neusee.run`, `sweep`, `train`, `evaluate`, `calibrate` and `study`, with the same options in each.
 
-``changes`` are those of a recipe that is given by name or file: a mapping as `load` takes it
-(``{"doe": "axicon", "sensor": {"read_noise": "20 e-"}}``), or arguments as on the command line
-(``["doe=axicon"]``). ``store`` is where results are kept: ``$NEUSEE_CACHE``, or the usual
-folder, if None. ``out`` is the folder in which a folder of results is made. ``progress`` is given
-one line for each thing that is done, and ``command`` is what the page says to run it again.
+``changes`` change a recipe that a caller names: a mapping as `load` takes it
+(``{"doe": "axicon", "sensor": {"read_noise": "20 e-"}}``), or arguments as on the command line (``["doe=axicon"]``).
+``store`` keeps results; None means ``$NEUSEE_CACHE`` or the default folder. The folder of results is made in ``out``.
+``progress`` takes a line for each finished part, and the page shows ``command`` as the command that repeats the call.
 """
 
 from __future__ import annotations
@@ -18,6 +17,7 @@ from neusee.workflows.graph.recipe_graph import Recipe
 from neusee.workflows.recipe.loading import load
 from neusee.workflows.recipe.text.overrides import Override
 from neusee.workflows.recipe.text.python_overrides import overrides_of
+from neusee.workflows.report.study_folder import Progress, silent
 from neusee.workflows.store.remote_store import open_store
 
 if TYPE_CHECKING:
@@ -29,16 +29,11 @@ if TYPE_CHECKING:
     from neusee.workflows.sweeps.sweep_run import Sweep
     from neusee.workflows.training.parallel.process_mesh import Mesh
 
-Named = str | os.PathLike[str]  #: a packaged recipe's name, or a file
+Named = str | os.PathLike[str]  #: the name of a packaged recipe, or the path of a file
 Changes = Mapping[str, Any] | Sequence[str]
-Progress = Callable[[str], None]
 Kind = Literal["accuracy", "stability", "leave-out", "calibration", "uncertainty"]
 
 __all__ = ["calibrate", "evaluate", "run", "study", "sweep", "train"]
-
-
-def _silent(line: str) -> None:
-    """Say nothing."""
 
 
 def run(
@@ -52,14 +47,14 @@ def run(
     executor: Executor | None = None,
     memory: int | None = None,
 ) -> Result:
-    """Run a recipe and return the values of ``outputs``, the recipe's own if None.
+    """Run a recipe and return the values of ``outputs``, or of the recipe's own outputs for None.
 
-    Args: device: one or several, ``cuda:0,cuda:1,cpu``, the preferred one first. watch: is given every `Event`.
-    executor: computes instead of this process. memory: bytes of each device that may be planned with.
+    Args: device: one or several devices, ``cuda:0,cuda:1,cpu``, the preferred one first. watch: takes every `Event`.
+    executor: computes instead of this process. memory: largest number of bytes to use on each device.
     Raises: `RecipeError` before anything runs, `RunError` where a step fails, ValueError for an unknown output.
     """
-    wanted = (outputs,) if isinstance(outputs, str) else outputs
-    return _read(recipe, changes).run(store, wanted, watch, device, executor, memory)
+    names = (outputs,) if isinstance(outputs, str) else outputs
+    return _read(recipe, changes).run(store, names, watch, device, executor, memory)
 
 
 def sweep(
@@ -72,9 +67,9 @@ def sweep(
     zip: bool = False,
     on_error: Literal["stop", "continue"] = "stop",
 ) -> Sweep:
-    """Run a recipe over every combination of the values of ``axes`` and return the table of all numbers.
+    """Run a recipe at every combination of the values of ``axes``, and return the results of all points.
 
-    Args: axes: a list of values by parameter or group, or a text such as ``"linspace(450 nm, 650 nm, 5)"``.
+    Args: axes: from a parameter or group to a list of values, or to a text such as ``"linspace(450 nm, 650 nm, 5)"``.
     zip: pair the values of the axes instead of combining them. on_error: ``"continue"`` keeps a failed point as a row.
     Raises: `RecipeError` with every mistake of every point before anything runs, the error of the first failed point.
     """
@@ -90,31 +85,30 @@ def train(
     store: Store | None = None,
     device: str = "cpu",
     out: Named = "runs",
-    progress: Progress = _silent,
+    progress: Progress = silent,
     command: Sequence[str] = (),
     stages: Sequence[int] | None = None,
     watch: Callable[[int, int, Mapping[str, float]], None] | None = None,
     mesh: Mesh | None = None,
 ) -> Path:
-    """Learn the mask and the restoration of a recipe, or its lift, and return the folder; go on where one was stopped.
+    """Train the mask and the networks of a recipe, or continue a stopped training, and return the folder of results.
 
-    Args: stages: 1 learns mask and network, 2 the network, 0 designs the mask without pictures; all that the recipe
-    names if None. watch: is given the stage (0 of a lift), its iterations so far and the losses. mesh: the processes of
-    `torchrun`.
-    Raises: ValueError for a recipe that cannot be learnt, `DesignError` or `MeshError` among them; `NotFinite` where a
-    loss is NaN or infinite.
+    Args: stages: 1 trains mask and network, 2 the network alone, 0 designs the mask without pictures; None means all
+    stages of the recipe. watch: takes the stage (0 for a lift), its finished iterations and the losses. mesh: the
+    processes of `torchrun`.
+    Raises: ValueError, or its subclass `DesignError` or `MeshError`, for a recipe that cannot be trained; `NotFinite`
+    where a loss is NaN or infinite.
     """
-    found, place = _read(recipe, changes), Path(out)
-    store = store or open_store()
-    if found.lifting is not None:
+    recipe, folder, store = _read(recipe, changes), Path(out), store or open_store()
+    if recipe.lifting is not None:
         from neusee.workflows.training.lift.lift_run import train_lift
 
-        return train_lift(found, store, place, command, progress, device, watch)
+        return train_lift(recipe, store, folder, command, progress, device, watch)
     from neusee.workflows.training.parallel.process_mesh import ALONE
-    from neusee.workflows.training.run_training import train as learn
+    from neusee.workflows.training.run_training import train as run_training
 
-    numbers = stages if stages is not None else found.training.learnt if found.training else ()
-    return learn(found, store, place, command, progress, tuple(numbers), device, watch, mesh or ALONE)
+    numbers = stages if stages is not None else recipe.training.learnt if recipe.training else ()
+    return run_training(recipe, store, folder, command, progress, tuple(numbers), device, watch, mesh or ALONE)
 
 
 def evaluate(
@@ -125,7 +119,7 @@ def evaluate(
     store: Store | None = None,
     device: str = "cpu",
     out: Named = "runs",
-    progress: Progress = _silent,
+    progress: Progress = silent,
     command: Sequence[str] = (),
     data: Named | None = None,
     scenes: int = 20,
@@ -133,24 +127,24 @@ def evaluate(
     small: int = 256,
     reference: str = "",
 ) -> Path:
-    """Judge masks and restorers on the same scenes and laser strengths, and return the folder of the results.
+    """Compare masks and restorers on the same scenes and laser strengths, and return the folder of results.
 
-    Args: pipelines: ``"flat+none, five_half_rings+wiener"``. data: a folder of photographs; the recipe's own scene if
-    None. scenes: how many. strengths: of the laser, multiples of saturation; those of the paper if None. small: shorter
-    side, in pixels, of the pictures that are compared a second time. reference: the pipeline to compare with.
+    Args: pipelines: a mask and a restorer each, ``"flat+none, five_half_rings+wiener"``. data: a folder of photographs;
+    None means the recipe's own scene. scenes: number of scenes. strengths: of the laser, in multiples of saturation;
+    None means those of the paper. small: the shorter side in pixels of reduced pictures, which are compared too.
+    reference: the pipeline with which all others are compared.
     Raises: `EvaluationRefused` with every mistake before anything runs, `RunError` where a step fails.
     """
-    from neusee.workflows.evaluation import run_evaluation as protocol
+    from neusee.workflows.evaluation import run_evaluation
 
-    here, name, arguments = Path.cwd(), _name(recipe, "evaluate"), _arguments(changes)
-    read = protocol.read_pipelines(pipelines, here) if isinstance(pipelines, str) else pipelines
-    return protocol.evaluate(
-        name,
-        read,
-        arguments,
+    here = Path.cwd()
+    return run_evaluation.evaluate(
+        _name(recipe, "evaluate"),
+        run_evaluation.read_pipelines(pipelines, here) if isinstance(pipelines, str) else pipelines,
+        _arguments(changes),
         data=None if data is None else Path(data).expanduser(),
         count=scenes,
-        strengths=protocol.STRENGTHS if strengths is None else strengths,
+        strengths=run_evaluation.STRENGTHS if strengths is None else strengths,
         small=small,
         reference=reference,
         store=store,
@@ -168,23 +162,24 @@ def calibrate(
     changes: Changes = (),
     store: Store | None = None,
     out: Named = "runs",
-    progress: Progress = _silent,
+    progress: Progress = silent,
     command: Sequence[str] = (),
     walkers: int = 64,
     move: str = "de",
     draws: int = 1000,
 ) -> Path:
-    """Find the posterior of a recipe's sensor from its levels, and return the folder; go on where one was stopped.
+    """Find the posterior of a recipe's sensor, or continue a stopped calibration, and return the folder of results.
 
-    Args: walkers: of each of the four ensembles. move: how walkers move, ``"de"`` or ``"stretch"``. draws: how many
-    independent ones there are at least.
-    Raises: `CalibrationRefused` where the levels tell too little, ValueError for a recipe that does not calibrate.
+    Args: walkers: number of walkers in each of the four ensembles. move: the move of the walkers, ``"de"`` or
+    ``"stretch"``. draws: least number of independent draws.
+    Raises: `CalibrationRefused` where the levels constrain the sensor too little, ValueError for a recipe without a
+    likelihood.
     """
-    from neusee.workflows.calibration.run_calibration import calibrate as found
+    from neusee.workflows.calibration import run_calibration
 
-    place = Path(out)
-    read = _read(recipe, changes)
-    return found(read, store or open_store(), place, command, progress, walkers=walkers, move=move, draws=draws)
+    recipe, store = _read(recipe, changes), store or open_store()
+    options: dict[str, Any] = {"walkers": walkers, "move": move, "draws": draws}
+    return run_calibration.calibrate(recipe, store, Path(out), command, progress, **options)
 
 
 def study(
@@ -194,43 +189,41 @@ def study(
     changes: Changes = (),
     store: Store | None = None,
     out: Named = "runs",
-    progress: Progress = _silent,
+    progress: Progress = silent,
     command: Sequence[str] = (),
     **options: Any,
 ) -> Path:
-    """Study what the numbers of a recipe are worth, and return the folder of the results; go on where one was stopped.
+    """Study how accurate the numbers of a recipe are, or continue a stopped study, and return the folder of results.
 
-    Args: kind: ``"accuracy"``, ``"stability"``, ``"leave-out"``, ``"calibration"`` or ``"uncertainty"``. options: of
-    that kind, as ``neusee study KIND --help`` lists them.
-    Raises: ValueError for an unknown kind or a recipe that the study does not fit, `RunError` where a step fails.
+    Args: kind: ``"accuracy"``, ``"stability"``, ``"leave-out"``, ``"calibration"`` or ``"uncertainty"``. options: the
+    options of this kind, as ``neusee study KIND --help`` lists them.
+    Raises: ValueError for an unknown kind or an unsuitable recipe, `RunError` where a step fails.
     """
     from neusee.workflows.studies import run_study
 
     if kind not in run_study.KINDS:
-        raise ValueError(f"no study {kind!r}: there are {', '.join(run_study.KINDS)}")
+        raise ValueError(f"no study {kind!r}: write one of {', '.join(run_study.KINDS)}")
     return run_study.study_recipe(kind, _read(recipe, changes), store, Path(out), command, progress, **options)
 
 
 def _read(recipe: Recipe | Named, changes: Changes) -> Recipe:
-    """Return the recipe, read if it is given by name or file."""
+    """Return ``recipe`` itself, or the recipe of that name or file with ``changes``."""
     if not isinstance(recipe, Recipe):
         return load(recipe, _arguments(changes))
     if changes:
-        raise TypeError(f"{recipe.name} is read already: give its name with changes, or change it in `load`")
+        raise TypeError(f"{recipe.name} is loaded already: pass the name of the recipe, or pass the changes to `load`")
     return recipe
 
 
 def _name(recipe: Named, verb: str) -> str:
-    """Return the name or file of a recipe that a verb reads anew with each change."""
+    """Return the name or file of a recipe that ``verb`` loads several times; raise TypeError for a loaded recipe."""
     if isinstance(recipe, Recipe):
-        raise TypeError(
-            f"{verb} reads the recipe anew for each point: give its name or file, and what differs as changes"
-        )
+        raise TypeError(f"{verb} loads the recipe several times: pass the name or file of the recipe, and changes")
     return os.fspath(recipe)
 
 
 def _arguments(changes: Changes) -> list[str | Override]:
-    """Return changes as the reader of a recipe takes them."""
+    """Return changes as arguments of `load`; raise TypeError for a single text."""
     if isinstance(changes, str):
-        raise TypeError(f"changes are a mapping or a list of arguments: write changes=[{changes!r}]")
+        raise TypeError(f"changes must be a mapping or a list of arguments: write changes=[{changes!r}]")
     return [*overrides_of(changes, Path.cwd())] if isinstance(changes, Mapping) else [*changes]

@@ -1,4 +1,4 @@
-"""Pictures of a calibration: the photon-transfer curve that the posterior predicts, its corners and its chains."""
+"""The pictures of a calibration: photon-transfer curve, pairs of parameters, and chains."""
 
 from __future__ import annotations
 
@@ -16,16 +16,16 @@ if TYPE_CHECKING:
     from neusee.workflows.calibration.log_posterior import FloatArray
 
 _BAND = (5.0, 50.0, 95.0)  #: percentiles
-_POINTS = 1500  #: of a chain that are drawn
-_LEAST = 0.1  #: DN2, where a level without any scatter is drawn
+_POINTS = 1500  #: most points of a chain in the picture
+_LEAST = 0.1  #: DN², the variance at which a level without scatter is drawn
 
 
 @drawn
 def transfer(measured: FloatArray, predicted: FloatArray, whole: NDArray[np.bool_]) -> Any:
-    """Draw variance against mean, and how far each level lies from what the posterior predicts.
+    """Draw variance against mean, and the distance of each level from the prediction of the posterior.
 
-    ``measured`` (3, level): mean, variance, degrees of freedom; ``predicted`` (2, draw, level): mean and variance, with
-    the chance of another such measurement; ``whole`` (level,): not cut off by an end.
+    ``measured`` (2, level) holds mean and variance, and ``predicted`` (2, draw, level) the mean and variance of another
+    such measurement. ``whole`` (level,) is False for levels that the well or the converter clips.
     """
     figure, axes = canvas(9.0, 7.2, 2, 1, sharex=True, height_ratios=(2.2, 1.0))
     above, below = axes[0, 0], axes[1, 0]
@@ -33,26 +33,25 @@ def transfer(measured: FloatArray, predicted: FloatArray, whole: NDArray[np.bool
     mean, (low, middle, high) = predicted[0].mean(0)[order], np.percentile(predicted[1], _BAND, axis=0)[:, order]
     above.fill_between(mean, low, high, color=BLUE, alpha=0.25, linewidth=0, label="predicted, 90 %")
     above.plot(mean, middle, color=BLUE, linewidth=1.2, label="predicted, median")
-    for at, style in ((whole, {"color": BLACK}), (~whole, {"color": VERMILION, "markerfacecolor": "none"})):
+    clipped = {"color": VERMILION, "markerfacecolor": "none", "label": "cut off or coarse: counted number by number"}
+    for at, style in ((whole, {"color": BLACK, "label": "measured"}), (~whole, clipped)):
         if at.any():
-            label = "measured" if style["color"] == BLACK else "cut off or coarse: counted number by number"
-            above.plot(measured[0, at], measured[1, at].clip(_LEAST), "o", markersize=5, label=label, **style)
+            above.plot(measured[0, at], measured[1, at].clip(_LEAST), "o", markersize=5, **style)
     above.set(xscale="log", yscale="log", ylabel="temporal variance (DN²)", title="Photon-transfer curve")
     above.legend(loc="upper left")
-    at = whole
-    centre, width = predicted[1].mean(0)[at], predicted[1].std(0)[at]
+    distance = (measured[1, whole] - predicted[1].mean(0)[whole]) / predicted[1].std(0)[whole]
     below.axhspan(-2, 2, color=BLUE, alpha=0.12, linewidth=0)
     below.axhline(0, color=BLUE, linewidth=1.0)
-    below.plot(measured[0, at], (measured[1, at] - centre) / width, "o", color=BLACK, markersize=5)
+    below.plot(measured[0, whole], distance, "o", color=BLACK, markersize=5)
     below.set(xlabel="mean (DN)", ylabel="off, in sd of\nthe prediction")
-    reach = max(3.5, 1.1 * float(np.abs((measured[1, at] - centre) / width).max(initial=0.0)))
+    reach = max(3.5, 1.1 * float(np.abs(distance).max(initial=0.0)))
     below.set_ylim(-reach, reach)
     return figure
 
 
 @drawn
 def corners(draws: FloatArray, names: Sequence[str], nominal: Sequence[float]) -> Any:
-    """Draw every pair of parameters; the recipe's own values are orange."""
+    """Draw every pair of parameters, with the recipe's own values in orange."""
     import corner
     from matplotlib.backends.backend_agg import FigureCanvasAgg
     from matplotlib.figure import Figure
@@ -60,16 +59,16 @@ def corners(draws: FloatArray, names: Sequence[str], nominal: Sequence[float]) -
     size = 1.75 * len(names) + 0.6
     figure = Figure(figsize=(size, size), dpi=100)
     FigureCanvasAgg(figure)
-    how: dict[str, Any] = {"label_kwargs": {"fontsize": 10}, "max_n_ticks": 3, "color": BLUE, "plot_datapoints": False}
+    style = {"label_kwargs": {"fontsize": 10}, "max_n_ticks": 3, "color": BLUE, "plot_datapoints": False}
     with warnings.catch_warnings():
-        warnings.simplefilter("ignore")  # of contours that few draws reach
-        corner.corner(draws, labels=list(names), truths=list(nominal), truth_color=ORANGE, fig=figure, **how)
+        warnings.simplefilter("ignore")  # corner warns of contours that few draws reach
+        corner.corner(draws, labels=list(names), truths=list(nominal), truth_color=ORANGE, fig=figure, **style)
     return figure
 
 
 @drawn
 def traces(draws: FloatArray, labels: Sequence[str]) -> Any:
-    """Draw each coordinate by step: the median and the middle 90 % of the walkers of each ensemble."""
+    """Draw the median and the middle 90 % of the walkers of each ensemble, for each coordinate by step."""
     count = len(labels)
     figure, axes = canvas(9.0, 1.35 * count + 0.5, count, 1, sharex=True)
     every = max(1, draws.shape[1] // _POINTS)

@@ -1,4 +1,4 @@
-"""The page of a calibration: parameters with intervals and limits, what is not identifiable, checks and pictures."""
+"""The page of a calibration: parameters with intervals or limits, identifiability, checks and pictures."""
 
 from __future__ import annotations
 
@@ -25,14 +25,14 @@ if TYPE_CHECKING:
     from neusee.workflows.calibration.emcee_sampler import Chains
     from neusee.workflows.calibration.log_posterior import FloatArray
 
-_PREDICTED = 400  #: draws that a band is made of
-_CORNER = 20_000  #: draws that a picture is made of
+_PREDICTED = 400  #: draws for the band of the predicted variance
+_CORNER = 20_000  #: draws for the picture of pairs
 _PURE = ("quantum_efficiency", "spread", "scatter", "lamp", "bend", "twist")  #: parameters without a unit
 
 
 @dataclass(frozen=True)
 class ParameterEstimate:
-    """The posterior of one parameter."""
+    """The posterior of one parameter: mean, standard deviation and interval beside the recipe's own value."""
 
     name: str
     unit: str
@@ -41,13 +41,13 @@ class ParameterEstimate:
     sd: float
     low: float  #: 5 %
     high: float  #: 95 %
-    nominal: float  #: what the recipe says
+    nominal: float  #: the recipe's own value
     share: float  #: of the draws that lie below ``nominal``
     narrower: float  #: width of the posterior over that of the prior
 
     @property
     def text(self) -> str:
-        """Return the value, a limit, or that there is neither."""
+        """Return the estimate or the limit with its unit, or a text that the frames give neither."""
         if self.kind == "estimate":
             return f"{with_uncertainty(self.mean, self.sd)} {self.unit}".rstrip()
         if self.kind == "none":
@@ -58,7 +58,7 @@ class ParameterEstimate:
 
 @dataclass(frozen=True)
 class CalibrationResult:
-    """All that a calibration computed."""
+    """The results of a calibration: mode, identifiability, chains, checks and models of the response."""
 
     problem: SensorPosterior
     mode: LaplaceFit
@@ -68,27 +68,30 @@ class CalibrationResult:
     models: Sequence[ModelSpread] = ()  #: of a camera of unknown response
 
     @property
+    def params(self) -> Mapping[str, Any]:
+        """Return the recipe's own parameters of the step that computes the likelihood."""
+        return self.problem.recipe.steps[self.problem.step].params
+
+    @property
     def draws(self) -> Mapping[str, FloatArray]:
-        """Return all draws of each parameter: (ensemble, step, walker)."""
+        """Return the draws (ensemble, step, walker) of each parameter by name."""
         return {name: x.numpy() for name, x in self.problem.parameters(self.chains.draws).items()}
 
     def rows(self) -> list[ParameterEstimate]:
         """Return one estimate for each parameter."""
-        params = self.problem.recipe.steps[self.problem.step].params
-        found = []
-        for (name, draws), share in zip(self.draws.items(), self.mode.shares, strict=True):
-            low, high = np.quantile(draws, [0.05, 0.95])
-            nominal, kind = float(params[name]), self.identifiability.kinds[name]
-            below, unit = float((draws < nominal).mean()), unit_of(name, params)
-            mean, sd = float(draws.mean()), float(draws.std())
-            found.append(
-                ParameterEstimate(name, unit, kind, mean, sd, float(low), float(high), nominal, below, float(share))
-            )
-        return found
+        rows = zip(self.draws.items(), self.mode.shares.tolist(), strict=True)
+        return [self._estimate(name, draws, narrower) for (name, draws), narrower in rows]
+
+    def _estimate(self, name: str, draws: FloatArray, narrower: float) -> ParameterEstimate:
+        low, high = np.quantile(draws, [0.05, 0.95]).tolist()
+        nominal, kind = float(self.params[name]), self.identifiability.kinds[name]
+        below, unit = float((draws < nominal).mean()), unit_of(name, self.params)
+        mean, sd = float(draws.mean()), float(draws.std())
+        return ParameterEstimate(name, unit, kind, mean, sd, low, high, nominal, below, narrower)
 
 
 def with_uncertainty(mean: float, sd: float) -> str:
-    """Return a mean with as many digits as show two of its standard deviation."""
+    """Return a mean and its standard deviation as text, with two significant digits of the standard deviation."""
     if not sd > 0:
         return f"{mean:.6g} ± {sd:g}"
     digits = 1 - math.floor(math.log10(sd))
@@ -96,7 +99,7 @@ def with_uncertainty(mean: float, sd: float) -> str:
 
 
 def unit_of(name: str, params: Mapping[str, Any]) -> str:
-    """Return the unit of a parameter of `density` or of `camera`."""
+    """Return the unit of a parameter of the node `calibrate.density` or `calibrate.camera`."""
     if name == "gain":
         return "DN/e-"
     if name == "dark_current":
@@ -105,7 +108,7 @@ def unit_of(name: str, params: Mapping[str, Any]) -> str:
 
 
 def banner(result: CalibrationResult) -> str:
-    """Return why the posterior must not be used; an empty text where no check fails."""
+    """Return a warning that names the failed checks, or an empty text if no check fails."""
     wrong = [f"{check.name}: {check.found}" for check in result.checks if check.mark == "fail"]
     if not wrong:
         return ""
@@ -113,26 +116,27 @@ def banner(result: CalibrationResult) -> str:
 
 
 def lead(result: CalibrationResult) -> str:
-    """Return the result in a few sentences."""
-    values = [f"{row.name.replace('_', ' ')} {row.text}" for row in result.rows()]
-    untold = (
-        f"\n\nNot determined by these frames: {'; '.join(result.identifiability.directions)}."
-        if result.identifiability.directions
-        else ""
-    )
-    return "; ".join(values) + "." + _stated(result) + untold
-
-
-def _stated(result: CalibrationResult) -> str:
-    """Return the values to state for a camera of unknown response: wider than one model of the response says."""
+    """Return the opening of the page: estimates, values to state, and the directions that are not determined."""
+    values = [f"{_words(row.name)} {row.text}" for row in result.rows()]
     estimated = [m for m in result.models if result.identifiability.kinds[m.name] == "estimate"]
-    said = [f"{m.name.replace('_', ' ')} {_between(m.stated)}" for m in estimated]
-    how = "To be stated, with 90 % intervals that include the difference between models of the response"
-    return f"\n\n{how}: {'; '.join(said)}." if said else ""
+    stated = [f"{_words(m.name)} {_between(m.stated)}" for m in estimated]
+    return "\n\n".join(
+        f"{opening}{'; '.join(parts)}."
+        for opening, parts in (
+            ("", values),
+            ("To be stated, with 90 % intervals that include the difference between models of the response: ", stated),
+            ("Not determined by these frames: ", result.identifiability.directions),
+        )
+        if parts
+    )
+
+
+def _words(name: str) -> str:
+    return name.replace("_", " ")
 
 
 def sections(result: CalibrationResult) -> list[Section]:
-    """Return the parts of the page: parameters, checks, what is not identifiable, and the pictures."""
+    """Return the sections of the page: parameters, checks, identifiability and pictures."""
     models = (_models,) if result.models else ()
     return [part(result) for part in (_parameters, *models, _checks, _not_determined, _curve, _corner, _chains)]
 
@@ -142,36 +146,30 @@ def _parameters(result: CalibrationResult) -> Section:
         limit, which depends on the prior. The last columns show where the recipe's own value lies among the draws, and
         the width of the posterior over that of the prior."""
     columns = ("parameter", "posterior", "5 %", "95 %", "unit", "recipe", "draws below it", "width / prior")
-    rows = [_cells(r) for r in result.rows()]
+    estimates = result.rows()
+    rows = [
+        (_words(r.name), r.text, f"{r.low:.6g}", f"{r.high:.6g}", r.unit, f"{r.nominal:.6g}", r.share, r.narrower)
+        for r in estimates
+    ]
     marks: dict[tuple[int, int], Mark] = {
-        (i, 6): "pass" if 0.005 <= r.share <= 0.995 else "warn"
-        for i, r in enumerate(result.rows())
-        if r.kind == "estimate"
+        (i, 6): "pass" if 0.005 <= r.share <= 0.995 else "warn" for i, r in enumerate(estimates) if r.kind == "estimate"
     }
     return Section("The sensor", text, columns, rows, marks=marks)
-
-
-def _cells(r: ParameterEstimate) -> Sequence[Any]:
-    numbers = (f"{x:.6g}" for x in (r.low, r.high))
-    return r.name.replace("_", " "), r.text, *numbers, r.unit, f"{r.nominal:.6g}", r.share, r.narrower
 
 
 def _models(result: CalibrationResult) -> Section:
     text = """The posterior of the same levels by a response that is straight, bent once and bent twice, each with
         its 90 % interval. The stated value is the middle of the two richest models; its width is the wider of both and
         half their distance. The interval of a single model is too narrow."""
-    count = len(result.models[0].models)
-    columns = ("parameter", *(f"{n} terms" for n in range(count)), "stated", "unit")
-    params = result.problem.recipe.steps[result.problem.step].params
+    columns = ("parameter", *(f"{n} terms" for n in range(len(result.models[0].models))), "stated", "unit")
     rows = [
-        (m.name.replace("_", " "), *map(_between, (*m.models, m.stated)), unit_of(m.name, params))
-        for m in result.models
+        (_words(m.name), *map(_between, (*m.models, m.stated)), unit_of(m.name, result.params)) for m in result.models
     ]
     return Section("How models of the response differ", text, columns, rows)
 
 
-def _between(figure: IntervalEstimate) -> str:
-    return f"{figure.value:.5g} ({figure.low:.5g} to {figure.high:.5g})"
+def _between(interval: IntervalEstimate) -> str:
+    return f"{interval.value:.5g} ({interval.low:.5g} to {interval.high:.5g})"
 
 
 def _checks(result: CalibrationResult) -> Section:
@@ -185,9 +183,8 @@ def _checks(result: CalibrationResult) -> Section:
 def _not_determined(result: CalibrationResult) -> Section:
     text = """Singular values of the slopes of the levels per standard deviation of the prior, before anything is
         drawn. In a direction below 3 the prior constrains the parameters more than the frames do."""
-    said = list(result.identifiability.directions)
-    weak = len(result.identifiability.strengths) - len(said)
-    rows = [(s, "" if i < weak else said[i - weak]) for i, s in enumerate(result.identifiability.strengths)]
+    strengths, directions = result.identifiability.strengths, result.identifiability.directions
+    rows = list(zip(strengths, [""] * (len(strengths) - len(directions)) + [*directions], strict=True))
     marks: dict[tuple[int, int], Mark] = {(i, 0): "warn" if text else "pass" for i, (_, text) in enumerate(rows)}
     return Section("What the levels determine", text, ("strength", "not determined"), rows, marks=marks)
 
@@ -201,8 +198,7 @@ def _curve(result: CalibrationResult) -> Section:
     chance = rng.standard_normal(variance.shape) * np.sqrt(2 / freedom.clip(1))
     whole: NDArray[np.bool_] = np.asarray((variance > 0).all(0))
     whole[levels.cell_level.numpy()] = False
-    measured = np.stack([*_moments(levels), freedom])
-    picture = figures.transfer(measured, np.stack([mean, variance * (1 + chance)]), whole)
+    picture = figures.transfer(np.stack(_moments(levels)), np.stack([mean, variance * (1 + chance)]), whole)
     text = """The measured variance of each level against its mean, and the prediction of the posterior for another
         such measurement. Levels that the well or the converter clips, or that are too coarse for a mean and a variance,
         enter the likelihood number by number and have no prediction here."""
@@ -210,7 +206,7 @@ def _curve(result: CalibrationResult) -> Section:
 
 
 def _moments(levels: Sufficient | Levels) -> tuple[FloatArray, FloatArray]:
-    """Return mean and variance of all numbers of each level, counted or not."""
+    """Return the mean and the variance of all numbers of each level, also of those that `Sufficient` counts singly."""
     if isinstance(levels, Levels):
         return levels.mean.numpy(), levels.variance.numpy()
     at, value, count = (x.numpy() for x in levels[-3:])
@@ -223,10 +219,9 @@ def _moments(levels: Sufficient | Levels) -> tuple[FloatArray, FloatArray]:
 
 
 def _corner(result: CalibrationResult) -> Section:
-    draws = result.draws
     every = max(1, result.chains.flat.shape[0] // _CORNER)
-    shown = np.stack([x.reshape(-1)[::every] for x in draws.values()], -1)
-    names = [f"{r.name.replace('_', ' ')}\n{r.unit}" for r in result.rows()]
+    shown = np.stack([x.reshape(-1)[::every] for x in result.draws.values()], -1)
+    names = [f"{_words(r.name)}\n{r.unit}" for r in result.rows()]
     text = "Every pair of parameters; the recipe's own values are orange. Gain, offset, noise and efficiency correlate."
     picture = figures.corners(shown, names, [r.nominal for r in result.rows()])
     return Section("Parameters in pairs", text, picture=picture)

@@ -1,13 +1,13 @@
-"""Draws from the posterior of a sensor with emcee: four ensembles, which end when they are long and agree.
+"""Draws from the posterior of a sensor with emcee: four ensembles, which end when their chains are long enough.
 
-This file and `ensembles` are the only ones that import emcee. Draws are kept in emcee's HDF5 format and written whole
-after each round. A killed run goes on from the last round, to the last bit as if it had never stopped.
+Only this file and `ensembles` import emcee. After each round all draws are written in emcee's HDF5 format. A killed run
+continues from the last round and gives the same draws, to the last bit, as a run that never stopped.
 """
 
 from __future__ import annotations
 
 import os
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -18,6 +18,7 @@ import numpy as np
 from neusee.workflows.calibration.ensembles import Walk, walk_until
 from neusee.workflows.calibration.log_posterior import SensorPosterior
 from neusee.workflows.calibration.posterior_mode import LaplaceFit
+from neusee.workflows.report.study_folder import Progress, silent
 
 if TYPE_CHECKING:
     from neusee.workflows.calibration.log_posterior import FloatArray
@@ -25,28 +26,23 @@ if TYPE_CHECKING:
 ENSEMBLES = 4
 STRANDED = 20.0  #: nats by which the median of a stranded walker lies below that of all walkers
 _FIRST, _GROWTH, _LONGEST = 250, 1.25, 32_000  #: steps of the first round; growth by round; most steps
-_TAUS, _SURELY, _CHANGE = (
-    50.0,
-    100.0,
-    0.01,
-)  #: least length in tau; length from which a change of tau counts no more; most change
+_TAUS, _CHANGE = 50.0, 0.01  #: least length of a chain in tau, and the largest change of tau in its last round
+_SURELY = 100.0  #: length in tau from which any change of tau is allowed
 _BESIDE = 5.0  #: nats for each parameter by which a starting point may lie below the mode
 _BURN = 10.0  #: autocorrelation times that are discarded
 _MOVES = {"de": emcee.moves.DEMove, "stretch": emcee.moves.StretchMove}
 
-Progress = Callable[[str], None]
-
 
 @dataclass(frozen=True)
 class Chains:
-    """The draws of all ensembles."""
+    """The draws and log posteriors of all ensembles, and how well their walkers mix."""
 
     draws: FloatArray  #: (ensemble, step, walker, free) coordinates, without the discarded steps
     log: FloatArray  #: (ensemble, step, walker)
     accepted: float  #: share of the moves
     tau: float  #: steps, the longest autocorrelation time of any coordinate
-    steps: int  #: the discarded ones included
-    long: bool  #: whether the chains are long enough
+    steps: int  #: with the discarded steps
+    long: bool  #: True if the chains are long enough
 
     @property
     def flat(self) -> FloatArray:
@@ -55,7 +51,7 @@ class Chains:
 
 
 def move(name: str) -> Any:
-    """Return the move of walkers, `de` or `stretch`; raise `ValueError` for any other, and explain the snooker."""
+    """Return the move of walkers ``de`` or ``stretch``; raise `ValueError` for any other name."""
     if name in _MOVES:
         return _MOVES[name]()
     if "snooker" in name.lower():
@@ -63,7 +59,7 @@ def move(name: str) -> Any:
             "DESnookerMove of emcee up to 3.1.6 draws from a distribution that is 18 % too narrow (emcee's pull "
             "request 531 corrects it): use de or stretch"
         )
-    raise ValueError(f"no move {name!r}: de or stretch")
+    raise ValueError(f"no move {name!r}: write de or stretch")
 
 
 def sample(
@@ -75,35 +71,36 @@ def sample(
     walkers: int = 64,
     how: str = "de",
     wanted: int = 1000,
-    progress: Progress = lambda line: None,
+    progress: Progress = silent,
 ) -> Chains:
     """Draw until every chain is 50 autocorrelation times long and the effective sample size is ``wanted``.
 
     ``file`` keeps the draws; where it exists, the chains continue from it.
     """
-    moves, runs = move(how), []
-    for index in range(ENSEMBLES):
-        runs.append(start_ensemble(problem, mode, file, index, seed, walkers, moves))
+    moves = move(how)
+    runs = [start_ensemble(problem, mode, file, index, seed, walkers, moves) for index in range(ENSEMBLES)]
     before, steps = _round(min(run.iteration for run in runs))
-    tau_before = max(autocorrelation_time(run.backend.get_chain()[:before]) for run in runs) if before else np.inf
+    tau_before = _longest_time(runs, before) if before else np.inf
     while True:
         walk_until(runs, steps, problem.log_posterior)
         _keep(file, [run.backend for run in runs], progress)
-        tau = max(autocorrelation_time(run.backend.get_chain()) for run in runs)
+        tau = _longest_time(runs)
         change = abs(tau - tau_before) / tau
         long = steps >= (_TAUS + _BURN) * tau and (change < _CHANGE or steps >= (_SURELY + _BURN) * tau)
-        found = _gathered(runs, tau, steps, long)
-        effective = found.flat.shape[0] / tau
-        progress(
-            f"{steps} steps of {ENSEMBLES} x {walkers} walkers: tau {tau:.1f}, effective sample size {effective:.0f}"
-        )
-        if (long and effective >= wanted) or steps >= _LONGEST:
-            return found
+        chains = _gathered(runs, tau, steps, long)
+        size = chains.flat.shape[0] / tau
+        progress(f"{steps} steps of {ENSEMBLES} x {walkers} walkers: tau {tau:.1f}, effective sample size {size:.0f}")
+        if (long and size >= wanted) or steps >= _LONGEST:
+            return chains
         tau_before, steps = tau, int(_GROWTH * steps)
 
 
+def _longest_time(runs: Sequence[Walk], steps: int | None = None) -> float:
+    return max(autocorrelation_time(run.backend.get_chain()[:steps]) for run in runs)
+
+
 def _round(iteration: int) -> tuple[int, int]:
-    """Return the round that ends at ``iteration`` and the one before: a stopped chain ends as if never stopped."""
+    """Return the lengths in steps of two successive rounds; the second is the first round to reach ``iteration``."""
     before, steps = 0, _FIRST
     while steps < iteration:
         before, steps = steps, int(_GROWTH * steps)
@@ -113,7 +110,7 @@ def _round(iteration: int) -> tuple[int, int]:
 def start_ensemble(
     problem: SensorPosterior, mode: LaplaceFit, file: Path, index: int, seed: int, walkers: int, moves: Any
 ) -> Walk:
-    """Return an ensemble that starts from the normal distribution about the mode, or continues where it stopped."""
+    """Return an ensemble that continues the draws in ``file`` or starts from the normal distribution at the mode."""
     dimensions = len(problem.names)
     backend = _read(file, index)
     if backend is not None and backend.shape == (walkers, dimensions):
@@ -128,27 +125,28 @@ def start_ensemble(
 
 
 def _alive(problem: SensorPosterior, mode: LaplaceFit, walkers: int, rng: np.random.Generator) -> FloatArray:
-    """Return likely starting points: beside the number of a full well the posterior is next to nothing."""
-    found = np.empty((0, len(mode.theta)))
+    """Return starting points (walker, free) that are likely; beyond a full well the posterior is almost zero."""
+    points = np.empty((0, len(mode.theta)))
     for _ in range(50):
         drawn = mode.draw(4 * walkers, rng)
         likely = problem.log_posterior(drawn) > mode.log - _BESIDE * (1 + len(mode.theta))
-        found = np.concatenate([found, drawn[likely]])
-        if len(found) >= walkers:
-            return found[:walkers]
+        points = np.concatenate([points, drawn[likely]])
+        if len(points) >= walkers:
+            return points[:walkers]
     raise ValueError(
         "the normal distribution about the mode hardly overlaps the posterior, so no chain can start from it"
     )
 
 
 def autocorrelation_time(chain: FloatArray) -> float:
+    """Return the longest autocorrelation time of any coordinate, in steps of a chain (step, walker, free)."""
     with np.errstate(invalid="ignore"):
-        found = float(np.max(emcee.autocorr.integrated_time(chain, tol=0, has_walkers=True)))
-    return found if np.isfinite(found) else float(len(chain))  # of walkers that never moved
+        tau = float(np.max(emcee.autocorr.integrated_time(chain, tol=0, has_walkers=True)))
+    return tau if np.isfinite(tau) else float(len(chain))  # NaN for walkers that never move
 
 
 def stranded(log: FloatArray) -> int:
-    """Return how many walkers of (..., step, walker) stay where the posterior is next to nothing."""
+    """Return the number of walkers of ``log`` (..., step, walker) that stay where the posterior is almost zero."""
     middle = np.median(log, -2)
     return int((middle < np.median(middle) - STRANDED).sum())
 
@@ -162,7 +160,7 @@ def _gathered(runs: Sequence[Walk], tau: float, steps: int, long: bool) -> Chain
 
 
 def _read(file: Path, index: int) -> Any:
-    """Return the draws of an ensemble, in memory; None where no file can be read."""
+    """Return the draws of an ensemble as a backend in memory; return None where no file can be read."""
     if not file.is_file():
         return None
     try:
@@ -178,7 +176,7 @@ def _read(file: Path, index: int) -> Any:
 
 
 def _keep(file: Path, backends: Sequence[Any], progress: Progress) -> None:
-    """Write the draws; where that fails, as on a full disk, report it and go on."""
+    """Write the draws; report a failure, such as a full disk, as progress and continue."""
     try:
         _write(file, backends)
     except (OSError, RuntimeError) as error:  # h5py raises both
@@ -186,7 +184,7 @@ def _keep(file: Path, backends: Sequence[Any], progress: Progress) -> None:
 
 
 def _write(file: Path, backends: Sequence[Any]) -> None:
-    """Write all ensembles to one file, which gets its name by an atomic rename."""
+    """Write all ensembles to one file with an atomic rename."""
     file.parent.mkdir(parents=True, exist_ok=True)
     part = file.with_suffix(f".{os.getpid()}.part")
     try:

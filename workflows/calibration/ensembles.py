@@ -1,7 +1,8 @@
-"""Ensembles that walk in step: each by emcee's moves and its own random stream, and all evaluated in one call.
+"""Ensembles of walkers that step together, so that one call evaluates the proposals of all ensembles.
 
-The draws are exactly those of emcee's `EnsembleSampler`. That class evaluates each ensemble by itself and loops over
-its walkers. A likelihood of few numbers takes as long for one ensemble as for four, and less than that loop.
+Each ensemble has emcee's moves and its own random stream. The draws are exactly those of emcee's `EnsembleSampler`,
+which evaluates one ensemble after another in a loop over walkers. A likelihood of few numbers takes as long for one
+ensemble as for four, and less time than that loop.
 """
 
 from __future__ import annotations
@@ -15,16 +16,16 @@ import numpy as np
 if TYPE_CHECKING:
     from neusee.workflows.calibration.log_posterior import FloatArray
 
-Weigh = Callable[["FloatArray"], "FloatArray"]  #: the log density of each walker of (walker, free), never NaN
+Weigh = Callable[["FloatArray"], "FloatArray"]  #: returns the log density (walker,) at (walker, free), never NaN
 
 
 class Walk:
-    """One ensemble."""
+    """One ensemble of walkers with its draws, its move and its random stream."""
 
     def __init__(
         self, backend: Any, move: Any, random: np.random.RandomState, initial_theta: FloatArray | None
     ) -> None:
-        self.backend = backend  #: emcee's, in memory: all steps so far
+        self.backend = backend  #: emcee's backend in memory, with all steps so far
         self.move, self.random = move, random
         self.initial_theta = initial_theta  #: (walker, free) before the first step; None after it
 
@@ -42,8 +43,8 @@ class Walk:
         self.backend.grow(steps, None)
 
     def begin_step(self) -> None:
-        """Split the walkers into parts: the proposals of each part come from the other parts."""
-        self.random.random_sample()  # by which emcee draws one of several moves
+        """Split the walkers into parts; the proposals of each part depend on the other parts."""
+        self.random.random_sample()  # emcee draws one of several moves with this number
         self.move.setup(self._state.coords)
         self._part = np.arange(len(self._state.coords)) % self.move.nsplits
         if self.move.randomize_split:
@@ -55,29 +56,29 @@ class Walk:
         sets = [self._state.coords[self._part == other] for other in range(self.move.nsplits)]
         others = sets[:part] + sets[part + 1 :]
         self._proposed, self._factors = self.move.get_proposal(sets[part], others, self.random)
-        found: FloatArray = self._proposed
-        return found
+        proposed: FloatArray = self._proposed
+        return proposed
 
     def decide(self, part: int, log: FloatArray) -> None:
         """Accept or reject the proposals of one part."""
         own = np.flatnonzero(self._part == part)
         gain = self._factors + log - self._state.log_prob[own]
-        goes = gain > np.log(self.random.rand(len(own)))
-        at = own[goes]
-        self._state.coords[at], self._state.log_prob[at] = self._proposed[goes], log[goes]
+        accepted = gain > np.log(self.random.rand(len(own)))
+        at = own[accepted]
+        self._state.coords[at], self._state.log_prob[at] = self._proposed[accepted], log[accepted]
         self._accepted[at] = True
 
     def end_step(self) -> None:
-        """Keep the step."""
+        """Add the step to the draws."""
         self.backend.save_step(self._state, self._accepted)
 
     def rest(self) -> None:
-        """Keep the state of the random stream, which a continued chain needs."""
+        """Store the state of the random stream, from which a later run continues."""
         self.backend.random_state = self.random.get_state()
 
 
 def walk_until(walks: Sequence[Walk], steps: int, weigh: Weigh) -> None:
-    """Walk until every ensemble has ``steps`` steps, those that are behind first."""
+    """Walk until every ensemble has ``steps`` steps; the ensembles with the fewest steps go first."""
     while (now := min(walk.iteration for walk in walks)) < steps:
         behind = [walk for walk in walks if walk.iteration == now]
         until = min([steps, *(walk.iteration for walk in walks if walk.iteration > now)])

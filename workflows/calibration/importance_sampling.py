@@ -1,4 +1,4 @@
-"""Samples of a posterior without a chain: importance sampling from a density that is fitted until both agree."""
+"""Importance sampling of a posterior, from a density that is fitted until both agree."""
 
 from __future__ import annotations
 
@@ -18,39 +18,37 @@ _ENOUGH, _SOFT, _LEAST = 0.3, 0.1, 0.02  #: effective sample fractions: to end, 
 
 
 def draw_samples(problem: SensorPosterior, mode: LaplaceFit, rng: np.random.Generator) -> tuple[FloatArray, FloatArray]:
-    """Return samples, and the logarithm of the posterior over the density that they were drawn from.
+    """Return samples, and for each sample the logarithm of the posterior over the density of the draw.
 
-    The density has wide tails, starts as that about the mode, and is fitted to the weighted samples until both agree.
-    Raises: `ValueError` where they never do.
+    The density is Student's t; its mean and covariance start as those at the mode and are fitted to the weighted
+    samples. Raises: `ValueError` where density and posterior never agree.
     """
     centre, covariance = mode.theta, mode.covariance
-    found, best = (np.empty((0, len(centre))), np.empty(0)), 0.0
+    kept, best = (np.empty((0, len(centre))), np.empty(0)), 0.0
     for _ in range(_ROUNDS):
         samples, log = _proposed(problem, centre, covariance, rng)
         fraction = _effective_sample_fraction(weights(log))
         if fraction > best:
-            found, best = (samples, log), fraction
+            kept, best = (samples, log), fraction
         if best >= _ENOUGH:
             break
-        while (
-            _effective_sample_fraction(soft := weights(log)) < _SOFT
-        ):  # few samples would make the next density too narrow
-            log = 0.5 * log
+        while _effective_sample_fraction(soft := weights(log)) < _SOFT:
+            log = 0.5 * log  # few samples would make the next density too narrow
         centre = soft @ samples
         covariance = (samples - centre).T @ (soft[:, None] * (samples - centre))
     if best < _LEAST:
         raise ValueError(
             f"{DRAWS} draws of {', '.join(problem.names)} have an effective sample size of {best * DRAWS:.0f}: "
-            "hold the parameters that the levels do not determine"
+            "hold the parameters that the levels do not determine at fixed values"
         )
-    return found
+    return kept
 
 
 def weights(log: FloatArray) -> FloatArray:
-    """Return shares that sum to one."""
-    share = np.exp(log - log.max())
-    found: FloatArray = share / share.sum()
-    return found
+    """Return the weight of each sample from the logarithm of that weight; the weights sum to one."""
+    weight = np.exp(log - log.max())
+    normalized: FloatArray = weight / weight.sum()
+    return normalized
 
 
 def _proposed(

@@ -24,7 +24,8 @@ if TYPE_CHECKING:
 
     FloatArray = NDArray[np.float64]
 
-#: by the node of the likelihood, the node of the prior and the class of the coordinates
+_Function = Callable[[Mapping[str, Any]], dict[str, Any]]  #: the likelihood by the name of the step, of parameters
+#: from the node of the likelihood to the node of the prior and the class of the coordinates
 _KINDS: dict[str, tuple[str, type[Coordinates] | type[CameraCoordinates]]] = {
     "calibrate.density": ("calibrate.prior", Coordinates),
     "calibrate.camera": ("calibrate.camera_prior", CameraCoordinates),
@@ -33,27 +34,29 @@ _KINDS: dict[str, tuple[str, type[Coordinates] | type[CameraCoordinates]]] = {
 
 @dataclass(frozen=True)
 class SensorPosterior:
-    """The posterior of a recipe's sensor; theta is a row of coordinates, one for each free parameter."""
+    """The posterior of a recipe's sensor; a sample is a row of coordinates, one for each free parameter."""
 
     recipe: Recipe
-    step: str  #: the step of the likelihood
-    key: str  #: of everything that decides the posterior
+    step: str  #: name of the step that computes the likelihood
+    key: str  #: digest of everything that decides the posterior
     coordinates: Coordinates | CameraCoordinates
     levels: Sufficient | Levels
-    weigh: Callable[[Mapping[str, Any]], dict[str, Any]]
-    weigh_in_full: Callable[[Mapping[str, Any]], dict[str, Any]]  #: with deviances and slopes too
+    weigh: _Function
+    weigh_in_full: _Function  #: with deviances and slopes too
 
     @classmethod
     def of(cls, recipe: Recipe, store: Store) -> SensorPosterior:
-        """Read a recipe; raise `ValueError` for a recipe without both steps, or with two of one."""
-        density, prior, kind = _pair(recipe)
+        """Return the posterior of a recipe; raise `ValueError` unless there is one likelihood with one prior."""
+        density = only_step(recipe, *_KINDS)
+        prior_node, kind = _KINDS[density.node.path]
+        prior = only_step(recipe, prior_node)
         source = str(density.wires["levels"])
         done = run(recipe, store, (density.name, prior.name, source))
         coordinates = kind.of(done[prior.name], density.params)
         free = [f"{density.name}.{name}" for name in coordinates.names]
         quick = replace(density, params={**density.params, "told": False})
 
-        def function(step: Step) -> Callable[[Mapping[str, Any]], dict[str, Any]]:
+        def function(step: Step) -> _Function:
             changed = replace(recipe, steps={**recipe.steps, step.name: step})
             return as_function(changed, *free, outputs=[step.name], store=store)
 
@@ -66,50 +69,44 @@ class SensorPosterior:
         return self.coordinates.names
 
     def parameters(self, samples: FloatArray) -> dict[str, Tensor]:
-        """Return the parameters, each (...), of samples (..., free)."""
+        """Return the parameters by name, each (...), of samples (..., free)."""
         return self.coordinates.parameters(torch.from_numpy(np.ascontiguousarray(samples)))
 
     def theta(self, parameters: Mapping[str, float | Tensor]) -> FloatArray:
-        """Return coordinates (..., free) of parameters."""
-        found: FloatArray = self.coordinates.place(parameters).numpy()
-        return found
+        """Return the coordinates (..., free) of parameters."""
+        coordinates: FloatArray = self.coordinates.place(parameters).numpy()
+        return coordinates
 
     def likelihood(self, samples: FloatArray) -> Likelihood:
         """Return the likelihood of the levels at samples (walker, free)."""
         with torch.no_grad(), one_thread():
-            found: Likelihood = self.weigh_in_full(self._named(self.parameters(samples)))[self.step]
-        return found
+            likelihood: Likelihood = self.weigh_in_full(self._named(self.parameters(samples)))[self.step]
+        return likelihood
 
     def log_posterior(self, samples: FloatArray) -> FloatArray:
-        """Return the log density (walker,) by the coordinates, up to a constant; minus infinity where it is zero."""
+        """Return the logarithm (walker,) of the posterior density of the coordinates, up to a constant."""
         with torch.no_grad(), one_thread():
             parameters = self.parameters(samples)
             total = self.weigh(self._named(parameters))[self.step].log + self.coordinates.log_prior(parameters)
-        found: FloatArray = total.nan_to_num(nan=-torch.inf, posinf=-torch.inf, neginf=-torch.inf).numpy()
-        return found
+        log: FloatArray = total.nan_to_num(nan=-torch.inf, posinf=-torch.inf, neginf=-torch.inf).numpy()
+        return log
 
     def whitened(self, samples: FloatArray) -> FloatArray:
         """Return samples (..., free) in standard deviations of the prior."""
-        found: FloatArray = self.coordinates.whitened(self.parameters(samples)).numpy()
-        return found
+        whitened: FloatArray = self.coordinates.whitened(self.parameters(samples)).numpy()
+        return whitened
 
     def _named(self, parameters: Mapping[str, Tensor]) -> dict[str, Tensor]:
         return {f"{self.step}.{name}": x for name, x in parameters.items()}
 
 
-def _pair(recipe: Recipe) -> tuple[Step, Step, type[Coordinates] | type[CameraCoordinates]]:
-    """Return the step that weighs the levels, the step of the prior, and the class of the coordinates."""
-    weighing = only_step(recipe, *_KINDS)
-    prior, kind = _KINDS[weighing.node.path]
-    return weighing, only_step(recipe, prior), kind
-
-
 def only_step(recipe: Recipe, *paths: str) -> Step:
-    found = [step for step in recipe.steps.values() if step.node.path in paths]
-    if len(found) != 1:
-        has = "no step" if not found else f"{len(found)} steps"
+    """Return the only step whose node is in ``paths``; raise `ValueError` for no such step or several."""
+    steps = [step for step in recipe.steps.values() if step.node.path in paths]
+    if len(steps) != 1:
+        count = f"{len(steps)} steps" if steps else "no step"
         raise ValueError(
-            f"{recipe.name} has {has} of the node {' or '.join(paths)}, and a calibration one: `neusee run calibrate` "
-            "and `neusee run calibrate_camera` show how"
+            f"{recipe.name} has {count} of the node {' or '.join(paths)}, but a calibration has one step: see "
+            "`neusee run calibrate` and `neusee run calibrate_camera`"
         )
-    return found[0]
+    return steps[0]

@@ -1,9 +1,8 @@
-"""The values to state for a real camera of unknown response: its posteriors, and how models of the response differ."""
+"""The values to state for a camera of unknown response: a posterior by each model of the response, and their spread."""
 
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
-from typing import TYPE_CHECKING
 
 import numpy as np
 
@@ -11,12 +10,9 @@ from neusee.nodes.values import Levels
 from neusee.workflows.calibration.importance_sampling import draw_samples, weights
 from neusee.workflows.calibration.log_posterior import SensorPosterior
 from neusee.workflows.calibration.posterior_mode import find_mode, initial_theta
-from neusee.workflows.graph.recipe_graph import Recipe, Step
+from neusee.workflows.graph.recipe_graph import Recipe
 from neusee.workflows.recipe.distributions.joint import Z_90
 from neusee.workflows.store.result_store import Store
-
-if TYPE_CHECKING:
-    from neusee.workflows.calibration.log_posterior import FloatArray
 
 TERMS = ("bend", "twist")  #: terms of the response, in the order in which models add them
 
@@ -36,28 +32,18 @@ class IntervalEstimate:
 
 @dataclass(frozen=True)
 class ModelSpread:
-    """One parameter: its posterior by each model of the response, and the interval to state."""
+    """The posterior of one parameter by each model of the response, and the interval to state."""
 
     name: str
-    models: tuple[IntervalEstimate, ...]  #: the posterior with 0, 1, 2 terms of the response, up to those that are free
+    models: tuple[IntervalEstimate, ...]  #: the posterior with 0, 1, 2 terms of the response, as far as they are free
     stated: IntervalEstimate
 
 
-@dataclass(frozen=True)
-class _ModelPosterior:
-    """The posterior of one model, as a normal distribution of each coordinate."""
-
-    names: tuple[str, ...]
-    centre: FloatArray
-    width: FloatArray
-
-    def of(self, name: str) -> tuple[float, float]:
-        at = self.names.index(name)
-        return float(self.centre[at]), float(self.width[at])
+_Posterior = dict[str, tuple[float, float]]  #: mean and standard deviation of each coordinate
 
 
 def compare_models(recipe: Recipe, store: Store, seed: int = 0) -> list[ModelSpread]:
-    """Return the parameters that are free in every model, with the posterior of each model and the interval to state.
+    """Return each parameter that is free in all models, with its posterior by each model and the interval to state.
 
     The stated value is the middle of the two richest models; its width is the wider of both and half their distance, in
     quadrature.
@@ -71,22 +57,22 @@ def compare_models(recipe: Recipe, store: Store, seed: int = 0) -> list[ModelSpr
 
     Raises: `ValueError` for too few levels, where no mode is found, and for too small an effective sample size.
     """
-    nothing = SensorPosterior.of(recipe, store)
-    if not isinstance(nothing.levels, Levels):
-        raise ValueError(f"{recipe.name} weighs pixels that are all alike: for models of the response, use the node "
-                         "calibrate.camera")  # fmt: skip
-    terms = [name for name in TERMS if name in nothing.names]
-    _enough(nothing, nothing.levels, terms)
+    full = SensorPosterior.of(recipe, store)
+    if not isinstance(full.levels, Levels):
+        raise ValueError(
+            f"{recipe.name} has a likelihood of identical pixels: models of the response need calibrate.camera"
+        )
+    terms = [name for name in TERMS if name in full.names]
+    _check_levels(full, full.levels, terms)
     rng = np.random.default_rng(seed)
-    diagnostics = [
-        SensorPosterior.of(_without(recipe, nothing.step, terms[count:]), store) for count in range(len(terms) + 1)
-    ]
-    laws = [_posterior(problem, rng) for problem in diagnostics]
-    return [_row(name, diagnostics[0], laws) for name in diagnostics[0].names]
+    models = [_without(recipe, full.step, terms[count:]) for count in range(len(terms) + 1)]
+    problems = [SensorPosterior.of(model, store) for model in models]
+    posteriors = [_posterior(problem, rng) for problem in problems]
+    return [_spread(name, problems[0], posteriors) for name in problems[0].names]
 
 
-def _enough(problem: SensorPosterior, levels: Levels, terms: list[str]) -> None:
-    """Raise `ValueError` where a drifting lamp leaves too few levels to fit a response through all of them.
+def _check_levels(problem: SensorPosterior, levels: Levels, terms: list[str]) -> None:
+    """Raise `ValueError` where a drifting lamp leaves too few levels for a response with ``terms``.
 
     With two terms and 4 lit levels, intervals of 90 % held the truth of 60 cameras in 93 %, with 2 levels in 58 %.
     """
@@ -95,42 +81,41 @@ def _enough(problem: SensorPosterior, levels: Levels, terms: list[str]) -> None:
     if lit < len(terms) + 2:
         raise ValueError(
             f"{lit} lit levels do not separate a response of {len(terms)} terms from a drifting lamp: "
-            f"give {len(terms) + 2} or more of different light below saturation, or "
+            f"give {len(terms) + 2} or more levels of different light below saturation, or "
             f"hold {' and '.join(terms[max(0, lit - 2) :])}"
         )
 
 
 def _without(recipe: Recipe, weighing: str, terms: list[str]) -> Recipe:
-    """Return the recipe with some terms of the response held at zero."""
-
-    def held(step: Step) -> Step:
+    """Return the recipe with ``terms`` of the response held at zero in the prior and in the step ``weighing``."""
+    steps = dict(recipe.steps)
+    for name, step in steps.items():
         if step.node.path == "calibrate.camera_prior":
-            return replace(step, params={**step.params, **dict.fromkeys(terms)})
-        if step.name == weighing:
-            return replace(step, params={**step.params, **dict.fromkeys(terms, 0.0)})
-        return step
-
-    return replace(recipe, steps={name: held(step) for name, step in recipe.steps.items()})
+            steps[name] = replace(step, params={**step.params, **dict.fromkeys(terms)})
+        elif name == weighing:
+            steps[name] = replace(step, params={**step.params, **dict.fromkeys(terms, 0.0)})
+    return replace(recipe, steps=steps)
 
 
-def _posterior(problem: SensorPosterior, rng: np.random.Generator) -> _ModelPosterior:
+def _posterior(problem: SensorPosterior, rng: np.random.Generator) -> _Posterior:
     mode = find_mode(problem, initial_theta(problem))
     if not mode.settled:
         raise ValueError(f"no mode of {', '.join(problem.names)} was found: give narrower priors")
     samples, log = draw_samples(problem, mode, rng)
     weight = weights(log)
     centre = weight @ samples
-    return _ModelPosterior(problem.names, centre, np.sqrt(weight @ (samples - centre) ** 2))
+    width = np.sqrt(weight @ (samples - centre) ** 2)
+    return dict(zip(problem.names, zip(centre.tolist(), width.tolist(), strict=True), strict=True))
 
 
-def _row(name: str, problem: SensorPosterior, laws: list[_ModelPosterior]) -> ModelSpread:
+def _spread(name: str, problem: SensorPosterior, posteriors: list[_Posterior]) -> ModelSpread:
     linear = name in problem.coordinates.linear
-    each_law = [law.of(name) for law in laws]
-    (low, narrow), (high, wide) = each_law[-2:] if len(each_law) > 1 else each_law * 2
+    models = [posterior[name] for posterior in posteriors]
+    (low, narrow), (high, wide) = models[-2:] if len(models) > 1 else models * 2
     middle, width = 0.5 * (low + high), float(np.hypot(max(narrow, wide), 0.5 * (high - low)))
-    return ModelSpread(name, tuple(_figure(*each, linear) for each in each_law), _figure(middle, width, linear))
+    return ModelSpread(name, tuple(_interval(*model, linear) for model in models), _interval(middle, width, linear))
 
 
-def _figure(centre: float, width: float, linear: bool) -> IntervalEstimate:
+def _interval(centre: float, width: float, linear: bool) -> IntervalEstimate:
     ends = [centre, centre - Z_90 * width, centre + Z_90 * width]
     return IntervalEstimate(*(ends if linear else [float(np.exp(x)) for x in ends]))

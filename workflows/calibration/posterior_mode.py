@@ -1,4 +1,4 @@
-"""The mode of a posterior and its covariance: Fisher's scoring from the least squares of the standard."""
+"""The mode and the covariance of a posterior by Fisher's scoring, which starts at the least squares of EMVA 1288."""
 
 from __future__ import annotations
 
@@ -17,44 +17,45 @@ if TYPE_CHECKING:
     from neusee.workflows.calibration.log_posterior import FloatArray
 
 _ROUNDS = 60
-_CLOSE = 1e-6  #: twice the nats that a step may still gain
-_NEXT = 1e-3  #: the same where no step gains, or an edge is near
-_STEP = 1e-3  #: step of a difference, in standard deviations of that coordinate
-_EDGE = 1e3  #: nats that such a step costs only over an edge
+_CLOSE = 1e-6  #: twice the nats that one more step may gain at the end of the search
+_NEXT = 1e-3  #: twice the nats that one more step may gain at a settled mode beside an edge
+_STEP = 1e-3  #: step of a difference, in standard deviations of the coordinate
+_EDGE = 1e3  #: nats: a step of a difference that costs more crosses an edge
 _NARROWER = 0.5 ** np.arange(1, 12)  #: shares of the way from the middle of the prior to the guess
-_SHORT = 1e-7  #: step before any standard deviation is known: a well is known to a part in a million
+_SHORT = 1e-7  #: step before any standard deviation is known: levels may determine a well to a part in a million
 
 
 @dataclass(frozen=True)
 class LaplaceFit:
-    """A normal distribution about the mode of a posterior."""
+    """The normal distribution about the mode of a posterior."""
 
     theta: FloatArray  #: (free,)
     log: float  #: log posterior at the mode
     covariance: FloatArray  #: (free, free), of the coordinates
     scaled_slopes: FloatArray  #: (row, free) slopes of the levels per standard deviation of the prior
     shares: FloatArray  #: (free,) standard deviation of each parameter over that of its prior
-    settled: bool  #: whether no step gains any more
+    settled: bool  #: True if no further step raises the posterior
 
     def draw(self, count: int, rng: np.random.Generator) -> FloatArray:
         """Return samples (count, free) of the normal distribution."""
         values, vectors = np.linalg.eigh(self.covariance)
         normal = rng.standard_normal((count, len(self.theta)))
-        found: FloatArray = self.theta + (normal * np.sqrt(values.clip(0))) @ vectors.T
-        return found
+        samples: FloatArray = self.theta + (normal * np.sqrt(values.clip(0))) @ vectors.T
+        return samples
 
 
 def log_density(mode: LaplaceFit, samples: FloatArray) -> FloatArray:
     """Return the log density (count,) of the normal distribution about a mode, up to a constant."""
     off = samples - mode.theta
-    found: FloatArray = -0.5 * np.einsum("ni,ij,nj->n", off, np.linalg.pinv(mode.covariance, hermitian=True), off)
-    return found
+    log: FloatArray = -0.5 * np.einsum("ni,ij,nj->n", off, np.linalg.pinv(mode.covariance, hermitian=True), off)
+    return log
 
 
 def initial_theta(problem: SensorPosterior) -> FloatArray:
-    """Return where the search for the mode starts: the guess, or a point between it and the middle of the prior.
+    """Return the start of the search for the mode: a point from the guess to the middle of the prior.
 
-    The posterior is not zero there. Raises: `ValueError` where it is zero at all points between.
+    The start is the point closest to the guess at which the posterior is not zero.
+    Raises: `ValueError` where the posterior is zero at all points.
     """
     coordinates = problem.coordinates
     middle = coordinates.from_whitened(torch.zeros(len(problem.names), dtype=torch.float64))
@@ -70,12 +71,15 @@ def initial_theta(problem: SensorPosterior) -> FloatArray:
             "no sensor allowed by the priors can produce these numbers: check rounding, bits and priors, then run "
             "least_squares"
         )
-    found: FloatArray = samples[int(alive.argmax())]
-    return found
+    start: FloatArray = samples[int(alive.argmax())]
+    return start
 
 
 def find_mode(problem: SensorPosterior, initial_theta: FloatArray) -> LaplaceFit:
-    """Climb from ``initial_theta`` to the mode; a direction that no level constrains stays as wide as the prior."""
+    """Climb from ``initial_theta`` to the mode, and return the normal distribution about the mode.
+
+    In a direction that no level constrains, the distribution is as wide as the prior.
+    """
     theta, step_of = initial_theta, np.full(len(initial_theta), _SHORT)
     log = float(problem.log_posterior(theta[None])[0])
     if not np.isfinite(log):
@@ -102,62 +106,61 @@ def find_mode(problem: SensorPosterior, initial_theta: FloatArray) -> LaplaceFit
 
 
 def _climb(problem: SensorPosterior, theta: FloatArray, log: float, step: FloatArray) -> tuple[FloatArray, float, bool]:
-    """Return the best of ever shorter steps, tried at once: of all coordinates, and of all but one near an edge."""
+    """Return the best of many points along ``step``, its log posterior, and True if the point is higher than ``theta``.
+
+    The points change all coordinates, or all except one, which may be at an edge.
+    """
     ways = np.concatenate([step[None], step * (1 - np.eye(len(step)))])
     tries = (theta + ways[:, None] * 0.5 ** np.arange(24)[:, None]).reshape(-1, len(theta))
-    found = problem.log_posterior(tries)
-    best = int(found.argmax())
-    if not found[best] > log:
-        return theta, log, False
-    return tries[best], float(found[best]), True
+    logs = problem.log_posterior(tries)
+    best = int(logs.argmax())
+    return (tries[best], float(logs[best]), True) if logs[best] > log else (theta, log, False)
 
 
 def _differences(
-    of: Callable[[FloatArray], FloatArray], theta: FloatArray, step: FloatArray, sides: FloatArray
+    function: Callable[[FloatArray], FloatArray], theta: FloatArray, step: FloatArray, sides: FloatArray
 ) -> FloatArray:
-    """Return slopes (value, free) by differences between the ``sides`` (2, free) of each coordinate, 1 or 0."""
+    """Return the slopes (value, free) of ``function`` by differences; ``sides`` (2, free) is 1 for each side to use."""
     apart = np.diag(step)
-    found = of(np.concatenate([theta + apart * sides[0], theta - apart * sides[1]]))
-    high, low = np.split(found, 2)
-    width = step * sides.sum(0).clip(1)
-    slopes: FloatArray = ((high - low) / width.reshape(-1, *(1 for _ in found.shape[1:]))).T
+    high, low = np.split(function(np.concatenate([theta + apart * sides[0], theta - apart * sides[1]])), 2)
+    slopes: FloatArray = (high - low).T / (step * sides.sum(0).clip(1))
     return slopes
 
 
 def _sides(problem: SensorPosterior, theta: FloatArray, step: FloatArray) -> FloatArray:
-    """Return (2, free) 1 where a step up, or down, is possible; beside a full well or a converter's end none is."""
+    """Return 1 (2, free) where a step up or down in a coordinate crosses no edge, such as a full well; 0 elsewhere."""
     apart = np.diag(step)
     log = problem.log_posterior(np.concatenate([theta[None], theta + apart, theta - apart]))
-    found: FloatArray = (log[1:] > log[0] - _EDGE).reshape(2, -1).astype(np.float64)
-    return found
+    possible: FloatArray = (log[1:] > log[0] - _EDGE).reshape(2, -1).astype(np.float64)
+    return possible
 
 
 def _slopes(problem: SensorPosterior, theta: FloatArray, step: FloatArray) -> tuple[FloatArray, FloatArray]:
-    """Return the slopes of levels and prior by coordinate; Fisher's information is their product with themselves."""
+    """Return the slopes of levels and prior by coordinate; the Gram matrix of both is Fisher's information."""
     rows = _differences(lambda p: problem.likelihood(p).scaled.numpy(), theta, step, _sides(problem, theta, step))
     rounded = problem.recipe.steps[problem.step].params["rounding"] == "nearest"
     for name in problem.coordinates.edged.intersection(problem.names) if rounded else ():
-        at = problem.names.index(name)  # nothing changes with it but at edges, over which there is no slope
+        at = problem.names.index(name)  # levels depend on this parameter at edges alone, over which there is no slope
         rows[:, at] = 0.0
         rows[-1, at] = float(problem.likelihood(theta[None]).scaled[0, -1])
     return rows, _differences(problem.whitened, theta, step, np.ones((2, len(step))))
 
 
 def _gradient(problem: SensorPosterior, theta: FloatArray, step: FloatArray) -> FloatArray:
+    """Return the slope (free,) of the log posterior."""
     sides = _sides(problem, theta, step)
-    found: FloatArray = _differences(lambda p: problem.log_posterior(p)[:, None], theta, step, sides)[0]
-    return found
+    gradient: FloatArray = _differences(problem.log_posterior, theta, step, sides)
+    return gradient
 
 
 def _free(problem: SensorPosterior, theta: FloatArray, step: FloatArray, gradient: FloatArray) -> FloatArray:
     """Return the gradient without the components that lead over an edge, beyond which the posterior is zero."""
     up, down = _sides(problem, theta, step) == 0
-    found: FloatArray = np.where((up & (gradient > 0)) | (down & (gradient < 0)), 0.0, gradient)
-    return found
+    return np.where((up & (gradient > 0)) | (down & (gradient < 0)), 0.0, gradient)
 
 
 def _covariance(rows: FloatArray, prior: FloatArray) -> FloatArray:
-    """Return the covariance by singular values of the slopes: the information itself would lose half of the digits."""
+    """Return the covariance by singular values of the slopes; inverting the information would lose half the digits."""
     _, s, v = np.linalg.svd(np.concatenate([rows, prior]), full_matrices=False)
-    found: FloatArray = (v.T / s**2) @ v
-    return found
+    covariance: FloatArray = (v.T / s**2) @ v
+    return covariance

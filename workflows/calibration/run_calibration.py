@@ -1,4 +1,4 @@
-"""``neusee calibrate``: from a recipe's levels to a folder with the posterior, its checks and its pictures."""
+"""``neusee calibrate``: compute the posterior of a recipe's sensor and write its folder."""
 
 from __future__ import annotations
 
@@ -25,11 +25,11 @@ from neusee.workflows.keys.engine_digest import engine
 from neusee.workflows.report.study_folder import Content, Progress, StudyReport, StudyRun, as_json, silent
 from neusee.workflows.store.result_store import Store
 
-_KEPT = 4000  #: draws that go into the folder
+_KEPT = 4000  #: draws in the file ``draws.npz``
 
 
 class CalibrationRefused(ValueError):
-    """Levels that constrain the sensor too little for a posterior to be worth drawing from."""
+    """Error for levels that constrain the sensor too little for a useful posterior."""
 
 
 def calibrate(
@@ -43,11 +43,10 @@ def calibrate(
     move: str = "de",
     draws: int = 1000,
 ) -> Path:
-    """Draw from the posterior of ``recipe``'s sensor, write it and return its folder.
+    """Draw from the posterior of the sensor of ``recipe``, and return the folder with the results.
 
-    An interrupted call goes on where it stopped, and a finished one draws nothing again. Raises: `CalibrationRefused`
-    before anything is drawn where the levels constrain the sensor too little, `ValueError` for a recipe that does not
-    calibrate.
+    A second call continues an interrupted calibration and does not repeat draws. Raises: `CalibrationRefused` before
+    anything is drawn where the levels constrain the sensor too little, `ValueError` for a recipe without a likelihood.
     """
     study_run = StudyRun("calibrate", recipe, command)
     result = find_posterior(recipe, store, progress, walkers=walkers, move=move, draws=draws)
@@ -58,10 +57,10 @@ def calibrate(
 def find_posterior(
     recipe: Recipe, store: Store, progress: Progress, *, walkers: int, move: str, draws: int
 ) -> CalibrationResult:
-    """Return the posterior with its identifiability, checks and models of the response."""
+    """Compute the posterior with its identifiability, checks and models of the response."""
     from neusee.workflows.calibration import emcee_sampler
 
-    emcee_sampler.move(move)  # a wrong name is refused before anything is computed
+    emcee_sampler.move(move)  # raises for a wrong name before anything is computed
     arviz()
     problem = SensorPosterior.of(recipe, store)
     mode = find_mode(problem, initial_theta(problem))
@@ -77,13 +76,12 @@ def find_posterior(
     )
     law = importance_samples(problem, mode, recipe.seed)
     models = compare_models(recipe, store, recipe.seed) if isinstance(problem.levels, Levels) else []
-    return CalibrationResult(
-        problem, mode, identifiability, chains, checks(problem, mode, identifiability, chains, law), models
-    )
+    tested = checks(problem, mode, identifiability, chains, law)
+    return CalibrationResult(problem, mode, identifiability, chains, tested, models)
 
 
 def _document(result: CalibrationResult) -> dict[str, Any]:
-    """Return what the folder says of the posterior, beside what every study says."""
+    """Return the part of ``posterior.json`` that only a calibration has."""
     problem, flat = result.problem, result.chains.flat
     return {
         "failed": count_failures(result.checks),
@@ -100,7 +98,7 @@ def _document(result: CalibrationResult) -> dict[str, Any]:
 
 
 def _plain(row: Mapping[str, Any]) -> dict[str, Any]:
-    """Return a row without mean and deviation where there is no estimate, so that nobody takes them for one."""
+    """Return the row of a parameter, without mean and standard deviation where there is no estimate."""
     kept = {name: value for name, value in row.items() if row["kind"] == "estimate" or name not in ("mean", "sd")}
     return {name: None if isinstance(x, float) and not math.isfinite(x) else x for name, x in kept.items()}
 
@@ -118,7 +116,7 @@ def _report(result: CalibrationResult, document: Mapping[str, Any]) -> StudyRepo
 
 
 def _draws(result: CalibrationResult) -> bytes:
-    """Return the draws of the parameters by name, evenly from all chains, as the bytes of an npz file."""
+    """Return the bytes of an npz file with draws of each parameter, taken evenly from all chains."""
     every = max(1, result.chains.flat.shape[0] // _KEPT)
     out = io.BytesIO()
     draws: dict[str, Any] = {name: x.reshape(-1)[::every] for name, x in result.draws.items()}
@@ -127,7 +125,7 @@ def _draws(result: CalibrationResult) -> bytes:
 
 
 def _inference_data(result: CalibrationResult) -> Any:
-    """Return the draws as ArviZ's inference data, each walker a chain."""
+    """Return the draws as inference data of ArviZ, with each walker as a chain."""
     chains = result.chains
 
     def by_walker(draws: Any) -> Any:

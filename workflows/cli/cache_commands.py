@@ -1,4 +1,4 @@
-"""The commands of ``neusee cache``, and the lines that they print: ls, verify, gc, pin, unpin, why."""
+"""The commands of ``neusee cache``: ls, verify, gc, pin, unpin and why, and the lines that they print."""
 
 from __future__ import annotations
 
@@ -7,9 +7,11 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from neusee.workflows.cli.command_frame import MISSED, fail, say, the_store
+from neusee.workflows.cli.command_frame import failing, say, the_store
+from neusee.workflows.cli.command_list import MISSED
 from neusee.workflows.report.text_table import columns
 from neusee.workflows.store.byte_sizes import format_size, parse_size
+from neusee.workflows.store.metadata import is_kept
 
 if TYPE_CHECKING:
     from neusee.workflows.store.derived_files import DerivedFiles
@@ -50,22 +52,22 @@ def gc(
 
     Beyond the budget, the results that save the fewest seconds for their bytes go first. Pinned results stay.
     """
-    try:
+    with failing(ValueError, before="--budget: "):
         say(gc_lines(the_store(), budget or None, dry))
-    except ValueError as error:
-        fail(f"--budget: {error}")
 
 
 @cache.command("pin")
 def pin(key: Key) -> None:
     """Keep a result whatever the budget is."""
-    _pinned(key, True)
+    with failing(ValueError):
+        say(pin_lines(the_store(), key))
 
 
 @cache.command("unpin")
 def unpin(key: Key) -> None:
     """Allow a pinned result to be removed again."""
-    _pinned(key, False)
+    with failing(ValueError):
+        say(pin_lines(the_store(), key, pin=False))
 
 
 @cache.command("why")
@@ -76,31 +78,22 @@ def why(key: Key) -> None:
     """
     from neusee.workflows.explain.why_rerun import why_key_lines
 
-    try:
+    with failing(LookupError):
         say(why_key_lines(the_store(), key))
-    except LookupError as error:
-        fail(str(error.args[0]))
-
-
-def _pinned(key: str, keep: bool) -> None:
-    try:
-        say(pin_lines(the_store(), key, keep))
-    except ValueError as error:
-        fail(str(error))
 
 
 # --- what the commands print ------------------------------------------------------------------------------------------
 
 
 def ls_lines(store: Store) -> list[str]:
-    """Return a line for each result, the newest last: date, bytes, seconds, step, recipe, key, pinned or a receipt."""
-    found = sorted(store.entries(), key=lambda entry: str(entry[1].get("date", "")))
+    """Return a line for each result with its date, bytes, seconds, step, recipe and key, the newest last."""
+    entries = sorted(store.entries(), key=lambda entry: str(entry[1].get("date", "")))
     pins = store.pinned()
-    rows = [_row(key, about, key in pins) for key, about in found]
-    kept = [about for _, about in found if _is_kept(about)]
+    rows = [_row(key, about, key in pins) for key, about in entries]
+    kept = [about for _, about in entries if is_kept(about)]
     last = f"{_count(len(kept), 'result')}, {format_size(sum(map(_size, kept)))}, in {store.root}"
-    if len(kept) < len(found):
-        last += f"; of {_count(len(found) - len(kept), 'more result')} the receipt alone"
+    if len(kept) < len(entries):
+        last += f"; of {_count(len(entries) - len(kept), 'more result')} the receipt alone"
     if store.budget is not None:
         last += f"; the budget is {format_size(store.budget)}"
     head = ["date", "bytes", "seconds", "step", "recipe", "key", ""]
@@ -108,22 +101,22 @@ def ls_lines(store: Store) -> list[str]:
 
 
 def verify_lines(store: Store) -> tuple[list[str], int]:
-    """Read every value and every picture; return a line for each damaged one, and their number."""
-    count, size, bad = 0, 0, list[str]()
+    """Read every stored value and picture; return a line for each damaged result, and their number."""
     from neusee.workflows.store.derived_files import DerivedFiles
 
-    shelf = DerivedFiles(store)
-    for found in store.check():
-        about = found.about or {}
-        problem = found.problem or _picture_problem(shelf, found.key, about)
+    files = DerivedFiles(store)
+    sizes, damaged = list[int](), list[str]()
+    for entry in store.check():
+        about = entry.about or {}
+        problem = entry.problem or _picture_problem(files, entry.key, about)
         if problem:
-            bad.append(f"{found.key}  {about.get('step') or '?'}  {problem}")
-        elif _is_kept(about):
-            count, size = count + 1, size + _size(about)
-    last = f"{_count(count, 'result')}, {format_size(size)}, as written"
-    if bad:
-        last += f"; {len(bad)} damaged, put aside in {store.root / 'bad'}: a next run computes what it needs of them"
-    return [*bad, last], len(bad)
+            damaged.append(f"{entry.key}  {about.get('step') or '?'}  {problem}")
+        elif is_kept(about):
+            sizes.append(_size(about))
+    last = f"{_count(len(sizes), 'result')}, {format_size(sum(sizes))}, as written"
+    if damaged:
+        last += f"; {len(damaged)} damaged, put aside in {store.root / 'bad'}: the next run computes those it needs"
+    return [*damaged, last], len(damaged)
 
 
 def gc_lines(store: Store, budget: str | None = None, dry: bool = False) -> list[str]:
@@ -139,54 +132,39 @@ def gc_lines(store: Store, budget: str | None = None, dry: bool = False) -> list
 
 
 def pin_lines(store: Store, prefix: str, pin: bool = True) -> list[str]:
-    """Pin or unpin the value whose key begins with ``prefix``; raise `ValueError` where no key or several do."""
-    key = _named(store, prefix, pin)
-    if pin:
-        store.pin(key)
-    else:
-        store.unpin(key)
-    step = (store.about(key) or {}).get("step") or "a value that is not here"
-    return [f"{'pinned' if pin else 'no longer pinned'}: {key}  {step}"]
-
-
-def _named(store: Store, prefix: str, pin: bool) -> str:
-    keys = store.pinned() if not pin else {key for key, about in store.entries() if _is_kept(about)}
-    found = sorted(key for key in keys if key.startswith(prefix.lower()))
-    if len(found) != 1:
+    """Pin or unpin the value whose key begins with ``prefix``; raise `ValueError` unless exactly one key does."""
+    keys = {key for key, about in store.entries() if is_kept(about)} if pin else store.pinned()
+    named = sorted(key for key in keys if key.startswith(prefix.lower()))
+    if len(named) != 1:
         what = "value" if pin else "pinned value"
-        few = f"these begin so: {', '.join(key[:12] for key in found[:5])}" if found else f"no {what} begins so"
+        few = f"these begin so: {', '.join(key[:12] for key in named[:5])}" if named else f"no {what} begins so"
         raise ValueError(f"{prefix!r} names no single {what}: {few} (`neusee cache ls` lists them)")
-    return found[0]
+    (store.pin if pin else store.unpin)(named[0])
+    step = (store.about(named[0]) or {}).get("step") or "a value that is not here"
+    return [f"{'pinned' if pin else 'no longer pinned'}: {named[0]}  {step}"]
 
 
-def _picture_problem(shelf: DerivedFiles, key: str, about: dict[str, Any]) -> str:
-    """Return what is wrong with the file of an entry, and put that file aside; return an empty text for a whole one."""
+def _picture_problem(files: DerivedFiles, key: str, about: dict[str, Any]) -> str:
+    """Return an empty text if the file of an entry is whole; otherwise put the file aside and return the problem."""
     name = about.get("file")
-    if not name or not _is_kept(about) or shelf.find(key, os.path.basename(name)[len(key) :]) is not None:
+    if not name or not is_kept(about) or files.find(key, os.path.basename(name)[len(key) :]) is not None:
         return ""
     problem = f"its file {name} is not what was written"
-    shelf.store.put_aside(key, ValueError(problem))
+    files.store.put_aside(key, ValueError(problem))
     return problem
 
 
 def _row(key: str, about: dict[str, Any], pinned: bool) -> list[str]:
     took, date = f"{about.get('seconds') or 0.0:.3f}", str(about.get("date") or "")[:19].replace("T", " ")
-    mark = "pinned" if pinned else "" if _is_kept(about) else "receipt"
+    mark = "pinned" if pinned else "" if is_kept(about) else "receipt"
     return [date, format_size(_size(about)), took, about.get("step") or "", about.get("recipe") or "", key[:8], mark]
 
 
 def _size(about: dict[str, Any]) -> int:
-    """Return the bytes of a result, or of the file that it stands for."""
+    """Return the bytes of a result, or of the picture that an entry describes."""
     size: int = about.get("file_bytes") or about.get("bytes") or 0
     return size
 
 
 def _count(count: int, what: str) -> str:
     return f"{count} {what}{'s' * (count != 1)}"
-
-
-def _is_kept(about: dict[str, Any]) -> bool:
-    """Return True for an entry whose value is stored, and False for a receipt alone."""
-    from neusee.workflows.store.metadata import is_kept
-
-    return is_kept(about)

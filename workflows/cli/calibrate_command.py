@@ -1,4 +1,4 @@
-"""The command ``neusee calibrate``: the posterior of a sensor from its calibration frames."""
+"""The command ``neusee calibrate``: find the posterior of a sensor from calibration frames."""
 
 from __future__ import annotations
 
@@ -8,7 +8,9 @@ from typing import Annotated, Any
 
 import typer
 
-from neusee.workflows.cli.command_frame import FAILED, MISSED, Debug, Out, Words, fail, load, say, the_store
+from neusee.workflows.cli.command_frame import fail, failing, load, say, the_store
+from neusee.workflows.cli.command_list import FAILED, MISSED
+from neusee.workflows.cli.command_options import Debug, Out, Quiet, Words, option_words, progress_lines
 
 
 def calibrate(
@@ -18,7 +20,7 @@ def calibrate(
         str, typer.Option("--move", help="Move of the walkers: de (differential evolution) or stretch.")
     ] = "de",
     draws: Annotated[int, typer.Option("--draws", min=100, help="Least number of independent draws.")] = 1000,
-    quiet: Annotated[bool, typer.Option("--quiet", help="Print only the path of the page.")] = False,
+    quiet: Quiet = False,
     debug: Debug = False,
     out: Out = Path("runs"),
 ) -> None:
@@ -28,20 +30,20 @@ def calibrate(
     fit; where a check fails, the page has a red banner and the exit code is 3. Run the same command again to
     continue. Needs: pip install -e ".[calibrate]".
     """
-    recipe, command = load(words)
+    recipe, command = load(words, "calibrate")
     from neusee.workflows.api import verbs
     from neusee.workflows.calibration.run_calibration import CalibrationRefused
     from neusee.workflows.graph.run_error import RunError
 
-    progress = (lambda line: None) if quiet else (lambda line: say([line]))
-    how: dict[str, Any] = {"walkers": walkers, "move": move, "draws": draws}
-    command = ["neusee", "calibrate", *command[2:], *(f"--{name} {value}" for name, value in how.items())]
-    try:
-        folder = verbs.calibrate(recipe, store=the_store(), out=out, command=command, progress=progress, **how)
-    except CalibrationRefused as error:
-        fail(f"refused, nothing was drawn: {error}", FAILED)
-    except (RunError, ValueError, ImportError) as error:
-        fail(str(error), FAILED)
+    options: dict[str, Any] = {"walkers": walkers, "move": move, "draws": draws}
+    command += option_words(options)
+    with (
+        failing(RunError, ValueError, ImportError, code=FAILED),
+        failing(CalibrationRefused, code=FAILED, before="refused, nothing was drawn: "),
+    ):
+        folder = verbs.calibrate(
+            recipe, store=the_store(), out=out, command=command, progress=progress_lines(quiet), **options
+        )
     document = json.loads((folder / "posterior.json").read_text())
     if not quiet:
         say(_lines(document["parameters"]))

@@ -1,4 +1,4 @@
-"""The frame of every command: read the recipe from the words, refuse mistakes, print, exit."""
+"""The functions with which every command reads a recipe, checks options, prints lines and fails."""
 
 from __future__ import annotations
 
@@ -7,41 +7,25 @@ import sys
 from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import replace
-from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, NoReturn
+from typing import TYPE_CHECKING, NoReturn
 
 import typer
 
+from neusee.workflows.cli.command_list import BAD
+from neusee.workflows.store.byte_sizes import parse_size
+
 if TYPE_CHECKING:
     from neusee.workflows.engine.step_job import Executor
-    from neusee.workflows.graph.diagnostics import RecipeError
     from neusee.workflows.graph.recipe_graph import Recipe
     from neusee.workflows.store.result_store import Store
 
-DONE, FAILED, BAD, MISSED = 0, 1, 2, 3
 DEFAULT = "first_light"
-
-Words = Annotated[
-    list[str] | None,
-    typer.Argument(
-        metavar="[RECIPE] [OVERRIDE]...",
-        help="A recipe's name or file, then changes: a.b=1, +a.b=1, ~a.b, laser=six.",
-        show_default=False,
-    ),
-]
-Debug = Annotated[bool, typer.Option("--debug", help="Show where in the code an error arose.")]
-Device = Annotated[str, typer.Option("--device", help="Where to compute: cpu, cuda, or several: cuda:0,cuda:1,cpu.")]
-Exact = Annotated[bool, typer.Option("--exact", help="Compute every step in full; omit nothing.")]
-Memory = Annotated[
-    str, typer.Option("--memory", help="Limit of a device's memory, such as 6 GB, as far as earlier runs tell.")
-]
-Out = Annotated[Path, typer.Option("--out", help="Folder in which to make the folder of results.")]
 
 
 def split(words: list[str] | None, before: int = 0) -> tuple[str, list[str], int]:
     """Return the name of the recipe, by default `first_light`, its changes, and the number of the first change.
 
-    ``before``: how many arguments stand before the words.
+    ``before`` is the number of arguments that stand before ``words`` on the command line.
     """
     words = list(words or [])
     named = bool(words) and not _is_change(words[0])
@@ -52,27 +36,42 @@ def split(words: list[str] | None, before: int = 0) -> tuple[str, list[str], int
     return name, words, 1 + named + before
 
 
-def load(words: list[str] | None, before: int = 0, exact: bool = False) -> tuple[Recipe, list[str]]:
-    """Return the recipe that the words name, with its changes, and the words of the command."""
+def _is_change(word: str) -> bool:
+    return "=" in word or word.startswith(("~", "+"))
+
+
+def load(words: list[str] | None, *command: str, before: int = 0, exact: bool = False) -> tuple[Recipe, list[str]]:
+    """Return the recipe that ``words`` name, with its changes, and the words that run ``command`` on that recipe."""
     name, changes, first = split(words, before)
-    from neusee.workflows.graph.diagnostics import RecipeError
     from neusee.workflows.recipe.loading import load as read
 
-    try:
+    with refusing():
         recipe = read(name, changes, first=first)
-    except RecipeError as error:
-        refuse(error)
     gc.freeze()
     gc.enable()
-    if exact:
-        return replace(recipe, exact=True), ["neusee", "run", name, *changes, "--exact"]
-    return recipe, ["neusee", "run", name, *changes]
+    again = ["neusee", *command, name, *changes]
+    return (replace(recipe, exact=True), [*again, "--exact"]) if exact else (recipe, again)
 
 
-def refuse(error: RecipeError) -> NoReturn:
-    """Print every mistake of a recipe and exit."""
-    count = len(error.diagnostics)
-    fail(f"{error}\n{count} problem{'s' * (count > 1)}, nothing was run")
+@contextmanager
+def refusing() -> Iterator[None]:
+    """Print every mistake of a recipe and end the command if the block raises `RecipeError`."""
+    from neusee.workflows.graph.diagnostics import RecipeError
+
+    try:
+        yield
+    except RecipeError as error:
+        count = len(error.diagnostics)
+        fail(f"{error}\n{count} problem{'s' * (count > 1)}, nothing was run")
+
+
+@contextmanager
+def failing(*errors: type[Exception], code: int = BAD, before: str = "") -> Iterator[None]:
+    """Print ``before`` and the message, and end the command with ``code``, if the block raises one of ``errors``."""
+    try:
+        yield
+    except errors as error:
+        fail(f"{before}{error.args[0] if isinstance(error, LookupError) else error}", code)
 
 
 def check_device(device: str) -> None:
@@ -89,17 +88,13 @@ def check_device(device: str) -> None:
             fail(f"--device {name}: {str(error).partition(chr(10))[0]}")
 
 
-def _is_change(word: str) -> bool:
-    return "=" in word or word.startswith(("~", "+"))
-
-
 def say(lines: list[str]) -> None:
     """Print lines to stdout."""
     print(*lines, sep="\n", flush=True)
 
 
 def fail(message: str, code: int = BAD) -> NoReturn:
-    """Print a message to stderr and exit."""
+    """Print a message to stderr and end the command."""
     print(message, file=sys.stderr)
     raise typer.Exit(code)
 
@@ -108,34 +103,28 @@ def the_store() -> Store:
     """Open the store that ``$NEUSEE_CACHE`` names, or the default store."""
     from neusee.workflows.store.remote_store import open_store
 
-    try:
+    with failing(ValueError, ModuleNotFoundError, before="NEUSEE_CACHE: "):
         return open_store()
-    except (ValueError, ModuleNotFoundError) as error:
-        fail(f"NEUSEE_CACHE: {error}")
 
 
-def parse_memory(text: str, option: str) -> int:
-    """Return the bytes that a text such as ``6 GB`` names; stop with a message for any other text."""
-    from neusee.workflows.store.byte_sizes import parse_size
-
-    try:
-        return parse_size(text)
-    except ValueError as error:
-        fail(f"{option}: {error}")
+def memory_limit(text: str) -> int | None:
+    """Return the bytes of ``--memory``, such as ``6 GB``; return None for an empty text."""
+    with failing(ValueError, before="--memory: "):
+        return parse_size(text) if text else None
 
 
 @contextmanager
-def executor_of(where: str, store: Store) -> Iterator[Executor | None]:
-    """Yield None for this process, or a cluster for the length of the command."""
-    if where == "local":
+def executor_of(place: str, store: Store) -> Iterator[Executor | None]:
+    """Yield None for ``local``, or the cluster that ``place`` names and that lives as long as the block."""
+    if place == "local":
         yield None
         return
-    kind, _, count = where.partition(":")
-    if not (kind == "dask" and (not count or count == "here" or count.isdecimal())) and "://" not in where:
-        fail(f"--executor {where}: write local, dask, dask:4, or a scheduler's address such as tcp://host:8786")
+    kind, _, count = place.partition(":")
+    if not (kind == "dask" and (not count or count == "here" or count.isdecimal())) and "://" not in place:
+        fail(f"--executor {place}: write local, dask, dask:4, or a scheduler's address such as tcp://host:8786")
     try:
         from neusee.workflows.engine.dask_executor import cluster
     except ModuleNotFoundError as error:
-        fail(f'--executor {where}: {error.name} is not installed: pip install "neusee[distributed]"')
-    with cluster(where, store) as found:
-        yield found
+        fail(f'--executor {place}: {error.name} is not installed: pip install "neusee[distributed]"')
+    with cluster(place, store) as executor:
+        yield executor

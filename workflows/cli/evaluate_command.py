@@ -7,17 +7,16 @@ from typing import Annotated, Any
 
 import typer
 
-from neusee.workflows.cli.command_frame import FAILED, Debug, Out, Words, check_device, fail, say, split, the_store
-
-_PIPELINES = "flat+none, five_half_rings+wiener"
+from neusee.workflows.cli.command_frame import check_device, fail, failing, say, split, the_store
+from neusee.workflows.cli.command_list import FAILED
+from neusee.workflows.cli.command_options import Debug, OneDevice, Out, Quiet, Words, option_words, progress_lines
 
 
 def evaluate(
     words: Words = None,
     pipelines: Annotated[
-        str,
-        typer.Option("--pipelines", help="MASK[@file]+RESTORER[@weights], …; none restores nothing."),
-    ] = _PIPELINES,
+        str, typer.Option("--pipelines", help="MASK[@file]+RESTORER[@weights], …; none restores nothing.")
+    ] = "flat+none, five_half_rings+wiener",
     data: Annotated[str, typer.Option("--data", help="Folder of photographs; else the recipe's own scene.")] = "",
     scenes: Annotated[int, typer.Option("--scenes", min=1, help="Number of scenes.")] = 20,
     strengths: Annotated[
@@ -27,8 +26,8 @@ def evaluate(
     reference: Annotated[
         str, typer.Option("--reference", help="Pipeline that the others are compared with; by default the first.")
     ] = "",
-    device: Annotated[str, typer.Option("--device", help="Where to compute: cpu or cuda.")] = "cpu",
-    quiet: Annotated[bool, typer.Option("--quiet", help="Print only the path of the page.")] = False,
+    device: OneDevice = "cpu",
+    quiet: Quiet = False,
     debug: Debug = False,
     out: Out = Path("runs"),
 ) -> None:
@@ -41,49 +40,38 @@ def evaluate(
     """
     name, changes, _ = split(words)
     check_device(device)
-    progress = (lambda line: None) if quiet else (lambda line: say([line]))
-    how = {"data": data, "scenes": scenes, "strengths": strengths, "small": small, "reference": reference}
-    command = ["neusee", "evaluate", name, *changes, f'--pipelines "{pipelines}"', *_given(how)]
+    options = {"data": data, "scenes": scenes, "strengths": strengths, "small": small, "reference": reference}
     folder = _evaluate(
         name,
-        changes,
-        pipelines,
+        changes=changes,
+        pipelines=pipelines,
         data=data or None,
         scenes=scenes,
         strengths=_numbers(strengths),
         small=small,
         reference=reference.replace(" ", ""),
-        out=out,
-        command=command,
-        progress=progress,
         device=device,
+        out=out,
+        progress=progress_lines(quiet),
+        command=["neusee", "evaluate", name, *changes, f'--pipelines "{pipelines}"', *option_words(options)],
     )
     say([str(folder / "report.html")])
 
 
-def _given(how: dict[str, Any]) -> list[str]:
-    return [f"--{key} {value}" for key, value in how.items() if value]
-
-
-def _evaluate(name: str, changes: list[str], pipelines: str, **how: Any) -> Path:
-    """Return the folder of the evaluation, or end with one line for each mistake."""
+def _evaluate(name: str, **options: Any) -> Path:
     from neusee.workflows.api import verbs
     from neusee.workflows.evaluation.pipelines import EvaluationRefused
     from neusee.workflows.graph.run_error import RunError
 
-    try:
-        return verbs.evaluate(name, pipelines=pipelines, changes=changes, store=the_store(), **how)
-    except EvaluationRefused as error:
-        fail(str(error))
-    except RunError as error:
-        fail(str(error), FAILED)
+    with failing(EvaluationRefused), failing(RunError, code=FAILED):
+        return verbs.evaluate(name, store=the_store(), **options)
 
 
 def _numbers(text: str) -> list[float]:
-    found = []
+    numbers = []
     for word in text.split(","):
         try:
-            found.append(float(word))
+            numbers.append(float(word))
         except ValueError:
             fail(f"--strengths: {word.strip() or 'nothing'} is no number: write 0,1e1,1e3,1e6")
-    return found
+    return numbers

@@ -1,4 +1,4 @@
-"""The commands ``neusee study``: accuracy, stability, leave-out, calibration and uncertainty."""
+"""The commands of ``neusee study``: accuracy, stability, leave-out, calibration and uncertainty."""
 
 from __future__ import annotations
 
@@ -8,7 +8,9 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from neusee.workflows.cli.command_frame import FAILED, Debug, Out, Words, check_device, fail, load, say, the_store
+from neusee.workflows.cli.command_frame import check_device, fail, failing, load, say, the_store
+from neusee.workflows.cli.command_list import FAILED
+from neusee.workflows.cli.command_options import Debug, OneDevice, Out, Quiet, Words, option_words, progress_lines
 
 if TYPE_CHECKING:
     from neusee.workflows.api.verbs import Kind
@@ -21,20 +23,17 @@ study = typer.Typer(
 
 
 class Move(StrEnum):
-    """The moves of the walkers of `calibrate`."""
+    """The choices of ``--move``: how the walkers of a calibration move."""
 
     DE = "de"
     STRETCH = "stretch"
 
 
 class Points(StrEnum):
-    """The ways to draw uncertain inputs."""
+    """The choices of ``--points``: how uncertain inputs are drawn."""
 
     DRAWS = "draws"
     SOBOL = "sobol"
-
-
-Quiet = Annotated[bool, typer.Option("--quiet", help="Print only the path of the page.")]
 
 
 @study.command()
@@ -108,7 +107,7 @@ def uncertainty(
     workers: Annotated[
         int, typer.Option("--workers", min=0, help="Number of draws computed at the same time; 0: one for each core.")
     ] = 0,
-    device: Annotated[str, typer.Option("--device", help="Where to compute: cpu or cuda.")] = "cpu",
+    device: OneDevice = "cpu",
     quiet: Quiet = False,
     debug: Debug = False,
     out: Out = Path("runs"),
@@ -125,20 +124,17 @@ def uncertainty(
 
 
 def _run(kind: Kind, words: list[str] | None, quiet: bool, out: Path, **options: Any) -> None:
-    recipe, command = load(words)
+    recipe, command = load(words, "study", kind)
     from neusee.workflows.api import verbs
     from neusee.workflows.graph.run_error import RunError
     from neusee.workflows.studies.run_study import count_failures
 
-    given = [f"--{name}" if value is True else f"--{name} {value}" for name, value in options.items() if value]
-    command = ["neusee", "study", kind, *command[2:], *given]
-    progress = (lambda line: None) if quiet else (lambda line: say([line]))
-    try:
+    command += option_words(options)
+    progress = progress_lines(quiet)
+    with failing(RunError, ValueError, ImportError, code=FAILED):
         folder = verbs.study(
             recipe, kind=kind, store=the_store(), out=out, command=command, progress=progress, **options
         )
-    except (RunError, ValueError, ImportError) as error:
-        fail(str(error), FAILED)
     say([str(folder / "report.html")])
     if count := count_failures(folder):
         fail(f"{count} do not hold: see {folder / 'report.html'}", FAILED)

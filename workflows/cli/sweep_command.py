@@ -1,4 +1,4 @@
-"""``neusee sweep``: a recipe at several values of its parameters."""
+"""The command ``neusee sweep``: run a recipe at several values of its parameters."""
 
 from __future__ import annotations
 
@@ -7,7 +7,8 @@ from typing import Annotated
 
 import typer
 
-from neusee.workflows.cli.command_frame import Debug, Device, Out, Words, check_device, fail, refuse, split, the_store
+from neusee.workflows.cli.command_frame import check_device, fail, refusing, split, the_store
+from neusee.workflows.cli.command_options import Debug, Device, Out, Words
 
 
 def sweep(
@@ -34,9 +35,8 @@ def sweep(
         fail(f"--on-error {on_error}: write stop or continue")
     check_device(device)
     from neusee.workflows.cli.sweep_screen import run_sweep
-    from neusee.workflows.graph.diagnostics import RecipeError
 
-    try:
+    with refusing():
         code = run_sweep(
             name,
             words,
@@ -49,7 +49,5 @@ def sweep(
             store=the_store(),
             quiet=quiet,
         )
-    except RecipeError as error:
-        refuse(error)
     if code:
         raise typer.Exit(code)

@@ -1,4 +1,4 @@
-"""A sweep on the screen: its table while it runs, the lines before and after, and the exit code."""
+"""The screen of ``neusee sweep``: the table of a running sweep, and the lines before and after the table."""
 
 from __future__ import annotations
 
@@ -10,10 +10,11 @@ from contextlib import closing
 from pathlib import Path
 from typing import TYPE_CHECKING
 
+from neusee.workflows.cli.command_list import DONE, FAILED, INTERRUPTED
 from neusee.workflows.report.console import Mode, ProgressTable, mode_for
 from neusee.workflows.store.remote_store import open_store
 from neusee.workflows.store.result_store import Store
-from neusee.workflows.sweeps.axes import Axis, read_words
+from neusee.workflows.sweeps.axes import read_words
 from neusee.workflows.sweeps.sweep_files import require_xarray
 from neusee.workflows.sweeps.sweep_points import OnError, PointOutcome, outcomes
 from neusee.workflows.sweeps.sweep_run import Sweep, Sweeping, SweepState, counted, write_sweep
@@ -23,9 +24,8 @@ if TYPE_CHECKING:
     from neusee.workflows.graph.step_record import Event
     from neusee.workflows.sweeps.axes import Point
 
-_NUMBERS = 4  #: columns of numbers on the screen
+_NUMBERS = 4  #: results in the row of a point
 _LAST = 25  #: points in a live table
-DONE, FAILED, INTERRUPTED = 0, 1, 130
 
 
 def run_sweep(
@@ -43,8 +43,8 @@ def run_sweep(
 ) -> int:
     """Run, show and write a sweep to ``out/sweeps/<date>_<recipe>_<key>/``; return the exit code of the command.
 
-    ``words`` are the changes and axes, counted from ``first``. Raises: RecipeError with every
-    mistake of every point, before anything runs.
+    ``words`` are the changes and axes; the first of them is argument ``first`` of the command line.
+    Raises: RecipeError with every mistake of every point, before anything runs.
     """
     if netcdf:
         require_xarray("--netcdf")
@@ -53,10 +53,10 @@ def run_sweep(
     again = _command(recipe, words, zip, on_error, netcdf, device, out)
     if not quiet:
         print(*_opening(work), sep="\n", flush=True)
-    found, state, error = _run_points(work, on_error, quiet)
-    if error is not None and not (on_error == "stop" and found and found[-1].state == "failed"):
+    done, state, error = _run_points(work, on_error, quiet)
+    if error is not None and not (on_error == "stop" and done and done[-1].state == "failed"):
         raise error
-    result = work.sweep(found, state)
+    result = work.sweep(done, state)
     path = write_sweep(work, result, again, out, netcdf, time.perf_counter() - began)
     if quiet:
         print(*_failures(result), sep="\n", end="\n" if result.failed else "", file=sys.stderr)
@@ -67,9 +67,9 @@ def run_sweep(
 
 
 def _opening(work: Sweeping) -> Iterator[str]:
-    """Return the lines before anything runs."""
-    recipe, sizes = work.plan.recipe, f" {'+' if work.paired else '×'} ".join(map(_sized, work.axes))
-    shared = work.sharing
+    """Yield the lines that appear before the first point runs."""
+    recipe, shared = work.plan.recipe, work.sharing
+    sizes = f" {'+' if work.paired else '×'} ".join(f"{axis.name}: {len(axis.coordinates)}" for axis in work.axes)
     yield f"neusee sweep: {recipe.title or recipe.name}"
     yield f"checked  {shared.points} points ({sizes}), {shared.steps} steps: all right"
     yield f"shared   {shared.made} different results: {100 * shared.saved:.0f} % less work than point by point"
@@ -78,27 +78,21 @@ def _opening(work: Sweeping) -> Iterator[str]:
     yield from (f"note     {line}" for line in work.plan.notes)
 
 
-def _sized(axis: Axis) -> str:
-    return f"{axis.name}: {len(axis.coordinates)}"
-
-
 def _run_points(
     work: Sweeping, on_error: OnError, quiet: bool
 ) -> tuple[list[PointOutcome], SweepState, Exception | None]:
-    """Run the points and show them; Ctrl-C and a failure end the sweep, and the outcomes so far are kept."""
-    shown = SweepTable(work.columns, len(work.plan.checked), mode_for(quiet))
+    """Run and show the points; return the outcomes so far where Ctrl-C or a failure ends the sweep."""
+    table = SweepTable(work.columns, len(work.plan.checked), mode_for(quiet))
+    running = outcomes(work.plan, work.store, on_error, work.device, table.started, table.watch)
     try:
-        with (
-            shown,
-            closing(outcomes(work.plan, work.store, on_error, work.device, shown.started, shown.watch)) as running,
-        ):
+        with table, closing(running):
             for outcome in running:
-                shown.finished(outcome)
+                table.finished(outcome)
     except KeyboardInterrupt:
-        return shown.outcomes, "interrupted", None
+        return table.outcomes, "interrupted", None
     except Exception as error:
-        return shown.outcomes, "stopped", error
-    return shown.outcomes, "complete", None
+        return table.outcomes, "stopped", error
+    return table.outcomes, "complete", None
 
 
 def _command(
@@ -113,7 +107,7 @@ def _command(
 
 
 def _closing(result: Sweep, path: Path, again: Sequence[str], seconds: float) -> Iterator[str]:
-    """Return the lines after the last point."""
+    """Yield the lines that appear after the last point."""
     yield ""
     yield f"{counted(result)}  ({lasts(seconds)})"
     yield from (f"  {line}" for line in _failures(result))
@@ -128,7 +122,7 @@ def _failures(result: Sweep) -> Iterator[str]:
 
 
 class SweepTable(ProgressTable):
-    """The points of a sweep, one row for each that ended."""
+    """The table of a sweep on the screen, with one row for each finished point."""
 
     def __init__(self, columns: Sequence[AxisColumn], points: int, mode: Mode) -> None:
         super().__init__(mode)
@@ -143,15 +137,15 @@ class SweepTable(ProgressTable):
         self.widths = [max(4, 2 * count + 1), max(5, count), *widest, 6, 8, 12, 0]
 
     def started(self, point: Point) -> None:
-        """Note that a point begins."""
+        """Record that ``point`` begins."""
         self.running, self.step = point, ""
 
     def watch(self, event: Event) -> None:
-        """Note that a step of the point begins or ended."""
+        """Record that a step of the running point begins or ends."""
         self.step = event.step if event.done is None else ""
 
     def finished(self, outcome: PointOutcome) -> None:
-        """Note what became of a point, and show its row."""
+        """Record the outcome of a point and show the row of that point."""
         self.outcomes.append(outcome)
         self.running = None
         self.lines.append(self.cells(outcome))
@@ -161,20 +155,20 @@ class SweepTable(ProgressTable):
             self.show_error(lines, f"point {outcome.point.number}: {outcome.point.shown}\n{outcome.message}")
 
     def cells(self, outcome: PointOutcome) -> list[str]:
-        """Return one row: which of how many, the values, state, seconds, the time that is left, the first numbers."""
+        """Return the row of a point: its number, values, state, seconds, the remaining time and the first results."""
         values = map(cell_text, point_cells(outcome.point, self.columns))
         numbers = list(headline(outcome.numbers).items())[:_NUMBERS]
         results = "  ".join(f"{name} {value}" for name, value in numbers)
-        where, left = f"{len(self.outcomes)}/{self.points}", lasts(outcome.left) if outcome.left else ""
-        return [where, str(outcome.point.number), *values, outcome.state, f"{outcome.seconds:.3f}", left, results]
+        done, left = f"{len(self.outcomes)}/{self.points}", lasts(outcome.left) if outcome.left else ""
+        return [done, str(outcome.point.number), *values, outcome.state, f"{outcome.seconds:.3f}", left, results]
 
     def live_rows(self) -> Iterator[tuple[list[str], str]]:
-        """Return the last points."""
+        """Yield the rows of the last points, each with its state."""
         state = len(self.columns) + 2
         yield from ((line, line[state]) for line in self.lines[-_LAST:])
 
     def caption(self) -> str:
-        """Return which point runs, its step, and the time that is left."""
+        """Return the number of the running point, its step, and the remaining time."""
         if self.running is None:
             return ""
         left = self.outcomes[-1].left if self.outcomes else 0.0

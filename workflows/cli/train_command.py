@@ -1,23 +1,25 @@
-"""The command ``neusee train``: learn the mask and the restoration of a recipe."""
+"""The command ``neusee train``: train the mask and the networks of a recipe."""
 
 from __future__ import annotations
 
+from collections.abc import Callable, Iterator, Mapping
+from contextlib import contextmanager
 from enum import StrEnum
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from neusee.workflows.cli.command_frame import FAILED, Debug, Out, Words, check_device, fail, load, say, the_store
+from neusee.workflows.cli.command_frame import check_device, fail, failing, load, say, the_store
+from neusee.workflows.cli.command_list import FAILED
+from neusee.workflows.cli.command_options import Debug, Out, Words, progress_lines
 
 if TYPE_CHECKING:
-    from collections.abc import Mapping
-
     from neusee.workflows.graph.recipe_graph import Recipe
 
 
 class Stages(StrEnum):
-    """The stages that are learnt."""
+    """The choices of ``--stage``: which stages of the training run."""
 
     FIRST = "1"
     SECOND = "2"
@@ -27,7 +29,7 @@ class Stages(StrEnum):
 
 _STAGES = "1: mask and network; 2: network alone; both: 1, then 2; mask: mask alone, without images."
 _MESH = "DATAxBAND processes of torchrun: 4x2, four groups that share the bands by two; else all share the data."
-_NUMBERS = {Stages.FIRST: (1,), Stages.SECOND: (2,), Stages.BOTH: (1, 2), Stages.MASK: (0,)}  #: of `train`
+_NUMBERS = {Stages.FIRST: (1,), Stages.SECOND: (2,), Stages.MASK: (0,)}  #: the `stages` that `verbs.train` takes
 
 
 def train(
@@ -49,12 +51,12 @@ def train(
     Several processes share one training: torchrun --nproc-per-node 8 --no-python neusee train RECIPE --device cuda
     --mesh 4x2.
     """
-    recipe, command = load(words or ["train_small"])
+    recipe, command = load(words or ["train_small"], "train")
     if recipe.lifting is not None:
         if stage is not Stages.BOTH or mesh:
             fail(f"{recipe.name} learns a lift, which has neither stages nor a mesh: leave --stage and --mesh out")
         check_device(device)
-        return _lift(recipe, ["neusee", "train", *command[2:]], out, device, quiet)
+        return _lift(recipe, command, out, device, quiet)
     from neusee.workflows.api import verbs
     from neusee.workflows.graph.run_error import RunError
     from neusee.workflows.training.parallel.process_mesh import MeshError, device_here, joined, processes
@@ -62,37 +64,33 @@ def train(
     device, (rank, world) = device_here(device), processes()
     check_device(device)
     quiet, who = quiet or rank > 0, f"process {rank}: " if world > 1 else ""
-    stages = _NUMBERS[stage] if stage is not Stages.BOTH else recipe.training.learnt if recipe.training else ()
-    progress = (lambda line: None) if quiet else (lambda line: say([line]))
-    again = ["neusee", "train", *command[2:], "--stage", stage.value, *(["--mesh", mesh] if mesh else [])]
+    stages = _NUMBERS.get(stage, recipe.training.learnt if recipe.training else ())
+    command += ["--stage", stage.value, *(["--mesh", mesh] if mesh else [])]
     lengths = {s: recipe.training.stages[s].iterations for s in stages if s} if recipe.training else {}
-    try:
-        with joined(mesh, device) as processes_here, _LossBar(quiet, lengths) as bar:
-            folder = verbs.train(recipe, store=the_store(), device=device, out=out, progress=progress, command=again,
-                                 stages=stages, watch=bar.watch, mesh=processes_here)  # fmt: skip
-    except MeshError as error:
-        fail(f"{who}{error}")
-    except (RunError, ValueError, ArithmeticError) as error:
-        fail(f"{who}{error}", FAILED)
+    with (
+        failing(RunError, ValueError, ArithmeticError, code=FAILED, before=who),
+        failing(MeshError, before=who),
+        joined(mesh, device) as processes_here,
+        _loss_bar(quiet, lengths) as watch,
+    ):
+        folder = verbs.train(recipe, store=the_store(), device=device, out=out, progress=progress_lines(quiet),
+                             command=command, stages=stages, watch=watch, mesh=processes_here)  # fmt: skip
     if not quiet:
         say(_next(folder, stage))
     if rank == 0:
         say([str(folder)])
 
 
-def _lift(recipe: Recipe, again: list[str], out: Path, device: str, quiet: bool) -> None:
-    """Learn a lift from RGB to spectra."""
+def _lift(recipe: Recipe, command: list[str], out: Path, device: str, quiet: bool) -> None:
+    """Train the network of a recipe from RGB to spectra."""
     from neusee.workflows.api import verbs
     from neusee.workflows.graph.run_error import RunError
 
     assert recipe.lifting is not None
-    progress = (lambda line: None) if quiet else (lambda line: say([line]))
-    try:
-        with _LossBar(quiet, {0: recipe.lifting.iterations}) as bar:
-            folder = verbs.train(recipe, store=the_store(), device=device, out=out, progress=progress, command=again,
-                                 watch=bar.watch)  # fmt: skip
-    except (RunError, ValueError, ArithmeticError) as error:
-        fail(str(error), FAILED)
+    lengths = {0: recipe.lifting.iterations}
+    with failing(RunError, ValueError, ArithmeticError, code=FAILED), _loss_bar(quiet, lengths) as watch:
+        folder = verbs.train(recipe, store=the_store(), device=device, out=out, progress=progress_lines(quiet),
+                             command=command, watch=watch)  # fmt: skip
     if not quiet:
         weights = folder / "mst_plus_plus.safetensors"
         say([f"weights: {weights}", f"curves:  {folder / 'curves.png'}", f"judged:  {folder / 'training.json'}",
@@ -108,31 +106,22 @@ def _next(folder: Path, stage: Stages) -> list[str]:
     return [*lines, f"network: {network}", f"curves:  {folder / 'curves.png'}"]
 
 
-class _LossBar:
-    """A progress bar with the losses, on a terminal."""
+@contextmanager
+def _loss_bar(quiet: bool, lengths: Mapping[int, int]) -> Iterator[Callable[[int, int, Mapping[str, float]], None]]:
+    """Show a progress bar on a terminal; yield the function that shows the losses of an iteration of a stage."""
+    from rich.console import Console
+    from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
 
-    def __init__(self, quiet: bool, lengths: Mapping[int, int]) -> None:
-        from rich.console import Console
-        from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
+    columns = TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn(), TimeRemainingColumn()
+    console = Console(stderr=True)
+    hidden = quiet or not console.is_terminal
+    bar = Progress(*columns, TextColumn("{task.fields[losses]}"), console=console, disable=hidden)
+    tasks = {s: bar.add_task(f"stage {s}" if s else "lift", total=n, losses="") for s, n in lengths.items()}
 
-        columns = TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn(), TimeRemainingColumn()
-        console = Console(stderr=True)
-        self._shown = Progress(*columns, TextColumn("{task.fields[losses]}"), console=console,
-                               disable=quiet or not console.is_terminal)  # fmt: skip
-        self._tasks = {
-            s: self._shown.add_task(f"stage {s}" if s else "lift", total=n, losses="") for s, n in lengths.items()
-        }
+    def watch(stage: int, done: int, losses: Mapping[str, float]) -> None:
+        names = [name for name in ("LSR", "L1", "critics", "MRAE", "RMSE") if name in losses]
+        text = " ".join(f"{name} {losses[name]:.3g}" for name in names)
+        bar.update(tasks[stage], completed=done, losses=text)
 
-    def __enter__(self) -> _LossBar:
-        self._shown.start()
-        return self
-
-    def __exit__(self, *error: object) -> None:
-        self._shown.stop()
-
-    def watch(self, stage: int, done: int, found: Mapping[str, float]) -> None:
-        """Show the losses of an iteration."""
-        losses = " ".join(
-            f"{name} {found[name]:.3g}" for name in ("LSR", "L1", "critics", "MRAE", "RMSE") if name in found
-        )
-        self._shown.update(self._tasks[stage], completed=done, losses=losses)
+    with bar:
+        yield watch

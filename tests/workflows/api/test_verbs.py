@@ -61,7 +61,7 @@ def test_run_takes_a_name_a_file_or_a_recipe_and_changes_in_both_forms(tmp_path)
 @pytest.mark.parametrize("verb", ["run", "train", "calibrate", "study"])
 def test_a_recipe_that_is_read_takes_no_changes(verb):
     more = {"kind": "accuracy"} if verb == "study" else {}
-    with pytest.raises(TypeError, match="laser_free is read already: give its name with changes"):
+    with pytest.raises(TypeError, match="laser_free is loaded already: pass the name of the recipe"):
         getattr(neusee, verb)(neusee.load("laser_free"), changes={"doe": "axicon"}, **more)
 
 
@@ -69,7 +69,7 @@ def test_a_recipe_that_is_read_takes_no_changes(verb):
     ("verb", "more"), [("sweep", {"axes": {"doe": ["flat"]}}), ("evaluate", {"pipelines": "flat+none"})]
 )
 def test_a_verb_that_reads_a_recipe_anew_asks_for_its_name(verb, more):
-    with pytest.raises(TypeError, match=f"{verb} reads the recipe anew for each point: give its name or file"):
+    with pytest.raises(TypeError, match=f"{verb} loads the recipe several times: pass the name or file"):
         getattr(neusee, verb)(neusee.load("laser_free"), **more)
 
 
@@ -127,5 +127,5 @@ def test_calibrate_study_and_train_hand_their_options_to_their_rooms(monkeypatch
 
 
 def test_an_unknown_kind_of_study_is_refused_with_those_there_are():
-    with pytest.raises(ValueError, match="no study 'acuracy': there are accuracy, stability, leave-out"):
+    with pytest.raises(ValueError, match="no study 'acuracy': write one of accuracy, stability, leave-out"):
         neusee.study("laser_free", kind="acuracy")

@@ -139,12 +139,12 @@ def test_too_few_levels_are_refused_with_what_would_do(store, tmp_path):
 
 
 def test_pixels_that_are_all_alike_have_no_models_of_a_response(store):
-    with pytest.raises(ValueError, match="calibrate weighs pixels that are all alike"):
+    with pytest.raises(ValueError, match="calibrate has a likelihood of identical pixels"):
         compare_models(load("calibrate", ["flats.shape=[32, 32]"]), store)
 
 
 def test_a_recipe_that_calibrates_nothing_says_what_is_missing(store):
-    with pytest.raises(ValueError, match=r"no step of the node calibrate\.density or calibrate\.camera, and a calib"):
+    with pytest.raises(ValueError, match=r"no step of the node calibrate\.density or calibrate\.camera, but a calib"):
         SensorPosterior.of(load("plain_lens"), store)
 
 

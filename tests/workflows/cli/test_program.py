@@ -1,14 +1,17 @@
 """The program as a whole: its version, help of every command, and completion in a shell."""
 
+import importlib
+import inspect
 import os
 import subprocess
 import sys
+from pathlib import Path
 
 import pytest
 import typer
 
 import neusee
-from neusee.workflows.cli import app
+from neusee.workflows.cli import app, command_list, typer_program
 
 
 def commands(group, *before):
@@ -62,6 +65,56 @@ def test_the_list_of_commands_is_whole(said):
     assert "--version" in text
     listed = [line.split()[0] for line in text.partition("Commands:")[2].strip().partition("\n\n")[0].splitlines()]
     assert listed == list(WHOLE.commands)
+
+
+@pytest.mark.parametrize("name", command_list.COMMANDS)
+def test_the_list_has_the_first_line_of_the_help_of_a_command(name):
+    module, text = command_list.COMMANDS[name]
+    command = getattr(importlib.import_module(f"neusee.workflows.cli.{module}"), name)
+    own = command.info.help if isinstance(command, typer.Typer) else inspect.getdoc(command)
+    assert own.partition("\n")[0] == text
+
+
+@pytest.mark.parametrize("columns", ["80", "81", "200"])
+def test_the_page_of_help_is_that_of_typer_to_the_letter(columns, said, capsys, monkeypatch):
+    monkeypatch.setenv("COLUMNS", columns)
+    assert typer_program.run_program(["--help"], False) == 0
+    page = capsys.readouterr().out
+    assert said("--help") == page == f"{command_list.help_page()}\n"
+
+
+@pytest.mark.parametrize("columns", ["79", "60", "20"])
+def test_a_narrow_terminal_gets_the_page_from_typer(columns, said, monkeypatch):
+    monkeypatch.setenv("COLUMNS", columns)
+    text = said("--help")
+    assert text != f"{command_list.help_page()}\n"
+    assert max(map(len, text.splitlines())) <= max(50, int(columns) - 2)
+
+
+def test_the_page_of_help_needs_nothing_but_the_standard_library():
+    path = str(Path(neusee.__file__).parents[1])  # -S keeps away the installed packages
+    done = subprocess.run(
+        [sys.executable, "-S", "-m", "neusee", "--help"], env={"PYTHONPATH": path}, capture_output=True, text=True
+    )
+    assert (done.stdout, done.stderr) == (f"{command_list.help_page()}\n", "")
+
+
+@pytest.mark.parametrize("name", ["run", "nodes", "study", "cache"])
+def test_the_help_of_a_command_imports_no_other_command(name):
+    own = command_list.COMMANDS[name][0]
+    others = {f"neusee.workflows.cli.{module}" for module, _ in command_list.COMMANDS.values() if module != own}
+    code = (
+        "import sys\nfrom neusee.workflows.cli.app import main\n"
+        f"try: main({[name, '--help']!r})\nexcept SystemExit: pass\n"
+        f"assert not {others | {'torch', 'rich'}!r} & set(sys.modules)"
+    )
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=False)
+    assert done.returncode == 0, done.stderr
+
+
+def test_a_name_that_the_program_lacks_is_an_attribute_error():
+    with pytest.raises(AttributeError, match="has no attribute 'ap'"):
+        _ = app.ap
 
 
 def test_the_version_is_that_of_the_package(said):

@@ -1,0 +1,60 @@
+"""The names of all commands, the exit codes, and the page of ``neusee --help``, all without an import of typer."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from textwrap import fill
+
+DONE, FAILED, BAD, MISSED, INTERRUPTED = 0, 1, 2, 3, 130  #: exit codes
+
+SUMMARY = (
+    "Simulate what a laser does to a camera: its light, its glass and its sensor, as recipes. "
+    "Start with `neusee run`. Each command explains itself: `neusee run --help`."
+)
+EXIT_CODES = (
+    "Exit codes: 0 done; 1 failed while running; 2 mistake in the recipe or the arguments; "
+    "3 expected numbers missed, a check of a calibration failed, or damaged results found."
+)
+
+#: from the name of each command to the module that defines the command, and to the first line of the command's help
+COMMANDS = {
+    "run": ("recipe_commands", "Run a recipe and write its report."),
+    "validate": ("recipe_commands", "Check a recipe without running it."),
+    "plan": ("recipe_commands", "Say what a run would compute, where and for how long."),
+    "why": ("recipe_commands", "Say why a step differs from its nearest earlier result."),
+    "config": ("recipe_commands", "Print every final value and where it comes from."),
+    "report": ("recipe_commands", "Write the page of a run again from stored results."),
+    "sweep": ("sweep_command", "Run a recipe at several values of its parameters."),
+    "train": ("train_command", "Train a recipe's mask and the network that restores."),
+    "calibrate": ("calibrate_command", "Find the posterior of a sensor from calibration frames."),
+    "evaluate": ("evaluate_command", "Compare masks and restorers on the same scenes and lasers."),
+    "recipes": ("catalogue", "List the recipes and the groups that they choose from."),
+    "nodes": ("catalogue", "List the nodes, or explain one of them."),
+    "schema": ("catalogue", "Print the JSON schema of recipes for editors."),
+    "study": ("study_commands", "Study how accurate, stable and certain a recipe's numbers are."),
+    "cache": ("cache_commands", "List, check, remove and keep stored results."),
+}
+_OPTIONS = {
+    "--version": "Show the version and exit.",
+    "--install-completion": "Install completion for the current shell.",
+    "--show-completion": "Show completion for the current shell, to copy it or customize the installation.",
+    "-h, --help": "Show this message and exit.",
+}
+COLUMNS = 80  #: of the widest page of help that typer prints
+
+
+def help_page() -> str:
+    """Return the page of ``neusee --help`` as typer prints that page on a terminal of 80 columns or more."""
+    summary, exit_codes = (_filled("  ", text, "  ") for text in (SUMMARY, EXIT_CODES))
+    commands = {name: text for name, (_, text) in COMMANDS.items()}
+    usage = "Usage: neusee [OPTIONS] COMMAND [ARGS]..."
+    return "\n\n".join([usage, summary, f"Options:\n{_list(_OPTIONS)}", f"Commands:\n{_list(commands)}", exit_codes])
+
+
+def _list(texts: Mapping[str, str]) -> str:
+    indent = max(map(len, texts)) + 4
+    return "\n".join(_filled(f"  {name}".ljust(indent), text, " " * indent) for name, text in texts.items())
+
+
+def _filled(before: str, text: str, indent: str) -> str:
+    return fill(text, COLUMNS - 2, initial_indent=before, subsequent_indent=indent)

@@ -1,0 +1,165 @@
+"""The commands for one recipe or one run of a recipe: run, validate, plan, why, config and report."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated
+
+import typer
+
+from neusee.workflows.cli.command_frame import (
+    check_device,
+    executor_of,
+    fail,
+    failing,
+    load,
+    memory_limit,
+    refusing,
+    say,
+    the_store,
+)
+from neusee.workflows.cli.command_list import FAILED, MISSED
+from neusee.workflows.cli.command_options import Debug, Device, Exact, Memory, Out, Words
+
+if TYPE_CHECKING:
+    from neusee.workflows.graph.recipe_graph import Recipe
+    from neusee.workflows.store.result_store import Store
+
+Where = Annotated[
+    str, typer.Option("--executor", help="Who computes: local, dask, dask:4 (workers), or tcp://scheduler:8786.")
+]
+
+
+def run(
+    words: Words = None,
+    as_json: Annotated[bool, typer.Option("--json", help="Print one JSON document instead of the table.")] = False,
+    quiet: Annotated[bool, typer.Option("--quiet", help="Print only the path of the report.")] = False,
+    debug: Debug = False,
+    device: Device = "cpu",
+    executor: Where = "local",
+    memory: Memory = "",
+    exact: Exact = False,
+    out: Out = Path("runs"),
+) -> None:
+    """Run a recipe and write its report.
+
+    Steps whose results are in the cache are not computed again. Without a name the recipe is first_light. The folder
+    of results holds report.html, the numbers, the pictures and the recipe with every final value.
+    """
+    recipe, command = load(words, "run", exact=exact)
+    from neusee.workflows.report import console, contents
+    from neusee.workflows.simulation.simulate_recipe import simulate
+    from neusee.workflows.tolerance.cheaper_steps import with_substitutions
+
+    check_device(device)
+    limit, silent = memory_limit(memory), as_json or quiet
+    if not silent:
+        say(console.opening(recipe, " ".join(command[1:])))
+    store = the_store()
+    if limit is not None:
+        _refuse_too_large(recipe, store, device, limit)
+    cheaper = with_substitutions(recipe, contents.wanted(recipe))
+    table = console.RunTable(cheaper, contents.steps_of(cheaper), console.mode_for(silent))
+    with executor_of(executor, store) as cluster, table:
+        done = simulate(cheaper, store, out, command, device, table.watch, cluster, limit)
+    if as_json:
+        say([json.dumps({"report": str(done.page), **done.document}, ensure_ascii=False)])
+    elif quiet:
+        say([str(done.page)])
+    else:
+        say(console.closing(done.document, str(done.page), console.next_commands(recipe)))
+    if done.document["missed"]:
+        raise typer.Exit(MISSED)
+
+
+def _refuse_too_large(recipe: Recipe, store: Store, device: str, memory: int) -> None:
+    """End the command before anything runs if earlier runs show that the memory is too small."""
+    from neusee.workflows.engine.local_executor import lanes_of
+    from neusee.workflows.explain.run_forecast import planned
+
+    if refused := planned(recipe, store, lanes_of(device.split(","), memory)).refused:
+        fail(f"--memory: {refused}")
+
+
+def validate(words: Words = None, debug: Debug = False) -> None:
+    """Check a recipe without running it.
+
+    All mistakes are listed at once, each with its file, line and column and the nearest known name.
+    """
+    recipe, command = load(words, "run")
+    from neusee.workflows.report.console import opening
+
+    say(opening(recipe, " ".join(command[1:])))
+
+
+def plan(
+    words: Words = None,
+    debug: Debug = False,
+    device: Device = "cpu",
+    memory: Memory = "",
+    exact: Exact = False,
+    devices: Annotated[
+        str, typer.Option("--devices", help="Simulate these machines: a YAML file, or the example eight_a100.")
+    ] = "",
+) -> None:
+    """Say what a run would compute, where and for how long.
+
+    Nothing is computed. Seconds, bytes and memory are those of earlier runs of the same step, even at another size;
+    a step that never ran shows a question mark. With --devices the run is simulated on machines that you do not
+    have: makespan, utilisation and critical path.
+    """
+    recipe, _ = load(words, exact=exact)
+    from neusee.workflows.explain import run_forecast
+
+    check_device(device)
+    if devices:
+        with refusing():
+            say(run_forecast.simulated_lines(recipe, the_store(), devices))
+        return
+    lines, refused = run_forecast.plan_lines(recipe, the_store(), device, memory_limit(memory))
+    say(lines)
+    if refused:
+        raise typer.Exit(FAILED)
+
+
+def why(
+    step: Annotated[str, typer.Argument(help="A step, such as raw or raw[mask].")],
+    words: Words = None,
+    debug: Debug = False,
+    device: Device = "cpu",
+) -> None:
+    """Say why a step differs from its nearest earlier result.
+
+    The answer names the value that changed and where it was written, such as
+    `sensor.read_noise 10.5 -> 20 e- (argument 2)`, or the code that changed.
+    """
+    recipe, _ = load(words, before=1)
+    from neusee.workflows.explain.why_rerun import why_lines
+
+    with failing(ValueError):
+        say(why_lines(recipe, the_store(), step, device))
+
+
+def config(words: Words = None, debug: Debug = False) -> None:
+    """Print every final value and where it comes from.
+
+    The output is YAML: a recipe that can be run.
+    """
+    recipe, _ = load(words)
+    from neusee.workflows.simulation.simulate_recipe import recipe_text
+
+    say(recipe_text(recipe).splitlines())
+
+
+def report(
+    folder: Annotated[str, typer.Argument(metavar="RUN_FOLDER", help="A run's folder, or `latest`.")] = "latest",
+    out: Annotated[Path, typer.Option("--out", help="Folder that holds the folders of runs.")] = Path("runs"),
+    debug: Debug = False,
+) -> None:
+    """Write the page of a run again from stored results."""
+    from neusee.workflows.report.run_folder import find_run
+    from neusee.workflows.report.run_page import rebuild
+
+    with failing(FileNotFoundError):
+        say([str(rebuild(find_run(folder, out)))])
