@@ -1,4 +1,4 @@
-"""The machine, the versions of the libraries and the time at which a result was made."""
+"""Provenance of a result: the machine, the versions of the libraries, and the time."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ import torch
 
 @functools.cache
 def versions() -> dict[str, str]:
-    """Return the versions of Python and of the libraries that compute; they stand beside a result, not in its key."""
+    """Return the versions of Python and of the libraries that compute; no key depends on the versions."""
     found = {"python": platform.python_version()}
     for name in ("neusee", "torch", "kornia", "colour-science", "OpenEXR"):
         try:
@@ -24,10 +24,10 @@ def versions() -> dict[str, str]:
 
 
 def machine() -> Sequence[str]:
-    """Return what a measured time depends on: the machine, its threads and the versions of the libraries."""
+    """Return the machine, its number of threads and the versions of the libraries, on which a run time depends."""
     return [platform.node(), platform.machine(), str(torch.get_num_threads()), *versions().values()]
 
 
 def timestamp() -> str:
-    """Return the time now, in UTC, to the second."""
+    """Return the present time in UTC, to the second, in ISO format."""
     return datetime.now(UTC).isoformat(timespec="seconds")
