@@ -21,7 +21,7 @@ from neusee.workflows.tolerance.cheaper_steps import with_substitutions
 
 @dataclass(frozen=True, slots=True)
 class Figure:
-    """A figure of the report: title, caption, drawing function, and the need of each argument of this function."""
+    """A figure of the report: title, caption, drawing function, and the value that each of its arguments needs."""
 
     name: str
     title: str

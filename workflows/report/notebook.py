@@ -72,7 +72,8 @@ def result_html(result: Result) -> str:
     """Return a page with pictures, the result table and the state of each step, without values that take over 2 s."""
     values = _at_hand(result, [*_of_table(result), *_of_overview().values()])
     checks = [f"{d.step}: {c.text}" for d in result.done.values() for c in d.checks if not c.ok]
-    return _page(
+    return filled(
+        "notebook.html.j2",
         title=result.recipe.name,
         lines=[line for line in (result.recipe.title, f"{_counts(result)}, on {result.device}") if line],
         look=checks,
@@ -218,7 +219,8 @@ def recipe_html(recipe: Recipe) -> str:
     written = {name: s for name, s in recipe.config.settings.items() if not s.default and not name.startswith("steps.")}
     changed = {name: s for name, s in recipe.config.settings.items() if "argument " in s.source}
     lines = [recipe.title, f"gives {', '.join(by_family(recipe.outputs))}"]
-    return _page(
+    return filled(
+        "notebook.html.j2",
         title=recipe.name,
         lines=[*filter(None, lines), f"seed {recipe.seed}, tolerance {recipe.tolerance:g}", *recipe.notes],
         look=[],
@@ -257,7 +259,3 @@ def _table(
     title: str, columns: Sequence[str], rows: Sequence[Sequence[str]], numbers: Sequence[str] = (), shown: bool = True
 ) -> dict[str, Any]:
     return {"title": title, "columns": columns, "rows": rows, "numbers": numbers, "open": shown}
-
-
-def _page(**doc: Any) -> str:
-    return filled("notebook.html.j2", doc=doc)

@@ -7,8 +7,6 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any
 
-import torch
-
 from neusee.workflows.graph.recipe_graph import Recipe, Step
 from neusee.workflows.keys.cache_key import plain
 from neusee.workflows.keys.code_digest import Code
@@ -26,14 +24,8 @@ class Bound:
 
     step: Step
 
-    def __call__(self, *inputs: Any, rng: torch.Generator | None = None, **changes: Any) -> Any:
-        stream = {"rng": rng} if self.step.node.random else {}
-        return self.step.node(*inputs, **{**self.step.params, **changes, **stream})
-
-    @property
-    def random(self) -> bool:
-        """Return True if the node draws random numbers."""
-        return self.step.node.random
+    def __call__(self, *inputs: Any, **changes: Any) -> Any:
+        return self.step.node(*inputs, **{**self.step.params, **changes})
 
     def reference(self, *inputs: Any, **changes: Any) -> Any:
         """Compute the reference of the node, its slow float64 form; raise `Missing` if the node has no reference."""
@@ -52,7 +44,7 @@ class Found:
 
 
 def find(need: str, recipe: Recipe, keys: Mapping[str, str], code: Code) -> Found:
-    """Resolve a need in the notation of `neusee.workflows.report.contents`; raise `Missing` if a step is missing."""
+    """Resolve a need such as ``psf[mask]``, in the notation of `neusee.workflows.report.contents`."""
     if need.endswith("()"):
         step = _step(need[:-2], recipe)
         params = [[name, plain(value)] for name, value in step.params.items()]

@@ -137,12 +137,9 @@ def _graph(result: Result, shelf: DerivedFiles, drawing: str) -> Path:
     states = {name: "cached" if done.state == "not needed" else str(done.state) for name, done in result.done.items()}
     again = {name: "left out" if state == "left out" else "cached" for name, state in states.items()}
     sources = {name: list(result.recipe.steps[name].sources) for name in result.done}
-    paths = []
+    draw, paths = _function("report.figures.recipe_graph:graph"), []
     for now in (states, again):
         key = digest("graph", drawing, sources, now)
-        path = shelf.find(key, ".png")
-        if path is None:
-            content = _function("report.figures.recipe_graph:graph")(sources=sources, states=now)
-            path = shelf.keep(key, ".png", "graph", content)
-        paths.append(path)
+        found = shelf.find(key, ".png")
+        paths.append(found or shelf.keep(key, ".png", "graph", draw(sources=sources, states=now)))
     return paths[0]

@@ -56,5 +56,4 @@ def _ring(ax: Any, spots: Mapping[str, Tensor], like: Tensor) -> None:
 
 
 def _brightest(spot: Tensor) -> tuple[int, int]:
-    index = int(spot.sum(0).argmax())
-    return index // spot.shape[-1], index % spot.shape[-1]
+    return divmod(int(spot.sum(0).argmax()), spot.shape[-1])

@@ -11,7 +11,7 @@ import torch
 from torch import Tensor
 
 from neusee.nodes.values import Psf, Pupil
-from neusee.workflows.report.figures.style import BLACK, BLUE, GREEN, canvas, drawn
+from neusee.workflows.report.figures.style import BLUE, GREEN, canvas, drawn
 
 STRENGTHS = (0.0, 1.0, 1e3, 1e6)  #: peak of the laser over the white of the scene
 METHODS = ("shifted PSF, added", "scene and laser\nin one convolution")
@@ -63,7 +63,7 @@ def stability(*, step: Callable[..., Any], psf: Psf) -> Any:
             error = float(errors[row, column])
             verdict, colour = _verdict(error)
             ax.barh(row, 0.94, 0.9, left=column - 0.47, color=colour)
-            ax.text(column, row, f"{verdict}\n{error:.1e}", ha="center", va="center", color=BLACK, fontsize=10)
+            ax.text(column, row, f"{verdict}\n{error:.1e}", ha="center", va="center", color="black", fontsize=10)
     ax.set_xticks(range(len(STRENGTHS)), [f"{s:.0e}" if s > 1 else f"{s:.0f}" for s in STRENGTHS])
     ax.set_yticks(range(len(METHODS)), METHODS)
     ax.invert_yaxis()

@@ -10,18 +10,7 @@ from torch import Tensor
 from neusee.nodes import metrics
 from neusee.nodes.optics import mask_turns
 from neusee.nodes.values import Bands, Psf, Pupil
-from neusee.workflows.report.figures.style import (
-    BLACK,
-    BLUE,
-    GREEN,
-    VERMILION,
-    canvas,
-    drawn,
-    nanometres,
-    nearest,
-    picture,
-    wavelength_colour,
-)
+from neusee.workflows.report.figures.style import BLUE, GREEN, VERMILION, canvas, drawn, nanometres, nearest, picture
 
 _WAVELENGTHS = (450e-9, 550e-9, 638e-9)  #: m, at which phase and PSF are drawn
 
@@ -86,11 +75,11 @@ def _window(image: Tensor, size: int) -> Tensor:
 
 def _encircled(ax: Any, psf: Psf, bands: Bands, pitch: float, arm: str) -> None:
     """Draw the share of the clear pupil's light within a radius, at three wavelengths."""
-    for wavelength in _WAVELENGTHS:
+    for wavelength, colour in zip(_WAVELENGTHS, (BLUE, "#00785A", "#B3261E"), strict=True):
         band, name = nearest(bands.centres, wavelength)
         share = metrics.encircled_curve(psf.intensity[band])
         microns = (torch.arange(len(share)) + 0.5) * pitch * 1e6
-        ax.semilogx(microns.numpy(), share.numpy(), color=wavelength_colour(wavelength), label=name)
+        ax.semilogx(microns.numpy(), share.numpy(), color=colour, label=name)
     title = f"{arm}: encircled energy"
     ax.set(ylim=(0.0, 1.02), title=title, xlabel="radius (µm)", ylabel="share of the pupil's light")
     ax.legend(loc="best")
@@ -101,11 +90,11 @@ def suppression(*, lsr: Tensor, bands: Bands, psf: Psf, bsr: Tensor | None = Non
     """Draw laser and background suppression against wavelength, with the lower bound from energy conservation."""
     figure, axes = canvas(11.0, 4.2, 1, 2)
     nm, left, right = nanometres(bands.centres), axes[0, 0], axes[0, 1]
-    left.axhline(1.0, color=BLACK, linewidth=0.8, linestyle=":", label="plain lens")
+    left.axhline(1.0, color="black", linewidth=0.8, linestyle=":", label="plain lens")
     left.semilogy(nm, lsr.cpu().numpy(), "o-", color=VERMILION, markersize=3.5, label="with mask")
     left.semilogy(nm, metrics.least_lsr(psf).cpu().numpy(), "--", color=BLUE, label="energy floor")
     left.set(title="laser suppression ratio (peak / clear peak)", ylabel="LSR")
-    right.axhline(1.0, color=BLACK, linewidth=0.8, linestyle=":", label="plain lens")
+    right.axhline(1.0, color="black", linewidth=0.8, linestyle=":", label="plain lens")
     if bsr is not None:
         right.plot(nm, bsr.cpu().numpy(), "s-", color=GREEN, markersize=3.5, label="with mask")
     right.set_ylim(0.0, max(1.1, 1.1 if bsr is None else 1.1 * float(bsr.max())))

@@ -10,17 +10,7 @@ from torch import Tensor
 
 from neusee.nodes.spectra import mean_wavelength
 from neusee.nodes.values import Bands
-from neusee.workflows.report.figures.style import (
-    BLACK,
-    BLUE,
-    GREEN,
-    VERMILION,
-    canvas,
-    drawn,
-    encoded,
-    nanometres,
-    picture,
-)
+from neusee.workflows.report.figures.style import BLUE, GREEN, VERMILION, canvas, drawn, encoded, nanometres, picture
 
 _POINTS = ("A", "B", "C")
 _CHANNELS = ((VERMILION, "R"), (GREEN, "G"), (BLUE, "B"))
@@ -56,11 +46,7 @@ def _points(scene: Tensor) -> list[tuple[int, int]]:
     lit = inner.amax(0)
     usable = (lit > 0.2 * lit.max()) & (lit < 0.9 * lit.max())
     share = inner / inner.sum(0).clamp_min(1e-9)
-    points = []
-    for channel in range(3):
-        index = int(share[channel].where(usable, -1.0).argmax())
-        points.append((index // scene.shape[-1], index % scene.shape[-1]))
-    return points
+    return [divmod(int(channel.where(usable, -1.0).argmax()), scene.shape[-1]) for channel in share]
 
 
 def _scene(ax: Any, scene: Tensor, points: list[tuple[int, int]]) -> None:
@@ -86,7 +72,7 @@ def _spectra(ax: Any, scene: Tensor, radiance: Tensor, bands: Bands, points: lis
 
 def _channels(ax: Any, illuminant: Tensor, responses: Tensor, bands: Bands) -> None:
     nm = nanometres(bands.centres)
-    ax.plot(nm, illuminant.cpu().numpy(), color=BLACK, linestyle="--", label="illuminant")
+    ax.plot(nm, illuminant.cpu().numpy(), color="black", linestyle="--", label="illuminant")
     for channel, (colour, name) in zip(responses, _CHANNELS, strict=True):
         ax.plot(nm, channel.cpu().numpy(), color=colour, label=f"channel {name}")
     ax.set(title="illuminant and channels", ylabel="relative")

@@ -78,12 +78,6 @@ def encoded(linear: Tensor) -> Any:
     return linear_rgb_to_rgb(rgb[None])[0].permute(1, 2, 0).clamp(0.0, 1.0).numpy()
 
 
-def wavelength_colour(metres: float) -> str:
-    """Return a dark colour that resembles the colour of light of this wavelength."""
-    stops = ((430e-9, "#4B2E9E"), (490e-9, BLUE), (575e-9, "#00785A"), (610e-9, "#B8730A"))
-    return next((colour for limit, colour in stops if metres < limit), "#B3261E")
-
-
 def nanometres(metres: Tensor) -> Any:
     """Convert a tensor of lengths in metres to a NumPy array in nanometres."""
     return metres.detach().double().cpu().numpy() * 1e9
