@@ -7,7 +7,8 @@ band of the result as a blob with this key as name. To hash the inputs is cheap:
 
 from __future__ import annotations
 
-from collections.abc import Callable, Collection, Iterator, Sequence
+from collections.abc import Callable, Collection, Sequence
+from contextlib import suppress
 from math import ceil
 from typing import Any
 
@@ -59,7 +60,8 @@ def plain_of(value: Any) -> Any:
 
 def band_count(step: Step, inputs: Sequence[Any]) -> int:
     """Return the number of bands that a step computes independently of each other; 0 if the step has no such bands."""
-    banded = list(_banded(step, inputs))
+    named = zip(step.node.inputs, inputs, strict=False)
+    banded = [(axis, value) for name, value in named if (axis := _axis(step, name, value)) is not None]
     if any(not isinstance(value, Tensor) and type(value) not in BAND_FIELDS for _, value in banded):
         return 0  # a low-rank cube has no slice of one band
     found = {x.shape[axis] for axis, value in banded for x in band_tensors(value) if _has(x, axis)}
@@ -91,13 +93,6 @@ def _hashed(x: Tensor) -> str:
 
 def _axis(step: Step, name: str, value: Any) -> int | None:
     return None if value is None or step.node.bands is None else step.node.bands.get(name)
-
-
-def _banded(step: Step, inputs: Sequence[Any]) -> Iterator[tuple[int, Any]]:
-    for name, value in zip(step.node.inputs, inputs, strict=False):
-        axis = _axis(step, name, value)
-        if axis is not None:
-            yield axis, value
 
 
 def band_tensors(value: Any) -> list[Tensor]:
@@ -194,8 +189,10 @@ class _Stack:
         """Add the computed bands ``x``, whose indices are ``which``."""
         axis = self.axis % x.dim()
         slices = x.unbind(axis)
-        if axis == 0 and self._written(which, slices):
-            return
+        if axis == 0:
+            with suppress(OSError):
+                self.blobs.write_all([self.names[i] for i in which], slices)
+                return
         if self.held is None:
             self.held = x.new_empty(*x.shape[:axis], len(self.names), *x.shape[axis + 1 :])
         for i, part in zip(which, slices, strict=True):
@@ -213,10 +210,3 @@ class _Stack:
             part = self.held.select(self.axis, i)
             part.copy_(self.blobs.read([self.names[i]], (1, *part.shape), part.dtype)[0])
         return self.held
-
-    def _written(self, which: list[int], slices: Sequence[Tensor]) -> bool:
-        try:
-            self.blobs.write_all([self.names[i] for i in which], slices)
-        except OSError:
-            return False
-        return True

@@ -92,8 +92,10 @@ class Dask:
         """Return the outcomes of a chain, or an outcome with a `RunError` if its workers died."""
         chain = self._running.pop(future)
         if future.status == "finished":
-            found: list[Outcome] = future.result()
-            return [_of_lane(outcome, chain[0].lane) for outcome in found]
+            outcomes: list[Outcome] = future.result()
+            for outcome in outcomes:  # another worker may have computed the chain
+                outcome.work = replace(outcome.work, lane=chain[0].lane)
+            return outcomes
         cause = future.exception() if future.status == "error" else None
         if cause is None and self._tries[chain[0].key] < _TRIES:  # the task was lost with its worker or its scheduler
             self.submit(chain)
@@ -111,12 +113,6 @@ class Dask:
         known = {**self._lanes, **{address: Lane(*about) for address, about in found.items()}}
         self._lanes = {address: known[address] for address in sorted(there) if address in known}
         self._looked = time.monotonic()
-
-
-def _of_lane(outcome: Outcome, lane: str) -> Outcome:
-    """Return the outcome with the lane to which its task was sent, even if another worker ran the task."""
-    outcome.work = replace(outcome.work, lane=lane)
-    return outcome
 
 
 # --- on a worker ----------------------------------------------------------------------------------------------------
@@ -207,6 +203,7 @@ def cluster(where: str, store: Store) -> Iterator[Dask]:
     from distributed import Client, LocalCluster
 
     kind, _, count = where.partition(":")
+    address: Any = where
     with ExitStack() as open_now:
         if kind == "dask":
             here = count == "here"
@@ -214,7 +211,5 @@ def cluster(where: str, store: Store) -> Iterator[Dask]:
             local = LocalCluster(
                 n_workers=workers, threads_per_worker=1, processes=not here, dashboard_address=None, silence_logs=40
             )
-            address: Any = open_now.enter_context(local)
-        else:
-            address = where
+            address = open_now.enter_context(local)
         yield Dask(open_now.enter_context(Client(address, set_as_default=False)), store)

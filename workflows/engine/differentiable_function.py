@@ -48,11 +48,10 @@ def as_function(
     order = in_order(sources, wanted)
     if idle := sorted((given | tuned.keys()) - set(order)):
         raise ValueError(f"no output depends on {', '.join(idle)}")
-    live: dict[str, None] = {}
+    live, roots = dict[str, None](), {*given, *tuned, *redraw}
     for name in order:
-        free_itself = name in given or name in tuned or name in redraw
-        if free_itself or any(source in live for source in sources[name]):
-            live.setdefault(name)
+        if name in roots or not live.keys().isdisjoint(sources[name]):
+            live[name] = None
     border = {name for step in live for name in sources[step]} | set(wanted)
     fixed = run(recipe, store, sorted(border - live.keys()), device=device)
     left_out = {name: done.bound or 0.0 for name, done in fixed.done.items() if done.state == "left out"}
@@ -138,32 +137,12 @@ class _Ends:
     def __init__(self, value: Tensor) -> None:
         self._value = value.detach()
         self.shape, self.dtype = tuple(value.shape), "float32"
+        self.min, self.max = map(float, torch.aminmax(self._value)) if value.numel() else (math.nan, math.nan)
+        self.finite = not value.numel() or (math.isfinite(self.min) and math.isfinite(self.max))
 
     @cached_property
-    def _ends(self) -> tuple[float, float]:
-        if self._value.numel() == 0:
-            return math.nan, math.nan
-        low, high = torch.aminmax(self._value)
-        return float(low), float(high)
-
-    @property
-    def min(self) -> float:
-        return self._ends[0]
-
-    @property
-    def max(self) -> float:
-        return self._ends[1]
-
-    @property
-    def finite(self) -> bool:
-        """Return True if all elements are finite."""
-        return self._value.numel() == 0 or all(map(math.isfinite, self._ends))
-
-    @cached_property
-    def _whole(self) -> TensorStats:
-        found = TensorStats.of(self._value)
-        assert found is not None
-        return found
+    def _whole(self) -> TensorStats | None:
+        return TensorStats.of(self._value)
 
     def __getattr__(self, name: str) -> Any:
         return getattr(self._whole, name)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import time
+from collections import Counter
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import replace
 
@@ -111,12 +112,11 @@ class Loop:
             self.busy.pop(outcome.work.lane, None)
         if outcome.held:
             return
-        freed = []
-        for waiting in self._after.pop(outcome.work.key, ()):
-            self._missing[waiting].discard(outcome.work.key)
-            if not self._missing[waiting]:
-                freed.append(waiting)
-        self._ready += sorted(freed, reverse=True)
+        waiting = self._after.pop(outcome.work.key, ())
+        for i in waiting:
+            self._missing[i].discard(outcome.work.key)
+        freed = [i for i in waiting if not self._missing[i]]
+        self._ready += freed
         if len(self.executor.lanes) > 1 or freed:
             self._ready.sort(reverse=True)
 
@@ -125,10 +125,7 @@ def chains_of(works: Sequence[StepJob], fused: bool) -> list[Chain]:
     """Return the jobs as chains of one step, or if ``fused``, of steps of one lane that only feed the next step."""
     if not fused:
         return [(work,) for work in works]
-    readers: dict[Key, int] = {}
-    for work in works:
-        for key in set(work.sources):
-            readers[key] = readers.get(key, 0) + 1
+    readers = Counter(key for work in works for key in set(work.sources))
     planned = {work.key for work in works}
     chains: dict[Key, list[StepJob]] = {}  # by the key at their end
     for work in works:

@@ -72,9 +72,10 @@ class Execution:
         for name in order:
             step = self.recipe.steps[name]
             if step.node.hooks.skip_bound is not None:
-                verdict = self.verdicts[name] = self._judge(step)
+                verdict = self.verdicts[name] = self.ledger.verdict(step, step.params, self._facts_of)
                 if verdict.left_out:
-                    self._leave_out(step, verdict)
+                    key = self.keys[name] = self.keys[verdict.instead]
+                    self._finish(StepRecord(name, "left out", verdict.why, 0.0, key, bound=verdict.bound))
                     continue
             else:
                 self.ledger.pass_on(step)
@@ -266,25 +267,17 @@ class Execution:
         facts, bound, error = facts_in(about), self._bound(name), error_in(about)
         return StepRecord(name, "cached", why, seconds, key, facts, checks, "cpu", about["bytes"], bound, error=error)
 
-    def _judge(self, step: Step) -> SkipDecision:
-        """Return the decision whether to omit a step; compute its input first if the skip bound needs statistics."""
-
-        def facts_of(name: str) -> TensorStats | None:
-            key = self.keys[name]
-            if key not in self.facts and self.store.about(key) is None:
-                self.make([key], keep=True)
-            return self.known_facts(name)
-
-        return self.ledger.verdict(step, step.params, facts_of)
+    def _facts_of(self, name: str) -> TensorStats | None:
+        """Return the statistics of the result of a step, which is computed if no run computed the result before."""
+        key = self.keys[name]
+        if key not in self.facts and self.store.about(key) is None:
+            self.make([key], keep=True)
+        return self.known_facts(name)
 
     def known_facts(self, name: str) -> TensorStats | None:
         """Return the statistics of the result of a step, from this run or from an earlier run."""
         key = self.keys[name]
         return self.facts[key] if key in self.facts else facts_in(self.store.about(key))
-
-    def _leave_out(self, step: Step, verdict: SkipDecision) -> None:
-        key = self.keys[step.name] = self.keys[verdict.instead]
-        self._finish(StepRecord(step.name, "left out", verdict.why, 0.0, key, bound=verdict.bound))
 
     def _why(self, name: str, key: Key) -> str:
         verdict = self.verdicts.get(name)

@@ -15,7 +15,7 @@ from neusee.workflows.graph.recipe_graph import in_order
 from neusee.workflows.keys.cache_key import Key
 
 _GAIN = 1e-3  #: s that recomputing a value must save before the cut is solved
-_SCALE = 1 << 30  #: capacities are integers of 31 bits
+_SCALE = 1 << 30  #: the sum of all finite prices as integer capacity, less than an edge that is never cut
 
 Price = Callable[[Key], float]
 
@@ -75,7 +75,8 @@ def _smallest_cut(
     number = {key: i for i, key in enumerate(keys)}
     source, sink, never = 2 * len(keys), 2 * len(keys) + 1, 2**31 - 1
     edges = [(source, 2 * number[key], never) for key in dict.fromkeys(targets)]
-    unit = _unit(keys, load, compute)
+    prices = [price(key) for key in keys for price in (load, compute)]
+    unit = max(sum(price for price in prices if price < float("inf")), 1e-9) / _SCALE  # s in one unit of capacity
     for key in keys:
         have, make = 2 * number[key], 2 * number[key] + 1
         edges.append((have, make, _whole(load(key), unit)))
@@ -88,12 +89,6 @@ def _smallest_cut(
     rest.eliminate_zeros()
     reached = set(breadth_first_order(rest, source, return_predecessors=False).tolist())
     return {key for key in keys if 2 * number[key] + 1 in reached}
-
-
-def _unit(keys: Sequence[Key], load: Price, compute: Price) -> float:
-    """Return the seconds in one unit of capacity; the sum of all finite prices is less than an edge never cut."""
-    total = sum(price(key) for key in keys for price in (load, compute) if price(key) < float("inf"))
-    return max(total, 1e-9) / _SCALE
 
 
 def _whole(seconds: float, unit: float) -> int:

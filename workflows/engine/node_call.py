@@ -53,14 +53,15 @@ def places(step: Step, devices: Sequence[str]) -> tuple[str, ...]:
     hint = step.device or step.node.device
     if hint == "cpu":
         return ("cpu",)
-    fits = [d for d in devices if _fits(d, hint)] or list(devices)
-    return tuple(d for d in fits if not step.node.random or device_kind(d) == device_kind(fits[0]))
+    allowed = [d for d in devices if fits(d, device_kind(d), hint)] or list(devices)
+    return tuple(d for d in allowed if not step.node.random or device_kind(d) == device_kind(allowed[0]))
 
 
-def _fits(device: str, hint: str) -> bool:
+def fits(device: str, kind: str, hint: str) -> bool:
+    """Return True if the hint of a step, such as ``cpu``, ``gpu`` or ``cuda:1``, allows a device of this kind."""
     if hint in ("any", ""):
         return True
-    return device_kind(device) != "cpu" if hint == "gpu" else device == hint or device_kind(device) == hint
+    return kind != "cpu" if hint == "gpu" else hint in (kind, device)
 
 
 def to_device(value: Any, device: str) -> Any:

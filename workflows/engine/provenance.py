@@ -14,13 +14,16 @@ import torch
 @functools.cache
 def versions() -> dict[str, str]:
     """Return the versions of Python and of the libraries that compute; no key depends on the versions."""
-    found = {"python": platform.python_version()}
-    for name in ("neusee", "torch", "kornia", "colour-science", "OpenEXR"):
-        try:
-            found[name] = version(name)
-        except PackageNotFoundError:
-            found[name] = "none"
-    return found
+    libraries = ("neusee", "torch", "kornia", "colour-science", "OpenEXR")
+    return {"python": platform.python_version(), **{name: version_of(name) or "none" for name in libraries}}
+
+
+def version_of(package: str) -> str:
+    """Return the version of an installed package, or an empty string if the package is not installed."""
+    try:
+        return version(package)
+    except PackageNotFoundError:
+        return ""
 
 
 def machine() -> Sequence[str]:

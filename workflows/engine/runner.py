@@ -22,8 +22,6 @@ from neusee.workflows.store.result_store import Store
 from neusee.workflows.tolerance.cheaper_steps import with_substitutions
 from neusee.workflows.tolerance.error_propagation import ErrorBounds, ToleranceNotProven, proof, tolerance_frontier
 
-__all__ = ["Event", "Result", "StepRecord", "run"]
-
 _SAFE = 0.8  #: tolerance scale of a second attempt over the largest scale that would suffice
 
 
@@ -103,15 +101,11 @@ def run(
         try:
             return _attempt(work, wanted, began)
         except ToleranceNotProven as failed:
-            recipe = with_substitutions(_stricter(recipe, failed.over), wanted)
+            scale = _SAFE / failed.over if recipe.tolerance_scale == 1.0 else 0.0  # a third attempt is exact
+            stricter = replace(recipe.unsubstituted or recipe, tolerance_scale=scale, exact=scale == 0.0)
+            recipe = with_substitutions(stricter, wanted)
         finally:
             work.close()
-
-
-def _stricter(recipe: Recipe, over: float) -> Recipe:
-    """Return the recipe with a smaller tolerance scale after a failed proof, and as exact after a second one."""
-    scale = _SAFE / over if recipe.tolerance_scale == 1.0 else 0.0
-    return replace(recipe.unsubstituted or recipe, tolerance_scale=scale, exact=scale == 0.0)
 
 
 def _attempt(work: Execution, wanted: tuple[str, ...], began: float) -> Result:

@@ -31,7 +31,6 @@ class WriteBehind:
         self._guard = threading.Lock()
 
     def __contains__(self, key: Key) -> bool:
-        """Return True if the result of a key waits to be written."""
         return key in self._sizes
 
     def add(self, key: Key, size: int, write: Callable[[], Any]) -> None:

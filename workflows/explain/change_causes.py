@@ -163,7 +163,8 @@ class Comparison:
         """Return clauses for added and removed sources, with a location for sources that are not items of a step."""
         where = self._wired(path) if any("[" not in name for name in came) else ""
         texts = [f"reads {_few(came)} now{where}"] if came else []
-        return [*texts, f"reads {_few(went)} no more{self._absent(went[0])}"] if went else texts
+        null = self.recipe.absent.get(went[0].partition("[")[0]) if went and self.recipe else None
+        return [*texts, f"reads {_few(went)} no more{f': it is {null}' if null else ''}"] if went else texts
 
     def _between(self, key: Key, wanted: tuple[str | None, ...]) -> tuple[list[str], Key | None]:
         """Search upstream along first inputs for a ``wanted`` step; return the steps on the way and the key found."""
@@ -191,10 +192,6 @@ class Comparison:
     def _wired(self, path: tuple[str, ...]) -> str:
         """Return the location of an input in the recipe, as text in brackets."""
         return self.wording.source(*path) or self.wording.source(*path[:-1]) if path else ""
-
-    def _absent(self, name: str) -> str:
-        where = self.recipe.absent.get(name.partition("[")[0]) if self.recipe else None
-        return f": it is {where}" if where else ""
 
     def _stream(self, old: list[Any] | None, new: list[Any] | None) -> list[str]:
         """Return one clause for each difference in the random stream of a step."""

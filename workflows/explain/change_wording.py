@@ -7,6 +7,7 @@ import re
 from collections import defaultdict
 from collections.abc import Callable, Mapping
 from contextlib import suppress
+from functools import cached_property
 from pathlib import Path
 from typing import Any
 
@@ -23,7 +24,6 @@ class Wording:
 
     def __init__(self, recipe: Recipe | None = None) -> None:
         self._recipe = recipe
-        self._by_mark: dict[str, list[Setting]] | None = None
 
     def params(self, label: str, old: Mapping[str, Any], new: Mapping[str, Any]) -> list[str]:
         """Return one clause for each parameter that differs between two results of the step ``label``."""
@@ -58,20 +58,20 @@ class Wording:
         if name not in step.param_marks:
             return None, f"default of {step.node.path}"
         mark = str(step.param_marks[name])
-        found = self._marked().get(mark, [])
+        found = self._marked.get(mark, [])
         here = ("steps", step.name.partition("[")[0], "with", name)
         named = [s for s in found if s.path == here] or [s for s in found if s.path[-1:] == (name,)]
         setting = (named or found)[0] if named or len(found) == 1 else None
         return setting, setting.source if setting else mark
 
-    def _marked(self) -> dict[str, list[Setting]]:
+    @cached_property
+    def _marked(self) -> Mapping[str, list[Setting]]:
         """Return the settings that a user wrote, by location."""
-        if self._by_mark is None:
-            self._by_mark = defaultdict(list)
-            for setting in self._recipe.config.settings.values() if self._recipe else ():
-                if not setting.default:
-                    self._by_mark[setting.source.partition(", ")[0]].append(setting)
-        return self._by_mark
+        settings = defaultdict(list)
+        for setting in self._recipe.config.settings.values() if self._recipe else ():
+            if not setting.default:
+                settings[setting.source.partition(", ")[0]].append(setting)
+        return settings
 
 
 def _file(step: Step | None, name: str) -> str:
@@ -101,7 +101,6 @@ def _both(written: Any, old: Any, new: Any) -> tuple[str, str]:
 
 
 def _in_unit_of(written: Any, new: Any, old: Any) -> str:
-    """Return the text of an old number in the unit of the new number."""
     unit = _unit(written, new)
     return f"{spoken(unit[0](old))} {unit[1]}" if unit and _is_number(old) else spoken(old)
 

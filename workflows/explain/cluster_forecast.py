@@ -6,9 +6,10 @@ from collections import Counter
 from collections.abc import Mapping
 
 from neusee.workflows.engine.cost_model import Estimate
+from neusee.workflows.engine.node_call import fits
 from neusee.workflows.engine.placement_inputs import MOST_PARTS
 from neusee.workflows.graph.recipe_graph import Recipe, Step
-from neusee.workflows.placement.heft_and_cpop import Device, Schedule, Task, TooLarge, heft
+from neusee.workflows.placement.heft_and_cpop import Schedule, Task, TooLarge, heft
 from neusee.workflows.placement.machine_file import Machines
 from neusee.workflows.report.text_table import columns
 from neusee.workflows.store.byte_sizes import format_size
@@ -21,7 +22,7 @@ def cluster_lines(recipe: Recipe, estimates: Mapping[str, Estimate], machines: M
 
     The seconds on a device are the measured seconds on the CPU, divided by the relative speed of the device.
     """
-    devices, alone = len(machines.devices), sum(map(_measured, estimates.values()))
+    devices, alone = len(machines.devices), sum(cost.seconds["cpu"] for cost in estimates.values())
     head = f"{_count(len(estimates), 'step')} on {_count(devices, 'device')}: {machines.title or 'no title'}"
     try:
         schedule = simulated(recipe, estimates, machines)
@@ -52,25 +53,10 @@ def simulated(recipe: Recipe, estimates: Mapping[str, Estimate], machines: Machi
 
 def _task(step: Step, cost: Estimate, among: Mapping[str, Estimate], machines: Machines) -> Task:
     hint = step.device or step.node.device
-    allowed = [d for d in machines.devices if _fits(d, hint)] or machines.devices
-    seconds = {d.name: _measured(cost) / machines.speed(d.name, step.node.path) for d in allowed}
+    allowed = [d for d in machines.devices if fits(d.name.rpartition("/")[2], d.kind, hint)] or machines.devices
+    seconds = {d.name: cost.seconds["cpu"] / machines.speed(d.name, step.node.path) for d in allowed}
     sources = tuple(dict.fromkeys(name for name in step.sources if name in among))
     return Task(step.name, sources, seconds, cost.bytes, cost.work, MOST_PARTS if step.node.bands else 1)
-
-
-def _fits(device: Device, hint: str) -> bool:
-    """Return True if a hint of a step, such as ``cpu``, ``gpu`` or ``cuda:1``, allows a device."""
-    if hint in ("any", ""):
-        return True
-    return device.kind != "cpu" if hint == "gpu" else hint in (device.kind, device.name.rpartition("/")[2])
-
-
-def _measured(cost: Estimate) -> float:
-    """Return the seconds of a step on the CPU on which its cost was measured."""
-    return cost.seconds["cpu"]
-
-
-# --- lines ----------------------------------------------------------------------------------------------------------
 
 
 def _devices(schedule: Schedule, machines: Machines) -> list[str]:

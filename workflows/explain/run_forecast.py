@@ -46,11 +46,11 @@ def planned(recipe: Recipe, store: Store, lanes: Mapping[str, Lane]) -> Plan:
     resolved = resolve(recipe, order, store, ",".join(devices))
     keys, left_out = resolved.keys, {name: resolved.left_out(name) for name in order}
     awake, loaded = _awake(recipe, keys, store)
-    works, seen = [], set[Key]()
+    makers: dict[Key, str] = {}
     for name in order:
-        if name in awake and not left_out.get(name) and keys[name] not in seen:
-            seen.add(keys[name])
-            works.append(_work(recipe, name, keys, devices))
+        if name in awake and not left_out[name]:
+            makers.setdefault(keys[name], name)
+    works = [_work(recipe, name, keys, devices) for name in makers.values()]
     costs = past_costs(store) if works else Costs([])
     abouts = {work.key: about for work in works if (about := store.about(work.key))}
     kinds = sorted({lane.kind for lane in lanes.values()} | {"cpu"})

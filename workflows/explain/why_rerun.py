@@ -83,15 +83,9 @@ def _step_lines(comparison: Comparison, recipe: Recipe, step: Step, resolved: Re
     maker = resolved.makers[key]
     if maker != step.name:
         lines.append(f"  same key as {maker}")
-    if unsure := _unsure(recipe, step.name, resolved):
+    if unsure := [name for name in needed(recipe, [step.name]) if resolved.left_out(name) is None]:
         lines.append(f"  left out or not, depending on the values of the inputs: {', '.join(unsure[:_SHOWN])}")
     return [*lines, *_because(comparison, step.name, key, about, maker)]
-
-
-def _unsure(recipe: Recipe, step: str, resolved: Resolved) -> list[str]:
-    """Return the steps upstream of a step that may be left out, which depends on unknown values of inputs."""
-    unsure = {name for name in resolved.verdicts if resolved.left_out(name) is None}
-    return [name for name in needed(recipe, [step]) if name in unsure] if unsure else []
 
 
 def _state(about: Mapping[str, Any] | None) -> str:
@@ -184,7 +178,6 @@ def _chain(names: list[str]) -> str:
 
 
 def _keys(rows: Iterable[dict[str, Any]]) -> list[Key]:
-    """Return the keys of journal lines, each once, in the order of their first computation."""
     return list(dict.fromkeys(row["key"] for row in rows))
 
 

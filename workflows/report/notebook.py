@@ -28,9 +28,6 @@ _NAMES = {"plain": "plain lens", "mask": "with mask"}
 _LONGEST = 100  #: characters of a value in a table, at most
 
 
-# --- numbers and arrays ---------------------------------------------------------------------------------------------
-
-
 def numbers_of(result: Result) -> dict[str, float | list[float]]:
     """Return the figures of merit that ``neusee run`` prints, by name; a figure of each band is a list."""
     recipe = result.recipe.unsubstituted or result.recipe
@@ -60,9 +57,6 @@ def arrays_of(value: Any) -> Any:
     return {name: arrays_of(item) for name, item in value.items()} if isinstance(value, dict) else value
 
 
-# --- a result -------------------------------------------------------------------------------------------------------
-
-
 def result_line(result: Result) -> str:
     """Return one line such as ``<result of first_light: restored, raw; 12 run, 3 cached in 0.31 s>``."""
     return f"<result of {result.recipe.name}: {', '.join(by_family(result.values))}; {_counts(result)}>"
@@ -71,12 +65,11 @@ def result_line(result: Result) -> str:
 def result_html(result: Result) -> str:
     """Return a page with pictures, the result table and the state of each step, without values that take over 2 s."""
     values = _at_hand(result, [*_of_table(result), *_of_overview().values()])
-    checks = [f"{d.step}: {c.text}" for d in result.done.values() for c in d.checks if not c.ok]
     return filled(
         "notebook.html.j2",
         title=result.recipe.name,
         lines=[line for line in (result.recipe.title, f"{_counts(result)}, on {result.device}") if line],
-        look=checks,
+        look=[f"{d.step}: {c.text}" for d in result.done.values() for c in d.checks if not c.ok],
         pictures=_pictures({**result.values, **values}),
         tables=[*_results(result, values), _outputs(result), _steps(result)],
     )
@@ -89,7 +82,6 @@ def _counts(result: Result) -> str:
 
 
 def _of_table(result: Result) -> list[str]:
-    """Return the names of the steps that the result table reads."""
     cells = [step for row in TABLE.values() for step in row.values()]
     return [BANDS, *[n for n in result.keys if n.startswith(LINES.removesuffix("*]"))], *cells]
 
@@ -107,13 +99,13 @@ def _at_hand(result: Result, steps: Iterable[str]) -> dict[str, Any]:
         missing = [n for n in in_order(sources, [*kept, name]) if n not in held] if name in sources else []
         if name in sources and sum(_took(result, n) for n in missing) <= _LONGEST_WAIT:
             kept.append(name)
-    wanted = [name for name in kept if name not in result.values]
-    again = result.recipe.run(result.store, wanted, device=result.device).values if wanted else {}
-    return {name: result.values[name] if name in result.values else again[name] for name in kept}
+    absent = [name for name in kept if name not in result.values]
+    again = result.recipe.run(result.store, absent, device=result.device).values if absent else {}
+    values = {**again, **result.values}
+    return {name: values[name] for name in kept}
 
 
 def _took(result: Result, step: str) -> float:
-    """Return the seconds that the last execution of a step took."""
     done = result.done[step]
     if done.state == "run":
         return done.seconds
@@ -162,9 +154,6 @@ def _steps(result: Result) -> dict[str, Any]:
     return _table(f"{len(rows)} steps", ["step", "state", "seconds", "why"], rows, ["seconds"], shown=len(rows) <= 12)
 
 
-# --- pictures -------------------------------------------------------------------------------------------------------
-
-
 def _pictures(values: Mapping[str, Any]) -> list[dict[str, Any]]:
     """Encode the pictures of the camera overview in one scale, or up to four other images if these are missing."""
     from neusee.workflows.report.figures.camera_overview import centre, high
@@ -209,9 +198,6 @@ def _picture(name: str, linear: Tensor, edge: int) -> dict[str, Any]:
     Image.fromarray((encoded(image) * 255).round().astype("uint8")).save(out, "PNG")
     width = 250 * image.shape[-1] // max(image.shape[-2:])
     return {"name": name, "png": base64.b64encode(out.getvalue()).decode(), "width": width}
-
-
-# --- a recipe -------------------------------------------------------------------------------------------------------
 
 
 def recipe_html(recipe: Recipe) -> str:

@@ -17,12 +17,12 @@ from collections import Counter
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import replace
 from datetime import datetime
-from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
 from typing import Any
 
 from neusee.nodes import Check
 from neusee.workflows.engine.finished_step import facts_in
+from neusee.workflows.engine.provenance import version_of
 from neusee.workflows.engine.runner import Result
 from neusee.workflows.graph.recipe_graph import Recipe
 from neusee.workflows.graph.step_record import StepRecord
@@ -37,6 +37,7 @@ from neusee.workflows.store.byte_sizes import format_size
 
 _LIBRARIES = ("torch", "numpy", "kornia", "colour-science", "OpenEXR", "pydantic", "safetensors")
 _COPIED = ("device", "state", "why", "seconds", "predicted", "began", "lane", "peak", "kept")  #: from `StepRecord`
+_TITLES = {figure.name: figure.title for figure in FIGURES}
 _UNITS = frozenset(("m", "nm", "rad", "e-", "DN", "photons", "W/m2", "dB"))
 _SAMPLING = "The PSF is sampled at the pixel centres; one pixel centre lies on the optical axis."
 
@@ -53,7 +54,7 @@ def document(
     return {
         "recipe": recipe.name,
         "title": recipe.title,
-        "version": _version("neusee"),
+        "version": version_of("neusee"),
         "command": shlex.join(command),
         "started": datetime.now().astimezone().strftime("%Y-%m-%d %H:%M:%S %Z"),
         "device": result.device,
@@ -67,7 +68,7 @@ def document(
         "expected": found,
         "table": table(recipe, result.keys, result.value),
         "metrics": metrics(recipe, result.keys, result.value),
-        "notes": [*_sampling(recipe), *recipe.notes, *warnings],
+        "notes": [*_sampling(recipe), *recipe.notes, *dict.fromkeys(warnings)],
         "posterior": told(recipe.uncertain.standings) if recipe.uncertain else [],
         "readings": _readings(recipe),
         "left_out": [{"step": d.step, "bound": d.bound, "why": d.why} for d in done if d.state == "left out"],
@@ -76,7 +77,7 @@ def document(
         "timing": {**time, "said": said_of(time)},
         "steps": steps,
         "figures": _figures(missing, bool(time["ran"])),
-        "missing": [{"name": n, "title": _title(n), "why": why} for n, why in missing.items()],
+        "missing": [{"name": n, "title": _TITLES.get(n, n), "why": why} for n, why in missing.items()],
         "facts": _facts(result),
         "inputs": _inputs(recipe),
     }
@@ -192,19 +193,15 @@ def _figures(missing: Mapping[str, str], ran: bool) -> list[dict[str, str]]:
     return [{"name": n, "title": t, "caption": c, "file": f"figures/{n}.png"} for n, t, c in shown]
 
 
-def _title(name: str) -> str:
-    return next((f.title for f in FIGURES if f.name == name), name)
-
-
 def _facts(result: Result) -> list[list[str]]:
     """Return names and values of the software, the machine and the settings of the run."""
     import torch
 
     cores, threads = f"{os.cpu_count()} cores", f"{torch.get_num_threads()} threads"
     rows = [
-        ["neusee", _version("neusee")],
+        ["neusee", version_of("neusee")],
         ["Python", platform.python_version()],
-        *[[name, _version(name)] for name in _LIBRARIES],
+        *[[name, version_of(name)] for name in _LIBRARIES],
         ["machine", f"{platform.system()} {platform.machine()}, {cores}, {threads}"],
         ["device", result.device],
         ["recipe seed", str(result.recipe.seed)],
@@ -213,13 +210,6 @@ def _facts(result: Result) -> list[list[str]]:
         ["peak memory", format_size(result.peak_memory)],
     ]
     return [[name, value] for name, value in rows if value]
-
-
-def _version(package: str) -> str:
-    try:
-        return version(package)
-    except PackageNotFoundError:
-        return ""
 
 
 def _inputs(recipe: Recipe) -> list[dict[str, str]]:

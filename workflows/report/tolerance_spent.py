@@ -12,6 +12,7 @@ from neusee.workflows.engine.resolve_keys import resolve
 from neusee.workflows.engine.runner import Result
 from neusee.workflows.graph.recipe_graph import Recipe, Substitution, needed
 from neusee.workflows.graph.run_error import RunError
+from neusee.workflows.graph.step_record import StepRecord
 from neusee.workflows.tolerance.error_norm import error_of
 
 NORM = "root mean square over the largest element"
@@ -34,7 +35,15 @@ def spent(result: Result) -> dict[str, Any]:
         "unbounded": [name for name in result.recipe.outputs if result.proof.of(name) is None],
         "measured": _measured(result),
         "economies": [_economy(result, costs, each) for each in result.recipe.substitutions],
-        "left_out": [_omission(result, costs, name) for name in _left_out(result)],
+        "left_out": [
+            {
+                "step": done.step,
+                "bound": done.bound,
+                "why": done.why,
+                "full_seconds": _seconds(result, costs, done.step),
+            }
+            for done in _left_out(result)
+        ],
     }
 
 
@@ -53,8 +62,8 @@ def _within(bound: float | None) -> str:
     return "error unknown" if bound is None else f"at most {bound:.1e}"
 
 
-def _left_out(result: Result) -> list[str]:
-    return [name for name, done in result.done.items() if done.state == "left out"]
+def _left_out(result: Result) -> list[StepRecord]:
+    return [done for done in result.done.values() if done.state == "left out"]
 
 
 def _economy(result: Result, costs: Costs, each: Substitution) -> dict[str, Any]:
@@ -69,11 +78,6 @@ def _economy(result: Result, costs: Costs, each: Substitution) -> dict[str, Any]
         "bound": done.error[0] if done and done.error else None,
         "what": "; ".join(check.text for check in done.checks) if done else "",
     }
-
-
-def _omission(result: Result, costs: Costs, step: str) -> dict[str, Any]:
-    done = result.done[step]
-    return {"step": step, "bound": done.bound, "why": done.why, "full_seconds": _seconds(result, costs, step)}
 
 
 def _seconds(result: Result, costs: Costs, step: str) -> float | None:

@@ -4,8 +4,7 @@ from __future__ import annotations
 
 import json
 import warnings
-from collections.abc import Callable, Iterable, Iterator, Sequence
-from contextlib import contextmanager
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -24,8 +23,6 @@ from neusee.workflows.report.run_pictures import pictures, timeline
 from neusee.workflows.store.derived_files import DerivedFiles
 from neusee.workflows.store.result_store import Store
 from neusee.workflows.tolerance.cheaper_steps import with_substitutions
-
-__all__ = ["Simulation", "recipe_text", "simulate"]
 
 _TIMING = ("step", "node", "device", "lane", "state", "began", "seconds", "predicted", "peak", "bytes", "key")
 
@@ -62,21 +59,24 @@ def simulate(
         if watch is not None:
             watch(event)
 
-    with _warnings() as notes:
+    with warnings.catch_warnings(record=True) as caught:
+        warnings.simplefilter("default")
         recipe = with_substitutions(recipe, wanted(recipe))
         result = run(recipe, store, wanted(recipe), explained(recipe, store, note), device, executor, memory)
         result = replace(result, done={name: finished.get(name, done) for name, done in result.done.items()})
         key = digest([[name, result.keys[name]] for name in wanted(result.recipe)])
         with new_run(runs, recipe.name, key) as folder:
-            doc = _write(result, folder, command, notes)
+            doc = _write(result, folder, command, caught)
     return Simulation(folder.path, doc)
 
 
-def _write(result: Result, folder: RunFolder, command: Sequence[str], notes: Iterable[str]) -> dict[str, Any]:
+def _write(
+    result: Result, folder: RunFolder, command: Sequence[str], caught: Sequence[warnings.WarningMessage]
+) -> dict[str, Any]:
     shelf = DerivedFiles(result.store)
     drawn, missing = pictures(result, shelf)
     files, refused = exports(result, shelf)
-    doc = run_page.document(result, command, notes, missing)
+    doc = run_page.document(result, command, (str(warning.message) for warning in caught), missing)
     doc["files"] = sorted(files)
     doc["missing"] += [{"name": n, "title": f"data/{n}", "why": why} for n, why in refused.items()]
     shown = {name: path.read_bytes() for name, path in drawn.items()}
@@ -93,21 +93,6 @@ def _write(result: Result, folder: RunFolder, command: Sequence[str], notes: Ite
     folder.write("provenance.json", json.dumps(doc, indent=1, ensure_ascii=False, allow_nan=True))
     folder.write("report.html", run_page.page(doc, shown))
     return doc
-
-
-@contextmanager
-def _warnings() -> Iterator[list[str]]:
-    """Yield a list that receives the text of each warning once, instead of the console."""
-    notes: list[str] = []
-
-    def note(message: Warning | str, *rest: Any, **named: Any) -> None:
-        if str(message) not in notes:
-            notes.append(str(message))
-
-    with warnings.catch_warnings():
-        warnings.showwarning = note
-        warnings.simplefilter("default")
-        yield notes
 
 
 def recipe_text(recipe: Recipe) -> str:

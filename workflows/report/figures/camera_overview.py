@@ -50,10 +50,7 @@ def _ring(ax: Any, spots: Mapping[str, Tensor], like: Tensor) -> None:
     from matplotlib.patches import Circle
 
     radius = max(like.shape[-1] / 14, 3.0)
-    for y, x in {_brightest(centre(s, like)) for s in spots.values()}:
+    images = [centre(spot, like) for spot in spots.values()]
+    for y, x in {divmod(int(image.sum(0).argmax()), image.shape[-1]) for image in images}:
         for width, colour in ((3.0, "black"), (1.4, ORANGE)):
             ax.add_patch(Circle((x, y), radius, fill=False, color=colour, linewidth=width))
-
-
-def _brightest(spot: Tensor) -> tuple[int, int]:
-    return divmod(int(spot.sum(0).argmax()), spot.shape[-1])
