@@ -1,13 +1,14 @@
-"""Results by band: if one band of a stack of 31 has changed, one band is computed and written.
+"""Results stored by wavelength band: if one of 31 bands has changed, only this band is computed and written.
 
-A node that declares its bands computes each band to the same bits whatever the other bands are. A band therefore has a
-key of its own: a digest of that band of the inputs and of everything else that determines the band. Its slice of the
-result is a blob of that name. Hashing reads the inputs once at memory speed, where computing reads them many times.
+A node that declares its bands computes each band to the same bits whatever the other bands are. Each band therefore has
+its own key, a digest of this band of the inputs and of everything else that determines the band. The store keeps the
+band of the result as a blob with this key as name. To hash the inputs is cheap: they are read only once.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable, Collection, Iterator, Sequence
+from collections.abc import Callable, Collection, Sequence
+from contextlib import suppress
 from math import ceil
 from typing import Any
 
@@ -21,23 +22,18 @@ from neusee.workflows.keys.cache_key import digest, plain
 from neusee.workflows.store.band_files import Blobs, Damaged, Stacked, bytes_of
 from neusee.workflows.store.serialization import pack
 
-LEAST = 1 << 22  #: bytes of a result below which the result is kept as one tensor
+LEAST = 1 << 22  #: bytes; a smaller result is kept as one tensor
 _ALIGN = 64  #: bytes; a kernel may take another path at another alignment
 _TRIES = 3  #: attempts that may find damaged bands before all bands are computed
 
+Evaluate = Callable[[Sequence[Any]], Any]  #: a function from the inputs of a step to its result
 
-def call_by_band(
-    step: Step,
-    inputs: Sequence[Any],
-    evaluate: Callable[[Sequence[Any]], Any],
-    code: str,
-    blobs: Blobs,
-    parts: int = 1,
-) -> Any:
+
+def call_by_band(step: Step, inputs: Sequence[Any], evaluate: Evaluate, code: str, blobs: Blobs, parts: int = 1) -> Any:
     """Return the result of ``step``; ``evaluate`` computes only the bands that ``blobs`` does not hold.
 
-    ``code`` is the digest of the node's code. ``parts`` is the number of passes; more need less memory. Tensors of
-    the result that can be stored by band are returned as `Stacked`; `plain_of` returns the value itself.
+    ``code`` is the digest of the code of the node. A larger number of passes, ``parts``, needs less memory. Tensors
+    that can be stored by band are returned as `Stacked`, which `plain_of` converts to plain tensors.
     """
     count = band_count(step, inputs)
     if count < 2:
@@ -56,15 +52,16 @@ def call_by_band(
 
 
 def plain_of(value: Any) -> Any:
-    """Return ``value`` with a plain tensor in place of every stack."""
+    """Return ``value`` with a plain tensor in place of every `Stacked` tensor."""
     if isinstance(value, Stacked):
         return value.tensor
     return value._make(map(plain_of, value)) if type(value) in BAND_FIELDS else value
 
 
 def band_count(step: Step, inputs: Sequence[Any]) -> int:
-    """Return the number of bands that a step computes independently; 0 where its node or its inputs have none."""
-    banded = list(_banded(step, inputs))
+    """Return the number of bands that a step computes independently of each other; 0 if the step has no such bands."""
+    named = zip(step.node.inputs, inputs, strict=False)
+    banded = [(axis, value) for name, value in named if (axis := _axis(step, name, value)) is not None]
     if any(not isinstance(value, Tensor) and type(value) not in BAND_FIELDS for _, value in banded):
         return 0  # a low-rank cube has no slice of one band
     found = {x.shape[axis] for axis, value in banded for x in band_tensors(value) if _has(x, axis)}
@@ -72,7 +69,7 @@ def band_count(step: Step, inputs: Sequence[Any]) -> int:
 
 
 def band_keys(step: Step, inputs: Sequence[Any], code: str) -> list[str]:
-    """Return the key of each band: node, code, parameters, that band of the inputs and the whole other inputs."""
+    """Return a key for each band, from node, code, parameters, this band of the inputs, and inputs without bands."""
     params = {name: plain(value) for name, value in step.params.items()}
     same: list[Any] = ["band", step.node.path, code, params]
     each: list[list[str]] = []
@@ -85,7 +82,7 @@ def band_keys(step: Step, inputs: Sequence[Any], code: str) -> list[str]:
 
 
 def content(value: Any) -> list[Any]:
-    """Return the content of a value as JSON: its layout, and type, shape and xxh3 of each tensor."""
+    """Return the identity of a value as JSON: layout, and type, shape and xxh3 digest of each tensor."""
     layout, tensors = pack(value)
     return [layout, [_hashed(x) for x in tensors]]
 
@@ -98,22 +95,15 @@ def _axis(step: Step, name: str, value: Any) -> int | None:
     return None if value is None or step.node.bands is None else step.node.bands.get(name)
 
 
-def _banded(step: Step, inputs: Sequence[Any]) -> Iterator[tuple[int, Any]]:
-    for name, value in zip(step.node.inputs, inputs, strict=False):
-        axis = _axis(step, name, value)
-        if axis is not None:
-            yield axis, value
-
-
 def band_tensors(value: Any) -> list[Tensor]:
-    """Return the tensors of a value that have bands."""
+    """Return the tensors of a value that have a band axis."""
     if isinstance(value, Tensor):
         return [value]
     return [getattr(value, name) for name in BAND_FIELDS[type(value)]]
 
 
 def with_band_tensors(value: Any, tensors: Sequence[Tensor]) -> Any:
-    """Return ``value`` with other tensors in place of those that have bands."""
+    """Return ``value`` with ``tensors`` in place of its tensors with a band axis."""
     if isinstance(value, Tensor):
         return tensors[0]
     return value._replace(**dict(zip(BAND_FIELDS[type(value)], tensors, strict=True)))
@@ -128,22 +118,17 @@ def _has(x: Tensor, axis: int) -> bool:
 
 
 def taken(step: Step, inputs: Sequence[Any], which: list[int], of: Collection[str] | None = None) -> list[Any]:
-    """Return the inputs with the bands ``which`` only; ``of`` names the inputs to slice (all banded inputs if None)."""
+    """Return the inputs with the bands ``which`` only; ``of`` names the inputs to slice, None all inputs with bands."""
     found = list(inputs)
     for i, (name, value) in enumerate(zip(step.node.inputs, inputs, strict=False)):
         axis = _axis(step, name, value)
-        if axis is None or (of is not None and name not in of):
-            continue
-        if isinstance(value, Tensor):
-            found[i] = _slices(value, axis, which)
-        else:
-            fields = {name: _slices(getattr(value, name), axis, which) for name in BAND_FIELDS[type(value)]}
-            found[i] = value._replace(**fields)
+        if axis is not None and (of is None or name in of):
+            found[i] = with_band_tensors(value, [_slices(x, axis, which) for x in band_tensors(value)])
     return found
 
 
 def _slices(x: Tensor, axis: int, which: list[int]) -> Tensor:
-    """Return a view where it is laid out in memory like a new tensor, else a copy."""
+    """Return the bands ``which`` of a tensor: a view if the view is contiguous and aligned, else a copy."""
     if which == list(range(which[0], which[0] + len(which))):
         part = x.narrow(axis, which[0], len(which))
         if part.is_contiguous() and part.data_ptr() % _ALIGN == 0:
@@ -163,7 +148,7 @@ def _rebuilt(step: Step, items: list[Any]) -> Any:
 
 
 def _stacked(step: Step, value: Any, keys: list[str]) -> Any:
-    """Return a result that was computed as a whole, with the names of its bands if the result is large."""
+    """Return a result whose bands were computed together, with the name of each band if the result is large."""
     tensors = band_tensors(value)
     leading = all(x.shape[0] == len(keys) and _leads(step, x) for x in tensors)
     if not leading or sum(x.nbytes for x in tensors) < LEAST:
@@ -173,19 +158,13 @@ def _stacked(step: Step, value: Any, keys: list[str]) -> Any:
 
 
 def _leads(step: Step, x: Tensor) -> bool:
-    """Return True if the bands are the first axis, because only such a stack lies in memory band by band."""
+    """Return True if the bands are the first axis of a tensor, so that each band is contiguous in memory."""
     assert step.node.bands is not None
     return _has(x, step.node.bands["return"]) and step.node.bands["return"] % x.dim() == 0
 
 
 def _gathered(
-    step: Step,
-    inputs: Sequence[Any],
-    evaluate: Callable[[Sequence[Any]], Any],
-    keys: list[str],
-    missing: list[int],
-    size: int,
-    blobs: Blobs,
+    step: Step, inputs: Sequence[Any], evaluate: Evaluate, keys: list[str], missing: list[int], size: int, blobs: Blobs
 ) -> Any:
     """Compute the missing bands, ``size`` at a time, and assemble all bands; raise `Damaged` for a damaged band."""
     assert step.node.bands is not None
@@ -199,19 +178,21 @@ def _gathered(
 
 
 class _Stack:
-    """One tensor of an unfinished result: its bands go to the store, or to memory where the store cannot be written."""
+    """One tensor of an unfinished result; its bands go to the store, or to memory if the store cannot be written."""
 
     def __init__(self, axis: int, names: list[str], blobs: Blobs) -> None:
         self.axis, self.names, self.blobs = axis, names, blobs
         self.held: Tensor | None = None
-        self.inside: set[int] = set()  # bands that are in memory
+        self.inside: set[int] = set()  # indices of the bands in memory
 
     def add(self, which: list[int], x: Tensor) -> None:
-        """Add the bands ``which``."""
+        """Add the computed bands ``x``, whose indices are ``which``."""
         axis = self.axis % x.dim()
         slices = x.unbind(axis)
-        if axis == 0 and self._written(which, slices):
-            return
+        if axis == 0:
+            with suppress(OSError):
+                self.blobs.write_all([self.names[i] for i in which], slices)
+                return
         if self.held is None:
             self.held = x.new_empty(*x.shape[:axis], len(self.names), *x.shape[axis + 1 :])
         for i, part in zip(which, slices, strict=True):
@@ -229,10 +210,3 @@ class _Stack:
             part = self.held.select(self.axis, i)
             part.copy_(self.blobs.read([self.names[i]], (1, *part.shape), part.dtype)[0])
         return self.held
-
-    def _written(self, which: list[int], slices: Sequence[Tensor]) -> bool:
-        try:
-            self.blobs.write_all([self.names[i] for i in which], slices)
-        except OSError:
-            return False
-        return True

@@ -1,4 +1,4 @@
-"""Cost model: seconds by kind of device, bytes and memory of a step, predicted from earlier runs."""
+"""Cost model: run time, size of the result and memory of a step, predicted from earlier runs."""
 
 from __future__ import annotations
 
@@ -24,11 +24,11 @@ class Estimate:
     seconds: Mapping[str, float]  #: by kind of device: ``cpu``, ``cuda``
     bytes: float  #: size of the result
     work: float  #: memory during the run, beside the inputs and the result
-    known: bool  #: whether this very step was measured before
+    known: bool  #: True if this step was measured before
 
 
 class Costs:
-    """Costs by step and by node, from the lines of a journal, the newest line last."""
+    """Costs of steps and of nodes, from the lines of a journal, the newest line last."""
 
     def __init__(self, rows: Iterable[Row]) -> None:
         self._steps: dict[str, list[Row]] = {}
@@ -40,7 +40,7 @@ class Costs:
         self._ratio = {"cpu": 1.0, **self._measured_ratios()}
 
     def of(self, step: Step, kinds: Sequence[str], exact: Row | None = None) -> Estimate:
-        """Return the estimate for ``step`` on each of ``kinds``; ``exact`` is the measurement of this very result."""
+        """Return the cost of ``step`` on each of ``kinds``; ``exact`` is an earlier measurement of the same result."""
         own = self._steps.get(f"{step.name} {step.node.path}", [])
         rows = [exact] if exact else own[-_NEWEST:] or self._nodes.get(step.node.path, [])[-_NEWEST:]
         if not rows:
@@ -62,7 +62,7 @@ class Costs:
         return self._ratio.get(kind, _FASTER)
 
     def _measured_ratios(self) -> dict[str, float]:
-        """Return the speed of each kind of device relative to the CPU, over the steps that were measured on both."""
+        """Return the speed of each kind of device relative to the CPU, from the steps that were measured on both."""
         found: dict[str, list[float]] = {}
         for rows in self._steps.values():
             by_kind: dict[str, list[float]] = {}

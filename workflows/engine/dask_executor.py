@@ -1,9 +1,9 @@
-"""Executor on a dask.distributed cluster: keys are sent, tensors are not.
+"""Executor on a dask.distributed cluster, to which keys are sent instead of tensors.
 
 A task is a chain of steps with the keys of its inputs. The worker reads values by key from the
-store, or from its memory of earlier tasks, and writes the end of the chain to the store. Only
-the metadata of the results are sent back. If a worker dies, its finished results are stored,
-and storing a result twice does no harm.
+store, or from its memory of earlier tasks, and writes the end of the chain to the store. The
+worker returns only the metadata of the results. If a worker dies, the store has its finished
+results, and a second worker may write a result again without harm.
 """
 
 from __future__ import annotations
@@ -26,10 +26,10 @@ from neusee.workflows.store.remote_store import open_store
 from neusee.workflows.store.result_store import Store
 from neusee.workflows.store.serialization import tensors_in
 
-_SHARE = 0.4  #: of the planned memory, for values that the next tasks of a worker may read
-_PLANNED = 0.6  #: of a worker's memory, which a plan may use
+_SHARE = 0.4  #: fraction of the planned memory for values that the next tasks of a worker may read
+_PLANNED = 0.6  #: fraction of the memory of a worker that a plan may use
 _LOOK = 1.0  #: s between two queries for the present workers
-_TRIES = 3  #: workers that one chain may kill before the run gives up
+_TRIES = 3  #: workers that may die with one chain before the run fails
 
 
 class Dask:
@@ -53,7 +53,7 @@ class Dask:
         return self._lanes
 
     def submit(self, work: Sequence[StepJob]) -> None:
-        """Send one chain to the worker of its lane, or to another worker if that one is gone."""
+        """Send one chain to the worker of its lane, or to another worker if this worker is gone."""
         self._tries[work[0].key] = self._tries.get(work[0].key, 0) + 1
         future = self.client.submit(
             work_here,
@@ -83,17 +83,19 @@ class Dask:
         return [outcome for future in done for outcome in self._taken(future)]
 
     def cancel(self) -> None:
-        """Cancel the tasks that have not begun; running tasks end, and their results are stored."""
+        """Cancel the tasks that have not begun; running tasks continue, and their results are stored."""
         if self._running:
             self.client.cancel(list(self._running))
             self._running = {}
 
     def _taken(self, future: Any) -> list[Outcome]:
-        """Return the outcomes of a chain, or a `RunError` where its workers died."""
+        """Return the outcomes of a chain, or an outcome with a `RunError` if its workers died."""
         chain = self._running.pop(future)
         if future.status == "finished":
-            found: list[Outcome] = future.result()
-            return [_of_lane(outcome, chain[0].lane) for outcome in found]
+            outcomes: list[Outcome] = future.result()
+            for outcome in outcomes:  # another worker may have computed the chain
+                outcome.work = replace(outcome.work, lane=chain[0].lane)
+            return outcomes
         cause = future.exception() if future.status == "error" else None
         if cause is None and self._tries[chain[0].key] < _TRIES:  # the task was lost with its worker or its scheduler
             self.submit(chain)
@@ -102,7 +104,7 @@ class Dask:
         return [Outcome(chain[0], error=RunError(chain[0].step, [], OSError(text)))]
 
     def _look(self) -> None:
-        """Query the present workers and their devices; wait for the first worker."""
+        """Update the lanes from the present workers and their devices; wait until there is a worker."""
         if not self.client.nthreads():
             self.client.wait_for_workers(1, timeout=60)
         there = self.client.nthreads()
@@ -113,17 +115,11 @@ class Dask:
         self._looked = time.monotonic()
 
 
-def _of_lane(outcome: Outcome, lane: str) -> Outcome:
-    """Return the outcome with the lane to which its task was sent, whichever worker ran the task."""
-    outcome.work = replace(outcome.work, lane=lane)
-    return outcome
-
-
 # --- on a worker ----------------------------------------------------------------------------------------------------
 
 
 class _Here:
-    """State of one worker between tasks: the store, digests of the worker's code, the values used last."""
+    """State of one worker between tasks: the store, digests of code, and the values that were used last."""
 
     def __init__(self, where: str, room: float) -> None:
         self.store = open_store(where)
@@ -152,7 +148,7 @@ _here: dict[str, _Here] = {}
 
 
 def lane_here(dask_worker: Any) -> tuple[str, float]:
-    """Return the device of a worker and the bytes that a plan may use; dask passes the worker."""
+    """Return the device of a worker, and the bytes of memory that a plan may use on this device."""
     if torch.cuda.is_available():
         return "cuda:0", _PLANNED * there_is("cuda:0")
     allowed = getattr(dask_worker.memory_manager, "memory_limit", None)
@@ -160,7 +156,7 @@ def lane_here(dask_worker: Any) -> tuple[str, float]:
 
 
 def work_here(chain: tuple[StepJob, ...], where: str, threads: int, room: float) -> list[Outcome]:
-    """Carry out a chain and return its outcomes without their values; keep ``room`` bytes of values on the worker."""
+    """Compute a chain and return its outcomes without values; the worker keeps at most ``room`` bytes of values."""
     if torch.get_num_threads() != threads:
         torch.set_num_threads(threads)
     here = _here.get(where) or _here.setdefault(where, _Here(where, room))
@@ -187,7 +183,7 @@ def _one_here(work: StepJob, here: _Here) -> Outcome:
 
 
 def _light(outcome: Outcome) -> Outcome:
-    """Return the outcome without its value, and with an error that can be pickled."""
+    """Return the outcome without its value; pickle must be able to send its error."""
     outcome.value = None
     if outcome.error is not None and not isinstance(outcome.error, RunError):
         outcome.error = RunError(outcome.work.step, [], outcome.error)
@@ -203,18 +199,17 @@ def _size(value: Any) -> int:
 
 @contextmanager
 def cluster(where: str, store: Store) -> Iterator[Dask]:
-    """Yield an executor for ``dask``, ``dask:4`` (local workers), ``dask:here`` (in process) or a scheduler address."""
+    """Yield an executor for ``dask:4`` (local workers), ``dask:here`` (in this process) or a scheduler address."""
     from distributed import Client, LocalCluster
 
     kind, _, count = where.partition(":")
+    address: Any = where
     with ExitStack() as open_now:
         if kind == "dask":
             here = count == "here"
             workers = 1 if here or not count else int(count)
-            made = LocalCluster(
+            local = LocalCluster(
                 n_workers=workers, threads_per_worker=1, processes=not here, dashboard_address=None, silence_logs=40
             )
-            address: Any = open_now.enter_context(made)
-        else:
-            address = where
+            address = open_now.enter_context(local)
         yield Dask(open_now.enter_context(Client(address, set_as_default=False)), store)

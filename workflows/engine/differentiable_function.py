@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Collection, Iterable, Mapping
+from dataclasses import dataclass
 from functools import cached_property
 from typing import Any
 
@@ -13,6 +14,7 @@ from torch import Tensor
 from neusee.nodes import TensorStats
 from neusee.workflows.engine.node_call import call, place
 from neusee.workflows.engine.runner import run
+from neusee.workflows.engine.step_job import gathered
 from neusee.workflows.graph.diagnostics import nearest
 from neusee.workflows.graph.recipe_graph import Recipe, Step, in_order, needed, unknown_step
 from neusee.workflows.store.result_store import Store
@@ -32,13 +34,12 @@ def as_function(
     redraw: Collection[str] = (),
     caller: Callable[..., Any] = call,
 ) -> _Function:
-    """Return the recipe as a differentiable ``theta -> {output: value}``, equal to `run` to the last bit.
+    """Return the recipe as a differentiable function ``theta -> {output: value}``, equal to `run` to the last bit.
 
-    Args: free: parameters such as ``"spot.strength"``, or steps whose whole value is given, such
-    as ``"height"``. Steps that do not depend on ``free`` are computed once, here, or read from
-    the store. Noise is the same at every call: its stream depends on the seed and the step.
-    Random steps in ``redraw`` are computed at every call, which may be given another seed.
-    ``caller`` replaces `call` for every live step, for example to keep values.
+    Args: free: parameters such as ``"spot.strength"``, or steps such as ``"height"``, whose result the caller
+    gives. Steps that do not depend on ``free`` are computed once, here, or read from the store. Noise is the
+    same at every call, because its stream depends on the seed and the step. Random steps in ``redraw`` are
+    computed at every call, which may have another seed. ``caller`` replaces `call` for every live step.
     """
     wanted = recipe.outputs if outputs is None else tuple(outputs)
     given, tuned = _read(recipe, free)
@@ -47,11 +48,10 @@ def as_function(
     order = in_order(sources, wanted)
     if idle := sorted((given | tuned.keys()) - set(order)):
         raise ValueError(f"no output depends on {', '.join(idle)}")
-    live: dict[str, None] = {}
+    live, roots = dict[str, None](), {*given, *tuned, *redraw}
     for name in order:
-        free_itself = name in given or name in tuned or name in redraw
-        if free_itself or any(source in live for source in sources[name]):
-            live.setdefault(name)
+        if name in roots or not live.keys().isdisjoint(sources[name]):
+            live[name] = None
     border = {name for step in live for name in sources[step]} | set(wanted)
     fixed = run(recipe, store, sorted(border - live.keys()), device=device)
     left_out = {name: done.bound or 0.0 for name, done in fixed.done.items() if done.state == "left out"}
@@ -59,7 +59,7 @@ def as_function(
 
 
 def _read(recipe: Recipe, free: tuple[str, ...]) -> tuple[set[str], dict[str, dict[str, str]]]:
-    """Return the steps that are given whole, and by step the free parameters with their full names."""
+    """Return the steps whose results are free, and for each other step its free parameters and their full names."""
     given: set[str] = set()
     tuned: dict[str, dict[str, str]] = {}
     for name in free:
@@ -75,31 +75,29 @@ def _read(recipe: Recipe, free: tuple[str, ...]) -> tuple[set[str], dict[str, di
     return given, tuned
 
 
+@dataclass(eq=False, repr=False)
 class _Function:
-    """The live part of a recipe, with the values of all steps that feed the live part."""
+    """The live steps of a recipe, which depend on the free values, and the fixed values that feed these steps."""
 
-    def __init__(
-        self,
-        recipe: Recipe,
-        free: tuple[str, ...],
-        wanted: tuple[str, ...],
-        given: set[str],
-        tuned: dict[str, dict[str, str]],
-        live: list[str],
-        fixed: dict[str, Any],
-        left_out: Mapping[str, float],
-        device: str,
-        caller: Callable[..., Any] = call,
-    ) -> None:
-        self._caller = caller
-        self.recipe, self.free, self.wanted, self.device = recipe, free, wanted, device
-        self.given, self.tuned, self.live, self.fixed = given, tuned, live, fixed
+    recipe: Recipe
+    free: tuple[str, ...]
+    wanted: tuple[str, ...]
+    given: set[str]
+    tuned: dict[str, dict[str, str]]
+    live: list[str]
+    fixed: dict[str, Any]
+    left_out: Mapping[str, float]
+    device: str
+    caller: Callable[..., Any]
+
+    def __post_init__(self) -> None:
         self._facts: dict[str, TensorStats | None] = {}
-        self._spent = _spent(recipe, fixed, left_out)
-        self._last = {source: name for name in live if name not in given for source in recipe.steps[name].sources}
+        self._spent = _spent(self.recipe, self.fixed, self.left_out)
+        live = [name for name in self.live if name not in self.given]
+        self._last = {source: name for name in live for source in self.recipe.steps[name].sources}
 
     def __call__(self, theta: Theta, seed: int | None = None) -> dict[str, Any]:
-        """Return the outputs at ``theta``, with the noise of ``seed`` or of the recipe's own seed."""
+        """Return the outputs at ``theta``, with the noise of ``seed``; None is the seed of the recipe."""
         seed = self.recipe.seed if seed is None else seed
         if set(theta) != set(self.free):
             raise ValueError(f"give values for exactly {', '.join(self.free)}, not for {', '.join(theta) or 'nothing'}")
@@ -121,8 +119,8 @@ class _Function:
                 return values[verdict.instead]
         else:
             ledger.pass_on(step)
-        inputs = [_gather(step.wires.get(name), values) for name in step.node.inputs]
-        return self._caller(step, inputs, params, seed, place(step, self.device))
+        inputs = [gathered(step.wires.get(name), values.__getitem__) for name in step.node.inputs]
+        return self.caller(step, inputs, params, seed, place(step, self.device))
 
     def _facts_of(self, name: str, values: dict[str, Any]) -> Any:
         if name not in self.fixed:
@@ -134,53 +132,27 @@ class _Function:
 
 
 class _Ends:
-    """Statistics of an image that each call computes anew; most bounds need the least and greatest value only."""
+    """Statistics of a new image; a statistic other than minimum and maximum is computed at its first use."""
 
     def __init__(self, value: Tensor) -> None:
         self._value = value.detach()
         self.shape, self.dtype = tuple(value.shape), "float32"
+        self.min, self.max = map(float, torch.aminmax(self._value)) if value.numel() else (math.nan, math.nan)
+        self.finite = not value.numel() or (math.isfinite(self.min) and math.isfinite(self.max))
 
     @cached_property
-    def _ends(self) -> tuple[float, float]:
-        if self._value.numel() == 0:
-            return math.nan, math.nan
-        low, high = torch.aminmax(self._value)
-        return float(low), float(high)
-
-    @property
-    def min(self) -> float:
-        return self._ends[0]
-
-    @property
-    def max(self) -> float:
-        return self._ends[1]
-
-    @property
-    def finite(self) -> bool:
-        """Return True if all elements are finite, which makes their sum in double precision finite."""
-        return self._value.numel() == 0 or all(map(math.isfinite, self._ends))
-
-    @cached_property
-    def _whole(self) -> TensorStats:
-        found = TensorStats.of(self._value)
-        assert found is not None
-        return found
+    def _whole(self) -> TensorStats | None:
+        return TensorStats.of(self._value)
 
     def __getattr__(self, name: str) -> Any:
         return getattr(self._whole, name)
 
 
 def _spent(recipe: Recipe, fixed: Mapping[str, Any], left_out: Mapping[str, float]) -> ErrorBudget:
-    """Return the error budget with the bounds of all fixed steps entered."""
+    """Return an error budget that contains the error bounds of all fixed steps."""
     ledger = ErrorBudget(recipe)
     for name in needed(recipe, fixed):
         ledger.pass_on(recipe.steps[name])
         if name in left_out:
             ledger.leave_out(recipe.steps[name], left_out[name])
     return ledger
-
-
-def _gather(wire: str | tuple[str, ...] | None, values: Mapping[str, Any]) -> Any:
-    if wire is None or isinstance(wire, str):
-        return None if wire is None else values[wire]
-    return [values[name] for name in wire]

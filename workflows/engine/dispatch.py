@@ -1,31 +1,27 @@
-"""Dispatch: submit work when its inputs are ready, and collect the outcomes."""
+"""Dispatch of jobs: each job is submitted when its inputs are ready, and its outcome is collected."""
 
 from __future__ import annotations
 
 import time
+from collections import Counter
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import replace
 
 from neusee.workflows.engine.step_job import Executor, Outcome, StepJob
 from neusee.workflows.keys.cache_key import Key, device_kind
 
-_FIRST_LOOK, _LONGEST = 0.01, 0.5  #: s between looks at work that another process holds
+_FIRST_LOOK, _LONGEST = 0.01, 0.5  #: s between attempts at a job that another process computes
 
 Chain = tuple[StepJob, ...]  #: steps of which each feeds only the next one
-MemoryProfile = Callable[
-    [StepJob, Sequence[StepJob]], bool
-]  #: whether the memory suffices for one more step beside the running steps
+#: a function that returns True if the memory suffices for one more step beside the running steps
+MemoryProfile = Callable[[StepJob, Sequence[StepJob]], bool]
 
 
 class Loop:
-    """State of one plan: the chains that wait for inputs, the ready chains and the chain of each lane."""
+    """State of a plan in progress: the waiting chains, the ready chains, and the chain that each lane computes."""
 
     def __init__(
-        self,
-        chains: Sequence[Chain],
-        executor: Executor,
-        begin: Callable[[StepJob], StepJob],
-        room: MemoryProfile,
+        self, chains: Sequence[Chain], executor: Executor, begin: Callable[[StepJob], StepJob], room: MemoryProfile
     ) -> None:
         self.executor, self.begin, self.room = executor, begin, room
         self.busy: dict[str, Chain] = {}
@@ -42,24 +38,24 @@ class Loop:
         self._open = len(chains)
 
     def outcomes(self) -> Iterator[Outcome]:
-        """Yield each outcome as it arrives, until all work is done; the caller raises the error of an outcome."""
+        """Yield each outcome when it arrives, until all jobs are done; the caller raises the error of an outcome."""
         while self._open:
             self._hand_out()
             if not self.busy and not self._held:
-                ready = self._chains[self._ready[-1]][0] if self._ready else None
-                raise RuntimeError(f"no lane is left for {ready.step.name if ready else 'the remaining steps'}")
+                name = self._chains[self._ready[-1]][0].step.name if self._ready else "the remaining steps"
+                raise RuntimeError(f"no device or worker is left to compute {name}")
             for outcome in self.executor.wait(self._patience()):
                 self._settle(outcome)
                 if not outcome.held:
                     yield outcome
 
     def _outside(self, chain: Chain) -> set[Key]:
-        """Return the keys of this plan that a chain reads from other chains."""
+        """Return the keys that a chain reads from other chains of this plan."""
         own = {work.key for work in chain}
         return {key for work in chain for key in work.sources if key in self._chain_of and key not in own}
 
     def _hand_out(self) -> None:
-        """Give every idle lane the first ready chain that may run there."""
+        """Submit to every idle lane the first ready chain that may run on this lane."""
         self._look_again()
         for lane, where in self.executor.lanes.items():
             if lane in self.busy or not self._ready:
@@ -73,7 +69,7 @@ class Loop:
                 self.executor.submit(chain)
 
     def _first_for(self, lane: str, device: str) -> int | None:
-        """Return the place in the ready list of the next chain for ``lane``: its own, or one of a busy or lost lane."""
+        """Return the index in the ready list of the next chain for ``lane``, also a chain of a busy or lost lane."""
         running = [work for chain in self.busy.values() for work in chain]
         there = self.executor.lanes
         for place in range(len(self._ready) - 1, -1, -1):
@@ -91,7 +87,7 @@ class Loop:
             self._held[i] = (float("inf"), self._held[i][1])
 
     def _patience(self) -> float | None:
-        """Return the s to wait for running work; sleep here where other processes hold all the remaining work."""
+        """Return the seconds to wait for running jobs; sleep if other processes compute all remaining jobs."""
         waits = [when for when, _ in self._held.values() if when < float("inf")]
         if not waits:
             return None
@@ -101,7 +97,7 @@ class Loop:
         return pause
 
     def _settle(self, outcome: Outcome) -> None:
-        """Free the lane, and release the chains that waited for this key."""
+        """Mark the lane of an outcome as idle, and the chains that waited for its key as ready."""
         i = self._chain_of[outcome.work.key]
         chain = self._chains[i]
         last = outcome.work.key == chain[-1].key
@@ -116,24 +112,20 @@ class Loop:
             self.busy.pop(outcome.work.lane, None)
         if outcome.held:
             return
-        freed = []
-        for waiting in self._after.pop(outcome.work.key, ()):
-            self._missing[waiting].discard(outcome.work.key)
-            if not self._missing[waiting]:
-                freed.append(waiting)
-        self._ready += sorted(freed, reverse=True)
+        waiting = self._after.pop(outcome.work.key, ())
+        for i in waiting:
+            self._missing[i].discard(outcome.work.key)
+        freed = [i for i in waiting if not self._missing[i]]
+        self._ready += freed
         if len(self.executor.lanes) > 1 or freed:
             self._ready.sort(reverse=True)
 
 
 def chains_of(works: Sequence[StepJob], fused: bool) -> list[Chain]:
-    """Return each step as a chain, or, if ``fused``, join it with the steps that alone follow on its lane."""
+    """Return the jobs as chains of one step, or if ``fused``, of steps of one lane that only feed the next step."""
     if not fused:
         return [(work,) for work in works]
-    readers: dict[Key, int] = {}
-    for work in works:
-        for key in set(work.sources):
-            readers[key] = readers.get(key, 0) + 1
+    readers = Counter(key for work in works for key in set(work.sources))
     planned = {work.key for work in works}
     chains: dict[Key, list[StepJob]] = {}  # by the key at their end
     for work in works:
@@ -149,5 +141,5 @@ def chains_of(works: Sequence[StepJob], fused: bool) -> list[Chain]:
 
 
 def _moved(work: StepJob, lane: str, device: str) -> StepJob:
-    """Return ``work`` on another lane; a step that computes on the CPU of an accelerator's lane still does so there."""
+    """Return a job on another lane; a job that needs the CPU computes on the CPU there too."""
     return replace(work, lane=lane, device=device if device_kind(work.device) == device_kind(device) else work.device)

@@ -1,7 +1,7 @@
-"""Execution of one run: resolve the keys, find the cheapest way to the wanted values, record the steps.
+"""Execution of one run: the keys of the steps, the cheapest way to the wanted values, and the records.
 
-No function here is recursive over the graph, and values are held by key: two steps that are the
-same computation are computed once, and a step that is left out shares the key of its input.
+No function here is recursive over the graph. Values are held by key, so that two steps with the same
+key are computed once. A step that is left out has the key of its input.
 """
 
 from __future__ import annotations
@@ -68,13 +68,14 @@ class Execution:
         self.schedule: Schedule | None = None
 
     def resolve(self, order: list[str]) -> None:
-        """Give every step its key, and leave out the steps whose bound allows the omission."""
+        """Compute the key of every step, and leave out each step whose skip bound is within the tolerance."""
         for name in order:
             step = self.recipe.steps[name]
             if step.node.hooks.skip_bound is not None:
-                verdict = self.verdicts[name] = self._judge(step)
+                verdict = self.verdicts[name] = self.ledger.verdict(step, step.params, self._facts_of)
                 if verdict.left_out:
-                    self._leave_out(step, verdict)
+                    key = self.keys[name] = self.keys[verdict.instead]
+                    self._finish(StepRecord(name, "left out", verdict.why, 0.0, key, bound=verdict.bound))
                     continue
             else:
                 self.ledger.pass_on(step)
@@ -88,7 +89,7 @@ class Execution:
                 self.makers[key], self.origins[key] = step, origin
 
     def make(self, targets: list[Key], keep: bool, later: Sequence[Key] = ()) -> None:
-        """Hold the values of ``targets`` and the made ones that ``later`` needs; ``keep`` holds unstored values too."""
+        """Load or compute ``targets``; keep in memory the needs of ``later``, and with ``keep`` each unstored value."""
         while True:
             below = Upstream(self.known, self.sources)
             order = in_order(below, targets)
@@ -103,13 +104,13 @@ class Execution:
                 continue
 
     def close(self) -> None:
-        """Save the digests of the code, and drop the executor to break the reference cycle with this run."""
+        """Save the digests of the code, end the writes, and delete the executor, which refers to this run."""
         self.code.save()
         self.own.cancel()
         del self.own, self.executor
 
     def account(self, order: list[str]) -> dict[str, StepRecord]:
-        """Return the record of every step, in running order."""
+        """Return the record of every step in running order, after the record of each step that did not run is added."""
         for name in order:
             if name in self.done:
                 continue
@@ -122,12 +123,12 @@ class Execution:
         return {name: self.done[name] for name in order}
 
     def asleep(self, name: str) -> StepRecord:
-        """Return the record of a step that was not needed."""
+        """Return the record of a step whose value no other step needed."""
         key, error = self.keys[name], error_in(self.store.about(self.keys[name]))
         return StepRecord(name, "not needed", "nothing needed it", 0.0, key, bound=self._bound(name), error=error)
 
     def missing(self, names: Iterable[str]) -> set[Key]:
-        """Return the keys to compute for the values of ``names``."""
+        """Return the keys of all values to compute, so that the values of the steps ``names`` are known."""
         below = Upstream(self.known, self.sources)
         in_order(below, [self.keys[name] for name in names])
         return set(below.missing)
@@ -136,7 +137,7 @@ class Execution:
         return [self.keys[name] for name in self.makers[key].sources]
 
     def known(self, key: Key) -> bool:
-        """Return True if the value is in memory or in the store; remember the receipt of a value that is not kept."""
+        """Return True if a value is in memory or in the store; record the receipt of a value that was not kept."""
         if key in self.values:
             return True
         about = self.store.about(key)
@@ -146,7 +147,7 @@ class Execution:
         return False
 
     def _dear(self, below: Upstream, targets: list[Key]) -> frozenset[Key]:
-        """Return the stored values that take longer to read than to compute, as far as recomputing is cheaper."""
+        """Return the keys of the stored values that are cheaper to compute than to read."""
 
         def compute(key: Key) -> float:
             about = self.receipts.get(key) or self.store.about(key)
@@ -161,7 +162,7 @@ class Execution:
         return frozenset(cheaper_to_recompute(targets, self.sources, load, compute))
 
     def _reading(self, key: Key) -> float:
-        """Return the predicted seconds for reading a stored value."""
+        """Return the predicted seconds for reading a stored value; inf if the value is not stored."""
         about = self.store.about(key)
         return self.store.read_seconds(about["bytes"]) if about else float("inf")
 
@@ -180,14 +181,14 @@ class Execution:
             self._fetch(key)
 
     def _free(self, keys: Iterable[Key], uses: Counter[Key], keep: bool) -> None:
-        """Delete values after their last use."""
+        """Delete from memory the values that no step will use."""
         for key in keys:
             unsafe = key in self.own.later or (keep and not self.store.has(key))
             if uses[key] <= 0 and key in self.values and not unsafe:
                 del self.values[key]
 
     def _outcomes(self, plan: list[Key], again: frozenset[Key], targets: list[Key]) -> Iterator[Outcome]:
-        """Carry out the plan and record each outcome; the first failure stops the steps that have not begun."""
+        """Compute the plan and yield each outcome; after an error no further step begins."""
         works = [self._work(key, key in again, key in targets) for key in plan]
         self.costs = self.costs or past_costs(self.store)
         try:
@@ -220,7 +221,7 @@ class Execution:
         return self.keys[wire] if isinstance(wire, str) else wire and tuple(self.keys[name] for name in wire)
 
     def _begin(self, work: StepJob) -> StepJob:
-        """Report that a step begins, and add the seconds for obtaining its inputs again."""
+        """Report that a job begins, and return the job with the seconds for computing or reading its inputs again."""
         self.watch(Event(work.step.name, None))
         refetch = sum(self.again[key] if key in self.again else self._reading(key) for key in set(work.sources))
         unlocked = self.took.get(work.step.node.path, _QUICK) < _QUICK
@@ -245,7 +246,7 @@ class Execution:
         self._finish(ran(outcome, self._why(step.name, key), self._bound(step.name), self.began, predicted))
 
     def _fetch(self, key: Key) -> Any:
-        """Return a value from memory or the store; raise `InputMissing` where both lack the value."""
+        """Return a value from memory or from the store; raise `InputMissing` if neither has the value."""
         if key not in self.values:
             began = time.perf_counter()
             try:
@@ -266,25 +267,17 @@ class Execution:
         facts, bound, error = facts_in(about), self._bound(name), error_in(about)
         return StepRecord(name, "cached", why, seconds, key, facts, checks, "cpu", about["bytes"], bound, error=error)
 
-    def _judge(self, step: Step) -> SkipDecision:
-        """Return the decision on a step; compute an input first where the bound needs its unknown statistics."""
-
-        def facts_of(name: str) -> TensorStats | None:
-            key = self.keys[name]
-            if key not in self.facts and self.store.about(key) is None:
-                self.make([key], keep=True)
-            return self.known_facts(name)
-
-        return self.ledger.verdict(step, step.params, facts_of)
+    def _facts_of(self, name: str) -> TensorStats | None:
+        """Return the statistics of the result of a step, which is computed if no run computed the result before."""
+        key = self.keys[name]
+        if key not in self.facts and self.store.about(key) is None:
+            self.make([key], keep=True)
+        return self.known_facts(name)
 
     def known_facts(self, name: str) -> TensorStats | None:
-        """Return the statistics of a step's result from this run or an earlier run."""
+        """Return the statistics of the result of a step, from this run or from an earlier run."""
         key = self.keys[name]
         return self.facts[key] if key in self.facts else facts_in(self.store.about(key))
-
-    def _leave_out(self, step: Step, verdict: SkipDecision) -> None:
-        key = self.keys[step.name] = self.keys[verdict.instead]
-        self._finish(StepRecord(step.name, "left out", verdict.why, 0.0, key, bound=verdict.bound))
 
     def _why(self, name: str, key: Key) -> str:
         verdict = self.verdicts.get(name)

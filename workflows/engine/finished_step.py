@@ -1,4 +1,4 @@
-"""Records of finished steps: of one that was computed now, and what a stored result says of itself."""
+"""Records of finished steps, from an outcome of this run or from the metadata of a stored result."""
 
 from __future__ import annotations
 
@@ -13,19 +13,19 @@ if TYPE_CHECKING:
 
 
 def error_in(about: Mapping[str, Any] | None) -> tuple[float, float] | None:
-    """Return the approximation error that a stored result carries, or None."""
+    """Return the approximation error from the metadata of a stored result, or None."""
     found = (about or {}).get("error")
     return (float(found[0]), float(found[1])) if found else None
 
 
 def facts_in(about: Mapping[str, Any] | None) -> TensorStats | None:
-    """Return the statistics that a stored result carries, or None."""
+    """Return the statistics from the metadata of a stored result, or None."""
     found = (about or {}).get("facts")
     return TensorStats(**{**found, "shape": tuple(found["shape"])}) if found else None
 
 
 def ran(outcome: Outcome, why: str, bound: float | None, began: float, predicted: float | None) -> StepRecord:
-    """Return the record of a step computed in a run that started at ``began``."""
+    """Return the record of a step that was computed in the run that started at the time ``began``."""
     work = outcome.work
     return StepRecord(
         work.step.name,

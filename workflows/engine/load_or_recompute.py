@@ -1,10 +1,9 @@
-"""Load or recompute, whichever is cheaper: an exact choice by a minimum cut.
+"""Choice between loading and computing each value, at the lowest total time, by a minimum cut.
 
-Each value is either loaded, which costs the time of reading, or computed, which costs its seconds
-and requires its inputs. The cheapest choice for a whole graph is a minimum cut (Xin et al., Helix,
-PVLDB 12(4), 2018, section 5): ``have v`` and ``compute v`` are two nodes, loading is the edge
-between the two, computing is the edge to the sink, and an input that is required is an edge that
-is never cut.
+To load a value costs the time of reading. To compute a value costs the time of its step and requires
+its inputs. The cheapest choice for a whole graph is a minimum cut (Xin et al., Helix, PVLDB 12(4),
+2018, section 5): ``have v`` and ``compute v`` are two nodes, loading is the edge between the two,
+computing is the edge to the sink, and a required input is an edge that is never cut.
 """
 
 from __future__ import annotations
@@ -16,13 +15,13 @@ from neusee.workflows.graph.recipe_graph import in_order
 from neusee.workflows.keys.cache_key import Key
 
 _GAIN = 1e-3  #: s that recomputing a value must save before the cut is solved
-_SCALE = 1 << 30  #: capacities are integers of 31 bits
+_SCALE = 1 << 30  #: the sum of all finite prices as integer capacity, less than an edge that is never cut
 
 Price = Callable[[Key], float]
 
 
 class Upstream(dict[Key, list[Key]]):
-    """Keys by the key that needs them: the sources of a value to compute, none for a known value."""
+    """Dictionary from a key to the keys of its sources; a known value, which is not computed, has no sources."""
 
     def __init__(self, known: Callable[[Key], bool], sources: Callable[[Key], list[Key]]) -> None:
         self._known, self._sources = known, sources
@@ -40,7 +39,7 @@ class Upstream(dict[Key, list[Key]]):
 def uses_of(
     plan: Iterable[Key], targets: Sequence[Key], known: Callable[[Key], bool], sources: Callable[[Key], list[Key]]
 ) -> Counter[Key]:
-    """Return how often each value is read for ``plan``, ``targets`` and the values yet to be computed for them."""
+    """Return how often each value is read to compute ``plan``, ``targets`` and the values that these need."""
     below, uses = Upstream(known, sources), Counter(targets)
     in_order(below, targets)
     for key in below.missing.union(plan):
@@ -49,7 +48,7 @@ def uses_of(
 
 
 def worth_solving(load: float, compute: float) -> bool:
-    """Return True if a stored value may be cheaper to compute than to load."""
+    """Return True if computing a stored value saves time, given the seconds of loading and of computing."""
     return load > compute + _GAIN
 
 
@@ -60,25 +59,15 @@ def cheaper_to_recompute(
 
     ``load`` returns inf for a value that is not stored, and 0 for a value in memory.
     """
-    reach = _reached(targets, sources)
+    reach = in_order(Upstream(lambda key: False, lambda key: list(sources(key))), targets)
     computed = _smallest_cut(targets, reach, sources, load, compute)
     return {key for key in computed if load(key) < float("inf")}
-
-
-def _reached(targets: Iterable[Key], sources: Callable[[Key], Sequence[Key]]) -> list[Key]:
-    seen, todo = dict[Key, None](), list(targets)
-    while todo:
-        key = todo.pop()
-        if key not in seen:
-            seen[key] = None
-            todo += sources(key)
-    return list(seen)
 
 
 def _smallest_cut(
     targets: Sequence[Key], keys: Sequence[Key], sources: Callable[[Key], Sequence[Key]], load: Price, compute: Price
 ) -> set[Key]:
-    """Return the keys whose ``compute`` node lies on the source's side of the minimum cut."""
+    """Return the keys to compute: their ``compute`` nodes are on the source's side of the minimum cut."""
     import numpy as np
     from scipy.sparse import csr_array
     from scipy.sparse.csgraph import breadth_first_order, maximum_flow
@@ -86,7 +75,8 @@ def _smallest_cut(
     number = {key: i for i, key in enumerate(keys)}
     source, sink, never = 2 * len(keys), 2 * len(keys) + 1, 2**31 - 1
     edges = [(source, 2 * number[key], never) for key in dict.fromkeys(targets)]
-    unit = _unit(keys, load, compute)
+    prices = [price(key) for key in keys for price in (load, compute)]
+    unit = max(sum(price for price in prices if price < float("inf")), 1e-9) / _SCALE  # s in one unit of capacity
     for key in keys:
         have, make = 2 * number[key], 2 * number[key] + 1
         edges.append((have, make, _whole(load(key), unit)))
@@ -99,12 +89,6 @@ def _smallest_cut(
     rest.eliminate_zeros()
     reached = set(breadth_first_order(rest, source, return_predecessors=False).tolist())
     return {key for key in keys if 2 * number[key] + 1 in reached}
-
-
-def _unit(keys: Sequence[Key], load: Price, compute: Price) -> float:
-    """Return the s in one unit of capacity, so that the sum of all finite prices stays below an uncuttable edge."""
-    total = sum(price(key) for key in keys for price in (load, compute) if price(key) < float("inf"))
-    return max(total, 1e-9) / _SCALE
 
 
 def _whole(seconds: float, unit: float) -> int:

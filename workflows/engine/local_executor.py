@@ -1,6 +1,6 @@
-"""Executor in this process: one thread for each device, or no thread where there is one device.
+"""Executor in this process: one thread for each device, or the thread of the caller if there is one device.
 
-``cpu:0,cpu:1`` are two lanes of one CPU, which helps where steps are too small to fill its cores.
+``cpu:0,cpu:1`` are two lanes of one CPU, so that two small steps run at the same time.
 """
 
 from __future__ import annotations
@@ -23,13 +23,13 @@ _SHARE = 0.9  #: fraction of a device's memory that a plan may use
 
 
 def lanes_of(devices: Sequence[str], memory: int | None = None) -> dict[str, Lane]:
-    """Return one lane for each device; lanes that use the same memory share its planned part."""
+    """Return one lane for each device; lanes of the same memory share the bytes that a plan may use."""
     pools = [pool_of(device) for device in devices]
     return {d: Lane(d, (memory or _SHARE * there_is(d)) / pools.count(pool_of(d))) for d in devices}
 
 
 class Local:
-    """An `Executor` in this process. With one device the work is done in `wait`, in the thread of the caller."""
+    """An `Executor` in this process; with one device, `wait` computes the steps in the thread of the caller."""
 
     shares = True
 
@@ -44,15 +44,15 @@ class Local:
         self._running: set[Future[Outcome]] = set()
 
     def submit(self, work: Sequence[StepJob]) -> None:
-        """Queue the steps of ``work``."""
-        for one in work:
+        """Add the jobs to the queue, or start them in the threads of their lanes."""
+        for job in work:
             if len(self.lanes) == 1:
-                self._queue.append(one)
+                self._queue.append(job)
             else:
-                self._running.add(self._pool(one.lane).submit(carry_out, one, self._fetch, self._store, self.later))
+                self._running.add(self._pool(job.lane).submit(carry_out, job, self._fetch, self._store, self.later))
 
     def wait(self, seconds: float | None = None) -> list[Outcome]:
-        """Carry out the next step, or wait until a thread ends one."""
+        """Return the outcome of the next job in the queue, or wait for the outcomes of jobs in threads."""
         if self._queue:
             return [carry_out(self._queue.popleft(), self._fetch, self._store, self.later)]
         if not self._running:
@@ -61,7 +61,7 @@ class Local:
         return [future.result() for future in done]
 
     def cancel(self) -> None:
-        """Drop the steps that have not begun, let running steps end, and write all results that are to be kept."""
+        """Drop the jobs that have not begun, wait for the running jobs, and finish the writes of results."""
         self._queue.clear()
         for pool in self._pools.values():
             pool.shutdown(wait=True, cancel_futures=True)
@@ -76,7 +76,7 @@ class Local:
 
 @contextmanager
 def one_thread() -> Iterator[None]:
-    """Run a block of code on one thread of torch: small work ends before other threads wake up."""
+    """Run a block of code on one thread of torch, which is faster for small tensors."""
     before = torch.get_num_threads()
     torch.set_num_threads(1)
     try:

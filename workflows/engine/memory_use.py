@@ -1,4 +1,4 @@
-"""Memory use: peak memory of a step, and memory of a device."""
+"""Memory use: the peak memory of a step, and the memory of a device."""
 
 from __future__ import annotations
 
@@ -13,10 +13,10 @@ _CGROUPS = ("/sys/fs/cgroup/memory.max", "/sys/fs/cgroup/memory/memory.limit_in_
 
 
 class PeakMemory:
-    """Peak bytes of a block of code, beside the memory in use before the block.
+    """Peak memory of a block of code in bytes, less the memory in use before the block.
 
-    On the CPU this is the resident memory of the whole process, so that parallel steps count for
-    each other; ``bytes`` is None where the system gives no numbers.
+    On the CPU this is the resident memory of the whole process, parallel steps included. ``bytes`` is
+    None if the system gives no numbers.
     """
 
     def __init__(self, device: str, watched: bool = True) -> None:
@@ -31,7 +31,7 @@ class PeakMemory:
             torch.cuda.reset_peak_memory_stats(self.device)
             self._before = torch.cuda.memory_allocated(self.device)
         elif self.device.startswith("cpu"):
-            self._before = _resident("VmRSS:") if _forgotten() else None
+            self._before = _resident("VmRSS:") if _peak_reset() else None
         return self
 
     def __exit__(self, *error: object) -> None:
@@ -44,12 +44,12 @@ class PeakMemory:
 
 
 def pool_of(device: str) -> str:
-    """Return the name of the memory that a device uses, which all lanes of the CPU share."""
+    """Return the name of the memory of a device; all lanes of the CPU have the same memory."""
     return "cpu" if device.startswith("cpu") else device
 
 
-def _forgotten() -> bool:
-    """Reset the peak memory of this process; return False where the system does not allow the reset."""
+def _peak_reset() -> bool:
+    """Reset the peak memory of this process; return False if the system does not allow the reset."""
     try:
         with open("/proc/self/clear_refs", "w") as file:
             file.write("5")
@@ -67,7 +67,7 @@ def _resident(field: str) -> int | None:
 
 
 def there_is(device: str) -> int:
-    """Return the bytes of memory of a device, or on the CPU the bytes that this process may use."""
+    """Return the bytes of memory of a GPU, or on the CPU the bytes that this process may use."""
     if device.startswith("cuda"):
         return int(torch.cuda.get_device_properties(device).total_memory)
     found = os.sysconf("SC_PAGE_SIZE") * os.sysconf("SC_PHYS_PAGES")

@@ -1,4 +1,4 @@
-"""Call of one step's node, on its device and with its random stream; an error names the step and its place."""
+"""Call of the node of a step, on the device of the step and with its random stream."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from neusee.workflows.store.serialization import each_tensor, settle, tensors_in
 
 
 def call(step: Step, inputs: Sequence[Any], params: Mapping[str, Any], seed: int, device: str) -> Any:
-    """Return the result of a step, laid out as the store would return it; gradients are kept."""
+    """Return the result of a step, in the memory layout of a stored result; gradients are kept."""
     moved = [to_device(value, device) for value in inputs]
     rng = {"rng": torch.Generator(device).manual_seed(stream_seed(seed, step.name))} if step.node.random else {}
     tensors = tensors_in(moved)
@@ -30,7 +30,7 @@ def call(step: Step, inputs: Sequence[Any], params: Mapping[str, Any], seed: int
 
 
 def examine(step: Step, value: Any, inputs: Sequence[Any]) -> tuple[Check, ...]:
-    """Return the results of the node's own check; a check that raises counts as failed."""
+    """Return the results of the checks of a node; a check that raises an error counts as failed."""
     if step.node.hooks.check is None:
         return ()
     try:
@@ -40,27 +40,28 @@ def examine(step: Step, value: Any, inputs: Sequence[Any]) -> tuple[Check, ...]:
 
 
 def place(step: Step, device: str) -> str:
-    """Return the preferred device of a step among the devices that commas separate."""
+    """Return the preferred device of a step among ``device``, names of devices separated by commas."""
     return places(step, device.split(","))[0]
 
 
 def places(step: Step, devices: Sequence[str]) -> tuple[str, ...]:
     """Return the devices on which a step may run, the preferred device first.
 
-    The recipe's hint precedes the hint of the node. A random step stays on one kind of device, because
-    its random stream, and so its key, depends on that kind.
+    The hint of the recipe precedes the hint of the node. A random step stays on one kind of device,
+    because its random stream and its key depend on the kind of device.
     """
     hint = step.device or step.node.device
     if hint == "cpu":
         return ("cpu",)
-    fits = [d for d in devices if _fits(d, hint)] or list(devices)
-    return tuple(d for d in fits if not step.node.random or device_kind(d) == device_kind(fits[0]))
+    allowed = [d for d in devices if fits(d, device_kind(d), hint)] or list(devices)
+    return tuple(d for d in allowed if not step.node.random or device_kind(d) == device_kind(allowed[0]))
 
 
-def _fits(device: str, hint: str) -> bool:
+def fits(device: str, kind: str, hint: str) -> bool:
+    """Return True if the hint of a step, such as ``cpu``, ``gpu`` or ``cuda:1``, allows a device of this kind."""
     if hint in ("any", ""):
         return True
-    return device_kind(device) != "cpu" if hint == "gpu" else device == hint or device_kind(device) == hint
+    return kind != "cpu" if hint == "gpu" else hint in (kind, device)
 
 
 def to_device(value: Any, device: str) -> Any:

@@ -1,4 +1,4 @@
-"""Inputs of the placement: from the steps to run, their predicted costs, lanes and memory."""
+"""Inputs of the placement of steps on devices: predicted costs, possible devices and memory."""
 
 from __future__ import annotations
 
@@ -16,12 +16,12 @@ from neusee.workflows.placement.heft_and_cpop import Cluster, Device, Schedule, 
 from neusee.workflows.store.result_store import Store
 from neusee.workflows.store.serialization import tensors_in
 
-_MOST_PARTS = 64  #: upper bound on the parts of a step cut by bands; the number of bands is known when the step runs
+MOST_PARTS = 64  #: upper bound on the parts of a step cut by bands; the number of bands is known when the step runs
 
 
 @dataclass(frozen=True, slots=True)
 class Prepared:
-    """Work in the order in which to begin, its predicted costs, and the schedule."""
+    """Jobs in the order in which they begin, their predicted costs, and the schedule."""
 
     works: list[StepJob]
     expected: Mapping[Key, Estimate]
@@ -35,7 +35,7 @@ def prepare(
     lanes: Mapping[str, Lane],
     keep: Collection[Key],
 ) -> Prepared:
-    """Return the work with a lane and a device for every step. Raises `TooLarge` where the memory is too small."""
+    """Return the jobs with a lane and a device each; raise `TooLarge` if the memory is too small."""
     kinds = sorted({lane.kind for lane in lanes.values()} | {"cpu"})
     expected = {w.key: costs.of(w.step, kinds, abouts.get(w.key)) for w in works}
     only, lane = next(iter(lanes.items()))
@@ -53,7 +53,7 @@ def prepare(
 
 
 def room_for(expected: Mapping[Key, Estimate], executor: Executor, values: Mapping[Key, Any]) -> MemoryProfile:
-    """Return a function that tells if one more step fits beside the running steps and the present ``values``."""
+    """Return a function that returns True if one more job fits into memory beside running jobs and ``values``."""
 
     def room(work: StepJob, running: Sequence[StepJob]) -> bool:
         pool = pool_of(work.device)
@@ -68,7 +68,7 @@ def room_for(expected: Mapping[Key, Estimate], executor: Executor, values: Mappi
 
 
 def joined(first: Schedule | None, then: Schedule | None) -> Schedule | None:
-    """Return one schedule after the other; a run whose decisions need values makes several schedules."""
+    """Return the schedule ``first``, followed by the schedule ``then``."""
     if first is None or then is None:
         return first or then
     by = first.makespan
@@ -86,30 +86,27 @@ def _placed(work: StepJob, slot: Slot, lanes: Mapping[str, Lane]) -> StepJob:
 
 def _task(work: StepJob, estimate: Estimate, lanes: Mapping[str, Lane], names: Mapping[Key, str]) -> Task:
     if _cpu_only(work):
-        seconds = {name: estimate.seconds["cpu"] for name in _of_kind("cpu", lanes) or lanes}
+        on_cpu = [name for name, lane in lanes.items() if lane.kind == "cpu"]
+        seconds = {name: estimate.seconds["cpu"] for name in on_cpu or lanes}
     else:
         allowed = places(work.step, [lane.device for lane in lanes.values()])
         here = {name: lane for name, lane in lanes.items() if lane.device in allowed}
         seconds = {name: estimate.seconds[lane.kind] for name, lane in here.items()}
     sources = tuple(dict.fromkeys(names[key] for key in work.sources if key in names))
-    parts = _MOST_PARTS if work.step.node.bands else 1
+    parts = MOST_PARTS if work.step.node.bands else 1
     return Task(work.step.name, sources, seconds, estimate.bytes, estimate.work, parts)
 
 
 def _cpu_only(work: StepJob) -> bool:
-    """Return True if a step computes on the CPU of any lane; the key of a random step fixes its kind of device."""
+    """Return True if a step computes on the CPU whatever its lane; the key of a random step fixes the device kind."""
     hint = work.step.device or work.step.node.device
     return hint == "cpu" or (work.step.node.random and work.device == "cpu")
-
-
-def _of_kind(kind: str, lanes: Mapping[str, Lane]) -> list[str]:
-    return [name for name, lane in lanes.items() if lane.kind == kind]
 
 
 def _one_after_another(
     works: Sequence[StepJob], expected: Mapping[Key, Estimate], lane: str, keep: Collection[Key]
 ) -> Schedule:
-    """Return the schedule of the works in their order, where each result is freed after its last use."""
+    """Return the schedule of the jobs in the given order on one lane; each result is freed after its last use."""
     last = {key: work.key for work in works for key in work.sources}
     now, held, most, slots = 0.0, 0.0, 0.0, []
     for work in works:
@@ -124,5 +121,5 @@ def _one_after_another(
 
 
 def past_costs(store: Store) -> Costs:
-    """Return the costs of all results that a store remembers."""
+    """Return the costs of all results in the journal of a store."""
     return Costs(store.journal.rows())

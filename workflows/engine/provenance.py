@@ -1,4 +1,4 @@
-"""The machine, the versions of the libraries and the time at which a result was made."""
+"""Provenance of a result: the machine, the versions of the libraries, and the time."""
 
 from __future__ import annotations
 
@@ -13,21 +13,24 @@ import torch
 
 @functools.cache
 def versions() -> dict[str, str]:
-    """Return the versions of Python and of the libraries that compute; they stand beside a result, not in its key."""
-    found = {"python": platform.python_version()}
-    for name in ("neusee", "torch", "kornia", "colour-science", "OpenEXR"):
-        try:
-            found[name] = version(name)
-        except PackageNotFoundError:
-            found[name] = "none"
-    return found
+    """Return the versions of Python and of the libraries that compute; no key depends on the versions."""
+    libraries = ("neusee", "torch", "kornia", "colour-science", "OpenEXR")
+    return {"python": platform.python_version(), **{name: version_of(name) or "none" for name in libraries}}
+
+
+def version_of(package: str) -> str:
+    """Return the version of an installed package, or an empty string if the package is not installed."""
+    try:
+        return version(package)
+    except PackageNotFoundError:
+        return ""
 
 
 def machine() -> Sequence[str]:
-    """Return what a measured time depends on: the machine, its threads and the versions of the libraries."""
+    """Return the machine, its number of threads and the versions of the libraries, on which a run time depends."""
     return [platform.node(), platform.machine(), str(torch.get_num_threads()), *versions().values()]
 
 
 def timestamp() -> str:
-    """Return the time now, in UTC, to the second."""
+    """Return the present time in UTC, to the second, in ISO format."""
     return datetime.now(UTC).isoformat(timespec="seconds")

@@ -1,4 +1,4 @@
-"""Resolution of keys: the keys that a run would give the steps of a recipe, without running a step."""
+"""Resolution of keys: the key of each step of a recipe in a run, without computing a step."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ from neusee.workflows.tolerance.skip_decision import SkipDecision
 
 @dataclass(frozen=True, slots=True)
 class Resolved:
-    """Keys, their origins, and the decisions on the steps that may be left out."""
+    """Keys of steps, the parts of each key, and the decisions on the steps that may be left out."""
 
     keys: dict[str, Key] = field(default_factory=dict)
     origins: dict[Key, Mapping[str, Any]] = field(default_factory=dict)
@@ -28,19 +28,19 @@ class Resolved:
     verdicts: dict[str, SkipDecision | None] = field(default_factory=dict)  #: None where statistics are missing
 
     def left_out(self, name: str) -> bool | None:
-        """Return whether a step is left out; None, which counts as run, where only its inputs can decide."""
+        """Return True if a step is left out, False if it runs, and None if only the values of its inputs can decide."""
         verdict = self.verdicts.get(name)
         return None if verdict is None and name in self.verdicts else verdict is not None and verdict.left_out
 
     def stands_for(self, name: str) -> str:
-        """Return the step whose result a step passes on: the step itself, unless it is left out."""
+        """Return the step itself, or the upstream step whose result replaces the result of a step that is left out."""
         while (verdict := self.verdicts.get(name)) is not None and verdict.left_out:
             name = verdict.instead
         return name
 
 
 def resolve(recipe: Recipe, order: Iterable[str], store: Store, device: str = "cpu") -> Resolved:
-    """Return the key of each step of ``order`` (sources first) as a run on ``device`` would compute it."""
+    """Return the key of each step of ``order``, which has sources first, in a run on ``device``."""
     found, code, ledger = Resolved(), Code(store.code_memo), ErrorBudget(recipe)
 
     def facts_of(name: str) -> TensorStats | None:

@@ -1,4 +1,4 @@
-"""Run of a recipe: walk back from the wanted outputs, stop at known results, compute the rest."""
+"""Run of a recipe: the search goes upstream from the wanted outputs to stored results, and the rest is computed."""
 
 from __future__ import annotations
 
@@ -22,14 +22,12 @@ from neusee.workflows.store.result_store import Store
 from neusee.workflows.tolerance.cheaper_steps import with_substitutions
 from neusee.workflows.tolerance.error_propagation import ErrorBounds, ToleranceNotProven, proof, tolerance_frontier
 
-__all__ = ["Event", "Result", "StepRecord", "run"]
-
-_SAFE = 0.8  #: fraction of the just sufficient tolerance scale that a second attempt uses
+_SAFE = 0.8  #: tolerance scale of a second attempt over the largest scale that would suffice
 
 
 @dataclass(frozen=True, repr=False)
 class Result:
-    """Result of a run: the requested values, and a record of every step that they need."""
+    """Result of a run: the wanted values, and a record of every step upstream of these values."""
 
     values: dict[str, Any]
     done: dict[str, StepRecord]
@@ -40,12 +38,10 @@ class Result:
     store: Store
     device: str = "cpu"
     schedule: Schedule | None = None  #: predicted times of the steps that ran
-    proof: ErrorBounds = field(
-        default_factory=ErrorBounds
-    )  #: upper bounds on the errors of omitted and approximated steps, at each step
+    proof: ErrorBounds = field(default_factory=ErrorBounds)  #: error bounds of the steps
 
     def value(self, step: str) -> Any:
-        """Return the value of any step of the recipe: from this run, from the store, or computed now."""
+        """Return the value of any step of the recipe; the value is read from the store or computed if necessary."""
         if step in self.values:
             return self.values[step]
         return run(self.recipe, self.store, (step,), device=self.device).values[step]
@@ -53,7 +49,7 @@ class Result:
     __getitem__ = value
 
     def numpy(self, step: str) -> Any:
-        """Return the value of a step with a numpy array in place of every tensor."""
+        """Return the value of a step with a NumPy array in place of every tensor."""
         from neusee.workflows.report.notebook import arrays_of
 
         return arrays_of(self.value(step))
@@ -61,7 +57,7 @@ class Result:
     def metrics(self) -> dict[str, float | list[float]]:
         """Return every figure of merit that ``neusee run`` prints, such as ``restored_quality.psnr``.
 
-        A figure of each band is a list. A figure that this run did not need is read from the store, or computed now.
+        A figure of each band is a list. A figure that this run did not need is read from the store or computed.
         """
         from neusee.workflows.report.notebook import numbers_of
 
@@ -87,11 +83,12 @@ def run(
     executor: Executor | None = None,
     memory: int | None = None,
 ) -> Result:
-    """Return the values of ``outputs`` (the recipe's own, if None); compute what ``store`` does not hold.
+    """Return the values of the steps ``outputs``; compute each value that ``store`` does not hold.
 
-    Args: device: one or several, ``cuda:0,cuda:1,cpu``, the preferred one first. executor: where to
-    compute instead of this process. memory: bytes of each device that a plan may use; nine tenths
-    of its memory if None. Raises `RunError`, which names the step.
+    Args: outputs: if None, the outputs of the recipe. device: one or several devices, such as
+    ``cuda:0,cuda:1,cpu``, the preferred device first. executor: computes the steps in place of this process.
+    memory: bytes of each device that a plan may use; if None, nine tenths of its memory.
+    Raises `RunError`, which names the step.
     """
     began = time.perf_counter()
     wanted = recipe.outputs if outputs is None else tuple(outputs)
@@ -104,19 +101,15 @@ def run(
         try:
             return _attempt(work, wanted, began)
         except ToleranceNotProven as failed:
-            recipe = with_substitutions(_stricter(recipe, failed.over), wanted)
+            scale = _SAFE / failed.over if recipe.tolerance_scale == 1.0 else 0.0  # a third attempt is exact
+            stricter = replace(recipe.unsubstituted or recipe, tolerance_scale=scale, exact=scale == 0.0)
+            recipe = with_substitutions(stricter, wanted)
         finally:
             work.close()
 
 
-def _stricter(recipe: Recipe, over: float) -> Recipe:
-    """Return the recipe with a smaller tolerance scale after a failed proof; 0 (exact) after the second."""
-    scale = _SAFE / over if recipe.tolerance_scale == 1.0 else 0.0
-    return replace(recipe.unsubstituted or recipe, tolerance_scale=scale, exact=scale == 0.0)
-
-
 def _attempt(work: Execution, wanted: tuple[str, ...], began: float) -> Result:
-    """Run the recipe, first as far as the proof of its tolerance needs; raise `ToleranceNotProven` if that fails."""
+    """Run the recipe; raise `ToleranceNotProven` if its errors cannot be proved to be within the tolerance."""
     recipe, store = work.recipe, work.store
     order = needed(recipe, wanted)
     with torch.no_grad():

@@ -1,15 +1,15 @@
-"""Job of one step: the step with the keys of its inputs, and the outcome.
+"""Job of one step: the step with the keys of its inputs, and the outcome of the job.
 
-A job carries keys and parameters and never a tensor, so that this process or another one can
-carry it out. The cost of a value decides whether the store keeps the value.
+A job contains keys and parameters but no tensor, so that any process can compute the step. The cost
+of a value decides whether the store keeps the value.
 """
 
 from __future__ import annotations
 
 import time
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, field, fields
-from datetime import UTC, datetime
+from dataclasses import asdict, dataclass
+from functools import partial
 from typing import Any, Protocol
 
 import torch
@@ -18,7 +18,7 @@ from neusee.nodes import Check, TensorStats
 from neusee.workflows.engine.band_results import call_by_band, plain_of
 from neusee.workflows.engine.memory_use import PeakMemory
 from neusee.workflows.engine.node_call import call, examine
-from neusee.workflows.engine.provenance import versions
+from neusee.workflows.engine.provenance import timestamp, versions
 from neusee.workflows.engine.write_behind import LARGE, WriteBehind
 from neusee.workflows.graph.recipe_graph import Step
 from neusee.workflows.graph.run_error import RunError
@@ -30,17 +30,16 @@ from neusee.workflows.store.serialization import pack, tensors_in
 
 Read = Key | tuple[Key, ...] | None  #: content of one input: one value, a list of values, or nothing
 Fetch = Callable[[Key], Any]
-_FACTS = tuple(f.name for f in fields(TensorStats))
 _WATCHED = 1 << 20  #: bytes of inputs from which the memory of a step is measured
 
 
 class InputMissing(Exception):
-    """A stored result is damaged or gone when it is read: the run plans again without that result."""
+    """Error for a stored result that is damaged or gone when it is read; the run then makes a new plan."""
 
 
 @dataclass(frozen=True, slots=True)
 class StepJob:
-    """A step to be carried out."""
+    """A step to compute, with the keys of its inputs."""
 
     step: Step
     key: Key
@@ -50,21 +49,21 @@ class StepJob:
     recipe: str
     device: str  #: device of the computation: ``cpu``, ``cuda:1``
     lane: str  #: lane of the executor
-    wanted: bool = False  #: whether the result is requested, and so is kept whatever its cost
+    wanted: bool = False  #: True if the result is requested, and therefore kept whatever its cost
     unlocked: bool = False  #: compute without a lease, because the node takes so little time
-    recompute: bool = False  #: whether to compute a stored result because computing is faster than reading
+    recompute: bool = False  #: True to compute a stored result because computing is faster than reading
     refetch_seconds: float = 0.0  #: s to obtain the inputs again if this result is not kept
     parts: int = 1  #: number of passes over the bands, for less memory
 
     @property
     def sources(self) -> tuple[Key, ...]:
-        """Return every key that the job reads."""
+        """Return the keys of all values that the job reads."""
         return tuple(k for read in self.reads for k in ((read,) if isinstance(read, str) else read or ()))
 
 
 @dataclass(slots=True)
 class Outcome:
-    """Outcome of a job."""
+    """Outcome of a job: the value and its costs, or the reason why there is no value."""
 
     work: StepJob
     value: Any = None  #: None where another process computed the value
@@ -80,12 +79,12 @@ class Outcome:
     held: bool = False  #: another process computes this key
     found: bool = False  #: another process has already stored this result
     error: BaseException | None = None
-    lost: tuple[Key, ...] = field(default=())  #: inputs that could not be read
+    lost: tuple[Key, ...] = ()  #: inputs that could not be read
 
 
 @dataclass(frozen=True, slots=True)
 class Lane:
-    """A place that carries out one job at a time."""
+    """A device or worker that computes one job at a time."""
 
     device: str
     memory: float  #: bytes that a plan may use
@@ -97,7 +96,7 @@ class Lane:
 
 
 class Executor(Protocol):
-    """Interface of an executor, three calls wide, so that another engine can be added."""
+    """Interface of an executor, which computes jobs in this process or on a cluster."""
 
     @property
     def lanes(self) -> Mapping[str, Lane]:
@@ -105,20 +104,20 @@ class Executor(Protocol):
 
     @property
     def shares(self) -> bool:
-        """Return True if values stay in this process; otherwise they pass through the store by key."""
+        """Return True if values stay in this process, and False if steps exchange values through the store."""
 
     def submit(self, work: Sequence[StepJob]) -> None:
-        """Begin with ``work``, steps of one lane of which each feeds the next."""
+        """Start jobs of one lane, of which each feeds the next job."""
 
     def wait(self, seconds: float | None = None) -> list[Outcome]:
-        """Return the outcomes since the last call; at least one, unless no job runs or the time is over."""
+        """Return the outcomes since the last call; wait for an outcome while a job runs, at most ``seconds``."""
 
     def cancel(self) -> None:
-        """Begin with no further job, and wait for the running jobs."""
+        """Start no further job, and wait for the running jobs."""
 
 
 def carry_out(work: StepJob, fetch: Fetch, store: Store, later: WriteBehind | None = None) -> Outcome:
-    """Compute one step and store the result if that pays, perhaps ``later``; return a failure in the outcome."""
+    """Compute one step and store its result if storing saves time; return an error as part of the outcome."""
     if work.unlocked:
         return _carried_out(work, fetch, store, None, Lease())
     lease = store.claim(work.key)
@@ -137,7 +136,7 @@ def carry_out(work: StepJob, fetch: Fetch, store: Store, later: WriteBehind | No
 
 def _carried_out(work: StepJob, fetch: Fetch, store: Store, later: WriteBehind | None, lease: Lease) -> Outcome:
     try:
-        inputs = [_gathered(read, fetch) for read in work.reads]
+        inputs = [gathered(read, fetch) for read in work.reads]
     except InputMissing as error:
         return Outcome(work, lost=error.args)
     try:
@@ -146,29 +145,24 @@ def _carried_out(work: StepJob, fetch: Fetch, store: Store, later: WriteBehind |
         return Outcome(work, error=error)
 
 
-def _gathered(read: Read, fetch: Fetch) -> Any:
+def gathered(read: Read, fetch: Fetch) -> Any:
+    """Return the value of one input: one value, a list of values, or None for an absent input."""
     if read is None or isinstance(read, str):
         return None if read is None else fetch(read)
     return [fetch(key) for key in read]
 
 
 def _computed(work: StepJob, inputs: list[Any], store: Store) -> Outcome:
-    """Return the value, its statistics and its cost."""
+    """Return the value of a step with its statistics, checks and costs."""
     step = work.step
+    evaluate = partial(call, step, params=step.params, seed=work.seed, device=work.device)
     began, clock = time.time(), time.perf_counter()
     size = sum(t.nbytes for t in tensors_in(inputs))
     with PeakMemory(work.device, size >= _WATCHED or not inputs) as peak, torch.no_grad():
         if step.node.bands and (work.parts > 1 or work.device.startswith("cpu")):
-            value = call_by_band(
-                step,
-                inputs,
-                lambda given: call(step, given, step.params, work.seed, work.device),
-                work.origin["code"],
-                store.blobs,
-                work.parts,
-            )
+            value = call_by_band(step, inputs, evaluate, work.origin["code"], store.blobs, work.parts)
         else:
-            value = call(step, inputs, step.params, work.seed, work.device)
+            value = evaluate(inputs)
         bare = plain_of(value)
         checks = examine(step, bare, inputs)
     seconds = time.perf_counter() - clock
@@ -180,7 +174,7 @@ def _computed(work: StepJob, inputs: list[Any], store: Store) -> Outcome:
 
 
 def _kept(outcome: Outcome, store: Store, later: WriteBehind | None, lease: Lease) -> Outcome:
-    """Store the value where that pays, and its metadata in any case."""
+    """Store the metadata of an outcome, and the value too if reading is cheaper than computing."""
     work, value, about = outcome.work, outcome.value, _about(outcome)
     small = outcome.bytes <= INLINE
     try:
@@ -206,7 +200,7 @@ def _written(store: Store, key: Key, value: Any, about: dict[str, Any], lease: L
 
 
 def _pays(outcome: Outcome, store: Store, size: int) -> bool:
-    """Return True if computing the result again costs more than writing ``size`` bytes now and reading them once."""
+    """Return True if computing a result again takes longer than writing and reading ``size`` bytes."""
     return outcome.seconds + outcome.work.refetch_seconds > store.write_seconds(size) + store.read_seconds(size)
 
 
@@ -216,7 +210,7 @@ def _about(outcome: Outcome) -> dict[str, Any]:
         "step": work.step.name,
         "recipe": work.recipe,
         "origin": dict(work.origin),
-        "facts": outcome.facts and {name: getattr(outcome.facts, name) for name in _FACTS},
+        "facts": outcome.facts and asdict(outcome.facts),
         "checks": [[check.text, check.ok] for check in outcome.checks],
         "seconds": outcome.seconds,
         "bytes": outcome.bytes,
@@ -224,8 +218,5 @@ def _about(outcome: Outcome) -> dict[str, Any]:
         "error": outcome.deviation,
         "device": work.device,
         "versions": versions(),
-        "date": datetime.now(UTC).isoformat(timespec="seconds"),
+        "date": timestamp(),
     }
-
-
-__all__ = ["Executor", "Fetch", "InputMissing", "Lane", "Outcome", "Read", "StepJob", "carry_out"]

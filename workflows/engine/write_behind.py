@@ -1,6 +1,6 @@
-"""Writes of large results while the next steps compute.
+"""Writes of large results in the background, while the next steps compute.
 
-A run ends after all writes. A waiting result stays in memory and keeps its lease, so that another
+A run ends after all writes. A result that waits stays in memory and keeps its lease, so that another
 process that needs the same result finds either the lease or the result.
 """
 
@@ -16,13 +16,13 @@ from typing import Any
 
 from neusee.workflows.keys.cache_key import Key
 
-LARGE = 1 << 20  #: bytes from which a result is written during the next step
+LARGE = 1 << 20  #: bytes; a larger result is written during the next step
 _ROOM = 1 << 29  #: bytes that may wait; a larger result waits alone
-_NICE = 10
+_NICE = 10  #: priority of the writing thread, from 0 (normal) to 19 (lowest)
 
 
 class WriteBehind:
-    """Pending writes, carried out one at a time."""
+    """Pending writes of results, one at a time in the background."""
 
     def __init__(self) -> None:
         self._pool: ThreadPoolExecutor | None = None
@@ -31,15 +31,14 @@ class WriteBehind:
         self._guard = threading.Lock()
 
     def __contains__(self, key: Key) -> bool:
-        """Return True if a result still waits to be written."""
         return key in self._sizes
 
     def add(self, key: Key, size: int, write: Callable[[], Any]) -> None:
-        """Queue a write; wait for earlier writes where ``size`` more bytes would exceed the limit."""
+        """Start a write in the background; wait for earlier writes if too many bytes would be pending."""
         while self._sizes and sum(list(self._sizes.values())) + size > _ROOM:
             wait([self._writes[key] for key in list(self._sizes) if key in self._writes], return_when=FIRST_COMPLETED)
         with self._guard:
-            self._pool = self._pool or ThreadPoolExecutor(1, "neusee store", _yielding)
+            self._pool = self._pool or ThreadPoolExecutor(1, "neusee store", _lower_priority)
             self._sizes[key] = size
             self._writes[key] = self._pool.submit(self._write, key, write)
 
@@ -60,8 +59,8 @@ class WriteBehind:
             del self._sizes[key]
 
 
-def _yielding() -> None:
-    """Lower the priority of the writing thread, so that the computing threads, which wait for each other, run first."""
+def _lower_priority() -> None:
+    """Lower the priority of the writing thread, so that the computing threads run first."""
     if sys.platform == "linux":  # elsewhere: the whole process; new threads inherit it
         with suppress(OSError):
             os.setpriority(os.PRIO_PROCESS, threading.get_native_id(), _NICE)

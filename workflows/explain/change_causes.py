@@ -1,12 +1,12 @@
-"""Causes of a change: the differences between a result and an earlier one, at a step and upstream of it.
+"""Causes of a change: the differences between a new and an earlier result of a step, and upstream of the step.
 
-A pair is a present result and a past one. Pairs are compared by the parts of their keys, so that
-no tensor is read and no step need have run. The search goes from a pair to the pairs of its
-inputs whose keys differ.
+A pair is a new and an earlier result. The two results are compared by the parts of their keys, so that no
+tensor is read. The search goes from a pair to the pairs of its inputs whose keys differ.
 """
 
 from __future__ import annotations
 
+import functools
 from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any, NamedTuple
@@ -19,30 +19,30 @@ from neusee.workflows.keys.cache_key import Key
 from neusee.workflows.store.result_store import Store
 
 Origin = Mapping[str, Any]  #: the parts of a key: node, code, params, inputs, stream
-_FEW = 4  #: steps of an input that are named
-_FAR = 100  #: steps that are searched for an inserted one
+_FEW = 4  #: steps of an input that a clause names
+_FAR = 100  #: steps upstream that are searched for an inserted step
 
 
 class Pair(NamedTuple):
-    """A step's present result and an earlier stored result."""
+    """A new result of a step and an earlier, stored result."""
 
     label: str
     new: Key
     old: Key
 
 
-Found = tuple[list[str], list[Pair]]  #: causes at a pair itself, and the pairs of its inputs
+Found = tuple[list[str], list[Pair]]  #: differences at a pair itself, and the pairs of its inputs
 
 
 @dataclass(frozen=True, slots=True)
 class Roots:
-    """Differences that no other step explains, the nearest first, and the path of each one to the first pair."""
+    """Root causes of a change, the nearest first, and the path from the compared step to each cause."""
 
-    found: dict[str, Pair]  #: by its description
+    found: dict[str, Pair]  #: by the description of the cause
     above: dict[Pair, Pair | None]
 
     def chain(self, text: str) -> list[str]:
-        """Return the steps from the start of the comparison to the step with the cause."""
+        """Return the names of the steps from the compared step to the step with the cause ``text``."""
         way: list[str] = []
         pair: Pair | None = self.found[text]
         while pair is not None:
@@ -52,17 +52,17 @@ class Roots:
 
 
 class Comparison:
-    """Comparison of present results, of a recipe if there is one, with stored results."""
+    """Comparison of new results, of a recipe if there is one, with stored results."""
 
     def __init__(self, store: Store, recipe: Recipe | None = None, resolved: Resolved | None = None) -> None:
         self.store, self.recipe, self.resolved = store, recipe, resolved or Resolved()
         self.wording = Wording(recipe)
         self.seen: dict[Pair, Found] = {}
-        self._edits: dict[tuple[str, str], list[str]] = {}
-        self._abouts: dict[Key, Mapping[str, Any] | None] = {}
+        self.about = functools.cache(store.about)
+        self._edited = functools.cache(functools.partial(edits, store.root))
 
     def roots(self, start: Pair, most: float = float("inf")) -> Roots | None:
-        """Return every root cause once, or None as soon as there are more than ``most``."""
+        """Return the root causes of the change from the earlier to the new result; None if more than ``most``."""
         above: dict[Pair, Pair | None] = {start: None}
         found: dict[str, Pair] = {}
         todo = [start]
@@ -79,13 +79,13 @@ class Comparison:
         return Roots(found, above)
 
     def compare(self, pair: Pair) -> Found:
-        """Return the differences at a pair itself, and the pairs of sources that differ."""
+        """Return the differences of the two results themselves, and the pairs of inputs that differ."""
         if pair not in self.seen:
             self.seen[pair] = self._compare(pair)
         return self.seen[pair]
 
     def own(self, label: str, old: Origin, new: Origin) -> list[str]:
-        """Return the differences between two origins of a step, except for its inputs."""
+        """Return the differences between the origins of two results of a step, without differences of inputs."""
         if old["node"] != new["node"]:
             where = self.wording.source("steps", label.partition("[")[0], "node")
             return [f"{old['node']} -> {new['node']}{where}"]
@@ -95,18 +95,12 @@ class Comparison:
         return found + self._stream(old.get("stream"), new.get("stream"))
 
     def origin(self, key: Key) -> Origin | None:
-        """Return the parts of a key, from the recipe or the store, or None."""
+        """Return the parts of a key from the recipe or from the store, or None if both lack the key."""
         return self.resolved.origins.get(key) or (self.about(key) or {}).get("origin")
 
     def step(self, key: Key) -> str | None:
-        """Return the step for which a key was first computed."""
+        """Return the first step with this key, or None if the key is unknown."""
         return self.resolved.makers.get(key) or (self.about(key) or {}).get("step")
-
-    def about(self, key: Key) -> Mapping[str, Any] | None:
-        """Return the stored metadata of a key; each key is read once."""
-        if key not in self._abouts:
-            self._abouts[key] = self.store.about(key)
-        return self._abouts[key]
 
     def _compare(self, pair: Pair) -> Found:
         old, new = self.origin(pair.old), self.origin(pair.new)
@@ -123,7 +117,7 @@ class Comparison:
         return texts, pairs
 
     def _labels(self, pair: Pair, origin: Origin) -> list[tuple[tuple[str, ...], list[str]]]:
-        """Return, by input, its path in the recipe and the steps that feed it, else the steps that made its keys."""
+        """Return for each input its path in the recipe and the steps that feed it."""
         step = self.recipe.steps.get(pair.label) if self.recipe else None
         if step is None or self.resolved.keys.get(pair.label) != pair.new:
             return [((), [self.step(key) or "a step" for key in _listed(keys)]) for keys in origin["inputs"]]
@@ -132,7 +126,7 @@ class Comparison:
         return [((*path, name), [self.resolved.stands_for(wire) for wire in wired]) for name, wired in wires]
 
     def _input(self, path: tuple[str, ...], labels: list[str], new: list[Key], old: list[Key]) -> Found:
-        """Return the differences of one input, which takes one step or many."""
+        """Return the differences of one input, which reads one step or several steps."""
         if len(new) == 1 and len(old) == 1:
             return self._source(path, labels[0], new[0], old[0])
         then = dict(zip([self.step(key) or key for key in old], old, strict=True))
@@ -145,33 +139,35 @@ class Comparison:
         return texts or ([] if pairs else ["the order of its sources changed"]), pairs
 
     def _source(self, path: tuple[str, ...], label: str, new: Key, old: Key) -> Found:
-        """Return the differences of a source: changed, exchanged, left out, or with a step in between."""
+        """Return the differences of a source that changed, was exchanged, or has a new or a removed step after it."""
         if new == old:
             return [], []
         was = self.step(old)
         if was in (None, label, self.step(new)):
             return [], [Pair(label, new, old)]
+        exchanged = f"reads {label}, not {was}{self._wired(path)}"
         between, key = self._between(new, (was,))
         if key is not None:
-            texts = [self._came(name) or f"reads {label}, not {was}{self._wired(path)}" for name in between]
+            texts = [self._came(name) or exchanged for name in between]
             return list(dict.fromkeys(texts)), [Pair(str(was), key, old)] if key != old else []
         between, key = self._between(old, (label, self.step(new)))
         if key is not None:
-            texts = [self._went(name) or f"reads {label}, not {was}{self._wired(path)}" for name in between]
+            texts = [self._went(name) or exchanged for name in between]
             return list(dict.fromkeys(texts)), [Pair(label, new, key)] if key != new else []
         before, after = self.origin(old), self.origin(new)
         if before and after and before["node"] == after["node"]:
             return [], [Pair(label, new, old)]
-        return [f"reads {label}, not {was}{self._wired(path)}"], []
+        return [exchanged], []
 
     def _joined(self, path: tuple[str, ...], came: list[str], went: list[str]) -> list[str]:
-        """Return clauses for added and removed sources; only a source that is no item is located by its wire."""
+        """Return clauses for added and removed sources, with a location for sources that are not items of a step."""
         where = self._wired(path) if any("[" not in name for name in came) else ""
         texts = [f"reads {_few(came)} now{where}"] if came else []
-        return [*texts, f"reads {_few(went)} no more{self._absent(went[0])}"] if went else texts
+        null = self.recipe.absent.get(went[0].partition("[")[0]) if went and self.recipe else None
+        return [*texts, f"reads {_few(went)} no more{f': it is {null}' if null else ''}"] if went else texts
 
     def _between(self, key: Key, wanted: tuple[str | None, ...]) -> tuple[list[str], Key | None]:
-        """Search upstream along first inputs for a ``wanted`` step; return the steps passed and its key, if found."""
+        """Search upstream along first inputs for a ``wanted`` step; return the steps on the way and the key found."""
         passed: list[str] = []
         for _ in range(_FAR):
             first = next(iter((self.origin(key) or {}).get("inputs", ())), None)
@@ -194,32 +190,23 @@ class Comparison:
         return f"{name} is left out now: {verdict.why}" if verdict and verdict.left_out else ""
 
     def _wired(self, path: tuple[str, ...]) -> str:
-        """Return the location of the wire of an input."""
+        """Return the location of an input in the recipe, as text in brackets."""
         return self.wording.source(*path) or self.wording.source(*path[:-1]) if path else ""
 
-    def _absent(self, name: str) -> str:
-        said = self.recipe.absent.get(name.partition("[")[0]) if self.recipe else None
-        return f": it is {said}" if said else ""
-
-    def _edited(self, old: str, new: str) -> list[str]:
-        if (old, new) not in self._edits:
-            self._edits[old, new] = edits(self.store.root, old, new)
-        return self._edits[old, new]
-
     def _stream(self, old: list[Any] | None, new: list[Any] | None) -> list[str]:
-        """Return the differences in the random stream of a step."""
+        """Return one clause for each difference in the random stream of a step."""
         if old is None or new is None:
             return [] if old == new else ["it draws noise now" if new else "it draws no noise any more"]
-        said = (
+        texts = (
             f"seed {old[0]} -> {new[0]}{self.wording.source('seed')}",
             f"its noise uses the stream of {new[1]}, not of {old[1]}",
             f"its noise is drawn on {new[2]}, not on {old[2]}",
         )
-        return [text for text, before, after in zip(said, old, new, strict=True) if before != after]
+        return [text for text, before, after in zip(texts, old, new, strict=True) if before != after]
 
 
 def _few(names: list[str]) -> str:
-    """Return names as ``a, b and 4 more``."""
+    """Return the first names of a list as text, such as ``a, b and 4 more``."""
     rest = len(names) - _FEW
     return ", ".join(names) if rest <= 0 else f"{', '.join(names[:_FEW])} and {rest} more"
 

@@ -1,4 +1,4 @@
-"""Wording of changed parameters: with the recipe's paths and units, and the location of the value."""
+"""Wording of changed parameters, with path, unit and location in the recipe."""
 
 from __future__ import annotations
 
@@ -7,6 +7,7 @@ import re
 from collections import defaultdict
 from collections.abc import Callable, Mapping
 from contextlib import suppress
+from functools import cached_property
 from pathlib import Path
 from typing import Any
 
@@ -19,20 +20,19 @@ _ABSENT = object()
 
 
 class Wording:
-    """Description of changes; without a recipe, by the parameter's own name and in SI."""
+    """Description of changed parameters; without a recipe, the name of the parameter and SI units are used."""
 
     def __init__(self, recipe: Recipe | None = None) -> None:
         self._recipe = recipe
-        self._by_mark: dict[str, list[Setting]] | None = None
 
     def params(self, label: str, old: Mapping[str, Any], new: Mapping[str, Any]) -> list[str]:
-        """Return one clause for each differing parameter of a step, given as `plain` writes parameters."""
+        """Return one clause for each parameter that differs between two results of the step ``label``."""
         step = self._recipe.steps.get(label) if self._recipe else None
         names = [n for n in dict.fromkeys([*old, *new]) if old.get(n) != new.get(n)]
         return [self._param(step, n, old.get(n, _ABSENT), new.get(n, _ABSENT)) for n in names]
 
     def source(self, *path: str) -> str:
-        """Return `` (recipe.yaml:3:7)`` for a value of the recipe, or an empty string where its place is unknown."""
+        """Return the location of a value in the recipe, such as `` (recipe.yaml:3:7)``, or an empty string."""
         setting = self._recipe.config.settings.get(".".join(path)) if self._recipe else None
         return f" ({setting.source})" if setting else ""
 
@@ -52,26 +52,26 @@ class Wording:
         return f"{path} {before} -> {after}{where}"
 
     def _setting(self, step: Step | None, name: str) -> tuple[Setting | None, str]:
-        """Return the recipe's setting of a parameter, wherever it is written, and its location."""
+        """Return the setting that gives the value of a parameter, or None, and the location of the value."""
         if step is None:
             return None, ""
         if name not in step.param_marks:
             return None, f"default of {step.node.path}"
         mark = str(step.param_marks[name])
-        found = self._marked().get(mark, [])
+        found = self._marked.get(mark, [])
         here = ("steps", step.name.partition("[")[0], "with", name)
         named = [s for s in found if s.path == here] or [s for s in found if s.path[-1:] == (name,)]
         setting = (named or found)[0] if named or len(found) == 1 else None
         return setting, setting.source if setting else mark
 
-    def _marked(self) -> dict[str, list[Setting]]:
-        """Return the written settings by their location."""
-        if self._by_mark is None:
-            self._by_mark = defaultdict(list)
-            for setting in self._recipe.config.settings.values() if self._recipe else ():
-                if not setting.default:
-                    self._by_mark[setting.source.partition(", ")[0]].append(setting)
-        return self._by_mark
+    @cached_property
+    def _marked(self) -> Mapping[str, list[Setting]]:
+        """Return the settings that a user wrote, by location."""
+        settings = defaultdict(list)
+        for setting in self._recipe.config.settings.values() if self._recipe else ():
+            if not setting.default:
+                settings[setting.source.partition(", ")[0]].append(setting)
+        return settings
 
 
 def _file(step: Step | None, name: str) -> str:
@@ -86,7 +86,7 @@ def _other_file(old: Any, new: Mapping[str, Any]) -> str:
 
 
 def _both(written: Any, old: Any, new: Any) -> tuple[str, str]:
-    """Return the old and the new value, in the unit of the new one."""
+    """Return the old and the new value as text, both in the unit of the new value."""
     after = _as_written(written, new)
     if isinstance(old, list) and isinstance(new, list) and len(old) == len(new):
         parts = written if isinstance(written, list) and len(written) == len(old) else [None] * len(old)
@@ -101,7 +101,6 @@ def _both(written: Any, old: Any, new: Any) -> tuple[str, str]:
 
 
 def _in_unit_of(written: Any, new: Any, old: Any) -> str:
-    """Return an old number with the unit of the present one."""
     unit = _unit(written, new)
     return f"{spoken(unit[0](old))} {unit[1]}" if unit and _is_number(old) else spoken(old)
 
@@ -111,21 +110,21 @@ def _is_number(value: Any) -> bool:
 
 
 def _items(old: Mapping[str, Any], new: Mapping[str, Any]) -> tuple[str, str]:
-    """Return the entries in which two mappings differ."""
+    """Return the entries of the old and of the new mapping that the other mapping lacks, as text."""
     pairs = [[(str(key), value) for key, value in m.get("items", ())] for m in (old, new)]
     only = [[f"{k}: {spoken(v)}" for k, v in pairs[i] if (k, v) not in pairs[1 - i]] for i in (0, 1)]
     return f"{{{', '.join(only[0])}}}", f"{{{', '.join(only[1])}}}"
 
 
 def _as_written(written: Any, new: Any) -> str:
-    """Return a new value as its user wrote it, where the text says more than the number."""
+    """Return the text of a new value, as the user wrote it if the text has a unit."""
     if _unit(written, new) or (isinstance(written, list) and isinstance(new, list)):
         return flow(written)
     return spoken(new)
 
 
 def _unit(written: Any, new: Any) -> tuple[Callable[[float], float], str] | None:
-    """Return the function from SI to a written quantity's unit, and the unit's name; None without a unit."""
+    """Return the function from SI to the unit of a written quantity, and the unit; None without a unit."""
     match = _QUANTITY.fullmatch(written.strip()) if isinstance(written, str) else None
     if match is None or not _is_number(new):
         return None
@@ -144,15 +143,12 @@ def _times(factor: float) -> Callable[[float], float]:
 
 
 def spoken(value: Any) -> str:
-    """Return a short text for a parameter, given as `plain` writes parameters."""
+    """Return a short text for the value of a parameter."""
     if isinstance(value, float):
         return f"{value:.6g}"
     if isinstance(value, Mapping):
-        return f"a {value['suffix']} file".replace("  ", " ") if "file" in value else flow_of_items(value)
+        items = ", ".join(f"{spoken(k)}: {spoken(v)}" for k, v in value.get("items", ()))
+        return f"a {value['suffix']} file".replace("  ", " ") if "file" in value else f"{{{items}}}"
     if isinstance(value, list):
         return f"[{', '.join(map(spoken, value))}]"
     return "none" if value is None else flow(value)
-
-
-def flow_of_items(value: Mapping[str, Any]) -> str:
-    return f"{{{', '.join(f'{spoken(k)}: {spoken(v)}' for k, v in value.get('items', ()))}}}"

@@ -1,40 +1,28 @@
-"""Forecast of a recipe on other machines: makespan, utilisation, transfers and peak memory."""
+"""Forecast of a run on other machines: makespan, utilisation, transfers and peak memory."""
 
 from __future__ import annotations
 
+from collections import Counter
 from collections.abc import Mapping
-from typing import Protocol
 
+from neusee.workflows.engine.cost_model import Estimate
+from neusee.workflows.engine.node_call import fits
+from neusee.workflows.engine.placement_inputs import MOST_PARTS
 from neusee.workflows.graph.recipe_graph import Recipe, Step
-from neusee.workflows.placement.heft_and_cpop import Device, Schedule, Slot, Task, TooLarge, heft
+from neusee.workflows.placement.heft_and_cpop import Schedule, Task, TooLarge, heft
 from neusee.workflows.placement.machine_file import Machines
 from neusee.workflows.report.text_table import columns
 from neusee.workflows.store.byte_sizes import format_size
 
-_MOST_PARTS = 64  #: upper bound on the parts of a step cut by bands; the number of bands is known when the step runs
 _SHOWN = 24  #: steps of the critical path
 
 
-class Cost(Protocol):
-    """Cost of a step, from earlier runs."""
+def cluster_lines(recipe: Recipe, estimates: Mapping[str, Estimate], machines: Machines) -> list[str]:
+    """Return lines on the makespan, the devices, the transfers and the critical path of a run with an empty store.
 
-    @property
-    def seconds(self) -> Mapping[str, float]: ...
-    @property
-    def bytes(self) -> float: ...
-    @property
-    def work(self) -> float: ...
-    @property
-    def known(self) -> bool: ...
-
-
-def cluster_lines(recipe: Recipe, estimates: Mapping[str, Cost], machines: Machines) -> list[str]:
-    """Return lines on makespan, devices, bytes sent, critical path, and on costs that were never measured.
-
-    Every step of ``estimates`` runs, as if nothing were stored. The seconds on a device are those on the
-    measured CPU divided by the device's speed. A plan that does not fit is one line with the needed bytes.
+    The seconds on a device are the measured seconds on the CPU, divided by the relative speed of the device.
     """
-    devices, alone = len(machines.devices), sum(map(_measured, estimates.values()))
+    devices, alone = len(machines.devices), sum(cost.seconds["cpu"] for cost in estimates.values())
     head = f"{_count(len(estimates), 'step')} on {_count(devices, 'device')}: {machines.title or 'no title'}"
     try:
         schedule = simulated(recipe, estimates, machines)
@@ -42,12 +30,13 @@ def cluster_lines(recipe: Recipe, estimates: Mapping[str, Cost], machines: Machi
         return [head, f"refused: {error}", *_guesses(estimates)]
     faster = f": {alone / schedule.makespan:.3g} times as long" if schedule.makespan else ""
     sent = f"{format_size(schedule.transferred)} in {_count(len(schedule.moves), 'copy', 'copies')}"
+    cut = ", ".join(f"{slot.task} ({slot.parts})" for slot in schedule.slots if slot.parts > 1)
     return [
         head,
         "",
         f"makespan     {_time(schedule.makespan)}; where they were measured, one after another, {_time(alone)}{faster}",
         f"transferred  {sent}",
-        *([f"in parts     {cut}"] if (cut := _cut(schedule)) else []),
+        *([f"in parts     {cut}"] if cut else []),
         "",
         *_devices(schedule, machines),
         "",
@@ -56,74 +45,47 @@ def cluster_lines(recipe: Recipe, estimates: Mapping[str, Cost], machines: Machi
     ]
 
 
-def simulated(recipe: Recipe, estimates: Mapping[str, Cost], machines: Machines) -> Schedule:
-    """Return the schedule of a recipe's steps on other machines; raise `TooLarge` where the memory is too small."""
+def simulated(recipe: Recipe, estimates: Mapping[str, Estimate], machines: Machines) -> Schedule:
+    """Return the schedule of the steps of a recipe on other machines; raise `TooLarge` if the memory is too small."""
     tasks = [_task(recipe.steps[name], cost, estimates, machines) for name, cost in estimates.items()]
     return heft(tasks, machines.cluster, [name for name in dict.fromkeys(recipe.outputs) if name in estimates])
 
 
-def _task(step: Step, cost: Cost, among: Mapping[str, Cost], machines: Machines) -> Task:
+def _task(step: Step, cost: Estimate, among: Mapping[str, Estimate], machines: Machines) -> Task:
     hint = step.device or step.node.device
-    allowed = [d for d in machines.devices if _fits(d, hint)] or machines.devices
-    seconds = {d.name: _measured(cost) / machines.speed(d.name, step.node.path) for d in allowed}
+    allowed = [d for d in machines.devices if fits(d.name.rpartition("/")[2], d.kind, hint)] or machines.devices
+    seconds = {d.name: cost.seconds["cpu"] / machines.speed(d.name, step.node.path) for d in allowed}
     sources = tuple(dict.fromkeys(name for name in step.sources if name in among))
-    return Task(step.name, sources, seconds, cost.bytes, cost.work, _MOST_PARTS if step.node.bands else 1)
-
-
-def _fits(device: Device, hint: str) -> bool:
-    """Return True if a hint such as ``cpu``, ``gpu`` or ``cuda:1`` allows a device."""
-    if hint in ("any", ""):
-        return True
-    return device.kind != "cpu" if hint == "gpu" else hint in (device.kind, device.name.rpartition("/")[2])
-
-
-def _measured(cost: Cost) -> float:
-    """Return the seconds on the CPU on which the costs were measured."""
-    return cost.seconds["cpu"]
-
-
-# --- lines ----------------------------------------------------------------------------------------------------------
+    return Task(step.name, sources, seconds, cost.bytes, cost.work, MOST_PARTS if step.node.bands else 1)
 
 
 def _devices(schedule: Schedule, machines: Machines) -> list[str]:
-    """Return one line for each device: its share of the makespan, its steps and its memory."""
-    shares, steps = schedule.utilisation(), dict.fromkeys(schedule.peak, 0)
-    for slot in schedule.slots:
-        steps[slot.device] += 1
-    rows = [["device", "busy", "steps", "memory", "of"]]
-    for d in machines.devices:
-        held, memory = format_size(schedule.peak[d.name]), format_size(d.memory)
-        rows.append([d.name, f"{shares[d.name]:.0%}", str(steps[d.name]), held, memory])
+    """Return one line for each device: busy share of the makespan, number of steps and peak memory."""
+    shares, steps = schedule.utilisation(), Counter(slot.device for slot in schedule.slots)
+    rows = [
+        [d.name, f"{shares[d.name]:.0%}", str(steps[d.name]), format_size(schedule.peak[d.name]), format_size(d.memory)]
+        for d in machines.devices
+    ]
     mean = sum(shares.values()) / len(shares)
-    return [*columns(rows, ">"), f"the devices are busy {mean:.0%} of the time on average"]
+    table = columns([["device", "busy", "steps", "memory", "of"], *rows], ">")
+    return [*table, f"the devices are busy {mean:.0%} of the time on average"]
 
 
 def _path(schedule: Schedule) -> list[str]:
-    """Return the critical path; the middle of a long path is left out."""
+    """Return a table of the critical path, without the middle of a long path."""
     path = schedule.critical_path()
     busy = sum(slot.end - slot.start for slot in path)
-    share = (
-        f" of {_time(schedule.makespan)}; the rest is waiting for data or memory"
-        if busy < 0.999 * schedule.makespan
-        else ""
-    )
-    rows = [["critical path", "device", "at", "takes"], *map(_row, path)]
+    wait = f" of {_time(schedule.makespan)}; the rest is waiting for data or memory"
+    share = wait if busy < 0.999 * schedule.makespan else ""
+    times = [[slot.task, slot.device, _time(slot.start), _time(slot.end - slot.start)] for slot in path]
+    rows = [["critical path", "device", "at", "takes"], *times]
     if len(path) > _SHOWN:
         half = _SHOWN // 2
         rows = [*rows[: half + 1], [f"… {len(path) - _SHOWN} more …", "", "", ""], *rows[-half:]]
     return [*columns(rows), f"{_count(len(path), 'step')} on it, {_time(busy)}{share}"]
 
 
-def _row(slot: Slot) -> list[str]:
-    return [slot.task, slot.device, _time(slot.start), _time(slot.end - slot.start)]
-
-
-def _cut(schedule: Schedule) -> str:
-    """Return the steps that must be cut by bands to fit into memory."""
-    return ", ".join(f"{slot.task} ({slot.parts})" for slot in schedule.slots if slot.parts > 1)
-
-
-def _guesses(estimates: Mapping[str, Cost]) -> list[str]:
+def _guesses(estimates: Mapping[str, Estimate]) -> list[str]:
     names = [name for name, cost in estimates.items() if not cost.known]
     if not names:
         return []

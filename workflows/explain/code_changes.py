@@ -1,4 +1,4 @@
-"""Code changes: the functions and constants that differ between two digests of code."""
+"""Changes of code: the functions, classes and constants that differ between two digests of code."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ Parts = dict[str, dict[str, str]]  #: digests of definitions, by module
 
 
 def edits(root: Path, old: str, new: str) -> list[str]:
-    """Return one clause for each definition that differs, or nothing where the store at ``root`` has no record."""
+    """Return one clause for each definition that differs, or an empty list if the store at ``root`` has no record."""
     before, after = _parts(root, old), _parts(root, new)
     if not before or not after:
         return []
@@ -22,20 +22,17 @@ def edits(root: Path, old: str, new: str) -> list[str]:
 
 
 def _inside(module: str, old: dict[str, str], new: dict[str, str]) -> list[str]:
-    """Return the differences within one module."""
+    """Return one clause for each changed, added or removed definition of a module."""
     file = _file(module)
-    changed = [f"{_changed(label)} in {file} changed" for label in new if label in old and old[label] != new[label]]
+    differ = [label for label in new if label in old and old[label] != new[label]]
+    changed = [f"{'code of ' + label if label.endswith('()') else _named(label)} in {file} changed" for label in differ]
     added = [f"{_named(label)} was added to {file}" for label in new if label not in old]
     removed = [f"{_named(label)} was removed from {file}" for label in old if label not in new]
     return changed + added + removed
 
 
-def _changed(label: str) -> str:
-    return f"code of {label}" if label.endswith("()") else _named(label)
-
-
 def _named(label: str) -> str:
-    """Return ``function psf()``, ``constant _FALL``, ``class Psf`` or ``the imports``."""
+    """Return the label of a definition with its kind, such as ``function psf()`` or ``the imports``."""
     if label.endswith("()"):
         return f"function {label}"
     return label if label.startswith(("class ", "constant ")) else f"the {label}"
@@ -48,7 +45,7 @@ def _file(module: str) -> str:
 
 
 def _parts(root: Path, found: str) -> Parts:
-    """Return the definitions behind a digest, or nothing where the file is missing or damaged."""
+    """Return the definitions behind a digest of code; an empty dictionary if their file is missing or damaged."""
     try:
         parts = json.loads(parts_file(root, found).read_bytes())
         whole = all(isinstance(found, str) for inside in parts.values() for found in inside.values())

@@ -1,4 +1,4 @@
-"""Forecast of a run: cache hits, bytes, seconds, memory and devices, from the records of earlier runs."""
+"""Forecast of a run from earlier runs: cache hits, bytes, seconds, memory and devices."""
 
 from __future__ import annotations
 
@@ -24,13 +24,13 @@ from neusee.workflows.tolerance.cheaper_steps import with_substitutions
 
 @dataclass(frozen=True)
 class Plan:
-    """Forecast for every step of a recipe."""
+    """Forecast of a run, step by step."""
 
     recipe: Recipe
     order: list[str]
     keys: dict[str, Key]
     left_out: dict[str, bool | None]  #: None where only the inputs of a step can decide
-    awake: set[str]  #: steps that would run
+    awake: set[str]  #: steps that would be computed or left out
     loaded: dict[str, int]  #: stored steps that would be read, with their bytes
     expected: Mapping[str, Estimate]  #: by step, for the steps that would run
     lanes: Mapping[str, str]  #: by step
@@ -39,36 +39,32 @@ class Plan:
 
 
 def planned(recipe: Recipe, store: Store, lanes: Mapping[str, Lane]) -> Plan:
-    """Return what a run would compute, read and need, without computing anything."""
+    """Return the forecast of a run: the steps to compute and to read, their costs and their schedule."""
     recipe = with_substitutions(recipe, wanted(recipe))
     order = steps_of(recipe)
     devices = [lane.device for lane in lanes.values()]
     resolved = resolve(recipe, order, store, ",".join(devices))
     keys, left_out = resolved.keys, {name: resolved.left_out(name) for name in order}
     awake, loaded = _awake(recipe, keys, store)
-    works, seen = [], set[Key]()
+    makers: dict[Key, str] = {}
     for name in order:
-        if name in awake and not left_out.get(name) and keys[name] not in seen:
-            seen.add(keys[name])
-            works.append(_work(recipe, name, keys, devices))
+        if name in awake and not left_out[name]:
+            makers.setdefault(keys[name], name)
+    works = [_work(recipe, name, keys, devices) for name in makers.values()]
     costs = past_costs(store) if works else Costs([])
     abouts = {work.key: about for work in works if (about := store.about(work.key))}
+    kinds = sorted({lane.kind for lane in lanes.values()} | {"cpu"})
+    expected = {w.step.name: costs.of(w.step, kinds, abouts.get(w.key)) for w in works}
     try:
         found = prepare(works, costs, abouts, lanes, [keys[name] for name in wanted(recipe)])
     except TooLarge as error:
-        kinds = sorted({lane.kind for lane in lanes.values()} | {"cpu"})
-        expected = {w.step.name: costs.of(w.step, kinds, abouts.get(w.key)) for w in works}
         return Plan(recipe, order, keys, left_out, awake, loaded, expected, {}, None, str(error))
-    expected = {w.step.name: found.expected[w.key] for w in found.works}
     where = {w.step.name: w.lane for w in found.works}
     return Plan(recipe, order, keys, left_out, awake, loaded, expected, where, found.schedule)
 
 
 def plan_lines(recipe: Recipe, store: Store, device: str = "cpu", memory: int | None = None) -> tuple[list[str], bool]:
-    """Return one line for each step (state, device, seconds, bytes, memory), the sums, and whether memory is short.
-
-    A run that is short of memory would be refused.
-    """
+    """Return lines on each step and on their sums; the second value is True if a run would lack memory."""
     lanes = lanes_of(device.split(","), memory)
     plan = planned(recipe, store, lanes)
     rows = [_row(name, plan, store) for name in plan.order]
@@ -77,7 +73,7 @@ def plan_lines(recipe: Recipe, store: Store, device: str = "cpu", memory: int | 
 
 
 def simulated_lines(recipe: Recipe, store: Store, machines: str) -> list[str]:
-    """Return the forecast of the whole recipe on the machines of a YAML file, with an empty store."""
+    """Return lines on a run of the whole recipe, with an empty store, on the machines of a YAML file."""
     from neusee.workflows.explain.cluster_forecast import cluster_lines
     from neusee.workflows.placement.machine_file import read_machines
 
@@ -106,7 +102,7 @@ def _row(name: str, plan: Plan, store: Store) -> list[str]:
 
 
 def _sums(plan: Plan, lanes: Mapping[str, Lane]) -> list[str]:
-    """Return lines with the sums over all steps, and with the steps whose state is not known yet."""
+    """Return lines with sums over all steps, and with the steps that may be left out."""
     ran, new = len(plan.expected), sum(e.bytes for e in plan.expected.values())
     guesses = sum(not e.known for e in plan.expected.values())
     lines = []
@@ -119,11 +115,9 @@ def _sums(plan: Plan, lanes: Mapping[str, Lane]) -> list[str]:
         f"{ran} of {len(plan.order)} steps would run{guessed}: {took}, {format_size(int(new))} new, {read} to load"
     )
     if plan.schedule:
-        peaks = {name: plan.schedule.peak.get(name, 0.0) for name in lanes}
-        lines += [
-            f"memory  {name}: {format_size(int(peak))} at most, of {format_size(int(lanes[name].memory))}"
-            for name, peak in peaks.items()
-        ]
+        for name, lane in lanes.items():
+            peak = format_size(int(plan.schedule.peak.get(name, 0.0)))
+            lines.append(f"memory  {name}: {peak} at most, of {format_size(int(lane.memory))}")
     return [*lines, *([f"refused: {plan.refused}"] if plan.refused else [])]
 
 
@@ -134,7 +128,7 @@ def _work(recipe: Recipe, name: str, keys: Mapping[str, Key], devices: Sequence[
 
 
 def _awake(recipe: Recipe, keys: Mapping[str, Key], store: Store) -> tuple[set[str], dict[str, int]]:
-    """Return the steps that a run would compute, and the stored steps that it would read, with their bytes."""
+    """Return the steps to compute, and the stored steps to read with the bytes of each result."""
     found, loaded, todo = set[str](), dict[str, int](), [*wanted(recipe)]
     while todo:
         name = todo.pop()

@@ -1,4 +1,4 @@
-"""Reason for a rerun: the differences from the nearest earlier result of the same step, and their origin."""
+"""Reasons why a step runs again: the differences from the most similar earlier result of the step."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ from neusee.workflows.keys.cache_key import Key
 from neusee.workflows.store.result_store import Store
 from neusee.workflows.tolerance.cheaper_steps import with_substitutions
 
-_CANDIDATES = 200  #: newest earlier results of a step that are compared
+_CANDIDATES = 200  #: earlier results of a step, the newest, that are compared
 _PAIRS = 20_000  #: comparisons after which no further earlier result is examined
 _AT_ONCE = 5  #: earlier results that a step is compared with during a run
 _SHOWN = 10  #: causes that are listed
@@ -24,9 +24,9 @@ _LINKS = 6  #: steps of a chain that are named
 
 
 def why_lines(recipe: Recipe, store: Store, step: str, device: str = "cpu") -> list[str]:
-    """Return lines that tell whether ``step`` or its items are stored, and the differences from earlier results.
+    """Return lines on the state of ``step`` or of its items, and on the differences from earlier results.
 
-    Raises `ValueError` with the nearest name where the step does not exist.
+    Raises `ValueError` with the nearest name if the step does not exist.
     """
     names = [name for name in recipe.steps if step in (name, name.partition("[")[0])]
     if not names:
@@ -39,9 +39,9 @@ def why_lines(recipe: Recipe, store: Store, step: str, device: str = "cpu") -> l
 
 
 def why_key_lines(store: Store, prefix: str) -> list[str]:
-    """Return the parts of the one key that begins with ``prefix``, and its differences from an earlier result.
+    """Return lines on the parts of the key that begins with ``prefix``, and on the differences from earlier results.
 
-    Raises `LookupError` where no result or more than one matches.
+    Raises `LookupError` if no key or more than one key begins with ``prefix``.
     """
     found = sorted(dict.fromkeys(row["key"] for row in _rows(store) if row["key"].startswith(prefix)))
     if len(found) != 1:
@@ -56,7 +56,7 @@ def why_key_lines(store: Store, prefix: str) -> list[str]:
 
 
 def explained(recipe: Recipe, store: Store, watch: Callable[[Event], None]) -> Callable[[Event], None]:
-    """Return ``watch``, extended by the reason why each step ran."""
+    """Return a function that adds the reason why a step ran to each event, and then calls ``watch``."""
     comparison = Comparison(store, recipe)
     before: dict[str, list[Key]] = {}
 
@@ -73,7 +73,7 @@ def explained(recipe: Recipe, store: Store, watch: Callable[[Event], None]) -> C
 
 
 def _step_lines(comparison: Comparison, recipe: Recipe, step: Step, resolved: Resolved) -> list[str]:
-    """Return the lines of one step: its state, and the causes of that state."""
+    """Return lines on the state of one step and on its differences from earlier results."""
     key, verdict = resolved.keys[step.name], resolved.verdicts.get(step.name)
     head = f"{step.name} ({step.node.path})"
     if verdict is not None and verdict.left_out:
@@ -83,16 +83,9 @@ def _step_lines(comparison: Comparison, recipe: Recipe, step: Step, resolved: Re
     maker = resolved.makers[key]
     if maker != step.name:
         lines.append(f"  same key as {maker}")
-    unsure = _unsure(recipe, step.name, resolved)
-    if unsure:
+    if unsure := [name for name in needed(recipe, [step.name]) if resolved.left_out(name) is None]:
         lines.append(f"  left out or not, depending on the values of the inputs: {', '.join(unsure[:_SHOWN])}")
     return [*lines, *_because(comparison, step.name, key, about, maker)]
-
-
-def _unsure(recipe: Recipe, step: str, resolved: Resolved) -> list[str]:
-    """Return the steps upstream of a step that may be left out; they are assumed to run."""
-    unsure = {name for name in resolved.verdicts if resolved.left_out(name) is None}
-    return [name for name in needed(recipe, [step]) if name in unsure] if unsure else []
 
 
 def _state(about: Mapping[str, Any] | None) -> str:
@@ -105,7 +98,7 @@ def _state(about: Mapping[str, Any] | None) -> str:
 def _because(
     comparison: Comparison, label: str, key: Key, about: Mapping[str, Any] | None, maker: str = ""
 ) -> Iterator[str]:
-    """Yield the differences from the nearest earlier result, and name that result."""
+    """Yield lines on the differences from the most similar earlier result."""
     rows = _rows(comparison.store, label) or _rows(comparison.store, maker or label)
     keys = _keys(rows)
     earlier = keys[: keys.index(key)] if key in keys else keys
@@ -123,7 +116,7 @@ def _because(
 
 
 def _nearest(comparison: Comparison, label: str, key: Key, earlier: list[Key]) -> tuple[Key, Roots] | None:
-    """Return the newest of the earlier results with the fewest root causes."""
+    """Return the earlier result with the fewest differences, the newest of several, and these differences."""
     best: tuple[Key, Roots] | None = None
     for old in earlier[: -_CANDIDATES - 1 : -1]:
         if comparison.origin(old) is None:
@@ -137,7 +130,7 @@ def _nearest(comparison: Comparison, label: str, key: Key, earlier: list[Key]) -
 
 
 def _at_once(comparison: Comparison, step: Step, key: Key, earlier: list[Key]) -> str:
-    """Return one line on why a step ran, from the known keys; an empty string without an earlier result."""
+    """Return the reason why a step ran, or an empty string if there is no earlier result."""
     if key in earlier:
         return "computed before, but its value is not stored"
     best: list[str] = []
@@ -151,7 +144,7 @@ def _at_once(comparison: Comparison, step: Step, key: Key, earlier: list[Key]) -
 
 
 def _direct(comparison: Comparison, step: Step, old: Origin, new: Origin) -> list[str]:
-    """Return the differences at a step itself, and then the sources that differ."""
+    """Return the differences at a step itself, followed by the sources that differ."""
     texts = comparison.own(step.name, old, new)
     if old["node"] != new["node"] or len(old["inputs"]) != len(new["inputs"]):
         return texts
@@ -163,7 +156,7 @@ def _direct(comparison: Comparison, step: Step, old: Origin, new: Origin) -> lis
 
 
 def _made_of(comparison: Comparison, key: Key) -> Iterator[str]:
-    """Yield the parts of a key, one line each."""
+    """Yield one line for each part of a key: node, parameters, inputs and random stream."""
     origin = comparison.origin(key)
     if origin is None:
         return
@@ -178,14 +171,13 @@ def _made_of(comparison: Comparison, key: Key) -> Iterator[str]:
 
 
 def _chain(names: list[str]) -> str:
-    """Return ``restored <- raw <- read``, shortened."""
+    """Return names as a chain such as ``restored <- raw <- read``, without the middle of a long chain."""
     if len(names) > _LINKS:
         names = [*names[: _LINKS - 2], f"({len(names) - _LINKS + 1} more)", names[-1]]
     return " <- ".join(names)
 
 
 def _keys(rows: Iterable[dict[str, Any]]) -> list[Key]:
-    """Return the keys in the order in which they were first computed."""
     return list(dict.fromkeys(row["key"] for row in rows))
 
 

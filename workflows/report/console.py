@@ -1,19 +1,20 @@
-"""The lines of a run on the screen: a live table on a terminal, plain lines elsewhere, then the numbers.
+"""Screen output of a run: a live table on a terminal, plain lines elsewhere, then the result table.
 
-Items of one step, such as ``spot[mask,green]``, share a line. Steps that were not needed share one line too.
+Items of one step, such as ``spot[mask,green]``, share a line. All steps that were not needed share one line.
 """
 
 from __future__ import annotations
 
 import sys
 from abc import ABC, abstractmethod
+from collections import Counter
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Any, Literal, Self
 
 from neusee.workflows.graph.step_record import Event, StepRecord
 from neusee.workflows.report.run_page import shape_of, unit_of
-from neusee.workflows.report.text_table import columns, indented
+from neusee.workflows.report.text_table import by_family, columns, indented
 from neusee.workflows.report.tolerance_spent import said_of_economies
 
 if TYPE_CHECKING:
@@ -22,14 +23,13 @@ if TYPE_CHECKING:
 Mode = Literal["silent", "plain", "live"]
 _STYLES = {"run": "bold", "cached": "cyan", "left out": "dim", "failed": "red"}  #: by state
 
-
 HEADER = ("step", "where", "state", "seconds", "output", "check")
 _WIDTHS = (5, 10, 9, 28, 0)  #: of the columns after the first
 
 
 @dataclass
 class Family:
-    """The items of one step, and the records of those that are done."""
+    """The items of one step, and the records of the finished items."""
 
     name: str
     members: list[str]
@@ -38,16 +38,16 @@ class Family:
     begun: bool = False
 
     @property
-    def awake(self) -> list[StepRecord]:
+    def needed(self) -> list[StepRecord]:
         """Return the records of the items that were needed."""
         return [d for d in self.done if d.state != "not needed"]
 
     def cells(self) -> tuple[str, ...]:
-        """Return the row of these items, by `HEADER`."""
-        done, many = self.awake, len(self.members) > 1
-        name = f"{self.name} ×{len(self.members)}" if many else self.members[0]
+        """Return the table row of these items, with the columns of `HEADER`."""
+        done, count = self.needed, len(self.members)
+        name = f"{self.name} ×{count}" if count > 1 else self.members[0]
         if not done:
-            return (name, "", "…" if self.begun else "", "", "", "")
+            return name, "", "…" if self.begun else "", "", "", ""
         ran = sum(d.seconds for d in done if d.state == "run")
         last = max(done, key=lambda d: (d.facts is not None, self.members.index(d.step)))
         shown = next((d for d in done if any(not c.ok for c in d.checks)), last)
@@ -55,30 +55,22 @@ class Family:
         check = "; ".join(("" if c.ok else "LOOK: ") + c.text for c in shown.checks)
         why = next((d.why for d in done if d.state in ("run", "left out") and d.why), "")
         check = f"{check}  ({why})" if check and why else check or why
-        return (
-            name,
-            shown.device,
-            self.state(),
-            f"{ran:.3f}" if ran else "",
-            f"{shape} {self.unit}".strip() if shape else "",
-            check,
-        )
+        output = f"{shape} {self.unit}".strip() if shape else ""
+        return name, shown.device, self.state(), f"{ran:.3f}" if ran else "", output, check
 
     def state(self) -> str:
-        """Return ``run``, ``cached`` or ``left out``, or the number of each."""
-        states = [d.state for d in self.awake]
-        if len(set(states)) == 1:
-            return states[0]
-        return ", ".join(f"{states.count(s)} {s}" for s in dict.fromkeys(states))
+        """Return the state of all items, such as ``run``, or the number of items in each state."""
+        states = Counter(str(d.state) for d in self.needed)
+        return "".join(states) if len(states) == 1 else ", ".join(f"{n} {s}" for s, n in states.items())
 
 
 def mode_for(silent: bool) -> Mode:
-    """Return how a table is shown: live only where the output goes to a terminal."""
+    """Return the mode of a table: silent on request, live on a terminal, plain elsewhere."""
     return "silent" if silent else "live" if sys.stdout.isatty() else "plain"
 
 
 class ProgressTable(ABC):
-    """A table on the screen for as long as its ``with`` block lasts."""
+    """A table that is on the screen during a ``with`` block."""
 
     header: Sequence[str]
     widths: Sequence[int]  #: least widths of the columns of plain lines
@@ -89,7 +81,7 @@ class ProgressTable(ABC):
 
     @abstractmethod
     def live_rows(self) -> Iterable[tuple[Sequence[str], str]]:
-        """Return the rows of a live table, each with its state."""
+        """Return the cells and the state of each row of a live table."""
 
     @abstractmethod
     def caption(self) -> str:
@@ -109,7 +101,7 @@ class ProgressTable(ABC):
             self._live.stop()
 
     def show_row(self, cells: Sequence[str]) -> None:
-        """Print a row that will not change; a live table shows its rows by itself."""
+        """Print a final row in plain mode; a live table shows its rows without this call."""
         if self.mode != "plain":
             return
         columns = zip(self.header, cells, self.widths, strict=True)
@@ -117,7 +109,7 @@ class ProgressTable(ABC):
         print("  " + "  ".join(padded).rstrip(), flush=True)
 
     def show_error(self, plain: Iterable[str], live: str) -> None:
-        """Print what went wrong: lines below the last plain row, or a text above a live table."""
+        """Print an error: the lines ``plain`` below the last plain row, or the text ``live`` above a live table."""
         if self.mode == "plain":
             print(*plain, sep="\n", flush=True)
         elif self.mode == "live":
@@ -136,7 +128,7 @@ class ProgressTable(ABC):
 
 
 class RunTable(ProgressTable):
-    """The steps of a run: as plain lines, a step is printed when its last item is done."""
+    """Table of the steps of a run; in plain mode, a step is printed after its last item."""
 
     header, numbers = HEADER, ("seconds",)
 
@@ -151,36 +143,34 @@ class RunTable(ProgressTable):
             print(f"  {self.caption()}")
 
     def watch(self, event: Event) -> None:
-        """Take one event of the engine."""
+        """Add an event of the engine to the table."""
         family = note(self.families, event)
-        if event.done is not None and family.awake and len(family.done) == len(family.members):
+        if event.done is not None and family.needed and len(family.done) == len(family.members):
             self.show_row(family.cells())
 
     def live_rows(self) -> Iterator[tuple[tuple[str, ...], str]]:
-        """Return the steps that have begun."""
+        """Yield the cells and the state of each step that has begun."""
         for family in self.families.values():
-            if family.begun or family.awake:
+            if family.begun or family.needed:
                 cells = family.cells()
                 yield cells, "failed" if "LOOK" in cells[5] else cells[2]
 
     def caption(self) -> str:
-        """Return how many steps were not needed."""
-        asleep = sum(d.state == "not needed" for f in self.families.values() for d in f.done)
-        return f"{asleep} steps were not needed: the results that need them are in the cache" if asleep else ""
+        """Return a sentence with the number of steps that were not needed."""
+        count = sum(d.state == "not needed" for f in self.families.values() for d in f.done)
+        return f"{count} steps were not needed: the results that need them are in the cache" if count else ""
 
 
 def families(recipe: Recipe, names: Iterable[str]) -> dict[str, Family]:
     """Group steps by the name before the bracket, in running order."""
-    found: dict[str, Family] = {}
-    for name in names:
-        short = name.partition("[")[0]
-        unit = unit_of(recipe.steps[name].node.__doc__ or "")
-        found.setdefault(short, Family(short, [], unit)).members.append(name)
-    return found
+    return {
+        short: Family(short, members, unit_of(recipe.steps[members[0]].node.__doc__ or ""))
+        for short, members in by_family(names).items()
+    }
 
 
 def note(families: dict[str, Family], event: Event) -> Family:
-    """Add an event to the items of its step; a second attempt of a run repeats steps, and adds others."""
+    """Add an event to its step and return the items of this step; a second attempt of a run may add steps."""
     short = event.step.partition("[")[0]
     family = families.setdefault(short, Family(short, [], ""))
     if event.step not in family.members:
@@ -193,33 +183,32 @@ def note(families: dict[str, Family], event: Event) -> Family:
 
 
 def opening(recipe: Recipe, command: str) -> list[str]:
-    """Return the lines before anything runs: what was checked, and notes."""
+    """Return the lines to print before a run: title, numbers of checked steps and parameters, and notes."""
     values = sum(len(step.params) for step in recipe.steps.values())
     nodes = len({step.node.path for step in recipe.steps.values()})
-    lines = [f"neusee {command}: {recipe.title or recipe.name}"]
-    lines.append(f"checked  {len(recipe.steps)} steps of {nodes} nodes, {values} parameters: all right")
-    lines += [f"note     {line}" for line in recipe.notes]
-    return lines
+    checked = f"checked  {len(recipe.steps)} steps of {nodes} nodes, {values} parameters: all right"
+    notes = [f"note     {line}" for line in recipe.notes]
+    return [f"neusee {command}: {recipe.title or recipe.name}", checked, *notes]
 
 
 def closing(doc: Mapping[str, Any], path: str, again: Sequence[str]) -> list[str]:
-    """Return the lines after the run: what was left out, the table, the verdict, the page, and commands to try."""
+    """Return the lines to print after a run: steps left out, result table, verdict, page and commands to try."""
     lines = [said_of_economies(doc["spent"])] if doc["spent"]["economies"] else []
     lines += [left_out_line(doc)] if doc["left_out"] else []
     rows = [[row["name"], *row["cells"]] for row in doc["table"]["rows"]]
     lines += ["", *indented([["", *doc["table"]["columns"]], *rows])] if rows else []
     lines += [f"  {line}" for line in doc["table"]["legend"]]
     lines += ["", f"{doc['verdict']}  ({doc['counts']}, {doc['seconds']:.2f} s)"]
-    for e in doc["expected"]:
-        if not e["ok"]:
-            lines.append(
-                f"  missed: {e['name']} = {e['found']:.5g}, expected {e['wanted']:.5g} ± {100 * e['rtol']:.2g} %"
-            )
+    lines += [
+        f"  missed: {e['name']} = {e['found']:.5g}, expected {e['wanted']:.5g} ± {100 * e['rtol']:.2g} %"
+        for e in doc["expected"]
+        if not e["ok"]
+    ]
     return [*lines, f"report   {path}", "", "next", *[f"  {line}" for line in again]]
 
 
 def left_out_line(doc: Mapping[str, Any]) -> str:
-    """Return one line that names the steps that were left out, and the bounds of their effect."""
+    """Return one line with the steps that were left out and the upper bounds of the resulting changes."""
     named: dict[str, float] = {}
     for row in doc["left_out"]:
         short = row["step"].partition("[")[0]
@@ -230,13 +219,13 @@ def left_out_line(doc: Mapping[str, Any]) -> str:
 
 def next_commands(recipe: Recipe) -> list[str]:
     """Return three commands that work on this recipe."""
-    has, name = recipe.config.settings, recipe.name
-    tries = [
-        (f'neusee run {name} sensor.read_noise="20 e-"', "only what follows is run", "sensor.read_noise" in has),
+    name, noise = recipe.name, "sensor.read_noise"
+    commands = [
+        (f'neusee run {name} {noise}="20 e-"', "only what follows is run", noise in recipe.config.settings),
         (f"neusee run {name} doe=vortex", "another mask", "height" in recipe.steps),
         (f"neusee plan {name}", "what would run, and for how long", True),
         ("neusee nodes optics.psf", "what a step computes, and its source", True),
         ("neusee recipes", "what else there is", True),
     ]
-    shown = [(command, why) for command, why, fits in tries if fits][:3]
-    return columns([[command, f"# {why}"] for command, why in shown], gap="   ")
+    shown = [[command, f"# {comment}"] for command, comment, works in commands if works]
+    return columns(shown[:3], gap="   ")

@@ -1,23 +1,19 @@
-"""Contents of a run's report: its figures, its result table, its data files, and the steps that each of them reads.
+"""Contents of the report of a run: figures, result table, data files, and the steps that each of these reads.
 
-Only this file names the steps of the camera graph. A need names a value in the notation of a recipe:
+Only this file names the steps of the camera graph. A need is a text that names a value in the notation of a recipe:
 
     psf[mask]                    the value of a step
-    spot[mask,*]                 the values of all items of a step, by item
+    spot[mask,*]                 a dictionary with the value of each item of a step
     psf[mask].pixel_pitch        a parameter of a step
-    psf[mask]()                  a step with its parameters, which the figure calls itself
+    psf[mask]()                  a function: the node of a step with the parameters of the step
 
-A leading ``?`` marks an optional need: the figure is drawn without this argument if the recipe lacks the step.
+A leading ``?`` marks an optional need: if the recipe lacks the step, the figure is drawn without this argument.
 """
 
 from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import TYPE_CHECKING
-
-if TYPE_CHECKING:
-    from neusee.workflows.graph.recipe_graph import Recipe
 
 from neusee.workflows.graph.recipe_graph import Recipe, needed
 from neusee.workflows.tolerance.cheaper_steps import with_substitutions
@@ -25,7 +21,7 @@ from neusee.workflows.tolerance.cheaper_steps import with_substitutions
 
 @dataclass(frozen=True, slots=True)
 class Figure:
-    """A figure of the report: its texts, its drawing function, and the need of each argument of that function."""
+    """A figure of the report: title, caption, drawing function, and the value that each of its arguments needs."""
 
     name: str
     title: str
@@ -115,22 +111,17 @@ FIGURES = (
     ),
 )
 
+
+def _row(arm: str) -> dict[str, str]:
+    """Return the step that each column of the result table reads, for the arm ``plain`` or ``mask``."""
+    steps = {"peak/I_sat": "peak", "LSR": "lsr", "BSR": "bsr", "quality": "developed_quality", "saturated": "saturated"}
+    return {column: f"{step}[{arm}]" for column, step in steps.items()}
+
+
 #: Rows of the result table: the step that each column reads. `LSR` is taken at the wavelength of the first laser.
 TABLE: Mapping[str, Mapping[str, str]] = {
-    "plain lens": {
-        "peak/I_sat": "peak[plain]",
-        "LSR": "lsr[plain]",
-        "BSR": "bsr[plain]",
-        "quality": "developed_quality[plain]",
-        "saturated": "saturated[plain]",
-    },
-    "with mask": {
-        "peak/I_sat": "peak[mask]",
-        "LSR": "lsr[mask]",
-        "BSR": "bsr[mask]",
-        "quality": "developed_quality[mask]",
-        "saturated": "saturated[mask]",
-    },
+    "plain lens": _row("plain"),
+    "with mask": _row("mask"),
     "restored": {"quality": "restored_quality"},
 }
 #: Steps that only a figure reads. A run computes each of these steps if the recipe has the step.
@@ -153,12 +144,12 @@ FILES: Mapping[str, tuple[str, Mapping[str, str]]] = {
 
 
 def wanted(recipe: Recipe) -> tuple[str, ...]:
-    """Return the recipe's outputs, the steps of its expected numbers, and those that the result table shows."""
+    """Return the outputs of a recipe, the steps of its expected numbers, and the steps that only the report shows."""
     promised = [e.step for e in recipe.expect]
     shown = [s for s in (*(s for row in TABLE.values() for s in row.values()), *SHOWN) if s in recipe.steps]
     return tuple(dict.fromkeys([*recipe.outputs, *promised, *shown]))
 
 
 def steps_of(recipe: Recipe) -> list[str]:
-    """Return every step that a run of ``recipe`` looks at, in running order."""
+    """Return every step that a run of ``recipe`` computes or loads, in running order."""
     return needed(with_substitutions(recipe, wanted(recipe)), wanted(recipe))

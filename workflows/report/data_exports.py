@@ -1,4 +1,4 @@
-"""Data files of a run: spectral OpenEXR, RGB OpenEXR, 16-bit PNG and safetensors, stored by the key of their values."""
+"""Data files of a run: spectral OpenEXR, RGB OpenEXR, 16-bit PNG and safetensors."""
 
 from __future__ import annotations
 
@@ -14,31 +14,22 @@ from torch import Tensor
 
 from neusee.nodes.values import Bands, Psf
 from neusee.workflows.engine.runner import Result
-from neusee.workflows.keys.cache_key import digest
-from neusee.workflows.keys.code_digest import Code
 from neusee.workflows.report.contents import FILES
-from neusee.workflows.report.requirements import Missing
-from neusee.workflows.report.run_pictures import Job, finished, needs
+from neusee.workflows.report.run_pictures import DerivedFile, files_of
 from neusee.workflows.store.derived_files import DerivedFiles
 
-_FORM = 1  #: version of the file formats; to be increased when a file is written differently
+_VERSION = 1  #: of the file formats; increase the number when a file is written differently
 
 
 def exports(result: Result, shelf: DerivedFiles) -> tuple[dict[str, Path], dict[str, str]]:
-    """Return the path of every file of ``data/`` that the run provides, and the reason why another file is missing."""
-    code, jobs, missing = Code(result.store.code_memo), [], {}
-    for name, (form, wanted) in FILES.items():
-        try:
-            found = needs(wanted, result, code)
-        except Missing as why:
-            missing[name] = str(why)
-            continue
-        key = digest("file", form, _FORM, [[n, f.identity] for n, f in found.items()])
-        jobs.append(Job(name, Path(name).suffix, key, found, _FORMS[form]))
-    found = needs({step: step for step in result.recipe.outputs}, result, code)
-    key = digest("file", "safetensors", _FORM, [[n, f.identity] for n, f in found.items()])
-    jobs.append(Job("outputs.safetensors", ".safetensors", key, found, safetensors))
-    return finished(jobs, result, shelf, missing), missing
+    """Return the path of each file for ``data/``, and for each file that cannot be written, the reason."""
+    outputs = {step: step for step in result.recipe.outputs}
+    contents = {**FILES, "outputs.safetensors": ("safetensors", outputs)}
+    files = (
+        DerivedFile(name, Path(name).suffix, ("file", form, _VERSION), needs, _WRITERS[form])
+        for name, (form, needs) in contents.items()
+    )
+    return files_of(files, result, shelf)
 
 
 def spectral(cube: Tensor | Psf, bands: Bands) -> bytes:
@@ -50,7 +41,7 @@ def spectral(cube: Tensor | Psf, bands: Bands) -> bytes:
 
 
 def safetensors(**values: Any) -> bytes:
-    """Encode tensors as safetensors, named ``step``, or ``step.field`` if a step returns several tensors."""
+    """Encode the tensors of each step as safetensors; the name of a tensor is ``step`` or ``step.field``."""
     from safetensors.torch import save
 
     tensors: dict[str, Tensor] = {}
@@ -71,10 +62,12 @@ def exr(image: Tensor) -> bytes:
 
 
 def png16(image: Tensor) -> bytes:
-    """Encode whole numbers in [0, 65535], shape (3, y, x), as a 16-bit RGB PNG without loss."""
+    """Encode an image (3, y, x) of integers in [0, 65535] as a lossless 16-bit RGB PNG."""
     words = image.detach().cpu().double().round()
     if image.ndim != 3 or image.shape[0] != 3 or float(words.min()) < 0 or float(words.max()) > 65535:
-        raise ValueError(f"a 16-bit PNG holds (3, y, x) in [0, 65535], not {tuple(image.shape)}")
+        raise ValueError(
+            f"a 16-bit PNG needs an image (3, y, x) of values in [0, 65535], not of shape {tuple(image.shape)}"
+        )
     height, width = image.shape[1:]
     big = words.permute(1, 2, 0).to(torch.int32).numpy().astype(">u2").reshape(height, -1)
     lines = b"".join(b"\0" + row.tobytes() for row in big)
@@ -88,11 +81,16 @@ def _chunk(name: bytes, body: bytes) -> bytes:
 
 
 def _written(suffix: str, write: Callable[[Path], Any]) -> bytes:
-    """Return the bytes that ``write`` writes to a temporary file."""
+    """Call ``write`` with the path of a temporary file, and return the bytes of this file."""
     with TemporaryDirectory(prefix="neusee-") as folder:
         path = Path(folder) / f"file{suffix}"
         write(path)
         return path.read_bytes()
 
 
-_FORMS: dict[str, Callable[..., bytes]] = {"spectral": spectral, "exr": exr, "png16": png16}
+_WRITERS: dict[str, Callable[..., bytes]] = {
+    "spectral": spectral,
+    "exr": exr,
+    "png16": png16,
+    "safetensors": safetensors,
+}

@@ -1,13 +1,11 @@
-"""HTML views of a recipe and of a result for a notebook: one small page without external files."""
+"""HTML views of a recipe and of a result for a notebook: one small page that loads no other file."""
 
 from __future__ import annotations
 
 import base64
 import io
 import math
-from collections import Counter
 from collections.abc import Iterable, Mapping, Sequence
-from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from neusee.workflows.graph.final_values import Setting, flow
@@ -15,25 +13,23 @@ from neusee.workflows.graph.recipe_graph import Recipe, in_order
 from neusee.workflows.report import result_numbers
 from neusee.workflows.report.contents import BANDS, FIGURES, LINES, TABLE, wanted
 from neusee.workflows.report.result_numbers import metrics_of, table
+from neusee.workflows.report.study_page import filled
+from neusee.workflows.report.text_table import by_family
 
 if TYPE_CHECKING:
     from torch import Tensor
 
     from neusee.workflows.engine.runner import Result
 
-_TEMPLATE = Path(__file__).parent / "templates" / "notebook.html.j2"
-_PATIENCE = 2.0  #: s, limit of the time for computing again the values that the store does not hold
+_LONGEST_WAIT = 2.0  #: s, limit for computing values that the store does not hold
 _WEIGHT = 800_000  #: bytes of base64, limit for all pictures together
 _EDGES = {1: 640, 2: 400}  #: pixels of the longer side, by the number of pictures; 280 for other numbers
 _NAMES = {"plain": "plain lens", "mask": "with mask"}
 _LONGEST = 100  #: characters of a value in a table, at most
 
 
-# --- numbers and arrays ---------------------------------------------------------------------------------------------
-
-
 def numbers_of(result: Result) -> dict[str, float | list[float]]:
-    """Return the figures of merit that ``neusee run`` prints, by name; a list where there is one for each band."""
+    """Return the figures of merit that ``neusee run`` prints, by name; a figure of each band is a list."""
     recipe = result.recipe.unsubstituted or result.recipe
     names = metrics_of(recipe, {*result.keys, *wanted(recipe)})
     absent = [name for name in names if name not in result.values]
@@ -46,7 +42,7 @@ def numbers_of(result: Result) -> dict[str, float | list[float]]:
 
 
 def arrays_of(value: Any) -> Any:
-    """Return ``value`` with a NumPy array in place of every tensor; bfloat16, which NumPy lacks, becomes float32."""
+    """Return ``value`` with a NumPy array in place of every tensor; bfloat16 becomes float32."""
     import torch
     from torch import Tensor
 
@@ -61,59 +57,55 @@ def arrays_of(value: Any) -> Any:
     return {name: arrays_of(item) for name, item in value.items()} if isinstance(value, dict) else value
 
 
-# --- a result -------------------------------------------------------------------------------------------------------
-
-
 def result_line(result: Result) -> str:
     """Return one line such as ``<result of first_light: restored, raw; 12 run, 3 cached in 0.31 s>``."""
-    return f"<result of {result.recipe.name}: {', '.join(families(result.values))}; {_said(result)}>"
+    return f"<result of {result.recipe.name}: {', '.join(by_family(result.values))}; {_counts(result)}>"
 
 
 def result_html(result: Result) -> str:
-    """Return a page with pictures, the result table and the state of each step; skip values that take more than 2 s."""
-    values = _at_hand(result, [*_of_table(result), *_of_overview()])
-    checks = [f"{d.step}: {c.text}" for d in result.done.values() for c in d.checks if not c.ok]
-    return _page(
+    """Return a page with pictures, the result table and the state of each step, without values that take over 2 s."""
+    values = _at_hand(result, [*_of_table(result), *_of_overview().values()])
+    return filled(
+        "notebook.html.j2",
         title=result.recipe.name,
-        lines=[line for line in (result.recipe.title, f"{_said(result)}, on {result.device}") if line],
-        look=checks,
+        lines=[line for line in (result.recipe.title, f"{_counts(result)}, on {result.device}") if line],
+        look=[f"{d.step}: {c.text}" for d in result.done.values() for c in d.checks if not c.ok],
         pictures=_pictures({**result.values, **values}),
         tables=[*_results(result, values), _outputs(result), _steps(result)],
     )
 
 
-def _said(result: Result) -> str:
-    from neusee.workflows.report.run_page import said
+def _counts(result: Result) -> str:
+    from neusee.workflows.report.run_page import state_counts
 
-    return f"{said(Counter(str(d.state) for d in result.done.values()))} in {result.seconds:.3g} s"
+    return f"{state_counts(result.done.values())} in {result.seconds:.3g} s"
 
 
 def _of_table(result: Result) -> list[str]:
-    """Return the names of the steps that the result table reads."""
     cells = [step for row in TABLE.values() for step in row.values()]
     return [BANDS, *[n for n in result.keys if n.startswith(LINES.removesuffix("*]"))], *cells]
 
 
-def _of_overview() -> list[str]:
-    return [need for need in FIGURES[0].needs.values() if not need.startswith("?")]
+def _of_overview() -> dict[str, str]:
+    return {name: need for name, need in FIGURES[0].needs.items() if not need.startswith("?")}
 
 
 def _at_hand(result: Result, steps: Iterable[str]) -> dict[str, Any]:
-    """Return the values of those ``steps`` that are stored, or that can be computed again within ``_PATIENCE``."""
+    """Return the values of those ``steps`` that are stored, or that can be computed again in 2 s."""
     held = {name for name, key in result.keys.items() if name in result.values or result.store.has(key)}
     sources = {name: () if name in held else result.recipe.steps[name].sources for name in result.keys}
     kept: list[str] = []
     for name in dict.fromkeys(steps):
         missing = [n for n in in_order(sources, [*kept, name]) if n not in held] if name in sources else []
-        if name in sources and sum(_took(result, n) for n in missing) <= _PATIENCE:
+        if name in sources and sum(_took(result, n) for n in missing) <= _LONGEST_WAIT:
             kept.append(name)
-    wanted = [name for name in kept if name not in result.values]
-    again = result.recipe.run(result.store, wanted, device=result.device).values if wanted else {}
-    return {name: result.values[name] if name in result.values else again[name] for name in kept}
+    absent = [name for name in kept if name not in result.values]
+    again = result.recipe.run(result.store, absent, device=result.device).values if absent else {}
+    values = {**again, **result.values}
+    return {name: values[name] for name in kept}
 
 
 def _took(result: Result, step: str) -> float:
-    """Return the seconds that the last execution of a step took."""
     done = result.done[step]
     if done.state == "run":
         return done.seconds
@@ -140,7 +132,7 @@ def _outputs(result: Result) -> dict[str, Any]:
 
 
 def _looks(value: Any) -> tuple[str, str, str]:
-    """Return shape, type and range of a value; for a named tuple, return its scalars by name as the range."""
+    """Return shape, type and range of a value; for a named tuple, return its scalars in place of the range."""
     from neusee.nodes import TensorStats
 
     facts = TensorStats.of(value)
@@ -162,14 +154,11 @@ def _steps(result: Result) -> dict[str, Any]:
     return _table(f"{len(rows)} steps", ["step", "state", "seconds", "why"], rows, ["seconds"], shown=len(rows) <= 12)
 
 
-# --- pictures -------------------------------------------------------------------------------------------------------
-
-
 def _pictures(values: Mapping[str, Any]) -> list[dict[str, Any]]:
-    """Encode the pictures of the camera overview with one scale; without them, encode up to four other images."""
+    """Encode the pictures of the camera overview in one scale, or up to four other images if these are missing."""
     from neusee.workflows.report.figures.camera_overview import centre, high
 
-    needs = {name: need for name, need in FIGURES[0].needs.items() if not need.startswith("?")}
+    needs = _of_overview()
     if all(need in values for need in needs.values()):
         truth = values[needs["truth"]]
         white = high(truth)
@@ -179,9 +168,9 @@ def _pictures(values: Mapping[str, Any]) -> list[dict[str, Any]]:
         shown = {name: image.float() / high(image.float()) for name, image in list(found.items())[:4]}
     edge = _EDGES.get(len(shown), 280)
     while True:
-        made = [_picture(_NAMES.get(name, name), image, edge) for name, image in shown.items()]
-        if sum(len(p["png"]) for p in made) <= _WEIGHT:
-            return made
+        pictures = [_picture(_NAMES.get(name, name), image, edge) for name, image in shown.items()]
+        if sum(len(p["png"]) for p in pictures) <= _WEIGHT:
+            return pictures
         edge = edge * 3 // 4
 
 
@@ -194,7 +183,7 @@ def _is_picture(value: Any) -> bool:
 
 
 def _picture(name: str, linear: Tensor, edge: int) -> dict[str, Any]:
-    """Return a picture as PNG, at most ``edge`` pixels on a side: reduced in linear light, then encoded as sRGB."""
+    """Return an image as PNG with at most ``edge`` pixels on a side, reduced in linear light before the encoding."""
     from kornia.geometry.transform import resize
     from PIL import Image
 
@@ -211,15 +200,13 @@ def _picture(name: str, linear: Tensor, edge: int) -> dict[str, Any]:
     return {"name": name, "png": base64.b64encode(out.getvalue()).decode(), "width": width}
 
 
-# --- a recipe -------------------------------------------------------------------------------------------------------
-
-
 def recipe_html(recipe: Recipe) -> str:
-    """Return a page with the outputs of a recipe, the changed values, the steps, and every value with its source."""
+    """Return a page with the outputs of a recipe, its changed values, its steps, and every value with its source."""
     written = {name: s for name, s in recipe.config.settings.items() if not s.default and not name.startswith("steps.")}
     changed = {name: s for name, s in recipe.config.settings.items() if "argument " in s.source}
-    lines = [recipe.title, f"gives {', '.join(families(recipe.outputs))}"]
-    return _page(
+    lines = [recipe.title, f"gives {', '.join(by_family(recipe.outputs))}"]
+    return filled(
+        "notebook.html.j2",
         title=recipe.name,
         lines=[*filter(None, lines), f"seed {recipe.seed}, tolerance {recipe.tolerance:g}", *recipe.notes],
         look=[],
@@ -232,20 +219,12 @@ def recipe_html(recipe: Recipe) -> str:
     )
 
 
-def families(names: Iterable[str]) -> dict[str, list[str]]:
-    """Group names by the part before the bracket: ``psf[plain]`` and ``psf[mask]`` belong to ``psf``."""
-    found: dict[str, list[str]] = {}
-    for name in names:
-        found.setdefault(name.partition("[")[0], []).append(name)
-    return found
-
-
 def _graph(recipe: Recipe) -> dict[str, Any]:
     """Return the table of steps; all items of one step share a row."""
     rows = []
-    for family, names in families(recipe.steps).items():
+    for family, names in by_family(recipe.steps).items():
         step = recipe.steps[names[0]]
-        reads = families(source for n in names for source in recipe.steps[n].sources)
+        reads = by_family(source for n in names for source in recipe.steps[n].sources)
         title = f"{family} ×{len(names)}" if len(names) > 1 else names[0]
         devices = dict.fromkeys(recipe.steps[n].device for n in names if recipe.steps[n].device)
         rows.append([title, step.node.path, ", ".join(reads), ", ".join(devices)])
@@ -266,11 +245,3 @@ def _table(
     title: str, columns: Sequence[str], rows: Sequence[Sequence[str]], numbers: Sequence[str] = (), shown: bool = True
 ) -> dict[str, Any]:
     return {"title": title, "columns": columns, "rows": rows, "numbers": numbers, "open": shown}
-
-
-def _page(**doc: Any) -> str:
-    from jinja2 import Environment, StrictUndefined
-
-    environment = Environment(autoescape=True, undefined=StrictUndefined)
-    text = _TEMPLATE.read_text(encoding="utf-8")
-    return environment.from_string(text).render(doc=doc)

@@ -1,4 +1,4 @@
-"""Numbers of a run: the expected numbers of the recipe, the result table, and the rows of the metrics file."""
+"""Numbers of a run: the expected numbers of the recipe, the result table, and the rows of ``metrics.csv``."""
 
 from __future__ import annotations
 
@@ -10,15 +10,24 @@ from torch import Tensor
 from neusee.nodes.spectra import mean_wavelength
 from neusee.workflows.graph.recipe_graph import Recipe
 from neusee.workflows.report.contents import BANDS, LINES, TABLE
+from neusee.workflows.report.figures.style import nearest
 
-Value = Callable[[str], Any]  #: a function that returns the value of a step and reads the store only when called
-_COLUMNS = ("peak/I_sat", "LSR", "BSR", "PSNR (dB)", "SSIM", "saturated px")
-_DESIGN = 550e-9  #: m, wavelength of the LSR in the result table for a recipe without a laser
-_SMALL = 4096  #: elements, at most, of a result whose numbers become rows
+Value = Callable[[str], Any]  #: a function from the name of a step to the value of the step
+#: Columns of the result table: the result in `TABLE`, its field, the number of this field and a band, and the format
+_COLUMNS: Mapping[str, tuple[str, str, Callable[[Tensor, int], Any], str]] = {
+    "peak/I_sat": ("peak/I_sat", "", lambda x, band: x.max(), "{:.4g}"),
+    "LSR": ("LSR", "", lambda x, band: x.flatten()[min(band, x.numel() - 1)], "{:.3g}"),
+    "BSR": ("BSR", "", lambda x, band: x.double().mean(), "{:.3f}"),
+    "PSNR (dB)": ("quality", "psnr", lambda x, band: x, "{:.2f}"),
+    "SSIM": ("quality", "ssim", lambda x, band: x, "{:.3f}"),
+    "saturated px": ("saturated", "", lambda x, band: x.double().sum(), "{:,.0f}"),
+}
+_DESIGN_WAVELENGTH = 550e-9  #: m, for the LSR in the result table of a recipe without a laser
+_MOST = 4096  #: elements, at most, of a result whose numbers become rows
 
 
 def expected(recipe: Recipe, value: Value) -> list[dict[str, Any]]:
-    """Return every expected number of the recipe with the number that the run found."""
+    """Return every expected number of the recipe, with the number from the run."""
     rows = []
     for e in recipe.expect:
         found: Any = value(e.step)
@@ -31,42 +40,33 @@ def expected(recipe: Recipe, value: Value) -> list[dict[str, Any]]:
 
 
 def table(recipe: Recipe, keys: Mapping[str, str], value: Value) -> dict[str, Any]:
-    """Return the result table: a row each for plain lens, mask and restored picture; no rows if all cells are empty."""
+    """Return the result table, with rows for plain lens, mask and restored picture if any cell has a number."""
     band, where = _band(recipe, keys, value)
     rows = []
     for name, cells in TABLE.items():
         known = {column: value(step) for column, step in cells.items() if step in keys}
-        rows.append({"name": name, "cells": _cells(known, band)})
+        texts = [_cell(known.get(x), field, number, form, band) for x, field, number, form in _COLUMNS.values()]
+        rows.append({"name": name, "cells": texts})
     legend = [f"LSR at {where}; BSR is the mean over the bands."] if any(r["cells"][1] for r in rows) else []
     rows = rows if any(any(row["cells"]) for row in rows) else []
     return {"columns": list(_COLUMNS), "rows": rows, "legend": legend}
 
 
-def _cells(known: Mapping[str, Any], band: int) -> list[str]:
-    quality = known.get("quality")
-    numbers = {
-        "peak/I_sat": (_largest(known.get("peak/I_sat")), "{:.4g}"),
-        "LSR": (_at(known.get("LSR"), band), "{:.3g}"),
-        "BSR": (_mean(known.get("BSR")), "{:.3f}"),
-        "PSNR (dB)": (_field(quality, "psnr"), "{:.2f}"),
-        "SSIM": (_field(quality, "ssim"), "{:.3f}"),
-        "saturated px": (_sum(known.get("saturated")), "{:,.0f}"),
-    }
-    return ["" if number is None else form.format(number) for number, form in (numbers[c] for c in _COLUMNS)]
+def _cell(found: Any, field: str, number: Callable[[Tensor, int], Any], form: str, band: int) -> str:
+    """Return the text of one number of a result, or an empty string if the result has no such field."""
+    fields = {} if found is None else dict(_fields(found))
+    tensor = fields.get(field) if field else next(iter(fields.values()), None)
+    return "" if tensor is None else form.format(float(number(tensor, band)))
 
 
 def _band(recipe: Recipe, keys: Mapping[str, str], value: Value) -> tuple[int, str]:
-    """Return the band of the scene that is nearest to the first laser, or to 550 nm if there is no laser."""
+    """Return the index and the text of the band that is nearest to the first laser, or to 550 nm without a laser."""
     if BANDS not in keys:
         return 0, "the first band"
     prefix = LINES.removesuffix("*]")
     lines = [name for name in recipe.steps if name.startswith(prefix) and name in keys]
-    wanted = _DESIGN
-    if lines:
-        wanted = mean_wavelength(value(lines[0]))
-    centres = value(BANDS).centres
-    band = int((centres - wanted).abs().argmin())
-    return band, f"{float(centres[band]) * 1e9:.0f} nm"
+    wavelength = mean_wavelength(value(lines[0])) if lines else _DESIGN_WAVELENGTH
+    return nearest(value(BANDS).centres, wavelength)
 
 
 def metrics(recipe: Recipe, keys: Mapping[str, str], value: Value) -> list[list[Any]]:
@@ -75,15 +75,15 @@ def metrics(recipe: Recipe, keys: Mapping[str, str], value: Value) -> list[list[
 
 
 def metrics_of(recipe: Recipe, among: Container[str]) -> list[str]:
-    """Return the steps ``among`` those given that are metrics, in the order of the recipe."""
+    """Return those steps of ``among`` whose nodes are metrics, in the order of the recipe."""
     return [name for name, step in recipe.steps.items() if name in among and step.node.path.startswith("metrics.")]
 
 
 def numbers_of(step: str, found: Any) -> list[list[Any]]:
-    """Return a row (step, field, index, value) for each number of a small result; none for a picture."""
+    """Return a row (step, field, index, value) for each number of a small result, and no row for a picture."""
     rows: list[list[Any]] = []
     for field, tensor in _fields(found):
-        if tensor.numel() <= _SMALL and not tensor.is_complex():
+        if tensor.numel() <= _MOST and not tensor.is_complex():
             numbers = tensor.detach().double().flatten().tolist()
             rows += [[step, field, i if len(numbers) > 1 else "", n] for i, n in enumerate(numbers)]
     return rows
@@ -95,32 +95,3 @@ def _fields(found: Any) -> list[tuple[str, Tensor]]:
     if hasattr(found, "_asdict"):
         return [(k, v) for k, v in found._asdict().items() if isinstance(v, Tensor)]
     return []
-
-
-def _tensor(found: Any) -> Tensor | None:
-    fields = [] if found is None else _fields(found)
-    return fields[0][1] if fields else None
-
-
-def _largest(found: Any) -> float | None:
-    tensor = _tensor(found)
-    return None if tensor is None else float(tensor.max())
-
-
-def _mean(found: Any) -> float | None:
-    tensor = _tensor(found)
-    return None if tensor is None else float(tensor.double().mean())
-
-
-def _sum(found: Any) -> float | None:
-    tensor = _tensor(found)
-    return None if tensor is None else float(tensor.double().sum())
-
-
-def _at(found: Any, band: int) -> float | None:
-    tensor = _tensor(found)
-    return None if tensor is None else float(tensor.flatten()[min(band, tensor.numel() - 1)])
-
-
-def _field(found: Any, name: str) -> float | None:
-    return None if found is None else float(getattr(found, name))

@@ -1,4 +1,4 @@
-"""Folder of a run. A folder appears only when complete and is never overwritten. ``latest`` names the newest folder."""
+"""Folder of a run: the folder appears only when it is complete, and ``latest`` points to the newest folder."""
 
 from __future__ import annotations
 
@@ -13,17 +13,17 @@ from datetime import date
 from pathlib import Path
 from typing import Any
 
-_ABANDONED = 3600.0  #: s without a change, after which an unfinished folder counts as left by a killed run
+_ABANDONED = 3600.0  #: s without a change, after which an unfinished folder is removed
 
 
 @dataclass
 class RunFolder:
-    """The folder of a run: a temporary path while the run is being written, the final path afterwards."""
+    """The folder of a run, with a temporary path until all files are written, and the final path afterwards."""
 
     path: Path
 
     def write(self, name: str, content: str | bytes) -> Path:
-        """Write a file below the folder and create the parent folders."""
+        """Write a file into the folder, create its parent folders, and return its path."""
         path = self.path / name
         path.parent.mkdir(parents=True, exist_ok=True)
         path.write_bytes(content.encode() if isinstance(content, str) else content)
@@ -48,7 +48,7 @@ class RunFolder:
 
 @contextmanager
 def new_run(root: Path, recipe: str, key: str) -> Iterator[RunFolder]:
-    """Yield a folder with a temporary name; rename the folder after the block, or remove it if the block fails."""
+    """Yield a folder with a temporary name; rename the folder after the block, or remove the folder after an error."""
     root.mkdir(parents=True, exist_ok=True)
     _sweep(root)
     name = f"{date.today().isoformat()}_{recipe}_{key[:8]}"
@@ -57,7 +57,7 @@ def new_run(root: Path, recipe: str, key: str) -> Iterator[RunFolder]:
     run.path.mkdir()
     try:
         yield run
-        run.path = _settle(run.path, root / name)
+        run.path = _rename(run.path, root / name)
     except BaseException:
         shutil.rmtree(run.path, ignore_errors=True)
         raise
@@ -65,7 +65,7 @@ def new_run(root: Path, recipe: str, key: str) -> Iterator[RunFolder]:
 
 
 def _sweep(root: Path) -> None:
-    """Remove the unfinished folders of killed runs; the folder of a run in progress has changed more recently."""
+    """Remove unfinished folders in which no file has changed for an hour: their runs were killed."""
     for part in root.glob(".*.part"):
         try:
             if time.time() - max(p.stat().st_mtime for p in (part, *part.rglob("*"))) > _ABANDONED:
@@ -74,11 +74,11 @@ def _sweep(root: Path) -> None:
             continue
 
 
-def _settle(part: Path, wanted: Path) -> Path:
+def _rename(part: Path, target: Path) -> Path:
     """Rename a complete folder to the first free name: ``name``, ``name_2``, ``name_3`` …"""
     number = 1
     while True:
-        path = wanted if number == 1 else wanted.with_name(f"{wanted.name}_{number}")
+        path = target if number == 1 else target.with_name(f"{target.name}_{number}")
         if not path.exists():
             try:
                 return part.rename(path)
@@ -89,7 +89,7 @@ def _settle(part: Path, wanted: Path) -> Path:
 
 
 def _point(root: Path, name: str) -> None:
-    """Point ``latest`` to the newest run, by a symbolic link, or by a file with the name if links are refused."""
+    """Make ``latest`` a symbolic link to the run ``name``, or a file with this name if links are not possible."""
     part = root / f".latest.{os.getpid()}"
     try:
         part.symlink_to(name, target_is_directory=True)
@@ -103,10 +103,10 @@ def _point(root: Path, name: str) -> None:
 
 
 def find_run(where: str, root: Path) -> Path:
-    """Return the folder of a run, given as ``latest``, as a name under ``root`` or as a path."""
+    """Return the folder of a run; ``where`` is ``latest``, the name of a folder in ``root`` or a path."""
     for path in (root / where, Path(where)):
         if path.is_file():
             path = path.with_name(path.read_text(encoding="utf-8").strip())
         if (path / "provenance.json").is_file():
             return path
-    raise FileNotFoundError(f"no run at {where}: give the name of a folder under {root}, a path, or `latest`")
+    raise FileNotFoundError(f"no run at {where}: give the name of a folder in {root}, a path, or `latest`")

@@ -1,7 +1,7 @@
-"""Document and page of a run: its numbers, the record of every step, and the HTML page.
+"""Document and HTML page of a run: numbers, records of the steps, pictures and provenance.
 
 `document` returns plain JSON, which a run stores beside the pictures as ``provenance.json``.
-`page` renders the page from this document and the pictures alone, so that `rebuild` can render the page again.
+`page` needs this document and the pictures only, so that `rebuild` can write the page again.
 """
 
 from __future__ import annotations
@@ -17,12 +17,12 @@ from collections import Counter
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import replace
 from datetime import datetime
-from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
 from typing import Any
 
 from neusee.nodes import Check
 from neusee.workflows.engine.finished_step import facts_in
+from neusee.workflows.engine.provenance import version_of
 from neusee.workflows.engine.runner import Result
 from neusee.workflows.graph.recipe_graph import Recipe
 from neusee.workflows.graph.step_record import StepRecord
@@ -31,11 +31,13 @@ from neusee.workflows.recipe.paper_readings import in_force
 from neusee.workflows.report.contents import FIGURES
 from neusee.workflows.report.result_numbers import expected, metrics, table
 from neusee.workflows.report.run_timing import said_of, timing
+from neusee.workflows.report.study_page import filled
 from neusee.workflows.report.tolerance_spent import spent
 from neusee.workflows.store.byte_sizes import format_size
 
-_TEMPLATE = Path(__file__).parent / "templates" / "run_page.html.j2"
 _LIBRARIES = ("torch", "numpy", "kornia", "colour-science", "OpenEXR", "pydantic", "safetensors")
+_COPIED = ("device", "state", "why", "seconds", "predicted", "began", "lane", "peak", "kept")  #: from `StepRecord`
+_TITLES = {figure.name: figure.title for figure in FIGURES}
 _UNITS = frozenset(("m", "nm", "rad", "e-", "DN", "photons", "W/m2", "dB"))
 _SAMPLING = "The PSF is sampled at the pixel centres; one pixel centre lies on the optical axis."
 
@@ -43,31 +45,30 @@ _SAMPLING = "The PSF is sampled at the pixel centres; one pixel centre lies on t
 def document(
     result: Result, command: Sequence[str], warnings: Iterable[str], missing: Mapping[str, str]
 ) -> dict[str, Any]:
-    """Return all information of a run's report as plain JSON."""
+    """Return all contents of the report of a run, apart from the pictures, as plain JSON."""
     recipe, done = result.recipe, list(result.done.values())
     found = expected(recipe, result.value)
     steps = [_step(d, result) for d in done]
     failed = [f"{s['step']}: {c['text']}" for s in steps for c in s["checks"] if not c["ok"]]
-    counts = Counter[str](d.state for d in done)
     time = timing(steps, _planned(result))
     return {
         "recipe": recipe.name,
         "title": recipe.title,
-        "version": _version("neusee"),
+        "version": version_of("neusee"),
         "command": shlex.join(command),
         "started": datetime.now().astimezone().strftime("%Y-%m-%d %H:%M:%S %Z"),
         "device": result.device,
         "seconds": result.seconds,
         "tolerance": recipe.tolerance,
         "seed": recipe.seed,
-        "counts": said(counts),
+        "counts": state_counts(done),
         "verdict": verdict(found, failed),
         "missed": [e["name"] for e in found if not e["ok"]],
         "failed": failed,
         "expected": found,
         "table": table(recipe, result.keys, result.value),
         "metrics": metrics(recipe, result.keys, result.value),
-        "notes": [*_sampling(recipe), *recipe.notes, *warnings],
+        "notes": [*_sampling(recipe), *recipe.notes, *dict.fromkeys(warnings)],
         "posterior": told(recipe.uncertain.standings) if recipe.uncertain else [],
         "readings": _readings(recipe),
         "left_out": [{"step": d.step, "bound": d.bound, "why": d.why} for d in done if d.state == "left out"],
@@ -76,25 +77,21 @@ def document(
         "timing": {**time, "said": said_of(time)},
         "steps": steps,
         "figures": _figures(missing, bool(time["ran"])),
-        "missing": [{"name": n, "title": _title(n), "why": why} for n, why in missing.items()],
+        "missing": [{"name": n, "title": _TITLES.get(n, n), "why": why} for n, why in missing.items()],
         "facts": _facts(result),
         "inputs": _inputs(recipe),
     }
 
 
 def page(doc: Mapping[str, Any], pictures: Mapping[str, bytes]) -> str:
-    """Render a document and its pictures as one HTML file that loads no other file."""
-    from jinja2 import Environment, StrictUndefined
-
-    environment = Environment(autoescape=True, undefined=StrictUndefined)
-    template = environment.from_string(_TEMPLATE.read_text(encoding="utf-8"))
+    """Return a document and its pictures as one HTML page that loads no other file."""
     inline = {name: base64.b64encode(content).decode() for name, content in pictures.items()}
     shown = {**doc, "figures": [f for f in doc["figures"] if f["name"] in inline]}
-    return template.render(doc=shown, pictures=inline)
+    return filled("run_page.html.j2", doc=shown, pictures=inline)
 
 
 def rebuild(folder: Path) -> Path:
-    """Write the page of a run again, from the document and the pictures in its folder, and return its path."""
+    """Write the page of a run again from the document and the pictures in ``folder``; return the path of the page."""
     doc = json.loads((folder / "provenance.json").read_text(encoding="utf-8"))
     pictures = {p.stem: p.read_bytes() for p in sorted((folder / "figures").glob("*.png"))}
     target = folder / "report.html"
@@ -105,24 +102,25 @@ def rebuild(folder: Path) -> Path:
 
 
 def verdict(found: Sequence[Mapping[str, Any]], failed: Sequence[str]) -> str:
-    """Return one line: how many expected numbers are met, and how many checks failed."""
+    """Return one line with the number of expected numbers that are met, and the number of checks that failed."""
     met = sum(e["ok"] for e in found)
-    numbers = (
-        f"{met} of {len(found)} expected numbers within tolerance" if found else "No expected numbers in this recipe"
-    )
+    some = f"{met} of {len(found)} expected numbers within tolerance"
+    numbers = some if found else "No expected numbers in this recipe"
     checks = "every check held" if not failed else f"{len(failed)} check{'s' * (len(failed) > 1)} to look at"
     return f"{numbers}; {checks}."
 
 
-def said(counts: Mapping[str, int]) -> str:
-    """Return the counts as ``12 run, 3 cached, 1 left out``; steps that were not needed count as cached."""
-    merged = Counter({"cached": counts.get("cached", 0) + counts.get("not needed", 0)})
-    merged.update({s: n for s, n in counts.items() if s not in ("cached", "not needed")})
-    return ", ".join(f"{merged[s]} {s}" for s in ("run", "cached", "left out") if merged[s]) or "nothing to do"
+def state_counts(records: Iterable[StepRecord]) -> str:
+    """Return the number of steps in each state, such as ``12 run, 3 cached``; a step not needed counts as cached."""
+    counts = Counter("cached" if done.state == "not needed" else str(done.state) for done in records)
+    return (
+        ", ".join(f"{counts[state]} {state}" for state in ("run", "cached", "left out") if counts[state])
+        or "nothing to do"
+    )
 
 
 def shape_of(done: StepRecord) -> str:
-    """Return the shape as ``31 × 512 × 512``, or an empty string if the shape is unknown."""
+    """Return the shape of a result as ``31 × 512 × 512``, or an empty string if the shape is unknown."""
     return " × ".join(map(str, done.facts.shape)) or "number" if done.facts else ""
 
 
@@ -133,15 +131,7 @@ def _step(done: StepRecord, result: Result) -> dict[str, Any]:
     return {
         "step": done.step,
         "node": node.path,
-        "device": done.device,
-        "state": done.state,
-        "why": done.why,
-        "seconds": done.seconds,
-        "predicted": done.predicted,
-        "began": done.began,
-        "lane": done.lane,
-        "peak": done.peak,
-        "kept": done.kept,
+        **{name: getattr(done, name) for name in _COPIED},
         "made_in": about["seconds"] if about else done.seconds,
         "shape": shape_of(done),
         "unit": unit_of(node.__doc__ or ""),
@@ -154,7 +144,7 @@ def _step(done: StepRecord, result: Result) -> dict[str, Any]:
 
 
 def _planned(result: Result) -> float | None:
-    """Return the planned seconds of the run; None if the plan lacks a step that ran or the cost of such a step."""
+    """Return the planned seconds of a run; None if the plan lacks a step that ran, or its cost."""
     ran = [done for done in result.done.values() if done.state == "run"]
     if result.schedule is None or any(done.predicted is None for done in ran):
         return None
@@ -163,14 +153,14 @@ def _planned(result: Result) -> float | None:
 
 
 def _remembered(done: StepRecord, about: Mapping[str, Any]) -> StepRecord:
-    """Return the record of a step that did not run, completed with the stored facts about its result."""
+    """Return the record of a step that did not run, completed by the metadata ``about`` its stored result."""
     checks = tuple(Check(text, ok) for text, ok in about.get("checks", ()))
     why = f"made {about['date'][:16].replace('T', ' ')} UTC"
     return replace(done, why=why, facts=facts_in(about), checks=checks, bytes=about["bytes"])
 
 
 def unit_of(docstring: str) -> str:
-    """Return the unit of a node's result from its ``Units:`` line: the word after ``result``, else the first word."""
+    """Return the unit of a node's result: in ``Units:``, the word after ``result``, or the first word without it."""
     lines = (line.strip() for line in docstring.splitlines())
     units = next((line for line in lines if line.startswith("Units:")), "Units:").removeprefix("Units:").strip()
     before, found, after = units.partition("result ")
@@ -185,40 +175,34 @@ def _sampling(recipe: Recipe) -> list[str]:
 
 
 def _readings(recipe: Recipe) -> list[dict[str, str]]:
-    settings = recipe.config.settings
-    if not any(path.startswith("reading.") for path in settings):
+    """Return a row for each contradiction of the paper, with the value that the recipe uses."""
+    values = {path: setting.value for path, setting in recipe.config.settings.items()}
+    if not any(path.startswith("reading.") for path in values):
         return []
-    values = {path: setting.value for path, setting in settings.items()}
-    keep = ("name", "number", "matter", "reason")
-    rows = []
-    for row, state in in_force(values):
-        rows.append({k: str(getattr(row, k)) for k in keep} | {"value": str(values[row.path]), "state": state})
-    return rows
+    texts = ("name", "number", "matter", "reason")
+    return [
+        {name: str(getattr(row, name)) for name in texts} | {"value": str(values[row.path]), "state": state}
+        for row, state in in_force(values)
+    ]
 
 
 def _figures(missing: Mapping[str, str], ran: bool) -> list[dict[str, str]]:
     from neusee.workflows.report.run_pictures import GRAPH, TIMELINE
 
-    drawn = [(f.name, f.title, f.caption) for f in FIGURES if f.name not in missing] + [GRAPH] + [TIMELINE] * ran
-    return [{"name": n, "title": t, "caption": c, "file": f"figures/{n}.png"} for n, t, c in drawn]
-
-
-def _title(name: str) -> str:
-    return next((f.title for f in FIGURES if f.name == name), name)
+    shown = [(f.name, f.title, f.caption) for f in FIGURES if f.name not in missing] + [GRAPH] + [TIMELINE] * ran
+    return [{"name": n, "title": t, "caption": c, "file": f"figures/{n}.png"} for n, t, c in shown]
 
 
 def _facts(result: Result) -> list[list[str]]:
     """Return names and values of the software, the machine and the settings of the run."""
     import torch
 
+    cores, threads = f"{os.cpu_count()} cores", f"{torch.get_num_threads()} threads"
     rows = [
-        ["neusee", _version("neusee")],
+        ["neusee", version_of("neusee")],
         ["Python", platform.python_version()],
-        *[[name, _version(name)] for name in _LIBRARIES],
-        [
-            "machine",
-            f"{platform.system()} {platform.machine()}, {os.cpu_count()} cores, {torch.get_num_threads()} threads",
-        ],
+        *[[name, version_of(name)] for name in _LIBRARIES],
+        ["machine", f"{platform.system()} {platform.machine()}, {cores}, {threads}"],
         ["device", result.device],
         ["recipe seed", str(result.recipe.seed)],
         ["tolerance", f"{result.recipe.tolerance:g}"],
@@ -228,21 +212,13 @@ def _facts(result: Result) -> list[list[str]]:
     return [[name, value] for name, value in rows if value]
 
 
-def _version(package: str) -> str:
-    try:
-        return version(package)
-    except PackageNotFoundError:
-        return ""
-
-
 def _inputs(recipe: Recipe) -> list[dict[str, str]]:
-    """Return a row for every file that the parameters of the recipe name."""
+    """Return a row for every file that a parameter of the recipe names."""
     from neusee.workflows.keys.cache_key import file_digest
 
-    rows: dict[str, dict[str, str]] = {}
-    for step in recipe.steps.values():
-        for name, value in step.params.items():
-            if isinstance(value, Path):
-                path = f"{step.name}.{name}"
-                rows[path] = {"parameter": path, "file": value.name, "digest": file_digest(value)}
-    return list(rows.values())
+    return [
+        {"parameter": f"{step.name}.{name}", "file": value.name, "digest": file_digest(value)}
+        for step in recipe.steps.values()
+        for name, value in step.params.items()
+        if isinstance(value, Path)
+    ]

@@ -1,9 +1,9 @@
-"""Pictures of a run. Each picture is stored by the key of its values, and is drawn once."""
+"""Pictures of a run. A picture is drawn once and stored under a key of the values that the picture shows."""
 
 from __future__ import annotations
 
 import importlib
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -32,38 +32,45 @@ TIMELINE = (
 
 
 @dataclass(frozen=True, slots=True)
-class Job:
-    """A file that a run can provide: its name, its key, the values that it needs, and the function that writes it."""
+class DerivedFile:
+    """A file made from results: the needs of the arguments of ``make``, a function that returns the bytes."""
 
     name: str
     suffix: str
-    key: str
-    found: Mapping[str, Found]
+    kind: Sequence[Any]  #: the parts of the key that do not depend on the results
+    needs: Mapping[str, str]
     make: Callable[..., bytes]
 
 
+Job = tuple[DerivedFile, str, Mapping[str, Found]]  #: a file, its key, and the arguments of its ``make``
+
+
 def pictures(result: Result, shelf: DerivedFiles) -> tuple[dict[str, Path], dict[str, str]]:
-    """Return the path of every picture that can be drawn, and the reason why each other picture is missing."""
-    code, drawing = Code(result.store.code_memo), _drawing()
-    jobs, missing = [], {}
-    for figure in FIGURES:
+    """Return the path of each picture, and for each picture that cannot be drawn, the reason."""
+    drawing = engine(*sorted({figure.draw.partition(":")[0] for figure in FIGURES}), "report.figures.recipe_graph")
+    files = (DerivedFile(f.name, ".png", ("figure", f.draw, drawing), f.needs, _function(f.draw)) for f in FIGURES)
+    paths, missing = files_of(files, result, shelf)
+    return {**paths, "graph": _graph(result, shelf, drawing)}, missing
+
+
+def files_of(
+    files: Iterable[DerivedFile], result: Result, shelf: DerivedFiles
+) -> tuple[dict[str, Path], dict[str, str]]:
+    """Return the path of each file, either stored or made now, and for each file that cannot be made, the reason."""
+    code, jobs, missing = Code(result.store.code_memo), list[Job](), dict[str, str]()
+    for file in files:
         try:
-            found = needs(figure.needs, result, code)
+            found = _arguments(file.needs, result, code)
         except Missing as why:
-            missing[figure.name] = str(why)
+            missing[file.name] = str(why)
             continue
-        key = digest("figure", figure.draw, drawing, [[name, f.identity] for name, f in found.items()])
-        jobs.append(Job(figure.name, ".png", key, found, _function(figure.draw)))
+        jobs.append((file, digest(*file.kind, [[name, x.identity] for name, x in found.items()]), found))
     code.save()
-    made = finished(jobs, result, shelf, missing)
-    return {**made, "graph": _graph(result, shelf, drawing)}, missing
+    return _made(jobs, result, shelf, missing), missing
 
 
 def timeline(result: Result) -> bytes | None:
-    """Draw the times of all steps beside the plan; return None if no step ran.
-
-    Times differ from run to run, so the picture is not stored.
-    """
+    """Draw the planned and the actual times of all steps; return None if no step ran. The picture is not stored."""
     ran = [done for done in result.done.values() if done.state == "run"]
     if not ran:
         return None
@@ -78,21 +85,22 @@ def timeline(result: Result) -> bytes | None:
 
 
 def _in_turn(known: Iterable[StepRecord]) -> tuple[Slot, ...]:
-    """Return one plan in place of several: on each lane, the steps follow each other in the order in which they ran."""
+    """Return a plan in which the steps of each lane follow each other, in the order in which the steps ran."""
     end: dict[str, Slot] = {}
     slots = []
     for done in sorted(known, key=lambda done: done.began):
-        lane, before = done.lane or done.device, end.get(done.lane or done.device)
+        lane = done.lane or done.device
+        before = end.get(lane)
         start = before.end if before else 0.0
         slots.append(Slot(done.step, lane, start, start + (done.predicted or 0.0), after=before.task if before else ""))
         end[lane] = slots[-1]
     return tuple(slots)
 
 
-def needs(wanted: Mapping[str, str], result: Result, code: Code) -> dict[str, Found]:
+def _arguments(needs: Mapping[str, str], result: Result, code: Code) -> dict[str, Found]:
     """Resolve the need of each argument; omit an argument if its need begins with ``?`` and its step is missing."""
     found = {}
-    for argument, need in wanted.items():
+    for argument, need in needs.items():
         try:
             found[argument] = find(need.removeprefix("?"), result.recipe, result.keys, code)
         except Missing:
@@ -101,51 +109,37 @@ def needs(wanted: Mapping[str, str], result: Result, code: Code) -> dict[str, Fo
     return found
 
 
-def finished(jobs: Iterable[Job], result: Result, shelf: DerivedFiles, missing: dict[str, str]) -> dict[str, Path]:
-    """Return the file of each job, either stored or made now; one run provides the values of all new files."""
-    jobs = list(jobs)
-    done = {job.name: path for job in jobs if (path := shelf.find(job.key, job.suffix))}
-    todo = [job for job in jobs if job.name not in done]
-    steps = {step for job in todo for f in job.found.values() for step in f.steps}
-    values = run(result.recipe, result.store, sorted(steps), device=result.device).values if todo else {}
-    for job in todo:
-        arguments = {name: f.make(values) for name, f in job.found.items()}
+def _made(jobs: Sequence[Job], result: Result, shelf: DerivedFiles, missing: dict[str, str]) -> dict[str, Path]:
+    """Return the path of each file; one run provides the values for all files that are not stored."""
+    paths = {file.name: path for file, key, _ in jobs if (path := shelf.find(key, file.suffix))}
+    new = [job for job in jobs if job[0].name not in paths]
+    steps = {step for _, _, found in new for x in found.values() for step in x.steps}
+    values = run(result.recipe, result.store, sorted(steps), device=result.device).values if new else {}
+    for file, key, found in new:
+        arguments = {name: x.make(values) for name, x in found.items()}
         try:
-            content = job.make(**arguments)
+            content = file.make(**arguments)
         except (ValueError, Missing, RuntimeError) as error:
-            missing[job.name] = str(error).partition("\n")[0]
+            missing[file.name] = str(error).partition("\n")[0]
             continue
-        done[job.name] = shelf.keep(job.key, job.suffix, job.name, content)
-    return {job.name: done[job.name] for job in jobs if job.name in done}
+        paths[file.name] = shelf.keep(key, file.suffix, file.name, content)
+    return {file.name: paths[file.name] for file, _, _ in jobs if file.name in paths}
 
 
 def _function(path: str) -> Callable[..., bytes]:
     """Return the drawing function ``module:function``; its module is imported at the first call."""
     module, _, name = path.partition(":")
-
-    def draw(**arguments: Any) -> bytes:
-        found: bytes = getattr(importlib.import_module(f"neusee.workflows.{module}"), name)(**arguments)
-        return found
-
-    return draw
-
-
-def _drawing() -> str:
-    """Return a digest of the drawing code, so that a change of this code draws every picture again."""
-    return engine(*sorted({figure.draw.partition(":")[0] for figure in FIGURES}), "report.figures.recipe_graph")
+    return lambda **arguments: getattr(importlib.import_module(f"neusee.workflows.{module}"), name)(**arguments)
 
 
 def _graph(result: Result, shelf: DerivedFiles, drawing: str) -> Path:
-    """Draw the graph with the state of each step; also draw and store the graph of a fully cached run for later."""
+    """Draw the graph with the state of each step, and also the graph that a run from the cache alone will show."""
     states = {name: "cached" if done.state == "not needed" else str(done.state) for name, done in result.done.items()}
     again = {name: "left out" if state == "left out" else "cached" for name, state in states.items()}
     sources = {name: list(result.recipe.steps[name].sources) for name in result.done}
-    paths = []
+    draw, paths = _function("report.figures.recipe_graph:graph"), []
     for now in (states, again):
         key = digest("graph", drawing, sources, now)
-        path = shelf.find(key, ".png")
-        if path is None:
-            content = _function("report.figures.recipe_graph:graph")(sources=sources, states=now)
-            path = shelf.keep(key, ".png", "graph", content)
-        paths.append(path)
+        found = shelf.find(key, ".png")
+        paths.append(found or shelf.keep(key, ".png", "graph", draw(sources=sources, states=now)))
     return paths[0]

@@ -1,24 +1,21 @@
-"""Time that a run took and time that the cache saved, computed from the records of the steps."""
+"""Times of a run: seconds of computing, seconds that the cache saved, and the seconds that were predicted."""
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from typing import Any
 
 from neusee.workflows.store.byte_sizes import format_size
 
-StepRow = Mapping[str, Any]  #: a step as the report says it
+StepRow = Mapping[str, Any]  #: a step in the document of a run
 
 
 def timing(steps: Sequence[StepRow], planned: float | None = None) -> dict[str, Any]:
-    """Return predicted and actual seconds, the seconds that the cache saved, and the bytes read and written.
-
-    A key that several steps share counts once. ``planned`` is the planned duration of the run in s, or None.
-    """
+    """Return predicted, planned, actual and saved seconds, and bytes read and written; each key counts once."""
     ran = [s for s in steps if s["state"] == "run"]
     own = {s["key"] for s in ran}
     served = _once(s for s in steps if s["state"] in ("cached", "not needed") and s["key"] not in own)
-    told = [s for s in ran if s["predicted"] is not None]
+    known = [s for s in ran if s["predicted"] is not None]
     took, saved = sum(s["seconds"] for s in ran), sum(s["made_in"] for s in served)
     ends = [s["began"] + s["seconds"] for s in ran]
     return {
@@ -28,9 +25,9 @@ def timing(steps: Sequence[StepRow], planned: float | None = None) -> dict[str, 
         "seconds": took,
         "span": max(ends) - min(s["began"] for s in ran) if ran else 0.0,
         "planned": planned if ran else None,
-        "told": len(told),
-        "predicted": sum(s["predicted"] for s in told),
-        "actual": sum(s["seconds"] for s in told),
+        "told": len(known),
+        "predicted": sum(s["predicted"] for s in known),
+        "actual": sum(s["seconds"] for s in known),
         "saved": saved,
         "share": saved / (saved + took) if saved + took else 0.0,
         "read": sum(s["bytes"] for s in served if s["state"] == "cached"),
@@ -38,8 +35,8 @@ def timing(steps: Sequence[StepRow], planned: float | None = None) -> dict[str, 
     }
 
 
-def _once(steps: Any) -> list[StepRow]:
-    """Return one step for each key: the step that was read from the cache, or else the first step with this key."""
+def _once(steps: Iterable[StepRow]) -> list[StepRow]:
+    """Return one step for each key: a step that was read from the cache, or the first step if none was read."""
     found: dict[str, StepRow] = {}
     for step in steps:
         if step["key"] not in found or step["state"] == "cached":
@@ -48,7 +45,7 @@ def _once(steps: Any) -> list[StepRow]:
 
 
 def said_of(found: Mapping[str, Any]) -> list[str]:
-    """Return the result of `timing` as sentences."""
+    """Return the numbers from `timing` as sentences."""
     lines = []
     if found["ran"]:
         lines.append(f"{found['ran']} of {found['steps']} steps ran: {_seconds(found['seconds'])} of computing time.")

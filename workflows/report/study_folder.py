@@ -1,7 +1,7 @@
-"""The folder of a study: what a study, a calibration and an evaluation write alike.
+"""The folder of a study, of a calibration or of an evaluation: page, pictures, tables and provenance.
 
 run = StudyRun("stability", recipe, command)            # starts the clock
-document = run.document({"failed": 3})                  # what provenance.json holds
+document = run.document({"failed": 3})                  # the content of provenance.json
 report = StudyReport("Stability of it", lead, sections) # the page, its pictures and its tables
 folder = run.write(runs, key, document, report)
 """
@@ -20,10 +20,10 @@ from neusee.workflows.graph.recipe_graph import Recipe
 from neusee.workflows.report.run_folder import RunFolder, new_run
 from neusee.workflows.report.study_page import Section, page
 
-Progress = Callable[[str], None]  #: takes one line for each part of a study that is done
+Progress = Callable[[str], None]  #: receives a line after each part of a study
 CsvTable = tuple[Sequence[str], Iterable[Sequence[Any]]]  #: the names of the columns, and the rows
-Content = str | bytes | Callable[[Path], Any]  #: of a file, or what writes the file at a path
-SHOWN = ("command", "date", "seconds", "versions")  #: what the page of a study shows of its document
+Content = str | bytes | Callable[[Path], Any]  #: of a file, or a function that writes the file at a path
+SHOWN = ("command", "date", "seconds", "versions")  #: values of the document that the page of a study shows
 
 
 def silent(line: str) -> None:
@@ -32,7 +32,7 @@ def silent(line: str) -> None:
 
 @dataclass(frozen=True)
 class StudyReport:
-    """What a study writes beside its document: the parts of its page, pictures, tables and other files by name."""
+    """The report of a study: title, lead and sections of the page, and pictures, tables and other files by name."""
 
     title: str
     lead: str
@@ -41,10 +41,10 @@ class StudyReport:
     tables: Mapping[str, CsvTable] = field(default_factory=dict)  #: by file name
     files: Mapping[str, Content] = field(default_factory=dict)  #: by file name
     shown: Sequence[str] = SHOWN  #: the values of the document that the page shows
-    banner: str = ""  #: why the result must not be used
+    banner: str = ""  #: reason why nobody may use the result
 
     def write(self, folder: RunFolder, document: Mapping[str, Any]) -> None:
-        """Write the page, its pictures, tables and files, and ``document`` as ``provenance.json``."""
+        """Write the page, the pictures, the tables, the other files, and ``document`` as ``provenance.json``."""
         for name, picture in self.pictures.items():
             if picture:
                 folder.write(f"figures/{name}.png", picture)
@@ -58,14 +58,14 @@ class StudyReport:
 
 
 class StudyRun:
-    """A study under way: the clock runs from the moment that it is made."""
+    """A study in progress; its clock starts when the object is created."""
 
     def __init__(self, kind: str, recipe: Recipe, command: Sequence[str]) -> None:
         self.kind, self.recipe, self.command = kind, recipe, command
         self._began = time.perf_counter()
 
     def document(self, content: Mapping[str, Any]) -> dict[str, Any]:
-        """Return what ``provenance.json`` holds: the command, date and seconds, then ``content``, then the recipe."""
+        """Return the document of the study: command, date and seconds, then ``content``, then versions and recipe."""
         return {
             "study": self.kind,
             "recipe": self.recipe.name,
@@ -78,7 +78,7 @@ class StudyRun:
         }
 
     def write(self, runs: Path, key: str, document: Mapping[str, Any], report: StudyReport, name: str = "") -> Path:
-        """Write ``runs/<date>_<recipe>_<name>_<key>`` and return it; ``name`` is the kind of study by default."""
+        """Write the folder ``runs/<date>_<recipe>_<name>_<key>`` and return its path; ``name`` replaces the kind."""
         with new_run(runs, f"{self.recipe.name}_{name or self.kind.replace('-', '_')}", key) as folder:
             report.write(folder, document)
         return folder.path

@@ -1,7 +1,6 @@
-"""Page of a study: paragraphs, pictures and tables whose cells are coloured by a verdict.
+"""Page of a study: one HTML file of paragraphs, pictures and tables that loads no other file.
 
-The page is one file that loads no other file. Light mode, dark mode and print are supported. A sign in each coloured
-cell repeats the meaning of the colour.
+The page has a light mode, a dark mode and a print mode. A sign in each coloured cell repeats the meaning of the colour.
 """
 
 from __future__ import annotations
@@ -14,32 +13,25 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, Literal
 
-_TEMPLATE = Path(__file__).parent / "templates" / "study_page.html.j2"
 Mark = Literal["pass", "warn", "fail"]
 
 
 @dataclass(frozen=True)
 class Section:
-    """A section of the page: heading, text, picture and table. A blank line in the text begins a new paragraph."""
+    """A section of a page: heading, text, picture and table. A blank line in the text begins a new paragraph."""
 
     heading: str
     text: str
     columns: Sequence[str] = ()
-    rows: Sequence[Sequence[Any]] = ()  #: numbers are shown with three digits, None as a dash
+    rows: Sequence[Sequence[Any]] = ()  #: a real number is shown with three digits, None as a dash
     picture: bytes | None = None  #: PNG
     marks: Mapping[tuple[int, int], Mark] = field(default_factory=dict)  #: (row, column), from 0
 
 
 def page(title: str, lead: str, sections: Sequence[Section], provenance: Mapping[str, Any], banner: str = "") -> str:
-    """Render a page: ``lead`` states the result, the sections show the details, ``provenance`` lists the sources.
-
-    ``banner`` stands in red above all other text and says why the result must not be used.
-    """
-    from jinja2 import Environment, StrictUndefined
-
-    environment = Environment(autoescape=True, undefined=StrictUndefined)
-    template = environment.from_string(_TEMPLATE.read_text(encoding="utf-8"))
-    return template.render(
+    """Return the HTML of a page; ``lead`` states the result, and a red ``banner`` says why nobody may use it."""
+    return filled(
+        "study_page.html.j2",
         title=title,
         banner=banner,
         lead=_paragraphs(lead),
@@ -48,8 +40,16 @@ def page(title: str, lead: str, sections: Sequence[Section], provenance: Mapping
     )
 
 
+def filled(template: str, **values: Any) -> str:
+    """Return the HTML of a template of this room with ``values`` filled in."""
+    from jinja2 import Environment, StrictUndefined
+
+    text = (Path(__file__).parent / "templates" / template).read_text(encoding="utf-8")
+    return Environment(autoescape=True, undefined=StrictUndefined).from_string(text).render(**values)
+
+
 def said(value: Any) -> str:
-    """Return a cell's text: three digits of a real number, all digits of an integer, a dash for None."""
+    """Return the text of a cell: three digits of a real number, all digits of an integer, a dash for None."""
     if value is None:
         return "–"
     if isinstance(value, bool):
@@ -76,10 +76,12 @@ def _section(anchor: str, section: Section) -> dict[str, Any]:
 
 
 def _refuse_stray_marks(section: Section) -> None:
-    """Raise ValueError for a mark outside the table, because such a mark would hide a failure."""
+    """Raise ValueError if a mark is outside the table, where nobody would see the mark."""
     for row, column in section.marks:
         if not (0 <= row < len(section.rows) and 0 <= column < len(section.rows[row])):
-            raise ValueError(f"{section.heading}: a mark at ({row}, {column}) is outside the table: mark a cell of it")
+            raise ValueError(
+                f"{section.heading}: a mark at ({row}, {column}) is outside the table: mark a cell of the table"
+            )
 
 
 def _cell(value: Any, mark: Mark | None) -> dict[str, str]:
@@ -91,9 +93,9 @@ def _is_number(value: Any) -> bool:
 
 
 def _holds_numbers(cells: Sequence[Any]) -> bool:
-    """Return True if a column holds numbers only, so that its header is right-aligned like the numbers."""
-    found = [c for c in cells if c is not None]
-    return bool(found) and all(map(_is_number, found))
+    """Return True if a column holds numbers only, apart from empty cells."""
+    filled_cells = [c for c in cells if c is not None]
+    return bool(filled_cells) and all(map(_is_number, filled_cells))
 
 
 def _paragraphs(text: str) -> list[str]:

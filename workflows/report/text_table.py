@@ -1,20 +1,28 @@
-"""Tables as lines of text: each column as wide as its widest cell."""
+"""Tables as lines of text: each column is as wide as its widest cell."""
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 
 Rows = Sequence[Sequence[str]]
 
 
 def columns(rows: Rows, numbers: str = "<", gap: str = "  ") -> list[str]:
-    """Return one line for each row, the first cell aligned left and the others as ``numbers`` says: ``<`` or ``>``."""
+    """Return a line for each row; ``numbers`` aligns all columns after the first, left (``<``) or right (``>``)."""
     widths = [max(map(len, cells)) for cells in zip(*rows, strict=True)]
     forms = [f"{'<' if i == 0 else numbers}{width}" for i, width in enumerate(widths)]
     return [gap.join(f"{cell:{form}}" for cell, form in zip(row, forms, strict=True)).rstrip() for row in rows]
 
 
 def indented(rows: Rows) -> list[str]:
-    """Return indented lines for a table of text in the first column and numbers in the others; a lacking one is –."""
+    """Return an indented line for each row, with numbers aligned right and a dash for an empty cell."""
     full = [[name, *(cell or "–" for cell in cells)] for name, *cells in rows]
     return [f"  {line}" for line in columns(full, ">", "   ")]
+
+
+def by_family(names: Iterable[str]) -> dict[str, list[str]]:
+    """Group names of steps by the part before the bracket: ``psf[plain]`` and ``psf[mask]`` belong to ``psf``."""
+    groups: dict[str, list[str]] = {}
+    for name in names:
+        groups.setdefault(name.partition("[")[0], []).append(name)
+    return groups

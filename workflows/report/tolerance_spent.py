@@ -1,4 +1,4 @@
-"""Use of the tolerance by a run: omitted steps, cheaper steps, upper bounds of the error, and measured errors."""
+"""Use of the tolerance by a run: omitted steps, cheaper steps, error bounds and measured errors."""
 
 from __future__ import annotations
 
@@ -10,8 +10,9 @@ from neusee.workflows.engine.cost_model import Costs
 from neusee.workflows.engine.placement_inputs import past_costs
 from neusee.workflows.engine.resolve_keys import resolve
 from neusee.workflows.engine.runner import Result
-from neusee.workflows.graph.recipe_graph import Recipe, needed
+from neusee.workflows.graph.recipe_graph import Recipe, Substitution, needed
 from neusee.workflows.graph.run_error import RunError
+from neusee.workflows.graph.step_record import StepRecord
 from neusee.workflows.tolerance.error_norm import error_of
 
 NORM = "root mean square over the largest element"
@@ -20,9 +21,8 @@ NORM = "root mean square over the largest element"
 def spent(result: Result) -> dict[str, Any]:
     """Return the tolerance of a run and its use as plain JSON.
 
-    ``bounds`` holds the error bound of each value that must meet the tolerance: an output, or an input of a step that
-    states no error bound. ``measured`` holds the error of each output compared with a run with ``--exact``, if the
-    store has the results of such a run.
+    ``bounds`` has the error bound of each output, and of each input of a step that states no error bound.
+    ``measured`` has the error of each output relative to a run with ``--exact``, if the store has its results.
     """
     costs = past_costs(result.store) if result.recipe.substitutions or _left_out(result) else Costs([])
     return {
@@ -34,13 +34,21 @@ def spent(result: Result) -> dict[str, Any]:
         "bounds": {name: share for name, share in result.proof.held.items() if share > 0},
         "unbounded": [name for name in result.recipe.outputs if result.proof.of(name) is None],
         "measured": _measured(result),
-        "economies": [_economy(result, costs, e.step, e.instead, e.why) for e in result.recipe.substitutions],
-        "left_out": [_omission(result, costs, name) for name in _left_out(result)],
+        "economies": [_economy(result, costs, each) for each in result.recipe.substitutions],
+        "left_out": [
+            {
+                "step": done.step,
+                "bound": done.bound,
+                "why": done.why,
+                "full_seconds": _seconds(result, costs, done.step),
+            }
+            for done in _left_out(result)
+        ],
     }
 
 
 def said_of_economies(account: Mapping[str, Any]) -> str:
-    """Return one line for the console: the replaced and skipped steps, their error bounds, and measured errors."""
+    """Return one line with the replaced and the omitted steps, their error bounds, and the measured error."""
     summed = [f"{e['step']} ({_within(e['bound'])})" for e in account["economies"] if e["instead"]]
     nothing = [f"{e['step']} (no error)" for e in account["economies"] if not e["instead"]]
     worst = max(account["bounds"].values(), default=0.0)
@@ -54,32 +62,32 @@ def _within(bound: float | None) -> str:
     return "error unknown" if bound is None else f"at most {bound:.1e}"
 
 
-def _left_out(result: Result) -> list[str]:
-    return [name for name, done in result.done.items() if done.state == "left out"]
+def _left_out(result: Result) -> list[StepRecord]:
+    return [done for done in result.done.values() if done.state == "left out"]
 
 
-def _economy(result: Result, costs: Costs, step: str, instead: str, why: str) -> dict[str, Any]:
-    done = result.done.get(instead) if instead else None
+def _economy(result: Result, costs: Costs, each: Substitution) -> dict[str, Any]:
+    done = result.done.get(each.instead) if each.instead else None
     about = result.store.about(done.key) if done else None
-    took = done.seconds if done and done.state == "run" else about["seconds"] if about else None
-    row = {"step": step, "instead": instead, "why": why, "seconds": took, "full_seconds": _seconds(result, costs, step)}
-    checks = [check.text for check in done.checks] if done else []
-    return {**row, "bound": done.error[0] if done and done.error else None, "what": "; ".join(checks)}
-
-
-def _omission(result: Result, costs: Costs, step: str) -> dict[str, Any]:
-    done = result.done[step]
-    return {"step": step, "bound": done.bound, "why": done.why, "full_seconds": _seconds(result, costs, step)}
+    return {
+        "step": each.step,
+        "instead": each.instead,
+        "why": each.why,
+        "seconds": done.seconds if done and done.state == "run" else about["seconds"] if about else None,
+        "full_seconds": _seconds(result, costs, each.step),
+        "bound": done.error[0] if done and done.error else None,
+        "what": "; ".join(check.text for check in done.checks) if done else "",
+    }
 
 
 def _seconds(result: Result, costs: Costs, step: str) -> float | None:
-    """Return the seconds that the full step takes, estimated from earlier runs; None without such a run."""
+    """Return the seconds of the full step, estimated from earlier runs; return None if the step never ran."""
     estimate = costs.of(result.recipe.steps[step], ["cpu"])
     return estimate.seconds["cpu"] if estimate.known else None
 
 
 def _measured(result: Result) -> dict[str, float]:
-    """Return the error of each output compared with an exact run whose results are in the store."""
+    """Return the error of each output relative to an exact run, if the store has the results of such a run."""
     recipe = result.recipe
     if recipe.exact or not (recipe.substitutions or _left_out(result)):
         return {}

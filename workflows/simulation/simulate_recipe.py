@@ -4,8 +4,7 @@ from __future__ import annotations
 
 import json
 import warnings
-from collections.abc import Callable, Iterable, Iterator, Sequence
-from contextlib import contextmanager
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -25,14 +24,12 @@ from neusee.workflows.store.derived_files import DerivedFiles
 from neusee.workflows.store.result_store import Store
 from neusee.workflows.tolerance.cheaper_steps import with_substitutions
 
-__all__ = ["Simulation", "recipe_text", "simulate"]
-
 _TIMING = ("step", "node", "device", "lane", "state", "began", "seconds", "predicted", "peak", "bytes", "key")
 
 
 @dataclass(frozen=True)
 class Simulation:
-    """A finished run: its folder and its document, the content of ``provenance.json``."""
+    """A finished run: its folder, and its document, which is the content of ``provenance.json``."""
 
     folder: Path
     document: dict[str, Any]
@@ -53,41 +50,35 @@ def simulate(
     executor: Executor | None = None,
     memory: int | None = None,
 ) -> Simulation:
-    """Run ``recipe`` and write the folder ``runs/<date>_<recipe>_<key>/``; after a failure no folder remains."""
-    with _noted() as notes:
-        told: dict[str, StepRecord] = {}
-        recipe = with_substitutions(recipe, wanted(recipe))
-        tell = explained(recipe, store, _both(told, watch))
-        result = run(recipe, store, wanted(recipe), tell, device, executor, memory)
-        result = replace(result, done={name: told.get(name, done) for name, done in result.done.items()})
-        with new_run(runs, recipe.name, _run_key(result)) as folder:
-            doc = _write(result, folder, command, notes)
-    return Simulation(folder.path, doc)
-
-
-def _both(told: dict[str, StepRecord], watch: Callable[[Event], None] | None) -> Callable[[Event], None]:
-    """Return a watcher that records each finished step in ``told`` and then calls ``watch``."""
+    """Run a recipe and write the folder ``runs/<date>_<recipe>_<key>/``; after an error no folder remains."""
+    finished: dict[str, StepRecord] = {}
 
     def note(event: Event) -> None:
         if event.done is not None:
-            told[event.step] = event.done
+            finished[event.step] = event.done
         if watch is not None:
             watch(event)
 
-    return note
+    with warnings.catch_warnings(record=True) as caught:
+        warnings.simplefilter("default")
+        recipe = with_substitutions(recipe, wanted(recipe))
+        result = run(recipe, store, wanted(recipe), explained(recipe, store, note), device, executor, memory)
+        result = replace(result, done={name: finished.get(name, done) for name, done in result.done.items()})
+        key = digest([[name, result.keys[name]] for name in wanted(result.recipe)])
+        with new_run(runs, recipe.name, key) as folder:
+            doc = _write(result, folder, command, caught)
+    return Simulation(folder.path, doc)
 
 
-def _run_key(result: Result) -> str:
-    return digest([[name, result.keys[name]] for name in wanted(result.recipe)])
-
-
-def _write(result: Result, folder: RunFolder, command: Sequence[str], notes: Iterable[str]) -> dict[str, Any]:
+def _write(
+    result: Result, folder: RunFolder, command: Sequence[str], caught: Sequence[warnings.WarningMessage]
+) -> dict[str, Any]:
     shelf = DerivedFiles(result.store)
     drawn, missing = pictures(result, shelf)
-    files, without = exports(result, shelf)
-    doc = run_page.document(result, command, notes, missing)
+    files, refused = exports(result, shelf)
+    doc = run_page.document(result, command, (str(warning.message) for warning in caught), missing)
     doc["files"] = sorted(files)
-    doc["missing"] += [{"name": n, "title": f"data/{n}", "why": why} for n, why in without.items()]
+    doc["missing"] += [{"name": n, "title": f"data/{n}", "why": why} for n, why in refused.items()]
     shown = {name: path.read_bytes() for name, path in drawn.items()}
     for name, path in drawn.items():
         folder.take(f"figures/{name}.png", path)
@@ -104,22 +95,7 @@ def _write(result: Result, folder: RunFolder, command: Sequence[str], notes: Ite
     return doc
 
 
-@contextmanager
-def _noted() -> Iterator[list[str]]:
-    """Yield a list that collects the warnings, each once, for the report instead of the console."""
-    notes: list[str] = []
-
-    def note(message: Warning | str, *rest: Any, **named: Any) -> None:
-        if str(message) not in notes:
-            notes.append(str(message))
-
-    with warnings.catch_warnings():
-        warnings.showwarning = note
-        warnings.simplefilter("default")
-        yield notes
-
-
 def recipe_text(recipe: Recipe) -> str:
-    """Return all final values of the recipe as YAML that can be run again, each with its source as a comment."""
+    """Return the recipe as YAML that can be run again: all final values, with the source of each as a comment."""
     head = f"# {recipe.title or recipe.name}\n# Final values; the comment after each value names its source.\n"
     return head + recipe.config.to_yaml()

@@ -131,5 +131,5 @@ def test_work_of_a_lane_that_is_gone_goes_to_another_of_its_kind():
 
 
 def test_work_that_no_lane_can_take_is_an_error_and_no_wait_for_ever():
-    with pytest.raises(RuntimeError, match="no lane is left for a"):
+    with pytest.raises(RuntimeError, match="no device or worker is left to compute a"):
         ran([work("a", lane="dead")], Fake({"g": "cuda:0"}))

@@ -1,6 +1,6 @@
 """What does each picture of a run show?
 
-One function a picture, from values to a figure, and the style that all share.
+Each picture is drawn by one function from values to a figure. All pictures share one style.
 Nothing here reads the cache; a formula of physics belongs to a node.
 Offers: `style.drawn`, `style.canvas`, `camera_overview.overview`, `optics.psf`, `recipe_graph.graph`,
 `gantt.timeline`.

@@ -1,4 +1,4 @@
-"""Camera overview: the pictures of truth, plain lens, mask and restoration, and the error of the restoration."""
+"""Camera overview: the scene, its pictures through plain lens and mask, the restored picture and its error."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from neusee.workflows.report.figures.style import ORANGE, canvas, drawn, encoded
 def overview(
     *, truth: Tensor, plain: Tensor, mask: Tensor, restored: Tensor, spots: Mapping[str, Tensor] | None = None
 ) -> Any:
-    """Draw truth, plain lens, with mask and restored with one common scale, then |error|; ring each laser."""
+    """Draw truth, plain lens, mask and restored picture in one scale, then the absolute error; mark each laser."""
     white = high(truth)
     pictures = {"truth": truth, "plain lens": plain, "with mask": mask, "restored": restored}
     figure, axes = canvas(13.0, 3.4, 1, 5)
@@ -32,29 +32,25 @@ def overview(
 
 
 def high(values: Tensor) -> float:
-    """Return the level that only one value in 200 exceeds, at least 1e-9."""
-    some = values.detach().flatten()[:: max(1, values.numel() // 200_000)].float()
-    return max(float(torch.quantile(some, 0.995)), 1e-9)
+    """Return the level that one value in 200 exceeds; the level is at least 1e-9."""
+    sample = values.detach().flatten()[:: max(1, values.numel() // 200_000)].float()
+    return max(float(torch.quantile(sample, 0.995)), 1e-9)
 
 
 def centre(image: Tensor, like: Tensor) -> Tensor:
-    """Return the central part of an image in the size of ``like``; the axis of both is at sample N // 2."""
+    """Return the central part of an image, as large as ``like``; the optical axis of both is at sample N // 2."""
     top, left = (image.shape[d] // 2 - like.shape[d] // 2 for d in (-2, -1))
     if top < 0 or left < 0:
-        raise ValueError(f"a picture of {tuple(image.shape)} is smaller than the truth, {tuple(like.shape)}")
+        raise ValueError(f"a picture of {tuple(image.shape)} is smaller than the true picture, {tuple(like.shape)}")
     return image[..., top : top + like.shape[-2], left : left + like.shape[-1]].float()
 
 
 def _ring(ax: Any, spots: Mapping[str, Tensor], like: Tensor) -> None:
-    """Draw a ring round the brightest pixel of every laser."""
+    """Draw a ring around the brightest pixel of each laser."""
     from matplotlib.patches import Circle
 
     radius = max(like.shape[-1] / 14, 3.0)
-    for y, x in {_brightest(centre(s, like)) for s in spots.values()}:
+    images = [centre(spot, like) for spot in spots.values()]
+    for y, x in {divmod(int(image.sum(0).argmax()), image.shape[-1]) for image in images}:
         for width, colour in ((3.0, "black"), (1.4, ORANGE)):
             ax.add_patch(Circle((x, y), radius, fill=False, color=colour, linewidth=width))
-
-
-def _brightest(spot: Tensor) -> tuple[int, int]:
-    index = int(spot.sum(0).argmax())
-    return index // spot.shape[-1], index % spot.shape[-1]

@@ -1,7 +1,8 @@
-"""Gantt chart of the planned and the actual times of the steps, by lane and by step."""
+"""Gantt chart of the planned and the actual times of the steps: a row for each device, and a row for each step."""
 
 from __future__ import annotations
 
+import itertools
 from collections.abc import Iterable, Mapping, Sequence
 from typing import Any
 
@@ -9,17 +10,16 @@ from neusee.workflows.placement.heft_and_cpop import Schedule
 from neusee.workflows.report.figures.style import BLACK, BLUE, GREEN, ORANGE, VERMILION, canvas, drawn
 
 Row = tuple[str, str, float, float]  #: step, lane, start in s since the run began, duration in s
-Span = tuple[str, float, float]  #: lane, start in s, duration in s
+Spans = Mapping[str, tuple[str, float, float]]  #: lane, start in s and duration in s of each step
 
 _COLOURS = (BLUE, ORANGE, GREEN, "#CC79A7", "#56B4E9", "#8C6D1F", "#6A51A3", "#5F6B6D")
 _MOST = 80  #: rows of steps, at most; of more steps, the longest have a row
-_TALL = 0.2  #: inches, height of the row of a step
-_LANE = 0.3  #: inches, height of the row of a lane
+_STEP_HEIGHT, _LANE_HEIGHT = 0.2, 0.3  #: inches, of the row of a step and of a lane
 
 
 @drawn
 def timeline(*, schedule: Schedule, rows: Iterable[Row]) -> Any:
-    """Draw lanes above and steps below: hollow bars show the plan, solid bars show the run; both begin at 0 s.
+    """Draw lanes above and steps below, with hollow bars for the plan and solid bars for the run from 0 s on.
 
     ``rows`` may lack steps of the plan, and may have steps that the plan lacks.
     """
@@ -29,68 +29,54 @@ def timeline(*, schedule: Schedule, rows: Iterable[Row]) -> Any:
     lanes = [lane for lane in lanes if any(span[0] == lane for span in (*plan.values(), *ran.values()))]
     steps = _shown(plan, ran)
     end = max((start + took for _, start, took in (*plan.values(), *ran.values())), default=0.0) or 1.0
-    scale, unit = next((s, u) for least, s, u in ((1.0, 1.0, "s"), (1e-3, 1e3, "ms"), (0.0, 1e6, "µs")) if end >= least)
-    high = (_LANE * max(len(lanes), 2) + 0.25, _TALL * max(len(steps), 3) + 0.25)
-    figure, axes = canvas(10.0, sum(high) + 1.1, 2, 1, sharex=True, height_ratios=high)
-    colour = {lane: _COLOURS[i % len(_COLOURS)] for i, lane in enumerate(lanes)}
-    _lanes(axes[0, 0], lanes, plan, ran, colour, scale)
+    scale, unit = _unit(end)
+    heights = (_LANE_HEIGHT * max(len(lanes), 2) + 0.25, _STEP_HEIGHT * max(len(steps), 3) + 0.25)
+    figure, axes = canvas(10.0, sum(heights) + 1.1, 2, 1, sharex=True, height_ratios=heights)
+    colour = dict(zip(lanes, itertools.cycle(_COLOURS), strict=False))
+    _lanes(axes[0, 0], colour, plan, ran, scale)
     critical = {slot.task for slot in schedule.critical_path()}
     _steps(axes[1, 0], steps, plan, ran, colour, scale, critical)
     left = len(plan.keys() | ran.keys()) - len(steps)
-    axes[1, 0].set_xlabel(f"time ({unit})" + (f"; the {left} shortest steps have no row" if left else ""))
-    axes[1, 0].set_xlim(-0.004 * end * scale, end * scale * 1.01)
+    xlabel = f"time ({unit})" + (f"; the {left} shortest steps have no row" if left else "")
+    axes[1, 0].set(xlabel=xlabel, xlim=(-0.004 * end * scale, end * scale * 1.01))
     axes[0, 0].set_title(_title(plan, ran), loc="left")
     _legend(figure)
     return figure
 
 
-def _shown(plan: Mapping[str, Span], ran: Mapping[str, Span]) -> list[str]:
-    """Return the steps in the order of their start; of more than ``_MOST`` steps, return only the longest."""
+def _shown(plan: Spans, ran: Spans) -> list[str]:
+    """Return the steps that have a row, in the order of their start."""
     longest = sorted({**plan, **ran}, key=lambda s: -max(plan.get(s, ("", 0, 0))[2], ran.get(s, ("", 0, 0))[2]))
     return sorted(longest[:_MOST], key=lambda s: (ran.get(s) or plan[s])[1])
 
 
-def _lanes(
-    ax: Any,
-    lanes: Sequence[str],
-    plan: Mapping[str, Span],
-    ran: Mapping[str, Span],
-    colour: Mapping[str, str],
-    scale: float,
-) -> None:
+def _lanes(ax: Any, colour: Mapping[str, str], plan: Spans, ran: Spans, scale: float) -> None:
     """Draw two rows for each lane: the plan above, the run below."""
-    for y, lane in enumerate(lanes):
+    for y, lane in enumerate(colour):
         planned = [(start * scale, took * scale) for on, start, took in plan.values() if on == lane]
         done = [(start * scale, took * scale) for on, start, took in ran.values() if on == lane]
         ax.broken_barh(planned, (y - 0.4, 0.36), facecolor="white", edgecolor=colour[lane], linewidth=0.9)
         ax.broken_barh(done, (y + 0.04, 0.36), facecolor=colour[lane], edgecolor="white", linewidth=0.3)
-    _rows(ax, lanes)
-    for tick, lane in zip(ax.get_yticklabels(), lanes, strict=True):
-        tick.set_color(colour[lane])
-        tick.set_fontweight("bold")
+    _rows(ax, list(colour))
+    for tick, shade in zip(ax.get_yticklabels(), colour.values(), strict=True):
+        tick.set(color=shade, fontweight="bold")
 
 
 def _steps(
-    ax: Any,
-    steps: Sequence[str],
-    plan: Mapping[str, Span],
-    ran: Mapping[str, Span],
-    colour: Mapping[str, str],
-    scale: float,
-    critical: set[str],
+    ax: Any, steps: Sequence[str], plan: Spans, ran: Spans, colour: Mapping[str, str], scale: float, critical: set[str]
 ) -> None:
     """Draw one row for each step, and write the planned and the actual duration at the right."""
+    right: dict[str, Any] = {"xycoords": ("axes fraction", "data"), "va": "center"}
     for y, step in enumerate(steps):
         if step in plan:
             lane, start, took = plan[step]
-            ax.barh(
-                y, took * scale, 0.74, start * scale, facecolor="none", edgecolor=colour[lane], linewidth=0.9, zorder=3
-            )
+            ax.barh(y, took * scale, 0.74, start * scale, fc="none", ec=colour[lane], linewidth=0.9, zorder=3)
         if step in ran:
             lane, start, took = ran[step]
-            ax.barh(y, took * scale, 0.4, start * scale, facecolor=colour[lane], edgecolor=colour[lane], linewidth=0.9)
-        ax.annotate(_said(plan.get(step), ran.get(step)), (1.01, y), xycoords=("axes fraction", "data"), va="center")
-    ax.annotate("planned → took", (1.01, -1), xycoords=("axes fraction", "data"), va="center", fontweight="bold")
+            ax.barh(y, took * scale, 0.4, start * scale, fc=colour[lane], ec=colour[lane], linewidth=0.9)
+        times = (_time(spans[step][2]) if step in spans else "–" for spans in (plan, ran))
+        ax.annotate(" → ".join(times), (1.01, y), **right)
+    ax.annotate("planned → took", (1.01, -1), fontweight="bold", **right)
     _rows(ax, steps)
     for tick, step in zip(ax.get_yticklabels(), steps, strict=True):
         tick.set_color(VERMILION if step in critical else BLACK)
@@ -105,22 +91,23 @@ def _rows(ax: Any, names: Sequence[str]) -> None:
     ax.set_axisbelow(True)
 
 
-def _said(plan: Span | None, ran: Span | None) -> str:
-    return " → ".join(_time(span[2]) if span else "–" for span in (plan, ran))
+def _title(plan: Spans, ran: Spans) -> str:
+    ends = {
+        word: max(start + took for _, start, took in spans.values())
+        for word, spans in (("planned", plan), ("took", ran))
+        if spans
+    }
+    return ", ".join(f"{word} {_time(end)}" for word, end in ends.items()) or "nothing to run"
 
 
-def _title(plan: Mapping[str, Span], ran: Mapping[str, Span]) -> str:
-    ends = [max((start + took for _, start, took in spans.values()), default=None) for spans in (plan, ran)]
-    said = [f"{word} {_time(end)}" for word, end in zip(("planned", "took"), ends, strict=True) if end is not None]
-    return ", ".join(said) or "nothing to run"
+def _unit(seconds: float) -> tuple[float, str]:
+    """Return the unit that suits a time, after the factor from seconds to this unit."""
+    return (1.0, "s") if seconds >= 1.0 else (1e3, "ms") if seconds >= 1e-3 else (1e6, "µs")
 
 
 def _time(seconds: float) -> str:
-    """Return seconds with three digits and a fitting unit, such as ``12.3 ms``."""
-    for least, scale, unit in ((1.0, 1.0, "s"), (1e-3, 1e3, "ms")):
-        if seconds >= least:
-            return f"{seconds * scale:.3g} {unit}"
-    return f"{seconds * 1e6:.3g} µs"
+    scale, unit = _unit(seconds)
+    return f"{seconds * scale:.3g} {unit}"
 
 
 def _legend(figure: Any) -> None:

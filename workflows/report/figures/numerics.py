@@ -1,8 +1,8 @@
-"""Numerical accuracy: error against run time, and round-off error of a strong laser in single precision."""
+"""Pictures of numerical accuracy: error against run time, and round-off error of a strong laser in float32."""
 
 from __future__ import annotations
 
-import time
+import timeit
 from collections.abc import Callable
 from functools import partial
 from typing import Any
@@ -11,15 +11,15 @@ import torch
 from torch import Tensor
 
 from neusee.nodes.values import Psf, Pupil
-from neusee.workflows.report.figures.style import BLACK, BLUE, GREEN, canvas, drawn
+from neusee.workflows.report.figures.style import BLUE, GREEN, canvas, drawn
 
-STRENGTHS = (0.0, 1.0, 1e3, 1e6)
-WAYS = ("shifted PSF, added", "scene and laser\nin one convolution")
+STRENGTHS = (0.0, 1.0, 1e3, 1e6)  #: peak of the laser over the white of the scene
+METHODS = ("shifted PSF, added", "scene and laser\nin one convolution")
 
 
 @drawn
 def error_time(*, step: Callable[..., Any], pupil: Pupil) -> Any:
-    """Draw the error of the PSF of one band against the run time on this machine, by precision and window."""
+    """Draw the error of the PSF of one band against the run time on this machine, for each precision and window."""
     figure, axes = canvas(6.4, 4.2)
     ax = axes[0, 0]
     rows = precision_trial(step, pupil)
@@ -27,60 +27,49 @@ def error_time(*, step: Callable[..., Any], pupil: Pupil) -> Any:
         mine = [row for row in rows if row[0] == precision]
         ax.loglog([r[2] * 1e3 for r in mine], [r[3] for r in mine], mark, color=colour, label=f"{precision} precision")
         for _, window, seconds, error in mine:
-            above = (0, 7)
-            ax.annotate(
-                f"{window}²", (seconds * 1e3, error), above, textcoords="offset points", ha="center", fontsize=9
-            )
+            text, at = f"{window}²", (seconds * 1e3, error)
+            ax.annotate(text, at, (0, 7), textcoords="offset points", ha="center", fontsize=9)
     ax.margins(x=0.25, y=0.35)
-    ax.set_title("PSF of one band: error against run time")
-    ax.set_xlabel("run time (ms), fastest of three; labels: window in pixels")
-    ax.set_ylabel("largest error / peak")
+    xlabel = "run time (ms), fastest of three; labels: window in pixels"
+    ax.set(title="PSF of one band: error against run time", xlabel=xlabel, ylabel="largest error / peak")
     ax.legend(loc="center left")
     return figure
 
 
 def precision_trial(step: Callable[..., Any], pupil: Pupil) -> list[tuple[str, int, float, float]]:
-    """Return rows (precision, window, seconds, error from the direct float64 sum) for the middle band."""
+    """Return rows (precision, window, seconds, error relative to the direct float64 sum) for the middle band."""
     band = slice(len(pupil.wavelengths) // 2, len(pupil.wavelengths) // 2 + 1)
     one = pupil._replace(index=pupil.index[band], wavelengths=pupil.wavelengths[band])
     truth = step.reference(one, shape=(9, 9)).intensity.double()  # type: ignore[attr-defined]
     rows = []
     for precision in ("single", "double"):
         for window in (9, 65, 257):
-            seconds, found = _timed(partial(step, one, shape=(window, window), precision=precision))
+            compute = partial(step, one, shape=(window, window), precision=precision)
+            seconds = min(timeit.repeat(compute, number=1, repeat=3))
             middle = slice(window // 2 - 4, window // 2 + 5)
-            error = (found.intensity[..., middle, middle].double() - truth).abs().max() / truth.max()
+            error = (compute().intensity[..., middle, middle].double() - truth).abs().max() / truth.max()
             rows.append((precision, window, seconds, max(float(error), 1e-17)))
     return rows
 
 
-def _timed(call: Callable[[], Any]) -> tuple[float, Any]:
-    best, found = float("inf"), None
-    for _ in range(3):
-        began = time.perf_counter()
-        found = call()
-        best = min(best, time.perf_counter() - began)
-    return best, found
-
-
 @drawn
 def stability(*, step: Callable[..., Any], psf: Psf) -> Any:
-    """Draw the float32 error of a laser's glare, added as a shifted PSF or convolved together with the scene."""
+    """Draw the float32 error of a laser that is added as a shifted PSF, or convolved together with the scene."""
     errors = laser_trial(step, psf)
     figure, axes = canvas(6.4, 3.6)
     ax = axes[0, 0]
     for column in range(len(STRENGTHS)):
-        for row in range(len(WAYS)):
+        for row in range(len(METHODS)):
             error = float(errors[row, column])
             verdict, colour = _verdict(error)
             ax.barh(row, 0.94, 0.9, left=column - 0.47, color=colour)
-            ax.text(column, row, f"{verdict}\n{error:.1e}", ha="center", va="center", color=BLACK, fontsize=10)
+            ax.text(column, row, f"{verdict}\n{error:.1e}", ha="center", va="center", color="black", fontsize=10)
     ax.set_xticks(range(len(STRENGTHS)), [f"{s:.0e}" if s > 1 else f"{s:.0f}" for s in STRENGTHS])
-    ax.set_yticks(range(len(WAYS)), WAYS)
+    ax.set_yticks(range(len(METHODS)), METHODS)
     ax.invert_yaxis()
     ax.grid(False)
-    ax.set_xlabel("peak of the laser / white of the scene")
-    ax.set_title("largest float32 error far from the laser / range of the scene")
+    title = "largest float32 error far from the laser / range of the scene"
+    ax.set(xlabel="peak of the laser / white of the scene", title=title)
     return figure
 
 
@@ -89,15 +78,14 @@ def _verdict(error: float) -> tuple[str, str]:
 
 
 def laser_trial(step: Callable[..., Any], psf: Psf, size: int = 192) -> Tensor:
-    """Return the error (way, strength) from float64 for the middle band and a random scene."""
+    """Return the float32 error for each method and strength, with the middle band and a random scene."""
     band, half = psf.intensity.shape[0] // 2, min(64, *(n // 2 for n in psf.intensity.shape[-2:]))
     top, left = (n // 2 - half for n in psf.intensity.shape[-2:])
     core = psf.intensity[band : band + 1, top : top + 2 * half, left : left + 2 * half]
     kernel = Psf(core / core.sum(), psf.clear_peak[band : band + 1])
     scene = torch.rand(1, size, size, generator=torch.Generator().manual_seed(3))
     at = size // 2 - 11
-    rows = [_errors(step, scene, kernel, strength, at, half) for strength in STRENGTHS]
-    return torch.tensor(rows).T
+    return torch.tensor([_errors(step, scene, kernel, strength, at, half) for strength in STRENGTHS]).T
 
 
 def _errors(step: Callable[..., Any], scene: Tensor, psf: Psf, strength: float, at: int, half: int) -> list[float]:
@@ -107,7 +95,7 @@ def _errors(step: Callable[..., Any], scene: Tensor, psf: Psf, strength: float, 
     spot[..., at - half : at + half, at - half : at + half] = strength * psf.intensity
     double = Psf(psf.intensity.double(), psf.clear_peak)
     truth = step(scene.double(), double) + spot.double()
-    ways = (step(scene, psf) + spot, step(scene + point, psf))
-    y, x = (torch.arange(n) - at for n in scene.shape[-2:])
-    far = torch.hypot(y[:, None].double(), x[None, :].double()) > 16
-    return [float(((w.double() - truth).abs()[..., far]).max() / (scene.max() - scene.min())) for w in ways]
+    results = (step(scene, psf) + spot, step(scene + point, psf))
+    down, across = (torch.arange(n) - at for n in scene.shape[-2:])
+    far = torch.hypot(down[:, None].double(), across[None, :].double()) > 16
+    return [float(((x.double() - truth).abs()[..., far]).max() / (scene.max() - scene.min())) for x in results]

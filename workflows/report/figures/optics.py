@@ -1,4 +1,4 @@
-"""Pictures of the optics: height and phase of the mask, point-spread functions, suppression against wavelength."""
+"""Pictures of the optics: height and phase of the mask, point-spread functions, suppression at each wavelength."""
 
 from __future__ import annotations
 
@@ -10,20 +10,9 @@ from torch import Tensor
 from neusee.nodes import metrics
 from neusee.nodes.optics import mask_turns
 from neusee.nodes.values import Bands, Psf, Pupil
-from neusee.workflows.report.figures.style import (
-    BLACK,
-    BLUE,
-    GREEN,
-    VERMILION,
-    canvas,
-    drawn,
-    nanometres,
-    nearest,
-    picture,
-    wavelength_colour,
-)
+from neusee.workflows.report.figures.style import BLUE, GREEN, VERMILION, canvas, drawn, nanometres, nearest, picture
 
-_SHOWN = (450e-9, 550e-9, 638e-9)
+_WAVELENGTHS = (450e-9, 550e-9, 638e-9)  #: m, at which phase and PSF are drawn
 
 
 @drawn
@@ -36,27 +25,19 @@ def height(*, pupil: Pupil) -> Any:
     extent = (-half, half, -half, half)
     metres = pupil.height[::step, ::step].double()
     _map(figure, axes[0, 0], (metres * 1e6).where(clear, torch.nan), "height", "µm", extent, cmap="cividis")
-    for ax, wanted in zip(axes[0, 1:], _SHOWN, strict=True):
-        band = nearest(pupil.wavelengths, wanted)
-        title = f"phase at {nanometres(float(pupil.wavelengths[band])):.0f} nm"
-        limits = {"cmap": "twilight", "vmin": 0.0, "vmax": 1.0}
-        _map(
-            figure,
-            ax,
-            torch.remainder(mask_turns(pupil, band, step), 1.0).where(clear, torch.nan),
-            title,
-            "turns, wrapped",
-            extent,
-            **limits,
-        )
+    for ax, wavelength in zip(axes[0, 1:], _WAVELENGTHS, strict=True):
+        band, name = nearest(pupil.wavelengths, wavelength)
+        turns = torch.remainder(mask_turns(pupil, band, step), 1.0).where(clear, torch.nan)
+        _map(figure, ax, turns, f"phase at {name}", "turns, wrapped", extent, cmap="twilight", vmin=0.0, vmax=1.0)
     axes[0, 0].set_ylabel("v (mm)")
     return figure
 
 
-def _map(figure: Any, ax: Any, values: Tensor, title: str, unit: str, extent: tuple[float, ...], **how: Any) -> None:
-    shown = ax.imshow(values.cpu().numpy(), origin="lower", extent=extent, **how)
-    ax.set_title(title)
-    ax.set_xlabel("u (mm)")
+def _map(
+    figure: Any, ax: Any, values: Tensor, title: str, unit: str, extent: tuple[float, ...], **options: Any
+) -> None:
+    shown = ax.imshow(values.cpu().numpy(), origin="lower", extent=extent, **options)
+    ax.set(title=title, xlabel="u (mm)")
     ax.grid(False)
     bar = figure.colorbar(shown, ax=ax, fraction=0.046, pad=0.03)
     bar.set_label(unit, fontsize=9)
@@ -65,12 +46,12 @@ def _map(figure: Any, ax: Any, values: Tensor, title: str, unit: str, extent: tu
 
 @drawn
 def psf(*, plain: Psf, mask: Psf, bands: Bands, pixel_pitch: float) -> Any:
-    """Draw the logarithm of the PSF at three wavelengths, and the encircled energy, without and with the mask."""
+    """Draw the logarithm of the PSF at three wavelengths, and the encircled energy, for plain lens and mask."""
     figure, axes = canvas(13.0, 6.6, 2, 4)
     shown: Any = None
     for row, (arm, each) in enumerate({"plain lens": plain, "with mask": mask}.items()):
-        for column, wanted in enumerate(_SHOWN):
-            shown = _spot(axes[row, column], each, nearest(bands.centres, wanted), bands, pixel_pitch, arm)
+        for column, wavelength in enumerate(_WAVELENGTHS):
+            shown = _spot(axes[row, column], each, *nearest(bands.centres, wavelength), pixel_pitch, arm)
         _encircled(axes[row, 3], each, bands, pixel_pitch, arm)
     bar = figure.colorbar(shown, ax=axes[:, :3].ravel().tolist(), fraction=0.025, pad=0.01)
     bar.set_label("log₁₀ (pixel / peak of the clear lens)", fontsize=10)
@@ -78,35 +59,29 @@ def psf(*, plain: Psf, mask: Psf, bands: Bands, pixel_pitch: float) -> Any:
     return figure
 
 
-def _spot(ax: Any, psf: Psf, band: int, bands: Bands, pitch: float, arm: str) -> Any:
+def _spot(ax: Any, psf: Psf, band: int, name: str, pitch: float, arm: str) -> Any:
     size = min(257, *psf.intensity.shape[-2:])
     log = _window(metrics.over_clear_peak(psf, band), size).double().clamp_min(1e-30).log10()
-    shown = picture(ax, log.cpu().numpy(), "", origin="lower", cmap="viridis", vmin=-8.0, vmax=0.0)
-    ax.set_title(f"{arm}, {nanometres(float(bands.centres[band])):.0f} nm")
+    shown = picture(ax, log.cpu().numpy(), f"{arm}, {name}", origin="lower", cmap="viridis", vmin=-8.0, vmax=0.0)
     ax.set_xlabel(f"{size * pitch * 1e6:.0f} µm across")
     return shown
 
 
 def _window(image: Tensor, size: int) -> Tensor:
-    """Return the middle ``size`` by ``size`` pixels; the axis stays at sample N // 2."""
+    """Return the middle ``size`` by ``size`` pixels; the optical axis stays at sample N // 2."""
     top, left = (n // 2 - size // 2 for n in image.shape[-2:])
     return image[top : top + size, left : left + size]
 
 
 def _encircled(ax: Any, psf: Psf, bands: Bands, pitch: float, arm: str) -> None:
     """Draw the share of the clear pupil's light within a radius, at three wavelengths."""
-    for wanted in _SHOWN:
-        band = nearest(bands.centres, wanted)
+    for wavelength, colour in zip(_WAVELENGTHS, (BLUE, "#00785A", "#B3261E"), strict=True):
+        band, name = nearest(bands.centres, wavelength)
         share = metrics.encircled_curve(psf.intensity[band])
         microns = (torch.arange(len(share)) + 0.5) * pitch * 1e6
-        colour = wavelength_colour(wanted)
-        ax.semilogx(
-            microns.numpy(), share.numpy(), color=colour, label=f"{nanometres(float(bands.centres[band])):.0f} nm"
-        )
-    ax.set_ylim(0.0, 1.02)
-    ax.set_title(f"{arm}: encircled energy")
-    ax.set_xlabel("radius (µm)")
-    ax.set_ylabel("share of the pupil's light")
+        ax.semilogx(microns.numpy(), share.numpy(), color=colour, label=name)
+    title = f"{arm}: encircled energy"
+    ax.set(ylim=(0.0, 1.02), title=title, xlabel="radius (µm)", ylabel="share of the pupil's light")
     ax.legend(loc="best")
 
 
@@ -115,17 +90,15 @@ def suppression(*, lsr: Tensor, bands: Bands, psf: Psf, bsr: Tensor | None = Non
     """Draw laser and background suppression against wavelength, with the lower bound from energy conservation."""
     figure, axes = canvas(11.0, 4.2, 1, 2)
     nm, left, right = nanometres(bands.centres), axes[0, 0], axes[0, 1]
-    left.axhline(1.0, color=BLACK, linewidth=0.8, linestyle=":", label="plain lens")
+    left.axhline(1.0, color="black", linewidth=0.8, linestyle=":", label="plain lens")
     left.semilogy(nm, lsr.cpu().numpy(), "o-", color=VERMILION, markersize=3.5, label="with mask")
     left.semilogy(nm, metrics.least_lsr(psf).cpu().numpy(), "--", color=BLUE, label="energy floor")
-    left.set_title("laser suppression ratio (peak / clear peak)")
-    left.set_ylabel("LSR")
-    right.axhline(1.0, color=BLACK, linewidth=0.8, linestyle=":", label="plain lens")
+    left.set(title="laser suppression ratio (peak / clear peak)", ylabel="LSR")
+    right.axhline(1.0, color="black", linewidth=0.8, linestyle=":", label="plain lens")
     if bsr is not None:
         right.plot(nm, bsr.cpu().numpy(), "s-", color=GREEN, markersize=3.5, label="with mask")
     right.set_ylim(0.0, max(1.1, 1.1 if bsr is None else 1.1 * float(bsr.max())))
-    right.set_title("background kept in the field (BSR)")
-    right.set_ylabel("BSR")
+    right.set(title="background kept in the field (BSR)", ylabel="BSR")
     for ax in (left, right):
         ax.set_xlabel("wavelength (nm)")
         ax.legend(loc="upper center", bbox_to_anchor=(0.5, -0.17), ncols=3)

@@ -1,4 +1,4 @@
-"""Photon-transfer curve of the sensor: standard deviation against mean of simulated flat fields."""
+"""Photon-transfer curve of the sensor: standard deviation over mean of simulated flat fields."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from neusee.workflows.report.figures.style import BLACK, BLUE, GREEN, VERMILION,
 
 @drawn
 def transfer(*, measured: Tensor) -> Any:
-    """Draw the photon-transfer curve from rows (signal DN, variance DN², predicted variance DN²), the first dark."""
+    """Draw the curve from rows (signal DN, variance DN², predicted variance DN²); the first row has no light."""
     signal, variance, predicted = measured.detach().double().cpu().unbind(1)
     figure, axes = canvas(6.6, 4.4)
     ax = axes[0, 0]
@@ -25,8 +25,7 @@ def transfer(*, measured: Tensor) -> Any:
     full = float(signal.max())
     ax.axvline(full, color=VERMILION, linestyle=":", label=f"saturation, {full:,.0f} DN above dark")
     ax.set_ylim(min(floor, float(variance[seen].sqrt().min())) / 3, 3 * float(predicted.max().sqrt()))
-    ax.set_title("photon-transfer curve of this sensor")
-    ax.set_xlabel("mean above dark (DN)")
-    ax.set_ylabel("standard deviation (DN)")
+    title = "photon-transfer curve of this sensor"
+    ax.set(title=title, xlabel="mean above dark (DN)", ylabel="standard deviation (DN)")
     ax.legend(loc="upper center", bbox_to_anchor=(0.5, -0.15), ncols=2)
     return figure

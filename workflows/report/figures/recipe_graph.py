@@ -1,4 +1,4 @@
-"""Graph of a recipe: one box for each step, coloured by the state of the step. Items of one step share a box."""
+"""Graph of a recipe: one box for each step, coloured by the state of the step; items of one step share a box."""
 
 from __future__ import annotations
 
@@ -15,25 +15,24 @@ LOOKS = {
     "cached": ("#BFDDF0", "from the cache"),
     "left out": ("#FFFFFF", "left out: within the tolerance"),
 }
-_WIDE, _TALL = 1.75, 0.66
+_WIDTH, _HEIGHT = 1.75, 0.66  #: inches, of the place of a box
 
 
 @drawn
 def graph(*, sources: Mapping[str, Iterable[str]], states: Mapping[str, str]) -> Any:
-    """Draw the steps in rows, each below its sources; ``sources`` and ``states`` have keys such as ``psf[mask]``."""
+    """Draw a box for each step, below the boxes of its sources; both arguments have keys such as ``psf[mask]``."""
     wires, looks, counts = grouped(sources, states)
     places = layout(wires)
     columns = max((x for x, _ in places.values()), default=0.0) + 1
     rows = max((y for _, y in places.values()), default=0) + 1
-    figure, axes = canvas(min(max(_WIDE * columns, 6.0), 15.0), _TALL * rows + 0.7)
+    figure, axes = canvas(min(max(_WIDTH * columns, 6.0), 15.0), _HEIGHT * rows + 0.7)
     ax = axes[0, 0]
     for name, befores in wires.items():
         for before in befores:
             _edge(ax, places[before], places[name])
     for name, (x, y) in places.items():
         _box(ax, x, y, f"{name} ×{counts[name]}" if counts[name] > 1 else name, looks[name])
-    ax.set_xlim(-0.6, columns - 0.4)
-    ax.set_ylim(rows - 0.5, -0.5)
+    ax.set(xlim=(-0.6, columns - 0.4), ylim=(rows - 0.5, -0.5))
     ax.axis("off")
     _legend(figure, looks.values())
     return figure
@@ -42,21 +41,20 @@ def graph(*, sources: Mapping[str, Iterable[str]], states: Mapping[str, str]) ->
 def grouped(
     sources: Mapping[str, Iterable[str]], states: Mapping[str, str]
 ) -> tuple[dict[str, list[str]], dict[str, str], Counter[str]]:
-    """Merge the items of each step: sources, state and number by family; a family ran if any of its items ran."""
+    """Return the sources, the state and the number of items of each step; a step ran if any of its items ran."""
     family = {name: name.partition("[")[0] for name in sources}
     wires: dict[str, list[str]] = {f: [] for f in family.values()}
     looks: dict[str, str] = {}
     for name, befores in sources.items():
         mine = family[name]
         wires[mine] += [f for f in dict.fromkeys(family[b] for b in befores) if f not in (*wires[mine], mine)]
-        state = states.get(name, "cached")
-        state = state if state in LOOKS else "cached"
+        state = states[name] if states.get(name) in LOOKS else "cached"
         looks[mine] = "run" if "run" in (state, looks.get(mine)) else state
     return wires, looks, Counter(family.values())
 
 
 def layout(wires: Mapping[str, list[str]]) -> dict[str, tuple[float, int]]:
-    """Place each family: the row follows from its depth, the order within a row from the places of its sources."""
+    """Return (x, row) of each step: the depth decides the row, and the positions of the sources decide x."""
     depth = _depths(wires)
     rows: dict[int, list[str]] = {}
     for name, row in depth.items():
@@ -72,7 +70,7 @@ def layout(wires: Mapping[str, list[str]]) -> dict[str, tuple[float, int]]:
 
 
 def _depths(wires: Mapping[str, list[str]]) -> dict[str, int]:
-    """Return the row of each step: the longest path from a source, then moved down to just above its first reader."""
+    """Return the row of each step: just above the first step that reads its result."""
     order = in_order(wires, wires)
     depth: dict[str, int] = {}
     for name in order:
@@ -102,9 +100,8 @@ def _box(ax: Any, x: float, y: float, text: str, look: str) -> None:
     from matplotlib.patches import FancyBboxPatch
 
     style: dict[str, Any] = {"boxstyle": "round,pad=0.0,rounding_size=0.08", "mutation_aspect": 1.6, "zorder": 2}
-    style["linestyle"] = "--" if look == "left out" else "-"
-    colour = LOOKS[look][0]
-    ax.add_patch(FancyBboxPatch((x - 0.46, y - 0.26), 0.92, 0.52, facecolor=colour, edgecolor="#444444", **style))
+    style |= {"facecolor": LOOKS[look][0], "edgecolor": "#444444", "linestyle": "--" if look == "left out" else "-"}
+    ax.add_patch(FancyBboxPatch((x - 0.46, y - 0.26), 0.92, 0.52, **style))
     ax.text(x, y, text, ha="center", va="center", fontsize=9.5, zorder=3)
 
 

@@ -1,4 +1,4 @@
-"""Spectra of three points of the scene, beside the RGB values from which the spectra are reconstructed."""
+"""Spectra of three points of the scene, and the RGB values from which the spectra are reconstructed."""
 
 from __future__ import annotations
 
@@ -10,17 +10,7 @@ from torch import Tensor
 
 from neusee.nodes.spectra import mean_wavelength
 from neusee.nodes.values import Bands
-from neusee.workflows.report.figures.style import (
-    BLACK,
-    BLUE,
-    GREEN,
-    VERMILION,
-    canvas,
-    drawn,
-    encoded,
-    nanometres,
-    picture,
-)
+from neusee.workflows.report.figures.style import BLUE, GREEN, VERMILION, canvas, drawn, encoded, nanometres, picture
 
 _POINTS = ("A", "B", "C")
 _CHANNELS = ((VERMILION, "R"), (GREEN, "G"), (BLUE, "B"))
@@ -38,9 +28,9 @@ def spectra(
 ) -> Any:
     """Draw RGB values and spectra of three points of the scene, the illuminant, and the channels of the sensor."""
     figure, axes = canvas(13.0, 4.4, 1, 3, width_ratios=(1.0, 1.35, 1.35))
-    places = _places(scene)
-    _scene(axes[0, 0], scene, places)
-    _points(axes[0, 1], scene, radiance, bands, places)
+    points = _points(scene)
+    _scene(axes[0, 0], scene, points)
+    _spectra(axes[0, 1], scene, radiance, bands, points)
     _channels(axes[0, 2], illuminant, responses, bands)
     for ax in axes[0, 1:]:
         _lasers(ax, lines or {})
@@ -50,54 +40,46 @@ def spectra(
     return figure
 
 
-def _places(scene: Tensor) -> list[tuple[int, int]]:
-    """Return the reddest, the greenest and the bluest point that is neither dark nor clipped, after a local average."""
+def _points(scene: Tensor) -> list[tuple[int, int]]:
+    """Return (y, x) of the reddest, the greenest and the bluest point that is neither dark nor clipped."""
     inner = torch.nn.functional.avg_pool2d(scene[None].float(), 5, 1, 2)[0] if min(scene.shape[-2:]) >= 5 else scene
     lit = inner.amax(0)
     usable = (lit > 0.2 * lit.max()) & (lit < 0.9 * lit.max())
     share = inner / inner.sum(0).clamp_min(1e-9)
-    places = []
-    for channel in range(3):
-        index = int(share[channel].where(usable, -1.0).argmax())
-        places.append((index // scene.shape[-1], index % scene.shape[-1]))
-    return places
+    return [divmod(int(channel.where(usable, -1.0).argmax()), scene.shape[-1]) for channel in share]
 
 
-def _scene(ax: Any, scene: Tensor, places: list[tuple[int, int]]) -> None:
+def _scene(ax: Any, scene: Tensor, points: list[tuple[int, int]]) -> None:
     picture(ax, encoded(scene / scene.max().clamp_min(1e-9)), "three points of the scene")
     box = {"boxstyle": "round,pad=0.15", "facecolor": "white", "edgecolor": "black", "linewidth": 0.8}
-    for name, (y, x) in zip(_POINTS, places, strict=True):
-        ax.plot(x, y, "o", markerfacecolor="none", markeredgecolor="white", markersize=9, markeredgewidth=2.5)
-        ax.plot(x, y, "o", markerfacecolor="none", markeredgecolor="black", markersize=9, markeredgewidth=1.0)
-        inside = -1 if x > scene.shape[-1] / 2 else 1
-        ax.annotate(
-            name, (x, y), xytext=(14 * inside, 0), textcoords="offset points", bbox=box, ha="center", va="center"
-        )
+    for name, (y, x) in zip(_POINTS, points, strict=True):
+        for colour, width in (("white", 2.5), ("black", 1.0)):
+            ax.plot(x, y, "o", mfc="none", mec=colour, markersize=9, mew=width)
+        beside = (-14 if x > scene.shape[-1] / 2 else 14, 0)
+        ax.annotate(name, (x, y), beside, textcoords="offset points", bbox=box, ha="center", va="center")
 
 
-def _points(ax: Any, scene: Tensor, radiance: Tensor, bands: Bands, places: list[tuple[int, int]]) -> None:
+def _spectra(ax: Any, scene: Tensor, radiance: Tensor, bands: Bands, points: list[tuple[int, int]]) -> None:
     nm = nanometres(bands.centres)
-    for name, (y, x), style in zip(_POINTS, places, ("-", "--", "-."), strict=True):
+    for name, (y, x), style in zip(_POINTS, points, ("-", "--", "-."), strict=True):
         rgb = scene[:, y, x].tolist()
         row, column = (p * r // s for p, r, s in zip((y, x), radiance.shape[-2:], scene.shape[-2:], strict=True))
         label = f"{name}: RGB {rgb[0]:.2f} {rgb[1]:.2f} {rgb[2]:.2f}"
         colour = encoded(0.75 * scene[:, y : y + 1, x : x + 1] / max(*rgb, 1e-9))[0, 0]
         ax.plot(nm, radiance[:, row, column].cpu().numpy(), style, color=colour, label=label)
-    ax.set_title("spectra reconstructed from RGB")
-    ax.set_ylabel("relative spectral radiance")
+    ax.set(title="spectra reconstructed from RGB", ylabel="relative spectral radiance")
 
 
 def _channels(ax: Any, illuminant: Tensor, responses: Tensor, bands: Bands) -> None:
     nm = nanometres(bands.centres)
-    ax.plot(nm, illuminant.cpu().numpy(), color=BLACK, linestyle="--", label="illuminant")
+    ax.plot(nm, illuminant.cpu().numpy(), color="black", linestyle="--", label="illuminant")
     for channel, (colour, name) in zip(responses, _CHANNELS, strict=True):
         ax.plot(nm, channel.cpu().numpy(), color=colour, label=f"channel {name}")
-    ax.set_title("illuminant and channels")
-    ax.set_ylabel("relative")
+    ax.set(title="illuminant and channels", ylabel="relative")
 
 
 def _lasers(ax: Any, lines: Mapping[str, Bands]) -> None:
-    """Draw a vertical line at each laser's wavelength; more than two lasers share one label."""
+    """Draw a vertical line at the wavelength of each laser; three or more lasers share one label."""
     for number, (name, line) in enumerate(lines.items()):
         nm = mean_wavelength(line) * 1e9
         label = f"laser {name}, {nm:.0f} nm" if len(lines) < 3 else f"{len(lines)} lasers" if number == 0 else None

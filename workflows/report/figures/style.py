@@ -1,4 +1,4 @@
-"""Common style of all figures: light, safe for colour-blind readers, at least 9 points, encoded as PNG."""
+"""Style of all figures: light background, colours for colour-blind readers, text of at least 9 points, PNG."""
 
 from __future__ import annotations
 
@@ -34,18 +34,18 @@ _RC: Mapping[str, Any] = {
 }
 
 
-def canvas(width: float, height: float, rows: int = 1, columns: int = 1, **how: Any) -> tuple[Any, Any]:
-    """Create a figure of ``width`` by ``height`` inches and its axes, without a window system."""
+def canvas(width: float, height: float, rows: int = 1, columns: int = 1, **options: Any) -> tuple[Any, Any]:
+    """Return a new figure of ``width`` by ``height`` inches, and the array of axes in this figure."""
     from matplotlib.backends.backend_agg import FigureCanvasAgg
     from matplotlib.figure import Figure
 
     figure = Figure(figsize=(width, height), dpi=120, layout="constrained")
     FigureCanvasAgg(figure)
-    return figure, figure.subplots(rows, columns, squeeze=False, **how)
+    return figure, figure.subplots(rows, columns, squeeze=False, **options)
 
 
 def drawn(draw: Callable[P, Any]) -> Callable[P, bytes]:
-    """Decorate a drawing function: apply the common style and return PNG bytes, the same bytes for the same picture."""
+    """Decorate a drawing function, so that the function uses the common style and returns the bytes of a PNG file."""
 
     @functools.wraps(draw)
     def inner(*args: P.args, **kwargs: P.kwargs) -> bytes:
@@ -60,12 +60,10 @@ def drawn(draw: Callable[P, Any]) -> Callable[P, bytes]:
     return inner
 
 
-def picture(axes: Any, image: Any, title: str, **how: Any) -> Any:
-    """Show an image without ticks; the caller sets the scale."""
-    shown = axes.imshow(image, **how)
-    axes.set_title(title)
-    axes.set_xticks([])
-    axes.set_yticks([])
+def picture(axes: Any, image: Any, title: str, **options: Any) -> Any:
+    """Show an image without ticks; ``options``, such as the colour scale, go to ``imshow``."""
+    shown = axes.imshow(image, **options)
+    axes.set(title=title, xticks=[], yticks=[])
     axes.grid(False)
     for spine in axes.spines.values():
         spine.set_visible(False)
@@ -73,24 +71,19 @@ def picture(axes: Any, image: Any, title: str, **how: Any) -> Any:
 
 
 def encoded(linear: Tensor) -> Any:
-    """Encode linear sRGB (3, y, x) for a screen: gamma-encoded (y, x, 3), clipped to [0, 1]; NaN becomes 0."""
+    """Return linear sRGB (3, y, x) as gamma-encoded values (y, x, 3), clipped to [0, 1]; NaN becomes 0."""
     from kornia.color import linear_rgb_to_rgb
 
     rgb = torch.nan_to_num(linear.detach().to("cpu", torch.float32)).clamp(0.0, 1.0)
     return linear_rgb_to_rgb(rgb[None])[0].permute(1, 2, 0).clamp(0.0, 1.0).numpy()
 
 
-def wavelength_colour(metres: float) -> str:
-    """Return a dark, readable colour similar to the colour of the wavelength."""
-    stops = ((430e-9, "#4B2E9E"), (490e-9, BLUE), (575e-9, "#00785A"), (610e-9, "#B8730A"))
-    return next((colour for limit, colour in stops if metres < limit), "#B3261E")
+def nanometres(metres: Tensor) -> Any:
+    """Convert a tensor of lengths in metres to a NumPy array in nanometres."""
+    return metres.detach().double().cpu().numpy() * 1e9
 
 
-def nanometres(metres: Tensor | float) -> Any:
-    """Convert metres to nanometres; return a NumPy array for a tensor."""
-    return metres.detach().double().cpu().numpy() * 1e9 if isinstance(metres, Tensor) else metres * 1e9
-
-
-def nearest(centres: Tensor, metres: float) -> int:
-    """Return the index of the band nearest to a wavelength."""
-    return int((centres - metres).abs().argmin())
+def nearest(centres: Tensor, metres: float) -> tuple[int, str]:
+    """Return the index of the band nearest to a wavelength, and the centre of this band as text, such as ``550 nm``."""
+    band = int((centres - metres).abs().argmin())
+    return band, f"{float(centres[band]) * 1e9:.0f} nm"
