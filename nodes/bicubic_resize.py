@@ -10,7 +10,10 @@ from neusee.nodes._half_precision import single
 
 
 def enlarge(image: Tensor, height: int, width: int) -> Tensor:
-    """Resample (…, y, x) by bicubic interpolation: smooth between the samples, and aliased on a coarser grid."""
+    """Resample (…, y, x) by bicubic interpolation: smooth between the samples, and aliased on a coarser grid.
+
+    Kornia's `resize` gives the same numbers, but on CUDA the sum of its gradient has no fixed order.
+    """
     return _product(image, _through(image.shape[-2], height, image), _through(image.shape[-1], width, image))
 
 
@@ -18,7 +21,7 @@ def resize(image: Tensor, height: int, width: int) -> Tensor:
     """Resample (…, y, x) without aliasing, by Keys' kernel scaled to the coarser of the two grids.
 
     The result equals torch's ``interpolate(mode="bicubic", antialias=True)`` within round-off, in single precision
-    under autocast too.
+    under autocast too. Kornia's `resize` blurs with a Gaussian first, and differs by up to 0.08 of white on noise.
     """
     image = single(image)
     rows, columns = (_keys(n, new).to(image) for n, new in zip(image.shape[-2:], (height, width), strict=True))

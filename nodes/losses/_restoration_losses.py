@@ -18,6 +18,8 @@ def charbonnier(
 ) -> Tensor:
     """Average sqrt(difference^2 + epsilon): an absolute difference that is smooth at 0.
 
+    Kornia's `charbonnier_loss` has a fixed epsilon of 1, and is a square for all differences of pictures in [0, 1].
+
     Shapes: estimate and truth alike -> ().
     Units:  those of the pictures; epsilon in their square.
     Error:  above the mean absolute difference by at most sqrt(epsilon), 1e-3.

@@ -10,7 +10,8 @@ from neusee.nodes.units import Shape
 def framed(scene: Tensor, shape: Shape | None) -> Tensor:
     """Scale linear light with its aspect ratio until it covers `shape`, then crop: (band, y, x) -> (band, *shape).
 
-    Kornia's antialiased bilinear resampling has no overshoot, so that no value becomes negative.
+    Kornia's antialiased bilinear resampling has no overshoot, so that no value becomes negative. Kornia's `center_crop`
+    would interpolate between pixels where a number of rows or columns to remove is odd.
     """
     from kornia.geometry.transform import resize
 

@@ -105,10 +105,7 @@ def _to_srgb(header: dict[str, Any]) -> NDArray[np.float64]:
         return np.eye(3)
     white = values[6:]
     neutral = np.asarray(header.get("adoptedNeutral", white), dtype=np.float64)
-    srgb = colour.RGB_COLOURSPACES["sRGB"]
     own = colour.models.normalised_primary_matrix(values[:6].reshape(3, 2), white)
-    adapt = colour.adaptation.matrix_chromatic_adaptation_VonKries(
-        colour.xy_to_XYZ(neutral), colour.xy_to_XYZ(srgb.whitepoint), transform="Bradford"
-    )
-    matrix: NDArray[np.float64] = np.linalg.inv(srgb.matrix_RGB_to_XYZ) @ adapt @ own
+    space = colour.RGB_Colourspace("file", values[:6], neutral, matrix_RGB_to_XYZ=own)
+    matrix: NDArray[np.float64] = colour.matrix_RGB_to_RGB(space, colour.RGB_COLOURSPACES["sRGB"], "Bradford")
     return matrix

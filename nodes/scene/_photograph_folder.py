@@ -120,7 +120,8 @@ class Photographs:
     def crop(self, shape: tuple[int, int], seed: int, index: Index) -> Tensor:
         """A part of one of them, either way round; for one that proves broken another is drawn.
 
-        The same ``seed`` and ``index`` give the same, in whatever order and in however many processes.
+        The same ``seed`` and ``index`` give the same part in any order and in any number of processes, whereas the
+        random crops and flips of kornia draw from the one random stream of torch.
         """
         rng = np.random.default_rng([seed, _DRAW, *_indices(index)])
         for _ in range(_TRIES):

@@ -1,7 +1,7 @@
 """Spectral OpenEXR: one channel per wavelength, named as by Fichet, Pacanowski and Wilkie (JCGT 10(3), 2021).
 
 Emitted light is ``S0.550,0nm``, reflectance is ``T.550,0nm``. The decimal mark is a comma because a point separates
-layers.
+layers. Colour-science reads and writes these files with OpenImageIO alone, and its import takes longer than this check.
 """
 
 import re
@@ -14,12 +14,13 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
+from neusee.nodes.constants import SPEED_OF_LIGHT
+
 _NAME = re.compile(r"(S0|T)\.(\d*,?\d*(?:[eE][-+]?\d+)?)(Y|Z|E|P|T|G|M|k|h|da|d|c|m|u|n|p)?(m|Hz)")
 _PREFIX = {
     "": 0, "p": -12, "n": -9, "u": -6, "m": -3, "c": -2, "d": -1, "da": 1, "h": 2, "k": 3,
     "M": 6, "G": 9, "T": 12, "P": 15, "E": 18, "Z": 21, "Y": 24,
 }  # fmt: skip
-_LIGHT = 299_792_458.0  #: m/s
 
 
 def write_spectral(
@@ -87,4 +88,4 @@ def _wavelength(match: re.Match[str]) -> float:
     number = float(f"{match[2].replace(',', '.')}")
     # a division converts nanometres, so that 550,0nm gives the same float64 as 550 / 1e9
     value = number / 10.0**-exponent if exponent < 0 else number * 10.0**exponent
-    return value if match[4] == "m" else _LIGHT / value
+    return value if match[4] == "m" else SPEED_OF_LIGHT / value

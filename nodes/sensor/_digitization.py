@@ -125,6 +125,8 @@ def _(result: Tensor, *inputs: Tensor, bits: int = 16, **params: Any) -> list[Ch
 def crop(image: Tensor, *, shape: Shape) -> Tensor:
     """Cut the window of the sensor out of the image; the sample on the optical axis stays at N // 2.
 
+    Where image and window are not both odd or both even, kornia's `center_crop` interpolates between pixels.
+
     Shapes: image (..., y, x) -> (..., *shape).
     Units:  any.
     Error:  exact.

@@ -19,8 +19,8 @@ def render(reflectance: Tensor, bands: Bands) -> Tensor:
     """Render reflectance under D65 to linear sRGB by the CIE 1931 observer; a lift from RGB inverts this step.
 
     Shapes: reflectance (..., band, y, x) -> (..., 3, y, x).
-    Units:  reflectance to linear sRGB; white is (1, 1, 1) on exactly these bands, and a colour outside sRGB has a
-            negative value.
+    Units:  reflectance to linear sRGB; white is (1, 1, 1) on exactly these bands (on 31 bands, `sd_to_XYZ` of
+            colour-science tints white by 2e-4), and a colour outside sRGB has a negative value.
     Error:  float32: 1e-6 of the brightest value; 31 bands shift saturated colours by some 1e-3 from 5 nm sampling.
     Raises: ValueError where reflectance and bands differ in the number of bands.
     Source: CIE 15:2004; IEC 61966-2-1.

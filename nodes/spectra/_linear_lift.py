@@ -19,6 +19,8 @@ _FIRST, _LAST = 380e-9, 780e-9  #: m, range of the measured reflectances and of 
 def lift_mallett(rgb: Tensor, bands: Bands) -> Tensor:
     """Compute the reflectance of each pixel from three basis spectra, whose sum is 1 at every wavelength.
 
+    `RGB_to_sd_Mallett2019` of colour-science gives the same numbers for a single pixel, without a gradient.
+
     Shapes: rgb (3, y, x) -> (band, y, x).
     Units:  linear sRGB to reflectance; the lift is linear and keeps HDR values above 1.
     Error:  real paints: PSNR 31 dB (CAVE balloons); the result, rendered to sRGB under D65, is within 5e-3 of rgb.

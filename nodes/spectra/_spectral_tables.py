@@ -27,7 +27,10 @@ class Table(NamedTuple):
         return self.values[:, right - 1] * (1 - share) + self.values[:, right] * share
 
     def over(self, bands: Bands) -> Tensor:
-        """Average the linear interpolation over each band, with 0 beyond the ends: (spectrum, band)."""
+        """Average the linear interpolation over each band, with 0 beyond the ends: (spectrum, band).
+
+        Colour-science samples spectra at points, which changes the energy of the lines of a lamp by 10 %.
+        """
         centres, half = bands.centres.detach().cpu().double(), bands.widths.detach().cpu().double() / 2
         thin = half <= 1e-13
         mean = (self._below(centres + half) - self._below(centres - half)) / (2 * half).where(~thin, 1.0)
