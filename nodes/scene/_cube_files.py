@@ -63,10 +63,8 @@ def exr_size(file: Path) -> tuple[int, int]:
 
 def _listed(file: Path) -> dict[str, tuple[tuple[int, ...], str]]:
     """Return the variables of a .mat file, with shape and type."""
-    try:
-        from scipy.io import whosmat
-    except ImportError:
-        raise ParameterError("file", f"{file.name}: .mat files need scipy: pip install scipy") from None
+    from scipy.io import whosmat
+
     try:
         return {name: (size, _TYPES.get(kind, kind)) for name, size, kind in whosmat(file)}
     except Exception:  # scipy raises many kinds of errors for foreign bytes

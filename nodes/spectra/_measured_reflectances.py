@@ -14,12 +14,11 @@ from torch import Tensor
 
 from neusee.nodes import Check, ParameterError, node
 from neusee.nodes.spectra._linear_lift import inside_charts
-from neusee.nodes.spectra._spectral_tables import Table, gamut_samples, paints
+from neusee.nodes.spectra._spectral_tables import Table, gamut_samples, paints, require_range
 from neusee.nodes.units import DataFiles
 from neusee.nodes.values import Bands
 
 Set = Literal["charts", "CIE 2017", "CQS"]
-_SLACK = 1e-12  #: m
 _MOST = 1.5  #: reflectance, above which a file is taken to be in percent
 _FILES = "give .csv (first column wavelength in nm), .npz (wavelengths, reflectances) or .mat (S_name, sur_name)"
 
@@ -47,9 +46,11 @@ def reflectances(
     if sets:
         inside_charts(bands)
     tables = [table for name in sets for table in _SETS[name]()]
-    found = [table.at(bands.centres) for table in tables]
-    found += [_inside(_read(file), bands, file).at(bands.centres) for file in files or ()]
-    return torch.cat(found).clamp(0.0, 1.0).to(bands.centres.device)
+    for file in files or ():
+        tables.append(_read(file))
+        fix = "leave the file out, or choose bands inside that range"
+        require_range(bands.centres, tables[-1].wavelengths, f"{file.name} holds", fix)
+    return torch.cat([table.at(bands.centres) for table in tables]).clamp(0.0, 1.0).to(bands.centres.device)
 
 
 @reflectances.preflight
@@ -71,17 +72,6 @@ _SETS: dict[str, Callable[[], tuple[Table, ...]]] = {
     "CIE 2017": lambda: (gamut_samples("CIE 2017"),),
     "CQS": lambda: (gamut_samples("CQS"),),
 }
-
-
-def _inside(table: Table, bands: Bands, file: Path) -> Table:
-    low, high = float(bands.centres.min()), float(bands.centres.max())
-    first, last = float(table.wavelengths[0]), float(table.wavelengths[-1])
-    if low < first - _SLACK or high > last + _SLACK:
-        raise ValueError(
-            f"bands from {low * 1e9:.4g} to {high * 1e9:.4g} nm, but {file.name} holds {first * 1e9:.4g} to "
-            f"{last * 1e9:.4g} nm: leave the file out, or choose bands inside that range"
-        )
-    return table
 
 
 # --- files ----------------------------------------------------------------------------------------------------------
@@ -130,19 +120,17 @@ def _csv(file: Path) -> tuple[Numbers, Numbers]:
 
 
 def _npz(file: Path) -> tuple[Numbers, Numbers]:
-    with np.load(file, allow_pickle=False) as held:
-        return np.asarray(held["wavelengths"], np.float64), np.asarray(held["reflectances"], np.float64)
+    with np.load(file, allow_pickle=False) as arrays:
+        return np.asarray(arrays["wavelengths"], np.float64), np.asarray(arrays["reflectances"], np.float64)
 
 
 def _mat(file: Path) -> tuple[Numbers, Numbers]:
+    from scipy.io import loadmat
+
     try:
-        from scipy.io import loadmat
-    except ImportError:
-        raise ValueError(".mat files need scipy: pip install scipy") from None
-    try:
-        held = loadmat(file)
+        variables = loadmat(file)
     except Exception as why:  # scipy raises many kinds of errors for foreign bytes
         raise ValueError(f"not a .mat file up to version 7: {why}") from None
-    name = next(name.removeprefix("sur_") for name in [*held, "sur_"] if name.startswith("sur_"))
-    start, step, count = np.asarray(held[f"S_{name}"], np.float64).ravel()
-    return start + step * np.arange(int(count)), np.asarray(held[f"sur_{name}"], np.float64).T
+    name = next(name.removeprefix("sur_") for name in [*variables, "sur_"] if name.startswith("sur_"))
+    start, step, count = np.asarray(variables[f"S_{name}"], np.float64).ravel()
+    return start + step * np.arange(int(count)), np.asarray(variables[f"sur_{name}"], np.float64).T

@@ -1,4 +1,4 @@
-"""Measured spectra of colour-science, read once and sampled at the bands; wavelengths in m, float64."""
+"""Measured spectra of colour-science, read once and interpolated to bands; wavelengths in m, float64."""
 
 import functools
 from typing import NamedTuple
@@ -9,6 +9,7 @@ from torch import Tensor
 from neusee.nodes.values import Bands
 
 OBSERVER = "CIE 1931 2 Degree Standard Observer"
+_ROUNDING = 1e-3  #: nm
 _CHARTS = ("BabelColor Average", "ColorChecker N Ohta", "PMC", "ISO 17321-1")
 
 
@@ -108,18 +109,22 @@ def gamut_samples(name: str) -> Table:
     return _table(load_TCS_CIE2017(colour.SpectralShape(380, 780, 5)))
 
 
-@functools.cache
-def xyz_to_srgb() -> Tensor:
-    """Return the matrix from CIE XYZ to linear sRGB, (3, 3)."""
-    import colour
-
-    return torch.tensor(colour.RGB_COLOURSPACES["sRGB"].matrix_XYZ_to_RGB, dtype=torch.float64)
-
-
 def to_srgb(centres: Tensor) -> Tensor:
     """Return the matrix (3, band) from reflectance under D65 to linear sRGB: white is (1, 1, 1) on these bands."""
-    matrix = xyz_to_srgb() @ (observer().at(centres) * light("D65").at(centres))
+    import colour
+
+    from_xyz = torch.tensor(colour.RGB_COLOURSPACES["sRGB"].matrix_XYZ_to_RGB, dtype=torch.float64)
+    matrix = from_xyz @ (observer().at(centres) * light("D65").at(centres))
     return matrix / matrix.sum(1, keepdim=True)
+
+
+def require_range(
+    wavelengths: Tensor, known: Tensor | tuple[float, float], source: str, fix: str = "choose bands inside that range"
+) -> None:
+    """Raise ValueError for wavelengths of bands outside the ``known`` range (m) of a source, such as "D65 holds"."""
+    low, high, first, last = (float(x) * 1e9 for x in (wavelengths.min(), wavelengths.max(), known[0], known[-1]))
+    if low < first - _ROUNDING or high > last + _ROUNDING:
+        raise ValueError(f"bands from {low:.4g} to {high:.4g} nm, but {source} {first:.4g} to {last:.4g} nm: {fix}")
 
 
 def _table(spectra: object) -> Table:
