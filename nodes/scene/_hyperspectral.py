@@ -1,4 +1,4 @@
-"""A hyperspectral scene: measured reflectance, not reflectance lifted from three channels."""
+"""A hyperspectral scene: reflectance measured in many bands instead of lifted from three channels."""
 
 from pathlib import Path
 from typing import Any
@@ -26,7 +26,7 @@ def hyperspectral(
     layout: Layout = "y x band",
     shape: Shape | None = None,
 ) -> Tensor:
-    """Read a spectral cube and interpolate the cube linearly in wavelength to `bands`.
+    """Read a spectral cube and interpolate its spectra linearly to the wavelengths of `bands`.
 
     A spectral OpenEXR carries its wavelengths; .mat (`variable`, or the only cube in the file) and .npy need `start`
     and `stop`, the first and last of evenly spaced bands. Whole numbers are scaled by their type: 65535 becomes 1.
@@ -61,9 +61,8 @@ def _(
         return enlarged(exr_size(file), shape)
     if start is None or stop is None or not start < stop:
         name = "stop" if start is not None else "start"
-        raise ParameterError(
-            name, f"{file.name} carries no wavelengths: give start below stop, such as 400 nm and 700 nm"
-        )
+        text = f"{file.name} has no wavelengths: give start below stop, such as 400 nm and 700 nm"
+        raise ParameterError(name, text)
     size, kind = size_and_type(file, variable)
     if np.dtype(kind).kind not in "uf":
         raise ParameterError("file", f"{file.name} holds {kind}: save it as float, uint8 or uint16")

@@ -56,15 +56,13 @@ def _edge(y: Tensor, x: Tensor) -> Tensor:
 
 
 def _slanted(y: Tensor, x: Tensor) -> Tensor:
-    """Return the share of each pixel beyond a line through the axis, by a second difference of a second integral."""
+    """Return the share of each pixel on one side of a tilted line through the axis, exact to round-off."""
     c, s = math.cos(_TILT), math.sin(_TILT)
     distance = x * c + y * s
-    corners = [sign * (distance + off).clamp_min(0) ** 2 / 2 for sign, off in _corners(c, s)]
-    return (sum(corners, torch.zeros_like(distance)) / (c * s)).clamp(0, 1)
-
-
-def _corners(c: float, s: float) -> list[tuple[int, float]]:
-    return [(1, (c + s) / 2), (-1, (c - s) / 2), (-1, -(c - s) / 2), (1, -(c + s) / 2)]
+    wide, narrow = (c + s) / 2, (c - s) / 2
+    corners = [(1, wide), (-1, narrow), (-1, -narrow), (1, -wide)]
+    areas = [sign * (distance + off).clamp_min(0) ** 2 / 2 for sign, off in corners]
+    return (sum(areas, torch.zeros_like(distance)) / (c * s)).clamp(0, 1)
 
 
 def _siemens(y: Tensor, x: Tensor) -> Tensor:
