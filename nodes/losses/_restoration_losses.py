@@ -1,4 +1,4 @@
-"""Losses of a restoration: the error of the colour at every pixel and at every frequency."""
+"""Losses of a restoration: differences from the true picture by pixel and by spatial frequency."""
 
 from typing import Annotated
 
@@ -32,7 +32,7 @@ def charbonnier(
 
 @node()
 def fft_l1(estimate: Tensor, truth: Tensor) -> Tensor:
-    """Average the absolute difference of the Fourier spectra of estimate and truth.
+    """Average the absolute difference of the spatial Fourier spectra of estimate and truth.
 
     The transform is in float64: in single precision a coefficient near 0 has neither a reliable size nor a reliable
     direction, and the gradient is that direction.

@@ -26,16 +26,15 @@ def mrae(
     Source: mean relative absolute error as in NTIRE 2022 and Cai et al., MST++, CVPRW 2022; the floor is ours.
     """
     if estimate.shape != truth.shape:
-        raise ValueError(
-            f"estimate {tuple(estimate.shape)} and truth {tuple(truth.shape)} differ: lift the same picture"
-        )
-    wanted = single(truth)
-    result: Tensor = ((single(estimate) - wanted).abs() / wanted.abs().clamp_min(floor)).mean()
+        shapes = f"estimate {tuple(estimate.shape)} and truth {tuple(truth.shape)}"
+        raise ValueError(f"{shapes} differ: lift the picture that was rendered from the truth")
+    truth = single(truth)
+    result: Tensor = ((single(estimate) - truth).abs() / truth.abs().clamp_min(floor)).mean()
     return result
 
 
 @mrae.reference
 def _(estimate: Tensor, truth: Tensor, *, floor: float = 0.02) -> Tensor:
-    wanted = truth.double()
-    share = (estimate.double() - wanted).abs() / torch.maximum(wanted.abs(), torch.tensor(floor, dtype=torch.float64))
+    truth = truth.double()
+    share = (estimate.double() - truth).abs() / torch.maximum(truth.abs(), torch.tensor(floor, dtype=torch.float64))
     return share.sum() / share.numel()

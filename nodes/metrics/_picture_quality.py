@@ -1,4 +1,4 @@
-"""Quality of a restored picture, by comparison with the truth."""
+"""Quality of a restored picture, measured by comparison with the true picture."""
 
 import math
 from typing import Annotated, Literal, NamedTuple
@@ -15,7 +15,7 @@ _STRIPE = 118  #: rows that are compared together: 128 with the margin of the wi
 
 
 class Quality(NamedTuple):
-    """Three measures of the difference of two pictures, over all channels together."""
+    """Three measures of the difference of two pictures, each over all channels together."""
 
     l1: Tensor  #: () float64, mean absolute difference
     psnr: Tensor  #: () float64, dB, for a white of 1; 200 dB for equal pictures
@@ -50,7 +50,8 @@ def quality(
         )
     a, b = (_inside(x, border) for x in (estimate, truth))
     if min(a.shape[-2:]) < _WINDOW:
-        raise ValueError(f"{tuple(a.shape[-2:])} pixels inside the border: SSIM needs {_WINDOW} x {_WINDOW}")
+        size = f"{_WINDOW} x {_WINDOW}"
+        raise ValueError(f"{tuple(a.shape[-2:])} pixels inside the border: SSIM needs {size}, so give a larger picture")
     absolute, square, alike = _sums(a, b, domain)
     psnr = -10.0 * (square / a.numel()).clamp_min(1e-20).log10()
     seen = a[..., _WINDOW - 1 :, _WINDOW - 1 :].numel()
@@ -76,7 +77,7 @@ def _shown(picture: Tensor, domain: str) -> Tensor:
 
 
 def _sums(a: Tensor, b: Tensor, domain: str) -> tuple[Tensor, Tensor, Tensor]:
-    """Sum absolute differences, square differences and SSIM over all pixels, in stripes that stay in the cache."""
+    """Sum absolute differences, square differences and SSIM over all pixels, in stripes that fit into the CPU cache."""
     absolute, square, alike = (torch.zeros((), dtype=torch.float64, device=a.device) for _ in range(3))
     rows = a.shape[-2] - _WINDOW + 1
     for first in range(0, rows, _STRIPE):
