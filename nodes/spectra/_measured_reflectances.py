@@ -1,4 +1,4 @@
-"""Measured reflectances, from colour-science and from files of the user."""
+"""Measured reflectances from colour-science and from the user's files."""
 
 import csv
 import functools
@@ -29,7 +29,7 @@ Numbers = NDArray[np.float64]
 def reflectances(
     bands: Bands, *, sets: tuple[Set, ...] = ("charts", "CIE 2017", "CQS"), files: DataFiles | None = None
 ) -> Tensor:
-    """Gather measured reflectances from sets of colour-science and from files of the user, spectrum after spectrum.
+    """Return the measured reflectances of sets in colour-science and of the user's files, one spectrum in each row.
 
     `charts` are the 102 patches of `spectra.lift_lmmse`, `CIE 2017` the 99 objects of the colour fidelity index, `CQS`
     15 saturated paints. A file is .csv (a header; first column nm, then one column for each spectrum), .npz
@@ -83,7 +83,7 @@ def _read(file: Path) -> Table:
 
 @functools.lru_cache(maxsize=32)
 def _known(file: Path, stamp: int) -> Table:
-    """Return the table of a file; a changed file is read again."""
+    """Return the table of a file; a new time ``stamp`` reads a changed file again."""
     reader = {".csv": _csv, ".npz": _npz, ".mat": _mat}.get(file.suffix.lower())
     if reader is None:
         raise ParameterError("files", f"{file.name} holds no reflectances: {_FILES}")
@@ -98,7 +98,7 @@ def _known(file: Path, stamp: int) -> Table:
 
 
 def _wrong(wavelengths: Numbers, values: Numbers) -> str:
-    """Return why the values are not reflectances, or an empty text."""
+    """Return why these values cannot be reflectances, or an empty text."""
     if wavelengths.ndim != 1 or values.ndim != 2 or values.shape[1] != len(wavelengths) or values.size == 0:
         return f"{wavelengths.shape} wavelengths and {values.shape} reflectances: write (spectrum, wavelength)"
     if not (np.isfinite(wavelengths).all() and np.isfinite(values).all()):

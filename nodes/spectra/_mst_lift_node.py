@@ -1,4 +1,4 @@
-"""The paper's lift: MST++ from linear RGB to 31 bands."""
+"""The lift of the paper, from linear RGB to 31 bands by the network MST++."""
 
 from pathlib import Path
 from typing import Any, Literal
@@ -124,7 +124,7 @@ def _untrained(untrained: str, rng: torch.Generator) -> MSTPlusPlus:
 
 
 def _fitting(weights: Path) -> dict[str, Tensor]:
-    """Return the tensors of a checkpoint; raise ParameterError unless names and shapes are those of the network."""
+    """Return the tensors of a checkpoint; raise ParameterError unless names and shapes fit the network."""
     found = {name.removeprefix("module."): tensor for name, tensor in _read(weights).items()}
     network = _empty().state_dict()
     wrong = [name for name in network if name not in found or found[name].shape != network[name].shape]
@@ -136,7 +136,7 @@ def _fitting(weights: Path) -> dict[str, Tensor]:
 
 
 def _read(weights: Path) -> dict[str, Tensor]:
-    """Read a file of tensors: .safetensors, or a pickle that holds tensors alone, bare or under `state_dict`."""
+    """Read tensors by name from .safetensors, or from a pickle of tensors alone, with or without key `state_dict`."""
     try:
         if weights.suffix == ".safetensors":
             from safetensors.torch import load_file

@@ -8,27 +8,26 @@ from torch import Tensor
 
 from neusee.nodes.values import Bands
 
-OBSERVER = "CIE 1931 2 Degree Standard Observer"
 _ROUNDING = 1e-3  #: nm
 _CHARTS = ("BabelColor Average", "ColorChecker N Ohta", "PMC", "ISO 17321-1")
 
 
 class Table(NamedTuple):
-    """Spectra on one grid of wavelengths."""
+    """Spectra that are sampled at the same wavelengths."""
 
     wavelengths: Tensor  #: (sample,) m, rising
     values: Tensor  #: (spectrum, sample)
 
     def at(self, centres: Tensor) -> Tensor:
-        """Interpolate linearly between the samples, with the last value beyond the ends: (spectrum, band), on CPU."""
-        wanted = centres.detach().cpu().double()
-        right = torch.searchsorted(self.wavelengths, wanted).clamp(1, len(self.wavelengths) - 1)
+        """Interpolate spectra linearly, constant beyond the first and last sample: (spectrum, band), on the CPU."""
+        x = centres.detach().cpu().double()
+        right = torch.searchsorted(self.wavelengths, x).clamp(1, len(self.wavelengths) - 1)
         low, high = self.wavelengths[right - 1], self.wavelengths[right]
-        share = ((wanted - low) / (high - low)).clamp(0, 1)
+        share = ((x - low) / (high - low)).clamp(0, 1)
         return self.values[:, right - 1] * (1 - share) + self.values[:, right] * share
 
     def over(self, bands: Bands) -> Tensor:
-        """Average the linear interpolation over each band, with 0 beyond the ends: (spectrum, band).
+        """Average the linear interpolation over each band, with 0 beyond the first and last sample: (spectrum, band).
 
         Colour-science samples spectra at points, which changes the energy of the lines of a lamp by 10 %.
         """
@@ -54,12 +53,12 @@ def observer() -> Table:
     """Return the colour-matching functions of the CIE 1931 observer, 360 to 830 nm by 1 nm."""
     import colour
 
-    return _table(colour.MSDS_CMFS[OBSERVER])
+    return _table(colour.MSDS_CMFS["CIE 1931 2 Degree Standard Observer"])
 
 
 @functools.cache
-def camera(name: str) -> Table:
-    """Return the measured channels of a camera: red, green, blue."""
+def measured_camera(name: str) -> Table:
+    """Return the measured sensitivities of a camera's channels: red, green, blue."""
     import colour
 
     return _table(colour.MSDS_CAMERA_SENSITIVITIES[f"{name} (NPL)"])
@@ -99,7 +98,7 @@ def paints() -> tuple[Table, ...]:
 
 @functools.cache
 def gamut_samples(name: str) -> Table:
-    """Return the reflectances that test colour rendition: the 99 objects of CIE 2017, or the 15 paints of the CQS."""
+    """Return reflectances that test the colours of lamps: the 99 objects of CIE 2017, or the 15 paints of the CQS."""
     import colour
 
     if name == "CQS":
