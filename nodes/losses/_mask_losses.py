@@ -43,9 +43,8 @@ def suppression_loss(psf: Psf, *, power: Annotated[float, Field(ge=8, le=64)] = 
 def _(psf: Psf, *, power: float = 8.0, log: bool = False) -> Tensor:
     ratio = (psf.intensity.double() / psf.clear_peak[:, None, None]).flatten(1)
     dark = ratio.detach().amax(1, keepdim=True) <= _DARK
-    peaks = (
-        ((power * ratio.where(~dark, 1.0).clamp_min(1e-300).log()).logsumexp(1) / power).exp().where(~dark[:, 0], 0.0)
-    )
+    logs = ratio.where(~dark, 1.0).clamp_min(1e-300).log()
+    peaks = ((power * logs).logsumexp(1) / power).exp().where(~dark[:, 0], 0.0)
     loss: Tensor = (peaks + _DARK).log().sum() if log else peaks.sum()
     return loss
 

@@ -8,6 +8,7 @@ from torch import Tensor
 
 from neusee.nodes import node
 from neusee.nodes._half_precision import single
+from neusee.nodes.metrics._picture_quality import require_same_shape
 
 _LEAST = 1e-30  #: least power, because the root has no gradient at 0
 
@@ -26,7 +27,7 @@ def charbonnier(
     Raises: ValueError for pictures of different shapes.
     Source: NeuSee, section Two-Stage Training (L_REC), with the mean; epsilon is ours.
     """
-    _alike(estimate, truth)
+    require_same_shape(estimate, truth)
     return ((single(estimate) - single(truth)).square() + epsilon).sqrt().mean()
 
 
@@ -43,14 +44,7 @@ def fft_l1(estimate: Tensor, truth: Tensor) -> Tensor:
     Raises: ValueError for pictures of different shapes.
     Source: NeuSee, section Two-Stage Training (L_REC), with a unitary transform and the mean.
     """
-    _alike(estimate, truth)
+    require_same_shape(estimate, truth)
     spectrum: Tensor = torch.fft.fft2(estimate.double() - truth.double(), norm="ortho")
     loss = (spectrum.real.square() + spectrum.imag.square() + _LEAST).sqrt().mean()
     return loss.to(single(estimate).dtype)
-
-
-def _alike(estimate: Tensor, truth: Tensor) -> None:
-    if estimate.shape != truth.shape:
-        raise ValueError(
-            f"estimate {tuple(estimate.shape)} and truth {tuple(truth.shape)} differ: crop the truth to the estimate"
-        )

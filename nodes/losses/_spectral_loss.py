@@ -8,6 +8,7 @@ from torch import Tensor
 
 from neusee.nodes import node
 from neusee.nodes._half_precision import single
+from neusee.nodes.metrics._picture_quality import require_same_shape
 
 
 @node()
@@ -25,9 +26,7 @@ def mrae(
     Raises: ValueError for spectra of different shapes.
     Source: mean relative absolute error as in NTIRE 2022 and Cai et al., MST++, CVPRW 2022; the floor is ours.
     """
-    if estimate.shape != truth.shape:
-        shapes = f"estimate {tuple(estimate.shape)} and truth {tuple(truth.shape)}"
-        raise ValueError(f"{shapes} differ: lift the picture that was rendered from the truth")
+    require_same_shape(estimate, truth, "lift the picture that was rendered from the truth")
     truth = single(truth)
     result: Tensor = ((single(estimate) - truth).abs() / truth.abs().clamp_min(floor)).mean()
     return result

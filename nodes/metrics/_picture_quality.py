@@ -44,10 +44,7 @@ def quality(
     Raises: ValueError for pictures of different shapes, and for pictures smaller than the window of SSIM.
     Source: Wang et al., IEEE Trans. Image Process. 13, 600 (2004); sRGB as IEC 61966-2-1.
     """
-    if estimate.shape != truth.shape:
-        raise ValueError(
-            f"estimate {tuple(estimate.shape)} and truth {tuple(truth.shape)} differ: crop the truth to the estimate"
-        )
+    require_same_shape(estimate, truth)
     a, b = (_inside(x, border) for x in (estimate, truth))
     if min(a.shape[-2:]) < _WINDOW:
         size = f"{_WINDOW} x {_WINDOW}"
@@ -62,6 +59,12 @@ def quality(
 def _(result: Quality, *inputs: Tensor, **params: object) -> list[Check]:
     l1, psnr, ssim = (float(x) for x in result)
     return [Check(f"L1 {l1:.4f}, PSNR {psnr:.2f} dB, SSIM {ssim:.3f}", math.isfinite(psnr))]
+
+
+def require_same_shape(estimate: Tensor, truth: Tensor, fix: str = "crop the truth to the estimate") -> None:
+    """Raise ValueError for an estimate and a truth of different shapes."""
+    if estimate.shape != truth.shape:
+        raise ValueError(f"estimate {tuple(estimate.shape)} and truth {tuple(truth.shape)} differ in shape: {fix}")
 
 
 def _inside(picture: Tensor, border: int) -> Tensor:

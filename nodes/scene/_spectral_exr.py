@@ -55,7 +55,8 @@ def write_spectral(
     wavelengths = [float(w) for w in centres]
     if cube.ndim != 3 or len(wavelengths) != len(cube):
         raise ValueError(f"cube {tuple(cube.shape)} must be (band, y, x) with {len(wavelengths)} bands")
-    names = [_name(w, kind) for w in wavelengths]
+    quantity = "S0" if kind == "emissive" else "T"
+    names = [quantity + "." + f"{w * 1e9:.6f}nm".replace(".", ",") for w in wavelengths]
     if len(set(names)) < len(names):
         raise ValueError(f"bands closer than 1e-6 nm would have equal channel names: {names}")
     planes = cube.detach().cpu().float().contiguous().numpy()
@@ -92,14 +93,9 @@ def spectral_channels(names: Sequence[str]) -> dict[float, str]:
     return {}
 
 
-def _name(wavelength: float, kind: str) -> str:
-    text = f"{wavelength * 1e9:.6f}".replace(".", ",")
-    return f"{'S0' if kind == 'emissive' else 'T'}.{text}nm"
-
-
 def _wavelength(match: re.Match[str]) -> float:
     exponent = _PREFIX[match[3] or ""]
-    number = float(f"{match[2].replace(',', '.')}")
+    number = float(match[2].replace(",", "."))
     # a division converts nanometres, so that 550,0nm gives the same float64 as 550 / 1e9
     value = number / 10.0**-exponent if exponent < 0 else number * 10.0**exponent
     return value if match[4] == "m" else SPEED_OF_LIGHT / value

@@ -37,9 +37,8 @@ def _of_rows(weights: Tensor, rows: Tensor) -> Tensor:
     inverse = torch.linalg.pinv(known / scale.where(scale > 0, 1.0)) / scale.where(scale > 0, 1.0).T
     exact = weights.cpu().double()
     if exact.shape[-1] != known.shape[1]:
-        raise ValueError(
-            f"weights of {exact.shape[-1]} bands, but channels of {known.shape[1]}: use the same `bands` step for both"
-        )
+        counts = f"the weights have {exact.shape[-1]} bands and the sums of the image {known.shape[1]} bands"
+        raise ValueError(f"{counts}: use the same `bands` step for both")
     matrix: Tensor = exact @ inverse
     _require_combination(exact.detach(), matrix.detach() @ known)
     return matrix

@@ -50,7 +50,7 @@ def _(electrons: ErrorBound, **params: Any) -> float:
 
 @full_well.check
 def _(result: Tensor, electrons: Tensor, *, capacity: float) -> list[Check]:
-    return [Check(f"{int(torch.count_nonzero(result >= capacity))} of {result.numel()} full")]
+    return [Check(f"{int(torch.count_nonzero(result >= capacity))} of {result.numel()} pixels full")]
 
 
 @node(rtol=0.0)
@@ -118,7 +118,7 @@ def _(*, gain: float, bits: int = 16, **params: object) -> list[str]:
 @digitize.check
 def _(result: Tensor, *inputs: Tensor, bits: int = 16, **params: Any) -> list[Check]:
     high, low = (int(torch.count_nonzero(result == end)) / max(1, result.numel()) for end in (2**bits - 1, 0))
-    return [Check(f"{high:.2%} at the top, {low:.2%} at 0 DN", high < 0.5)]
+    return [Check(f"{high:.2%} of pixels at the largest number, {low:.2%} at 0 DN", high < 0.5)]
 
 
 @node(rtol=0.0)

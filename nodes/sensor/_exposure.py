@@ -2,6 +2,7 @@
 
 import math
 from collections.abc import Mapping
+from itertools import chain
 from typing import Annotated, Any, Literal
 
 import torch
@@ -53,11 +54,9 @@ def _(
     bands: Bands,
     responses: Tensor,
     level: Tensor | None = None,
-    *,
-    pixel_pitch: float,
-    exposure: float,
+    **sizes: float,
 ) -> Tensor:
-    weights = channel_weights(bands, responses, level, pixel_pitch=pixel_pitch, exposure=exposure)
+    weights = channel_weights(bands, responses, level, **sizes)
     if isinstance(irradiance, Channels):
         return weighted(irradiance._replace(planes=irradiance.planes.double()), weights)
     channels = [(row[:, None, None] * irradiance.double()).sum(-3) for row in weights.to(irradiance.device)]
@@ -164,7 +163,7 @@ def add_photons(photons: Tensor, lasers: list[Tensor] | None = None, ghosts: lis
     Source: NeuSee, Eq. (photon_count).
     """
     total = single(photons)
-    for added in [*(lasers or ()), *(ghosts or ())]:
+    for added in chain(lasers or (), ghosts or ()):
         if added.shape[-3:] != photons.shape[-3:]:
             raise ValueError(
                 f"light of shape {tuple(added.shape)} cannot fall on {tuple(photons.shape)}: "
@@ -175,13 +174,8 @@ def add_photons(photons: Tensor, lasers: list[Tensor] | None = None, ghosts: lis
 
 
 @add_photons.propagate_error
-def _(
-    photons: ErrorBound,
-    lasers: list[ErrorBound] | None = None,
-    ghosts: list[ErrorBound] | None = None,
-    **params: Any,
-) -> float:
-    return math.fsum(part.rms for part in (photons, *(lasers or ()), *(ghosts or ())))
+def _(photons: ErrorBound, *added: list[ErrorBound] | None, **params: Any) -> float:
+    return math.fsum(part.rms for part in (photons, *chain.from_iterable(filter(None, added))))
 
 
 @add_photons.check

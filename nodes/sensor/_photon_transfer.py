@@ -72,6 +72,6 @@ def _pair(one: Tensor, two: Tensor) -> tuple[float, float]:
 def _(result: Tensor, *, full_well: float, gain: float, **params: Any) -> list[Check]:
     middle = (result[:, 0] > 0.02 * full_well * gain) & (result[:, 0] < 0.7 * full_well * gain)
     if not bool(middle.any()):
-        return [Check("too few levels to judge the slope")]
+        return [Check("too few levels between 2 and 70 % of the well to judge the variance")]
     ratio = float((result[middle, 1] / result[middle, 2]).mean())
     return [Check(f"variance {ratio:.3f} of the predicted variance", abs(ratio - 1) < 0.1)]

@@ -108,7 +108,12 @@ def lift_checks(result: Tensor, rgb: Tensor, bands: Bands, matrix: Tensor | None
     colours, spectra = (t.detach().flatten(1)[:, ::step].double().cpu() for t in (rgb, result))
     scale = max(float(colours.abs().max()), 1e-30)
     off = float((to_srgb(bands.centres) @ spectra - colours).abs().max()) / scale
-    checks = [Check(f"rendered back to sRGB within {off:.2g} of the brightest", float(result.min()) >= 0)]
+    checks = [
+        Check(
+            f"spectra rendered to sRGB differ from the colours by {off:.2g} of the brightest colour",
+            float(result.min()) >= 0,
+        )
+    ]
     if matrix is not None:
         raw = matrix.cpu() @ colours
         below = float(raw.clamp_max(0).abs().sum()) / max(float(raw.abs().sum()), 1e-30)
@@ -161,7 +166,7 @@ def lift_matrix(known: Tensor, centres: Tensor) -> Tensor:
     seen = rgb @ second @ rgb.T
     if len(centres) < 3 or not float(torch.linalg.cond(seen)) < 1e10:
         ends = f"{len(centres)} bands from {float(centres[0]) * 1e9:.4g} to {float(centres[-1]) * 1e9:.4g} nm"
-        raise ValueError(f"{ends} cannot carry three colours: use more bands, such as 31 from 400 to 700 nm")
+        raise ValueError(f"{ends} cannot distinguish three colours: use more bands, such as 31 from 400 to 700 nm")
     weights: Tensor = torch.linalg.solve(seen, rgb @ second).T
     return weights
 

@@ -68,4 +68,4 @@ def plane_checks(result: LowRankCube, *inputs: object, **params: object) -> list
         for x in (result.residual_rms, result.residual_max)
     )
     count = f"{len(result.planes)} planes for {len(result.basis)} bands"
-    return [Check(f"{count}, within {rms:.2g} of the brightest, at worst {most:.2g}")]
+    return [Check(f"{count}, within {rms:.2g} of the largest element in rms, at worst {most:.2g}")]
