@@ -60,7 +60,7 @@ def _in_si(number: float, si: str, unit: str) -> float:
 
 
 def read_any(text: Any) -> tuple[float, str]:
-    """Return ``"550 nm"`` or ``0.56`` as a finite number and an SI unit, which is empty for a number without a unit."""
+    """Return ``"550 nm"`` or ``0.56`` as a finite number and SI unit ("" for none); raise ValueError for other text."""
     number, si, reciprocal = read_written(text)
     return (_in_si(number, si, "e-/DN"), si) if reciprocal else (number, si)
 

@@ -63,7 +63,7 @@ def _(result: Mtf, *inputs: Psf) -> list[Check]:
 
 @node(rtol=1e-6)
 def encircled(psf: Psf, *, pixel_pitch: PositiveLength, radius: PositiveLength) -> Tensor:
-    """Sum the share of the pupil's light that falls within a radius of the axis.
+    """Compute the share of the light through the clear pupil that falls within a radius of the axis.
 
     Shapes: psf.intensity (band, y, x) -> (band,) float64.
     Units:  radius m on the sensor; result a share of the light through the clear pupil.

@@ -86,7 +86,7 @@ def _profile(image: Any) -> str:
 
 
 def _codes(file: Path) -> Tensor:
-    """Read upright code values in [0, 1]: (3, y, x) float32; Pillow reduces 16-bit colour to 8 bits, kornia_rs not."""
+    """Read upright code values in [0, 1]: (3, y, x) float32, 16-bit colour by kornia_rs, as Pillow keeps 8 bits."""
     import numpy as np
     from PIL import Image, ImageOps
 

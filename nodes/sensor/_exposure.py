@@ -104,7 +104,7 @@ def level(
     exposure: Time,
     rule: Literal["channel_sum", "per_band"] = "channel_sum",
 ) -> Tensor:
-    """Compute the factor from image to W/m2 at which the plain lens fills the brightest pixel to a share of the well.
+    """Compute the factor from image to W/m2 that gives the brightest pixel of the plain lens ``strength`` full wells.
 
     `channel_sum`: the brightest pixel of the brightest channel holds strength x full well, summed over bands.
     `per_band`: each band alone peaks at strength x I_sat, as the paper prints; the sum of 31 bands overexposes.

@@ -88,7 +88,7 @@ def line(
     floor: Fraction = 1e-3,
     sampling: Literal["integrated", "point"] = "integrated",
 ) -> Samples:
-    """Distribute the energy of a Gaussian laser line, with a floor relative to its peak, over a few bands of the laser.
+    """Distribute the energy of a Gaussian laser line, with a floor relative to the peak, over a few bands of the laser.
 
     `integrated`: `count` equal bands cover `span` (3 fwhm). A weight is the exact energy in a band; the weights sum
     to 1. `point`: the bands are the `count` nearest multiples of 10 nm. A weight is the value of the line at the

@@ -34,7 +34,7 @@ def lift_mallett(rgb: Tensor, bands: Bands) -> Tensor:
 
 @node(rtol=1e-6)
 def lift_mallett_mixture(rgb: Tensor, bands: Bands, *, within: Share = 1e-6) -> LowRankCube:
-    """Compute the reflectance of `lift_mallett` as few planes, block by block: the cube is never in memory.
+    """Compute the reflectance of `lift_mallett` as a few planes, block by block, without a cube in memory.
 
     Shapes: rgb (3, y, x) -> planes (k, y, x), basis (band, k), residual_max and residual_rms (k + 1, band)
             float64.
@@ -66,7 +66,7 @@ def lift_lmmse(rgb: Tensor, bands: Bands) -> Tensor:
 
 @node(rtol=1e-6)
 def lift_lmmse_mixture(rgb: Tensor, bands: Bands, *, within: Share = 1e-6) -> LowRankCube:
-    """Compute the reflectance of `lift_lmmse` as few planes, block by block: the cube is never in memory.
+    """Compute the reflectance of `lift_lmmse` as a few planes, block by block, without a cube in memory.
 
     Shapes: rgb (3, y, x) -> planes (k, y, x), basis (band, k), residual_max and residual_rms (k + 1, band)
             float64.
@@ -82,7 +82,7 @@ def lift_lmmse_mixture(rgb: Tensor, bands: Bands, *, within: Share = 1e-6) -> Lo
 
 
 def _attach(lift: Node, low_rank: Node, matrix: Callable[[Bands], Tensor]) -> None:
-    """Attach to a lift by this matrix (band, 3) a reference, a check and the low-rank form."""
+    """Attach the reference, the check and the low-rank form to a lift that multiplies by this matrix (band, 3)."""
 
     @lift.reference
     def lifted(rgb: Tensor, bands: Bands) -> Tensor:
@@ -124,7 +124,7 @@ def lift_checks(result: Tensor, rgb: Tensor, bands: Bands, matrix: Tensor | None
 def needs_rgb(rgb: Tensor) -> None:
     """Raise ValueError unless rgb is a picture of three channels."""
     if rgb.ndim != 3 or rgb.shape[0] != 3:
-        raise ValueError(f"rgb {tuple(rgb.shape)} must be (3, y, x): wire a scene of three channels")
+        raise ValueError(f"rgb {tuple(rgb.shape)} must be (3, y, x): connect a scene of three channels")
 
 
 def _lifted(rgb: Tensor, matrix: Tensor) -> Tensor:

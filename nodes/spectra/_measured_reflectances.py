@@ -83,7 +83,7 @@ def _read(file: Path) -> Table:
 
 @functools.lru_cache(maxsize=32)
 def _known(file: Path, stamp: int) -> Table:
-    """Return the table of a file; a new time ``stamp`` reads a changed file again."""
+    """Return the table of a file; a file whose time ``stamp`` has changed is read again."""
     reader = {".csv": _csv, ".npz": _npz, ".mat": _mat}.get(file.suffix.lower())
     if reader is None:
         raise ParameterError("files", f"{file.name} holds no reflectances: {_FILES}")

@@ -100,7 +100,7 @@ def _drawn(of: int, shape: tuple[int, ...], rng: torch.Generator) -> Tensor:
 
 
 def _limits(base: Tensor, black: Tensor) -> tuple[Tensor, Tensor]:
-    """Return the smallest and the largest multiple of a black at which the sum stays in [0, 1]: two (spectrum, 1)."""
+    """Return the smallest and the largest multiple of a black at which the sum stays in [0, 1], each (spectrum, 1)."""
     to_white, to_dark = (1.0 - base) / black, -base / black
     high = torch.where(black > 0, to_white, torch.where(black < 0, to_dark, torch.inf))
     low = torch.where(black > 0, to_dark, torch.where(black < 0, to_white, -torch.inf))
