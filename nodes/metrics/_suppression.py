@@ -89,7 +89,7 @@ def saturated(raw: Tensor, *, full_well: Well, gain: Gain, bits: Bits = 16) -> S
 
     Shapes: raw (..., channel, y, x) -> two scalars, float64.
     Units:  raw DN; pixels.
-    Error:  a pixel within one DN of the full well counts as saturated, and so does a pixel that is NaN.
+    Error:  a pixel within one DN of the full well counts as saturated, and so does one that is not a number.
     Source: NeuSee, Eq. (SensorImage).
     """
     full = clipped(raw, full_well=full_well, gain=gain, bits=bits).any(-3)
