@@ -1,4 +1,4 @@
-"""What an engine knows of a tensor without loading it: its statistics, and a bound of its error."""
+"""Statistics and error bounds of tensors, which an engine reads without loading the tensors."""
 
 from __future__ import annotations
 
@@ -10,12 +10,12 @@ import torch
 from torch import Tensor
 
 _FEW = 64  #: up to this many elements, a loop in Python is faster than five calls of torch
-_PART, _ROW = 1 << 17, 1 << 10  #: elements that are looked at together, and summed in their own precision
+_PART, _ROW = 1 << 17, 1 << 10  #: elements of one part, and elements that are summed in their own precision
 
 
 @dataclass(frozen=True, slots=True)
 class TensorStats:
-    """Cheap statistics of a tensor, kept beside it so that no decision about a step needs to load it."""
+    """Statistics of a tensor, stored beside the tensor so that no decision about a step loads the tensor."""
 
     shape: tuple[int, ...]
     dtype: str
@@ -40,37 +40,39 @@ class TensorStats:
         few = x.reshape(-1).tolist() if x.numel() <= _FEW else []
         if few and math.isfinite(total := float(sum(few))):
             return cls(shape, dtype, float(min(few)), float(max(few)), total, sum(v != 0 for v in few), True)
-        low, high, total, support = _measured(x.reshape(-1))
+        low, high, total, support = _measure(x.reshape(-1))
         finite = all(map(math.isfinite, (low, high, total)))
         return cls(shape, dtype, low, high, total, support, finite)
 
 
-def _measured(flat: Tensor) -> tuple[float, float, float, int]:
-    """Least, greatest, sum and number of what is not zero, by parts that stay in cache: memory is read once."""
+def _measure(flat: Tensor) -> tuple[float, float, float, int]:
+    """Return minimum, maximum, sum and count of nonzero elements, by parts that fit into the CPU cache."""
     small = flat.dtype == torch.bool or (flat.is_floating_point() and flat.element_size() < 4)
-    found = []
+    parts = []
     for part in torch.split(flat, _PART):
         part = part.float() if small else part
         rows = part.view(-1, _ROW) if part.numel() % _ROW == 0 else part[None]
-        found.append((*torch.aminmax(part), rows.sum(1).sum(dtype=torch.float64), torch.count_nonzero(part)))
-    lows, highs, sums, counts = (torch.stack(each) for each in zip(*found, strict=True))
+        parts.append((*torch.aminmax(part), rows.sum(1).sum(dtype=torch.float64), torch.count_nonzero(part)))
+    lows, highs, sums, counts = (torch.stack(each) for each in zip(*parts, strict=True))
     low, high, total = (float(x) for x in (lows.min(), highs.max(), sums.sum()))
-    if math.isinf(total) and math.isfinite(low) and math.isfinite(high):  # a row went beyond its own type
+    if math.isinf(total) and math.isfinite(low) and math.isfinite(high):  # the sum of a row overflowed
         total = float(sum(part.sum(dtype=torch.float64) for part in torch.split(flat, _PART)))
     return low, high, total, int(counts.sum())
 
 
 @dataclass(frozen=True, slots=True)
 class ErrorBound:
-    """An upper bound of the error of an input, with the statistics of that input."""
+    """An upper bound of the error of an input, with the statistics of this input."""
 
     rms: float  #: bound of the root mean square error, over the elements and the noise, in the unit of the input
     stats: TensorStats | None = None
-    peak: float | None = None  #: bound of the error of the largest element, as a share of it; None where not known
+    peak: float | None = (
+        None  #: bound of the error of the largest element, as a share of this element; None where not known
+    )
 
     @property
     def share(self) -> float:
-        """The root mean square bound as a share of the input's largest element."""
+        """Return the bound in root mean square as a share of the input's largest absolute element."""
         if self.rms == 0.0:
             return 0.0
         top = max(abs(self.stats.min), abs(self.stats.max)) if self.stats else 0.0
@@ -78,5 +80,5 @@ class ErrorBound:
 
     @property
     def largest(self) -> float:
-        """The bound on the largest element, as a share of that element."""
+        """Return the bound of the largest element's error, as a share of this element; inf where it is not known."""
         return 0.0 if self.rms == 0.0 else math.inf if self.peak is None else self.peak

@@ -1,8 +1,8 @@
-"""What a node is: a plain function, plus the little that an engine must know of it.
+"""Nodes: plain functions, with the little that an engine must know of each function.
 
-The signature is the whole contract. What stands before ``*`` is data and comes from
-other steps; what stands after ``*`` is a parameter and comes from the recipe; a
-parameter named ``rng`` is filled in by the engine.
+The signature is the whole contract. Arguments before ``*`` are data from other steps.
+Arguments after ``*`` are parameters from the recipe, and the engine gives the random
+generator for a parameter named ``rng``.
 
     @node(rtol=0.0)
     def digitize(electrons: Tensor, *, gain: Gain, bits: Bits = 16) -> Tensor: ...
@@ -11,9 +11,9 @@ parameter named ``rng`` is filled in by the engine.
     @digitize.skip_bound       # true upper bound of what skipping the step changes
     @digitize.propagate_error  # how far errors of the inputs can move the result
     @digitize.preflight        # looks at the parameters before anything runs
-    @digitize.check            # looks at the result: what a physicist would look at first
+    @digitize.check            # looks at the result as a physicist would
 
-What is attached is found under the same name in ``digitize.hooks``.
+``digitize.hooks`` has each attached function under the name of its decorator.
 """
 
 from __future__ import annotations
@@ -35,7 +35,7 @@ Fn = TypeVar("Fn", bound=Callable[..., Any])
 
 
 class ParameterError(ValueError):
-    """A parameter cannot be used; raised by a node's ``preflight``, before anything runs.
+    """The refusal of a parameter by a node's ``preflight``, before anything runs.
 
     Args: the name of the parameter, and one sentence with the value and the fix.
     """
@@ -47,7 +47,7 @@ class ParameterError(ValueError):
 
 @dataclass(frozen=True, slots=True)
 class Check:
-    """One line that a physicist would look at: ``Check("phase step 0.31 turn < 0.5", True)``."""
+    """One finding about a result, for a physicist to read: ``Check("phase step 0.31 turn < 0.5", True)``."""
 
     text: str
     ok: bool = True
@@ -55,17 +55,43 @@ class Check:
 
 @dataclass(slots=True)
 class Hooks:
-    """What a node has beside its function; `Node` has a decorator of the same name for each."""
+    """The functions attached to a node, by the decorators of the same names: ``@digitize.check`` attaches ``check``."""
 
+    #: slow float64 form: same arguments, same result within ``rtol``
     reference: Callable[..., Any] | None = None
+    #: (`TensorStats` of each input, *, parameters): bound of ``max |with - without| / max |with|`` if the step is left
+    #: out, which then returns its first input; for a random node, in root mean square over the noise
     skip_bound: Callable[..., float] | None = None
+    #: (`TensorStats` of the first input, *, parameters): the scale of `skip_bound`, such as the full well, because a
+    #: later step cuts off larger values
     skip_scale: Callable[..., float] | None = None
+    #: (`TensorStats` of each input, None for an absent input, *, parameters): bound of the result's largest element;
+    #: where the bound is 0, the step and the steps that only feed this step are left out
     zero_bound: Callable[..., float] | None = None
+    #: (`ErrorBound` of each input, *, result: TensorStats, parameters): the result's error; both errors are upper
+    #: bounds in root mean square, of a list input a list, of an absent input None; without this hook the inputs of the
+    #: node are held to the tolerance, because the error of the result is not known
     propagate_error: Callable[..., float] | None = None
+    #: (result): the error of a cheaper form as shares of its largest element, in root mean square and of the largest
+    #: element alone, both with the approximations that the inputs carry
     approximation_error: Callable[[Any], tuple[float, float]] | None = None
+    #: (parameters): True if the result is the same for every band
     band_invariant: Callable[[Mapping[str, Any]], bool] | None = None
+    #: (*, parameters): notes for the user, before anything runs; may raise `ParameterError`; an argument with the name
+    #: of an input receives the value of that input where a node with ``before_run`` computes it, else None
     preflight: Callable[..., Sequence[str]] | None = None
+    #: (result, *inputs, **parameters): findings, once after computing
     check: Callable[..., Sequence[Check]] | None = None
+
+
+def _attaches(hook: str) -> Callable[[Any, Fn], Fn]:
+    """Return the decorator that attaches a function to a node as this hook."""
+
+    def attach(to: Node, fn: Fn) -> Fn:
+        setattr(to.hooks, hook, fn)
+        return fn
+
+    return attach
 
 
 class Node:
@@ -100,7 +126,6 @@ class Node:
         data = [p for p in pars if p.kind is p.POSITIONAL_OR_KEYWORD]
         self.inputs = tuple(p.name for p in data)
         self.optional = frozenset(p.name for p in data if p.default is not p.empty)
-        self.preflight_inputs: tuple[str, ...] = ()
         self.random = any(p.name == "rng" for p in pars)
         self._keyword_only = [p for p in pars if p.kind is p.KEYWORD_ONLY and p.name != "rng"]
         self.bands = bands and self._declared(bands)
@@ -109,19 +134,19 @@ class Node:
             raise ValueError(f"{self.path}: before_run is for a node of parameters alone, without inputs and rng")
 
     def __call__(self, *inputs: Any, **params: Any) -> Any:
-        """Call the function itself: no validation, no cache; gradients flow."""
+        """Call the function itself, without validation and without cache; gradients flow."""
         return self.fn(*inputs, **params)
 
     def __repr__(self) -> str:
         return f"<node {self.path}>"
 
     def __reduce__(self) -> tuple[Any, ...]:
-        """A node travels as its name: the other process has its own code, which it can compare."""
-        return _found, (self.fn.__module__, self.fn.__name__)
+        """Pickle a node as its name: the process that reads the pickle imports its own code of the node."""
+        return _imported, (self.fn.__module__, self.fn.__name__)
 
     @functools.cached_property
     def path(self) -> str:
-        """The name a recipe writes: ``sensor.digitize``."""
+        """Return the name of the node in a recipe, such as ``sensor.digitize``."""
         parts = [p for p in self.fn.__module__.removeprefix("neusee.nodes.").split(".") if not p.startswith("_")]
         return ".".join([*parts, self.fn.__name__])
 
@@ -130,94 +155,39 @@ class Node:
         if unknown or "return" not in bands or len(bands) < 2:
             raise ValueError(f"{self.path}: bands={dict(bands)} must name 'return' and inputs among {self.inputs}")
         if self.random:
-            raise ValueError(f"{self.path} draws at random, so that a band is not the same in another stack")
+            raise ValueError(
+                f"{self.path} draws random numbers, so a band would change with its neighbours: omit bands="
+            )
         return MappingProxyType(dict(bands))
 
     @functools.cached_property
     def hints(self) -> dict[str, Any]:
-        """Annotations by argument name, and ``return``, with their ``Annotated`` extras."""
+        """Return the annotations by argument name and of ``return``, with their ``Annotated`` extras."""
         return get_type_hints(self.fn, include_extras=True)
 
     @functools.cached_property
     def params(self) -> type[BaseModel]:
-        """Model that reads this node's parameters from a recipe and rejects the rest."""
+        """Return the pydantic model that reads this node's parameters from a recipe and rejects unknown ones."""
         fields = {p.name: (self.hints[p.name], ... if p.default is p.empty else p.default) for p in self._keyword_only}
         config = ConfigDict(extra="forbid", frozen=True, arbitrary_types_allowed=True)
         model: type[BaseModel] = create_model(self.fn.__name__, __config__=config, **fields)  # type: ignore[call-overload]
         return model
 
-    def reference(self, fn: Fn) -> Fn:
-        """Attach the slow float64 form: same arguments, same result within ``rtol``."""
-        self.hooks.reference = fn
-        return fn
+    reference, preflight, check = _attaches("reference"), _attaches("preflight"), _attaches("check")
+    skip_bound, skip_scale, zero_bound = _attaches("skip_bound"), _attaches("skip_scale"), _attaches("zero_bound")
+    propagate_error, approximation_error = _attaches("propagate_error"), _attaches("approximation_error")
+    band_invariant = _attaches("band_invariant")
 
-    def skip_bound(self, fn: Fn) -> Fn:
-        """Attach the bound of skipping: ``(`TensorStats` of each input, *, parameters) -> float``.
-
-        The value bounds ``max |with - without| / max |with|``; for a random node, the same ratio with the root mean
-        square over the noise. A skipped node returns its first input.
-        """
-        self.hooks.skip_bound = fn
-        return fn
-
-    def skip_scale(self, fn: Fn) -> Fn:
-        """Attach ``(`TensorStats` of the first input, *, parameters) -> float``: the scale of `skip_bound`.
-
-        An example is the full well, because a later step cuts off what is above it.
-        """
-        self.hooks.skip_scale = fn
-        return fn
-
-    def zero_bound(self, fn: Fn) -> Fn:
-        """Attach ``(`TensorStats` of each input, *, parameters) -> float``: a bound of the result's largest element.
-
-        Where the bound is 0, the step and the steps that only feed it are left out. An absent input is given as None.
-        """
-        self.hooks.zero_bound = fn
-        return fn
-
-    def propagate_error(self, fn: Fn) -> Fn:
-        """Attach ``(`ErrorBound` of each input, *, result: TensorStats, parameters) -> float``: the result's error.
-
-        Both errors are upper bounds in root mean square. A list input is a list of bounds, an absent input is None.
-        Without this hook the error behind the node is not known, and its inputs are held to the tolerance instead.
-        """
-        self.hooks.propagate_error = fn
-        return fn
-
-    def approximation_error(self, fn: Fn) -> Fn:
-        """Attach ``(result) -> (rms, peak)``: bounds of a cheaper form's error, as shares of its largest element.
-
-        The first is in root mean square, the second of the largest element alone. Both include the approximations
-        that the inputs carry.
-        """
-        self.hooks.approximation_error = fn
-        return fn
-
-    def band_invariant(self, fn: Callable[[Mapping[str, Any]], bool]) -> Callable[[Mapping[str, Any]], bool]:
-        """Attach ``(parameters) -> bool``: whether the result is the same for every band."""
-        self.hooks.band_invariant = fn
-        return fn
-
-    def preflight(self, fn: Fn) -> Fn:
-        """Attach ``(*, parameters) -> notes``, called before anything runs; ``fn`` may raise `ParameterError`.
-
-        An argument with the name of an input receives the value of this input where a node with ``before_run``
-        computes it; the argument is None where the value is known only during the run.
-        """
-        self.hooks.preflight = fn
-        self.preflight_inputs = tuple(name for name in inspect.signature(fn).parameters if name in self.inputs)
-        return fn
-
-    def check(self, fn: Fn) -> Fn:
-        """Attach ``(result, *inputs, **parameters) -> checks``, run once after computing."""
-        self.hooks.check = fn
-        return fn
+    @property
+    def preflight_inputs(self) -> tuple[str, ...]:
+        """The inputs whose values the preflight receives if a node with ``before_run`` computes the value."""
+        hook = self.hooks.preflight
+        return tuple(name for name in inspect.signature(hook).parameters if name in self.inputs) if hook else ()
 
 
-def _found(module: str, name: str) -> Node:
-    found: Node = getattr(importlib.import_module(module), name)
-    return found
+def _imported(module: str, name: str) -> Node:
+    imported: Node = getattr(importlib.import_module(module), name)
+    return imported
 
 
 def node(
@@ -231,19 +201,24 @@ def node(
     additive_inputs: Sequence[tuple[str, ...]] = (),
     before_run: bool = False,
 ) -> Callable[[Callable[..., Any]], Node]:
-    """Make a node of a function. ``rtol`` is the agreed error against its reference.
+    """Return the decorator that makes a node of a function; ``rtol`` is the agreed error against its reference.
 
-    Args:
-        bands: the axis of the bands of some inputs and of the result (``return``). Band i of the result depends on
-            band i of those inputs and on the whole of the others, and is the same to the last bit whatever bands
-            stand beside it. Of a named tuple, only the fields in `values.BAND_FIELDS` have that axis.
-        accepts_channel_sums: inputs that may be `Channels` instead of an image of all bands.
-        needs_band_invariant: inputs that must then be the same for every band.
-        accepts_low_rank: inputs that may be a `LowRankCube` instead of a cube.
-        additive_inputs: inputs that change nothing where they are zero, an optional input or a list; each with the
-            inputs that belong to it.
-        before_run: True for a node of few numbers without inputs, which the check of a recipe computes too, so that
-            the preflight of another node can use the result.
+        Args:
+            bands: the axis of the bands of some inputs and of the result (``return``). Band i of the result depends only
+                on band i of these inputs and on the whole of every other input, and is the same to the last bit for any
+                other bands in the stack. In a named tuple, only the fields in `values.BAND_FIELDS` have this axis.
+            accepts_channel_sums: inputs that may be `Channels` instead of an image of all bands.
+            needs_band_invariant: inputs that must be the same for every band if an image is given as `Channels`.
+            accepts_low_rank: inputs that may be a `LowRankCube` instead of a cube.
+    <<<<<<< HEAD
+            additive_inputs: inputs that change nothing where they are zero, an optional input or a list; each with the
+                inputs that belong to it.
+            before_run: True for a node of few numbers without inputs, which the check of a recipe computes too, so that
+                the preflight of another node can use the result.
+    =======
+            additive_inputs: groups of inputs; the first input of a group is optional or a list, and changes nothing where
+                its values are zero. The other inputs of the group belong to the first one.
+    >>>>>>> r_kornia
     """
     return lambda fn: Node(
         fn,

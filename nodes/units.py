@@ -24,36 +24,31 @@ _SCALE: dict[str, dict[str, float]] = {
     "waves": {"waves": 1.0, "wave": 1.0},
     "DN/e-": {"DN/e-": 1.0, "e-/DN": 1.0},
 }
+_USUAL = {"m": "um", "s": "ms", "rad": "mrad"}  #: the unit that messages suggest for an SI unit
 _RECIPROCAL = {"e-/DN"}  #: units of 1 over the quantity
 _NUMBER = re.compile(r"([-+]?(?:\d+\.?\d*|\.\d+)(?:[eE][-+]?\d+)?)\s*(.*)")
 
 
-def _usual(si: str) -> str:
-    return {"m": "um", "s": "ms", "rad": "mrad"}.get(si, si)
-
-
 def read_quantity(value: Any, si: str) -> float:
-    """Read ``"550 nm"`` as a finite number of ``si``; raise ValueError, which names the fix, without a unit."""
-    text = str(value).strip()
-    match = _NUMBER.fullmatch(text)
-    units = ", ".join(_SCALE[si])
+    """Return ``"550 nm"`` as a finite number in the SI unit ``si``; raise ValueError for another or for no unit."""
+    match = _NUMBER.fullmatch(str(value).strip())
     if isinstance(value, bool) or match is None:
-        raise ValueError(f"is not a quantity: write a number and a unit, such as '1 {_usual(si)}'")
+        raise ValueError(f"is not a quantity: write a number and a unit, such as '1 {_USUAL.get(si, si)}'")
     number, unit = float(match[1]), match[2].strip()
     if not unit:
         raise ValueError(f"needs a unit: write {_with_unit(match[1], si)}")
     if unit not in _SCALE[si]:
-        raise ValueError(f"has the wrong unit {unit!r}: write one of {units}")
+        raise ValueError(f"has the wrong unit {unit!r}: write one of {', '.join(_SCALE[si])}")
     if not math.isfinite(number):
         raise ValueError("must be finite")
     return _in_si(number, si, unit)
 
 
 def _with_unit(number: str, si: str) -> str:
-    """Return what to write for a bare number; a gain has two units that are both usual."""
+    """Return the text that a message suggests for a number without a unit; both units of a gain are usual."""
     if si == "DN/e-":
         return f"{number} e-/DN or {number} DN/e- (EMVA's K is DN/e-)"
-    return f"{number} {_usual(si)} (one of {', '.join(_SCALE[si])})"
+    return f"{number} {_USUAL.get(si, si)} (one of {', '.join(_SCALE[si])})"
 
 
 def _in_si(number: float, si: str, unit: str) -> float:
@@ -65,15 +60,15 @@ def _in_si(number: float, si: str, unit: str) -> float:
 
 
 def read_any(text: Any) -> tuple[float, str]:
-    """Read ``"550 nm"`` or ``0.56`` as a finite number and an SI unit, empty for a bare number, or raise ValueError."""
+    """Return ``"550 nm"`` or ``0.56`` as a finite number and SI unit ("" for none); raise ValueError for other text."""
     number, si, reciprocal = read_written(text)
     return (_in_si(number, si, "e-/DN"), si) if reciprocal else (number, si)
 
 
 def read_written(text: Any) -> tuple[float, str, bool]:
-    """Read as `read_any` does, but keep a number in a reciprocal unit such as e-/DN: number, SI unit, is reciprocal.
+    """Return the number, the SI unit, and True for a reciprocal unit such as e-/DN, in which the number stays.
 
-    A distribution of the reciprocal, such as a normal one of 0.37 e-/DN, is not of the same kind for the quantity.
+    The reciprocal of a normal distribution, such as that of 0.37 e-/DN, is not normal, so no number is converted here.
     """
     match = _NUMBER.fullmatch(str(text).strip())
     unit = match[2].strip() if match else ""
@@ -111,7 +106,7 @@ Shape = tuple[Count, Count]  #: (y, x) in pixels
 
 
 class IsFile:
-    """The mark of a file parameter: the *content* of the file decides the result and enters the engine's digest."""
+    """The mark of a file parameter: the result depends on the content of the file, which enters the engine's digest."""
 
 
 def _existing(path: Path) -> Path:
@@ -123,14 +118,14 @@ def _existing(path: Path) -> Path:
 DataFile = Annotated[Path, AfterValidator(_existing), IsFile()]  #: path of a file that exists
 
 
-def _found(given: Any) -> list[Path]:
+def _files(written: Any) -> list[Path]:
     """Return the files of a path, a pattern, a folder or a list of these; patterns and folders are sorted by name."""
-    if isinstance(given, list | tuple):
-        return [path for each in given for path in _found(each)]
-    path = Path(given)
+    if isinstance(written, list | tuple):
+        return [path for each in written for path in _files(each)]
+    path = Path(written)
     if path.is_file():
         return [path]
-    inside = path.iterdir() if path.is_dir() else map(Path, glob(str(given)))
+    inside = path.iterdir() if path.is_dir() else map(Path, glob(str(written)))
     files = sorted(each for each in inside if each.is_file() and not each.name.startswith("."))
     if not files:
         raise ValueError(f"no such file, and no folder or pattern that holds one: {path}")
@@ -138,4 +133,4 @@ def _found(given: Any) -> list[Path]:
 
 
 #: one or more files: a path, a folder, a pattern such as ``dark/*.png``, or a list of these
-DataFiles = Annotated[tuple[Path, ...], BeforeValidator(_found, json_schema_input_type=str | list[str]), IsFile()]
+DataFiles = Annotated[tuple[Path, ...], BeforeValidator(_files, json_schema_input_type=str | list[str]), IsFile()]

@@ -179,9 +179,9 @@ MUTANTS = (
     ),
     Mutant(
         "nodes/metrics/_picture_quality.py",
-        "0.03**2",
-        "0.02**2",
-        within("nodes/metrics", "picture_quality.py::test_ssim_is_that_of_kornia_at_any_size"),
+        "eps=0.0",
+        "eps=1e-12",
+        within("nodes", "kornia_and_colour.py::test_dark_pictures_are_as_alike_as_scikit_image_says"),
     ),
     Mutant(
         "nodes/doe/_fabrication_limits.py",
@@ -308,7 +308,7 @@ def copied(to: Path) -> Path:
     for name in (*_LINKED, "tests"):
         shutil.copytree(ROOT / name, to / name, ignore=_SKIPPED)
     shutil.copy(ROOT / "pyproject.toml", to)
-    (to / ".src/neusee").mkdir(parents=True)
+    shutil.copytree(ROOT / ".src", to / ".src", ignore=shutil.ignore_patterns("__pycache__", *_LINKED))
     for name in _LINKED:
         (to / ".src/neusee" / name).symlink_to(Path("../..") / name)
     return to

@@ -1,4 +1,4 @@
-"""The gradient penalty that keeps the slope of a critic at one."""
+"""The gradient penalty of a critic: the loss that keeps the norm of its gradient near 1."""
 
 from torch import Tensor
 
@@ -8,7 +8,7 @@ from neusee.nodes._half_precision import single
 
 @node()
 def gradient_penalty(slopes: Tensor) -> Tensor:
-    """Average (norm of each sample's slope - 1)^2, which keeps the slope of a critic near 1.
+    """Average (norm - 1)^2 over samples, where the norm is that of a sample's gradient of the critic.
 
     ``slopes`` are the gradients of the critic with respect to its inputs, made with ``create_graph=True``.
 

@@ -1,4 +1,4 @@
-"""Losses of a mask: a low peak of the laser, and all light of the scene in the field."""
+"""Losses of a mask: the peak that a laser leaves, and the light of the scene that the mask scatters away."""
 
 from typing import Annotated
 
@@ -15,7 +15,7 @@ _DARK = 1e-30  #: light, or a ratio, that counts as none
 
 @node()
 def suppression_loss(psf: Psf, *, power: Annotated[float, Field(ge=8, le=64)] = 8.0, log: bool = False) -> Tensor:
-    """Sum the laser suppression ratio over the bands, with a peak that has a gradient everywhere.
+    """Sum the laser suppression ratio over the bands, with a smooth peak whose gradient reaches all bright pixels.
 
     The peak of PSF / clear peak is the p-norm over pixels, whose gradient reaches every bright pixel, while the
     gradient of the maximum reaches a single pixel. With ``log`` each band counts by its logarithm, so that a factor
@@ -43,16 +43,15 @@ def suppression_loss(psf: Psf, *, power: Annotated[float, Field(ge=8, le=64)] = 
 def _(psf: Psf, *, power: float = 8.0, log: bool = False) -> Tensor:
     ratio = (psf.intensity.double() / psf.clear_peak[:, None, None]).flatten(1)
     dark = ratio.detach().amax(1, keepdim=True) <= _DARK
-    peaks = (
-        ((power * ratio.where(~dark, 1.0).clamp_min(1e-300).log()).logsumexp(1) / power).exp().where(~dark[:, 0], 0.0)
-    )
+    logs = ratio.where(~dark, 1.0).clamp_min(1e-300).log()
+    peaks = ((power * logs).logsumexp(1) / power).exp().where(~dark[:, 0], 0.0)
     loss: Tensor = (peaks + _DARK).log().sum() if log else peaks.sum()
     return loss
 
 
 @node()
 def background_loss(image: Tensor, plain_image: Tensor) -> Tensor:
-    """Sum, over the bands, the light of the scene through the plain lens over the light through the mask.
+    """Sum over the bands the ratio of the scene's light through the plain lens to the light through the mask.
 
     Shapes: image and plain_image (..., band, y, x) -> ().
     Units:  none; equal to the number of bands where no light is lost.

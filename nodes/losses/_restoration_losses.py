@@ -1,4 +1,4 @@
-"""Losses of a restoration: the error of the colour at every pixel and at every frequency."""
+"""Losses of a restoration: differences from the true picture by pixel and by spatial frequency."""
 
 from typing import Annotated
 
@@ -8,6 +8,7 @@ from torch import Tensor
 
 from neusee.nodes import node
 from neusee.nodes._half_precision import single
+from neusee.nodes.metrics._picture_quality import require_same_shape
 
 _LEAST = 1e-30  #: least power, because the root has no gradient at 0
 
@@ -18,19 +19,21 @@ def charbonnier(
 ) -> Tensor:
     """Average sqrt(difference^2 + epsilon): an absolute difference that is smooth at 0.
 
+    Kornia's `charbonnier_loss` has a fixed epsilon of 1, and is a square for all differences of pictures in [0, 1].
+
     Shapes: estimate and truth alike -> ().
     Units:  those of the pictures; epsilon in their square.
     Error:  above the mean absolute difference by at most sqrt(epsilon), 1e-3.
     Raises: ValueError for pictures of different shapes.
     Source: NeuSee, section Two-Stage Training (L_REC), with the mean; epsilon is ours.
     """
-    _alike(estimate, truth)
+    require_same_shape(estimate, truth)
     return ((single(estimate) - single(truth)).square() + epsilon).sqrt().mean()
 
 
 @node()
 def fft_l1(estimate: Tensor, truth: Tensor) -> Tensor:
-    """Average the absolute difference of the Fourier spectra of estimate and truth.
+    """Average the absolute difference of the spatial Fourier spectra of estimate and truth.
 
     The transform is in float64: in single precision a coefficient near 0 has neither a reliable size nor a reliable
     direction, and the gradient is that direction.
@@ -41,14 +44,7 @@ def fft_l1(estimate: Tensor, truth: Tensor) -> Tensor:
     Raises: ValueError for pictures of different shapes.
     Source: NeuSee, section Two-Stage Training (L_REC), with a unitary transform and the mean.
     """
-    _alike(estimate, truth)
+    require_same_shape(estimate, truth)
     spectrum: Tensor = torch.fft.fft2(estimate.double() - truth.double(), norm="ortho")
     loss = (spectrum.real.square() + spectrum.imag.square() + _LEAST).sqrt().mean()
     return loss.to(single(estimate).dtype)
-
-
-def _alike(estimate: Tensor, truth: Tensor) -> None:
-    if estimate.shape != truth.shape:
-        raise ValueError(
-            f"estimate {tuple(estimate.shape)} and truth {tuple(truth.shape)} differ: crop the truth to the estimate"
-        )

@@ -8,13 +8,14 @@ from torch import Tensor
 
 from neusee.nodes import node
 from neusee.nodes._half_precision import single
+from neusee.nodes.metrics._picture_quality import require_same_shape
 
 
 @node()
 def mrae(
     estimate: Tensor, truth: Tensor, *, floor: Annotated[float, Field(gt=0, allow_inf_nan=False)] = 0.02
 ) -> Tensor:
-    """Average the absolute difference, divided by the truth or by `floor`, whichever is larger.
+    """Average the absolute difference of spectra, divided by the true value or by `floor`, whichever is larger.
 
     Without a floor a black of 1e-4 has ten thousand times the gradient of white, and training fits the noise of the
     black. With a floor no gradient exceeds 1 / floor, and for a truth below the floor the divisor is constant.
@@ -25,17 +26,14 @@ def mrae(
     Raises: ValueError for spectra of different shapes.
     Source: mean relative absolute error as in NTIRE 2022 and Cai et al., MST++, CVPRW 2022; the floor is ours.
     """
-    if estimate.shape != truth.shape:
-        raise ValueError(
-            f"estimate {tuple(estimate.shape)} and truth {tuple(truth.shape)} differ: lift the same picture"
-        )
-    wanted = single(truth)
-    result: Tensor = ((single(estimate) - wanted).abs() / wanted.abs().clamp_min(floor)).mean()
+    require_same_shape(estimate, truth, "lift the picture that was rendered from the truth")
+    truth = single(truth)
+    result: Tensor = ((single(estimate) - truth).abs() / truth.abs().clamp_min(floor)).mean()
     return result
 
 
 @mrae.reference
 def _(estimate: Tensor, truth: Tensor, *, floor: float = 0.02) -> Tensor:
-    wanted = truth.double()
-    share = (estimate.double() - wanted).abs() / torch.maximum(wanted.abs(), torch.tensor(floor, dtype=torch.float64))
+    truth = truth.double()
+    share = (estimate.double() - truth).abs() / torch.maximum(truth.abs(), torch.tensor(floor, dtype=torch.float64))
     return share.sum() / share.numel()

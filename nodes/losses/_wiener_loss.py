@@ -1,4 +1,4 @@
-"""The permanent damage of a mask to the scene: the part of a picture that no Wiener filter recovers."""
+"""The Wiener loss of a mask: the part of a picture that a Wiener filter behind the mask cannot recover."""
 
 from typing import Annotated
 
@@ -28,7 +28,7 @@ def wiener(
     colour: OneBandShare = 1.0,
     up_to: HighestFrequency | None = None,
 ) -> Tensor:
-    """Compute the log share of a picture's variance that a Wiener filter leaves as error, as a mean over channels.
+    """Average over channels the logarithm of the share of a picture's variance that a Wiener filter leaves as error.
 
     The power of the pictures falls with frequency as in the prior of `restore.wiener`. The filter uses the PSF of a
     channel for a grey scene. The error at a frequency has two parts: the part of the picture that noise hides, and, for
@@ -64,7 +64,7 @@ def _square(spectrum: Tensor) -> Tensor:
 
 
 def _counted(size: tuple[int, int], up_to: float | None) -> Tensor:
-    """Mark the frequencies of half a spectrum that count: up to ``up_to``, without frequency 0."""
+    """Return True for the frequencies of half a spectrum above 0 and up to ``up_to``."""
     fy, fx = torch.fft.fftfreq(size[0], dtype=torch.float64), torch.fft.rfftfreq(size[1], dtype=torch.float64)
     square = fy[:, None].square() + fx.square()
     inside: Tensor = (square > 0) & (square <= (1.0 if up_to is None else up_to**2))

@@ -1,4 +1,4 @@
-"""Limits of every mask: light that stays in the field reaches some pixel, and a low peak leaves little contrast."""
+"""Limits that no mask can exceed: the least laser suppression ratio, and the most contrast for a given peak."""
 
 import math
 from typing import NamedTuple
@@ -13,7 +13,7 @@ _DARK = 1e-30  #: share of the light that counts as none
 
 
 class Limits(NamedTuple):
-    """Bounds from the window, the light and the peak of a PSF alone, and the contrast of the PSF for comparison."""
+    """Bounds that follow from the size, the light and the peak of a PSF, with the contrast of the PSF beside them."""
 
     floor: Tensor  #: (band,) float64, LSR of the light in the window if spread evenly over the window
     rms: Tensor  #: (band,) float64, root mean square contrast over all frequencies that the pixels sample
@@ -24,7 +24,7 @@ class Limits(NamedTuple):
 
 @node(rtol=1e-6)
 def limits(psf: Psf) -> Limits:
-    """Compute bounds of suppression and contrast, from an even spread of the light and from Parseval's theorem.
+    """Compute bounds of suppression and contrast from evenly spread light and from Parseval's theorem.
 
     Light E in N pixels has a peak of at least E / N, and LSR = peak / p0. The mean of |OTF|**2 over all frequencies is
     the sum of PSF**2, which is at most peak times light. Over a share s of the frequencies the mean is at most 1 / s
@@ -33,30 +33,30 @@ def limits(psf: Psf) -> Limits:
     Shapes: psf.intensity (band, y, x) -> five of (band,) float64.
     Units:  none.
     Error:  1e-6 in float32. The floor holds for the window: a wider field has a lower floor. Without light (1e-30) all
-            five are 0.
+            five bounds are 0.
     Source: Parseval's theorem; the cut-off of the clear aperture as in `metrics.mtf`.
     """
-    rows = [_limits(one.double()) for one in psf.intensity]
+    rows = [_contrast_bound(one.double()) for one in psf.intensity]
     light, rms, bound = (torch.stack(column) for column in zip(*rows, strict=True))
     passed = bound / shares(psf).to(bound).sqrt()
     return Limits(light * least_lsr(psf).to(light), rms, bound, passed, math.sqrt(2.0) * passed)
 
 
-def _limits(kernel: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-    """Return the light, the root mean square contrast, and the upper bound of the contrast."""
+def _contrast_bound(kernel: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+    """Return the light of one band, the root mean square contrast, and the upper bound of this contrast."""
     dark = kernel.sum() <= _DARK  # false for NaN, so that NaN reaches the result
     kernel = kernel.where(~dark, 1.0)  # a root has no gradient at 0
     light, peak = kernel.sum(), kernel.amax()
-    found = (light, kernel.square().sum().sqrt() / light, (peak / light).sqrt())
-    return tuple(x.where(~dark, 0.0) for x in found)  # type: ignore[return-value]
+    rms, bound = kernel.square().sum().sqrt() / light, (peak / light).sqrt()
+    return light.where(~dark, 0.0), rms.where(~dark, 0.0), bound.where(~dark, 0.0)
 
 
 @limits.check
 def _(result: Limits, psf: Psf) -> list[Check]:
     low, high = float(result.floor.min()), float(result.floor.max())
-    held = bool((result.rms <= result.bound * (1 + 1e-6)).all())
+    bounded = bool((result.rms <= result.bound * (1 + 1e-6)).all())
     return [Check(f"even light: LSR {low:.3g} to {high:.3g}; rms contrast {float(result.rms.mean()):.3g}, at most "
-                  f"{float(result.bound.mean()):.3g}", held)]  # fmt: skip
+                  f"{float(result.bound.mean()):.3g}", bounded)]  # fmt: skip
 
 
 # --- limits of any mask on this lens ----------------------------------------------------------------------------------
@@ -74,18 +74,18 @@ def least_lsr(psf: Psf) -> Tensor:
 
 
 def most_unsuppressed(psf: Psf) -> Tensor:
-    """Return `Limits.passed` of an element that keeps all light at LSR 1: (band,); the bound scales with sqrt(LSR)."""
+    """Return `Limits.passed` (band,) of a mask with LSR 1 that keeps all light; the bound scales with sqrt(LSR)."""
     clear_peak = psf.clear_peak.double()
     return (clear_peak / shares(psf).to(clear_peak)).sqrt()
 
 
 def shares(psf: Psf) -> Tensor:
-    """Return the share of the sampled frequencies that lies within the cut-off sqrt(4 p0 / pi): (band,) float64."""
+    """Return the share of the sampled frequencies below the cut-off sqrt(4 p0 / pi) of the lens: (band,) float64."""
     fy, fx = (torch.fft.fftfreq(n, dtype=torch.float64) for n in psf.intensity.shape[-2:])
     radius = torch.hypot(fy[:, None], fx)
     return torch.stack([(radius <= math.sqrt(4.0 * float(p) / math.pi)).double().mean() for p in psf.clear_peak])
 
 
 def most_contrast(unsuppressed: float, lsr: Tensor) -> Tensor:
-    """Return the bound of the root mean square contrast at each `lsr`, given the bound at an LSR of 1; at most 1."""
+    """Return the bound, at most 1, of the rms contrast of a mask at each `lsr`, from the bound at an LSR of 1."""
     return (unsuppressed * lsr.sqrt()).clamp_max(1.0)

@@ -1,4 +1,4 @@
-"""Quality of a restored picture, by comparison with the truth."""
+"""Quality of a restored picture, measured by comparison with the true picture."""
 
 import math
 from typing import Annotated, Literal, NamedTuple
@@ -6,18 +6,16 @@ from typing import Annotated, Literal, NamedTuple
 import torch
 from pydantic import Field
 from torch import Tensor
-from torch.nn.functional import pad
 
 from neusee.nodes import Check, node
 from neusee.nodes._half_precision import single
 
-_WINDOW, _SIGMA = 11, 1.5  #: pixels, of the Gaussian of SSIM
-_C1, _C2 = 0.01**2, 0.03**2  #: constants of SSIM, for a white of 1
-_STRIPE, _BLOCK = 54, 54  #: rows and columns of one block: 64 with the margin of the window
+_WINDOW = 11  #: pixels of the Gaussian of SSIM
+_STRIPE = 118  #: rows that are compared together: 128 with the margin of the window
 
 
 class Quality(NamedTuple):
-    """Three measures of the difference of two pictures, over all channels together."""
+    """Three measures of the difference of two pictures, each over all channels together."""
 
     l1: Tensor  #: () float64, mean absolute difference
     psnr: Tensor  #: () float64, dB, for a white of 1; 200 dB for equal pictures
@@ -35,8 +33,10 @@ def quality(
     """Compare a picture with the truth: mean absolute difference, PSNR and SSIM.
 
     Both pictures are clipped to [0, 1], the range of a display. `encoded` compares sRGB-encoded values, as is usual for
-    published photographs; `linear` compares light. SSIM has the Gaussian form (11 x 11, sigma 1.5) and is averaged
-    over the RGB channels and over the pixels whose window lies inside the picture.
+    published photographs; `linear` compares light. SSIM is that of kornia (Gaussian window, 11 x 11, sigma 1.5),
+    averaged over the RGB channels and over the pixels whose window lies inside the picture. The term 1e-12 of kornia's
+    denominator is left out: with this term two black pictures have an SSIM of 0.99999. Kornia's PSNR of two equal
+    pictures is infinite, and 200 dB here, so that a mean over pictures stays finite.
 
     Shapes: estimate and truth (3, y, x), linear sRGB -> three scalars, float64.
     Units:  none; PSNR dB. ``border`` pixels at each side do not count.
@@ -44,13 +44,11 @@ def quality(
     Raises: ValueError for pictures of different shapes, and for pictures smaller than the window of SSIM.
     Source: Wang et al., IEEE Trans. Image Process. 13, 600 (2004); sRGB as IEC 61966-2-1.
     """
-    if estimate.shape != truth.shape:
-        raise ValueError(
-            f"estimate {tuple(estimate.shape)} and truth {tuple(truth.shape)} differ: crop the truth to the estimate"
-        )
+    require_same_shape(estimate, truth)
     a, b = (_inside(x, border) for x in (estimate, truth))
     if min(a.shape[-2:]) < _WINDOW:
-        raise ValueError(f"{tuple(a.shape[-2:])} pixels inside the border: SSIM needs {_WINDOW} x {_WINDOW}")
+        size = f"{_WINDOW} x {_WINDOW}"
+        raise ValueError(f"{tuple(a.shape[-2:])} pixels inside the border: SSIM needs {size}, so give a larger picture")
     absolute, square, alike = _sums(a, b, domain)
     psnr = -10.0 * (square / a.numel()).clamp_min(1e-20).log10()
     seen = a[..., _WINDOW - 1 :, _WINDOW - 1 :].numel()
@@ -61,6 +59,12 @@ def quality(
 def _(result: Quality, *inputs: Tensor, **params: object) -> list[Check]:
     l1, psnr, ssim = (float(x) for x in result)
     return [Check(f"L1 {l1:.4f}, PSNR {psnr:.2f} dB, SSIM {ssim:.3f}", math.isfinite(psnr))]
+
+
+def require_same_shape(estimate: Tensor, truth: Tensor, fix: str = "crop the truth to the estimate") -> None:
+    """Raise ValueError for an estimate and a truth of different shapes."""
+    if estimate.shape != truth.shape:
+        raise ValueError(f"estimate {tuple(estimate.shape)} and truth {tuple(truth.shape)} differ in shape: {fix}")
 
 
 def _inside(picture: Tensor, border: int) -> Tensor:
@@ -76,7 +80,7 @@ def _shown(picture: Tensor, domain: str) -> Tensor:
 
 
 def _sums(a: Tensor, b: Tensor, domain: str) -> tuple[Tensor, Tensor, Tensor]:
-    """Sum absolute differences, square differences and SSIM over all pixels, in stripes that stay in the cache."""
+    """Sum absolute differences, square differences and SSIM over all pixels, in stripes that fit into the CPU cache."""
     absolute, square, alike = (torch.zeros((), dtype=torch.float64, device=a.device) for _ in range(3))
     rows = a.shape[-2] - _WINDOW + 1
     for first in range(0, rows, _STRIPE):
@@ -91,26 +95,10 @@ def _sums(a: Tensor, b: Tensor, domain: str) -> tuple[Tensor, Tensor, Tensor]:
 
 
 def _ssim(p: Tensor, q: Tensor) -> Tensor:
-    """Return SSIM at the pixels whose window lies inside; only the sum of the two variances is needed."""
-    mean_p, mean_q, squares, product = _blurred(torch.stack([p, q, p * p + q * q, p * q]))
-    means, mean_squares = mean_p * mean_q, mean_p * mean_p + mean_q * mean_q
-    numerator = (2 * means + _C1) * (2 * (product - means) + _C2)
-    similar: Tensor = numerator / ((mean_squares + _C1) * (squares - mean_squares + _C2))
+    """Return SSIM at the pixels whose window lies inside the picture, on CUDA without the rounding of TF32."""
+    from kornia.metrics import ssim
+
+    pictures = (x.reshape(1, -1, *x.shape[-2:]) for x in (p, q))
+    with torch.backends.cudnn.flags(enabled=True, allow_tf32=False):
+        similar: Tensor = ssim(*pictures, _WINDOW, eps=0.0, padding="valid")
     return similar
-
-
-def _blurred(maps: Tensor) -> Tensor:
-    """Average (..., y, x) over the window: along y, then along x in blocks, by products with small matrices."""
-    rows, columns = (n - _WINDOW + 1 for n in maps.shape[-2:])
-    tall = _windows(rows, maps) @ maps
-    blocks = -(-columns // _BLOCK)
-    wide = pad(tall, (0, blocks * _BLOCK - columns)).unfold(-1, _BLOCK + _WINDOW - 1, _BLOCK)
-    mean = wide.flatten(0, -2) @ _windows(_BLOCK, maps).T
-    return mean.view(*tall.shape[:-1], -1)[..., :columns]
-
-
-def _windows(count: int, like: Tensor) -> Tensor:
-    """Return the window at ``count`` neighbouring positions: (count, count + window - 1)."""
-    offset = torch.arange(count + _WINDOW - 1, dtype=torch.float64) - torch.arange(count)[:, None] - _WINDOW // 2
-    weight: Tensor = torch.exp(-offset.square() / (2 * _SIGMA**2)).where(offset.abs() <= _WINDOW // 2, 0.0)
-    return (weight / weight[0].sum()).to(like)

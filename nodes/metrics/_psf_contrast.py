@@ -1,4 +1,4 @@
-"""Contrast that a PSF leaves, and the spread of its light."""
+"""Contrast of the images that a PSF gives, and the spread of the light of a PSF."""
 
 import math
 from typing import NamedTuple
@@ -15,7 +15,7 @@ _DARK = 1e-30  #: share of the light that counts as none
 
 
 class Mtf(NamedTuple):
-    """Contrast over the frequencies that the clear aperture passes."""
+    """Statistics of the contrast over the frequencies that the clear aperture passes."""
 
     rms: Tensor  #: (band,) float64, root mean square
     median: Tensor  #: (band,) float64
@@ -24,7 +24,7 @@ class Mtf(NamedTuple):
 
 @node(rtol=1e-5)
 def mtf(psf: Psf) -> Mtf:
-    """Compute the contrast, |OTF| over its value at frequency 0, up to the cut-off frequency of the clear aperture.
+    """Compute the contrast, |OTF| / OTF(0), over all frequencies up to the cut-off of the clear aperture.
 
     The cut-off D / (wavelength x f) follows from the peak of the clear lens p0: sqrt(4 p0 / pi) cycles per pixel.
     Parseval: no mask has an rms contrast (over all frequencies that the pixels sample) above sqrt(LSR p0 / light kept).
@@ -33,8 +33,8 @@ def mtf(psf: Psf) -> Mtf:
     Units:  none.
     Error:  1e-7 in float32, plus the error of the window: light outside the window counts as lost, and the window sets
             the frequencies. The cut-off holds for a round aperture and a PSF sampled at points. Without light (1e-30)
-            the contrast is 0. Only `rms` has a gradient: a median depends on a single frequency, and among equal
-            values the choice of that frequency is arbitrary.
+            the contrast is 0. Only `rms` has a gradient: a median depends on one frequency, whose choice among equal
+            values is arbitrary.
     Source: Goodman, Introduction to Fourier Optics, 4th ed., ch. 7 (OTF as autocorrelation of the pupil).
     """
     rows = [_contrast(one, float(p)) for one, p in zip(psf.intensity, psf.clear_peak, strict=True)]
@@ -49,9 +49,9 @@ def _contrast(kernel: Tensor, clear_peak: float) -> tuple[Tensor, Tensor, Tensor
     whole = otf[0, 0].to(torch.complex128).abs()
     dark = whole <= _DARK
     passed = otf[inside].to(torch.complex128).abs() / whole.where(~dark, 1.0)
-    found = passed.where(~dark, 0.0).clamp_max(1.0)
-    ordered = found.detach().sort().values
-    rms: Tensor = torch.linalg.vector_norm(found) / math.sqrt(len(found))
+    contrast = passed.where(~dark, 0.0).clamp_max(1.0)
+    ordered = contrast.detach().sort().values
+    rms: Tensor = torch.linalg.vector_norm(contrast) / math.sqrt(len(contrast))
     return rms, ordered[(len(ordered) - 1) // 2], ordered[(len(ordered) - 1) // 100]
 
 
@@ -63,7 +63,7 @@ def _(result: Mtf, *inputs: Psf) -> list[Check]:
 
 @node(rtol=1e-6)
 def encircled(psf: Psf, *, pixel_pitch: PositiveLength, radius: PositiveLength) -> Tensor:
-    """Sum the share of the pupil's light that falls within a radius of the axis.
+    """Compute the share of the light through the clear pupil that falls within a radius of the axis.
 
     Shapes: psf.intensity (band, y, x) -> (band,) float64.
     Units:  radius m on the sensor; result a share of the light through the clear pupil.
@@ -79,7 +79,7 @@ def encircled(psf: Psf, *, pixel_pitch: PositiveLength, radius: PositiveLength) 
 @encircled.check
 def _(result: Tensor, *inputs: Psf, **params: float) -> list[Check]:
     low, high = float(result.min()), float(result.max())
-    return [Check(f"{low:.1%} to {high:.1%} inside", high <= 1.01)]
+    return [Check(f"{low:.1%} to {high:.1%} of the light inside", high <= 1.01)]
 
 
 # --- as curves --------------------------------------------------------------------------------------------------------
@@ -89,11 +89,11 @@ def encircled_curve(light: Tensor) -> Tensor:
     """Return the light of one band (y, x) within 0, 1, 2, … pixels of the axis: (radius,) float64."""
     y, x = (torch.arange(n, dtype=torch.float64) - n // 2 for n in light.shape)
     radius = torch.hypot(y[:, None], x[None, :]).ceil().long().flatten()
-    found = torch.zeros(int(radius.max()) + 1, dtype=torch.float64)
-    return found.index_add_(0, radius, light.detach().double().cpu().flatten()).cumsum(0)
+    rings = torch.zeros(int(radius.max()) + 1, dtype=torch.float64)
+    return rings.index_add_(0, radius, light.detach().double().cpu().flatten()).cumsum(0)
 
 
 def over_clear_peak(psf: Psf, band: int) -> Tensor:
-    """Return the light (y, x) of a band as multiples of the peak of the clear lens."""
-    found: Tensor = psf.intensity[band] / psf.clear_peak[band]
-    return found
+    """Return the PSF (y, x) of a band as multiples of the peak of the clear lens."""
+    relative: Tensor = psf.intensity[band] / psf.clear_peak[band]
+    return relative

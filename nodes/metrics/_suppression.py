@@ -1,4 +1,4 @@
-"""Effect of the element on the laser and on the scene, and the remaining peak on the sensor."""
+"""Effect of a mask on the laser and on the scene, with the brightest and the saturated pixels of the sensor."""
 
 from typing import Annotated, Any, NamedTuple
 
@@ -34,7 +34,7 @@ class Saturated(NamedTuple):
 
 @node(rtol=1e-6)
 def lsr(psf: Psf) -> Tensor:
-    """Compute the laser suppression ratio: the brightest pixel of the PSF over the brightest pixel of the clear lens.
+    """Compute the laser suppression ratio: the brightest pixel of the PSF over that of the clear lens.
 
     Shapes: psf.intensity (band, y, x) -> (band,) float64.
     Units:  none; 1 for the clear lens.
@@ -64,18 +64,18 @@ def bsr(image: Tensor | Channels, plain_image: Tensor | Channels) -> Tensor:
     Raises: ValueError for images of different shapes.
     Source: NeuSee, section Sensor Image (BSR), as a ratio of energies.
     """
-    here, there = ((*x.flux.shape, *x.planes.shape[1:]) if isinstance(x, Channels) else tuple(x.shape)
-                   for x in (image, plain_image))  # fmt: skip
-    if here != there:
-        raise ValueError(f"image {here} and plain image {there} differ in shape: compute both from the same scene")
-    kept, plain = (x.flux if isinstance(x, Channels) else _light(x) for x in (image, plain_image))
+    (shape, kept), (plain_shape, plain) = _shape_and_light(image), _shape_and_light(plain_image)
+    if shape != plain_shape:
+        raise ValueError(f"image {shape} and plain image {plain_shape} differ in shape: use one scene for both")
     dark = plain <= _DARK  # false for NaN, so that NaN reaches the result
     ratio: Tensor = torch.where(dark, 1.0, kept / plain.where(~dark, 1.0))
     return ratio
 
 
-def _light(image: Tensor) -> Tensor:
-    return single(image).sum(-1).sum(-1, dtype=torch.float64)
+def _shape_and_light(image: Tensor | Channels) -> tuple[tuple[int, ...], Tensor]:
+    if isinstance(image, Channels):
+        return (*image.flux.shape, *image.planes.shape[1:]), image.flux
+    return tuple(image.shape), single(image).sum(-1).sum(-1, dtype=torch.float64)
 
 
 @bsr.check
@@ -85,11 +85,11 @@ def _(result: Tensor, *inputs: Tensor | Channels) -> list[Check]:
 
 @node(rtol=1e-6)
 def saturated(raw: Tensor, *, full_well: Well, gain: Gain, bits: Bits = 16) -> Saturated:
-    """Count the saturated pixels, with a channel at the full well or at the largest number of the converter.
+    """Count the pixels with a channel at the full well or at the largest number of the converter.
 
     Shapes: raw (..., channel, y, x) -> two scalars, float64.
     Units:  raw DN; pixels.
-    Error:  a pixel within one DN of the full well counts as full, and so does one that is not a number.
+    Error:  a pixel within one DN of the full well counts as saturated, and so does one that is not a number.
     Source: NeuSee, Eq. (SensorImage).
     """
     full = clipped(raw, full_well=full_well, gain=gain, bits=bits).any(-3)
@@ -103,7 +103,7 @@ def _(result: Saturated, *inputs: Tensor, **params: Any) -> list[Check]:
 
 
 def clipped(raw: Tensor, *, full_well: float, gain: float, bits: int) -> Tensor:
-    """Mark the values at the full well, at the largest number of the converter, or NaN."""
+    """Return True for values at the full well, at the largest number of the converter, and for NaN."""
     full = int(full_well * gain - 0.5)
     marked: Tensor = ~(raw < max(1, min(2**bits - 1, full)))  # NaN counts as clipped
     return marked
@@ -123,7 +123,7 @@ def peak_irradiance(
     exposure: Time,
     damage: Annotated[float, Field(gt=0)] = 1e6,
 ) -> Peak:
-    """Find the brightest pixel of scene and lasers together: the sum over wavelengths of I / I_sat.
+    """Find the largest sum over wavelengths of I / I_sat in a pixel, for the scene and all lasers together.
 
     Shapes: image (band, y, x), level (band,), each spot (line band, y, x) -> two scalars, float64.
     Units:  multiples of saturation; damage the multiple above which a sensor may break.
@@ -143,7 +143,7 @@ def peak_irradiance(
 
 
 def _in_wells(irradiance: Tensor | Channels, saturating: Tensor) -> Tensor:
-    """Sum irradiance over saturation irradiance over all wavelengths."""
+    """Return the irradiance of each pixel in units of saturation: the sum over wavelengths of I / I_sat."""
     return weighted(irradiance, (1.0 / saturating)[None])[0]
 
 

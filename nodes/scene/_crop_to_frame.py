@@ -1,4 +1,4 @@
-"""The frame of a scene: a scene is scaled to cover the frame and cropped at its centre."""
+"""Scaling of a scene until the scene covers the frame of a recipe, and the cut at the centre."""
 
 import math
 
@@ -10,7 +10,8 @@ from neusee.nodes.units import Shape
 def framed(scene: Tensor, shape: Shape | None) -> Tensor:
     """Scale linear light with its aspect ratio until it covers `shape`, then crop: (band, y, x) -> (band, *shape).
 
-    Kornia's antialiased bilinear resampling has no overshoot, so that no value becomes negative.
+    Kornia's antialiased bilinear resampling has no overshoot, so that no value becomes negative. Kornia's `center_crop`
+    would interpolate between pixels where a number of rows or columns to remove is odd.
     """
     from kornia.geometry.transform import resize
 
@@ -30,7 +31,7 @@ def covering(size: tuple[int, int], shape: Shape) -> tuple[int, int]:
 
 
 def enlarged(size: tuple[int, int], shape: Shape | None) -> list[str]:
-    """Return a note where a frame needs more pixels than the file has."""
+    """Return a note if a scene of this size is enlarged to cover `shape`, and nothing otherwise."""
     if shape is None:
         return []
     scale = max(shape[0] / size[0], shape[1] / size[1])

@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from neusee.nodes import ParameterError
-from neusee.nodes.scene._spectral_exr import read_spectral, spectral_channels
+from neusee.nodes.scene._spectral_exr import exr_header, read_spectral, spectral_channels
 
 Layout = Literal["y x band", "band y x"]
 _TYPES = {"double": "float64", "single": "float32", "logical": "bool", "char": "str", "cell": "O", "struct": "O"}
@@ -23,8 +23,8 @@ def cube_and_wavelengths(
         cube, known, _ = read_spectral(file)
         return cube, known
     if start is None or stop is None:
-        raise ValueError(f"{file.name} carries no wavelengths: give start and stop")
-    values = np.load(file) if file.suffix == ".npy" else _mat(file, _only(file, variable))
+        raise ValueError(f"{file.name} has no wavelengths: give start and stop")
+    values = np.load(file) if file.suffix == ".npy" else _mat(file, _cube_name(file, variable))
     scale = float(np.iinfo(values.dtype).max) if values.dtype.kind == "u" else 1.0
     first = np.moveaxis(values, -1, 0) if layout == "y x band" else values
     cube = torch.from_numpy(np.ascontiguousarray(first, dtype=np.float32)) / scale
@@ -37,7 +37,7 @@ def size_and_type(file: Path, variable: str | None) -> tuple[tuple[int, ...], st
         head = np.load(file, mmap_mode="r")
         size, kind = head.shape, str(head.dtype)
     elif file.suffix == ".mat":
-        size, kind = _listed(file)[_only(file, variable)]
+        size, kind = _listed(file)[_cube_name(file, variable)]
     else:
         raise ParameterError("file", f"{file.name} is not a .mat, .npy or .exr file: save the cube as one of these")
     if len(size) != 3:
@@ -47,26 +47,16 @@ def size_and_type(file: Path, variable: str | None) -> tuple[tuple[int, ...], st
 
 def exr_size(file: Path) -> tuple[int, int]:
     """Read the numbers of rows and columns from the header of a spectral OpenEXR."""
-    import OpenEXR
-
-    try:
-        with OpenEXR.File(str(file), header_only=True) as opened:
-            header = dict(opened.header())
-    except (RuntimeError, OSError, ValueError) as why:
-        raise ParameterError("file", f"{file} cannot be read as OpenEXR ({str(why).strip()})") from None
-    names = [channel.name for channel in header["channels"]]
+    _, names, size = exr_header(file)
     if not spectral_channels(names):
         raise ParameterError("file", f"{file.name} has the channels {', '.join(names)}: none is named like T.550,0nm")
-    low, high = header["dataWindow"]
-    return int(high[1] - low[1]) + 1, int(high[0] - low[0]) + 1
+    return size
 
 
 def _listed(file: Path) -> dict[str, tuple[tuple[int, ...], str]]:
-    """Return the variables of a .mat file, with shape and type."""
-    try:
-        from scipy.io import whosmat
-    except ImportError:
-        raise ParameterError("file", f"{file.name}: .mat files need scipy: pip install scipy") from None
+    """Return the shape and the type of each variable in a .mat file."""
+    from scipy.io import whosmat
+
     try:
         return {name: (size, _TYPES.get(kind, kind)) for name, size, kind in whosmat(file)}
     except Exception:  # scipy raises many kinds of errors for foreign bytes
@@ -75,16 +65,16 @@ def _listed(file: Path) -> dict[str, tuple[tuple[int, ...], str]]:
         ) from None
 
 
-def _only(file: Path, variable: str | None) -> str:
-    """Return the requested variable, or the only cube of the file."""
-    held = _listed(file)
-    cubes = [name for name, (size, _) in held.items() if len(size) == 3]
-    if variable in held:
+def _cube_name(file: Path, variable: str | None) -> str:
+    """Return the name of the requested variable, or of the only cube in the file."""
+    variables = _listed(file)
+    cubes = [name for name, (size, _) in variables.items() if len(size) == 3]
+    if variable in variables:
         return str(variable)
     if variable is None and len(cubes) == 1:
         return cubes[0]
-    asked = f"has no variable {variable!r}" if variable is not None else f"holds {len(cubes)} cubes"
-    raise ParameterError("variable", f"{file.name} {asked}: name one of {', '.join(held)}")
+    problem = f"has no variable {variable!r}" if variable is not None else f"holds {len(cubes)} cubes"
+    raise ParameterError("variable", f"{file.name} {problem}: write one of {', '.join(variables)}")
 
 
 def _mat(file: Path, variable: str) -> NDArray[Any]:

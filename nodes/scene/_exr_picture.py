@@ -11,6 +11,7 @@ from torch import Tensor
 
 from neusee.nodes import Check, ParameterError, node
 from neusee.nodes.scene._crop_to_frame import enlarged, framed
+from neusee.nodes.scene._spectral_exr import exr_header
 from neusee.nodes.units import DataFile, Shape
 
 White = Annotated[float, Field(gt=0, allow_inf_nan=False)]
@@ -39,14 +40,11 @@ def exr(
 
 @exr.preflight
 def _(*, file: Path, shape: Shape | None = None, **params: Any) -> list[str]:
-    header = _header(file)
-    names = [channel.name for channel in header["channels"]]
-    _wanted(file, names)
-    low, high = header["dataWindow"]
-    notes = [] if {"R", "G", "B"} <= set(names) else [f"{file.name}: luminance only, taken as grey"]
+    header, names, size = exr_header(file)
+    notes = [f"{file.name}: luminance only, read as grey"] if _colour_channels(file, names) == ["Y"] else []
     if abs(float(header.get("pixelAspectRatio", 1.0)) - 1) > 1e-3:
-        notes += [f"{file.name}: pixels are not square ({header['pixelAspectRatio']:.3f}), taken as square"]
-    return notes + enlarged((int(high[1] - low[1]) + 1, int(high[0] - low[0]) + 1), shape)
+        notes += [f"{file.name}: pixels are not square ({header['pixelAspectRatio']:.3f}), read as square"]
+    return notes + enlarged(size, shape)
 
 
 @exr.check
@@ -57,39 +55,29 @@ def _(result: Tensor, *, file: Path, **params: Any) -> list[Check]:
     return [Check(text + (f"; {below} of {linear.numel()} values were negative, down to {least:.2g}" if below else ""))]
 
 
-def _header(file: Path) -> dict[str, Any]:
-    import OpenEXR
-
-    try:
-        with OpenEXR.File(str(file), header_only=True) as opened:
-            return dict(opened.header())
-    except (RuntimeError, OSError, ValueError) as why:
-        raise ParameterError(
-            "file", f"{file} cannot be read as OpenEXR ({str(why).strip()}): give an .exr file"
-        ) from None
-
-
-def _wanted(file: Path, names: list[str]) -> list[str]:
-    """Return the channels to read: R, G, B, or else Y alone."""
-    for wanted in (["R", "G", "B"], ["Y"]):
-        if set(wanted) <= set(names) and not {"RY", "BY"} & set(names):
-            return wanted
-    held = ", ".join(names)
-    raise ParameterError(
-        "file", f"{file} has the channels {held}, but R, G and B, or Y alone, are needed: save it as RGB"
+def _colour_channels(file: Path, names: list[str]) -> list[str]:
+    """Return the names of the channels to read: R, G and B, or else Y alone."""
+    for channels in (["R", "G", "B"], ["Y"]):
+        if set(channels) <= set(names) and not {"RY", "BY"} & set(names):
+            return channels
+    text = (
+        f"{file} has the channels {', '.join(names)}, but R, G and B, or Y alone, are needed: save the picture as RGB"
     )
+    raise ParameterError("file", text)
 
 
 def _linear(file: Path) -> Tensor:
-    """Read linear sRGB in the size of the file, (3, y, x) float32."""
+    """Read a file as linear sRGB, (3, y, x) float32, with all pixels of the file."""
     import OpenEXR
 
     with OpenEXR.File(str(file), separate_channels=True) as opened:
         header, channels = dict(opened.header()), opened.channels()
-        names = _wanted(file, list(channels))
+        names = _colour_channels(file, list(channels))
         pixels = np.stack([np.asarray(channels[name].pixels, dtype=np.float32) for name in names])
     if bad := int((~np.isfinite(pixels)).sum()):
-        raise ValueError(f"{file.name} holds {bad} values that are not finite: replace these, say by the largest")
+        raise ValueError(
+            f"{file.name} holds {bad} values that are not finite: replace these values, such as by the largest"
+        )
     if names == ["Y"]:
         return torch.from_numpy(pixels).expand(3, -1, -1).clone()
     matrix = torch.from_numpy(_to_srgb(header)).to(torch.float32)
@@ -97,7 +85,7 @@ def _linear(file: Path) -> Tensor:
 
 
 def _to_srgb(header: dict[str, Any]) -> NDArray[np.float64]:
-    """Return the matrix from the file's primaries to linear sRGB; Bradford adapts the file's neutral to D65."""
+    """Return the matrix from the primaries of a header to linear sRGB; Bradford adapts the header's neutral to D65."""
     import colour
 
     values = np.asarray(header.get("chromaticities", _REC709), dtype=np.float64)
@@ -105,10 +93,7 @@ def _to_srgb(header: dict[str, Any]) -> NDArray[np.float64]:
         return np.eye(3)
     white = values[6:]
     neutral = np.asarray(header.get("adoptedNeutral", white), dtype=np.float64)
-    srgb = colour.RGB_COLOURSPACES["sRGB"]
     own = colour.models.normalised_primary_matrix(values[:6].reshape(3, 2), white)
-    adapt = colour.adaptation.matrix_chromatic_adaptation_VonKries(
-        colour.xy_to_XYZ(neutral), colour.xy_to_XYZ(srgb.whitepoint), transform="Bradford"
-    )
-    matrix: NDArray[np.float64] = np.linalg.inv(srgb.matrix_RGB_to_XYZ) @ adapt @ own
+    space = colour.RGB_Colourspace("file", values[:6], neutral, matrix_RGB_to_XYZ=own)
+    matrix: NDArray[np.float64] = colour.matrix_RGB_to_RGB(space, colour.RGB_COLOURSPACES["sRGB"], "Bradford")
     return matrix

@@ -12,6 +12,7 @@ from neusee.nodes.units import DataFile, Shape
 
 _MODES = ("RGB", "L", "P", "1", "I", "I;16", "I;16B")
 _FIX = "convert it to 8- or 16-bit sRGB: magick {name} -alpha off -colorspace sRGB -depth 16 {stem}.png"
+_ORIENTATION = 0x0112  #: EXIF tag
 _ROTATED = range(5, 9)  #: EXIF orientations that exchange width and height
 
 
@@ -44,14 +45,11 @@ def _(*, file: Path, shape: Shape | None = None) -> list[str]:
     try:
         with Image.open(file) as image:
             _refuse(file, image)
-            profile = _profile(image)
-            notes = (
-                [f"{file.name}: colour profile {profile!r} not applied, the file is read as sRGB"] if profile else []
-            )
-            turned = image.getexif().get(0x0112, 1)
+            profile, turned = _profile(image), image.getexif().get(_ORIENTATION, 1)
             size = image.size if turned in _ROTATED else image.size[::-1]
     except UnidentifiedImageError:
         raise ParameterError("file", f"{file} is not a readable picture: give a PNG or JPEG file") from None
+    notes = [f"{file.name}: colour profile {profile!r} not applied, the file is read as sRGB"] if profile else []
     notes += [f"{file.name}: turned upright, as its EXIF orientation {turned} says"] if turned != 1 else []
     return notes + enlarged(size, shape)
 
@@ -88,14 +86,14 @@ def _profile(image: Any) -> str:
 
 
 def _codes(file: Path) -> Tensor:
-    """Read upright code values in [0, 1]: (3, y, x) float32. Pillow reduces 16-bit colour to 8; kornia_rs does not."""
+    """Read upright code values in [0, 1]: (3, y, x) float32, 16-bit colour by kornia_rs, as Pillow keeps 8 bits."""
     import numpy as np
     from PIL import Image, ImageOps
 
     with Image.open(file) as image:
         _refuse(file, image)
         if image.mode == "RGB" and _depth(file) == 16:
-            values = _words(file, image.getexif().get(0x0112, 1))
+            values = _words(file, image.getexif().get(_ORIENTATION, 1))
         else:
             upright = ImageOps.exif_transpose(image)
             values = np.asarray(upright if upright.mode.startswith("I") else upright.convert("RGB"))
@@ -111,7 +109,7 @@ def _depth(file: Path) -> int:
 
 
 def _words(file: Path, turned: int) -> Any:
-    """Read 16-bit RGB, turned as the EXIF orientation says."""
+    """Read a 16-bit RGB file, and turn the picture upright by its EXIF orientation."""
     import numpy as np
     from kornia_rs.io import read_image_png_u16
 

@@ -1,4 +1,4 @@
-"""A folder of photographs as scenes: what can be read of it, and a part of a picture that the seed alone decides."""
+"""Photographs of a folder as scenes: the files that can be read, and parts of pictures drawn from a seed."""
 
 from __future__ import annotations
 
@@ -17,42 +17,36 @@ from neusee.nodes.scene._crop_to_frame import covering
 from neusee.nodes.scene._photograph import photograph
 
 _PICTURES = frozenset({".png", ".jpg", ".jpeg", ".jpe", ".webp", ".tif", ".tiff", ".bmp", ".gif"})
-_ENDS = {b"\xff\xd8": b"\xff\xd9", b"\x89P": b"IEND"}  #: first bytes of a format -> what stands near its end
-_TAIL = 1 << 16  #: bytes at the end of a file in which that is looked for: some cameras write more behind it
-_ORDER, _CUT, _DRAW = 0, 1, 2  #: streams of one seed
+_ENDS = {b"\xff\xd8": b"\xff\xd9", b"\x89P": b"IEND"}  #: first bytes of a format -> mark near the end of its files
+_TAIL = 1 << 16  #: bytes at the end of a file in which the mark must be: some cameras write more behind the mark
+_ORDER, _PART, _DRAW = 0, 1, 2  #: random streams of one seed
 _KEPT = 64  #: decoded photographs that a process keeps
-_TRIES = 100  #: broken ones in a row, after which a folder is given up
+_TRIES = 100  #: broken photographs in a row, after which drawing stops with an error
 
-Index = int | Sequence[int]  #: of a scene; of a sample of training (epoch, index)
+Index = int | Sequence[int]  #: the number of a scene, or (stage, number) of a picture for training
 
 
 def list_photographs(root: Path) -> tuple[list[Path], list[tuple[Path, str]]]:
-    """Photographs below a folder in the order of their paths, and those that cannot be read, with the reason.
+    """List the photographs below a folder in the order of their paths, and the unreadable files, each with a reason.
 
-    Headers and ends of the files are looked at, no picture is decoded. What is hidden, or no picture by its name, is
-    passed over.
+    The headers and the ends of the files decide; no picture is decoded. Hidden files, hidden folders and files without
+    the suffix of a picture are ignored.
     """
-    paths: list[Path] = []
-    broken: list[tuple[Path, str]] = []
-    for path in _files(root):
-        reason = _wrong(path)
-        if reason:
-            broken.append((path, reason))
-        else:
-            paths.append(path)
-    return paths, broken
+    reasons = {path: _problem(path) for path in _files(root)}
+    broken = [(path, reason) for path, reason in reasons.items() if reason]
+    return [path for path, reason in reasons.items() if not reason], broken
 
 
 def _files(root: Path) -> list[Path]:
-    found = []
+    pictures = []
     for folder, below, names in os.walk(root, followlinks=True):
         below[:] = sorted(name for name in below if not name.startswith("."))
-        found += [Path(folder, n) for n in names if not n.startswith(".") and Path(n).suffix.lower() in _PICTURES]
-    return sorted(found, key=lambda path: path.relative_to(root).parts)
+        pictures += [Path(folder, n) for n in names if not n.startswith(".") and Path(n).suffix.lower() in _PICTURES]
+    return sorted(pictures, key=lambda path: path.relative_to(root).parts)
 
 
-def _wrong(path: Path) -> str:
-    """Why a file is no photograph that can be read, or nothing."""
+def _problem(path: Path) -> str:
+    """Return why a file cannot be read as a photograph, or an empty text."""
     try:
         if photograph.hooks.preflight is not None:
             photograph.hooks.preflight(file=path, shape=None)
@@ -65,36 +59,31 @@ def _wrong(path: Path) -> str:
 
 
 def choose_photograph(paths: Sequence[Path], seed: int, index: int) -> Path:
-    """The photograph of a scene: all of them in an order that the seed decides, and then from the start again."""
+    """Return the photograph of a scene: every photograph once in an order drawn from the seed, then all again."""
     order: list[int] = np.random.default_rng([seed, _ORDER]).permutation(len(paths)).tolist()
     return paths[order[index % len(paths)]]
 
 
 def crop_photograph(path: Path, shape: tuple[int, int], seed: int, index: Index) -> Tensor:
-    """A part of a photograph, linear sRGB (3, y, x), its place drawn from the seed and the index alone.
+    """Cut a part out of a photograph, linear sRGB (3, y, x), at a position drawn from the seed and the index alone.
 
-    One that is smaller is first enlarged, by the bicubic kernel in linear light, just until it covers ``shape``; what
-    the kernel puts below black is black.
+    A smaller photograph is first enlarged by the bicubic kernel in linear light until it just covers ``shape``;
+    negative results of the kernel become black.
     """
     picture = _decoded(path)
     size = (picture.shape[-2], picture.shape[-1])
     if any(have < want for have, want in zip(size, shape, strict=True)):
         size = covering(size, shape)
         picture = resize(picture, *size).clamp_min(0.0)
-    at = _place(size, shape, seed, index)
-    return picture[:, at[0] : at[0] + shape[0], at[1] : at[1] + shape[1]].contiguous()
+    draw = np.random.default_rng([seed, _PART, *_indices(index)])
+    top, left = (int(draw.integers(0, have - want + 1)) for have, want in zip(size, shape, strict=True))
+    return picture[:, top : top + shape[0], left : left + shape[1]].contiguous()
 
 
 @functools.lru_cache(maxsize=_KEPT)
 def _decoded(path: Path) -> Tensor:
-    found: Tensor = photograph(file=path)
-    return found
-
-
-def _place(size: tuple[int, int], shape: tuple[int, int], seed: int, index: Index) -> tuple[int, int]:
-    draw = np.random.default_rng([seed, _CUT, *_indices(index)])
-    top, left = (int(draw.integers(0, have - want + 1)) for have, want in zip(size, shape, strict=True))
-    return top, left
+    picture: Tensor = photograph(file=path)
+    return picture
 
 
 def _indices(index: Index) -> list[int]:
@@ -103,24 +92,25 @@ def _indices(index: Index) -> list[int]:
 
 @dataclass
 class Photographs:
-    """Photographs to learn from, and files that turned out to be none."""
+    """Photographs for training, and the files that cannot be read as photographs."""
 
     paths: tuple[Path, ...]  #: in the order of their names
-    broken: dict[Path, str] = field(default_factory=dict)  #: what cannot be read, and why
+    broken: dict[Path, str] = field(default_factory=dict)  #: why each of the other files cannot be read
 
     @classmethod
     def under(cls, root: Path) -> Photographs:
-        """All below a folder, however deep. Raises ValueError where there is none."""
-        good, broken = list_photographs(root)
-        if not good:
+        """Return all photographs below a folder at any depth; raise ValueError for a folder without photographs."""
+        paths, broken = list_photographs(root)
+        if not paths:
             why = f"; {len(broken)} cannot be read, such as {broken[0][0]}: {broken[0][1]}" if broken else ""
             raise ValueError(f"no photograph below {root}{why}")
-        return cls(tuple(good), dict(broken))
+        return cls(tuple(paths), dict(broken))
 
     def crop(self, shape: tuple[int, int], seed: int, index: Index) -> Tensor:
-        """A part of one of them, either way round; for one that proves broken another is drawn.
+        """Draw a photograph and cut a part out of it, mirrored or not; a broken photograph is replaced by another draw.
 
-        The same ``seed`` and ``index`` give the same, in whatever order and in however many processes.
+        The same ``seed`` and ``index`` give the same part in any order and in any number of processes, whereas the
+        random crops and flips of kornia draw from the one random stream of torch.
         """
         rng = np.random.default_rng([seed, _DRAW, *_indices(index)])
         for _ in range(_TRIES):

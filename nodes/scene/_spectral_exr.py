@@ -1,7 +1,7 @@
 """Spectral OpenEXR: one channel per wavelength, named as by Fichet, Pacanowski and Wilkie (JCGT 10(3), 2021).
 
 Emitted light is ``S0.550,0nm``, reflectance is ``T.550,0nm``. The decimal mark is a comma because a point separates
-layers.
+layers. Colour-science reads and writes such files only with OpenImageIO, and its import alone takes a second.
 """
 
 import re
@@ -11,15 +11,31 @@ from typing import Any, Literal
 
 import numpy as np
 import torch
-from numpy.typing import NDArray
 from torch import Tensor
+
+from neusee.nodes import ParameterError
+from neusee.nodes.constants import SPEED_OF_LIGHT
 
 _NAME = re.compile(r"(S0|T)\.(\d*,?\d*(?:[eE][-+]?\d+)?)(Y|Z|E|P|T|G|M|k|h|da|d|c|m|u|n|p)?(m|Hz)")
 _PREFIX = {
     "": 0, "p": -12, "n": -9, "u": -6, "m": -3, "c": -2, "d": -1, "da": 1, "h": 2, "k": 3,
     "M": 6, "G": 9, "T": 12, "P": 15, "E": 18, "Z": 21, "Y": 24,
 }  # fmt: skip
-_LIGHT = 299_792_458.0  #: m/s
+
+
+def exr_header(file: Path) -> tuple[dict[str, Any], list[str], tuple[int, int]]:
+    """Read the header of an OpenEXR file, with the names of the channels and the numbers of rows and columns."""
+    import OpenEXR
+
+    try:
+        with OpenEXR.File(str(file), header_only=True) as opened:
+            header = dict(opened.header())
+    except (RuntimeError, OSError, ValueError) as why:
+        text = f"{file} cannot be read as OpenEXR ({str(why).strip()}): give an .exr file"
+        raise ParameterError("file", text) from None
+    low, high = header["dataWindow"]
+    names = [channel.name for channel in header["channels"]]
+    return header, names, (int(high[1] - low[1]) + 1, int(high[0] - low[0]) + 1)
 
 
 def write_spectral(
@@ -39,9 +55,10 @@ def write_spectral(
     wavelengths = [float(w) for w in centres]
     if cube.ndim != 3 or len(wavelengths) != len(cube):
         raise ValueError(f"cube {tuple(cube.shape)} must be (band, y, x) with {len(wavelengths)} bands")
-    names = [_name(w, kind) for w in wavelengths]
+    quantity = "S0" if kind == "emissive" else "T"
+    names = [quantity + "." + f"{w * 1e9:.6f}nm".replace(".", ",") for w in wavelengths]
     if len(set(names)) < len(names):
-        raise ValueError(f"bands closer than 1e-6 nm get one name: {names}")
+        raise ValueError(f"bands closer than 1e-6 nm would have equal channel names: {names}")
     planes = cube.detach().cpu().float().contiguous().numpy()
     about = {"spectralLayoutVersion": "1.0", "compression": OpenEXR.ZIP_COMPRESSION, "type": OpenEXR.scanlineimage}
     about |= {"emissiveUnits": "W.m^-2"} if kind == "emissive" else {}
@@ -51,25 +68,24 @@ def write_spectral(
 def read_spectral(path: Path | str) -> tuple[Tensor, Tensor, dict[str, Any]]:
     """Read a cube (band, y, x) float32, its rising wavelengths (band,) float64 in m, and the header.
 
-    From a file with both emission and reflectance the emission is read.
+    Only the emission is read from a file with both emission and reflectance.
     Raises: ValueError, which lists the channels of the file, where no channel is spectral.
     """
     import OpenEXR
 
     with OpenEXR.File(str(path), separate_channels=True) as opened:
         header, channels = dict(opened.header()), opened.channels()
-        found = spectral_channels(list(channels))
-        if not found:
+        spectral = spectral_channels(list(channels))
+        if not spectral:
             raise ValueError(
                 f"{path} has the channels {', '.join(channels)}: none is named like S0.550,0nm or T.550,0nm"
             )
-        planes = [np.asarray(channels[name].pixels, dtype=np.float32) for name in found.values()]
-    cube: NDArray[np.float32] = np.stack(planes)
-    return torch.from_numpy(cube), torch.tensor(list(found), dtype=torch.float64), header
+        planes = [np.asarray(channels[name].pixels, dtype=np.float32) for name in spectral.values()]
+    return torch.from_numpy(np.stack(planes)), torch.tensor(list(spectral), dtype=torch.float64), header
 
 
 def spectral_channels(names: Sequence[str]) -> dict[float, str]:
-    """Map each wavelength in m to its channel, by rising wavelength: emission, or else reflectance."""
+    """Map each wavelength in m, rising, to the name of its channel; reflectance counts where no emission is named."""
     for kind in ("S0", "T"):
         matches = [m for m in map(_NAME.fullmatch, names) if m and m[1] == kind and m[2] not in ("", ",")]
         if matches:
@@ -77,14 +93,9 @@ def spectral_channels(names: Sequence[str]) -> dict[float, str]:
     return {}
 
 
-def _name(wavelength: float, kind: str) -> str:
-    text = f"{wavelength * 1e9:.6f}".replace(".", ",")
-    return f"{'S0' if kind == 'emissive' else 'T'}.{text}nm"
-
-
 def _wavelength(match: re.Match[str]) -> float:
     exponent = _PREFIX[match[3] or ""]
-    number = float(f"{match[2].replace(',', '.')}")
+    number = float(match[2].replace(",", "."))
     # a division converts nanometres, so that 550,0nm gives the same float64 as 550 / 1e9
     value = number / 10.0**-exponent if exponent < 0 else number * 10.0**exponent
-    return value if match[4] == "m" else _LIGHT / value
+    return value if match[4] == "m" else SPEED_OF_LIGHT / value

@@ -1,6 +1,7 @@
 """Synthetic scenes whose image has a known answer."""
 
 import math
+from collections.abc import Callable
 from typing import Any, Literal
 
 import torch
@@ -37,7 +38,7 @@ def targets(*, kind: Kind, shape: Shape, low: Fraction = 0.0, high: Fraction = 1
 @targets.preflight
 def _(*, low: float = 0.0, high: float = 1.0, **params: Any) -> list[str]:
     if low > high:
-        raise ParameterError("low", f"low {low:g} is above high {high:g}: exchange them")
+        raise ParameterError("low", f"low {low:g} is above high {high:g}: exchange the two")
     return []
 
 
@@ -47,24 +48,14 @@ def _(result: Tensor, *, low: float = 0.0, high: float = 1.0, **params: Any) -> 
     return [Check(f"light from {least:.3g} to {most:.3g}", least >= low - 1e-6 and most <= high + 1e-6)]
 
 
-def _flat(y: Tensor, x: Tensor) -> Tensor:
-    return torch.ones_like(y + x)
-
-
-def _edge(y: Tensor, x: Tensor) -> Tensor:
-    return (x + 0.5 + 0 * y).clamp(0, 1)
-
-
 def _slanted(y: Tensor, x: Tensor) -> Tensor:
-    """Return the share of each pixel beyond a line through the axis, by a second difference of a second integral."""
+    """Return the share of each pixel on one side of a tilted line through the axis, exact to round-off."""
     c, s = math.cos(_TILT), math.sin(_TILT)
     distance = x * c + y * s
-    corners = [sign * (distance + off).clamp_min(0) ** 2 / 2 for sign, off in _corners(c, s)]
-    return (sum(corners, torch.zeros_like(distance)) / (c * s)).clamp(0, 1)
-
-
-def _corners(c: float, s: float) -> list[tuple[int, float]]:
-    return [(1, (c + s) / 2), (-1, (c - s) / 2), (-1, -(c - s) / 2), (1, -(c + s) / 2)]
+    wide, narrow = (c + s) / 2, (c - s) / 2
+    corners = [(1, wide), (-1, narrow), (-1, -narrow), (1, -wide)]
+    areas = [sign * (distance + off).clamp_min(0) ** 2 / 2 for sign, off in corners]
+    return (sum(areas, torch.zeros_like(distance)) / (c * s)).clamp(0, 1)
 
 
 def _siemens(y: Tensor, x: Tensor) -> Tensor:
@@ -75,8 +66,11 @@ def _siemens(y: Tensor, x: Tensor) -> Tensor:
     return 0.5 + 0.5 * inside * torch.cos(_CYCLES * torch.atan2(y, x))
 
 
-def _points(y: Tensor, x: Tensor) -> Tensor:
-    return ((y % _SPACING == 0) & (x % _SPACING == 0)).double()
-
-
-_SHARE = {"flat": _flat, "edge": _edge, "slanted_edge": _slanted, "siemens": _siemens, "points": _points}
+#: share of `high` in each pixel, from the distances y and x to the axis
+_SHARE: dict[Kind, Callable[[Tensor, Tensor], Tensor]] = {
+    "flat": lambda y, x: torch.ones_like(y + x),
+    "edge": lambda y, x: (x + 0.5 + 0 * y).clamp(0, 1),
+    "slanted_edge": _slanted,
+    "siemens": _siemens,
+    "points": lambda y, x: ((y % _SPACING == 0) & (x % _SPACING == 0)).double(),
+}

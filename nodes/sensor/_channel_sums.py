@@ -1,4 +1,4 @@
-"""Weighted sums over the bands of an image, also of an image that is stored as channel sums."""
+"""Weighted sums over the bands of an image, which may be stored as all bands or as channel sums."""
 
 import torch
 from torch import Tensor
@@ -10,7 +10,7 @@ _OFF = 1e-9  #: relative error, at most, of weights that are combined from the r
 
 
 def weighted(image: Tensor | Channels, weights: Tensor) -> Tensor:
-    """Return the sum (..., y, x) of the bands, weighted by (..., band); raise ValueError if the bands do not fit."""
+    """Return the sum of an image's bands with ``weights`` (..., band); raise ValueError if the bands do not fit."""
     if isinstance(image, Channels):
         mixed = _of_rows(weights, image.rows).to(image.planes)
         summed: Tensor = torch.tensordot(mixed, image.planes, 1)
@@ -31,27 +31,26 @@ def channel_sums(image: Tensor, rows: Tensor) -> Channels:
 
 
 def _of_rows(weights: Tensor, rows: Tensor) -> Tensor:
-    """Return M with weights = M rows, by least squares in float64; the gradient reaches the weights."""
+    """Return the matrix M with weights = M rows, by least squares in float64; the gradient reaches the weights."""
     known = rows.detach().cpu().double()
     scale = known.abs().amax(1, keepdim=True)
     inverse = torch.linalg.pinv(known / scale.where(scale > 0, 1.0)) / scale.where(scale > 0, 1.0).T
-    wanted = weights.cpu().double()
-    if wanted.shape[-1] != known.shape[1]:
-        raise ValueError(
-            f"weights of {wanted.shape[-1]} bands, but channels of {known.shape[1]}: use the same `bands` step for both"
-        )
-    found: Tensor = wanted @ inverse
-    _inside(wanted.detach(), found.detach() @ known)
-    return found
+    exact = weights.cpu().double()
+    if exact.shape[-1] != known.shape[1]:
+        counts = f"the weights have {exact.shape[-1]} bands and the sums of the image {known.shape[1]} bands"
+        raise ValueError(f"{counts}: use the same `bands` step for both")
+    matrix: Tensor = exact @ inverse
+    _require_combination(exact.detach(), matrix.detach() @ known)
+    return matrix
 
 
-def _inside(wanted: Tensor, made: Tensor) -> None:
-    """Raise ValueError for weights that are no combination of the rows; each row has its own scale."""
-    off, most = (wanted - made).abs().flatten(0, -2), wanted.abs().flatten(0, -2).amax(-1)
+def _require_combination(exact: Tensor, combined: Tensor) -> None:
+    """Raise ValueError unless combined rows equal the exact weights, relative to the largest weight of each channel."""
+    off, most = (exact - combined).abs().flatten(0, -2), exact.abs().flatten(0, -2).amax(-1)
     if not bool((off.amax(-1) <= _OFF * most).all()):
         worst = float((off.amax(-1) / most.clamp_min(1e-300)).max())
         raise ValueError(
-            f"the image was summed over its bands with other weights: {worst:.2g} of the wanted weights lies outside "
-            "its rows, and 1e-9 is allowed: compute the rows from the same `bands` and `responses`, with a level that "
-            "is equal in all bands, or keep the image of all bands"
+            f"the image was summed over its bands with other weights: {worst:.2g} of the weights of this step lies "
+            "outside the span of the image's rows, and 1e-9 is allowed: compute the rows from the same `bands` and "
+            "`responses`, with a level that is equal in all bands, or keep the image of all bands"
         )

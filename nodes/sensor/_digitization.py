@@ -31,16 +31,16 @@ def full_well(electrons: Tensor, *, capacity: Well) -> Tensor:
 
 @full_well.skip_bound
 def _(electrons: TensorStats, *, capacity: float) -> float:
-    """Return the loss of the brightest pixel relative to the largest absolute result; the bound is exact.
+    """Return the loss of the brightest pixel relative to the largest absolute result, an exact bound.
 
     The well is rounded to the dtype, and so differs from ``capacity`` by up to half a step of the dtype.
     """
     dtype = torch.promote_types(getattr(torch, electrons.dtype), torch.float32)
-    held = float(torch.tensor(capacity, dtype=dtype))
-    if electrons.max <= held:
+    well = float(torch.tensor(capacity, dtype=dtype))
+    if electrons.max <= well:
         return 0.0
-    largest = max(held, -electrons.min)
-    return (electrons.max - held) / largest if largest > 0 else math.inf
+    largest = max(well, -electrons.min)
+    return (electrons.max - well) / largest if largest > 0 else math.inf
 
 
 @full_well.propagate_error
@@ -50,7 +50,7 @@ def _(electrons: ErrorBound, **params: Any) -> float:
 
 @full_well.check
 def _(result: Tensor, electrons: Tensor, *, capacity: float) -> list[Check]:
-    return [Check(f"{int(torch.count_nonzero(result >= capacity))} of {result.numel()} full")]
+    return [Check(f"{int(torch.count_nonzero(result >= capacity))} of {result.numel()} pixels full")]
 
 
 @node(rtol=0.0)
@@ -105,7 +105,7 @@ def _(
 
 @digitize.propagate_error
 def _(electrons: ErrorBound, *, result: TensorStats, gain: float, **params: Any) -> float:
-    """Of the line before rounding: whatever is near the middle between two numbers may become the next one."""
+    """Bound the error before rounding, because a value near the middle of two numbers may be rounded to either."""
     return electrons.rms * gain
 
 
@@ -118,12 +118,14 @@ def _(*, gain: float, bits: int = 16, **params: object) -> list[str]:
 @digitize.check
 def _(result: Tensor, *inputs: Tensor, bits: int = 16, **params: Any) -> list[Check]:
     high, low = (int(torch.count_nonzero(result == end)) / max(1, result.numel()) for end in (2**bits - 1, 0))
-    return [Check(f"{high:.2%} at the top, {low:.2%} at 0 DN", high < 0.5)]
+    return [Check(f"{high:.2%} of pixels at the largest number, {low:.2%} at 0 DN", high < 0.5)]
 
 
 @node(rtol=0.0)
 def crop(image: Tensor, *, shape: Shape) -> Tensor:
     """Cut the window of the sensor out of the image; the sample on the optical axis stays at N // 2.
+
+    Where image and window are not both odd or both even, kornia's `center_crop` interpolates between pixels.
 
     Shapes: image (..., y, x) -> (..., *shape).
     Units:  any.
@@ -139,7 +141,7 @@ def crop(image: Tensor, *, shape: Shape) -> Tensor:
 
 @crop.propagate_error
 def _(image: ErrorBound, *, result: TensorStats, **params: Any) -> float:
-    """Return a bound for the case that the whole error lies in the window."""
+    """Bound the error of the window by the whole error of the image."""
     before = math.prod(image.stats.shape) if image.stats else math.inf
     return image.rms * math.sqrt(before / max(1, math.prod(result.shape)))
 

@@ -2,6 +2,7 @@
 
 import math
 from collections.abc import Mapping
+from itertools import chain
 from typing import Annotated, Any, Literal
 
 import torch
@@ -11,7 +12,7 @@ from torch import Tensor
 from neusee.nodes import Check, ErrorBound, TensorStats, node
 from neusee.nodes._half_precision import refuse_not_finite, single
 from neusee.nodes.sensor._channel_sums import weighted
-from neusee.nodes.sensor._saturation import Efficiency, Well, photons_per_joule, saturation
+from neusee.nodes.sensor._saturation import Efficiency, Well, photons_per_joule, photons_that_fill, saturation
 from neusee.nodes.units import PositiveLength, Time
 from neusee.nodes.values import Bands, Channels
 
@@ -28,7 +29,7 @@ def expose(
     pixel_pitch: PositiveLength,
     exposure: Time,
 ) -> Tensor:
-    """Compute the photons that each channel of a pixel receives: sum over bands of r I level lambda t dx^2 / (h c).
+    """Compute the photons in each channel of a pixel: the sum over the bands of r I level lambda t dx^2 / (h c).
 
     If the image has already been summed over its bands (`Channels`), the photons are weighted sums of its planes.
 
@@ -53,11 +54,9 @@ def _(
     bands: Bands,
     responses: Tensor,
     level: Tensor | None = None,
-    *,
-    pixel_pitch: float,
-    exposure: float,
+    **sizes: float,
 ) -> Tensor:
-    weights = channel_weights(bands, responses, level, pixel_pitch=pixel_pitch, exposure=exposure)
+    weights = channel_weights(bands, responses, level, **sizes)
     if isinstance(irradiance, Channels):
         return weighted(irradiance._replace(planes=irradiance.planes.double()), weights)
     channels = [(row[:, None, None] * irradiance.double()).sum(-3) for row in weights.to(irradiance.device)]
@@ -72,7 +71,7 @@ def _(result: Tensor, *inputs: object, **params: object) -> list[Check]:
 
 @expose.propagate_error
 def _(irradiance: ErrorBound, *others: ErrorBound | None, result: TensorStats, **params: Any) -> float:
-    """Add the relative errors of image and level: light is not negative, so no channel has a larger relative error."""
+    """Add the relative errors of image and level; no channel has a larger relative error, as light is not negative."""
     level = others[2] if len(others) > 2 else None
     return (irradiance.share + (level.share if level else 0.0)) * result.max
 
@@ -80,7 +79,7 @@ def _(irradiance: ErrorBound, *others: ErrorBound | None, result: TensorStats, *
 def channel_weights(
     bands: Bands, responses: Tensor, level: Tensor | None, *, pixel_pitch: float, exposure: float
 ) -> Tensor:
-    """Return the photons in each channel for one unit of each band, (channel, band) float64."""
+    """Return the photons that one unit of irradiance in each band gives in each channel: (channel, band) float64."""
     lengths = {len(bands.centres), responses.shape[-1]} | (set() if level is None else {len(level)})
     if len(lengths) > 1:
         raise ValueError(
@@ -105,7 +104,7 @@ def level(
     exposure: Time,
     rule: Literal["channel_sum", "per_band"] = "channel_sum",
 ) -> Tensor:
-    """Compute the factor from the unscaled image to W/m2 with which the plain lens fills its brightest pixel.
+    """Compute the factor from image to W/m2 that gives the brightest pixel of the plain lens ``strength`` full wells.
 
     `channel_sum`: the brightest pixel of the brightest channel holds strength x full well, summed over bands.
     `per_band`: each band alone peaks at strength x I_sat, as the paper prints; the sum of 31 bands overexposes.
@@ -122,17 +121,12 @@ def level(
             raise ValueError("rule per_band needs the peak of each band, but this image is summed over its bands: "
                              "use rule channel_sum, or keep the image of all bands")  # fmt: skip
         peaks = plain_image.amax((-2, -1)).reshape(-1, len(bands.centres)).amax(0).double()
-        top = saturation(
-            bands,
-            full_well=full_well,
-            quantum_efficiency=quantum_efficiency,
-            pixel_pitch=pixel_pitch,
-            exposure=exposure,
-        )
+        sensor = {"full_well": full_well, "quantum_efficiency": quantum_efficiency}
+        top = saturation(bands, **sensor, pixel_pitch=pixel_pitch, exposure=exposure)
     else:
         photons: Tensor = expose(plain_image, bands, responses, pixel_pitch=pixel_pitch, exposure=exposure)
         peaks = photons.amax().double().expand(len(bands.centres))
-        top = torch.tensor(full_well / quantum_efficiency, dtype=torch.float64)
+        top = torch.tensor(photons_that_fill(full_well, quantum_efficiency), dtype=torch.float64)
     refuse_not_finite("no level can scale this image", plain_image=peaks)
     lit = peaks > 0
     return torch.where(lit, strength * top.to(peaks) / peaks.where(lit, 1.0), 0.0)
@@ -169,7 +163,7 @@ def add_photons(photons: Tensor, lasers: list[Tensor] | None = None, ghosts: lis
     Source: NeuSee, Eq. (photon_count).
     """
     total = single(photons)
-    for added in [*(lasers or ()), *(ghosts or ())]:
+    for added in chain(lasers or (), ghosts or ()):
         if added.shape[-3:] != photons.shape[-3:]:
             raise ValueError(
                 f"light of shape {tuple(added.shape)} cannot fall on {tuple(photons.shape)}: "
@@ -180,13 +174,8 @@ def add_photons(photons: Tensor, lasers: list[Tensor] | None = None, ghosts: lis
 
 
 @add_photons.propagate_error
-def _(
-    photons: ErrorBound,
-    lasers: list[ErrorBound] | None = None,
-    ghosts: list[ErrorBound] | None = None,
-    **params: Any,
-) -> float:
-    return math.fsum(part.rms for part in (photons, *(lasers or ()), *(ghosts or ())))
+def _(photons: ErrorBound, *added: list[ErrorBound] | None, **params: Any) -> float:
+    return math.fsum(part.rms for part in (photons, *chain.from_iterable(filter(None, added))))
 
 
 @add_photons.check
@@ -205,7 +194,7 @@ def _(
     pixel_pitch: float,
     exposure: float,
 ) -> float:
-    """Return the photons if all bands had the largest irradiance and the largest response; exact for one band."""
+    """Bound the photons by the largest irradiance and the largest response in every band; exact for a single band."""
     brightest = max(irradiance.max, -irradiance.min)
     if brightest == 0:
         return 0.0

@@ -46,11 +46,11 @@ def photon_noise(
     """
     kept = mean_shift if mean == "literal" else 1.0 + mean_shift
 
-    def detected(some: Tensor) -> Tensor:
-        counts = some.clamp_min(0) * (quantum_efficiency if drawn_in == "electrons" else 1.0)
+    def detected(part: Tensor) -> Tensor:
+        counts = part.clamp_min(0) * (quantum_efficiency if drawn_in == "electrons" else 1.0)
         fluctuation = _poisson(counts, rng) if distribution == "poisson" else _gaussian(counts, rng)
-        found = (kept * counts).add_(spread * fluctuation).clamp_min(0)
-        return found if drawn_in == "electrons" else found * quantum_efficiency
+        drawn = (kept * counts).add_(spread * fluctuation).clamp_min(0)
+        return drawn if drawn_in == "electrons" else drawn * quantum_efficiency
 
     return _by_parts(detected, single(photons), rng)
 
@@ -73,7 +73,7 @@ def _(result: Tensor, photons: Tensor, **params: Any) -> list[Check]:
 def _(
     photons: ErrorBound, *, result: TensorStats, quantum_efficiency: float, spread: float = 1.0, **params: Any
 ) -> float:
-    """Bound the errors of the mean and of its square root: |sqrt(a) - sqrt(b)| <= sqrt|a - b| and <= |a - b| / sqrt(a).
+    """Bound the errors of a mean a and of its root: |sqrt(a) - sqrt(b)| <= sqrt|a - b| and <= |a - b| / sqrt(a).
 
     Poisson numbers are drawn anew for another mean, so their error has no bound.
     """
@@ -110,15 +110,15 @@ def _by_parts(compute: Callable[[Tensor], Tensor], whole: Tensor, rng: Generator
     count = whole.numel()
     if torch.is_grad_enabled() or {whole.device.type, rng.device.type} != {"cpu"} or count < 2 * _PART:
         return compute(whole)
-    made, flat = torch.empty(whole.shape, dtype=whole.dtype), whole.reshape(-1)
+    result, flat = torch.empty(whole.shape, dtype=whole.dtype), whole.reshape(-1)
     ends = [*range(_PART, count - _PART, _PART), count]
     for first, last in pairwise([0, *ends]):
-        made.view(-1)[first:last] = compute(flat[first:last])
-    return made
+        result.view(-1)[first:last] = compute(flat[first:last])
+    return result
 
 
 def normal(like: Tensor, rng: Generator) -> Tensor:
-    """Draw standard normal numbers in the shape of ``like`` on the device of ``rng``, equal in every precision."""
+    """Draw standard normal numbers in the shape of ``like``: the same numbers for every precision of ``like``."""
     return torch.randn(like.shape, generator=rng, device=rng.device, dtype=torch.float32).to(like)
 
 
@@ -135,11 +135,11 @@ def dark_current(electrons: Tensor, *, mean: Electrons, full_well: Well | None =
     Source: NeuSee, section Sensor Image; EMVA Standard 1288, release 4.0 (dark current).
     """
 
-    def heated(some: Tensor) -> Tensor:
-        rate = torch.full(some.shape, mean, dtype=some.dtype, device=rng.device)
-        return some + torch.poisson(rate, generator=rng).to(some)
+    def with_dark_current(part: Tensor) -> Tensor:
+        rate = torch.full(part.shape, mean, dtype=part.dtype, device=rng.device)
+        return part + torch.poisson(rate, generator=rng).to(part)
 
-    return _by_parts(heated, single(electrons), rng)
+    return _by_parts(with_dark_current, single(electrons), rng)
 
 
 @dark_current.skip_bound
@@ -147,21 +147,11 @@ def _(electrons: TensorStats, *, mean: float, full_well: float | None) -> float:
     return _share(mean, math.sqrt(mean), electrons, full_well)
 
 
-@dark_current.skip_scale
-def _(electrons: TensorStats, *, full_well: float | None, **params: Any) -> float:
-    return _scale(electrons, full_well)
-
-
-@dark_current.propagate_error
-def _(electrons: ErrorBound, **params: Any) -> float:
-    return electrons.rms
-
-
 @node()
 def read_noise(
     electrons: Tensor, *, offset: Electrons, read_noise: Electrons, full_well: Well | None = None, rng: Generator
 ) -> Tensor:
-    """Add the offset of the amplifier and its Gaussian noise; ``full_well`` as for the dark current.
+    """Add the offset of the amplifier and its Gaussian noise; ``full_well`` has the meaning of `sensor.dark_current`.
 
     The temporal dark noise that EMVA 1288 measures is that of read-out and dark current together:
     sigma_d**2 = read_noise**2 + mean of the dark current. Its dark signal mu_d is offset + mean of the dark current.
@@ -173,10 +163,10 @@ def read_noise(
             PM170 (2007).
     """
 
-    def read(some: Tensor) -> Tensor:
-        return some + normal(some, rng).mul_(read_noise).add_(offset)
+    def with_read_noise(part: Tensor) -> Tensor:
+        return part + normal(part, rng).mul_(read_noise).add_(offset)
 
-    return _by_parts(read, single(electrons), rng)
+    return _by_parts(with_read_noise, single(electrons), rng)
 
 
 @read_noise.skip_bound
@@ -184,24 +174,22 @@ def _(electrons: TensorStats, *, offset: float, read_noise: float, full_well: fl
     return _share(offset, read_noise, electrons, full_well)
 
 
+@dark_current.skip_scale
 @read_noise.skip_scale
 def _(electrons: TensorStats, *, full_well: float | None, **params: Any) -> float:
-    return _scale(electrons, full_well)
-
-
-@read_noise.propagate_error
-def _(electrons: ErrorBound, **params: Any) -> float:
-    return electrons.rms
-
-
-def _scale(electrons: TensorStats, full_well: float | None) -> float:
     """Return the largest absolute count, limited to the full well."""
     largest = max(abs(electrons.max), abs(electrons.min))
     return largest if full_well is None else min(largest, full_well)
 
 
+@dark_current.propagate_error
+@read_noise.propagate_error
+def _(electrons: ErrorBound, **params: Any) -> float:
+    return electrons.rms
+
+
 def _share(shift: float, spread: float, electrons: TensorStats, full_well: float | None) -> float:
-    """Return the root mean square of the addition over the largest result or over the well, whichever is less.
+    """Return the root mean square of the added electrons over the largest result, or over the well if that is less.
 
     The largest result is that of the brightest pixel, or that of the darkest pixel if the counts are below 0. The well
     alone is not enough, because a dark frame is noise alone. The bound is exact for one mean and spread everywhere.

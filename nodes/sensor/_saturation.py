@@ -38,7 +38,7 @@ def photons_that_fill(full_well: float, quantum_efficiency: float) -> float:
 def saturation(
     bands: Bands, *, full_well: Well, quantum_efficiency: Efficiency, pixel_pitch: PositiveLength, exposure: Time
 ) -> Tensor:
-    """Compute the irradiance that fills a pixel within one exposure, for each wavelength alone.
+    """Compute the irradiance that fills a pixel within one exposure, separately for light of each wavelength.
 
     Shapes: bands (band,) -> (band,) float64.
     Units:  result W/m2.

@@ -1,4 +1,4 @@
-"""Sampling of the spectrum: the bands of a scene, and the few bands of one laser line."""
+"""Sampling of the spectrum by the bands of a scene, and of a laser line by its own few bands."""
 
 import math
 from typing import Annotated, Any, Literal
@@ -16,7 +16,7 @@ _GRID = 10e-9  #: m, spacing of the scene's bands, on which the paper also sampl
 
 @node(rtol=1e-12)
 def bands(*, start: Wavelength, stop: Wavelength, count: Count) -> Samples:
-    """Divide the spectrum into bands with evenly spaced centres from start to stop (a single band: in the middle).
+    """Divide the spectrum into bands with evenly spaced centres from start to stop; a single band lies in the middle.
 
     Shapes: -> centres, widths, weights (band,) float64.
     Units:  centres and widths m; weights 1.
@@ -67,7 +67,8 @@ def filters(
 @filters.preflight
 def _(*, centres: tuple[float, ...], widths: tuple[float, ...]) -> list[str]:
     if len(widths) not in (1, len(centres)):
-        raise ParameterError("widths", f"{len(widths)} widths for {len(centres)} centres: give one, or one per centre")
+        text = f"{len(widths)} widths for {len(centres)} centres: give one width, or one width for each centre"
+        raise ParameterError("widths", text)
     return []
 
 
@@ -87,7 +88,7 @@ def line(
     floor: Fraction = 1e-3,
     sampling: Literal["integrated", "point"] = "integrated",
 ) -> Samples:
-    """Distribute the energy of a Gaussian laser line, on a floor relative to its peak, over a few bands of its own.
+    """Distribute the energy of a Gaussian laser line, with a floor relative to the peak, over a few bands of the laser.
 
     `integrated`: `count` equal bands cover `span` (3 fwhm). A weight is the exact energy in a band; the weights sum
     to 1. `point`: the bands are the `count` nearest multiples of 10 nm. A weight is the value of the line at the
@@ -113,12 +114,15 @@ def line(
 
 @line.preflight
 def _(*, wavelength: float, fwhm: float = 10e-9, count: int = 5, span: float | None = None, **params: Any) -> list[str]:
-    printed = params.get("sampling") == "point"
-    reach = _GRID * count / 2 if printed else (3 * fwhm if span is None else span) / 2
+    points = params.get("sampling") == "point"
+    reach = _GRID * count / 2 if points else (3 * fwhm if span is None else span) / 2
     if wavelength - reach < 100e-9:
-        name = "count" if printed else "fwhm" if span is None else "span"
-        raise ParameterError(name, f"bands reach down to {(wavelength - reach) * 1e9:.3g} nm: keep them above 100 nm")
-    return ["laser sampled at points of the 10 nm grid: its energy is off by up to 5.7 %"] if printed else []
+        name = "count" if points else "fwhm" if span is None else "span"
+        text = f"the bands of the laser reach down to {(wavelength - reach) * 1e9:.3g} nm: keep all bands above 100 nm"
+        raise ParameterError(name, text)
+    return (
+        ["laser sampled at points of the 10 nm grid: the energy of the laser is off by up to 5.7 %"] if points else []
+    )
 
 
 @line.check
@@ -138,5 +142,5 @@ def _points(wavelength: float, sigma: float, count: int, floor: float) -> Sample
 
 
 def mean_wavelength(line: Samples) -> float:
-    """Return the mean wavelength of a laser line in m, weighted by the energy of its bands."""
+    """Return the mean wavelength of a laser line in m, in which each band counts by its energy."""
     return float((line.centres * line.weights).sum() / line.weights.sum())

@@ -1,4 +1,4 @@
-"""Colours of spectra: the picture of a camera without faults, and the grain that a real camera adds."""
+"""Colours of spectra as an ideal camera records them, and the grain that a real camera adds."""
 
 from typing import Annotated, Any
 
@@ -16,16 +16,20 @@ GrainDeviation = Annotated[float, Field(ge=0, le=1)]
 
 @node(rtol=1e-5)
 def render(reflectance: Tensor, bands: Bands) -> Tensor:
-    """Render reflectance under D65 to linear sRGB by the CIE 1931 observer; a lift from RGB inverts this step.
+    """Compute linear sRGB from reflectance under D65, by the CIE 1931 observer: the inverse of a lift from RGB.
 
     Shapes: reflectance (..., band, y, x) -> (..., 3, y, x).
-    Units:  reflectance to linear sRGB; white is (1, 1, 1) on exactly these bands, and a colour outside sRGB has a
-            negative value.
+    Units:  reflectance to linear sRGB; white is (1, 1, 1) on exactly these bands (on 31 bands, `sd_to_XYZ` of
+            colour-science tints white by 2e-4), and a colour outside sRGB has a negative value.
     Error:  float32: 1e-6 of the brightest value; 31 bands shift saturated colours by some 1e-3 from 5 nm sampling.
     Raises: ValueError where reflectance and bands differ in the number of bands.
     Source: CIE 15:2004; IEC 61966-2-1.
     """
-    _needs_bands(reflectance, bands)
+    if reflectance.ndim < 3 or reflectance.shape[-3] != len(bands.centres):
+        raise ValueError(
+            f"reflectance {tuple(reflectance.shape)} is not (band, y, x) of {len(bands.centres)} bands: "
+            "compute both from the same `bands` step"
+        )
     light = single(reflectance)
     return torch.einsum("cb,...byx->...cyx", to_srgb(bands.centres).to(light), light)
 
@@ -33,8 +37,8 @@ def render(reflectance: Tensor, bands: Bands) -> Tensor:
 @render.reference
 def _(reflectance: Tensor, bands: Bands) -> Tensor:
     matrix = to_srgb(bands.centres).to(reflectance.device)
-    found = matrix @ reflectance.double().flatten(-2)
-    return found.reshape(*found.shape[:-1], *reflectance.shape[-2:])
+    rendered = matrix @ reflectance.double().flatten(-2)
+    return rendered.reshape(*rendered.shape[:-1], *reflectance.shape[-2:])
 
 
 @render.check
@@ -44,7 +48,7 @@ def _(result: Tensor, *inputs: Any) -> list[Check]:
 
 @node(rtol=1e-5)
 def grain(picture: Tensor, *, read: GrainDeviation = 1e-3, shot: GrainDeviation = 2e-3, rng: torch.Generator) -> Tensor:
-    """Add camera grain to a developed picture: normal noise whose variance rises with the light.
+    """Add camera grain to a developed picture: normal noise whose variance rises linearly with the light.
 
     Shapes: picture (..., y, x) -> the same.
     Units:  those of the picture; standard deviation `read` in the dark, sqrt(read^2 + shot^2) at 1.
@@ -52,18 +56,10 @@ def grain(picture: Tensor, *, read: GrainDeviation = 1e-3, shot: GrainDeviation 
     Source: EMVA Standard 1288, release 4.0 Linear, section 2 (variance linear in the mean).
     """
     picture = single(picture)
-    drawn = torch.randn(picture.shape, generator=rng, device=rng.device, dtype=picture.dtype)
-    return picture + drawn * (read**2 + shot**2 * picture.clamp_min(0)).sqrt()
+    normal = torch.randn(picture.shape, generator=rng, device=rng.device, dtype=picture.dtype)
+    return picture + normal * (read**2 + shot**2 * picture.clamp_min(0)).sqrt()
 
 
 @grain.check
 def _(result: Tensor, picture: Tensor, **params: Any) -> list[Check]:
     return [Check(f"grain of {float((result - picture).std()):.3g} rms")]
-
-
-def _needs_bands(reflectance: Tensor, bands: Bands) -> None:
-    if reflectance.ndim < 3 or reflectance.shape[-3] != len(bands.centres):
-        raise ValueError(
-            f"reflectance {tuple(reflectance.shape)} is not (band, y, x) of {len(bands.centres)} bands: "
-            "compute both from the same `bands` step"
-        )

@@ -1,11 +1,11 @@
-"""Spectral responses of the channels of the sensor."""
+"""Spectral responses of the colour channels of a sensor."""
 
 from typing import Literal
 
 from torch import Tensor
 
 from neusee.nodes import Check, node
-from neusee.nodes.spectra._spectral_tables import Table, camera, observer
+from neusee.nodes.spectra._spectral_tables import measured_camera, observer
 from neusee.nodes.values import Bands
 
 Camera = Literal["CIE 1931", "Nikon 5100", "Sigma SDMerill"]
@@ -13,7 +13,7 @@ Camera = Literal["CIE 1931", "Nikon 5100", "Sigma SDMerill"]
 
 @node(rtol=1e-9)
 def responses(bands: Bands, *, camera: Camera = "CIE 1931") -> Tensor:
-    """Average the sensitivity of each channel over each band: colour-matching functions, or a measured camera.
+    """Average over each band the sensitivity of each channel, of the CIE observer or of a measured camera.
 
     Shapes: -> (3, band) float64.
     Units:  relative to the largest sensitivity of any channel at any wavelength; no response is negative.
@@ -22,7 +22,7 @@ def responses(bands: Bands, *, camera: Camera = "CIE 1931") -> Tensor:
             is still 0.16 at 400 nm).
     Source: CIE 1931 2 degree observer; NPL measurements of the Nikon 5100 and Sigma SD Merrill in colour-science.
     """
-    table = _table(camera)
+    table = observer() if camera == "CIE 1931" else measured_camera(camera)
     return (table.over(bands) / table.values.max()).clamp_min(0).to(bands.centres.device)
 
 
@@ -30,10 +30,5 @@ def responses(bands: Bands, *, camera: Camera = "CIE 1931") -> Tensor:
 def _(result: Tensor, bands: Bands, *, camera: Camera = "CIE 1931") -> list[Check]:
     peaks = [float(bands.centres[int(row.argmax())]) * 1e9 for row in result]
     lit = bool((result.amax(1) > 0).all())
-    return [
-        Check(f"{camera}: peaks at {peaks[0]:.4g}, {peaks[1]:.4g}, {peaks[2]:.4g} nm", lit or len(bands.centres) < 10)
-    ]
-
-
-def _table(name: str) -> Table:
-    return observer() if name == "CIE 1931" else camera(name)
+    text = f"{camera}: peaks at {peaks[0]:.4g}, {peaks[1]:.4g}, {peaks[2]:.4g} nm"
+    return [Check(text, lit or len(bands.centres) < 10)]

@@ -1,4 +1,4 @@
-"""A synthetic picture of spectra: leaves that cover one another, with edges, texture and shade."""
+"""Synthetic pictures of spectra: overlapping ellipses with edges, texture and shade."""
 
 from typing import Annotated, Any
 
@@ -30,7 +30,7 @@ def leaves(
     daylights: Fraction = 0.2,
     rng: torch.Generator,
 ) -> Tensor:
-    """Draw overlapping ellipses of all sizes, one spectrum each: dead leaves, with the statistics of a photograph.
+    """Draw overlapping ellipses of all sizes and one spectrum each, a "dead leaves" picture with photograph statistics.
 
     Radii range from `smallest` to half the picture, with a density that falls with the inverse cube of the radius. The
     brightness of a leaf is log-uniform from `darkest` to 1. Up to a share `texture` of another spectrum is mixed in,
@@ -66,7 +66,7 @@ def _(result: Tensor, *inputs: Any, **params: Any) -> list[Check]:
 
 
 def _topmost(count: int, size: tuple[int, int], smallest: float, rng: torch.Generator) -> Tensor:
-    """Return the index of the leaf that is visible at each sample, (y, x)."""
+    """Draw the ellipses, and return the index of the visible leaf at each sample: (y, x)."""
     largest = max(min(size) / 2, smallest)
     share = _even(rng, count)
     radius = (smallest**-2 * (1 - share) + largest**-2 * share) ** -0.5
@@ -80,20 +80,20 @@ def _topmost(count: int, size: tuple[int, int], smallest: float, rng: torch.Gene
 
 
 def _smooth(size: tuple[int, int], rng: torch.Generator) -> Tensor:
-    """Draw numbers from 0 to 1 that vary slowly, (y, x)."""
+    """Draw numbers from 0 to 1 that vary slowly over the picture: (y, x)."""
     coarse = (max(2, size[0] // (_FINE * _COARSE)), max(2, size[1] // (_FINE * _COARSE)))
     grid = torch.rand(1, 1, *coarse, generator=rng, device=rng.device)
     return F.interpolate(grid, size, mode="bilinear", align_corners=True)[0, 0]
 
 
 def _lights(bands: Bands, share: float, rng: torch.Generator) -> Tensor:
-    """Draw the light of the picture over D65, at most 1: (band,) float64, on the CPU unless the light is D65."""
-    other, which = torch.rand(2, generator=rng, device=rng.device).tolist()
+    """Draw the ratio of the picture's light to D65, scaled to a largest ratio of 1: (band,) float64."""
+    chance, which = torch.rand(2, generator=rng, device=rng.device).tolist()
     centres = bands.centres
-    if other >= share:
+    if chance >= share:
         return torch.ones_like(centres)
-    mired = 1 / _WARMEST + (1 / _COOLEST - 1 / _WARMEST) * int(which * _LIGHTS) / (_LIGHTS - 1)
-    ratio = daylight(1 / mired).at(centres)[0] / light("D65").at(centres)[0]
+    per_kelvin = 1 / _WARMEST + (1 / _COOLEST - 1 / _WARMEST) * int(which * _LIGHTS) / (_LIGHTS - 1)
+    ratio = daylight(1 / per_kelvin).at(centres)[0] / light("D65").at(centres)[0]
     return (ratio / ratio.max()).to(centres)
 
 

@@ -1,4 +1,4 @@
-"""The few weighted sums over bands that a sensor can distinguish."""
+"""Weights of the few sums over bands that a sensor forms from an image."""
 
 import torch
 from torch import Tensor
@@ -9,7 +9,7 @@ from neusee.nodes.values import Bands
 
 @node(rtol=1e-12)
 def rows(bands: Bands, responses: Tensor, *, well: bool = True) -> Tensor:
-    """List the weights of the bands in every sum that a sensor forms: the photons of each channel, and the well.
+    """Return the weights of the bands in each sum that a sensor forms: the photons of each channel, and the well.
 
     A channel counts photons, so its weights are response times wavelength. A quantity relative to saturation is
     weighted by the wavelength alone, because a photon of any wavelength frees one electron. With `well` false

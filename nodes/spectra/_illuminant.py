@@ -7,7 +7,7 @@ from torch import Tensor
 
 from neusee.nodes import Check, ParameterError, node
 from neusee.nodes._half_precision import single
-from neusee.nodes.spectra._spectral_tables import daylight, light
+from neusee.nodes.spectra._spectral_tables import daylight, light, require_range
 from neusee.nodes.units import Temperature
 from neusee.nodes.values import Bands, LowRankCube
 
@@ -19,7 +19,7 @@ Kind = Literal[
 
 @node(rtol=1e-9)
 def illuminant(bands: Bands, *, kind: Kind = "daylight", temperature: Temperature = 6504.0) -> Tensor:
-    """Average the relative power of a CIE illuminant over each band; `temperature` applies to `daylight` alone.
+    """Average the relative power of a CIE illuminant over each band; only the kind `daylight` uses `temperature`.
 
     Shapes: -> (band,) float64.
     Units:  relative, mean 1 over the bands.
@@ -28,17 +28,12 @@ def illuminant(bands: Bands, *, kind: Kind = "daylight", temperature: Temperatur
     Source: CIE 15:2004 (D series, A, E, FL, HP), CIE 15:2018 (LED), by way of colour-science.
     """
     table = daylight(temperature) if kind == "daylight" else light(kind)
-    low = float((bands.centres - bands.widths / 2).min())
-    high = float((bands.centres + bands.widths / 2).max())
-    first, last = float(table.wavelengths[0]), float(table.wavelengths[-1])
-    if low < first - 1e-12 or high > last + 1e-12:
-        raise ValueError(
-            f"bands reach from {low * 1e9:.4g} to {high * 1e9:.4g} nm, but {kind} is tabulated from "
-            f"{first * 1e9:.4g} to {last * 1e9:.4g} nm: choose bands inside that range"
-        )
+    edges = torch.cat([bands.centres - bands.widths / 2, bands.centres + bands.widths / 2])
+    require_range(edges, table.wavelengths, f"{kind} is tabulated from")
     power = table.over(bands)[0]
     if not float(power.mean()) > 0:
-        raise ValueError(f"{kind} gives no light from {low * 1e9:.4g} to {high * 1e9:.4g} nm: choose other bands")
+        low, high = float(edges.min()) * 1e9, float(edges.max()) * 1e9
+        raise ValueError(f"{kind} gives no light from {low:.4g} to {high:.4g} nm: choose other bands")
     return (power / power.mean()).to(bands.centres.device)
 
 
@@ -78,16 +73,18 @@ def illuminate(
     if isinstance(reflectance, LowRankCube):
         basis = reflectance.basis * power.to(reflectance.basis)[:, None]
         by = power.detach().abs().to(reflectance.residual_max)
-        spread = reflectance.residual_rms * by if reflectance.residual_rms.numel() else reflectance.residual_rms
-        return LowRankCube(
-            reflectance.planes, basis, reflectance.residual_max * by, spread, reflectance.residual_map * float(by.max())
-        )
+        rms = reflectance.residual_rms * by if reflectance.residual_rms.numel() else reflectance.residual_rms
+        largest = reflectance.residual_map * float(by.max())
+        return LowRankCube(reflectance.planes, basis, reflectance.residual_max * by, rms, largest)
     reflectance = single(reflectance)
     return reflectance * power.to(reflectance)[:, None, None]
 
 
 def _same_bands(reflectance: Tensor | LowRankCube, illuminant: Tensor) -> None:
-    shape = tuple(reflectance.shape) if isinstance(reflectance, Tensor) else _shape(reflectance)
+    if isinstance(reflectance, LowRankCube):
+        shape: tuple[int, ...] = (len(reflectance.basis), *reflectance.planes.shape[1:])
+    else:
+        shape = tuple(reflectance.shape)
     if len(shape) < 3 or illuminant.ndim != 1 or shape[-3] != len(illuminant):
         raise ValueError(
             f"reflectance {shape} is not (band, y, x) of the {tuple(illuminant.shape)} bands of the "
@@ -95,21 +92,16 @@ def _same_bands(reflectance: Tensor | LowRankCube, illuminant: Tensor) -> None:
         )
 
 
-def _shape(mixture: LowRankCube) -> tuple[int, ...]:
-    return len(mixture.basis), *mixture.planes.shape[1:]
-
-
 @illuminate.reference
 def _(reflectance: Tensor | LowRankCube, illuminant: Tensor, *, times: str = "once") -> Tensor | LowRankCube:
     power = [float(p) ** (1 if times == "once" else 2) for p in illuminant]
     if isinstance(reflectance, LowRankCube):
         basis = torch.stack([row.double() * p for row, p in zip(reflectance.basis, power, strict=True)])
-        rest = torch.stack([column * p for column, p in zip(reflectance.residual_max.T, power, strict=True)], 1)
-        spread = [column * p for column, p in zip(reflectance.residual_rms.T, power, strict=False)]
-        found = torch.stack(spread, 1) if spread else rest[:0, :0]
-        return LowRankCube(
-            reflectance.planes.double(), basis, rest, found, reflectance.residual_map.double() * max(power)
-        )
+        most = torch.stack([column * p for column, p in zip(reflectance.residual_max.T, power, strict=True)], 1)
+        columns = [column * p for column, p in zip(reflectance.residual_rms.T, power, strict=False)]
+        rms = torch.stack(columns, 1) if columns else most[:0, :0]
+        largest = reflectance.residual_map.double() * max(power)
+        return LowRankCube(reflectance.planes.double(), basis, most, rms, largest)
     return torch.stack([reflectance[..., b, :, :].double() * p for b, p in enumerate(power)], -3)
 
 

@@ -1,15 +1,16 @@
 """Linear lifts from three channels to a spectrum."""
 
 import functools
+from collections.abc import Callable
 
 import torch
 from torch import Tensor
 
 from neusee.nodes import Check, Node, node
 from neusee.nodes._half_precision import single
-from neusee.nodes.spectra._low_rank_cube import Share, compress, mixture, said_of_planes
+from neusee.nodes.spectra._low_rank_cube import Share, as_low_rank_cube, compress, plane_checks
 from neusee.nodes.spectra._principal_planes import Source, few_planes
-from neusee.nodes.spectra._spectral_tables import mallett, paints, to_srgb
+from neusee.nodes.spectra._spectral_tables import mallett, paints, require_range, to_srgb
 from neusee.nodes.values import Bands, LowRankCube
 
 _FIRST, _LAST = 380e-9, 780e-9  #: m, range of the measured reflectances and of the basis
@@ -18,6 +19,8 @@ _FIRST, _LAST = 380e-9, 780e-9  #: m, range of the measured reflectances and of 
 @node(rtol=1e-5)
 def lift_mallett(rgb: Tensor, bands: Bands) -> Tensor:
     """Compute the reflectance of each pixel from three basis spectra, whose sum is 1 at every wavelength.
+
+    `RGB_to_sd_Mallett2019` of colour-science gives the same numbers for a single pixel, without a gradient.
 
     Shapes: rgb (3, y, x) -> (band, y, x).
     Units:  linear sRGB to reflectance; the lift is linear and keeps HDR values above 1.
@@ -29,19 +32,9 @@ def lift_mallett(rgb: Tensor, bands: Bands) -> Tensor:
     return _lifted(rgb, _basis(bands))
 
 
-@lift_mallett.reference
-def _(rgb: Tensor, bands: Bands) -> Tensor:
-    return torch.einsum("bc,cyx->byx", _basis(bands).to(rgb.device), rgb.double()).relu()
-
-
-@lift_mallett.check
-def _(result: Tensor, rgb: Tensor, bands: Bands) -> list[Check]:
-    return lift_checks(result, rgb, bands, _basis(bands))
-
-
 @node(rtol=1e-6)
 def lift_mallett_mixture(rgb: Tensor, bands: Bands, *, within: Share = 1e-6) -> LowRankCube:
-    """Compute the reflectance of `lift_mallett` as few planes, block by block: the cube is never in memory.
+    """Compute the reflectance of `lift_mallett` as a few planes, block by block, without a cube in memory.
 
     Shapes: rgb (3, y, x) -> planes (k, y, x), basis (band, k), residual_max and residual_rms (k + 1, band)
             float64.
@@ -51,17 +44,6 @@ def lift_mallett_mixture(rgb: Tensor, bands: Bands, *, within: Share = 1e-6) -> 
     Source: as `lift_mallett`.
     """
     return _mixed(rgb, _basis(bands), within)
-
-
-@lift_mallett_mixture.reference
-def _(rgb: Tensor, bands: Bands, *, within: float = 1e-6) -> LowRankCube:
-    return _mixed_whole(lift_mallett, rgb, bands, within)
-
-
-lift_mallett_mixture.check(said_of_planes)
-
-
-lift_mallett.low_rank_form = lift_mallett_mixture
 
 
 @node(rtol=1e-5)
@@ -82,19 +64,9 @@ def lift_lmmse(rgb: Tensor, bands: Bands) -> Tensor:
     return _lifted(rgb, _estimator(bands))
 
 
-@lift_lmmse.reference
-def _(rgb: Tensor, bands: Bands) -> Tensor:
-    return torch.einsum("bc,cyx->byx", _estimator(bands).to(rgb.device), rgb.double()).relu()
-
-
-@lift_lmmse.check
-def _(result: Tensor, rgb: Tensor, bands: Bands) -> list[Check]:
-    return lift_checks(result, rgb, bands, _estimator(bands))
-
-
 @node(rtol=1e-6)
 def lift_lmmse_mixture(rgb: Tensor, bands: Bands, *, within: Share = 1e-6) -> LowRankCube:
-    """Compute the reflectance of `lift_lmmse` as few planes, block by block: the cube is never in memory.
+    """Compute the reflectance of `lift_lmmse` as a few planes, block by block, without a cube in memory.
 
     Shapes: rgb (3, y, x) -> planes (k, y, x), basis (band, k), residual_max and residual_rms (k + 1, band)
             float64.
@@ -106,24 +78,42 @@ def lift_lmmse_mixture(rgb: Tensor, bands: Bands, *, within: Share = 1e-6) -> Lo
     return _mixed(rgb, _estimator(bands), within)
 
 
-@lift_lmmse_mixture.reference
-def _(rgb: Tensor, bands: Bands, *, within: float = 1e-6) -> LowRankCube:
-    return _mixed_whole(lift_lmmse, rgb, bands, within)
+# --- hooks of both lifts ----------------------------------------------------------------------------------------------
 
 
-lift_lmmse_mixture.check(said_of_planes)
+def _attach(lift: Node, low_rank: Node, matrix: Callable[[Bands], Tensor]) -> None:
+    """Attach the reference, the check and the low-rank form to a lift that multiplies by this matrix (band, 3)."""
 
+    @lift.reference
+    def lifted(rgb: Tensor, bands: Bands) -> Tensor:
+        return torch.einsum("bc,cyx->byx", matrix(bands).to(rgb.device), rgb.double()).relu()
 
-lift_lmmse.low_rank_form = lift_lmmse_mixture
+    @lift.check
+    def _(result: Tensor, rgb: Tensor, bands: Bands) -> list[Check]:
+        return lift_checks(result, rgb, bands, matrix(bands))
+
+    @low_rank.reference
+    def _(rgb: Tensor, bands: Bands, *, within: float = 1e-6) -> LowRankCube:
+        assert compress.hooks.reference is not None
+        planes: LowRankCube = compress.hooks.reference(lifted(rgb, bands), within=within)
+        return planes
+
+    low_rank.check(plane_checks)
+    lift.low_rank_form = low_rank
 
 
 def lift_checks(result: Tensor, rgb: Tensor, bands: Bands, matrix: Tensor | None = None) -> list[Check]:
-    """Check the clipped share, and the distance of the spectra from the source colours, on some 65 000 pixels."""
+    """Check on some 65 000 pixels the share of clipped energy, and how far the spectra are from the source colours."""
     step = max(1, rgb[0].numel() // 65536)
     colours, spectra = (t.detach().flatten(1)[:, ::step].double().cpu() for t in (rgb, result))
     scale = max(float(colours.abs().max()), 1e-30)
     off = float((to_srgb(bands.centres) @ spectra - colours).abs().max()) / scale
-    checks = [Check(f"rendered back to sRGB within {off:.2g} of the brightest", float(result.min()) >= 0)]
+    checks = [
+        Check(
+            f"spectra rendered to sRGB differ from the colours by {off:.2g} of the brightest colour",
+            float(result.min()) >= 0,
+        )
+    ]
     if matrix is not None:
         raw = matrix.cpu() @ colours
         below = float(raw.clamp_max(0).abs().sum()) / max(float(raw.abs().sum()), 1e-30)
@@ -134,31 +124,23 @@ def lift_checks(result: Tensor, rgb: Tensor, bands: Bands, matrix: Tensor | None
 def needs_rgb(rgb: Tensor) -> None:
     """Raise ValueError unless rgb is a picture of three channels."""
     if rgb.ndim != 3 or rgb.shape[0] != 3:
-        raise ValueError(f"rgb {tuple(rgb.shape)} must be (3, y, x): wire a scene of three channels")
+        raise ValueError(f"rgb {tuple(rgb.shape)} must be (3, y, x): connect a scene of three channels")
 
 
 def _lifted(rgb: Tensor, matrix: Tensor) -> Tensor:
-    """Multiply straight into the result and clip in place, without a second cube."""
+    """Return the product of matrix and picture, clipped in place so that no second cube is in memory."""
     needs_rgb(rgb)
     rgb = single(rgb)
     return torch.relu_(matrix.to(rgb) @ rgb.flatten(1)).reshape(-1, *rgb.shape[1:])
 
 
 def _mixed(rgb: Tensor, matrix: Tensor, within: float) -> LowRankCube:
-    """Compute the planes; a picture that requires a gradient is lifted whole, so that the gradient flows."""
+    """Return the lift as a low-rank cube; a picture that requires a gradient is lifted whole, so the gradient flows."""
     needs_rgb(rgb)
     flat, exact = rgb.detach().flatten(1), matrix.to(rgb.device)
     dtype = rgb.dtype if rgb.dtype == torch.float64 else torch.float32
     source = Source(lambda part: (exact @ flat[:, part].double()).clamp_min_(0), len(exact), flat.shape[1], dtype)
-    return mixture(few_planes(source, within), _lifted(rgb, matrix) if rgb.requires_grad else rgb)
-
-
-def _mixed_whole(lift: Node, rgb: Tensor, bands: Bands, within: float) -> LowRankCube:
-    """Compute the reference of both low-rank cubes: the principal components of the reference cube of the lift."""
-    assert lift.hooks.reference is not None
-    assert compress.hooks.reference is not None
-    found: LowRankCube = compress.hooks.reference(lift.hooks.reference(rgb, bands), within=within)
-    return found
+    return as_low_rank_cube(few_planes(source, within), _lifted(rgb, matrix) if rgb.requires_grad else rgb)
 
 
 def _basis(bands: Bands) -> Tensor:
@@ -173,27 +155,26 @@ def _estimator(bands: Bands) -> Tensor:
 
 @functools.lru_cache(maxsize=16)
 def _solved(centres: tuple[float, ...]) -> Tensor:
-    """Return W, (band, 3) float64."""
+    """Return the matrix (band, 3) float64 of `lift_lmmse` at these wavelengths."""
     at = torch.tensor(centres, dtype=torch.float64)
     return lift_matrix(torch.cat([paint.at(at) for paint in paints()]), at)
 
 
 def lift_matrix(known: Tensor, centres: Tensor) -> Tensor:
-    """Return W of known reflectances (spectrum, band): the matrix (band, 3) float64 that estimates them from sRGB."""
+    """Return the matrix (band, 3) float64 that estimates reflectances like the ``known`` (spectrum, band) from sRGB."""
     second, rgb = known.T @ known / len(known), to_srgb(centres)
     seen = rgb @ second @ rgb.T
     if len(centres) < 3 or not float(torch.linalg.cond(seen)) < 1e10:
         ends = f"{len(centres)} bands from {float(centres[0]) * 1e9:.4g} to {float(centres[-1]) * 1e9:.4g} nm"
-        raise ValueError(f"{ends} cannot carry three colours: use more bands, such as 31 from 400 to 700 nm")
+        raise ValueError(f"{ends} cannot distinguish three colours: use more bands, such as 31 from 400 to 700 nm")
     weights: Tensor = torch.linalg.solve(seen, rgb @ second).T
     return weights
 
 
 def inside_charts(bands: Bands) -> None:
     """Raise ValueError for bands outside the measured range of the charts."""
-    low, high = float(bands.centres.min()), float(bands.centres.max())
-    if low < _FIRST - 1e-12 or high > _LAST + 1e-12:
-        raise ValueError(
-            f"bands from {low * 1e9:.4g} to {high * 1e9:.4g} nm, but reflectances are known from 380 to 780 nm: "
-            "choose bands inside that range"
-        )
+    require_range(bands.centres, (_FIRST, _LAST), "reflectances are known from")
+
+
+_attach(lift_mallett, lift_mallett_mixture, _basis)
+_attach(lift_lmmse, lift_lmmse_mixture, _estimator)

@@ -7,7 +7,7 @@ from pydantic import Field
 from torch import Tensor
 
 from neusee.nodes import Check, node
-from neusee.nodes.spectra._principal_planes import Found, Source, few_planes
+from neusee.nodes.spectra._principal_planes import Source, few_planes
 from neusee.nodes.values import LowRankCube
 
 Share = Annotated[float, Field(ge=0, allow_inf_nan=False)]  #: relative to the largest element
@@ -34,17 +34,16 @@ def compress(cube: Tensor, *, within: Share = 1e-6) -> LowRankCube:
     flat = cube.detach().flatten(1)
     dtype = cube.dtype if cube.dtype == torch.float64 else torch.float32
     source = Source(lambda pixels: flat[:, pixels].to(torch.float64, copy=True), len(flat), flat.shape[1], dtype)
-    return mixture(few_planes(source, within), cube)
+    return as_low_rank_cube(few_planes(source, within), cube)
 
 
-def mixture(found: Found, cube: Tensor) -> LowRankCube:
-    """Return the planes as pictures; a cube that requires a gradient is projected here, so that the gradient flows."""
+def as_low_rank_cube(flat: LowRankCube, cube: Tensor) -> LowRankCube:
+    """Return planes of one row of pixels as pictures; with a gradient, the planes are projections of ``cube``."""
     if cube.requires_grad:
-        planes = torch.tensordot(found.basis.T.to(cube), cube, 1)
+        planes = torch.tensordot(flat.basis.T.to(cube), cube, 1)
     else:
-        planes = found.planes.reshape(-1, *cube.shape[-2:])
-    left = found.residual_map.reshape(cube.shape[-2:])
-    return LowRankCube(planes, found.basis, found.residual_max, found.residual_rms, left)
+        planes = flat.planes.reshape(-1, *cube.shape[-2:])
+    return flat._replace(planes=planes, residual_map=flat.residual_map.reshape(cube.shape[-2:]))
 
 
 @compress.reference
@@ -62,11 +61,11 @@ def _(cube: Tensor, *, within: float = 1e-6) -> LowRankCube:
 
 
 @compress.check
-def said_of_planes(result: LowRankCube, *inputs: object, **params: object) -> list[Check]:
+def plane_checks(result: LowRankCube, *inputs: object, **params: object) -> list[Check]:
     """Report the number of planes and their distance from the cube, for any node that returns a `LowRankCube`."""
     rms, most = (
         float(x[-1].max()) / max(float(result.residual_max[0].max()), 1e-300)
         for x in (result.residual_rms, result.residual_max)
     )
-    few = f"{len(result.planes)} planes for {len(result.basis)} bands"
-    return [Check(f"{few}, within {rms:.2g} of the brightest, at worst {most:.2g}")]
+    count = f"{len(result.planes)} planes for {len(result.basis)} bands"
+    return [Check(f"{count}, within {rms:.2g} of the largest element in rms, at worst {most:.2g}")]

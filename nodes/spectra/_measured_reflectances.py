@@ -1,4 +1,4 @@
-"""Measured reflectances, from colour-science and from files of the user."""
+"""Measured reflectances from colour-science and from the user's files."""
 
 import csv
 import functools
@@ -14,12 +14,11 @@ from torch import Tensor
 
 from neusee.nodes import Check, ParameterError, node
 from neusee.nodes.spectra._linear_lift import inside_charts
-from neusee.nodes.spectra._spectral_tables import Table, gamut_samples, paints
+from neusee.nodes.spectra._spectral_tables import Table, gamut_samples, paints, require_range
 from neusee.nodes.units import DataFiles
 from neusee.nodes.values import Bands
 
 Set = Literal["charts", "CIE 2017", "CQS"]
-_SLACK = 1e-12  #: m
 _MOST = 1.5  #: reflectance, above which a file is taken to be in percent
 _FILES = "give .csv (first column wavelength in nm), .npz (wavelengths, reflectances) or .mat (S_name, sur_name)"
 
@@ -30,7 +29,7 @@ Numbers = NDArray[np.float64]
 def reflectances(
     bands: Bands, *, sets: tuple[Set, ...] = ("charts", "CIE 2017", "CQS"), files: DataFiles | None = None
 ) -> Tensor:
-    """Gather measured reflectances from sets of colour-science and from files of the user, spectrum after spectrum.
+    """Return the measured reflectances of sets in colour-science and of the user's files, one spectrum in each row.
 
     `charts` are the 102 patches of `spectra.lift_lmmse`, `CIE 2017` the 99 objects of the colour fidelity index, `CQS`
     15 saturated paints. A file is .csv (a header; first column nm, then one column for each spectrum), .npz
@@ -47,9 +46,11 @@ def reflectances(
     if sets:
         inside_charts(bands)
     tables = [table for name in sets for table in _SETS[name]()]
-    found = [table.at(bands.centres) for table in tables]
-    found += [_inside(_read(file), bands, file).at(bands.centres) for file in files or ()]
-    return torch.cat(found).clamp(0.0, 1.0).to(bands.centres.device)
+    for file in files or ():
+        tables.append(_read(file))
+        fix = "leave the file out, or choose bands inside that range"
+        require_range(bands.centres, tables[-1].wavelengths, f"{file.name} holds", fix)
+    return torch.cat([table.at(bands.centres) for table in tables]).clamp(0.0, 1.0).to(bands.centres.device)
 
 
 @reflectances.preflight
@@ -73,17 +74,6 @@ _SETS: dict[str, Callable[[], tuple[Table, ...]]] = {
 }
 
 
-def _inside(table: Table, bands: Bands, file: Path) -> Table:
-    low, high = float(bands.centres.min()), float(bands.centres.max())
-    first, last = float(table.wavelengths[0]), float(table.wavelengths[-1])
-    if low < first - _SLACK or high > last + _SLACK:
-        raise ValueError(
-            f"bands from {low * 1e9:.4g} to {high * 1e9:.4g} nm, but {file.name} holds {first * 1e9:.4g} to "
-            f"{last * 1e9:.4g} nm: leave the file out, or choose bands inside that range"
-        )
-    return table
-
-
 # --- files ----------------------------------------------------------------------------------------------------------
 
 
@@ -93,7 +83,7 @@ def _read(file: Path) -> Table:
 
 @functools.lru_cache(maxsize=32)
 def _known(file: Path, stamp: int) -> Table:
-    """Return the table of a file; a changed file is read again."""
+    """Return the table of a file; a file whose time ``stamp`` has changed is read again."""
     reader = {".csv": _csv, ".npz": _npz, ".mat": _mat}.get(file.suffix.lower())
     if reader is None:
         raise ParameterError("files", f"{file.name} holds no reflectances: {_FILES}")
@@ -108,7 +98,7 @@ def _known(file: Path, stamp: int) -> Table:
 
 
 def _wrong(wavelengths: Numbers, values: Numbers) -> str:
-    """Return why the values are not reflectances, or an empty text."""
+    """Return why these values cannot be reflectances, or an empty text."""
     if wavelengths.ndim != 1 or values.ndim != 2 or values.shape[1] != len(wavelengths) or values.size == 0:
         return f"{wavelengths.shape} wavelengths and {values.shape} reflectances: write (spectrum, wavelength)"
     if not (np.isfinite(wavelengths).all() and np.isfinite(values).all()):
@@ -130,19 +120,17 @@ def _csv(file: Path) -> tuple[Numbers, Numbers]:
 
 
 def _npz(file: Path) -> tuple[Numbers, Numbers]:
-    with np.load(file, allow_pickle=False) as held:
-        return np.asarray(held["wavelengths"], np.float64), np.asarray(held["reflectances"], np.float64)
+    with np.load(file, allow_pickle=False) as arrays:
+        return np.asarray(arrays["wavelengths"], np.float64), np.asarray(arrays["reflectances"], np.float64)
 
 
 def _mat(file: Path) -> tuple[Numbers, Numbers]:
+    from scipy.io import loadmat
+
     try:
-        from scipy.io import loadmat
-    except ImportError:
-        raise ValueError(".mat files need scipy: pip install scipy") from None
-    try:
-        held = loadmat(file)
+        variables = loadmat(file)
     except Exception as why:  # scipy raises many kinds of errors for foreign bytes
         raise ValueError(f"not a .mat file up to version 7: {why}") from None
-    name = next(name.removeprefix("sur_") for name in [*held, "sur_"] if name.startswith("sur_"))
-    start, step, count = np.asarray(held[f"S_{name}"], np.float64).ravel()
-    return start + step * np.arange(int(count)), np.asarray(held[f"sur_{name}"], np.float64).T
+    name = next(name.removeprefix("sur_") for name in [*variables, "sur_"] if name.startswith("sur_"))
+    start, step, count = np.asarray(variables[f"S_{name}"], np.float64).ravel()
+    return start + step * np.arange(int(count)), np.asarray(variables[f"sur_{name}"], np.float64).T

@@ -1,4 +1,4 @@
-"""Plausible spectra: mixtures of measured spectra, and metamers, which share a colour with a mixture."""
+"""Plausible spectra: mixtures of measured spectra, and other spectra of the same colour, their metamers."""
 
 from typing import Annotated, Any
 
@@ -29,7 +29,7 @@ def metamers(
     blacks: Strength = 0.5,
     rng: torch.Generator,
 ) -> Tensor:
-    """Draw reflectances: mixtures of measured spectra, as thinner and thicker layers, each with a metameric black.
+    """Draw mixtures of measured reflectances as thinner and thicker layers, each with a metameric black added.
 
     A layer of thickness p turns a reflectance s into s^p (Beer and Lambert), which makes colours paler and deeper than
     measured. A metameric black is a measured spectrum minus the linear estimate from its colour: a black changes the
@@ -54,16 +54,18 @@ def metamers(
     base = _mixtures(known, count, mixed, thickness, rng)
     black = metameric_blacks(known[_drawn(len(known), (count,), rng)] - known[_drawn(len(known), (count,), rng)],
                              known, bands)  # fmt: skip
-    wanted = torch.randn(count, 1, generator=rng, device=rng.device, dtype=torch.float64)
-    share = blacks * wanted * base.mean(1, keepdim=True) / known.mean()
-    low, high = _room(base, black)
+    normal = torch.randn(count, 1, generator=rng, device=rng.device, dtype=torch.float64)
+    share = blacks * normal * base.mean(1, keepdim=True) / known.mean()
+    low, high = _limits(base, black)
     return (base + share.maximum(low).minimum(high) * black).clamp(0.0, 1.0)
 
 
 @metamers.preflight
 def _(*, thickness: tuple[float, float] = (0.5, 2.0), **params: Any) -> list[str]:
     if thickness[0] > thickness[1]:
-        raise ParameterError("thickness", f"{thickness[0]:g} is above {thickness[1]:g}: exchange them")
+        raise ParameterError(
+            "thickness", f"the thinnest layer {thickness[0]:g} is above {thickness[1]:g}: exchange the numbers"
+        )
     return []
 
 
@@ -74,31 +76,31 @@ def _(result: Tensor, *inputs: Any, **params: Any) -> list[Check]:
 
 
 def metameric_blacks(spectra: Tensor, known: Tensor, bands: Bands) -> Tensor:
-    """Return spectra (spectrum, band) minus the linear estimates from their colours: spectra of colour (0, 0, 0)."""
+    """Return spectra (spectrum, band) minus the linear estimates from their colours, with colour (0, 0, 0)."""
     centres = bands.centres.detach().cpu().double()
     estimate = lift_matrix(known.cpu(), centres) @ to_srgb(centres)
     return spectra - spectra @ estimate.T.to(spectra)
 
 
 def _mixtures(known: Tensor, count: int, mixed: int, thickness: tuple[float, float], rng: torch.Generator) -> Tensor:
-    """Draw convex sums, most of them dominated by one spectrum, with a log-uniform thickness of the layer."""
-    how = {"generator": rng, "device": rng.device, "dtype": torch.float64}
-    weights = -torch.rand(count, mixed, **how).clamp_min(1e-12).log()  # type: ignore[call-overload]
+    """Draw layers of log-uniform thickness from convex sums of spectra, in most of which one spectrum dominates."""
+    options = {"generator": rng, "device": rng.device, "dtype": torch.float64}
+    weights = -torch.rand(count, mixed, **options).clamp_min(1e-12).log()  # type: ignore[call-overload]
     weights = weights.square()
     weights = weights / weights.sum(1, keepdim=True)
     sums = (weights[..., None] * known[_drawn(len(known), (count, mixed), rng)]).sum(1)
-    even: Tensor = torch.rand(count, 1, **how)  # type: ignore[call-overload]
+    even: Tensor = torch.rand(count, 1, **options)  # type: ignore[call-overload]
     power: Tensor = thickness[0] * (thickness[1] / thickness[0]) ** even
-    found: Tensor = sums.clamp(_DARKEST, 1.0) ** power
-    return found
+    layers: Tensor = sums.clamp(_DARKEST, 1.0) ** power
+    return layers
 
 
 def _drawn(of: int, shape: tuple[int, ...], rng: torch.Generator) -> Tensor:
     return torch.randint(of, shape, generator=rng, device=rng.device)
 
 
-def _room(base: Tensor, black: Tensor) -> tuple[Tensor, Tensor]:
-    """Return the least and the largest share of a black that keep a spectrum in [0, 1]: two tensors (spectrum, 1)."""
+def _limits(base: Tensor, black: Tensor) -> tuple[Tensor, Tensor]:
+    """Return the smallest and the largest multiple of a black at which the sum stays in [0, 1], each (spectrum, 1)."""
     to_white, to_dark = (1.0 - base) / black, -base / black
     high = torch.where(black > 0, to_white, torch.where(black < 0, to_dark, torch.inf))
     low = torch.where(black > 0, to_dark, torch.where(black < 0, to_white, -torch.inf))

@@ -1,6 +1,5 @@
-"""The paper's lift: MST++ from linear RGB to 31 bands."""
+"""The lift of the paper, from linear RGB to 31 bands by the network MST++."""
 
-import functools
 from pathlib import Path
 from typing import Any, Literal
 
@@ -8,6 +7,7 @@ import torch
 from torch import Tensor, nn
 
 from neusee.nodes import Check, ParameterError, node
+from neusee.nodes.network_weights import empty
 from neusee.nodes.spectra._linear_lift import lift_checks, needs_rgb
 from neusee.nodes.spectra._mst_plus_plus import BANDS, MSTPlusPlus
 from neusee.nodes.units import DataFile
@@ -23,7 +23,7 @@ def lift_mst_plus_plus(
     untrained: Literal["refuse", "allow"] = "refuse",
     rng: torch.Generator,
 ) -> Tensor:
-    """Lift a whole picture by MST++; the stretch of the picture to [0, 1] is undone, so that radiometry is preserved.
+    """Lift a whole picture by MST++; the picture is stretched to [0, 1] and the cube is scaled back to keep radiometry.
 
     The published checkpoint loads unchanged (.pth or .safetensors). Without weights the network consists of random
     orthogonal layers from `rng`: a recipe runs, but the spectra have no meaning.
@@ -55,10 +55,8 @@ def _(*, weights: Path | None = None, untrained: str = "refuse", **params: Any) 
         _fitting(weights)
         return []
     if untrained == "refuse":
-        raise ParameterError(
-            "weights",
-            "MST++ has no weights: give the file of its checkpoint, choose another lift, or set untrained: allow",
-        )
+        text = "MST++ has no weights: give the file of its checkpoint, choose another lift, or set untrained: allow"
+        raise ParameterError("weights", text)
     return ["MST++ is untrained: its spectra are noise"]
 
 
@@ -69,7 +67,7 @@ def _(result: Tensor, rgb: Tensor, bands: Bands, *, weights: Path | None = None,
 
 
 def lift_pictures(network: nn.Module, rgb: Tensor) -> Tensor:
-    """Lift pictures (n, 3, y, x) by MST++, each stretched to [0, 1] and back: (n, 31, y, x), not yet clipped."""
+    """Lift pictures (n, 3, y, x) by MST++, each stretched to [0, 1] and back: (n, 31, y, x), negative values kept."""
     low, high = rgb.amin((1, 2, 3), keepdim=True), rgb.amax((1, 2, 3), keepdim=True)
     span = high - low
     cube: Tensor = network((rgb - low) / span.where(span > 0, 1.0))
@@ -77,9 +75,9 @@ def lift_pictures(network: nn.Module, rgb: Tensor) -> Tensor:
 
 
 def start_mst_plus_plus(rng: torch.Generator, linear: Tensor | None = None) -> MSTPlusPlus:
-    """Return a network to train, with orthogonal layers; with W (31, 3) the network starts as W times a pixel's colour.
+    """Return a network to train: of orthogonal layers, or equal to a ``linear`` lift, the matrix (31, 3), at the start.
 
-    The skip connection around the body holds the linear estimate W, and the last layer starts at 0. Training adds the
+    The skip connection around the body has the linear lift, and the last layer starts at 0. Training adds the
     corrections that image structure and a non-linear estimate allow.
     """
     network = _untrained("allow", rng).requires_grad_(True).train()
@@ -91,10 +89,10 @@ def start_mst_plus_plus(rng: torch.Generator, linear: Tensor | None = None) -> M
 
 
 def need_mst_plus_plus_bands(bands: Bands) -> None:
-    """Raise ValueError unless the bands are those of MST++."""
+    """Raise ValueError unless the bands are 31 from 400 to 700 nm, the bands of MST++."""
     centres = bands.centres.cpu().double()
-    wanted = torch.linspace(400e-9, 700e-9, BANDS, dtype=torch.float64)
-    if len(centres) != BANDS or float((centres - wanted).abs().max()) > 0.5e-9:
+    published = torch.linspace(400e-9, 700e-9, BANDS, dtype=torch.float64)
+    if len(centres) != BANDS or float((centres - published).abs().max()) > 0.5e-9:
         raise ValueError(
             f"MST++ gives {BANDS} bands from 400 to 700 nm, not {len(centres)} from {float(centres[0]) * 1e9:.4g} to "
             f"{float(centres[-1]) * 1e9:.4g} nm: give the bands of MST++, or choose another lift"
@@ -102,9 +100,7 @@ def need_mst_plus_plus_bands(bands: Bands) -> None:
 
 
 def _empty() -> MSTPlusPlus:
-    """Build the network without memory for its tensors and without a draw from the global random stream."""
-    with torch.device("meta"):
-        return MSTPlusPlus().requires_grad_(False).eval()
+    return empty(MSTPlusPlus).requires_grad_(False).eval()
 
 
 def _loaded(weights: Path) -> nn.Module:
@@ -128,35 +124,28 @@ def _untrained(untrained: str, rng: torch.Generator) -> MSTPlusPlus:
 
 
 def _fitting(weights: Path) -> dict[str, Tensor]:
-    """Return the tensors of a checkpoint; raise ParameterError unless names and shapes are those of the network."""
+    """Return the tensors of a checkpoint; raise ParameterError unless names and shapes fit the network."""
     found = {name.removeprefix("module."): tensor for name, tensor in _read(weights).items()}
-    wanted = _shapes()
-    wrong = [name for name in wanted if name not in found or found[name].shape != wanted[name]]
-    wrong += [name for name in found if name not in wanted]
+    network = _empty().state_dict()
+    wrong = [name for name in network if name not in found or found[name].shape != network[name].shape]
+    wrong += [name for name in found if name not in network]
     if wrong:
-        raise ParameterError(
-            "weights",
-            f"{weights} holds {len(found)} tensors and does not fit MST++ at {len(wrong)}, such as {wrong[0]}",
-        )
+        text = f"{weights} holds {len(found)} tensors, and {len(wrong)} tensors do not fit MST++, such as {wrong[0]}"
+        raise ParameterError("weights", text)
     return {name: tensor.float() for name, tensor in found.items()}
 
 
-@functools.cache
-def _shapes() -> dict[str, torch.Size]:
-    return {name: tensor.shape for name, tensor in _empty().state_dict().items()}
-
-
 def _read(weights: Path) -> dict[str, Tensor]:
-    """Read a file of tensors: .safetensors, or a pickle that holds tensors alone, bare or under `state_dict`."""
+    """Read tensors by name from .safetensors, or from a pickle of tensors alone, with or without key `state_dict`."""
     try:
         if weights.suffix == ".safetensors":
             from safetensors.torch import load_file
 
             return load_file(weights)
-        held = torch.load(weights, map_location="cpu", weights_only=True)
+        content = torch.load(weights, map_location="cpu", weights_only=True)
     except Exception as why:  # each library raises its own errors for a broken file
         raise ParameterError("weights", f"{weights} holds no tensors that can be read safely ({why})") from None
-    state = held.get("state_dict", held) if isinstance(held, dict) else held
+    state = content.get("state_dict", content) if isinstance(content, dict) else content
     if not isinstance(state, dict) or not all(isinstance(v, Tensor) for v in state.values()):
         raise ParameterError("weights", f"{weights} is not a state dict: save model.state_dict()")
     return state

@@ -17,7 +17,7 @@ BANDS = 31
 
 
 class MSTPlusPlus(nn.Module):
-    """The network: RGB in [0, 1], (n, 3, y, x) of any size -> (n, 31, y, x)."""
+    """The network from RGB in [0, 1], (n, 3, y, x) of any size, to 31 bands, (n, 31, y, x)."""
 
     def __init__(self) -> None:
         super().__init__()
@@ -75,7 +75,7 @@ class Blocks(nn.Module):
 
 
 class SpectralAttention(nn.Module):
-    """Attention of every band to every band: 31 x 31 weights per head, at a cost that is linear in the pixels."""
+    """Attention between all bands: 31 x 31 weights per head, at a cost that is linear in the number of pixels."""
 
     def __init__(self, dim: int) -> None:
         super().__init__()
@@ -96,13 +96,13 @@ class SpectralAttention(nn.Module):
         return result
 
     def _across(self, pixels: Tensor) -> tuple[Tensor, Tensor]:
-        """Return query and key, with each band normalised to length 1 over the picture."""
+        """Return query and key of the attention, with each band normalised to length 1 over the picture."""
         query, key = (F.normalize(to(pixels).transpose(1, 2), dim=-1) for to in (self.to_q, self.to_k))
         return query, key
 
 
 class Normed(nn.Module):
-    """A layer norm over bands, then the feed-forward network (the published names: norm, fn)."""
+    """A layer norm over the bands, then the feed-forward network; `norm` and `fn` are the published names."""
 
     def __init__(self, dim: int) -> None:
         super().__init__()

@@ -6,13 +6,15 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
+from neusee.nodes.values import LowRankCube
+
 _PIECE = 4096  #: pixels of a block: 31 bands in float64 take 1 MB and stay in the cache
 _FLOOR = 8  #: round-off units of the planes; no smaller error can be guaranteed
 _ROOT = 2e-7  #: relative resolution of a root mean square that is computed from products in float64
 
 
 class Source(NamedTuple):
-    """A cube that need not be in memory."""
+    """A cube that is read block by block, so that the whole cube is never in memory."""
 
     part: Callable[[slice], Tensor]  #: a block of pixels, (band, pixel) float64, as a copy that may be changed
     bands: int
@@ -20,42 +22,31 @@ class Source(NamedTuple):
     dtype: torch.dtype  #: of the planes
 
     def pieces(self) -> list[slice]:
-        """Return slices of all pixels, block by block."""
         return [slice(i, min(i + _PIECE, self.pixels)) for i in range(0, self.pixels, _PIECE)]
 
 
-class Found(NamedTuple):
-    """The fields of a `LowRankCube`, with all pixels in one row."""
-
-    planes: Tensor  #: (k, pixel)
-    basis: Tensor  #: (band, k) float64
-    residual_max: Tensor  #: (k + 1, band) float64
-    residual_rms: Tensor  #: (k + 1, band) float64
-    residual_map: Tensor  #: (pixel,)
-
-
-def few_planes(source: Source, within: float) -> Found:
+def few_planes(source: Source, within: float) -> LowRankCube:
     """Find the fewest principal components whose root mean square error is within a share of the largest element.
 
-    The error of every pixel is measured too. Raises ValueError for NaN.
+    The planes and the error of every pixel have all pixels in one row. Raises ValueError for NaN.
     """
-    most, gram = _looked_at(source)
+    most, gram = _largest_and_products(source)
     scale = float(most.max())
     scaled = scale > 0 and not 1e-280 < float(gram.amax()) < 1e280
     if scaled:
-        gram = _looked_at(source, scale)[1]
+        gram = _largest_and_products(source, scale)[1]
     axes = torch.linalg.eigh(gram).eigenvectors.flip(1)
-    target = max(within, _FLOOR * torch.finfo(source.dtype).eps, _ROOT) * scale
     eps = torch.finfo(source.dtype).eps
+    target = max(within, _FLOOR * eps, _ROOT) * scale
     spread = _spread(gram / source.pixels, axes, source.bands, eps) * (scale if scaled else 1.0)
     count = max(1, next((k for k, left in enumerate(spread) if float(left.max()) <= target), source.bands))
     planes, last, off = _projected(source, axes[:, :count])
     rest = _rest(most, planes, axes[:, :count], last)
     spread = torch.cat([spread[:count], torch.minimum(spread[count], rest[count])[None]])  # no more than was measured
-    return Found(planes, axes[:, :count], rest, spread, off)
+    return LowRankCube(planes, axes[:, :count], rest, spread, off)
 
 
-def _looked_at(source: Source, scale: float = 1.0) -> tuple[Tensor, Tensor]:
+def _largest_and_products(source: Source, scale: float = 1.0) -> tuple[Tensor, Tensor]:
     """Return the largest |element| of each band, and the products of the bands of the cube over ``scale``."""
     if not source.pixels or not source.bands:
         raise ValueError("the cube has no pixels: give a scene")
@@ -71,7 +62,7 @@ def _looked_at(source: Source, scale: float = 1.0) -> tuple[Tensor, Tensor]:
 
 
 def _projected(source: Source, axes: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-    """Return the planes in their own precision, and the largest error of each band and of each pixel."""
+    """Return the planes in the precision of the source, and the largest error of each band and of each pixel."""
     planes = torch.empty(axes.shape[1], source.pixels, dtype=source.dtype, device=axes.device)
     last, off = axes.new_zeros(source.bands), planes.new_empty(source.pixels)
     for piece in source.pieces():
@@ -84,7 +75,7 @@ def _projected(source: Source, axes: Tensor) -> tuple[Tensor, Tensor, Tensor]:
 
 
 def _spread(power: Tensor, axes: Tensor, count: int, eps: float) -> Tensor:
-    """Return the root mean square error of the first r planes: the omitted axes, and the round-off of the planes.
+    """Return the root mean square error of the first r planes, from the omitted axes and the round-off of the planes.
 
     ``power`` holds the mean products of the bands. The round-off of these products counts as part of the error.
     """
@@ -97,7 +88,7 @@ def _spread(power: Tensor, axes: Tensor, count: int, eps: float) -> Tensor:
 
 
 def _rest(most: Tensor, planes: Tensor, basis: Tensor, last: Tensor) -> Tensor:
-    """Return a bound of the error of the first r planes: measured at both ends, a sum over omitted planes between."""
+    """Return a bound of the error of the first r planes: measured for no plane and for all planes, else a sum."""
     each = basis.abs() * torch.maximum(planes.amax(1), -planes.amin(1)).double()
     last = last + 4 * torch.finfo(torch.float64).eps * (most + each.sum(1))  # round-off of the measurement
     after = each.flip(1).cumsum(1).flip(1).T

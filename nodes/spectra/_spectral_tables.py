@@ -1,4 +1,4 @@
-"""Measured spectra of colour-science, read once and sampled at the bands; wavelengths in m, float64."""
+"""Measured spectra of colour-science, read once and interpolated to bands; wavelengths in m, float64."""
 
 import functools
 from typing import NamedTuple
@@ -8,26 +8,29 @@ from torch import Tensor
 
 from neusee.nodes.values import Bands
 
-OBSERVER = "CIE 1931 2 Degree Standard Observer"
+_ROUNDING = 1e-3  #: nm
 _CHARTS = ("BabelColor Average", "ColorChecker N Ohta", "PMC", "ISO 17321-1")
 
 
 class Table(NamedTuple):
-    """Spectra on one grid of wavelengths."""
+    """Spectra that are sampled at the same wavelengths."""
 
     wavelengths: Tensor  #: (sample,) m, rising
     values: Tensor  #: (spectrum, sample)
 
     def at(self, centres: Tensor) -> Tensor:
-        """Interpolate linearly between the samples, with the last value beyond the ends: (spectrum, band), on CPU."""
-        wanted = centres.detach().cpu().double()
-        right = torch.searchsorted(self.wavelengths, wanted).clamp(1, len(self.wavelengths) - 1)
+        """Interpolate spectra linearly, constant beyond the first and last sample: (spectrum, band), on the CPU."""
+        x = centres.detach().cpu().double()
+        right = torch.searchsorted(self.wavelengths, x).clamp(1, len(self.wavelengths) - 1)
         low, high = self.wavelengths[right - 1], self.wavelengths[right]
-        share = ((wanted - low) / (high - low)).clamp(0, 1)
+        share = ((x - low) / (high - low)).clamp(0, 1)
         return self.values[:, right - 1] * (1 - share) + self.values[:, right] * share
 
     def over(self, bands: Bands) -> Tensor:
-        """Average the linear interpolation over each band, with 0 beyond the ends: (spectrum, band)."""
+        """Average the linear interpolation over each band, with 0 beyond the first and last sample: (spectrum, band).
+
+        Colour-science samples spectra at points, which changes the energy of the lines of a lamp by 10 %.
+        """
         centres, half = bands.centres.detach().cpu().double(), bands.widths.detach().cpu().double() / 2
         thin = half <= 1e-13
         mean = (self._below(centres + half) - self._below(centres - half)) / (2 * half).where(~thin, 1.0)
@@ -50,12 +53,12 @@ def observer() -> Table:
     """Return the colour-matching functions of the CIE 1931 observer, 360 to 830 nm by 1 nm."""
     import colour
 
-    return _table(colour.MSDS_CMFS[OBSERVER])
+    return _table(colour.MSDS_CMFS["CIE 1931 2 Degree Standard Observer"])
 
 
 @functools.cache
-def camera(name: str) -> Table:
-    """Return the measured channels of a camera: red, green, blue."""
+def measured_camera(name: str) -> Table:
+    """Return the measured sensitivities of a camera's channels: red, green, blue."""
     import colour
 
     return _table(colour.MSDS_CAMERA_SENSITIVITIES[f"{name} (NPL)"])
@@ -95,7 +98,7 @@ def paints() -> tuple[Table, ...]:
 
 @functools.cache
 def gamut_samples(name: str) -> Table:
-    """Return the reflectances that test colour rendition: the 99 objects of CIE 2017, or the 15 paints of the CQS."""
+    """Return reflectances that test the colours of lamps: the 99 objects of CIE 2017, or the 15 paints of the CQS."""
     import colour
 
     if name == "CQS":
@@ -105,18 +108,22 @@ def gamut_samples(name: str) -> Table:
     return _table(load_TCS_CIE2017(colour.SpectralShape(380, 780, 5)))
 
 
-@functools.cache
-def xyz_to_srgb() -> Tensor:
-    """Return the matrix from CIE XYZ to linear sRGB, (3, 3)."""
-    import colour
-
-    return torch.tensor(colour.RGB_COLOURSPACES["sRGB"].matrix_XYZ_to_RGB, dtype=torch.float64)
-
-
 def to_srgb(centres: Tensor) -> Tensor:
     """Return the matrix (3, band) from reflectance under D65 to linear sRGB: white is (1, 1, 1) on these bands."""
-    matrix = xyz_to_srgb() @ (observer().at(centres) * light("D65").at(centres))
+    import colour
+
+    from_xyz = torch.tensor(colour.RGB_COLOURSPACES["sRGB"].matrix_XYZ_to_RGB, dtype=torch.float64)
+    matrix = from_xyz @ (observer().at(centres) * light("D65").at(centres))
     return matrix / matrix.sum(1, keepdim=True)
+
+
+def require_range(
+    wavelengths: Tensor, known: Tensor | tuple[float, float], source: str, fix: str = "choose bands inside that range"
+) -> None:
+    """Raise ValueError for wavelengths of bands outside the ``known`` range (m) of a source, such as "D65 holds"."""
+    low, high, first, last = (float(x) * 1e9 for x in (wavelengths.min(), wavelengths.max(), known[0], known[-1]))
+    if low < first - _ROUNDING or high > last + _ROUNDING:
+        raise ValueError(f"bands from {low:.4g} to {high:.4g} nm, but {source} {first:.4g} to {last:.4g} nm: {fix}")
 
 
 def _table(spectra: object) -> Table:

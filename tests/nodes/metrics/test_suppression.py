@@ -117,7 +117,7 @@ def test_peak_and_bsr_of_channels_are_those_of_all_bands():
     torch.testing.assert_close(bsr(kept, both[0]), bsr(kept, scene), rtol=1e-12, atol=0)
     with pytest.raises(ValueError, match="differ in shape"):
         bsr(both[0], scene[:, :3])
-    with pytest.raises(ValueError, match="lies outside its rows"):
+    with pytest.raises(ValueError, match="lies outside the span of the image's rows"):
         peak_irradiance(channels(scene, rows(visible, seen)[:1]), visible, factor, **SENSOR)
     assert (peak_irradiance.accepts_channel_sums, peak_irradiance.needs_band_invariant, bsr.accepts_channel_sums) == (
         ("image",),

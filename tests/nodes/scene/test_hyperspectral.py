@@ -143,7 +143,7 @@ def test_spectral_exr_as_a_scene(tmp_path):
 def test_writing_refuses_what_does_not_fit(tmp_path):
     with pytest.raises(ValueError, match="2 bands"):
         write_spectral(tmp_path / "s.exr", torch.ones(3, 1, 1), [1e-7, 2e-7])
-    with pytest.raises(ValueError, match="one name"):
+    with pytest.raises(ValueError, match="equal channel names"):
         write_spectral(tmp_path / "s.exr", torch.ones(2, 1, 1), [5e-7, 5e-7])
 
 

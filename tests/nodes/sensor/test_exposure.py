@@ -151,9 +151,9 @@ def test_channels_in_single_precision_and_of_rows_that_say_the_same_twice():
 
 def test_channels_of_other_weights_are_refused():
     summed = channels(scene(2, 2), rows(BANDS, RESPONSES))
-    with pytest.raises(ValueError, match="lies outside its rows"):
+    with pytest.raises(ValueError, match="lies outside the span of the image's rows"):
         expose(summed, BANDS, RESPONSES, torch.linspace(1, 2, 5), **SHUTTER)
-    with pytest.raises(ValueError, match="lies outside its rows"):
+    with pytest.raises(ValueError, match="lies outside the span of the image's rows"):
         expose(summed, BANDS, RESPONSES + 1e-6 * torch.eye(3, 5), **SHUTTER)
     with pytest.raises(ValueError, match="per_band needs the peak of each band"):
         level(summed, BANDS, RESPONSES, strength=0.7, rule="per_band", **SENSOR)
