@@ -1,11 +1,11 @@
-"""The page of an evaluation."""
+"""The page of an evaluation: tables, pictures and their explanations."""
 
 from __future__ import annotations
 
 import math
 import re
 from collections.abc import Mapping, Sequence
-from dataclasses import asdict
+from dataclasses import asdict, astuple
 from typing import TYPE_CHECKING, Any
 
 from neusee.workflows.evaluation import evaluation_figures as figures
@@ -19,12 +19,12 @@ if TYPE_CHECKING:
 _EACH = ("mean", "low", "high")
 COLUMNS = ("pipeline", "mask", "restorer", "scenes", *(f"{m} {e}" for m in METRICS for e in _EACH),
            *(f"{name} {e}" for name in ("l1 less", "l1 gain", "l1 small gain") for e in _EACH))  # fmt: skip
-_COARSE = 1.05  #: the band of the aperture is a disc, counted by the grid of frequencies that the pixels sample
+_COARSE = 1.05  #: the frequencies of a circular aperture are counted on the square grid of the pixels
 _DIGITS = {"psnr": ".2f", "l1": ".4f", "ssim": ".3f", "saturated": ".0f", "damaged": ".2f"}
 
 
 def draw_pictures(found: EvaluationResult) -> dict[str, bytes]:
-    """Return the pictures, by name."""
+    """Draw the pictures of the page, and return each picture by name."""
     return {
         "cases": figures.cases(found.panels),
         "strengths": figures.strengths(found.tables, found.small),
@@ -34,7 +34,7 @@ def draw_pictures(found: EvaluationResult) -> dict[str, bytes]:
 
 
 def summary(found: EvaluationResult) -> dict[str, Any]:
-    """Return for each pipeline the mean of every metric with its interval, and the gain over the reference."""
+    """Return the mean and interval of every metric and the gain over the reference, for each pipeline."""
     return {
         p.name: {
             "mask": p.front,
@@ -47,39 +47,39 @@ def summary(found: EvaluationResult) -> dict[str, Any]:
 
 
 def rows(found: EvaluationResult) -> list[Sequence[Any]]:
-    """Return the rows of the table: for each pipeline the numbers of `summary`."""
+    """Return the rows of ``table.csv``, with the numbers of `summary` for each pipeline."""
     listed: list[Sequence[Any]] = []
     for p in found.pipelines:
         each = [mean(found.tables[p.name].scenes(metric)) for metric in METRICS] + list(found.against[p.name].values())
-        numbers = [x for interval in each for x in (interval.mean, interval.low, interval.high)]
+        numbers = [x for interval in each for x in astuple(interval)]
         listed.append((p.name, p.front, p.back, len(found.scenes), *("" if math.isnan(x) else x for x in numbers)))
     return listed
 
 
 def lead(found: EvaluationResult) -> str:
-    """Return the result in a few sentences."""
+    """Return the result of the evaluation in a few sentences."""
     best = min(found.pipelines, key=lambda p: float(found.tables[p.name].scenes("l1").mean()))
-    said = _with_interval(mean(found.tables[best.name].scenes("l1")), "l1")
+    least = _with_interval(mean(found.tables[best.name].scenes("l1")), "l1")
     strengths = ", ".join("none" if k == 0 else f"{k:g}".replace("e+0", "e") for k in found.strengths)
     enough = len(found.scenes) >= len(CASES)
-    few = "" if enough else f" These are too few scenes for all {len(CASES)} cases of the protocol."
+    few = "" if enough else f" These are too few scenes for all {len(CASES)} lasers of the protocol."
     uncertain = found.recipe.uncertain
-    laws = [name for name in (uncertain.names if uncertain else ()) if not name.startswith("lasers.")]
-    drawn = f" Drawn anew for each scene: {', '.join(laws)}." if laws else ""
-    return f"""{len(found.scenes)} scenes, laser strengths {strengths} (multiples of what saturates a pixel of the
-        plain lens), {len(found.pipelines)} pipelines of a mask and a restorer. Least L1: {best.name}, {said}.
+    names = [name for name in (uncertain.names if uncertain else ()) if not name.startswith("lasers.")]
+    drawn = f" These values are drawn for each scene: {', '.join(names)}." if names else ""
+    return f"""{len(found.scenes)} scenes, laser strengths {strengths} (1 saturates a pixel of the plain lens),
+        {len(found.pipelines)} pipelines of a mask and a restorer. Lowest L1: {best.name}, {least}.
         {few}{drawn}"""
 
 
 def sections(found: EvaluationResult, shown: Mapping[str, bytes]) -> list[Section]:
-    """Return the parts of the page, from mask by restorer to the scenes."""
+    """Return the sections of the page, from the table of masks and restorers to the list of scenes."""
     parts = [_crossed(found), _numbers(found), _compared(found)]
-    text = """Mean over scenes and its 95 % interval. A scene without a laser counts at no strength but none, so
-        that the scenes of the other points have a laser each."""
+    text = """Mean over scenes and its 95 % interval. A scene without a laser counts only at the strength none, so
+        that every scene of the other points has a laser."""
     parts.append(Section("Error over strength", text, picture=shown["strengths"]))
-    text = """The first scene behind each laser of the protocol and behind none, all by one stretch: rows are the
-        truth, the plain lens, whose picture is developed and no more, and every pipeline."""
-    parts.append(Section("Lasers, and none", text, picture=shown["cases"]))
+    text = """The first scene with each laser of the protocol and without a laser, all with the same scale. The rows are
+        the truth, the picture of the plain lens without restoration, and every pipeline."""
+    parts.append(Section("With each laser and without a laser", text, picture=shown["cases"]))
     return [*parts, _suppression(found, shown["curves"]), _plane(found, shown["plane"]), *_data(found)]
 
 
@@ -88,7 +88,7 @@ def _crossed(found: EvaluationResult) -> Section:
     restorers = list(dict.fromkeys(p.back for p in found.pipelines))
     each = {(p.front, p.back): p.name for p in found.pipelines}
     listed = [(mask, *(_cell(found, each.get((mask, back))) for back in restorers)) for mask in masks]
-    text = """L1 at full size (sRGB as a display shows it, 0 to 1): of each scene the mean over its strengths, then
+    text = """L1 at full size (sRGB from 0 to 1, as a display shows it): the mean over the strengths of each scene, then
         mean and 95 % confidence interval over scenes (Student's t)."""
     return Section("Mask by restorer", text, ("mask", *restorers), listed)
 
@@ -98,19 +98,16 @@ def _cell(found: EvaluationResult, name: str | None) -> str | None:
 
 
 def _with_interval(x: Interval, metric: str) -> str:
-    how = _DIGITS.get(metric.partition(" ")[0], ".3g")
-    return (
-        f"{x.mean:{how}}"
-        if math.isnan(x.half)
-        else f"{x.mean:{how}}\N{NO-BREAK SPACE}±\N{NO-BREAK SPACE}{x.half:{how}}"
-    )
+    digits = _DIGITS.get(metric.partition(" ")[0], ".3g")
+    half = "" if math.isnan(x.half) else f"\N{NO-BREAK SPACE}±\N{NO-BREAK SPACE}{x.half:{digits}}"
+    return f"{x.mean:{digits}}{half}"
 
 
 def _numbers(found: EvaluationResult) -> Section:
     text = f"""Mean and 95 % interval over scenes. Small: the picture that a display shows, reduced to {found.small}
-        pixels of its shorter side in linear light, antialiased. Saturated: pixels of the raw picture. Damaged:
-        share of the points whose brightest pixel passes the damage threshold of the sensor. PSNR is a mean of
-        decibels."""
+        pixels of its shorter side in linear light, antialiased. Saturated: number of saturated pixels of the raw
+        picture. Damaged: fraction of the points whose brightest pixel exceeds the damage threshold of the sensor.
+        PSNR is a mean of decibels."""
     metrics = [metric for metric in METRICS if metric != "peak"]
     columns = ("pipeline", *(re.sub("l1|psnr|ssim", lambda found: found[0].upper(), metric) for metric in metrics))
     listed = [
@@ -121,10 +118,10 @@ def _numbers(found: EvaluationResult) -> Section:
 
 
 def _compared(found: EvaluationResult) -> Section:
-    text = f"""Against {found.reference}, scene by scene. L1 less: how much lower the L1 is (Student's t of the
-        differences). Gain: the same as a share of the reference's mean L1, its interval from scenes drawn again
-        (10 000 times, both pipelines on the same; of fewer than five scenes none is given). Marked where zero lies
-        outside the interval. Many pipelines against one: one in twenty passes by chance."""
+    text = f"""Differences from {found.reference} in the same scenes. L1 less: by how much L1 is lower, with interval
+        of Student's t. Gain: the same as a fraction of the mean L1 of the reference, with an interval from 10 000 draws
+        of the scenes (bootstrap); fewer than five scenes have no interval. A colour marks an interval without zero. If
+        many pipelines are compared with one reference, about one in twenty is marked by chance."""
     listed: list[Sequence[Any]] = []
     marks: dict[tuple[int, int], Mark] = {}
     for p in found.pipelines:
@@ -139,16 +136,16 @@ def _compared(found: EvaluationResult) -> Section:
     return Section(f"Against {found.reference}", text, columns, listed, marks=marks)
 
 
-def _between(x: Interval, how: str) -> str:
-    return f"{x.mean:{how}}" if math.isnan(x.low) else f"{x.mean:{how}} ({x.low:{how}} to {x.high:{how}})"
+def _between(x: Interval, digits: str) -> str:
+    return f"{x.mean:{digits}}" + ("" if math.isnan(x.low) else f" ({x.low:{digits}} to {x.high:{digits}})")
 
 
 def _suppression(found: EvaluationResult, picture: bytes) -> Section:
     own = next(p.front for p in found.pipelines if p.name == found.reference)
-    text = f"""LSR: the brightest pixel of a laser behind the mask over that behind the clear lens; BSR: light of
-        the scene in the field over that of the plain lens, mean over scenes. Energy floor: the LSR of light that is
-        spread evenly over the window of the PSF. Stronger: how many times lower the mean LSR is than that of {own}.
-        The same by wavelength: suppression.csv."""
+    text = f"""LSR: the brightest pixel of a laser with the mask, divided by the brightest pixel without the mask; BSR:
+        light of the scene in the field, divided by the light with the plain lens, mean over scenes. Energy floor: the
+        LSR of light that is spread evenly over the window of the PSF. Stronger: the mean LSR of {own} divided by the
+        mean LSR of the mask. The file suppression.csv has LSR and BSR by wavelength."""
     base = float(found.masks[own].lsr.mean())
     listed: list[Sequence[Any]] = []
     for name, m in found.masks.items():
@@ -160,31 +157,27 @@ def _suppression(found: EvaluationResult, picture: bytes) -> Section:
 
 
 def _plane(found: EvaluationResult, picture: bytes) -> Section:
-    text = """Means over wavelengths, contrast within the band that the clear aperture passes. A low peak costs
-        contrast: by Parseval the rms over all sampled frequencies is at most sqrt(LSR p0), p0 the share of light in
-        the brightest pixel of the clear lens, and within the band, a share 4 p0 of them, at most sqrt(LSR) / 2; the
-        median is at most 1.41 times the rms. Where a mask throws light out of the window, contrast is that of the
-        light that is kept, and its own bound is that much higher: the table has it."""
+    text = """Means over wavelengths, with the contrast within the band that the clear aperture passes. A low peak costs
+        contrast: by Parseval the rms over all sampled frequencies is at most sqrt(LSR p0), where p0 is the fraction of
+        light in the brightest pixel of the clear lens, and the rms within the band, a fraction 4 p0 of the frequencies,
+        is at most sqrt(LSR) / 2; the median is at most 1.41 times the rms. If a mask sends light out of the window, the
+        contrast is that of the remaining light, and the bound of the mask, in the table, is higher."""
     listed: list[Sequence[Any]] = []
     marks: dict[tuple[int, int], Mark] = {}
     for name, m in found.masks.items():
-        marks[len(listed), 4] = _mark(bool((m.rms <= _COARSE * m.most).all()))
+        marks[len(listed), 4] = "pass" if (m.rms <= _COARSE * m.most).all() else "fail"
         listed.append((name, *(float(x.mean()) for x in (m.lsr, m.median, m.rms, m.most))))
     columns = ("mask", "mean LSR", "median", "rms", "rms at most")
     return Section("Suppression and contrast", text, columns, listed, picture, marks)
 
 
-def _mark(held: bool) -> Mark:
-    return "pass" if held else "fail"
-
-
 def _data(found: EvaluationResult) -> list[Section]:
-    text = """Scenes in the order of their numbers; each is a part of a photograph that the recipe's seed decides,
-        and has its own seed, of the laser's direction and of the noise, the same behind every pipeline. A run of
-        the recipe with that seed and scene gives the same numbers."""
+    text = """Scenes in the order of their numbers. The seed of the recipe chooses part of a photograph for each scene.
+        The seed of a scene decides the direction of the laser and the noise, which are the same for every pipeline. A
+        run of the recipe with this seed and scene gives the same numbers."""
     listed = [(s.number, s.name, s.case, s.seed) for s in found.scenes]
     parts = [Section("Scenes", text, ("scene", "photograph", "laser", "seed"), listed)]
     if found.broken:
         broken = [(path.name, reason) for path, reason in found.broken]
-        parts.append(Section("Photographs that were passed over", "", ("file", "why"), broken))
+        parts.append(Section("Photographs that cannot be read", "", ("file", "why"), broken))
     return parts

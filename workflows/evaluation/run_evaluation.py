@@ -1,10 +1,10 @@
-"""The paper's evaluation of masks and restorers: every pipeline on the same scenes and laser strengths.
+"""The evaluation of masks and restorers as in the paper: every pipeline on the same scenes and laser strengths.
 
     evaluate("first_light", read_pipelines("flat+none, five_half_rings+wiener", Path()), data=Path("photographs"))
 
-Each point, of a scene, a laser's strength and a pipeline, has the numbers of a run of the pipeline's recipe, to the
-last bit. A run that cannot prove its tolerance computes again more strictly; a point is computed once. The store keeps
-all points, so that an interrupted evaluation goes on.
+Each point has a scene, a strength of the laser and a pipeline, and the numbers of a run of the recipe to the last bit.
+A run that cannot prove its tolerance is computed again more strictly; a point is computed once. The store keeps all
+points, so that an interrupted evaluation continues.
 """
 
 from __future__ import annotations
@@ -39,8 +39,8 @@ from neusee.workflows.store.result_store import Store
 
 __all__ = ["STRENGTHS", "EvaluationRefused", "EvaluationResult", "evaluate", "read_pipelines"]
 
-STRENGTHS = (0.0, 1e1, 1e2, 1e3, 1e4, 1e5, 1e6)  #: the paper's
-SMALL = 256  #: pixels of the shorter side, at which the paper restores
+STRENGTHS = (0.0, 1e1, 1e2, 1e3, 1e4, 1e5, 1e6)  #: strengths of the paper, in multiples of saturation
+SMALL = 256  #: pixels of the shorter side of the pictures that the paper restores
 
 
 def evaluate(
@@ -60,12 +60,12 @@ def evaluate(
     device: str = "cpu",
     folder: Path | None = None,
 ) -> Path:
-    """Measure every pipeline over ``count`` scenes and all ``strengths``; return the folder of the results.
+    """Measure every pipeline on ``count`` scenes at all ``strengths``, and return the folder of the results.
 
-    Args: recipe, changes: the camera, as `load` takes them. data: a folder of photographs; without one, the recipe's
-    own scene. small: shorter side of the reduced pictures that are compared too. reference: the pipeline to compare
-    with, the first one by default. progress: receives a line for each scene. Raises: `EvaluationRefused` with every
-    mistake before anything runs.
+    Args: recipe, changes: the camera, as for `load`. data: a folder of photographs, by default the scene of the recipe.
+    small: shorter side of the reduced pictures, which are compared too. reference: the pipeline with which the others
+    are compared, by default the first pipeline. progress: receives a line for each scene.
+    Raises: `EvaluationRefused` with every mistake before anything runs.
     """
     store, place = store or open_store(), folder or Path.cwd()
     each = compose_pipelines(recipe, changes, pipelines, place)
@@ -89,7 +89,7 @@ def evaluate(
 
 def _strengths(strengths: Sequence[float]) -> tuple[float, ...]:
     if not strengths or min(strengths) < 0 or not all(map(np.isfinite, strengths)):
-        raise EvaluationRefused("--strengths: write multiples of saturation from 0, such as 0,1e1,1e3,1e6")
+        raise EvaluationRefused("--strengths: write multiples of saturation, 0 or more, such as 0,1e1,1e3,1e6")
     return tuple(sorted(set(map(float, strengths))))
 
 
@@ -123,7 +123,7 @@ def _points(
     strengths: Sequence[float],
     progress: Progress,
 ) -> dict[str, list[dict[float, PointNumbers]]]:
-    """Return every point, with the scenes of one laser after another because they share its optics."""
+    """Compute all points, with the scenes of one laser one after another because these scenes share optics."""
     found: dict[str, list[dict[float, PointNumbers]]] = {p.name: [{} for _ in shown] for p in each}
     before, order = "", [scene.case for scene in shown]
     for done, scene in enumerate(sorted(shown, key=lambda scene: order.index(scene.case)), 1):
@@ -132,9 +132,8 @@ def _points(
         before, alone = scene.case, replace(scene)  # a copy, so that the picture is released with it
         for strength in strengths if scene.case != NONE else (0.0,):
             for pipeline in each:
-                found[pipeline.name][scene.number][strength] = bench.point(
-                    pipeline, PointRequest(alone, scene.case, strength)
-                )
+                point = bench.point(pipeline, PointRequest(alone, strength))
+                found[pipeline.name][scene.number][strength] = point
         progress(f"scene {done} of {len(shown)} ({scene.case}, {scene.name}): {bench.computed} points computed")
     return found
 
@@ -143,7 +142,7 @@ def _points(
 
 
 def _document(found: EvaluationResult, bench: EvaluationPoints) -> dict[str, Any]:
-    """Return what the folder says of the evaluation, beside what every study says."""
+    """Return the values of an evaluation that ``provenance.json`` holds in addition to the values of every study."""
     from neusee.workflows.evaluation.evaluation_page import summary
 
     return {
@@ -163,7 +162,7 @@ def _report(found: EvaluationResult) -> StudyReport:
 
     pictures = draw_pictures(found)
     tables: dict[str, CsvTable] = {
-        "points.csv": (("pipeline", "mask", "restorer", *_POINT, *METRICS), _point_rows(found)),
+        "points.csv": ((*_POINT, *METRICS), _point_rows(found)),
         "table.csv": (COLUMNS, rows(found)),
         "suppression.csv": (("mask", "wavelength (nm)", "lsr", "bsr", "floor"), _curve_rows(found)),
     }
@@ -172,7 +171,7 @@ def _report(found: EvaluationResult) -> StudyReport:
     return StudyReport(title, lead(found), sections(found, pictures), pictures, tables, shown=shown)
 
 
-_POINT = ("scene", "photograph", "laser", "strength")
+_POINT = ("pipeline", "mask", "restorer", "scene", "photograph", "laser", "strength")
 
 
 def _point_rows(found: EvaluationResult) -> list[Sequence[Any]]:
