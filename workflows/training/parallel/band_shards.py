@@ -1,14 +1,14 @@
-"""Which steps the processes of a band axis share by wavelength, and where the bands come together again.
+"""The steps that several processes share by wavelength, and the steps that need all bands again.
 
-A node that declares its bands gives each band the same bits, whatever other bands are computed with it. So each
-process computes its own bands of every step that works on the bands of the scene. The first later step that does not
-work band by band needs all bands: those of the mask's PSF are gathered by every process, those of a picture are sent
-to the process that owns the picture. Where only sums over the bands of an image are read, only the sums are sent.
+A node that declares its bands gives each band the same bits, whatever other bands are computed in the same call. So
+each process computes its own bands of every step that works on the bands of the scene. The first later step that does
+not work band by band needs all bands: every process gathers the bands of the mask's PSF, and the bands of a picture are
+sent to the process that owns the picture. Where only sums over the bands of an image are read, only the sums are sent.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable, Collection, Mapping, Sequence
+from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Any, get_args
 
@@ -32,20 +32,20 @@ Port = Swapped | Sum
 
 @dataclass(frozen=True)
 class Shards:
-    """The steps that are shared by band, and the steps that follow them."""
+    """The steps of a recipe that several processes share by band, and the steps that depend on shared steps."""
 
     recipe: Recipe
     mesh: Mesh = ALONE
     count: int = 0  #: bands of the scene
-    steps: frozenset[str] = frozenset()  #: those of which each process computes its own bands
-    behind: frozenset[str] = frozenset()  #: those that need all bands of a shared step
-    rows: Mapping[str, Tensor] = field(default_factory=dict)  #: weights of sums, by image of which only sums are read
+    steps: frozenset[str] = frozenset()  #: shared steps, of which each process computes its own bands
+    behind: frozenset[str] = frozenset()  #: steps that need all bands of a shared step
+    rows: Mapping[str, Tensor] = field(default_factory=dict)  #: weights of sums, by image whose bands are only summed
 
     @classmethod
     def of(
         cls, recipe: Recipe, psf: str, wanted: Sequence[str], live: Collection[str], store: Store, mesh: Mesh
     ) -> Shards:
-        """Find the ``live`` steps that work on the bands of the PSF; raise MeshError for too few bands."""
+        """Return the division of the ``live`` steps among the processes; raise MeshError for too few bands."""
         if mesh.band == 1:
             return cls(recipe)
         spectral = _sampled(recipe, psf)
@@ -65,22 +65,18 @@ class Shards:
 
     @property
     def own(self) -> list[int]:
-        """Return the bands of this process."""
+        """Return the indices of the bands of this process."""
         return own_bands(self.mesh, self.count)
 
-    @property
-    def call(self) -> Callable[..., Any]:
-        """Return the function that computes a step; of shared steps it computes the bands of this process."""
-        return self._call if self.steps else call
-
-    def _call(self, step: Step, inputs: Sequence[Any], params: Mapping[str, Any], seed: int, device: str) -> Any:
+    def call(self, step: Step, inputs: Sequence[Any], params: Mapping[str, Any], seed: int, device: str) -> Any:
+        """Compute a step and return its result; of a shared step, compute only the bands of this process."""
         if step.name in self.steps:
             whole = [name for name in step.node.inputs if step.wires.get(name) not in self.steps]
             inputs = taken(step, inputs, self.own, whole)
         return call(step, inputs, params, seed, device)
 
     def gathered(self, name: str, value: Any) -> Any:
-        """Gather all bands of a result of which each process has its own bands."""
+        """Gather all bands of the result of a shared step from all processes."""
         axis = self.axis(name)
         return with_band_tensors(value, [gathered(self.mesh, x, axis, self.count) for x in band_tensors(value)])
 
@@ -91,20 +87,20 @@ class Shards:
         return bands["return"]
 
     def sent(self, name: str, value: Any) -> list[Tensor]:
-        """Return the tensors of one picture's result that are sent to the process that owns the picture."""
+        """Return the tensors of a result that are sent to the process that owns the picture."""
         if name not in self.rows:
             return band_tensors(value)
         part = channel_sums(value, self.rows[name][:, self.own])
         return [part.planes, part.flux]
 
     def ports(self, name: str, sent: Sequence[Tensor]) -> list[Port]:
-        """Return the port through which each of these tensors is sent."""
+        """Return the exchange by which each of the tensors ``sent`` goes to the process that owns the picture."""
         if name in self.rows:
             return [Sum(self.mesh), Swapped(self.mesh, -1, self.count)]
         return [Swapped(self.mesh, self.axis(name), self.count) for _ in sent]
 
     def received(self, name: str, like: Any, found: Sequence[Tensor]) -> Any:
-        """Return the result in the form that later steps read."""
+        """Return the result of a step from the received tensors, in the form that later steps read."""
         if name not in self.rows:
             return with_band_tensors(like, found)
         planes, flux = found
@@ -113,18 +109,18 @@ class Shards:
 
 
 def _sampled(recipe: Recipe, name: str) -> set[str]:
-    """Return the steps that give the wavelengths of a step."""
+    """Return the steps whose result is the bands of a step."""
     return {n for n in needed(recipe, [name]) if recipe.steps[n].node.hints["return"] is Bands}
 
 
 def _by_band(recipe: Recipe, name: str, spectral: set[str]) -> bool:
-    """Return True if a step works on each of these bands separately."""
+    """Return True if a step works separately on each band of the steps ``spectral``."""
     node = recipe.steps[name].node
     return node.bands is not None and _sampled(recipe, name) == spectral and not _mixed(recipe, name)
 
 
 def _mixed(recipe: Recipe, name: str) -> bool:
-    """Return True if a step gives a mixture of planes, none of which is a single band."""
+    """Return True if the planes of the result of a step are mixtures of several bands."""
     while (kind := recipe.steps[name].node.hints["return"]) is not LowRankCube:
         step = recipe.steps[name]
         through = next((w for i in step.node.accepts_low_rank if isinstance(w := step.wires.get(i), str)), None)
@@ -138,16 +134,15 @@ def _count(recipe: Recipe, psf: str, spectral: set[str], store: Store, mesh: Mes
     step = recipe.steps[psf]
     if not _by_band(recipe, psf, spectral) or len(spectral) != 1:
         raise MeshError(
-            f"{step.mark}: {psf} ({step.node.path}) couples its bands, so that --mesh {mesh} has none to share: "
+            f"{step.mark}: {psf} ({step.node.path}) couples its bands, so that --mesh {mesh} cannot share the bands: "
             f"write --mesh {mesh.size}x1"
         )
     (bands,) = spectral
     count = len(run(recipe, store, [bands]).values[bands].centres)
     if mesh.band > count:
-        where = recipe.steps[bands].mark
         raise MeshError(
-            f"{where}: {bands} has {count} bands, which {mesh.band} processes cannot share: --mesh {mesh} may have "
-            f"{count} along its band axis at most"
+            f"{recipe.steps[bands].mark}: {bands} has {count} bands, which {mesh.band} processes cannot share: write a "
+            f"band axis of at most {count} in --mesh {mesh}"
         )
     return count
 
@@ -155,7 +150,7 @@ def _count(recipe: Recipe, psf: str, spectral: set[str], store: Store, mesh: Mes
 def _asked(
     recipe: Recipe, name: str, wanted: Sequence[str], behind: Collection[str], live: Collection[str]
 ) -> Asked | None:
-    """Return the sums that are read of an image; None if anything else is read, or if their weights change."""
+    """Return the sums that later steps read from an image; None if other values are read or the weights change."""
     asked = None if name in wanted else asked_of(recipe, name, wanted)
     still = asked is not None and asked.bands not in live and asked.responses not in live
     return asked if asked is not None and still and set(behind).issuperset(asked.readers) else None
