@@ -31,7 +31,7 @@ class Panel:
 def panels(
     bench: EvaluationPoints, each: Sequence[PipelineRecipes], scene: Scene, strengths: Sequence[float]
 ) -> list[Panel]:
-    """Return the scene with each laser, with strengths from 1e4, as in the paper, to the largest of ``strengths``."""
+    """Return a column for each laser, with strengths from 1e4, as in the paper, to the largest of ``strengths``."""
     columns = []
     lasers = [case for case in CASES if case != NONE]
     top = max(max(strengths), _WEAKEST)
@@ -46,7 +46,6 @@ def panels(
 
 
 def _develop(bench: EvaluationPoints, each: Sequence[PipelineRecipes], point: PointRequest) -> dict[str, Tensor]:
-    """Return the truth, the picture of the plain lens and the picture of each pipeline in the size of the figure."""
     pictures: dict[str, Tensor] = {}
     for pipeline in each:
         values = bench.values(pipeline, point, () if pictures else (_PLAIN,))

@@ -5,15 +5,11 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from typing import TYPE_CHECKING
 
 import numpy as np
+from numpy.typing import NDArray
 
-if TYPE_CHECKING:
-    from numpy.typing import NDArray
-
-    Numbers = NDArray[np.float64]
-
+Numbers = NDArray[np.float64]
 CONFIDENCE = 0.95
 _AGAIN = 10_000  #: sets of scenes that the bootstrap draws for a ratio
 _AT_ONCE = 500  #: sets in memory at once
@@ -23,7 +19,7 @@ METRICS = ("l1", "psnr", "ssim", "l1 small", "psnr small", "ssim small", "satura
 
 @dataclass(frozen=True)
 class Interval:
-    """A mean and its 95 % confidence interval, with NaN for limits of too few scenes."""
+    """A mean with its 95 % confidence interval, whose limits are NaN for too few scenes."""
 
     mean: float
     low: float

@@ -14,12 +14,8 @@ from neusee.workflows.report.figures.camera_overview import high
 from neusee.workflows.report.figures.style import BLACK, BLUE, GREEN, ORANGE, VERMILION, canvas, drawn, encoded, picture
 
 if TYPE_CHECKING:
-    from numpy.typing import NDArray
-
     from neusee.workflows.evaluation.comparison_pictures import Panel
     from neusee.workflows.evaluation.mask_optics import MaskOptics
-
-    Numbers = NDArray[np.float64]
 
 _COLOURS = (BLUE, VERMILION, GREEN, ORANGE, "#56B4E9", "#CC79A7", BLACK, "#777777")
 _STYLES = ("-", "--", ":", "-.")  #: the next style begins when all colours are used
@@ -56,7 +52,6 @@ def _power(strength: float) -> str:
 
 
 def _broken(name: str) -> str:
-    """Return a name with line breaks if the name is long."""
     return name if len(name) <= _LETTERS else name.replace("+", "\n+ ").replace("@", "\n@ ")
 
 

@@ -86,15 +86,11 @@ def sections(found: EvaluationResult, shown: Mapping[str, bytes]) -> list[Sectio
 def _crossed(found: EvaluationResult) -> Section:
     masks = list(dict.fromkeys(p.front for p in found.pipelines))
     restorers = list(dict.fromkeys(p.back for p in found.pipelines))
-    each = {(p.front, p.back): p.name for p in found.pipelines}
-    listed = [(mask, *(_cell(found, each.get((mask, back))) for back in restorers)) for mask in masks]
+    l1 = {(p.front, p.back): _with_interval(mean(found.tables[p.name].scenes("l1")), "l1") for p in found.pipelines}
+    listed = [(mask, *(l1.get((mask, back)) for back in restorers)) for mask in masks]
     text = """L1 at full size (sRGB from 0 to 1, as a display shows it): the mean over the strengths of each scene, then
         mean and 95 % confidence interval over scenes (Student's t)."""
     return Section("Mask by restorer", text, ("mask", *restorers), listed)
-
-
-def _cell(found: EvaluationResult, name: str | None) -> str | None:
-    return _with_interval(mean(found.tables[name].scenes("l1")), "l1") if name else None
 
 
 def _with_interval(x: Interval, metric: str) -> str:

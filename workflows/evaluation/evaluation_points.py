@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, replace
 from functools import partial
@@ -77,7 +77,7 @@ class EvaluationPoints:
         function = self._function(pipeline, wanted.lit, outputs)
         self._kept.turn(wanted)
         with torch.no_grad():
-            changed = self._changed(pipeline.recipes[wanted.lit], wanted, outputs)
+            changed = self._changed(pipeline.recipe(wanted.lit), wanted, outputs)
             known = {name: value for name, value in changed.items() if name in function.free}
             values: dict[str, Any] = function({"scene": wanted.scene.picture, **known})
         return values
@@ -91,7 +91,7 @@ class EvaluationPoints:
 
     def key(self, pipeline: PipelineRecipes, wanted: PointRequest) -> str:
         """Return a digest of everything that decides a point: the keys of a run and the settings of the comparison."""
-        recipe, outputs = pipeline.recipes[wanted.lit], pipeline.pipeline.outputs
+        recipe, outputs = pipeline.recipe(wanted.lit), pipeline.pipeline.outputs
         params: dict[str, dict[str, Any]] = {}
         for name, value in self._changed(recipe, wanted, outputs).items():
             step, _, param = name.rpartition(".")
@@ -100,26 +100,26 @@ class EvaluationPoints:
             name: replace(recipe.steps[name], params={**recipe.steps[name].params, **changed})
             for name, changed in params.items()
         }
-        keys = self._keys(replace(recipe, steps={**recipe.steps, **steps}), wanted, outputs)
+        keys = self._keys(replace(recipe, steps={**recipe.steps, **steps}), outputs, wanted.scene)
         within = [recipe.tolerance, recipe.exact, device_kind(self.device), self.small]
         own = [self._code.digest(used.__module__) for used in (quality, resize)]
         return digest("evaluate", engine("evaluation.evaluation_points"), [keys[name] for name in outputs], within, own)
 
-    def _keys(self, recipe: Recipe, wanted: PointRequest, outputs: Sequence[str]) -> dict[str, str]:
+    def _keys(self, recipe: Recipe, outputs: Iterable[str], scene: Scene | None = None) -> dict[str, str]:
         """Return the key of each step; only steps that depend on the scene get the seed of the scene."""
-        keys = {"scene": wanted.scene.key(self._code)}
-        live = _reached(recipe, ("scene",))
+        keys = {"scene": scene.key(self._code)} if scene else {}
+        live = _reached(recipe, keys)
         for name in needed(recipe, outputs):
             if name not in keys:
                 step = recipe.steps[name]
-                seed = wanted.scene.seed if name in live else recipe.seed
+                seed = scene.seed if scene and name in live else recipe.seed
                 keys[name], _ = key_of(step, keys, seed, self._code, place(step, self.device))
         return keys
 
     def _function(self, pipeline: PipelineRecipes, case: str, outputs: tuple[str, ...]) -> Any:
         name = (f"{pipeline.name} {outputs}", case)
         if name not in self._functions:
-            recipe = pipeline.recipes[case]
+            recipe = pipeline.recipe(case)
             whole = with_substitutions(recipe, outputs)  # as in `run`, but the scene is an argument
             steps = set(needed(whole, outputs))
             inputs = self._inputs(recipe, outputs)
@@ -154,10 +154,7 @@ class EvaluationPoints:
 
     def _share(self, function: Any, recipe: Recipe) -> None:
         """Replace the fixed results of a function by the same results of earlier functions, which saves memory."""
-        keys: dict[str, str] = {}
-        for name in needed(recipe, function.fixed):
-            step = recipe.steps[name]
-            keys[name], _ = key_of(step, keys, recipe.seed, self._code, place(step, self.device))
+        keys = self._keys(recipe, function.fixed)
         for name, value in function.fixed.items():
             function.fixed[name] = self._fixed.setdefault(keys[name], value)
 
@@ -165,7 +162,7 @@ class EvaluationPoints:
         line, truth = pipeline.pipeline, values["truth"]
         small = whole = values[line.quality]
         if min(truth.shape[-2:]) > self.small:
-            domain = pipeline.recipes[NONE].steps[line.quality].params["domain"]
+            domain = pipeline.recipe(NONE).steps[line.quality].params["domain"]
             small = quality(reduced(values[line.picture], self.small), reduced(truth, self.small), domain=domain)
         peak, saturated = values["peak[mask]"], values["saturated[mask]"]
         return {
@@ -211,7 +208,8 @@ class _SharedResults:
         def compute(step: Step, inputs: Sequence[Any], params: Mapping[str, Any], seed: int, device: str) -> Any:
             kept = self._of_strength if step.name in moved else self._of_scene
             own = (step.name, self._seed) if step.node.random else ()
-            key = (own, step.node.path, repr(sorted(params.items())), device, *_identities(inputs))
+            identities = [tuple(map(id, x)) if type(x) is list else id(x) for x in inputs]
+            key = (own, step.node.path, repr(sorted(params.items())), device, *identities)
             if key not in kept:  # the inputs are kept too, so that no other object gets their identity
                 kept[key] = (inputs, call(step, inputs, params, self._seed, device))
             return kept[key][1]
@@ -219,15 +217,12 @@ class _SharedResults:
         return compute
 
 
-def _identities(inputs: Sequence[Any]) -> list[Any]:
-    return [tuple(id(y) for y in x) if type(x) is list else id(x) for x in inputs]
-
-
 def _spots(recipe: Recipe, outputs: Sequence[str]) -> list[str]:
     return [name for name in needed(recipe, outputs) if name.startswith("spot[")]
 
 
-def _reached(recipe: Recipe, roots: Sequence[str]) -> set[str]:
+def _reached(recipe: Recipe, roots: Iterable[str]) -> set[str]:
+    """Return the steps ``roots`` and all steps that depend on these steps."""
     found = set(roots)
     for name in needed(recipe, recipe.steps):
         if not found.isdisjoint(recipe.steps[name].sources):

@@ -4,20 +4,16 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 
 from neusee.nodes import metrics
 from neusee.nodes.metrics import least_lsr, most_unsuppressed
 from neusee.workflows.engine.runner import run
+from neusee.workflows.evaluation.confidence_intervals import Numbers
 from neusee.workflows.evaluation.pipelines import NONE, PipelineRecipes
 from neusee.workflows.store.result_store import Store
-
-if TYPE_CHECKING:
-    from numpy.typing import NDArray
-
-    Numbers = NDArray[np.float64]
 
 
 @dataclass(frozen=True)
@@ -48,7 +44,7 @@ def masks(
 
 def _mask(pipeline: PipelineRecipes, store: Store, device: str, bsr: Numbers) -> MaskOptics:
     wanted = ("bands", "lsr[mask]", "mtf[mask]", "psf[mask]")
-    values = run(pipeline.recipes[NONE], store, wanted, device=device).values
+    values = run(pipeline.recipe(NONE), store, wanted, device=device).values
     bands, lsr, mtf, psf = (values[name] for name in wanted)
     each = (lsr, mtf.median, mtf.rms, least_lsr(psf), metrics.limits(psf).passed, most_unsuppressed(psf))
     suppression, *rest = (x.double().cpu().numpy() for x in each)

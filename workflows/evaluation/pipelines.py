@@ -3,8 +3,9 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from functools import cache, partial
 from pathlib import Path
 
 from neusee.workflows.graph.diagnostics import Diagnostic, RecipeError, nearest
@@ -30,7 +31,7 @@ _HOW = "write MASK+RESTORER, such as flat+none, five_half_rings+wiener or pixelw
 
 
 class EvaluationRefused(ValueError):
-    """Error for mistakes in the arguments of an evaluation, raised before anything runs."""
+    """Error for mistakes in the arguments or the photographs of an evaluation."""
 
 
 @dataclass(frozen=True)
@@ -75,26 +76,14 @@ class Pipeline:
 
 @dataclass(frozen=True)
 class PipelineRecipes:
-    """A pipeline with one recipe for each laser."""
+    """A pipeline with one recipe for each laser; the recipes differ only in the wavelength of the laser."""
 
     pipeline: Pipeline
-    recipes: _Recipes  #: by case
+    recipe: Callable[[str], Recipe]  #: of a laser by name
 
     @property
     def name(self) -> str:
         return self.pipeline.name
-
-
-class _Recipes(dict[str, Recipe]):
-    """The recipe of each laser by name, loaded at first use; the recipes differ only in the wavelength of the laser."""
-
-    def __init__(self, recipe: str, words: Sequence[str | Override], fwhm: float, folder: Path) -> None:
-        super().__init__()
-        self._recipe, self._words, self._fwhm, self._folder = recipe, words, fwhm, folder
-
-    def __missing__(self, case: str) -> Recipe:
-        self[case] = load(self._recipe, [*self._words, _laser(CASES[case], self._fwhm)], self._folder)
-        return self[case]
 
 
 def read_pipelines(text: str, folder: Path) -> list[Pipeline]:
@@ -128,10 +117,10 @@ def compose_pipelines(
     for pipeline in pipelines:
         try:
             words = [*changes, *_words(pipeline)]
-            recipes = _Recipes(recipe, words, fwhm, folder)
+            recipe_of = cache(partial(_with_laser, recipe, words, fwhm, folder))
             for case in (NONE, next(iter(CASES))):
-                _check(recipes[case], pipeline)
-            found.append(PipelineRecipes(pipeline, recipes))
+                _check(recipe_of(case), pipeline)
+            found.append(PipelineRecipes(pipeline, recipe_of))
         except RecipeError as error:
             wrong |= dict.fromkeys(f"{pipeline.name}: {_one_line(problem)}" for problem in error.diagnostics)
         except EvaluationRefused as error:
@@ -170,12 +159,13 @@ def _takes(group: str, option: str) -> str:
     raise EvaluationRefused(f"{option} takes no file")
 
 
-def _laser(metres: float | None, fwhm: float) -> str:
-    """Return the argument that sets the laser; strength and direction are set later for each point."""
-    if metres is None:
-        return "lasers={}"
-    line = f"wavelength: {metres * 1e9:g} nm, fwhm: {fwhm * 1e9:g} nm"
-    return f"lasers={{{BEAM}: {{{line}, strength: 1, angle: null}}}}"
+def _with_laser(recipe: str, words: Sequence[str | Override], fwhm: float, folder: Path, case: str) -> Recipe:
+    """Load a recipe with the laser of a case; strength and direction of the laser are set later for each point."""
+    laser = ""
+    if (metres := CASES[case]) is not None:
+        line = f"wavelength: {metres * 1e9:g} nm, fwhm: {fwhm * 1e9:g} nm"
+        laser = f"{BEAM}: {{{line}, strength: 1, angle: null}}"
+    return load(recipe, [*words, f"lasers={{{laser}}}"], folder)
 
 
 def _fwhm(recipe: str, changes: Sequence[str | Override], folder: Path) -> float:

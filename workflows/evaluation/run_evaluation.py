@@ -73,7 +73,9 @@ def evaluate(
     base = load(recipe, changes, place)
     study_run = StudyRun("evaluate", base, command)
     shown, broken = scenes(base, store, data, count)
-    _announce(progress, each, shown, broken, strengths)
+    names = ", ".join(pipeline.name for pipeline in pipelines)
+    progress(f"{len(shown)} scenes, {len(strengths)} strengths, {len(pipelines)} pipelines: {names}")
+    _report_broken(broken, progress)
     bench = EvaluationPoints(store, small, device)
     points = _points(bench, each, shown, strengths, progress)
     optics = masks(each, store, device, points)
@@ -96,20 +98,11 @@ def _strengths(strengths: Sequence[float]) -> tuple[float, ...]:
 def _reference(reference: str, pipelines: Sequence[Pipeline]) -> str:
     names = [pipeline.name for pipeline in pipelines]
     if reference and reference not in names:
-        raise EvaluationRefused(f"--reference {reference}: is none of the pipelines {', '.join(names)}")
+        raise EvaluationRefused(f"--reference {reference}: write one of the pipelines {', '.join(names)}")
     return reference or names[0]
 
 
-def _announce(
-    progress: Progress,
-    each: Sequence[PipelineRecipes],
-    shown: Sequence[Scene],
-    broken: Sequence[Any],
-    strengths: Sequence[float],
-) -> None:
-    progress(
-        f"{len(shown)} scenes, {len(strengths)} strengths, {len(each)} pipelines: {', '.join(p.name for p in each)}"
-    )
+def _report_broken(broken: Sequence[tuple[Path, str]], progress: Progress) -> None:
     for path, reason in broken[:5]:
         progress(f"not read: {path.name}: {reason}")
     if len(broken) > 5:
@@ -142,7 +135,6 @@ def _points(
 
 
 def _document(found: EvaluationResult, bench: EvaluationPoints) -> dict[str, Any]:
-    """Return the values of an evaluation that ``provenance.json`` holds in addition to the values of every study."""
     from neusee.workflows.evaluation.evaluation_page import summary
 
     return {

@@ -57,7 +57,7 @@ class Point:
 
 
 def read_words(words: Sequence[str | Override], folder: Path, first: int = 1) -> list[Argument]:
-    """Read arguments of the command line, counted from ``first``; raise `RecipeError` with the mistakes of all."""
+    """Read arguments of the command line, counted from ``first``; raise `RecipeError` with all mistakes."""
     return _every(partial(_read_word, word, number, folder) for number, word in enumerate(words, first))
 
 
@@ -67,7 +67,7 @@ def read_axes(axes: Mapping[str, str | Iterable[Any]], folder: Path) -> list[Arg
 
 
 def points(arguments: Sequence[Argument], paired: bool = False) -> list[Point]:
-    """Return all combinations of values, the last axis fastest; ``paired``: value n of every axis, for each n."""
+    """Return all combinations of values, the last axis fastest, or, if ``paired``, value n of every axis for each n."""
     axes = [argument for argument in arguments if isinstance(argument, Axis)]
     diagnostics = list(_wrong(axes, paired))
     if diagnostics:
@@ -81,7 +81,7 @@ def points(arguments: Sequence[Argument], paired: bool = False) -> list[Point]:
 
 
 def _every(readers: Iterable[Callable[[], _T]]) -> list[_T]:
-    """Return the result of each reader; raise one `RecipeError` with the mistakes that all readers find."""
+    """Call each function and return the results; raise one `RecipeError` with the mistakes of all functions."""
     results: list[_T] = []
     diagnostics: list[Diagnostic] = []
     for read in readers:

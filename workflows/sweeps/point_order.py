@@ -1,8 +1,7 @@
 """The order in which the points of a sweep run, the results that points share, and the work of each point.
 
-Two points share the result of a step if the step has the same key at both points. Points that share much run one after
-another, so that a costly result is computed once, used at once and released: an axis that changes costly steps varies
-slowly, and from one point to the next only one axis changes.
+Two points share the result of a step if the step has the same key at both points. An axis that changes costly steps
+varies slowly, and only one axis changes from point to point, so that a costly result is needed only once in memory.
 """
 
 from __future__ import annotations
@@ -58,8 +57,7 @@ def best_order(jobs: Sequence[PointJob], costs: Mapping[str, float], paired: boo
     Args: jobs: one job for each point, in the order of the product of the axes, the last axis fastest.
     costs: known seconds by step. paired: the axes vary together, as one axis.
 
-    For a product whose axes each change a fixed set of steps, no order changes less work from point to point: every
-    change costs at least its cheapest axis, and a cheaper axis is used as often as a path through the points can.
+    If each axis changes a fixed set of steps, no other order of a product changes less work from point to point.
     """
     weights = filled(costs, {step for job in jobs for step in job.keys})
     if paired:

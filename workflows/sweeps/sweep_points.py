@@ -118,7 +118,6 @@ def outcomes(
 def _run(
     checked: CheckedPoint, store: Store, watch: Callable[[Event], None] | None, device: str
 ) -> tuple[PointState, tuple[ResultNumber, ...]]:
-    """Run a point and return its state and the numbers of its small outputs."""
     result = run(check(checked.composed), store, watch=watch, device=device)
     rows = (row for step, value in result.values.items() for row in numbers_of(step, value))
     ran = any(step.state == "run" for step in result.done.values())
@@ -132,7 +131,6 @@ def _failed(point: Point, error: Exception, seconds: float, left: float) -> Poin
 
 
 def _costs(store: Store) -> dict[str, float]:
-    """Return the median seconds of every step that has results in the store."""
     known: dict[str, list[float]] = defaultdict(list)
     for row in store.journal.rows():
         if row["step"] and row["seconds"] is not None:

@@ -124,7 +124,7 @@ class Sweeping:
 
 
 def write_sweep(work: Sweeping, result: Sweep, again: Sequence[str], out: Path, netcdf: bool, seconds: float) -> Path:
-    """Write the folder of a sweep and return the path of the folder, which names an unfinished sweep ``partial``."""
+    """Write the folder of a sweep, with ``partial`` in the name of an unfinished sweep, and return its path."""
     name = f"{result.recipe}{'' if result.state == 'complete' else '_partial'}"
     key = digest([checked.job.keys[name] for checked in work.plan.checked for name in checked.job.outputs])
     with new_run(out / "sweeps", name, key) as folder:
@@ -157,7 +157,7 @@ def _account(work: Sweeping, result: Sweep, again: Sequence[str], seconds: float
 
 
 def counted(result: Sweep) -> str:
-    """Return a text such as ``12 points: 8 run, 3 cached, 1 failed``."""
+    """Return the number of points in each state, such as ``12 points: 8 run, 3 cached, 1 failed``."""
     states = [outcome.state for outcome in result.outcomes]
     parts = [f"{states.count(state)} {state}" for state in ("run", "cached", "failed") if state in states]
     rest = result.points - len(states)

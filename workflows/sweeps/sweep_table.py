@@ -110,7 +110,7 @@ def cell_text(cell: Any) -> str:
 
 
 def lasts(seconds: float) -> str:
-    """Return a duration such as ``3 h 05 min``, ``2 min 10 s`` or ``4 s``."""
+    """Return a duration in words, such as ``3 h 05 min``, ``2 min 10 s`` or ``4 s``."""
     whole = round(seconds)
     if whole >= 3600:
         return f"{whole // 3600} h {whole % 3600 // 60:02} min"

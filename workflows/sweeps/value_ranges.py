@@ -9,7 +9,6 @@ from __future__ import annotations
 import difflib
 import math
 import re
-from collections.abc import Callable
 from decimal import Decimal, localcontext
 from fractions import Fraction
 
@@ -95,7 +94,6 @@ def _linspace(arguments: list[str]) -> list[str]:
 
 
 def _logspace(arguments: list[str]) -> list[str]:
-    """Return values with equal ratios from the first argument to the second."""
     (start, stop), unit, count = _ends(arguments, "logspace(1e2, 1e6, 5)")
     if start <= 0 or stop <= 0:
         raise ValueError("both ends must be positive, because the ratio of neighbouring values is constant")
@@ -107,15 +105,11 @@ def _logspace(arguments: list[str]) -> list[str]:
     return [_written(x, unit) for x in ends]
 
 
-_FUNCTIONS: dict[str, Callable[[list[str]], list[str]]] = {
-    "range": _range,
-    "linspace": _linspace,
-    "logspace": _logspace,
-}
+_FUNCTIONS = {"range": _range, "linspace": _linspace, "logspace": _logspace}
 
 
 def _ends(arguments: list[str], example: str) -> tuple[list[Fraction], str, int]:
-    """Return the first and the last value, their unit, and the number of values."""
+    """Return the first and last value of a range, their unit, and the number of values."""
     if len(arguments) != 3:
         raise ValueError(f"write the first value, the last value and the number of values: {example}")
     numbers, unit = _numbers(arguments[:2])

@@ -74,7 +74,6 @@ def train(
 
 
 def _require_equal_shares(recipe: Recipe, settings: Training, mesh: Mesh) -> None:
-    """Raise `MeshError` for a batch that the processes of the data axis cannot share equally."""
     for number, stage in settings.stages.items():
         if stage.batch % mesh.data:
             path = f"{KEY}.stages.{number}.batch"
@@ -105,8 +104,6 @@ def _key(recipe: Recipe, settings: Training, photographs: Photographs) -> str:
 
 
 class _TrainingLoop(ResumableLoop[Learner]):
-    """The training of a mask and a network, in stages."""
-
     def __init__(
         self, recipe: Recipe, settings: Training, photographs: Photographs, store: Store, folder: Path,
         progress: Progress, device: str, watch: Watch | None, mesh: Mesh,
@@ -118,7 +115,7 @@ class _TrainingLoop(ResumableLoop[Learner]):
         self.mesh, self.stage = mesh, 2 if self.designed else min(settings.learnt)
         self.resume()
         mesh.agree(f"{folder.name} in stage {self.stage} after {self.iteration} iterations")
-        self.board = open_board(folder, self._behind) if settings.tensorboard and mesh.first else None
+        self.board = open_board(folder, self._iterations_of_all_stages) if settings.tensorboard and mesh.first else None
 
     def begin_stage(self) -> None:
         """Give the learner new optimisers for the present stage; after the last stage nothing learns."""
@@ -141,8 +138,7 @@ class _TrainingLoop(ResumableLoop[Learner]):
             self._close(command)
 
     @property
-    def _behind(self) -> int:
-        """Return the number of iterations so far, over all stages."""
+    def _iterations_of_all_stages(self) -> int:
         return self.iteration + sum(s.iterations for number, s in self.settings.stages.items() if number < self.stage)
 
     @property
@@ -172,7 +168,7 @@ class _TrainingLoop(ResumableLoop[Learner]):
         """Write the losses to TensorBoard, and pass the losses to the function that watches the training."""
         if self.board:
             for name, value in losses.items():
-                self.board.add_scalar(name, value, self._behind - 1)
+                self.board.add_scalar(name, value, self._iterations_of_all_stages - 1)
         super().note(losses)
 
     def keep(self) -> None:
@@ -188,7 +184,7 @@ class _TrainingLoop(ResumableLoop[Learner]):
             restored = self.learner.net(sample.picture[:1])[0].float()
         shown = strip([sample.picture[0].detach(), restored, sample.truth[0]])
         if self.board:
-            self.board.add_image(f"stage {self.stage}", shown, self._behind - 1, dataformats="HWC")
+            self.board.add_image(f"stage {self.stage}", shown, self._iterations_of_all_stages - 1, dataformats="HWC")
         self.write_picture(f"stage{self.stage}_{self.iteration:06d}", png(shown))
 
     def _export(self) -> None:
@@ -200,7 +196,6 @@ class _TrainingLoop(ResumableLoop[Learner]):
 
     @property
     def _mask_source(self) -> str:
-        """Return the origin of the mask in words."""
         if self.settings.learn is None:
             return "the recipe's own"
         return "designed without images" if self.designed else "learnt in stage 1"

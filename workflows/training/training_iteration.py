@@ -36,16 +36,10 @@ from neusee.workflows.training.training_pictures import Sample, TrainingStream
 
 
 class Scales(NamedTuple):
-    """Pictures at half size and at full size."""
+    """A batch of pictures at half size and at full size."""
 
     coarse: Tensor
     fine: Tensor
-
-    @classmethod
-    def of(cls, picture: Tensor) -> Scales:
-        """Return a picture (n, 3, y, x) at half size and at full size."""
-        y, x = picture.shape[-2:]
-        return cls(resize(picture, -(-y // 2), -(-x // 2)), picture)
 
 
 class Learner:
@@ -64,17 +58,17 @@ class Learner:
         self.begin(Stage(iterations=0), learns=True)
 
     def _start(self, step: Step) -> nn.Module:
-        """Return the parameters of the mask that is trained, at the start of the training."""
+        """Return the parameters of the mask that learns."""
         path = step.node.path
         if path not in PARAMETRISATIONS:
-            text = f"{self.settings.learn} is {path}, which cannot be trained; {nearest(path, PARAMETRISATIONS)}"
-            raise ValueError(f"train: {text}; or design the mask without images: --stage mask")
+            text = f"{self.settings.learn} is {path}, of which nothing is learnt; {nearest(path, PARAMETRISATIONS)}"
+            raise ValueError(f"train: {text}; or design it without images: --stage mask")
         return PARAMETRISATIONS[path](step.params, self._rng("element"))
 
     def height(self) -> Tensor:
-        """Return the height map (v, u) of the mask in m; raise ValueError if no mask is trained."""
+        """Return the height map (v, u) in m; raise ValueError where no mask learns."""
         if self._step is None:
-            raise ValueError("train.learn: no mask is trained")
+            raise ValueError("train.learn: no mask learns")
         made: Tensor = self.mask(stop(*(self._step.params[name] for name in GRID)))
         return made
 
@@ -169,7 +163,8 @@ class Learner:
         with low:
             coarse, fine = self.net.pyramid(picture)
         estimate = Scales(coarse.to(self.settings.dtype), fine.to(self.settings.dtype))
-        truth = Scales.of(sample.truth.detach())
+        y, x = sample.truth.shape[-2:]
+        truth = Scales(resize(sample.truth.detach(), -(-y // 2), -(-x // 2)), sample.truth.detach())
         zero = torch.zeros((), device=fine.device)
         terms = {"L1": (0.0, (estimate.fine - truth.fine).abs().mean())}
         if self.stage.bsr:

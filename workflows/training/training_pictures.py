@@ -1,10 +1,8 @@
 """The numbered pictures of a training, each with its own scene, laser, sensor and noise.
 
-The steps of a recipe fall into three parts. Steps that depend neither on the mask nor on a drawn value are computed
-once. Steps that depend on the mask alone are computed once in each iteration. Steps that depend on a scene, a drawn
-value or a random step are computed for each picture. The gradient at the border between the second and the third part
-is summed over all pictures, so that one picture is in memory at a time. Each of several processes has its own pictures,
-and along a band axis its own bands.
+Steps that depend neither on the mask nor on a drawn value are computed once, steps that depend only on the mask once
+in each iteration, and steps that depend on a scene, a drawn value or noise once for each picture. Gradients of steps
+that depend only on the mask are summed over all pictures, so that one picture is in memory at a time.
 """
 
 from __future__ import annotations
@@ -77,7 +75,7 @@ class TrainingStream:
         drawn = _behind(recipe, order, noise | {settings.scene, *(name.rpartition(".")[0] for name in readers)})
         learnt = _behind(recipe, order, {learn} if learn else set())
         if settings.psf in drawn:
-            raise ValueError(f"{settings.psf} changes with each picture: name a PSF in train.psf that does not")
+            raise ValueError(f"{settings.psf} changes with each picture: name a PSF in train.psf that does not change")
         self.shards = Shards.of(recipe, settings.psf, wanted, drawn | learnt, store, mesh)
         drawn |= self.shards.behind
         read = _sources(recipe, drawn) | {settings.psf}

@@ -103,7 +103,7 @@ def test_what_a_recipe_has_laws_for_is_drawn_for_each_scene(tmp_path, store):
     bench, seen = EvaluationPoints(store, 16), list[dict[str, float]]()
     for scene in shown:
         for pipeline in each:
-            recipe = pipeline.recipes[scene.case]
+            recipe = pipeline.recipe(scene.case)
             seen.append(scene.draw(Inputs.of(recipe, pipeline.pipeline.outputs)))
             units = {
                 name: f"{value!r} e-" if name == "sensor.offset" else repr(value) for name, value in seen[-1].items()
@@ -263,7 +263,7 @@ def test_weights_of_another_network_are_refused(tmp_path):
         (["--data", "empty"], "--data empty: no photograph that can be read"),
         (["--strengths", "0,lots"], "--strengths: lots is no number"),
         (["--strengths", "-1"], "--strengths: write multiples"),
-        (["--reference", "flat+wiener"], "--reference flat+wiener: is none of the pipelines"),
+        (["--reference", "flat+wiener"], "--reference flat+wiener: write one of the pipelines"),
         (["--pipelines", "flat"], "flat: write MASK+RESTORER"),
     ],
 )

@@ -61,6 +61,7 @@ class LiftLearner:
         self.net = start_mst_plus_plus(rng, self.linear if settings.start == "linear" else None)
         self.optimiser = torch.optim.Adam(self.net.parameters(), lr=settings.rate, betas=settings.betas)
         self.average = averaged(self.net, settings.ema_decay)
+        self.best: nn.Module = self.average.module if self.average else self.net
 
     def parts(self) -> dict[str, Any]:
         """Return every part whose state decides later iterations, by name."""
@@ -85,10 +86,6 @@ class LiftLearner:
             self.average.update_parameters(self.net)
         return found
 
-    def best(self) -> nn.Module:
-        """Return the network with averaged weights, or the network itself if the weights are not averaged."""
-        return self.average.module if self.average else self.net
-
     @torch.no_grad()
     def validate(self) -> dict[str, Losses]:
         """Return the mean errors of the network and of the linear estimate on pictures outside of the training."""
@@ -108,7 +105,7 @@ class LiftLearner:
         """Return the spectra of a picture that the network estimates, and the linear estimate of the spectra."""
         linear = torch.einsum("bc,cyx->byx", self.linear, picture)
         return {
-            "mst_plus_plus": lift_pictures(self.best(), picture[None])[0].clamp_min(0),
+            "mst_plus_plus": lift_pictures(self.best, picture[None])[0].clamp_min(0),
             "linear": linear.clamp_min(0),
         }
 

@@ -63,8 +63,6 @@ def _key(recipe: Recipe, settings: LiftTraining) -> str:
 
 
 class _LiftLoop(ResumableLoop[LiftLearner]):
-    """The training of a lift, which has no stages."""
-
     def __init__(
         self, settings: LiftTraining, learner: LiftLearner, folder: Path, progress: Progress, device: str,
         watch: Watch | None,
@@ -80,7 +78,7 @@ class _LiftLoop(ResumableLoop[LiftLearner]):
         if self.iteration < self.settings.iterations:
             self.run(self.settings.iterations, self.settings.batch)
             self.keep()
-        export(self.folder, "mst_plus_plus", self.learner.best().state_dict())
+        export(self.folder, "mst_plus_plus", self.learner.best.state_dict())
         self.close(
             lift_curves(self.rows.rows),
             recipe.name,
@@ -91,7 +89,6 @@ class _LiftLoop(ResumableLoop[LiftLearner]):
         )
 
     def iterate(self) -> Losses:
-        """Train on one batch of pictures."""
         return self.learner.iterate(self.iteration)
 
     @torch.no_grad()

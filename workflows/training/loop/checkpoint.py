@@ -7,6 +7,7 @@ import io
 import os
 from collections.abc import Mapping, Sequence
 from contextlib import suppress
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -30,11 +31,11 @@ def write_whole(path: Path, data: bytes) -> None:
         raise
 
 
+@dataclass(frozen=True)
 class StateFile:
     """A file with the state of unfinished work; a killed process leaves either the old or the new state, complete."""
 
-    def __init__(self, path: Path) -> None:
-        self.path = path
+    path: Path
 
     def write(self, state: Mapping[str, Any]) -> None:
         """Write the state in place of the old state."""

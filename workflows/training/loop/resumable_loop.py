@@ -55,7 +55,7 @@ class ResumableLoop(ABC, Generic[L]):
 
     @abstractmethod
     def iterate(self) -> Losses:
-        """Compute one iteration and return its losses; raise `NotFinite` before a bad step."""
+        """Compute one iteration and return the losses; raise `NotFinite` before a step with NaN or infinity."""
 
     @abstractmethod
     def show(self) -> None:
@@ -142,7 +142,7 @@ def require_finite(numbers: Mapping[str, float]) -> None:
     """Raise `NotFinite` with the names of all numbers that are NaN or infinite."""
     wrong = [name for name, x in numbers.items() if not abs(x) < float("inf")]
     if wrong:
-        raise NotFinite(f"not finite: {', '.join(wrong)}")
+        raise NotFinite(f"NaN or infinite: {', '.join(wrong)}")
 
 
 def averaged(net: nn.Module, decay: float) -> AveragedModel | None:

@@ -112,7 +112,7 @@ class DesignedMask:
         store: Store | None,
         kept: StateFile,
         progress: Progress,
-        device: str = "cpu",
+        device: str,
     ) -> DesignedMask:
         """Optimise a mask, or continue from the state ``kept``, and compute the figures of merit of the mask."""
         learning = Terms(_at(recipe, settings), settings, store, device)
@@ -142,7 +142,6 @@ class DesignedMask:
         folder.write("mask.json", json.dumps(document, indent=1))
 
     def _report(self, shown: Sequence[str]) -> StudyReport:
-        """Return the page, the pictures, the table of losses and the height map of the mask."""
         from safetensors.torch import save
 
         from neusee.workflows.training.mask_design.design_page import pictures, sections

@@ -42,16 +42,13 @@ class Fabrication:
         """Return the name and the value of each limit in words."""
         words = {"levels": "levels", "max_height": "greatest height", "wrap_at": "wrapped at one wave of",
                  "feature": "least feature"}  # fmt: skip
-        return [(words[name], _limit(name, value)) for name, value in self.values.items()]
+        texts = {name: _FREE if x is None else f"{x * 1e6:.4g} um" for name, x in self.values.items()}
+        if (levels := self.values["levels"]) is not None:
+            texts["levels"] = str(levels)
+        return [(words[name], text) for name, text in texts.items()]
 
     def __str__(self) -> str:
         return ", ".join(f"{name} {text}" for name, text in self.rows() if text != _FREE) or "no limits"
-
-
-def _limit(name: str, value: Any) -> str:
-    if value is None:
-        return _FREE
-    return str(value) if name == "levels" else f"{value * 1e6:.4g} um"
 
 
 class Terms:
@@ -60,31 +57,27 @@ class Terms:
     def __init__(self, recipe: Recipe, settings: MaskTraining, store: Store | None, device: str = "cpu") -> None:
         need_steps(recipe.steps, settings)
         self.settings = settings
+        self.fabrication = Fabrication.of(recipe, settings)
         self.recipe = replace(recipe, exact=True)  # the bound on the effect of a mask has no gradient
         self._bands = _bands_step(self.recipe, settings.psf)
         self._function = as_function(
             self.recipe, settings.height, self._bands, outputs=[settings.psf], store=store, device=device
         )
-        channels = [settings.illuminant, settings.responses] if settings.weights.wiener else []
-        results = run(self.recipe, store, [self._bands, settings.plain, *channels], device=device)
-        self._channels: list[Tensor] = [results[name] for name in channels]
-        self.bands: Bands = results[self._bands]
-        self._plain: Psf = results[settings.plain]
+        seen = [settings.illuminant, settings.responses] if settings.weights.wiener else []
+        done = run(self.recipe, store, [self._bands, settings.plain, *seen], device=device)
+        self._seen: list[Tensor] = [done[name] for name in seen]
+        self.bands: Bands = done[self._bands]
+        self._plain: Psf = done[settings.plain]
         self.device = self._plain.intensity.device
 
     @property
-    def fabrication(self) -> Fabrication:
-        """Return the limits of fabrication of the mask."""
-        return Fabrication.of(self.recipe, self.settings)
-
-    @property
     def mask_step(self) -> Step:
-        """Return the step of the recipe whose height map is designed."""
+        """Return the step of the mask that is replaced."""
         return self.recipe.steps[self.settings.height]
 
     @cached_property
     def stop(self) -> Stop:
-        """Return the grid of the pupil of the step whose height map is designed."""
+        """Return the grid of the pupil that the replaced step has."""
         params = self.mask_step.params
         if missing := [name for name in ("samples", "pitch", "diameter", "aperture") if name not in params]:
             raise DesignError(f"height: {self.settings.height} has no {missing[0]}: take a recipe whose mask is a doe")
@@ -135,7 +128,7 @@ class Terms:
         return loss.clamp_min(count * (math.log(settings.enough) if settings.log else settings.enough))
 
     def _wiener_error(self, psf: Psf, chosen: Sequence[int] | None) -> Tensor:
-        light, responses = (x if chosen is None else x[..., list(chosen)] for x in self._channels)
+        light, responses = (x if chosen is None else x[..., list(chosen)] for x in self._seen)
         bands, settings = _some(self.bands, chosen), self.settings
         error: Tensor = losses.wiener(
             psf, light, responses, bands, noise=settings.noise_share, colour=settings.colour, up_to=settings.up_to

@@ -4,7 +4,8 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable
-from dataclasses import dataclass, field
+from copy import deepcopy
+from dataclasses import dataclass
 from typing import Any
 
 import torch
@@ -39,7 +40,7 @@ class LearntMask:
     height: Callable[[Stop], Tensor]
     loss: float
     numbers: dict[str, Any]  #: parameters of a mask with few parameters
-    history: list[dict[str, float]] = field(default_factory=list)
+    history: list[dict[str, float]]
 
 
 def learn(terms: Terms, state: StateFile, progress: Progress) -> LearntMask:
@@ -52,7 +53,7 @@ def learn(terms: Terms, state: StateFile, progress: Progress) -> LearntMask:
 
 
 def shape_of(settings: MaskTraining, start: int, step: Step) -> nn.Module:
-    """Return the parameters of the mask of ``step`` at the beginning of a start."""
+    """Return the parameters to learn, as they are at a start; ``step`` is the step of the mask."""
     shape = _free(settings, torch.Generator().manual_seed(settings.seed + _APART * start), step)
     return shape if settings.feature is None else Written(shape, settings.feature)
 
@@ -60,7 +61,7 @@ def shape_of(settings: MaskTraining, start: int, step: Step) -> nn.Module:
 def _free(settings: MaskTraining, rng: torch.Generator, step: Step) -> nn.Module:
     if settings.kind == "recipe_mask":
         if step.node.path not in PARAMETRISATIONS:
-            raise DesignError(f"kind: {step.name} is {step.node.path}, whose samples cannot be optimised")
+            raise DesignError(f"kind: {step.name} is {step.node.path}, whose samples are not learnt")
         return PARAMETRISATIONS[step.node.path](step.params, rng)
     if settings.kind == "pixelwise":
         return Pixels(settings.grid, settings.max_height, settings.scale, rng, _start(settings))
@@ -102,7 +103,7 @@ def _descend(terms: Terms, file: StateFile, progress: Progress) -> LearntMask:
         if not math.isfinite(loss):
             raise DesignError(f"start {start + 1}: the loss on all bands is NaN or infinite: lower the learning rate")
         if state["best"] is None or loss < state["best"]["loss"]:
-            state["best"] = {"loss": loss, "start": start, "shape": _copied(shape.state_dict())}
+            state["best"] = {"loss": loss, "start": start, "shape": deepcopy(shape.state_dict())}
         for name in ("shape", "adam", "iteration"):
             state.pop(name, None)
         state["start"] = start + 1
@@ -115,7 +116,7 @@ def _descend(terms: Terms, file: StateFile, progress: Progress) -> LearntMask:
 def _one_start(
     terms: Terms, shape: nn.Module, start: int, state: dict[str, Any], file: StateFile, progress: Progress
 ) -> None:
-    """Optimise the parameters of one start, and add the losses and, at times, the parameters to ``state``."""
+    """Optimise the parameters from one start, and save the losses and, at times, the parameters in ``state``."""
     settings = terms.settings
     adam = torch.optim.Adam(shape.parameters(), lr=settings.rate)
     if "shape" in state:
@@ -128,7 +129,7 @@ def _one_start(
         state["history"].append(row)
         if (number + 1) % settings.save_every == 0:
             progress(f"{number + 1}/{settings.iterations}  {_losses_line(row)}")
-            state |= {"shape": _copied(shape.state_dict()), "adam": adam.state_dict(), "iteration": number + 1}
+            state |= {"shape": shape.state_dict(), "adam": adam.state_dict(), "iteration": number + 1}
             file.write(state)
 
 
@@ -153,12 +154,8 @@ def _losses_line(row: dict[str, float]) -> str:
     return ", ".join(f"{name} {value:.5g}" for name, value in row.items() if name not in ("start", "iteration"))
 
 
-def _copied(state: dict[str, Tensor]) -> dict[str, Tensor]:
-    return {name: value.detach().cpu().clone() for name, value in state.items()}
-
-
 def _few(shape: nn.Module) -> dict[str, Any]:
-    """Return the parameters of a mask that has at most 1000 parameters in a row, such as the waves of modes."""
+    """Return the parameters of a mask as lists, without matrices and without lists of more than 1000 numbers."""
     inner: Any = shape.shape if isinstance(shape, Written) else shape
     state = {} if isinstance(inner, Drawn) else inner.state_dict()
     return {name: x.tolist() for name, x in state.items() if x.numel() <= 1000 and x.dim() == 1}
@@ -169,7 +166,8 @@ def _few(shape: nn.Module) -> dict[str, Any]:
 
 def half_ring_height(genes: Any, settings: MaskTraining) -> Callable[[Stop], Tensor]:
     """Return a function that computes the height map of the half-rings of a set of genes on a grid."""
-    given = _half_ring_parameters(genes)
+    *slopes, side, turn = (float(gene) for gene in genes)
+    given = {"waves": tuple(slopes), "alternate": side >= 0.5, "orientation": turn}
 
     def height(grid: Stop) -> Tensor:
         made: Tensor = half_rings(
@@ -179,12 +177,6 @@ def half_ring_height(genes: Any, settings: MaskTraining) -> Callable[[Stop], Ten
         return made
 
     return height if settings.feature is None else Written(height, settings.feature)
-
-
-def _half_ring_parameters(genes: Any) -> dict[str, Any]:
-    """Return the parameters of `half_rings`: five slopes, the side of every second ring and the orientation."""
-    *slopes, side, turn = (float(gene) for gene in genes)
-    return {"waves": tuple(slopes), "alternate": side >= 0.5, "orientation": turn}
 
 
 class _LossOfGenes:
@@ -227,7 +219,9 @@ def _evolve(terms: Terms, state: StateFile, progress: Progress) -> LearntMask:
         populations.append((least, genes))
     state.write({"values": loss.known})
     least, genes = min(populations, key=lambda pair: pair[0])
-    return LearntMask(half_ring_height(genes, settings), least, _half_ring_parameters(genes), history)
+    *waves, side, turn = (float(x) for x in genes)
+    numbers = {"waves": waves, "alternate": side >= 0.5, "orientation": turn}
+    return LearntMask(half_ring_height(genes, settings), least, numbers, history)
 
 
 def _population(
@@ -257,7 +251,7 @@ def _population(
             polish=False,
             tol=0.0,
             callback=note_generation,
-            x0=_USUAL if min(_USUAL[:5]) >= settings.slopes[0] and max(_USUAL[:5]) <= settings.slopes[1] else None,
+            x0=_USUAL if _holds_usual(settings) else None,
         )
         if settings.polish:  # on all bands, because a tenth of a wave changes the peak
             loss.chosen = None
@@ -274,3 +268,8 @@ def _steepest(terms: Terms) -> float:
     material, wavelength = terms.settings.material, terms.settings.wavelength
     turned = wave_height(material, wavelength) / wave_height(material, float(terms.bands.centres.min()))
     return terms.stop.diameter / (4 * terms.stop.pitch * turned)
+
+
+def _holds_usual(settings: MaskTraining) -> bool:
+    """Return True if the slopes that were chosen by hand lie within the allowed slopes."""
+    return settings.slopes[0] <= min(_USUAL[:5]) and settings.slopes[1] >= max(_USUAL[:5])

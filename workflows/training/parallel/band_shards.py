@@ -1,9 +1,8 @@
-"""The steps that several processes share by wavelength, and the steps that need all bands again.
+"""The steps whose bands are divided among several processes, and the later steps that need all bands.
 
-A node that declares its bands gives each band the same bits, whatever other bands are computed in the same call. So
-each process computes its own bands of every step that works on the bands of the scene. The first later step that does
-not work band by band needs all bands: every process gathers the bands of the mask's PSF, and the bands of a picture are
-sent to the process that owns the picture. Where only sums over the bands of an image are read, only the sums are sent.
+Each process computes its own bands of every step that works band by band. The first later step that does not work band
+by band needs all bands: every process gathers the bands of the mask's PSF, and the bands of a picture are sent to the
+process that owns the picture. Where only sums over the bands of an image are read, only the sums are sent.
 """
 
 from __future__ import annotations
@@ -32,20 +31,20 @@ Port = Swapped | Sum
 
 @dataclass(frozen=True)
 class Shards:
-    """The steps of a recipe that several processes share by band, and the steps that depend on shared steps."""
+    """The steps of a recipe whose bands are divided among processes, and the later steps that need all bands."""
 
     recipe: Recipe
     mesh: Mesh = ALONE
     count: int = 0  #: bands of the scene
-    steps: frozenset[str] = frozenset()  #: shared steps, of which each process computes its own bands
-    behind: frozenset[str] = frozenset()  #: steps that need all bands of a shared step
+    steps: frozenset[str] = frozenset()  #: steps of which each process computes its own bands
+    behind: frozenset[str] = frozenset()  #: later steps, which need all bands
     rows: Mapping[str, Tensor] = field(default_factory=dict)  #: weights of sums, by image whose bands are only summed
 
     @classmethod
     def of(
         cls, recipe: Recipe, psf: str, wanted: Sequence[str], live: Collection[str], store: Store, mesh: Mesh
     ) -> Shards:
-        """Return the division of the ``live`` steps among the processes; raise MeshError for too few bands."""
+        """Divide the ``live`` steps by band among the processes; raise MeshError for too few bands."""
         if mesh.band == 1:
             return cls(recipe)
         spectral = _sampled(recipe, psf)
@@ -69,19 +68,19 @@ class Shards:
         return own_bands(self.mesh, self.count)
 
     def call(self, step: Step, inputs: Sequence[Any], params: Mapping[str, Any], seed: int, device: str) -> Any:
-        """Compute a step and return its result; of a shared step, compute only the bands of this process."""
+        """Compute a step and return its result, only at the bands of this process if the step is divided by band."""
         if step.name in self.steps:
             whole = [name for name in step.node.inputs if step.wires.get(name) not in self.steps]
             inputs = taken(step, inputs, self.own, whole)
         return call(step, inputs, params, seed, device)
 
     def gathered(self, name: str, value: Any) -> Any:
-        """Gather all bands of the result of a shared step from all processes."""
+        """Gather all bands of a result of which each process has its own bands."""
         axis = self.axis(name)
         return with_band_tensors(value, [gathered(self.mesh, x, axis, self.count) for x in band_tensors(value)])
 
     def axis(self, name: str) -> int:
-        """Return the axis along which the bands of a shared step lie."""
+        """Return the axis of the bands in the result of a step that works band by band."""
         bands = self.recipe.steps[name].node.bands
         assert bands is not None
         return bands["return"]

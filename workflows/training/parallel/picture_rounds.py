@@ -1,7 +1,7 @@
-"""Pictures of processes that share bands: each process begins all pictures of a round and finishes its own picture.
+"""Pictures of processes that share bands: each process begins the pictures of all and finishes its own picture.
 
-Every process computes its bands of every picture of the round. Then the bands, or sums over the bands, are sent to the
-process that owns the picture, and this process computes all later steps. Gradients return to all processes.
+Every process computes its bands of every picture. Then the process that owns a picture receives the bands, or sums over
+the bands, and computes all later steps. Gradients return to all processes.
 """
 
 from __future__ import annotations
@@ -54,7 +54,7 @@ class Pictures:
     def together(
         self, shared: Shared, drawn: Mapping[int, tuple[Theta, int]], mine: int | None
     ) -> Iterator[dict[str, Any]]:
-        """Begin all pictures of a round, and yield the outputs of picture ``mine``, or nothing if it is None.
+        """Begin the pictures of all processes, and yield the outputs of picture ``mine``, or nothing for None.
 
         When the block ends, the gradients return to the processes that sent the bands.
         """
@@ -70,7 +70,7 @@ class Pictures:
 
 
 class _Cut:
-    """The results of a round that are sent to the processes that own the pictures."""
+    """The results of several pictures that are sent to the processes that own the pictures."""
 
     def __init__(self, begun: Sequence[Mapping[str, Any]], names: Sequence[str], shards: Shards) -> None:
         self._sent: list[tuple[Port, tuple[Tensor, ...], Tensor]] = []  #: tensors of all pictures, and what is received

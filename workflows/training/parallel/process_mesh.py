@@ -1,9 +1,8 @@
 """The mesh (data, band) of the processes that `torchrun` starts for one training.
 
-Every process runs the same program. Along the data axis the processes have different pictures; along the band axis the
-processes share the optics of the same pictures by wavelength. Networks, optimisers and the state are equal in all
-processes: gradients are added over all processes, and each process takes the same step. A single process is a mesh of
-1 x 1, which sends no messages.
+Processes along the data axis have different pictures. Processes along the band axis share the optics of the same
+pictures by wavelength. Gradients are added over all processes, so that networks, optimisers and state stay equal in all
+processes. A single process is a mesh of 1 x 1, which sends no messages.
 """
 
 from __future__ import annotations
@@ -71,10 +70,10 @@ class Mesh:
         dist.all_gather_object(texts, about)
         for rank, other in enumerate(texts):
             if other != texts[0]:
-                raise MeshError(f"process 0 is at {texts[0]}, process {rank} at {other}: give all the same folder")
+                raise MeshError(f"process 0 is at {texts[0]}, process {rank} at {other}: use the same folder in all")
 
     def numbers(self, own: Mapping[str, float], names: Sequence[str], device: str) -> dict[str, float]:
-        """Return the sums over all processes of the numbers ``names``."""
+        """Return the sum over all processes of each of the numbers ``names``."""
         if self.size == 1:
             return dict(own)
         total = torch.tensor([own.get(name, 0.0) for name in names], dtype=torch.float64, device=device)

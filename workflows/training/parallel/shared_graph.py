@@ -18,9 +18,9 @@ from neusee.workflows.training.parallel.collectives import gathered_back
 class Shared:
     """Results that depend on the mask alone, and detached copies at which the gradients of all pictures add up."""
 
-    made: Mapping[str, Any]  #: results with their graph; for shared steps, the bands of this process
+    made: Mapping[str, Any]  #: results with their graph, at the bands of this process
     values: Mapping[str, Any]  #: detached copies
-    whole: Mapping[str, Any] = field(default_factory=dict)  #: all bands of the shared steps that later steps read whole
+    whole: Mapping[str, Any] = field(default_factory=dict)  #: copies with all bands
     shards: Shards | None = None
 
     @classmethod
@@ -34,7 +34,7 @@ class Shared:
 
     @property
     def seen(self) -> Mapping[str, Any]:
-        """Return the copies for steps that need all bands."""
+        """Return the detached copies, with all bands of results that later steps read whole."""
         return {**self.values, **self.whole}
 
     def back(self) -> None:
@@ -58,7 +58,7 @@ class Shared:
 
 
 def leaf(x: Tensor) -> Tensor:
-    """Return a detached copy of a tensor that takes up gradients if the tensor requires gradients."""
+    """Return a detached copy of a tensor, which requires gradients if the tensor requires gradients."""
     return x.detach().requires_grad_(x.requires_grad)
 
 

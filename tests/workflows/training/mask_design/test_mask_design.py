@@ -202,7 +202,7 @@ def test_a_filter_leaves_the_same_wrong_of_all_bands_chosen_or_not(recipe, store
 
 def test_a_relief_that_is_not_learnt_is_refused(store, tmp_path):
     flat = load("plain_lens", SMALL)
-    with pytest.raises(DesignError, match=r"kind: height is doe.flat, whose samples cannot be optimised"):
+    with pytest.raises(DesignError, match=r"kind: height is doe.flat, whose samples are not learnt"):
         design(flat, how(kind="recipe_mask", iterations=1), store, tmp_path, quiet)
 
 
