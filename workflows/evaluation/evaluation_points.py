@@ -59,27 +59,27 @@ class EvaluationPoints:
         self._fixed: dict[str, Any] = {}  #: results that do not depend on a scene, by key: one copy for all functions
         self._kept = _SharedResults()
 
-    def point(self, pipeline: PipelineRecipes, wanted: PointRequest) -> PointNumbers:
+    def point(self, pipeline: PipelineRecipes, point: PointRequest) -> PointNumbers:
         """Return the numbers of a point from the store, or compute and store them."""
-        compute = partial(self._measure, pipeline, wanted)
-        return compute_once(self.store, self.key(pipeline, wanted), dict, compute, {"step": "evaluate"}, small=True)
+        compute = partial(self._measure, pipeline, point)
+        return compute_once(self.store, self.key(pipeline, point), dict, compute, {"step": "evaluate"}, small=True)
 
-    def _measure(self, pipeline: PipelineRecipes, wanted: PointRequest) -> PointNumbers:
+    def _measure(self, pipeline: PipelineRecipes, point: PointRequest) -> PointNumbers:
         began = time.perf_counter()
-        point = self._numbers(pipeline, self.values(pipeline, wanted))
+        numbers = self._numbers(pipeline, self.values(pipeline, point))
         self.seconds += time.perf_counter() - began
         self.computed += 1
-        return point
+        return numbers
 
-    def values(self, pipeline: PipelineRecipes, wanted: PointRequest, more: Sequence[str] = ()) -> dict[str, Any]:
+    def values(self, pipeline: PipelineRecipes, point: PointRequest, more: Sequence[str] = ()) -> dict[str, Any]:
         """Return the outputs of a run with this scene and laser, and the results of the steps ``more``."""
         outputs = (*pipeline.pipeline.outputs, *more)
-        function = self._function(pipeline, wanted.lit, outputs)
-        self._kept.turn(wanted)
+        function = self._function(pipeline, point.lit, outputs)
+        self._kept.turn(point)
         with torch.no_grad():
-            changed = self._changed(pipeline.recipe(wanted.lit), wanted, outputs)
+            changed = self._changed(pipeline.recipe(point.lit), point, outputs)
             known = {name: value for name, value in changed.items() if name in function.free}
-            values: dict[str, Any] = function({"scene": wanted.scene.picture, **known})
+            values: dict[str, Any] = function({"scene": point.scene.picture, **known})
         return values
 
     def forget(self) -> None:
@@ -89,18 +89,18 @@ class EvaluationPoints:
         self._fixed = {key: value for key, value in self._fixed.items() if id(value) in used}
         self._kept.clear()
 
-    def key(self, pipeline: PipelineRecipes, wanted: PointRequest) -> str:
+    def key(self, pipeline: PipelineRecipes, point: PointRequest) -> str:
         """Return a digest of everything that decides a point: the keys of a run and the settings of the comparison."""
-        recipe, outputs = pipeline.recipe(wanted.lit), pipeline.pipeline.outputs
+        recipe, outputs = pipeline.recipe(point.lit), pipeline.pipeline.outputs
         params: dict[str, dict[str, Any]] = {}
-        for name, value in self._changed(recipe, wanted, outputs).items():
+        for name, value in self._changed(recipe, point, outputs).items():
             step, _, param = name.rpartition(".")
             params.setdefault(step, {})[param] = value
         steps = {
             name: replace(recipe.steps[name], params={**recipe.steps[name].params, **changed})
             for name, changed in params.items()
         }
-        keys = self._keys(replace(recipe, steps={**recipe.steps, **steps}), outputs, wanted.scene)
+        keys = self._keys(replace(recipe, steps={**recipe.steps, **steps}), outputs, point.scene)
         within = [recipe.tolerance, recipe.exact, device_kind(self.device), self.small]
         own = [self._code.digest(used.__module__) for used in (quality, resize)]
         return digest("evaluate", engine("evaluation.evaluation_points"), [keys[name] for name in outputs], within, own)
@@ -127,18 +127,18 @@ class EvaluationPoints:
             if case != NONE:
                 free += [f"direction[{BEAM}].angle", *(f"{spot}.strength" for spot in _spots(recipe, outputs))]
             caller = self._kept.caller(_reached(whole, [n for n in whole.steps if n.partition("[")[0] in _MOVED]))
-            found: Any = as_function(whole, *free, outputs=outputs, store=self.store, device=self.device, caller=caller)
-            self._share(found, whole)
-            self._functions[name] = found
+            ways: dict[str, Any] = {"store": self.store, "device": self.device, "caller": caller}
+            self._functions[name] = as_function(whole, *free, outputs=outputs, **ways)
+            self._share(self._functions[name], whole)
         return self._functions[name]
 
-    def _changed(self, recipe: Recipe, wanted: PointRequest, outputs: Sequence[str]) -> dict[str, Any]:
+    def _changed(self, recipe: Recipe, point: PointRequest, outputs: Sequence[str]) -> dict[str, Any]:
         """Return the parameters that a point changes: drawn values, and the direction and strength of the laser."""
         inputs = self._inputs(recipe, outputs)
-        changed = inputs.theta(wanted.scene.draw(inputs)) if inputs else {}
-        if wanted.lit != NONE:
-            changed[f"direction[{BEAM}].angle"] = wanted.scene.angle(recipe)
-            changed |= {f"{spot}.strength": wanted.strength for spot in _spots(recipe, outputs)}
+        changed = inputs.theta(point.scene.draw(inputs)) if inputs else {}
+        if point.lit != NONE:
+            changed[f"direction[{BEAM}].angle"] = point.scene.angle(recipe)
+            changed |= {f"{spot}.strength": point.strength for spot in _spots(recipe, outputs)}
         return changed
 
     def _inputs(self, recipe: Recipe, outputs: Sequence[str]) -> Inputs | None:
@@ -153,7 +153,7 @@ class EvaluationPoints:
         return self._drawn[key][1]
 
     def _share(self, function: Any, recipe: Recipe) -> None:
-        """Replace the fixed results of a function by the same results of earlier functions, which saves memory."""
+        """Give a function the equal fixed results of earlier functions, so that later results are shared too."""
         keys = self._keys(recipe, function.fixed)
         for name, value in function.fixed.items():
             function.fixed[name] = self._fixed.setdefault(keys[name], value)
@@ -190,14 +190,14 @@ class _SharedResults:
         self._of_scene.clear()
         self._of_strength.clear()
 
-    def turn(self, wanted: PointRequest) -> None:
+    def turn(self, point: PointRequest) -> None:
         """Go to a point, and release the results of other scenes, lasers and strengths."""
-        scene = (wanted.scene.number, wanted.scene.seed, wanted.scene.case)
+        scene = (point.scene.number, point.scene.seed, point.scene.case)
         if scene != self._scene:
             self._of_scene.clear()
-        if (*scene, wanted.strength) != (*self._scene, self._strength):
+        if (*scene, point.strength) != (*self._scene, self._strength):
             self._of_strength.clear()
-        self._scene, self._strength, self._seed = scene, wanted.strength, wanted.scene.seed
+        self._scene, self._strength, self._seed = scene, point.strength, point.scene.seed
 
     def caller(self, moved: set[str]) -> Callable[..., Any]:
         """Return a function that computes a step, or returns the kept result of a step for the same input objects.
@@ -223,11 +223,11 @@ def _spots(recipe: Recipe, outputs: Sequence[str]) -> list[str]:
 
 def _reached(recipe: Recipe, roots: Iterable[str]) -> set[str]:
     """Return the steps ``roots`` and all steps that depend on these steps."""
-    found = set(roots)
+    reached = set(roots)
     for name in needed(recipe, recipe.steps):
-        if not found.isdisjoint(recipe.steps[name].sources):
-            found.add(name)
-    return found
+        if not reached.isdisjoint(recipe.steps[name].sources):
+            reached.add(name)
+    return reached
 
 
 def reduced(picture: Tensor, side: int) -> Tensor:

@@ -80,13 +80,13 @@ def evaluate(
     points = _points(bench, each, shown, strengths, progress)
     optics = masks(each, store, device, points)
     drawn = panels(bench, each, shown[0], strengths)
-    tables = {name: metric_table(found, strengths) for name, found in points.items()}
+    tables = {name: metric_table(own, strengths) for name, own in points.items()}
     least = min(small, *(base.steps["truth"].params["shape"])) if "truth" in base.steps else small
     more = {name: compare_with(own, tables[reference], base.seed) for name, own in tables.items()}
     rest = (reference, points, tables, more, optics, drawn, list(pipelines))
-    found = EvaluationResult(base, shown, broken, strengths, least, *rest)
-    document = study_run.document(_document(found, bench))
-    return study_run.write(runs, digest(document["summary"]), document, _report(found))
+    result = EvaluationResult(base, shown, broken, strengths, least, *rest)
+    document = study_run.document(_document(result, bench))
+    return study_run.write(runs, digest(document["summary"]), document, _report(result))
 
 
 def _strengths(strengths: Sequence[float]) -> tuple[float, ...]:
@@ -117,7 +117,7 @@ def _points(
     progress: Progress,
 ) -> dict[str, list[dict[float, PointNumbers]]]:
     """Compute all points, with the scenes of one laser one after another because these scenes share optics."""
-    found: dict[str, list[dict[float, PointNumbers]]] = {p.name: [{} for _ in shown] for p in each}
+    points: dict[str, list[dict[float, PointNumbers]]] = {p.name: [{} for _ in shown] for p in each}
     before, order = "", [scene.case for scene in shown]
     for done, scene in enumerate(sorted(shown, key=lambda scene: order.index(scene.case)), 1):
         if before not in ("", scene.case):
@@ -126,58 +126,58 @@ def _points(
         for strength in strengths if scene.case != NONE else (0.0,):
             for pipeline in each:
                 point = bench.point(pipeline, PointRequest(alone, strength))
-                found[pipeline.name][scene.number][strength] = point
+                points[pipeline.name][scene.number][strength] = point
         progress(f"scene {done} of {len(shown)} ({scene.case}, {scene.name}): {bench.computed} points computed")
-    return found
+    return points
 
 
 # --- the folder -------------------------------------------------------------------------------------------------------
 
 
-def _document(found: EvaluationResult, bench: EvaluationPoints) -> dict[str, Any]:
+def _document(result: EvaluationResult, bench: EvaluationPoints) -> dict[str, Any]:
     from neusee.workflows.evaluation.evaluation_page import summary
 
     return {
-        "scenes": [[s.number, s.name, s.case, s.seed] for s in found.scenes],
-        "not read": [[str(path), reason] for path, reason in found.broken],
-        "strengths": list(found.strengths),
-        "small": found.small,
-        "reference": found.reference,
+        "scenes": [[s.number, s.name, s.case, s.seed] for s in result.scenes],
+        "not read": [[str(path), reason] for path, reason in result.broken],
+        "strengths": list(result.strengths),
+        "small": result.small,
+        "reference": result.reference,
         "computed": bench.computed,
         "seconds a point": bench.seconds / bench.computed if bench.computed else None,
-        "summary": summary(found),
+        "summary": summary(result),
     }
 
 
-def _report(found: EvaluationResult) -> StudyReport:
+def _report(result: EvaluationResult) -> StudyReport:
     from neusee.workflows.evaluation.evaluation_page import COLUMNS, draw_pictures, lead, rows, sections
 
-    pictures = draw_pictures(found)
+    pictures = draw_pictures(result)
     tables: dict[str, CsvTable] = {
-        "points.csv": ((*_POINT, *METRICS), _point_rows(found)),
-        "table.csv": (COLUMNS, rows(found)),
-        "suppression.csv": (("mask", "wavelength (nm)", "lsr", "bsr", "floor"), _curve_rows(found)),
+        "points.csv": ((*_POINT, *METRICS), _point_rows(result)),
+        "table.csv": (COLUMNS, rows(result)),
+        "suppression.csv": (("mask", "wavelength (nm)", "lsr", "bsr", "floor"), _curve_rows(result)),
     }
     shown = ("command", "date", "seconds", "computed", "seconds a point", "reference", "versions")
-    title = f"{found.recipe.name}: evaluated"
-    return StudyReport(title, lead(found), sections(found, pictures), pictures, tables, shown=shown)
+    title = f"{result.recipe.name}: evaluated"
+    return StudyReport(title, lead(result), sections(result, pictures), pictures, tables, shown=shown)
 
 
 _POINT = ("pipeline", "mask", "restorer", "scene", "photograph", "laser", "strength")
 
 
-def _point_rows(found: EvaluationResult) -> list[Sequence[Any]]:
+def _point_rows(result: EvaluationResult) -> list[Sequence[Any]]:
     return [
         (p.name, p.front, p.back, s.number, s.name, s.case, f"{k:g}", *(point[metric] for metric in METRICS))
-        for p in found.pipelines
-        for s, at in zip(found.scenes, found.points[p.name], strict=True)
+        for p in result.pipelines
+        for s, at in zip(result.scenes, result.points[p.name], strict=True)
         for k, point in at.items()
     ]
 
 
-def _curve_rows(found: EvaluationResult) -> list[Sequence[Any]]:
+def _curve_rows(result: EvaluationResult) -> list[Sequence[Any]]:
     return [
         (name, f"{x:.6g}", *row)
-        for name, mask in found.masks.items()
+        for name, mask in result.masks.items()
         for x, *row in zip(mask.wavelengths, mask.lsr, mask.bsr, mask.floor, strict=True)
     ]

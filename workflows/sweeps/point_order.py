@@ -1,7 +1,7 @@
 """The order in which the points of a sweep run, the results that points share, and the work of each point.
 
 Two points share the result of a step if the step has the same key at both points. An axis that changes costly steps
-varies slowly, and only one axis changes from point to point, so that a costly result is needed only once in memory.
+varies slowly, and only one axis changes from point to point: a costly result is computed once and released soon.
 """
 
 from __future__ import annotations

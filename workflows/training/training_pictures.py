@@ -61,12 +61,12 @@ class TrainingStream:
         self.seed, self.mesh = recipe.seed, mesh
         self._pool = settings.pool if frozen else None
         self._kept: dict[tuple[int, int], Sample] = {}
-        wanted = (settings.picture, settings.truth, settings.light, settings.psf)
-        require_steps(recipe, "train", (*wanted, settings.scene, *([learn] if learn else [])))
-        self._inputs = Inputs.of(recipe, wanted) if recipe.uncertain and recipe.uncertain.names else None
+        outputs = (settings.picture, settings.truth, settings.light, settings.psf)
+        require_steps(recipe, "train", (*outputs, settings.scene, *([learn] if learn else [])))
+        self._inputs = Inputs.of(recipe, outputs) if recipe.uncertain and recipe.uncertain.names else None
         self.shape = _frame(recipe, settings.scene)
-        recipe = with_substitutions(frozen or recipe, wanted, {learn} if learn else ())
-        order = needed(recipe, wanted)
+        recipe = with_substitutions(frozen or recipe, outputs, {learn} if learn else ())
+        order = needed(recipe, outputs)
         self._lasers = [f"{n}.{_LASER[1]}" for n in order if recipe.steps[n].node.path == _LASER[0]]
         readers = dict.fromkeys([*(self._inputs.readers if self._inputs else ()), *self._lasers])
         self._readers = {name: _given(recipe, name) for name in readers}
@@ -76,7 +76,7 @@ class TrainingStream:
         learnt = _behind(recipe, order, {learn} if learn else set())
         if settings.psf in drawn:
             raise ValueError(f"{settings.psf} changes with each picture: name a PSF in train.psf that does not change")
-        self.shards = Shards.of(recipe, settings.psf, wanted, drawn | learnt, store, mesh)
+        self.shards = Shards.of(recipe, settings.psf, outputs, drawn | learnt, store, mesh)
         drawn |= self.shards.behind
         read = _sources(recipe, drawn) | {settings.psf}
         self._divide(recipe, learn, [n for n in order if n in (learnt - drawn) & read], drawn, noise, store)
@@ -205,8 +205,8 @@ def _sources(recipe: Recipe, readers: Iterable[str]) -> set[str]:
 
 def _behind(recipe: Recipe, order: Sequence[str], first: set[str]) -> set[str]:
     """Return the steps ``first`` and all steps that depend on these steps."""
-    found = set(first)
+    dependents = set(first)
     for name in order:
-        if not found.isdisjoint(recipe.steps[name].sources):
-            found.add(name)
-    return found
+        if not dependents.isdisjoint(recipe.steps[name].sources):
+            dependents.add(name)
+    return dependents

@@ -79,12 +79,12 @@ class LiftLearner:
         loss = losses.mrae(estimate, cube, floor=self.settings.floor)
         loss.backward()
         slope = float(nn.utils.clip_grad_norm_(self.net.parameters(), STEEPEST))
-        found = {"MRAE": float(loss.detach()), "RMSE": _rmse(estimate.detach(), cube), "slope": slope, "rate": rate}
-        require_finite(found)
+        errors = {"MRAE": float(loss.detach()), "RMSE": _rmse(estimate.detach(), cube), "slope": slope, "rate": rate}
+        require_finite(errors)
         self.optimiser.step()
         if self.average:
             self.average.update_parameters(self.net)
-        return found
+        return errors
 
     @torch.no_grad()
     def validate(self) -> dict[str, Losses]:
@@ -93,12 +93,12 @@ class LiftLearner:
         for number in range(count):
             picture, cube = self.pairs("judge", number)
             for name, estimate in self.estimates(picture).items():
-                found = {
+                errors = {
                     "MRAE": float(losses.mrae(estimate, cube, floor=self.settings.floor)),
                     "RMSE": _rmse(estimate, cube),
                     "colour": _rmse(render(estimate, self.pairs.bands), picture),
                 }
-                sums[name] = {key: sums.get(name, {}).get(key, 0.0) + x / count for key, x in found.items()}
+                sums[name] = {key: sums.get(name, {}).get(key, 0.0) + x / count for key, x in errors.items()}
         return sums
 
     def estimates(self, picture: Tensor) -> dict[str, Tensor]:

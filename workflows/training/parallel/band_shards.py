@@ -1,8 +1,8 @@
 """The steps whose bands are divided among several processes, and the later steps that need all bands.
 
-Each process computes its own bands of every step that works band by band. The first later step that does not work band
-by band needs all bands: every process gathers the bands of the mask's PSF, and the bands of a picture are sent to the
-process that owns the picture. Where only sums over the bands of an image are read, only the sums are sent.
+Each process computes its own bands of every step that works band by band, with the same bits as a single process. The
+first step that does not work band by band needs all bands: every process gathers the bands of the mask's PSF, and the
+bands of a picture are sent to its process. If later steps read only sums over bands, only the sums are sent.
 """
 
 from __future__ import annotations
@@ -42,7 +42,7 @@ class Shards:
 
     @classmethod
     def of(
-        cls, recipe: Recipe, psf: str, wanted: Sequence[str], live: Collection[str], store: Store, mesh: Mesh
+        cls, recipe: Recipe, psf: str, outputs: Sequence[str], live: Collection[str], store: Store, mesh: Mesh
     ) -> Shards:
         """Divide the ``live`` steps by band among the processes; raise MeshError for too few bands."""
         if mesh.band == 1:
@@ -50,7 +50,7 @@ class Shards:
         spectral = _sampled(recipe, psf)
         count = _count(recipe, psf, spectral, store, mesh)
         steps, behind = set[str](), set[str]()
-        for name in needed(recipe, wanted):
+        for name in needed(recipe, outputs):
             if name not in live:
                 continue
             sources = set(recipe.steps[name].sources)
@@ -58,7 +58,7 @@ class Shards:
                 steps.add(name)
             elif sources & (behind | steps):
                 behind.add(name)
-        summed_alone = {n: asked for n in sorted(steps) if (asked := _asked(recipe, n, wanted, behind, live))}
+        summed_alone = {n: asked for n in sorted(steps) if (asked := _asked(recipe, n, outputs, behind, live))}
         rows = {name: _rows(recipe, asked, store) for name, asked in summed_alone.items()}
         return cls(recipe, mesh, count, frozenset(steps), frozenset(behind), rows)
 
@@ -147,10 +147,10 @@ def _count(recipe: Recipe, psf: str, spectral: set[str], store: Store, mesh: Mes
 
 
 def _asked(
-    recipe: Recipe, name: str, wanted: Sequence[str], behind: Collection[str], live: Collection[str]
+    recipe: Recipe, name: str, outputs: Sequence[str], behind: Collection[str], live: Collection[str]
 ) -> Asked | None:
     """Return the sums that later steps read from an image; None if other values are read or the weights change."""
-    asked = None if name in wanted else asked_of(recipe, name, wanted)
+    asked = None if name in outputs else asked_of(recipe, name, outputs)
     still = asked is not None and asked.bands not in live and asked.responses not in live
     return asked if asked is not None and still and set(behind).issuperset(asked.readers) else None
 

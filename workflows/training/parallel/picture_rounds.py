@@ -96,14 +96,14 @@ class _Cut:
             torch.autograd.backward(roots, grads)
 
 
-def _live(recipe: Recipe, given: Sequence[str], wanted: Sequence[str]) -> list[str]:
+def _live(recipe: Recipe, given: Sequence[str], outputs: Sequence[str]) -> list[str]:
     sources = {name: () if name in given else step.sources for name, step in recipe.steps.items()}
-    return in_order(sources, wanted)
+    return in_order(sources, outputs)
 
 
-def _used(recipe: Recipe, free: Sequence[str], wanted: Sequence[str]) -> list[str]:
-    """Return the free steps and parameters on which a wanted step depends."""
-    live = set(_live(recipe, free, wanted))
+def _used(recipe: Recipe, free: Sequence[str], outputs: Sequence[str]) -> list[str]:
+    """Return the free steps and parameters on which an output depends."""
+    live = set(_live(recipe, free, outputs))
     return [name for name in free if (name if name in recipe.steps else name.rpartition(".")[0]) in live]
 
 
