@@ -1,4 +1,4 @@
-"""The paper's figure: one scene behind each laser and behind none, seen by a plain lens and by every pipeline."""
+"""The figure of the paper: one scene with each laser and without a laser, by the plain lens and by every pipeline."""
 
 from __future__ import annotations
 
@@ -14,14 +14,14 @@ from neusee.workflows.evaluation.pipelines import CASES, NONE, PipelineRecipes
 from neusee.workflows.keys.cache_key import digest
 from neusee.workflows.store.memo import compute_once
 
-_SIDE = 200  #: pixels of the shorter side, as drawn
+_SIDE = 200  #: pixels of the shorter side of a picture in the figure
 _PLAIN = "developed[plain]"
-_WEAKEST = 1e4  #: the paper's figure begins there
+_WEAKEST = 1e4  #: strength of the first laser in the figure of the paper
 
 
 @dataclass(frozen=True)
 class Panel:
-    """A column of the figure: pictures by row, linear sRGB (3, y, x)."""
+    """A column of the figure: the pictures of one laser by row, linear sRGB (3, y, x)."""
 
     case: str
     strength: float
@@ -31,32 +31,28 @@ class Panel:
 def panels(
     bench: EvaluationPoints, each: Sequence[PipelineRecipes], scene: Scene, strengths: Sequence[float]
 ) -> list[Panel]:
-    """Return the scene behind every laser, from a strength of 1e4, as in the paper, to the strongest asked for."""
-    found = []
+    """Return a column for each laser, with strengths from 1e4, as in the paper, to the largest of ``strengths``."""
+    columns = []
     lasers = [case for case in CASES if case != NONE]
     top = max(max(strengths), _WEAKEST)
     steps = [_WEAKEST * (top / _WEAKEST) ** (i / (len(lasers) - 1)) for i in range(len(lasers))]
     for case, strength in zip((*lasers, NONE), (*steps, 0.0), strict=True):
         bench.forget()
-        alone = replace(scene, case=case)
-        found.append(Panel(case, strength, _pictures(bench, each, PointRequest(alone, case, strength))))
-    return found
+        point = PointRequest(replace(scene, case=case), strength)
+        key = digest("evaluate pictures", _SIDE, [[p.name, bench.key(p, point)] for p in each])
+        compute = partial(_develop, bench, each, point)
+        columns.append(Panel(case, strength, compute_once(bench.store, key, dict, compute, {"step": "evaluate"})))
+    return columns
 
 
-def _pictures(bench: EvaluationPoints, each: Sequence[PipelineRecipes], wanted: PointRequest) -> dict[str, Tensor]:
-    key = digest("evaluate pictures", _SIDE, [[p.name, bench.key(p, wanted)] for p in each])
-    return compute_once(bench.store, key, dict, partial(_develop, bench, each, wanted), {"step": "evaluate"})
-
-
-def _develop(bench: EvaluationPoints, each: Sequence[PipelineRecipes], wanted: PointRequest) -> dict[str, Tensor]:
-    """Return the truth, the picture of the plain lens and that of each pipeline, as large as they are drawn."""
-    found: dict[str, Tensor] = {}
-    for number, pipeline in enumerate(each):
-        values = bench.values(pipeline, wanted, () if number else (_PLAIN,))
-        if not number:
-            found |= {"truth": _shrink(values["truth"]), "plain lens": _shrink(values[_PLAIN])}
-        found[pipeline.name] = _shrink(values[pipeline.pipeline.picture])
-    return found
+def _develop(bench: EvaluationPoints, each: Sequence[PipelineRecipes], point: PointRequest) -> dict[str, Tensor]:
+    pictures: dict[str, Tensor] = {}
+    for pipeline in each:
+        values = bench.values(pipeline, point, () if pictures else (_PLAIN,))
+        if not pictures:
+            pictures = {"truth": _shrink(values["truth"]), "plain lens": _shrink(values[_PLAIN])}
+        pictures[pipeline.name] = _shrink(values[pipeline.pipeline.picture])
+    return pictures
 
 
 def _shrink(picture: Tensor) -> Tensor:

@@ -1,29 +1,25 @@
-"""Confidence intervals over scenes: of means, and of differences from a reference scene by scene."""
+"""Confidence intervals over scenes, of means and of differences from a reference in each scene."""
 
 from __future__ import annotations
 
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from typing import TYPE_CHECKING
 
 import numpy as np
+from numpy.typing import NDArray
 
-if TYPE_CHECKING:
-    from numpy.typing import NDArray
-
-    Numbers = NDArray[np.float64]
-
+Numbers = NDArray[np.float64]
 CONFIDENCE = 0.95
-_AGAIN = 10_000  #: bootstrap sets of scenes for a ratio
+_AGAIN = 10_000  #: sets of scenes that the bootstrap draws for a ratio
 _AT_ONCE = 500  #: sets in memory at once
-_FEW = 5  #: least scenes for a bootstrap
+_FEW = 5  #: smallest number of scenes for the bootstrap
 METRICS = ("l1", "psnr", "ssim", "l1 small", "psnr small", "ssim small", "saturated", "peak", "damaged")
 
 
 @dataclass(frozen=True)
 class Interval:
-    """A mean and its 95 % confidence interval; the limits are NaN where there is one scene, or too few."""
+    """A mean with its 95 % confidence interval, whose limits are NaN for too few scenes."""
 
     mean: float
     low: float
@@ -31,36 +27,35 @@ class Interval:
 
     @property
     def half(self) -> float:
-        """Return half the width."""
+        """Return half the width of the interval."""
         return (self.high - self.low) / 2
 
     @property
     def excludes_zero(self) -> bool:
-        """Return True if zero lies outside."""
+        """Return True if zero lies outside of the interval."""
         return self.low > 0 or self.high < 0
 
 
 @dataclass(frozen=True)
 class MetricTable:
-    """All points of one pipeline: (scene, strength) by metric, NaN where a scene has no laser to vary."""
+    """All points of one pipeline: values (scene, strength) by metric, NaN for a scene that has no laser."""
 
     strengths: tuple[float, ...]
     values: Mapping[str, Numbers]
 
     def scenes(self, metric: str) -> Numbers:
-        """Return the mean over strengths of each scene."""
-        found: Numbers = np.nanmean(self.values[metric], axis=1)
-        return found
+        """Return the mean of a metric over strengths, for each scene."""
+        means: Numbers = np.nanmean(self.values[metric], axis=1)
+        return means
 
     def at(self, metric: str, strength: int) -> Numbers:
-        """Return the value at one strength of each scene that has one."""
-        column = self.values[metric][:, strength]
-        found: Numbers = column[~np.isnan(column)]
-        return found
+        """Return the values of a metric at one strength, for each scene that has a value."""
+        column: Numbers = self.values[metric][:, strength]
+        return column[~np.isnan(column)]
 
 
 def mean(values: Sequence[float] | Numbers) -> Interval:
-    """Return the mean over scenes with the interval of Student's t."""
+    """Return the mean over scenes with the confidence interval of Student's t distribution."""
     x = np.asarray(values, dtype=np.float64)
     centre = float(x.mean()) if len(x) else math.nan
     if len(x) < 2:
@@ -71,40 +66,35 @@ def mean(values: Sequence[float] | Numbers) -> Interval:
     return Interval(centre, centre - half, centre + half)
 
 
-def difference(values: Numbers, reference: Numbers) -> Interval:
-    """Return the mean of the differences scene by scene with the interval of Student's t."""
-    return mean(values - reference)
-
-
 def gain(values: Numbers, reference: Numbers, seed: int) -> Interval:
-    """Return by which share of the reference's mean a metric is lower, such as L1 by 10.1 %.
+    """Return the fraction by which the mean of a metric is lower than the mean of the reference, such as 10.1 %.
 
-    The interval is that of the bootstrap: it draws the same scenes of both again, with a seed of its own.
+    The interval comes from the bootstrap, which draws the same scenes of both pipelines from the seed ``seed``.
     """
-    found = 1.0 - float(values.mean()) / float(reference.mean())
+    fraction = 1.0 - float(values.mean()) / float(reference.mean())
     if len(values) < _FEW:
-        return Interval(found, math.nan, math.nan)
+        return Interval(fraction, math.nan, math.nan)
     rng = np.random.default_rng(seed)
     drawn: list[Numbers] = []
     for _ in range(0, _AGAIN, _AT_ONCE):
         at = rng.integers(0, len(values), (_AT_ONCE, len(values)))
         drawn.append(1.0 - values[at].mean(1) / reference[at].mean(1))
     low, high = np.quantile(drawn, [(1 - CONFIDENCE) / 2, (1 + CONFIDENCE) / 2])
-    return Interval(found, float(low), float(high))
+    return Interval(fraction, float(low), float(high))
 
 
 def compare_with(values: MetricTable, reference: MetricTable, seed: int) -> dict[str, Interval]:
-    """Return how much lower a pipeline's L1 is than the reference's: as it is, as a share, and of small pictures."""
+    """Return by how much L1 is lower than L1 of the reference: the difference, the fraction, and of small pictures."""
     own, other = values.scenes("l1"), reference.scenes("l1")
     return {
-        "l1 less": difference(other, own),
+        "l1 less": mean(other - own),
         "l1 gain": gain(own, other, seed),
         "l1 small gain": gain(values.scenes("l1 small"), reference.scenes("l1 small"), seed),
     }
 
 
 def metric_table(points: Sequence[Mapping[float, Mapping[str, float]]], strengths: Sequence[float]) -> MetricTable:
-    """Return points by scene and strength as arrays."""
+    """Return the points of one pipeline by scene and strength as arrays (scene, strength)."""
     each = {
         metric: np.array([[point.get(k, {}).get(metric, math.nan) for k in strengths] for point in points])
         for metric in METRICS

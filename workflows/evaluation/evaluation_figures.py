@@ -1,4 +1,4 @@
-"""Pictures of an evaluation: cases, error over strength, suppression by wavelength, suppression against contrast."""
+"""Figures of an evaluation: lasers, error over strength, suppression by wavelength, suppression against contrast."""
 
 from __future__ import annotations
 
@@ -14,21 +14,17 @@ from neusee.workflows.report.figures.camera_overview import high
 from neusee.workflows.report.figures.style import BLACK, BLUE, GREEN, ORANGE, VERMILION, canvas, drawn, encoded, picture
 
 if TYPE_CHECKING:
-    from numpy.typing import NDArray
-
     from neusee.workflows.evaluation.comparison_pictures import Panel
     from neusee.workflows.evaluation.mask_optics import MaskOptics
 
-    Numbers = NDArray[np.float64]
-
 _COLOURS = (BLUE, VERMILION, GREEN, ORANGE, "#56B4E9", "#CC79A7", BLACK, "#777777")
-_STYLES = ("-", "--", ":", "-.")  #: after as many lines as there are colours
+_STYLES = ("-", "--", ":", "-.")  #: the next style begins when all colours are used
 _GREY = "#777777"
-_LETTERS = 16  #: of a row's name before it is broken
+_LETTERS = 16  #: longest name of a row on one line
 
 
 def _looks(names: Sequence[str]) -> dict[str, dict[str, Any]]:
-    """Return a colour and a dash for each name, the same in every figure."""
+    """Return a colour and a line style for each name, the same in every figure."""
     count = len(_COLOURS)
     return {
         name: {"color": _COLOURS[i % count], "linestyle": _STYLES[i // count % len(_STYLES)]}
@@ -38,20 +34,17 @@ def _looks(names: Sequence[str]) -> dict[str, dict[str, Any]]:
 
 @drawn
 def cases(panels: Sequence[Panel]) -> Any:
-    """Draw truth, plain lens and every pipeline (rows) behind each laser and behind none, all scaled alike."""
+    """Draw truth, plain lens and every pipeline (rows) for each laser (columns), all with the same scale."""
     rows = list(panels[0].pictures)
     white = high(panels[0].pictures["truth"])
     figure, axes = canvas(1.95 * len(panels) + 0.6, 2.0 * len(rows) + 0.3, len(rows), len(panels))
     for i, panel in enumerate(panels):
         for j, (name, shown) in enumerate(panel.pictures.items()):
-            picture(axes[j, i], encoded(shown / white), _over(panel) if j == 0 else "")
+            title = f"{panel.case}, {_power(panel.strength)}" if panel.strength else "no laser"
+            picture(axes[j, i], encoded(shown / white), "" if j else title)
             if i == 0:
                 axes[j, i].set_ylabel(_broken(name), fontsize=10)
     return figure
-
-
-def _over(panel: Panel) -> str:
-    return f"{panel.case}, {_power(panel.strength)}" if panel.strength else "no laser"
 
 
 def _power(strength: float) -> str:
@@ -59,22 +52,23 @@ def _power(strength: float) -> str:
 
 
 def _broken(name: str) -> str:
-    """Return a long name on several lines."""
     return name if len(name) <= _LETTERS else name.replace("+", "\n+ ").replace("@", "\n@ ")
 
 
 @drawn
 def strengths(tables: Mapping[str, MetricTable], small: int) -> Any:
-    """Draw L1 over the laser's strength: mean over scenes and its 95 % interval, at full size and reduced."""
+    """Draw L1 over the strength of the laser with its 95 % interval, for full pictures and for small pictures."""
     figure, axes = canvas(11.0, 4.2, 1, 2, sharex=True)
     looks = _looks(list(tables))
-    whole = ((axes[0, 0], "l1", "full size"), (axes[0, 1], "l1 small", f"shorter side {small} pixels"))
-    for ax, metric, title in whole:
+    titles = {"l1": "full size", "l1 small": f"shorter side {small} pixels"}
+    for ax, (metric, title) in zip(axes[0], titles.items(), strict=True):
         for name, table in tables.items():
             _line(ax, table, metric, looks[name], name)
         ax.set_title(f"L1, {title}")
         ax.set_xlabel("laser strength (multiples of saturation)")
-        _axis(ax, next(iter(tables.values())).strengths)
+        values = next(iter(tables.values())).strengths
+        ax.set_xticks(_places(values), ["none" if k == 0 else _power(k) for k in values])
+        ax.set_ylim(bottom=0)
     axes[0, 0].set_ylabel("L1 (sRGB, 0 to 1)")
     handles, labels = axes[0, 0].get_legend_handles_labels()
     figure.legend(handles, labels, loc="outside lower center", ncols=min(3, len(labels)))
@@ -82,27 +76,22 @@ def strengths(tables: Mapping[str, MetricTable], small: int) -> Any:
 
 
 def _line(ax: Any, table: MetricTable, metric: str, look: Mapping[str, Any], name: str) -> None:
-    found = [mean(table.at(metric, i)) for i in range(len(table.strengths))]
+    intervals = [mean(table.at(metric, i)) for i in range(len(table.strengths))]
     at = _places(table.strengths)
-    ax.plot(at, [x.mean for x in found], marker="o", markersize=4, linewidth=1.4, label=name, **look)
-    low, up = ([getattr(x, end) for x in found] for end in ("low", "high"))
+    ax.plot(at, [x.mean for x in intervals], marker="o", markersize=4, linewidth=1.4, label=name, **look)
+    low, up = [x.low for x in intervals], [x.high for x in intervals]
     ax.fill_between(at, low, up, color=look["color"], alpha=0.15, linewidth=0)
 
 
 def _places(values: Sequence[float]) -> list[float]:
-    """Return the decades of strengths; no laser stands one step before the weakest."""
+    """Return the logarithms of strengths; a strength of 0 is one decade below the smallest strength."""
     logs = [float(np.log10(k)) for k in values if k > 0]
     return [float(np.log10(k)) if k > 0 else (min(logs) - 1 if logs else 0.0) for k in values]
 
 
-def _axis(ax: Any, values: Sequence[float]) -> None:
-    ax.set_xticks(_places(values), ["none" if k == 0 else _power(k) for k in values])
-    ax.set_ylim(bottom=0)
-
-
 @drawn
 def curves(masks: Mapping[str, MaskOptics]) -> Any:
-    """Draw LSR and BSR of every mask at each wavelength."""
+    """Draw LSR and BSR of every mask over the wavelength."""
     figure, axes = canvas(11.0, 4.2, 1, 2, sharex=True)
     looks = _looks(list(masks))
     left, right = axes[0]
@@ -125,7 +114,7 @@ def curves(masks: Mapping[str, MaskOptics]) -> Any:
 
 @drawn
 def plane(masks: Mapping[str, MaskOptics]) -> Any:
-    """Draw mean LSR against the contrast that is left, and the region that no mask reaches."""
+    """Draw the contrast of each mask over its mean LSR, and the region that no mask reaches."""
     figure, axes = canvas(8.4, 5.2)
     ax = axes[0, 0]
     floor = float(np.mean([mask.floor.mean() for mask in masks.values()]))

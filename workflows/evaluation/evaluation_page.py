@@ -1,11 +1,11 @@
-"""The page of an evaluation."""
+"""The page of an evaluation: tables, pictures and their explanations."""
 
 from __future__ import annotations
 
 import math
 import re
 from collections.abc import Mapping, Sequence
-from dataclasses import asdict
+from dataclasses import asdict, astuple
 from typing import TYPE_CHECKING, Any
 
 from neusee.workflows.evaluation import evaluation_figures as figures
@@ -19,139 +19,134 @@ if TYPE_CHECKING:
 _EACH = ("mean", "low", "high")
 COLUMNS = ("pipeline", "mask", "restorer", "scenes", *(f"{m} {e}" for m in METRICS for e in _EACH),
            *(f"{name} {e}" for name in ("l1 less", "l1 gain", "l1 small gain") for e in _EACH))  # fmt: skip
-_COARSE = 1.05  #: the band of the aperture is a disc, counted by the grid of frequencies that the pixels sample
+_COARSE = 1.05  #: the frequencies of a circular aperture are counted on the square grid of the pixels
 _DIGITS = {"psnr": ".2f", "l1": ".4f", "ssim": ".3f", "saturated": ".0f", "damaged": ".2f"}
 
 
-def draw_pictures(found: EvaluationResult) -> dict[str, bytes]:
-    """Return the pictures, by name."""
+def draw_pictures(result: EvaluationResult) -> dict[str, bytes]:
+    """Draw the pictures of the page, and return each picture by name."""
     return {
-        "cases": figures.cases(found.panels),
-        "strengths": figures.strengths(found.tables, found.small),
-        "curves": figures.curves(found.masks),
-        "plane": figures.plane(found.masks),
+        "cases": figures.cases(result.panels),
+        "strengths": figures.strengths(result.tables, result.small),
+        "curves": figures.curves(result.masks),
+        "plane": figures.plane(result.masks),
     }
 
 
-def summary(found: EvaluationResult) -> dict[str, Any]:
-    """Return for each pipeline the mean of every metric with its interval, and the gain over the reference."""
+def summary(result: EvaluationResult) -> dict[str, Any]:
+    """Return the mean and interval of every metric and the gain over the reference, for each pipeline."""
     return {
         p.name: {
             "mask": p.front,
             "restorer": p.back,
-            **{metric: asdict(mean(found.tables[p.name].scenes(metric))) for metric in METRICS},
-            "against": {name: asdict(x) for name, x in found.against[p.name].items()},
+            **{metric: asdict(mean(result.tables[p.name].scenes(metric))) for metric in METRICS},
+            "against": {name: asdict(x) for name, x in result.against[p.name].items()},
         }
-        for p in found.pipelines
+        for p in result.pipelines
     }
 
 
-def rows(found: EvaluationResult) -> list[Sequence[Any]]:
-    """Return the rows of the table: for each pipeline the numbers of `summary`."""
+def rows(result: EvaluationResult) -> list[Sequence[Any]]:
+    """Return the rows of ``table.csv``, with the numbers of `summary` for each pipeline."""
     listed: list[Sequence[Any]] = []
-    for p in found.pipelines:
-        each = [mean(found.tables[p.name].scenes(metric)) for metric in METRICS] + list(found.against[p.name].values())
-        numbers = [x for interval in each for x in (interval.mean, interval.low, interval.high)]
-        listed.append((p.name, p.front, p.back, len(found.scenes), *("" if math.isnan(x) else x for x in numbers)))
+    for p in result.pipelines:
+        each = [mean(result.tables[p.name].scenes(metric)) for metric in METRICS] + list(
+            result.against[p.name].values()
+        )
+        numbers = [x for interval in each for x in astuple(interval)]
+        listed.append((p.name, p.front, p.back, len(result.scenes), *("" if math.isnan(x) else x for x in numbers)))
     return listed
 
 
-def lead(found: EvaluationResult) -> str:
-    """Return the result in a few sentences."""
-    best = min(found.pipelines, key=lambda p: float(found.tables[p.name].scenes("l1").mean()))
-    said = _with_interval(mean(found.tables[best.name].scenes("l1")), "l1")
-    strengths = ", ".join("none" if k == 0 else f"{k:g}".replace("e+0", "e") for k in found.strengths)
-    enough = len(found.scenes) >= len(CASES)
-    few = "" if enough else f" These are too few scenes for all {len(CASES)} cases of the protocol."
-    uncertain = found.recipe.uncertain
-    laws = [name for name in (uncertain.names if uncertain else ()) if not name.startswith("lasers.")]
-    drawn = f" Drawn anew for each scene: {', '.join(laws)}." if laws else ""
-    return f"""{len(found.scenes)} scenes, laser strengths {strengths} (multiples of what saturates a pixel of the
-        plain lens), {len(found.pipelines)} pipelines of a mask and a restorer. Least L1: {best.name}, {said}.
+def lead(result: EvaluationResult) -> str:
+    """Return the result of the evaluation in a few sentences."""
+    best = min(result.pipelines, key=lambda p: float(result.tables[p.name].scenes("l1").mean()))
+    least = _with_interval(mean(result.tables[best.name].scenes("l1")), "l1")
+    strengths = ", ".join("none" if k == 0 else f"{k:g}".replace("e+0", "e") for k in result.strengths)
+    enough = len(result.scenes) >= len(CASES)
+    few = "" if enough else f" These are too few scenes for all {len(CASES)} lasers of the protocol."
+    uncertain = result.recipe.uncertain
+    names = [name for name in (uncertain.names if uncertain else ()) if not name.startswith("lasers.")]
+    drawn = f" These values are drawn for each scene: {', '.join(names)}." if names else ""
+    return f"""{len(result.scenes)} scenes, laser strengths {strengths} (1 saturates a pixel of the plain lens),
+        {len(result.pipelines)} pipelines of a mask and a restorer. Lowest L1: {best.name}, {least}.
         {few}{drawn}"""
 
 
-def sections(found: EvaluationResult, shown: Mapping[str, bytes]) -> list[Section]:
-    """Return the parts of the page, from mask by restorer to the scenes."""
-    parts = [_crossed(found), _numbers(found), _compared(found)]
-    text = """Mean over scenes and its 95 % interval. A scene without a laser counts at no strength but none, so
-        that the scenes of the other points have a laser each."""
+def sections(result: EvaluationResult, shown: Mapping[str, bytes]) -> list[Section]:
+    """Return the sections of the page, from the table of masks and restorers to the list of scenes."""
+    parts = [_crossed(result), _numbers(result), _compared(result)]
+    text = """Mean over scenes and its 95 % interval. A scene without a laser counts only at the strength none, so
+        that every scene of the other points has a laser."""
     parts.append(Section("Error over strength", text, picture=shown["strengths"]))
-    text = """The first scene behind each laser of the protocol and behind none, all by one stretch: rows are the
-        truth, the plain lens, whose picture is developed and no more, and every pipeline."""
-    parts.append(Section("Lasers, and none", text, picture=shown["cases"]))
-    return [*parts, _suppression(found, shown["curves"]), _plane(found, shown["plane"]), *_data(found)]
+    text = """The first scene with each laser of the protocol and without a laser, all with the same scale. The rows are
+        the truth, the picture of the plain lens without restoration, and every pipeline."""
+    parts.append(Section("With each laser and without a laser", text, picture=shown["cases"]))
+    return [*parts, _suppression(result, shown["curves"]), _plane(result, shown["plane"]), *_data(result)]
 
 
-def _crossed(found: EvaluationResult) -> Section:
-    masks = list(dict.fromkeys(p.front for p in found.pipelines))
-    restorers = list(dict.fromkeys(p.back for p in found.pipelines))
-    each = {(p.front, p.back): p.name for p in found.pipelines}
-    listed = [(mask, *(_cell(found, each.get((mask, back))) for back in restorers)) for mask in masks]
-    text = """L1 at full size (sRGB as a display shows it, 0 to 1): of each scene the mean over its strengths, then
+def _crossed(result: EvaluationResult) -> Section:
+    masks = list(dict.fromkeys(p.front for p in result.pipelines))
+    restorers = list(dict.fromkeys(p.back for p in result.pipelines))
+    l1 = {(p.front, p.back): _with_interval(mean(result.tables[p.name].scenes("l1")), "l1") for p in result.pipelines}
+    listed = [(mask, *(l1.get((mask, back)) for back in restorers)) for mask in masks]
+    text = """L1 at full size (sRGB from 0 to 1, as a display shows it): the mean over the strengths of each scene, then
         mean and 95 % confidence interval over scenes (Student's t)."""
     return Section("Mask by restorer", text, ("mask", *restorers), listed)
 
 
-def _cell(found: EvaluationResult, name: str | None) -> str | None:
-    return _with_interval(mean(found.tables[name].scenes("l1")), "l1") if name else None
-
-
 def _with_interval(x: Interval, metric: str) -> str:
-    how = _DIGITS.get(metric.partition(" ")[0], ".3g")
-    return (
-        f"{x.mean:{how}}"
-        if math.isnan(x.half)
-        else f"{x.mean:{how}}\N{NO-BREAK SPACE}±\N{NO-BREAK SPACE}{x.half:{how}}"
-    )
+    digits = _DIGITS.get(metric.partition(" ")[0], ".3g")
+    half = "" if math.isnan(x.half) else f"\N{NO-BREAK SPACE}±\N{NO-BREAK SPACE}{x.half:{digits}}"
+    return f"{x.mean:{digits}}{half}"
 
 
-def _numbers(found: EvaluationResult) -> Section:
-    text = f"""Mean and 95 % interval over scenes. Small: the picture that a display shows, reduced to {found.small}
-        pixels of its shorter side in linear light, antialiased. Saturated: pixels of the raw picture. Damaged:
-        share of the points whose brightest pixel passes the damage threshold of the sensor. PSNR is a mean of
-        decibels."""
+def _numbers(result: EvaluationResult) -> Section:
+    text = f"""Mean and 95 % interval over scenes. Small: the picture that a display shows, reduced to {result.small}
+        pixels of its shorter side in linear light, antialiased. Saturated: number of saturated pixels of the raw
+        picture. Damaged: fraction of the points whose brightest pixel exceeds the damage threshold of the sensor.
+        PSNR is a mean of decibels."""
     metrics = [metric for metric in METRICS if metric != "peak"]
-    columns = ("pipeline", *(re.sub("l1|psnr|ssim", lambda found: found[0].upper(), metric) for metric in metrics))
+    columns = ("pipeline", *(re.sub("l1|psnr|ssim", lambda match: match[0].upper(), metric) for metric in metrics))
     listed = [
-        (p.name, *(_with_interval(mean(found.tables[p.name].scenes(metric)), metric) for metric in metrics))
-        for p in found.pipelines
+        (p.name, *(_with_interval(mean(result.tables[p.name].scenes(metric)), metric) for metric in metrics))
+        for p in result.pipelines
     ]
     return Section("All numbers", text, columns, listed)
 
 
-def _compared(found: EvaluationResult) -> Section:
-    text = f"""Against {found.reference}, scene by scene. L1 less: how much lower the L1 is (Student's t of the
-        differences). Gain: the same as a share of the reference's mean L1, its interval from scenes drawn again
-        (10 000 times, both pipelines on the same; of fewer than five scenes none is given). Marked where zero lies
-        outside the interval. Many pipelines against one: one in twenty passes by chance."""
+def _compared(result: EvaluationResult) -> Section:
+    text = f"""Differences from {result.reference} in the same scenes. L1 less: by how much L1 is lower, with interval
+        of Student's t. Gain: the same as a fraction of the mean L1 of the reference, with an interval from 10 000 draws
+        of the scenes (bootstrap); fewer than five scenes have no interval. A colour marks an interval without zero. If
+        many pipelines are compared with one reference, about one in twenty is marked by chance."""
     listed: list[Sequence[Any]] = []
     marks: dict[tuple[int, int], Mark] = {}
-    for p in found.pipelines:
-        if p.name == found.reference:
+    for p in result.pipelines:
+        if p.name == result.reference:
             continue
-        less, share, small = found.against[p.name].values()
+        less, share, small = result.against[p.name].values()
         for column, interval in ((1, less), (2, share), (3, small)):
             if interval.excludes_zero:
                 marks[len(listed), column] = "pass" if interval.mean > 0 else "fail"
         listed.append((p.name, _between(less, ".4f"), _between(share, ".1%"), _between(small, ".1%")))
     columns = ("pipeline", "L1 less", "gain", "gain, small")
-    return Section(f"Against {found.reference}", text, columns, listed, marks=marks)
+    return Section(f"Against {result.reference}", text, columns, listed, marks=marks)
 
 
-def _between(x: Interval, how: str) -> str:
-    return f"{x.mean:{how}}" if math.isnan(x.low) else f"{x.mean:{how}} ({x.low:{how}} to {x.high:{how}})"
+def _between(x: Interval, digits: str) -> str:
+    return f"{x.mean:{digits}}" + ("" if math.isnan(x.low) else f" ({x.low:{digits}} to {x.high:{digits}})")
 
 
-def _suppression(found: EvaluationResult, picture: bytes) -> Section:
-    own = next(p.front for p in found.pipelines if p.name == found.reference)
-    text = f"""LSR: the brightest pixel of a laser behind the mask over that behind the clear lens; BSR: light of
-        the scene in the field over that of the plain lens, mean over scenes. Energy floor: the LSR of light that is
-        spread evenly over the window of the PSF. Stronger: how many times lower the mean LSR is than that of {own}.
-        The same by wavelength: suppression.csv."""
-    base = float(found.masks[own].lsr.mean())
+def _suppression(result: EvaluationResult, picture: bytes) -> Section:
+    own = next(p.front for p in result.pipelines if p.name == result.reference)
+    text = f"""LSR: the brightest pixel of a laser with the mask, divided by the brightest pixel without the mask; BSR:
+        light of the scene in the field, divided by the light with the plain lens, mean over scenes. Energy floor: the
+        LSR of light that is spread evenly over the window of the PSF. Stronger: the mean LSR of {own} divided by the
+        mean LSR of the mask. The file suppression.csv has LSR and BSR by wavelength."""
+    base = float(result.masks[own].lsr.mean())
     listed: list[Sequence[Any]] = []
-    for name, m in found.masks.items():
+    for name, m in result.masks.items():
         middle = float(m.lsr.mean())
         numbers = (m.lsr.min(), m.lsr.max(), base / middle, m.floor.mean(), m.bsr.mean())
         listed.append((name, middle, *map(float, numbers)))
@@ -159,32 +154,28 @@ def _suppression(found: EvaluationResult, picture: bytes) -> Section:
     return Section("Suppression by wavelength", text, columns, listed, picture)
 
 
-def _plane(found: EvaluationResult, picture: bytes) -> Section:
-    text = """Means over wavelengths, contrast within the band that the clear aperture passes. A low peak costs
-        contrast: by Parseval the rms over all sampled frequencies is at most sqrt(LSR p0), p0 the share of light in
-        the brightest pixel of the clear lens, and within the band, a share 4 p0 of them, at most sqrt(LSR) / 2; the
-        median is at most 1.41 times the rms. Where a mask throws light out of the window, contrast is that of the
-        light that is kept, and its own bound is that much higher: the table has it."""
+def _plane(result: EvaluationResult, picture: bytes) -> Section:
+    text = """Means over wavelengths, with the contrast within the band that the clear aperture passes. A low peak costs
+        contrast: by Parseval the rms over all sampled frequencies is at most sqrt(LSR p0), where p0 is the fraction of
+        light in the brightest pixel of the clear lens, and the rms within the band, a fraction 4 p0 of the frequencies,
+        is at most sqrt(LSR) / 2; the median is at most 1.41 times the rms. If a mask sends light out of the window, the
+        contrast is that of the remaining light, and the bound of the mask, in the table, is higher."""
     listed: list[Sequence[Any]] = []
     marks: dict[tuple[int, int], Mark] = {}
-    for name, m in found.masks.items():
-        marks[len(listed), 4] = _mark(bool((m.rms <= _COARSE * m.most).all()))
+    for name, m in result.masks.items():
+        marks[len(listed), 4] = "pass" if (m.rms <= _COARSE * m.most).all() else "fail"
         listed.append((name, *(float(x.mean()) for x in (m.lsr, m.median, m.rms, m.most))))
     columns = ("mask", "mean LSR", "median", "rms", "rms at most")
     return Section("Suppression and contrast", text, columns, listed, picture, marks)
 
 
-def _mark(held: bool) -> Mark:
-    return "pass" if held else "fail"
-
-
-def _data(found: EvaluationResult) -> list[Section]:
-    text = """Scenes in the order of their numbers; each is a part of a photograph that the recipe's seed decides,
-        and has its own seed, of the laser's direction and of the noise, the same behind every pipeline. A run of
-        the recipe with that seed and scene gives the same numbers."""
-    listed = [(s.number, s.name, s.case, s.seed) for s in found.scenes]
+def _data(result: EvaluationResult) -> list[Section]:
+    text = """Scenes in the order of their numbers. The seed of the recipe chooses part of a photograph for each scene.
+        The seed of a scene decides the direction of the laser and the noise, which are the same for every pipeline. A
+        run of the recipe with this seed and scene gives the same numbers."""
+    listed = [(s.number, s.name, s.case, s.seed) for s in result.scenes]
     parts = [Section("Scenes", text, ("scene", "photograph", "laser", "seed"), listed)]
-    if found.broken:
-        broken = [(path.name, reason) for path, reason in found.broken]
-        parts.append(Section("Photographs that were passed over", "", ("file", "why"), broken))
+    if result.broken:
+        broken = [(path.name, reason) for path, reason in result.broken]
+        parts.append(Section("Photographs that cannot be read", "", ("file", "why"), broken))
     return parts

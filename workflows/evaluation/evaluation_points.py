@@ -1,9 +1,9 @@
-"""Points of an evaluation: the numbers of a scene, a laser of some strength and a pipeline, each computed once."""
+"""The points of an evaluation: the numbers for a scene, a strength of the laser and a pipeline, computed once each."""
 
 from __future__ import annotations
 
 import time
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, replace
 from functools import partial
@@ -27,151 +27,143 @@ from neusee.workflows.store.memo import compute_once
 from neusee.workflows.store.result_store import Store
 from neusee.workflows.tolerance.cheaper_steps import with_substitutions
 
-_MOVED = ("spot", "photons")  #: first steps that depend on the strength of the laser
+_MOVED = ("spot", "photons")  #: the first steps that depend on the strength of the laser
 
 PointNumbers = dict[str, Any]  #: numbers by name; ``bsr`` is a list
 
 
 @dataclass(frozen=True)
 class PointRequest:
-    """A point to evaluate."""
+    """A scene with its laser, and the strength of the laser."""
 
     scene: Scene
-    case: str
     strength: float
 
     @property
     def lit(self) -> str:
-        """Return the case whose recipe is run: a laser without light counts as no laser."""
-        return self.case if self.strength > 0 else NONE
+        """Return the name of the laser whose recipe is run, which is none if the strength is 0."""
+        return self.scene.case if self.strength > 0 else NONE
 
 
 class EvaluationPoints:
-    """Points of an evaluation; results that several points share are computed once."""
+    """The computation of points; results that several points share are computed once."""
 
     def __init__(self, store: Store, small: int, device: str = "cpu") -> None:
         self.store, self.small, self.device = store, small, device
         self.computed = 0  #: points that were not in the store
-        self.seconds = 0.0  #: of them
+        self.seconds = 0.0  #: that these points took
         self._code = Code(store.code_memo)
         self._functions: dict[tuple[str, str], Any] = {}
-        self._drawn: dict[
-            Any, tuple[Recipe, Inputs | None]
-        ] = {}  #: with the recipe, so that no other recipe gets its identity
-        self._fixed: dict[str, Any] = {}  #: results that no scene reaches, by key: one copy for all functions
+        #: by identity of a recipe; the recipe is kept too, so that no other recipe gets the same identity
+        self._drawn: dict[Any, tuple[Recipe, Inputs | None]] = {}
+        self._fixed: dict[str, Any] = {}  #: results that do not depend on a scene, by key: one copy for all functions
         self._kept = _SharedResults()
 
-    def point(self, pipeline: PipelineRecipes, wanted: PointRequest) -> PointNumbers:
-        """Return the numbers of a point, from the store or measured now."""
-        compute = partial(self._measure, pipeline, wanted)
-        return compute_once(self.store, self.key(pipeline, wanted), dict, compute, {"step": "evaluate"}, small=True)
+    def point(self, pipeline: PipelineRecipes, point: PointRequest) -> PointNumbers:
+        """Return the numbers of a point from the store, or compute and store them."""
+        compute = partial(self._measure, pipeline, point)
+        return compute_once(self.store, self.key(pipeline, point), dict, compute, {"step": "evaluate"}, small=True)
 
-    def _measure(self, pipeline: PipelineRecipes, wanted: PointRequest) -> PointNumbers:
+    def _measure(self, pipeline: PipelineRecipes, point: PointRequest) -> PointNumbers:
         began = time.perf_counter()
-        point = self._numbers(pipeline, self.values(pipeline, wanted))
+        numbers = self._numbers(pipeline, self.values(pipeline, point))
         self.seconds += time.perf_counter() - began
         self.computed += 1
-        return point
+        return numbers
 
-    def values(self, pipeline: PipelineRecipes, wanted: PointRequest, more: Sequence[str] = ()) -> dict[str, Any]:
-        """Return the outputs of a run with this scene and laser, and the steps ``more``."""
+    def values(self, pipeline: PipelineRecipes, point: PointRequest, more: Sequence[str] = ()) -> dict[str, Any]:
+        """Return the outputs of a run with this scene and laser, and the results of the steps ``more``."""
         outputs = (*pipeline.pipeline.outputs, *more)
-        function = self._function(pipeline, wanted.lit, outputs)
-        self._kept.turn(wanted)
+        function = self._function(pipeline, point.lit, outputs)
+        self._kept.turn(point)
         with torch.no_grad():
-            changed = self._changed(pipeline.recipes[wanted.lit], wanted, outputs)
+            changed = self._changed(pipeline.recipe(point.lit), point, outputs)
             known = {name: value for name, value in changed.items() if name in function.free}
-            found: dict[str, Any] = function({"scene": wanted.scene.picture, **known})
-        return found
+            values: dict[str, Any] = function({"scene": point.scene.picture, **known})
+        return values
 
     def forget(self) -> None:
-        """Release the results of one laser."""
+        """Release all results that depend on the laser."""
         self._functions = {name: f for name, f in self._functions.items() if name[1] == NONE}
         used = {id(value) for f in self._functions.values() for value in f.fixed.values()}
         self._fixed = {key: value for key, value in self._fixed.items() if id(value) in used}
         self._kept.clear()
 
-    def key(self, pipeline: PipelineRecipes, wanted: PointRequest) -> str:
-        """Return what decides a point: the keys of a run with its values, and how its pictures are compared."""
-        recipe, outputs = pipeline.recipes[wanted.lit], pipeline.pipeline.outputs
+    def key(self, pipeline: PipelineRecipes, point: PointRequest) -> str:
+        """Return a digest of everything that decides a point: the keys of a run and the settings of the comparison."""
+        recipe, outputs = pipeline.recipe(point.lit), pipeline.pipeline.outputs
         params: dict[str, dict[str, Any]] = {}
-        for name, value in self._changed(recipe, wanted, outputs).items():
+        for name, value in self._changed(recipe, point, outputs).items():
             step, _, param = name.rpartition(".")
             params.setdefault(step, {})[param] = value
         steps = {
             name: replace(recipe.steps[name], params={**recipe.steps[name].params, **changed})
             for name, changed in params.items()
         }
-        keys = self._keys(replace(recipe, steps={**recipe.steps, **steps}), wanted, outputs)
+        keys = self._keys(replace(recipe, steps={**recipe.steps, **steps}), outputs, point.scene)
         within = [recipe.tolerance, recipe.exact, device_kind(self.device), self.small]
         own = [self._code.digest(used.__module__) for used in (quality, resize)]
         return digest("evaluate", engine("evaluation.evaluation_points"), [keys[name] for name in outputs], within, own)
 
-    def _keys(self, recipe: Recipe, wanted: PointRequest, outputs: Sequence[str]) -> dict[str, str]:
-        """Return the key of each step.
-
-        Noise depends on the scene. What no scene reaches, such as a mask that is drawn, depends on the recipe only.
-        """
-        keys = {"scene": wanted.scene.key(self._code)}
-        live = _reached(recipe, ("scene",))
+    def _keys(self, recipe: Recipe, outputs: Iterable[str], scene: Scene | None = None) -> dict[str, str]:
+        """Return the key of each step; only steps that depend on the scene get the seed of the scene."""
+        keys = {"scene": scene.key(self._code)} if scene else {}
+        live = _reached(recipe, keys)
         for name in needed(recipe, outputs):
             if name not in keys:
                 step = recipe.steps[name]
-                seed = wanted.scene.seed if name in live else recipe.seed
+                seed = scene.seed if scene and name in live else recipe.seed
                 keys[name], _ = key_of(step, keys, seed, self._code, place(step, self.device))
         return keys
 
     def _function(self, pipeline: PipelineRecipes, case: str, outputs: tuple[str, ...]) -> Any:
         name = (f"{pipeline.name} {outputs}", case)
         if name not in self._functions:
-            recipe = pipeline.recipes[case]
+            recipe = pipeline.recipe(case)
             whole = with_substitutions(recipe, outputs)  # as in `run`, but the scene is an argument
-            there = set(needed(whole, outputs))
+            steps = set(needed(whole, outputs))
             inputs = self._inputs(recipe, outputs)
-            readers = [name for name in (inputs.readers if inputs else ()) if name.rpartition(".")[0] in there]
-            free = ["scene", *readers]
+            free = ["scene", *(r for r in (inputs.readers if inputs else ()) if r.rpartition(".")[0] in steps)]
             if case != NONE:
                 free += [f"direction[{BEAM}].angle", *(f"{spot}.strength" for spot in _spots(recipe, outputs))]
             caller = self._kept.caller(_reached(whole, [n for n in whole.steps if n.partition("[")[0] in _MOVED]))
-            found: Any = as_function(whole, *free, outputs=outputs, store=self.store, device=self.device, caller=caller)
-            self._share(found, whole)
-            self._functions[name] = found
+            ways: dict[str, Any] = {"store": self.store, "device": self.device, "caller": caller}
+            self._functions[name] = as_function(whole, *free, outputs=outputs, **ways)
+            self._share(self._functions[name], whole)
         return self._functions[name]
 
-    def _changed(self, recipe: Recipe, wanted: PointRequest, outputs: Sequence[str]) -> dict[str, Any]:
-        """Return the parameters that differ from the recipe's: those drawn for the scene, and the laser's."""
+    def _changed(self, recipe: Recipe, point: PointRequest, outputs: Sequence[str]) -> dict[str, Any]:
+        """Return the parameters that a point changes: drawn values, and the direction and strength of the laser."""
         inputs = self._inputs(recipe, outputs)
-        drawn = inputs.theta(wanted.scene.draw(inputs)) if inputs else {}
-        return drawn | _moved(recipe, wanted, outputs)
+        changed = inputs.theta(point.scene.draw(inputs)) if inputs else {}
+        if point.lit != NONE:
+            changed[f"direction[{BEAM}].angle"] = point.scene.angle(recipe)
+            changed |= {f"{spot}.strength": point.strength for spot in _spots(recipe, outputs)}
+        return changed
 
     def _inputs(self, recipe: Recipe, outputs: Sequence[str]) -> Inputs | None:
-        """Return the uncertain inputs of the recipe; None where no output depends on any."""
+        """Return the uncertain inputs of the recipe, or None if no output depends on an uncertain input."""
         if recipe.uncertain is None or not recipe.uncertain.names:
             return None
         key = (id(recipe), tuple(outputs))
         if key not in self._drawn:
             self._drawn[key] = (recipe, None)
-            with suppress(ValueError):  # no output depends on any
+            with suppress(ValueError):  # no output depends on an uncertain input
                 self._drawn[key] = (recipe, Inputs.of(recipe, outputs))
         return self._drawn[key][1]
 
     def _share(self, function: Any, recipe: Recipe) -> None:
-        """Make functions hold one copy of the results that they share, so that later results are shared too."""
-        keys: dict[str, str] = {}
-        for name in needed(recipe, function.fixed):
-            step = recipe.steps[name]
-            keys[name], _ = key_of(step, keys, recipe.seed, self._code, place(step, self.device))
+        """Give a function the equal fixed results of earlier functions, so that later results are shared too."""
+        keys = self._keys(recipe, function.fixed)
         for name, value in function.fixed.items():
             function.fixed[name] = self._fixed.setdefault(keys[name], value)
 
     def _numbers(self, pipeline: PipelineRecipes, values: Mapping[str, Any]) -> PointNumbers:
-        line = pipeline.pipeline
-        picture, truth = values[line.picture], values["truth"]
-        whole = values[line.quality]
-        small = whole
+        line, truth = pipeline.pipeline, values["truth"]
+        small = whole = values[line.quality]
         if min(truth.shape[-2:]) > self.small:
-            domain = pipeline.recipes[NONE].steps[line.quality].params["domain"]
-            small = quality(*(reduced(x, self.small) for x in (picture, truth)), domain=domain)
+            domain = pipeline.recipe(NONE).steps[line.quality].params["domain"]
+            small = quality(reduced(values[line.picture], self.small), reduced(truth, self.small), domain=domain)
         peak, saturated = values["peak[mask]"], values["saturated[mask]"]
         return {
             **{name: float(value) for name, value in whole._asdict().items()},
@@ -183,16 +175,8 @@ class EvaluationPoints:
         }
 
 
-def _moved(recipe: Recipe, wanted: PointRequest, outputs: Sequence[str]) -> dict[str, Any]:
-    """Return the parameters that a point changes: the laser's direction and strength, where there is a laser."""
-    if wanted.lit == NONE:
-        return {}
-    strengths = {f"{spot}.strength": wanted.strength for spot in _spots(recipe, outputs)}
-    return {f"direction[{BEAM}].angle": wanted.scene.angle(recipe), **strengths}
-
-
 class _SharedResults:
-    """Results that the next point needs again: those of a scene, and those of a strength."""
+    """Results that the next point needs again: results of the scene, and results of the strength."""
 
     def __init__(self) -> None:
         self._of_scene: dict[Any, tuple[Any, Any]] = {}
@@ -206,50 +190,48 @@ class _SharedResults:
         self._of_scene.clear()
         self._of_strength.clear()
 
-    def turn(self, wanted: PointRequest) -> None:
-        """Go to a point, and release the results of any other scene, case or strength."""
-        scene = (wanted.scene.number, wanted.scene.seed, wanted.case)
+    def turn(self, point: PointRequest) -> None:
+        """Go to a point, and release the results of other scenes, lasers and strengths."""
+        scene = (point.scene.number, point.scene.seed, point.scene.case)
         if scene != self._scene:
             self._of_scene.clear()
-        if (*scene, wanted.strength) != (*self._scene, self._strength):
+        if (*scene, point.strength) != (*self._scene, self._strength):
             self._of_strength.clear()
-        self._scene, self._strength, self._seed = scene, wanted.strength, wanted.scene.seed
+        self._scene, self._strength, self._seed = scene, point.strength, point.scene.seed
 
     def caller(self, moved: set[str]) -> Callable[..., Any]:
-        """Return a function that calls a step, or returns its result for the very same inputs.
+        """Return a function that computes a step, or returns the kept result of a step for the same input objects.
 
         ``moved`` names the steps that depend on the strength of the laser.
         """
 
-        def asked(step: Step, inputs: Sequence[Any], params: Mapping[str, Any], seed: int, device: str) -> Any:
+        def compute(step: Step, inputs: Sequence[Any], params: Mapping[str, Any], seed: int, device: str) -> Any:
             kept = self._of_strength if step.name in moved else self._of_scene
             own = (step.name, self._seed) if step.node.random else ()
-            key = (own, step.node.path, repr(sorted(params.items())), device, *_identities(inputs))
-            if key not in kept:  # kept with its inputs, so that no other object gets their identity
+            identities = [tuple(map(id, x)) if type(x) is list else id(x) for x in inputs]
+            key = (own, step.node.path, repr(sorted(params.items())), device, *identities)
+            if key not in kept:  # the inputs are kept too, so that no other object gets their identity
                 kept[key] = (inputs, call(step, inputs, params, self._seed, device))
             return kept[key][1]
 
-        return asked
-
-
-def _identities(inputs: Sequence[Any]) -> list[Any]:
-    return [tuple(id(y) for y in x) if type(x) is list else id(x) for x in inputs]
+        return compute
 
 
 def _spots(recipe: Recipe, outputs: Sequence[str]) -> list[str]:
     return [name for name in needed(recipe, outputs) if name.startswith("spot[")]
 
 
-def _reached(recipe: Recipe, roots: Sequence[str]) -> set[str]:
-    found = set(roots)
+def _reached(recipe: Recipe, roots: Iterable[str]) -> set[str]:
+    """Return the steps ``roots`` and all steps that depend on these steps."""
+    reached = set(roots)
     for name in needed(recipe, recipe.steps):
-        if not found.isdisjoint(recipe.steps[name].sources):
-            found.add(name)
-    return found
+        if not reached.isdisjoint(recipe.steps[name].sources):
+            reached.add(name)
+    return reached
 
 
 def reduced(picture: Tensor, side: int) -> Tensor:
-    """Return a picture as a display shows it, its shorter side ``side`` pixels, antialiased, in linear light."""
+    """Clip a picture to [0, 1] and reduce the shorter side to ``side`` pixels, antialiased and in linear light."""
     y, x = picture.shape[-2:]
     scale = side / min(y, x)
     return resize(picture.clamp(0, 1), round(y * scale), round(x * scale))

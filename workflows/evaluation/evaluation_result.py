@@ -1,4 +1,4 @@
-"""The result of an evaluation: what was measured of every pipeline, scene by scene, and the tables over them."""
+"""The result of an evaluation: the numbers of every pipeline in every scene, and statistics over the scenes."""
 
 from __future__ import annotations
 
@@ -17,17 +17,17 @@ from neusee.workflows.graph.recipe_graph import Recipe
 
 @dataclass(frozen=True)
 class EvaluationResult:
-    """All that was measured."""
+    """The scenes, points, statistics, masks and pictures of an evaluation."""
 
     recipe: Recipe
     scenes: Sequence[Scene]
     broken: Sequence[tuple[Path, str]]
     strengths: tuple[float, ...]
     small: int  #: pixels of the shorter side of the small pictures
-    reference: str  #: the pipeline to compare with
-    points: dict[str, list[dict[float, PointNumbers]]]  #: by pipeline, and scene by scene
+    reference: str  #: the pipeline with which all others are compared
+    points: dict[str, list[dict[float, PointNumbers]]]  #: by pipeline and scene
     tables: dict[str, MetricTable]  #: by pipeline
-    against: dict[str, dict[str, Interval]]  #: gains over the reference, by pipeline
+    against: dict[str, dict[str, Interval]]  #: gains over the reference by pipeline
     masks: dict[str, MaskOptics]  #: by mask
     panels: Sequence[Panel]
     pipelines: Sequence[Pipeline]

@@ -1,9 +1,9 @@
-"""Scenes of an evaluation: part of a photograph, the direction of a laser and the seed of the noise, by number."""
+"""The numbered scenes of an evaluation: part of a photograph, direction of a laser and seed of the noise."""
 
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
 
@@ -13,7 +13,7 @@ from neusee.nodes import ParameterError
 from neusee.nodes.scene import choose_photograph, crop_photograph, list_photographs
 from neusee.workflows.engine.node_call import call
 from neusee.workflows.engine.runner import run
-from neusee.workflows.evaluation.pipelines import BEAM, CASES, NONE, EvaluationRefused
+from neusee.workflows.evaluation.pipelines import BEAM, CASES, EvaluationRefused
 from neusee.workflows.graph.recipe_graph import Recipe
 from neusee.workflows.keys.cache_key import digest, file_digest, key_of, stream_seed
 from neusee.workflows.keys.code_digest import Code
@@ -25,84 +25,56 @@ _PHOTOGRAPH = "scene.photograph"
 
 @dataclass(frozen=True)
 class Scene:
-    """One scene; its picture is read when it is first needed."""
+    """One scene of an evaluation, whose picture is read when the picture is first needed."""
 
     number: int
-    seed: int  #: of noise and direction: those of a run of the recipe with this seed
-    case: str  #: its laser
-    source: _Source
+    case: str  #: name of the laser, or none
+    name: str  #: path of the photograph within its folder, or the node of the recipe's own scene
+    path: Path | None  #: photograph; None for the recipe's own scene
+    shape: tuple[int, int]
+    recipe: Recipe
+    store: Store
 
     @property
-    def name(self) -> str:
-        """Return the path of the photograph within its folder."""
-        return self.source.name(self.number)
+    def seed(self) -> int:
+        """Return the seed of noise and direction: a run of the recipe with this seed has the same values."""
+        return self.recipe.seed + self.number
 
     @cached_property
     def picture(self) -> Tensor:
         """Return the picture in linear sRGB (3, y, x)."""
-        return self.source.picture(self.number)
+        if self.path is None:
+            own: Tensor = run(self.recipe, self.store, ("scene",))["scene"]
+            return own
+        try:
+            return crop_photograph(self.path, self.shape, self.recipe.seed, self.number)
+        except (ParameterError, OSError, ValueError, SyntaxError) as error:
+            text = "remove this file and run the same command again; all other points are kept"
+            raise EvaluationRefused(f"{self.path}: {error}: {text}") from error
 
     def key(self, code: Code) -> str:
-        """Return what decides the picture."""
-        return self.source.key(self.number, code)
+        """Return a digest of everything that decides the picture."""
+        if self.path is None:
+            return digest("own scene", key_of(self.recipe.steps["scene"], {}, self.recipe.seed, code)[0])
+        own = code.digest(crop_photograph.__module__)
+        return digest("photograph", own, file_digest(self.path), list(self.shape), self.recipe.seed, self.number)
 
     def draw(self, inputs: Inputs) -> dict[str, float]:
-        """Return a draw of each uncertain value, in SI: the same for every mask, restorer and laser."""
+        """Draw each uncertain value, in SI, with the same result for every mask, restorer and laser."""
         import numpy as np
 
         z = [np.random.default_rng([self.seed, stream_seed(0, name)]).standard_normal() for name in inputs.names]
         return dict(zip(inputs.names, map(float, inputs.at(np.array([z]))[0]), strict=True))
 
     def angle(self, recipe: Recipe) -> tuple[float, float]:
-        """Return direction cosines (y, x) of the laser, drawn as the paper draws them."""
+        """Draw the direction cosines (y, x) of the laser as the paper does."""
         step = recipe.steps[f"direction[{BEAM}]"]
         drawn = call(step, [], step.params, self.seed, "cpu")
         return float(drawn[0]), float(drawn[1])
 
 
-@dataclass(frozen=True)
-class _Source:
-    """The source of pictures: photographs, or the one scene of the recipe."""
-
-    recipe: Recipe
-    store: Store
-    root: Path | None
-    paths: Sequence[Path]
-    shape: tuple[int, int]
-
-    def name(self, number: int) -> str:
-        if not self.paths:
-            return self.recipe.steps["scene"].node.path
-        path = choose_photograph(self.paths, self.recipe.seed, number)
-        return path.relative_to(self.root).as_posix() if self.root else path.name
-
-    def picture(self, number: int) -> Tensor:
-        if not self.paths:
-            return self._own
-        path = choose_photograph(self.paths, self.recipe.seed, number)
-        try:
-            return crop_photograph(path, self.shape, self.recipe.seed, number)
-        except (ParameterError, OSError, ValueError, SyntaxError) as error:
-            raise EvaluationRefused(f"{path}: {error}: remove this file; all other points are kept") from error
-
-    @cached_property
-    def _own(self) -> Tensor:
-        found: Tensor = run(self.recipe, self.store, ("scene",))["scene"]
-        return found
-
-    def key(self, number: int, code: Code) -> str:
-        if not self.paths:
-            step = self.recipe.steps["scene"]
-            return digest("own scene", key_of(step, {}, self.recipe.seed, code)[0])
-        path = choose_photograph(self.paths, self.recipe.seed, number)
-        own = code.digest(crop_photograph.__module__)
-        return digest("photograph", own, file_digest(path), list(self.shape), self.recipe.seed, number)
-
-
-def scenes(
-    recipe: Recipe, store: Store, root: Path | None, count: int, cases: Sequence[str] = tuple(CASES)
-) -> tuple[list[Scene], list[tuple[Path, str]]]:
-    """Return ``count`` scenes, the cases in turn, and the photographs that cannot be read."""
+def scenes(recipe: Recipe, store: Store, root: Path | None, count: int) -> tuple[list[Scene], list[tuple[Path, str]]]:
+    """Return ``count`` scenes with the lasers in turn, and the unreadable photographs with the reasons."""
     broken: list[tuple[Path, str]] = []
     own = recipe.steps["scene"]
     shape = _shape(recipe)
@@ -112,25 +84,21 @@ def scenes(
             raise EvaluationRefused(f"--data {root}: no such folder")
         paths, broken = list_photographs(root)
         if not paths:
-            said = f"; {broken[0][0].name}: {broken[0][1]}" if broken else ""
-            raise EvaluationRefused(f"--data {root}: no photograph that can be read, PNG or JPEG{said}")
-    source = _Source(recipe, store, root, paths, shape)
-    return [Scene(i, recipe.seed + i, cases[i % len(cases)], source) for i in range(count)], broken
+            reason = f"; {broken[0][0].name}: {broken[0][1]}" if broken else ""
+            raise EvaluationRefused(f"--data {root}: no photograph that can be read, PNG or JPEG{reason}")
+    cases, shown = list(CASES), []
+    for i in range(count):
+        path = choose_photograph(paths, recipe.seed, i) if paths else None
+        name = own.node.path if path is None else path.relative_to(root).as_posix() if root else path.name
+        shown.append(Scene(i, cases[i % len(cases)], name, path, shape, recipe, store))
+    return shown, broken
 
 
 def _shape(recipe: Recipe) -> tuple[int, int]:
-    """Return the size of the scene, as the step of the recipe states it."""
+    """Return the size of the scene from the parameters of its step; raise `EvaluationRefused` without a size."""
     shape = recipe.steps["scene"].params.get("shape")
     if shape is None and recipe.steps["scene"].node.path == _PHOTOGRAPH:
         raise EvaluationRefused("scene.shape: give the size to crop from every photograph, such as [768, 768]")
     if shape is None:
-        raise EvaluationRefused("the recipe's scene has no shape: write one, such as scene.shape=[768, 768]")
+        raise EvaluationRefused("the scene of the recipe has no shape: write one, such as scene.shape=[768, 768]")
     return int(shape[0]), int(shape[1])
-
-
-def with_case(scene: Scene, case: str) -> Scene:
-    """Return the same scene and direction behind another laser."""
-    return replace(scene, case=case)
-
-
-__all__ = ["NONE", "Scene", "scenes", "with_case"]

@@ -1,54 +1,50 @@
-"""The optics of a mask alone: suppression at each wavelength, the contrast that is left, and the limits of both."""
+"""The optics of a mask without a scene: suppression and contrast at each wavelength, and bounds on both."""
 
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 
 from neusee.nodes import metrics
 from neusee.nodes.metrics import least_lsr, most_unsuppressed
 from neusee.workflows.engine.runner import run
+from neusee.workflows.evaluation.confidence_intervals import Numbers
 from neusee.workflows.evaluation.pipelines import NONE, PipelineRecipes
 from neusee.workflows.store.result_store import Store
-
-if TYPE_CHECKING:
-    from numpy.typing import NDArray
-
-    Numbers = NDArray[np.float64]
 
 
 @dataclass(frozen=True)
 class MaskOptics:
-    """Suppression and contrast of a mask, by band."""
+    """Suppression and contrast of a mask by band."""
 
     wavelengths: Numbers  #: nm
     lsr: Numbers
     bsr: Numbers  #: mean over scenes
     median: Numbers  #: contrast, within the band of the clear aperture
-    rms: Numbers  #: of the same
-    floor: Numbers  #: least LSR of light that is kept in the field
-    most: Numbers  #: most rms contrast that the peak allows
-    unsuppressed: Numbers  #: the same of a mask with an LSR of 1 that keeps all light
+    rms: Numbers  #: rms contrast within the same band
+    floor: Numbers  #: smallest LSR of a mask that keeps all light in the field
+    most: Numbers  #: largest rms contrast that the peak allows
+    unsuppressed: Numbers  #: largest rms contrast of a mask with an LSR of 1 that keeps all light
 
 
 def masks(
     each: Sequence[PipelineRecipes], store: Store, device: str, points: Mapping[str, Sequence[Mapping[float, Any]]]
 ) -> dict[str, MaskOptics]:
-    """Return the optics of every mask once, in the order of the pipelines."""
-    found: dict[str, MaskOptics] = {}
+    """Return the optics of each mask by name, in the order of the pipelines."""
+    optics: dict[str, MaskOptics] = {}
     for pipeline in each:
-        if pipeline.pipeline.front not in found:
-            bsr = [point["bsr"] for at in points[pipeline.name] for point in list(at.values())[:1]]
-            found[pipeline.pipeline.front] = _mask(pipeline, store, device, np.mean(bsr, axis=0))
-    return found
+        if pipeline.pipeline.front not in optics:
+            bsr = [next(iter(point.values()))["bsr"] for point in points[pipeline.name]]
+            optics[pipeline.pipeline.front] = _mask(pipeline, store, device, np.mean(bsr, axis=0))
+    return optics
 
 
 def _mask(pipeline: PipelineRecipes, store: Store, device: str, bsr: Numbers) -> MaskOptics:
     wanted = ("bands", "lsr[mask]", "mtf[mask]", "psf[mask]")
-    values = run(pipeline.recipes[NONE], store, wanted, device=device).values
+    values = run(pipeline.recipe(NONE), store, wanted, device=device).values
     bands, lsr, mtf, psf = (values[name] for name in wanted)
     each = (lsr, mtf.median, mtf.rms, least_lsr(psf), metrics.limits(psf).passed, most_unsuppressed(psf))
     suppression, *rest = (x.double().cpu().numpy() for x in each)

@@ -1,10 +1,11 @@
-"""The pipelines of an evaluation: a mask and a restorer each, with one recipe for each laser."""
+"""The pipelines of an evaluation: pairs of a mask and a restorer, with one recipe for each laser."""
 
 from __future__ import annotations
 
 import re
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from functools import cache, partial
 from pathlib import Path
 
 from neusee.workflows.graph.diagnostics import Diagnostic, RecipeError, nearest
@@ -13,11 +14,10 @@ from neusee.workflows.recipe.loading import load
 from neusee.workflows.recipe.text.composition import groups_of, packaged
 from neusee.workflows.recipe.text.overrides import Override
 
-NONE = "none"  #: of restorers: the raw picture, developed; of cases: no laser
-BEAM = "beam"  #: the laser's name in every recipe of an evaluation
-FILES = ("file", "weights")  #: parameters by which an option may take a file
+NONE = "none"  #: name of the restorer that restores nothing, and of the case without a laser
+BEAM = "beam"  #: name of the laser in every recipe of an evaluation
 
-#: the paper's cases; where the paper names only a colour, the wavelength (m) of a common laser
+#: the lasers of the paper with wavelengths in m: where the paper names only a colour, a common laser of this colour
 CASES: dict[str, float | None] = {
     "violet": 405e-9,
     "blue": 450e-9,
@@ -31,12 +31,12 @@ _HOW = "write MASK+RESTORER, such as flat+none, five_half_rings+wiener or pixelw
 
 
 class EvaluationRefused(ValueError):
-    """Mistakes in the arguments of an evaluation; nothing was run."""
+    """Error for mistakes in the arguments or the photographs of an evaluation."""
 
 
 @dataclass(frozen=True)
 class Pipeline:
-    """A mask in front of the lens and the restorer of its picture."""
+    """A mask in front of the lens, and the restorer of the picture behind this mask."""
 
     mask: str  #: an option of `doe`
     restorer: str  #: an option of `restore`, or none
@@ -45,62 +45,49 @@ class Pipeline:
 
     @property
     def name(self) -> str:
-        """Return the pipeline as it was asked for, files by their names."""
+        """Return the pipeline as text, with the names of files without folders."""
         return f"{self.front}+{self.back}"
 
     @property
     def front(self) -> str:
-        """Return the mask with its file."""
+        """Return the name of the mask, with its file if any."""
         return self.mask + (f"@{self.height_file.name}" if self.height_file else "")
 
     @property
     def back(self) -> str:
-        """Return the restorer with its file."""
+        """Return the name of the restorer, with its file if any."""
         return self.restorer + (f"@{self.weights.name}" if self.weights else "")
 
     @property
     def picture(self) -> str:
-        """Return the step whose picture is judged."""
+        """Return the step whose picture is compared with the truth."""
         return "developed[mask]" if self.restorer == NONE else "restored"
 
     @property
     def quality(self) -> str:
-        """Return the step that judges the picture."""
+        """Return the step that compares the picture with the truth."""
         return "developed_quality[mask]" if self.restorer == NONE else "restored_quality"
 
     @property
     def outputs(self) -> tuple[str, ...]:
-        """Return the steps that an evaluation needs of a run."""
+        """Return the steps whose results an evaluation needs."""
         return (self.picture, "truth", self.quality, "saturated[mask]", "peak[mask]", "bsr[mask]")
 
 
 @dataclass(frozen=True)
 class PipelineRecipes:
-    """A pipeline with its recipe for each case."""
+    """A pipeline with one recipe for each laser; the recipes differ only in the wavelength of the laser."""
 
     pipeline: Pipeline
-    recipes: _Recipes  #: by case
+    recipe: Callable[[str], Recipe]  #: of a laser by name
 
     @property
     def name(self) -> str:
         return self.pipeline.name
 
 
-class _Recipes(dict[str, Recipe]):
-    """The recipe of each case, read when it is first asked for; the recipes differ in one wavelength."""
-
-    def __init__(self, recipe: str, words: Sequence[str | Override], fwhm: float, folder: Path) -> None:
-        super().__init__()
-        self._how = recipe, words, fwhm, folder
-
-    def __missing__(self, case: str) -> Recipe:
-        recipe, words, fwhm, folder = self._how
-        self[case] = load(recipe, [*words, _laser(CASES[case], fwhm)], folder)
-        return self[case]
-
-
 def read_pipelines(text: str, folder: Path) -> list[Pipeline]:
-    """Read text such as ``flat+none, five_half_rings+wiener``; raise `EvaluationRefused` with every mistake."""
+    """Read pipelines such as ``flat+none, five_half_rings+wiener``; raise `EvaluationRefused` with every mistake."""
     found: list[Pipeline] = []
     wrong: list[str] = []
     for word in filter(None, (part.strip() for part in text.split(","))):
@@ -112,7 +99,7 @@ def read_pipelines(text: str, folder: Path) -> list[Pipeline]:
         found.append(Pipeline(match["mask"], match["restorer"], height, weights))
         wrong += [f"{word}: no file {path}" for path in (height, weights) if path and not path.is_file()]
     twice = {p.name for p in found if [q.name for q in found].count(p.name) > 1}
-    wrong += [f"{name}: stands twice" for name in sorted(twice)]
+    wrong += [f"{name}: is listed twice" for name in sorted(twice)]
     if not found and not wrong:
         wrong = [f"no pipeline: {_HOW}"]
     if wrong:
@@ -123,17 +110,17 @@ def read_pipelines(text: str, folder: Path) -> list[Pipeline]:
 def compose_pipelines(
     recipe: str, changes: Sequence[str | Override], pipelines: Sequence[Pipeline], folder: Path
 ) -> list[PipelineRecipes]:
-    """Return every pipeline with its recipes; raise `EvaluationRefused` with the mistakes of all of them."""
+    """Return the recipes of every pipeline; raise `EvaluationRefused` with the mistakes of all pipelines."""
     fwhm = _fwhm(recipe, changes, folder)
     found: list[PipelineRecipes] = []
     wrong: dict[str, None] = {}
     for pipeline in pipelines:
         try:
             words = [*changes, *_words(pipeline)]
-            recipes = _Recipes(recipe, words, fwhm, folder)
+            recipe_of = cache(partial(_with_laser, recipe, words, fwhm, folder))
             for case in (NONE, next(iter(CASES))):
-                _check(recipes[case], pipeline)
-            found.append(PipelineRecipes(pipeline, recipes))
+                _check(recipe_of(case), pipeline)
+            found.append(PipelineRecipes(pipeline, recipe_of))
         except RecipeError as error:
             wrong |= dict.fromkeys(f"{pipeline.name}: {_one_line(problem)}" for problem in error.diagnostics)
         except EvaluationRefused as error:
@@ -148,7 +135,7 @@ def _one_line(problem: Diagnostic) -> str:
 
 
 def _words(pipeline: Pipeline) -> list[str]:
-    """Return the changes of the recipe that make it this pipeline."""
+    """Return the arguments that change the recipe to the mask and restorer of a pipeline."""
     words = [f"doe={pipeline.mask}"]
     if pipeline.height_file:
         words.append(f"doe.{_takes('doe', pipeline.mask)}={pipeline.height_file.absolute()}")
@@ -160,33 +147,29 @@ def _words(pipeline: Pipeline) -> list[str]:
 
 
 def _takes(group: str, option: str) -> str:
-    """Return the parameter by which an option of a group takes a file."""
+    """Return the parameter that gives a file to an option of a group; raise `EvaluationRefused` without a parameter."""
     options = groups_of(packaged()).get(group, [])
     path = packaged() / group / f"{option}.yaml"
     if option == NONE or (option in options and not path.is_file()):
         raise EvaluationRefused(f"{option} takes no file")
     if not path.is_file():
         raise EvaluationRefused(f"no option {option} in {group}; {nearest(option, options)}")
-    text = path.read_text(encoding="utf-8")
-    for name in FILES:
-        if re.search(rf"\b{name}: null", text):
-            return name
+    if match := re.search(r"\b(file|weights): null", path.read_text(encoding="utf-8")):
+        return match[1]
     raise EvaluationRefused(f"{option} takes no file")
 
 
-def _laser(metres: float | None, fwhm: float) -> str:
-    """Return the lasers of a case as an argument.
-
-    The strength of 1 stands for all strengths, and a direction is drawn for each scene.
-    """
-    if metres is None:
-        return "lasers={}"
-    line = f"wavelength: {metres * 1e9:g} nm, fwhm: {fwhm * 1e9:g} nm"
-    return f"lasers={{{BEAM}: {{{line}, strength: 1, angle: null}}}}"
+def _with_laser(recipe: str, words: Sequence[str | Override], fwhm: float, folder: Path, case: str) -> Recipe:
+    """Load a recipe with the laser of a case; strength and direction of the laser are set later for each point."""
+    laser = ""
+    if (metres := CASES[case]) is not None:
+        line = f"wavelength: {metres * 1e9:g} nm, fwhm: {fwhm * 1e9:g} nm"
+        laser = f"{BEAM}: {{{line}, strength: 1, angle: null}}"
+    return load(recipe, [*words, f"lasers={{{laser}}}"], folder)
 
 
 def _fwhm(recipe: str, changes: Sequence[str | Override], folder: Path) -> float:
-    """Return the width of the recipe's own first line; 10 nm where the recipe has no laser."""
+    """Return the width of the first laser line of the recipe in m, or 10 nm for a recipe without a laser."""
     try:
         steps = load(recipe, changes, folder).steps
     except RecipeError as error:
@@ -196,6 +179,6 @@ def _fwhm(recipe: str, changes: Sequence[str | Override], folder: Path) -> float
 
 
 def _check(recipe: Recipe, pipeline: Pipeline) -> None:
-    lacking = [name for name in ("scene", *pipeline.outputs, "lsr[mask]", "mtf[mask]") if name not in recipe.steps]
-    if lacking:
-        raise EvaluationRefused(f"an evaluation needs the steps {', '.join(lacking)}, which {recipe.name} lacks")
+    missing = [name for name in ("scene", *pipeline.outputs, "lsr[mask]", "mtf[mask]") if name not in recipe.steps]
+    if missing:
+        raise EvaluationRefused(f"{recipe.name} lacks steps that an evaluation needs: {', '.join(missing)}")

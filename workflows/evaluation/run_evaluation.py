@@ -1,10 +1,10 @@
-"""The paper's evaluation of masks and restorers: every pipeline on the same scenes and laser strengths.
+"""The evaluation of masks and restorers as in the paper: every pipeline on the same scenes and laser strengths.
 
     evaluate("first_light", read_pipelines("flat+none, five_half_rings+wiener", Path()), data=Path("photographs"))
 
-Each point, of a scene, a laser's strength and a pipeline, has the numbers of a run of the pipeline's recipe, to the
-last bit. A run that cannot prove its tolerance computes again more strictly; a point is computed once. The store keeps
-all points, so that an interrupted evaluation goes on.
+Each point has a scene, a strength of the laser and a pipeline, and the numbers of a run of the recipe to the last bit.
+A run that cannot prove its tolerance is computed again more strictly; a point is computed once. The store keeps all
+points, so that an interrupted evaluation continues.
 """
 
 from __future__ import annotations
@@ -39,8 +39,8 @@ from neusee.workflows.store.result_store import Store
 
 __all__ = ["STRENGTHS", "EvaluationRefused", "EvaluationResult", "evaluate", "read_pipelines"]
 
-STRENGTHS = (0.0, 1e1, 1e2, 1e3, 1e4, 1e5, 1e6)  #: the paper's
-SMALL = 256  #: pixels of the shorter side, at which the paper restores
+STRENGTHS = (0.0, 1e1, 1e2, 1e3, 1e4, 1e5, 1e6)  #: strengths of the paper, in multiples of saturation
+SMALL = 256  #: pixels of the shorter side of the pictures that the paper restores
 
 
 def evaluate(
@@ -60,12 +60,12 @@ def evaluate(
     device: str = "cpu",
     folder: Path | None = None,
 ) -> Path:
-    """Measure every pipeline over ``count`` scenes and all ``strengths``; return the folder of the results.
+    """Measure every pipeline on ``count`` scenes at all ``strengths``, and return the folder of the results.
 
-    Args: recipe, changes: the camera, as `load` takes them. data: a folder of photographs; without one, the recipe's
-    own scene. small: shorter side of the reduced pictures that are compared too. reference: the pipeline to compare
-    with, the first one by default. progress: receives a line for each scene. Raises: `EvaluationRefused` with every
-    mistake before anything runs.
+    Args: recipe, changes: the camera, as for `load`. data: a folder of photographs, by default the scene of the recipe.
+    small: shorter side of the reduced pictures, which are compared too. reference: the pipeline with which the others
+    are compared, by default the first pipeline. progress: receives a line for each scene.
+    Raises: `EvaluationRefused` with every mistake before anything runs.
     """
     store, place = store or open_store(), folder or Path.cwd()
     each = compose_pipelines(recipe, changes, pipelines, place)
@@ -73,43 +73,36 @@ def evaluate(
     base = load(recipe, changes, place)
     study_run = StudyRun("evaluate", base, command)
     shown, broken = scenes(base, store, data, count)
-    _announce(progress, each, shown, broken, strengths)
+    names = ", ".join(pipeline.name for pipeline in pipelines)
+    progress(f"{len(shown)} scenes, {len(strengths)} strengths, {len(pipelines)} pipelines: {names}")
+    _report_broken(broken, progress)
     bench = EvaluationPoints(store, small, device)
     points = _points(bench, each, shown, strengths, progress)
     optics = masks(each, store, device, points)
     drawn = panels(bench, each, shown[0], strengths)
-    tables = {name: metric_table(found, strengths) for name, found in points.items()}
+    tables = {name: metric_table(own, strengths) for name, own in points.items()}
     least = min(small, *(base.steps["truth"].params["shape"])) if "truth" in base.steps else small
     more = {name: compare_with(own, tables[reference], base.seed) for name, own in tables.items()}
     rest = (reference, points, tables, more, optics, drawn, list(pipelines))
-    found = EvaluationResult(base, shown, broken, strengths, least, *rest)
-    document = study_run.document(_document(found, bench))
-    return study_run.write(runs, digest(document["summary"]), document, _report(found))
+    result = EvaluationResult(base, shown, broken, strengths, least, *rest)
+    document = study_run.document(_document(result, bench))
+    return study_run.write(runs, digest(document["summary"]), document, _report(result))
 
 
 def _strengths(strengths: Sequence[float]) -> tuple[float, ...]:
     if not strengths or min(strengths) < 0 or not all(map(np.isfinite, strengths)):
-        raise EvaluationRefused("--strengths: write multiples of saturation from 0, such as 0,1e1,1e3,1e6")
+        raise EvaluationRefused("--strengths: write multiples of saturation, 0 or more, such as 0,1e1,1e3,1e6")
     return tuple(sorted(set(map(float, strengths))))
 
 
 def _reference(reference: str, pipelines: Sequence[Pipeline]) -> str:
     names = [pipeline.name for pipeline in pipelines]
     if reference and reference not in names:
-        raise EvaluationRefused(f"--reference {reference}: is none of the pipelines {', '.join(names)}")
+        raise EvaluationRefused(f"--reference {reference}: write one of the pipelines {', '.join(names)}")
     return reference or names[0]
 
 
-def _announce(
-    progress: Progress,
-    each: Sequence[PipelineRecipes],
-    shown: Sequence[Scene],
-    broken: Sequence[Any],
-    strengths: Sequence[float],
-) -> None:
-    progress(
-        f"{len(shown)} scenes, {len(strengths)} strengths, {len(each)} pipelines: {', '.join(p.name for p in each)}"
-    )
+def _report_broken(broken: Sequence[tuple[Path, str]], progress: Progress) -> None:
     for path, reason in broken[:5]:
         progress(f"not read: {path.name}: {reason}")
     if len(broken) > 5:
@@ -123,8 +116,8 @@ def _points(
     strengths: Sequence[float],
     progress: Progress,
 ) -> dict[str, list[dict[float, PointNumbers]]]:
-    """Return every point, with the scenes of one laser after another because they share its optics."""
-    found: dict[str, list[dict[float, PointNumbers]]] = {p.name: [{} for _ in shown] for p in each}
+    """Compute all points, with the scenes of one laser one after another because these scenes share optics."""
+    points: dict[str, list[dict[float, PointNumbers]]] = {p.name: [{} for _ in shown] for p in each}
     before, order = "", [scene.case for scene in shown]
     for done, scene in enumerate(sorted(shown, key=lambda scene: order.index(scene.case)), 1):
         if before not in ("", scene.case):
@@ -132,61 +125,59 @@ def _points(
         before, alone = scene.case, replace(scene)  # a copy, so that the picture is released with it
         for strength in strengths if scene.case != NONE else (0.0,):
             for pipeline in each:
-                found[pipeline.name][scene.number][strength] = bench.point(
-                    pipeline, PointRequest(alone, scene.case, strength)
-                )
+                point = bench.point(pipeline, PointRequest(alone, strength))
+                points[pipeline.name][scene.number][strength] = point
         progress(f"scene {done} of {len(shown)} ({scene.case}, {scene.name}): {bench.computed} points computed")
-    return found
+    return points
 
 
 # --- the folder -------------------------------------------------------------------------------------------------------
 
 
-def _document(found: EvaluationResult, bench: EvaluationPoints) -> dict[str, Any]:
-    """Return what the folder says of the evaluation, beside what every study says."""
+def _document(result: EvaluationResult, bench: EvaluationPoints) -> dict[str, Any]:
     from neusee.workflows.evaluation.evaluation_page import summary
 
     return {
-        "scenes": [[s.number, s.name, s.case, s.seed] for s in found.scenes],
-        "not read": [[str(path), reason] for path, reason in found.broken],
-        "strengths": list(found.strengths),
-        "small": found.small,
-        "reference": found.reference,
+        "scenes": [[s.number, s.name, s.case, s.seed] for s in result.scenes],
+        "not read": [[str(path), reason] for path, reason in result.broken],
+        "strengths": list(result.strengths),
+        "small": result.small,
+        "reference": result.reference,
         "computed": bench.computed,
         "seconds a point": bench.seconds / bench.computed if bench.computed else None,
-        "summary": summary(found),
+        "summary": summary(result),
     }
 
 
-def _report(found: EvaluationResult) -> StudyReport:
+def _report(result: EvaluationResult) -> StudyReport:
     from neusee.workflows.evaluation.evaluation_page import COLUMNS, draw_pictures, lead, rows, sections
 
-    pictures = draw_pictures(found)
+    pictures = draw_pictures(result)
     tables: dict[str, CsvTable] = {
-        "points.csv": (("pipeline", "mask", "restorer", *_POINT, *METRICS), _point_rows(found)),
-        "table.csv": (COLUMNS, rows(found)),
-        "suppression.csv": (("mask", "wavelength (nm)", "lsr", "bsr", "floor"), _curve_rows(found)),
+        "points.csv": ((*_POINT, *METRICS), _point_rows(result)),
+        "table.csv": (COLUMNS, rows(result)),
+        "suppression.csv": (("mask", "wavelength (nm)", "lsr", "bsr", "floor"), _curve_rows(result)),
     }
     shown = ("command", "date", "seconds", "computed", "seconds a point", "reference", "versions")
-    title = f"{found.recipe.name}: evaluated"
-    return StudyReport(title, lead(found), sections(found, pictures), pictures, tables, shown=shown)
+    title = f"{result.recipe.name}: evaluated"
+    return StudyReport(title, lead(result), sections(result, pictures), pictures, tables, shown=shown)
 
 
-_POINT = ("scene", "photograph", "laser", "strength")
+_POINT = ("pipeline", "mask", "restorer", "scene", "photograph", "laser", "strength")
 
 
-def _point_rows(found: EvaluationResult) -> list[Sequence[Any]]:
+def _point_rows(result: EvaluationResult) -> list[Sequence[Any]]:
     return [
         (p.name, p.front, p.back, s.number, s.name, s.case, f"{k:g}", *(point[metric] for metric in METRICS))
-        for p in found.pipelines
-        for s, at in zip(found.scenes, found.points[p.name], strict=True)
+        for p in result.pipelines
+        for s, at in zip(result.scenes, result.points[p.name], strict=True)
         for k, point in at.items()
     ]
 
 
-def _curve_rows(found: EvaluationResult) -> list[Sequence[Any]]:
+def _curve_rows(result: EvaluationResult) -> list[Sequence[Any]]:
     return [
         (name, f"{x:.6g}", *row)
-        for name, mask in found.masks.items()
+        for name, mask in result.masks.items()
         for x, *row in zip(mask.wavelengths, mask.lsr, mask.bsr, mask.floor, strict=True)
     ]

@@ -1,14 +1,15 @@
-"""The axes of a sweep, written as in Hydra: ``a=1,2,3`` and ``b='range(0, 10, 2)'``, and their points."""
+"""The axes of a sweep in the notation of Hydra, ``a=1,2,3`` and ``b='range(0, 10, 2)'``, and the points of the axes."""
 
 from __future__ import annotations
 
 import itertools
 import math
 from collections import Counter
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeVar
 
 from neusee.workflows.graph.diagnostics import Diagnostic, Location, RecipeError
 from neusee.workflows.graph.final_values import flow
@@ -19,7 +20,7 @@ from neusee.workflows.sweeps.value_ranges import MOST, spans, values_of
 
 @dataclass(frozen=True, slots=True)
 class Coordinate:
-    """One value of an axis."""
+    """One value of an axis, with the changes of the recipe that set the value."""
 
     shown: str  #: as a user writes it
     value: Any  #: as YAML reads it
@@ -28,7 +29,7 @@ class Coordinate:
 
 @dataclass(frozen=True, slots=True)
 class Axis:
-    """A parameter, or a group, with its values."""
+    """A parameter or a group of a recipe, with the values that a sweep gives to the parameter or group."""
 
     name: str
     coordinates: tuple[Coordinate, ...]
@@ -36,17 +37,18 @@ class Axis:
 
 
 Argument = Override | Axis
+_T = TypeVar("_T")
 
 
 @dataclass(frozen=True, slots=True)
 class Point:
-    """One combination of values; points count from 1 in the order in which the axes are written."""
+    """One combination of the values of all axes."""
 
-    number: int
+    number: int  #: counts from 1, with the last axis fastest
     place: tuple[int, ...]  #: index along every axis
     coordinates: tuple[Coordinate, ...]  #: one for each axis
     overrides: tuple[Override, ...]  #: every change of the recipe, in the order of the arguments
-    axes: tuple[str, ...]  #: their names
+    axes: tuple[str, ...]  #: the names of the axes
 
     @property
     def shown(self) -> str:
@@ -55,36 +57,17 @@ class Point:
 
 
 def read_words(words: Sequence[str | Override], folder: Path, first: int = 1) -> list[Argument]:
-    """Read arguments of the command line, counted from ``first``; raise `RecipeError` with every mistake in them."""
-    found: list[Argument] = []
-    diagnostics: list[Diagnostic] = []
-    for number, word in enumerate(words, first):
-        try:
-            found.append(_read_word(word, Location(f"argument {number}", folder=str(folder))))
-        except RecipeError as error:
-            diagnostics += error.diagnostics
-    if diagnostics:
-        raise RecipeError(diagnostics)
-    return found
+    """Read arguments of the command line, counted from ``first``; raise `RecipeError` with all mistakes."""
+    return _every(partial(_read_word, word, number, folder) for number, word in enumerate(words, first))
 
 
 def read_axes(axes: Mapping[str, str | Iterable[Any]], folder: Path) -> list[Argument]:
-    """Read axes from Python values: a list of values, or a text as on the command line."""
-    found: list[Argument] = []
-    diagnostics: list[Diagnostic] = []
-    for name, values in axes.items():
-        mark = Location(f"axis {name}", folder=str(folder))
-        try:
-            found.append(_read_axis(name, values, mark, folder))
-        except RecipeError as error:
-            diagnostics += error.diagnostics
-    if diagnostics:
-        raise RecipeError(diagnostics)
-    return found
+    """Read axes whose values are a Python list, or a text as on the command line."""
+    return _every(partial(_read_axis, name, values, folder) for name, values in axes.items())
 
 
 def points(arguments: Sequence[Argument], paired: bool = False) -> list[Point]:
-    """Return every combination of values, the last axis fastest; ``paired``: the first values, the second values, …"""
+    """Return all combinations of values, the last axis fastest, or, if ``paired``, value n of every axis for each n."""
     axes = [argument for argument in arguments if isinstance(argument, Axis)]
     diagnostics = list(_wrong(axes, paired))
     if diagnostics:
@@ -97,40 +80,56 @@ def points(arguments: Sequence[Argument], paired: bool = False) -> list[Point]:
 # --- arguments ------------------------------------------------------------------------------------------------------
 
 
-def _read_word(word: str | Override, mark: Location) -> Argument:
+def _every(readers: Iterable[Callable[[], _T]]) -> list[_T]:
+    """Call each function and return the results; raise one `RecipeError` with the mistakes of all functions."""
+    results: list[_T] = []
+    diagnostics: list[Diagnostic] = []
+    for read in readers:
+        try:
+            results.append(read())
+        except RecipeError as error:
+            diagnostics += error.diagnostics
+    if diagnostics:
+        raise RecipeError(diagnostics)
+    return results
+
+
+def _read_word(word: str | Override, number: int, folder: Path) -> Argument:
     if isinstance(word, Override):
         return word
+    mark = Location(f"argument {number}", folder=str(folder))
     name, _, text = word.partition("=")
     if "=" not in word or name.startswith("~"):
         return read_override(word, mark)
-    try:
-        values = values_of(text)
-        one = len(values) == 1 and not spans(text)
-    except ValueError as error:
-        raise RecipeError([Diagnostic(mark, word, str(error))]) from None
-    if one:
+    values = _values(text, word, mark)
+    if len(values) == 1 and not spans(text):
         return read_override(word, mark)
     if name.startswith("+"):
-        fix = "an added value is the same at every point: quote a text with commas"
+        fix = "+ adds a value that is the same at every point: put a text with commas in quotes"
         raise RecipeError([Diagnostic(mark, word, fix)])
     return _axis(name, values, mark)
 
 
-def _read_axis(name: str, values: str | Iterable[Any], mark: Location, folder: Path) -> Axis:
+def _read_axis(name: str, values: str | Iterable[Any], folder: Path) -> Axis:
+    mark = Location(f"axis {name}", folder=str(folder))
     if name.startswith(("+", "~")):
-        raise RecipeError([Diagnostic(mark, name, "an axis changes a value that is there: leave out the sign")])
+        raise RecipeError([Diagnostic(mark, name, "write the name of an axis without + or ~")])
     if isinstance(values, str):
-        try:
-            return _axis(name, values_of(values), mark)
-        except ValueError as error:
-            raise RecipeError([Diagnostic(mark, f"{name}={values}", str(error))]) from None
+        return _axis(name, _values(values, f"{name}={values}", mark), mark)
     listed = values.tolist() if hasattr(values, "tolist") else values
     if isinstance(listed, Mapping) or not isinstance(listed, Iterable):
         raise RecipeError([Diagnostic(mark, name, f"give a list of values, not {type(values).__name__}")])
-    found = tuple(_coordinate(name, value, folder) for value in listed)
-    if not found:
-        raise RecipeError([Diagnostic(mark, name, "has no values")])
-    return Axis(name, found, mark)
+    coordinates = tuple(_coordinate(name, value, folder) for value in listed)
+    if not coordinates:
+        raise RecipeError([Diagnostic(mark, name, "the list of values is empty")])
+    return Axis(name, coordinates, mark)
+
+
+def _values(text: str, path: str, mark: Location) -> list[str]:
+    try:
+        return values_of(text)
+    except ValueError as error:
+        raise RecipeError([Diagnostic(mark, path, str(error))]) from None
 
 
 def _coordinate(name: str, value: Any, folder: Path) -> Coordinate:
@@ -141,48 +140,40 @@ def _coordinate(name: str, value: Any, folder: Path) -> Coordinate:
 
 
 def _axis(name: str, values: Sequence[str], mark: Location) -> Axis:
-    diagnostics: list[Diagnostic] = []
-    found: list[Coordinate] = []
-    for text in values:
-        try:
-            change = read_override(f"{name}={text}", mark)
-        except RecipeError as error:
-            diagnostics += error.diagnostics
-            continue
+    coordinates = []
+    for text, change in zip(values, _every(partial(read_override, f"{name}={v}", mark) for v in values), strict=True):
         assert change.value is not None
         plain = change.value.plain
-        found.append(Coordinate(plain if isinstance(plain, str) else text, plain, (change,)))
-    if diagnostics:
-        raise RecipeError(diagnostics)
-    return Axis(name, tuple(found), mark)
+        coordinates.append(Coordinate(plain if isinstance(plain, str) else text, plain, (change,)))
+    return Axis(name, tuple(coordinates), mark)
 
 
 # --- combinations ---------------------------------------------------------------------------------------------------
 
 
 def _wrong(axes: Sequence[Axis], paired: bool) -> Iterable[Diagnostic]:
-    """Return the mistakes of all axes together."""
+    """Yield the mistakes in the names and the numbers of values of all axes."""
     if not axes:
-        yield Diagnostic(Location("sweep"), "", "no axis: write a=1,2,3 or a='linspace(450 nm, 650 nm, 5)'")
+        yield Diagnostic(Location("sweep"), "", "there is no axis: write a=1,2,3 or a='linspace(450 nm, 650 nm, 5)'")
     first: dict[str, Axis] = {}
     for axis in axes:
         if first.setdefault(axis.name, axis) is not axis:
-            yield Diagnostic(axis.mark, axis.name, f"is an axis already ({first[axis.name].mark})")
+            yield Diagnostic(axis.mark, axis.name, f"{axis.name} is already an axis ({first[axis.name].mark})")
         twice = [value for value, count in Counter(c.shown for c in axis.coordinates).items() if count > 1]
         if twice:
-            yield Diagnostic(axis.mark, axis.name, f"{twice[0]} appears twice")
+            yield Diagnostic(axis.mark, axis.name, f"the value {twice[0]} appears twice")
         there, here = len(axes[0].coordinates), len(axis.coordinates)
         if paired and there != here:
             text = f"has {here} values, and {axes[0].name} ({axes[0].mark}) has {there}"
-            yield Diagnostic(axis.mark, axis.name, f"{text}: paired axes have equally many values")
-    count = 1 if paired else math.prod(len(axis.coordinates) for axis in axes)
-    if count > MOST:
-        yield Diagnostic(Location("sweep"), "", f"{count} points: at most {MOST}")
+            yield Diagnostic(axis.mark, axis.name, f"{text}: paired axes need equally many values")
+    product = 1 if paired else math.prod(len(axis.coordinates) for axis in axes)
+    if product > MOST:
+        yield Diagnostic(Location("sweep"), "", f"a sweep of {product} points is too long: at most {MOST} points")
 
 
 def _point(number: int, place: tuple[int, ...], arguments: Sequence[Argument], axes: Sequence[Axis]) -> Point:
     coordinates = tuple(axis.coordinates[i] for axis, i in zip(axes, place, strict=True))
     here = iter(coordinates)
-    changes = [next(here).overrides if isinstance(a, Axis) else (a,) for a in arguments]
+    changes = (next(here).overrides if isinstance(a, Axis) else (a,) for a in arguments)
     names = tuple(axis.name for axis in axes)
-    return Point(number, place, coordinates, tuple(change for group in changes for change in group), names)
+    return Point(number, place, coordinates, tuple(itertools.chain.from_iterable(changes)), names)

@@ -1,24 +1,24 @@
-"""The order in which the points of a sweep run, the results that they share, and the work that each has left.
+"""The order in which the points of a sweep run, the results that points share, and the work of each point.
 
-Two points share a step if its key is the same. Points that share much run one after another, so that a costly result
-is made once, used at once and dropped: an axis that reaches costly steps varies slowly, and from one point to the next
-only one axis changes.
+Two points share the result of a step if the step has the same key at both points. An axis that changes costly steps
+varies slowly, and only one axis changes from point to point: a costly result is computed once and released soon.
 """
 
 from __future__ import annotations
 
-from collections import defaultdict
+import math
+from collections import Counter, defaultdict
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass
+from functools import cache
 from statistics import median
 
-from neusee.workflows.graph.recipe_graph import in_order
 from neusee.workflows.keys.cache_key import Key
 
 
 @dataclass(frozen=True, slots=True)
 class PointJob:
-    """The steps that one point needs."""
+    """The steps that one point of a sweep needs, with their keys and sources."""
 
     place: tuple[int, ...]  #: index along every axis
     keys: Mapping[str, Key]  #: of every step that the outputs need
@@ -28,23 +28,23 @@ class PointJob:
 
 @dataclass(frozen=True, slots=True)
 class Sharing:
-    """The results that the points of a sweep share."""
+    """The results that the points of a sweep share, and the work that this saves."""
 
     points: int
-    distinct: Mapping[str, int]  #: different results by step
-    steps: int  #: steps of all points, each point for itself
-    made: int  #: different results in all
+    distinct: Mapping[str, int]  #: number of different results of each step
+    steps: int  #: number of steps of all points together
+    made: int  #: number of different results of all steps
     alone: float  #: work of all points, each for itself: seconds, or steps where no seconds are known
     together: float  #: work of the different results
 
     @property
     def saved(self) -> float:
-        """Return the share of the work that sharing saves, in [0, 1]."""
+        """Return the fraction of the work that shared results save, in [0, 1]."""
         return 1 - self.together / self.alone if self.alone else 0.0
 
 
 def filled(costs: Mapping[str, float], steps: Iterable[str]) -> dict[str, float]:
-    """Return a cost for every step: its known cost, else the median of known costs, else 1."""
+    """Return a cost for every step: the known cost of the step, else the median of the known costs, else 1."""
     steps = list(steps)
     known = [costs[step] for step in steps if step in costs]
     usual = median(known) if known else 1.0
@@ -52,13 +52,12 @@ def filled(costs: Mapping[str, float], steps: Iterable[str]) -> dict[str, float]
 
 
 def best_order(jobs: Sequence[PointJob], costs: Mapping[str, float], paired: bool = False) -> list[int]:
-    """Return an order of ``jobs``, as indices, in which costly shared steps run once although little is held.
+    """Return indices of ``jobs`` in an order in which costly shared steps run once although few results are held.
 
-    Args: jobs: one for each point, in the order of the product of the axes, the last axis fastest.
-    costs: seconds by step, or nothing. paired: the axes vary together, as one axis.
+    Args: jobs: one job for each point, in the order of the product of the axes, the last axis fastest.
+    costs: known seconds by step. paired: the axes vary together, as one axis.
 
-    For a product whose axes each reach a fixed set of steps, no order changes less work from point to point: every
-    change costs at least its cheapest axis, and a cheaper axis is used as often as a path through the points can.
+    If each axis changes a fixed set of steps, no other order of a product changes less work from point to point.
     """
     weights = filled(costs, {step for job in jobs for step in job.keys})
     if paired:
@@ -71,69 +70,49 @@ def best_order(jobs: Sequence[PointJob], costs: Mapping[str, float], paired: boo
 
 
 def sharing(jobs: Sequence[PointJob], costs: Mapping[str, float]) -> Sharing:
-    """Count the different results of every step, and the work that sharing saves."""
+    """Count the different results of every step, and the work with and without shared results."""
     weights = filled(costs, {step for job in jobs for step in job.keys})
-    found: dict[str, set[Key]] = defaultdict(set)
-    cost: dict[Key, float] = {}
+    different: dict[Key, float] = {}
     alone, steps = 0.0, 0
     for job in jobs:
-        mine = {key: weights[step] for step, key in job.keys.items()}
-        for step, key in job.keys.items():
-            found[step].add(key)
-        cost |= mine
-        alone, steps = alone + sum(mine.values()), steps + len(mine)
-    distinct = {step: len(keys) for step, keys in found.items()}
-    return Sharing(len(jobs), distinct, steps, len(cost), alone, sum(cost.values()))
+        own = {key: weights[step] for step, key in job.keys.items()}
+        different |= own
+        alone, steps = alone + sum(own.values()), steps + len(own)
+    distinct = Counter(step for step, _ in {pair for job in jobs for pair in job.keys.items()})
+    return Sharing(len(jobs), distinct, steps, len(different), alone, sum(different.values()))
 
 
 def work_left(jobs: Iterable[PointJob], costs: Mapping[str, float], stored: Callable[[Key], bool]) -> list[float]:
-    """Return the work of each job in turn; a result that is stored, or made by an earlier job, costs nothing."""
-    made: set[Key] = set()
-    found = []
-
-    def known(key: Key) -> bool:
-        return key in made or stored(key)
-
+    """Return the work of each job in turn; a result that is stored, or computed by an earlier job, costs nothing."""
+    computed: set[Key] = set()
+    in_store = cache(stored)
+    work = []
     for job in jobs:
-        weights = filled(costs, job.keys)
-        missing = _Missing(job, known)
-        names = [name for name in in_order(missing, job.outputs) if name in missing.names]
-        fresh = {job.keys[name]: weights[name] for name in names}
-        made.update(fresh)
-        found.append(sum(fresh.values()))
-    return found
-
-
-class _Missing(dict[str, tuple[str, ...]]):
-    """The steps that each step asks for: its sources where its result is missing, none where the result is known."""
-
-    def __init__(self, job: PointJob, known: Callable[[Key], bool]) -> None:
-        self.job, self.known, self.names = job, known, set[str]()
-
-    def __missing__(self, name: str) -> tuple[str, ...]:
-        self[name] = ()
-        if not self.known(self.job.keys[name]):
-            self.names.add(name)
-            self[name] = self.job.sources[name]
-        return self[name]
+        weights, fresh, waiting = filled(costs, job.keys), list[float](), list(job.outputs)
+        while waiting:
+            name = waiting.pop()
+            key = job.keys[name]
+            if key not in computed and not in_store(key):
+                computed.add(key)
+                fresh.append(weights[name])
+                waiting += job.sources[name]
+        work.append(sum(fresh))
+    return work
 
 
 def _reach(jobs: Sequence[PointJob], weights: Mapping[str, float], sizes: Sequence[int], axis: int) -> float:
-    """Return the mean work of one move along an axis."""
-    stride = 1
-    for size in sizes[axis + 1 :]:
-        stride *= size
-    changed, moves = 0.0, 0
-    for i, job in enumerate(jobs):
-        if job.place[axis]:
-            before = jobs[i - stride].keys
-            changed += sum(weights[step] for step, key in job.keys.items() if before.get(step) != key)
-            moves += 1
-    return changed / moves if moves else 0.0
+    """Return the mean work of the steps that change from one value of an axis to the next."""
+    stride = math.prod(sizes[axis + 1 :])
+    work = [
+        sum(weights[step] for step, key in job.keys.items() if jobs[i - stride].keys.get(step) != key)
+        for i, job in enumerate(jobs)
+        if job.place[axis]
+    ]
+    return sum(work) / len(work) if work else 0.0
 
 
 def _there_and_back(sizes: Sequence[int], slowest_first: Sequence[int]) -> list[tuple[int, ...]]:
-    """Return every place, each one step along one axis away from the place before."""
+    """Return the indices of every point along the axes; from one point to the next one index changes by 1."""
     rows: list[list[int]] = [[0] * len(sizes)]
     for axis in slowest_first:
         grown = []
@@ -145,7 +124,7 @@ def _there_and_back(sizes: Sequence[int], slowest_first: Sequence[int]) -> list[
 
 
 def _grouped(jobs: Sequence[PointJob], weights: Mapping[str, float]) -> list[int]:
-    """Order points so that equal costly results come one after another, and otherwise as given."""
+    """Return indices of ``jobs`` with equal costly results one after another, and otherwise in the given order."""
     first: dict[str, dict[Key, int]] = defaultdict(dict)
     for i, job in enumerate(jobs):
         for step, key in job.keys.items():

@@ -1,4 +1,4 @@
-"""The files of a sweep: a tidy table, an account with the command, and a data set with named dimensions."""
+"""The data set of a sweep: an `xarray.Dataset` with the axes of the sweep as named dimensions."""
 
 from __future__ import annotations
 
@@ -7,34 +7,20 @@ from collections.abc import Collection, Mapping, Sequence
 from typing import TYPE_CHECKING, Any
 
 from neusee.workflows.graph.diagnostics import Diagnostic, Location, RecipeError
-from neusee.workflows.graph.final_values import flow
-from neusee.workflows.sweeps.sweep_table import AxisColumn, header, rows_of
+from neusee.workflows.sweeps.sweep_table import AxisColumn
 
 if TYPE_CHECKING:
-    from neusee.workflows.report.run_folder import RunFolder
     from neusee.workflows.sweeps.sweep_points import PointOutcome
 
 _PACKAGES = ("xarray", "h5netcdf", "h5py")
 
 
 def require_xarray(asked_by: str) -> None:
-    """Raise `RecipeError` before anything runs where xarray or its writers are not installed."""
+    """Raise `RecipeError` if xarray or a package with which xarray writes files is not installed."""
     missing = [name for name in _PACKAGES if importlib.util.find_spec(name) is None]
     if missing:
         text = f'needs {" and ".join(missing)}: pip install "neusee[xarray]"'
         raise RecipeError([Diagnostic(Location(asked_by), "", text)])
-
-
-def write_table(folder: RunFolder, outcomes: Sequence[PointOutcome], columns: Sequence[AxisColumn]) -> None:
-    """Write ``sweep.csv``: one row for each number of each point, in the order of the points."""
-    rows = (row for outcome in outcomes for row in rows_of(outcome, columns))
-    folder.write_rows("sweep.csv", header(columns), rows)
-
-
-def write_account(folder: RunFolder, title: str, account: Mapping[str, Any]) -> None:
-    """Write ``sweep.yaml``: recipe, axes, order, versions and the command."""
-    lines = [f"# {title}", *(f"{key}: {flow(value)}" for key, value in account.items())]
-    folder.write("sweep.yaml", "\n".join(lines) + "\n")
 
 
 def dataset(
@@ -42,8 +28,8 @@ def dataset(
 ) -> Any:
     """Return an `xarray.Dataset` whose dimensions are the axes, or ``point`` for paired axes; coordinates are in SI.
 
-    A result of several numbers has a dimension of its own, ``<result> index``. A point that failed, or did not run,
-    is NaN; ``ran`` is true where there are numbers.
+    A result of several numbers has its own dimension, ``<result> index``. The numbers of a point that failed, or did
+    not run, are NaN; ``ran`` is true at the points that have numbers.
     """
     import numpy
     import xarray
@@ -64,13 +50,13 @@ def dataset(
             if name not in arrays:
                 arrays[name] = numpy.full((*shape, *more), numpy.nan)
             arrays[name][(*place, index or 0) if more else place] = value
-    found = {name: ((*dims, f"{name} index") if name in long else dims, array) for name, array in arrays.items()}
+    results = {name: ((*dims, f"{name} index") if name in long else dims, array) for name, array in arrays.items()}
     own = {"ran": (dims, ran), "seconds": (dims, seconds, {"units": "s"})}
-    return xarray.Dataset({**found, **own}, coords, dict(about))
+    return xarray.Dataset({**results, **own}, coords, dict(about))
 
 
 def _lengths(outcomes: Sequence[PointOutcome], taken: Collection[str]) -> dict[str, int]:
-    """Return the largest number of values of every result that has several."""
+    """Return the largest number of values of every result that has several values."""
     long: dict[str, int] = {}
     for outcome in outcomes:
         for step, part, index, _ in outcome.numbers:
@@ -81,6 +67,6 @@ def _lengths(outcomes: Sequence[PointOutcome], taken: Collection[str]) -> dict[s
 
 
 def _variable(step: str, part: str, taken: Collection[str]) -> str:
-    """Return the name of a result, distinct from those of the coordinates."""
+    """Return the name of a result in the data set, distinct from the names of the coordinates."""
     name = f"{step}.{part}".rstrip(".").replace("/", "_")
     return f"{name} (result)" if name in taken else name

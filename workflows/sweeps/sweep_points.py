@@ -1,7 +1,7 @@
-"""The points of a sweep: checked, and then run one after another on one store.
+"""The points of a sweep, which are all checked and then run one after another on one store.
 
 Every point is composed and checked before the first point runs. A point keeps its composed values, which it shares
-almost entirely with the other points; its steps are bound again when it runs.
+almost entirely with the other points; the steps of a point are bound again when the point runs.
 """
 
 from __future__ import annotations
@@ -15,7 +15,7 @@ from statistics import median
 from typing import Any, Literal
 
 from neusee.workflows.engine.node_call import place
-from neusee.workflows.engine.runner import Result, run
+from neusee.workflows.engine.runner import run
 from neusee.workflows.graph.diagnostics import Diagnostic, RecipeError
 from neusee.workflows.graph.recipe_graph import Recipe, needed
 from neusee.workflows.graph.run_error import RunError
@@ -32,12 +32,12 @@ from neusee.workflows.tolerance.cheaper_steps import with_substitutions
 
 PointState = Literal["run", "cached", "failed"]
 OnError = Literal["continue", "stop"]
-ResultNumber = tuple[str, str, int | str, float]  #: step, field, index (empty of a single number), value
+ResultNumber = tuple[str, str, int | str, float]  #: step, field, index (empty for a single number), value
 
 
 @dataclass(frozen=True, slots=True)
 class CheckedPoint:
-    """A point without mistakes, and the steps that it needs."""
+    """A point without mistakes, and the steps that the point needs."""
 
     point: Point
     composed: Composed
@@ -46,15 +46,15 @@ class CheckedPoint:
 
 @dataclass(frozen=True, slots=True)
 class PointOutcome:
-    """The outcome of a point."""
+    """The outcome of one point of a sweep: its numbers, or the error that stopped the point."""
 
     point: Point
     state: PointState  #: ``cached``: no step had to run
     seconds: float
     numbers: tuple[ResultNumber, ...] = ()
     step: str = ""  #: the step that failed
-    message: str = ""  #: why it failed, with the place where the step is written
-    left: float = 0.0  #: seconds that the points after it will take, as the ones before it took
+    message: str = ""  #: why the step failed, with its location in the recipe
+    left: float = 0.0  #: predicted seconds of all later points
 
 
 @dataclass(frozen=True)
@@ -94,30 +94,34 @@ def outcomes(
     started: Callable[[Point], None] = lambda point: None,
     watch: Callable[[Event], None] | None = None,
 ) -> Generator[PointOutcome, None, None]:
-    """Run the points in turn, and yield the outcome of each.
+    """Run the points one after another, and yield the outcome of each point.
 
-    With ``on_error="stop"`` the error of the first point that fails is raised after its outcome.
+    With ``on_error="stop"`` the error of the first point that fails is raised after the outcome of the point.
     """
     clock = _Clock(plan.work)
     for checked in plan.checked:
         started(checked.point)
-        began, failure, result = time.perf_counter(), None, None
+        began = time.perf_counter()
         try:
-            result = run(check(checked.composed), store, watch=watch, device=device)
-            numbers = _numbers(result)
+            state, numbers = _run(checked, store, watch, device)
         except Exception as error:
-            failure = error
-        seconds = time.perf_counter() - began
-        left = clock.left(seconds)
-        if failure is not None:
-            failure.add_note(f"at point {checked.point.number}: {checked.point.shown}")
-            yield _failed(checked.point, failure, seconds, left)
+            seconds = time.perf_counter() - began
+            error.add_note(f"at point {checked.point.number}: {checked.point.shown}")
+            yield _failed(checked.point, error, seconds, clock.left(seconds))
             if on_error == "stop":
-                raise failure
-            failure = None  # it holds the values that the failed step was given
-        elif result is not None:
-            state: PointState = "run" if any(d.state == "run" for d in result.done.values()) else "cached"
-            yield PointOutcome(checked.point, state, seconds, numbers, left=left)
+                raise
+        else:
+            seconds = time.perf_counter() - began
+            yield PointOutcome(checked.point, state, seconds, numbers, left=clock.left(seconds))
+
+
+def _run(
+    checked: CheckedPoint, store: Store, watch: Callable[[Event], None] | None, device: str
+) -> tuple[PointState, tuple[ResultNumber, ...]]:
+    result = run(check(checked.composed), store, watch=watch, device=device)
+    rows = (row for step, value in result.values.items() for row in numbers_of(step, value))
+    ran = any(step.state == "run" for step in result.done.values())
+    return "run" if ran else "cached", tuple((step, field, index, number) for step, field, index, number in rows)
 
 
 def _failed(point: Point, error: Exception, seconds: float, left: float) -> PointOutcome:
@@ -126,23 +130,16 @@ def _failed(point: Point, error: Exception, seconds: float, left: float) -> Poin
     return PointOutcome(point, "failed", seconds, step=step, message=message, left=left)
 
 
-def _numbers(result: Result) -> tuple[ResultNumber, ...]:
-    """Return every small output, number by number."""
-    rows = (row for step, value in result.values.items() for row in numbers_of(step, value))
-    return tuple((step, field, index, number) for step, field, index, number in rows)
-
-
 def _costs(store: Store) -> dict[str, float]:
-    """Return the median seconds of every step that has results in the store."""
-    found: dict[str, list[float]] = defaultdict(list)
+    known: dict[str, list[float]] = defaultdict(list)
     for row in store.journal.rows():
         if row["step"] and row["seconds"] is not None:
-            found[row["step"]].append(row["seconds"])
-    return {step: median(seconds) for step, seconds in found.items()}
+            known[row["step"]].append(row["seconds"])
+    return {step: median(seconds) for step, seconds in known.items()}
 
 
 class _Clock:
-    """A prediction of the remaining seconds, from the work so far and the work that is left."""
+    """A prediction of the remaining seconds of a sweep, from the finished work and the remaining work."""
 
     def __init__(self, work: Sequence[float]) -> None:
         least = sum(work) / 100 / len(work) or 1.0  # reading a point's numbers is work too
@@ -152,14 +149,13 @@ class _Clock:
 
     def left(self, seconds: float) -> float:
         """Return the seconds that the remaining points will take, after a point that took ``seconds``."""
-        one = self.work[0]
-        del self.work[0]
-        self.todo, self.done, self.seconds = self.todo - one, self.done + one, self.seconds + seconds
+        work = self.work.pop(0)
+        self.todo, self.done, self.seconds = self.todo - work, self.done + work, self.seconds + seconds
         return max(self.todo, 0.0) * self.seconds / self.done if self.work else 0.0
 
 
 class _Checker:
-    """The check of one point after another."""
+    """The check of the points of a sweep, one after another, which collects the mistakes of all points."""
 
     def __init__(self, recipe: str, folder: Path, store: Store, device: str) -> None:
         self.recipe, self.folder, self.device = recipe, folder, device
@@ -170,7 +166,7 @@ class _Checker:
         self._same: dict[Any, Any] = {}
 
     def every(self, points: Sequence[Point]) -> Iterator[CheckedPoint]:
-        """Yield the points without mistakes; the mistakes of the others are in ``diagnostics``."""
+        """Yield the points without mistakes, and add the mistakes of all other points to ``diagnostics``."""
         for point in points:
             try:
                 composed = compose(self.recipe, point.overrides, self.folder)
@@ -195,5 +191,5 @@ class _Checker:
         return PointJob(point.place, keys, graph, recipe.outputs)
 
     def _once(self, key: Key) -> Key:
-        """Return one text object for equal keys, for points share most of their keys."""
+        """Return one text object for equal keys, which saves memory because points share most of their keys."""
         return str(self._same.setdefault(key, key))

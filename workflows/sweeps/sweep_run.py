@@ -1,9 +1,9 @@
-"""A recipe over every combination of some of its values, with all numbers in one table.
+"""A run of a recipe at every combination of some of its values, with all numbers in one table.
 
     sweep("first_light", {"sensor.read_noise": ["5 e-", "10 e-"], "doe": ["axicon", "vortex"]})
 
-Results lie in the store by key: a stopped sweep goes on when the same sweep runs again, and results that points share
-are made once.
+Results are stored by key: a stopped sweep continues when the same sweep runs again, and results that points share
+are computed once.
 """
 
 from __future__ import annotations
@@ -17,6 +17,7 @@ from pathlib import Path
 from typing import Any, Literal
 
 from neusee.workflows.engine.provenance import versions
+from neusee.workflows.graph.final_values import flow
 from neusee.workflows.keys.cache_key import digest
 from neusee.workflows.recipe.text.overrides import Override
 from neusee.workflows.report.run_folder import new_run
@@ -25,7 +26,7 @@ from neusee.workflows.store.remote_store import open_store
 from neusee.workflows.store.result_store import Store
 from neusee.workflows.sweeps.axes import Argument, Axis, points, read_axes, read_words
 from neusee.workflows.sweeps.point_order import Sharing, sharing
-from neusee.workflows.sweeps.sweep_files import dataset, require_xarray, write_account, write_table
+from neusee.workflows.sweeps.sweep_files import dataset, require_xarray
 from neusee.workflows.sweeps.sweep_points import OnError, PointOutcome, SweepPlan, outcomes, plan_sweep
 from neusee.workflows.sweeps.sweep_table import AxisColumn, column, header, rows_of, wide
 
@@ -34,7 +35,7 @@ SweepState = Literal["complete", "stopped", "interrupted"]
 
 @dataclass(frozen=True)
 class Sweep:
-    """The result of a sweep: the points that ran, in the order of the axes, the last axis fastest."""
+    """The result of a sweep: the outcomes of the points that ran, in the order of the axes, the last axis fastest."""
 
     recipe: str
     title: str
@@ -47,21 +48,21 @@ class Sweep:
 
     @property
     def failed(self) -> tuple[PointOutcome, ...]:
-        """Return the points that failed."""
+        """Return the outcomes of the points that failed."""
         return tuple(outcome for outcome in self.outcomes if outcome.state == "failed")
 
     @property
     def rows(self) -> list[dict[str, Any]]:
-        """Return the tidy table: a row for each number of each point."""
+        """Return the tidy table of the sweep, with one row for each number of each point."""
         names = header(self.columns)
         return [dict(zip(names, row, strict=True)) for o in self.outcomes for row in rows_of(o, self.columns)]
 
     def table(self) -> str:
-        """Return a table with one line for each point."""
+        """Return a text table with one line for each point."""
         return "\n".join(indented(wide(self.outcomes, self.columns)))
 
     def to_xarray(self) -> Any:
-        """Return an `xarray.Dataset` with the axes as dimensions and coordinates in SI; NaN where a point failed.
+        """Return an `xarray.Dataset` with the axes as dimensions and coordinates in SI; a failed point is NaN.
 
         Raises: RecipeError where xarray is not installed.
         """
@@ -87,24 +88,23 @@ def sweep(
     device: str = "cpu",
     folder: str | os.PathLike[str] | None = None,
 ) -> Sweep:
-    """Run ``recipe`` at every combination of the axes' values, or, with ``zip``, at the first values, the second, ….
+    """Run ``recipe`` at every combination of the values of the axes, or, with ``zip``, at value n of every axis.
 
     Args: axes: by parameter or group, a list of values, or a text as on the command line, such
     as ``"linspace(450 nm, 650 nm, 5)"``. overrides: changes that are the same at every point.
     on_error: ``"stop"`` raises the first point's error, ``"continue"`` keeps it as a row.
-    folder: what relative paths are relative to.
+    folder: the folder of relative paths, by default the current folder.
 
     Raises: RecipeError with every mistake of every point, before anything runs.
     """
     place = Path(folder or ".").absolute()
     arguments = [*read_words(overrides, place), *read_axes(axes, place)]
     work = Sweeping(os.fspath(recipe), arguments, place, store or open_store(), zip, device)
-    found = list(outcomes(work.plan, work.store, on_error, device))
-    return work.sweep(found, "complete")
+    return work.sweep(list(outcomes(work.plan, work.store, on_error, device)), "complete")
 
 
 class Sweeping:
-    """A sweep that is checked and ready to run."""
+    """A sweep whose points are checked and ready to run."""
 
     def __init__(
         self, recipe: str, arguments: Sequence[Argument], folder: Path, store: Store, paired: bool, device: str
@@ -116,20 +116,22 @@ class Sweeping:
         self.plan: SweepPlan = plan_sweep(recipe, points(arguments, paired), folder, store, paired, device)
         self.sharing = sharing(self.plan.jobs, self.plan.costs)
 
-    def sweep(self, found: Sequence[PointOutcome], state: SweepState) -> Sweep:
-        recipe, in_turn = self.plan.recipe, sorted(found, key=lambda outcome: outcome.point.number)
+    def sweep(self, outcomes: Sequence[PointOutcome], state: SweepState) -> Sweep:
+        """Return the result of the sweep with these outcomes, sorted by the number of the point."""
+        recipe, in_turn = self.plan.recipe, sorted(outcomes, key=lambda outcome: outcome.point.number)
         count = len(self.plan.checked)
         return Sweep(recipe.name, recipe.title, self.columns, tuple(in_turn), count, self.sharing, self.paired, state)
 
 
 def write_sweep(work: Sweeping, result: Sweep, again: Sequence[str], out: Path, netcdf: bool, seconds: float) -> Path:
-    """Write the folder of a sweep and return its path. A sweep that did not end has ``partial`` in its name."""
+    """Write the folder of a sweep, with ``partial`` in the name of an unfinished sweep, and return its path."""
     name = f"{result.recipe}{'' if result.state == 'complete' else '_partial'}"
     key = digest([checked.job.keys[name] for checked in work.plan.checked for name in checked.job.outputs])
     with new_run(out / "sweeps", name, key) as folder:
-        write_table(folder, result.outcomes, result.columns)
+        folder.write_rows("sweep.csv", header(result.columns), (list(row.values()) for row in result.rows))
         title = f"{(result.title or result.recipe).rstrip('.')}: {counted(result)}"
-        write_account(folder, title, _account(work, result, again, seconds))
+        account = _account(work, result, again, seconds).items()
+        folder.write("sweep.yaml", "".join([f"# {title}\n", *(f"{key}: {flow(value)}\n" for key, value in account)]))
         if netcdf:
             result.to_xarray().to_netcdf(folder.path / "sweep.nc", engine="h5netcdf")
     return folder.path
@@ -155,7 +157,7 @@ def _account(work: Sweeping, result: Sweep, again: Sequence[str], seconds: float
 
 
 def counted(result: Sweep) -> str:
-    """Return a text such as ``12 points: 8 run, 3 cached, 1 failed``."""
+    """Return the number of points in each state, such as ``12 points: 8 run, 3 cached, 1 failed``."""
     states = [outcome.state for outcome in result.outcomes]
     parts = [f"{states.count(state)} {state}" for state in ("run", "cached", "failed") if state in states]
     rest = result.points - len(states)

@@ -1,4 +1,4 @@
-"""The table of a sweep: its columns, its rows for a file, and the words of its cells."""
+"""The table of a sweep: columns, rows for a file, and the text of the cells."""
 
 from __future__ import annotations
 
@@ -17,24 +17,25 @@ AFTER = ("status", "step", "field", "index", "value", "seconds", "cached", "mess
 
 @dataclass(frozen=True, slots=True)
 class AxisColumn:
-    """An axis as a column, with its unit in the header where all values have one unit."""
+    """An axis as a column of a table, with the unit in the header if all values have one unit."""
 
     name: str
     header: str
-    cells: tuple[Any, ...]  #: by place on the axis
+    cells: tuple[Any, ...]  #: the values of the axis, in order
     si: tuple[Any, ...]
     unit: str  #: of ``si``; empty for pure numbers and for words
 
 
 def column(axis: Axis) -> AxisColumn:
-    """Return an axis as a column: numbers in their unit, or in SI if they have several units; words as they are."""
+    """Return the column of an axis: numbers in their common unit, or in SI for several units; words unchanged."""
     values = [c.value for c in axis.coordinates]
-    found = [q for q in map(_quantity, values) if q is not None]
+    quantities = [q for q in map(_quantity, values) if q is not None]
     header = f"{axis.name} (axis)" if axis.name in ("point", *AFTER) else axis.name
-    if len(found) == len(values) and len({q.si_unit for q in found}) == 1:
-        si, unit, written = tuple(q.si for q in found), found[0].si_unit, {q.unit for q in found}
-        cells = tuple(q.number for q in found) if len(written) == 1 else si
-        return AxisColumn(axis.name, f"{header} ({found[0].unit if len(written) == 1 else unit})", cells, si, unit)
+    if len(quantities) == len(values) and len({q.si_unit for q in quantities}) == 1:
+        si, unit = tuple(q.si for q in quantities), quantities[0].si_unit
+        if len({q.unit for q in quantities}) > 1:
+            return AxisColumn(axis.name, f"{header} ({unit})", si, si, unit)
+        return AxisColumn(axis.name, f"{header} ({quantities[0].unit})", tuple(q.number for q in quantities), si, unit)
     if all(isinstance(v, int | float) and not isinstance(v, bool) for v in values):
         return AxisColumn(axis.name, header, tuple(values), tuple(map(float, values)), "")
     words = tuple(c.shown for c in axis.coordinates)
@@ -66,7 +67,7 @@ def header(columns: Sequence[AxisColumn]) -> list[str]:
 
 
 def rows_of(outcome: PointOutcome, columns: Sequence[AxisColumn]) -> Iterator[list[Any]]:
-    """Yield one row for each number of a point; one row for a point that failed or has no numbers."""
+    """Yield one row for each number of a point, or one row for a point that failed or has no numbers."""
     where = [outcome.point.number, *point_cells(outcome.point, columns)]
     status = "failed" if outcome.state == "failed" else "ok"
     last = [round(outcome.seconds, 6), outcome.state == "cached", outcome.message]
@@ -75,16 +76,15 @@ def rows_of(outcome: PointOutcome, columns: Sequence[AxisColumn]) -> Iterator[li
 
 
 def headline(numbers: Sequence[ResultNumber]) -> dict[str, str]:
-    """Return a text for every result: a single number, or the least and the largest; single numbers come first."""
-    found: dict[str, list[float]] = {}
+    """Return each result as text: a single number, or the range of several numbers; single numbers come first."""
+    results: dict[str, list[float]] = {}
     for step, part, _, value in numbers:
-        found.setdefault(f"{step}.{part}".rstrip("."), []).append(value)
-    texts = {name: _range_of(values) for name, values in found.items()}
-    return dict(sorted(texts.items(), key=lambda item: len(found[item[0]]) > 1))
+        results.setdefault(f"{step}.{part}".rstrip("."), []).append(value)
+    return {name: _range_of(values) for name, values in sorted(results.items(), key=lambda item: len(item[1]) > 1)}
 
 
 def wide(outcomes: Sequence[PointOutcome], columns: Sequence[AxisColumn]) -> list[list[str]]:
-    """Return a header and one row for each point: its place, its results, its state and its seconds."""
+    """Return a header and one row for each point: its values, results, state and seconds."""
     results = [headline(outcome.numbers) for outcome in outcomes]
     names = list(dict.fromkeys(name for result in results for name in result))
     rows = [["point", *(c.header for c in columns), *names, "state", "seconds"]]
@@ -96,7 +96,7 @@ def wide(outcomes: Sequence[PointOutcome], columns: Sequence[AxisColumn]) -> lis
 
 
 def point_cells(point: Point, columns: Sequence[AxisColumn]) -> list[Any]:
-    """Return the values of a point on the axes."""
+    """Return the value of a point on each axis."""
     return [c.cells[i] for c, i in zip(columns, point.place, strict=True)]
 
 
@@ -105,12 +105,12 @@ def _range_of(values: Sequence[float]) -> str:
 
 
 def cell_text(cell: Any) -> str:
-    """Return a value of an axis as a table shows it."""
+    """Return the text of a value of an axis in a table."""
     return f"{cell:.6g}" if isinstance(cell, float) else str(cell)
 
 
 def lasts(seconds: float) -> str:
-    """Return a duration such as ``3 h 05 min``, ``2 min 10 s`` or ``4 s``."""
+    """Return a duration in words, such as ``3 h 05 min``, ``2 min 10 s`` or ``4 s``."""
     whole = round(seconds)
     if whole >= 3600:
         return f"{whole // 3600} h {whole % 3600 // 60:02} min"

@@ -9,7 +9,6 @@ from __future__ import annotations
 import difflib
 import math
 import re
-from collections.abc import Callable
 from decimal import Decimal, localcontext
 from fractions import Fraction
 
@@ -24,7 +23,7 @@ _EXACT = 10**15  #: whole numbers below are written without a point
 
 
 def split(text: str) -> list[str]:
-    """Return the parts between commas outside of quotes and brackets; raise `ValueError` for a bracket left open."""
+    """Split a text at the commas outside of quotes and brackets; raise `ValueError` for a bracket left open."""
     parts, waiting = [""], list[str]()
     for token in _TOKEN.findall(text):
         if token == "," and not waiting:
@@ -41,7 +40,7 @@ def split(text: str) -> list[str]:
 
 
 def values_of(text: str) -> list[str]:
-    """Return the values of a text, each as YAML; raise `ValueError` with the fix for a wrong list or range."""
+    """Return the values of a list or a range, each as YAML; raise `ValueError` with the fix for a wrong text."""
     parts = split(text)
     if len(parts) > 1 and not all(part.strip() for part in parts):
         raise ValueError("a value is missing beside a comma")
@@ -49,12 +48,12 @@ def values_of(text: str) -> list[str]:
 
 
 def spans(text: str) -> bool:
-    """Return True if a text is a range."""
+    """Return True if a text is a range, such as ``range(4)``."""
     return _function(text) is not None
 
 
 def _spanned(text: str) -> list[str]:
-    """Return the values of one part: the values of a range, or the part itself."""
+    """Return the values of a text without outer commas: the values of a range, or the text itself."""
     function = _function(text)
     if function is None:
         return [text.strip()]
@@ -72,7 +71,7 @@ def _function(text: str) -> tuple[str, str] | None:
         return match and (match[1], match[2])
     close = difflib.get_close_matches(match[1].lower(), _FUNCTIONS, 1, 0.7)
     if close:
-        raise ValueError(f"no range {match[1]}; did you mean {close[0]}?")
+        raise ValueError(f"no range is called {match[1]}; did you mean {close[0]}?")
     return None
 
 
@@ -83,7 +82,7 @@ def _range(arguments: list[str]) -> list[str]:
     start, stop = (Fraction(0), numbers[0]) if len(numbers) == 1 else (numbers[0], numbers[1])
     step = numbers[2] if len(numbers) == 3 else Fraction(1)
     if step == 0:
-        raise ValueError("the step is 0")
+        raise ValueError("the step is 0, so that the range never ends")
     count = _count(math.ceil((stop - start) / step))
     return [_written(start + i * step, unit) for i in range(count)]
 
@@ -95,10 +94,9 @@ def _linspace(arguments: list[str]) -> list[str]:
 
 
 def _logspace(arguments: list[str]) -> list[str]:
-    """Return values in equal ratios from the first end to the second."""
     (start, stop), unit, count = _ends(arguments, "logspace(1e2, 1e6, 5)")
     if start <= 0 or stop <= 0:
-        raise ValueError("both ends must be positive: they are the first and the last value")
+        raise ValueError("both ends must be positive, because the ratio of neighbouring values is constant")
     with localcontext(prec=50):
         low, high = (Decimal(x.numerator) / Decimal(x.denominator) for x in (start, stop))
         step = (high / low).ln() / max(count - 1, 1)
@@ -107,17 +105,13 @@ def _logspace(arguments: list[str]) -> list[str]:
     return [_written(x, unit) for x in ends]
 
 
-_FUNCTIONS: dict[str, Callable[[list[str]], list[str]]] = {
-    "range": _range,
-    "linspace": _linspace,
-    "logspace": _logspace,
-}
+_FUNCTIONS = {"range": _range, "linspace": _linspace, "logspace": _logspace}
 
 
 def _ends(arguments: list[str], example: str) -> tuple[list[Fraction], str, int]:
-    """Return the first and the last value, their unit, and the number of values."""
+    """Return the first and last value of a range, their unit, and the number of values."""
     if len(arguments) != 3:
-        raise ValueError(f"takes first, last and how many: {example}")
+        raise ValueError(f"write the first value, the last value and the number of values: {example}")
     numbers, unit = _numbers(arguments[:2])
     if not re.fullmatch(r"\+?\d{1,9}", arguments[2]):
         raise ValueError(f"the number of values is a whole number from 1, not {arguments[2] or 'nothing'}")
@@ -126,24 +120,23 @@ def _ends(arguments: list[str], example: str) -> tuple[list[Fraction], str, int]
 
 def _count(count: int) -> int:
     if count < 1:
-        raise ValueError("is empty")
+        raise ValueError("there are no values: change the ends or the number of values")
     if count > MOST:
-        raise ValueError(f"{count if count < _EXACT else 'too many'} values: at most {MOST}")
+        raise ValueError(f"{count if count < _EXACT else 'too many'} values: an axis has at most {MOST}")
     return count
 
 
 def _numbers(texts: list[str]) -> tuple[list[Fraction], str]:
-    """Return the numbers exactly as they are written, and their one unit."""
-    found = [_NUMBER.fullmatch(text) for text in texts]
-    for text, match in zip(texts, found, strict=True):
+    """Return the numbers exactly as they are written, and their common unit."""
+    matches = [_NUMBER.fullmatch(text) for text in texts]
+    for text, match in zip(texts, matches, strict=True):
         if match is None or not math.isfinite(float(match[1])):
-            raise ValueError(f"{text or 'nothing'} is no number")
-    units = [(match[2] or "").strip() for match in found if match]
+            raise ValueError(f"{text or 'nothing'} is not a number")
+    units = [(match[2] or "").strip() for match in matches if match]
     if len(set(units)) > 1:
-        raise ValueError(
-            f"write every number in one unit, not in {', '.join(u or 'none' for u in dict.fromkeys(units))}"
-        )
-    return [Fraction(repr(float(match[1]))) for match in found if match], units[0]
+        several = ", ".join(unit or "none" for unit in dict.fromkeys(units))
+        raise ValueError(f"write every number in one unit, not in {several}")
+    return [Fraction(repr(float(match[1]))) for match in matches if match], units[0]
 
 
 def _written(number: Fraction, unit: str) -> str:

@@ -1,8 +1,9 @@
-"""The training of a mask and of the restoration behind it, in stages, in one folder."""
+"""The training of a mask and of the network that restores its pictures, in stages and in one folder."""
 
 from __future__ import annotations
 
 from collections.abc import Sequence
+from contextlib import nullcontext
 from dataclasses import replace
 from pathlib import Path
 
@@ -16,12 +17,12 @@ from neusee.workflows.keys.cache_key import digest
 from neusee.workflows.recipe.blocks.mask_design_block import MaskSettings
 from neusee.workflows.recipe.blocks.train_block import KEY, Stage, Training
 from neusee.workflows.store.result_store import Store
-from neusee.workflows.training.loop.checkpoint import export, weights_of
+from neusee.workflows.training.loop.checkpoint import export
 from neusee.workflows.training.loop.resumable_loop import Losses, Progress, ResumableLoop, Watch
 from neusee.workflows.training.mask_design.design_run import MASK, design_in, designed
 from neusee.workflows.training.parallel.process_mesh import ALONE, Mesh, MeshError
-from neusee.workflows.training.tensorboard_log import TensorBoardLog
-from neusee.workflows.training.training_figures import curves, strip
+from neusee.workflows.training.tensorboard_log import open_board
+from neusee.workflows.training.training_figures import curves, png, strip
 from neusee.workflows.training.training_iteration import Learner
 from neusee.workflows.training.training_pictures import TrainingStream
 
@@ -40,23 +41,23 @@ def train(
     watch: Watch | None = None,
     mesh: Mesh = ALONE,
 ) -> Path:
-    """Learn through the stages and return the folder; a stopped training goes on where it stopped.
+    """Train through the stages and return the folder of the training; a stopped training continues.
 
     Stage 0 designs the mask without images, in place of stage 1.
 
     Every process of a mesh calls this function with the same arguments and a folder that all processes see; only the
-    first process writes, and an error in one process ends all of them. The mesh changes results by rounding alone.
+    first process writes, and an error in one process ends all processes. The mesh changes results only by rounding.
 
-    Raises ValueError for a recipe without the block ``train``, a folder without photographs, a second stage before
-    there is a mask, a first stage after the mask was designed, or a mesh that does not fit; ArithmeticError where a
-    loss is NaN or infinite, with the weights and pictures that led to the loss in a file.
+    Raises ValueError for a recipe without the block ``train``, a folder without photographs, stage 2 without a mask,
+    stage 1 after the mask was designed, or a mesh that does not fit; ArithmeticError for a loss that is NaN or
+    infinite, with the weights and pictures that led to the loss in a file.
     """
     settings = recipe.training
     if settings is None:
         raise ValueError(f"{recipe.name} has no block train: add `train: recommended` to its defaults")
     with_pictures = [number for number in stages if number != MASK]
     if MASK in stages and mesh.size > 1:
-        raise MeshError("--stage mask is designed by one process: start it without torchrun")
+        raise MeshError("--stage mask runs in one process: start the training without torchrun")
     _require_equal_shares(recipe, settings, mesh)
     photographs = _photographs(recipe, settings, bool(with_pictures))
     folder = runs / f"{recipe.name}_train_{_key(recipe, settings, photographs)}"
@@ -67,23 +68,19 @@ def train(
         design_in(folder, recipe, settings, store, command, progress, device)
     if with_pictures:
         loop = _TrainingLoop(recipe, settings, photographs, store, folder, progress, device, watch, mesh)
-        try:
+        with loop.board or nullcontext():
             loop.run_stages(with_pictures, command)
-        finally:
-            if loop.board is not None:
-                loop.board.close()
     return folder
 
 
 def _require_equal_shares(recipe: Recipe, settings: Training, mesh: Mesh) -> None:
-    """Raise `MeshError` for a batch that the processes of the data axis cannot share equally."""
     for number, stage in settings.stages.items():
         if stage.batch % mesh.data:
             path = f"{KEY}.stages.{number}.batch"
-            where = recipe.config.settings.get(path)
+            setting = recipe.config.settings.get(path)
             raise MeshError(
-                f"{where.source if where else recipe.name}   {path}   {stage.batch} pictures cannot be shared equally "
-                f"among {mesh.data}: --mesh {mesh} needs a multiple of {mesh.data}"
+                f"{setting.source if setting else recipe.name}   {path}   {stage.batch} pictures cannot be shared "
+                f"equally among {mesh.data} processes: --mesh {mesh} needs a multiple of {mesh.data}"
             )
 
 
@@ -92,23 +89,21 @@ def _photographs(recipe: Recipe, settings: Training, needed: bool) -> Photograph
         return Photographs.under(settings.photographs)
     file = recipe.steps[settings.scene].params.get("file") if settings.scene in recipe.steps else None
     if not isinstance(file, Path) and needed:
-        raise ValueError("train.photographs: name a folder of photographs")
+        raise ValueError("train.photographs: write the path of a folder of photographs")
     return Photographs((file,) if isinstance(file, Path) else ())
 
 
 def _key(recipe: Recipe, settings: Training, photographs: Photographs) -> str:
-    """Return a digest of all that decides a training; how often it is kept and shown decides nothing."""
-    given = recipe.config.settings.items()
-    values = {name: str(setting.value) for name, setting in given if not name.startswith(f"{KEY}.")}
-    usual = {"mask"} if settings.mask == MaskSettings() else set()  # trainings from before there was a mask go on
+    """Return a digest of all values that change the result of a training, without ``keep`` and ``show``."""
+    items = recipe.config.settings.items()
+    values = {name: str(setting.value) for name, setting in items if not name.startswith(f"{KEY}.")}
+    usual = {"mask"} if settings.mask == MaskSettings() else set()  # so that trainings of older versions continue
     block = settings.model_copy(update={"keep": 1, "show": 1}).model_dump(mode="json", exclude={"tensorboard", *usual})
     block["network"] = {"kind": settings.network.kind, "width": settings.network.width, **settings.network.options}
     return digest("training", values, block, [path.name for path in photographs.paths])[:8]
 
 
 class _TrainingLoop(ResumableLoop[Learner]):
-    """One training in stages."""
-
     def __init__(
         self, recipe: Recipe, settings: Training, photographs: Photographs, store: Store, folder: Path,
         progress: Progress, device: str, watch: Watch | None, mesh: Mesh,
@@ -120,22 +115,22 @@ class _TrainingLoop(ResumableLoop[Learner]):
         self.mesh, self.stage = mesh, 2 if self.designed else min(settings.learnt)
         self.resume()
         mesh.agree(f"{folder.name} in stage {self.stage} after {self.iteration} iterations")
-        self.board = TensorBoardLog(folder, self._behind) if settings.tensorboard and mesh.first else None
+        self.board = open_board(folder, self._iterations_of_all_stages) if settings.tensorboard and mesh.first else None
 
     def begin_stage(self) -> None:
-        """Give the optimisers of the stage fresh moments; after the last stage nothing learns."""
+        """Give the learner new optimisers for the present stage; after the last stage nothing learns."""
         self.learner.begin(self.settings.stages.get(self.stage, Stage(iterations=0)), self.stage == 1)
 
     def run_stages(self, stages: Sequence[int], command: Sequence[str]) -> None:
-        """Learn through the stages that are asked for, and write what was learnt."""
+        """Train through these stages, and write the results of the training."""
         if self.designed and 1 in stages:
-            raise ValueError(f"the mask in {self.folder} was designed without images: --stage 2 goes on from it")
+            raise ValueError(f"the mask in {self.folder} was designed without images: continue with --stage 2")
         for number in stages:
             if number not in self.settings.learnt:
-                learnt = self.settings.learnt
-                raise ValueError(f"there is no stage {number}: train.stages and train.learn leave {learnt}")
+                stages_left = self.settings.learnt
+                raise ValueError(f"there is no stage {number}: train.stages and train.learn allow {stages_left}")
             if number > self.stage:
-                first = f"its {self._length} iterations first, or --stage mask"
+                first = f"run its {self._length} iterations first, or --stage mask"
                 raise ValueError(f"stage {number} needs stage {self.stage}: {first}")
             if number == self.stage:
                 self._run_stage()
@@ -143,8 +138,7 @@ class _TrainingLoop(ResumableLoop[Learner]):
             self._close(command)
 
     @property
-    def _behind(self) -> int:
-        """Return the iterations of all stages so far."""
+    def _iterations_of_all_stages(self) -> int:
         return self.iteration + sum(s.iterations for number, s in self.settings.stages.items() if number < self.stage)
 
     @property
@@ -152,57 +146,56 @@ class _TrainingLoop(ResumableLoop[Learner]):
         return self.settings.stages[self.stage].iterations
 
     def _run_stage(self) -> None:
-        """Iterate to the end of the stage, and write the state in which the next stage begins."""
-        learns = self.stage == 1
-        fixed = None if learns else frozen(self.recipe, self.settings, self.folder)
+        """Iterate to the end of the stage, and write the state with which the next stage begins."""
+        fixed = None if self.stage == 1 else frozen(self.recipe, self.settings, self.folder)
         parts = self.recipe, self.settings, self.photographs, self.store, self.device
         self.samples = TrainingStream(*parts, fixed, self.mesh)
         self.run(self._length, self.settings.stages[self.stage].batch)
         if self.writes:
-            self._export(learns)
+            self._export()
         self.stage, self.iteration = self.stage + 1, 0
         self.begin_stage()
         self.keep()
-        self.mesh.wait()  # for the mask that is frozen now
+        self.mesh.wait()  # until the first process has written the mask
 
     def iterate(self) -> Losses:
-        """Learn from a batch of pictures."""
+        """Train on one batch of pictures, and return the losses and the factor on the learning rates."""
         rate = self.learner.set_rates(self.iteration)
         losses, self.seen = self.learner.iterate(self.samples, self.stage, self.iteration)
         return losses | {"rate": rate}
 
     def note(self, losses: Losses) -> None:
-        """Pass the losses on to TensorBoard and to the caller."""
-        if self.board is not None:
-            self.board.row(self._behind - 1, losses)
+        """Write the losses to TensorBoard, and pass the losses to the function that watches the training."""
+        if self.board:
+            for name, value in losses.items():
+                self.board.add_scalar(name, value, self._iterations_of_all_stages - 1)
         super().note(losses)
 
     def keep(self) -> None:
-        """Write rows, state and TensorBoard's events."""
-        if self.board is not None:
-            self.board.keep()
+        """Write the events of TensorBoard, the table of losses and the state to disk."""
+        if self.board:
+            self.board.flush()
         super().keep()
 
     def show(self) -> None:
-        """Write the first picture of the last batch, what the network makes of it, and the truth."""
+        """Write the first picture of the last batch, the picture that the network restores, and the truth."""
         sample = self.seen[0]
         with torch.no_grad():
             restored = self.learner.net(sample.picture[:1])[0].float()
         shown = strip([sample.picture[0].detach(), restored, sample.truth[0]])
-        if self.board is not None:
-            self.board.picture(self._behind - 1, self.stage, shown)
-        self.write_picture(f"stage{self.stage}_{self.iteration:06d}", shown)
+        if self.board:
+            self.board.add_image(f"stage {self.stage}", shown, self._iterations_of_all_stages - 1, dataformats="HWC")
+        self.write_picture(f"stage{self.stage}_{self.iteration:06d}", png(shown))
 
-    def _export(self, learns: bool) -> None:
-        if learns:
+    def _export(self) -> None:
+        if self.stage == 1:
             with torch.no_grad():
                 export(self.folder, "mask", {"height": self.learner.height()})
-        net = self.learner.average or self.learner.net
-        export(self.folder, "network", weights_of(net), file_metadata(self.learner.net))
+        net = self.learner.average.module if self.learner.average else self.learner.net
+        export(self.folder, "network", net.state_dict(), file_metadata(self.learner.net))
 
     @property
     def _mask_source(self) -> str:
-        """Return where the mask comes from."""
         if self.settings.learn is None:
             return "the recipe's own"
         return "designed without images" if self.designed else "learnt in stage 1"
@@ -224,12 +217,12 @@ class _TrainingLoop(ResumableLoop[Learner]):
 
 
 def frozen(recipe: Recipe, settings: Training, folder: Path) -> Recipe:
-    """Return the recipe with the mask that was learnt in place of the step that learns."""
+    """Return the recipe with the trained mask in place of the step whose mask was trained."""
     if settings.learn is None:
         return recipe
     file = folder / "mask.safetensors"
     if not file.is_file():
-        raise ValueError(f"{file} is not there: --stage 1 or mask makes it")
+        raise ValueError(f"{file} does not exist: --stage 1 or --stage mask writes this file")
     step = recipe.steps[settings.learn]
     params, wires = {"file": file, "depth": 1e-6, "scale": 0.1}, {"stop": step.wires["stop"]}
     learnt = replace(step, node=doe.pixelwise, params=params, wires=wires)

@@ -2,14 +2,15 @@
 
 from __future__ import annotations
 
+import io
+import statistics
 from collections.abc import Mapping, Sequence
 from typing import Any
 
 import torch
 from torch import Tensor
 
-from neusee.workflows.report.figures.style import BLUE, VERMILION, canvas, drawn
-from neusee.workflows.training.loop.checkpoint import loss_curve
+from neusee.workflows.report.figures.style import BLUE, VERMILION, canvas, drawn, encoded
 
 _SHOWN = ("LSR", "BSR", "L1", "reconstruction", "adversarial", "critics", "penalty", "rate")
 _GAP = 4  #: pixels between pictures
@@ -17,14 +18,15 @@ _GAP = 4  #: pixels between pictures
 
 @drawn
 def curves(rows: Sequence[Mapping[str, str]]) -> Any:
-    """Draw each loss over the iterations, the second stage after the first: pale as it is, full as a running median."""
+    """Draw each loss over the iterations of both stages: the values pale, and their running median in full colour."""
     names = [name for name in _SHOWN if any(row[name] for row in rows)]
     figure, axes = canvas(11.0, 2.4 * -(-len(names) // 2), -(-len(names) // 2), 2)
     first = 1 + max((int(r["iteration"]) for r in rows if r["stage"] == "1"), default=-1)
     for ax, name in zip(axes.flat, names, strict=False):
         for stage, colour in ((1, BLUE), (2, VERMILION)):
-            at, values = loss_curve(rows, stage, name)
-            at = [i + first * (stage == 2) for i in at]
+            shown = [row for row in rows if row["stage"] == str(stage) and row[name]]
+            at = [int(row["iteration"]) + first * (stage == 2) for row in shown]
+            values = [float(row[name]) for row in shown]
             ax.plot(at, values, color=colour, alpha=0.25, linewidth=0.7)
             ax.plot(at, running_median(values), color=colour, linewidth=1.5, label=f"stage {stage}")
         if name in ("LSR", "L1", "reconstruction", "rate"):
@@ -38,23 +40,22 @@ def curves(rows: Sequence[Mapping[str, str]]) -> Any:
 
 
 def running_median(values: Sequence[float]) -> list[float]:
-    """Return the running median, over about a twentieth of the values."""
-    import statistics
-
+    """Return the median around each value, over about a twentieth of all values."""
     half = max(1, len(values) // 40)
     return [statistics.median(values[max(0, i - half) : i + half + 1]) for i in range(len(values))]
 
 
-def strip(pictures: Sequence[Tensor]) -> bytes:
-    """Return linear pictures (3, y, x) side by side as an sRGB PNG."""
-    import io
+def strip(pictures: Sequence[Tensor]) -> Any:
+    """Return linear pictures (3, y, x) side by side as one sRGB array (y, x, 3) of bytes."""
+    gap = torch.ones(3, pictures[0].shape[-2], _GAP)
+    parts = [part for picture in pictures for part in (picture.detach().cpu(), gap)][:-1]
+    return (encoded(torch.cat(parts, -1)) * 255).round().astype("uint8")
 
-    from kornia.color import linear_rgb_to_rgb
+
+def png(codes: Any) -> bytes:
+    """Return an array (y, x, 3) of bytes as a PNG file."""
     from PIL import Image
 
-    gap = torch.ones(3, pictures[0].shape[-2], _GAP)
-    parts = [part for p in pictures for part in (p.detach().cpu().float().clamp(0, 1), gap)][:-1]
-    codes = (linear_rgb_to_rgb(torch.cat(parts, -1)[None])[0].clamp(0, 1) * 255).round().to(torch.uint8)
     memory = io.BytesIO()
-    Image.fromarray(codes.permute(1, 2, 0).numpy()).save(memory, "PNG")
+    Image.fromarray(codes).save(memory, "PNG")
     return memory.getvalue()

@@ -1,10 +1,9 @@
-"""The mask, the network and its critics, and one iteration of learning them."""
+"""The mask, the network and the critics of a training, and one iteration of the training."""
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Iterator, Mapping, Sequence
-from dataclasses import dataclass
-from typing import Any
+from collections.abc import Mapping, Sequence
+from typing import Any, NamedTuple
 
 import torch
 from torch import Tensor, nn
@@ -36,26 +35,15 @@ from neusee.workflows.training.parallel.shared_graph import Shared
 from neusee.workflows.training.training_pictures import Sample, TrainingStream
 
 
-@dataclass
-class Scales:
-    """Pictures at two scales, the coarse scale first."""
+class Scales(NamedTuple):
+    """A batch of pictures at half size and at full size."""
 
     coarse: Tensor
     fine: Tensor
 
-    def __iter__(self) -> Iterator[Tensor]:
-        yield self.coarse
-        yield self.fine
-
-    @classmethod
-    def of(cls, picture: Tensor) -> Scales:
-        """Return a picture (n, 3, y, x) with its half-size version."""
-        y, x = picture.shape[-2:]
-        return cls(resize(picture, -(-y // 2), -(-x // 2)), picture)
-
 
 class Learner:
-    """Everything that learns, on one device; equal in every process of a mesh."""
+    """The mask, networks and optimisers of a training on one device, equal in every process of a mesh."""
 
     def __init__(
         self, recipe: Recipe, settings: Training, device: str, designed: bool = False, mesh: Mesh = ALONE
@@ -91,7 +79,7 @@ class Learner:
         return torch.Generator(self.device).manual_seed(stream_seed(self.seed, " ".join(map(str, ("train", *names)))))
 
     def begin(self, stage: Stage, learns: bool) -> None:
-        """Begin a stage with new moments and the first learning rates."""
+        """Begin a stage with new optimisers and the first learning rates; the mask is trained if ``learns``."""
         rates, self.stage, self.learns = self.settings.rates, stage, learns
         groups = parameter_groups(self.net, rates.weights, rates.biases)
         if learns:
@@ -103,25 +91,25 @@ class Learner:
         self._first = [[g["lr"] for g in o.param_groups] for o in (self.generator_optimizer, self.critic_optimizer)]
 
     def set_rates(self, iteration: int) -> float:
-        """Set the learning rates of an iteration of the stage, and return their factor on the first rates."""
-        share = self.settings.rates.share(iteration)
+        """Set the learning rates of an iteration of the stage, and return the factor on the first learning rates."""
+        factor = self.settings.rates.share(iteration)
         for optimiser, first in zip((self.generator_optimizer, self.critic_optimizer), self._first, strict=True):
             for group, rate in zip(optimiser.param_groups, first, strict=True):
-                group["lr"] = max(rate * share, min(rate, self.settings.rates.least))
-        return share
+                group["lr"] = max(rate * factor, min(rate, self.settings.rates.least))
+        return factor
 
     def parts(self) -> dict[str, Any]:
-        """Return everything on which a later iteration depends."""
-        found = {"mask": self.mask, "net": self.net, "critics": self.critics, "makers": self.generator_optimizer}
-        return {**found, "judges": self.critic_optimizer, **({"average": self.average} if self.average else {})}
+        """Return every part whose state decides later iterations, by its name in the state."""
+        parts = {"mask": self.mask, "net": self.net, "critics": self.critics, "makers": self.generator_optimizer}
+        return {**parts, "judges": self.critic_optimizer, **({"average": self.average} if self.average else {})}
 
     # --- one iteration ------------------------------------------------------------------------------------------------
 
     def iterate(self, samples: TrainingStream, stage: int, iteration: int) -> tuple[Losses, list[Sample]]:
-        """Learn from a batch of pictures, one after another; raise `NotFinite` before a bad step.
+        """Train on a batch of pictures, one after another; raise `NotFinite` before a step with NaN or infinity.
 
-        Returns the losses of the batch, and the pictures of this process. Of several processes each has pictures of
-        its own, and all of them step by the sum of the gradients.
+        Returns the losses of the batch, and the pictures of this process. Each of several processes has its own
+        pictures, and all processes step along the sum of the gradients.
         """
         self.generator_optimizer.zero_grad(set_to_none=True)
         shared = samples.begin(self.height()) if samples.shared else Shared.of({})
@@ -146,15 +134,15 @@ class Learner:
         return found, seen
 
     def _names(self) -> list[str]:
-        """Return the names of the losses of the stage, the same in every process."""
+        """Return the names of the losses of the stage, which are the same in every process."""
         weights = {"BSR": self.stage.bsr, "reconstruction": self.stage.reconstruction,
                    "adversarial": self.stage.adversarial}  # fmt: skip
         return [*(["LSR"] if self.learns else []), "L1", *(name for name, weight in weights.items() if weight)]
 
     def _mask_suppression(self, shared: Shared, samples: TrainingStream) -> Losses:
-        """Differentiate the suppression of each band, one band at a time, so that the norm of one band is held at once.
+        """Differentiate the suppression band by band, which saves memory, and return the mean LSR of all bands.
 
-        Each process has bands of its own, or a share of all bands, so that each band counts once over all processes.
+        Several processes have different bands, or the same bands with smaller weights, so that each band counts once.
         """
         psf: Psf = shared.values[self.settings.psf]
         count, times = samples.counted(self.settings.psf, len(psf.clear_peak))
@@ -167,35 +155,33 @@ class Learner:
         return {"LSR": float(peaks.mean()) * (len(peaks) / count) / times}
 
     def _suppression(self, intensity: Tensor, clear: Tensor, band: int) -> Tensor:
-        one: Tensor = losses.suppression_loss(
-            Psf(intensity[band : band + 1], clear[band : band + 1]), log=self.settings.logarithm
-        )
-        return one
+        psf = Psf(intensity[band : band + 1], clear[band : band + 1])
+        loss: Tensor = losses.suppression_loss(psf, log=self.settings.logarithm)
+        return loss
 
     def _restoration_terms(self, sample: Sample) -> tuple[dict[str, tuple[float, Tensor]], Scales, Scales]:
-        """Return each term with its weight, the truth, and the detached estimate."""
+        """Return each term of the loss with its weight, the truth, and the detached estimate of the network."""
         low = torch.autocast(device_kind(self.device), torch.bfloat16, self.settings.precision == "bfloat16")
         picture = sample.picture if self.learns else sample.picture.detach()
         with low:
             coarse, fine = self.net.pyramid(picture)
         estimate = Scales(coarse.to(self.settings.dtype), fine.to(self.settings.dtype))
-        truth = Scales.of(sample.truth.detach())
+        y, x = sample.truth.shape[-2:]
+        truth = Scales(resize(sample.truth.detach(), -(-y // 2), -(-x // 2)), sample.truth.detach())
+        zero = torch.zeros((), device=fine.device)
         terms = {"L1": (0.0, (estimate.fine - truth.fine).abs().mean())}
         if self.stage.bsr:
             terms["BSR"] = (self.stage.bsr, (1.0 / sample.light.clamp_min(1e-30)).sum())
         if self.stage.reconstruction:
-            terms["reconstruction"] = (
-                self.stage.reconstruction,
-                sum((losses.charbonnier(e, t) + losses.fft_l1(e, t) for e, t in zip(estimate, truth, strict=True)),
-                    torch.zeros((), device=fine.device)),
-            )  # fmt: skip
+            errors = (losses.charbonnier(e, t) + losses.fft_l1(e, t) for e, t in zip(estimate, truth, strict=True))
+            terms["reconstruction"] = (self.stage.reconstruction, sum(errors, zero))
         if self.stage.adversarial:
-            scores = [-critic(e).mean() for critic, e in zip(self.critics, estimate, strict=True)]
-            terms["adversarial"] = (self.stage.adversarial, sum(scores, torch.zeros((), device=fine.device)))
+            scores = (-critic(e).mean() for critic, e in zip(self.critics, estimate, strict=True))
+            terms["adversarial"] = (self.stage.adversarial, sum(scores, zero))
         return terms, truth, Scales(estimate.coarse.detach(), estimate.fine.detach())
 
     def _train_critics(self, pairs: Mapping[int, tuple[Scales, Scales]], rng: torch.Generator) -> Losses:
-        """Let the critics learn to tell truth from estimates; the random stream does not depend on the process."""
+        """Train the critics to tell truth from estimates, with random numbers that are the same in every process."""
         self.critic_optimizer.zero_grad(set_to_none=True)
         found, batch = {"critics": 0.0, "penalty": 0.0}, self.stage.batch
         for i in range(batch):
@@ -210,16 +196,15 @@ class Learner:
                 found["critics"] += float(apart.detach()) / batch
                 found["penalty"] += float(steep.detach()) / batch
         found = self.mesh.numbers(found, tuple(found), self.device)
-        self._move(self.critic_optimizer, found, self.critics)
+        self._move(self.critic_optimizer, found, list(self.critics))
         return found
 
-    def _move(self, optimiser: torch.optim.Optimizer, found: Mapping[str, float], parts: Iterable[nn.Module]) -> float:
-        """Step against the gradient, and return the largest norm of a part; raise `NotFinite` before a bad step.
+    def _move(self, optimiser: torch.optim.Optimizer, found: Mapping[str, float], parts: Sequence[nn.Module]) -> float:
+        """Step against the gradient, and return the largest gradient norm of a part; raise `NotFinite` before the step.
 
-        The gradient of each part is clipped separately: the suppression acts on the mask a thousand times as strongly
-        as on a network.
+        The gradient of each part is clipped separately, because the suppression acts on the mask a thousand times as
+        strongly as on a network.
         """
-        parts = list(parts)
         self.mesh.add_gradients(parts)
         norm = max(float(nn.utils.clip_grad_norm_(part.parameters(), STEEPEST)) for part in parts)
         require_finite({**found, "norm of the gradient": norm})

@@ -1,4 +1,4 @@
-"""The network of a lift, one iteration of learning it, and the numbered pictures with known spectra."""
+"""The network of a lift, one iteration of its training, and the numbered pictures with known spectra."""
 
 from __future__ import annotations
 
@@ -12,30 +12,27 @@ from neusee.nodes import losses
 from neusee.nodes.spectra import lift_matrix, lift_pictures, need_mst_plus_plus_bands, render, start_mst_plus_plus
 from neusee.nodes.values import Bands
 from neusee.workflows.engine.differentiable_function import as_function
-from neusee.workflows.graph.diagnostics import nearest
 from neusee.workflows.graph.recipe_graph import Recipe, needed
 from neusee.workflows.keys.cache_key import stream_seed
 from neusee.workflows.recipe.blocks.train_lift_block import LiftTraining
 from neusee.workflows.store.result_store import Store
 from neusee.workflows.training.loop.resumable_loop import STEEPEST, Losses, averaged, require_finite
+from neusee.workflows.training.training_pictures import require_steps
 
 
 class Pairs:
-    """Pictures (3, y, x) with their spectra (31, y, x); a number always gives the same pair."""
+    """Pairs of a picture (3, y, x) and its spectra (31, y, x), where a number always gives the same pair."""
 
     def __init__(self, recipe: Recipe, settings: LiftTraining, store: Store, device: str) -> None:
-        for name in (settings.measured, settings.picture, settings.cube):
-            if name not in recipe.steps:
-                raise ValueError(f"train_lift: the recipe has no step {name}; {nearest(name, recipe.steps)}")
-        wires = recipe.steps[settings.measured].wires
-        if not isinstance(wires.get("bands"), str):
+        require_steps(recipe, "train_lift", (settings.measured, settings.picture, settings.cube))
+        bands = recipe.steps[settings.measured].wires.get("bands")
+        if not isinstance(bands, str):
             name = settings.measured
-            raise ValueError(f"train_lift.measured: {name} takes no bands: name a spectra.reflectances step")
+            raise ValueError(f"train_lift.measured: {name} takes no bands: name a step of spectra.reflectances")
         self._names, self._seed = (settings.picture, settings.cube), recipe.seed
-        bands = str(wires["bands"])
         random = {name for name in needed(recipe, self._names) if recipe.steps[name].node.random}
         if not random:
-            raise ValueError(f"train_lift: {settings.picture} never changes: draw the picture by spectra.leaves")
+            raise ValueError(f"train_lift: {settings.picture} is always the same picture: draw it with spectra.leaves")
         known = recipe.run(store, [bands, settings.measured], device=device)
         self.bands: Bands = known[bands]
         self.measured: Tensor = known[settings.measured]
@@ -43,19 +40,19 @@ class Pairs:
         self._draw = as_function(recipe, outputs=self._names, store=store, device=device, redraw=random)
 
     def __call__(self, *number: object) -> tuple[Tensor, Tensor]:
-        """Return the picture of a number, and its spectra."""
-        found = self._draw({}, seed=stream_seed(self._seed, " ".join(map(str, ("lift", *number)))))
-        picture, cube = (found[name] for name in self._names)
+        """Return the picture of a number, and the spectra of the picture."""
+        values = self._draw({}, seed=stream_seed(self._seed, " ".join(map(str, ("lift", *number)))))
+        picture, cube = (values[name] for name in self._names)
         return picture.float(), cube.float()
 
     def batch(self, numbers: Sequence[int]) -> tuple[Tensor, Tensor]:
-        """Return the stacked pictures and spectra of several numbers."""
+        """Return the pictures and the spectra of several numbers, each stacked into one tensor."""
         pictures, cubes = zip(*map(self, numbers), strict=True)
         return torch.stack(pictures), torch.stack(cubes)
 
 
 class LiftLearner:
-    """The network, its optimiser and the moving average of its weights."""
+    """The network of a lift, its optimiser and the moving average of its weights."""
 
     def __init__(self, settings: LiftTraining, pairs: Pairs, seed: int, device: str) -> None:
         self.settings, self.pairs = settings, pairs
@@ -64,14 +61,15 @@ class LiftLearner:
         self.net = start_mst_plus_plus(rng, self.linear if settings.start == "linear" else None)
         self.optimiser = torch.optim.Adam(self.net.parameters(), lr=settings.rate, betas=settings.betas)
         self.average = averaged(self.net, settings.ema_decay)
+        self.best: nn.Module = self.average.module if self.average else self.net
 
     def parts(self) -> dict[str, Any]:
-        """Return everything on which a later iteration depends."""
-        found = {"net": self.net, "optimiser": self.optimiser}
-        return {**found, **({"average": self.average} if self.average else {})}
+        """Return every part whose state decides later iterations, by name."""
+        parts = {"net": self.net, "optimiser": self.optimiser, "average": self.average}
+        return {name: part for name, part in parts.items() if part}
 
     def iterate(self, iteration: int) -> Losses:
-        """Learn from a batch and return its losses; raise `NotFinite` before a bad step."""
+        """Train on one batch and return the losses; raise `NotFinite` before a step with NaN or infinity."""
         batch, rate = self.settings.batch, self.settings.rate_at(iteration)
         for group in self.optimiser.param_groups:
             group["lr"] = rate
@@ -81,37 +79,36 @@ class LiftLearner:
         loss = losses.mrae(estimate, cube, floor=self.settings.floor)
         loss.backward()
         slope = float(nn.utils.clip_grad_norm_(self.net.parameters(), STEEPEST))
-        found = {"MRAE": float(loss.detach()), **_rmse(estimate.detach(), cube), "slope": slope, "rate": rate}
-        require_finite(found)
+        errors = {"MRAE": float(loss.detach()), "RMSE": _rmse(estimate.detach(), cube), "slope": slope, "rate": rate}
+        require_finite(errors)
         self.optimiser.step()
         if self.average:
             self.average.update_parameters(self.net)
-        return found
-
-    def best(self) -> nn.Module:
-        """Return the network to use: the average, where there is one."""
-        return self.average.module if self.average else self.net
+        return errors
 
     @torch.no_grad()
     def validate(self) -> dict[str, Losses]:
-        """Return the mean errors of the network and of the linear estimate, on pictures that were not learnt from."""
+        """Return the mean errors of the network and of the linear estimate on pictures outside of the training."""
         sums, count = dict[str, Losses](), self.settings.validation_batches
         for number in range(count):
             picture, cube = self.pairs("judge", number)
             for name, estimate in self.estimates(picture).items():
-                found = {"MRAE": float(losses.mrae(estimate, cube, floor=self.settings.floor)), **_rmse(estimate, cube),
-                         "colour": _rmse(render(estimate, self.pairs.bands), picture)["RMSE"]}  # fmt: skip
-                sums[name] = {key: sums.get(name, {}).get(key, 0.0) + x / count for key, x in found.items()}
+                errors = {
+                    "MRAE": float(losses.mrae(estimate, cube, floor=self.settings.floor)),
+                    "RMSE": _rmse(estimate, cube),
+                    "colour": _rmse(render(estimate, self.pairs.bands), picture),
+                }
+                sums[name] = {key: sums.get(name, {}).get(key, 0.0) + x / count for key, x in errors.items()}
         return sums
 
     def estimates(self, picture: Tensor) -> dict[str, Tensor]:
-        """Return the spectra of a picture by the network, and by the linear estimate."""
+        """Return the spectra of a picture that the network estimates, and the linear estimate of the spectra."""
         linear = torch.einsum("bc,cyx->byx", self.linear, picture)
         return {
-            "mst_plus_plus": lift_pictures(self.best(), picture[None])[0].clamp_min(0),
+            "mst_plus_plus": lift_pictures(self.best, picture[None])[0].clamp_min(0),
             "linear": linear.clamp_min(0),
         }
 
 
-def _rmse(estimate: Tensor, truth: Tensor) -> Losses:
-    return {"RMSE": float((estimate - truth).square().mean().sqrt())}
+def _rmse(estimate: Tensor, truth: Tensor) -> float:
+    return float((estimate - truth).square().mean().sqrt())

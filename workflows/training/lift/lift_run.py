@@ -1,4 +1,4 @@
-"""The training of a lift from RGB to spectra, from the settings of a recipe to weights that `lift` reads."""
+"""The training of a lift from RGB to spectra, from the settings of a recipe to the file of weights."""
 
 from __future__ import annotations
 
@@ -13,12 +13,11 @@ from neusee.workflows.recipe.blocks.train_lift_block import LiftTraining
 from neusee.workflows.store.result_store import Store
 from neusee.workflows.training.lift.lift_figures import lift_curves, lifted_spectra
 from neusee.workflows.training.lift.lift_iteration import LiftLearner, Pairs
-from neusee.workflows.training.loop.checkpoint import export, weights_of
+from neusee.workflows.training.loop.checkpoint import export
 from neusee.workflows.training.loop.resumable_loop import DOCUMENT, Losses, Progress, ResumableLoop, Watch
 
 _COLUMNS = ("iteration", "MRAE", "RMSE", "slope", "rate", "seconds")
-_NETWORK = "mst_plus_plus"
-#: in the names of folders, so that trainings of version 0.1 go on
+#: names of settings in the key of a folder, so that trainings of version 0.1 continue
 _OLD_NAMES = {"min_rate": "least", "warmup": "warm", "ema_decay": "average", "validation_batches": "judge"}
 
 
@@ -31,16 +30,16 @@ def train_lift(
     device: str = "cpu",
     watch: Watch | None = None,
 ) -> Path:
-    """Learn MST++ as the block ``train_lift`` of a recipe says, and return the folder; a stopped training goes on.
+    """Train MST++ with the settings ``train_lift`` of a recipe and return the folder; a stopped training continues.
 
     ``mst_plus_plus.safetensors`` holds the weights for `spectra.lift_mst_plus_plus`.
 
-    Raises ValueError for a recipe without the block or its steps; ArithmeticError where a loss is NaN or infinite, with
-    the weights and pictures that led to the loss in a file.
+    Raises ValueError for a recipe without the block or the steps that the block names; ArithmeticError for a loss that
+    is NaN or infinite, with the weights and pictures that led to the loss in a file.
     """
     settings = recipe.lifting
     if settings is None:
-        raise ValueError(f"{recipe.name} has no block train_lift: begin with the recipe train_lift")
+        raise ValueError(f"{recipe.name} has no block train_lift: start from the recipe train_lift")
     pairs = Pairs(recipe, settings, store, device)
     folder = runs / f"{recipe.name}_{_key(recipe, settings)}"
     folder.mkdir(parents=True, exist_ok=True)
@@ -50,7 +49,7 @@ def train_lift(
 
 
 def _key(recipe: Recipe, settings: LiftTraining) -> str:
-    """Return a digest of all that decides a training; how often it is kept and shown decides nothing."""
+    """Return a digest of all values that change the result of a training, without ``keep`` and ``show``."""
     steps = {
         name: [
             recipe.steps[name].node.path,
@@ -64,8 +63,6 @@ def _key(recipe: Recipe, settings: LiftTraining) -> str:
 
 
 class _LiftLoop(ResumableLoop[LiftLearner]):
-    """One training of a lift, without stages."""
-
     def __init__(
         self, settings: LiftTraining, learner: LiftLearner, folder: Path, progress: Progress, device: str,
         watch: Watch | None,
@@ -75,13 +72,13 @@ class _LiftLoop(ResumableLoop[LiftLearner]):
         self.resume()
 
     def run_to_end(self, recipe: Recipe, command: Sequence[str]) -> None:
-        """Learn to the last iteration and write what was learnt; leave a finished training as it is."""
+        """Train to the last iteration and write the results, unless the training is finished."""
         if self.iteration == self.settings.iterations and (self.folder / DOCUMENT).is_file():
             return
         if self.iteration < self.settings.iterations:
             self.run(self.settings.iterations, self.settings.batch)
             self.keep()
-        export(self.folder, _NETWORK, weights_of(self.learner.best()))
+        export(self.folder, "mst_plus_plus", self.learner.best.state_dict())
         self.close(
             lift_curves(self.rows.rows),
             recipe.name,
@@ -92,12 +89,11 @@ class _LiftLoop(ResumableLoop[LiftLearner]):
         )
 
     def iterate(self) -> Losses:
-        """Learn from a batch of pictures."""
         return self.learner.iterate(self.iteration)
 
     @torch.no_grad()
     def show(self) -> None:
-        """Write a picture with its spectra: the truth and the estimates."""
+        """Write a picture with its true and estimated spectra."""
         picture, cube = self.learner.pairs("show", 0)
         centres = self.learner.pairs.bands.centres
         self.write_picture(

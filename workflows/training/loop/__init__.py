@@ -1,4 +1,4 @@
-"""How does a training that was stopped go on to the same bits?
+"""How does a stopped training continue and reach the same bits?
 
 The loop of every training, and its files: the state, the table of losses, what was learnt.
 Nothing here knows a network or a recipe.

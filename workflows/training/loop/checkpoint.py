@@ -1,24 +1,24 @@
-"""The files of a training: a state from which it goes on, a row for each iteration, and what was learnt."""
+"""The files of a training: the state from which a training continues, the table of losses, and the trained weights."""
 
 from __future__ import annotations
 
 import csv
 import io
-import json
 import os
 from collections.abc import Mapping, Sequence
+from contextlib import suppress
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 import torch
-from torch import nn
 
-_FORMAT = 1  #: of a state; a state of another format is refused
-_NAMES = {"relief": "mask"}  #: parts of a state that 0.1 calls otherwise
+_FORMAT = 1  #: format of a state; a state of another format is refused
+_NAMES = {"relief": "mask"}  #: new names of the parts of a state that version 0.1 wrote
 
 
 def write_whole(path: Path, data: bytes) -> None:
-    """Write a file whole or not at all."""
+    """Write a whole file, or leave the old file as it was."""
     part = path.with_name(f".{path.name}.{os.getpid()}.part")
     try:
         with part.open("wb") as file:
@@ -31,43 +31,41 @@ def write_whole(path: Path, data: bytes) -> None:
         raise
 
 
+@dataclass(frozen=True)
 class StateFile:
-    """The state of unfinished work: one file, always whole: a killed process leaves the old one or the new."""
+    """A file with the state of unfinished work; a killed process leaves either the old or the new state, complete."""
 
-    def __init__(self, path: Path) -> None:
-        self.path = path
+    path: Path
 
     def write(self, state: Mapping[str, Any]) -> None:
-        """Replace the file."""
+        """Write the state in place of the old state."""
         self.path.parent.mkdir(parents=True, exist_ok=True)
         memory = io.BytesIO()
         torch.save({"edition": _FORMAT, **state}, memory)
         write_whole(self.path, memory.getvalue())
 
     def read(self, device: str = "cpu", strict: bool = True) -> dict[str, Any]:
-        """Return the state, or an empty one where there is no file.
+        """Return the state, which is empty if there is no file.
 
-        Raises ValueError for a file that cannot be read; without ``strict`` such a file counts as absent.
+        Raises ValueError for a file that cannot be read; if not ``strict``, an unreadable file counts as absent.
         """
         if not self.path.exists():
             return {}
         try:
-            found: dict[str, Any] = torch.load(self.path, map_location=device, weights_only=True)
-            if found.get("edition", _FORMAT) != _FORMAT:
-                raise ValueError(f"edition {found['edition']}, not {_FORMAT}")
-            if "parts" in found:
-                found["parts"] = {_NAMES.get(name, name): part for name, part in found["parts"].items()}
+            state: dict[str, Any] = torch.load(self.path, map_location=device, weights_only=True)
+            if state.get("edition", _FORMAT) != _FORMAT:
+                raise ValueError(f"the state has format {state['edition']}, not {_FORMAT}")
+            if "parts" in state:
+                state["parts"] = {_NAMES.get(name, name): part for name, part in state["parts"].items()}
         except (RuntimeError, KeyError, EOFError, OSError, ValueError, TypeError, AttributeError) as error:
             if not strict:
                 return {}
-            raise ValueError(
-                f"{self.path} cannot be gone on from ({error}): remove its folder to begin anew"
-            ) from error
-        return found
+            raise ValueError(f"{self.path} cannot be read ({error}): remove its folder to begin anew") from error
+        return state
 
 
 class Rows:
-    """The table ``losses.csv``, a row for each iteration; a training that goes on cuts rows after its state off."""
+    """The table ``losses.csv`` with a row for each iteration of a training."""
 
     def __init__(self, path: Path, columns: Sequence[str]) -> None:
         self._path, self._columns = path, columns
@@ -75,7 +73,7 @@ class Rows:
         self._kept = 0
 
     def cut(self, stage: int, iteration: int, write: bool = True) -> None:
-        """Keep the rows before an iteration of a stage."""
+        """Read the table, and remove the rows from an iteration of a stage on."""
         if self._path.exists():
             with self._path.open(newline="", encoding="utf-8") as file:
                 self.rows = [row for row in csv.DictReader(file) if _place(row) < (stage, iteration)]
@@ -83,13 +81,13 @@ class Rows:
         if write:
             self.keep()
 
-    def add(self, stage: int, iteration: int, found: Mapping[str, float]) -> None:
-        """Add the row of an iteration, which the next `keep` writes to disk."""
-        row = {"stage": stage, "iteration": iteration, **{name: f"{x:.6g}" for name, x in found.items()}}
+    def add(self, stage: int, iteration: int, losses: Mapping[str, float]) -> None:
+        """Add the row of an iteration, which the next call of `keep` writes to disk."""
+        row = {"stage": stage, "iteration": iteration, **{name: f"{x:.6g}" for name, x in losses.items()}}
         self.rows.append({name: str(row.get(name, "")) for name in self._columns})
 
     def keep(self) -> None:
-        """Append the new rows; the first call writes all rows, whole or not at all."""
+        """Append the new rows to the file; the first call writes the whole file."""
         text = io.StringIO(newline="")
         writer = csv.DictWriter(text, self._columns)
         if self._kept == 0:
@@ -104,38 +102,16 @@ class Rows:
 
 
 def _place(row: Mapping[str, str | None]) -> tuple[int, int]:
-    try:
-        if None in row.values():
-            raise ValueError("not all of its columns")
-        return int(row.get("stage") or 0), int(row["iteration"] or 0)
-    except (ValueError, TypeError, KeyError):
-        return (1 << 62, 0)  # half a row, of a process that was killed
+    """Return the stage and iteration of a row; an incomplete row of a killed process comes after all others."""
+    with suppress(ValueError, TypeError, KeyError):
+        if None not in row.values():
+            return int(row.get("stage") or 0), int(row["iteration"] or 0)
+    return 1 << 62, 0
 
 
-def export(
-    folder: Path, name: str, tensors: Mapping[str, torch.Tensor], about: Mapping[str, str] | None = None
-) -> Path:
-    """Write tensors with their metadata as a safetensors file, whole or not at all, and return its path."""
+def export(folder: Path, name: str, tensors: Mapping[str, torch.Tensor], about: dict[str, str] | None = None) -> None:
+    """Write tensors and their metadata to the safetensors file ``name`` of a folder."""
     from safetensors.torch import save
 
-    path = folder / f"{name}.safetensors"
     whole = {key: x.detach().cpu().contiguous() for key, x in tensors.items()}
-    write_whole(path, save(whole, dict(about) if about else None))
-    return path
-
-
-def weights_of(net: nn.Module) -> dict[str, torch.Tensor]:
-    """Return the weights of a network, or of the network inside an average."""
-    inner = net.module if isinstance(net, torch.optim.swa_utils.AveragedModel) else net
-    return dict(inner.state_dict())
-
-
-def write_json(path: Path, document: Mapping[str, Any]) -> None:
-    """Write a document whole or not at all."""
-    write_whole(path, (json.dumps(document, indent=1, ensure_ascii=False) + "\n").encode())
-
-
-def loss_curve(rows: Sequence[Mapping[str, str]], stage: int, name: str) -> tuple[list[int], list[float]]:
-    """Return the iterations of a stage that have a value in a column, and these values."""
-    pairs = [(int(r["iteration"]), float(r[name])) for r in rows if int(r["stage"]) == stage and r[name]]
-    return [i for i, _ in pairs], [x for _, x in pairs]
+    write_whole(folder / f"{name}.safetensors", save(whole, about or None))

@@ -1,7 +1,8 @@
-"""The loop of every training: a stopped one goes on from its last state to the same bits."""
+"""The loop of every training: a stopped training continues from its last state and reaches the same bits."""
 
 from __future__ import annotations
 
+import json
 import time
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Mapping, Sequence
@@ -14,33 +15,33 @@ from torch.optim.swa_utils import AveragedModel, get_ema_multi_avg_fn
 from neusee.workflows.engine.provenance import versions
 from neusee.workflows.recipe.blocks.train_block import Training
 from neusee.workflows.recipe.blocks.train_lift_block import LiftTraining
-from neusee.workflows.training.loop.checkpoint import Rows, StateFile, write_json, write_whole
+from neusee.workflows.training.loop.checkpoint import Rows, StateFile, write_whole
 
 Losses = dict[str, float]
 Progress = Callable[[str], None]  #: takes one line about what a training does
 Watch = Callable[[int, int, Mapping[str, float]], None]  #: takes the stage, its iterations so far, and the losses
 DOCUMENT = "training.json"  #: the file that a training writes last
-STEEPEST = 10.0  #: the norm above which a gradient is shortened
+STEEPEST = 10.0  #: largest norm of a gradient; a longer gradient is clipped
 
 
 class NotFinite(ArithmeticError):
-    """A loss or a gradient that is NaN or infinite."""
+    """Error for a loss or a gradient that is NaN or infinite."""
 
 
 class Learns(Protocol):
-    """Networks, parameters and their optimisers."""
+    """Everything that a training changes: networks, parameters and optimisers."""
 
     def parts(self) -> dict[str, Any]:
-        """Return everything on which a later iteration depends."""
+        """Return every part whose state decides later iterations, by name."""
 
 
 L = TypeVar("L", bound=Learns)
 
 
 class ResumableLoop(ABC, Generic[L]):
-    """A training in a folder: its state, a row for each iteration, pictures on the way, and a document at the end.
+    """A training in a folder with its state, table of losses, pictures and, at the end, a document.
 
-    Of several processes one ``writes`` files. A training without stages stays in stage 0.
+    Of several processes only one process ``writes`` files. A training without stages stays in stage 0.
     """
 
     def __init__(
@@ -54,31 +55,38 @@ class ResumableLoop(ABC, Generic[L]):
 
     @abstractmethod
     def iterate(self) -> Losses:
-        """Compute one iteration and return its losses; raise `NotFinite` before a bad step."""
+        """Compute one iteration and return the losses; raise `NotFinite` before a step with NaN or infinity."""
 
     @abstractmethod
     def show(self) -> None:
-        """Write a picture of the present state of learning."""
+        """Write a picture that shows what the networks do at this iteration."""
 
     def begin_stage(self) -> None:
         """Prepare the learner for the present stage."""
 
     def resume(self) -> None:
-        """Begin at the first iteration, or go on from the state that an earlier process left."""
-        found = self.state.read(self.device)
-        self.stage, self.iteration = found.get("stage", self.stage), found.get("iteration", 0)
+        """Continue from the state that an earlier process wrote, or else begin at the first iteration."""
+        state = self.state.read(self.device)
+        self.stage, self.iteration = state.get("stage", self.stage), state.get("iteration", 0)
         self.begin_stage()
-        if found:
+        if state:
             for name, part in self.learner.parts().items():
-                part.load_state_dict(found["parts"][name])
+                part.load_state_dict(state["parts"][name])
             self.rows.cut(self.stage, self.iteration, self.writes)
-            self.progress(f"goes on {f'in stage {self.stage} ' if self.stage else ''}after {self.iteration} iterations")
+            self.progress(
+                f"continues {f'in stage {self.stage} ' if self.stage else ''}after {self.iteration} iterations"
+            )
 
     def run(self, iterations: int, batch: int) -> None:
-        """Iterate to the end of the present stage; the caller keeps the state that follows the last iteration."""
+        """Iterate to the end of the present stage; the caller saves the state after the last iteration."""
         self.batch = batch
         while self.iteration < iterations:
-            losses = self._timed()
+            began = time.perf_counter()
+            try:
+                losses = self.iterate()
+            except NotFinite as error:
+                raise self._dumped(error) from error
+            losses["seconds"] = time.perf_counter() - began
             self.rows.add(self.stage, self.iteration, losses)
             self.iteration += 1
             ended = self.iteration == iterations
@@ -89,42 +97,35 @@ class ResumableLoop(ABC, Generic[L]):
                 self.keep()
 
     def note(self, losses: Losses) -> None:
-        """Pass on the losses of the iteration that has just ended."""
+        """Pass the losses of the last iteration to the function that watches the training."""
         if self.watch is not None:
             self.watch(self.stage, self.iteration, losses)
 
     def keep(self) -> None:
-        """Write the rows and then the state: surplus rows are cut off later, lacking rows would be lost."""
+        """Write the table and then the state, because `resume` can remove surplus rows but not restore missing rows."""
         if self.writes:
             self.rows.keep()
             self.state.write(self._packed())
 
     def write_picture(self, name: str, picture: bytes) -> None:
-        """Write a PNG into the folder of pictures."""
+        """Write a PNG into the folder ``pictures``."""
         (self.folder / "pictures").mkdir(exist_ok=True)
         write_whole(self.folder / "pictures" / f"{name}.png", picture)
 
     def close(self, curves: bytes, recipe: str, command: Sequence[str], **facts: Any) -> None:
-        """Write the curves of the losses, and at last the document that says what was learnt, from what and how."""
+        """Write the curves of the losses and, last, the document with the settings and the results of the training."""
         write_whole(self.folder / "curves.png", curves)
         seconds = sum(float(row["seconds"]) for row in self.rows.rows)
         about = {"command": list(command), "recipe": recipe, **facts, "seconds": seconds, "versions": versions()}
-        write_json(self.folder / DOCUMENT, about)
-
-    def _timed(self) -> Losses:
-        began = time.perf_counter()
-        try:
-            losses = self.iterate()
-        except NotFinite as error:
-            raise self._dumped(error) from error
-        return losses | {"seconds": time.perf_counter() - began}
+        text = json.dumps(about, indent=1, ensure_ascii=False) + "\n"
+        write_whole(self.folder / DOCUMENT, text.encode())
 
     def _packed(self, **about: Any) -> dict[str, Any]:
         parts = {name: part.state_dict() for name, part in self.learner.parts().items()}
         return {"stage": self.stage, "iteration": self.iteration, **about, "parts": parts}
 
     def _dumped(self, error: NotFinite) -> ArithmeticError:
-        """Return the error to raise, after the weights and the numbers of the pictures that led to it are written."""
+        """Write the weights and the numbers of the pictures that led to an error, and return the error to raise."""
         place = [self.stage, self.iteration] if self.stage else [self.iteration]
         dump = StateFile(self.folder / f"not_finite_{'_'.join(map(str, place))}.pt")
         first, count = self.iteration * self.batch, self.batch
@@ -133,20 +134,18 @@ class ResumableLoop(ABC, Generic[L]):
             self.rows.keep()
         stage = f"stage {self.stage}, " if self.stage else ""
         pictures = f"pictures {first} to {first + count - 1}" if count > 1 else f"picture {first}"
-        text = f"{stage}iteration {self.iteration}, {pictures}: {error}; weights of that moment: {dump.path}"
+        text = f"{stage}iteration {self.iteration}, {pictures}: {error}; the weights are in {dump.path}"
         return ArithmeticError(text)
 
 
 def require_finite(numbers: Mapping[str, float]) -> None:
-    """Raise `NotFinite` with the names of the numbers that are NaN or infinite."""
+    """Raise `NotFinite` with the names of all numbers that are NaN or infinite."""
     wrong = [name for name, x in numbers.items() if not abs(x) < float("inf")]
     if wrong:
-        raise NotFinite(f"not finite: {', '.join(wrong)}")
+        raise NotFinite(f"NaN or infinite: {', '.join(wrong)}")
 
 
 def averaged(net: nn.Module, decay: float) -> AveragedModel | None:
     """Return an exponential moving average of the weights of a network, or None for a decay of 0."""
-    if not decay:
-        return None
     mean = get_ema_multi_avg_fn(decay)  # type: ignore[no-untyped-call]
-    return AveragedModel(net, multi_avg_fn=mean)
+    return AveragedModel(net, multi_avg_fn=mean) if decay else None

@@ -1,4 +1,4 @@
-"""The page of a designed mask: its height, its figures at each wavelength with their bounds, and how it was learnt."""
+"""The page of a designed mask: height map, figures of merit at each wavelength with bounds, and losses."""
 
 from __future__ import annotations
 
@@ -19,20 +19,20 @@ _NAMES = ("lsr", "energy_floor", "bsr", "median_mtf", "median_mtf_bound", "rms_m
 
 
 def pictures(terms: Terms, height: Tensor, learnt: LearntMask) -> dict[str, bytes]:
-    """Draw height map, PSF, suppression by wavelength and the losses, as PNG."""
+    """Draw the height map, PSF, suppression by wavelength and losses of a mask, and return each picture as PNG."""
     pupil, psf, plain = terms.pupil(height), terms.psf(height), terms.plain()
     pitch = terms.recipe.steps[terms.settings.psf].params["pixel_pitch"]
-    shown = {
+    drawings = {
         "height": optics.height(pupil=pupil),
         "psf": optics.psf(plain=plain, mask=psf, bands=terms.bands, pixel_pitch=pitch),
         "suppression": optics.suppression(lsr=metrics.lsr(psf), bands=terms.bands, psf=psf),
     }
-    return shown | ({"history": history(learnt.history)} if learnt.history else {})
+    return drawings | ({"history": history(learnt.history)} if learnt.history else {})
 
 
 @drawn
 def history(rows: Sequence[Mapping[str, float]]) -> Any:
-    """Draw the loss and its terms over the iterations, one line for each start."""
+    """Draw the loss and the terms of the loss over the iterations, with one line for each start."""
     names = [name for name in dict.fromkeys(n for row in rows for n in row) if name not in ("start", "iteration")]
     figure, axes = canvas(3.6 * len(names), 3.2, 1, len(names))
     for ax, name in zip(axes[0], names, strict=True):
@@ -44,24 +44,22 @@ def history(rows: Sequence[Mapping[str, float]]) -> Any:
     return figure
 
 
-def sections(found: Mapping[str, Any], limits: Fabrication, shown: Mapping[str, bytes]) -> list[Section]:
-    """Return the sections of the page."""
-    bands = found["bands"]
+def sections(bands: Mapping[str, Any], limits: Fabrication, shown: Mapping[str, bytes]) -> list[Section]:
+    """Return the sections of the page of a mask with these figures by band, limits of fabrication and pictures."""
     columns = [[1e9 * value for value in bands["wavelength"]], *(bands[name] for name in _NAMES)]
     bounds = (
-        "Light that stays in the field lands somewhere: spread evenly over the window it gives `even light`. "
-        "The sum of the squares of a PSF equals that of its contrast, so that a low peak leaves little contrast: "
-        "no PSF with this peak has more contrast than `at most`."
+        "`even light` is the LSR of light that is spread evenly over the window of the PSF. "
+        "The sum of the squares of a PSF equals the sum of the squares of its contrast (Parseval), so that a low peak "
+        "leaves little contrast: no PSF with this peak has more contrast than `at most`."
     )
     parts = [
-        Section("Mask", "Its height map, and its phase at three wavelengths.", picture=shown.get("height")),
-        Section("Fabrication", f"{limits}.", ("limit", "value"), [(name, text) for name, text in limits.rows()]),
-        Section("Light", "The spread light beside the plain lens's.", picture=shown.get("psf")),
+        Section("Mask", "The height map, and the phase at three wavelengths.", picture=shown.get("height")),
+        Section("Fabrication", f"{limits}.", ("limit", "value"), limits.rows()),
+        Section("Light", "The PSF with the mask beside the PSF of the plain lens.", picture=shown.get("psf")),
         Section("Suppression", "", picture=shown.get("suppression")),
         Section("By wavelength", bounds, _COLUMNS, list(zip(*columns, strict=True))),
     ]
     if "history" in shown:
-        parts.append(
-            Section("Learning", "Each term is a mean over the bands of that iteration.", picture=shown["history"])
-        )
+        text = "Each term is a mean over the bands of an iteration."
+        parts.append(Section("Learning", text, picture=shown["history"]))
     return parts

@@ -1,7 +1,7 @@
-"""The design of a mask without images: it spreads the laser, keeps the light in the field, and keeps contrast.
+"""The design of a mask without images, which spreads the laser and keeps the light and the contrast of the scene.
 
-The height map is learnt through the graph of the recipe on the terms of the mask alone. Then it is judged by the same
-figures as any other mask, on every band and at the full sampling of the recipe.
+The height map is optimised through the graph of the recipe with terms that depend on the mask alone. Then the mask is
+judged by the same figures of merit as any other mask, on every band and at the full sampling of the recipe.
 """
 
 from __future__ import annotations
@@ -19,6 +19,7 @@ from neusee.nodes import losses, metrics
 from neusee.nodes.doe import PARAMETRISATIONS, half_rings
 from neusee.workflows.engine.provenance import timestamp, versions
 from neusee.workflows.graph.diagnostics import RecipeError
+from neusee.workflows.graph.final_values import flow
 from neusee.workflows.graph.recipe_graph import Recipe, needed
 from neusee.workflows.keys.cache_key import digest, file_digest
 from neusee.workflows.keys.code_digest import Code
@@ -27,7 +28,7 @@ from neusee.workflows.recipe.blocks.mask_design_block import DesignError, MaskTr
 from neusee.workflows.recipe.blocks.train_block import Training
 from neusee.workflows.recipe.changed_recipe import changed
 from neusee.workflows.report.run_folder import RunFolder, new_run
-from neusee.workflows.report.study_page import page
+from neusee.workflows.report.study_folder import StudyReport
 from neusee.workflows.store.result_store import Store
 from neusee.workflows.training.loop.checkpoint import StateFile
 from neusee.workflows.training.loop.resumable_loop import Progress
@@ -36,7 +37,7 @@ from neusee.workflows.training.mask_design.optimizers import LearntMask, learn
 
 __all__ = ["DesignError", "MaskTraining", "Weights", "design", "mask_figures"]
 
-MASK = 0  #: the number of this stage in a training: it comes before the first
+MASK = 0  #: the number of the stage that designs the mask, before stage 1
 _LEARNT_WITH = {
     used.__module__
     for used in (half_rings, PARAMETRISATIONS["doe.pixelwise"], losses.contrast, losses.suppression_loss)
@@ -46,26 +47,26 @@ _LEARNT_WITH = {
 def design(
     recipe: Recipe, settings: MaskTraining, store: Store | None, out: Path, progress: Progress, *, device: str = "cpu"
 ) -> Path:
-    """Learn a mask, write ``out/<date>_<recipe>_mask_<key>/`` and return this folder.
+    """Design a mask, write ``out/<date>_<recipe>_mask_<key>/`` and return this folder.
 
     ``mask.safetensors`` holds the height map for `doe.pixelwise`, ``history.csv`` the terms at each iteration,
-    ``mask.json`` the figures, ``provenance.json`` the settings. The state of an unfinished design lies beside the
-    folder; the same call goes on from there.
+    ``mask.json`` the figures of merit, ``provenance.json`` the settings. The state of an unfinished design lies beside
+    the folder; the same call continues from this state.
 
     Raises: `DesignError` for a recipe without the steps, or a loss that is NaN or infinite.
     """
     need_steps(recipe.steps, settings)
     key = _key(recipe, settings, store)
     kept = StateFile(state_file(out, recipe.name, key))
-    made = DesignedMask.of(recipe, settings, store, kept, progress, device)
+    mask = DesignedMask.of(recipe, settings, store, kept, progress, device)
     with new_run(out, f"{recipe.name}_mask", key) as folder:
-        made.write(folder)
+        mask.write(folder)
     kept.path.unlink(missing_ok=True)
     return folder.path
 
 
 def designed(folder: Path) -> bool:
-    """Return True if the mask of a training in a folder was designed without images; its document is written last."""
+    """Return True if the training in a folder has a complete mask that was designed without images."""
     return (folder / "mask.json").is_file()
 
 
@@ -78,17 +79,17 @@ def design_in(
     progress: Progress,
     device: str,
 ) -> None:
-    """Design the mask in the folder of a training, which goes on from there, or go on where that was stopped.
+    """Design the mask in the folder of a training, or continue a design that was stopped.
 
-    Raises `DesignError` as `design` does; ValueError where stage 1 has begun to learn another mask, or no mask learns.
+    Raises `DesignError` as `design` does; ValueError if stage 1 has begun to train another mask, or no mask is trained.
     """
     if training.learn is None:
-        raise ValueError("train.learn: name the step of the mask that is designed")
+        raise ValueError("train.learn: write the name of the step whose mask is designed")
     if designed(folder):
         progress("the mask is designed")
         return
     if (folder / "state.pt").exists():
-        raise ValueError(f"stage 1 has begun in {folder}: remove that folder, or change a value of train.mask")
+        raise ValueError(f"stage 1 has begun in {folder}: remove this folder, or change a value of train.mask")
     kept = StateFile(folder / "mask.state")
     DesignedMask.of(recipe, training.design, store, kept, progress, device).write(RunFolder(folder), command)
     kept.path.unlink(missing_ok=True)
@@ -96,12 +97,12 @@ def design_in(
 
 @dataclass(frozen=True)
 class DesignedMask:
-    """A designed height map at the sampling of its recipe, with its figures."""
+    """A designed height map at the sampling of the recipe, with the figures of merit of the mask."""
 
     terms: Terms
     learnt: LearntMask
     height: Tensor
-    found: Mapping[str, Any]
+    figures: Mapping[str, Any]
 
     @classmethod
     def of(
@@ -111,36 +112,22 @@ class DesignedMask:
         store: Store | None,
         kept: StateFile,
         progress: Progress,
-        device: str = "cpu",
+        device: str,
     ) -> DesignedMask:
-        """Learn a mask, or go on from its state, and judge it; raise `DesignError` as `design` does."""
+        """Optimise a mask, or continue from the state ``kept``, and compute the figures of merit of the mask."""
         learning = Terms(_at(recipe, settings), settings, store, device)
         full = Terms(recipe, settings, store, device) if settings.at else learning
         progress(f"fabrication: {full.fabrication}")
         learnt = learn(learning, kept, progress)
         with torch.no_grad():
             height = learnt.height(full.stop).detach().to("cpu", torch.float32).contiguous()
-            found = mask_figures(full, height.to(full.device))
-        progress(summary_line(found))
-        return cls(full, learnt, height, found)
+            figures = mask_figures(full, height.to(full.device))
+        progress(summary_line(figures))
+        return cls(full, learnt, height, figures)
 
     def write(self, folder: RunFolder, command: Sequence[str] = ()) -> None:
-        """Write mask, curves, page and settings; ``mask.json`` comes last and marks a complete design."""
-        from safetensors.torch import save
-
+        """Write mask, losses, page and settings, and last ``mask.json``, which marks a complete design."""
         learnt, recipe, settings = self.learnt, self.terms.recipe, self.terms.settings
-        folder.write("mask.safetensors", save({"height": self.height}))
-        header = list(dict.fromkeys(name for row in learnt.history for name in row))
-        folder.write_rows("history.csv", header, [[row.get(name, "") for name in header] for row in learnt.history])
-        self._page(folder, command)
-        made = {"fabrication": self.terms.fabrication.values, "numbers": learnt.numbers}
-        doc = {"recipe": recipe.name, "kind": settings.kind, "loss": learnt.loss, **self.found, **made}
-        folder.write("mask.json", json.dumps(doc, indent=1))
-
-    def _page(self, folder: RunFolder, command: Sequence[str]) -> None:
-        from neusee.workflows.training.mask_design.design_page import pictures, sections
-
-        recipe, settings = self.terms.recipe, self.terms.settings
         provenance = {
             "stage": "mask",
             "recipe": recipe.name,
@@ -149,33 +136,39 @@ class DesignedMask:
             "settings": settings.model_dump(mode="json"),
             "versions": versions(),
         }
-        written = provenance | {"config": recipe.config.to_yaml()}
-        folder.write("provenance.json", json.dumps(written, indent=1, ensure_ascii=False))
+        self._report(tuple(provenance)).write(folder, provenance | {"config": recipe.config.to_yaml()})
+        document = {"recipe": recipe.name, "kind": settings.kind, "loss": learnt.loss, **self.figures,
+                    "fabrication": self.terms.fabrication.values, "numbers": learnt.numbers}  # fmt: skip
+        folder.write("mask.json", json.dumps(document, indent=1))
+
+    def _report(self, shown: Sequence[str]) -> StudyReport:
+        from safetensors.torch import save
+
+        from neusee.workflows.training.mask_design.design_page import pictures, sections
+
+        terms, history = self.terms, self.learnt.history
         with torch.no_grad():
-            shown = pictures(self.terms, self.height.to(self.terms.device), self.learnt)
-        for name, picture in shown.items():
-            folder.write(f"figures/{name}.png", picture)
-        title, intro = f"{recipe.name}: a mask designed without images", f"{settings.kind}: {summary_line(self.found)}."
-        body = sections(self.found, self.terms.fabrication, shown)
-        folder.write("report.html", page(title, intro, body, provenance))
+            drawings = pictures(terms, self.height.to(terms.device), self.learnt)
+        header = list(dict.fromkeys(name for row in history for name in row))
+        tables = {"history.csv": (header, [[row.get(name, "") for name in header] for row in history])}
+        title, lead = f"{terms.recipe.name}: a mask designed without images", summary_line(self.figures)
+        parts = sections(self.figures["bands"], terms.fabrication, drawings)
+        files = {"mask.safetensors": save({"height": self.height})}
+        return StudyReport(title, f"{terms.settings.kind}: {lead}.", parts, drawings, tables, files, shown)
 
 
 def _at(recipe: Recipe, settings: MaskTraining) -> Recipe:
-    """Return the recipe with the values that hold while the mask is learnt."""
+    """Return the recipe with the values of ``at``, which replace other values while the mask is optimised."""
     if not settings.at:
         return recipe
     try:
-        return changed(recipe, [f"{name}={_word(value)}" for name, value in settings.at.items()])
+        return changed(recipe, [f"{name}={flow(value)}" for name, value in settings.at.items()])
     except RecipeError as error:
         raise DesignError(f"at: {error.diagnostics[0].path}: {error.diagnostics[0].message}") from error
 
 
-def _word(value: Any) -> str:
-    return json.dumps(value) if isinstance(value, list | tuple | dict) else str(value)
-
-
 def _key(recipe: Recipe, settings: MaskTraining, store: Store | None) -> str:
-    """Return a digest of all that decides the bits of a mask: recipe, settings, code of nodes and design."""
+    """Return a digest of everything that decides the bits of a mask: recipe, settings, code of nodes and design."""
     code = Code((store or Store()).code_memo)
     steps = [recipe.steps[name] for name in needed(recipe, [settings.psf, settings.plain])]
     nodes = sorted({step.node.fn.__module__ for step in steps} | _LEARNT_WITH)
@@ -192,7 +185,7 @@ def _key(recipe: Recipe, settings: MaskTraining, store: Store | None) -> str:
 
 
 def mask_figures(terms: Terms, height: Tensor) -> dict[str, Any]:
-    """Return LSR, BSR and contrast of a mask by band, their means, and the bounds that hold for them."""
+    """Return LSR, BSR and contrast of a mask by band, with bounds on the contrast, and the means over the bands."""
     with torch.no_grad():
         psf, plain = terms.psf(height), terms.plain()
         lsr, bsr = metrics.lsr(psf), metrics.bsr(psf.intensity, plain.intensity)
@@ -207,11 +200,11 @@ def mask_figures(terms: Terms, height: Tensor) -> dict[str, Any]:
     return {"mean": means, "bands": plain_values, "depth": float(height.amax() - height.amin())}
 
 
-def summary_line(found: Mapping[str, Any]) -> str:
-    """Return the figures in one line."""
-    mean = found["mean"]
+def summary_line(figures: Mapping[str, Any]) -> str:
+    """Return the mean figures of merit of a mask in one line."""
+    mean = figures["mean"]
     return (
         f"mean LSR {mean['lsr']:.3g} (even light {mean['energy_floor']:.2g}), BSR {mean['bsr']:.3f}, "
         f"median MTF {mean['median_mtf']:.3g} (at most {mean['median_mtf_bound']:.2g}), "
-        f"relief {found['depth'] * 1e6:.3g} um deep"
+        f"relief {figures['depth'] * 1e6:.3g} um deep"
     )

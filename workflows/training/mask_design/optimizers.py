@@ -1,10 +1,11 @@
-"""How a mask is learnt: by Adam, or by differential evolution; a stopped design goes on from its state."""
+"""Optimisation of a mask by Adam or by differential evolution, which continues from the state of a stopped design."""
 
 from __future__ import annotations
 
 import math
 from collections.abc import Callable
-from dataclasses import dataclass, field
+from copy import deepcopy
+from dataclasses import dataclass
 from typing import Any
 
 import torch
@@ -27,24 +28,24 @@ from neusee.workflows.training.loop.checkpoint import StateFile
 from neusee.workflows.training.loop.resumable_loop import Progress
 from neusee.workflows.training.mask_design.design_terms import Terms
 
-_APART = 7919  #: between the streams of two starts
-_USUAL = (12.0, 18.0, 24.0, 30.0, 36.0, 1.0, 0.0)  #: genes of the half-rings that nobody optimised
+_APART = 7919  #: difference of the seeds of two starts
+_USUAL = (12.0, 18.0, 24.0, 30.0, 36.0, 1.0, 0.0)  #: genes of half-rings that were chosen by hand
 
 
 @dataclass
 class LearntMask:
-    """The best mask, and the losses on the way to it."""
+    """The best mask of a design, and the losses at all iterations."""
 
     height: Callable[[Stop], Tensor]
     loss: float
-    numbers: dict[str, Any]  #: of a mask that has few
-    history: list[dict[str, float]] = field(default_factory=list)
+    numbers: dict[str, Any]  #: parameters of a mask with few parameters
+    history: list[dict[str, float]]
 
 
 def learn(terms: Terms, state: StateFile, progress: Progress) -> LearntMask:
-    """Design a mask; on the CPU the same settings give the same bits, however often the design was stopped."""
-    learner = _evolve if terms.settings.kind == "five_half_rings" else _descend
-    return learner(terms, state, progress)
+    """Optimise a mask; on the CPU the same settings give the same bits, also if the design was stopped."""
+    optimise = _evolve if terms.settings.kind == "five_half_rings" else _descend
+    return optimise(terms, state, progress)
 
 
 # --- by gradients -----------------------------------------------------------------------------------------------------
@@ -73,18 +74,17 @@ def _free(terms: Terms, rng: torch.Generator) -> nn.Module:
 
 
 def _start(settings: MaskTraining) -> Tensor | None:
-    """Return the height map from which pixels start."""
+    """Return the height map of the file ``start``, from which the optimisation of pixels begins."""
     if settings.start is None:
         return None
     height = read_height_map(settings.start, settings.max_height)
-    if float(height.max()) > settings.max_height:
-        deep, most = f"{float(height.max()) * 1e6:.3g} um", f"{settings.max_height * 1e6:.3g} um"
-        raise DesignError(f"start: {settings.start.name} is {deep} deep: set max_height to more than {most}")
+    if (deepest := float(height.max())) > settings.max_height:
+        raise DesignError(f"start: {settings.start.name} is {deepest * 1e6:.3g} um deep: set max_height to more")
     return height
 
 
 def rate(settings: MaskTraining, number: int) -> float:
-    """Return the learning rate of an iteration, counted from 0."""
+    """Return the learning rate of an iteration; iterations count from 0."""
     done = number / settings.iterations
     if settings.schedule == "step":
         return settings.rate * 0.5 ** math.floor(5 * done)
@@ -94,7 +94,7 @@ def rate(settings: MaskTraining, number: int) -> float:
 def _descend(terms: Terms, file: StateFile, progress: Progress) -> LearntMask:
     state, settings = file.read(strict=False) or {"start": 0, "history": [], "best": None}, terms.settings
     if state["start"] or "shape" in state:
-        progress(f"going on from start {state['start'] + 1}, iteration {state.get('iteration', 0)}")
+        progress(f"continues from start {state['start'] + 1}, iteration {state.get('iteration', 0)}")
     for start in range(state["start"], settings.starts):
         shape = shape_of(terms, start).to(terms.device)
         _one_start(terms, shape, start, state, file, progress)
@@ -102,9 +102,9 @@ def _descend(terms: Terms, file: StateFile, progress: Progress) -> LearntMask:
             loss = float(terms.total(terms.parts(shape(terms.stop))))
         progress(f"start {start + 1} of {settings.starts}: {loss:.5g} on all bands")
         if not math.isfinite(loss):
-            raise DesignError(f"start {start + 1}: the loss on all bands is not finite: lower the learning rate")
+            raise DesignError(f"start {start + 1}: the loss on all bands is NaN or infinite: lower the learning rate")
         if state["best"] is None or loss < state["best"]["loss"]:
-            state["best"] = {"loss": loss, "start": start, "shape": _copied(shape.state_dict())}
+            state["best"] = {"loss": loss, "start": start, "shape": deepcopy(shape.state_dict())}
         for name in ("shape", "adam", "iteration"):
             state.pop(name, None)
         state["start"] = start + 1
@@ -117,7 +117,7 @@ def _descend(terms: Terms, file: StateFile, progress: Progress) -> LearntMask:
 def _one_start(
     terms: Terms, shape: nn.Module, start: int, state: dict[str, Any], file: StateFile, progress: Progress
 ) -> None:
-    """Learn one start to its last iteration; ``state`` takes up its history, and its weights as often as is kept."""
+    """Optimise the parameters from one start, and save the losses and, at times, the parameters in ``state``."""
     settings = terms.settings
     adam = torch.optim.Adam(shape.parameters(), lr=settings.rate)
     if "shape" in state:
@@ -129,8 +129,8 @@ def _one_start(
         row = _step(terms, shape, adam, start, number)
         state["history"].append(row)
         if (number + 1) % settings.save_every == 0:
-            progress(f"{number + 1}/{settings.iterations}  " + _losses_line(row))
-            state |= {"shape": _copied(shape.state_dict()), "adam": adam.state_dict(), "iteration": number + 1}
+            progress(f"{number + 1}/{settings.iterations}  {_losses_line(row)}")
+            state |= {"shape": shape.state_dict(), "adam": adam.state_dict(), "iteration": number + 1}
             file.write(state)
 
 
@@ -141,13 +141,12 @@ def _step(terms: Terms, shape: nn.Module, adam: torch.optim.Adam, start: int, nu
     row = {"start": start, "iteration": number, "loss": float(loss.detach())}
     row |= {name: float(term.detach()) for name, term in parts.items()}
     if not math.isfinite(row["loss"]):
-        raise DesignError(f"start {start + 1}, iteration {number}: the loss is not finite ({_losses_line(row)})")
+        raise DesignError(f"start {start + 1}, iteration {number}: the loss is NaN or infinite ({_losses_line(row)})")
     loss.backward()  # type: ignore[no-untyped-call]
     for name, parameter in shape.named_parameters():
         if parameter.grad is not None and not bool(parameter.grad.isfinite().all()):
-            raise DesignError(
-                f"start {start + 1}, iteration {number}: the gradient of {name} is not finite; {_losses_line(row)}"
-            )
+            text = f"the gradient of {name} is NaN or infinite; {_losses_line(row)}"
+            raise DesignError(f"start {start + 1}, iteration {number}: {text}")
     adam.step()
     return row
 
@@ -156,22 +155,18 @@ def _losses_line(row: dict[str, float]) -> str:
     return ", ".join(f"{name} {value:.5g}" for name, value in row.items() if name not in ("start", "iteration"))
 
 
-def _copied(state: dict[str, Tensor]) -> dict[str, Tensor]:
-    return {name: value.detach().cpu().clone() for name, value in state.items()}
-
-
 def _few(shape: nn.Module) -> dict[str, Any]:
-    """Return the parameters of a mask that are few enough for a table."""
+    """Return the parameters of a mask as lists, without matrices and without lists of more than 1000 numbers."""
     inner: Any = shape.shape if isinstance(shape, Written) else shape
-    return {name: x.tolist() for name, x in inner.state_dict().items() if x.numel() <= 1000 and x.dim() == 1
-            and not isinstance(inner, Drawn)}  # fmt: skip
+    state = {} if isinstance(inner, Drawn) else inner.state_dict()
+    return {name: x.tolist() for name, x in state.items() if x.numel() <= 1000 and x.dim() == 1}
 
 
 # --- by differential evolution ----------------------------------------------------------------------------------------
 
 
 def half_ring_height(genes: Any, settings: MaskTraining) -> Callable[[Stop], Tensor]:
-    """Return the height map of five slopes, the side of every second ring and the orientation."""
+    """Return a function that computes the height map of the half-rings of a set of genes on a grid."""
     *slopes, side, turn = (float(gene) for gene in genes)
     given = {"waves": tuple(slopes), "alternate": side >= 0.5, "orientation": turn}
 
@@ -183,14 +178,14 @@ def half_ring_height(genes: Any, settings: MaskTraining) -> Callable[[Stop], Ten
 
 
 class _LossOfGenes:
-    """The loss of a set of genes; what was asked before an interruption is answered from the state."""
+    """The loss of a set of genes; the losses of calls before an interruption are read from the state."""
 
     def __init__(self, terms: Terms, state: StateFile, progress: Progress) -> None:
         self.terms, self.state = terms, state
         self.known: list[float] = list(state.read(strict=False).get("values", []))
         self.asked, self.chosen = 0, terms.even()  # None: all bands
         if self.known:
-            progress(f"going on after {len(self.known)} masks")
+            progress(f"continues after {len(self.known)} masks")
 
     def __call__(self, genes: Any) -> float:
         if self.asked == len(self.known):
@@ -198,7 +193,7 @@ class _LossOfGenes:
                 height = half_ring_height(genes, self.terms.settings)(self.terms.stop)
                 loss = float(self.terms.total(self.terms.parts(height.to(self.terms.device), self.chosen)))
             if not math.isfinite(loss):
-                raise DesignError(f"mask {self.asked}: the loss of slopes {list(genes[:-2])} is not finite")
+                raise DesignError(f"mask {self.asked}: the loss of slopes {list(genes[:-2])} is NaN or infinite")
             self.known.append(loss)
             if len(self.known) % (self.terms.settings.save_every * 10) == 0:
                 self.state.write({"values": self.known})
@@ -211,25 +206,26 @@ def _evolve(terms: Terms, state: StateFile, progress: Progress) -> LearntMask:
 
     settings = terms.settings
     if (most := _steepest(terms)) < settings.slopes[1]:
-        progress(f"slopes: those above {most:.3g} waves are too steep for the pupil's samples: take more of them")
+        progress(f"slopes above {most:.3g} waves are too steep for the samples of the pupil: use more samples")
     loss, history = _LossOfGenes(terms, state, progress), list[dict[str, float]]()
-    best: tuple[float, Any] = (math.inf, None)
+    populations: list[tuple[float, Any]] = []
     bounds = np.array([settings.slopes] * 5 + [(0.0, 1.0), (0.0, math.pi)])
     for start in range(settings.starts):
-        found = _population(loss, bounds, start, history, progress)
-        slopes = [round(float(x), 2) for x in found[1][:5]]
-        progress(f"start {start + 1} of {settings.starts}: {found[0]:.5g}, slopes {slopes}")
-        best = min(best, found, key=lambda pair: pair[0])
+        least, genes = _population(loss, bounds, start, history, progress)
+        slopes = [round(float(x), 2) for x in genes[:5]]
+        progress(f"start {start + 1} of {settings.starts}: {least:.5g}, slopes {slopes}")
+        populations.append((least, genes))
     state.write({"values": loss.known})
-    *waves, side, turn = (float(x) for x in best[1])
+    least, genes = min(populations, key=lambda pair: pair[0])
+    *waves, side, turn = (float(x) for x in genes)
     numbers = {"waves": waves, "alternate": side >= 0.5, "orientation": turn}
-    return LearntMask(half_ring_height(best[1], settings), best[0], numbers, history)
+    return LearntMask(half_ring_height(genes, settings), least, numbers, history)
 
 
 def _population(
     loss: _LossOfGenes, bounds: Any, start: int, history: list[dict[str, float]], progress: Progress
 ) -> tuple[float, Any]:
-    """Return the least loss that one population finds, and its genes; ``history`` takes up each generation."""
+    """Return the least loss and the best genes of one population, and add a row for each generation to ``history``."""
     import numpy as np
     from scipy.optimize import differential_evolution, minimize
 
@@ -255,23 +251,23 @@ def _population(
             callback=note_generation,
             x0=_USUAL if _holds_usual(settings) else None,
         )
-        if settings.polish:  # the peak depends on the slopes to a tenth of a wave, and few bands suit few slopes
+        if settings.polish:  # on all bands, because a tenth of a wave changes the peak
             loss.chosen = None
             simplex = found.x + np.concatenate([np.zeros((1, len(low))), 0.01 * np.diag(high - low)])
             fine = {"maxfev": settings.polish, "initial_simplex": np.clip(simplex, low, high)}
             found = minimize(loss, found.x, method="Nelder-Mead", bounds=bounds, options=fine)
-    except RuntimeError as error:  # scipy takes a refusal for a fault of its own call
+    except RuntimeError as error:  # scipy raises this for any error of the loss
         raise error.__cause__ if isinstance(error.__cause__, DesignError) else error from None
     return float(found.fun), found.x
 
 
 def _steepest(terms: Terms) -> float:
-    """Return the slope, in waves at the rim, that turns half a wave a sample in the first band: Nyquist's limit."""
+    """Return the slope, in waves at the rim, that changes by half a wave per sample in the shortest band (Nyquist)."""
     material, wavelength = terms.settings.material, terms.settings.wavelength
     turned = wave_height(material, wavelength) / wave_height(material, float(terms.bands.centres.min()))
     return float(terms.stop.diameter / (4 * terms.stop.pitch * turned))
 
 
 def _holds_usual(settings: MaskTraining) -> bool:
-    """Return True if the slopes that nobody optimised are among those that are tried."""
+    """Return True if the slopes that were chosen by hand lie within the allowed slopes."""
     return settings.slopes[0] <= min(_USUAL[:5]) and settings.slopes[1] >= max(_USUAL[:5])

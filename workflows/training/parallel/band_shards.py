@@ -1,14 +1,13 @@
-"""Which steps the processes of a band axis share by wavelength, and where the bands come together again.
+"""The steps whose bands are divided among several processes, and the later steps that need all bands.
 
-A node that declares its bands gives each band the same bits, whatever other bands are computed with it. So each
-process computes its own bands of every step that works on the bands of the scene. The first later step that does not
-work band by band needs all bands: those of the mask's PSF are gathered by every process, those of a picture are sent
-to the process that owns the picture. Where only sums over the bands of an image are read, only the sums are sent.
+Each process computes its own bands of every step that works band by band, with the same bits as a single process. The
+first step that does not work band by band needs all bands: every process gathers the bands of the mask's PSF, and the
+bands of a picture are sent to its process. If later steps read only sums over bands, only the sums are sent.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable, Collection, Mapping, Sequence
+from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Any, get_args
 
@@ -32,26 +31,26 @@ Port = Swapped | Sum
 
 @dataclass(frozen=True)
 class Shards:
-    """The steps that are shared by band, and the steps that follow them."""
+    """The steps of a recipe whose bands are divided among processes, and the later steps that need all bands."""
 
     recipe: Recipe
     mesh: Mesh = ALONE
     count: int = 0  #: bands of the scene
-    steps: frozenset[str] = frozenset()  #: those of which each process computes its own bands
-    behind: frozenset[str] = frozenset()  #: those that need all bands of a shared step
-    rows: Mapping[str, Tensor] = field(default_factory=dict)  #: weights of sums, by image of which only sums are read
+    steps: frozenset[str] = frozenset()  #: steps of which each process computes its own bands
+    behind: frozenset[str] = frozenset()  #: later steps, which need all bands
+    rows: Mapping[str, Tensor] = field(default_factory=dict)  #: weights of sums, by image whose bands are only summed
 
     @classmethod
     def of(
-        cls, recipe: Recipe, psf: str, wanted: Sequence[str], live: Collection[str], store: Store, mesh: Mesh
+        cls, recipe: Recipe, psf: str, outputs: Sequence[str], live: Collection[str], store: Store, mesh: Mesh
     ) -> Shards:
-        """Find the ``live`` steps that work on the bands of the PSF; raise MeshError for too few bands."""
+        """Divide the ``live`` steps by band among the processes; raise MeshError for too few bands."""
         if mesh.band == 1:
             return cls(recipe)
         spectral = _sampled(recipe, psf)
         count = _count(recipe, psf, spectral, store, mesh)
         steps, behind = set[str](), set[str]()
-        for name in needed(recipe, wanted):
+        for name in needed(recipe, outputs):
             if name not in live:
                 continue
             sources = set(recipe.steps[name].sources)
@@ -59,21 +58,17 @@ class Shards:
                 steps.add(name)
             elif sources & (behind | steps):
                 behind.add(name)
-        summed_alone = {n: asked for n in sorted(steps) if (asked := _asked(recipe, n, wanted, behind, live))}
+        summed_alone = {n: asked for n in sorted(steps) if (asked := _asked(recipe, n, outputs, behind, live))}
         rows = {name: _rows(recipe, asked, store) for name, asked in summed_alone.items()}
         return cls(recipe, mesh, count, frozenset(steps), frozenset(behind), rows)
 
     @property
     def own(self) -> list[int]:
-        """Return the bands of this process."""
+        """Return the indices of the bands of this process."""
         return own_bands(self.mesh, self.count)
 
-    @property
-    def call(self) -> Callable[..., Any]:
-        """Return the function that computes a step; of shared steps it computes the bands of this process."""
-        return self._call if self.steps else call
-
-    def _call(self, step: Step, inputs: Sequence[Any], params: Mapping[str, Any], seed: int, device: str) -> Any:
+    def call(self, step: Step, inputs: Sequence[Any], params: Mapping[str, Any], seed: int, device: str) -> Any:
+        """Compute a step and return its result, only at the bands of this process if the step is divided by band."""
         if step.name in self.steps:
             whole = [name for name in step.node.inputs if step.wires.get(name) not in self.steps]
             inputs = taken(step, inputs, self.own, whole)
@@ -85,26 +80,26 @@ class Shards:
         return with_band_tensors(value, [gathered(self.mesh, x, axis, self.count) for x in band_tensors(value)])
 
     def axis(self, name: str) -> int:
-        """Return the axis along which the bands of a shared step lie."""
+        """Return the axis of the bands in the result of a step that works band by band."""
         bands = self.recipe.steps[name].node.bands
         assert bands is not None
         return bands["return"]
 
     def sent(self, name: str, value: Any) -> list[Tensor]:
-        """Return the tensors of one picture's result that are sent to the process that owns the picture."""
+        """Return the tensors of a result that are sent to the process that owns the picture."""
         if name not in self.rows:
             return band_tensors(value)
         part = channel_sums(value, self.rows[name][:, self.own])
         return [part.planes, part.flux]
 
     def ports(self, name: str, sent: Sequence[Tensor]) -> list[Port]:
-        """Return the port through which each of these tensors is sent."""
+        """Return the exchange by which each of the tensors ``sent`` goes to the process that owns the picture."""
         if name in self.rows:
             return [Sum(self.mesh), Swapped(self.mesh, -1, self.count)]
         return [Swapped(self.mesh, self.axis(name), self.count) for _ in sent]
 
     def received(self, name: str, like: Any, found: Sequence[Tensor]) -> Any:
-        """Return the result in the form that later steps read."""
+        """Return the result of a step from the received tensors, in the form that later steps read."""
         if name not in self.rows:
             return with_band_tensors(like, found)
         planes, flux = found
@@ -113,18 +108,18 @@ class Shards:
 
 
 def _sampled(recipe: Recipe, name: str) -> set[str]:
-    """Return the steps that give the wavelengths of a step."""
+    """Return the steps whose result is the bands of a step."""
     return {n for n in needed(recipe, [name]) if recipe.steps[n].node.hints["return"] is Bands}
 
 
 def _by_band(recipe: Recipe, name: str, spectral: set[str]) -> bool:
-    """Return True if a step works on each of these bands separately."""
+    """Return True if a step works separately on each band of the steps ``spectral``."""
     node = recipe.steps[name].node
     return node.bands is not None and _sampled(recipe, name) == spectral and not _mixed(recipe, name)
 
 
 def _mixed(recipe: Recipe, name: str) -> bool:
-    """Return True if a step gives a mixture of planes, none of which is a single band."""
+    """Return True if the planes of the result of a step are mixtures of several bands."""
     while (kind := recipe.steps[name].node.hints["return"]) is not LowRankCube:
         step = recipe.steps[name]
         through = next((w for i in step.node.accepts_low_rank if isinstance(w := step.wires.get(i), str)), None)
@@ -138,25 +133,24 @@ def _count(recipe: Recipe, psf: str, spectral: set[str], store: Store, mesh: Mes
     step = recipe.steps[psf]
     if not _by_band(recipe, psf, spectral) or len(spectral) != 1:
         raise MeshError(
-            f"{step.mark}: {psf} ({step.node.path}) couples its bands, so that --mesh {mesh} has none to share: "
+            f"{step.mark}: {psf} ({step.node.path}) couples its bands, so that --mesh {mesh} cannot share the bands: "
             f"write --mesh {mesh.size}x1"
         )
     (bands,) = spectral
     count = len(run(recipe, store, [bands]).values[bands].centres)
     if mesh.band > count:
-        where = recipe.steps[bands].mark
         raise MeshError(
-            f"{where}: {bands} has {count} bands, which {mesh.band} processes cannot share: --mesh {mesh} may have "
-            f"{count} along its band axis at most"
+            f"{recipe.steps[bands].mark}: {bands} has {count} bands, which {mesh.band} processes cannot share: write a "
+            f"band axis of at most {count} in --mesh {mesh}"
         )
     return count
 
 
 def _asked(
-    recipe: Recipe, name: str, wanted: Sequence[str], behind: Collection[str], live: Collection[str]
+    recipe: Recipe, name: str, outputs: Sequence[str], behind: Collection[str], live: Collection[str]
 ) -> Asked | None:
-    """Return the sums that are read of an image; None if anything else is read, or if their weights change."""
-    asked = None if name in wanted else asked_of(recipe, name, wanted)
+    """Return the sums that later steps read from an image; None if other values are read or the weights change."""
+    asked = None if name in outputs else asked_of(recipe, name, outputs)
     still = asked is not None and asked.bands not in live and asked.responses not in live
     return asked if asked is not None and still and set(behind).issuperset(asked.readers) else None
 

@@ -1,9 +1,8 @@
-"""The mesh (data, band) of the processes that learn together, as `torchrun` starts them.
+"""The mesh (data, band) of the processes that `torchrun` starts for one training.
 
-Every process runs the same program. Along the data axis the processes see different pictures; along the band axis they
-share the optics of the same pictures by wavelength. Networks, optimisers and the state are equal in all processes:
-gradients are added over all of them, and each process takes the same step. A single process is a mesh of 1 x 1, which
-sends no messages.
+Processes along the data axis have different pictures. Processes along the band axis share the optics of the same
+pictures by wavelength. Gradients are added over all processes, so that networks, optimisers and state stay equal in all
+processes. A single process is a mesh of 1 x 1, which sends no messages.
 """
 
 from __future__ import annotations
@@ -21,36 +20,36 @@ from torch import nn
 
 
 class MeshError(ValueError):
-    """A mesh that does not fit the processes, the recipe or the arguments of the processes."""
+    """Error for a mesh that does not fit the number of processes, the recipe or the arguments."""
 
 
 @dataclass(frozen=True)
 class Mesh:
-    """One process of ``data`` x ``band``; neighbours share the bands of the same pictures."""
+    """One process of a mesh of ``data`` x ``band`` processes; neighbours share the bands of the same pictures."""
 
     data: int = 1
     band: int = 1
     rank: int = 0
-    group: Any = None  #: the process group of torch.distributed that has the same pictures
+    group: Any = None  #: the process group of torch.distributed with the same pictures
 
     @property
     def size(self) -> int:
-        """Return the number of processes."""
+        """Return the number of processes of the mesh."""
         return self.data * self.band
 
     @property
     def row(self) -> int:
-        """Return the number of this process along the data axis."""
+        """Return the index of this process along the data axis."""
         return self.rank // self.band
 
     @property
     def column(self) -> int:
-        """Return the number of this process along the band axis."""
+        """Return the index of this process along the band axis."""
         return self.rank % self.band
 
     @property
     def first(self) -> bool:
-        """Return True for the one process that writes files."""
+        """Return True for the only process that writes files."""
         return self.rank == 0
 
     def __str__(self) -> str:
@@ -71,18 +70,18 @@ class Mesh:
         dist.all_gather_object(texts, about)
         for rank, other in enumerate(texts):
             if other != texts[0]:
-                raise MeshError(f"process 0 is at {texts[0]}, process {rank} at {other}: let all see the same folder")
+                raise MeshError(f"process 0 is at {texts[0]}, process {rank} at {other}: use the same folder in all")
 
-    def numbers(self, found: Mapping[str, float], names: Sequence[str], device: str) -> dict[str, float]:
-        """Return the sum of each of ``names`` over all processes."""
+    def numbers(self, own: Mapping[str, float], names: Sequence[str], device: str) -> dict[str, float]:
+        """Return the sum over all processes of each of the numbers ``names``."""
         if self.size == 1:
-            return dict(found)
-        total = torch.tensor([found.get(name, 0.0) for name in names], dtype=torch.float64, device=device)
+            return dict(own)
+        total = torch.tensor([own.get(name, 0.0) for name in names], dtype=torch.float64, device=device)
         dist.all_reduce(total)
         return dict(zip(names, total.tolist(), strict=True))
 
     def add_gradients(self, parts: Iterable[nn.Module]) -> None:
-        """Give all processes the sum of their gradients, in one message for each precision; None stays None."""
+        """Replace the gradients in all processes by their sum, in one message for each dtype; None stays None."""
         if self.size == 1:
             return
         own = [p for part in parts for p in part.parameters()]
@@ -91,7 +90,7 @@ class Mesh:
 
 
 def _add(own: Sequence[nn.Parameter]) -> None:
-    """Add gradients over all processes; where no process has a gradient, it stays None, so that no step is taken."""
+    """Add gradients over all processes; a gradient that is None in every process stays None."""
     there = torch.tensor([float(p.grad is not None) for p in own]).to(own[0])
     grads = [torch.zeros_like(p) if p.grad is None else p.grad for p in own]
     flat = torch.cat([*(g.reshape(-1) for g in grads), there])
@@ -105,12 +104,12 @@ ALONE = Mesh()
 
 
 def processes() -> tuple[int, int]:
-    """Return the number of this process and the number of processes, as `torchrun` sets them in the environment."""
+    """Return the index of this process and the number of processes from the environment that `torchrun` sets."""
     return int(os.environ.get("RANK", "0")), int(os.environ.get("WORLD_SIZE", "1"))
 
 
 def shape_of(text: str, world: int) -> tuple[int, int]:
-    """Return ``4x2`` as numbers, and (world, 1) for no text; raise MeshError unless their product is ``world``."""
+    """Return (4, 2) for the text ``4x2``, and (world, 1) for no text; raise MeshError for another product."""
     if not text:
         return world, 1
     if not re.fullmatch(r"[1-9]\d*x[1-9]\d*", text):
@@ -124,14 +123,14 @@ def shape_of(text: str, world: int) -> tuple[int, int]:
 
 
 def device_here(device: str) -> str:
-    """Return the device of this process among those of its machine."""
+    """Return the name of the device that this process uses."""
     local = os.environ.get("LOCAL_RANK", "0")
     return f"cuda:{local}" if device == "cuda" and processes()[1] > 1 else device
 
 
 @contextmanager
 def joined(text: str, device: str) -> Iterator[Mesh]:
-    """Join the mesh that ``--mesh`` names for the length of the block; raise MeshError for a mesh that does not fit."""
+    """Join the mesh that ``--mesh`` names until the block ends; raise MeshError for a mesh that does not fit."""
     rank, world = processes()
     data, band = shape_of(text, world)
     if world == 1:
@@ -144,4 +143,4 @@ def joined(text: str, device: str) -> Iterator[Mesh]:
         dist.init_process_group("gloo")
     groups = [dist.new_group(list(range(row * band, (row + 1) * band))) for row in range(data)]
     yield Mesh(data, band, rank, groups[rank // band])
-    dist.destroy_process_group()  # after an error all end, and nobody waits for the others
+    dist.destroy_process_group()  # not after an error, when a process would wait for others that have ended

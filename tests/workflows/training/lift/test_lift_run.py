@@ -133,7 +133,7 @@ def test_what_is_not_a_number_stops_and_is_kept(tmp_path, monkeypatch):
     from neusee.nodes import losses as nodes
 
     monkeypatch.setattr(nodes, "mrae", lambda a, b, floor: (a - b).mean() * float("nan"))
-    with pytest.raises(ArithmeticError, match=r"iteration 0, picture 0: not finite: MRAE"):
+    with pytest.raises(ArithmeticError, match=r"iteration 0, picture 0: NaN or infinite: MRAE"):
         trained(load("train_lift", TINY), tmp_path)
     (folder,) = (tmp_path / "runs").iterdir()
     assert {"net", "optimiser"} <= torch.load(folder / "not_finite_0.pt", weights_only=True)["parts"].keys()
