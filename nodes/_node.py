@@ -203,22 +203,17 @@ def node(
 ) -> Callable[[Callable[..., Any]], Node]:
     """Return the decorator that makes a node of a function; ``rtol`` is the agreed error against its reference.
 
-        Args:
-            bands: the axis of the bands of some inputs and of the result (``return``). Band i of the result depends only
-                on band i of these inputs and on the whole of every other input, and is the same to the last bit for any
-                other bands in the stack. In a named tuple, only the fields in `values.BAND_FIELDS` have this axis.
-            accepts_channel_sums: inputs that may be `Channels` instead of an image of all bands.
-            needs_band_invariant: inputs that must be the same for every band if an image is given as `Channels`.
-            accepts_low_rank: inputs that may be a `LowRankCube` instead of a cube.
-    <<<<<<< HEAD
-            additive_inputs: inputs that change nothing where they are zero, an optional input or a list; each with the
-                inputs that belong to it.
-            before_run: True for a node of few numbers without inputs, which the check of a recipe computes too, so that
-                the preflight of another node can use the result.
-    =======
-            additive_inputs: groups of inputs; the first input of a group is optional or a list, and changes nothing where
-                its values are zero. The other inputs of the group belong to the first one.
-    >>>>>>> r_kornia
+    Args:
+        bands: the axis of the bands of some inputs and of the result (``return``). Band i of the result depends only
+            on band i of these inputs and on the whole of every other input, and is the same to the last bit for any
+            other bands in the stack. In a named tuple, only the fields in `values.BAND_FIELDS` have this axis.
+        accepts_channel_sums: inputs that may be `Channels` instead of an image of all bands.
+        needs_band_invariant: inputs that must be the same for every band if an image is given as `Channels`.
+        accepts_low_rank: inputs that may be a `LowRankCube` instead of a cube.
+        additive_inputs: groups of inputs; the first input of a group is optional or a list, and changes nothing where
+            its values are zero. The other inputs of the group belong to the first one.
+        before_run: True for a node without inputs and with a result of few numbers, which is also computed when a
+            recipe is checked, so that the preflight of another node can use the result.
     """
     return lambda fn: Node(
         fn,
