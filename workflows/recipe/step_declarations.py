@@ -156,11 +156,11 @@ def _is_item_list(block: Value) -> bool:
 def find_node(name: str) -> Node:
     """Return the node with a name such as ``sensor.digitize``; raise `LookupError` with the most similar name."""
     family, _, attribute = name.partition(".")
-    if now := instead(name):
-        raise LookupError(f"{name} {now}")
     module = f"{neusee.nodes.__name__}.{family}"
     exists = family.isidentifier() and (module in sys.modules or importlib.util.find_spec(module) is not None)
     nodes = nodes_of(family) if exists else {}
+    if attribute not in nodes and (now := instead(name)):
+        raise LookupError(f"{name} {now}")
     if not nodes:
         raise LookupError(f"no family {family}; {_elsewhere(attribute) or nearest(family, families())}")
     if attribute not in nodes:

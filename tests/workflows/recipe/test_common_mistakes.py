@@ -182,8 +182,8 @@ def test_19_one_pixel_is_legal_and_none_is_not(accepted, refused):
 
 
 def test_19_one_wavelength_is_no_range(refused):
-    (problem,) = refused("optics.start=550 nm", "optics.stop=550 nm")
-    assert problem.startswith("argument 1 | optics.start = 550 nm | start 550 nm must be below stop 550 nm")
+    (problem,) = refused("optics.shortest=550 nm", "optics.longest=550 nm")
+    assert problem.startswith("argument 1 | optics.shortest = 550 nm | start 550 nm must be below stop 550 nm")
 
 
 def test_20_a_steep_element_is_legal_before_the_run(accepted):

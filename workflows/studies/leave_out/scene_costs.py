@@ -106,7 +106,7 @@ def _window_steps(recipe: Recipe) -> set[str]:
 
 
 def _bands(recipe: Recipe, start: str, stop: str, count: int) -> list[str]:
-    names = ("optics.start", "optics.stop", "optics.bands")
+    names = ("optics.shortest", "optics.longest", "optics.bands")
     if any(name not in recipe.config.settings for name in names):
         return []
     return [f"{name}={value}" for name, value in zip(names, (start, stop, count), strict=True)]

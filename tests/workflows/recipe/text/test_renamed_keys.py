@@ -19,6 +19,7 @@ BLOCKS_OF_KEYS = ("sensor", "reading", "camera")
 ELEMENT = [old for old in old_names() if "element" in old]  #: a block, a step, words of `train`
 KEYS = [old for old in old_names() if old.count(".") == 1 and old.partition(".")[0] in BLOCKS_OF_KEYS]
 KEYS.remove("sensor.gather")  # a node of the family `sensor`, not a key of the block
+KEYS += ["optics.start", "optics.stop"]
 KEYS += [f"element.{name}" for name in ("material", "wrap_at", "levels", "max_height")]
 LIFT = [old for old in old_names() if old.startswith("train_lift.")]
 NODES = [old for old in old_names() if old.count(".") == 1 and old not in (*KEYS, *ELEMENT, *LIFT)]
