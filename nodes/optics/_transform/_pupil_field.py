@@ -62,7 +62,7 @@ class Field:
         angle = work.take("angle", *planes.shape[1:])
         turns = angle if self.few else work.take("turns", *planes.shape[1:], dtype=torch.float64)
         unit = 2 * math.pi if self.few else 1.0
-        torch.mul(self.screens.height[rows, columns], unit * self.view.turns_height, out=turns)
+        turns.copy_(self.screens.height[rows, columns]).mul_(unit * self.view.turns_height)  # cast before the product
         if self.screens.longest > 0:
             turns.add_(self.screens.path[rows, columns], alpha=unit * self.view.turns_path)
         turns.add_(self.tilt_u[columns], alpha=unit).add_(self.tilt_v[rows], alpha=unit)
