@@ -4,8 +4,9 @@ from neusee.nodes.optics._imaging._band_image import image
 from neusee.nodes.optics._imaging._channel_image import image_channels
 from neusee.nodes.optics._laser_direction import direction, field_of_view
 from neusee.nodes.optics._laser_spot import laser_irradiance
+from neusee.nodes.optics._phase_steps import mask_turns
 from neusee.nodes.optics._psf import psf
-from neusee.nodes.optics._pupil import mask_turns, pupil
+from neusee.nodes.optics._pupil import pupil
 from neusee.nodes.optics._stop import stop
 
 __all__ = [

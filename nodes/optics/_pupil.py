@@ -8,6 +8,7 @@ from torch import Tensor
 
 from neusee.nodes import Check, node
 from neusee.nodes._half_precision import refuse_half
+from neusee.nodes.optics._phase_steps import phase_steps
 from neusee.nodes.optics._pupil_grid import PupilGrid, axes, grid_of, inside, opening, refuse_other_grid, stripes
 from neusee.nodes.optics._zernike import surface
 from neusee.nodes.units import Count, Length, Waves
@@ -88,30 +89,3 @@ def _(result: Pupil, height: Tensor, index: Tensor, bands: Bands, stop: Stop, *_
 
 def _light(amplitude: Tensor) -> float:
     return float(torch.bmm(amplitude[:, None, :], amplitude[:, :, None]).sum(dtype=torch.float64))
-
-
-def phase_steps(pupil: Pupil) -> tuple[float, float]:
-    """Return the median phase step between neighbouring samples, in turns, and the share of steps above half a turn.
-
-    Both numbers are from the band with the largest phase steps, inside the stop. In a large pupil only every k-th row
-    is measured, 512 rows or more. A wrapped or split mask has steps at its edges by design, so a few large steps mean
-    nothing. Many large steps mean that the samples cannot follow the phase.
-    """
-    worst = int((pupil.index / pupil.wavelengths).argmax())
-    every = max(1, len(pupil.height) // _ROWS)
-    turns, lit = [], []
-    for first in (0, 1):
-        height, path, aperture = (x[first::every] for x in (pupil.height, pupil.path, pupil.aperture))
-        turns.append((pupil.index[worst] * height + path) / pupil.wavelengths[worst])
-        lit.append(aperture > 0)
-    pairs = min(map(len, turns))
-    down = (turns[1][:pairs] - turns[0][:pairs])[lit[1][:pairs] & lit[0][:pairs]]
-    along = turns[0].diff(dim=1)[lit[0][:, 1:] & lit[0][:, :-1]]
-    steps = torch.cat([down, along]).abs()
-    return (float(steps.median()), float((steps > 0.5).double().mean())) if steps.numel() else (0.0, 0.0)
-
-
-def mask_turns(pupil: Pupil, band: int, step: int = 1) -> Tensor:
-    """Return the phase of the mask in a band, in turns, float64, at every ``step``-th sample."""
-    turns: Tensor = pupil.index[band] * pupil.height[::step, ::step].double() / pupil.wavelengths[band]
-    return turns
