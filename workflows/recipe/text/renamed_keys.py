@@ -48,7 +48,7 @@ _STOP = (
 _GONE = {
     **{f"{node}.{name}": _STOP for node in _ON_A_GRID for name in _GRID},
     "optics.start": "is called optics.shortest now",
-    "optics.stop": "is called optics.longest now: a stop is that of the lens",  # also the path of a node, so not in `_CALLED`
+    "optics.stop": "is called optics.longest now: a stop is that of the lens",  # also a node, so not in `_CALLED`
     "reading.gain_unit": _UNIT.format("sensor"),
     "camera.gain_unit": _UNIT.format("camera"),
     **dict.fromkeys(
