@@ -137,6 +137,12 @@ MUTANTS = (
         within("nodes/optics/transform", "scaled_transform.py::test_every_method_is_the_double_sum[folded]"),
     ),
     Mutant(
+        "nodes/optics/_transform/_pupil_field.py",
+        "_FEW_TURNS = 2.0",
+        "_FEW_TURNS = 2e9",
+        within("nodes/optics", "psf_independent.py"),
+    ),
+    Mutant(
         "nodes/spectra/_illuminant.py",
         "- bands.widths / 2",
         "- bands.widths",

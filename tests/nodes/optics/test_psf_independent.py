@@ -1,0 +1,78 @@
+"""The PSF against a reference that shares no line with it, from the height map to the intensity: `independent_psf`.
+
+The heights and the index are inputs of both. Everything after that, the stop included, is computed twice.
+"""
+
+import sys
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+
+from neusee.nodes import doe, optics, spectra
+
+sys.path.insert(0, str(Path(__file__).parent))
+from independent_psf import round_stop, window
+
+FOCAL_LENGTH, PIXEL_PITCH, WAVELENGTH = 0.11, 3.45e-6, 532e-9
+ANGLE = (0.37 * 3 * PIXEL_PITCH / FOCAL_LENGTH, -5 * PIXEL_PITCH / FOCAL_LENGTH)
+LINE = spectra.bands(start=WAVELENGTH, stop=WAVELENGTH + 1e-12, count=1)
+INDEX = doe.material(LINE)
+
+
+def rough(stop):
+    """Draw a height of up to ten waves for each sample by itself."""
+    samples = int(stop.samples)
+    share = torch.rand(samples, samples, generator=torch.Generator().manual_seed(3))
+    return share * (10 * WAVELENGTH / float(INDEX[0]))
+
+
+MASKS = {
+    "flat": doe.flat,
+    "half-ring": lambda stop: doe.half_rings(stop, waves=(20.0,)),
+    "five half-rings": lambda stop: doe.half_rings(stop, waves=(12.0, 18.0, 24.0, 30.0, 36.0)),
+    "axicon of 100 waves": lambda stop: doe.axicon(stop, waves=100.0),
+    "vortex": lambda stop: doe.vortex(stop, charge=3),
+    "cubic": lambda stop: doe.cubic(stop, waves=5.0),
+    "rough": rough,
+    "100 um": lambda stop: doe.half_rings(stop, waves=(20.0,)) + 100e-6,
+    "10 mm plate": lambda stop: doe.half_rings(stop, waves=(20.0,)) + 10e-3,
+}
+LENS = {540: 14.96e-6, 2160: 3.74e-6}  #: samples and pitch of the pupil
+
+
+def both(mask, samples, precision, side=64):
+    """Return the intensity of the node and that of the reference, (y, x) float64."""
+    stop = optics.stop(samples=samples, pitch=LENS[samples], diameter=8e-3)
+    height = MASKS[mask](stop)
+    pupil = optics.pupil(height, INDEX, LINE, stop)
+    sensor = {"focal_length": FOCAL_LENGTH, "pixel_pitch": PIXEL_PITCH, "shape": (side, side), "angle": ANGLE}
+    found = optics.psf(pupil, **sensor, precision=precision).intensity[0].double().numpy()
+    expected = window(
+        height.numpy(), np.zeros((samples, samples)), round_stop(samples, LENS[samples], 8e-3), float(INDEX[0]),
+        float(LINE.centres[0]), LENS[samples], FOCAL_LENGTH, PIXEL_PITCH, (side, side), ANGLE,
+    )  # fmt: skip
+    return found, expected
+
+
+sizes = pytest.mark.parametrize("samples", [540, pytest.param(2160, marks=pytest.mark.slow)])
+
+
+@sizes
+@pytest.mark.parametrize(("precision", "limit"), [("single", 2e-6), ("double", 1e-11)])
+@pytest.mark.parametrize("mask", MASKS)
+def test_the_error_is_as_stated_from_the_height_map_to_the_intensity(mask, precision, limit, samples):
+    found, expected = both(mask, samples, precision)
+    assert np.abs(found - expected).max() <= limit * expected.max()
+
+
+@sizes
+@pytest.mark.parametrize("mask", ["flat", "vortex"])
+def test_a_tail_at_1e_8_of_the_brightest_pixel_is_right(mask, samples):
+    found, expected = both(mask, samples, "single", side=192)
+    tail = np.abs(np.log2(expected / expected.max() / 1e-8)) < 1
+    error = np.abs(found - expected)[tail] / expected[tail]
+    assert tail.sum() > 20
+    assert np.median(error) <= 1e-4
+    assert error.max() <= 1e-3
