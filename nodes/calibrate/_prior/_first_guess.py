@@ -1,4 +1,4 @@
-"""A first guess of a sensor's parameters, from the levels."""
+"""First guesses of the parameters of a sensor or camera, from measured levels."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ from typing import Any
 
 import torch
 
-from neusee.nodes.calibrate._emva_fit import least_squares
+from neusee.nodes.calibrate._emva_fit import least_squares, without_histograms
 from neusee.nodes.calibrate._likelihood._linear_sensor import ROUNDED
 from neusee.nodes.calibrate._likelihood._sufficient_statistics import Sufficient
 from neusee.nodes.values import Levels
@@ -18,7 +18,9 @@ _LEAST = 1e-3  #: least dark current or read noise, relative to the believed val
 
 
 def guess(levels: Sufficient, believed: Mapping[str, float], params: Mapping[str, Any]) -> dict[str, float]:
-    """Return the least-squares estimates, and the ``believed`` values elsewhere; ``params`` are those of `density`.
+    """Return a least-squares estimate of each parameter of a sensor, or the ``believed`` value without an estimate.
+
+    ``params`` are the fixed parameters of `density`.
 
     Shapes: levels (level,); numbers by name, with the names of ``believed``.
     Units:  those of `density`.
@@ -26,9 +28,8 @@ def guess(levels: Sufficient, believed: Mapping[str, float], params: Mapping[str
     Source: EMVA Standard 1288, release 4.0 Linear, sections 6.6 to 6.8.
     """
     found = dict(believed)
-    lit = levels.pixels > 0
     try:
-        fit = least_squares(Levels(*(x[lit] for x in levels[:6]), *(x[:0] for x in levels[6:])))
+        fit = least_squares(without_histograms(Levels(*levels), levels.pixels > 0))
     except ValueError:
         gain = float(believed["gain"])
         return found | {"full_well": _well(levels, found, gain, params)}
@@ -47,7 +48,9 @@ def guess(levels: Sufficient, believed: Mapping[str, float], params: Mapping[str
 
 
 def guess_camera(levels: Levels, believed: Mapping[str, float], params: Mapping[str, Any]) -> dict[str, float]:
-    """Return the first guess of a real camera; ``params`` are those of `camera`.
+    """Return a least-squares estimate of each parameter of a camera, or the ``believed`` value without an estimate.
+
+    ``params`` are the fixed parameters of `camera`.
 
     Shapes: levels (level,); numbers by name, with the names of ``believed``.
     Units:  those of `camera`.
@@ -69,7 +72,7 @@ def guess_camera(levels: Levels, believed: Mapping[str, float], params: Mapping[
 
 
 def _well(levels: Sufficient, found: Mapping[str, float], gain: float, params: Mapping[str, Any]) -> float:
-    """Return the well at which numbers pile up, or else a well above every number."""
+    """Return the full well at which numbers pile up, or, if none pile up, a full well above every number."""
     top, shift = 2 ** params["bits"] - 1, ROUNDED[params["rounding"]][0]
     seen = levels.mean[levels.pixels > 0]
     brightest = max([*seen.tolist(), *levels.cell_value.tolist()], default=0.0)
