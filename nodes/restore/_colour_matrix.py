@@ -1,4 +1,4 @@
-"""The colour matrix: from electrons of the channels to the colour that the scene would have in daylight."""
+"""The colour matrix, which converts electrons of the channels to the colour of the scene in daylight."""
 
 from typing import Any
 
@@ -52,7 +52,7 @@ def _(result: Tensor, *inputs: Any, **params: float) -> list[Check]:
     spectra = _paints(bands.centres)
     counts = _counts(bands, illuminant, responses, level, **params)
     off = (spectra @ counts.T @ result.T - spectra @ to_srgb(bands.centres).T).square().mean().sqrt()
-    return [Check(f"rms {float(off):.3f} on colour charts", float(off) < 0.1)]
+    return [Check(f"rms error {float(off):.3f} on colour charts", float(off) < 0.1)]
 
 
 def _counts(
@@ -71,5 +71,5 @@ def _counts(
 
 
 def _paints(centres: Tensor) -> Tensor:
-    """Return the reflectances of the colour charts at these wavelengths: (paint, band) float64."""
+    """Return the reflectances of the colour charts at the wavelengths ``centres``: (paint, band) float64."""
     return torch.cat([paint.at(centres) for paint in paints()])

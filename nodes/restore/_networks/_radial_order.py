@@ -8,7 +8,7 @@ from torch import Tensor
 
 @functools.lru_cache(maxsize=32)
 def radial_order(size: tuple[int, int], device: torch.device) -> tuple[Tensor, Tensor]:
-    """Return the positions of rising radius in the half spectrum of a (y, x) picture, and the rank of each position.
+    """Return the positions in the half spectrum of a (y, x) picture by rising radius, and the rank of each position.
 
     Radii are in cycles per pixel. Equal radii are ordered by angle, from -90 to 90 degrees.
     """

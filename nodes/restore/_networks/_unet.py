@@ -14,7 +14,7 @@ from neusee.nodes.units import Count, DataFile
 
 
 class UNet(Flat):
-    """A network of four levels, each of two convolutions, half the size and twice the width, and back with skips."""
+    """A network whose four levels halve the size and double the width, and then reverse both, with skip connections."""
 
     multiple, gain = 8, LEAKY
 
