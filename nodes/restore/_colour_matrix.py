@@ -38,7 +38,8 @@ def colour_matrix(
     """
     spectra = _paints(bands.centres)
     second = spectra.T @ spectra / len(spectra)
-    counts = _counts(bands, illuminant, responses, level, pixel_pitch, exposure, quantum_efficiency)
+    pixel = {"pixel_pitch": pixel_pitch, "exposure": exposure}
+    counts = _counts(bands, illuminant, responses, level, quantum_efficiency, **pixel)
     rgb = to_srgb(bands.centres)
     seen = counts @ second @ counts.T
     ridge = (1e-12 * seen.diagonal().mean()).clamp_min(1e-200) * torch.eye(len(seen), dtype=torch.float64)
@@ -56,17 +57,11 @@ def _(result: Tensor, *inputs: Any, **params: float) -> list[Check]:
 
 
 def _counts(
-    bands: Bands,
-    illuminant: Tensor,
-    responses: Tensor,
-    level: Tensor,
-    pixel_pitch: float,
-    exposure: float,
-    quantum_efficiency: float,
+    bands: Bands, illuminant: Tensor, responses: Tensor, level: Tensor, quantum_efficiency: float, **pixel: float
 ) -> Tensor:
     """Return the electrons in each channel for one unit of reflectance in each band, on the CPU."""
     lit = level.cpu().double() * illuminant.cpu().double()
-    weights = channel_weights(bands, responses.cpu(), lit, pixel_pitch=pixel_pitch, exposure=exposure)
+    weights = channel_weights(bands, responses.cpu(), lit, **pixel)
     return weights * quantum_efficiency
 
 

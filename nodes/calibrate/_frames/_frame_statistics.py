@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterator
+from itertools import accumulate
 from typing import Annotated, Any, Literal
 
 import torch
@@ -83,10 +84,8 @@ def levels(parts: list[Levels]) -> Levels:
     if not parts:
         raise ValueError("there are no levels to join: wire at least one level")
     joined = [torch.cat(each) for each in zip(*parts, strict=True)]
-    before, shifted = 0, []
-    for part in parts:
-        shifted.append(part.cell_level + before)
-        before += len(part.mean)
+    starts = accumulate((len(part.mean) for part in parts), initial=0)
+    shifted = [part.cell_level + start for part, start in zip(parts, starts, strict=False)]
     return Levels(*joined)._replace(cell_level=torch.cat(shifted))
 
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import inspect
 from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import ClassVar
@@ -14,18 +15,6 @@ from neusee.nodes.calibrate._prior._free_parameters import Factor, Free, Positiv
 from neusee.nodes.sensor._saturation import Efficiency
 from neusee.nodes.units import Electrons, Gain, Real
 
-CAMERA_NAMES = (
-    "gain",
-    "quantum_efficiency",
-    "dark_signal",
-    "temporal_dark_noise",
-    "dark_current",
-    "scatter",
-    "lamp",
-    "drift",
-    "bend",
-    "twist",
-)  #: the parameters of `camera` that may be free
 _LINEAR = frozenset({"dark_signal", "bend", "twist"})
 
 
@@ -57,6 +46,9 @@ def camera_prior(
     dark = (dark_signal, temporal_dark_noise, dark_current)
     pairs = (gain, quantum_efficiency, *dark, scatter, lamp, drift, bend, twist)
     return believed(dict(zip(CAMERA_NAMES, pairs, strict=True)), _LINEAR)
+
+
+CAMERA_NAMES = tuple(inspect.signature(camera_prior.fn).parameters)  #: the parameters of `camera` that may be free
 
 
 @camera_prior.check

@@ -31,8 +31,7 @@ def guess(levels: Sufficient, believed: Mapping[str, float], params: Mapping[str
     try:
         fit = least_squares(without_histograms(Levels(*levels), levels.pixels > 0))
     except ValueError:
-        gain = float(believed["gain"])
-        return found | {"full_well": _well(levels, found, gain, params)}
+        return found | {"full_well": _well(levels, found, params)}
     gain = float(fit.gain)
     dark = float(fit.dark_current) * params["dark_exposure"]
     first = levels.exposure[levels.photons == 0].min()
@@ -44,7 +43,7 @@ def guess(levels: Sufficient, believed: Mapping[str, float], params: Mapping[str
         "read_noise": max(float(fit.temporal_dark_noise), _LEAST * believed["read_noise"]),
         "dark_current": dark if dark > 0 else _LEAST * believed["dark_current"],
     }
-    return found | {"full_well": _well(levels, found, gain, params)}
+    return found | {"full_well": _well(levels, found, params)}
 
 
 def guess_camera(levels: Levels, believed: Mapping[str, float], params: Mapping[str, Any]) -> dict[str, float]:
@@ -71,9 +70,9 @@ def guess_camera(levels: Levels, believed: Mapping[str, float], params: Mapping[
     return {**believed, **usable}
 
 
-def _well(levels: Sufficient, found: Mapping[str, float], gain: float, params: Mapping[str, Any]) -> float:
+def _well(levels: Sufficient, found: Mapping[str, float], params: Mapping[str, Any]) -> float:
     """Return the full well at which numbers pile up, or, if none pile up, a full well above every number."""
-    top, shift = 2 ** params["bits"] - 1, ROUNDED[params["rounding"]][0]
+    top, shift, gain = 2 ** params["bits"] - 1, ROUNDED[params["rounding"]][0], float(found["gain"])
     seen = levels.mean[levels.pixels > 0]
     brightest = max([*seen.tolist(), *levels.cell_value.tolist()], default=0.0)
     at = levels.cell_value >= brightest - 2

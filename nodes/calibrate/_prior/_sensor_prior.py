@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import inspect
 import math
 from collections.abc import Mapping
 from dataclasses import dataclass
@@ -15,15 +16,6 @@ from neusee.nodes.calibrate._prior._free_parameters import Factor, Free, Positiv
 from neusee.nodes.sensor._saturation import Efficiency, Well
 from neusee.nodes.units import Electrons, Gain
 
-NAMES = (
-    "gain",
-    "offset",
-    "read_noise",
-    "dark_current",
-    "full_well",
-    "quantum_efficiency",
-    "spread",
-)  #: the parameters of `density` that may be free
 _LINEAR = "offset"  #: the only parameter that may be 0 or negative
 
 
@@ -51,6 +43,9 @@ def prior(
     """
     pairs = (gain, offset, read_noise, dark_current, full_well, quantum_efficiency, spread)
     return believed(dict(zip(NAMES, pairs, strict=True)), frozenset({_LINEAR}))
+
+
+NAMES = tuple(inspect.signature(prior.fn).parameters)  #: the parameters of `density` that may be free
 
 
 @prior.check

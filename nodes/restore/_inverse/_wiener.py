@@ -1,7 +1,6 @@
 """Wiener deconvolution with a known PSF, a baseline that needs no training."""
 
 import math
-from itertools import product
 from typing import Annotated, Any
 
 import torch
@@ -165,10 +164,8 @@ def _strengths(electrons: Tensor, known: Tensor, glare: list[Tensor]) -> Tensor:
             every = torch.stack([*flat, electrons[at].flatten()]).double()
             products += every[:-1] @ every.T
     fit = (torch.linalg.pinv(products[:, :-1], hermitian=True) @ products[:, -1]).to(electrons)
-    total = torch.zeros_like(electrons)
-    for strength, pattern in zip(fit, glare, strict=True):
-        total = total + strength * pattern
-    return total
+    parts = (strength * pattern for strength, pattern in zip(fit, glare, strict=True))
+    return sum(parts, torch.zeros_like(electrons))
 
 
 def fall(size: tuple[int, int]) -> Tensor:
@@ -195,15 +192,7 @@ def wrapped(kernels: Tensor, size: tuple[int, int]) -> Tensor:
     """Return the kernels centred on the first sample of a periodic grid; a kernel wider than the grid wraps around."""
     (m, n), (y, x) = kernels.shape[-2:], size
     rows, columns = -(-m // y), -(-n // x)
+    around = pad(kernels, (0, columns * x - n, 0, rows * y - m))
     if rows * columns > 1:
-        wide = pad(kernels, (0, columns * x - n, 0, rows * y - m))
-        folded = wide.reshape(-1, rows, y, columns, x).sum((1, 3))
-        return folded.roll((-(m // 2), -(n // 2)), (-2, -1))
-    around = kernels.new_zeros(len(kernels), y, x)
-    halves = [
-        ((slice(k // 2, k), slice(0, k - k // 2)), (slice(0, k // 2), slice(size[d] - k // 2, size[d])))
-        for d, k in enumerate((m, n))
-    ]
-    for (from_y, to_y), (from_x, to_x) in product(*halves):
-        around[:, to_y, to_x] = kernels[:, from_y, from_x]
-    return around
+        around = around.reshape(-1, rows, y, columns, x).sum((1, 3))
+    return around.roll((-(m // 2), -(n // 2)), (-2, -1))

@@ -1,8 +1,6 @@
 """The restoring network of the paper, which scans a picture and its spectrum, first coarse and then fine."""
 
 from functools import partial
-from pathlib import Path
-from typing import Any
 
 import torch
 from torch import Tensor, nn
@@ -105,13 +103,5 @@ def fft_mamba(
     return restored(picture, kind, weights, tile, reduce, detail)
 
 
-@fft_mamba.preflight
-def _(
-    *, weights: Path | None = None, tile: int | None = None, reduce: int = 1, detail: bool = False, **sizes: Any
-) -> list[str]:
-    return fitting(partial(FFTMamba, **sizes), weights, sizes["width"])
-
-
-@fft_mamba.check
-def _(result: Tensor, picture: Tensor, **params: Any) -> list[Any]:
-    return restorer_checks(result, picture)
+fft_mamba.preflight(partial(fitting, FFTMamba))
+fft_mamba.check(restorer_checks)

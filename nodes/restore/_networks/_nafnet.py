@@ -2,8 +2,6 @@
 
 from collections.abc import Sequence
 from functools import partial
-from pathlib import Path
-from typing import Any
 
 from torch import Tensor, nn
 
@@ -95,11 +93,5 @@ def nafnet(
     return restored(picture, partial(NAFNet, width), weights, tile, reduce, detail)
 
 
-@nafnet.preflight
-def _(*, weights: Path | None = None, width: int = 16, **how: Any) -> list[str]:
-    return fitting(partial(NAFNet, width), weights, width)
-
-
-@nafnet.check
-def _(result: Tensor, picture: Tensor, **params: Any) -> list[Any]:
-    return restorer_checks(result, picture)
+nafnet.preflight(partial(fitting, NAFNet))
+nafnet.check(restorer_checks)

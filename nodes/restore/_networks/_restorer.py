@@ -3,6 +3,7 @@
 import math
 from abc import ABC, abstractmethod
 from collections.abc import Callable
+from functools import partial
 from pathlib import Path
 from typing import Annotated, Any, TypeVar
 
@@ -139,9 +140,18 @@ def restored(
     return result[0]
 
 
-def fitting(make: Callable[[], Restorer], weights: Path | None, width: int) -> list[str]:
+def fitting(
+    network: Callable[..., Restorer],
+    *,
+    weights: Path | None = None,
+    tile: int | None = None,
+    reduce: int = 1,
+    detail: bool = False,
+    width: int,
+    **sizes: Any,
+) -> list[str]:
     """Raise ParameterError without a file of weights, or with the weights of another network; return no warnings."""
-    same_layout(make, _needed(weights), width)
+    same_layout(partial(network, width, **sizes), _needed(weights), width)
     return []
 
 

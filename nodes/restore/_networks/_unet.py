@@ -2,8 +2,6 @@
 
 from functools import partial
 from itertools import pairwise
-from pathlib import Path
-from typing import Any
 
 import torch
 from torch import Tensor, nn
@@ -67,11 +65,5 @@ def unet(
     return restored(picture, partial(UNet, width), weights, tile, reduce, detail)
 
 
-@unet.preflight
-def _(*, weights: Path | None = None, width: int = 32, **how: Any) -> list[str]:
-    return fitting(partial(UNet, width), weights, width)
-
-
-@unet.check
-def _(result: Tensor, picture: Tensor, **params: Any) -> list[Any]:
-    return restorer_checks(result, picture)
+unet.preflight(partial(fitting, UNet))
+unet.check(restorer_checks)

@@ -67,16 +67,11 @@ def _check_shapes(u: Tensor, dt: Tensor, A: Tensor, B: Tensor, C: Tensor, D: Ten
         raise ValueError(f"u must be (batch, length, d) and A (d, n), not {tuple(u.shape)} and {tuple(A.shape)}")
     if not (u.numel() and A.numel()):
         raise ValueError(f"there is nothing to scan: u is {tuple(u.shape)} and A is {tuple(A.shape)}")
-    (batch, length, d), n = u.shape, A.shape[1]
-    shapes = {
-        "dt": (dt, (batch, length, d)),
-        "A": (A, (d, n)),
-        "B": (B, (batch, length, n)),
-        "C": (C, (batch, length, n)),
-    }
-    if D is not None:
-        shapes["D"] = (D, (d,))
-    for name, (x, shape) in shapes.items():
+    (*line, d), n = u.shape, A.shape[1]
+    shapes = {"dt": (*line, d), "A": (d, n), "B": (*line, n), "C": (*line, n), "D": (d,)}
+    for (name, shape), x in zip(shapes.items(), (dt, A, B, C, D), strict=True):
+        if x is None:
+            continue
         if tuple(x.shape) != shape:
             raise ValueError(f"{name} is {tuple(x.shape)}; u {tuple(u.shape)} and A {tuple(A.shape)} need {shape}")
         if x.device != u.device:
