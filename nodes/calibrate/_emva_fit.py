@@ -79,7 +79,7 @@ def least_squares(levels: Levels, *, share: Share = 0.7) -> LeastSquares:
         gain,
         efficiency,
         noise / gain,
-        levels.mean[_first(levels, dark)],
+        levels.mean[_shortest_dark(levels, dark)],
         _dark_current(levels, dark) / gain,
         full / gain,
         gain_error * gain,
@@ -114,14 +114,13 @@ def _error(x: Tensor, own: Tensor, dark: Tensor, which: Tensor) -> Tensor:
     return (x.square() @ own + shared.square().sum()).sqrt() / (x @ x)
 
 
-def _first(levels: Levels, dark: Tensor) -> Tensor:
-    """Return the index of the dark level of the shortest exposure."""
+def _shortest_dark(levels: Levels, dark: Tensor) -> Tensor:
     return torch.where(dark, levels.exposure, math.inf).argmin()
 
 
 def _dark_noise(levels: Levels, dark: Tensor) -> tuple[Tensor, Tensor]:
     """Return the temporal dark noise without rounding, and the standard error, DN: infinite for a noise of 0."""
-    variance, freedom = (x[_first(levels, dark)] for x in (levels.variance, levels.degrees_of_freedom))
+    variance, freedom = (x[_shortest_dark(levels, dark)] for x in (levels.variance, levels.degrees_of_freedom))
     noise = (variance - _QUANTIZATION).clamp_min(0.0).sqrt()
     return noise, torch.where(noise > 0, variance / (2 * freedom).sqrt() / noise, math.inf)
 

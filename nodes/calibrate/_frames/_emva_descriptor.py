@@ -79,7 +79,9 @@ def _(*, file: Sequence[Path], **rest: object) -> list[str]:
 @descriptor.check
 def _(result: Levels, **params: Any) -> list[Check]:
     dark = int((result.photons == 0).sum())
-    return [Check(f"{len(result.mean)} levels, {dark} dark, {float(result.exposure.max()):.3g} s at most", dark > 0)]
+    return [
+        Check(f"{len(result.mean)} levels, {dark} dark, exposures up to {float(result.exposure.max()):.3g} s", dark > 0)
+    ]
 
 
 def _reduced(name: str, measurement: _Measurement, level: _Level, scatter: Temporal) -> Levels:
@@ -130,7 +132,7 @@ def _take(found: _Measurement, kind: str, rest: str, folder: Path, line: int) ->
         found.levels[-1].images.append((line, folder / rest.replace("\\", "/")))
         return
     if kind not in _WORDS:
-        raise ValueError(f"cannot read {kind!r}: lines begin with v, n, b, d, i or #")
+        raise ValueError(f"cannot read {kind!r}: begin the line with v, n, b, d, i or #")
     words = rest.split()
     try:
         numbers = [float(word) for word in words]

@@ -145,7 +145,7 @@ def _kept(value: Tensor, count: Tensor, mean: float, sigma: float, alike: bool) 
 
 
 def _piled(held: float, total: float, low: float, sigma: float, alike: bool) -> bool:
-    """Return True if ``held`` pixels from ``low`` to ``low`` + 2 DN above the mean are more than a Gaussian has."""
+    """Return True if the count ``held`` of two neighbouring numbers exceeds the count that a Gaussian gives."""
     expected = total * 0.5 * abs(math.erf((low + 2.0) / sigma / math.sqrt(2)) - math.erf(low / sigma / math.sqrt(2)))
     more = _SURE * math.sqrt(expected) if alike else (_RATIO - 1) * expected
     return held >= _FEW and held - expected > more

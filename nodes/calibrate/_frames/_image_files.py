@@ -44,7 +44,6 @@ def readable(file: Path) -> Callable[[Path], NDArray[Any]]:
 
 
 def _picture(file: Path) -> NDArray[Any]:
-    """Read all pages of a PNG or TIFF file by Pillow."""
     from PIL import Image, ImageSequence, UnidentifiedImageError
 
     try:

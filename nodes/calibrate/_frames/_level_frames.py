@@ -55,5 +55,5 @@ def stack(files: Sequence[Path]) -> np.ndarray[Any, np.dtype[np.int32]]:
     stacks = [read(file) for file in files]
     for file, each in zip(files, stacks, strict=True):
         if each.shape[1:] != stacks[0].shape[1:]:
-            raise ValueError(f"{file} is {each.shape[1:]}, but {files[0]} is {stacks[0].shape[1:]}: give one size")
+            raise ValueError(f"{file} is {each.shape[1:]}, but {files[0]} is {stacks[0].shape[1:]}: give equal sizes")
     return np.concatenate(stacks)

@@ -121,7 +121,7 @@ def _(result: Likelihood, levels: Levels, **params: Any) -> list[Check]:
         return []
     off, used = float(result.deviance.sum()), result.degrees_of_freedom > 0
     count, coarse = int(used.sum()), int((levels.variance[used] < _QUIET).sum())
-    checks = [Check(f"deviance {off:.4g} of {2 * count} means and variances, {count} of {len(used)} levels")]
+    checks = [Check(f"deviance {off:.4g} for {2 * count} means and variances, from {count} of {len(used)} levels")]
     if coarse:
         text = f"{coarse} levels with a variance below {_QUIET} DN2, where rounding is not independent noise"
         checks.append(Check(text, False))

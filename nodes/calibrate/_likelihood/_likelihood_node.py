@@ -74,4 +74,4 @@ def _(result: Likelihood, *inputs: Sufficient, **params: Any) -> list[Check]:
     if not len(result.degrees_of_freedom):
         return []
     off, freedom = float(result.deviance.sum()), float(result.degrees_of_freedom.sum())
-    return [Check(f"deviance {off:.4g} of {freedom:.0f} degrees of freedom")]
+    return [Check(f"deviance {off:.4g} for {freedom:.0f} degrees of freedom")]

@@ -59,7 +59,7 @@ def likelihood(levels: Sufficient, sensor: Sensor, rounding: Rounding, bits: int
     log = -0.5 * (
         (levels.degrees_of_freedom + 1) * variance.log() + levels.degrees_of_freedom * levels.variance / variance + off
     )
-    counted, measured = _cells_in(levels), levels.pixels > 0
+    counted, measured = _has_cells(levels), levels.pixels > 0
     below = levels.pixels * log_ndtr((sensor.well - signal.mean) / signal.variance.sqrt())
     cells = _log_cells(levels, signal, sensor, rounding, top)
     total = (log + below.where(~counted, 0.0)).where(measured, 0.0).sum(-1) + (levels.cell_count * cells).sum(-1)
@@ -98,8 +98,7 @@ def _expected(levels: Sufficient, sensor: Sensor) -> _Expected:
     return _Expected(mean, sensor.read.square() + sensor.gain * dark + sensor.noise * levels.photons)
 
 
-def _cells_in(levels: Sufficient) -> Tensor:
-    """Return a mask of the levels that have histogram cells."""
+def _has_cells(levels: Sufficient) -> Tensor:
     return torch.zeros_like(levels.pixels, dtype=torch.bool).index_fill_(0, levels.cell_level, True)
 
 

@@ -25,7 +25,10 @@ class Prior(NamedTuple):
 
 
 def believed(pairs: Mapping[str, Pair | None], linear: frozenset[str]) -> Prior:
-    """Build a prior from median and factor, or, if linear, mean and standard deviation; None holds a parameter."""
+    """Build a prior from a pair of numbers for each free parameter, and None for each held parameter.
+
+    The pair is median and factor, or mean and standard deviation for a parameter in ``linear``.
+    """
     normals = [_normal(name, pair, name in linear) for name, pair in pairs.items()]
     if all(math.isnan(width) for _, width in normals):
         raise ValueError(f"no parameter is free: give a prior of at least one of {', '.join(pairs)}")
@@ -71,11 +74,11 @@ class Free:
 
     def whitened(self, parameters: Mapping[str, Tensor]) -> Tensor:
         """Convert parameters to distances (..., free) from the prior's centre, in standard deviations of the prior."""
-        return (self.scaled(parameters) - self._centre) / self._width
+        return (self.scaled(parameters) - self._normals.centre) / self._normals.width
 
     def from_whitened(self, z: Tensor) -> dict[str, Tensor]:
         """Convert distances (..., free) from the prior's centre, in standard deviations, to parameters."""
-        return self.unscaled(self._centre + self._width * z)
+        return self.unscaled(self._normals.centre + self._normals.width * z)
 
     def scaled(self, parameters: Mapping[str, Tensor]) -> Tensor:
         """Return the logarithms of the free parameters, or the values of linear parameters: (..., free)."""
@@ -88,9 +91,6 @@ class Free:
         return {name: x if name in self.linear else x.exp() for name, x in pairs}
 
     @cached_property
-    def _centre(self) -> Tensor:
-        return self.prior.centre[self.prior.width.isfinite()]
-
-    @cached_property
-    def _width(self) -> Tensor:
-        return self.prior.width[self.prior.width.isfinite()]
+    def _normals(self) -> Prior:
+        free = self.prior.width.isfinite()
+        return Prior(self.prior.centre[free], self.prior.width[free])

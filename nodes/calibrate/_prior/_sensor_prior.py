@@ -82,11 +82,9 @@ class Coordinates(Free):
     def parameters(self, place: Tensor) -> dict[str, Tensor]:
         """Convert coordinates (..., free) to the free parameters."""
         at = dict(zip(self.names, place.unbind(-1), strict=True))
-        spread = at["spread"] if "spread" in at else torch.tensor(math.log(self.held["spread"]), dtype=torch.float64)
-        if "gain" in at:
-            slope = at["gain"] - 2.0 * spread
-        else:
-            slope = torch.tensor(math.log(self.held["gain"]), dtype=torch.float64)
+        held = {name: math.log(self.held[name]) for name in ("gain", "spread") if name in self.held}
+        logs = {name: torch.tensor(x, dtype=torch.float64) for name, x in held.items()} | at
+        slope = logs["gain"] - 2.0 * logs["spread"] if "gain" in at else logs["gain"]
         found = {}
         for name, x in at.items():
             if name == "gain":

@@ -1,5 +1,6 @@
 """Blocks of the FFT-Mamba network, which scan a picture and the spectrum of the picture and mix both results."""
 
+import functools
 from typing import Any, Literal
 
 import torch
@@ -7,7 +8,6 @@ from torch import Tensor, nn
 from torch.nn import functional as F
 
 from neusee.nodes._half_precision import single
-from neusee.nodes.restore._networks._radial_order import radial_order
 from neusee.nodes.restore._networks._restorer import ChannelNorm, Scale, gated
 from neusee.nodes.restore._networks._scan_layer import BothWays, Kind
 
@@ -62,6 +62,23 @@ class _Phase(torch.autograd.Function):
         real, imaginary = ctx.saved_tensors
         slope = seen[0] / (real.square() + imaginary.square() + SMALL)
         return -slope * imaginary, slope * real
+
+
+@functools.lru_cache(maxsize=32)
+def radial_order(size: tuple[int, int], device: torch.device) -> tuple[Tensor, Tensor]:
+    """Return the positions in the half spectrum of a (y, x) picture by rising radius, and the rank of each position.
+
+    Radii are in cycles per pixel. Equal radii are ordered by angle, from -90 to 90 degrees.
+    """
+    y, x = size
+    with torch.inference_mode(False):  # the cache may serve a caller that trains
+        rows = torch.fft.fftfreq(y, 1 / y, dtype=torch.float64).round().long()[:, None] * x
+        columns = torch.arange(x // 2 + 1)[None] * y
+        radius = (rows * rows + columns * columns).flatten()  # whole numbers, so that equal radii compare equal
+        angle = torch.atan2(rows.double(), columns.double()).flatten()
+        order = angle.argsort(stable=True)
+        order = order[radius[order].argsort(stable=True)]
+        return order.to(device), order.argsort().to(device)
 
 
 class Frequency(nn.Module):

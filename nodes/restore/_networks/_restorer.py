@@ -35,7 +35,7 @@ class Restorer(nn.Module, ABC):
 
     @abstractmethod
     def scales(self, picture: Tensor) -> tuple[Tensor, Tensor]:
-        """Return the coarse (half the size) and the fine estimate of a picture whose sides `multiple` divides."""
+        """Return the coarse (half the size) and fine estimate of a picture whose sides are multiples of `multiple`."""
 
     def pyramid(self, picture: Tensor) -> tuple[Tensor, Tensor]:
         """Return the coarse estimate at half the size, rounded up, and the fine estimate at the full size."""
@@ -52,7 +52,7 @@ class Flat(Restorer):
 
     @abstractmethod
     def change(self, picture: Tensor) -> Tensor:
-        """Return the restored minus the given picture, whose sides `multiple` divides."""
+        """Return the restored picture minus ``picture``, whose sides are multiples of `multiple`."""
 
     def scales(self, picture: Tensor) -> tuple[Tensor, Tensor]:
         fine = picture + self.change(picture)
@@ -105,7 +105,7 @@ def start_network(make: Callable[[], Net], rng: torch.Generator) -> Net:
 
 
 def parameter_groups(net: nn.Module, weights: float = 2e-4, biases: float = 4e-4) -> list[dict[str, Any]]:
-    """Return two groups of parameters for an optimiser: all except biases of layers, and the biases of layers."""
+    """Return the parameters in two groups for an optimiser; the second group holds the biases of layers."""
     of_layers = [m.bias for m in net.modules() if isinstance(m, LAYERS) and m.bias is not None]
     known = set(map(id, of_layers))
     others = [p for p in net.parameters() if id(p) not in known]
@@ -166,7 +166,7 @@ def restorer_checks(result: Tensor, picture: Tensor, **params: Any) -> list[Chec
     """Return a check that reports the root mean square of the change and of the picture, and fails if not finite."""
     change = float((result - picture).square().mean(dtype=torch.float64).sqrt())
     before = float(picture.square().mean(dtype=torch.float64).sqrt())
-    return [Check(f"changed by {change:.3g} rms, picture {before:.3g} rms", math.isfinite(change))]
+    return [Check(f"changed by {change:.3g} rms; the picture has {before:.3g} rms", math.isfinite(change))]
 
 
 def gated(x: Tensor) -> Tensor:

@@ -17,7 +17,7 @@ STEPS = (1e-3, 0.1)  #: range of the first steps of a scan, log-uniform: a memor
 
 
 class Scan(nn.Module):
-    """A selective scan along a line (n, length, channel), from which step, input and output weights are computed."""
+    """A selective scan along a line (n, length, channel), with step, input and output computed from the line."""
 
     def __init__(self, channels: int, states: int, rank: int) -> None:
         super().__init__()

@@ -24,7 +24,7 @@ def selective_scan(
     *,
     backend: Literal["auto", "torch", "cpp", "triton", "mamba_ssm"] = "auto",
 ) -> Tensor:
-    """Run h_t = exp(dt_t A) h_(t-1) + dt_t B_t u_t from h = 0 and return y_t = C_t . h_t + D u_t.
+    """Run the scan h_t = exp(dt_t A) h_(t-1) + dt_t B_t u_t from h = 0, and return y_t = <C_t, h_t> + D u_t.
 
     ``A`` is negative and ``dt`` positive: decays are at most 1 and are only multiplied, so nothing overflows at any
     length. ``backend`` "auto" is C++ on a CPU with a compiler; on CUDA in float32 a Triton kernel, or mamba_ssm where
@@ -79,7 +79,6 @@ def _check_shapes(u: Tensor, dt: Tensor, A: Tensor, B: Tensor, C: Tensor, D: Ten
 
 
 def _kind(*tensors: Tensor) -> torch.dtype:
-    """Return float64 if any tensor is float64, else float32."""
     for x in tensors:
         if not x.is_floating_point():
             raise ValueError(f"the selective scan needs real numbers in floating point, not {x.dtype}")
@@ -131,7 +130,7 @@ def _run(backend: str, u: Tensor, dt: Tensor, A: Tensor, B: Tensor, C: Tensor) -
 def by_triton(*tensors: Tensor) -> Tensor:
     """Run the scan by the Triton kernel; raise ValueError if Triton is not installed."""
     if not importlib.util.find_spec("triton"):
-        raise ValueError("the backend triton is not installed: install a CUDA build of torch, which includes it")
+        raise ValueError("the backend triton is not installed: install a CUDA build of torch, which includes Triton")
     from neusee.nodes.restore._scan import _triton_scan
 
     y: Tensor = _triton_scan.Scan.apply(*tensors)  # type: ignore[no-untyped-call]

@@ -123,7 +123,7 @@ def test_images_are_held_to_what_the_descriptor_says(folder, old, new, message):
 
 def test_the_check_wants_a_dark(folder):
     found = descriptor(file=given(folder))
-    assert descriptor.hooks.check(found)[0].text == "3 levels, 2 dark, 0.001 s at most"
+    assert descriptor.hooks.check(found)[0].text == "3 levels, 2 dark, exposures up to 0.001 s"
     lit = reduce(np_stack(folder), photons=1.0, exposure=0.1)
     assert not descriptor.hooks.check(lit)[0].ok
 

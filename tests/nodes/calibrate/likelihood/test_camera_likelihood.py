@@ -197,7 +197,7 @@ def test_a_level_without_scatter_and_light_that_does_nothing_are_refused():
 
 def test_the_check_says_what_was_used():
     found = camera(around(), **SENSOR)
-    assert camera.hooks.check(found, around())[0].text.endswith("of 12 means and variances, 6 of 8 levels")
+    assert camera.hooks.check(found, around())[0].text.endswith("for 12 means and variances, from 6 of 8 levels")
     assert camera.hooks.check(found, around())[0].ok
     assert camera.hooks.check(camera(around(), **SENSOR, told=False), around()) == []
 
