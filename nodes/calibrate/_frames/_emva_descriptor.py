@@ -94,26 +94,26 @@ def _reduced(name: str, measurement: _Measurement, level: _Level, scatter: Tempo
         raise ValueError(
             f"{name}:{level.line}: an image holds {numbers.max()} DN, more than the {measurement.bits} bits of line n"
         )
-    found: Levels = reduce(torch.from_numpy(numbers), photons=level.photons, exposure=level.exposure, scatter=scatter)
-    return found
+    reduced: Levels = reduce(torch.from_numpy(numbers), photons=level.photons, exposure=level.exposure, scatter=scatter)
+    return reduced
 
 
 def _parsed(path: Path) -> _Measurement:
-    found = _Measurement()
+    measurement = _Measurement()
     for number, line in _lines(path):
         kind, _, rest = line.partition(" ")
         try:
-            _take(found, kind, rest.strip(), path.parent, number)
+            _take(measurement, kind, rest.strip(), path.parent, number)
         except ValueError as why:
             raise ValueError(f"{path.name}:{number}: {why}") from None
-    for level in found.levels:
+    for level in measurement.levels:
         if len(level.images) < 2:
             raise ValueError(f"{path.name}:{level.line}: {len(level.images)} image(s): a level needs at least two")
-    if not found.levels:
+    if not measurement.levels:
         raise ValueError(
             f"{path.name}: no line begins with 'b' or 'd', so there is no level: give an EMVA 1288 descriptor"
         )
-    return found
+    return measurement
 
 
 def _lines(path: Path) -> Iterator[tuple[int, str]]:
@@ -124,12 +124,12 @@ def _lines(path: Path) -> Iterator[tuple[int, str]]:
             yield number, line.strip().replace("\t", " ")
 
 
-def _take(found: _Measurement, kind: str, rest: str, folder: Path, line: int) -> None:
+def _take(measurement: _Measurement, kind: str, rest: str, folder: Path, line: int) -> None:
     """Add the content of one line of a descriptor to the measurement."""
     if kind == "i":
-        if not found.levels:
+        if not measurement.levels:
             raise ValueError("an image stands before the first level: begin a level with a line 'b' or 'd'")
-        found.levels[-1].images.append((line, folder / rest.replace("\\", "/")))
+        measurement.levels[-1].images.append((line, folder / rest.replace("\\", "/")))
         return
     if kind not in _WORDS:
         raise ValueError(f"cannot read {kind!r}: begin the line with v, n, b, d, i or #")
@@ -137,9 +137,9 @@ def _take(found: _Measurement, kind: str, rest: str, folder: Path, line: int) ->
     try:
         numbers = [float(word) for word in words]
         if kind == "n":
-            found.bits, found.shape = int(words[0]), (int(words[2]), int(words[1]))
+            measurement.bits, measurement.shape = int(words[0]), (int(words[2]), int(words[1]))
         elif kind != "v":
-            found.levels.append(_level(line, kind, numbers))
+            measurement.levels.append(_level(line, kind, numbers))
     except (ValueError, IndexError):
         raise ValueError(f"cannot read {kind} {rest!r}: write {_WORDS[kind]}") from None
 

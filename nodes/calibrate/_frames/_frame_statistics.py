@@ -99,9 +99,9 @@ def histogram(frames: Tensor) -> tuple[Tensor, Tensor]:
     """Return the digital numbers that occur, in rising order, and the count of each number: two (cell,) int64."""
     counts = torch.zeros(0, dtype=torch.int64, device=frames.device)
     for piece in _pieces(frames.reshape(1, -1)):
-        found = torch.bincount(_whole(piece).reshape(-1), minlength=len(counts))
-        found[: len(counts)] += counts
-        counts = found
+        more = torch.bincount(_whole(piece).reshape(-1), minlength=len(counts))
+        more[: len(counts)] += counts
+        counts = more
     value = counts.nonzero().squeeze(1)
     return value.cpu(), counts[value].cpu()
 

@@ -101,18 +101,18 @@ def camera(
     parameters = (gain, quantum_efficiency, *dark, scatter, lamp, drift, bend, twist)
     sensor = _Camera(*(torch.as_tensor(x, dtype=torch.float64)[..., None] for x in parameters))
     sensor = sensor._replace(current=sensor.current / dark_exposure)
-    found = _residuals(without_histograms(levels, seen), top, sensor, first, ROUNDED[rounding][1])
-    each = found.variance[0].square() + found.mean[0].square()
-    log = -0.5 * each - found.variance[1] - found.mean[1]
-    total = log.where(found.possible, -torch.inf).sum(-1)
+    residuals = _residuals(without_histograms(levels, seen), top, sensor, first, ROUNDED[rounding][1])
+    each = residuals.variance[0].square() + residuals.mean[0].square()
+    log = -0.5 * each - residuals.variance[1] - residuals.mean[1]
+    total = log.where(residuals.possible, -torch.inf).sum(-1)
     if not told:
         return Likelihood(total, *(torch.zeros(0, dtype=torch.float64) for _ in range(5)))
     deviance = each.new_zeros(*each.shape[:-1], len(levels.mean)).index_copy(-1, seen, each)
     freedom = torch.zeros_like(levels.mean).index_fill(0, seen, 2.0)
     # squared derivatives of a residual and of its log width sum, on average, to the Fisher information
     mean = levels.mean.expand(*each.shape[:-1], -1)
-    variance = torch.zeros_like(mean).index_copy(-1, seen, found.expected)  # for the levels used
-    return Likelihood(total, deviance, freedom, torch.cat([*found.variance, *found.mean], -1), mean, variance)
+    variance = torch.zeros_like(mean).index_copy(-1, seen, residuals.expected)  # for the levels used
+    return Likelihood(total, deviance, freedom, torch.cat([*residuals.variance, *residuals.mean], -1), mean, variance)
 
 
 @camera.check

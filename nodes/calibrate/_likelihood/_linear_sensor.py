@@ -80,8 +80,8 @@ def likelihood(levels: Sufficient, sensor: Sensor, rounding: Rounding, bits: int
 def _cut_off(levels: Sufficient, signal: _Expected, sensor: Sensor, top: int) -> Tensor:
     """Return a mask (..., 1) of the sensors whose full well clips numbers that the converter could still give."""
     over = _pixels(levels) * ndtr((signal.mean - sensor.well) / signal.variance.sqrt())
-    found: Tensor = (over.sum(-1, keepdim=True) > 1.0) & (sensor.well < top - 0.5)
-    return found
+    clips: Tensor = (over.sum(-1, keepdim=True) > 1.0) & (sensor.well < top - 0.5)
+    return clips
 
 
 def _scaled(levels: Sufficient, mean: Tensor, variance: Tensor) -> Tensor:
@@ -111,13 +111,15 @@ def _log_cells(levels: Sufficient, signal: _Expected, sensor: Sensor, rounding: 
     """Return the logarithm of the probability of each histogram cell: (..., cell)."""
     at = levels.cell_level
     mean, variance = signal.mean.index_select(-1, at), signal.variance.index_select(-1, at)
-    found = log_cell(levels.cell_value, mean, variance.sqrt(), sensor.well, rounding, top)
+    continuous = log_cell(levels.cell_value, mean, variance.sqrt(), sensor.well, rounding, top)
     coarse = (levels.pixels == 0)[at]
     electrons = (mean - sensor.offset if sensor.counted else sensor.dark * levels.exposure[at]) / sensor.gain
     few = coarse & (electrons <= _FEW) & (sensor.gain.square() * electrons > _GRAIN * variance)
     if not bool(few.any()):
-        return found
-    return torch.where(few, _counted_out(levels, signal, sensor, rounding, top, electrons.expand_as(found)), found)
+        return continuous
+    return torch.where(
+        few, _counted_out(levels, signal, sensor, rounding, top, electrons.expand_as(continuous)), continuous
+    )
 
 
 def _counted_out(
@@ -142,5 +144,5 @@ def _deviance(levels: Sufficient, moments: Tensor, cells: Tensor, measured: Tens
     summed = torch.zeros_like(moments).index_add(-1, levels.cell_level, each.expand(*moments.shape[:-1], -1))
     distinct = torch.zeros_like(levels.pixels).index_add(0, levels.cell_level, torch.ones_like(count))
     freedom = torch.where(measured, 2.0, torch.where(whole, (distinct - 1).clamp_min(0.0), 0.0))
-    found = torch.where(measured, moments, torch.where(whole, summed, 0.0))
-    return torch.where(freedom > 0, found, 0.0), freedom
+    deviance = torch.where(measured, moments, torch.where(whole, summed, 0.0))
+    return torch.where(freedom > 0, deviance, 0.0), freedom

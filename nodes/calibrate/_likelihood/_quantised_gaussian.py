@@ -28,8 +28,8 @@ def log_cell(value: Tensor, mean: Tensor, sd: Tensor, well: Tensor, rounding: Ro
         low = torch.where(value <= 0, -math.inf, value - 0.5)
         high = torch.where((value >= top) | (value + 0.5 >= well), math.inf, value + 0.5)
         return torch.where(low < well, _between(low, high, mean, sd), -math.inf)
-    found = _dithered(value, mean, sd, well, top)
-    return torch.where(found > _LEAST, found.clamp_min(_LEAST).log(), -math.inf)
+    probability = _dithered(value, mean, sd, well, top)
+    return torch.where(probability > _LEAST, probability.clamp_min(_LEAST).log(), -math.inf)
 
 
 def _between(low: Tensor, high: Tensor, mean: Tensor, sd: Tensor) -> Tensor:
@@ -38,8 +38,8 @@ def _between(low: Tensor, high: Tensor, mean: Tensor, sd: Tensor) -> Tensor:
     above = a + b > 0
     a, b = torch.where(above, -b, a), torch.where(above, -a, b)
     far, near = log_ndtr(a), log_ndtr(b)
-    found: Tensor = near + torch.log(-torch.expm1((far - near).clamp_max(-_LEAST)))
-    return found
+    log_probability: Tensor = near + torch.log(-torch.expm1((far - near).clamp_max(-_LEAST)))
+    return log_probability
 
 
 def _dithered(value: Tensor, mean: Tensor, sd: Tensor, well: Tensor, top: int) -> Tensor:
@@ -68,5 +68,5 @@ def _integral(x: Tensor, mean: Tensor, sd: Tensor, above: Tensor) -> Tensor:
     density = torch.exp(-0.5 * z.square()) / math.sqrt(2.0 * math.pi)
     side = torch.where(above, z, -z)
     tail = 0.5 * torch.special.erfc(side / math.sqrt(2.0))  # `ndtr` loses all digits below -8
-    found: Tensor = sd * (density - side * tail)
-    return found
+    integral: Tensor = sd * (density - side * tail)
+    return integral

@@ -27,23 +27,23 @@ def guess(levels: Sufficient, believed: Mapping[str, float], params: Mapping[str
     Error:  a start for a search, not an estimate.
     Source: EMVA Standard 1288, release 4.0 Linear, sections 6.6 to 6.8.
     """
-    found = dict(believed)
+    values = dict(believed)
     try:
         fit = least_squares(without_histograms(Levels(*levels), levels.pixels > 0))
     except ValueError:
-        return found | {"full_well": _well(levels, found, params)}
+        return values | {"full_well": _well(levels, values, params)}
     gain = float(fit.gain)
     dark = float(fit.dark_current) * params["dark_exposure"]
     first = levels.exposure[levels.photons == 0].min()
     ahead = float(first) / params["dark_exposure"] * (dark if dark > 0 else 0.0)
-    found |= {
+    values |= {
         "gain": gain,
         "quantum_efficiency": float(fit.efficiency),
         "offset": (float(fit.dark_signal) - ROUNDED[params["rounding"]][0]) / gain - ahead,
         "read_noise": max(float(fit.temporal_dark_noise), _LEAST * believed["read_noise"]),
         "dark_current": dark if dark > 0 else _LEAST * believed["dark_current"],
     }
-    return found | {"full_well": _well(levels, found, params)}
+    return values | {"full_well": _well(levels, values, params)}
 
 
 def guess_camera(levels: Levels, believed: Mapping[str, float], params: Mapping[str, Any]) -> dict[str, float]:
@@ -59,20 +59,20 @@ def guess_camera(levels: Levels, believed: Mapping[str, float], params: Mapping[
     """
     fit = least_squares(levels, share=params["share"])
     gain = float(fit.gain)
-    found = {
+    values = {
         "gain": gain,
         "quantum_efficiency": float(fit.efficiency),
         "dark_signal": float(fit.dark_signal),
         "temporal_dark_noise": float(fit.temporal_dark_noise),
         "dark_current": float(fit.dark_current) * params["dark_exposure"],
     }
-    usable = {name: x for name, x in found.items() if math.isfinite(x) and (x > 0 or name == "dark_signal")}
+    usable = {name: x for name, x in values.items() if math.isfinite(x) and (x > 0 or name == "dark_signal")}
     return {**believed, **usable}
 
 
-def _well(levels: Sufficient, found: Mapping[str, float], params: Mapping[str, Any]) -> float:
+def _well(levels: Sufficient, values: Mapping[str, float], params: Mapping[str, Any]) -> float:
     """Return the full well at which numbers pile up, or, if none pile up, a full well above every number."""
-    top, shift, gain = 2 ** params["bits"] - 1, ROUNDED[params["rounding"]][0], float(found["gain"])
+    top, shift, gain = 2 ** params["bits"] - 1, ROUNDED[params["rounding"]][0], float(values["gain"])
     seen = levels.mean[levels.pixels > 0]
     brightest = max([*seen.tolist(), *levels.cell_value.tolist()], default=0.0)
     at = levels.cell_value >= brightest - 2
@@ -80,4 +80,4 @@ def _well(levels: Sufficient, found: Mapping[str, float], params: Mapping[str, A
     if piled and brightest < top:
         weight = levels.cell_count[at]
         return float((levels.cell_value[at] * weight).sum() / weight.sum() - shift) / gain
-    return max(found["full_well"], _ABOVE * min(brightest + 1, torch.inf) / gain)
+    return max(values["full_well"], _ABOVE * min(brightest + 1, torch.inf) / gain)

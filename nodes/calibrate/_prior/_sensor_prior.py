@@ -85,15 +85,15 @@ class Coordinates(Free):
         held = {name: math.log(self.held[name]) for name in ("gain", "spread") if name in self.held}
         logs = {name: torch.tensor(x, dtype=torch.float64) for name, x in held.items()} | at
         slope = logs["gain"] - 2.0 * logs["spread"] if "gain" in at else logs["gain"]
-        found = {}
+        parameters = {}
         for name, x in at.items():
             if name == "gain":
-                found[name] = slope.exp()
+                parameters[name] = slope.exp()
             elif name == _LINEAR:
-                found[name] = x * (-slope).exp()
+                parameters[name] = x * (-slope).exp()
             else:
-                found[name] = (x if name == "spread" else x - slope).exp()
-        return found
+                parameters[name] = (x if name == "spread" else x - slope).exp()
+        return parameters
 
     def log_prior(self, parameters: Mapping[str, Tensor]) -> Tensor:
         """Return the log prior density (...) per unit of the coordinates, up to a constant."""

@@ -73,8 +73,8 @@ class _Followed(torch.autograd.Function):
         pull = torch.fft.rfft2(grad)
         seen = replace(ctx.seen, picture=torch.zeros_like(ctx.seen.picture), pull=pull)
         enough = 1e-10 * float(inner(pull, _spread(seen, pull), seen.torus))
-        found = _nested(seen, ctx.steps, enough)
-        return None, torch.fft.irfft2(found, s=seen.torus), None, None
+        slope = _nested(seen, ctx.steps, enough)
+        return None, torch.fft.irfft2(slope, s=seen.torus), None, None
 
 
 def _nested(seen: Blurred, steps: int, enough: float) -> Tensor:

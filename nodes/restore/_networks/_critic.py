@@ -60,5 +60,5 @@ def critic_slopes(critic: nn.Module, truth: Tensor, estimate: Tensor, rng: torch
     share = torch.rand(len(truth), 1, 1, 1, generator=rng, device=rng.device).to(truth)
     between = torch.lerp(estimate, truth, share).requires_grad_()
     with torch.enable_grad(), torch.autocast(truth.device.type, enabled=False):
-        (found,) = torch.autograd.grad(critic(between).sum(), between, create_graph=True)
-    return found
+        (slopes,) = torch.autograd.grad(critic(between).sum(), between, create_graph=True)
+    return slopes

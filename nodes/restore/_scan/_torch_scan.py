@@ -113,11 +113,11 @@ def _walk(h: Tensor, lost: list[Tensor], start: Tensor, back: bool = False) -> T
     for less, before, now, share, further in zip(lost[1:], rows, rows[1:], shares, shares[1:], strict=False):
         now.addcmul_(less, before).add_(before)
         torch.add(less, share, out=further).addcmul_(less, share)  # (1 + e)(1 + l) - 1, exact near 0
-    left, kept, given = rows[-1].double(), shares[-1].double(), torch.empty_like(rows[-1])
+    left, kept, starts = rows[-1].double(), shares[-1].double(), torch.empty_like(rows[-1])
     for chunk in range(h.shape[1])[turn]:
-        given[chunk] = start
+        starts[chunk] = start
         start = (left[chunk] + start).addcmul_(kept[chunk], start)
-    h.addcmul_(through, given).add_(given)
+    h.addcmul_(through, starts).add_(starts)
     return start
 
 
@@ -129,8 +129,8 @@ class Scan(torch.autograd.Function):
     """The scan in torch, differentiable once: u, dt (batch, length, d), A (d, n), B, C (batch, length, n) -> as u."""
 
     @staticmethod
-    def forward(ctx: Any, *given: Tensor) -> Tensor:
-        u, dt, rate, *into_out = given
+    def forward(ctx: Any, *inputs: Tensor) -> Tensor:
+        u, dt, rate, *into_out = inputs
         (batch, length, _), (d, n) = u.shape, rate.shape
         ctx.division = plan(length, batch * d * n, u.is_cuda)
         y, state, starts = torch.empty_like(u), u.new_zeros(batch, d, n, dtype=torch.float64), list[Tensor]()
@@ -139,14 +139,14 @@ class Scan(torch.autograd.Function):
             part = _Segment(ctx.division, rows, rate, u, dt, *into_out)
             h, state = part.states(state)
             y[:, rows] = part.back((h @ part.out[..., None])[..., 0])
-        ctx.save_for_backward(*given, torch.stack(starts))
+        ctx.save_for_backward(*inputs, torch.stack(starts))
         return y
 
     @staticmethod
     def backward(ctx: Any, *seen: Tensor) -> tuple[Tensor, ...]:
         refuse_twice()
-        *given, starts = ctx.saved_tensors
-        u, dt, rate, *into_out = given
+        *inputs, starts = ctx.saved_tensors
+        u, dt, rate, *into_out = inputs
         du, ddt, dB, dC = (torch.empty_like(x) for x in (u, dt, *into_out))
         end, dA = torch.zeros_like(starts[0], dtype=torch.float64), torch.zeros_like(rate, dtype=torch.float64)
         with torch.autocast(u.device.type, enabled=False):
