@@ -36,7 +36,7 @@ def clipped(raw: Tensor, *, full_well: Well, gain: Gain, bits: Bits = 16) -> Ten
 
     Shapes: raw (..., y, x) -> (..., y, x) bool.
     Units:  raw DN.
-    Error:  a value within one DN of the full well is marked too, and so is a value that is not a number (NaN).
+    Error:  a value within one DN of the full well is marked too, and so is what is not a number (NaN).
     Source: NeuSee, Eq. (SensorImage).
     """
     return at_the_end(raw, full_well=full_well, gain=gain, bits=bits)

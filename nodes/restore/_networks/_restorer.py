@@ -157,7 +157,7 @@ def fitting(
 
 def _needed(weights: Path | None) -> Path:
     if weights is None:
-        text = "a network needs trained weights: give the .safetensors file of the weights, or choose restore: wiener"
+        text = "a network needs trained weights: give the .safetensors file of its weights, or choose restore: wiener"
         raise ParameterError("weights", text)
     return weights
 
