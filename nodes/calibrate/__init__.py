@@ -1,4 +1,4 @@
-"""Calibrate: the constants of a sensor and their uncertainties, from frames of flat illumination."""
+"""Calibration nodes, which estimate the constants of a sensor with uncertainties from frames of flat light."""
 
 from neusee.nodes.calibrate._emva_fit import LeastSquares, least_squares
 from neusee.nodes.calibrate._frames._emva_descriptor import descriptor

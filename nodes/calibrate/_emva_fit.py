@@ -1,4 +1,4 @@
-"""The linear camera model of EMVA 1288, fitted as the standard prescribes: a first estimate, and a start for others."""
+"""A least-squares fit of the linear camera model, as EMVA 1288 prescribes; slower fits start from this estimate."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ _QUANTIZATION = 1.0 / 12.0  #: DN2, of rounding to the nearest number
 
 
 class LeastSquares(NamedTuple):
-    """The results of a photon-transfer measurement; all () float64, errors are standard errors from the noise alone."""
+    """The results of a photon-transfer measurement, float64 scalars; errors are standard errors from noise alone."""
 
     gain: Tensor  #: K, DN/e-
     efficiency: Tensor  #: electrons per photon
@@ -33,10 +33,11 @@ class LeastSquares(NamedTuple):
 
 @node(rtol=1e-9)
 def least_squares(levels: Levels, *, share: Share = 0.7) -> LeastSquares:
-    """Fit gain, quantum efficiency and temporal dark noise: lines through the origin, up to a share of saturation.
+    """Fit gain and quantum efficiency by lines through the origin, and estimate temporal dark noise and dark current.
 
-    The level of the greatest variance marks saturation. The slope of mean over photons is the responsivity, and the
-    slope of variance over mean is the gain, after subtraction of the dark level of the nearest exposure.
+    The slope of mean over photons is the responsivity, and the slope of variance over mean is the gain, after
+    subtraction of the dark level of the nearest exposure. The level of the greatest variance marks saturation; only
+    levels up to ``share`` of saturation are fitted.
 
     Shapes: levels (level,) -> ten scalars.
     Units:  K DN/e-; temporal dark noise, saturation e-; dark current e-/s.
@@ -50,38 +51,40 @@ def least_squares(levels: Levels, *, share: Share = 0.7) -> LeastSquares:
     """
     dark = levels.photons == 0
     if not bool(dark.any()):
-        raise ValueError("no dark frames, so that the offset of the camera is not known: give frames without light")
+        raise ValueError("the offset of the camera is unknown without dark frames: give frames without light")
     if int((~dark).sum()) < 2:
-        raise ValueError(f"{int((~dark).sum())} lit level: a line needs at least two of different light")
+        raise ValueError(
+            f"{int((~dark).sum())} lit level(s) cannot define a line: give at least two of different light"
+        )
     nearest = (levels.exposure[~dark, None] - levels.exposure[dark]).abs().argmin(1)
-    lit, below = _only(levels, ~dark), _only(levels, dark.nonzero().squeeze(1)[nearest])
+    lit = without_histograms(levels, ~dark)
+    below = without_histograms(levels, dark.nonzero().squeeze(1)[nearest])
     mean, variance = lit.mean - below.mean, lit.variance - below.variance
     full = mean[lit.variance.argmax()]
     used = (mean <= share * full).nonzero().squeeze(1)
     if len(set(lit.photons[used].tolist())) < 2:
-        raise ValueError(f"{len(used)} lit level(s) below {share:.0%} of saturation, {float(full):.4g} DN above the "
-                         "dark: give two or more of different light there")  # fmt: skip
+        raise ValueError(f"{len(used)} lit level(s) below {share:.0%} of saturation ({float(full):.4g} DN above the "
+                         "dark level) cannot define a line: give at least two of different light there")  # fmt: skip
     gain, response = _slope(mean[used], variance[used]), _slope(lit.photons[used], mean[used])
     if not (float(gain) > 0 and float(response) > 0):
-        raise ValueError(f"slopes {float(gain):.3g} DN/e- and {float(response):.3g} DN/photon: brighter frames must "
-                         "be brighter and noisier; check that the light belongs to the levels")  # fmt: skip
-    scatter = 2 * lit.variance.square() / lit.degrees_of_freedom
-    dim = 2 * below.variance.square() / below.degrees_of_freedom
-    off = _error(mean[used], scatter[used], dim[used], nearest[used]) / gain
-    faint = lit.variance / lit.pixels, below.variance / below.pixels
-    weak = _error(lit.photons[used], faint[0][used], faint[1][used], nearest[used]) / response
-    noise, doubt = _dark_noise(levels, dark)
+        raise ValueError(f"slopes {float(gain):.3g} DN/e- and {float(response):.3g} DN/photon are not positive: more "
+                         "light must raise mean and variance; check `photons` of each level")  # fmt: skip
+    of_lit, of_dark = ((2 * x.variance.square() / x.degrees_of_freedom)[used] for x in (lit, below))
+    gain_error = _error(mean[used], of_lit, of_dark, nearest[used]) / gain
+    of_lit, of_dark = ((x.variance / x.pixels)[used] for x in (lit, below))
+    response_error = _error(lit.photons[used], of_lit, of_dark, nearest[used]) / response
+    noise, noise_error = _dark_noise(levels, dark)
     efficiency = response / gain
     return LeastSquares(
         gain,
         efficiency,
         noise / gain,
-        levels.mean[_first(levels, dark)],
+        levels.mean[_shortest_dark(levels, dark)],
         _dark_current(levels, dark) / gain,
         full / gain,
-        off * gain,
-        efficiency * torch.hypot(off, weak),
-        torch.hypot(doubt, off * noise) / gain,
+        gain_error * gain,
+        efficiency * torch.hypot(gain_error, response_error),
+        torch.hypot(noise_error, gain_error * noise) / gain,
         torch.tensor(float(len(used)), dtype=torch.float64),
     )
 
@@ -95,36 +98,35 @@ def _(result: LeastSquares, levels: Levels, **params: float) -> list[Check]:
     return [Check(text, 0.0 < float(result.efficiency) <= 1.0)]
 
 
-def _only(levels: Levels, which: Tensor) -> Levels:
-    """Select some of the levels, without their histograms."""
+def without_histograms(levels: Levels, which: Tensor) -> Levels:
+    """Return the levels that an index or a mask selects, without their histograms."""
     return Levels._make([*(x[which] for x in levels[:6]), *(x[:0] for x in levels[6:])])
 
 
 def _slope(x: Tensor, y: Tensor) -> Tensor:
-    """Return the slope of the line through the origin."""
+    """Return the slope of the line through the origin that fits the points (x, y) best."""
     return (x @ y) / (x @ x)
 
 
 def _error(x: Tensor, own: Tensor, dark: Tensor, which: Tensor) -> Tensor:
-    """Return the standard error of that slope, where several levels may share the dark level subtracted from y."""
+    """Return the standard error of `_slope`; ``which`` is the index of the dark level subtracted from each point."""
     shared = torch.zeros(int(which.max()) + 1, dtype=x.dtype, device=x.device).index_add_(0, which, x * dark.sqrt())
     return (x.square() @ own + shared.square().sum()).sqrt() / (x @ x)
 
 
-def _first(levels: Levels, dark: Tensor) -> Tensor:
-    """Return the index of the dark level of the shortest exposure."""
+def _shortest_dark(levels: Levels, dark: Tensor) -> Tensor:
     return torch.where(dark, levels.exposure, math.inf).argmin()
 
 
 def _dark_noise(levels: Levels, dark: Tensor) -> tuple[Tensor, Tensor]:
-    """Return the temporal dark noise without rounding, and its standard error, DN; infinite without other noise."""
-    variance, freedom = (x[_first(levels, dark)] for x in (levels.variance, levels.degrees_of_freedom))
+    """Return the temporal dark noise without rounding, and the standard error, DN: infinite for a noise of 0."""
+    variance, freedom = (x[_shortest_dark(levels, dark)] for x in (levels.variance, levels.degrees_of_freedom))
     noise = (variance - _QUANTIZATION).clamp_min(0.0).sqrt()
     return noise, torch.where(noise > 0, variance / (2 * freedom).sqrt() / noise, math.inf)
 
 
 def _dark_current(levels: Levels, dark: Tensor) -> Tensor:
-    """Return the slope of the dark signal over exposure, DN/s."""
+    """Return the slope of the dark signal over exposure, DN/s, or NaN if all dark levels have the same exposure."""
     time, signal = levels.exposure[dark], levels.mean[dark]
     apart = time - time.mean()
     return torch.where(time.max() > time.min(), (apart @ signal) / (apart @ apart), math.nan)

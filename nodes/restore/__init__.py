@@ -1,4 +1,4 @@
-"""Restoration nodes: from raw digital numbers back to colour."""
+"""Restoration nodes, which compute a colour picture of the scene from raw digital numbers."""
 
 from neusee.nodes.restore._colour_matrix import colour_matrix
 from neusee.nodes.restore._electrons_and_colour import clipped, colour, electrons

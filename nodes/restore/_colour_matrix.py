@@ -1,4 +1,4 @@
-"""The colour matrix: from electrons of the channels to the colour that the scene would have in daylight."""
+"""The colour matrix, which converts electrons of the channels to the colour of the scene in daylight."""
 
 from typing import Any
 
@@ -38,7 +38,8 @@ def colour_matrix(
     """
     spectra = _paints(bands.centres)
     second = spectra.T @ spectra / len(spectra)
-    counts = _counts(bands, illuminant, responses, level, pixel_pitch, exposure, quantum_efficiency)
+    pixel = {"pixel_pitch": pixel_pitch, "exposure": exposure}
+    counts = _counts(bands, illuminant, responses, level, quantum_efficiency, **pixel)
     rgb = to_srgb(bands.centres)
     seen = counts @ second @ counts.T
     ridge = (1e-12 * seen.diagonal().mean()).clamp_min(1e-200) * torch.eye(len(seen), dtype=torch.float64)
@@ -52,24 +53,18 @@ def _(result: Tensor, *inputs: Any, **params: float) -> list[Check]:
     spectra = _paints(bands.centres)
     counts = _counts(bands, illuminant, responses, level, **params)
     off = (spectra @ counts.T @ result.T - spectra @ to_srgb(bands.centres).T).square().mean().sqrt()
-    return [Check(f"rms {float(off):.3f} on colour charts", float(off) < 0.1)]
+    return [Check(f"rms error {float(off):.3f} on colour charts", float(off) < 0.1)]
 
 
 def _counts(
-    bands: Bands,
-    illuminant: Tensor,
-    responses: Tensor,
-    level: Tensor,
-    pixel_pitch: float,
-    exposure: float,
-    quantum_efficiency: float,
+    bands: Bands, illuminant: Tensor, responses: Tensor, level: Tensor, quantum_efficiency: float, **pixel: float
 ) -> Tensor:
     """Return the electrons in each channel for one unit of reflectance in each band, on the CPU."""
     lit = level.cpu().double() * illuminant.cpu().double()
-    weights = channel_weights(bands, responses.cpu(), lit, pixel_pitch=pixel_pitch, exposure=exposure)
+    weights = channel_weights(bands, responses.cpu(), lit, **pixel)
     return weights * quantum_efficiency
 
 
 def _paints(centres: Tensor) -> Tensor:
-    """Return the reflectances of the colour charts at these wavelengths: (paint, band) float64."""
+    """Return the reflectances of the colour charts at the wavelengths ``centres``: (paint, band) float64."""
     return torch.cat([paint.at(centres) for paint in paints()])

@@ -1,4 +1,4 @@
-"""Digital numbers to electrons, and electrons to colour."""
+"""Nodes that convert digital numbers to electrons, and electrons to colour."""
 
 import torch
 from torch import Tensor
@@ -26,13 +26,13 @@ def electrons(raw: Tensor, *, gain: Gain, offset: Electrons, offset_subtracted: 
 @electrons.preflight
 def _(*, offset: float, offset_subtracted: bool = True, **params: object) -> list[str]:
     if offset and not offset_subtracted:
-        return [f"an offset of {offset:g} e- stays in the picture: set offset_subtracted: true to remove it"]
+        return [f"an offset of {offset:g} e- stays in the picture: set offset_subtracted: true to remove the offset"]
     return []
 
 
 @node(rtol=0.0)
 def clipped(raw: Tensor, *, full_well: Well, gain: Gain, bits: Bits = 16) -> Tensor:
-    """Mark clipped values, which give only a lower bound: at the full well, or at the largest number of the converter.
+    """Mark clipped values, which reach the full well or the largest number of the converter.
 
     Shapes: raw (..., y, x) -> (..., y, x) bool.
     Units:  raw DN.
@@ -44,16 +44,18 @@ def clipped(raw: Tensor, *, full_well: Well, gain: Gain, bits: Bits = 16) -> Ten
 
 @node()
 def colour(channels: Tensor, matrix: Tensor) -> Tensor:
-    """Turn the channels of the sensor into linear sRGB.
+    """Convert the channels of the sensor to linear sRGB by a colour matrix.
 
     Shapes: channels (..., 3, y, x), matrix (3, 3) -> (..., 3, y, x).
     Units:  channels e-; result linear sRGB, white 1; colours out of gamut below 0.
-    Error:  that of the matrix: no matrix is right for all spectra.
+    Error:  the error of the matrix: no matrix is right for all spectra.
     Raises: ValueError for a number of channels other than three.
     Source: Reinhard et al., High Dynamic Range Imaging, 2nd ed. (colour spaces as 3 x 3 matrices).
     """
     if channels.ndim < 3 or channels.shape[-3] != matrix.shape[-1]:
-        raise ValueError(f"channels {tuple(channels.shape)} do not fit a matrix {tuple(matrix.shape)}: give (3, y, x)")
+        raise ValueError(
+            f"channels {tuple(channels.shape)} do not fit the matrix {tuple(matrix.shape)}: give (3, y, x)"
+        )
     channels = single(channels)
     flat = matrix.to(channels) @ channels.flatten(-2)
     return flat.reshape(*flat.shape[:-1], *channels.shape[-2:])

@@ -1,4 +1,4 @@
-"""A measurement in the data format of EMVA 1288: a descriptor file, and the images that the file names."""
+"""A node that reads a measurement in the data format of EMVA 1288: a descriptor file and its images."""
 
 from __future__ import annotations
 
@@ -10,10 +10,9 @@ from typing import Annotated, Any
 import torch
 from pydantic import BeforeValidator
 
-from neusee.nodes import Check, ParameterError, node
+from neusee.nodes import Check, node
 from neusee.nodes.calibrate._frames._frame_statistics import Temporal, levels, reduce
-from neusee.nodes.calibrate._frames._image_files import readable
-from neusee.nodes.calibrate._frames._level_frames import stack
+from neusee.nodes.calibrate._frames._level_frames import refuse_unreadable, stack
 from neusee.nodes.units import IsFile
 from neusee.nodes.values import Levels
 
@@ -38,13 +37,13 @@ class _Measurement:
 
 
 def _with_images(file: Any) -> tuple[Path, ...]:
-    """Return the descriptor and every image that the descriptor names, so that the content of all files counts."""
+    """Return the path of the descriptor, and then the path of each image that the descriptor names."""
     if isinstance(file, tuple):
         return file
     path = Path(file)
     if not path.is_file():
         raise ValueError(f"no such file: {path}")
-    images = [named for level in _parsed(path).levels for named in level.images]
+    images = [image for level in _parsed(path).levels for image in level.images]
     for line, image in images:
         if not image.is_file():
             raise ValueError(f"{path.name}:{line}: no such image: {image}: put the image beside the descriptor")
@@ -56,7 +55,7 @@ DescriptorFile = Annotated[tuple[Path, ...], BeforeValidator(_with_images, json_
 
 @node(rtol=0.0)
 def descriptor(*, file: DescriptorFile, scatter: Temporal = "temporal") -> Levels:
-    """Read a measurement by its EMVA 1288 descriptor, and reduce each level with the variance of `reduce`.
+    """Read the images that an EMVA 1288 descriptor names, and reduce each level to mean and variance as `reduce` does.
 
     Shapes: -> (level,), in the order of the descriptor.
     Units:  in the descriptor exposures ns, photons per pixel and exposure; mean DN; variance DN2.
@@ -67,83 +66,86 @@ def descriptor(*, file: DescriptorFile, scatter: Temporal = "temporal") -> Level
     Source: EMVA Standard 1288, release 3.0 and 4.0 (data sets of the working group, descriptor file).
     """
     files = _with_images(file)
-    said = _parsed(files[0])
-    joined: Levels = levels([_reduced(files[0].name, said, level, scatter) for level in said.levels])
+    measurement = _parsed(files[0])
+    joined: Levels = levels([_reduced(files[0].name, measurement, level, scatter) for level in measurement.levels])
     return joined
 
 
 @descriptor.preflight
 def _(*, file: Sequence[Path], **rest: object) -> list[str]:
-    try:
-        for image in file[1:]:
-            readable(image)
-    except ValueError as why:
-        raise ParameterError("file", str(why)) from None
-    return []
+    return refuse_unreadable("file", file[1:])
 
 
 @descriptor.check
 def _(result: Levels, **params: Any) -> list[Check]:
     dark = int((result.photons == 0).sum())
-    return [Check(f"{len(result.mean)} levels, {dark} dark, {float(result.exposure.max()):.3g} s at most", dark > 0)]
+    return [
+        Check(f"{len(result.mean)} levels, {dark} dark, exposures up to {float(result.exposure.max()):.3g} s", dark > 0)
+    ]
 
 
-def _reduced(name: str, said: _Measurement, level: _Level, scatter: Temporal) -> Levels:
+def _reduced(name: str, measurement: _Measurement, level: _Level, scatter: Temporal) -> Levels:
     numbers = stack([image for _, image in level.images])
-    if said.shape and numbers.shape[1:] != said.shape:
-        raise ValueError(f"{name}:{level.line}: images of {numbers.shape[1:]}, descriptor says {said.shape} (y, x)")
-    if int(numbers.max()) >= 2**said.bits:
-        raise ValueError(f"{name}:{level.line}: an image holds {numbers.max()} DN, more than {said.bits} bits")
-    found: Levels = reduce(torch.from_numpy(numbers), photons=level.photons, exposure=level.exposure, scatter=scatter)
-    return found
+    if measurement.shape and numbers.shape[1:] != measurement.shape:
+        raise ValueError(
+            f"{name}:{level.line}: images of {numbers.shape[1:]}, but the descriptor says {measurement.shape} (y, x)"
+        )
+    if int(numbers.max()) >= 2**measurement.bits:
+        raise ValueError(
+            f"{name}:{level.line}: an image holds {numbers.max()} DN, more than the {measurement.bits} bits of line n"
+        )
+    reduced: Levels = reduce(torch.from_numpy(numbers), photons=level.photons, exposure=level.exposure, scatter=scatter)
+    return reduced
 
 
 def _parsed(path: Path) -> _Measurement:
-    found = _Measurement()
+    measurement = _Measurement()
     for number, line in _lines(path):
         kind, _, rest = line.partition(" ")
         try:
-            _take(found, kind, rest.strip(), path.parent, number)
+            _take(measurement, kind, rest.strip(), path.parent, number)
         except ValueError as why:
             raise ValueError(f"{path.name}:{number}: {why}") from None
-    for level in found.levels:
+    for level in measurement.levels:
         if len(level.images) < 2:
-            raise ValueError(f"{path.name}:{level.line}: {len(level.images)} image(s): a level needs two")
-    if not found.levels:
-        raise ValueError(f"{path.name}: no line 'b' or 'd', hence no level: give an EMVA 1288 descriptor")
-    return found
+            raise ValueError(f"{path.name}:{level.line}: {len(level.images)} image(s): a level needs at least two")
+    if not measurement.levels:
+        raise ValueError(
+            f"{path.name}: no line begins with 'b' or 'd', so there is no level: give an EMVA 1288 descriptor"
+        )
+    return measurement
 
 
 def _lines(path: Path) -> Iterator[tuple[int, str]]:
-    """Yield the lines with content, each with its number."""
+    """Yield the number and the text of each line that is neither empty nor a comment."""
     text = path.read_text(encoding="utf-8-sig", errors="replace")
     for number, line in enumerate(text.splitlines(), 1):
         if line.strip() and not line.lstrip().startswith("#"):
             yield number, line.strip().replace("\t", " ")
 
 
-def _take(found: _Measurement, kind: str, rest: str, folder: Path, line: int) -> None:
-    """Add the content of one line to the measurement."""
+def _take(measurement: _Measurement, kind: str, rest: str, folder: Path, line: int) -> None:
+    """Add the content of one line of a descriptor to the measurement."""
     if kind == "i":
-        if not found.levels:
-            raise ValueError("an image before the first level: begin a level with 'b' or 'd'")
-        found.levels[-1].images.append((line, folder / rest.replace("\\", "/")))
+        if not measurement.levels:
+            raise ValueError("an image stands before the first level: begin a level with a line 'b' or 'd'")
+        measurement.levels[-1].images.append((line, folder / rest.replace("\\", "/")))
         return
     if kind not in _WORDS:
-        raise ValueError(f"cannot read {kind!r}: lines begin with v, n, b, d, i or #")
+        raise ValueError(f"cannot read {kind!r}: begin the line with v, n, b, d, i or #")
     words = rest.split()
     try:
         numbers = [float(word) for word in words]
         if kind == "n":
-            found.bits, found.shape = int(words[0]), (int(words[2]), int(words[1]))
+            measurement.bits, measurement.shape = int(words[0]), (int(words[2]), int(words[1]))
         elif kind != "v":
-            found.levels.append(_level(line, kind, numbers))
+            measurement.levels.append(_level(line, kind, numbers))
     except (ValueError, IndexError):
         raise ValueError(f"cannot read {kind} {rest!r}: write {_WORDS[kind]}") from None
 
 
 def _level(line: int, kind: str, numbers: list[float]) -> _Level:
-    """Return a level; a bright level needs exposure and photons above 0, and a dark level 0 photons or none."""
+    """Return the level that a line describes; raise ValueError for an invalid exposure or number of photons."""
     exposure, photons = (*numbers, 0.0)[:2] if kind == "d" else numbers
     if not 0 < exposure < float("inf") or not (0 < photons < float("inf") if kind == "b" else photons == 0):
         raise ValueError

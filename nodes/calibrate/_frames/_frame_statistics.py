@@ -1,9 +1,10 @@
-"""Statistics of frames of a flat illumination: counts, means, variances, and histograms where moments mislead."""
+"""Statistics of frames of a flat illumination: mean, variance, and a histogram where both are not enough."""
 
 from __future__ import annotations
 
 import math
 from collections.abc import Iterator
+from itertools import accumulate
 from typing import Annotated, Any, Literal
 
 import torch
@@ -25,23 +26,26 @@ _FEW, _SURE, _RATIO = 8, 5.0, 5.0  #: least count at an end; least excess in sig
 
 @node(rtol=1e-12)
 def reduce(frames: Tensor, *, photons: Photons, exposure: Time, scatter: Scatter = "all") -> Levels:
-    """Reduce the frames of one flat illumination to mean and variance, and to a histogram where moments mislead.
+    """Reduce the frames of one flat illumination to mean and variance, with a histogram where both are not enough.
 
-    `all`: every pixel of every frame is alike, as in a simulation. `temporal`: the variance of a pixel from frame to
-    frame, which for two frames is half the mean squared difference. `steady`: the temporal variance minus the part that
-    all pixels share, for two frames half the squared difference of the means, as from a drifting lamp; `camera` needs
-    this variance. The histogram is kept where numbers pile up at an end or have a standard deviation below 0.8 DN.
+    ``scatter`` selects the variance. `all`: the variance over all pixels and frames, for pixels that are alike, as in a
+    simulation. `temporal`: the variance of a pixel from frame to frame, for two frames half the mean squared
+    difference. `steady`: the temporal variance minus the part that all pixels share, as from a drifting lamp, for two
+    frames half the squared difference of the means; `camera` needs this variance. The histogram is kept where numbers
+    pile up at an end or have a standard deviation below 0.8 DN.
 
     Shapes: frames (frame, y, x) -> one level.
     Units:  frames DN, whole; photons per pixel and exposure; exposure s; mean DN; variance DN2.
     Error:  counted in whole numbers: 1e-15. Numbers pile up at an end where their count exceeds the count of a Gaussian
-            with the mean and variance of all pixels: for `all` by 5 sigma; for the others, whose pixels differ, 5-fold.
+            with the mean and variance of all pixels: for `all` by 5 sigma; for `temporal` and `steady`, 5-fold.
     Raises: ValueError for numbers that are fractional, negative or not finite, for a stack that is not (frame, y, x),
             for a single number, for `temporal` and `steady` of one frame, and for `steady` of one pixel.
     Source: EMVA Standard 1288, release 4.0 Linear, sections 6.5 and 6.6.
     """
     if frames.ndim != 3 or not frames.numel():
-        raise ValueError(f"frames {tuple(frames.shape)} are not (frame, y, x): give a stack, one frame as (1, y, x)")
+        raise ValueError(
+            f"frames {tuple(frames.shape)} are not (frame, y, x): give a stack, or (1, y, x) for one frame"
+        )
     if scatter != "all" and len(frames) < 2:
         raise ValueError("one frame has no temporal variance: give two frames or more, or set scatter: all")
     if frames.numel() < 2 or (scatter == "steady" and frames[0].numel() < 2):
@@ -78,12 +82,10 @@ def levels(parts: list[Levels]) -> Levels:
     Source: EMVA Standard 1288, release 4.0 Linear, section 6.5 (a measurement is a series of levels).
     """
     if not parts:
-        raise ValueError("no levels to join: wire at least one")
+        raise ValueError("there are no levels to join: wire at least one level")
     joined = [torch.cat(each) for each in zip(*parts, strict=True)]
-    before, shifted = 0, []
-    for part in parts:
-        shifted.append(part.cell_level + before)
-        before += len(part.mean)
+    starts = accumulate((len(part.mean) for part in parts), initial=0)
+    shifted = [part.cell_level + start for part, start in zip(parts, starts, strict=False)]
     return Levels(*joined)._replace(cell_level=torch.cat(shifted))
 
 
@@ -94,12 +96,12 @@ def _(result: Levels, *inputs: object) -> list[Check]:
 
 
 def histogram(frames: Tensor) -> tuple[Tensor, Tensor]:
-    """Return the whole numbers that occur, rising, and the count of each number: two (cell,) int64."""
+    """Return the digital numbers that occur, in rising order, and the count of each number: two (cell,) int64."""
     counts = torch.zeros(0, dtype=torch.int64, device=frames.device)
     for piece in _pieces(frames.reshape(1, -1)):
-        found = torch.bincount(_whole(piece).reshape(-1), minlength=len(counts))
-        found[: len(counts)] += counts
-        counts = found
+        more = torch.bincount(_whole(piece).reshape(-1), minlength=len(counts))
+        more[: len(counts)] += counts
+        counts = more
     value = counts.nonzero().squeeze(1)
     return value.cpu(), counts[value].cpu()
 
@@ -110,7 +112,7 @@ def _pieces(rows: Tensor) -> Iterator[Tensor]:
 
 
 def _whole(piece: Tensor) -> Tensor:
-    """Return the piece as int64; raise ValueError for a number that no converter gives."""
+    """Return numbers as int64; raise ValueError for a number that no converter can give."""
     whole = piece.to(torch.int64)
     low, high = (int(end) for end in torch.aminmax(whole))
     if low < 0 or high >= _TOP or (piece.is_floating_point() and not bool((whole == piece).all())):
@@ -123,7 +125,7 @@ def _whole(piece: Tensor) -> Tensor:
 
 
 def _within(frames: Tensor, steady: bool) -> float:
-    """Sum the squared deviations from the mean of each pixel, and with ``steady`` also from the mean of each frame."""
+    """Return the sum of squared deviations from the mean of each pixel, and with ``steady`` also of each frame."""
     parts, sums = [], torch.zeros(len(frames), dtype=torch.float64)
     for piece in _pieces(frames.reshape(len(frames), -1)):
         numbers = piece.double()
@@ -135,7 +137,7 @@ def _within(frames: Tensor, steady: bool) -> float:
 
 
 def _kept(value: Tensor, count: Tensor, mean: float, sigma: float, alike: bool) -> bool:
-    """Return True where the histogram holds information that mean and variance lack."""
+    """Return True if the histogram holds information that mean and variance lack."""
     if sigma < _COARSE:
         return True
     ends = ((value >= value[-1] - 1, value[-1] - 1.5), (value <= value[0] + 1, value[0] - 0.5))
@@ -143,8 +145,7 @@ def _kept(value: Tensor, count: Tensor, mean: float, sigma: float, alike: bool) 
 
 
 def _piled(held: float, total: float, low: float, sigma: float, alike: bool) -> bool:
-    """Return True where two neighbouring numbers, the lower ``low`` above the mean, have more pixels than a Gaussian
-    gives."""
+    """Return True if the count ``held`` of two neighbouring numbers exceeds the count that a Gaussian gives."""
     expected = total * 0.5 * abs(math.erf((low + 2.0) / sigma / math.sqrt(2)) - math.erf(low / sigma / math.sqrt(2)))
     more = _SURE * math.sqrt(expected) if alike else (_RATIO - 1) * expected
     return held >= _FEW and held - expected > more

@@ -1,9 +1,10 @@
-"""Frames from files, with the unchanged numbers of the camera."""
+"""Readers of frames from image files, which keep the numbers of the camera unchanged."""
 
 from __future__ import annotations
 
 import importlib.util
 from collections.abc import Callable
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -31,17 +32,18 @@ def read(file: Path) -> NDArray[np.int32]:
 
 
 def readable(file: Path) -> Callable[[Path], NDArray[Any]]:
-    """Return the reader of this kind of file; raise ValueError for an unknown kind."""
+    """Return the function that reads files of this suffix; raise ValueError for an unknown suffix."""
     suffix = file.suffix.lower()
     if suffix in _FITS and importlib.util.find_spec("astropy") is None:
         raise ValueError(f"{file.name} needs astropy: pip install 'neusee[fits]'")
     if suffix not in _READERS:
-        raise ValueError(f"{file.name}: no frames are read from {suffix or 'such files'}: give {', '.join(_READERS)}")
+        raise ValueError(
+            f"{file.name}: frames cannot be read from {suffix or 'such files'}: give {', '.join(_READERS)}"
+        )
     return _READERS[suffix]
 
 
 def _picture(file: Path) -> NDArray[Any]:
-    """Read all pages of a PNG or TIFF file by Pillow."""
     from PIL import Image, ImageSequence, UnidentifiedImageError
 
     try:
@@ -49,7 +51,9 @@ def _picture(file: Path) -> NDArray[Any]:
             pages = [_page(file, page) for page in ImageSequence.Iterator(image)]
     except UnidentifiedImageError:
         raise ValueError(f"{file} is not a readable picture: save the frame as 16-bit grey PNG") from None
-    return np.stack(_alike(file, pages))
+    if len({page.shape for page in pages}) > 1:
+        raise ValueError(f"{file}: the pages differ in size: give frames of one size")
+    return np.stack(pages)
 
 
 def _page(file: Path, page: Any) -> NDArray[Any]:
@@ -60,29 +64,18 @@ def _page(file: Path, page: Any) -> NDArray[Any]:
     return np.array(page)
 
 
-def _alike(file: Path, pages: list[NDArray[Any]]) -> list[NDArray[Any]]:
-    if len({page.shape for page in pages}) > 1:
-        raise ValueError(f"{file}: the pages differ in size: give frames of one size")
-    return pages
-
-
-def _array(file: Path) -> NDArray[Any]:
-    found: NDArray[Any] = np.load(file, allow_pickle=False)
-    return found
-
-
 def _exr(file: Path) -> NDArray[Any]:
     import OpenEXR
 
     with OpenEXR.File(str(file), separate_channels=True) as opened:
         channels = opened.channels()
         if len(channels) != 1:
-            raise ValueError(f"{file} has the channels {', '.join(channels)}: save one of them alone")
+            raise ValueError(f"{file} has the channels {', '.join(channels)}: save one channel alone")
         return np.array(next(iter(channels.values())).pixels)
 
 
 def _fits(file: Path) -> NDArray[Any]:
-    """Read the first image of a FITS file, with zero and scale of the file applied."""
+    """Read the first image of a FITS file, with the zero point and scale of the header applied."""
     from astropy.io import fits
 
     with fits.open(file) as opened:
@@ -97,6 +90,6 @@ _READERS: dict[str, Callable[[Path], NDArray[Any]]] = {
     ".tif": _picture,
     ".tiff": _picture,
     ".exr": _exr,
-    ".npy": _array,
+    ".npy": partial(np.load, allow_pickle=False),
     **dict.fromkeys(_FITS, _fits),
 }

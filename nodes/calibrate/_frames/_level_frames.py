@@ -1,4 +1,4 @@
-"""The frames of one level, from files."""
+"""A node that reads the frames of one level from image files."""
 
 from __future__ import annotations
 
@@ -31,12 +31,7 @@ def frames(*, files: DataFiles) -> Tensor:
 
 @frames.preflight
 def _(*, files: Sequence[Path]) -> list[str]:
-    try:
-        for file in files:
-            readable(file)
-    except ValueError as why:
-        raise ParameterError("files", str(why)) from None
-    return []
+    return refuse_unreadable("files", files)
 
 
 @frames.check
@@ -45,10 +40,20 @@ def _(result: Tensor, **params: Any) -> list[Check]:
     return [Check(f"{len(result)} frames of {result.shape[1]} x {result.shape[2]}, {low} to {high} DN")]
 
 
+def refuse_unreadable(parameter: str, files: Sequence[Path]) -> list[str]:
+    """Raise ParameterError if a file has an unknown suffix; return no warnings."""
+    try:
+        for file in files:
+            readable(file)
+    except ValueError as error:
+        raise ParameterError(parameter, str(error)) from None
+    return []
+
+
 def stack(files: Sequence[Path]) -> np.ndarray[Any, np.dtype[np.int32]]:
-    """Read the frames of all files; raise ValueError where the frames differ in size."""
-    found = [read(file) for file in files]
-    for file, each in zip(files, found, strict=True):
-        if each.shape[1:] != found[0].shape[1:]:
-            raise ValueError(f"{file} is {each.shape[1:]}, {files[0]} is {found[0].shape[1:]}: give frames of one size")
-    return np.concatenate(found)
+    """Read the frames of all files into one array; raise ValueError if the frames differ in size."""
+    stacks = [read(file) for file in files]
+    for file, each in zip(files, stacks, strict=True):
+        if each.shape[1:] != stacks[0].shape[1:]:
+            raise ValueError(f"{file} is {each.shape[1:]}, but {files[0]} is {stacks[0].shape[1:]}: give equal sizes")
+    return np.concatenate(stacks)

@@ -1,4 +1,4 @@
-"""Moments of frames, measured by another program, from a table."""
+"""A node that reads the moments of frames, measured by another program, from a table."""
 
 from __future__ import annotations
 
@@ -29,7 +29,7 @@ def table(
     drift: str | None = None,
     exposure_unit: Literal["s", "ms", "us", "ns"] = "s",
 ) -> Levels:
-    """Read the moments of pairs of frames from a CSV file, one level per line, by the names of the columns.
+    """Read the moments of pairs of frames from a CSV file with one level per line and with named columns.
 
     ``drift`` names the column with the difference of the two means, for a table whose variance excludes that
     difference. Half the square of the difference is then added, because the variance of EMVA 1288 includes that part.
@@ -43,7 +43,7 @@ def table(
     names = {"photons": photons, "exposure": exposure, "pixels": pixels, "mean": mean, "variance": variance}
     rows = _rows(file, {**names, **({} if drift is None else {"drift": drift})})
     if not rows:
-        raise ValueError(f"{file.name} has no line below its header: give one line per level")
+        raise ValueError(f"{file.name} has no line below the header: give one line per level")
     columns = {name: torch.tensor([row[name] for row in rows], dtype=torch.float64) for name in rows[0]}
     measured = columns["variance"] + (columns["drift"].square() / 2 if drift is not None else 0.0)
     times, number = columns["exposure"] * _SECONDS[exposure_unit], columns["pixels"]
@@ -70,21 +70,20 @@ def _(result: Levels, **params: Any) -> list[Check]:
 def _rows(file: Path, columns: dict[str, str]) -> list[dict[str, float]]:
     with file.open(newline="", encoding="utf-8-sig") as opened:
         reader = csv.DictReader(opened)
-        return [_read(row, columns, f"{file.name}:{reader.line_num}") for row in reader]
-
-
-def _read(row: dict[str, str], columns: dict[str, str], where: str) -> dict[str, float]:
-    return {name: _number(row.get(column), name, f"{where}: column {column}") for name, column in columns.items()}
+        return [
+            {n: _number(row.get(c), n, f"{file.name}:{reader.line_num}: column {c}") for n, c in columns.items()}
+            for row in reader
+        ]
 
 
 def _number(text: str | None, name: str, where: str) -> float:
-    wanted = _NUMBERS.get(name, "finite")
+    needed = _NUMBERS.get(name, "finite")
     try:
         number = float(text or "")
     except ValueError:
         number = math.nan
-    least = {">= 0": number >= 0, "> 0": number > 0, ">= 1": number >= 1 and number.is_integer()}
-    if not math.isfinite(number) or not least.get(wanted, True):
+    valid = {">= 0": number >= 0, "> 0": number > 0, ">= 1": number >= 1 and number.is_integer()}
+    if not math.isfinite(number) or not valid.get(needed, True):
         kind = "whole number" if name == "pixels" else "number"
-        raise ValueError(f"{where}: {text!r} is not valid for {name}: write a {kind}, {wanted}")
+        raise ValueError(f"{where}: {text!r} is not valid for {name}: write a {kind}, {needed}")
     return number

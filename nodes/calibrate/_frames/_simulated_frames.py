@@ -1,4 +1,4 @@
-"""Simulated frames of a flat field, from the steps that simulate a picture."""
+"""A node that simulates frames of a flat field by the same sensor steps as a picture."""
 
 from __future__ import annotations
 
@@ -39,12 +39,12 @@ def expose(
     spread: Spread = 1.0,
     rng: Generator,
 ) -> Tensor:
-    """Simulate frames of a flat field with this sensor, by the same steps that simulate a picture.
+    """Simulate frames of a flat field by the same sensor steps that simulate a picture.
 
     Shapes: -> (frame, y, x).
     Units:  result DN; photons per pixel and exposure; dark_current e- of one dark_exposure, in proportion to the
             exposure; offset, read_noise, full_well e-; gain K, DN/e-.
-    Error:  that of each step of the sensor. All pixels are alike: neither non-uniformity nor drift of the lamp.
+    Error:  the errors of the sensor steps. All pixels are alike: neither non-uniformity nor drift of the lamp.
     Source: NeuSee, section Sensor Image; EMVA Standard 1288, release 4.0 Linear (mathematical model).
     """
     flat = torch.full((frames, *shape), photons, device=rng.device)

@@ -1,4 +1,4 @@
-"""Likelihood of calibration frames, given the parameters of a sensor."""
+"""The node of the likelihood of calibration frames, given the parameters of a sensor."""
 
 from __future__ import annotations
 
@@ -35,22 +35,22 @@ def density(
     bits: Bits = 16,
     told: bool = True,
 ) -> Likelihood:
-    """Compute the likelihood of the measured levels: the steps of `sensor`, as distributions instead of draws.
+    """Compute the likelihood of measured levels from the probability distributions of the steps of `sensor`.
 
     Where numbers count as continuous, mean and variance are sufficient statistics of a level, so that the cost does not
-    depend on the number of pixels. Numbers cut off by the well, and coarse numbers, have their exact probabilities in
-    the quantiser. Any of the seven numbers of the sensor may be a tensor (walker,), and all walkers are computed at
+    depend on the number of pixels. Numbers near the well and coarse numbers have the exact probabilities of the
+    quantiser. Any of the seven numbers of the sensor may be a tensor (walker,), and all walkers are computed at
     once. ``told`` adds deviances and the rows of the Fisher information, which a sampler does not need.
 
     Shapes: levels -> log (walker,), deviance (walker, level), scaled (walker, row).
     Units:  gain K, DN/e-; dark_current e- in ``dark_exposure``; log in nats, for numbers of 1 DN.
-    Error:  the signal counts as Gaussian, except in coarse levels of up to 8 electrons: relative 1e-3 at 3 standard
+    Error:  the signal is taken as Gaussian, except in coarse levels of up to 8 electrons: relative 1e-3 at 3 standard
             deviations of 100 Poisson electrons. All pixels are assumed alike; crosstalk of neighbours, lag and drift
             of the lamp, which real frames show, are neglected (see `camera`).
     Source: NeuSee, section Sensor Image; EMVA Standard 1288, release 4.0 Linear, section 3.
     """
-    given = (gain, quantum_efficiency, offset, read_noise, dark_current, full_well, mean_shift, spread)
-    columns = [torch.as_tensor(x, dtype=torch.float64)[..., None] for x in given]
+    parameters = (gain, quantum_efficiency, offset, read_noise, dark_current, full_well, mean_shift, spread)
+    columns = [torch.as_tensor(x, dtype=torch.float64)[..., None] for x in parameters]
     alike = torch.broadcast_tensors(*columns)  # type: ignore[no-untyped-call]
     k, efficiency, bias, read, dark, well, shift, c2 = alike
     kept = shift + (mean == "additive")
@@ -74,4 +74,4 @@ def _(result: Likelihood, *inputs: Sufficient, **params: Any) -> list[Check]:
     if not len(result.degrees_of_freedom):
         return []
     off, freedom = float(result.deviance.sum()), float(result.degrees_of_freedom.sum())
-    return [Check(f"deviance {off:.4g} of {freedom:.0f} degrees of freedom")]
+    return [Check(f"deviance {off:.4g} for {freedom:.0f} degrees of freedom")]

@@ -1,6 +1,6 @@
-"""Probability of each number of a converter, for a Gaussian signal that ends at a full well: exact in the quantiser.
+"""The exact probability of each number of a converter, for a Gaussian signal limited by a full well.
 
-No number counts as continuous, and no quantization variance is added.
+Numbers are not treated as continuous, and no quantization variance is added.
 """
 
 from __future__ import annotations
@@ -17,7 +17,7 @@ _LEAST = 1e-300  #: probability below which a probability counts as 0
 
 
 def log_cell(value: Tensor, mean: Tensor, sd: Tensor, well: Tensor, rounding: Rounding, top: int) -> Tensor:
-    """Return the logarithm of the probability of a whole number; minus infinity for an impossible number.
+    """Return the logarithm of the probability of each digital number, minus infinity for an impossible number.
 
     Shapes: all broadcast.
     Units:  DN; ``well`` is the signal of a full pixel, the largest signal; ``top`` the largest number of the converter.
@@ -28,22 +28,22 @@ def log_cell(value: Tensor, mean: Tensor, sd: Tensor, well: Tensor, rounding: Ro
         low = torch.where(value <= 0, -math.inf, value - 0.5)
         high = torch.where((value >= top) | (value + 0.5 >= well), math.inf, value + 0.5)
         return torch.where(low < well, _between(low, high, mean, sd), -math.inf)
-    found = _dithered(value, mean, sd, well, top)
-    return torch.where(found > _LEAST, found.clamp_min(_LEAST).log(), -math.inf)
+    probability = _dithered(value, mean, sd, well, top)
+    return torch.where(probability > _LEAST, probability.clamp_min(_LEAST).log(), -math.inf)
 
 
 def _between(low: Tensor, high: Tensor, mean: Tensor, sd: Tensor) -> Tensor:
-    """Return log P(low < x < high), computed on the side of the mean without cancellation."""
+    """Return log P(low < x < high) for a Gaussian x, computed in the tail where no digits cancel."""
     a, b = (low - mean) / sd, (high - mean) / sd
     above = a + b > 0
     a, b = torch.where(above, -b, a), torch.where(above, -a, b)
     far, near = log_ndtr(a), log_ndtr(b)
-    found: Tensor = near + torch.log(-torch.expm1((far - near).clamp_max(-_LEAST)))
-    return found
+    log_probability: Tensor = near + torch.log(-torch.expm1((far - near).clamp_max(-_LEAST)))
+    return log_probability
 
 
 def _dithered(value: Tensor, mean: Tensor, sd: Tensor, well: Tensor, top: int) -> Tensor:
-    """Return P(floor(x + U(-1/2, 1/2)) = k): the density of x under a triangle about k + 1/2, 1 wide on either side.
+    """Return P(floor(x + U(-1/2, 1/2)) = k): the density of x, weighted by a triangle from k - 1/2 to k + 3/2.
 
     Integration by parts uses the integral G of the distribution function: G'' is the density, and the triangle has
     three corners. No x lies beyond the well; the probability beyond the well is concentrated at the well. Above the
@@ -63,10 +63,10 @@ def _dithered(value: Tensor, mean: Tensor, sd: Tensor, well: Tensor, top: int) -
 
 
 def _integral(x: Tensor, mean: Tensor, sd: Tensor, above: Tensor) -> Tensor:
-    """Integrate the distribution function up to x; where ``above``, subtract x - mean."""
+    """Return the integral of the Gaussian distribution function up to x, minus x - mean where ``above``."""
     z = (x - mean) / sd
     density = torch.exp(-0.5 * z.square()) / math.sqrt(2.0 * math.pi)
     side = torch.where(above, z, -z)
-    share = 0.5 * torch.special.erfc(side / math.sqrt(2.0))  # `ndtr` loses all digits below -8
-    found: Tensor = sd * (density - side * share)
-    return found
+    tail = 0.5 * torch.special.erfc(side / math.sqrt(2.0))  # `ndtr` loses all digits below -8
+    integral: Tensor = sd * (density - side * tail)
+    return integral

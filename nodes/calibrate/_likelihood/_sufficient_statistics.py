@@ -16,7 +16,7 @@ _COARSE = 0.8  #: DN, standard deviation below which mean and variance are not s
 
 
 class Sufficient(NamedTuple):
-    """Mean and variance of most pixels of each level, and a histogram of the others; no pixel counts twice."""
+    """The mean and variance of most pixels of each level, and a histogram of the remaining pixels."""
 
     photons: Tensor  #: (level,) float64, per pixel and exposure
     exposure: Tensor  #: (level,) float64, s
@@ -31,7 +31,7 @@ class Sufficient(NamedTuple):
 
 @node(rtol=1e-9)
 def sufficient(levels: Levels) -> Sufficient:
-    """Split the histograms of levels: numbers at an end keep their counts, and moments replace the other numbers.
+    """Replace the middle of each histogram by a mean and a variance, and keep the counts near both ends.
 
     Between the ends numbers count as continuous, and mean and variance are sufficient; at a full well every single
     number carries information. A level with a standard deviation below 0.8 DN keeps its whole histogram.
@@ -43,19 +43,21 @@ def sufficient(levels: Levels) -> Sufficient:
     """
     moments = torch.stack([levels.pixels, levels.mean, levels.variance, levels.degrees_of_freedom], 1)
     kept = torch.ones(len(levels.cell_level), dtype=torch.bool)
-    for one in sorted(set(levels.cell_level.tolist())):
-        at = levels.cell_level == one
-        inner, found = _inner(levels.cell_value[at], levels.cell_count[at], math.sqrt(float(levels.variance[one])))
-        moments[one], kept[at] = found, ~inner
-    level, value, count = (x[kept] for x in (levels.cell_level, levels.cell_value, levels.cell_count))
-    numbers, mean, variance, freedom = moments.T.contiguous()
-    return Sufficient(levels.photons, levels.exposure, numbers, mean, variance, freedom, level, value, count)
+    for level in sorted(set(levels.cell_level.tolist())):
+        at = levels.cell_level == level
+        sd = math.sqrt(float(levels.variance[level]))
+        inner, moments[level] = _inner(levels.cell_value[at], levels.cell_count[at], sd)
+        kept[at] = ~inner
+    cells = (x[kept] for x in (levels.cell_level, levels.cell_value, levels.cell_count))
+    return Sufficient(levels.photons, levels.exposure, *moments.T.contiguous(), *cells)
 
 
 @sufficient.check
 def _(result: Sufficient, *inputs: Levels) -> list[Check]:
     counted = len(set(result.cell_level.tolist()))
-    return [Check(f"{len(result.mean)} levels, {counted} with numbers counted: {len(result.cell_level)} in all")]
+    return [
+        Check(f"{len(result.mean)} levels, {counted} with a histogram, {len(result.cell_level)} histogram cells in all")
+    ]
 
 
 @sufficient.reference
@@ -82,7 +84,7 @@ def _(levels: Levels) -> Sufficient:
 
 
 def _inner(value: Tensor, count: Tensor, sd: float) -> tuple[Tensor, Tensor]:
-    """Mark the numbers that go into moments, and return the moments: pixels, mean, variance, degrees of freedom."""
+    """Return a mask of the numbers away from both ends, and their count, mean, variance and degrees of freedom."""
     inner = (value > value[0] + _EDGE) & (value < value[-1] - _EDGE)
     total = float(count[inner].sum())
     if sd < _COARSE or total < 2:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import inspect
 from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import ClassVar
@@ -14,18 +15,6 @@ from neusee.nodes.calibrate._prior._free_parameters import Factor, Free, Positiv
 from neusee.nodes.sensor._saturation import Efficiency
 from neusee.nodes.units import Electrons, Gain, Real
 
-CAMERA_NAMES = (
-    "gain",
-    "quantum_efficiency",
-    "dark_signal",
-    "temporal_dark_noise",
-    "dark_current",
-    "scatter",
-    "lamp",
-    "drift",
-    "bend",
-    "twist",
-)  #: the parameters of `camera` that may be free
 _LINEAR = frozenset({"dark_signal", "bend", "twist"})
 
 
@@ -43,7 +32,7 @@ def camera_prior(
     bend: tuple[Real, Positive] | None = None,
     twist: tuple[Real, Positive] | None = None,
 ) -> Prior:
-    """State the prior of each free parameter of a camera; a parameter without a prior is held.
+    """Collect the priors of the free parameters of a camera; a parameter without a prior is held at a fixed value.
 
     A prior is a median and a factor: [0.37, 2] means half to twice the median with a probability of two thirds. The
     priors of the dark signal and of the two terms of the response are a mean and a standard deviation.
@@ -59,6 +48,9 @@ def camera_prior(
     return believed(dict(zip(CAMERA_NAMES, pairs, strict=True)), _LINEAR)
 
 
+CAMERA_NAMES = tuple(inspect.signature(camera_prior.fn).parameters)  #: the parameters of `camera` that may be free
+
+
 @camera_prior.check
 def _(result: Prior, **params: object) -> list[Check]:
     free = freed(CAMERA_NAMES, result)
@@ -67,31 +59,24 @@ def _(result: Prior, **params: object) -> list[Check]:
 
 @dataclass(frozen=True)
 class CameraCoordinates(Free):
-    """One coordinate for each free parameter: the logarithm, or the value itself if 0 or negative values may occur."""
+    """Coordinates of the free parameters of a camera: logarithms, or values of parameters that may be 0 or negative."""
 
+    every: ClassVar[tuple[str, ...]] = CAMERA_NAMES
     linear: ClassVar[frozenset[str]] = _LINEAR
-
-    @classmethod
-    def of(cls, prior: Prior, nominal: Mapping[str, float]) -> CameraCoordinates:
-        """Build coordinates from ``nominal``, all of `CAMERA_NAMES` in the units of `camera`."""
-        free = freed(CAMERA_NAMES, prior)
-        return cls(free, prior, {name: float(nominal[name]) for name in CAMERA_NAMES if name not in free})
 
     @property
     def labels(self) -> tuple[str, ...]:
-        """Return the name of each coordinate."""
-        plain = {name: name.replace("_", " ") for name in self.names}
-        return tuple(plain[name] if name in self.linear else f"ln {plain[name]}" for name in self.names)
+        """Return a readable name of each coordinate."""
+        return tuple(("" if name in self.linear else "ln ") + name.replace("_", " ") for name in self.names)
 
     def place(self, parameters: Mapping[str, float | Tensor]) -> Tensor:
-        """Return the coordinates (..., free) of parameters."""
-        given = {name: torch.as_tensor(parameters[name], dtype=torch.float64) for name in self.names}
-        return torch.stack([self._walked(name, x) for name, x in given.items()], -1)
+        """Convert parameters to coordinates: (..., free)."""
+        return self.scaled({name: torch.as_tensor(parameters[name], dtype=torch.float64) for name in self.names})
 
     def parameters(self, place: Tensor) -> dict[str, Tensor]:
-        """Return the free parameters at coordinates (..., free)."""
-        return {n: x if n in self.linear else x.exp() for n, x in zip(self.names, place.unbind(-1), strict=True)}
+        """Convert coordinates (..., free) to the free parameters."""
+        return self.unscaled(place)
 
     def log_prior(self, parameters: Mapping[str, Tensor]) -> Tensor:
-        """Return the log density (...) per unit of the coordinates, up to a constant."""
+        """Return the log prior density (...) per unit of the coordinates, up to a constant."""
         return -0.5 * self.whitened(parameters).square().sum(-1)

@@ -1,4 +1,4 @@
-"""A first guess of a sensor's parameters, from the levels."""
+"""First guesses of the parameters of a sensor or camera, from measured levels."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ from typing import Any
 
 import torch
 
-from neusee.nodes.calibrate._emva_fit import least_squares
+from neusee.nodes.calibrate._emva_fit import least_squares, without_histograms
 from neusee.nodes.calibrate._likelihood._linear_sensor import ROUNDED
 from neusee.nodes.calibrate._likelihood._sufficient_statistics import Sufficient
 from neusee.nodes.values import Levels
@@ -18,36 +18,38 @@ _LEAST = 1e-3  #: least dark current or read noise, relative to the believed val
 
 
 def guess(levels: Sufficient, believed: Mapping[str, float], params: Mapping[str, Any]) -> dict[str, float]:
-    """Return the least-squares estimates, and the ``believed`` values elsewhere; ``params`` are those of `density`.
+    """Return a least-squares estimate of each parameter of a sensor, or the ``believed`` value without an estimate.
+
+    ``params`` are the fixed parameters of `density`.
 
     Shapes: levels (level,); numbers by name, with the names of ``believed``.
     Units:  those of `density`.
     Error:  a start for a search, not an estimate.
     Source: EMVA Standard 1288, release 4.0 Linear, sections 6.6 to 6.8.
     """
-    found = dict(believed)
-    lit = levels.pixels > 0
+    values = dict(believed)
     try:
-        fit = least_squares(Levels(*(x[lit] for x in levels[:6]), *(x[:0] for x in levels[6:])))
+        fit = least_squares(without_histograms(Levels(*levels), levels.pixels > 0))
     except ValueError:
-        gain = float(believed["gain"])
-        return found | {"full_well": _well(levels, found, gain, params)}
+        return values | {"full_well": _well(levels, values, params)}
     gain = float(fit.gain)
     dark = float(fit.dark_current) * params["dark_exposure"]
     first = levels.exposure[levels.photons == 0].min()
     ahead = float(first) / params["dark_exposure"] * (dark if dark > 0 else 0.0)
-    found |= {
+    values |= {
         "gain": gain,
         "quantum_efficiency": float(fit.efficiency),
         "offset": (float(fit.dark_signal) - ROUNDED[params["rounding"]][0]) / gain - ahead,
         "read_noise": max(float(fit.temporal_dark_noise), _LEAST * believed["read_noise"]),
         "dark_current": dark if dark > 0 else _LEAST * believed["dark_current"],
     }
-    return found | {"full_well": _well(levels, found, gain, params)}
+    return values | {"full_well": _well(levels, values, params)}
 
 
 def guess_camera(levels: Levels, believed: Mapping[str, float], params: Mapping[str, Any]) -> dict[str, float]:
-    """Return the first guess of a real camera; ``params`` are those of `camera`.
+    """Return a least-squares estimate of each parameter of a camera, or the ``believed`` value without an estimate.
+
+    ``params`` are the fixed parameters of `camera`.
 
     Shapes: levels (level,); numbers by name, with the names of ``believed``.
     Units:  those of `camera`.
@@ -57,20 +59,20 @@ def guess_camera(levels: Levels, believed: Mapping[str, float], params: Mapping[
     """
     fit = least_squares(levels, share=params["share"])
     gain = float(fit.gain)
-    found = {
+    values = {
         "gain": gain,
         "quantum_efficiency": float(fit.efficiency),
         "dark_signal": float(fit.dark_signal),
         "temporal_dark_noise": float(fit.temporal_dark_noise),
         "dark_current": float(fit.dark_current) * params["dark_exposure"],
     }
-    usable = {name: x for name, x in found.items() if math.isfinite(x) and (x > 0 or name == "dark_signal")}
+    usable = {name: x for name, x in values.items() if math.isfinite(x) and (x > 0 or name == "dark_signal")}
     return {**believed, **usable}
 
 
-def _well(levels: Sufficient, found: Mapping[str, float], gain: float, params: Mapping[str, Any]) -> float:
-    """Return the well at which numbers pile up, or else a well above every number."""
-    top, shift = 2 ** params["bits"] - 1, ROUNDED[params["rounding"]][0]
+def _well(levels: Sufficient, values: Mapping[str, float], params: Mapping[str, Any]) -> float:
+    """Return the full well at which numbers pile up, or, if none pile up, a full well above every number."""
+    top, shift, gain = 2 ** params["bits"] - 1, ROUNDED[params["rounding"]][0], float(values["gain"])
     seen = levels.mean[levels.pixels > 0]
     brightest = max([*seen.tolist(), *levels.cell_value.tolist()], default=0.0)
     at = levels.cell_value >= brightest - 2
@@ -78,4 +80,4 @@ def _well(levels: Sufficient, found: Mapping[str, float], gain: float, params: M
     if piled and brightest < top:
         weight = levels.cell_count[at]
         return float((levels.cell_value[at] * weight).sum() / weight.sum() - shift) / gain
-    return max(found["full_well"], _ABOVE * min(brightest + 1, torch.inf) / gain)
+    return max(values["full_well"], _ABOVE * min(brightest + 1, torch.inf) / gain)

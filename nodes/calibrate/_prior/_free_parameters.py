@@ -1,4 +1,4 @@
-"""Free parameters: the prior of each parameter, and the coordinates in which a sampler moves."""
+"""The priors of free parameters, and the common base of the coordinates in which a sampler moves."""
 
 from __future__ import annotations
 
@@ -6,7 +6,7 @@ import math
 from collections.abc import Mapping
 from dataclasses import dataclass
 from functools import cached_property
-from typing import Annotated, ClassVar, NamedTuple
+from typing import Annotated, ClassVar, NamedTuple, Self
 
 import torch
 from pydantic import Field
@@ -18,27 +18,30 @@ Pair = tuple[float, float]
 
 
 class Prior(NamedTuple):
-    """Independent normal distributions in an agreed order, with NaN for a held parameter."""
+    """Independent normal distributions, one for each parameter of a sensor; NaN stands for a held parameter."""
 
     centre: Tensor  #: (parameter,) float64, mean of the logarithm, or of a linear parameter itself
     width: Tensor  #: (parameter,) float64, standard deviation of the same quantity
 
 
-def believed(given: Mapping[str, Pair | None], linear: frozenset[str]) -> Prior:
-    """Build a prior from medians and factors, or means and standard deviations if linear; None holds a parameter."""
-    laws = [_law(name, pair, name in linear) for name, pair in given.items()]
-    if all(math.isnan(width) for _, width in laws):
-        raise ValueError(f"no parameter is free: give a prior of one of {', '.join(given)}")
-    centre, width = torch.tensor(laws, dtype=torch.float64).unbind(1)
+def believed(pairs: Mapping[str, Pair | None], linear: frozenset[str]) -> Prior:
+    """Build a prior from a pair of numbers for each free parameter, and None for each held parameter.
+
+    The pair is median and factor, or mean and standard deviation for a parameter in ``linear``.
+    """
+    normals = [_normal(name, pair, name in linear) for name, pair in pairs.items()]
+    if all(math.isnan(width) for _, width in normals):
+        raise ValueError(f"no parameter is free: give a prior of at least one of {', '.join(pairs)}")
+    centre, width = torch.tensor(normals, dtype=torch.float64).unbind(1)
     return Prior(centre, width)
 
 
 def freed(names: tuple[str, ...], prior: Prior) -> tuple[str, ...]:
-    """Return the parameters of ``names`` that are free in a prior."""
+    """Return the names of the parameters that have a prior; ``names`` are the names of all parameters."""
     return tuple(name for name, width in zip(names, prior.width.tolist(), strict=True) if not math.isnan(width))
 
 
-def _law(name: str, pair: Pair | None, linear: bool) -> Pair:
+def _normal(name: str, pair: Pair | None, linear: bool) -> Pair:
     if pair is None:
         return math.nan, math.nan
     if not pair[1] > 0 or not (linear or pair[0] > 0):
@@ -50,6 +53,7 @@ def _law(name: str, pair: Pair | None, linear: bool) -> Pair:
 class Free:
     """Free parameters and their prior; each subclass defines the coordinates."""
 
+    every: ClassVar[tuple[str, ...]]  #: the names of all parameters, free or held
     linear: ClassVar[frozenset[str]]  #: the parameters that may be 0 or negative
     edged: ClassVar[frozenset[str]] = frozenset()  #: the parameters that rounded numbers
     #: constrain by edges and not by a slope: the last row of `Likelihood.scaled` describes the free one of these
@@ -58,27 +62,35 @@ class Free:
     prior: Prior
     held: Mapping[str, float]  #: values of the held parameters
 
+    @classmethod
+    def of(cls, prior: Prior, nominal: Mapping[str, float]) -> Self:
+        """Build coordinates for the free parameters of a prior; all other parameters keep the ``nominal`` values."""
+        free = freed(cls.every, prior)
+        return cls(free, prior, {name: float(nominal[name]) for name in cls.every if name not in free})
+
     def draw(self, count: int, rng: torch.Generator) -> dict[str, Tensor]:
-        """Draw parameters from the prior: (count,)."""
+        """Draw ``count`` values of each free parameter from the prior."""
         return self.from_whitened(torch.randn(count, len(self.names), generator=rng, dtype=torch.float64))
 
     def whitened(self, parameters: Mapping[str, Tensor]) -> Tensor:
-        """Return parameters, (..., free), as distances from the prior's centre in standard deviations of the prior."""
-        value = torch.stack([self._walked(name, parameters[name]) for name in self.names], -1)
-        return (value - self._centre) / self._width
+        """Convert parameters to distances (..., free) from the prior's centre, in standard deviations of the prior."""
+        return (self.scaled(parameters) - self._normals.centre) / self._normals.width
 
     def from_whitened(self, z: Tensor) -> dict[str, Tensor]:
-        """Invert `whitened`."""
-        found = (self._centre + self._width * z).unbind(-1)
-        return {name: x if name in self.linear else x.exp() for x, name in zip(found, self.names, strict=True)}
+        """Convert distances (..., free) from the prior's centre, in standard deviations, to parameters."""
+        return self.unscaled(self._normals.centre + self._normals.width * z)
 
-    def _walked(self, name: str, value: Tensor) -> Tensor:
-        return value if name in self.linear else value.log()
+    def scaled(self, parameters: Mapping[str, Tensor]) -> Tensor:
+        """Return the logarithms of the free parameters, or the values of linear parameters: (..., free)."""
+        values = ((name, parameters[name]) for name in self.names)
+        return torch.stack([x if name in self.linear else x.log() for name, x in values], -1)
+
+    def unscaled(self, values: Tensor) -> dict[str, Tensor]:
+        """Return the free parameters from logarithms (..., free), or from values of linear parameters."""
+        pairs = zip(self.names, values.unbind(-1), strict=True)
+        return {name: x if name in self.linear else x.exp() for name, x in pairs}
 
     @cached_property
-    def _centre(self) -> Tensor:
-        return self.prior.centre[self.prior.width.isfinite()]
-
-    @cached_property
-    def _width(self) -> Tensor:
-        return self.prior.width[self.prior.width.isfinite()]
+    def _normals(self) -> Prior:
+        free = self.prior.width.isfinite()
+        return Prior(self.prior.centre[free], self.prior.width[free])

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import inspect
 import math
 from collections.abc import Mapping
 from dataclasses import dataclass
@@ -15,15 +16,6 @@ from neusee.nodes.calibrate._prior._free_parameters import Factor, Free, Positiv
 from neusee.nodes.sensor._saturation import Efficiency, Well
 from neusee.nodes.units import Electrons, Gain
 
-NAMES = (
-    "gain",
-    "offset",
-    "read_noise",
-    "dark_current",
-    "full_well",
-    "quantum_efficiency",
-    "spread",
-)  #: the parameters of `density` that may be free
 _LINEAR = "offset"  #: the only parameter that may be 0 or negative
 
 
@@ -38,7 +30,7 @@ def prior(
     quantum_efficiency: tuple[Efficiency, Factor] | None = None,
     spread: tuple[Positive, Factor] | None = None,
 ) -> Prior:
-    """State the prior of each free parameter of the sensor; a parameter without a prior is held.
+    """Collect the priors of the free parameters of a sensor; a parameter without a prior is held at a fixed value.
 
     A prior is a median and a factor: [0.37, 2] means half to twice the median with a probability of two thirds. The
     prior of the offset is a mean and a standard deviation.
@@ -49,10 +41,11 @@ def prior(
     Raises: ValueError where no parameter is free, or where a median or width is not positive.
     Source: log-normal and normal distributions.
     """
-    given = dict(
-        zip(NAMES, (gain, offset, read_noise, dark_current, full_well, quantum_efficiency, spread), strict=True)
-    )
-    return believed(given, frozenset({_LINEAR}))
+    pairs = (gain, offset, read_noise, dark_current, full_well, quantum_efficiency, spread)
+    return believed(dict(zip(NAMES, pairs, strict=True)), frozenset({_LINEAR}))
+
+
+NAMES = tuple(inspect.signature(prior.fn).parameters)  #: the parameters of `density` that may be free
 
 
 @prior.check
@@ -63,61 +56,53 @@ def _(result: Prior, **params: object) -> list[Check]:
 
 @dataclass(frozen=True)
 class Coordinates(Free):
-    """The free parameters in digital numbers, which do not depend on the gain.
+    """Coordinates of the free parameters of a sensor, in digital numbers, which frames constrain independently.
 
     Frames constrain the slope of the photon-transfer curve, the offset in DN, the dark variance, the response and the
     saturation level independently. Frames constrain gain, offset in electrons, read noise and well only jointly, with a
     correlation of 1 - 1e-3. All coordinates except the offset in DN are logarithms.
     """
 
+    every: ClassVar[tuple[str, ...]] = NAMES
     linear: ClassVar[frozenset[str]] = frozenset({_LINEAR})
     edged: ClassVar[frozenset[str]] = frozenset({"full_well"})
 
-    @classmethod
-    def of(cls, prior: Prior, nominal: Mapping[str, float]) -> Coordinates:
-        """Build coordinates from ``nominal``, all of `NAMES` in the units of `density`."""
-        free = freed(NAMES, prior)
-        held = {name: float(nominal[name]) for name in NAMES if name not in free}
-        return cls(free, prior, held)
-
     @property
     def labels(self) -> tuple[str, ...]:
-        """Return the name of each coordinate."""
+        """Return a readable name of each coordinate."""
         of = {"gain": "ln slope of the photon-transfer curve", "offset": "offset, DN", "spread": "ln spread"}
         return tuple(of.get(name, f"ln {name.replace('_', ' ')} in numbers") for name in self.names)
 
     def place(self, parameters: Mapping[str, float | Tensor]) -> Tensor:
-        """Return the coordinates (..., free) of parameters."""
+        """Convert parameters to coordinates: (..., free)."""
         full = {name: torch.as_tensor(parameters.get(name, self.held.get(name)), dtype=torch.float64) for name in NAMES}
         slope = full["gain"].log()
-        return torch.stack([self._seen(name, full, slope) for name in self.names], -1)
+        return torch.stack([self._coordinate(name, full, slope) for name in self.names], -1)
 
     def parameters(self, place: Tensor) -> dict[str, Tensor]:
-        """Return the free parameters at coordinates (..., free)."""
+        """Convert coordinates (..., free) to the free parameters."""
         at = dict(zip(self.names, place.unbind(-1), strict=True))
-        spread = at["spread"] if "spread" in at else torch.tensor(math.log(self.held["spread"]), dtype=torch.float64)
-        if "gain" in at:
-            slope = at["gain"] - 2.0 * spread
-        else:
-            slope = torch.tensor(math.log(self.held["gain"]), dtype=torch.float64)
-        found = {}
+        held = {name: math.log(self.held[name]) for name in ("gain", "spread") if name in self.held}
+        logs = {name: torch.tensor(x, dtype=torch.float64) for name, x in held.items()} | at
+        slope = logs["gain"] - 2.0 * logs["spread"] if "gain" in at else logs["gain"]
+        parameters = {}
         for name, x in at.items():
             if name == "gain":
-                found[name] = slope.exp()
+                parameters[name] = slope.exp()
             elif name == _LINEAR:
-                found[name] = x * (-slope).exp()
+                parameters[name] = x * (-slope).exp()
             else:
-                found[name] = (x if name == "spread" else x - slope).exp()
-        return found
+                parameters[name] = (x if name == "spread" else x - slope).exp()
+        return parameters
 
     def log_prior(self, parameters: Mapping[str, Tensor]) -> Tensor:
-        """Return the log density (...) per unit of the coordinates, up to a constant."""
+        """Return the log prior density (...) per unit of the coordinates, up to a constant."""
         total = -0.5 * self.whitened(parameters).square().sum(-1)
         if _LINEAR in self.names and "gain" in self.names:
             total = total - parameters["gain"].log()  # Jacobian from offset in DN to electrons
         return total
 
-    def _seen(self, name: str, full: Mapping[str, Tensor], slope: Tensor) -> Tensor:
+    def _coordinate(self, name: str, full: Mapping[str, Tensor], slope: Tensor) -> Tensor:
         if name == "gain":
             return slope + 2.0 * full["spread"].log()
         if name == _LINEAR:

@@ -1,4 +1,4 @@
-"""Preconditioned conjugate gradients for the most likely picture, in place, in little memory."""
+"""Preconditioned conjugate gradients, which find the most likely picture in place, in little memory."""
 
 from __future__ import annotations
 
@@ -15,7 +15,10 @@ _PIECE = 2**18  #: numbers of a spectrum worked on at a time, which fit in the c
 
 
 def descend(seen: Blurred, x: Tensor, steps: int, enough: float) -> Tensor:
-    """Improve `x` in place until its squared distance in posterior units is at most `enough`, or for `steps` steps."""
+    """Improve the half spectrum `x` in place by at most `steps` steps of conjugate gradients, and return `x`.
+
+    The steps end early when the squared distance from the solution, in units of the posterior, is about `enough`.
+    """
     if steps < 1:
         return x
     normal, inverse = _Normal(seen), _Inverse(seen)
@@ -36,18 +39,18 @@ def descend(seen: Blurred, x: Tensor, steps: int, enough: float) -> Tensor:
 
 
 def pieces(spectrum: Tensor) -> Iterator[slice]:
-    """Return slices of a few rows of half a spectrum."""
+    """Return slices that cut half a spectrum into blocks of a few rows, which fit in the cache."""
     return _few(spectrum.shape[-2], len(spectrum) * spectrum.shape[-1])
 
 
 def _few(count: int, numbers: int) -> Iterator[slice]:
-    """Return slices of `count` lines of `numbers` numbers each, a few lines at a time."""
+    """Return slices that cut `count` lines of `numbers` numbers each into blocks of a few lines."""
     step = max(1, _PIECE // numbers)
     return (slice(i, i + step) for i in range(0, count, step))
 
 
 def corner(spectrum: Tensor, torus: Size, pixels: Tensor) -> None:
-    """Write the first corner of the inverse of half a spectrum (fy, fx) to `pixels`, in half the time of `irfft2`."""
+    """Write the top left corner of the inverse FFT of half a spectrum (fy, fx) to `pixels`, faster than `irfft2`."""
     rows, columns = pixels.shape
     tall = spectrum.new_empty(rows, spectrum.shape[1])
     for some in _few(spectrum.shape[1], torus[0]):
@@ -57,7 +60,7 @@ def corner(spectrum: Tensor, torus: Size, pixels: Tensor) -> None:
 
 
 class _Normal:
-    """The normal matrix, from prior and noise, whose inverse is the posterior covariance."""
+    """The normal matrix of the least-squares problem, whose inverse is the posterior covariance."""
 
     def __init__(self, seen: Blurred) -> None:
         self.seen, self.weigh = seen, weighing(seen)
@@ -84,14 +87,14 @@ class _Normal:
         return self.pixels
 
     def _gather(self, pixels: Tensor, result: Tensor) -> None:
-        """Write the spectra of the pixels, without the adjoint of the blur."""
+        """Write the spectra of the pixels to `result`, without the adjoint of the blur."""
         rows, columns = pixels.shape[-2:]
         for channel, picture in enumerate(pixels):
             self.plane[:rows, :columns] = picture
             torch.fft.rfft2(self.plane, out=result[channel])
 
     def _finish(self, x: Tensor, result: Tensor, sign: float) -> None:
-        """Multiply by the adjoint of the blur, and add `sign` times the inverse prior covariance times x."""
+        """Multiply `result` by the adjoint of the blur, and add `sign` times the inverse prior covariance times x."""
         own, shared = inverse_colour(len(x), self.seen.grey)
         for rows in pieces(x):
             prior = mixed(x[:, rows], own, -shared).mul_(self.inverse[rows])
@@ -99,7 +102,7 @@ class _Normal:
 
 
 class _Inverse:
-    """The preconditioner: the inverse for a picture without edges, made exact at the lowest frequencies."""
+    """The preconditioner: the inverse normal matrix of a picture without edges, exact at the lowest frequencies."""
 
     def __init__(self, seen: Blurred) -> None:
         own, shared = inverse_colour(len(seen.picture), seen.grey)

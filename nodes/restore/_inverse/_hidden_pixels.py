@@ -1,4 +1,4 @@
-"""The most likely picture behind a blur of which only some pixels are seen.
+"""The most likely picture before a blur, given only some pixels of the blurred picture.
 
 Linear least squares with a Gaussian prior (Kaipio and Somersalo, Statistical and Computational Inverse Problems, 2005,
 ch. 3), in which pixels beyond the edge are as unknown as pixels within. Light from beyond the edge mixes with the seen
@@ -30,21 +30,21 @@ CAREFUL = 8.0  #: factor by which the tolerance falls with each coarser grid, wh
 
 
 def torus(picture: Size, edge: Size) -> Size:
-    """Return a grid with `edge` unknown pixels around the picture, which can be halved until the picture is small."""
+    """Return the size of a periodic grid for the picture and `edge` unknown pixels on each side."""
     whole = 2 ** _halvings(picture)
     y, x = (whole * _smooth(-(-(n + 2 * e) // whole)) for n, e in zip(picture, edge, strict=True))
     return y, x
 
 
 def _smooth(n: int) -> int:
-    """Return the least whole number from ``n`` on with no prime factor above 7, for which FFTs are fast."""
+    """Return the least whole number of at least ``n`` without prime factors above 7, for which FFTs are fast."""
     while 210**32 % n:
         n += 1
     return n
 
 
 def most_likely(seen: Blurred, steps: int = STEPS, enough: float = ENOUGH) -> Tensor:
-    """Return half the spectrum of the x with the greatest posterior, given the picture and the prior."""
+    """Return half the spectrum of the most likely picture before the blur, given the seen pixels and the prior."""
     if not _halvings(_size(seen)):
         return _exact(seen)
     tensors = (seen.picture, seen.weight, seen.transfer, *seen.glare)
@@ -59,7 +59,7 @@ def most_likely(seen: Blurred, steps: int = STEPS, enough: float = ENOUGH) -> Te
 
 
 class _Followed(torch.autograd.Function):
-    """The solution as a function of the residual slope, through which its gradient is computed."""
+    """A function that returns the solution and passes the gradient of the solution on to the residual slope."""
 
     @staticmethod
     def forward(ctx: Any, answer: Tensor, rest: Tensor, seen: Blurred, steps: int) -> Tensor:
@@ -69,12 +69,12 @@ class _Followed(torch.autograd.Function):
     @staticmethod
     @once_differentiable
     def backward(ctx: Any, grad: Tensor) -> tuple[None, Tensor, None, None]:
-        """Solve the same linear problem for the gradient."""
+        """Solve the same linear problem with the incoming gradient in place of the picture."""
         pull = torch.fft.rfft2(grad)
         seen = replace(ctx.seen, picture=torch.zeros_like(ctx.seen.picture), pull=pull)
         enough = 1e-10 * float(inner(pull, _spread(seen, pull), seen.torus))
-        found = _nested(seen, ctx.steps, enough)
-        return None, torch.fft.irfft2(found, s=seen.torus), None, None
+        slope = _nested(seen, ctx.steps, enough)
+        return None, torch.fft.irfft2(slope, s=seen.torus), None, None
 
 
 def _nested(seen: Blurred, steps: int, enough: float) -> Tensor:
@@ -95,7 +95,7 @@ def _halvings(picture: Size) -> int:
 
 
 def halved(seen: Blurred) -> Blurred:
-    """Return the same problem on pixels twice as wide; variance lost by the wider pixels counts as noise."""
+    """Return the same problem on pixels twice as wide; the variance that wide pixels lose counts as noise."""
     weight = _pooled(seen.weight)
     picture, *glare = (_pooled(seen.weight * p) / weight.clamp_min(1e-30) for p in (seen.picture, *seen.glare))
     size = (seen.torus[0] // 2, seen.torus[1] // 2)
@@ -124,14 +124,14 @@ def _pooled(pixels: Tensor) -> Tensor:
 
 
 def _pooling(size: int, like: Tensor) -> Tensor:
-    """Return the transfer function of the mean of each pixel and the next one, along an axis of `size` pixels."""
+    """Return the transfer function of the mean of two neighbouring pixels along an axis of `size` pixels."""
     turns = torch.arange(size, dtype=torch.float64, device=like.device) / size
     turns = torch.where(turns > 0.5, turns - 1.0, turns)
     return ((1.0 + torch.exp(2j * math.pi * turns)) / 2.0).to(like)
 
 
 def _exact(seen: Blurred) -> Tensor:
-    """Solve for the weights of all seen pixels at once by Cholesky decomposition, in float64."""
+    """Return the exact solution for a small picture by Cholesky decomposition in float64."""
     channels = len(seen.picture)
     fine = replace(seen, transfer=seen.transfer.to(torch.complex128), power=seen.power.double())
     weight = seen.weight.double().flatten()
@@ -145,13 +145,13 @@ def _exact(seen: Blurred) -> Tensor:
         matrix = matrix + 1e8 * torch.outer(shape, shape) / shape.square().sum().clamp_min(1e-30)
     matrix.diagonal().add_(1.0)
     before = torch.zeros_like(fine.transfer) if seen.pull is None else _spread(fine, seen.pull.to(torch.complex128))
-    wanted = (root * (seen.picture.double() - fine.blur(before)).flatten())[:, None]
-    answer = root * torch.cholesky_solve(wanted, torch.linalg.cholesky(matrix))[:, 0]
+    residual = (root * (seen.picture.double() - fine.blur(before)).flatten())[:, None]
+    answer = root * torch.cholesky_solve(residual, torch.linalg.cholesky(matrix))[:, 0]
     return (before + _spread(fine, fine.gathered(answer.reshape(seen.picture.shape)))).to(seen.transfer)
 
 
 def _covariance(seen: Blurred, passed: Tensor) -> Tensor:
-    """Return the covariance of every two pixels of the picture, for the product of two transfer functions."""
+    """Return the prior covariance of all pairs of pixels, given the product of two transfer functions."""
     lags = torch.fft.irfft2(passed * seen.power, s=seen.torus)
     y, x = (torch.arange(n, device=lags.device) for n in seen.picture.shape[-2:])
     down, right = (y[:, None] - y) % seen.torus[0], (x[:, None] - x) % seen.torus[1]
@@ -160,5 +160,5 @@ def _covariance(seen: Blurred, passed: Tensor) -> Tensor:
 
 
 def _spread(seen: Blurred, spectrum: Tensor) -> Tensor:
-    """Return the prior covariance times half a spectrum."""
+    """Return the product of the prior covariance and half a spectrum."""
     return seen.power * mixed(spectrum, 1.0 - seen.grey, seen.grey)

@@ -1,4 +1,4 @@
-"""The exact solution among the lowest frequencies of a picture, by a dense matrix.
+"""The exact inverse of the normal matrix at the lowest frequencies of a picture, as a dense matrix.
 
 Seen pixels constrain unseen pixels (beyond the edge and in holes) through the lowest frequencies, where the signal is
 up to 1e8 times the noise. There the inverse for a picture without edges is wrong by that factor; this inverse is right.
@@ -21,7 +21,7 @@ SHARE = 24  #: grid points for each unknown, at least, on a small torus
 
 
 class Lowest:
-    """The inverse of a blur's normal matrix among its lowest frequencies, including the mean."""
+    """The inverse of the normal matrix of a blurred picture at the lowest frequencies, including the mean."""
 
     def __init__(self, seen: Blurred, gain: Tensor) -> None:
         """Build the inverse; `gain` (channel, fy, fx), the diagonal of an approximate inverse, scales the matrix."""
@@ -38,13 +38,13 @@ class Lowest:
         self.whiten = [whiten[end - _ROWS : end, :end].to(gain, copy=True) for end in ends]
 
     def add(self, slope: Tensor, onto: Tensor) -> Tensor:
-        """Add the inverse times `slope` to a spectrum, and return the inner product of both, as pixels."""
+        """Add a step, the inverse times `slope`, to `onto`, and return the inner product of the step and `slope`."""
         risen = _real(slope[:, self.fy, self.fx])
         both, rise = torch.zeros_like(risen), torch.zeros((), dtype=torch.float64, device=slope.device)
         for some in self.whiten:  # both products while the rows are in the cache
-            told = some @ risen[: some.shape[1]]
-            both[: some.shape[1]] += told @ some
-            rise += told.square().sum(dtype=torch.float64)
+            white = some @ risen[: some.shape[1]]
+            both[: some.shape[1]] += white @ some
+            rise += white.square().sum(dtype=torch.float64)
         both = both.reshape(len(slope), -1)
         real, imag = both[:, : len(self.fy)], pad(both[:, len(self.fy) :], (1, 0))
         step = torch.complex(real, imag)
@@ -55,7 +55,7 @@ class Lowest:
         return rise * (2.0 / (self.torus[0] * self.torus[1]))
 
     def _matrix(self, seen: Blurred) -> Tensor:
-        """Return the float64 normal matrix of prior, noise and glare, for real then imaginary parts of each channel."""
+        """Return the float64 normal matrix of prior, noise and glare, for real and imaginary parts of each channel."""
         transfer = seen.transfer[:, self.fy, self.fx].to(torch.complex128)
         inverse = 1.0 / seen.power[self.fy, self.fx].double().clamp_min(1e-30)
         inverse = torch.cat([2.0 * inverse[:1], inverse[1:], inverse[1:]])
@@ -70,7 +70,7 @@ class Lowest:
         return self._without_glare(matrix.view(size, size), seen, transfer)
 
     def _noise(self, weight: Tensor, through: Tensor) -> Tensor:
-        """Return one channel's information on its frequencies, for all pairs of frequencies and of mirror images."""
+        """Return the normal matrix of the noise of one channel, for all pairs of frequencies and mirror images."""
         plus, minus = (self._at(weight, s) * through.conj()[:, None] for s in (-1, 1))
         plus, minus = plus * through, minus * through.conj()
         top = torch.cat([plus.real + minus.real, (minus.imag - plus.imag)[:, 1:]], 1)
@@ -79,7 +79,7 @@ class Lowest:
         return both
 
     def _at(self, spectrum: Tensor, sign: int) -> Tensor:
-        """Return half a spectrum at the sum (`sign` 1) or the difference (-1) of every two frequencies."""
+        """Return the spectrum at the sums (`sign` 1) or differences (`sign` -1) of all pairs of lowest frequencies."""
         y, x = self.torus
         fy, fx = self.fy[:, None] + sign * self.fy, (self.fx[:, None] + sign * self.fx) % x
         far = fx > x // 2
@@ -87,7 +87,7 @@ class Lowest:
         return torch.where(far, values.conj(), values)
 
     def _without_glare(self, matrix: Tensor, seen: Blurred, transfer: Tensor) -> Tensor:
-        """Subtract, in place, the information that the unknown strength of each glare removes."""
+        """Subtract the information that the unknown strength of each glare removes, and return the same matrix."""
         if not seen.glare:
             return matrix
         flat = torch.stack(seen.glare).double().flatten(1)
@@ -95,8 +95,8 @@ class Lowest:
         inverse = torch.linalg.pinv(weighted @ flat.T, hermitian=True) * (2.0 / (self.torus[0] * self.torus[1]))
         shapes = weighted.reshape(-1, *seen.picture.shape)
         spectra = (torch.fft.rfft2(shape, s=seen.torus)[:, self.fy, self.fx] for shape in shapes)
-        told = torch.stack([_real(transfer.conj() * s) for s in spectra])
-        return matrix.addmm_(told.T, inverse @ told, alpha=-1.0)
+        rows = torch.stack([_real(transfer.conj() * s) for s in spectra])
+        return matrix.addmm_(rows.T, inverse @ rows, alpha=-1.0)
 
 
 def _inverse(lower: Tensor) -> Tensor:
@@ -118,12 +118,12 @@ def _invert(lower: Tensor, inverse: Tensor) -> None:
 
 
 def _real(spectrum: Tensor) -> Tensor:
-    """Return real and then imaginary parts, channel by channel; the first frequency has no imaginary part."""
+    """Return the real and then the imaginary parts of each channel; the first frequency has no imaginary part."""
     return torch.cat([spectrum.real, spectrum.imag[:, 1:]], 1).flatten()
 
 
 def _lowest(size: Size, count: int) -> tuple[Tensor, Tensor]:
-    """Return the lowest frequencies (fy, fx), the mean first, with one frequency of each mirror pair."""
+    """Return the `count` lowest frequencies (fy, fx), the mean first, with one frequency of each mirror pair."""
     reach = (size[0] - 1) // 2
     fy = torch.arange(-reach, reach + 1)[:, None]
     fx = torch.arange((size[1] - 1) // 2 + 1)

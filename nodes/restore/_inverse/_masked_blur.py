@@ -1,4 +1,4 @@
-"""A blurred picture of which only some pixels are seen, the prior of the picture before the blur, and their algebra.
+"""The model of a blurred picture of which only some pixels are seen, and the prior of the picture before the blur.
 
 All spectra are half spectra of a torus: (channel, fy, fx) with fx >= 0, as `torch.fft.rfft2` returns them.
 """
@@ -29,13 +29,13 @@ class Blurred:
     pull: Tensor | None = None  #: (channel, fy, fx), a further term of the log posterior's gradient
 
     def blur(self, spectrum: Tensor) -> Tensor:
-        """Return the pixels of the picture from half the spectrum of x."""
+        """Return the blurred picture, given half the spectrum of x."""
         y, x = self.picture.shape[-2:]
         pairs = zip(self.transfer, spectrum.expand_as(self.transfer), strict=True)  # one batch takes twice as long
         return torch.stack([torch.fft.irfft2(t * s, s=self.torus)[:y, :x] for t, s in pairs])
 
     def gathered(self, pixels: Tensor) -> Tensor:
-        """Return the adjoint of `blur` applied to pixels."""
+        """Return half the spectrum that the adjoint of `blur` computes from pixels."""
         spectrum: Tensor = self.transfer.conj() * torch.fft.rfft2(pixels, s=self.torus)
         return spectrum
 
@@ -48,7 +48,7 @@ class Blurred:
 
 
 def weighing(seen: Blurred) -> Map:
-    """Return a function that weighs residuals and projects out any amount of each glare."""
+    """Return a function that multiplies residuals by the weights and removes any amount of each glare."""
     if not seen.glare:
         return lambda residual: seen.weight * residual
     flat = torch.stack(seen.glare).flatten(1)
@@ -75,12 +75,12 @@ def inverse_colour(channels: int, grey: float) -> tuple[float, float]:
 
 
 def variance(power: Tensor, size: Size) -> Tensor:
-    """Return the mean over a whole spectrum, given half of it along the last dimension."""
+    """Return the variance of pictures, the mean of the whole power spectrum, given half the power spectrum."""
     return (power.sum(-2) * times(size, power)).sum(-1) / (size[0] * size[1])
 
 
 def times(size: Size, like: Tensor) -> Tensor:
-    """Return how often each column of half a spectrum occurs in the whole spectrum."""
+    """Return the number of times that each column of half a spectrum occurs in the whole spectrum."""
     count = torch.full((size[1] // 2 + 1,), 2.0, dtype=like.real.dtype, device=like.device)
     count[0] = 1.0
     if size[1] % 2 == 0:
@@ -89,7 +89,7 @@ def times(size: Size, like: Tensor) -> Tensor:
 
 
 def narrowed(spectrum: Tensor, size: Size) -> Tensor:
-    """Return half a spectrum of a grid twice as fine, cut to `size`, with 0 at an even size's highest frequency."""
+    """Return half a spectrum cut to the frequencies of a coarser grid `size`; the highest of an even size is 0."""
     up, down, right = (size[0] + 1) // 2, (size[0] - 1) // 2, (size[1] + 1) // 2
     cut = spectrum.new_zeros(*spectrum.shape[:-2], size[0], size[1] // 2 + 1)
     cut[..., :up, :right] = spectrum[..., :up, :right]
@@ -98,7 +98,7 @@ def narrowed(spectrum: Tensor, size: Size) -> Tensor:
 
 
 def widened(spectrum: Tensor, size: Size, wide: Size) -> Tensor:
-    """Return half a spectrum on a grid twice as fine."""
+    """Return half a spectrum of a grid `size`, extended by zeros to a grid `wide` that is twice as fine."""
     up, down, right = (size[0] + 1) // 2, (size[0] - 1) // 2, (size[1] + 1) // 2
     whole = spectrum.new_zeros(*spectrum.shape[:-2], wide[0], wide[1] // 2 + 1)
     whole[..., :up, :right] = 4.0 * spectrum[..., :up, :right]

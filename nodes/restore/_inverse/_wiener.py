@@ -1,7 +1,6 @@
-"""Wiener deconvolution with the known PSF: the baseline without training."""
+"""Wiener deconvolution with a known PSF, a baseline that needs no training."""
 
 import math
-from itertools import product
 from typing import Annotated, Any
 
 import torch
@@ -37,16 +36,16 @@ def wiener(
     balance: Annotated[float, Field(gt=0, allow_inf_nan=False)] = 1.0,
     read_noise: Electrons,
 ) -> Tensor:
-    """Deconvolve the picture as far as the noise allows: compute the most likely picture, given the seen pixels.
+    """Deconvolve a picture with a known PSF: compute the most likely scene, given the pixels that are not clipped.
 
     Least squares with a Gaussian prior, which for a picture without edges is the Wiener filter. Each channel has the
     PSF that it sees of a grey scene: the mean over bands, weighted by illuminant x response x wavelength. The power
     spectrum of the prior falls as 1 / frequency^3, like that of edges, with the variance of this picture; channels have
     a correlation of 0.95. Clipped pixels and pixels beyond the edge are unknown. The patterns of `glare`, wide as the
-    scene, are removed with unknown strength: direction and wavelength of those lasers are then assumed to be known.
+    scene, are removed with unknown strength: direction and wavelength of the lasers are then assumed to be known.
 
     Shapes: electrons and clipped (channel, y, x), psf.intensity (band, any, any), responses (channel, band),
-            each glare (channel, at least y, at least x), of which the centre counts -> (channel, y, x).
+            each glare (channel, at least y, at least x), cropped to the centre -> (channel, y, x).
     Units:  e-; glare any; the result as behind a perfect lens without losses. `balance` multiplies the noise variance.
     Error:  a grey scene is assumed, and noise in the dark no smaller than that of the mean picture. Without `glare` a
             laser that does not clip is taken for scene. The result may be negative: beside lamps hundreds of
@@ -77,11 +76,15 @@ def wiener(
 def _(result: Tensor, electrons: Tensor, *inputs: Any, **params: float) -> list[Check]:
     share = float(inputs[4].any(-3).double().mean())
     finite = math.isfinite(float(result.sum()))
-    return [Check(f"{share:.2%} not seen, mean {float(result.mean() / electrons.mean()):.2f} of the raw", finite)]
+    return [
+        Check(
+            f"{share:.2%} of pixels clipped, mean {float(result.mean() / electrons.mean()):.2f} of the raw mean", finite
+        )
+    ]
 
 
 def effective_psf(psf: Psf, illuminant: Tensor, responses: Tensor, bands: Bands) -> Tensor:
-    """Return the PSF that each channel sees of a grey scene: (channel, y, x)."""
+    """Return the PSF of each channel for a grey scene: (channel, y, x)."""
     lengths = {len(psf.intensity), len(illuminant), responses.shape[-1], len(bands.centres)}
     if len(lengths) > 1:
         raise ValueError(f"PSF, illuminant, responses and bands have {sorted(lengths)} bands: use one `bands` step")
@@ -120,7 +123,7 @@ def _restored(
 
 
 def _passed(transfer: Tensor, power: Tensor, size: tuple[int, int]) -> Tensor:
-    """Return the variance of a blurred picture: (channel, 1, 1); its large spectrum is read a few rows at a time."""
+    """Return the variance of a blurred picture: (channel, 1, 1), summed over a few rows of the spectrum at a time."""
     total = power.new_zeros(len(transfer))
     for rows in pieces(transfer):
         through = transfer[:, rows]
@@ -129,7 +132,7 @@ def _passed(transfer: Tensor, power: Tensor, size: tuple[int, int]) -> Tensor:
 
 
 def _noise(electrons: Tensor, mean: Tensor, read: float) -> Tensor:
-    """Return the variance of the noise: that of the mean picture, or of the local mean where that is brighter."""
+    """Return the noise variance of each pixel, from the larger of the local mean and the mean of the picture."""
     around = electrons[None]
     for window, rim in (((9, 1), (4, 0)), ((1, 9), (0, 4))):
         around = avg_pool2d(around, window, stride=1, padding=rim, count_include_pad=False)
@@ -149,7 +152,7 @@ def _visible(patterns: list[Tensor], known: Tensor) -> list[Tensor]:
 
 
 def _strengths(electrons: Tensor, known: Tensor, glare: list[Tensor]) -> Tensor:
-    """Return a first estimate of the glare, by least squares beside a constant."""
+    """Return a first estimate of the glare, a least-squares fit of the glare patterns and a constant."""
     if not glare:
         return torch.zeros_like(electrons)
     means = [_mean(pattern, known) for pattern in glare]
@@ -161,14 +164,12 @@ def _strengths(electrons: Tensor, known: Tensor, glare: list[Tensor]) -> Tensor:
             every = torch.stack([*flat, electrons[at].flatten()]).double()
             products += every[:-1] @ every.T
     fit = (torch.linalg.pinv(products[:, :-1], hermitian=True) @ products[:, -1]).to(electrons)
-    total = torch.zeros_like(electrons)
-    for strength, pattern in zip(fit, glare, strict=True):
-        total = total + strength * pattern
-    return total
+    parts = (strength * pattern for strength, pattern in zip(fit, glare, strict=True))
+    return sum(parts, torch.zeros_like(electrons))
 
 
 def fall(size: tuple[int, int]) -> Tensor:
-    """Return the power of pictures by frequency, half a spectrum of mean 1."""
+    """Return the power spectrum that the prior assumes, as half a spectrum of mean 1."""
     fy, fx = (torch.fft.fftfreq(n, dtype=torch.float64) for n in size)
     squared = fy[:, None].square() + fx[None, : size[1] // 2 + 1].square() + 1.0 / (size[0] * size[1])
     power: Tensor = squared.pow_(-_FALL / 2.0)
@@ -177,29 +178,21 @@ def fall(size: tuple[int, int]) -> Tensor:
 
 
 def edge(kernels: Tensor, picture: tuple[int, int]) -> tuple[int, int]:
-    """Return the reach (y, x) of almost all light of the PSF, at most the larger of 256 pixels and half the picture."""
-    found = []
+    """Return the radii (y, x) that hold 99.9 % of the PSF, at most the larger of 256 pixels and half the picture."""
+    reach = []
     for dim, size in ((-1, picture[0]), (-2, picture[1])):
         profile = kernels.detach().sum((0, dim)).double()
         radius = (torch.arange(len(profile), device=profile.device) - len(profile) // 2).abs()
         inside = profile.new_zeros(int(radius.max()) + 1).index_add(0, radius, profile).cumsum(0)
-        found.append(min(int((inside < _LIGHT * inside[-1]).sum()), max(256, size // 2), size))
-    return found[0], found[1]
+        reach.append(min(int((inside < _LIGHT * inside[-1]).sum()), max(256, size // 2), size))
+    return reach[0], reach[1]
 
 
 def wrapped(kernels: Tensor, size: tuple[int, int]) -> Tensor:
-    """Return the kernels around the first sample of a torus; a kernel wider than the torus wraps around."""
+    """Return the kernels centred on the first sample of a periodic grid; a kernel wider than the grid wraps around."""
     (m, n), (y, x) = kernels.shape[-2:], size
     rows, columns = -(-m // y), -(-n // x)
+    around = pad(kernels, (0, columns * x - n, 0, rows * y - m))
     if rows * columns > 1:
-        wide = pad(kernels, (0, columns * x - n, 0, rows * y - m))
-        folded = wide.reshape(-1, rows, y, columns, x).sum((1, 3))
-        return folded.roll((-(m // 2), -(n // 2)), (-2, -1))
-    around = kernels.new_zeros(len(kernels), y, x)
-    halves = [
-        ((slice(k // 2, k), slice(0, k - k // 2)), (slice(0, k // 2), slice(size[d] - k // 2, size[d])))
-        for d, k in enumerate((m, n))
-    ]
-    for (from_y, to_y), (from_x, to_x) in product(*halves):
-        around[:, to_y, to_x] = kernels[:, from_y, from_x]
-    return around
+        around = around.reshape(-1, rows, y, columns, x).sum((1, 3))
+    return around.roll((-(m // 2), -(n // 2)), (-2, -1))

@@ -1,4 +1,4 @@
-"""Critics, which score how far a restored picture is from true pictures and are trained beside the restoring network.
+"""Critic networks, which are trained to score the distance of a restored picture from true pictures.
 
 Critics are plain convolutions that are run uncompiled: their gradients are differentiated again, and a compiled or
 hand-written derivative may return a wrong second derivative without an error.
@@ -17,7 +17,10 @@ SMALLEST = 16  #: pixels a side, from which four halvings leave one
 
 
 class Critic(nn.Module):
-    """A network of four halvings and a mean: (n, 3, y, x) -> (n,). It has no norm, so each picture is scored alone."""
+    """A network that halves pictures four times and averages the scores of all positions: (n, 3, y, x) -> (n,).
+
+    The network has no norm, so each picture is scored alone.
+    """
 
     gain = LEAKY
 
@@ -29,30 +32,33 @@ class Critic(nn.Module):
 
     def forward(self, picture: Tensor) -> Tensor:
         if min(picture.shape[-2:]) < SMALLEST:
-            raise ValueError(f"a picture {tuple(picture.shape)} is too small to judge: give {SMALLEST} pixels a side")
+            raise ValueError(
+                f"a picture {tuple(picture.shape)} is too small for the critic: give {SMALLEST} pixels a side"
+            )
         scores: Tensor = self.layers(picture)
         return scores.mean((1, 2, 3))
 
 
 def critics(rng: torch.Generator, width: int = 64) -> tuple[Critic, Critic]:
-    """Draw critic D0 of the coarse estimate and D1 of the fine one: power-keeping orthogonal weights, zero biases."""
+    """Return two critics with random orthogonal weights: D0 for the coarse and D1 for the fine estimate."""
     first, second = (start_network(partial(Critic, width), rng) for _ in range(2))
     return first, second
 
 
 def skip_critic_draws(rng: torch.Generator, count: int = 1) -> None:
-    """Draw the random numbers of `critic_slopes` for ``count`` pictures whose slopes another process computes."""
+    """Advance ``rng`` as `critic_slopes` does for ``count`` pictures, whose slopes another process computes."""
     torch.rand(count, 1, 1, 1, generator=rng, device=rng.device)
 
 
 def critic_slopes(critic: nn.Module, truth: Tensor, estimate: Tensor, rng: torch.Generator) -> Tensor:
-    """Return the critic's gradient at a random point between each true picture and its estimate, at least in float32.
+    """Return the gradient of the critic at a random point between each true picture and the estimate of the picture.
 
-    The result can be differentiated again, as `losses.gradient_penalty` does. The pictures receive no gradient.
+    The gradient is at least float32 and can be differentiated again, as `losses.gradient_penalty` does. The pictures
+    receive no gradient.
     """
     truth, estimate = single(truth.detach()), single(estimate.detach())
     share = torch.rand(len(truth), 1, 1, 1, generator=rng, device=rng.device).to(truth)
     between = torch.lerp(estimate, truth, share).requires_grad_()
     with torch.enable_grad(), torch.autocast(truth.device.type, enabled=False):
-        (found,) = torch.autograd.grad(critic(between).sum(), between, create_graph=True)
-    return found
+        (slopes,) = torch.autograd.grad(critic(between).sum(), between, create_graph=True)
+    return slopes

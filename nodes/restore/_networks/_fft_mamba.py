@@ -1,8 +1,6 @@
 """The restoring network of the paper, which scans a picture and its spectrum, first coarse and then fine."""
 
 from functools import partial
-from pathlib import Path
-from typing import Any
 
 import torch
 from torch import Tensor, nn
@@ -17,11 +15,12 @@ from neusee.nodes.units import Count, DataFile
 
 
 class FFTMamba(Restorer):
-    """A network of blocks that alternate between rows and columns, run twice with the same weights: coarse, then fine.
+    """The FFT-Mamba network, whose blocks scan rows and columns in turn, run twice with the same weights.
 
-    The fine pass also takes the coarse estimate. With ``directions`` 4 every block scans rows and columns. With
-    ``pyramid`` the network runs once, and the coarse estimate is the reduced fine estimate. Eight blocks, two scales
-    and the modules are those of the paper. The sizes and connections of the modules are our choice.
+    The first pass computes a coarse estimate, from which the second pass computes a fine estimate. With ``directions``
+    4 every block scans rows and columns. With ``pyramid`` the network runs once, and the coarse estimate is the reduced
+    fine estimate. Eight blocks, two scales and the modules are those of the paper. The sizes and connections of the
+    modules are our choice.
     """
 
     def __init__(
@@ -56,7 +55,7 @@ class FFTMamba(Restorer):
         return coarse, self.improved(picture, resize(coarse, y, x))
 
     def improved(self, picture: Tensor, guess: Tensor) -> Tensor:
-        """Return the picture plus the part that one pass predicts to be missing, given a first estimate."""
+        """Return the picture plus the correction that one pass predicts from the picture and a first estimate."""
         first = self.enter(F.pixel_unshuffle(torch.cat([picture, guess], 1), self.shuffle))
         missing = self.last(first + self.leave(self.blocks(first)))
         return picture + F.pixel_shuffle(missing, self.shuffle)
@@ -104,13 +103,5 @@ def fft_mamba(
     return restored(picture, kind, weights, tile, reduce, detail)
 
 
-@fft_mamba.preflight
-def _(
-    *, weights: Path | None = None, tile: int | None = None, reduce: int = 1, detail: bool = False, **sizes: Any
-) -> list[str]:
-    return fitting(partial(FFTMamba, **sizes), weights, sizes["width"])
-
-
-@fft_mamba.check
-def _(result: Tensor, picture: Tensor, **params: Any) -> list[Any]:
-    return restorer_checks(result, picture)
+fft_mamba.preflight(partial(fitting, FFTMamba))
+fft_mamba.check(restorer_checks)

@@ -1,5 +1,6 @@
-"""Blocks of the FFT-Mamba network: scans over the picture and over its spectrum, and a gate between both."""
+"""Blocks of the FFT-Mamba network, which scan a picture and the spectrum of the picture and mix both results."""
 
+import functools
 from typing import Any, Literal
 
 import torch
@@ -7,7 +8,6 @@ from torch import Tensor, nn
 from torch.nn import functional as F
 
 from neusee.nodes._half_precision import single
-from neusee.nodes.restore._networks._radial_order import radial_order
 from neusee.nodes.restore._networks._restorer import ChannelNorm, Scale, gated
 from neusee.nodes.restore._networks._scan_layer import BothWays, Kind
 
@@ -17,7 +17,7 @@ SMALL = 1e-4  #: added to the square of an amplitude, so that gradients stay fin
 
 
 class Spatial(nn.Module):
-    """A scan of the picture along its rows, its columns, or both (four ``directions``), followed by a gate."""
+    """A layer that scans a picture along rows, columns, or both (four ``directions``), and gates the result."""
 
     def __init__(
         self, width: int, states: int, by_columns: bool, kind: Kind = "s6", directions: Directions = 2
@@ -43,14 +43,14 @@ class Spatial(nn.Module):
 
 
 def _along(scan: nn.Module, value: Tensor, by_columns: bool) -> Tensor:
-    """Scan (n, channel, y, x) along its rows or its columns."""
+    """Scan a picture (n, channel, y, x) along its rows, or along its columns if ``by_columns``."""
     value = value.mT if by_columns else value
     scanned: Tensor = scan(value.flatten(2).transpose(1, 2)).transpose(1, 2).unflatten(2, value.shape[-2:])
     return scanned.mT if by_columns else scanned
 
 
 class _Phase(torch.autograd.Function):
-    """The angle of real + i imaginary, with a finite gradient: |z|**2 + `SMALL` replaces |z|**2."""
+    """The angle of a complex number z, with a finite gradient: |z|**2 + `SMALL` replaces |z|**2."""
 
     @staticmethod
     def forward(ctx: Any, real: Tensor, imaginary: Tensor) -> Tensor:
@@ -64,8 +64,25 @@ class _Phase(torch.autograd.Function):
         return -slope * imaginary, slope * real
 
 
+@functools.lru_cache(maxsize=32)
+def radial_order(size: tuple[int, int], device: torch.device) -> tuple[Tensor, Tensor]:
+    """Return the positions in the half spectrum of a (y, x) picture by rising radius, and the rank of each position.
+
+    Radii are in cycles per pixel. Equal radii are ordered by angle, from -90 to 90 degrees.
+    """
+    y, x = size
+    with torch.inference_mode(False):  # the cache may serve a caller that trains
+        rows = torch.fft.fftfreq(y, 1 / y, dtype=torch.float64).round().long()[:, None] * x
+        columns = torch.arange(x // 2 + 1)[None] * y
+        radius = (rows * rows + columns * columns).flatten()  # whole numbers, so that equal radii compare equal
+        angle = torch.atan2(rows.double(), columns.double()).flatten()
+        order = angle.argsort(stable=True)
+        order = order[radius[order].argsort(stable=True)]
+        return order.to(device), order.argsort().to(device)
+
+
 class Frequency(nn.Module):
-    """A gate for the spectrum, computed by a scan from low to high frequencies and back.
+    """A layer that multiplies the spectrum by a gate, which a scan from low to high frequencies and back computes.
 
     The gate uses real and imaginary parts, because phase has no gradient at 0. Amplitude and phase, ``amp_phase``, are
     for comparison. At the start of training the gate is close to 1 and the picture passes almost unchanged.
@@ -107,7 +124,7 @@ class Frequency(nn.Module):
         return (real.square() + imaginary.square() + SMALL).sqrt(), phase
 
     def _factor(self, first: Tensor, second: Tensor) -> Tensor:
-        """Return the factor of the spectrum: 1 plus a complex number, or a change of amplitude and of phase."""
+        """Return the factor that multiplies the spectrum: near 1, from a complex number or from amplitude and phase."""
         if self.form == "complex":
             return 1 + self.strength * torch.complex(first, second)
         amplitude, turn = 1 + self.strength * first, self.strength * second
@@ -115,7 +132,7 @@ class Frequency(nn.Module):
 
 
 class Block(nn.Module):
-    """A block that weighs both scans against each other at every pixel, followed by a gated feed-forward layer."""
+    """A block that mixes the scans of picture and spectrum at every pixel, followed by a gated feed-forward layer."""
 
     def __init__(
         self,

@@ -1,9 +1,7 @@
-"""NAFNet, small: a restoring network without activation functions."""
+"""A small NAFNet, a restoring network without activation functions."""
 
 from collections.abc import Sequence
 from functools import partial
-from pathlib import Path
-from typing import Any
 
 from torch import Tensor, nn
 
@@ -13,7 +11,7 @@ from neusee.nodes.units import Count, DataFile
 
 
 class NAFBlock(nn.Module):
-    """A block that multiplies pairs of channels instead of an activation, and scales channels by mean-based factors."""
+    """A block that multiplies pairs of channels, instead of an activation, and scales channels by their means."""
 
     def __init__(self, width: int) -> None:
         super().__init__()
@@ -34,7 +32,7 @@ class NAFBlock(nn.Module):
 
 
 class NAFNet(Flat):
-    """Levels of blocks, each of half the size and twice the width, and back, with skip connections that are added."""
+    """A network whose levels halve the size and double the width, and then reverse both, with skip connections."""
 
     def __init__(self, width: int = 16, levels: Sequence[int] = (1, 1, 2, 4), middle: int = 2) -> None:
         super().__init__()
@@ -95,11 +93,5 @@ def nafnet(
     return restored(picture, partial(NAFNet, width), weights, tile, reduce, detail)
 
 
-@nafnet.preflight
-def _(*, weights: Path | None = None, width: int = 16, **how: Any) -> list[str]:
-    return fitting(partial(NAFNet, width), weights, width)
-
-
-@nafnet.check
-def _(result: Tensor, picture: Tensor, **params: Any) -> list[Any]:
-    return restorer_checks(result, picture)
+nafnet.preflight(partial(fitting, NAFNet))
+nafnet.check(restorer_checks)

@@ -1,8 +1,9 @@
-"""The common base of all restoring networks: two scales, any picture size, initial weights and application."""
+"""The common base of all restoring networks, with their initial weights and their application to a picture."""
 
 import math
 from abc import ABC, abstractmethod
 from collections.abc import Callable
+from functools import partial
 from pathlib import Path
 from typing import Annotated, Any, TypeVar
 
@@ -27,17 +28,17 @@ LAYERS = (nn.Conv2d, nn.ConvTranspose2d, nn.Linear)
 
 
 class Restorer(nn.Module, ABC):
-    """A network from a picture to the restored picture, (n, 3, y, x) of any size, at two scales."""
+    """A network that restores pictures (n, 3, y, x) of any size at two scales, a coarse and a fine scale."""
 
     multiple: int  #: divisor of the height and width inside the network
     last: nn.Conv2d  #: layer that computes the change that is added to the picture
 
     @abstractmethod
     def scales(self, picture: Tensor) -> tuple[Tensor, Tensor]:
-        """Restore a picture of a size that fits: return the coarse estimate (half the size) and the fine one."""
+        """Return the coarse (half the size) and fine estimate of a picture whose sides are multiples of `multiple`."""
 
     def pyramid(self, picture: Tensor) -> tuple[Tensor, Tensor]:
-        """Return the estimates at L = 0, half the size rounded up, and at L = 1, the full size."""
+        """Return the coarse estimate at half the size, rounded up, and the fine estimate at the full size."""
         y, x = picture.shape[-2:]
         coarse, fine = self.scales(mirrored(picture, -y % self.multiple, -x % self.multiple))
         return coarse[..., : -(-y // 2), : -(-x // 2)], fine[..., :y, :x]
@@ -47,11 +48,11 @@ class Restorer(nn.Module, ABC):
 
 
 class Flat(Restorer):
-    """A network of one scale that computes a change of the picture; its coarse estimate is the reduced fine one."""
+    """A network of one scale that changes a picture; the coarse estimate is the reduced fine estimate."""
 
     @abstractmethod
     def change(self, picture: Tensor) -> Tensor:
-        """Return the restored picture minus this picture, whose size fits."""
+        """Return the restored picture minus ``picture``, whose sides are multiples of `multiple`."""
 
     def scales(self, picture: Tensor) -> tuple[Tensor, Tensor]:
         fine = picture + self.change(picture)
@@ -59,7 +60,7 @@ class Flat(Restorer):
 
 
 class ChannelNorm(nn.LayerNorm):
-    """A layer norm over the channels of (n, channel, y, x), never in half precision."""
+    """A layer norm over the channels of a picture (n, channel, y, x), never in half precision."""
 
     def forward(self, input: Tensor) -> Tensor:
         return super().forward(single(input).movedim(1, -1)).movedim(-1, 1)
@@ -80,10 +81,11 @@ class Scale(nn.Module):
 
 
 def start_network(make: Callable[[], Net], rng: torch.Generator) -> Net:
-    """Draw a network: orthogonal weights and zero biases for layers; norms, decays and factors by their own rules.
+    """Return a network with initial values: random orthogonal weights and zero biases of linear and convolution layers.
 
-    The weights of a network with leaky layers are multiplied by its `gain`, which keeps the power from layer to layer.
-    The change to a picture is multiplied by a tenth, so that the network at first returns almost the same picture.
+    Norms, decays and factors have rules of their own. The weights of a network with leaky layers are multiplied by its
+    `gain`, which keeps the power from layer to layer. The change to a picture is multiplied by a tenth, so that the
+    network at first returns almost the same picture.
     """
     net = empty(make).to_empty(device=rng.device)
     gain = getattr(net, "gain", 1.0)
@@ -103,7 +105,7 @@ def start_network(make: Callable[[], Net], rng: torch.Generator) -> Net:
 
 
 def parameter_groups(net: nn.Module, weights: float = 2e-4, biases: float = 4e-4) -> list[dict[str, Any]]:
-    """Return two groups for an optimiser: all other parameters, and the biases of layers (not of scans and norms)."""
+    """Return the parameters in two groups for an optimiser; the second group holds the biases of layers."""
     of_layers = [m.bias for m in net.modules() if isinstance(m, LAYERS) and m.bias is not None]
     known = set(map(id, of_layers))
     others = [p for p in net.parameters() if id(p) not in known]
@@ -118,7 +120,7 @@ def restored(
     reduce: int = 1,
     detail: bool = False,
 ) -> Tensor:
-    """Restore the picture by the network with these weights, in single precision; only the picture receives gradients.
+    """Restore a picture in float32 by a network with the weights of a file; only the picture receives gradients.
 
     ``tile``: the side of the pieces in which a larger picture is restored. ``reduce``: the factor by which the picture
     is first reduced and afterwards enlarged, antialiased; ``detail`` adds the detail that the reduction loses.
@@ -138,9 +140,18 @@ def restored(
     return result[0]
 
 
-def fitting(make: Callable[[], Restorer], weights: Path | None, width: int) -> list[str]:
-    """Raise ParameterError for a network without weights, or with weights of another network."""
-    same_layout(make, _needed(weights), width)
+def fitting(
+    network: Callable[..., Restorer],
+    *,
+    weights: Path | None = None,
+    tile: int | None = None,
+    reduce: int = 1,
+    detail: bool = False,
+    width: int,
+    **sizes: Any,
+) -> list[str]:
+    """Raise ParameterError without a file of weights, or with the weights of another network; return no warnings."""
+    same_layout(partial(network, width, **sizes), _needed(weights), width)
     return []
 
 
@@ -152,13 +163,13 @@ def _needed(weights: Path | None) -> Path:
 
 
 def restorer_checks(result: Tensor, picture: Tensor, **params: Any) -> list[Check]:
-    """Return a check of the root mean square change by the network, beside that of the picture."""
+    """Return a check that reports the root mean square of the change and of the picture, and fails if not finite."""
     change = float((result - picture).square().mean(dtype=torch.float64).sqrt())
-    there = float(picture.square().mean(dtype=torch.float64).sqrt())
-    return [Check(f"changed by {change:.3g} rms, of {there:.3g}", math.isfinite(change))]
+    before = float(picture.square().mean(dtype=torch.float64).sqrt())
+    return [Check(f"changed by {change:.3g} rms; the picture has {before:.3g} rms", math.isfinite(change))]
 
 
 def gated(x: Tensor) -> Tensor:
-    """Return the first half of the channels, gated by the second half."""
+    """Return the first half of the channels, multiplied by GELU of the second half."""
     value, gate = x.chunk(2, 1)
     return F.gelu(gate) * value

@@ -1,4 +1,4 @@
-"""Selective scans along a line with trainable weights: their inputs, decays and initial values."""
+"""Trainable layers that scan along a line, with the initial values of their steps and decays."""
 
 import math
 from typing import Literal
@@ -17,7 +17,7 @@ STEPS = (1e-3, 0.1)  #: range of the first steps of a scan, log-uniform: a memor
 
 
 class Scan(nn.Module):
-    """A selective scan along (n, length, channel) whose step, input and output are computed from the line itself."""
+    """A selective scan along a line (n, length, channel), with step, input and output computed from the line."""
 
     def __init__(self, channels: int, states: int, rank: int) -> None:
         super().__init__()
@@ -29,7 +29,7 @@ class Scan(nn.Module):
         self.D = nn.Parameter(torch.empty(channels))
 
     def start(self, rng: torch.Generator) -> None:
-        """Set the first step and decay; zero biases, as in other layers, would give a memory of one position."""
+        """Draw the initial steps and set the initial decays; zero biases would give a memory of one position."""
         self.dt_bias.copy_(_first_steps(len(self.D), rng))
         self.A_log.copy_(torch.arange(1.0, 1.0 + self.A_log.shape[1], device=rng.device).log().expand_as(self.A_log))
         self.D.fill_(1.0)
@@ -53,7 +53,7 @@ class DualScan(nn.Module):
         self.dt_bias, self.A_log, self.D = (nn.Parameter(torch.empty(heads)) for _ in range(3))
 
     def start(self, rng: torch.Generator) -> None:
-        """Set decays uniform from 1 to 16, the range of `Scan`; zero biases would give a memory of one position."""
+        """Draw the initial steps, and initial decay rates uniformly from 1 to 16, the range of `Scan`."""
         self.dt_bias.copy_(_first_steps(len(self.D), rng))
         self.A_log.uniform_(1.0, 16.0, generator=rng).log_()
         self.D.fill_(1.0)
@@ -78,7 +78,7 @@ class BothWays(nn.Module):
 
 
 def _first_steps(count: int, rng: torch.Generator) -> Tensor:
-    """Return the biases that softplus turns into the first steps."""
+    """Return random biases that softplus turns into log-uniform steps within `STEPS`."""
     low, high = map(math.log, STEPS)
     steps = torch.rand(count, generator=rng, device=rng.device).mul_(high - low).add_(low).exp_()
     return steps + torch.log(-torch.expm1(-steps))

@@ -2,8 +2,6 @@
 
 from functools import partial
 from itertools import pairwise
-from pathlib import Path
-from typing import Any
 
 import torch
 from torch import Tensor, nn
@@ -14,7 +12,7 @@ from neusee.nodes.units import Count, DataFile
 
 
 class UNet(Flat):
-    """A network of four levels, each of two convolutions, half the size and twice the width, and back with skips."""
+    """A network whose four levels halve the size and double the width, and then reverse both, with skip connections."""
 
     multiple, gain = 8, LEAKY
 
@@ -67,11 +65,5 @@ def unet(
     return restored(picture, partial(UNet, width), weights, tile, reduce, detail)
 
 
-@unet.preflight
-def _(*, weights: Path | None = None, width: int = 32, **how: Any) -> list[str]:
-    return fitting(partial(UNet, width), weights, width)
-
-
-@unet.check
-def _(result: Tensor, picture: Tensor, **params: Any) -> list[Any]:
-    return restorer_checks(result, picture)
+unet.preflight(partial(fitting, UNet))
+unet.check(restorer_checks)

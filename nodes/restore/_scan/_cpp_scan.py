@@ -33,7 +33,7 @@ NAMES = {torch.float32: "f32", torch.float64: "f64"}
 
 
 class NoCompilerError(RuntimeError):
-    """The error that the operator cannot be compiled on this machine; its message gives the reason in one line."""
+    """The error of a machine on which the C++ scan cannot be compiled; the message gives the reason in one line."""
 
 
 def folder() -> Path:
@@ -45,37 +45,37 @@ def folder() -> Path:
 
 
 def _processor() -> str:
-    """Return the text that identifies a processor, because a home folder may be shared by different machines."""
+    """Return a text that identifies the processor, because different machines may share a home folder."""
     try:
         lines = Path("/proc/cpuinfo").read_text(encoding="utf-8", errors="replace").splitlines()
     except OSError:
         lines = []
-    told = [next((x for x in lines if x.startswith(word)), "") for word in ("model name", "flags", "Features")]
-    return "\n".join([platform.platform(), platform.machine(), platform.processor(), *told])
+    facts = [next((x for x in lines if x.startswith(word)), "") for word in ("model name", "flags", "Features")]
+    return "\n".join([platform.platform(), platform.machine(), platform.processor(), *facts])
 
 
 def _compile(where: Path) -> None:
-    """Compile the library to ``where``; raise `NoCompilerError` where that fails."""
+    """Compile the C++ scan to the file ``where``; raise `NoCompilerError` if that fails."""
     compiler = os.environ.get("CXX") or shutil.which("g++") or shutil.which("c++") or shutil.which("clang++")
     if compiler is None:
-        raise NoCompilerError("there is no C++ compiler: install g++, or set CXX")
+        raise NoCompilerError("no C++ compiler is installed: install g++, or set CXX to a compiler")
     try:
         where.parent.mkdir(parents=True, exist_ok=True)
         with tempfile.TemporaryDirectory(dir=where.parent) as aside:
-            made = Path(aside) / where.name
-            command = [*compiler.split(), *FLAGS, str(CODE), "-o", str(made)]
+            library = Path(aside) / where.name
+            command = [*compiler.split(), *FLAGS, str(CODE), "-o", str(library)]
             done = subprocess.run(command, capture_output=True, text=True, timeout=300, check=False)
             if done.returncode:
-                said = next((x for x in done.stderr.splitlines() if "error" in x), f"it returned {done.returncode}")
-                raise NoCompilerError(f"{compiler} failed: {said.strip()}")
-            os.replace(made, where)
+                reason = next((x for x in done.stderr.splitlines() if "error" in x), f"exit status {done.returncode}")
+                raise NoCompilerError(f"{compiler} failed: {reason.strip()}")
+            os.replace(library, where)
     except (OSError, subprocess.SubprocessError) as error:
         raise NoCompilerError(f"{compiler} could not be run: {error}") from error
 
 
 @functools.cache
-def _made(build: Path, compiler: str | None) -> ctypes.CDLL | NoCompilerError:
-    """Return the library, or the reason why there is none, after one attempt for each folder and compiler."""
+def _library(build: Path, compiler: str | None) -> ctypes.CDLL | NoCompilerError:
+    """Return the compiled library, or the error of the single attempt to compile for this folder and compiler."""
     words = [CODE.read_text(encoding="utf-8"), *FLAGS, compiler or "", _processor()]
     where = build / f"scan_{hashlib.sha256(chr(0).join(words).encode()).hexdigest()[:32]}.so"
     try:
@@ -89,20 +89,20 @@ def _made(build: Path, compiler: str | None) -> ctypes.CDLL | NoCompilerError:
 
 
 def operators() -> ctypes.CDLL:
-    """Return the compiled operator; raise `NoCompilerError` where it cannot be compiled."""
-    found = _made(folder(), os.environ.get("CXX"))
-    if isinstance(found, NoCompilerError):
-        raise found
-    return found
+    """Return the library of the C++ scan, compiled if needed; raise `NoCompilerError` if it cannot be compiled."""
+    library = _library(folder(), os.environ.get("CXX"))
+    if isinstance(library, NoCompilerError):
+        raise library
+    return library
 
 
 @functools.cache
 def _say_once(why: str) -> None:
-    warnings.warn(f"the selective scan is not compiled and torch computes the scan, slower: {why}", stacklevel=4)
+    warnings.warn(f"the C++ scan is not compiled and torch computes the scan more slowly: {why}", stacklevel=4)
 
 
 def compiled() -> bool:
-    """Return True if the operator is available, compiling it if needed; warn the first time it is not available."""
+    """Return True if the C++ scan is available, compiled if needed; warn the first time if it is not."""
     try:
         operators()
     except NoCompilerError as error:
@@ -112,39 +112,42 @@ def compiled() -> bool:
 
 
 def _sizes(u: Tensor, rate: Tensor) -> tuple[int, int, int, int, int, int]:
-    """Return batch, length, d, n, groups of channels (gradients of B and C are summed by group), and threads."""
+    """Return the sizes for the C++ scan: batch, length, d, n, groups of channels, and threads.
+
+    Each group of channels sums its own gradients of B and C.
+    """
     (batch, length, d), n, threads = u.shape, rate.shape[1], torch.get_num_threads()
     blocks = -(-d // (64 // u.element_size()))
     return batch, length, d, n, min(blocks, -(-threads // batch)), threads
 
 
 def _call(name: str, sizes: tuple[int, ...], *tensors: Tensor) -> None:
-    """Pass contiguous tensors to the operator ``name`` of their type, without the global interpreter lock."""
+    """Call the C++ function ``name`` for the type of the contiguous tensors, without the global interpreter lock."""
     operator = getattr(operators(), f"neusee_scan_{name}_{NAMES[tensors[0].dtype]}")
     operator((ctypes.c_int64 * len(sizes))(*sizes), *(ctypes.c_void_p(x.data_ptr()) for x in tensors))
 
 
 class Scan(torch.autograd.Function):
-    """The scan, differentiable once: u, dt (batch, length, d), A (d, n), B, C (batch, length, n) -> as u."""
+    """The C++ scan, differentiable once: u, dt (batch, length, d), A (d, n), B, C (batch, length, n) -> as u."""
 
     @staticmethod
     def forward(ctx: Any, *tensors: Tensor) -> Tensor:
-        given = [x.contiguous() for x in tensors]
-        u, rate = given[0], given[2]
+        inputs = [x.contiguous() for x in tensors]
+        u, rate = inputs[0], inputs[2]
         ctx.sizes = _sizes(u, rate)
         batch, length, d, n, *_ = ctx.sizes
         y, states = torch.empty_like(u), u.new_empty(batch, -(-length // operators().neusee_scan_steps()), n, d)
-        _call("forward", ctx.sizes, *given, y, states)
-        ctx.save_for_backward(*given, states)
+        _call("forward", ctx.sizes, *inputs, y, states)
+        ctx.save_for_backward(*inputs, states)
         return y
 
     @staticmethod
     def backward(ctx: Any, *seen: Tensor) -> tuple[Tensor, ...]:
         refuse_twice()
-        *given, states = ctx.saved_tensors
-        u = given[0]
+        *inputs, states = ctx.saved_tensors
+        u = inputs[0]
         batch, length, d, n, groups, _ = ctx.sizes
         du, ddt, dA = torch.empty_like(u), torch.empty_like(u), u.new_empty(batch, n, d)
         dB, dC = u.new_empty(groups, batch, length, n), u.new_empty(groups, batch, length, n)
-        _call("backward", ctx.sizes, *given, seen[0].contiguous(), states, du, ddt, dA, dB, dC)
+        _call("backward", ctx.sizes, *inputs, seen[0].contiguous(), states, du, ddt, dA, dB, dC)
         return du, ddt, dA.sum(0).T, dB.sum(0), dC.sum(0)

@@ -1,4 +1,4 @@
-"""The selective scan with one decay for each head, as matrix products, which need no kernel of their own."""
+"""The selective scan with one decay for each head, computed by matrix products of torch."""
 
 import torch
 from torch import Tensor
@@ -30,7 +30,7 @@ def dual_scan(u: Tensor, dt: Tensor, A: Tensor, B: Tensor, C: Tensor, D: Tensor,
 
 
 def _stretches(logs: Tensor) -> Tensor:
-    """Sum (…, position) to (…, i, j) over the positions after j up to i; minus infinity where j is later than i."""
+    """Return the sums (…, i, j) of ``logs`` over the positions after j up to i, minus infinity where j is after i."""
     size = logs.shape[-1]
     here = torch.ones(size, size, dtype=torch.bool, device=logs.device).tril()
     after = logs[..., None].expand(*logs.shape, size).masked_fill(~here.tril(-1), 0.0)
@@ -38,9 +38,9 @@ def _stretches(logs: Tensor) -> Tensor:
 
 
 def _handed_on(left: Tensor, decay: Tensor) -> Tensor:
-    """Return the state at the start of each chunk, which all earlier chunks contribute to."""
-    state, given = torch.zeros_like(left[:, 0]), []
+    """Return the state at the start of each chunk, to which all earlier chunks contribute."""
+    state, starts = torch.zeros_like(left[:, 0]), []
     for new, share in zip(left.unbind(1), decay.unbind(1), strict=True):
-        given.append(state)
+        starts.append(state)
         state = share * state + new
-    return torch.stack(given, 1)
+    return torch.stack(starts, 1)

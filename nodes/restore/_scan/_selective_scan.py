@@ -24,7 +24,7 @@ def selective_scan(
     *,
     backend: Literal["auto", "torch", "cpp", "triton", "mamba_ssm"] = "auto",
 ) -> Tensor:
-    """Run h_t = exp(dt_t A) h_(t-1) + dt_t B_t u_t from h = 0 and return y_t = C_t . h_t + D u_t.
+    """Run the scan h_t = exp(dt_t A) h_(t-1) + dt_t B_t u_t from h = 0, and return y_t = <C_t, h_t> + D u_t.
 
     ``A`` is negative and ``dt`` positive: decays are at most 1 and are only multiplied, so nothing overflows at any
     length. ``backend`` "auto" is C++ on a CPU with a compiler; on CUDA in float32 a Triton kernel, or mamba_ssm where
@@ -47,7 +47,7 @@ def selective_scan(
 
 
 def reference(u: Tensor, dt: Tensor, A: Tensor, B: Tensor, C: Tensor, D: Tensor | None = None) -> Tensor:
-    """Compute the scan by the loop that defines it, in float64, as a slow reference with all derivatives.
+    """Compute the selective scan by a loop over positions in float64, a slow reference with all derivatives.
 
     Shapes: as `selective_scan`.
     """
@@ -64,30 +64,24 @@ def reference(u: Tensor, dt: Tensor, A: Tensor, B: Tensor, C: Tensor, D: Tensor 
 
 def _check_shapes(u: Tensor, dt: Tensor, A: Tensor, B: Tensor, C: Tensor, D: Tensor | None) -> None:
     if u.ndim != 3 or A.ndim != 2:
-        raise ValueError(f"u is (batch, length, d) and A (d, n), not {tuple(u.shape)} and {tuple(A.shape)}")
+        raise ValueError(f"u must be (batch, length, d) and A (d, n), not {tuple(u.shape)} and {tuple(A.shape)}")
     if not (u.numel() and A.numel()):
-        raise ValueError(f"there is nothing to scan: u is {tuple(u.shape)} and A {tuple(A.shape)}")
-    (batch, length, d), n = u.shape, A.shape[1]
-    wanted = {
-        "dt": (dt, (batch, length, d)),
-        "A": (A, (d, n)),
-        "B": (B, (batch, length, n)),
-        "C": (C, (batch, length, n)),
-    }
-    if D is not None:
-        wanted["D"] = (D, (d,))
-    for name, (x, shape) in wanted.items():
+        raise ValueError(f"there is nothing to scan: u is {tuple(u.shape)} and A is {tuple(A.shape)}")
+    (*line, d), n = u.shape, A.shape[1]
+    shapes = {"dt": (*line, d), "A": (d, n), "B": (*line, n), "C": (*line, n), "D": (d,)}
+    for (name, shape), x in zip(shapes.items(), (dt, A, B, C, D), strict=True):
+        if x is None:
+            continue
         if tuple(x.shape) != shape:
-            raise ValueError(f"{name} is {tuple(x.shape)}; beside u {tuple(u.shape)} and A {tuple(A.shape)}: {shape}")
+            raise ValueError(f"{name} is {tuple(x.shape)}; u {tuple(u.shape)} and A {tuple(A.shape)} need {shape}")
         if x.device != u.device:
-            raise ValueError(f"{name} is on {x.device}, u on {u.device}")
+            raise ValueError(f"{name} is on {x.device}, but u is on {u.device}: move both to one device")
 
 
 def _kind(*tensors: Tensor) -> torch.dtype:
-    """Return float64 if any tensor is float64, else float32."""
     for x in tensors:
         if not x.is_floating_point():
-            raise ValueError(f"the selective scan takes real numbers, not {x.dtype}")
+            raise ValueError(f"the selective scan needs real numbers in floating point, not {x.dtype}")
     return torch.float64 if any(x.dtype == torch.float64 for x in tensors) else torch.float32
 
 
@@ -105,7 +99,7 @@ def _auto(u: Tensor, kind: torch.dtype) -> Backend:
 
 
 def _kernel(named: str) -> Backend:
-    """Return the backend for CUDA: the named backend if it is installed, else an installed one, else torch."""
+    """Return the backend for CUDA: the named backend if it is installed, else another installed backend, else torch."""
     if named != "mamba_ssm" and importlib.util.find_spec("triton"):
         return "triton"
     if named != "triton" and importlib.util.find_spec("mamba_ssm"):
@@ -116,7 +110,7 @@ def _kernel(named: str) -> Backend:
 
 @functools.cache
 def _say_once(why: str) -> None:
-    warnings.warn(f"{why}: torch computes the scan, slower", stacklevel=5)
+    warnings.warn(f"{why}: torch computes the scan more slowly", stacklevel=5)
 
 
 def _run(backend: str, u: Tensor, dt: Tensor, A: Tensor, B: Tensor, C: Tensor) -> Tensor:
@@ -134,9 +128,9 @@ def _run(backend: str, u: Tensor, dt: Tensor, A: Tensor, B: Tensor, C: Tensor) -
 
 
 def by_triton(*tensors: Tensor) -> Tensor:
-    """Run the scan by the Triton kernel; raise ValueError where Triton is not installed."""
+    """Run the scan by the Triton kernel; raise ValueError if Triton is not installed."""
     if not importlib.util.find_spec("triton"):
-        raise ValueError("the backend triton is not installed: install a CUDA build of torch, which includes it")
+        raise ValueError("the backend triton is not installed: install a CUDA build of torch, which includes Triton")
     from neusee.nodes.restore._scan import _triton_scan
 
     y: Tensor = _triton_scan.Scan.apply(*tensors)  # type: ignore[no-untyped-call]
@@ -144,7 +138,7 @@ def by_triton(*tensors: Tensor) -> Tensor:
 
 
 class _Once(torch.autograd.Function):
-    """An identity that refuses a second derivative, because that of mamba_ssm is wrong without an error."""
+    """An identity that refuses a second derivative, because mamba_ssm silently computes a wrong second derivative."""
 
     @staticmethod
     def forward(ctx: object, y: Tensor) -> Tensor:
@@ -157,7 +151,7 @@ class _Once(torch.autograd.Function):
 
 
 def by_mamba(u: Tensor, dt: Tensor, A: Tensor, B: Tensor, C: Tensor) -> Tensor:
-    """Run the scan by mamba_ssm's kernel, which takes the length last; raise ValueError where it is not installed."""
+    """Run the scan by the kernel of mamba_ssm; raise ValueError if mamba_ssm is not installed."""
     try:
         from mamba_ssm.ops.selective_scan_interface import selective_scan_fn
     except ImportError as error:

@@ -2,9 +2,9 @@
 
 The length is cut into segments that fit in a cache, and each segment into chunks that are walked in parallel. A segment
 takes as many operations as a chunk has steps, and one more for the carry of each chunk. Only the states between
-segments are stored; back-propagation computes all others again. Decays enter as exp(x) - 1, because the round-off of a
-decay near 1 would act at each step. The carry between chunks is float64, because a state that hardly decays is rounded
-at each carry.
+segments are stored; back-propagation computes all other states again. Decays enter as exp(x) - 1, because the
+round-off of a decay near 1 would act at each step. The carry between chunks is float64, because a state that hardly
+decays is rounded at each carry.
 """
 
 from collections.abc import Iterator
@@ -21,13 +21,15 @@ SEGMENT_CUDA, ROW_CUDA = 1 << 23, 1 << 17  #: the same two numbers on a GPU: cho
 
 
 def refuse_twice() -> None:
-    """Refuse a second derivative, which would be wrong without an error, because the backward pass has no graph."""
+    """Raise RuntimeError for a second derivative, which would be silently wrong, as the backward pass has no graph."""
     if torch.is_grad_enabled():
-        raise RuntimeError("the selective scan has no second derivative: do not ask for create_graph through it")
+        raise RuntimeError(
+            "the selective scan has no second derivative: do not use create_graph for a gradient through the scan"
+        )
 
 
 class Plan(NamedTuple):
-    """The division of a length: ``chunks`` chunks of ``steps`` steps make a segment."""
+    """The division of a line into segments of ``chunks`` chunks, each of ``steps`` steps."""
 
     steps: int
     chunks: int
@@ -46,19 +48,19 @@ def plan(length: int, width: int, cuda: bool) -> Plan:
 
 
 class _Segment:
-    """One segment's lines, time first, (step, chunk, batch, d or n), and decays, filled up with steps of length 0."""
+    """The inputs and decays of one segment, (step, chunk, batch, d or n), filled up with steps of length 0."""
 
-    def __init__(self, how: Plan, rows: slice, rate: Tensor, *lines: Tensor) -> None:
-        self.how, self.rows, self.rate = how, rows, rate
-        self.size = min(how.segment, lines[0].shape[1] - rows.start)
+    def __init__(self, division: Plan, rows: slice, rate: Tensor, *lines: Tensor) -> None:
+        self.division, self.rows, self.rate = division, rows, rate
+        self.size = min(division.segment, lines[0].shape[1] - rows.start)
         self.u, self.dt, self.into, self.out = (self.turn(x) for x in lines)
         self.pushed = self.u * self.dt
         self.lost = (self.dt[..., None] * rate).expm1_()
 
     def turn(self, x: Tensor) -> Tensor:
         """Rearrange (batch, length, m) into (step, chunk, batch, m)."""
-        part = F.pad(x[:, self.rows], (0, 0, 0, self.how.segment - self.size)).contiguous()
-        return part.view(len(x), self.how.chunks, self.how.steps, -1).permute(2, 1, 0, 3).contiguous()
+        part = F.pad(x[:, self.rows], (0, 0, 0, self.division.segment - self.size)).contiguous()
+        return part.view(len(x), self.division.chunks, self.division.steps, -1).permute(2, 1, 0, 3).contiguous()
 
     def back(self, x: Tensor) -> Tensor:
         """Rearrange (step, chunk, batch, m) into (batch, rows, m)."""
@@ -72,7 +74,8 @@ class _Segment:
     def slopes(self, seen: Tensor, end: Tensor) -> tuple[Tensor, Tensor]:
         """Return the gradients of all states, and of the state before the first step in float64.
 
-        The gradient of a state is that through its own output ``seen`` plus that through the next state, or ``end``.
+        The gradient of a state is the sum of the gradients through its output, ``seen``, and through the next state, or
+        ``end`` for the last state.
         """
         g = seen[..., None] * self.out[..., None, :]
         first, *others = self.lost.unbind(0)
@@ -97,11 +100,11 @@ class _Segment:
 
 
 def _walk(h: Tensor, lost: list[Tensor], start: Tensor, back: bool = False) -> Tensor:
-    """Turn pushes (step, chunk, ...) into states: h_i <- h_i + h_(i-1) + lost_i * h_(i-1), from ``start``.
+    """Turn the inputs ``h`` (step, chunk, ...) into states in place: h_i <- h_i + h_(i-1) + lost_i * h_(i-1).
 
-    ``back`` walks from the last step to the first; ``lost``, (chunk, ...) for each step, is in the order of the walk.
-    Every chunk starts from 0, and the state that earlier chunks carry over is added afterwards. The last state is
-    returned in float64.
+    The state before the first step is ``start``. ``back`` walks from the last step to the first; ``lost``, (chunk, ...)
+    for each step, is in the order of the walk. Every chunk starts from 0, and the state that earlier chunks carry over
+    is added afterwards. The last state is returned in float64.
     """
     turn = slice(None, None, -1 if back else 1)
     rows, through = h.unbind(0)[turn], torch.empty_like(h)
@@ -110,45 +113,45 @@ def _walk(h: Tensor, lost: list[Tensor], start: Tensor, back: bool = False) -> T
     for less, before, now, share, further in zip(lost[1:], rows, rows[1:], shares, shares[1:], strict=False):
         now.addcmul_(less, before).add_(before)
         torch.add(less, share, out=further).addcmul_(less, share)  # (1 + e)(1 + l) - 1, exact near 0
-    left, kept, given = rows[-1].double(), shares[-1].double(), torch.empty_like(rows[-1])
+    left, kept, starts = rows[-1].double(), shares[-1].double(), torch.empty_like(rows[-1])
     for chunk in range(h.shape[1])[turn]:
-        given[chunk] = start
+        starts[chunk] = start
         start = (left[chunk] + start).addcmul_(kept[chunk], start)
-    h.addcmul_(through, given).add_(given)
+    h.addcmul_(through, starts).add_(starts)
     return start
 
 
-def _segments(length: int, how: Plan) -> Iterator[slice]:
-    return (slice(i, i + how.segment) for i in range(0, length, how.segment))
+def _segments(length: int, division: Plan) -> Iterator[slice]:
+    return (slice(i, i + division.segment) for i in range(0, length, division.segment))
 
 
 class Scan(torch.autograd.Function):
-    """The scan, differentiable once: u, dt (batch, length, d), A (d, n), B, C (batch, length, n) -> as u."""
+    """The scan in torch, differentiable once: u, dt (batch, length, d), A (d, n), B, C (batch, length, n) -> as u."""
 
     @staticmethod
-    def forward(ctx: Any, *given: Tensor) -> Tensor:
-        u, dt, rate, *into_out = given
+    def forward(ctx: Any, *inputs: Tensor) -> Tensor:
+        u, dt, rate, *into_out = inputs
         (batch, length, _), (d, n) = u.shape, rate.shape
-        ctx.how = plan(length, batch * d * n, u.is_cuda)
+        ctx.division = plan(length, batch * d * n, u.is_cuda)
         y, state, starts = torch.empty_like(u), u.new_zeros(batch, d, n, dtype=torch.float64), list[Tensor]()
-        for rows in _segments(length, ctx.how):
+        for rows in _segments(length, ctx.division):
             starts.append(state.to(u))
-            part = _Segment(ctx.how, rows, rate, u, dt, *into_out)
+            part = _Segment(ctx.division, rows, rate, u, dt, *into_out)
             h, state = part.states(state)
             y[:, rows] = part.back((h @ part.out[..., None])[..., 0])
-        ctx.save_for_backward(*given, torch.stack(starts))
+        ctx.save_for_backward(*inputs, torch.stack(starts))
         return y
 
     @staticmethod
     def backward(ctx: Any, *seen: Tensor) -> tuple[Tensor, ...]:
         refuse_twice()
-        *given, starts = ctx.saved_tensors
-        u, dt, rate, *into_out = given
+        *inputs, starts = ctx.saved_tensors
+        u, dt, rate, *into_out = inputs
         du, ddt, dB, dC = (torch.empty_like(x) for x in (u, dt, *into_out))
         end, dA = torch.zeros_like(starts[0], dtype=torch.float64), torch.zeros_like(rate, dtype=torch.float64)
         with torch.autocast(u.device.type, enabled=False):
-            for rows, start in reversed(list(zip(_segments(u.shape[1], ctx.how), starts, strict=True))):
-                part = _Segment(ctx.how, rows, rate, u, dt, *into_out)
+            for rows, start in reversed(list(zip(_segments(u.shape[1], ctx.division), starts, strict=True))):
+                part = _Segment(ctx.division, rows, rate, u, dt, *into_out)
                 *lines, slope, end = part.gradients(seen[0], start, end)
                 for whole, line in zip((du, ddt, dB, dC), lines, strict=True):
                     whole[:, rows] = line

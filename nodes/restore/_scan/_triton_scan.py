@@ -40,7 +40,7 @@ def _lost(x):
 
 @triton.jit
 def _add(total, missed, more):
-    """Return the sum, and its round-off, which is added at the next step."""
+    """Return the sum of ``total`` and ``more``, and the round-off, which is added at the next step."""
     more = more + missed
     now = total + more
     return now, more - (now - total)
@@ -129,18 +129,18 @@ def _backward(
 
 @functools.cache
 def _wide(n: int) -> int:
-    """Return the least power of 2 from ``n`` on, because sizes of Triton's tensors are powers of 2."""
+    """Return the least power of 2 that is at least ``n``; the sizes of Triton tensors are powers of 2."""
     return 1 << (n - 1).bit_length()
 
 
 def _sizes(u: Tensor, rate: Tensor) -> tuple[int, int, int, int, int, int]:
-    """Return batch, length, d, n, blocks of channels, and chunks."""
+    """Return the sizes for the kernels: batch, length, d, n, blocks of channels, and chunks."""
     (batch, length, d), n = u.shape, rate.shape[1]
     return batch, length, d, n, -(-d // CHANNELS), -(-length // CHUNK)
 
 
 class Scan(torch.autograd.Function):
-    """The float32 scan, once differentiable: u, dt (batch, length, d), A (d, n), B, C (batch, length, n) -> as u."""
+    """The Triton scan, differentiable once: u, dt (batch, length, d), A (d, n), B, C (batch, length, n) -> as u."""
 
     @staticmethod
     def forward(ctx: Any, *tensors: Tensor) -> Tensor:

@@ -119,7 +119,7 @@ def test_a_dark_that_rounding_swallows_has_an_endless_error():
 @pytest.mark.parametrize(
     ("light", "message"),
     [
-        ([10.0, 100.0, 1000.0], "no dark frames"),
+        ([10.0, 100.0, 1000.0], "without dark frames"),
         ([0.0, 0.0], "0 lit level"),
         ([0.0, 100.0], "1 lit level"),
         ([0.0, 100.0, 100.0, 1000.0], "below 70% of saturation"),
@@ -133,7 +133,7 @@ def test_measurements_without_hope_are_refused(light, message):
 
 def test_a_camera_without_response_is_refused():
     blind = synthetic()
-    with pytest.raises(ValueError, match="must be brighter and noisier"):
+    with pytest.raises(ValueError, match="light must raise mean and variance"):
         least_squares(blind._replace(mean=torch.full_like(blind.mean, 100.0), variance=torch.ones_like(blind.mean)))
     quieter = blind._replace(variance=torch.tensor([9.0, 3.0, 3.0, 3.0, 3.0, 3.0, 4.0], dtype=torch.float64))
     with pytest.raises(ValueError, match="slopes -"):

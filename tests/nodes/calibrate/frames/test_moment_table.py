@@ -61,7 +61,7 @@ def test_a_missing_column_is_told_before_the_run(file, parameter):
         (",99,7", ",,7", "column mean: '' is not valid for mean"),
         (",99,7,-1", ",99", "column variance: None is not valid for variance"),
         (",99,7", ",99,-7", "column variance"),
-        ("0,0.1,100,10.5,2.5,0.2\n50.5,0.2,100,99,7,-1\n", "", "no line below its header"),
+        ("0,0.1,100,10.5,2.5,0.2\n50.5,0.2,100,99,7,-1\n", "", "no line below the header"),
     ],
 )
 def test_what_is_no_number_is_told_with_its_place(file, old, new, message):

@@ -191,13 +191,13 @@ def test_a_level_without_scatter_and_light_that_does_nothing_are_refused():
     levels = around()
     with pytest.raises(ValueError, match=r"level 3, of 3\d\d\.?\d* DN, has no variance"):
         camera(levels._replace(variance=torch.where(torch.arange(8) == 3, 0.0, levels.variance)), **SENSOR)
-    with pytest.raises(ValueError, match="above the dark: check that the light belongs"):
+    with pytest.raises(ValueError, match="above the dark level, which must be positive"):
         camera(levels._replace(mean=50.0 - levels.photons / 1e3), **SENSOR)
 
 
 def test_the_check_says_what_was_used():
     found = camera(around(), **SENSOR)
-    assert camera.hooks.check(found, around())[0].text.endswith("of 12 means and variances, 6 of 8 levels")
+    assert camera.hooks.check(found, around())[0].text.endswith("for 12 means and variances, from 6 of 8 levels")
     assert camera.hooks.check(found, around())[0].ok
     assert camera.hooks.check(camera(around(), **SENSOR, told=False), around()) == []
 
@@ -239,7 +239,7 @@ def test_one_standard_deviation_is_the_factor_or_the_deviation():
 
 
 def test_priors_that_are_none_are_refused():
-    with pytest.raises(ValueError, match="no parameter is free: give a prior of one of gain, quantum_efficiency"):
+    with pytest.raises(ValueError, match="no parameter is free: give a prior of at least one of gain, quantum"):
         camera_prior()
     with pytest.raises(ValueError, match=r"temporal_dark_noise: \[0, 2\] is not a prior"):
         camera_prior(temporal_dark_noise=(0.0, 2.0))

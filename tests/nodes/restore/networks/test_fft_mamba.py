@@ -14,8 +14,7 @@ from neusee.nodes import ParameterError
 from neusee.nodes.network_weights import file_metadata
 from neusee.nodes.restore import fft_mamba
 from neusee.nodes.restore._networks._fft_mamba import FFTMamba
-from neusee.nodes.restore._networks._mamba_blocks import SMALL, Block, Frequency, Spatial, _Phase
-from neusee.nodes.restore._networks._radial_order import radial_order
+from neusee.nodes.restore._networks._mamba_blocks import SMALL, Block, Frequency, Spatial, _Phase, radial_order
 from neusee.nodes.restore._networks._restorer import start_network
 from neusee.nodes.restore._networks._scan_layer import BothWays, DualScan, Scan, _decay, _step
 from neusee.nodes.restore._scan._one_decay_scan import dual_scan

@@ -229,9 +229,9 @@ def test_what_cannot_be_scanned_is_refused():
     values = draw(6, 3, 2)
     with pytest.raises(ValueError, match="nothing to scan"):
         selective_scan(*(x[:, :0] if x.ndim == 3 else x for x in values))
-    with pytest.raises(ValueError, match="real numbers"):
+    with pytest.raises(ValueError, match="real numbers in floating point"):
         selective_scan(*(x.to(torch.complex64) for x in values))
-    with pytest.raises(ValueError, match=r"u is \(batch, length, d\)"):
+    with pytest.raises(ValueError, match=r"u must be \(batch, length, d\)"):
         selective_scan(values[0][0], *values[1:])
     with pytest.raises(ValueError, match="backend is 'fast'"):
         selective_scan(*values, backend="fast")
