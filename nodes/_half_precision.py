@@ -7,7 +7,10 @@ HALVES = (torch.float16, torch.bfloat16)
 
 
 def single(x: Tensor) -> Tensor:
-    """Convert a half-precision tensor to float32, and return other tensors unchanged; gradients keep their type."""
+    """Convert a half-precision tensor to float32, and return other tensors unchanged.
+
+    The gradient has the type of ``x``.
+    """
     return x.float() if x.dtype in HALVES else x
 
 

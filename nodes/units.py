@@ -60,7 +60,10 @@ def _in_si(number: float, si: str, unit: str) -> float:
 
 
 def read_any(text: Any) -> tuple[float, str]:
-    """Convert a text such as ``"550 nm"`` or ``0.56`` to a finite number and its SI unit, "" for no unit."""
+    """Convert a text such as ``"550 nm"`` or ``0.56`` to a finite number and its SI unit, "" for no unit.
+
+    Raises ValueError for other text.
+    """
     number, si, reciprocal = read_written(text)
     return (_in_si(number, si, "e-/DN"), si) if reciprocal else (number, si)
 

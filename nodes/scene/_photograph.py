@@ -23,7 +23,7 @@ def photograph(*, file: DataFile, shape: Shape | None = None) -> Tensor:
     Shapes: -> (3, y, x) float32, the size of the file or `shape` (scaled to cover `shape`, cropped at the centre).
     Units:  linear sRGB, 1 = the white of the file.
     Error:  half a code value (8 bit: 1.8e-3 near white); the tone curve of the camera is not inverted. Every file is
-            read as sRGB: a note names an embedded profile, which is not applied.
+            read as sRGB: a note names an embedded colour profile, which is ignored.
     Raises: ParameterError before the run for another format, for another depth, and for transparency.
     Source: IEC 61966-2-1:1999 (sRGB); EXIF 2.3, tag Orientation.
     """

@@ -98,7 +98,7 @@ class Photographs:
     """The photographs of a folder for training, and the files that cannot be read as photographs."""
 
     paths: tuple[Path, ...]  #: in the order of their names
-    broken: dict[Path, str] = field(default_factory=dict)  #: why each of the other files cannot be read
+    broken: dict[Path, str] = field(default_factory=dict)  #: the reason why each other file cannot be read
 
     @classmethod
     def under(cls, root: Path) -> Photographs:
