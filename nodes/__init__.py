@@ -1,4 +1,4 @@
-"""The physics: one plain, differentiable function for each step of the camera.
+"""Physical models of the camera: one differentiable function for each step.
 
 No node depends on a recipe, a cache, a device or a graph.
 """

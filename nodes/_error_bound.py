@@ -1,4 +1,4 @@
-"""Statistics and error bounds of tensors, which an engine reads without loading the tensors."""
+"""Statistics and error bounds of tensors, which an engine reads in place of the tensors."""
 
 from __future__ import annotations
 
@@ -10,12 +10,12 @@ import torch
 from torch import Tensor
 
 _FEW = 64  #: up to this many elements, a loop in Python is faster than five calls of torch
-_PART, _ROW = 1 << 17, 1 << 10  #: elements of one part, and elements that are summed in their own precision
+_PART, _ROW = 1 << 17, 1 << 10  #: elements of one part, and elements that are summed in the precision of the tensor
 
 
 @dataclass(frozen=True, slots=True)
 class TensorStats:
-    """Statistics of a tensor, stored beside the tensor so that no decision about a step loads the tensor."""
+    """Statistics of a tensor, such as range and sum, which are stored so that the tensor need not be loaded."""
 
     shape: tuple[int, ...]
     dtype: str
@@ -27,7 +27,7 @@ class TensorStats:
 
     @classmethod
     def of(cls, value: Any) -> TensorStats | None:
-        """Measure a tensor, or the first tensor of a named tuple; return None for anything else."""
+        """Return the statistics of a tensor, or of the first tensor in a named tuple; return None for other values."""
         if isinstance(value, tuple | list) and value:
             return cls.of(value[0])
         if not isinstance(value, Tensor):
@@ -46,7 +46,7 @@ class TensorStats:
 
 
 def _measure(flat: Tensor) -> tuple[float, float, float, int]:
-    """Return minimum, maximum, sum and count of nonzero elements, by parts that fit into the CPU cache."""
+    """Return minimum, maximum, sum and number of nonzero elements of a flat tensor, in parts that fit the cache."""
     small = flat.dtype == torch.bool or (flat.is_floating_point() and flat.element_size() < 4)
     parts = []
     for part in torch.split(flat, _PART):
@@ -62,17 +62,17 @@ def _measure(flat: Tensor) -> tuple[float, float, float, int]:
 
 @dataclass(frozen=True, slots=True)
 class ErrorBound:
-    """An upper bound of the error of an input, with the statistics of this input."""
+    """An upper bound of the error of an input of a node, with the statistics of this input."""
 
     rms: float  #: bound of the root mean square error, over the elements and the noise, in the unit of the input
     stats: TensorStats | None = None
     peak: float | None = (
-        None  #: bound of the error of the largest element, as a share of this element; None where not known
+        None  #: bound of the error of the largest element, as a share of this element; None if it is unknown
     )
 
     @property
     def share(self) -> float:
-        """Return the bound in root mean square as a share of the input's largest absolute element."""
+        """Return the bound of the root mean square error, relative to the largest absolute element of the input."""
         if self.rms == 0.0:
             return 0.0
         top = max(abs(self.stats.min), abs(self.stats.max)) if self.stats else 0.0
@@ -80,5 +80,5 @@ class ErrorBound:
 
     @property
     def largest(self) -> float:
-        """Return the bound of the largest element's error, as a share of this element; inf where it is not known."""
+        """Return the bound of the relative error of the largest element, or inf if no bound is known."""
         return 0.0 if self.rms == 0.0 else math.inf if self.peak is None else self.peak

@@ -1,4 +1,4 @@
-"""Guards against half precision, which can store pictures but not light: float16 ends at 65504 photons."""
+"""Conversion and rejection of half-precision tensors, because float16 ends at 65504 photons."""
 
 import torch
 from torch import Tensor
@@ -7,20 +7,23 @@ HALVES = (torch.float16, torch.bfloat16)
 
 
 def single(x: Tensor) -> Tensor:
-    """Return a tensor of half precision in single precision and others unchanged; gradients keep the type of ``x``."""
+    """Convert a half-precision tensor to float32, and return other tensors unchanged.
+
+    The gradient has the type of ``x``.
+    """
     return x.float() if x.dtype in HALVES else x
 
 
 def refuse_half(**lengths: Tensor) -> None:
-    """Raise ValueError for lengths in half precision, because 1 µm is only 17 steps of the smallest float16 number."""
+    """Raise ValueError for lengths in half precision: 1 µm is only 17 times the smallest positive float16 number."""
     for name, x in lengths.items():
         if x.dtype in HALVES:
             kind = str(x.dtype).removeprefix("torch.")
-            raise ValueError(f"{name} is {kind}, which cannot hold a phase: give float32 or float64")
+            raise ValueError(f"{name} is {kind}, which is too coarse for a phase: give float32 or float64")
 
 
 def refuse_not_finite(why: str, **values: Tensor | float) -> None:
-    """Raise ValueError for values (or sums of values) that are not finite; ``why`` names the consequence."""
+    """Raise ValueError for values (or sums of values) that are not finite; ``why`` is the consequence for the user."""
     for name, x in values.items():
         if not bool(torch.as_tensor(x).isfinite().all()):
             raise ValueError(f"{name} holds values that are not finite: {why}")

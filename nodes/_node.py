@@ -1,17 +1,17 @@
-"""Nodes: plain functions, with the little that an engine must know of each function.
+"""Nodes: functions that compute one step of a recipe, with typed parameters and attached functions (hooks).
 
-The signature is the whole contract. Arguments before ``*`` are data from other steps.
+The signature defines the node. Arguments before ``*`` are data from other steps.
 Arguments after ``*`` are parameters from the recipe, and the engine gives the random
 generator for a parameter named ``rng``.
 
     @node(rtol=0.0)
     def digitize(electrons: Tensor, *, gain: Gain, bits: Bits = 16) -> Tensor: ...
 
-    @digitize.reference        # float64, slow, plainly right; a test compares to rtol
-    @digitize.skip_bound       # true upper bound of what skipping the step changes
-    @digitize.propagate_error  # how far errors of the inputs can move the result
-    @digitize.preflight        # looks at the parameters before anything runs
-    @digitize.check            # looks at the result as a physicist would
+    @digitize.reference        # slow and simple form in float64; a test compares to rtol
+    @digitize.skip_bound       # upper bound of the change if the step is skipped
+    @digitize.propagate_error  # upper bound of the error that errors of the inputs cause
+    @digitize.preflight        # checks the parameters before anything runs
+    @digitize.check            # checks that the result is plausible
 
 ``digitize.hooks`` has each attached function under the name of its decorator.
 """
@@ -35,7 +35,7 @@ Fn = TypeVar("Fn", bound=Callable[..., Any])
 
 
 class ParameterError(ValueError):
-    """The refusal of a parameter by a node's ``preflight``, before anything runs.
+    """The error that the ``preflight`` of a node raises for a wrong parameter, before any step runs.
 
     Args: the name of the parameter, and one sentence with the value and the fix.
     """
@@ -47,7 +47,7 @@ class ParameterError(ValueError):
 
 @dataclass(frozen=True, slots=True)
 class Check:
-    """One finding about a result, for a physicist to read: ``Check("phase step 0.31 turn < 0.5", True)``."""
+    """One finding about the result of a node, such as ``Check("phase step 0.31 turn < 0.5", True)``."""
 
     text: str
     ok: bool = True
@@ -55,12 +55,12 @@ class Check:
 
 @dataclass(slots=True)
 class Hooks:
-    """The functions attached to a node, by the decorators of the same names: ``@digitize.check`` attaches ``check``."""
+    """The functions attached to a node (hooks); the decorator ``@digitize.check`` attaches the hook ``check``."""
 
     #: slow float64 form: same arguments, same result within ``rtol``
     reference: Callable[..., Any] | None = None
     #: (`TensorStats` of each input, *, parameters): bound of ``max |with - without| / max |with|`` if the step is left
-    #: out, which then returns its first input; for a random node, in root mean square over the noise
+    #: out and its first input is used instead; for a random node, in root mean square over the noise
     skip_bound: Callable[..., float] | None = None
     #: (`TensorStats` of the first input, *, parameters): the scale of `skip_bound`, such as the full well, because a
     #: later step cuts off larger values
@@ -68,24 +68,24 @@ class Hooks:
     #: (`TensorStats` of each input, None for an absent input, *, parameters): bound of the result's largest element;
     #: where the bound is 0, the step and the steps that only feed this step are left out
     zero_bound: Callable[..., float] | None = None
-    #: (`ErrorBound` of each input, *, result: TensorStats, parameters): the result's error; both errors are upper
-    #: bounds in root mean square, of a list input a list, of an absent input None; without this hook the inputs of the
-    #: node are held to the tolerance, because the error of the result is not known
+    #: (`ErrorBound` of each input, *, result: TensorStats, parameters): the error of the result; both errors are
+    #: upper bounds in root mean square; a list input has a list, an absent input None; without this hook the inputs
+    #: must satisfy the tolerance themselves, because the error of the result is not known
     propagate_error: Callable[..., float] | None = None
-    #: (result): the error of a cheaper form as shares of its largest element, in root mean square and of the largest
-    #: element alone, both with the approximations that the inputs carry
+    #: (result): the error of a cheaper form relative to its largest element, in root mean square and for the largest
+    #: element alone; both include the approximations of the inputs
     approximation_error: Callable[[Any], tuple[float, float]] | None = None
     #: (parameters): True if the result is the same for every band
     band_invariant: Callable[[Mapping[str, Any]], bool] | None = None
     #: (*, parameters): notes for the user, before anything runs; may raise `ParameterError`; an argument with the name
-    #: of an input receives the value of that input where a node with ``before_run`` computes it, else None
+    #: of an input receives the value of that input if a node with ``before_run`` computes it, else None
     preflight: Callable[..., Sequence[str]] | None = None
     #: (result, *inputs, **parameters): findings, once after computing
     check: Callable[..., Sequence[Check]] | None = None
 
 
 def _attaches(hook: str) -> Callable[[Any, Fn], Fn]:
-    """Return the decorator that attaches a function to a node as this hook."""
+    """Return the decorator that attaches a function to a node as the hook with the given name."""
 
     def attach(to: Node, fn: Fn) -> Fn:
         setattr(to.hooks, hook, fn)
@@ -95,9 +95,9 @@ def _attaches(hook: str) -> Callable[[Any, Fn], Fn]:
 
 
 class Node:
-    """A function with its typed parameters and its hooks: the reference, the bounds and the checks.
+    """A function that computes one step of a recipe, with typed parameters and hooks such as checks.
 
-    Two cheaper forms may stand in for a node where a recipe's tolerance allows it: ``channel_sum_form`` gives
+    Two cheaper forms may replace a node where a recipe's tolerance allows it: ``channel_sum_form`` gives
     `Channels` instead of all bands, and ``low_rank_form`` gives a `LowRankCube` instead of a cube.
     """
 
@@ -131,17 +131,17 @@ class Node:
         self.bands = bands and self._declared(bands)
         self.before_run = before_run
         if before_run and (self.inputs or self.random):
-            raise ValueError(f"{self.path}: before_run is for a node of parameters alone, without inputs and rng")
+            raise ValueError(f"{self.path}: before_run needs a node without inputs and without rng: omit before_run")
 
     def __call__(self, *inputs: Any, **params: Any) -> Any:
-        """Call the function itself, without validation and without cache; gradients flow."""
+        """Call the function of the node directly, without validation and without cache; gradients flow."""
         return self.fn(*inputs, **params)
 
     def __repr__(self) -> str:
         return f"<node {self.path}>"
 
     def __reduce__(self) -> tuple[Any, ...]:
-        """Pickle a node as its name: the process that reads the pickle imports its own code of the node."""
+        """Pickle a node as its module and name; the process that unpickles the node imports the code."""
         return _imported, (self.fn.__module__, self.fn.__name__)
 
     @functools.cached_property
@@ -153,21 +153,21 @@ class Node:
     def _declared(self, bands: Mapping[str, int]) -> Mapping[str, int]:
         unknown = sorted(bands.keys() - {*self.inputs, "return"})
         if unknown or "return" not in bands or len(bands) < 2:
-            raise ValueError(f"{self.path}: bands={dict(bands)} must name 'return' and inputs among {self.inputs}")
+            raise ValueError(f"{self.path}: bands={dict(bands)} must name 'return' and at least one of {self.inputs}")
         if self.random:
             raise ValueError(
-                f"{self.path} draws random numbers, so a band would change with its neighbours: omit bands="
+                f"{self.path} draws random numbers, so each band would depend on the other bands: omit bands="
             )
         return MappingProxyType(dict(bands))
 
     @functools.cached_property
     def hints(self) -> dict[str, Any]:
-        """Return the annotations by argument name and of ``return``, with their ``Annotated`` extras."""
+        """Return the type annotation of each argument and of ``return``, with the metadata of ``Annotated``."""
         return get_type_hints(self.fn, include_extras=True)
 
     @functools.cached_property
     def params(self) -> type[BaseModel]:
-        """Return the pydantic model that reads this node's parameters from a recipe and rejects unknown ones."""
+        """Return the pydantic model that validates the parameters of the node and rejects unknown parameters."""
         fields = {p.name: (self.hints[p.name], ... if p.default is p.empty else p.default) for p in self._keyword_only}
         config = ConfigDict(extra="forbid", frozen=True, arbitrary_types_allowed=True)
         model: type[BaseModel] = create_model(self.fn.__name__, __config__=config, **fields)  # type: ignore[call-overload]
@@ -180,7 +180,7 @@ class Node:
 
     @property
     def preflight_inputs(self) -> tuple[str, ...]:
-        """The inputs whose values the preflight receives if a node with ``before_run`` computes the value."""
+        """Return the names of the inputs that ``preflight`` accepts, for values that are known before the run."""
         hook = self.hooks.preflight
         return tuple(name for name in inspect.signature(hook).parameters if name in self.inputs) if hook else ()
 
@@ -201,7 +201,7 @@ def node(
     additive_inputs: Sequence[tuple[str, ...]] = (),
     before_run: bool = False,
 ) -> Callable[[Callable[..., Any]], Node]:
-    """Return the decorator that makes a node of a function; ``rtol`` is the agreed error against its reference.
+    """Return the decorator that turns a function into a node; ``rtol`` is the allowed error relative to the reference.
 
     Args:
         bands: the axis of the bands of some inputs and of the result (``return``). Band i of the result depends only
@@ -211,7 +211,7 @@ def node(
         needs_band_invariant: inputs that must be the same for every band if an image is given as `Channels`.
         accepts_low_rank: inputs that may be a `LowRankCube` instead of a cube.
         additive_inputs: groups of inputs; the first input of a group is optional or a list, and changes nothing where
-            its values are zero. The other inputs of the group belong to the first one.
+            its values are zero. The other inputs of the group are used only with the first input.
         before_run: True for a node without inputs and with a result of few numbers, which is also computed when a
             recipe is checked, so that the preflight of another node can use the result.
     """

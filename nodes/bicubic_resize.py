@@ -1,4 +1,4 @@
-"""Bicubic resampling by two small matrix products: deterministic on every device, and differentiable to any order."""
+"""Bicubic resampling as two matrix products, deterministic on every device and differentiable to any order."""
 
 import functools
 
@@ -10,7 +10,7 @@ from neusee.nodes._half_precision import single
 
 
 def enlarge(image: Tensor, height: int, width: int) -> Tensor:
-    """Resample (…, y, x) by bicubic interpolation: smooth between the samples, and aliased on a coarser grid.
+    """Resample pictures (…, y, x) by bicubic interpolation, without a filter against aliasing on a coarser grid.
 
     Kornia's `resize` gives the same numbers, but on CUDA the sum of its gradient has no fixed order.
     """
@@ -19,10 +19,10 @@ def enlarge(image: Tensor, height: int, width: int) -> Tensor:
 
 
 def resize(image: Tensor, height: int, width: int) -> Tensor:
-    """Resample (…, y, x) without aliasing, by Keys' kernel scaled to the coarser of the two grids.
+    """Resample pictures (…, y, x) without aliasing, by Keys' bicubic kernel scaled to the coarser of the two grids.
 
-    The result equals torch's ``interpolate(mode="bicubic", antialias=True)`` within round-off, in single precision
-    under autocast too. Kornia's `resize` blurs with a Gaussian first, and differs by up to 0.08 of white on noise.
+    The result equals torch's ``interpolate(mode="bicubic", antialias=True)`` within round-off, also in single
+    precision under autocast. Kornia's `resize` first blurs with a Gaussian and differs by up to 0.08 of white on noise.
     """
     image = single(image)
     rows, columns = (_keys(n, new).to(image) for n, new in zip(image.shape[-2:], (height, width), strict=True))
@@ -31,14 +31,17 @@ def resize(image: Tensor, height: int, width: int) -> Tensor:
 
 
 def _interpolation(size: int, new: int, like: Tensor) -> Tensor:
-    """Return the matrix (new, size) of bicubic interpolation between two grids of the same extent."""
+    """Return the matrix (new, size) that interpolates ``size`` samples bicubically to ``new`` samples."""
     unit = torch.eye(size, dtype=like.dtype, device=like.device)[None, None]
     return F.interpolate(unit, size=(new, size), mode="bicubic", align_corners=False)[0, 0]
 
 
 @functools.lru_cache(maxsize=64)
 def _keys(size: int, new: int) -> Tensor:
-    """Return the matrix (new, size) float64 of Keys' kernel, cut off at the edges; the weights of a row sum to 1."""
+    """Return the matrix (new, size) float64 of antialiased bicubic resampling by Keys' kernel.
+
+    The kernel is cut off at the edges of the picture, and the weights of each row sum to 1.
+    """
     with torch.inference_mode(False):  # a later caller of the cached matrix may need gradients
         scale = size / new
         centres = (torch.arange(new, dtype=torch.float64)[:, None] + 0.5) * scale

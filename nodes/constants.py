@@ -1,4 +1,7 @@
-"""Constants of nature, exact in the SI of 2019 (CODATA); colour-science rounds Planck's constant to six digits."""
+"""Physical constants, exact by definition in the SI of 2019 (CODATA).
+
+Colour-science rounds the Planck constant to six digits.
+"""
 
 PLANCK = 6.626_070_15e-34  #: J s
 SPEED_OF_LIGHT = 299_792_458.0  #: m/s

@@ -1,4 +1,4 @@
-"""Files of network weights in the format safetensors, and the check that a file fits a network."""
+"""Files of network weights in safetensors format, and the check that a file fits a network."""
 
 import json
 from collections.abc import Callable, Mapping
@@ -11,17 +11,17 @@ from torch import nn
 from neusee.nodes import ParameterError
 
 Net = TypeVar("Net", bound=nn.Module)
-OPTIONS = "neusee.options"  #: metadata key of a network's options, which the tensors alone may not reveal
+OPTIONS = "neusee.options"  #: metadata key of the options of a network, which the tensors may not show
 
 
 def empty(make: Callable[[], Net]) -> Net:
-    """Return the network without memory for its tensors; no random number is drawn from torch's global stream."""
+    """Return a network without memory for its tensors; the global random stream of torch is not used."""
     with torch.device("meta"):
         return make()
 
 
 def loaded(make: Callable[[], Net], weights: Path) -> Net:
-    """Return the network with the weights of a file, in single precision."""
+    """Return a network in single precision, with the weights of a file."""
     from safetensors.torch import load_file
 
     net = empty(make)
@@ -30,13 +30,13 @@ def loaded(make: Callable[[], Net], weights: Path) -> Net:
 
 
 def file_metadata(net: nn.Module) -> dict[str, str]:
-    """Return the metadata to write into the network's weights file: the ``options`` of the network, if any."""
+    """Return the metadata for the weights file of a network: the ``options`` of the network, if it has any."""
     options = getattr(net, "options", None)
     return {} if options is None else {OPTIONS: json.dumps(options, sort_keys=True)}
 
 
 def same_layout(make: Callable[[], nn.Module], weights: Path, width: int) -> None:
-    """Raise ParameterError unless a file has the tensor names, the shapes and the options of this network."""
+    """Raise ParameterError unless a weights file has the tensor names, shapes and options of this network."""
     from safetensors import SafetensorError, safe_open
 
     net = empty(make)
@@ -56,7 +56,10 @@ def same_layout(make: Callable[[], nn.Module], weights: Path, width: int) -> Non
 
 
 def _same_options(trained: Mapping[str, Any], options: Mapping[str, Any], weights: Path) -> None:
-    """Raise ParameterError if a file's options differ: tensors of equal names and shapes would act differently."""
+    """Raise ParameterError if the options of a weights file differ from the options of this network.
+
+    The tensor names and shapes can be equal all the same, and the network would compute other results.
+    """
     for name in options:
         if name in trained and trained[name] != options[name]:
             text = f"{weights.name} was trained with {name}: {_word(trained[name])}, and this network has {name}: "

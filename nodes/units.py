@@ -25,12 +25,12 @@ _SCALE: dict[str, dict[str, float]] = {
     "DN/e-": {"DN/e-": 1.0, "e-/DN": 1.0},
 }
 _USUAL = {"m": "um", "s": "ms", "rad": "mrad"}  #: the unit that messages suggest for an SI unit
-_RECIPROCAL = {"e-/DN"}  #: units of 1 over the quantity
+_RECIPROCAL = {"e-/DN"}  #: units of the reciprocal of the quantity
 _NUMBER = re.compile(r"([-+]?(?:\d+\.?\d*|\.\d+)(?:[eE][-+]?\d+)?)\s*(.*)")
 
 
 def read_quantity(value: Any, si: str) -> float:
-    """Return ``"550 nm"`` as a finite number in the SI unit ``si``; raise ValueError for another or for no unit."""
+    """Convert a text such as ``"550 nm"`` to the SI unit ``si``; raise ValueError for a wrong or missing unit."""
     match = _NUMBER.fullmatch(str(value).strip())
     if isinstance(value, bool) or match is None:
         raise ValueError(f"is not a quantity: write a number and a unit, such as '1 {_USUAL.get(si, si)}'")
@@ -45,7 +45,7 @@ def read_quantity(value: Any, si: str) -> float:
 
 
 def _with_unit(number: str, si: str) -> str:
-    """Return the text that a message suggests for a number without a unit; both units of a gain are usual."""
+    """Return the example that an error message suggests for a number without a unit."""
     if si == "DN/e-":
         return f"{number} e-/DN or {number} DN/e- (EMVA's K is DN/e-)"
     return f"{number} {_USUAL.get(si, si)} (one of {', '.join(_SCALE[si])})"
@@ -60,15 +60,19 @@ def _in_si(number: float, si: str, unit: str) -> float:
 
 
 def read_any(text: Any) -> tuple[float, str]:
-    """Return ``"550 nm"`` or ``0.56`` as a finite number and SI unit ("" for none); raise ValueError for other text."""
+    """Convert a text such as ``"550 nm"`` or ``0.56`` to a finite number and its SI unit, "" for no unit.
+
+    Raises ValueError for other text.
+    """
     number, si, reciprocal = read_written(text)
     return (_in_si(number, si, "e-/DN"), si) if reciprocal else (number, si)
 
 
 def read_written(text: Any) -> tuple[float, str, bool]:
-    """Return the number, the SI unit, and True for a reciprocal unit such as e-/DN, in which the number stays.
+    """Return the number in a text, the SI unit, and True if the number has a reciprocal unit such as e-/DN.
 
-    The reciprocal of a normal distribution, such as that of 0.37 e-/DN, is not normal, so no number is converted here.
+    A number with a reciprocal unit is not converted, because the reciprocal of a normal distribution, such as that of
+    0.37 e-/DN, is not normal.
     """
     match = _NUMBER.fullmatch(str(text).strip())
     unit = match[2].strip() if match else ""
@@ -106,7 +110,7 @@ Shape = tuple[Count, Count]  #: (y, x) in pixels
 
 
 class IsFile:
-    """The mark of a file parameter: the result depends on the content of the file, which enters the engine's digest."""
+    """The annotation of a file parameter, which makes the content of the file part of the cache key."""
 
 
 def _existing(path: Path) -> Path:
@@ -119,7 +123,10 @@ DataFile = Annotated[Path, AfterValidator(_existing), IsFile()]  #: path of a fi
 
 
 def _files(written: Any) -> list[Path]:
-    """Return the files of a path, a pattern, a folder or a list of these; patterns and folders are sorted by name."""
+    """Return all files given by a path, a pattern, a folder or a list.
+
+    The files of a pattern or a folder are sorted by name.
+    """
     if isinstance(written, list | tuple):
         return [path for each in written for path in _files(each)]
     path = Path(written)
@@ -128,7 +135,7 @@ def _files(written: Any) -> list[Path]:
     inside = path.iterdir() if path.is_dir() else map(Path, glob(str(written)))
     files = sorted(each for each in inside if each.is_file() and not each.name.startswith("."))
     if not files:
-        raise ValueError(f"no such file, and no folder or pattern that holds one: {path}")
+        raise ValueError(f"no such file, and no folder or pattern with a file: {path}")
     return files
 
 

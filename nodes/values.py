@@ -1,7 +1,7 @@
-"""Values that pass between steps where one tensor is not enough.
+"""Named tuples that pass several tensors from one step to the next.
 
 Every field is a tensor, so that every value can be stored, moved and differentiated.
-Spectral sampling is data: a node that needs wavelengths receives `Bands`.
+Spectral sampling is a value, not a parameter: a node that needs wavelengths receives `Bands`.
 """
 
 from __future__ import annotations
@@ -21,7 +21,10 @@ class Bands(NamedTuple):
 
 
 class Stop(NamedTuple):
-    """The round stop, and the square pupil grid whose sample j lies at (j - (samples - 1) / 2) * pitch on each axis."""
+    """The circular aperture stop of the lens, and the square grid that samples the pupil.
+
+    Sample j lies at (j - (samples - 1) / 2) * pitch on each axis.
+    """
 
     samples: Tensor  #: () int64, number of samples along each axis
     pitch: Tensor  #: () float64, m between samples
@@ -29,14 +32,14 @@ class Stop(NamedTuple):
 
 
 class Dirt(NamedTuple):
-    """The effect of dirt on the window, as transmission and path in the plane of the pupil."""
+    """The effect of dirt on the window, as transmission and optical path in the plane of the pupil."""
 
     amplitude: Tensor  #: (v, u) transmission of the field in [0, 1]
     path: Tensor  #: (v, u) added optical path, m
 
 
 class Pupil(NamedTuple):
-    """The pupil function of all bands, stored as factors.
+    """The complex pupil function of each band, stored as real factors.
 
     The field of band b is ``amplitude * exp(2 pi i (index[b] * height + path) / wavelengths[b])``.
     The factors are stored because 31 complex fields of 2160 x 2160 take 1.2 GB and the factors 75 MB.
@@ -53,16 +56,16 @@ class Pupil(NamedTuple):
 
 
 class Psf(NamedTuple):
-    """Point-spread functions: the share of the light through the clear pupil that reaches each pixel."""
+    """Point-spread functions: the fraction of the light through the clear pupil that reaches each pixel."""
 
     intensity: Tensor  #: (band, y, x); the sum over an infinite plane is the transmitted share
-    clear_peak: Tensor  #: (band,) float64: the pixel on the axis of the same lens without mask, dirt and aberrations
+    clear_peak: Tensor  #: (band,) float64: pixel on the axis for the same lens without mask, dirt and aberrations
 
 
 class LowRankCube(NamedTuple):
-    """A low-rank cube of many bands: band b is about ``sum_k basis[b, k] planes[k]``, the strongest plane first."""
+    """A low-rank approximation of a spectral cube: band b is about ``sum_k basis[b, k] planes[k]``."""
 
-    planes: Tensor  #: (k, y, x)
+    planes: Tensor  #: (k, y, x), the strongest plane first
     basis: Tensor  #: (band, k) float64
     residual_max: Tensor  #: (k + 1, band) float64: bound of |band b minus the first r planes|, r = 0 to k
     residual_rms: Tensor = torch.zeros(0, 0, dtype=torch.float64)  #: root mean square of this difference, or empty
@@ -81,10 +84,10 @@ class Channels(NamedTuple):
 
 
 class Levels(NamedTuple):
-    """Statistics of frames under several flat illuminations, as a fit of the sensor needs them.
+    """Statistics of frames at several levels of flat illumination, from which sensor parameters are fitted.
 
-    A level whose numbers are clipped, or too coarse to count as continuous, keeps a histogram: one cell counts how
-    often one number occurs in one level.
+    A level with clipped or coarsely quantised numbers also has a histogram: a cell counts how often one number occurs
+    in one level.
     """
 
     photons: Tensor  #: (level,) float64, mean photons per pixel and exposure; 0 in the dark

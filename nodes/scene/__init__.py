@@ -1,4 +1,4 @@
-"""Scenes: the sources of light in a recipe."""
+"""Scenes: photographs, OpenEXR pictures, spectral cubes and test targets."""
 
 from neusee.nodes.scene._exr_picture import exr
 from neusee.nodes.scene._hyperspectral import hyperspectral

@@ -1,4 +1,4 @@
-"""Scaling of a scene until the scene covers the frame of a recipe, and the cut at the centre."""
+"""Scaling and central cropping of a scene to the frame of a recipe."""
 
 import math
 
@@ -8,10 +8,10 @@ from neusee.nodes.units import Shape
 
 
 def framed(scene: Tensor, shape: Shape | None) -> Tensor:
-    """Scale linear light with its aspect ratio until it covers `shape`, then crop: (band, y, x) -> (band, *shape).
+    """Scale a scene (band, y, x) without distortion until it covers `shape`, then crop the centre: (band, *shape).
 
     Kornia's antialiased bilinear resampling has no overshoot, so that no value becomes negative. Kornia's `center_crop`
-    would interpolate between pixels where a number of rows or columns to remove is odd.
+    would interpolate between pixels where the number of rows or columns to remove is odd.
     """
     from kornia.geometry.transform import resize
 
@@ -24,14 +24,14 @@ def framed(scene: Tensor, shape: Shape | None) -> Tensor:
 
 
 def covering(size: tuple[int, int], shape: Shape) -> tuple[int, int]:
-    """Return the smallest size of the same aspect ratio that covers `shape`."""
+    """Return the smallest picture size that covers `shape` and has the same aspect ratio as `size`."""
     scale = max(shape[0] / size[0], shape[1] / size[1])
     y, x = (max(n, math.floor(k * scale + 0.5)) for k, n in zip(size, shape, strict=True))
     return y, x
 
 
 def enlarged(size: tuple[int, int], shape: Shape | None) -> list[str]:
-    """Return a note if a scene of this size is enlarged to cover `shape`, and nothing otherwise."""
+    """Return a note for the user if a scene of this size must be enlarged to cover `shape`, else an empty list."""
     if shape is None:
         return []
     scale = max(shape[0] / size[0], shape[1] / size[1])

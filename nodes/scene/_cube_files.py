@@ -1,4 +1,4 @@
-"""Files of spectral cubes: .mat, .npy and spectral OpenEXR."""
+"""Functions that read spectral cubes from .mat, .npy and spectral OpenEXR files."""
 
 from pathlib import Path
 from typing import Any, Literal
@@ -18,7 +18,7 @@ _TYPES = {"double": "float64", "single": "float32", "logical": "bool", "char": "
 def cube_and_wavelengths(
     file: Path, variable: str | None, start: float | None, stop: float | None, layout: Layout
 ) -> tuple[Tensor, Tensor]:
-    """Read a cube (band, y, x) float32 and its wavelengths in m."""
+    """Read a spectral cube (band, y, x) float32 and its wavelengths in m from a file."""
     if file.suffix == ".exr":
         cube, known, _ = read_spectral(file)
         return cube, known
@@ -32,7 +32,7 @@ def cube_and_wavelengths(
 
 
 def size_and_type(file: Path, variable: str | None) -> tuple[tuple[int, ...], str]:
-    """Read the shape and the type of the cube from the header of the file."""
+    """Read the shape and the data type of a spectral cube from the header of a file."""
     if file.suffix == ".npy":
         head = np.load(file, mmap_mode="r")
         size, kind = head.shape, str(head.dtype)
@@ -41,12 +41,12 @@ def size_and_type(file: Path, variable: str | None) -> tuple[tuple[int, ...], st
     else:
         raise ParameterError("file", f"{file.name} is not a .mat, .npy or .exr file: save the cube as one of these")
     if len(size) != 3:
-        raise ParameterError("file", f"{file.name} holds shape {size}: a cube has three axes")
+        raise ParameterError("file", f"{file.name} holds an array of shape {size}: give a cube with three axes")
     return size, kind
 
 
 def exr_size(file: Path) -> tuple[int, int]:
-    """Read the numbers of rows and columns from the header of a spectral OpenEXR."""
+    """Read the numbers of rows and columns of a cube from the header of a spectral OpenEXR file."""
     _, names, size = exr_header(file)
     if not spectral_channels(names):
         raise ParameterError("file", f"{file.name} has the channels {', '.join(names)}: none is named like T.550,0nm")
@@ -54,19 +54,19 @@ def exr_size(file: Path) -> tuple[int, int]:
 
 
 def _listed(file: Path) -> dict[str, tuple[tuple[int, ...], str]]:
-    """Return the shape and the type of each variable in a .mat file."""
+    """Return the shape and the data type of each variable in a .mat file."""
     from scipy.io import whosmat
 
     try:
         return {name: (size, _TYPES.get(kind, kind)) for name, size, kind in whosmat(file)}
     except Exception:  # scipy raises many kinds of errors for foreign bytes
         raise ParameterError(
-            "file", f"{file.name} is not a .mat file up to version 7: save the cube in MATLAB with -v7"
+            "file", f"{file.name} is not a .mat file of version 7 or older: save the cube in MATLAB with -v7"
         ) from None
 
 
 def _cube_name(file: Path, variable: str | None) -> str:
-    """Return the name of the requested variable, or of the only cube in the file."""
+    """Return the name of the requested variable of a .mat file, or of the only cube in the file."""
     variables = _listed(file)
     cubes = [name for name, (size, _) in variables.items() if len(size) == 3]
     if variable in variables:

@@ -1,4 +1,4 @@
-"""A scene-linear OpenEXR picture, in the primaries that its header names."""
+"""Scene-linear OpenEXR pictures, converted to linear sRGB."""
 
 from pathlib import Path
 from typing import Annotated, Any, Literal
@@ -15,7 +15,7 @@ from neusee.nodes.scene._spectral_exr import exr_header
 from neusee.nodes.units import DataFile, Shape
 
 White = Annotated[float, Field(gt=0, allow_inf_nan=False)]
-_REC709 = (0.64, 0.33, 0.30, 0.60, 0.15, 0.06, 0.3127, 0.3290)  #: of a file without named primaries
+_REC709 = (0.64, 0.33, 0.30, 0.60, 0.15, 0.06, 0.3127, 0.3290)  #: of a file whose header has no primaries
 
 
 @node(rtol=1e-5)
@@ -26,12 +26,15 @@ def exr(
     white: White | None = None,
     negatives: Literal["clip", "keep"] = "clip",
 ) -> Tensor:
-    """Read scene-linear light and convert the primaries of the header to linear sRGB (Bradford where whites differ).
+    """Read a scene-linear OpenEXR picture and convert it to linear sRGB.
+
+    The header of the file gives the primaries; Bradford adaptation is used where the white points differ.
 
     Shapes: -> (3, y, x) float32, the size of the file or `shape` (scaled to cover `shape`, cropped at the centre).
     Units:  linear sRGB, 1 = `white` in the values of the file (with null the values stay unscaled); no upper limit.
     Error:  half floats resolve 5e-4. Negative light, from noise or colours outside sRGB, is clipped unless kept.
-    Raises: ParameterError before the run without R, G and B, or Y alone; ValueError for values that are not finite.
+    Raises: ParameterError before the run unless the channels are R, G and B, or Y alone; ValueError for values
+            that are not finite.
     Source: OpenEXR technical introduction (chromaticities, adoptedNeutral); matrices of colour-science.
     """
     scene = framed(_linear(file), shape) / (white or 1.0)
@@ -41,9 +44,9 @@ def exr(
 @exr.preflight
 def _(*, file: Path, shape: Shape | None = None, **params: Any) -> list[str]:
     header, names, size = exr_header(file)
-    notes = [f"{file.name}: luminance only, read as grey"] if _colour_channels(file, names) == ["Y"] else []
+    notes = [f"{file.name}: only luminance; the picture is grey"] if _colour_channels(file, names) == ["Y"] else []
     if abs(float(header.get("pixelAspectRatio", 1.0)) - 1) > 1e-3:
-        notes += [f"{file.name}: pixels are not square ({header['pixelAspectRatio']:.3f}), read as square"]
+        notes += [f"{file.name}: pixels are not square ({header['pixelAspectRatio']:.3f}), but are read as square"]
     return notes + enlarged(size, shape)
 
 
@@ -56,7 +59,7 @@ def _(result: Tensor, *, file: Path, **params: Any) -> list[Check]:
 
 
 def _colour_channels(file: Path, names: list[str]) -> list[str]:
-    """Return the names of the channels to read: R, G and B, or else Y alone."""
+    """Return the names of the channels to read from an OpenEXR file: R, G and B, or Y alone."""
     for channels in (["R", "G", "B"], ["Y"]):
         if set(channels) <= set(names) and not {"RY", "BY"} & set(names):
             return channels
@@ -67,7 +70,7 @@ def _colour_channels(file: Path, names: list[str]) -> list[str]:
 
 
 def _linear(file: Path) -> Tensor:
-    """Read a file as linear sRGB, (3, y, x) float32, with all pixels of the file."""
+    """Read all pixels of an OpenEXR file as linear sRGB, (3, y, x) float32."""
     import OpenEXR
 
     with OpenEXR.File(str(file), separate_channels=True) as opened:
@@ -76,7 +79,7 @@ def _linear(file: Path) -> Tensor:
         pixels = np.stack([np.asarray(channels[name].pixels, dtype=np.float32) for name in names])
     if bad := int((~np.isfinite(pixels)).sum()):
         raise ValueError(
-            f"{file.name} holds {bad} values that are not finite: replace these values, such as by the largest"
+            f"{file.name} holds {bad} values that are not finite: replace these values by finite numbers, such as 0"
         )
     if names == ["Y"]:
         return torch.from_numpy(pixels).expand(3, -1, -1).clone()
@@ -85,7 +88,10 @@ def _linear(file: Path) -> Tensor:
 
 
 def _to_srgb(header: dict[str, Any]) -> NDArray[np.float64]:
-    """Return the matrix from the primaries of a header to linear sRGB; Bradford adapts the header's neutral to D65."""
+    """Return the matrix from the primaries of an OpenEXR header to linear sRGB.
+
+    Bradford adaptation maps the neutral of the header to D65.
+    """
     import colour
 
     values = np.asarray(header.get("chromaticities", _REC709), dtype=np.float64)

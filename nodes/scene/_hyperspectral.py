@@ -1,4 +1,4 @@
-"""A hyperspectral scene: reflectance measured in many bands instead of lifted from three channels."""
+"""Hyperspectral scenes: reflectance measured in many bands instead of reconstructed from RGB."""
 
 from pathlib import Path
 from typing import Any
@@ -42,7 +42,7 @@ def hyperspectral(
     cube, known = cube_and_wavelengths(file, variable, start, stop, layout)
     require_range(bands.centres, known, f"{file.name} holds")
     if wrong := int((~torch.isfinite(cube)).sum()):
-        raise ValueError(f"{file.name} holds {wrong} values that are not finite: replace these values by numbers")
+        raise ValueError(f"{file.name} holds {wrong} values that are not finite: replace them by finite numbers")
     mixed = (_interpolation(known, bands.centres).float() @ cube.flatten(1)).reshape(-1, *cube.shape[1:])
     return framed(mixed, shape).clamp_min_(0).to(bands.centres.device)
 
@@ -65,7 +65,7 @@ def _(
         raise ParameterError(name, text)
     size, kind = size_and_type(file, variable)
     if np.dtype(kind).kind not in "uf":
-        raise ParameterError("file", f"{file.name} holds {kind}: save it as float, uint8 or uint16")
+        raise ParameterError("file", f"{file.name} holds values of type {kind}: save as float, uint8 or uint16")
     pixels = size[:2] if layout == "y x band" else size[1:]
     return enlarged((pixels[0], pixels[1]), shape)
 
@@ -77,7 +77,7 @@ def _(result: Tensor, bands: Bands, **params: Any) -> list[Check]:
 
 
 def _interpolation(known: Tensor, wavelengths: Tensor) -> Tensor:
-    """Return the matrix (wavelength, known wavelength) of linear interpolation."""
+    """Return the matrix that interpolates spectra linearly from the ``known`` wavelengths to ``wavelengths``."""
     if len(known) == 1:
         return torch.ones(len(wavelengths), 1, dtype=torch.float64)
     return Table(known, torch.eye(len(known), dtype=torch.float64)).at(wavelengths).T

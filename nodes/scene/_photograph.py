@@ -1,4 +1,4 @@
-"""A photograph: linear light from an sRGB file."""
+"""Photographs as scenes: linear light from sRGB files."""
 
 from pathlib import Path
 from typing import Any
@@ -22,8 +22,8 @@ def photograph(*, file: DataFile, shape: Shape | None = None) -> Tensor:
 
     Shapes: -> (3, y, x) float32, the size of the file or `shape` (scaled to cover `shape`, cropped at the centre).
     Units:  linear sRGB, 1 = the white of the file.
-    Error:  half a code value (8 bit: 1.8e-3 near white); the tone curve of the camera is not undone. Every file is
-            read as sRGB: a note names an embedded profile, which is not applied.
+    Error:  half a code value (8 bit: 1.8e-3 near white); the tone curve of the camera is not inverted. Every file is
+            read as sRGB: a note names an embedded colour profile, which is ignored.
     Raises: ParameterError before the run for another format, for another depth, and for transparency.
     Source: IEC 61966-2-1:1999 (sRGB); EXIF 2.3, tag Orientation.
     """
@@ -49,29 +49,29 @@ def _(*, file: Path, shape: Shape | None = None) -> list[str]:
             size = image.size if turned in _ROTATED else image.size[::-1]
     except UnidentifiedImageError:
         raise ParameterError("file", f"{file} is not a readable picture: give a PNG or JPEG file") from None
-    notes = [f"{file.name}: colour profile {profile!r} not applied, the file is read as sRGB"] if profile else []
-    notes += [f"{file.name}: turned upright, as its EXIF orientation {turned} says"] if turned != 1 else []
+    notes = [f"{file.name}: colour profile {profile!r} is ignored, and the file read as sRGB"] if profile else []
+    notes += [f"{file.name}: picture turned upright by EXIF orientation {turned}"] if turned != 1 else []
     return notes + enlarged(size, shape)
 
 
 @photograph.check
 def _(result: Tensor, **params: Any) -> list[Check]:
     clipped = float((result >= 1).any(0).float().mean())
-    return [Check(f"mean {float(result.mean()):.3f}, {clipped:.1%} of pixels at white", float(result.max()) > 0)]
+    return [Check(f"mean {float(result.mean()):.3f}, {clipped:.1%} of pixels are saturated", float(result.max()) > 0)]
 
 
 def _refuse(file: Path, image: Any) -> None:
     fix = _FIX.format(name=file.name, stem=file.stem)
     if image.format not in ("PNG", "JPEG", "MPO"):
-        raise ParameterError("file", f"{file} is {image.format}, not PNG or JPEG: {fix}; scene-linear: scene.exr")
+        raise ParameterError("file", f"{file} is {image.format}, not PNG or JPEG: {fix}, or use scene.exr")
     if "transparency" in image.info or image.mode.endswith("A"):
-        raise ParameterError("file", f"{file} has transparency, which is not light: {fix}")
+        raise ParameterError("file", f"{file} has transparency, which a scene cannot use: {fix}")
     if image.mode not in _MODES:
         raise ParameterError("file", f"{file} has pixels of kind {image.mode}, not grey or RGB: {fix}")
 
 
 def _profile(image: Any) -> str:
-    """Return the name of an embedded profile, or an empty text for sRGB itself."""
+    """Return the name of the colour profile embedded in a photograph, or an empty text for sRGB or no profile."""
     from io import BytesIO
 
     from PIL import ImageCms
@@ -86,7 +86,10 @@ def _profile(image: Any) -> str:
 
 
 def _codes(file: Path) -> Tensor:
-    """Read upright code values in [0, 1]: (3, y, x) float32, 16-bit colour by kornia_rs, as Pillow keeps 8 bits."""
+    """Read the sRGB code values of a photograph, turned upright and scaled to [0, 1]: (3, y, x) float32.
+
+    Kornia_rs reads 16-bit colour, of which Pillow would keep 8 bits.
+    """
     import numpy as np
     from PIL import Image, ImageOps
 
@@ -103,13 +106,13 @@ def _codes(file: Path) -> Tensor:
 
 
 def _depth(file: Path) -> int:
-    """Return the bits per channel: byte 24 of a PNG header, and 8 for every JPEG."""
+    """Return the number of bits per channel of a PNG or JPEG file, which is always 8 for JPEG."""
     head = file.read_bytes()[:26]
     return head[24] if head.startswith(b"\x89PNG") else 8
 
 
 def _words(file: Path, turned: int) -> Any:
-    """Read a 16-bit RGB file, and turn the picture upright by its EXIF orientation."""
+    """Read a 16-bit RGB PNG file, and turn the picture upright by the EXIF orientation ``turned``."""
     import numpy as np
     from kornia_rs.io import read_image_png_u16
 

@@ -1,4 +1,4 @@
-"""Photographs of a folder as scenes: the files that can be read, and parts of pictures drawn from a seed."""
+"""Photographs of a folder as scenes: search for readable files, and random crops that depend on a seed."""
 
 from __future__ import annotations
 
@@ -17,8 +17,8 @@ from neusee.nodes.scene._crop_to_frame import covering
 from neusee.nodes.scene._photograph import photograph
 
 _PICTURES = frozenset({".png", ".jpg", ".jpeg", ".jpe", ".webp", ".tif", ".tiff", ".bmp", ".gif"})
-_ENDS = {b"\xff\xd8": b"\xff\xd9", b"\x89P": b"IEND"}  #: first bytes of a format -> mark near the end of its files
-_TAIL = 1 << 16  #: bytes at the end of a file in which the mark must be: some cameras write more behind the mark
+_ENDS = {b"\xff\xd8": b"\xff\xd9", b"\x89P": b"IEND"}  #: first bytes of a format -> end mark of a file of this format
+_TAIL = 1 << 16  #: bytes at the end of a file that must contain the end mark: some cameras write more after it
 _ORDER, _PART, _DRAW = 0, 1, 2  #: random streams of one seed
 _KEPT = 64  #: decoded photographs that a process keeps
 _TRIES = 100  #: broken photographs in a row, after which drawing stops with an error
@@ -27,10 +27,10 @@ Index = int | Sequence[int]  #: the number of a scene, or (stage, number) of a p
 
 
 def list_photographs(root: Path) -> tuple[list[Path], list[tuple[Path, str]]]:
-    """List the photographs below a folder in the order of their paths, and the unreadable files, each with a reason.
+    """List the readable photographs below a folder, sorted by path, and the unreadable files with a reason for each.
 
-    The headers and the ends of the files decide; no picture is decoded. Hidden files, hidden folders and files without
-    the suffix of a picture are ignored.
+    Only the header and the end of each file are read; no picture is decoded. Hidden files, hidden folders and
+    files without the suffix of a picture are ignored.
     """
     reasons = {path: _problem(path) for path in _files(root)}
     broken = [(path, reason) for path, reason in reasons.items() if reason]
@@ -46,7 +46,7 @@ def _files(root: Path) -> list[Path]:
 
 
 def _problem(path: Path) -> str:
-    """Return why a file cannot be read as a photograph, or an empty text."""
+    """Return the reason why a file cannot be read as a photograph, or an empty text."""
     try:
         if photograph.hooks.preflight is not None:
             photograph.hooks.preflight(file=path, shape=None)
@@ -59,13 +59,16 @@ def _problem(path: Path) -> str:
 
 
 def choose_photograph(paths: Sequence[Path], seed: int, index: int) -> Path:
-    """Return the photograph of a scene: every photograph once in an order drawn from the seed, then all again."""
+    """Return the photograph for scene ``index``, so that every photograph is used once before any is repeated.
+
+    The order of the photographs is drawn from the seed.
+    """
     order: list[int] = np.random.default_rng([seed, _ORDER]).permutation(len(paths)).tolist()
     return paths[order[index % len(paths)]]
 
 
 def crop_photograph(path: Path, shape: tuple[int, int], seed: int, index: Index) -> Tensor:
-    """Cut a part out of a photograph, linear sRGB (3, y, x), at a position drawn from the seed and the index alone.
+    """Crop a photograph, linear sRGB (3, y, x), at a position that depends only on the seed and the index.
 
     A smaller photograph is first enlarged by the bicubic kernel in linear light until it just covers ``shape``;
     negative results of the kernel become black.
@@ -92,25 +95,26 @@ def _indices(index: Index) -> list[int]:
 
 @dataclass
 class Photographs:
-    """Photographs for training, and the files that cannot be read as photographs."""
+    """The photographs of a folder for training, and the files that cannot be read as photographs."""
 
     paths: tuple[Path, ...]  #: in the order of their names
-    broken: dict[Path, str] = field(default_factory=dict)  #: why each of the other files cannot be read
+    broken: dict[Path, str] = field(default_factory=dict)  #: the reason why each other file cannot be read
 
     @classmethod
     def under(cls, root: Path) -> Photographs:
-        """Return all photographs below a folder at any depth; raise ValueError for a folder without photographs."""
+        """Find all photographs below a folder at any depth; raise ValueError for a folder without photographs."""
         paths, broken = list_photographs(root)
         if not paths:
             why = f"; {len(broken)} cannot be read, such as {broken[0][0]}: {broken[0][1]}" if broken else ""
-            raise ValueError(f"no photograph below {root}{why}")
+            raise ValueError(f"no photograph is below {root}{why}")
         return cls(tuple(paths), dict(broken))
 
     def crop(self, shape: tuple[int, int], seed: int, index: Index) -> Tensor:
-        """Draw a photograph and cut a part out of it, mirrored or not; a broken photograph is replaced by another draw.
+        """Return a random crop of a random photograph, mirrored with probability 1/2.
 
-        The same ``seed`` and ``index`` give the same part in any order and in any number of processes, whereas the
-        random crops and flips of kornia draw from the one random stream of torch.
+        A broken photograph is replaced by another draw. The same ``seed`` and ``index`` give the same crop in any
+        order and in any number of processes, whereas the random crops and flips of kornia draw from the one random
+        stream of torch.
         """
         rng = np.random.default_rng([seed, _DRAW, *_indices(index)])
         for _ in range(_TRIES):

@@ -1,4 +1,4 @@
-"""Spectral OpenEXR: one channel per wavelength, named as by Fichet, Pacanowski and Wilkie (JCGT 10(3), 2021).
+"""Spectral OpenEXR files: one channel per wavelength, named as in Fichet et al. (JCGT 10(3), 2021).
 
 Emitted light is ``S0.550,0nm``, reflectance is ``T.550,0nm``. The decimal mark is a comma because a point separates
 layers. Colour-science reads and writes such files only with OpenImageIO, and its import alone takes a second.
@@ -24,7 +24,7 @@ _PREFIX = {
 
 
 def exr_header(file: Path) -> tuple[dict[str, Any], list[str], tuple[int, int]]:
-    """Read the header of an OpenEXR file, with the names of the channels and the numbers of rows and columns."""
+    """Read the header, the channel names, and the numbers of rows and columns of an OpenEXR file."""
     import OpenEXR
 
     try:
@@ -46,7 +46,7 @@ def write_spectral(
     kind: Literal["emissive", "reflective"] = "emissive",
     header: Mapping[str, Any] | None = None,
 ) -> None:
-    """Write a cube (band, y, x) with its wavelengths in metres as float32, losslessly.
+    """Write a spectral cube (band, y, x) with its wavelengths in m to an OpenEXR file, as lossless float32.
 
     Raises: ValueError where cube and wavelengths differ in number, and where two bands would get the same name.
     """
@@ -54,7 +54,7 @@ def write_spectral(
 
     wavelengths = [float(w) for w in centres]
     if cube.ndim != 3 or len(wavelengths) != len(cube):
-        raise ValueError(f"cube {tuple(cube.shape)} must be (band, y, x) with {len(wavelengths)} bands")
+        raise ValueError(f"cube has shape {tuple(cube.shape)}, not (band, y, x) with {len(wavelengths)} bands")
     quantity = "S0" if kind == "emissive" else "T"
     names = [quantity + "." + f"{w * 1e9:.6f}nm".replace(".", ",") for w in wavelengths]
     if len(set(names)) < len(names):
@@ -66,9 +66,10 @@ def write_spectral(
 
 
 def read_spectral(path: Path | str) -> tuple[Tensor, Tensor, dict[str, Any]]:
-    """Read a cube (band, y, x) float32, its rising wavelengths (band,) float64 in m, and the header.
+    """Read a spectral OpenEXR file: the cube (band, y, x), the rising wavelengths (band,) in m, and the header.
 
-    Only the emission is read from a file with both emission and reflectance.
+    The cube is float32, the wavelengths float64. Only the emission is read from a file with both emission and
+    reflectance.
     Raises: ValueError, which lists the channels of the file, where no channel is spectral.
     """
     import OpenEXR
@@ -85,7 +86,10 @@ def read_spectral(path: Path | str) -> tuple[Tensor, Tensor, dict[str, Any]]:
 
 
 def spectral_channels(names: Sequence[str]) -> dict[float, str]:
-    """Map each wavelength in m, rising, to the name of its channel; reflectance counts where no emission is named."""
+    """Return the name of the channel of each wavelength in m, rising.
+
+    Reflectance channels are used only if the file has no emission channels.
+    """
     for kind in ("S0", "T"):
         matches = [m for m in map(_NAME.fullmatch, names) if m and m[1] == kind and m[2] not in ("", ",")]
         if matches:

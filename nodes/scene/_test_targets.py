@@ -1,4 +1,4 @@
-"""Synthetic scenes whose image has a known answer."""
+"""Synthetic test targets as scenes: flat field, edges, Siemens star and points."""
 
 import math
 from collections.abc import Callable
@@ -18,10 +18,11 @@ _SPACING = 64  #: pixels between points
 
 @node(rtol=1e-5)
 def targets(*, kind: Kind, shape: Shape, low: Fraction = 0.0, high: Fraction = 1.0) -> Tensor:
-    """Draw a grey test target whose image has a known answer.
+    """Draw a grey test target: a flat field, a straight or slanted edge, a Siemens star, or points.
 
-    `flat` is `high` everywhere; `edge` runs through the axis, bright towards +x; `slanted_edge` is an edge tilted by 5
-    degrees; `siemens` is a sinusoidal star of 36 cycles; `points` are single pixels, 64 apart, with one on the axis.
+    `flat` is `high` everywhere; `edge` is vertical through the axis, bright towards +x; `slanted_edge` is an edge
+    tilted by 5 degrees; `siemens` is a sinusoidal star of 36 cycles; `points` are single pixels, 64 apart, with one on
+    the axis.
 
     Shapes: -> (3, y, x) float32, the axis at sample N//2.
     Units:  linear sRGB, grey between `low` and `high`.
@@ -38,7 +39,7 @@ def targets(*, kind: Kind, shape: Shape, low: Fraction = 0.0, high: Fraction = 1
 @targets.preflight
 def _(*, low: float = 0.0, high: float = 1.0, **params: Any) -> list[str]:
     if low > high:
-        raise ParameterError("low", f"low {low:g} is above high {high:g}: exchange the two")
+        raise ParameterError("low", f"low {low:g} is above high {high:g}: exchange the two numbers")
     return []
 
 
@@ -49,7 +50,7 @@ def _(result: Tensor, *, low: float = 0.0, high: float = 1.0, **params: Any) -> 
 
 
 def _slanted(y: Tensor, x: Tensor) -> Tensor:
-    """Return the share of each pixel on one side of a tilted line through the axis, exact to round-off."""
+    """Return the exact fraction of the area of each pixel on the bright side of a slanted edge through the axis."""
     c, s = math.cos(_TILT), math.sin(_TILT)
     distance = x * c + y * s
     wide, narrow = (c + s) / 2, (c - s) / 2

@@ -1,4 +1,4 @@
-"""Sensor: photons to electrons to digital numbers."""
+"""Sensor: conversion of photons to electrons, and of electrons to digital numbers."""
 
 from neusee.nodes.sensor._channel_sums import channel_sums
 from neusee.nodes.sensor._digitization import crop, digitize, full_well

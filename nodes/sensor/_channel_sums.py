@@ -1,4 +1,4 @@
-"""Weighted sums over the bands of an image, which may be stored as all bands or as channel sums."""
+"""Weighted sums over the bands of an image, for images stored as all bands or as channel sums."""
 
 import torch
 from torch import Tensor
@@ -6,11 +6,15 @@ from torch import Tensor
 from neusee.nodes._half_precision import single
 from neusee.nodes.values import Channels
 
-_OFF = 1e-9  #: relative error, at most, of weights that are combined from the rows
+_OFF = 1e-9  #: largest relative error of weights that are combined from the rows
 
 
 def weighted(image: Tensor | Channels, weights: Tensor) -> Tensor:
-    """Return the sum of an image's bands with ``weights`` (..., band); raise ValueError if the bands do not fit."""
+    """Return the weighted sum of the bands of an image, with ``weights`` (..., band).
+
+    Raises ValueError if weights and image have different numbers of bands, or if no combination of the channel sums
+    gives the weights.
+    """
     if isinstance(image, Channels):
         mixed = _of_rows(weights, image.rows).to(image.planes)
         summed: Tensor = torch.tensordot(mixed, image.planes, 1)
@@ -21,9 +25,10 @@ def weighted(image: Tensor | Channels, weights: Tensor) -> Tensor:
 
 
 def channel_sums(image: Tensor, rows: Tensor) -> Channels:
-    """Return the sums of an image (..., band, y, x) with each of ``rows`` (row, band), without error.
+    """Return the weighted sums of the bands of an image as `Channels`, one sum for each row of weights.
 
-    The sums of a part of the bands are the contribution of these bands to the whole.
+    Shapes: image (..., band, y, x), rows (row, band). The sums carry no approximation error. The sums of a part of the
+    bands are the contribution of these bands to the whole.
     """
     exact = torch.zeros((), dtype=torch.float64)
     light = single(image).sum(-1).sum(-1, dtype=torch.float64)
@@ -31,7 +36,10 @@ def channel_sums(image: Tensor, rows: Tensor) -> Channels:
 
 
 def _of_rows(weights: Tensor, rows: Tensor) -> Tensor:
-    """Return the matrix M with weights = M rows, by least squares in float64; the gradient reaches the weights."""
+    """Return the matrix M that satisfies ``weights = M rows``, by least squares in float64.
+
+    The gradient reaches the weights.
+    """
     known = rows.detach().cpu().double()
     scale = known.abs().amax(1, keepdim=True)
     inverse = torch.linalg.pinv(known / scale.where(scale > 0, 1.0)) / scale.where(scale > 0, 1.0).T
@@ -45,7 +53,7 @@ def _of_rows(weights: Tensor, rows: Tensor) -> Tensor:
 
 
 def _require_combination(exact: Tensor, combined: Tensor) -> None:
-    """Raise ValueError unless combined rows equal the exact weights, relative to the largest weight of each channel."""
+    """Raise ValueError unless ``combined`` equals the ``exact`` weights within 1e-9 of the largest weight."""
     off, most = (exact - combined).abs().flatten(0, -2), exact.abs().flatten(0, -2).amax(-1)
     if not bool((off.amax(-1) <= _OFF * most).all()):
         worst = float((off.amax(-1) / most.clamp_min(1e-300)).max())

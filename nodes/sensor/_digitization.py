@@ -1,4 +1,4 @@
-"""Conversion of electrons to digital numbers: the full well, the converter, and the window of the sensor."""
+"""Conversion of electrons to digital numbers: full well, analogue-to-digital converter, and sensor window."""
 
 import math
 from typing import Annotated, Any, Literal
@@ -18,12 +18,12 @@ Bits = Annotated[int, Field(ge=1, le=16)]
 
 @node(rtol=0.0)
 def full_well(electrons: Tensor, *, capacity: Well) -> Tensor:
-    """Limit the electrons of each pixel to its full well.
+    """Limit the electrons in each pixel to the full well.
 
     Shapes: electrons (..., y, x) -> (..., y, x).
     Units:  e-.
-    Error:  a hard edge: neither blooming into neighbours nor a soft knee. An offset added before takes its share
-            of the well, as the paper prints it.
+    Error:  a hard edge: neither blooming into neighbours nor a soft knee. An offset that is added before uses a
+            part of the well, as the paper prints.
     Source: NeuSee, Eq. (SensorImage).
     """
     return single(electrons).clamp_max(capacity)
@@ -31,7 +31,7 @@ def full_well(electrons: Tensor, *, capacity: Well) -> Tensor:
 
 @full_well.skip_bound
 def _(electrons: TensorStats, *, capacity: float) -> float:
-    """Return the loss of the brightest pixel relative to the largest absolute result, an exact bound.
+    """Return the change if the full well is omitted: the loss of the brightest pixel over the largest result.
 
     The well is rounded to the dtype, and so differs from ``capacity`` by up to half a step of the dtype.
     """
@@ -50,7 +50,7 @@ def _(electrons: ErrorBound, **params: Any) -> float:
 
 @full_well.check
 def _(result: Tensor, electrons: Tensor, *, capacity: float) -> list[Check]:
-    return [Check(f"{int(torch.count_nonzero(result >= capacity))} of {result.numel()} pixels full")]
+    return [Check(f"{int(torch.count_nonzero(result >= capacity))} of {result.numel()} pixels are full")]
 
 
 @node(rtol=0.0)
@@ -62,14 +62,14 @@ def digitize(
     bits: Bits = 16,
     rng: Generator | None = None,
 ) -> Tensor:
-    """Convert electrons to whole digital numbers, clipped to the range of the converter.
+    """Convert electrons to whole digital numbers, clipped to the range of the analogue-to-digital converter.
 
-    Shapes: electrons (..., y, x) -> (..., y, x), whole numbers in the dtype of the input (of half precision, float32).
+    Shapes: electrons (..., y, x) -> (..., y, x), whole numbers in the dtype of the input (float32 for half precision).
     Units:  electrons e-; gain K of EMVA 1288, DN/e-, which a recipe may also write as e-/DN; result DN in
             [0, 2**bits - 1].
     Error:  `nearest` is exact (half to even), with variance 1/12 DN2. `dithered_floor`, floor(x + U(-1/2, 1/2)) as
-            printed, lies 1/2 DN low with up to 1/6 DN2 more variance. Integral nonlinearity is left out. The
-            gradient is that of the line before rounding, and 0 where the converter clips.
+            printed, is 1/2 DN too low with up to 1/6 DN2 more variance. Integral nonlinearity is left out. The
+            gradient is that of the numbers before rounding, and 0 where the converter clips.
     Raises: ValueError for `dithered_floor` without rng.
     Source: NeuSee, Eq. (SensorImage); EMVA Standard 1288, release 4.0 (quantization variance 1/12 DN2).
     """
@@ -105,25 +105,28 @@ def _(
 
 @digitize.propagate_error
 def _(electrons: ErrorBound, *, result: TensorStats, gain: float, **params: Any) -> float:
-    """Bound the error before rounding, because a value near the middle of two numbers may be rounded to either."""
+    """Return the error bound of the digital numbers before rounding; the effect of rounding is not included.
+
+    A value near the middle of two numbers may be rounded to either number.
+    """
     return electrons.rms * gain
 
 
 @digitize.preflight
 def _(*, gain: float, bits: int = 16, **params: object) -> list[str]:
     top = 2**bits - 1
-    return [f"the converter ends at {top} DN = {top / gain:.0f} e-"]
+    return [f"the largest digital number is {top} DN = {top / gain:.0f} e-"]
 
 
 @digitize.check
 def _(result: Tensor, *inputs: Tensor, bits: int = 16, **params: Any) -> list[Check]:
     high, low = (int(torch.count_nonzero(result == end)) / max(1, result.numel()) for end in (2**bits - 1, 0))
-    return [Check(f"{high:.2%} of pixels at the largest number, {low:.2%} at 0 DN", high < 0.5)]
+    return [Check(f"{high:.2%} of pixels are at the largest number, {low:.2%} at 0 DN", high < 0.5)]
 
 
 @node(rtol=0.0)
 def crop(image: Tensor, *, shape: Shape) -> Tensor:
-    """Cut the window of the sensor out of the image; the sample on the optical axis stays at N // 2.
+    """Crop an image to the window of the sensor, with the optical axis at sample N // 2.
 
     Where image and window are not both odd or both even, kornia's `center_crop` interpolates between pixels.
 
@@ -141,7 +144,7 @@ def crop(image: Tensor, *, shape: Shape) -> Tensor:
 
 @crop.propagate_error
 def _(image: ErrorBound, *, result: TensorStats, **params: Any) -> float:
-    """Bound the error of the window by the whole error of the image."""
+    """Return an error bound of the cropped image for the worst case, in which all the error is inside the window."""
     before = math.prod(image.stats.shape) if image.stats else math.inf
     return image.rms * math.sqrt(before / max(1, math.prod(result.shape)))
 

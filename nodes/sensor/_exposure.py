@@ -1,4 +1,4 @@
-"""Conversion of irradiance to photons: the level of the scene, the channels of the sensor, the sum of all light."""
+"""Conversion of irradiance to photons in each colour channel, scaling of the scene, and addition of laser light."""
 
 import math
 from collections.abc import Mapping
@@ -29,12 +29,13 @@ def expose(
     pixel_pitch: PositiveLength,
     exposure: Time,
 ) -> Tensor:
-    """Compute the photons in each channel of a pixel: the sum over the bands of r I level lambda t dx^2 / (h c).
+    """Compute the photons in each colour channel of each pixel from the irradiance in each band.
 
-    If the image has already been summed over its bands (`Channels`), the photons are weighted sums of its planes.
+    Photons are the sum over the bands of r I level lambda t dx^2 / (h c), with response r and irradiance I. If the
+    image has already been summed over its bands (`Channels`), the photons are weighted sums of its planes.
 
     Shapes: irradiance (..., band, y, x), responses (channel, band), level (band,) -> (..., channel, y, x).
-    Units:  irradiance W/m2 of the whole band (without level: of the band, with it: any); result photons.
+    Units:  irradiance W/m2 in the whole band, or any unit if `level` is given; result photons.
     Error:  one wavelength represents its band: error below (width / wavelength)^2 / 12, 5e-5 at 10 nm.
     Raises: ValueError if the bands of the inputs differ, or if no combination of the rows gives the weights.
     Source: NeuSee, Eq. (photon_count); the channel sum as EMVA Standard 1288, release 4.0, for each wavelength.
@@ -42,7 +43,7 @@ def expose(
     weights = channel_weights(bands, responses, level, pixel_pitch=pixel_pitch, exposure=exposure)
     if isinstance(irradiance, Tensor) and (irradiance.ndim < 3 or irradiance.shape[-3] != weights.shape[1]):
         raise ValueError(
-            f"irradiance {tuple(irradiance.shape)} is not (band, y, x) of {weights.shape[1]} bands: "
+            f"irradiance has shape {tuple(irradiance.shape)}, not (band, y, x) with {weights.shape[1]} bands: "
             "compute irradiance, bands and responses from the same `bands` step"
         )
     return weighted(irradiance, weights)
@@ -66,12 +67,15 @@ def _(
 @expose.check
 def _(result: Tensor, *inputs: object, **params: object) -> list[Check]:
     low, high = float(result.min()), float(result.max())
-    return [Check(f"brightest {high:.4g} photons", low >= -1e-3 * high)]
+    return [Check(f"brightest pixel {high:.4g} photons", low >= -1e-3 * high)]
 
 
 @expose.propagate_error
 def _(irradiance: ErrorBound, *others: ErrorBound | None, result: TensorStats, **params: Any) -> float:
-    """Add the relative errors of image and level; no channel has a larger relative error, as light is not negative."""
+    """Return the error bound of the photons from the relative errors of image and level.
+
+    No channel has a larger relative error, because light is not negative.
+    """
     level = others[2] if len(others) > 2 else None
     return (irradiance.share + (level.share if level else 0.0)) * result.max
 
@@ -79,12 +83,12 @@ def _(irradiance: ErrorBound, *others: ErrorBound | None, result: TensorStats, *
 def channel_weights(
     bands: Bands, responses: Tensor, level: Tensor | None, *, pixel_pitch: float, exposure: float
 ) -> Tensor:
-    """Return the photons that one unit of irradiance in each band gives in each channel: (channel, band) float64."""
+    """Return the photons in each channel for one unit of irradiance in each band: (channel, band) float64."""
     lengths = {len(bands.centres), responses.shape[-1]} | (set() if level is None else {len(level)})
     if len(lengths) > 1:
         raise ValueError(
             f"bands {len(bands.centres)}, responses {tuple(responses.shape)}, level "
-            f"{None if level is None else tuple(level.shape)} must have the same bands: use one `bands` step for all"
+            f"{None if level is None else tuple(level.shape)} differ in the number of bands: use one `bands` step"
         )
     photons = photons_per_joule(bands.centres) * (exposure * pixel_pitch**2)
     weights = responses.double() * photons.to(responses.device)
@@ -104,7 +108,9 @@ def level(
     exposure: Time,
     rule: Literal["channel_sum", "per_band"] = "channel_sum",
 ) -> Tensor:
-    """Compute the factor from image to W/m2 that gives the brightest pixel of the plain lens ``strength`` full wells.
+    """Compute the factor from image values to irradiance for which the brightest pixel holds ``strength`` full wells.
+
+    The image is that of the plain lens, without mask.
 
     `channel_sum`: the brightest pixel of the brightest channel holds strength x full well, summed over bands.
     `per_band`: each band alone peaks at strength x I_sat, as the paper prints; the sum of 31 bands overexposes.
@@ -139,7 +145,7 @@ def _(params: Mapping[str, Any]) -> bool:
 
 @level.propagate_error
 def _(plain_image: ErrorBound, *others: object, result: TensorStats, **params: Any) -> float:
-    """Return the error of the level, which divides by the brightest pixel of the image."""
+    """Return the error bound of the level, which depends on the error of the brightest pixel of the image."""
     share = plain_image.largest
     return result.max * share / (1.0 - share) if share < 1.0 else math.inf
 
@@ -149,16 +155,17 @@ def _(*, strength: float, rule: str = "channel_sum", **params: object) -> list[s
     notes = (
         [f"background of {strength:g} full wells saturates the plain lens without any laser"] if strength > 1 else []
     )
-    return notes + (["level per band: each band alone fills the well"] if rule == "per_band" else [])
+    return notes + (["rule per_band: each band alone fills the well"] if rule == "per_band" else [])
 
 
 @node(rtol=1e-6, additive_inputs=[("lasers",), ("ghosts",)])
 def add_photons(photons: Tensor, lasers: list[Tensor] | None = None, ghosts: list[Tensor] | None = None) -> Tensor:
-    """Add the photons of the scene, of every laser and of every ghost: incoherent light adds.
+    """Add the photons of the scene, of every laser and of every ghost, which are mutually incoherent.
 
     Shapes: photons (..., channel, y, x), each laser and ghost the same -> (..., channel, y, x).
     Units:  photons.
-    Error:  float32: 6e-8 of the sum. Half precision ends at 65504, so such photons are added in float32.
+    Error:  float32: 6e-8 of the sum. Half precision ends at 65504, so photons in half precision are added in
+            float32.
     Raises: ValueError if a shape differs.
     Source: NeuSee, Eq. (photon_count).
     """
@@ -166,7 +173,7 @@ def add_photons(photons: Tensor, lasers: list[Tensor] | None = None, ghosts: lis
     for added in chain(lasers or (), ghosts or ()):
         if added.shape[-3:] != photons.shape[-3:]:
             raise ValueError(
-                f"light of shape {tuple(added.shape)} cannot fall on {tuple(photons.shape)}: "
+                f"light of shape {tuple(added.shape)} cannot be added to {tuple(photons.shape)}: "
                 "give laser and scene the same `shape`"
             )
         total = total + added
@@ -194,7 +201,10 @@ def _(
     pixel_pitch: float,
     exposure: float,
 ) -> float:
-    """Bound the photons by the largest irradiance and the largest response in every band; exact for a single band."""
+    """Return an upper bound of the photons, from the largest irradiance and the largest response.
+
+    The bound is exact for a single band.
+    """
     brightest = max(irradiance.max, -irradiance.min)
     if brightest == 0:
         return 0.0

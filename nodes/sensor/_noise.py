@@ -15,8 +15,8 @@ from neusee.nodes.sensor._saturation import Efficiency, Well
 from neusee.nodes.units import Electrons, Fraction
 
 Distribution = Literal["gaussian", "poisson"]
-_PART = 1 << 15  #: elements; torch splits larger arrays among threads, which wait for each other on a busy machine
-_DARK = 1e-30  #: e-; fewer count as 0: the root of a denormal number is inexact, and its slope unbounded
+_PART = 1 << 15  #: elements; torch splits larger arrays among threads, which is slow on a busy machine
+_DARK = 1e-30  #: e-; smaller numbers count as 0, because the slope of the square root is unbounded near 0
 Spread = Annotated[float, Field(ge=0, allow_inf_nan=False)]
 
 
@@ -34,9 +34,10 @@ def photon_noise(
 ) -> Tensor:
     """Convert photons to electrons and add photon noise.
 
-    With n the mean count where the noise is drawn: `additive` gives n + N(c1 n, c2 sqrt(n)), `literal` as printed
-    N(c1 n, c2 sqrt(n)), with c1 = mean_shift and c2 = spread. `poisson` draws the fluctuation from the Poisson law.
-    If the noise is drawn in photons and then multiplied by the efficiency, the noise is sqrt(efficiency) too small.
+    With the mean count n in the unit in which the noise is drawn, `additive` gives n + N(c1 n, c2 sqrt(n)), and
+    `literal` gives N(c1 n, c2 sqrt(n)), as the paper prints, with c1 = mean_shift and c2 = spread. `poisson` draws the
+    fluctuation from the Poisson distribution. If the noise is drawn in photons and then multiplied by the efficiency,
+    the noise is too small by a factor of sqrt(efficiency).
 
     Shapes: photons (..., y, x) -> (..., y, x).
     Units:  photons per exposure; result e-.
@@ -58,7 +59,7 @@ def photon_noise(
 @photon_noise.preflight
 def _(*, mean: str = "additive", mean_shift: float = 0.0, **params: object) -> list[str]:
     if mean == "literal" and mean_shift < 1:
-        return [f"photon noise read literally: the mean is {mean_shift:.0%} of the light"]
+        return [f"photon noise as the paper prints: the mean is {mean_shift:.0%} of the light"]
     return []
 
 
@@ -66,15 +67,16 @@ def _(*, mean: str = "additive", mean_shift: float = 0.0, **params: object) -> l
 def _(result: Tensor, photons: Tensor, **params: Any) -> list[Check]:
     low, high = float(photons.min()), float(photons.max())
     mean = float(result.sum(-1).sum(dtype=torch.float64)) / max(1, result.numel())
-    return [Check(f"mean {mean:.4g} e-", low >= -1e-4 * max(high, 1.0))]
+    return [Check(f"mean signal {mean:.4g} e-", low >= -1e-4 * max(high, 1.0))]
 
 
 @photon_noise.propagate_error
 def _(
     photons: ErrorBound, *, result: TensorStats, quantum_efficiency: float, spread: float = 1.0, **params: Any
 ) -> float:
-    """Bound the errors of a mean a and of its root: |sqrt(a) - sqrt(b)| <= sqrt|a - b| and <= |a - b| / sqrt(a).
+    """Return the error bound of the electrons: the error of the mean plus the error of the noise amplitude.
 
+    The noise amplitude is the square root of the mean: |sqrt(a) - sqrt(b)| <= sqrt|a - b| and <= |a - b| / sqrt(a).
     Poisson numbers are drawn anew for another mean, so their error has no bound.
     """
     if params["distribution"] == "poisson" and photons.rms > 0:
@@ -102,7 +104,7 @@ def _poisson(counts: Tensor, rng: Generator) -> Tensor:
 
 
 def _by_parts(compute: Callable[[Tensor], Tensor], whole: Tensor, rng: Generator) -> Tensor:
-    """Return ``compute(whole)`` to the last bit, computed in parts that fit into the cache of the processor.
+    """Return exactly ``compute(whole)``, computed in parts that fit into the cache of the processor.
 
     The random numbers must not depend on the parts. Torch draws fewer than 16 normal numbers by another method, so no
     part is that short.
@@ -118,16 +120,16 @@ def _by_parts(compute: Callable[[Tensor], Tensor], whole: Tensor, rng: Generator
 
 
 def normal(like: Tensor, rng: Generator) -> Tensor:
-    """Draw standard normal numbers in the shape of ``like``: the same numbers for every precision of ``like``."""
+    """Draw standard normal numbers in the shape of ``like``, the same numbers for every precision."""
     return torch.randn(like.shape, generator=rng, device=rng.device, dtype=torch.float32).to(like)
 
 
 @node()
 def dark_current(electrons: Tensor, *, mean: Electrons, full_well: Well | None = None, rng: Generator) -> Tensor:
-    """Add the thermal electrons of the exposure, with a Poisson distribution of the given mean.
+    """Add the thermal electrons of one exposure, drawn from a Poisson distribution with the given mean.
 
-    ``full_well`` only limits the scale that decides if the dark current is small enough to leave out: electrons
-    above the well are cut off later, so a laser must not raise this scale.
+    ``full_well`` is used only to decide if the dark current is small enough to leave out: the electrons are compared
+    with the signal up to the well, because a later step cuts off the signal of a laser above the well.
 
     Shapes: electrons (..., y, x) -> (..., y, x).
     Units:  e-; mean e- per exposure.
@@ -151,10 +153,11 @@ def _(electrons: TensorStats, *, mean: float, full_well: float | None) -> float:
 def read_noise(
     electrons: Tensor, *, offset: Electrons, read_noise: Electrons, full_well: Well | None = None, rng: Generator
 ) -> Tensor:
-    """Add the offset of the amplifier and its Gaussian noise; ``full_well`` has the meaning of `sensor.dark_current`.
+    """Add the offset and the Gaussian noise of the amplifier.
 
-    The temporal dark noise that EMVA 1288 measures is that of read-out and dark current together:
-    sigma_d**2 = read_noise**2 + mean of the dark current. Its dark signal mu_d is offset + mean of the dark current.
+    The temporal dark noise of EMVA 1288 includes read noise and dark current:
+    sigma_d**2 = read_noise**2 + mean of the dark current. The dark signal mu_d of EMVA 1288 is offset + mean of the
+    dark current. ``full_well`` has the same meaning as in `sensor.dark_current`.
 
     Shapes: electrons (..., y, x) -> (..., y, x).
     Units:  e-; offset e-, the paper's "mean read noise"; read_noise e- rms.
@@ -177,7 +180,7 @@ def _(electrons: TensorStats, *, offset: float, read_noise: float, full_well: fl
 @dark_current.skip_scale
 @read_noise.skip_scale
 def _(electrons: TensorStats, *, full_well: float | None, **params: Any) -> float:
-    """Return the largest absolute count, limited to the full well."""
+    """Return the largest absolute number of electrons, or the full well if that is smaller."""
     largest = max(abs(electrons.max), abs(electrons.min))
     return largest if full_well is None else min(largest, full_well)
 
@@ -189,10 +192,10 @@ def _(electrons: ErrorBound, **params: Any) -> float:
 
 
 def _share(shift: float, spread: float, electrons: TensorStats, full_well: float | None) -> float:
-    """Return the root mean square of the added electrons over the largest result, or over the well if that is less.
+    """Return the root mean square of the added electrons over the largest result or the well, whichever is smaller.
 
     The largest result is that of the brightest pixel, or that of the darkest pixel if the counts are below 0. The well
-    alone is not enough, because a dark frame is noise alone. The bound is exact for one mean and spread everywhere.
+    alone is not enough, because a dark frame is only noise. The bound is exact for one mean and spread everywhere.
     """
     added = math.hypot(shift, spread)
     if added == 0:

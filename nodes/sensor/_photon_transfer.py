@@ -30,15 +30,16 @@ def photon_transfer(
     pixels: Count = 16384,
     rng: Generator,
 ) -> Tensor:
-    """Measure the sensor with pairs of flat fields: the signal above the dark, and its variance beside a prediction.
+    """Simulate the photon-transfer curve: the measured and the predicted variance at each level of the signal.
 
-    The first level is dark; the others rise geometrically from one electron to 1.2 full wells. The frames are made by
-    the same nodes as a picture. The prediction is K^2 sigma_d^2 + sigma_q^2 + K (mean - dark mean).
+    Each level has two flat fields. The first level is dark; the other levels rise geometrically from one electron to
+    1.2 full wells. The frames are computed by the same nodes as a picture. The signal is the mean minus the dark
+    mean. The prediction is K^2 sigma_d^2 + sigma_q^2 + K (mean - dark mean).
 
     Shapes: -> (level, 3) float64.
     Units:  gain K, DN/e-; result DN, DN2, DN2.
-    Error:  sampling: the variance of a pair is known to sqrt(2 / pixels), 1.1 % at 16384. The prediction includes
-            neither the full well nor the end of the converter, so measured and predicted variances differ there.
+    Error:  sampling: the variance of a pair has a relative deviation of sqrt(2 / pixels), 1.1 % at 16384. The
+            prediction includes neither the full well nor the end of the converter, so the variances differ there.
     Source: EMVA Standard 1288, release 4.0 Linear (photon transfer method, difference of two frames).
     """
 
@@ -72,6 +73,6 @@ def _pair(one: Tensor, two: Tensor) -> tuple[float, float]:
 def _(result: Tensor, *, full_well: float, gain: float, **params: Any) -> list[Check]:
     middle = (result[:, 0] > 0.02 * full_well * gain) & (result[:, 0] < 0.7 * full_well * gain)
     if not bool(middle.any()):
-        return [Check("too few levels between 2 and 70 % of the well to judge the variance")]
+        return [Check("no level lies between 2 and 70 % of the full well, so the variance is not checked")]
     ratio = float((result[middle, 1] / result[middle, 2]).mean())
-    return [Check(f"variance {ratio:.3f} of the predicted variance", abs(ratio - 1) < 0.1)]
+    return [Check(f"measured variance is {ratio:.3f} of the predicted variance", abs(ratio - 1) < 0.1)]

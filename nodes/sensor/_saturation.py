@@ -1,4 +1,4 @@
-"""Saturation of the sensor: the irradiance that fills a pixel, signal to noise at saturation, dynamic range."""
+"""Saturation irradiance, largest signal-to-noise ratio and dynamic range of a sensor."""
 
 import math
 from typing import Annotated, NamedTuple
@@ -17,20 +17,20 @@ Well = Annotated[Electrons, Field(gt=0)]  #: electrons that fill a pixel
 
 
 class Limits(NamedTuple):
-    """Limits of a sensor: photons that fill a pixel, best signal to noise, dynamic range."""
+    """Limits of a sensor: photons that fill a pixel, largest signal-to-noise ratio, and dynamic range."""
 
     photons: Tensor  #: () float64, photons that fill a pixel
-    snr: Tensor  #: () float64, signal to noise at saturation
+    snr: Tensor  #: () float64, signal-to-noise ratio at saturation
     dynamic_range: Tensor  #: () float64, dB
 
 
 def photons_per_joule(centres: Tensor) -> Tensor:
-    """Return the number of photons of each wavelength in a joule: wavelength / (h c)."""
+    """Return the number of photons in one joule of light of each wavelength: wavelength / (h c)."""
     return centres.double() / (PLANCK * SPEED_OF_LIGHT)
 
 
 def photons_that_fill(full_well: float, quantum_efficiency: float) -> float:
-    """Return the number of photons whose electrons fill a pixel."""
+    """Return the number of photons that fill the well of a pixel: full well / quantum efficiency."""
     return full_well / quantum_efficiency
 
 
@@ -38,7 +38,7 @@ def photons_that_fill(full_well: float, quantum_efficiency: float) -> float:
 def saturation(
     bands: Bands, *, full_well: Well, quantum_efficiency: Efficiency, pixel_pitch: PositiveLength, exposure: Time
 ) -> Tensor:
-    """Compute the irradiance that fills a pixel within one exposure, separately for light of each wavelength.
+    """Compute the saturation irradiance at each wavelength, which fills a pixel within one exposure.
 
     Shapes: bands (band,) -> (band,) float64.
     Units:  result W/m2.
@@ -53,15 +53,15 @@ def saturation(
 @saturation.check
 def _(result: Tensor, bands: Bands, **params: object) -> list[Check]:
     low, high = float(result.min()), float(result.max())
-    return [Check(f"I_sat {low:.3e} to {high:.3e} W/m2", math.isfinite(low + high) and low > 0)]
+    return [Check(f"saturation irradiance {low:.3e} to {high:.3e} W/m2", math.isfinite(low + high) and low > 0)]
 
 
 @node(rtol=1e-12)
 def limits(*, full_well: Well, quantum_efficiency: Efficiency, read_noise: Electrons) -> Limits:
-    """Compute the limits of the sensor: photons that fill a pixel, signal to noise at saturation, dynamic range.
+    """Compute the photons that fill a pixel, the signal-to-noise ratio at saturation, and the dynamic range.
 
     Shapes: -> three scalars, float64.
-    Units:  photons; signal to noise as a ratio; dynamic range in dB, 20 log10(well / read noise).
+    Units:  photons; signal-to-noise ratio 1; dynamic range in dB, 20 log10(well / read noise).
     Error:  shot noise alone at the top and read noise alone at the bottom; a read noise under 1 e- counts as 1 e-.
     Source: EMVA Standard 1288, release 4.0 (SNR_max = sqrt(saturation capacity)).
     """

@@ -1,4 +1,4 @@
-"""Spectra: bands, illuminants, channels, and lifts from three colours to many bands."""
+"""Spectra: bands, illuminants, channel responses, and reconstruction of spectra from RGB (lifts)."""
 
 from neusee.nodes.spectra._bands import bands, filters, line, mean_wavelength
 from neusee.nodes.spectra._camera_colour import grain, render

@@ -1,4 +1,4 @@
-"""Sampling of the spectrum by the bands of a scene, and of a laser line by its own few bands."""
+"""Spectral bands of a scene, and spectral sampling of a laser line."""
 
 import math
 from typing import Annotated, Any, Literal
@@ -11,12 +11,14 @@ from neusee.nodes import Check, ParameterError, node
 from neusee.nodes.units import Count, Fraction, PositiveLength, Wavelength
 from neusee.nodes.values import Bands as Samples
 
-_GRID = 10e-9  #: m, spacing of the scene's bands, on which the paper also samples the lasers
+_GRID = 10e-9  #: m, spacing of the bands of a scene; the paper samples laser lines on the same grid
 
 
 @node(rtol=1e-12)
 def bands(*, start: Wavelength, stop: Wavelength, count: Count) -> Samples:
-    """Divide the spectrum into bands with evenly spaced centres from start to stop; a single band lies in the middle.
+    """Divide the spectrum into bands with evenly spaced centres from `start` to `stop`.
+
+    A single band lies in the middle and covers the whole range.
 
     Shapes: -> centres, widths, weights (band,) float64.
     Units:  centres and widths m; weights 1.
@@ -50,9 +52,9 @@ def filters(
     centres: Annotated[tuple[Wavelength, ...], Field(min_length=1)],
     widths: Annotated[tuple[PositiveLength, ...], Field(min_length=1)],
 ) -> Samples:
-    """List bands one by one, such as the bands of a set of filters; a single width applies to all bands.
+    """Return spectral bands with individual centres and widths, such as the passbands of a filter set.
 
-    Each band has its own centre and width: a change of one band leaves the other bands unchanged to the last bit.
+    A single width applies to all bands. A change of one band leaves the other bands unchanged to the last bit.
 
     Shapes: -> centres, widths, weights (band,) float64.
     Units:  centres and widths m; weights 1.
@@ -88,14 +90,16 @@ def line(
     floor: Fraction = 1e-3,
     sampling: Literal["integrated", "point"] = "integrated",
 ) -> Samples:
-    """Distribute the energy of a Gaussian laser line, with a floor relative to the peak, over a few bands of the laser.
+    """Sample a Gaussian laser line in a few spectral bands, weighted by the energy of the line in each band.
+
+    `floor` is a constant background of the line, relative to the peak.
 
     `integrated`: `count` equal bands cover `span` (3 fwhm). A weight is the exact energy in a band; the weights sum
     to 1. `point`: the bands are the `count` nearest multiples of 10 nm. A weight is the value of the line at the
     centre, as printed in the paper; the weights do not sum to 1.
 
     Shapes: -> centres, widths, weights (band,) float64.
-    Units:  centres and widths m; weights in parts of the line's energy.
+    Units:  centres and widths m; weights relative to the energy of the line.
     Error:  integrated: the 4e-4 of the line beyond 3 fwhm is redistributed over the bands; the floor beyond `span`
             (3 % over 400-700 nm) is neglected. point: the sum is off by up to 5.7 % at fwhm 10 nm.
     Raises: ParameterError before the run where the bands would reach below 100 nm.
@@ -142,5 +146,5 @@ def _points(wavelength: float, sigma: float, count: int, floor: float) -> Sample
 
 
 def mean_wavelength(line: Samples) -> float:
-    """Return the mean wavelength of a laser line in m, in which each band counts by its energy."""
+    """Return the mean wavelength of a laser line in m, weighted by the energy in each band."""
     return float((line.centres * line.weights).sum() / line.weights.sum())

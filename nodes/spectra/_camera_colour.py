@@ -1,4 +1,4 @@
-"""Colours of spectra as an ideal camera records them, and the grain that a real camera adds."""
+"""Conversion of reflectance spectra to sRGB, and simulated camera noise for a picture."""
 
 from typing import Annotated, Any
 
@@ -16,7 +16,7 @@ GrainDeviation = Annotated[float, Field(ge=0, le=1)]
 
 @node(rtol=1e-5)
 def render(reflectance: Tensor, bands: Bands) -> Tensor:
-    """Compute linear sRGB from reflectance under D65, by the CIE 1931 observer: the inverse of a lift from RGB.
+    """Convert reflectance spectra under D65 to linear sRGB with the CIE 1931 observer.
 
     Shapes: reflectance (..., band, y, x) -> (..., 3, y, x).
     Units:  reflectance to linear sRGB; white is (1, 1, 1) on exactly these bands (on 31 bands, `sd_to_XYZ` of
@@ -27,7 +27,7 @@ def render(reflectance: Tensor, bands: Bands) -> Tensor:
     """
     if reflectance.ndim < 3 or reflectance.shape[-3] != len(bands.centres):
         raise ValueError(
-            f"reflectance {tuple(reflectance.shape)} is not (band, y, x) of {len(bands.centres)} bands: "
+            f"reflectance has shape {tuple(reflectance.shape)}, not (band, y, x) with {len(bands.centres)} bands: "
             "compute both from the same `bands` step"
         )
     light = single(reflectance)
@@ -48,11 +48,12 @@ def _(result: Tensor, *inputs: Any) -> list[Check]:
 
 @node(rtol=1e-5)
 def grain(picture: Tensor, *, read: GrainDeviation = 1e-3, shot: GrainDeviation = 2e-3, rng: torch.Generator) -> Tensor:
-    """Add camera grain to a developed picture: normal noise whose variance rises linearly with the light.
+    """Add camera noise to a picture: Gaussian noise with a variance that rises linearly with the light.
 
     Shapes: picture (..., y, x) -> the same.
-    Units:  those of the picture; standard deviation `read` in the dark, sqrt(read^2 + shot^2) at 1.
-    Error:  the channels are independent, whereas a colour matrix correlates them; no quantiser, no blooming.
+    Units:  the units of the picture; standard deviation `read` in the dark, sqrt(read^2 + shot^2) at 1.
+    Error:  the channels are independent, whereas a colour matrix would correlate them; quantisation and blooming are
+            left out.
     Source: EMVA Standard 1288, release 4.0 Linear, section 2 (variance linear in the mean).
     """
     picture = single(picture)
@@ -62,4 +63,4 @@ def grain(picture: Tensor, *, read: GrainDeviation = 1e-3, shot: GrainDeviation 
 
 @grain.check
 def _(result: Tensor, picture: Tensor, **params: Any) -> list[Check]:
-    return [Check(f"grain of {float((result - picture).std()):.3g} rms")]
+    return [Check(f"rms of the added noise {float((result - picture).std()):.3g}")]

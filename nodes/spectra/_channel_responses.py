@@ -13,7 +13,7 @@ Camera = Literal["CIE 1931", "Nikon 5100", "Sigma SDMerill"]
 
 @node(rtol=1e-9)
 def responses(bands: Bands, *, camera: Camera = "CIE 1931") -> Tensor:
-    """Average over each band the sensitivity of each channel, of the CIE observer or of a measured camera.
+    """Average the sensitivity of each colour channel over each band, for the CIE observer or a measured camera.
 
     Shapes: -> (3, band) float64.
     Units:  relative to the largest sensitivity of any channel at any wavelength; no response is negative.

@@ -1,4 +1,4 @@
-"""Synthetic pictures of spectra: overlapping ellipses with edges, texture and shade."""
+"""Synthetic spectral pictures: overlapping ellipses with sharp edges, texture and shading."""
 
 from typing import Annotated, Any
 
@@ -30,12 +30,13 @@ def leaves(
     daylights: Fraction = 0.2,
     rng: torch.Generator,
 ) -> Tensor:
-    """Draw overlapping ellipses of all sizes and one spectrum each, a "dead leaves" picture with photograph statistics.
+    """Draw a "dead leaves" picture: overlapping ellipses (leaves) of random size, each with one spectrum.
 
-    Radii range from `smallest` to half the picture, with a density that falls with the inverse cube of the radius. The
-    brightness of a leaf is log-uniform from `darkest` to 1. Up to a share `texture` of another spectrum is mixed in,
-    and up to a share `shade` of the light is removed; both shares vary smoothly. A share `daylights` of the pictures is
-    lit by another daylight but keeps the white balance of D65.
+    The picture has statistics similar to those of photographs. Radii range from `smallest` to half the picture, with
+    a density that falls with the inverse cube of the radius. The brightness of a leaf is log-uniform from `darkest` to
+    1. Up to a share `texture` of another spectrum is mixed in, and up to a share `shade` of the light is removed; both
+    shares vary smoothly. A share `daylights` of the pictures is lit by another daylight but keeps the white balance of
+    D65.
 
     Shapes: spectra (leaf, band), the first leaf behind all others -> (band, y, x) float32.
     Units:  `smallest` pixels; reflectance under D65, in [0, 1]: another daylight is scaled to exceed D65 in no band.
@@ -45,7 +46,7 @@ def leaves(
     """
     if spectra.ndim != 2 or spectra.shape[1] != len(bands.centres):
         raise ValueError(
-            f"spectra {tuple(spectra.shape)} are not (leaf, band) of {len(bands.centres)} bands: "
+            f"spectra have shape {tuple(spectra.shape)}, not (leaf, band) with {len(bands.centres)} bands: "
             "compute both from the same `bands` step"
         )
     fine = (_FINE * shape[0], _FINE * shape[1])
@@ -66,7 +67,7 @@ def _(result: Tensor, *inputs: Any, **params: Any) -> list[Check]:
 
 
 def _topmost(count: int, size: tuple[int, int], smallest: float, rng: torch.Generator) -> Tensor:
-    """Draw the ellipses, and return the index of the visible leaf at each sample: (y, x)."""
+    """Draw random ellipses, and return the index of the topmost ellipse at each sample (y, x)."""
     largest = max(min(size) / 2, smallest)
     share = _even(rng, count)
     radius = (smallest**-2 * (1 - share) + largest**-2 * share) ** -0.5
@@ -80,14 +81,14 @@ def _topmost(count: int, size: tuple[int, int], smallest: float, rng: torch.Gene
 
 
 def _smooth(size: tuple[int, int], rng: torch.Generator) -> Tensor:
-    """Draw numbers from 0 to 1 that vary slowly over the picture: (y, x)."""
+    """Draw a random field (y, x) of numbers from 0 to 1 that vary slowly over the picture."""
     coarse = (max(2, size[0] // (_FINE * _COARSE)), max(2, size[1] // (_FINE * _COARSE)))
     grid = torch.rand(1, 1, *coarse, generator=rng, device=rng.device)
     return F.interpolate(grid, size, mode="bilinear", align_corners=True)[0, 0]
 
 
 def _lights(bands: Bands, share: float, rng: torch.Generator) -> Tensor:
-    """Draw the ratio of the picture's light to D65, scaled to a largest ratio of 1: (band,) float64."""
+    """Draw a random daylight spectrum, and return the ratio to D65 in each band, scaled to a maximum of 1."""
     chance, which = torch.rand(2, generator=rng, device=rng.device).tolist()
     centres = bands.centres
     if chance >= share:

@@ -1,4 +1,4 @@
-"""The illuminant of the scene."""
+"""Illuminants, and the radiance of a scene under an illuminant."""
 
 from typing import Any, Literal
 
@@ -19,7 +19,9 @@ Kind = Literal[
 
 @node(rtol=1e-9)
 def illuminant(bands: Bands, *, kind: Kind = "daylight", temperature: Temperature = 6504.0) -> Tensor:
-    """Average the relative power of a CIE illuminant over each band; only the kind `daylight` uses `temperature`.
+    """Average the relative spectral power of a CIE illuminant over each band.
+
+    Only the kind `daylight` uses `temperature`.
 
     Shapes: -> (band,) float64.
     Units:  relative, mean 1 over the bands.
@@ -51,16 +53,17 @@ def _(*, kind: str = "daylight", temperature: float = 6504.0) -> list[str]:
 def _(result: Tensor, bands: Bands, *, kind: str = "daylight", temperature: float = 6504.0) -> list[Check]:
     name = f"{kind} {temperature:g} K" if kind == "daylight" else kind
     peak = float(bands.centres[int(result.argmax())]) * 1e9
-    return [Check(f"{name}: {float(result.min()):.2f} to {float(result.max()):.2f}, brightest at {peak:.4g} nm")]
+    return [Check(f"{name}: power {float(result.min()):.2f} to {float(result.max()):.2f}, brightest at {peak:.4g} nm")]
 
 
 @node(bands={"reflectance": -3, "illuminant": 0, "return": -3}, accepts_low_rank=("reflectance",))
 def illuminate(
     reflectance: Tensor | LowRankCube, illuminant: Tensor, *, times: Literal["once", "twice"] = "once"
 ) -> Tensor | LowRankCube:
-    """Multiply reflectance by the illuminant: once, as in nature, or twice, as in the paper's formulas.
+    """Compute the radiance of a scene: reflectance times illuminant.
 
-    In a low-rank cube, a `LowRankCube`, the planes stay and the basis spectra are multiplied.
+    `once` is physical; `twice` multiplies by the square of the illuminant, as the paper prints. In a `LowRankCube`,
+    only the basis spectra are multiplied and the planes stay unchanged.
 
     Shapes: reflectance (..., band, y, x), illuminant (band,) -> (..., band, y, x).
     Units:  relative spectral radiance; the radiance of a white scene has mean 1 over the bands.
@@ -87,8 +90,8 @@ def _same_bands(reflectance: Tensor | LowRankCube, illuminant: Tensor) -> None:
         shape = tuple(reflectance.shape)
     if len(shape) < 3 or illuminant.ndim != 1 or shape[-3] != len(illuminant):
         raise ValueError(
-            f"reflectance {shape} is not (band, y, x) of the {tuple(illuminant.shape)} bands of the "
-            "illuminant: compute both from the same `bands` step"
+            f"reflectance {shape} and illuminant {tuple(illuminant.shape)} must have the shapes (band, y, x) and "
+            "(band,): compute both from the same `bands` step"
         )
 
 
@@ -107,7 +110,7 @@ def _(reflectance: Tensor | LowRankCube, illuminant: Tensor, *, times: str = "on
 
 @illuminate.preflight
 def _(*, times: str = "once") -> list[str]:
-    return ["light falls on the scene twice, as printed: daylight is squared"] if times == "twice" else []
+    return ["the illuminant is applied twice, as the paper prints: its spectrum is squared"] if times == "twice" else []
 
 
 @illuminate.check

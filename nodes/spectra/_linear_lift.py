@@ -1,4 +1,4 @@
-"""Linear lifts from three channels to a spectrum."""
+"""Linear reconstruction of spectra from RGB (linear lifts)."""
 
 import functools
 from collections.abc import Callable
@@ -18,9 +18,10 @@ _FIRST, _LAST = 380e-9, 780e-9  #: m, range of the measured reflectances and of 
 
 @node(rtol=1e-5)
 def lift_mallett(rgb: Tensor, bands: Bands) -> Tensor:
-    """Compute the reflectance of each pixel from three basis spectra, whose sum is 1 at every wavelength.
+    """Reconstruct the reflectance of each pixel from RGB as a weighted sum of three basis spectra.
 
-    `RGB_to_sd_Mallett2019` of colour-science gives the same numbers for a single pixel, without a gradient.
+    The basis spectra sum to 1 at every wavelength. `RGB_to_sd_Mallett2019` of colour-science gives the same numbers for
+    a single pixel, without a gradient.
 
     Shapes: rgb (3, y, x) -> (band, y, x).
     Units:  linear sRGB to reflectance; the lift is linear and keeps HDR values above 1.
@@ -34,12 +35,14 @@ def lift_mallett(rgb: Tensor, bands: Bands) -> Tensor:
 
 @node(rtol=1e-6)
 def lift_mallett_mixture(rgb: Tensor, bands: Bands, *, within: Share = 1e-6) -> LowRankCube:
-    """Compute the reflectance of `lift_mallett` as a few planes, block by block, without a cube in memory.
+    """Reconstruct the same reflectance as `spectra.lift_mallett`, as a low-rank cube of a few planes.
+
+    Pixels are computed block by block, so that the full cube is never in memory.
 
     Shapes: rgb (3, y, x) -> planes (k, y, x), basis (band, k), residual_max and residual_rms (k + 1, band)
             float64.
-    Units:  planes and residuals as reflectance; the basis has none.
-    Error:  that of `spectra.compress`, from the lift in float64; `lift_mallett` differs from that lift by round-off.
+    Units:  planes and residuals are reflectances; the basis has no unit.
+    Error:  as `spectra.compress`, relative to the lift in float64; `lift_mallett` differs from that lift by round-off.
     Raises: ValueError where `lift_mallett` or `spectra.compress` raises ValueError.
     Source: as `lift_mallett`.
     """
@@ -48,7 +51,7 @@ def lift_mallett_mixture(rgb: Tensor, bands: Bands, *, within: Share = 1e-6) -> 
 
 @node(rtol=1e-5)
 def lift_lmmse(rgb: Tensor, bands: Bands) -> Tensor:
-    """Compute the linear minimum-mean-square-error estimate of the reflectance, from measured colour charts.
+    """Estimate reflectance from RGB by the linear minimum-mean-square-error estimator fitted to measured colour charts.
 
     W = C T^t (T C T^t)^-1 with C = E[s s^t] over the paints and the matrix T from reflectance under D65 to linear sRGB.
 
@@ -66,12 +69,14 @@ def lift_lmmse(rgb: Tensor, bands: Bands) -> Tensor:
 
 @node(rtol=1e-6)
 def lift_lmmse_mixture(rgb: Tensor, bands: Bands, *, within: Share = 1e-6) -> LowRankCube:
-    """Compute the reflectance of `lift_lmmse` as a few planes, block by block, without a cube in memory.
+    """Reconstruct the same reflectance as `spectra.lift_lmmse`, as a low-rank cube of a few planes.
+
+    Pixels are computed block by block, so that the full cube is never in memory.
 
     Shapes: rgb (3, y, x) -> planes (k, y, x), basis (band, k), residual_max and residual_rms (k + 1, band)
             float64.
-    Units:  planes and residuals as reflectance; the basis has none.
-    Error:  that of `spectra.compress`, from the lift in float64; `lift_lmmse` differs from that lift by round-off.
+    Units:  planes and residuals are reflectances; the basis has no unit.
+    Error:  as `spectra.compress`, relative to the lift in float64; `lift_lmmse` differs from that lift by round-off.
     Raises: ValueError where `lift_lmmse` or `spectra.compress` raises ValueError.
     Source: as `lift_lmmse`.
     """
@@ -82,7 +87,7 @@ def lift_lmmse_mixture(rgb: Tensor, bands: Bands, *, within: Share = 1e-6) -> Lo
 
 
 def _attach(lift: Node, low_rank: Node, matrix: Callable[[Bands], Tensor]) -> None:
-    """Attach the reference, the check and the low-rank form to a lift that multiplies by this matrix (band, 3)."""
+    """Attach the reference, the check and the low-rank form to a node that multiplies RGB by a matrix (band, 3)."""
 
     @lift.reference
     def lifted(rgb: Tensor, bands: Bands) -> Tensor:
@@ -103,39 +108,45 @@ def _attach(lift: Node, low_rank: Node, matrix: Callable[[Bands], Tensor]) -> No
 
 
 def lift_checks(result: Tensor, rgb: Tensor, bands: Bands, matrix: Tensor | None = None) -> list[Check]:
-    """Check on some 65 000 pixels the share of clipped energy, and how far the spectra are from the source colours."""
+    """Report how far the colours of reconstructed spectra are from the source colours, and how much was clipped.
+
+    A large picture is sampled at some 100 000 pixels.
+    """
     step = max(1, rgb[0].numel() // 65536)
     colours, spectra = (t.detach().flatten(1)[:, ::step].double().cpu() for t in (rgb, result))
     scale = max(float(colours.abs().max()), 1e-30)
     off = float((to_srgb(bands.centres) @ spectra - colours).abs().max()) / scale
     checks = [
         Check(
-            f"spectra rendered to sRGB differ from the colours by {off:.2g} of the brightest colour",
+            f"colours of the spectra differ from the source colours by {off:.2g} of the brightest colour",
             float(result.min()) >= 0,
         )
     ]
     if matrix is not None:
         raw = matrix.cpu() @ colours
         below = float(raw.clamp_max(0).abs().sum()) / max(float(raw.abs().sum()), 1e-30)
-        checks.append(Check(f"{below:.2%} of the energy was negative and is clipped", below < 0.05))
+        checks.append(Check(f"{below:.2%} of the reconstructed light was negative and is clipped to 0", below < 0.05))
     return checks
 
 
 def needs_rgb(rgb: Tensor) -> None:
-    """Raise ValueError unless rgb is a picture of three channels."""
+    """Raise ValueError unless ``rgb`` is a picture of three channels (3, y, x)."""
     if rgb.ndim != 3 or rgb.shape[0] != 3:
-        raise ValueError(f"rgb {tuple(rgb.shape)} must be (3, y, x): connect a scene of three channels")
+        raise ValueError(f"rgb has shape {tuple(rgb.shape)}, not (3, y, x): connect a scene of three channels")
 
 
 def _lifted(rgb: Tensor, matrix: Tensor) -> Tensor:
-    """Return the product of matrix and picture, clipped in place so that no second cube is in memory."""
+    """Multiply a picture by a matrix, and set negative values to 0 in place to save memory."""
     needs_rgb(rgb)
     rgb = single(rgb)
     return torch.relu_(matrix.to(rgb) @ rgb.flatten(1)).reshape(-1, *rgb.shape[1:])
 
 
 def _mixed(rgb: Tensor, matrix: Tensor, within: float) -> LowRankCube:
-    """Return the lift as a low-rank cube; a picture that requires a gradient is lifted whole, so the gradient flows."""
+    """Return reconstructed spectra as a low-rank cube.
+
+    For a picture that requires a gradient, the full cube is computed, so that the gradient reaches the picture.
+    """
     needs_rgb(rgb)
     flat, exact = rgb.detach().flatten(1), matrix.to(rgb.device)
     dtype = rgb.dtype if rgb.dtype == torch.float64 else torch.float32
@@ -155,13 +166,16 @@ def _estimator(bands: Bands) -> Tensor:
 
 @functools.lru_cache(maxsize=16)
 def _solved(centres: tuple[float, ...]) -> Tensor:
-    """Return the matrix (band, 3) float64 of `lift_lmmse` at these wavelengths."""
+    """Return the matrix (band, 3) float64 of `lift_lmmse` for bands with the given centre wavelengths in m."""
     at = torch.tensor(centres, dtype=torch.float64)
     return lift_matrix(torch.cat([paint.at(at) for paint in paints()]), at)
 
 
 def lift_matrix(known: Tensor, centres: Tensor) -> Tensor:
-    """Return the matrix (band, 3) float64 that estimates reflectances like the ``known`` (spectrum, band) from sRGB."""
+    """Return the matrix that estimates reflectance from linear sRGB, for spectra with the statistics of ``known``.
+
+    Shapes: known (spectrum, band) -> (band, 3) float64.
+    """
     second, rgb = known.T @ known / len(known), to_srgb(centres)
     seen = rgb @ second @ rgb.T
     if len(centres) < 3 or not float(torch.linalg.cond(seen)) < 1e10:
@@ -172,7 +186,7 @@ def lift_matrix(known: Tensor, centres: Tensor) -> Tensor:
 
 
 def inside_charts(bands: Bands) -> None:
-    """Raise ValueError for bands outside the measured range of the charts."""
+    """Raise ValueError for bands outside 380 to 780 nm, the range of the measured colour charts."""
     require_range(bands.centres, (_FIRST, _LAST), "reflectances are known from")
 
 

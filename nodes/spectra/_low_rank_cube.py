@@ -1,4 +1,4 @@
-"""Low-rank form of a cube of many bands: few planes and their spectra, with an upper bound of the error."""
+"""Low-rank approximation of a spectral cube by a few planes and their spectra, with an upper bound of the error."""
 
 from typing import Annotated
 
@@ -15,13 +15,13 @@ Share = Annotated[float, Field(ge=0, allow_inf_nan=False)]  #: relative to the l
 
 @node(rtol=1e-6)
 def compress(cube: Tensor, *, within: Share = 1e-6) -> LowRankCube:
-    """Approximate a cube within a bound by the fewest planes, the principal components of its spectra.
+    """Approximate a spectral cube by the fewest principal components that keep the error within a bound.
 
-    A grey scene has one plane; a linear lift of three colours has three, and hardly more where few pixels are clipped.
+    A grey scene needs one plane. A linear lift from RGB needs three planes, or a few more where pixels are clipped.
 
     Shapes: cube (band, y, x) -> planes (k, y, x), basis (band, k), residual_max and residual_rms (k + 1, band)
             float64, residual_map (y, x).
-    Units:  planes and residuals as the cube; the basis has none.
+    Units:  planes and residuals as the cube; the basis has no unit.
     Error:  `residual_rms[k]` is at most the largest of `within`, 2e-7 and eight round-off units of the planes, times
             the largest element. `residual_max[k]` and `residual_map` are the largest errors of a band and of a pixel,
             measured on every pixel in float64. `residual_max[r]` for 0 < r < k is as a rule at most five times too
@@ -30,7 +30,7 @@ def compress(cube: Tensor, *, within: Share = 1e-6) -> LowRankCube:
     Source: principal components, Pearson 1901; Maloney, J. Opt. Soc. Am. A 3, 1673 (1986) for spectra.
     """
     if cube.ndim != 3:
-        raise ValueError(f"cube {tuple(cube.shape)} must be (band, y, x): compress one scene at a time")
+        raise ValueError(f"cube has shape {tuple(cube.shape)}, not (band, y, x): compress one scene at a time")
     flat = cube.detach().flatten(1)
     dtype = cube.dtype if cube.dtype == torch.float64 else torch.float32
     source = Source(lambda pixels: flat[:, pixels].to(torch.float64, copy=True), len(flat), flat.shape[1], dtype)
@@ -38,7 +38,10 @@ def compress(cube: Tensor, *, within: Share = 1e-6) -> LowRankCube:
 
 
 def as_low_rank_cube(flat: LowRankCube, cube: Tensor) -> LowRankCube:
-    """Return planes of one row of pixels as pictures; with a gradient, the planes are projections of ``cube``."""
+    """Reshape the flat planes of a low-rank cube to pictures of the size of ``cube``.
+
+    If ``cube`` requires a gradient, the planes are computed anew as projections of ``cube``.
+    """
     if cube.requires_grad:
         planes = torch.tensordot(flat.basis.T.to(cube), cube, 1)
     else:
@@ -62,10 +65,10 @@ def _(cube: Tensor, *, within: float = 1e-6) -> LowRankCube:
 
 @compress.check
 def plane_checks(result: LowRankCube, *inputs: object, **params: object) -> list[Check]:
-    """Report the number of planes and their distance from the cube, for any node that returns a `LowRankCube`."""
+    """Report the number of planes of a `LowRankCube`, and its error relative to the full cube."""
     rms, most = (
         float(x[-1].max()) / max(float(result.residual_max[0].max()), 1e-300)
         for x in (result.residual_rms, result.residual_max)
     )
     count = f"{len(result.planes)} planes for {len(result.basis)} bands"
-    return [Check(f"{count}, within {rms:.2g} of the largest element in rms, at worst {most:.2g}")]
+    return [Check(f"{count}: error {rms:.2g} rms, maximum {most:.2g}, relative to the largest element")]

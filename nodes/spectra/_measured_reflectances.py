@@ -19,7 +19,7 @@ from neusee.nodes.units import DataFiles
 from neusee.nodes.values import Bands
 
 Set = Literal["charts", "CIE 2017", "CQS"]
-_MOST = 1.5  #: reflectance, above which a file is taken to be in percent
+_MOST = 1.5  #: largest reflectance; a file with larger values is probably in percent
 _FILES = "give .csv (first column wavelength in nm), .npz (wavelengths, reflectances) or .mat (S_name, sur_name)"
 
 Numbers = NDArray[np.float64]
@@ -29,7 +29,7 @@ Numbers = NDArray[np.float64]
 def reflectances(
     bands: Bands, *, sets: tuple[Set, ...] = ("charts", "CIE 2017", "CQS"), files: DataFiles | None = None
 ) -> Tensor:
-    """Return the measured reflectances of sets in colour-science and of the user's files, one spectrum in each row.
+    """Return measured reflectances from colour-science and from the user's files, one spectrum in each row.
 
     `charts` are the 102 patches of `spectra.lift_lmmse`, `CIE 2017` the 99 objects of the colour fidelity index, `CQS`
     15 saturated paints. A file is .csv (a header; first column nm, then one column for each spectrum), .npz
@@ -83,7 +83,7 @@ def _read(file: Path) -> Table:
 
 @functools.lru_cache(maxsize=32)
 def _known(file: Path, stamp: int) -> Table:
-    """Return the table of a file; a file whose time ``stamp`` has changed is read again."""
+    """Read the spectra of a file, or return them from memory while the modification time ``stamp`` is unchanged."""
     reader = {".csv": _csv, ".npz": _npz, ".mat": _mat}.get(file.suffix.lower())
     if reader is None:
         raise ParameterError("files", f"{file.name} holds no reflectances: {_FILES}")
@@ -98,13 +98,13 @@ def _known(file: Path, stamp: int) -> Table:
 
 
 def _wrong(wavelengths: Numbers, values: Numbers) -> str:
-    """Return why these values cannot be reflectances, or an empty text."""
+    """Return the reason why numbers cannot be wavelengths and reflectances, or an empty text."""
     if wavelengths.ndim != 1 or values.ndim != 2 or values.shape[1] != len(wavelengths) or values.size == 0:
         return f"{wavelengths.shape} wavelengths and {values.shape} reflectances: write (spectrum, wavelength)"
     if not (np.isfinite(wavelengths).all() and np.isfinite(values).all()):
-        return "not every number is finite"
+        return "some numbers are not finite"
     if len(wavelengths) < 2 or not (np.diff(wavelengths) > 0).all() or wavelengths[0] < 100:
-        return "wavelengths must be at least two, rising, and in nm"
+        return "at least two rising wavelengths in nm are needed"
     if values.max() > _MOST or values.min() < -0.1:
         return f"values from {values.min():.3g} to {values.max():.3g} are not reflectances: write 1 for white, not 100"
     return ""
@@ -115,7 +115,7 @@ def _csv(file: Path) -> tuple[Numbers, Numbers]:
         rows = [row for row in csv.reader(opened) if row]
     numbers = np.array([[float(cell) for cell in row] for row in rows[1:]], np.float64)
     if numbers.ndim != 2 or numbers.shape[1] < 2:
-        raise ValueError("no columns of numbers below a header")
+        raise ValueError("the file has no columns of numbers below a header")
     return numbers[:, 0].copy(), numbers[:, 1:].T
 
 
@@ -130,7 +130,7 @@ def _mat(file: Path) -> tuple[Numbers, Numbers]:
     try:
         variables = loadmat(file)
     except Exception as why:  # scipy raises many kinds of errors for foreign bytes
-        raise ValueError(f"not a .mat file up to version 7: {why}") from None
+        raise ValueError(f"the file is not a .mat file of version 7 or older: {why}") from None
     name = next(name.removeprefix("sur_") for name in [*variables, "sur_"] if name.startswith("sur_"))
     start, step, count = np.asarray(variables[f"S_{name}"], np.float64).ravel()
     return start + step * np.arange(int(count)), np.asarray(variables[f"sur_{name}"], np.float64).T

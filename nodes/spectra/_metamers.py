@@ -1,4 +1,4 @@
-"""Plausible spectra: mixtures of measured spectra, and other spectra of the same colour, their metamers."""
+"""Random plausible spectra: mixtures of measured spectra, and metamers (other spectra of the same colour)."""
 
 from typing import Annotated, Any
 
@@ -12,7 +12,7 @@ from neusee.nodes.spectra._spectral_tables import to_srgb
 from neusee.nodes.units import Count
 from neusee.nodes.values import Bands
 
-_DARKEST = 1e-6  #: least reflectance to which the thickness of a layer is applied
+_DARKEST = 1e-6  #: smallest reflectance to which the thickness of a layer is applied
 
 Thickness = Annotated[float, Field(gt=0, le=10)]
 Strength = Annotated[float, Field(ge=0, le=10)]
@@ -29,9 +29,9 @@ def metamers(
     blacks: Strength = 0.5,
     rng: torch.Generator,
 ) -> Tensor:
-    """Draw mixtures of measured reflectances as thinner and thicker layers, each with a metameric black added.
+    """Draw random reflectance spectra: mixtures of measured spectra, each with a metameric black added.
 
-    A layer of thickness p turns a reflectance s into s^p (Beer and Lambert), which makes colours paler and deeper than
+    A layer of thickness p turns a reflectance s into s^p (Beer and Lambert), which makes colours paler or deeper than
     measured. A metameric black is a measured spectrum minus the linear estimate from its colour: a black changes the
     spectrum and not the colour. The strength of a black is normal with standard deviation `blacks`, where 1 is the
     strength in measured spectra of the same brightness. The strength is limited where the sum would leave [0, 1]. The
@@ -47,8 +47,8 @@ def metamers(
     """
     if reflectances.ndim != 2 or reflectances.shape[1] != len(bands.centres) or len(reflectances) < 4:
         raise ValueError(
-            f"reflectances {tuple(reflectances.shape)} are not four spectra or more of {len(bands.centres)} bands: "
-            "compute both from the same `bands` step"
+            f"reflectances have shape {tuple(reflectances.shape)}, but at least four spectra of {len(bands.centres)} "
+            "bands are needed: compute reflectances and bands from the same `bands` step"
         )
     known = reflectances.double()
     base = _mixtures(known, count, mixed, thickness, rng)
@@ -64,7 +64,7 @@ def metamers(
 def _(*, thickness: tuple[float, float] = (0.5, 2.0), **params: Any) -> list[str]:
     if thickness[0] > thickness[1]:
         raise ParameterError(
-            "thickness", f"the thinnest layer {thickness[0]:g} is above {thickness[1]:g}: exchange the numbers"
+            "thickness", f"the thinnest layer {thickness[0]:g} is above the thickest {thickness[1]:g}: exchange them"
         )
     return []
 
@@ -76,14 +76,20 @@ def _(result: Tensor, *inputs: Any, **params: Any) -> list[Check]:
 
 
 def metameric_blacks(spectra: Tensor, known: Tensor, bands: Bands) -> Tensor:
-    """Return spectra (spectrum, band) minus the linear estimates from their colours, with colour (0, 0, 0)."""
+    """Return the part of each spectrum that does not contribute to the colour, called metameric black.
+
+    A metameric black is a spectrum minus the linear estimate from its colour. Shapes: (spectrum, band) both.
+    """
     centres = bands.centres.detach().cpu().double()
     estimate = lift_matrix(known.cpu(), centres) @ to_srgb(centres)
     return spectra - spectra @ estimate.T.to(spectra)
 
 
 def _mixtures(known: Tensor, count: int, mixed: int, thickness: tuple[float, float], rng: torch.Generator) -> Tensor:
-    """Draw layers of log-uniform thickness from convex sums of spectra, in most of which one spectrum dominates."""
+    """Draw random mixtures of measured spectra, as layers of log-uniform thickness.
+
+    One spectrum dominates most mixtures.
+    """
     options = {"generator": rng, "device": rng.device, "dtype": torch.float64}
     weights = -torch.rand(count, mixed, **options).clamp_min(1e-12).log()  # type: ignore[call-overload]
     weights = weights.square()
@@ -100,7 +106,7 @@ def _drawn(of: int, shape: tuple[int, ...], rng: torch.Generator) -> Tensor:
 
 
 def _limits(base: Tensor, black: Tensor) -> tuple[Tensor, Tensor]:
-    """Return the smallest and the largest multiple of a black at which the sum stays in [0, 1], each (spectrum, 1)."""
+    """Return the smallest and the largest factor, (spectrum, 1), for which ``base + factor * black`` is in [0, 1]."""
     to_white, to_dark = (1.0 - base) / black, -base / black
     high = torch.where(black > 0, to_white, torch.where(black < 0, to_dark, torch.inf))
     low = torch.where(black > 0, to_dark, torch.where(black < 0, to_white, -torch.inf))

@@ -1,4 +1,4 @@
-"""The lift of the paper, from linear RGB to 31 bands by the network MST++."""
+"""Reconstruction of spectra from linear RGB to 31 bands by the network MST++."""
 
 from pathlib import Path
 from typing import Any, Literal
@@ -23,10 +23,11 @@ def lift_mst_plus_plus(
     untrained: Literal["refuse", "allow"] = "refuse",
     rng: torch.Generator,
 ) -> Tensor:
-    """Lift a whole picture by MST++; the picture is stretched to [0, 1] and the cube is scaled back to keep radiometry.
+    """Reconstruct the spectrum of each pixel from RGB by the network MST++.
 
-    The published checkpoint loads unchanged (.pth or .safetensors). Without weights the network consists of random
-    orthogonal layers from `rng`: a recipe runs, but the spectra have no meaning.
+    The picture is stretched to [0, 1], and the cube is scaled back to keep radiometry. The published checkpoint loads
+    unchanged (.pth or .safetensors). Without weights the network consists of random orthogonal layers from `rng`: a
+    recipe runs, but the spectra have no meaning.
 
     Shapes: rgb (3, y, x) -> (31, y, x).
     Units:  linear sRGB to the quantity of the training data, taken as reflectance; negative results are clipped.
@@ -57,17 +58,20 @@ def _(*, weights: Path | None = None, untrained: str = "refuse", **params: Any) 
     if untrained == "refuse":
         text = "MST++ has no weights: give the file of its checkpoint, choose another lift, or set untrained: allow"
         raise ParameterError("weights", text)
-    return ["MST++ is untrained: its spectra are noise"]
+    return ["MST++ is untrained: its spectra have no meaning"]
 
 
 @lift_mst_plus_plus.check
 def _(result: Tensor, rgb: Tensor, bands: Bands, *, weights: Path | None = None, **params: Any) -> list[Check]:
-    noise = [] if weights is not None else [Check("MST++ is untrained: these spectra have no meaning", False)]
+    noise = [] if weights is not None else [Check("MST++ is untrained: its spectra have no meaning", False)]
     return lift_checks(result, rgb, bands) + noise
 
 
 def lift_pictures(network: nn.Module, rgb: Tensor) -> Tensor:
-    """Lift pictures (n, 3, y, x) by MST++, each stretched to [0, 1] and back: (n, 31, y, x), negative values kept."""
+    """Reconstruct the spectra (n, 31, y, x) of pictures (n, 3, y, x) by the network MST++.
+
+    Each picture is stretched to [0, 1], and the result is scaled back. Negative values are kept.
+    """
     low, high = rgb.amin((1, 2, 3), keepdim=True), rgb.amax((1, 2, 3), keepdim=True)
     span = high - low
     cube: Tensor = network((rgb - low) / span.where(span > 0, 1.0))
@@ -75,10 +79,10 @@ def lift_pictures(network: nn.Module, rgb: Tensor) -> Tensor:
 
 
 def start_mst_plus_plus(rng: torch.Generator, linear: Tensor | None = None) -> MSTPlusPlus:
-    """Return a network to train: of orthogonal layers, or equal to a ``linear`` lift, the matrix (31, 3), at the start.
+    """Return an MST++ network to train, which starts with random layers or as a linear lift.
 
-    The skip connection around the body has the linear lift, and the last layer starts at 0. Training adds the
-    corrections that image structure and a non-linear estimate allow.
+    ``linear`` is the matrix (31, 3) of the linear lift. The skip connection around the body then has this matrix, and
+    the last layer starts at 0. Training adds the corrections that image structure and a non-linear estimate allow.
     """
     network = _untrained("allow", rng).requires_grad_(True).train()
     if linear is not None:
@@ -89,13 +93,13 @@ def start_mst_plus_plus(rng: torch.Generator, linear: Tensor | None = None) -> M
 
 
 def need_mst_plus_plus_bands(bands: Bands) -> None:
-    """Raise ValueError unless the bands are 31 from 400 to 700 nm, the bands of MST++."""
+    """Raise ValueError unless the bands are the 31 bands of MST++, from 400 to 700 nm."""
     centres = bands.centres.cpu().double()
     published = torch.linspace(400e-9, 700e-9, BANDS, dtype=torch.float64)
     if len(centres) != BANDS or float((centres - published).abs().max()) > 0.5e-9:
         raise ValueError(
             f"MST++ gives {BANDS} bands from 400 to 700 nm, not {len(centres)} from {float(centres[0]) * 1e9:.4g} to "
-            f"{float(centres[-1]) * 1e9:.4g} nm: give the bands of MST++, or choose another lift"
+            f"{float(centres[-1]) * 1e9:.4g} nm: use the bands of MST++, or choose another lift"
         )
 
 
@@ -124,7 +128,7 @@ def _untrained(untrained: str, rng: torch.Generator) -> MSTPlusPlus:
 
 
 def _fitting(weights: Path) -> dict[str, Tensor]:
-    """Return the tensors of a checkpoint; raise ParameterError unless names and shapes fit the network."""
+    """Return the tensors of a checkpoint file; raise ParameterError unless names and shapes fit MST++."""
     found = {name.removeprefix("module."): tensor for name, tensor in _read(weights).items()}
     network = _empty().state_dict()
     wrong = [name for name in network if name not in found or found[name].shape != network[name].shape]
@@ -136,7 +140,10 @@ def _fitting(weights: Path) -> dict[str, Tensor]:
 
 
 def _read(weights: Path) -> dict[str, Tensor]:
-    """Read tensors by name from .safetensors, or from a pickle of tensors alone, with or without key `state_dict`."""
+    """Read the named tensors of a checkpoint file.
+
+    The file is .safetensors or a pickle that holds only tensors, with or without the key `state_dict`.
+    """
     try:
         if weights.suffix == ".safetensors":
             from safetensors.torch import load_file
@@ -144,7 +151,7 @@ def _read(weights: Path) -> dict[str, Tensor]:
             return load_file(weights)
         content = torch.load(weights, map_location="cpu", weights_only=True)
     except Exception as why:  # each library raises its own errors for a broken file
-        raise ParameterError("weights", f"{weights} holds no tensors that can be read safely ({why})") from None
+        raise ParameterError("weights", f"{weights} holds no tensors that can be read safely: {why}") from None
     state = content.get("state_dict", content) if isinstance(content, dict) else content
     if not isinstance(state, dict) or not all(isinstance(v, Tensor) for v in state.values()):
         raise ParameterError("weights", f"{weights} is not a state dict: save model.state_dict()")

@@ -1,4 +1,4 @@
-"""MST++: three stages of spectral attention from RGB to 31 bands.
+"""MST++, a network that reconstructs 31 bands from RGB in three stages of spectral attention.
 
 The modules have the names of the published network, so that the published checkpoint loads unchanged: 1 619 625
 parameters in 227 tensors. Architecture: Cai et al., CVPRW 2022; reference code caiyuanhao1998/MST-plus-plus (MIT).
@@ -17,7 +17,7 @@ BANDS = 31
 
 
 class MSTPlusPlus(nn.Module):
-    """The network from RGB in [0, 1], (n, 3, y, x) of any size, to 31 bands, (n, 31, y, x)."""
+    """The network MST++ from RGB pictures (n, 3, y, x) in [0, 1], of any size, to 31 bands (n, 31, y, x)."""
 
     def __init__(self) -> None:
         super().__init__()
@@ -33,7 +33,7 @@ class MSTPlusPlus(nn.Module):
 
 
 class Stage(nn.Module):
-    """A U-Net of spectral attention with two levels and a residual connection."""
+    """A stage of MST++: a U-Net of spectral attention with two levels and a residual connection."""
 
     def __init__(self, dim: int) -> None:
         super().__init__()
@@ -61,7 +61,7 @@ class Stage(nn.Module):
 
 
 class Blocks(nn.Module):
-    """Spectral attention, then a feed-forward network behind a layer norm, both with a residual connection."""
+    """A transformer block: spectral attention and a feed-forward network, each with a residual connection."""
 
     def __init__(self, dim: int) -> None:
         super().__init__()
@@ -75,7 +75,7 @@ class Blocks(nn.Module):
 
 
 class SpectralAttention(nn.Module):
-    """Attention between all bands: 31 x 31 weights per head, at a cost that is linear in the number of pixels."""
+    """Self-attention between bands: 31 x 31 weights per head, at a cost that is linear in the number of pixels."""
 
     def __init__(self, dim: int) -> None:
         super().__init__()
@@ -96,13 +96,13 @@ class SpectralAttention(nn.Module):
         return result
 
     def _across(self, pixels: Tensor) -> tuple[Tensor, Tensor]:
-        """Return query and key of the attention, with each band normalised to length 1 over the picture."""
+        """Return query and key of the attention, each band normalised to unit length over all pixels."""
         query, key = (F.normalize(to(pixels).transpose(1, 2), dim=-1) for to in (self.to_q, self.to_k))
         return query, key
 
 
 class Normed(nn.Module):
-    """A layer norm over the bands, then the feed-forward network; `norm` and `fn` are the published names."""
+    """A layer norm over the bands, followed by a feed-forward network."""
 
     def __init__(self, dim: int) -> None:
         super().__init__()
@@ -115,7 +115,7 @@ class Normed(nn.Module):
 
 
 class FeedForward(nn.Module):
-    """A feed-forward network: four times as many channels, a 3 x 3 filter on each channel, and back."""
+    """A feed-forward network with four times as many hidden channels and a depthwise 3 x 3 convolution."""
 
     def __init__(self, dim: int) -> None:
         super().__init__()

@@ -1,4 +1,4 @@
-"""Principal components of the spectra of a cube, computed and verified a block of pixels at a time."""
+"""Principal components of the spectra of a cube, computed and verified in blocks of pixels."""
 
 from collections.abc import Callable
 from typing import NamedTuple
@@ -14,7 +14,7 @@ _ROOT = 2e-7  #: relative resolution of a root mean square that is computed from
 
 
 class Source(NamedTuple):
-    """A cube that is read block by block, so that the whole cube is never in memory."""
+    """A spectral cube that is read in blocks of pixels, so that the whole cube is never in memory."""
 
     part: Callable[[slice], Tensor]  #: a block of pixels, (band, pixel) float64, as a copy that may be changed
     bands: int
@@ -26,9 +26,10 @@ class Source(NamedTuple):
 
 
 def few_planes(source: Source, within: float) -> LowRankCube:
-    """Find the fewest principal components whose root mean square error is within a share of the largest element.
+    """Approximate a cube by the fewest principal components that keep the root mean square error within a bound.
 
-    The planes and the error of every pixel have all pixels in one row. Raises ValueError for NaN.
+    The bound ``within`` is relative to the largest element. The planes and the map of errors are flat, with all pixels
+    in one row. Raises ValueError for NaN.
     """
     most, gram = _largest_and_products(source)
     scale = float(most.max())
@@ -47,9 +48,12 @@ def few_planes(source: Source, within: float) -> LowRankCube:
 
 
 def _largest_and_products(source: Source, scale: float = 1.0) -> tuple[Tensor, Tensor]:
-    """Return the largest |element| of each band, and the products of the bands of the cube over ``scale``."""
+    """Return the largest absolute element of each band of a cube, and the Gram matrix of the bands.
+
+    The Gram matrix is that of the cube divided by ``scale``.
+    """
     if not source.pixels or not source.bands:
-        raise ValueError("the cube has no pixels: give a scene")
+        raise ValueError("the cube has no pixels: give a scene with pixels")
     tops, gram = [], None
     for piece in source.pieces():
         x = source.part(piece).div_(scale) if scale != 1.0 else source.part(piece)
@@ -57,12 +61,15 @@ def _largest_and_products(source: Source, scale: float = 1.0) -> tuple[Tensor, T
         tops.append(x.abs_().amax(1))
     most = torch.stack(tops).amax(0) * scale
     if gram is None or not bool(torch.isfinite(most).all()):
-        raise ValueError("the cube holds NaN or infinite light: repair the scene, or keep the image of all bands")
+        raise ValueError("the cube holds NaN or infinite values: replace these values, or do not compress the cube")
     return most, gram
 
 
 def _projected(source: Source, axes: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-    """Return the planes in the precision of the source, and the largest error of each band and of each pixel."""
+    """Return the planes of a cube, and the largest error of the approximation in each band and at each pixel.
+
+    The planes have the precision of the source.
+    """
     planes = torch.empty(axes.shape[1], source.pixels, dtype=source.dtype, device=axes.device)
     last, off = axes.new_zeros(source.bands), planes.new_empty(source.pixels)
     for piece in source.pieces():
@@ -75,9 +82,10 @@ def _projected(source: Source, axes: Tensor) -> tuple[Tensor, Tensor, Tensor]:
 
 
 def _spread(power: Tensor, axes: Tensor, count: int, eps: float) -> Tensor:
-    """Return the root mean square error of the first r planes, from the omitted axes and the round-off of the planes.
+    """Return the root mean square error of each band for approximations by the first 0, 1, 2, ... planes.
 
-    ``power`` holds the mean products of the bands. The round-off of these products counts as part of the error.
+    The error is that of the omitted planes plus the round-off of the planes. ``power`` holds the mean products of the
+    bands. The round-off of these products counts as part of the error.
     """
     each = axes.square() * ((power @ axes) * axes).sum(0).clamp_min(0)
     after = torch.cat([each.flip(1).cumsum(1).flip(1), torch.zeros_like(each[:, :1])], 1)[:, : count + 1].T
@@ -88,7 +96,11 @@ def _spread(power: Tensor, axes: Tensor, count: int, eps: float) -> Tensor:
 
 
 def _rest(most: Tensor, planes: Tensor, basis: Tensor, last: Tensor) -> Tensor:
-    """Return a bound of the error of the first r planes: measured for no plane and for all planes, else a sum."""
+    """Return a bound of the largest error of each band for approximations by the first 0, 1, 2, ... planes.
+
+    The errors of no plane and of all planes are measured. In between, the bound adds the omitted planes to the error
+    of all planes.
+    """
     each = basis.abs() * torch.maximum(planes.amax(1), -planes.amin(1)).double()
     last = last + 4 * torch.finfo(torch.float64).eps * (most + each.sum(1))  # round-off of the measurement
     after = each.flip(1).cumsum(1).flip(1).T

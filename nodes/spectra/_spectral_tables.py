@@ -1,4 +1,4 @@
-"""Measured spectra of colour-science, read once and interpolated to bands; wavelengths in m, float64."""
+"""Measured spectra from colour-science, interpolated to bands; wavelengths are in m, all values float64."""
 
 import functools
 from typing import NamedTuple
@@ -13,13 +13,16 @@ _CHARTS = ("BabelColor Average", "ColorChecker N Ohta", "PMC", "ISO 17321-1")
 
 
 class Table(NamedTuple):
-    """Spectra that are sampled at the same wavelengths."""
+    """A table of spectra that are sampled at the same wavelengths."""
 
     wavelengths: Tensor  #: (sample,) m, rising
     values: Tensor  #: (spectrum, sample)
 
     def at(self, centres: Tensor) -> Tensor:
-        """Interpolate spectra linearly, constant beyond the first and last sample: (spectrum, band), on the CPU."""
+        """Interpolate the spectra of the table linearly at the centres of bands: (spectrum, band), on the CPU.
+
+        The spectra are constant beyond the first and last sample.
+        """
         x = centres.detach().cpu().double()
         right = torch.searchsorted(self.wavelengths, x).clamp(1, len(self.wavelengths) - 1)
         low, high = self.wavelengths[right - 1], self.wavelengths[right]
@@ -27,9 +30,10 @@ class Table(NamedTuple):
         return self.values[:, right - 1] * (1 - share) + self.values[:, right] * share
 
     def over(self, bands: Bands) -> Tensor:
-        """Average the linear interpolation over each band, with 0 beyond the first and last sample: (spectrum, band).
+        """Average the linearly interpolated spectra of the table over each band: (spectrum, band).
 
-        Colour-science samples spectra at points, which changes the energy of the lines of a lamp by 10 %.
+        The spectra are 0 beyond the first and last sample. Colour-science samples spectra at points, which changes the
+        energy of the lines of a lamp by 10 %.
         """
         centres, half = bands.centres.detach().cpu().double(), bands.widths.detach().cpu().double() / 2
         thin = half <= 1e-13
@@ -38,7 +42,7 @@ class Table(NamedTuple):
         return torch.where(thin, self.at(centres) * inside, mean)
 
     def _below(self, limits: Tensor) -> Tensor:
-        """Integrate the linear interpolation exactly, from the first sample up to each limit."""
+        """Integrate the linearly interpolated spectra exactly, from the first sample up to each limit."""
         steps = self.wavelengths.diff()
         areas = ((self.values[:, 1:] + self.values[:, :-1]) / 2 * steps).cumsum(1)
         whole = torch.cat([torch.zeros_like(areas[:, :1]), areas], 1)
@@ -50,7 +54,7 @@ class Table(NamedTuple):
 
 @functools.cache
 def observer() -> Table:
-    """Return the colour-matching functions of the CIE 1931 observer, 360 to 830 nm by 1 nm."""
+    """Return the colour-matching functions of the CIE 1931 observer, 360 to 830 nm in steps of 1 nm."""
     import colour
 
     return _table(colour.MSDS_CMFS["CIE 1931 2 Degree Standard Observer"])
@@ -58,7 +62,7 @@ def observer() -> Table:
 
 @functools.cache
 def measured_camera(name: str) -> Table:
-    """Return the measured sensitivities of a camera's channels: red, green, blue."""
+    """Return the measured spectral sensitivities of the red, green and blue channels of a camera."""
     import colour
 
     return _table(colour.MSDS_CAMERA_SENSITIVITIES[f"{name} (NPL)"])
@@ -66,7 +70,7 @@ def measured_camera(name: str) -> Table:
 
 @functools.cache
 def light(kind: str) -> Table:
-    """Return the relative power of a CIE illuminant."""
+    """Return the relative spectral power of a CIE illuminant."""
     import colour
 
     return _table(colour.SDS_ILLUMINANTS[kind])
@@ -74,7 +78,7 @@ def light(kind: str) -> Table:
 
 @functools.cache
 def daylight(temperature: float) -> Table:
-    """Return the relative power of CIE daylight of a correlated colour temperature, 4000 to 25 000 K."""
+    """Return the relative spectral power of CIE daylight at a colour temperature from 4000 to 25 000 K."""
     import colour
 
     return _table(colour.sd_CIE_illuminant_D_series(colour.temperature.CCT_to_xy_CIE_D(temperature)))
@@ -82,7 +86,7 @@ def daylight(temperature: float) -> Table:
 
 @functools.cache
 def mallett() -> Table:
-    """Return the three basis reflectances of Mallett and Yuksel (2019), 380 to 780 nm by 5 nm."""
+    """Return the three basis reflectances of Mallett and Yuksel (2019), 380 to 780 nm in steps of 5 nm."""
     from colour.recovery import MSDS_BASIS_FUNCTIONS_sRGB_MALLETT2019
 
     return _table(MSDS_BASIS_FUNCTIONS_sRGB_MALLETT2019)
@@ -90,7 +94,7 @@ def mallett() -> Table:
 
 @functools.cache
 def paints() -> tuple[Table, ...]:
-    """Return the reflectances of the 102 patches of four measured colour charts; some end at 400 and 700 nm."""
+    """Return the reflectances of 102 patches of colour charts, some of them measured only from 400 to 700 nm."""
     import colour
 
     return tuple(_table(sd) for chart in _CHARTS for sd in colour.SDS_COLOURCHECKERS[chart].values())
@@ -98,7 +102,7 @@ def paints() -> tuple[Table, ...]:
 
 @functools.cache
 def gamut_samples(name: str) -> Table:
-    """Return reflectances that test the colours of lamps: the 99 objects of CIE 2017, or the 15 paints of the CQS."""
+    """Return the test reflectances of a colour-rendering index: the 99 of CIE 2017, or the 15 of NIST CQS 9.0."""
     import colour
 
     if name == "CQS":
@@ -109,7 +113,7 @@ def gamut_samples(name: str) -> Table:
 
 
 def to_srgb(centres: Tensor) -> Tensor:
-    """Return the matrix (3, band) from reflectance under D65 to linear sRGB: white is (1, 1, 1) on these bands."""
+    """Return the matrix (3, band) from reflectance under D65 to linear sRGB, scaled so that white is (1, 1, 1)."""
     import colour
 
     from_xyz = torch.tensor(colour.RGB_COLOURSPACES["sRGB"].matrix_XYZ_to_RGB, dtype=torch.float64)
@@ -120,7 +124,10 @@ def to_srgb(centres: Tensor) -> Tensor:
 def require_range(
     wavelengths: Tensor, known: Tensor | tuple[float, float], source: str, fix: str = "choose bands inside that range"
 ) -> None:
-    """Raise ValueError for wavelengths of bands outside the ``known`` range (m) of a source, such as "D65 holds"."""
+    """Raise ValueError for wavelengths outside the range of a source of spectra.
+
+    ``known`` has the range in m. ``source`` starts the message, such as "D65 is tabulated from".
+    """
     low, high, first, last = (float(x) * 1e9 for x in (wavelengths.min(), wavelengths.max(), known[0], known[-1]))
     if low < first - _ROUNDING or high > last + _ROUNDING:
         raise ValueError(f"bands from {low:.4g} to {high:.4g} nm, but {source} {first:.4g} to {last:.4g} nm: {fix}")

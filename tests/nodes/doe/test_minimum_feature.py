@@ -47,7 +47,7 @@ def test_gradient():
 def test_what_does_not_fit_is_refused_and_a_narrow_spot_said():
     with pytest.raises(ValueError, match="pupil grid"):
         smooth(torch.zeros(3, 3), STOP, feature=4e-6)
-    with pytest.raises(ValueError, match="cannot hold a phase"):
+    with pytest.raises(ValueError, match="too coarse for a phase"):
         smooth(relief().half(), STOP, feature=4e-6)
     assert "1.5 samples" in smooth.hooks.preflight(stop=STOP, feature=1e-6)[0]
     assert smooth.hooks.preflight(stop=STOP, feature=4e-6) == []

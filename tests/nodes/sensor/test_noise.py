@@ -157,7 +157,7 @@ def test_bounds_of_nothing():
 
 
 def test_what_a_reader_is_told():
-    assert "literally" in photon_noise.hooks.preflight(mean="literal", mean_shift=0.2)[0]
+    assert "as the paper prints" in photon_noise.hooks.preflight(mean="literal", mean_shift=0.2)[0]
     assert photon_noise.hooks.preflight(mean="additive", mean_shift=0.2) == []
     assert photon_noise.hooks.check(torch.ones(2), torch.ones(2))[0].ok
     assert not photon_noise.hooks.check(torch.ones(2), torch.tensor([-5.0, 1.0]))[0].ok

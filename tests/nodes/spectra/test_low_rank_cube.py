@@ -187,7 +187,7 @@ def test_the_gradient_of_the_planes_reaches_the_cube():
 
 def test_the_check_says_how_many():
     found = compress(rand(1, 4, 4) * rand(6, 1, 1))
-    assert compress.hooks.check(found)[0].text.startswith("1 planes for 6 bands, within ")
+    assert compress.hooks.check(found)[0].text.startswith("1 planes for 6 bands: error ")
 
 
 @settings(max_examples=20, deadline=None)
@@ -224,7 +224,7 @@ def test_rows_are_photons_of_each_channel_and_wells():
     assert found.shape == (4, 31)
     torch.testing.assert_close(found[:3], seen * SCENE.centres, rtol=1e-15, atol=0)
     torch.testing.assert_close(found[3], SCENE.centres, rtol=0, atol=0)
-    assert rows.hooks.check(found)[0].text == "4 rows of 31 bands, rank 4"
+    assert rows.hooks.check(found)[0].text == "4 rows of weights for 31 bands, rank 4"
     assert torch.equal(rows(SCENE, seen, well=False), found[:3])
     with pytest.raises(ValueError, match="same `bands` step"):
         rows(Bands(*(v[:5] for v in SCENE)), seen)

@@ -128,7 +128,7 @@ def test_refuses_to_run_untrained_unless_told(picture):
         lift_mst_plus_plus.hooks.preflight()
     with pytest.raises(ValueError, match="untrained: allow"):
         lift_mst_plus_plus(picture, SCENE, rng=generator())
-    assert "noise" in lift_mst_plus_plus.hooks.preflight(untrained="allow")[0]
+    assert "no meaning" in lift_mst_plus_plus.hooks.preflight(untrained="allow")[0]
     cube = lift_mst_plus_plus(picture, SCENE, untrained="allow", rng=generator())
     assert not lift_mst_plus_plus.hooks.check(cube, picture, SCENE, untrained="allow")[-1].ok
 

@@ -214,11 +214,11 @@ def test_bands_beyond_a_file_and_nothing_at_all_are_refused(tmp_path):
         reflectances.hooks.preflight(sets=())
     with pytest.raises(ParameterError, match="exchange"):
         metamers.hooks.preflight(thickness=(2.0, 1.0))
-    with pytest.raises(ValueError, match="four spectra or more of 31 bands"):
+    with pytest.raises(ValueError, match="at least four spectra of 31 bands"):
         metamers(torch.ones(3, 31), SCENE, rng=generator())
-    with pytest.raises(ValueError, match=r"\(leaf, band\) of 31 bands"):
+    with pytest.raises(ValueError, match=r"not \(leaf, band\) with 31 bands"):
         leaves(torch.ones(3, 30), SCENE, shape=(2, 2), rng=generator())
-    with pytest.raises(ValueError, match=r"\(band, y, x\) of 31 bands"):
+    with pytest.raises(ValueError, match=r"\(band, y, x\) with 31 bands"):
         render(torch.ones(3, 2, 2), SCENE)
 
 
