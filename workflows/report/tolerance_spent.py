@@ -55,7 +55,7 @@ def said_of_economies(account: Mapping[str, Any]) -> str:
     found = max(account["measured"].values(), default=None)
     measured = f", measured {found:.1e}" if found is not None else ""
     names = ", ".join([*summed, *nothing])
-    return f"spared   {names}: error at most {worst:.1e} in all{measured}; tolerance {account['tolerance']:g}"
+    return f"cheaper  {names}: error at most {worst:.1e} in all{measured}; tolerance {account['tolerance']:g}"
 
 
 def _within(bound: float | None) -> str:
