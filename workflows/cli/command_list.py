@@ -40,7 +40,7 @@ _OPTIONS = {
     "--show-completion": "Show completion for the current shell, to copy it or customize the installation.",
     "-h, --help": "Show this message and exit.",
 }
-COLUMNS = 80  #: of the widest page of help that typer prints
+COLUMNS = 80  #: width of the widest page of help that typer prints
 
 
 def help_page() -> str:

@@ -55,7 +55,7 @@ def accuracy(
 
 @study.command()
 def stability(words: Words = None, quiet: Quiet = False, debug: Debug = False, out: Out = Path("runs")) -> None:
-    """Compare float32 with float64 in stiff and extreme cases.
+    """Compare the steps with float64 in stiff and extreme cases.
 
     Values and gradients are compared: each case passes, warns or fails with its number. The exit code is 1 if
     a case fails.

@@ -103,7 +103,7 @@ def band_tensors(value: Any) -> list[Tensor]:
 
 
 def with_band_tensors(value: Any, tensors: Sequence[Tensor]) -> Any:
-    """Return ``value`` after replacing its tensors that have a band axis by ``tensors``."""
+    """Replace the tensors of ``value`` that have a band axis by ``tensors``, and return the result."""
     if isinstance(value, Tensor):
         return tensors[0]
     return value._replace(**dict(zip(BAND_FIELDS[type(value)], tensors, strict=True)))
@@ -118,7 +118,7 @@ def _has(x: Tensor, axis: int) -> bool:
 
 
 def taken(step: Step, inputs: Sequence[Any], which: list[int], of: Collection[str] | None = None) -> list[Any]:
-    """Return the inputs with only the bands ``which``; if ``of`` names inputs, slice only these inputs."""
+    """Return the inputs of a step with only the bands ``which``; if ``of`` names inputs, slice only these inputs."""
     found = list(inputs)
     for i, (name, value) in enumerate(zip(step.node.inputs, inputs, strict=False)):
         axis = _axis(step, name, value)
@@ -128,7 +128,7 @@ def taken(step: Step, inputs: Sequence[Any], which: list[int], of: Collection[st
 
 
 def _slices(x: Tensor, axis: int, which: list[int]) -> Tensor:
-    """Return the bands ``which`` of a tensor, as a view if they are contiguous and aligned, else as a copy."""
+    """Return the bands ``which`` of a tensor, as a view if these bands are contiguous and aligned, else as a copy."""
     if which == list(range(which[0], which[0] + len(which))):
         part = x.narrow(axis, which[0], len(which))
         if part.is_contiguous() and part.data_ptr() % _ALIGN == 0:
@@ -166,7 +166,7 @@ def _leads(step: Step, x: Tensor) -> bool:
 def _gathered(
     step: Step, inputs: Sequence[Any], evaluate: Evaluate, keys: list[str], missing: list[int], size: int, blobs: Blobs
 ) -> Any:
-    """Compute the missing bands, ``size`` at a time, and assemble all bands; raise `Damaged` for a bad stored band."""
+    """Compute the missing bands, ``size`` at a time, and assemble all bands; raise `Damaged` for a damaged band."""
     assert step.node.bands is not None
     axis = step.node.bands["return"]
     stacks = [_Stack(axis, [f"{key}.{n}" for key in keys], blobs) for n in range(_fields(step))]

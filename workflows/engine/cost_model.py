@@ -11,7 +11,7 @@ from neusee.workflows.graph.recipe_graph import Step
 from neusee.workflows.keys.cache_key import device_kind
 
 GUESS = 0.01  #: s for a step without any measurement
-_FASTER = 10.0  #: speed ratio of another kind of device to the CPU, until both are measured
+_FASTER = 10.0  #: speed of another kind of device relative to the CPU, until both are measured
 _NEWEST = 5  #: number of earlier results that are used
 
 Row = Mapping[str, Any]  #: a line of the journal

@@ -28,8 +28,8 @@ from neusee.workflows.store.serialization import tensors_in
 
 _SHARE = 0.4  #: fraction of the planned memory for values that the next tasks of a worker may read
 _PLANNED = 0.6  #: fraction of the memory of a worker that a plan may use
-_LOOK = 1.0  #: s between two queries for the present workers
-_TRIES = 3  #: workers that may die with one chain before the run fails
+_LOOK = 1.0  #: s between two queries for the connected workers
+_TRIES = 3  #: number of workers that may die during one chain before the run fails
 
 
 class Dask:
@@ -156,7 +156,7 @@ def lane_here(dask_worker: Any) -> tuple[str, float]:
 
 
 def work_here(chain: tuple[StepJob, ...], where: str, threads: int, room: float) -> list[Outcome]:
-    """Compute a chain of jobs on a worker and return the outcomes without values; keep at most ``room`` bytes."""
+    """Compute a chain of jobs on a worker and return outcomes without values; keep at most ``room`` bytes."""
     if torch.get_num_threads() != threads:
         torch.set_num_threads(threads)
     here = _here.get(where) or _here.setdefault(where, _Here(where, room))

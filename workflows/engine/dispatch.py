@@ -33,7 +33,7 @@ class Loop:
             for key in missing:
                 self._after.setdefault(key, []).append(i)
         self._ready = [i for i, missing in enumerate(self._missing) if not missing]
-        self._ready.reverse()  # the next chain is the last item, because a list pops there
+        self._ready.reverse()  # the next chain is the last item, which a list can remove fastest
         self._held: dict[int, tuple[float, float]] = {}  # chain -> time of the next attempt, and the wait after it
         self._open = len(chains)
 
@@ -97,7 +97,7 @@ class Loop:
         return pause
 
     def _settle(self, outcome: Outcome) -> None:
-        """Mark the lane of an outcome as idle, and the chains that waited for its key as ready."""
+        """Mark the lane of an outcome as idle, and the chains that waited for its result as ready."""
         i = self._chain_of[outcome.work.key]
         chain = self._chains[i]
         last = outcome.work.key == chain[-1].key
@@ -127,7 +127,7 @@ def chains_of(works: Sequence[StepJob], fused: bool) -> list[Chain]:
         return [(work,) for work in works]
     readers = Counter(key for work in works for key in set(work.sources))
     planned = {work.key for work in works}
-    chains: dict[Key, list[StepJob]] = {}  # by the key at their end
+    chains: dict[Key, list[StepJob]] = {}  # by the key of the last job
     for work in works:
         above = [key for key in dict.fromkeys(work.sources) if key in planned]
         chain = chains.get(above[0]) if len(above) == 1 else None

@@ -59,7 +59,7 @@ class Execution:
         self.origins: dict[Key, dict[str, Any]] = {}  # the parts of each key
         self.values: dict[Key, Any] = {}
         self.facts: dict[Key, TensorStats | None] = {}
-        self.again: dict[Key, float] = {}  # s for obtaining again a value that was computed here
+        self.again: dict[Key, float] = {}  # s to obtain again a value that was computed in this run
         self.took: dict[str, float] = {}  # the longest time of a step of each node, s
         self.verdicts, self.ledger = dict[str, SkipDecision](), ErrorBudget(recipe)
         self.done: dict[str, StepRecord] = {}

@@ -16,7 +16,7 @@ from neusee.workflows.placement.heft_and_cpop import Cluster, Device, Schedule, 
 from neusee.workflows.store.result_store import Store
 from neusee.workflows.store.serialization import tensors_in
 
-MOST_PARTS = 64  #: upper bound on the parts of a step cut by bands; the number of bands is known when the step runs
+MOST_PARTS = 64  #: upper bound on the parts of a step; the number of bands is only known when the step runs
 
 
 @dataclass(frozen=True, slots=True)
@@ -68,7 +68,7 @@ def room_for(expected: Mapping[Key, Estimate], executor: Executor, values: Mappi
 
 
 def joined(first: Schedule | None, then: Schedule | None) -> Schedule | None:
-    """Return the schedule ``first``, followed by the schedule ``then``."""
+    """Join two schedules: the schedule ``then`` begins when the schedule ``first`` ends."""
     if first is None or then is None:
         return first or then
     by = first.makespan

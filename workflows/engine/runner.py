@@ -22,7 +22,7 @@ from neusee.workflows.store.result_store import Store
 from neusee.workflows.tolerance.cheaper_steps import with_substitutions
 from neusee.workflows.tolerance.error_propagation import ErrorBounds, ToleranceNotProven, proof, tolerance_frontier
 
-_SAFE = 0.8  #: tolerance scale of a second attempt over the largest scale that would suffice
+_SAFE = 0.8  #: tolerance scale of a second attempt, relative to the largest scale that would suffice
 
 
 @dataclass(frozen=True, repr=False)
@@ -84,7 +84,7 @@ def run(
     executor: Executor | None = None,
     memory: int | None = None,
 ) -> Result:
-    """Return the values of the steps ``outputs``; compute each value that is not in ``store``.
+    """Return the values of the steps ``outputs``; compute the values that are not in ``store``.
 
     Args: outputs: if None, the outputs of the recipe. device: one or several devices, such as
     ``cuda:0,cuda:1,cpu``, the preferred device first. executor: computes the steps in place of this process.

@@ -1,4 +1,4 @@
-"""Texts on changed parameters, with path, unit and location in the recipe."""
+"""Texts that describe changed parameters, with path, unit and location in the recipe."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ _ABSENT = object()
 
 
 class Wording:
-    """Texts on changed parameters, with the paths and units of a recipe, or without a recipe in SI units."""
+    """Texts that describe changed parameters in the units of a recipe, or without a recipe in SI units."""
 
     def __init__(self, recipe: Recipe | None = None) -> None:
         self._recipe = recipe

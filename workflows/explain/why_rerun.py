@@ -31,7 +31,7 @@ def why_lines(recipe: Recipe, store: Store, step: str, device: str = "cpu") -> l
     names = [name for name in recipe.steps if step in (name, name.partition("[")[0])]
     if not names:
         known = {*recipe.steps, *(name.partition("[")[0] for name in recipe.steps)}
-        raise ValueError(f"no step {step!r}; {nearest(step, known)}")
+        raise ValueError(f"there is no step {step!r}; {nearest(step, known)}")
     recipe = with_substitutions(recipe, [*recipe.outputs, *names])
     resolved = resolve(recipe, needed(recipe, [*recipe.outputs, *names]), store, device)
     comparison = Comparison(store, recipe, resolved)
@@ -39,7 +39,7 @@ def why_lines(recipe: Recipe, store: Store, step: str, device: str = "cpu") -> l
 
 
 def why_key_lines(store: Store, prefix: str) -> list[str]:
-    """Return lines that explain the result whose key begins with ``prefix``: parts of the key, and differences.
+    """Return lines with the origin of a result, whose key begins with ``prefix``, and its differences.
 
     Raises `LookupError` if no key or more than one key begins with ``prefix``.
     """

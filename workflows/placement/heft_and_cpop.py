@@ -171,6 +171,6 @@ def _sequence(graph: Graph, d: int, order: Sequence[int]) -> Schedule:
 
 
 def _fewest(graph: Graph, i: int, room: float) -> int:
-    """Return the least number of parts with which task ``i`` fits into ``room`` bytes, or else the largest number."""
+    """Return the smallest number of parts with which task ``i`` fits into ``room`` bytes, or the largest allowed."""
     most = graph.tasks[i].parts
     return 1 + bisect_left(range(1, most), True, key=lambda parts: graph.work(i, parts) <= room)

@@ -34,7 +34,7 @@ _KINDS = ("cpu", "cuda", "mps")
 _SECONDS = {"s": 1.0, "ms": 1e-3, "us": 1e-6, "µs": 1e-6, "μs": 1e-6, "ns": 1e-9}
 _RATES = {f"{unit}/s": scale for unit, scale in UNITS.items() if unit in ("MB", "GB", "TB")}
 _QUANTITY = re.compile(r"((?:\d+\.?\d*|\.\d+)(?:[eE][-+]?\d+)?)\s*(.*)")
-_MOST = 4096  #: limit on the devices of one file
+_MOST = 4096  #: largest number of devices in one file
 _Reader = Callable[[Value, "list[Diagnostic]"], Any]
 
 
@@ -44,7 +44,7 @@ class Machines:
 
     title: str
     cluster: Cluster
-    speeds: Mapping[str, Mapping[str, float]] = field(repr=False)  #: by device, by family, with a ``default``
+    speeds: Mapping[str, Mapping[str, float]] = field(repr=False)  #: by device, then by family of nodes or ``default``
 
     @property
     def devices(self) -> tuple[Device, ...]:
@@ -194,7 +194,7 @@ def _factor(value: Value, diagnostics: list[Diagnostic]) -> float:
 
 
 def _quantity(value: Value, diagnostics: list[Diagnostic], units: Mapping[str, float], such: str) -> float:
-    """Return a quantity such as ``80 GB`` in SI units; report a missing or wrong unit, and a 0 that is not a time."""
+    """Convert a quantity such as ``80 GB`` to SI units; report a wrong unit, or a value that is out of range."""
     match = _QUANTITY.fullmatch(str(value.data).strip())
     if isinstance(value.data, bool) or match is None:
         diagnostics.append(_problem(value, f"must be a number and a unit, such as {such}"))
@@ -214,7 +214,7 @@ _time = partial(_quantity, units=_SECONDS, such="10 us")
 
 
 def _absent(links: Value | None, kinds: set[str]) -> list[Diagnostic]:
-    """Return a diagnostic for each kind of device that ``links`` names but that no device has."""
+    """Return a diagnostic for each kind of device that is in ``links`` but not in the cluster."""
     return [
         _problem(link, f"there is no device of kind {name}; {nearest(name, kinds)}", link.key)
         for pair, link in (links.items.items() if links else ())

@@ -21,13 +21,13 @@ class PartialSchedule:
         self.graph, devices, count = graph, graph.cluster.devices, len(graph.tasks)
         self.where, self.parts = [-1] * count, [1] * count
         self.start, self.end = [0.0] * count, [0.0] * count
-        self.free_at: list[float] = [0.0] * count  # time when the last reader placed so far has its input
+        self.free_at: list[float] = [0.0] * count  # time at which the last reader placed so far has its input
         self.left = [len(readers) for readers in graph.readers]
         self.gaps: list[tuple[list[float], list[float]]] = [([0.0], [math.inf]) for _ in devices]
         most = sum(graph.own) + max((graph.work(i, 1) for i in range(count)), default=0.0)
         sent = sum(max(0.0, math.ceil(s)) for t, sizes in enumerate(graph.sizes) for s in sizes if graph.tasks[t].takes)
         self.rooms = [MemoryProfile(d.memory) if bounded and d.memory < most + sent else None for d in devices]
-        self.links = [[graph.cluster.link(a.name, b.name) for b in devices] for a in devices]  # 0 s to itself
+        self.links = [[graph.cluster.link(a.name, b.name) for b in devices] for a in devices]  # no delay to itself
         self.least = [own + graph.work(i, graph.tasks[i].parts) for i, own in enumerate(graph.own)]
         self.copies: dict[Of, list[Copy]] = {}
         self.placed: list[int] = []
@@ -76,7 +76,7 @@ class PartialSchedule:
         return zip(self.graph.sources[i], self.graph.sizes[i], strict=True)
 
     def _slot(self, i: int, d: int, ready: float, seconds: float, best: float) -> float:
-        """Return the earliest start of task ``i`` on device ``d``, or infinity if it cannot end before ``best``."""
+        """Return the earliest start of task ``i`` on device ``d``, or infinity if the end is not before ``best``."""
         starts, ends = self.gaps[d]
         for gap in range(bisect_left(ends, ready + seconds), len(ends)):
             start = max(starts[gap], ready)
@@ -91,7 +91,7 @@ class PartialSchedule:
         return math.inf
 
     def _fitting(self, i: int, d: int, start: float, seconds: float, end: float) -> float:
-        """Return the earliest start of task ``i`` with enough memory, or a start that is too late for the gap."""
+        """Return the earliest start of task ``i`` with enough memory, or a start after which the gap is too short."""
         room, parts = self.rooms[d], self.graph.tasks[i].parts
         if room is None:
             return start
@@ -234,7 +234,7 @@ class PartialSchedule:
             ended[self.end[i]] = i
 
     def _waited(self, i: int, before: int, other: int) -> int:
-        """Return the task that delayed task ``i``: a source, the task before it, or a task that freed memory."""
+        """Return the task that delayed task ``i``: a source, the previous task, or a task that freed memory."""
         start, d = self.start[i], self.where[i]
         for j, size in self._inputs(i):
             if self.end[j] + self.links[self.where[j]][d].seconds(size) == start:

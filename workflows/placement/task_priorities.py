@@ -123,7 +123,7 @@ def frugal(graph: Graph) -> list[int]:
 
 
 def _needs(graph: Graph) -> tuple[list[float], list[list[int]]]:
-    """Return for each task the peak bytes of running it with all predecessors, and its sources in the best order."""
+    """Return the peak memory of each task with all its predecessors, and the best order of its sources."""
     need, befores = [0.0] * len(graph.tasks), list[list[int]]([] for _ in graph.tasks)
     for i in graph.by(range(len(graph.tasks))):
         befores[i] = sorted(graph.sources[i], key=lambda j: (graph.own[j] - need[j], j))

@@ -13,7 +13,7 @@ from functools import cached_property
 
 @dataclass(frozen=True, slots=True)
 class Device:
-    """A device that runs one task at a time: ``cuda:1`` of this machine, ``node2/cuda:1`` of machine ``node2``."""
+    """A device that runs one task at a time, such as ``cuda:1``, or ``node2/cuda:1`` on the machine ``node2``."""
 
     name: str
     kind: str = "cpu"
@@ -76,9 +76,9 @@ class Task:
     sources: tuple[str, ...]
     seconds: Mapping[str, float]  #: by device name; a device without an entry cannot run the task
     bytes: float = 0.0  #: size of the result
-    work: float = 0.0  #: bytes beside inputs and result during the run; a task of 0 s may use none
+    work: float = 0.0  #: memory during the run beside inputs and result, in bytes; 0 for a task of 0 s
     parts: int = 1  #: upper bound on the number of band slices, among which ``work`` is divided
-    takes: Mapping[str, float] = field(default_factory=dict)  #: bytes to send of a source, if not all
+    takes: Mapping[str, float] = field(default_factory=dict)  #: bytes that a source sends, if not its whole result
 
 
 @dataclass(frozen=True, slots=True)

@@ -130,7 +130,7 @@ SHOWN = ("transfer",)
 BANDS = "bands"
 LINES = "line[*]"
 
-#: Files of ``data/``: the format of each file, and the needs of its writer.
+#: Files of ``data/``: the format of each file, and the needs of the function that writes the file.
 FILES: Mapping[str, tuple[str, Mapping[str, str]]] = {
     "radiance.exr": ("spectral", {"cube": "radiance", "bands": "bands"}),
     "psf_plain.exr": ("spectral", {"cube": "psf[plain]", "bands": "bands"}),

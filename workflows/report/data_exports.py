@@ -18,7 +18,7 @@ from neusee.workflows.report.contents import FILES
 from neusee.workflows.report.run_pictures import DerivedFile, files_of
 from neusee.workflows.store.derived_files import DerivedFiles
 
-_VERSION = 1  #: of the file formats; increase the number when a file is written differently
+_VERSION = 1  #: version of the file formats; to be increased when a file is written differently
 
 
 def exports(result: Result, shelf: DerivedFiles) -> tuple[dict[str, Path], dict[str, str]]:

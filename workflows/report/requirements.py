@@ -36,7 +36,7 @@ class Bound:
 
 @dataclass(frozen=True, slots=True)
 class Found:
-    """The source of an argument: steps to read, a function that returns the argument, and its identity."""
+    """The source of an argument: steps to read, a function that returns the argument, and a part of the cache key."""
 
     steps: tuple[str, ...]
     make: Any  #: a function of the values by step, which returns the argument
@@ -67,7 +67,7 @@ def _step(name: str, recipe: Recipe) -> Step:
 
 
 def _items(prefix: str, recipe: Recipe, keys: Mapping[str, str]) -> Found:
-    """Find all items of a step from the beginning of their names, such as ``spot[mask,``, as a dictionary."""
+    """Find the items of a step whose names begin with ``prefix``, such as ``spot[mask,``."""
     names = {n[len(prefix) : -1]: n for n in recipe.steps if n.startswith(prefix) and n in keys}
     if not names:
         raise Missing(f"the recipe has no step {prefix}…]")

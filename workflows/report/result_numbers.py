@@ -80,7 +80,7 @@ def metrics_of(recipe: Recipe, among: Container[str]) -> list[str]:
 
 
 def numbers_of(step: str, found: Any) -> list[list[Any]]:
-    """Return a row (step, field, index, value) for each number of a small result; a picture has no rows."""
+    """Return a row (step, field, index, value) for each number of a small result; a picture gives no rows."""
     rows: list[list[Any]] = []
     for field, tensor in _fields(found):
         if tensor.numel() <= _MOST and not tensor.is_complex():

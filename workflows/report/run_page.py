@@ -102,7 +102,7 @@ def rebuild(folder: Path) -> Path:
 
 
 def verdict(found: Sequence[Mapping[str, Any]], failed: Sequence[str]) -> str:
-    """Return one line with the number of expected numbers that are met, and the number of checks that failed."""
+    """Return one line with the counts of expected numbers that the run met and of checks that failed."""
     met = sum(e["ok"] for e in found)
     some = f"{met} of {len(found)} expected numbers within tolerance"
     numbers = some if found else "No expected numbers in this recipe"

@@ -33,7 +33,7 @@ TIMELINE = (
 
 @dataclass(frozen=True, slots=True)
 class DerivedFile:
-    """A file that the function ``make`` makes from results, with the source of each argument of this function."""
+    """A file that the function ``make`` computes from results, with the source of each argument of this function."""
 
     name: str
     suffix: str

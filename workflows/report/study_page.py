@@ -93,7 +93,7 @@ def _is_number(value: Any) -> bool:
 
 
 def _holds_numbers(cells: Sequence[Any]) -> bool:
-    """Return True if a column holds numbers only, apart from empty cells."""
+    """Return True if a column contains only numbers, apart from empty cells."""
     filled_cells = [c for c in cells if c is not None]
     return bool(filled_cells) and all(map(_is_number, filled_cells))
 

@@ -1,8 +1,8 @@
 """Cheaper substitutes for steps, used where the error in the outputs stays below the tolerance.
 
 The sensor sums bands into a few channels before any random step. Where the steps after an image read only such sums,
-the sums are convolved instead of the bands. The substitutes are added beside the full steps, and only the wires of
-their readers change. A value requested by name is therefore always computed in full.
+the sums are convolved instead of the bands. The substitutes are added beside the full steps, and only the inputs of
+the later steps change. A value requested by name is therefore always computed in full.
 """
 
 from __future__ import annotations
@@ -20,9 +20,9 @@ from neusee.workflows.tolerance.zero_effect_steps import without_nothing
 if TYPE_CHECKING:
     from neusee.nodes import Node
 
-CHANNELS = 0.25  #: share of the tolerance for the channels of one image; the level may follow a second image
+CHANNELS = 0.25  #: share of the tolerance for the channels of an image; the scene level may depend on a second image
 _LEAST = 2e-5  #: tolerance below which sums over bands cannot be proved, because their round-off alone is 1.4e-6
-_MIXTURE = 0.1  #: share for a low-rank cube, rounded down to a power of ten so that the cube seldom changes
+_MIXTURE = 0.1  #: share of the tolerance for a low-rank cube, rounded to a power of ten so that the cube seldom changes
 
 
 def with_substitutions(recipe: Recipe, wanted: Iterable[str], pinned: Collection[str] = ()) -> Recipe:
@@ -113,7 +113,7 @@ class _Draft:
         name, within = f"{image.name}.channels", self.recipe.allowed(image.name) * CHANNELS
         cube, rows = self._mixture(radiance, image), self._rows(*weights, readers, image)
         wires = {"radiance": cube, "psf": image.wires.get("psf"), "rows": rows}
-        # the level follows the brightest pixel
+        # the level of the scene follows the brightest pixel
         largest = any(reader.node.hooks.band_invariant is not None for reader in readers)
         self._add(name, node, wires, {**image.params, "within": within, "largest": largest}, image)
         for reader in readers:
@@ -122,7 +122,7 @@ class _Draft:
         self.substitutions.append(Substitution(image.name, name, within, "only sums over its bands are needed"))
 
     def spectral(self, image: str, readers: Sequence[Step]) -> tuple[str, str] | None:
-        """Return the steps of the bands and responses of all ``readers``; None if a reader needs single bands."""
+        """Return the bands and the responses that all ``readers`` read, or None if a reader needs single bands."""
         pairs = {(r.wires.get("bands"), r.wires.get("responses")) for r in readers if "responses" in r.node.inputs}
         if len(pairs) != 1 or not all(self._sums(r, image) for r in readers):
             return None
@@ -130,7 +130,7 @@ class _Draft:
         return (bands, responses) if isinstance(bands, str) and isinstance(responses, str) else None
 
     def finished(self) -> Recipe:
-        """Return the recipe with the cheaper steps and the changed wires."""
+        """Return the recipe with the cheaper steps and with changed connections."""
         if not self.substitutions:
             return self.recipe
         steps = {**self.recipe.steps, **self.added, **self.rewired}

@@ -32,7 +32,7 @@ def largest_error(value: Any, reference: Any) -> float:
 
 
 def _errors(value: Any, reference: Any) -> tuple[float, float]:
-    """Return the root mean square error and the largest error, each for the pair of tensors with the largest value."""
+    """Return the root mean square error and the largest error, each as the maximum over all pairs of tensors."""
     pairs, mean, largest = [(value, reference)], 0.0, 0.0
     while pairs:
         a, b = pairs.pop()

@@ -62,7 +62,10 @@ def _known(wire: Wire, dark: Mapping[str, None]) -> Any:
 
 
 def without(step: Step, dark: Mapping[str, None]) -> dict[str, Wire]:
-    """Return the wires of a step without inputs from steps in ``dark`` and inputs that belong to these."""
+    """Return the inputs of a step after removing the inputs from steps in ``dark``.
+
+    The other inputs of the same group are removed, too.
+    """
     wires = dict(step.wires)
     for group in step.node.additive_inputs:
         wire = wires.get(group[0])

@@ -13,7 +13,7 @@ Row = tuple[str, str, float, float]  #: step, lane, start in s since the run beg
 Spans = Mapping[str, tuple[str, float, float]]  #: lane, start in s and duration in s of each step
 
 _COLOURS = (BLUE, ORANGE, GREEN, "#CC79A7", "#56B4E9", "#8C6D1F", "#6A51A3", "#5F6B6D")
-_MOST = 80  #: rows of steps, at most; of more steps, the longest have a row
+_MOST = 80  #: largest number of rows of steps; only the longest steps have a row
 _STEP_HEIGHT, _LANE_HEIGHT = 0.2, 0.3  #: inches, of the row of a step and of a lane
 
 
