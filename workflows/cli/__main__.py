@@ -1,4 +1,4 @@
-"""``python -m neusee.workflows.cli`` is ``neusee``."""
+"""Entry point of ``python -m neusee.workflows.cli``, which is the same as ``neusee``."""
 
 from neusee.workflows.cli.app import main
 

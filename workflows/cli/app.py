@@ -1,4 +1,4 @@
-"""The entry point of the command line: ``neusee --help`` answers without typer, and every mistake is one line."""
+"""The entry point of the command line: ``neusee --help`` works without typer, and an error is printed as one line."""
 
 from __future__ import annotations
 
@@ -25,16 +25,16 @@ def __getattr__(name: str) -> Any:
 
 
 def main(arguments: list[str] | None = None) -> None:
-    """Run the command line and exit; print an error as one line, or its whole traceback with ``--debug``."""
+    """Run the command line and exit; print an error as one line, or with ``--debug`` as a traceback."""
     arguments = sys.argv[1:] if arguments is None else arguments
-    gc.disable()  # imported modules stay: a search for garbage among them costs a tenth of the start
+    gc.disable()  # a search for garbage among imported modules takes a tenth of the start-up time
     try:
         sys.exit(_run(arguments))
     except BrokenPipeError:
         sys.stderr.close()
         sys.exit(DONE)
     except KeyboardInterrupt:
-        print("stopped; what was finished is kept, and a next run goes on from there", file=sys.stderr)
+        print("stopped; finished results are kept, and the next run continues from there", file=sys.stderr)
         sys.exit(INTERRUPTED)
     except Exception as error:
         if "--debug" in arguments:

@@ -33,9 +33,9 @@ def ls() -> None:
 
 @cache.command("verify")
 def verify() -> None:
-    """Compare the checksum of every stored result.
+    """Verify the checksum of every stored result.
 
-    The exit code is 3 where a result is damaged.
+    The exit code is 3 if a result is damaged.
     """
     lines, damaged = verify_lines(the_store())
     say(lines)
@@ -50,7 +50,7 @@ def gc(
 ) -> None:
     """Remove files that belong to no result, and results beyond a budget.
 
-    Beyond the budget, the results that save the fewest seconds for their bytes go first. Pinned results stay.
+    Beyond the budget, the results that save the fewest seconds for each byte are removed first. Pinned results stay.
     """
     with failing(ValueError, before="--budget: "):
         say(gc_lines(the_store(), budget or None, dry))
@@ -58,23 +58,23 @@ def gc(
 
 @cache.command("pin")
 def pin(key: Key) -> None:
-    """Keep a result whatever the budget is."""
+    """Keep a result even if the cache exceeds its budget."""
     with failing(ValueError):
         say(pin_lines(the_store(), key))
 
 
 @cache.command("unpin")
 def unpin(key: Key) -> None:
-    """Allow a pinned result to be removed again."""
+    """Unpin a result, so that `gc` may remove the result."""
     with failing(ValueError):
         say(pin_lines(the_store(), key, pin=False))
 
 
 @cache.command("why")
 def why(key: Key) -> None:
-    """Say what a result was computed from.
+    """Print the origin of a result.
 
-    Also says how that differs from the nearest earlier result.
+    Also print the differences from the nearest earlier result.
     """
     from neusee.workflows.explain.why_rerun import why_key_lines
 
@@ -132,20 +132,20 @@ def gc_lines(store: Store, budget: str | None = None, dry: bool = False) -> list
 
 
 def pin_lines(store: Store, prefix: str, pin: bool = True) -> list[str]:
-    """Pin or unpin the value whose key begins with ``prefix``; raise `ValueError` unless exactly one key does."""
+    """Pin or unpin the value whose key begins with ``prefix``; raise `ValueError` unless there is exactly one."""
     keys = {key for key, about in store.entries() if is_kept(about)} if pin else store.pinned()
     named = sorted(key for key in keys if key.startswith(prefix.lower()))
     if len(named) != 1:
         what = "value" if pin else "pinned value"
-        few = f"these begin so: {', '.join(key[:12] for key in named[:5])}" if named else f"no {what} begins so"
-        raise ValueError(f"{prefix!r} names no single {what}: {few} (`neusee cache ls` lists them)")
+        few = f"it matches {', '.join(key[:12] for key in named[:5])}" if named else "it matches no key"
+        raise ValueError(f"{prefix!r} must be the start of the key of one {what}: {few} (`neusee cache ls` lists keys)")
     (store.pin if pin else store.unpin)(named[0])
     step = (store.about(named[0]) or {}).get("step") or "a value that is not here"
     return [f"{'pinned' if pin else 'no longer pinned'}: {named[0]}  {step}"]
 
 
 def _picture_problem(files: DerivedFiles, key: str, about: dict[str, Any]) -> str:
-    """Return an empty text if the file of an entry is whole; otherwise put the file aside and return the problem."""
+    """Check the file of a picture; return an empty text, or move a damaged file away and return the problem."""
     name = about.get("file")
     if not name or not is_kept(about) or files.find(key, os.path.basename(name)[len(key) :]) is not None:
         return ""

@@ -39,7 +39,7 @@ _UNITS_IN_WORDS = {
 
 
 def recipes() -> None:
-    """List the recipes and the groups that they choose from."""
+    """List the recipes and the groups of options."""
     say(recipe_lines())
 
 
@@ -47,7 +47,7 @@ def nodes(
     name: Annotated[str | None, typer.Argument(help="One node, such as optics.psf; `reading`, or `glossary`.")] = None,
     debug: Debug = False,
 ) -> None:
-    """List the nodes, or explain one of them.
+    """List the nodes, or explain one node.
 
     For one node: its physics, source, error, inputs and parameters, and the recipes that use it. `reading` lists how
     the paper is read where it contradicts itself. `glossary` lists the terms of the field, one a line.
@@ -100,7 +100,7 @@ def node_lines(name: str) -> list[str]:
         return [line for row in READINGS for line in (*_reading(row.path), "")]
     nodes = dict(all_nodes())
     if name not in nodes:
-        raise LookupError(f"no node {name}: {nearest(name, nodes)}")
+        raise LookupError(f"there is no node {name}: {nearest(name, nodes)}")
     node, uses = nodes[name], list(_uses(name))
     lines = [name, "", *inspect.cleandoc(node.__doc__ or "").splitlines(), "", "inputs"]
     lines += [f"  {i}{' (optional)' if i in node.optional else ''}" for i in node.inputs] or ["  none"]
@@ -111,7 +111,7 @@ def node_lines(name: str) -> list[str]:
 
 
 def glossary_lines() -> list[str]:
-    """Return the terms of the packaged glossary, one a line, without the marks of Markdown."""
+    """Return the terms of the packaged glossary, one on each line, without Markdown markup."""
     text = (_recipes() / "guide" / "glossary.md").read_text(encoding="utf-8")
     return [re.sub(r"[*`]", "", line[2:]) for line in text.splitlines() if line.startswith("- **")]
 
@@ -132,7 +132,7 @@ def _parameters(node: Node) -> list[str]:
 
 
 def _kind(hint: Any) -> str:
-    """Return a type in words: its unit, the texts that it allows, or a number and the range of that number."""
+    """Describe a type in words, by its unit, its allowed texts, or the range of its numbers."""
     from neusee.nodes import units
 
     for name, words in _UNITS_IN_WORDS.items():
@@ -167,7 +167,7 @@ def _composed(hint: Any, arguments: tuple[Any, ...]) -> str:
 
 
 def _uses(name: str) -> Iterator[tuple[str, Any]]:
-    """Yield each packaged recipe file that has a step of the node ``name``, with that step."""
+    """Yield each packaged recipe file with a step that runs the node ``name``, together with this step."""
     from ruamel.yaml import YAML
 
     for path in sorted(_recipes().rglob("*.yaml")):

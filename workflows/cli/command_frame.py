@@ -1,4 +1,4 @@
-"""The functions with which every command reads a recipe, checks options, prints lines and fails."""
+"""Functions that all commands use to read a recipe, check options, print lines and report errors."""
 
 from __future__ import annotations
 
@@ -41,7 +41,7 @@ def _is_change(word: str) -> bool:
 
 
 def load(words: list[str] | None, *command: str, before: int = 0, exact: bool = False) -> tuple[Recipe, list[str]]:
-    """Return the recipe that ``words`` name, with its changes, and the words that run ``command`` on that recipe."""
+    """Return the recipe that ``words`` name and change, and the words of the command line that runs this recipe."""
     name, changes, first = split(words, before)
     from neusee.workflows.recipe.loading import load as read
 
@@ -75,7 +75,7 @@ def failing(*errors: type[Exception], code: int = BAD, before: str = "") -> Iter
 
 
 def check_device(device: str) -> None:
-    """Refuse a device that does not exist on this machine; several devices are separated by commas."""
+    """End the command if a device does not exist on this machine; ``device`` may be a list with commas."""
     import torch
 
     names = device.split(",")
@@ -115,7 +115,7 @@ def memory_limit(text: str) -> int | None:
 
 @contextmanager
 def executor_of(place: str, store: Store) -> Iterator[Executor | None]:
-    """Yield None for ``local``, or the cluster that ``place`` names and that lives as long as the block."""
+    """Yield None for ``local``, or an executor on the cluster ``place`` that is closed after the block."""
     if place == "local":
         yield None
         return

@@ -20,16 +20,16 @@ EXIT_CODES = (
 COMMANDS = {
     "run": ("recipe_commands", "Run a recipe and write its report."),
     "validate": ("recipe_commands", "Check a recipe without running it."),
-    "plan": ("recipe_commands", "Say what a run would compute, where and for how long."),
-    "why": ("recipe_commands", "Say why a step differs from its nearest earlier result."),
+    "plan": ("recipe_commands", "Show which steps a run would compute, where and for how long."),
+    "why": ("recipe_commands", "Explain why a step differs from its nearest earlier result."),
     "config": ("recipe_commands", "Print every final value and where it comes from."),
     "report": ("recipe_commands", "Write the page of a run again from stored results."),
     "sweep": ("sweep_command", "Run a recipe at several values of its parameters."),
-    "train": ("train_command", "Train a recipe's mask and the network that restores."),
+    "train": ("train_command", "Train the mask of a recipe and its restoring network."),
     "calibrate": ("calibrate_command", "Find the posterior of a sensor from calibration frames."),
     "evaluate": ("evaluate_command", "Compare masks and restorers on the same scenes and lasers."),
-    "recipes": ("catalogue", "List the recipes and the groups that they choose from."),
-    "nodes": ("catalogue", "List the nodes, or explain one of them."),
+    "recipes": ("catalogue", "List the recipes and the groups of options."),
+    "nodes": ("catalogue", "List the nodes, or explain one node."),
     "schema": ("catalogue", "Print the JSON schema of recipes for editors."),
     "study": ("study_commands", "Study how accurate, stable and certain a recipe's numbers are."),
     "cache": ("cache_commands", "List, check, remove and keep stored results."),
@@ -40,7 +40,7 @@ _OPTIONS = {
     "--show-completion": "Show completion for the current shell, to copy it or customize the installation.",
     "-h, --help": "Show this message and exit.",
 }
-COLUMNS = 80  #: of the widest page of help that typer prints
+COLUMNS = 80  #: width of the widest page of help that typer prints
 
 
 def help_page() -> str:

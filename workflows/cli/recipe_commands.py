@@ -103,9 +103,9 @@ def plan(
         str, typer.Option("--devices", help="Simulate these machines: a YAML file, or the example eight_a100.")
     ] = "",
 ) -> None:
-    """Say what a run would compute, where and for how long.
+    """Show which steps a run would compute, where and for how long.
 
-    Nothing is computed. Seconds, bytes and memory are those of earlier runs of the same step, even at another size;
+    Nothing is computed. Seconds, bytes and memory come from earlier runs of the same step, even at another size;
     a step that never ran shows a question mark. With --devices the run is simulated on machines that you do not
     have: makespan, utilisation and critical path.
     """
@@ -129,7 +129,7 @@ def why(
     debug: Debug = False,
     device: Device = "cpu",
 ) -> None:
-    """Say why a step differs from its nearest earlier result.
+    """Explain why a step differs from its nearest earlier result.
 
     The answer names the value that changed and where it was written, such as
     `sensor.read_noise 10.5 -> 20 e- (argument 2)`, or the code that changed.

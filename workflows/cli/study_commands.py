@@ -55,20 +55,20 @@ def accuracy(
 
 @study.command()
 def stability(words: Words = None, quiet: Quiet = False, debug: Debug = False, out: Out = Path("runs")) -> None:
-    """Compare stiff and extreme cases with float64.
+    """Compare the steps with float64 in stiff and extreme cases.
 
-    Values and gradients are compared: each case passes, warns or fails with its number. The exit code is 1 where
-    one fails.
+    Values and gradients are compared: each case passes, warns or fails with its number. The exit code is 1 if
+    a case fails.
     """
     _run("stability", words, quiet, out)
 
 
 @study.command("leave-out")
 def leave_out(words: Words = None, quiet: Quiet = False, debug: Debug = False, out: Out = Path("runs")) -> None:
-    """Measure what each omission changes and saves.
+    """Measure the effect and the saved time of each omitted step.
 
     Each omitted step is computed in full as well. The page has the stated bound, the measured change and the
-    seconds saved, and what simpler scenes cost. The exit code is 1 where a change exceeds its bound.
+    seconds saved, and what simpler scenes cost. The exit code is 1 if a change exceeds its bound.
     """
     _run("leave-out", words, quiet, out)
 
@@ -87,8 +87,8 @@ def calibration(
     """Test the calibration on simulated sensors.
 
     Sensors are drawn from the prior, their frames are simulated, and the truth is ranked among draws from each
-    posterior (simulation-based calibration, SBC). The page also has what doubling the width of each prior moves.
-    The exit code is 1 where ranks or coverage are wrong.
+    posterior (simulation-based calibration, SBC). The page also shows the effect of doubling the width of each prior.
+    The exit code is 1 if ranks or coverage are wrong.
     """
     _run("calibration", words, quiet, out, simulations=simulations, move=move.value)
 

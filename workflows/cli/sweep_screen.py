@@ -81,7 +81,7 @@ def _opening(work: Sweeping) -> Iterator[str]:
 def _run_points(
     work: Sweeping, on_error: OnError, quiet: bool
 ) -> tuple[list[PointOutcome], SweepState, Exception | None]:
-    """Run and show the points; return the outcomes so far where Ctrl-C or a failure ends the sweep."""
+    """Run and show the points of a sweep; return their outcomes, also after Ctrl-C or a failure."""
     table = SweepTable(work.columns, len(work.plan.checked), mode_for(quiet))
     running = outcomes(work.plan, work.store, on_error, work.device, table.started, table.watch)
     try:
@@ -137,7 +137,7 @@ class SweepTable(ProgressTable):
         self.widths = [max(4, 2 * count + 1), max(5, count), *widest, 6, 8, 12, 0]
 
     def started(self, point: Point) -> None:
-        """Record that ``point`` begins."""
+        """Record that a point of the sweep begins."""
         self.running, self.step = point, ""
 
     def watch(self, event: Event) -> None:

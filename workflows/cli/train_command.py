@@ -41,7 +41,7 @@ def train(
     debug: Debug = False,
     out: Out = Path("runs"),
 ) -> None:
-    """Train a recipe's mask and the network that restores.
+    """Train the mask of a recipe and its restoring network.
 
     Pictures come from the folder `train.photographs`; the paper trains in two stages. With --stage mask the mask is
     designed without images, as `train.mask` says; --stage 2 then trains the network behind that mask. The recipe
@@ -82,7 +82,7 @@ def train(
 
 
 def _lift(recipe: Recipe, command: list[str], out: Path, device: str, quiet: bool) -> None:
-    """Train the network of a recipe from RGB to spectra."""
+    """Train the network of a recipe that reconstructs spectra from RGB."""
     from neusee.workflows.api import verbs
     from neusee.workflows.graph.run_error import RunError
 
@@ -108,7 +108,7 @@ def _next(folder: Path, stage: Stages) -> list[str]:
 
 @contextmanager
 def _loss_bar(quiet: bool, lengths: Mapping[int, int]) -> Iterator[Callable[[int, int, Mapping[str, float]], None]]:
-    """Show a progress bar on a terminal; yield the function that shows the losses of an iteration of a stage."""
+    """Show a progress bar on a terminal; yield a function that shows the losses of an iteration."""
     from rich.console import Console
     from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
 

@@ -1,4 +1,4 @@
-"""The typer program: its options, and its commands, each imported only if the command line names the command."""
+"""The typer program: its options and its commands; a command is imported only if the command line names it."""
 
 from __future__ import annotations
 

@@ -2,7 +2,7 @@
 
 A node that declares its bands computes each band to the same bits whatever the other bands are. Each band therefore has
 its own key, a digest of this band of the inputs and of everything else that determines the band. The store keeps the
-band of the result as a blob with this key as name. To hash the inputs is cheap: they are read only once.
+band of the result as a blob with this key as name. Hashing the inputs is cheap, because every input is read only once.
 """
 
 from __future__ import annotations
@@ -30,9 +30,9 @@ Evaluate = Callable[[Sequence[Any]], Any]  #: a function from the inputs of a st
 
 
 def call_by_band(step: Step, inputs: Sequence[Any], evaluate: Evaluate, code: str, blobs: Blobs, parts: int = 1) -> Any:
-    """Return the result of ``step``; ``evaluate`` computes only the bands that ``blobs`` does not hold.
+    """Return the result of ``step``; compute only the bands that the store ``blobs`` does not contain.
 
-    ``code`` is the digest of the code of the node. A larger number of passes, ``parts``, needs less memory. Tensors
+    ``code`` is the digest of the code of the node. More passes over the bands, ``parts``, need less memory. Tensors
     that can be stored by band are returned as `Stacked`, which `plain_of` converts to plain tensors.
     """
     count = band_count(step, inputs)
@@ -69,7 +69,7 @@ def band_count(step: Step, inputs: Sequence[Any]) -> int:
 
 
 def band_keys(step: Step, inputs: Sequence[Any], code: str) -> list[str]:
-    """Return a key for each band, from node, code, parameters, this band of the inputs, and inputs without bands."""
+    """Return the key of each band: a digest of node, code, parameters, and this band of the inputs."""
     params = {name: plain(value) for name, value in step.params.items()}
     same: list[Any] = ["band", step.node.path, code, params]
     each: list[list[str]] = []
@@ -82,7 +82,7 @@ def band_keys(step: Step, inputs: Sequence[Any], code: str) -> list[str]:
 
 
 def content(value: Any) -> list[Any]:
-    """Return the identity of a value as JSON: layout, and type, shape and xxh3 digest of each tensor."""
+    """Return a JSON value that identifies a result: its layout, and type, shape and digest of each tensor."""
     layout, tensors = pack(value)
     return [layout, [_hashed(x) for x in tensors]]
 
@@ -103,7 +103,7 @@ def band_tensors(value: Any) -> list[Tensor]:
 
 
 def with_band_tensors(value: Any, tensors: Sequence[Tensor]) -> Any:
-    """Return ``value`` with ``tensors`` in place of its tensors with a band axis."""
+    """Replace the tensors of ``value`` that have a band axis by ``tensors``, and return the result."""
     if isinstance(value, Tensor):
         return tensors[0]
     return value._replace(**dict(zip(BAND_FIELDS[type(value)], tensors, strict=True)))
@@ -118,7 +118,7 @@ def _has(x: Tensor, axis: int) -> bool:
 
 
 def taken(step: Step, inputs: Sequence[Any], which: list[int], of: Collection[str] | None = None) -> list[Any]:
-    """Return the inputs with the bands ``which`` only; ``of`` names the inputs to slice, None all inputs with bands."""
+    """Return the inputs of a step with only the bands ``which``; if ``of`` names inputs, slice only these inputs."""
     found = list(inputs)
     for i, (name, value) in enumerate(zip(step.node.inputs, inputs, strict=False)):
         axis = _axis(step, name, value)
@@ -128,7 +128,7 @@ def taken(step: Step, inputs: Sequence[Any], which: list[int], of: Collection[st
 
 
 def _slices(x: Tensor, axis: int, which: list[int]) -> Tensor:
-    """Return the bands ``which`` of a tensor: a view if the view is contiguous and aligned, else a copy."""
+    """Return the bands ``which`` of a tensor, as a view if these bands are contiguous and aligned, else as a copy."""
     if which == list(range(which[0], which[0] + len(which))):
         part = x.narrow(axis, which[0], len(which))
         if part.is_contiguous() and part.data_ptr() % _ALIGN == 0:
@@ -148,7 +148,7 @@ def _rebuilt(step: Step, items: list[Any]) -> Any:
 
 
 def _stacked(step: Step, value: Any, keys: list[str]) -> Any:
-    """Return a result whose bands were computed together, with the name of each band if the result is large."""
+    """Return a large result as `Stacked` tensors with a key for each band, and any other result unchanged."""
     tensors = band_tensors(value)
     leading = all(x.shape[0] == len(keys) and _leads(step, x) for x in tensors)
     if not leading or sum(x.nbytes for x in tensors) < LEAST:
@@ -178,7 +178,7 @@ def _gathered(
 
 
 class _Stack:
-    """One tensor of an unfinished result; its bands go to the store, or to memory if the store cannot be written."""
+    """A tensor that is assembled from bands; computed bands go to the store, or to memory if writing fails."""
 
     def __init__(self, axis: int, names: list[str], blobs: Blobs) -> None:
         self.axis, self.names, self.blobs = axis, names, blobs
@@ -200,7 +200,7 @@ class _Stack:
         self.inside.update(which)
 
     def whole(self) -> Tensor | Stacked:
-        """Return all bands as one tensor; raise `Damaged` for a damaged band."""
+        """Return all bands as one tensor; raise `Damaged` if a stored band is damaged."""
         blob = self.blobs.about(self.names[0]) if self.held is None else None
         if blob is not None:
             shape = (len(self.names), *blob.shape)

@@ -11,8 +11,8 @@ from neusee.workflows.graph.recipe_graph import Step
 from neusee.workflows.keys.cache_key import device_kind
 
 GUESS = 0.01  #: s for a step without any measurement
-_FASTER = 10.0  #: speed ratio of another kind of device to the CPU, until both are measured
-_NEWEST = 5  #: number of earlier results that count
+_FASTER = 10.0  #: speed of another kind of device relative to the CPU, until both are measured
+_NEWEST = 5  #: number of earlier results that are used
 
 Row = Mapping[str, Any]  #: a line of the journal
 
@@ -28,7 +28,7 @@ class Estimate:
 
 
 class Costs:
-    """Costs of steps and of nodes, from the lines of a journal, the newest line last."""
+    """Measured costs of steps and nodes, from the lines of a journal in order of time."""
 
     def __init__(self, rows: Iterable[Row]) -> None:
         self._steps: dict[str, list[Row]] = {}
@@ -40,7 +40,7 @@ class Costs:
         self._ratio = {"cpu": 1.0, **self._measured_ratios()}
 
     def of(self, step: Step, kinds: Sequence[str], exact: Row | None = None) -> Estimate:
-        """Return the cost of ``step`` on each of ``kinds``; ``exact`` is an earlier measurement of the same result."""
+        """Predict the cost of ``step`` on each kind of device; ``exact`` is a measurement of the same result."""
         own = self._steps.get(f"{step.name} {step.node.path}", [])
         rows = [exact] if exact else own[-_NEWEST:] or self._nodes.get(step.node.path, [])[-_NEWEST:]
         if not rows:

@@ -1,9 +1,9 @@
-"""Executor on a dask.distributed cluster, to which keys are sent instead of tensors.
+"""Executor on a dask.distributed cluster, which receives cache keys instead of tensors.
 
 A task is a chain of steps with the keys of its inputs. The worker reads values by key from the
-store, or from its memory of earlier tasks, and writes the end of the chain to the store. The
-worker returns only the metadata of the results. If a worker dies, the store has its finished
-results, and a second worker may write a result again without harm.
+store, or takes values of earlier tasks from memory, and writes the last result of the chain to the
+store. The worker returns only the metadata of the results. If a worker dies, its finished results
+are in the store, and a second worker may write a result again without harm.
 """
 
 from __future__ import annotations
@@ -28,8 +28,8 @@ from neusee.workflows.store.serialization import tensors_in
 
 _SHARE = 0.4  #: fraction of the planned memory for values that the next tasks of a worker may read
 _PLANNED = 0.6  #: fraction of the memory of a worker that a plan may use
-_LOOK = 1.0  #: s between two queries for the present workers
-_TRIES = 3  #: workers that may die with one chain before the run fails
+_LOOK = 1.0  #: s between two queries for the connected workers
+_TRIES = 3  #: number of workers that may die during one chain before the run fails
 
 
 class Dask:
@@ -47,13 +47,13 @@ class Dask:
 
     @property
     def lanes(self) -> Mapping[str, Lane]:
-        """Return one lane for each worker; the workers are queried once a second because they come and go."""
+        """Return one lane for each worker; the list of workers is updated at most once a second."""
         if time.monotonic() - self._looked > _LOOK or not self._lanes:
             self._look()
         return self._lanes
 
     def submit(self, work: Sequence[StepJob]) -> None:
-        """Send one chain to the worker of its lane, or to another worker if this worker is gone."""
+        """Send a chain of jobs to the worker of its lane, or to another worker if that worker is gone."""
         self._tries[work[0].key] = self._tries.get(work[0].key, 0) + 1
         future = self.client.submit(
             work_here,
@@ -104,7 +104,7 @@ class Dask:
         return [Outcome(chain[0], error=RunError(chain[0].step, [], OSError(text)))]
 
     def _look(self) -> None:
-        """Update the lanes from the present workers and their devices; wait until there is a worker."""
+        """Update the lanes from the connected workers and their devices; wait until a worker is connected."""
         if not self.client.nthreads():
             self.client.wait_for_workers(1, timeout=60)
         there = self.client.nthreads()
@@ -119,7 +119,7 @@ class Dask:
 
 
 class _Here:
-    """State of one worker between tasks: the store, digests of code, and the values that were used last."""
+    """State of one worker between tasks: the store, digests of code, and the most recently used values."""
 
     def __init__(self, where: str, room: float) -> None:
         self.store = open_store(where)
@@ -156,7 +156,7 @@ def lane_here(dask_worker: Any) -> tuple[str, float]:
 
 
 def work_here(chain: tuple[StepJob, ...], where: str, threads: int, room: float) -> list[Outcome]:
-    """Compute a chain and return its outcomes without values; the worker keeps at most ``room`` bytes of values."""
+    """Compute a chain of jobs on a worker and return outcomes without values; keep at most ``room`` bytes."""
     if torch.get_num_threads() != threads:
         torch.set_num_threads(threads)
     here = _here.get(where) or _here.setdefault(where, _Here(where, room))
@@ -174,7 +174,7 @@ def work_here(chain: tuple[StepJob, ...], where: str, threads: int, room: float)
 def _one_here(work: StepJob, here: _Here) -> Outcome:
     own = here.code.digest(work.step.node.fn.__module__)
     if own != work.origin["code"]:
-        text = f"a worker has other code of {work.step.node.path}: install the version of this process there"
+        text = f"the code of {work.step.node.path} differs on a worker: install the same version there"
         return Outcome(work, error=RunError(work.step, [], OSError(text)))
     outcome = carry_out(work, here.fetch, here.store)
     if outcome.value is not None:
@@ -183,7 +183,7 @@ def _one_here(work: StepJob, here: _Here) -> Outcome:
 
 
 def _light(outcome: Outcome) -> Outcome:
-    """Return the outcome without its value; pickle must be able to send its error."""
+    """Return an outcome that pickle can send: without the value, and with any error as a `RunError`."""
     outcome.value = None
     if outcome.error is not None and not isinstance(outcome.error, RunError):
         outcome.error = RunError(outcome.work.step, [], outcome.error)
@@ -199,7 +199,7 @@ def _size(value: Any) -> int:
 
 @contextmanager
 def cluster(where: str, store: Store) -> Iterator[Dask]:
-    """Yield an executor for ``dask:4`` (local workers), ``dask:here`` (in this process) or a scheduler address."""
+    """Yield an executor for ``dask:4`` (four local workers), ``dask:here`` (this process) or a scheduler address."""
     from distributed import Client, LocalCluster
 
     kind, _, count = where.partition(":")

@@ -37,7 +37,7 @@ def as_function(
     """Return the recipe as a differentiable function ``theta -> {output: value}``, equal to `run` to the last bit.
 
     Args: free: parameters such as ``"spot.strength"``, or steps such as ``"height"``, whose result the caller
-    gives. Steps that do not depend on ``free`` are computed once, here, or read from the store. Noise is the
+    provides. Steps that do not depend on ``free`` are computed once, here, or read from the store. Noise is the
     same at every call, because its stream depends on the seed and the step. Random steps in ``redraw`` are
     computed at every call, which may have another seed. ``caller`` replaces `call` for every live step.
     """
@@ -59,7 +59,7 @@ def as_function(
 
 
 def _read(recipe: Recipe, free: tuple[str, ...]) -> tuple[set[str], dict[str, dict[str, str]]]:
-    """Return the steps whose results are free, and for each other step its free parameters and their full names."""
+    """Return the free steps, and the free parameters of every other step with their full names."""
     given: set[str] = set()
     tuned: dict[str, dict[str, str]] = {}
     for name in free:
@@ -77,7 +77,7 @@ def _read(recipe: Recipe, free: tuple[str, ...]) -> tuple[set[str], dict[str, di
 
 @dataclass(eq=False, repr=False)
 class _Function:
-    """The live steps of a recipe, which depend on the free values, and the fixed values that feed these steps."""
+    """A differentiable function: the steps that depend on the free values, and the fixed inputs of these steps."""
 
     recipe: Recipe
     free: tuple[str, ...]
@@ -97,7 +97,7 @@ class _Function:
         self._last = {source: name for name in live for source in self.recipe.steps[name].sources}
 
     def __call__(self, theta: Theta, seed: int | None = None) -> dict[str, Any]:
-        """Return the outputs at ``theta``, with the noise of ``seed``; None is the seed of the recipe."""
+        """Return the outputs for the free values ``theta``, with noise from ``seed`` or the seed of the recipe."""
         seed = self.recipe.seed if seed is None else seed
         if set(theta) != set(self.free):
             raise ValueError(f"give values for exactly {', '.join(self.free)}, not for {', '.join(theta) or 'nothing'}")
@@ -132,7 +132,7 @@ class _Function:
 
 
 class _Ends:
-    """Statistics of a new image; a statistic other than minimum and maximum is computed at its first use."""
+    """Statistics of an image; minimum and maximum are computed at once, any other statistic at its first use."""
 
     def __init__(self, value: Tensor) -> None:
         self._value = value.detach()

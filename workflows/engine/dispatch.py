@@ -12,13 +12,13 @@ from neusee.workflows.keys.cache_key import Key, device_kind
 
 _FIRST_LOOK, _LONGEST = 0.01, 0.5  #: s between attempts at a job that another process computes
 
-Chain = tuple[StepJob, ...]  #: steps of which each feeds only the next one
+Chain = tuple[StepJob, ...]  #: jobs of which each feeds only the next job
 #: a function that returns True if the memory suffices for one more step beside the running steps
 MemoryProfile = Callable[[StepJob, Sequence[StepJob]], bool]
 
 
 class Loop:
-    """State of a plan in progress: the waiting chains, the ready chains, and the chain that each lane computes."""
+    """Progress of a plan: the waiting chains of jobs, the ready chains, and the chain that each lane computes."""
 
     def __init__(
         self, chains: Sequence[Chain], executor: Executor, begin: Callable[[StepJob], StepJob], room: MemoryProfile
@@ -33,12 +33,12 @@ class Loop:
             for key in missing:
                 self._after.setdefault(key, []).append(i)
         self._ready = [i for i, missing in enumerate(self._missing) if not missing]
-        self._ready.reverse()  # the next chain is the last item, because a list pops there
-        self._held: dict[int, tuple[float, float]] = {}  # chain -> time of the next look, and the wait after that
+        self._ready.reverse()  # the next chain is the last item, which a list can remove fastest
+        self._held: dict[int, tuple[float, float]] = {}  # chain -> time of the next attempt, and the wait after it
         self._open = len(chains)
 
     def outcomes(self) -> Iterator[Outcome]:
-        """Yield each outcome when it arrives, until all jobs are done; the caller raises the error of an outcome."""
+        """Yield each outcome when it arrives, until all jobs are done; the caller must raise errors in outcomes."""
         while self._open:
             self._hand_out()
             if not self.busy and not self._held:
@@ -69,7 +69,7 @@ class Loop:
                 self.executor.submit(chain)
 
     def _first_for(self, lane: str, device: str) -> int | None:
-        """Return the index in the ready list of the next chain for ``lane``, also a chain of a busy or lost lane."""
+        """Return the index of the next ready chain that ``lane`` may compute, also a chain of a busy or lost lane."""
         running = [work for chain in self.busy.values() for work in chain]
         there = self.executor.lanes
         for place in range(len(self._ready) - 1, -1, -1):
@@ -87,7 +87,7 @@ class Loop:
             self._held[i] = (float("inf"), self._held[i][1])
 
     def _patience(self) -> float | None:
-        """Return the seconds to wait for running jobs; sleep if other processes compute all remaining jobs."""
+        """Return the time (s) to wait for running jobs; sleep first if only other processes are computing."""
         waits = [when for when, _ in self._held.values() if when < float("inf")]
         if not waits:
             return None
@@ -97,7 +97,7 @@ class Loop:
         return pause
 
     def _settle(self, outcome: Outcome) -> None:
-        """Mark the lane of an outcome as idle, and the chains that waited for its key as ready."""
+        """Mark the lane of an outcome as idle, and the chains that waited for its result as ready."""
         i = self._chain_of[outcome.work.key]
         chain = self._chains[i]
         last = outcome.work.key == chain[-1].key
@@ -122,12 +122,12 @@ class Loop:
 
 
 def chains_of(works: Sequence[StepJob], fused: bool) -> list[Chain]:
-    """Return the jobs as chains of one step, or if ``fused``, of steps of one lane that only feed the next step."""
+    """Group jobs into chains: one job each, or if ``fused``, jobs of one lane of which each feeds only the next job."""
     if not fused:
         return [(work,) for work in works]
     readers = Counter(key for work in works for key in set(work.sources))
     planned = {work.key for work in works}
-    chains: dict[Key, list[StepJob]] = {}  # by the key at their end
+    chains: dict[Key, list[StepJob]] = {}  # by the key of the last job
     for work in works:
         above = [key for key in dict.fromkeys(work.sources) if key in planned]
         chain = chains.get(above[0]) if len(above) == 1 else None
@@ -141,5 +141,5 @@ def chains_of(works: Sequence[StepJob], fused: bool) -> list[Chain]:
 
 
 def _moved(work: StepJob, lane: str, device: str) -> StepJob:
-    """Return a job on another lane; a job that needs the CPU computes on the CPU there too."""
+    """Return a job after moving it to another lane; a job that needs the CPU still computes on the CPU."""
     return replace(work, lane=lane, device=device if device_kind(work.device) == device_kind(device) else work.device)

@@ -1,6 +1,6 @@
-"""Execution of one run: the keys of the steps, the cheapest way to the wanted values, and the records.
+"""Execution of one run: the keys of the steps, the choice to load or compute each value, and the records.
 
-No function here is recursive over the graph. Values are held by key, so that two steps with the same
+No function here is recursive over the graph. Values are kept by key, so that two steps with the same
 key are computed once. A step that is left out has the key of its input.
 """
 
@@ -36,7 +36,7 @@ _UNKNOWN = 100.0  #: s of a step without measurement, when loading is compared w
 
 
 class Execution:
-    """One run in progress."""
+    """State of a run in progress: keys of the steps, values in memory, and records of finished steps."""
 
     def __init__(
         self,
@@ -59,7 +59,7 @@ class Execution:
         self.origins: dict[Key, dict[str, Any]] = {}  # the parts of each key
         self.values: dict[Key, Any] = {}
         self.facts: dict[Key, TensorStats | None] = {}
-        self.again: dict[Key, float] = {}  # s for obtaining again a value that was computed here
+        self.again: dict[Key, float] = {}  # s to obtain again a value that was computed in this run
         self.took: dict[str, float] = {}  # the longest time of a step of each node, s
         self.verdicts, self.ledger = dict[str, SkipDecision](), ErrorBudget(recipe)
         self.done: dict[str, StepRecord] = {}
@@ -68,7 +68,7 @@ class Execution:
         self.schedule: Schedule | None = None
 
     def resolve(self, order: list[str]) -> None:
-        """Compute the key of every step, and leave out each step whose skip bound is within the tolerance."""
+        """Compute the key of every step; leave out each step whose effect is within the tolerance."""
         for name in order:
             step = self.recipe.steps[name]
             if step.node.hooks.skip_bound is not None:
@@ -89,7 +89,10 @@ class Execution:
                 self.makers[key], self.origins[key] = step, origin
 
     def make(self, targets: list[Key], keep: bool, later: Sequence[Key] = ()) -> None:
-        """Load or compute ``targets``; keep in memory the needs of ``later``, and with ``keep`` each unstored value."""
+        """Load or compute the values with the keys ``targets``.
+
+        Values that the keys ``later`` need stay in memory, and with ``keep`` also each value that is not stored.
+        """
         while True:
             below = Upstream(self.known, self.sources)
             order = in_order(below, targets)
@@ -104,13 +107,13 @@ class Execution:
                 continue
 
     def close(self) -> None:
-        """Save the digests of the code, end the writes, and delete the executor, which refers to this run."""
+        """Save the digests of code, finish all writes, and delete the executor, which has a reference to this run."""
         self.code.save()
         self.own.cancel()
         del self.own, self.executor
 
     def account(self, order: list[str]) -> dict[str, StepRecord]:
-        """Return the record of every step in running order, after the record of each step that did not run is added."""
+        """Return the record of every step in running order; create records for the steps that did not run."""
         for name in order:
             if name in self.done:
                 continue
@@ -128,7 +131,7 @@ class Execution:
         return StepRecord(name, "not needed", "nothing needed it", 0.0, key, bound=self._bound(name), error=error)
 
     def missing(self, names: Iterable[str]) -> set[Key]:
-        """Return the keys of all values to compute, so that the values of the steps ``names`` are known."""
+        """Return the keys of all values that must be computed to obtain the results of the steps ``names``."""
         below = Upstream(self.known, self.sources)
         in_order(below, [self.keys[name] for name in names])
         return set(below.missing)
@@ -137,7 +140,7 @@ class Execution:
         return [self.keys[name] for name in self.makers[key].sources]
 
     def known(self, key: Key) -> bool:
-        """Return True if a value is in memory or in the store; record the receipt of a value that was not kept."""
+        """Return True if a value is in memory or in the store; remember the metadata of a value that was not stored."""
         if key in self.values:
             return True
         about = self.store.about(key)
@@ -162,7 +165,7 @@ class Execution:
         return frozenset(cheaper_to_recompute(targets, self.sources, load, compute))
 
     def _reading(self, key: Key) -> float:
-        """Return the predicted seconds for reading a stored value; inf if the value is not stored."""
+        """Return the predicted time (s) for reading a stored value, or infinity if the value is not stored."""
         about = self.store.about(key)
         return self.store.read_seconds(about["bytes"]) if about else float("inf")
 
@@ -221,14 +224,14 @@ class Execution:
         return self.keys[wire] if isinstance(wire, str) else wire and tuple(self.keys[name] for name in wire)
 
     def _begin(self, work: StepJob) -> StepJob:
-        """Report that a job begins, and return the job with the seconds for computing or reading its inputs again."""
+        """Report that a job begins; return the job with the predicted time for obtaining its inputs again."""
         self.watch(Event(work.step.name, None))
         refetch = sum(self.again[key] if key in self.again else self._reading(key) for key in set(work.sources))
         unlocked = self.took.get(work.step.node.path, _QUICK) < _QUICK
         return replace(work, refetch_seconds=refetch, unlocked=unlocked)
 
     def _note(self, outcome: Outcome, expected: Estimate) -> None:
-        """Record the outcome of a step."""
+        """Record the outcome of a step, or raise the error in this outcome."""
         work, step, key = outcome.work, outcome.work.step, outcome.work.key
         if outcome.lost:
             raise InputMissing(*outcome.lost)
@@ -268,7 +271,7 @@ class Execution:
         return StepRecord(name, "cached", why, seconds, key, facts, checks, "cpu", about["bytes"], bound, error=error)
 
     def _facts_of(self, name: str) -> TensorStats | None:
-        """Return the statistics of the result of a step, which is computed if no run computed the result before."""
+        """Return the statistics of the result of a step; compute the result if no statistics are known."""
         key = self.keys[name]
         if key not in self.facts and self.store.about(key) is None:
             self.make([key], keep=True)

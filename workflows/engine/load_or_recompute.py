@@ -1,4 +1,4 @@
-"""Choice between loading and computing each value, at the lowest total time, by a minimum cut.
+"""Choice between loading and computing each value: a minimum cut gives the lowest total time.
 
 To load a value costs the time of reading. To compute a value costs the time of its step and requires
 its inputs. The cheapest choice for a whole graph is a minimum cut (Xin et al., Helix, PVLDB 12(4),
@@ -21,7 +21,7 @@ Price = Callable[[Key], float]
 
 
 class Upstream(dict[Key, list[Key]]):
-    """Dictionary from a key to the keys of its sources; a known value, which is not computed, has no sources."""
+    """Dictionary from the key of a value to the keys of its sources; a value that is known already has no sources."""
 
     def __init__(self, known: Callable[[Key], bool], sources: Callable[[Key], list[Key]]) -> None:
         self._known, self._sources = known, sources
@@ -39,7 +39,7 @@ class Upstream(dict[Key, list[Key]]):
 def uses_of(
     plan: Iterable[Key], targets: Sequence[Key], known: Callable[[Key], bool], sources: Callable[[Key], list[Key]]
 ) -> Counter[Key]:
-    """Return how often each value is read to compute ``plan``, ``targets`` and the values that these need."""
+    """Return the number of times that each value is read while ``plan`` and ``targets`` are computed."""
     below, uses = Upstream(known, sources), Counter(targets)
     in_order(below, targets)
     for key in below.missing.union(plan):
@@ -48,7 +48,7 @@ def uses_of(
 
 
 def worth_solving(load: float, compute: float) -> bool:
-    """Return True if computing a stored value saves time, given the seconds of loading and of computing."""
+    """Return True if computing a value takes clearly less time than loading the value; both times are in s."""
     return load > compute + _GAIN
 
 
@@ -67,7 +67,7 @@ def cheaper_to_recompute(
 def _smallest_cut(
     targets: Sequence[Key], keys: Sequence[Key], sources: Callable[[Key], Sequence[Key]], load: Price, compute: Price
 ) -> set[Key]:
-    """Return the keys to compute: their ``compute`` nodes are on the source's side of the minimum cut."""
+    """Return the keys of the values to compute, which are on the source side of a minimum cut of the graph."""
     import numpy as np
     from scipy.sparse import csr_array
     from scipy.sparse.csgraph import breadth_first_order, maximum_flow

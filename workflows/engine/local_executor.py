@@ -1,4 +1,4 @@
-"""Executor in this process: one thread for each device, or the thread of the caller if there is one device.
+"""Executor in this process: one thread for each device, or the thread of the caller if there is only one device.
 
 ``cpu:0,cpu:1`` are two lanes of one CPU, so that two small steps run at the same time.
 """
@@ -23,7 +23,7 @@ _SHARE = 0.9  #: fraction of a device's memory that a plan may use
 
 
 def lanes_of(devices: Sequence[str], memory: int | None = None) -> dict[str, Lane]:
-    """Return one lane for each device; lanes of the same memory share the bytes that a plan may use."""
+    """Return one lane for each device; lanes with a common memory divide the bytes that a plan may use."""
     pools = [pool_of(device) for device in devices]
     return {d: Lane(d, (memory or _SHARE * there_is(d)) / pools.count(pool_of(d))) for d in devices}
 
@@ -52,7 +52,7 @@ class Local:
                 self._running.add(self._pool(job.lane).submit(carry_out, job, self._fetch, self._store, self.later))
 
     def wait(self, seconds: float | None = None) -> list[Outcome]:
-        """Return the outcome of the next job in the queue, or wait for the outcomes of jobs in threads."""
+        """Compute the next job in the queue and return its outcome, or wait for jobs in other threads."""
         if self._queue:
             return [carry_out(self._queue.popleft(), self._fetch, self._store, self.later)]
         if not self._running:
@@ -76,7 +76,7 @@ class Local:
 
 @contextmanager
 def one_thread() -> Iterator[None]:
-    """Run a block of code on one thread of torch, which is faster for small tensors."""
+    """Run a block of code with a single PyTorch thread, which is faster for small tensors."""
     before = torch.get_num_threads()
     torch.set_num_threads(1)
     try:

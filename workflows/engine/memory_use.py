@@ -44,7 +44,7 @@ class PeakMemory:
 
 
 def pool_of(device: str) -> str:
-    """Return the name of the memory of a device; all lanes of the CPU have the same memory."""
+    """Return the name of the memory that a device uses; all lanes of the CPU use the same memory."""
     return "cpu" if device.startswith("cpu") else device
 
 
@@ -67,7 +67,7 @@ def _resident(field: str) -> int | None:
 
 
 def there_is(device: str) -> int:
-    """Return the bytes of memory of a GPU, or on the CPU the bytes that this process may use."""
+    """Return the memory of a GPU in bytes, or for the CPU the memory that this process may use."""
     if device.startswith("cuda"):
         return int(torch.cuda.get_device_properties(device).total_memory)
     found = os.sysconf("SC_PAGE_SIZE") * os.sysconf("SC_PHYS_PAGES")

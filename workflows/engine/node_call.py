@@ -15,7 +15,7 @@ from neusee.workflows.store.serialization import each_tensor, settle, tensors_in
 
 
 def call(step: Step, inputs: Sequence[Any], params: Mapping[str, Any], seed: int, device: str) -> Any:
-    """Return the result of a step, in the memory layout of a stored result; gradients are kept."""
+    """Call the node of a step; return the result with gradients, in the memory layout of a stored result."""
     moved = [to_device(value, device) for value in inputs]
     rng = {"rng": torch.Generator(device).manual_seed(stream_seed(seed, step.name))} if step.node.random else {}
     tensors = tensors_in(moved)
@@ -40,7 +40,7 @@ def examine(step: Step, value: Any, inputs: Sequence[Any]) -> tuple[Check, ...]:
 
 
 def place(step: Step, device: str) -> str:
-    """Return the preferred device of a step among ``device``, names of devices separated by commas."""
+    """Return the preferred device of a step from a list of device names, separated by commas."""
     return places(step, device.split(","))[0]
 
 
@@ -58,7 +58,7 @@ def places(step: Step, devices: Sequence[str]) -> tuple[str, ...]:
 
 
 def fits(device: str, kind: str, hint: str) -> bool:
-    """Return True if the hint of a step, such as ``cpu``, ``gpu`` or ``cuda:1``, allows a device of this kind."""
+    """Return True if the hint of a step, such as ``cpu``, ``gpu`` or ``cuda:1``, allows this device."""
     if hint in ("any", ""):
         return True
     return kind != "cpu" if hint == "gpu" else hint in (kind, device)

@@ -16,7 +16,7 @@ from neusee.workflows.placement.heft_and_cpop import Cluster, Device, Schedule, 
 from neusee.workflows.store.result_store import Store
 from neusee.workflows.store.serialization import tensors_in
 
-MOST_PARTS = 64  #: upper bound on the parts of a step cut by bands; the number of bands is known when the step runs
+MOST_PARTS = 64  #: upper bound on the parts of a step; the number of bands is only known when the step runs
 
 
 @dataclass(frozen=True, slots=True)
@@ -35,7 +35,7 @@ def prepare(
     lanes: Mapping[str, Lane],
     keep: Collection[Key],
 ) -> Prepared:
-    """Return the jobs with a lane and a device each; raise `TooLarge` if the memory is too small."""
+    """Assign a lane and a device to each job; raise `TooLarge` if the memory is too small."""
     kinds = sorted({lane.kind for lane in lanes.values()} | {"cpu"})
     expected = {w.key: costs.of(w.step, kinds, abouts.get(w.key)) for w in works}
     only, lane = next(iter(lanes.items()))
@@ -53,7 +53,7 @@ def prepare(
 
 
 def room_for(expected: Mapping[Key, Estimate], executor: Executor, values: Mapping[Key, Any]) -> MemoryProfile:
-    """Return a function that returns True if one more job fits into memory beside running jobs and ``values``."""
+    """Return a function that is True if one more job fits into memory beside the running jobs and ``values``."""
 
     def room(work: StepJob, running: Sequence[StepJob]) -> bool:
         pool = pool_of(work.device)
@@ -68,7 +68,7 @@ def room_for(expected: Mapping[Key, Estimate], executor: Executor, values: Mappi
 
 
 def joined(first: Schedule | None, then: Schedule | None) -> Schedule | None:
-    """Return the schedule ``first``, followed by the schedule ``then``."""
+    """Join two schedules: the schedule ``then`` begins when the schedule ``first`` ends."""
     if first is None or then is None:
         return first or then
     by = first.makespan
@@ -98,7 +98,7 @@ def _task(work: StepJob, estimate: Estimate, lanes: Mapping[str, Lane], names: M
 
 
 def _cpu_only(work: StepJob) -> bool:
-    """Return True if a step computes on the CPU whatever its lane; the key of a random step fixes the device kind."""
+    """Return True if a job must run on the CPU, because of a device hint or of a random stream for the CPU."""
     hint = work.step.device or work.step.node.device
     return hint == "cpu" or (work.step.node.random and work.device == "cpu")
 
@@ -121,5 +121,5 @@ def _one_after_another(
 
 
 def past_costs(store: Store) -> Costs:
-    """Return the costs of all results in the journal of a store."""
+    """Return the measured costs of all results in the journal of a store."""
     return Costs(store.journal.rows())

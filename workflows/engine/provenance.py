@@ -13,7 +13,7 @@ import torch
 
 @functools.cache
 def versions() -> dict[str, str]:
-    """Return the versions of Python and of the libraries that compute; no key depends on the versions."""
+    """Return the versions of Python and of the numerical libraries; no cache key depends on these versions."""
     libraries = ("neusee", "torch", "kornia", "colour-science", "OpenEXR")
     return {"python": platform.python_version(), **{name: version_of(name) or "none" for name in libraries}}
 
@@ -27,7 +27,7 @@ def version_of(package: str) -> str:
 
 
 def machine() -> Sequence[str]:
-    """Return the machine, its number of threads and the versions of the libraries, on which a run time depends."""
+    """Return the name and type of the machine, the number of threads and the versions of the libraries."""
     return [platform.node(), platform.machine(), str(torch.get_num_threads()), *versions().values()]
 
 

@@ -1,4 +1,4 @@
-"""Resolution of keys: the key of each step of a recipe in a run, without computing a step."""
+"""Cache keys of the steps of a recipe, found without computing a step."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ from neusee.workflows.tolerance.skip_decision import SkipDecision
 
 @dataclass(frozen=True, slots=True)
 class Resolved:
-    """Keys of steps, the parts of each key, and the decisions on the steps that may be left out."""
+    """Cache keys of steps, the parts of each key, and the decisions on the steps that may be left out."""
 
     keys: dict[str, Key] = field(default_factory=dict)
     origins: dict[Key, Mapping[str, Any]] = field(default_factory=dict)
@@ -33,14 +33,14 @@ class Resolved:
         return None if verdict is None and name in self.verdicts else verdict is not None and verdict.left_out
 
     def stands_for(self, name: str) -> str:
-        """Return the step itself, or the upstream step whose result replaces the result of a step that is left out."""
+        """Return step ``name``, or if this step is left out, the upstream step whose result is used instead."""
         while (verdict := self.verdicts.get(name)) is not None and verdict.left_out:
             name = verdict.instead
         return name
 
 
 def resolve(recipe: Recipe, order: Iterable[str], store: Store, device: str = "cpu") -> Resolved:
-    """Return the key of each step of ``order``, which has sources first, in a run on ``device``."""
+    """Return the cache key of each step for a run on ``device``; ``order`` lists the steps with sources first."""
     found, code, ledger = Resolved(), Code(store.code_memo), ErrorBudget(recipe)
 
     def facts_of(name: str) -> TensorStats | None:

@@ -1,4 +1,4 @@
-"""Run of a recipe: the search goes upstream from the wanted outputs to stored results, and the rest is computed."""
+"""Run of a recipe: stored results are reused, and only other results that the outputs need are computed."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ from neusee.workflows.store.result_store import Store
 from neusee.workflows.tolerance.cheaper_steps import with_substitutions
 from neusee.workflows.tolerance.error_propagation import ErrorBounds, ToleranceNotProven, proof, tolerance_frontier
 
-_SAFE = 0.8  #: tolerance scale of a second attempt over the largest scale that would suffice
+_SAFE = 0.8  #: tolerance scale of a second attempt, relative to the largest scale that would suffice
 
 
 @dataclass(frozen=True, repr=False)
@@ -57,7 +57,8 @@ class Result:
     def metrics(self) -> dict[str, float | list[float]]:
         """Return every figure of merit that ``neusee run`` prints, such as ``restored_quality.psnr``.
 
-        A figure of each band is a list. A figure that this run did not need is read from the store or computed.
+        A figure with a value for each band is a list. A figure that this run did not need is read from the store or
+        computed.
         """
         from neusee.workflows.report.notebook import numbers_of
 
@@ -83,7 +84,7 @@ def run(
     executor: Executor | None = None,
     memory: int | None = None,
 ) -> Result:
-    """Return the values of the steps ``outputs``; compute each value that ``store`` does not hold.
+    """Return the values of the steps ``outputs``; compute the values that are not in ``store``.
 
     Args: outputs: if None, the outputs of the recipe. device: one or several devices, such as
     ``cuda:0,cuda:1,cpu``, the preferred device first. executor: computes the steps in place of this process.

@@ -34,7 +34,7 @@ _WATCHED = 1 << 20  #: bytes of inputs from which the memory of a step is measur
 
 
 class InputMissing(Exception):
-    """Error for a stored result that is damaged or gone when it is read; the run then makes a new plan."""
+    """Error for a stored result that is damaged or missing when it is read; the run then makes a new plan."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -72,12 +72,12 @@ class Outcome:
     began: float = 0.0  #: s, by `time.time`
     seconds: float = 0.0
     bytes: int = 0
-    deviation: tuple[float, float] | None = None  #: of a cheaper form: `Node.approximation_error`
+    deviation: tuple[float, float] | None = None  #: error of a cheaper form: `Node.approximation_error`
     peak: int | None = None  #: peak bytes beside the memory in use before
-    kept: bool = False  #: whether the store has the value
-    waits: bool = False  #: the value is written during the next steps, and its lease is released afterwards
-    held: bool = False  #: another process computes this key
-    found: bool = False  #: another process has already stored this result
+    kept: bool = False  #: True if the store has the value
+    waits: bool = False  #: True if the value is written during the next steps; its lease is released afterwards
+    held: bool = False  #: True if another process computes this result
+    found: bool = False  #: True if another process has already stored this result
     error: BaseException | None = None
     lost: tuple[Key, ...] = ()  #: inputs that could not be read
 
@@ -91,7 +91,7 @@ class Lane:
 
     @property
     def kind(self) -> str:
-        """Return ``cpu`` or ``cuda``, without the number."""
+        """Return the kind of the device, such as ``cpu`` or ``cuda``."""
         return device_kind(self.device)
 
 
@@ -107,10 +107,10 @@ class Executor(Protocol):
         """Return True if values stay in this process, and False if steps exchange values through the store."""
 
     def submit(self, work: Sequence[StepJob]) -> None:
-        """Start jobs of one lane, of which each feeds the next job."""
+        """Start a chain of jobs in one lane; each job computes an input of the next job."""
 
     def wait(self, seconds: float | None = None) -> list[Outcome]:
-        """Return the outcomes since the last call; wait for an outcome while a job runs, at most ``seconds``."""
+        """Return the outcomes since the last call; while jobs run, wait at most ``seconds`` for an outcome."""
 
     def cancel(self) -> None:
         """Start no further job, and wait for the running jobs."""
@@ -146,14 +146,14 @@ def _carried_out(work: StepJob, fetch: Fetch, store: Store, later: WriteBehind |
 
 
 def gathered(read: Read, fetch: Fetch) -> Any:
-    """Return the value of one input: one value, a list of values, or None for an absent input."""
+    """Fetch the value of an input: a single value, a list of values, or None for an absent input."""
     if read is None or isinstance(read, str):
         return None if read is None else fetch(read)
     return [fetch(key) for key in read]
 
 
 def _computed(work: StepJob, inputs: list[Any], store: Store) -> Outcome:
-    """Return the value of a step with its statistics, checks and costs."""
+    """Compute a step and return its value with statistics, checks and costs."""
     step = work.step
     evaluate = partial(call, step, params=step.params, seed=work.seed, device=work.device)
     began, clock = time.time(), time.perf_counter()

@@ -61,6 +61,6 @@ class WriteBehind:
 
 def _lower_priority() -> None:
     """Lower the priority of the writing thread, so that the computing threads run first."""
-    if sys.platform == "linux":  # elsewhere: the whole process; new threads inherit it
+    if sys.platform == "linux":  # on other systems the call would affect the whole process
         with suppress(OSError):
             os.setpriority(os.PRIO_PROCESS, threading.get_native_id(), _NICE)

@@ -1,4 +1,4 @@
-"""Causes of a change: the differences between a new and an earlier result of a step, and upstream of the step.
+"""Causes of a changed result: differences between a new and an earlier result, in the step or upstream of it.
 
 A pair is a new and an earlier result. The two results are compared by the parts of their keys, so that no
 tensor is read. The search goes from a pair to the pairs of its inputs whose keys differ.
@@ -52,7 +52,7 @@ class Roots:
 
 
 class Comparison:
-    """Comparison of new results, of a recipe if there is one, with stored results."""
+    """Comparison of the results of a recipe, or of a stored result, with earlier stored results."""
 
     def __init__(self, store: Store, recipe: Recipe | None = None, resolved: Resolved | None = None) -> None:
         self.store, self.recipe, self.resolved = store, recipe, resolved or Resolved()
@@ -62,7 +62,7 @@ class Comparison:
         self._edited = functools.cache(functools.partial(edits, store.root))
 
     def roots(self, start: Pair, most: float = float("inf")) -> Roots | None:
-        """Return the root causes of the change from the earlier to the new result; None if more than ``most``."""
+        """Return the root causes of the change of a result, or None if there are more than ``most`` causes."""
         above: dict[Pair, Pair | None] = {start: None}
         found: dict[str, Pair] = {}
         todo = [start]
@@ -79,13 +79,13 @@ class Comparison:
         return Roots(found, above)
 
     def compare(self, pair: Pair) -> Found:
-        """Return the differences of the two results themselves, and the pairs of inputs that differ."""
+        """Return the differences of two results themselves, and the pairs of inputs that differ."""
         if pair not in self.seen:
             self.seen[pair] = self._compare(pair)
         return self.seen[pair]
 
     def own(self, label: str, old: Origin, new: Origin) -> list[str]:
-        """Return the differences between the origins of two results of a step, without differences of inputs."""
+        """Return the differences of two results of a step in node, parameters, code and random stream."""
         if old["node"] != new["node"]:
             where = self.wording.source("steps", label.partition("[")[0], "node")
             return [f"{old['node']} -> {new['node']}{where}"]
@@ -95,7 +95,7 @@ class Comparison:
         return found + self._stream(old.get("stream"), new.get("stream"))
 
     def origin(self, key: Key) -> Origin | None:
-        """Return the parts of a key from the recipe or from the store, or None if both lack the key."""
+        """Return the parts of a key from the recipe or from the store, or None if the key is in neither."""
         return self.resolved.origins.get(key) or (self.about(key) or {}).get("origin")
 
     def step(self, key: Key) -> str | None:
@@ -117,7 +117,7 @@ class Comparison:
         return texts, pairs
 
     def _labels(self, pair: Pair, origin: Origin) -> list[tuple[tuple[str, ...], list[str]]]:
-        """Return for each input its path in the recipe and the steps that feed it."""
+        """Return the path of each input in the recipe, and the names of the steps that this input reads."""
         step = self.recipe.steps.get(pair.label) if self.recipe else None
         if step is None or self.resolved.keys.get(pair.label) != pair.new:
             return [((), [self.step(key) or "a step" for key in _listed(keys)]) for keys in origin["inputs"]]
@@ -126,7 +126,7 @@ class Comparison:
         return [((*path, name), [self.resolved.stands_for(wire) for wire in wired]) for name, wired in wires]
 
     def _input(self, path: tuple[str, ...], labels: list[str], new: list[Key], old: list[Key]) -> Found:
-        """Return the differences of one input, which reads one step or several steps."""
+        """Return the differences of an input, which reads one step or several steps."""
         if len(new) == 1 and len(old) == 1:
             return self._source(path, labels[0], new[0], old[0])
         then = dict(zip([self.step(key) or key for key in old], old, strict=True))
@@ -139,7 +139,7 @@ class Comparison:
         return texts or ([] if pairs else ["the order of its sources changed"]), pairs
 
     def _source(self, path: tuple[str, ...], label: str, new: Key, old: Key) -> Found:
-        """Return the differences of a source that changed, was exchanged, or has a new or a removed step after it."""
+        """Return the differences of one source of an input: a change, an exchange, or an added or removed step."""
         if new == old:
             return [], []
         was = self.step(old)
@@ -160,14 +160,14 @@ class Comparison:
         return [exchanged], []
 
     def _joined(self, path: tuple[str, ...], came: list[str], went: list[str]) -> list[str]:
-        """Return clauses for added and removed sources, with a location for sources that are not items of a step."""
+        """Return one clause for the added sources and one clause for the removed sources of an input."""
         where = self._wired(path) if any("[" not in name for name in came) else ""
         texts = [f"reads {_few(came)} now{where}"] if came else []
         null = self.recipe.absent.get(went[0].partition("[")[0]) if went and self.recipe else None
         return [*texts, f"reads {_few(went)} no more{f': it is {null}' if null else ''}"] if went else texts
 
     def _between(self, key: Key, wanted: tuple[str | None, ...]) -> tuple[list[str], Key | None]:
-        """Search upstream along first inputs for a ``wanted`` step; return the steps on the way and the key found."""
+        """Follow first inputs upstream to a step in ``wanted``; return the steps passed and the key of this step."""
         passed: list[str] = []
         for _ in range(_FAR):
             first = next(iter((self.origin(key) or {}).get("inputs", ())), None)
@@ -190,7 +190,7 @@ class Comparison:
         return f"{name} is left out now: {verdict.why}" if verdict and verdict.left_out else ""
 
     def _wired(self, path: tuple[str, ...]) -> str:
-        """Return the location of an input in the recipe, as text in brackets."""
+        """Return the location of an input in the recipe as text in brackets, such as `` (recipe.yaml:3:7)``."""
         return self.wording.source(*path) or self.wording.source(*path[:-1]) if path else ""
 
     def _stream(self, old: list[Any] | None, new: list[Any] | None) -> list[str]:

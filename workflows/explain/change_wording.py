@@ -1,4 +1,4 @@
-"""Wording of changed parameters, with path, unit and location in the recipe."""
+"""Texts that describe changed parameters, with path, unit and location in the recipe."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ _ABSENT = object()
 
 
 class Wording:
-    """Description of changed parameters; without a recipe, the name of the parameter and SI units are used."""
+    """Texts that describe changed parameters in the units of a recipe, or without a recipe in SI units."""
 
     def __init__(self, recipe: Recipe | None = None) -> None:
         self._recipe = recipe
@@ -66,7 +66,7 @@ class Wording:
 
     @cached_property
     def _marked(self) -> Mapping[str, list[Setting]]:
-        """Return the settings that a user wrote, by location."""
+        """Return the settings that the user wrote, by location in the recipe files."""
         settings = defaultdict(list)
         for setting in self._recipe.config.settings.values() if self._recipe else ():
             if not setting.default:
@@ -95,7 +95,7 @@ def _both(written: Any, old: Any, new: Any) -> tuple[str, str]:
         return _items(old, new)
     unit = _unit(written, new)
     before = spoken(unit[0](old)) if unit and _is_number(old) else spoken(old)
-    if before in (spoken(new), after.partition(" ")[0]):  # they differ by less than is shown
+    if before in (spoken(new), after.partition(" ")[0]):  # the values differ by less than the shown digits
         return repr(old), repr(new)
     return before, after
 
@@ -110,21 +110,21 @@ def _is_number(value: Any) -> bool:
 
 
 def _items(old: Mapping[str, Any], new: Mapping[str, Any]) -> tuple[str, str]:
-    """Return the entries of the old and of the new mapping that the other mapping lacks, as text."""
+    """Return as text the entries that only the old mapping has, and the entries that only the new mapping has."""
     pairs = [[(str(key), value) for key, value in m.get("items", ())] for m in (old, new)]
     only = [[f"{k}: {spoken(v)}" for k, v in pairs[i] if (k, v) not in pairs[1 - i]] for i in (0, 1)]
     return f"{{{', '.join(only[0])}}}", f"{{{', '.join(only[1])}}}"
 
 
 def _as_written(written: Any, new: Any) -> str:
-    """Return the text of a new value, as the user wrote it if the text has a unit."""
+    """Return a new value as text, as the user wrote this value if the text has a unit."""
     if _unit(written, new) or (isinstance(written, list) and isinstance(new, list)):
         return flow(written)
     return spoken(new)
 
 
 def _unit(written: Any, new: Any) -> tuple[Callable[[float], float], str] | None:
-    """Return the function from SI to the unit of a written quantity, and the unit; None without a unit."""
+    """Return the conversion from SI to the unit that the user wrote, and this unit; None without a unit."""
     match = _QUANTITY.fullmatch(written.strip()) if isinstance(written, str) else None
     if match is None or not _is_number(new):
         return None

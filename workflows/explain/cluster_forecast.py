@@ -72,7 +72,7 @@ def _devices(schedule: Schedule, machines: Machines) -> list[str]:
 
 
 def _path(schedule: Schedule) -> list[str]:
-    """Return a table of the critical path, without the middle of a long path."""
+    """Return a table of the critical path, shortened in the middle if the path is long."""
     path = schedule.critical_path()
     busy = sum(slot.end - slot.start for slot in path)
     wait = f" of {_time(schedule.makespan)}; the rest is waiting for data or memory"

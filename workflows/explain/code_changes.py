@@ -11,7 +11,7 @@ Parts = dict[str, dict[str, str]]  #: digests of definitions, by module
 
 
 def edits(root: Path, old: str, new: str) -> list[str]:
-    """Return one clause for each definition that differs, or an empty list if the store at ``root`` has no record."""
+    """Return one clause for each definition that differs, or an empty list without records of the code."""
     before, after = _parts(root, old), _parts(root, new)
     if not before or not after:
         return []
@@ -32,7 +32,7 @@ def _inside(module: str, old: dict[str, str], new: dict[str, str]) -> list[str]:
 
 
 def _named(label: str) -> str:
-    """Return the label of a definition with its kind, such as ``function psf()`` or ``the imports``."""
+    """Return the name of a definition with its kind, such as ``function psf()`` or ``the imports``."""
     if label.endswith("()"):
         return f"function {label}"
     return label if label.startswith(("class ", "constant ")) else f"the {label}"
@@ -45,7 +45,7 @@ def _file(module: str) -> str:
 
 
 def _parts(root: Path, found: str) -> Parts:
-    """Return the definitions behind a digest of code; an empty dictionary if their file is missing or damaged."""
+    """Return the digest of each definition in a recorded version of the code, or {} without an undamaged record."""
     try:
         parts = json.loads(parts_file(root, found).read_bytes())
         whole = all(isinstance(found, str) for inside in parts.values() for found in inside.values())

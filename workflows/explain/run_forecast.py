@@ -64,7 +64,7 @@ def planned(recipe: Recipe, store: Store, lanes: Mapping[str, Lane]) -> Plan:
 
 
 def plan_lines(recipe: Recipe, store: Store, device: str = "cpu", memory: int | None = None) -> tuple[list[str], bool]:
-    """Return lines on each step and on their sums; the second value is True if a run would lack memory."""
+    """Return the table of a forecast as lines, and True if the run would lack memory."""
     lanes = lanes_of(device.split(","), memory)
     plan = planned(recipe, store, lanes)
     rows = [_row(name, plan, store) for name in plan.order]
@@ -73,7 +73,7 @@ def plan_lines(recipe: Recipe, store: Store, device: str = "cpu", memory: int | 
 
 
 def simulated_lines(recipe: Recipe, store: Store, machines: str) -> list[str]:
-    """Return lines on a run of the whole recipe, with an empty store, on the machines of a YAML file."""
+    """Return the forecast of a run with an empty store on the machines of a YAML file, as lines of text."""
     from neusee.workflows.explain.cluster_forecast import cluster_lines
     from neusee.workflows.placement.machine_file import read_machines
 
@@ -102,7 +102,7 @@ def _row(name: str, plan: Plan, store: Store) -> list[str]:
 
 
 def _sums(plan: Plan, lanes: Mapping[str, Lane]) -> list[str]:
-    """Return lines with sums over all steps, and with the steps that may be left out."""
+    """Return lines with totals over all steps, and with the steps that may be left out."""
     ran, new = len(plan.expected), sum(e.bytes for e in plan.expected.values())
     guesses = sum(not e.known for e in plan.expected.values())
     lines = []
@@ -128,7 +128,7 @@ def _work(recipe: Recipe, name: str, keys: Mapping[str, Key], devices: Sequence[
 
 
 def _awake(recipe: Recipe, keys: Mapping[str, Key], store: Store) -> tuple[set[str], dict[str, int]]:
-    """Return the steps to compute, and the stored steps to read with the bytes of each result."""
+    """Return the steps to compute, and the size in bytes of each stored result to read."""
     found, loaded, todo = set[str](), dict[str, int](), [*wanted(recipe)]
     while todo:
         name = todo.pop()

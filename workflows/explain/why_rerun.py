@@ -24,14 +24,14 @@ _LINKS = 6  #: steps of a chain that are named
 
 
 def why_lines(recipe: Recipe, store: Store, step: str, device: str = "cpu") -> list[str]:
-    """Return lines on the state of ``step`` or of its items, and on the differences from earlier results.
+    """Return lines that explain the state of ``step`` and its differences from earlier results.
 
     Raises `ValueError` with the nearest name if the step does not exist.
     """
     names = [name for name in recipe.steps if step in (name, name.partition("[")[0])]
     if not names:
         known = {*recipe.steps, *(name.partition("[")[0] for name in recipe.steps)}
-        raise ValueError(f"no step {step!r}; {nearest(step, known)}")
+        raise ValueError(f"there is no step {step!r}; {nearest(step, known)}")
     recipe = with_substitutions(recipe, [*recipe.outputs, *names])
     resolved = resolve(recipe, needed(recipe, [*recipe.outputs, *names]), store, device)
     comparison = Comparison(store, recipe, resolved)
@@ -39,7 +39,7 @@ def why_lines(recipe: Recipe, store: Store, step: str, device: str = "cpu") -> l
 
 
 def why_key_lines(store: Store, prefix: str) -> list[str]:
-    """Return lines on the parts of the key that begins with ``prefix``, and on the differences from earlier results.
+    """Return lines with the origin of a result, whose key begins with ``prefix``, and its differences.
 
     Raises `LookupError` if no key or more than one key begins with ``prefix``.
     """
@@ -73,7 +73,7 @@ def explained(recipe: Recipe, store: Store, watch: Callable[[Event], None]) -> C
 
 
 def _step_lines(comparison: Comparison, recipe: Recipe, step: Step, resolved: Resolved) -> list[str]:
-    """Return lines on the state of one step and on its differences from earlier results."""
+    """Return lines with the state of one step and its differences from earlier results."""
     key, verdict = resolved.keys[step.name], resolved.verdicts.get(step.name)
     head = f"{step.name} ({step.node.path})"
     if verdict is not None and verdict.left_out:
@@ -98,7 +98,7 @@ def _state(about: Mapping[str, Any] | None) -> str:
 def _because(
     comparison: Comparison, label: str, key: Key, about: Mapping[str, Any] | None, maker: str = ""
 ) -> Iterator[str]:
-    """Yield lines on the differences from the most similar earlier result."""
+    """Yield lines with the differences of a result from the most similar earlier result."""
     rows = _rows(comparison.store, label) or _rows(comparison.store, maker or label)
     keys = _keys(rows)
     earlier = keys[: keys.index(key)] if key in keys else keys
@@ -116,7 +116,7 @@ def _because(
 
 
 def _nearest(comparison: Comparison, label: str, key: Key, earlier: list[Key]) -> tuple[Key, Roots] | None:
-    """Return the earlier result with the fewest differences, the newest of several, and these differences."""
+    """Return the earlier result with the fewest differences, and these differences; prefer the newest result."""
     best: tuple[Key, Roots] | None = None
     for old in earlier[: -_CANDIDATES - 1 : -1]:
         if comparison.origin(old) is None:
@@ -144,7 +144,7 @@ def _at_once(comparison: Comparison, step: Step, key: Key, earlier: list[Key]) -
 
 
 def _direct(comparison: Comparison, step: Step, old: Origin, new: Origin) -> list[str]:
-    """Return the differences at a step itself, followed by the sources that differ."""
+    """Return the differences of a step itself, followed by the inputs that differ."""
     texts = comparison.own(step.name, old, new)
     if old["node"] != new["node"] or len(old["inputs"]) != len(new["inputs"]):
         return texts
@@ -171,7 +171,7 @@ def _made_of(comparison: Comparison, key: Key) -> Iterator[str]:
 
 
 def _chain(names: list[str]) -> str:
-    """Return names as a chain such as ``restored <- raw <- read``, without the middle of a long chain."""
+    """Return names as a chain such as ``restored <- raw <- read``, shortened if the chain is long."""
     if len(names) > _LINKS:
         names = [*names[: _LINKS - 2], f"({len(names) - _LINKS + 1} more)", names[-1]]
     return " <- ".join(names)
@@ -186,5 +186,5 @@ def _date(about: Mapping[str, Any]) -> str:
 
 
 def _rows(store: Store, step: str | None = None) -> list[dict[str, Any]]:
-    """Return the journal lines of one step or of all steps, the newest last."""
+    """Return the journal lines of one step or of all steps, in order of time."""
     return store.journal.rows() if step is None else store.journal.of_step(step)

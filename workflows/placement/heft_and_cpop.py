@@ -1,8 +1,9 @@
-"""Placement of tasks on devices in time: HEFT with insertion and CPOP, with memory as a hard constraint.
+"""Scheduling of tasks on devices by the heuristics HEFT and CPOP, with memory as a hard constraint.
 
 A schedule is a pure function of tasks, costs and devices, for this machine and for machines described in a file.
-A result leaves a device after its last use. A task that does not fit is cut into parts of bands, waits
-or runs elsewhere; a task that fits nowhere is refused with the number of bytes that it needs.
+A result leaves a device after its last use. HEFT inserts tasks into idle gaps between placed tasks. A task that
+does not fit into memory is cut into parts of bands, waits or runs elsewhere; a task that fits nowhere is refused
+with the number of bytes that it needs.
 
 Source: Topcuoglu, Hariri, Wu, IEEE Transactions on Parallel and Distributed Systems 13 (2002) 260.
 """
@@ -23,13 +24,13 @@ __all__ = ["Cluster", "Device", "Link", "Schedule", "Slot", "Task", "TooLarge", 
 
 
 def heft(tasks: Sequence[Task], cluster: Cluster, keep: Collection[str] = ()) -> Schedule:
-    """Return the HEFT schedule: tasks with the longest remaining path first, each on the device where it ends first.
+    """Return the HEFT schedule: tasks in order of their longest path, each on the device that finishes it first.
 
-    ``keep`` names the results that are held to the end. Where memory is short, orders that hold less at once are tried
-    too. If one device alone would finish all tasks sooner, this device runs all tasks; tasks that one device could run
-    alone are never refused.
+    ``keep`` names the results that stay in memory to the end. If memory is short, orders of the tasks that need less
+    memory are tried too. If one device alone would finish all tasks sooner, this device runs all tasks; tasks that one
+    device could run alone are never refused.
 
-    Raises: `TooLarge` where no such plan fits, with the need of the plan that comes closest; ValueError for tasks that
+    Raises: `TooLarge` if no schedule fits, with the memory that the closest schedule needs; ValueError for tasks that
     no device runs, and for cyclic dependencies.
     """
     graph = Graph(tasks, cluster, keep)
@@ -39,7 +40,7 @@ def heft(tasks: Sequence[Task], cluster: Cluster, keep: Collection[str] = ()) ->
     try:
         schedule = _best(graph, orders)
     except TooLarge as error:
-        return _alone(graph, _able(graph), error)  # gives the need of one device alone, if smaller
+        return _alone(graph, _able(graph), error)  # reports the memory for one device, if this is less
     sooner = {d: took for d in _able(graph) if (took := sum(row[d] for row in graph.seconds)) < schedule.makespan}
     try:
         return _alone(graph, sorted(sooner, key=sooner.__getitem__)) if sooner else schedule
@@ -48,7 +49,7 @@ def heft(tasks: Sequence[Task], cluster: Cluster, keep: Collection[str] = ()) ->
 
 
 def cpop(tasks: Sequence[Task], cluster: Cluster, keep: Collection[str] = ()) -> Schedule:
-    """Return the CPOP schedule: the critical path on its fastest device, every other task where the task ends first.
+    """Return the CPOP schedule: the critical path on one device, every other task on the device that finishes it first.
 
     Raises: as `heft`.
     """
@@ -61,7 +62,7 @@ def cpop(tasks: Sequence[Task], cluster: Cluster, keep: Collection[str] = ()) ->
 
 
 def _best(graph: Graph, orders: Sequence[Sequence[int]], pinned: Mapping[int, int] | None = None) -> Schedule:
-    """Return the schedule of the first order of tasks if the memory suffices, else the shortest schedule that fits."""
+    """Return the schedule for the first of ``orders`` if it fits into memory, else the shortest schedule that fits."""
     pinned = pinned or {}
     memory = {device.name: device.memory for device in graph.cluster.devices}
     schedule = _placed(PartialSchedule(graph, bounded=False), orders[0], pinned).schedule()
@@ -83,10 +84,10 @@ def _best(graph: Graph, orders: Sequence[Sequence[int]], pinned: Mapping[int, in
 def _placed(
     board: PartialSchedule, order: Sequence[int], pinned: Mapping[int, int], below: float = math.inf
 ) -> PartialSchedule:
-    """Place tasks on ``board`` in an order, ``pinned`` tasks on their device if they fit there; return ``board``.
+    """Add the tasks to the partial schedule ``board`` in the given order, and return ``board``.
 
-    A task that does not fit into memory lets later tasks go first that may free memory. The placement
-    stops half-way where it cannot end before ``below``.
+    A task in ``pinned`` runs on its device there, if the task fits. A task that does not fit into memory waits
+    until later tasks free memory. The placement stops early if it cannot end before ``below``.
     """
     graph = board.graph
     missing, turn = [len(sources) for sources in graph.sources], {i: n for n, i in enumerate(order)}
@@ -116,7 +117,7 @@ def _placed(
 
 
 def _critical(graph: Graph, through: Sequence[float]) -> list[int]:
-    """Return the critical path: the source with the longest path, then always the reader with the longest path."""
+    """Return the tasks on the critical path, from a task without sources to a task without readers."""
     at = max((i for i, sources in enumerate(graph.sources) if not sources), key=through.__getitem__, default=-1)
     path = []
     while at >= 0:
@@ -129,14 +130,14 @@ def _critical(graph: Graph, through: Sequence[float]) -> list[int]:
 
 
 def _able(graph: Graph) -> list[int]:
-    """Return the devices that can run every task, the device with most memory first."""
+    """Return the devices that can run every task, in order of decreasing memory."""
     devices = graph.cluster.devices
     able = set(range(len(devices))).intersection(*graph.able)
     return sorted(able, key=lambda d: (-devices[d].memory, d))
 
 
 def _alone(graph: Graph, devices: Sequence[int], *refused: TooLarge) -> Schedule:
-    """Return the first schedule that fits on one device, with the tasks as given or in the order of least memory."""
+    """Return the first schedule on one device that fits into memory; try two orders of the tasks on each device."""
     for d in devices:
         for order in (graph.by(range(len(graph.tasks))), frugal(graph)):
             try:
@@ -147,7 +148,7 @@ def _alone(graph: Graph, devices: Sequence[int], *refused: TooLarge) -> Schedule
 
 
 def _sequence(graph: Graph, d: int, order: Sequence[int]) -> Schedule:
-    """Return the schedule of tasks in sequence on device ``d``; raise `TooLarge` with the memory that suffices."""
+    """Return the schedule of all tasks in ``order`` on device ``d``; raise `TooLarge` if the device lacks memory."""
     board, device = PartialSchedule(graph, bounded=False), graph.cluster.devices[d]
     left, held, peak, at = [len(readers) for readers in graph.readers], 0.0, 0.0, 0.0
     needed, largest = 0.0, 0
@@ -170,6 +171,6 @@ def _sequence(graph: Graph, d: int, order: Sequence[int]) -> Schedule:
 
 
 def _fewest(graph: Graph, i: int, room: float) -> int:
-    """Return the smallest number of parts with which task ``i`` needs at most ``room`` bytes, or the maximum."""
+    """Return the smallest number of parts with which task ``i`` fits into ``room`` bytes, or the largest allowed."""
     most = graph.tasks[i].parts
     return 1 + bisect_left(range(1, most), True, key=lambda parts: graph.work(i, parts) <= room)

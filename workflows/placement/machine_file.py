@@ -1,4 +1,4 @@
-"""Machine files: devices with speed and memory, and the links between them, in YAML.
+"""Reader of machine files, which describe devices, their speed and memory, and their links in YAML.
 
     devices:
       host: {kind: cpu, memory: 2 TB, speed: 10}
@@ -8,7 +8,7 @@
     network: {bandwidth: 25 GB/s, latency: 5 us}
 
 ``speed`` is the ratio to the machine on which the costs were measured, for all nodes or by family of nodes.
-``node: [a, b]`` puts a group of devices on each machine of these names; the network links the machines.
+``node: [a, b]`` puts a group of devices on each of the machines ``a`` and ``b``; the network links the machines.
 """
 
 from __future__ import annotations
@@ -34,30 +34,30 @@ _KINDS = ("cpu", "cuda", "mps")
 _SECONDS = {"s": 1.0, "ms": 1e-3, "us": 1e-6, "µs": 1e-6, "μs": 1e-6, "ns": 1e-9}
 _RATES = {f"{unit}/s": scale for unit, scale in UNITS.items() if unit in ("MB", "GB", "TB")}
 _QUANTITY = re.compile(r"((?:\d+\.?\d*|\.\d+)(?:[eE][-+]?\d+)?)\s*(.*)")
-_MOST = 4096  #: limit on the devices of one file
+_MOST = 4096  #: largest number of devices in one file
 _Reader = Callable[[Value, "list[Diagnostic]"], Any]
 
 
 @dataclass(frozen=True)
 class Machines:
-    """A cluster, with the speed of each device relative to the machine on which the costs were measured."""
+    """A cluster, with the speed of each device relative to the machine on which run times were measured."""
 
     title: str
     cluster: Cluster
-    speeds: Mapping[str, Mapping[str, float]] = field(repr=False)  #: by device, by family, with a ``default``
+    speeds: Mapping[str, Mapping[str, float]] = field(repr=False)  #: by device, then by family of nodes or ``default``
 
     @property
     def devices(self) -> tuple[Device, ...]:
         return self.cluster.devices
 
     def speed(self, device: str, node: str) -> float:
-        """Return the relative speed at which ``device`` runs the node of a path such as ``optics.psf``."""
+        """Return the relative speed at which ``device`` runs a node such as ``optics.psf``."""
         speeds = self.speeds[device]
         return speeds.get(node.partition(".")[0], speeds["default"])
 
 
 def read_machines(path: Path | str) -> Machines:
-    """Return the machines in a file, or in the example of this name; raise one `RecipeError` with all mistakes."""
+    """Return the machines that a file or a packaged example describes; raise one `RecipeError` with all mistakes."""
     document = read(_path(path), str(path))
     diagnostics: list[Diagnostic] = []
     root = _fields(document.root, {"devices": _groups, "links": _links, "network": _link}, ("devices",), diagnostics)
@@ -76,7 +76,7 @@ def read_machines(path: Path | str) -> Machines:
 
 
 def examples() -> dict[str, Path]:
-    """Return the paths of the example files of the program, by the names of the examples."""
+    """Return the path of each packaged example of a machine file, by the name of the example."""
     folder = Path(str(files("neusee.recipes"))) / "samples" / "clusters"
     return {path.stem: path for path in sorted(folder.glob("*.yaml"))}
 
@@ -92,7 +92,7 @@ def _path(path: Path | str) -> Path:
 
 
 def _devices(groups: list[dict[str, Any]]) -> dict[Device, dict[str, Any]]:
-    """Return each device of the groups with its group, named ``cpu``, ``cuda:0`` or, on machine a, ``a/cuda:0``."""
+    """Return the group of each device; a device has a name such as ``cpu`` or ``a/cuda:0``, GPU 0 of machine ``a``."""
     rows = [(machine, group) for group in groups for machine in group["node"] for _ in range(group["count"])]
     total, seen = Counter((machine, group["kind"]) for machine, group in rows), Counter[tuple[str, str]]()
     devices = {}
@@ -138,9 +138,9 @@ def _link(value: Value, diagnostics: list[Diagnostic]) -> Link:
 def _fields(
     value: Value, readers: Mapping[str, _Reader], required: tuple[str, ...], diagnostics: list[Diagnostic]
 ) -> dict[str, Any]:
-    """Return the fields of a mapping, each read by its function in ``readers``; report unknown and missing fields."""
+    """Return the fields of a mapping, read by the functions ``readers``; report unknown and missing fields."""
     if not isinstance(value.data, dict):
-        diagnostics.append(_problem(value, f"must be a mapping of {', '.join(readers)}, not {kind(value)}"))
+        diagnostics.append(_problem(value, f"must be a mapping with {', '.join(readers)}, not {kind(value)}"))
         return {}
     fields = {}
     for name, item in value.data.items():
@@ -172,14 +172,14 @@ def _names(value: Value, diagnostics: list[Diagnostic]) -> list[str]:
             diagnostics.append(_problem(name, "must be the name of a machine, or a list of such names"))
     plain = [str(name.data) for name in names]
     if len(set(plain)) < len(plain) or not plain:
-        diagnostics.append(_problem(value, "must name one machine or more, each once"))
+        diagnostics.append(_problem(value, "must name at least one machine, and no machine twice"))
     return plain
 
 
 def _speed(value: Value, diagnostics: list[Diagnostic]) -> dict[str, float]:
     if not isinstance(value.data, dict):
         return {"default": _factor(value, diagnostics)}
-    spec = find_spec("neusee.nodes")  # names the families of nodes without the import of a node
+    spec = find_spec("neusee.nodes")  # lists the families of nodes without importing a node
     packages = pkgutil.iter_modules(spec.submodule_search_locations if spec else [])
     families = ["default", *(package.name for package in packages if package.ispkg)]
     return _fields(value, dict.fromkeys(families, _factor), ("default",), diagnostics)
@@ -188,13 +188,13 @@ def _speed(value: Value, diagnostics: list[Diagnostic]) -> dict[str, float]:
 def _factor(value: Value, diagnostics: list[Diagnostic]) -> float:
     good = isinstance(value.data, int | float) and not isinstance(value.data, bool)
     if not good or not 0 < value.data < math.inf:
-        diagnostics.append(_problem(value, "must be a number above 0: the speed relative to the measured machine"))
+        diagnostics.append(_problem(value, "must be a number above 0: the ratio to the measured speed"))
         return 1.0
     return float(value.data)
 
 
 def _quantity(value: Value, diagnostics: list[Diagnostic], units: Mapping[str, float], such: str) -> float:
-    """Return a number with a unit in SI units; report a missing or unknown unit, and a zero except for a time."""
+    """Convert a quantity such as ``80 GB`` to SI units; report a wrong unit, or a value that is out of range."""
     match = _QUANTITY.fullmatch(str(value.data).strip())
     if isinstance(value.data, bool) or match is None:
         diagnostics.append(_problem(value, f"must be a number and a unit, such as {such}"))
@@ -214,7 +214,7 @@ _time = partial(_quantity, units=_SECONDS, such="10 us")
 
 
 def _absent(links: Value | None, kinds: set[str]) -> list[Diagnostic]:
-    """Return a diagnostic for each kind in the names of ``links`` that no device has."""
+    """Return a diagnostic for each kind of device that is in ``links`` but not in the cluster."""
     return [
         _problem(link, f"there is no device of kind {name}; {nearest(name, kinds)}", link.key)
         for pair, link in (links.items.items() if links else ())

@@ -1,4 +1,4 @@
-"""Memory profile of one device: the bytes that the tasks placed so far will hold, as a function of time."""
+"""Memory profile of one device: the bytes in use by the scheduled tasks, as a function of time."""
 
 from __future__ import annotations
 
@@ -14,36 +14,36 @@ Hold = tuple[float, float, float]  #: start, end (infinity if not yet known), by
 
 
 class MemoryProfile:
-    """Bytes in use as a step function of time that never rises above ``limit``.
+    """The bytes in use on a device as a step function of time that never rises above ``limit``.
 
-    A result whose readers are not all placed is held for ever, and freed when its last reader is
-    placed. Promises therefore only shrink after `wait` has checked them, and no later placement, not
-    even one in an earlier gap, can break a placement that was found to fit.
+    The memory of a result is reserved without end until the last reader of the result is placed, and then
+    only until this reader ends. Reserved memory therefore only shrinks after `wait` has checked it, and no later
+    placement, not even a placement in an earlier gap, can break a placement that fits.
     """
 
     def __init__(self, limit: float) -> None:
         self.limit = limit
         self.times = [-math.inf]
         self.level = np.zeros(64)
-        self.kept = 0.0  # bytes at the end of time
+        self.kept = 0.0  # bytes that are reserved without end
 
     def add(self, start: float, end: float, size: float) -> None:
-        """Hold ``size`` bytes from ``start`` until ``end``; free held bytes if ``size`` is negative."""
+        """Reserve ``size`` bytes from ``start`` until ``end``; a negative ``size`` frees reserved bytes."""
         if size and start < end:
             first = self._cut(start)
             self.level[first : self._cut(end) if end < math.inf else len(self.times)] += size
             self.kept += size if end == math.inf else 0.0
 
     def highest(self, start: float, end: float) -> float:
-        """Return the maximum of the bytes in use in [start, end)."""
+        """Return the largest number of bytes in use during [start, end)."""
         return float(self.level[self._within(start, end)].max())
 
     def free(self) -> float:
-        """Return the bytes that are free after the end of all placed tasks."""
+        """Return the number of bytes that are free after all placed tasks have ended."""
         return self.limit - self.kept
 
     def wait(self, holds: Iterable[Hold]) -> float:
-        """Return the least delay (s) with which all ``holds`` fit into the memory: 0 if no delay is needed."""
+        """Return the least delay (s) after which all memory reservations in ``holds`` stay below the limit."""
         shift = 0.0
         for start, end, size in stacked(holds):
             span = self._within(start, end)
@@ -58,7 +58,7 @@ class MemoryProfile:
         return slice(first, len(self.times) if end == math.inf else max(bisect_left(self.times, end), first + 1))
 
     def _cut(self, time: float) -> int:
-        """Return the index of the interval that begins at ``time``; split an interval there if needed."""
+        """Return the index of the interval that begins at ``time``; if there is none, split an interval at ``time``."""
         at, count = bisect_left(self.times, time), len(self.times)
         if at < count and self.times[at] == time:
             return at
@@ -71,7 +71,7 @@ class MemoryProfile:
 
 
 def stacked(holds: Iterable[Hold]) -> Iterator[Hold]:
-    """Yield the sum of the bytes that ``holds`` reserve at the same time, as consecutive time spans."""
+    """Yield the total of the memory reservations in ``holds`` as consecutive time spans of constant size."""
     steps = defaultdict[float, float](float)
     for start, end, size in holds:
         if start < end and size:
@@ -85,7 +85,7 @@ def stacked(holds: Iterable[Hold]) -> Iterator[Hold]:
 
 
 def without(start: float, end: float, taken: Iterable[tuple[float, float]]) -> Iterator[tuple[float, float]]:
-    """Yield the parts of [start, end) outside the ``taken`` spans, which are sorted and disjoint."""
+    """Yield the parts of [start, end) outside the spans in ``taken``, which are sorted and disjoint."""
     for first, last in taken:
         if first < end and last > start:
             if start < first:

@@ -1,4 +1,4 @@
-"""Partial schedule: the tasks placed so far, the free times of each device and the memory that each task will hold."""
+"""Partial schedule: the tasks placed so far, the idle times of each device, and the memory that each task will use."""
 
 from __future__ import annotations
 
@@ -21,13 +21,13 @@ class PartialSchedule:
         self.graph, devices, count = graph, graph.cluster.devices, len(graph.tasks)
         self.where, self.parts = [-1] * count, [1] * count
         self.start, self.end = [0.0] * count, [0.0] * count
-        self.free_at: list[float] = [0.0] * count  # time when the last reader placed so far has its input
+        self.free_at: list[float] = [0.0] * count  # time at which the last reader placed so far has its input
         self.left = [len(readers) for readers in graph.readers]
         self.gaps: list[tuple[list[float], list[float]]] = [([0.0], [math.inf]) for _ in devices]
         most = sum(graph.own) + max((graph.work(i, 1) for i in range(count)), default=0.0)
         sent = sum(max(0.0, math.ceil(s)) for t, sizes in enumerate(graph.sizes) for s in sizes if graph.tasks[t].takes)
         self.rooms = [MemoryProfile(d.memory) if bounded and d.memory < most + sent else None for d in devices]
-        self.links = [[graph.cluster.link(a.name, b.name) for b in devices] for a in devices]  # 0 s to itself
+        self.links = [[graph.cluster.link(a.name, b.name) for b in devices] for a in devices]  # no delay to itself
         self.least = [own + graph.work(i, graph.tasks[i].parts) for i, own in enumerate(graph.own)]
         self.copies: dict[Of, list[Copy]] = {}
         self.placed: list[int] = []
@@ -36,7 +36,7 @@ class PartialSchedule:
     # --- where and when -------------------------------------------------------------------------------------------
 
     def place(self, i: int, among: Sequence[int]) -> bool:
-        """Place task ``i`` on the device of ``among`` where the task ends first; return False if no device has room."""
+        """Place task ``i`` on the device that finishes it first; return False if no device has enough memory."""
         best, on, begin = math.inf, -1, 0.0
         for d in among:
             room = self.rooms[d]
@@ -53,11 +53,11 @@ class PartialSchedule:
         return on >= 0
 
     def gave_back(self, i: int) -> bool:
-        """Return True if the placement of task ``i`` freed memory for waiting tasks."""
+        """Return True if the placement of task ``i`` freed memory that waiting tasks may use."""
         return any(not self.left[j] for j in self.graph.sources[i]) or bool(self.refused)
 
     def force(self, i: int) -> None:
-        """Place a task that fits nowhere as if one device had enough memory, and record the needed bytes."""
+        """Place task ``i`` as if a device had enough memory for this task, and record the bytes that the task needs."""
         needs = {d: self._needs(i, d) for d in self.graph.able[i] if self.rooms[d] is not None}
         d = min(needs, key=lambda d: (needs[d] - self.graph.cluster.devices[d].memory, d))
         room = self.rooms[d]
@@ -67,16 +67,16 @@ class PartialSchedule:
         self.place(i, [d])
 
     def _ready(self, i: int, d: int) -> float:
-        """Return the time at which the last input of task ``i`` can be on device ``d``."""
+        """Return the earliest time at which all inputs of task ``i`` can be on device ``d``."""
         end, where, links = self.end, self.where, self.links
         return max((end[j] + links[where[j]][d].seconds(size) for j, size in self._inputs(i)), default=0.0)
 
     def _inputs(self, i: int) -> Iterator[tuple[int, float]]:
-        """Yield each source of task ``i`` with the bytes that another device must send."""
+        """Yield each source of task ``i`` with the bytes to send if the source is on another device."""
         return zip(self.graph.sources[i], self.graph.sizes[i], strict=True)
 
     def _slot(self, i: int, d: int, ready: float, seconds: float, best: float) -> float:
-        """Return the first start of task ``i`` in a gap of device ``d``, or infinity if it ends after ``best``."""
+        """Return the earliest start of task ``i`` on device ``d``, or infinity if the end is not before ``best``."""
         starts, ends = self.gaps[d]
         for gap in range(bisect_left(ends, ready + seconds), len(ends)):
             start = max(starts[gap], ready)
@@ -91,7 +91,7 @@ class PartialSchedule:
         return math.inf
 
     def _fitting(self, i: int, d: int, start: float, seconds: float, end: float) -> float:
-        """Return the first time from ``start`` on with enough memory, or a time that is too late for the gap."""
+        """Return the earliest start of task ``i`` with enough memory, or a start after which the gap is too short."""
         room, parts = self.rooms[d], self.graph.tasks[i].parts
         if room is None:
             return start
@@ -103,7 +103,7 @@ class PartialSchedule:
         return start
 
     def _holds(self, i: int, d: int, start: float, end: float, parts: int) -> list[Hold]:
-        """Return all memory that task ``i`` adds on device ``d``: result, work, and copies of the inputs."""
+        """Return the memory reservations of task ``i`` on device ``d`` for result, work, and copies of inputs."""
         graph = self.graph
         holds = [(start, math.inf if graph.held(i) else end, graph.own[i]), (start, end, graph.work(i, parts))]
         for of, leaves in self._arriving(i, d, start):
@@ -112,13 +112,13 @@ class PartialSchedule:
         return holds
 
     def _arriving(self, i: int, d: int, start: float) -> Iterator[tuple[Of, float]]:
-        """Yield each input from another device with the latest time at which the device must send the input."""
+        """Yield each input of task ``i`` on another device, with the latest time at which its transfer must start."""
         for j, size in self._inputs(i):
             if self.where[j] != d:
                 yield (j, size, d), max(start - self.links[self.where[j]][d].seconds(size), self.end[j])
 
     def _needs(self, i: int, d: int) -> float:
-        """Return the bytes that device ``d`` must have to run task ``i`` after all tasks placed before."""
+        """Return the bytes of memory with which device ``d`` could run task ``i`` after all tasks placed so far."""
         room = self.rooms[d]
         assert room is not None
         copies = sum(math.ceil(size) for j, size in self._inputs(i) if self.where[j] != d)
@@ -148,7 +148,10 @@ class PartialSchedule:
         self.placed.append(i)
 
     def _fewest(self, i: int, d: int, start: float, end: float, room: MemoryProfile) -> int:
-        """Return the smallest number of parts with which task ``i`` fits; the largest allowed number always fits."""
+        """Return the smallest number of parts into which task ``i`` must be cut to fit into the memory of device ``d``.
+
+        The largest allowed number always fits.
+        """
 
         def fits(parts: int) -> bool:
             return not room.wait(self._holds(i, d, start, end, parts))
@@ -156,7 +159,7 @@ class PartialSchedule:
         return 1 + bisect_left(range(1, self.graph.tasks[i].parts), True, key=fits)
 
     def _fill(self, d: int, start: float, end: float) -> None:
-        """Remove the time from ``start`` to ``end`` from the gap of device ``d`` that contains this time."""
+        """Mark the time from ``start`` to ``end`` as busy on device ``d``."""
         starts, ends = self.gaps[d]
         gap = bisect_left(ends, end)
         left = [(a, b) for a, b in ((starts[gap], start), (end, ends[gap])) if a < b]
@@ -166,13 +169,13 @@ class PartialSchedule:
     # --- the end --------------------------------------------------------------------------------------------------
 
     def too_large(self) -> TooLarge:
-        """Return the error for the first task that fits nowhere, with the bytes that its device needs for all tasks."""
+        """Return the error for the first task that fits on no device, with the bytes of memory that would suffice."""
         graph, (i, d, _) = self.graph, self.refused[0]
         needed, device = max(n for _, on, n in self.refused if on == d), graph.cluster.devices[d]
         return TooLarge(graph.tasks[i].name, device.name, needed, device.memory, graph.tasks[i].parts)
 
     def schedule(self) -> Schedule:
-        """Return the schedule after all tasks are placed."""
+        """Return the finished schedule after all tasks are placed."""
         devices = self.graph.cluster.devices
         self._bridge()
         moves = sorted(self._moves(), key=lambda m: (m.start, m.task, m.device))
@@ -182,7 +185,7 @@ class PartialSchedule:
         return Schedule(tuple(slots), max(self.end, default=0.0), peak, sum(m.bytes for m in moves), tuple(moves))
 
     def _bridge(self) -> None:
-        """Keep the copy of a result until its next use on a device, instead of a second transfer, if memory allows."""
+        """Avoid a second transfer of a result to a device by keeping the first copy there, if memory allows."""
         for (j, size, d), copies in self.copies.items():
             room, kept = self.rooms[d], copies[:1]
             for copy in copies[1:]:
@@ -203,7 +206,7 @@ class PartialSchedule:
                 yield Move(task, size, source, devices[d].name, leaves, arrives, until)
 
     def _held(self) -> list[list[Hold]]:
-        """Return all memory that the finished schedule holds, one list of holds for each device."""
+        """Return the memory reservations of the finished schedule, as one list for each device."""
         graph, held = self.graph, list[list[Hold]]([] for _ in self.rooms)
         until, over = list(self.end), max(self.end, default=0.0)
         for (j, size, d), copies in self.copies.items():
@@ -219,7 +222,7 @@ class PartialSchedule:
         return held
 
     def _slots(self) -> Iterator[Slot]:
-        """Yield the slot of every task, with the task that delayed the start."""
+        """Yield the device and the times of every task, with the task that delayed the start."""
         tasks, devices = self.graph.tasks, self.graph.cluster.devices
         before, ended = [-1] * len(devices), dict[float, int]()
         for i in sorted(self.placed, key=self.start.__getitem__):
@@ -243,7 +246,7 @@ class PartialSchedule:
 
 
 def _joined(copies: list[Copy]) -> list[Copy]:
-    """Return the copies of a result on a device in order of time, with overlapping copies joined to one copy."""
+    """Return the copies of a result on a device in order of time, with overlapping copies joined into one."""
     joined: list[Copy] = []
     for copy in sorted(copies):
         if joined and copy[0] <= joined[-1][2]:

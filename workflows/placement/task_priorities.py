@@ -1,4 +1,4 @@
-"""Priorities of tasks: the order in which tasks are placed, by rank or for little memory in use."""
+"""Priorities of tasks: orders in which a scheduler places tasks, by rank or for the least use of memory."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ class Graph:
             raise ValueError(f"two tasks have the name {twice}")
         for name in (*(s for task in self.tasks for s in task.sources), *keep):
             if name not in index:
-                raise ValueError(f"no task {name}; {nearest(name, index)}")
+                raise ValueError(f"there is no task {name}; {nearest(name, index)}")
         self.sources = [[index[s] for s in dict.fromkeys(task.sources)] for task in self.tasks]
         self.readers: list[list[int]] = [[] for _ in self.tasks]
         for i, sources in enumerate(self.sources):
@@ -39,14 +39,14 @@ class Graph:
         self._check()
 
     def held(self, i: int) -> bool:
-        """Return True if a later task reads the result of task ``i``, or the result is held to the end."""
+        """Return True if a later task reads the result of task ``i``, or if the result is kept to the end."""
         return bool(self.readers[i]) or i in self.kept
 
     def work(self, i: int, parts: int) -> float:
         return float(math.ceil(self.tasks[i].work / parts))
 
     def by(self, keys: Sequence[Any]) -> list[int]:
-        """Return the tasks in an order with sources first; of the ready tasks, the task with the least key is next."""
+        """Return the tasks in an order with sources first; among tasks that are ready, smaller keys come first."""
         missing = [len(sources) for sources in self.sources]
         ready = [(keys[i], i) for i, count in enumerate(missing) if not count]
         heapq.heapify(ready)
@@ -64,20 +64,20 @@ class Graph:
         there = ", ".join(device.name for device in self.cluster.devices)
         for task, able in zip(self.tasks, self.able, strict=True):
             if not able:
-                raise ValueError(f"{task.name} runs on {', '.join(task.seconds) or 'no device'}; there are: {there}")
+                raise ValueError(f"{task.name} needs {', '.join(task.seconds) or 'a device'}; the cluster has {there}")
             if not all(0 <= seconds < math.inf for seconds in task.seconds.values()):
-                raise ValueError(f"{task.name} must have finite seconds of 0 or more: {dict(task.seconds)} s")
+                raise ValueError(f"{task.name} must take a finite time of 0 s or more, not {dict(task.seconds)} s")
         if len(self.by(range(len(self.tasks)))) < len(self.tasks):
             raise ValueError("the tasks depend on each other in a cycle")
 
 
 def ranked(graph: Graph, ranks: Sequence[float]) -> list[int]:
-    """Return the tasks by falling rank, and by name where two ranks differ by no more than round-off."""
+    """Return the tasks in order of decreasing rank; ranks that differ only by round-off count as equal."""
     return graph.by([(-float(f"{rank:.9g}"), graph.tasks[i].name) for i, rank in enumerate(ranks)])
 
 
 def upward(graph: Graph) -> list[float]:
-    """Return rank_u, the seconds from the start of each task to the end of the graph, with mean costs.
+    """Return the upward rank of each task: the seconds from its start to the end of the graph, with mean costs.
 
     Source: Topcuoglu, Hariri, Wu, IEEE TPDS 13 (2002) 260, eq. 8.
     """
@@ -91,7 +91,10 @@ def upward(graph: Graph) -> list[float]:
 
 
 def downward(graph: Graph) -> list[float]:
-    """Return rank_d, the seconds from the start of the graph to the start of each task, with mean costs (eq. 10)."""
+    """Return the downward rank of each task: the seconds from the start of the graph to its start, with mean costs.
+
+    Source: Topcuoglu, Hariri, Wu, IEEE TPDS 13 (2002) 260, eq. 10.
+    """
     ranks, wait, cost = [0.0] * len(graph.tasks), _mean_transfer(graph), _mean_seconds(graph)
     for i in graph.by(range(len(graph.tasks))):
         pairs = zip(graph.sources[i], graph.sizes[i], strict=True)
@@ -100,9 +103,10 @@ def downward(graph: Graph) -> list[float]:
 
 
 def frugal(graph: Graph) -> list[int]:
-    """Return a depth-first order of the tasks, which places first the input that frees most of its peak memory.
+    """Return a depth-first order of the tasks with a low peak of memory in use.
 
-    Of all depth-first orders of a tree this order has the smallest peak memory (Liu, ACM TOMS 12 (1986) 249).
+    Of the inputs of a task, the input that frees most of its peak memory comes first. Of all depth-first
+    orders of a tree this order has the smallest peak memory (Liu, ACM TOMS 12 (1986) 249).
     """
     need, befores = _needs(graph)
     left = {i: graph.own[i] if i in graph.kept else 0.0 for i, r in enumerate(graph.readers) if not r}
@@ -119,7 +123,7 @@ def frugal(graph: Graph) -> list[int]:
 
 
 def _needs(graph: Graph) -> tuple[list[float], list[list[int]]]:
-    """Return for each task the peak bytes of a run with all predecessors, and the sources in the best order."""
+    """Return the peak memory of each task with all its predecessors, and the best order of its sources."""
     need, befores = [0.0] * len(graph.tasks), list[list[int]]([] for _ in graph.tasks)
     for i in graph.by(range(len(graph.tasks))):
         befores[i] = sorted(graph.sources[i], key=lambda j: (graph.own[j] - need[j], j))

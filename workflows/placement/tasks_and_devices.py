@@ -1,4 +1,4 @@
-"""Data of a schedule: devices with their links, tasks with their costs, and the device and the times of each task.
+"""Data types of a schedule: devices with their links, tasks with their costs, and the device and times of each task.
 
 All times are in s and all sizes in bytes. No code here runs a task or reads a tensor.
 """
@@ -13,7 +13,7 @@ from functools import cached_property
 
 @dataclass(frozen=True, slots=True)
 class Device:
-    """A device that runs one task at a time: ``cuda:1`` of this machine, ``node2/cuda:1`` of machine ``node2``."""
+    """A device that runs one task at a time, such as ``cuda:1``, or ``node2/cuda:1`` on the machine ``node2``."""
 
     name: str
     kind: str = "cpu"
@@ -51,10 +51,10 @@ class Cluster:
     def __post_init__(self) -> None:
         if not self.devices or len(self._by_name) < len(self.devices):
             names = ", ".join(d.name for d in self.devices)
-            raise ValueError(f"a cluster needs one device or more, with different names: {names or 'none'}")
+            raise ValueError(f"a cluster needs one or more devices with different names, not: {names or 'none'}")
 
     def link(self, a: str, b: str) -> Link:
-        """Return the link between two devices, without delay if both are the same device."""
+        """Return the link between two devices; from a device to itself, the link has no delay."""
         if a == b:
             return Link()
         one, other = self._by_name[a], self._by_name[b]
@@ -70,20 +70,20 @@ class Cluster:
 
 @dataclass(frozen=True, slots=True)
 class Task:
-    """A task, with its costs in seconds and bytes."""
+    """A task to schedule, with its costs in seconds and bytes."""
 
     name: str
     sources: tuple[str, ...]
     seconds: Mapping[str, float]  #: by device name; a device without an entry cannot run the task
     bytes: float = 0.0  #: size of the result
-    work: float = 0.0  #: bytes beside inputs and result during the run; a task of 0 s may use none
+    work: float = 0.0  #: memory during the run beside inputs and result, in bytes; 0 for a task of 0 s
     parts: int = 1  #: upper bound on the number of band slices, among which ``work`` is divided
-    takes: Mapping[str, float] = field(default_factory=dict)  #: bytes to send of a source, if not all
+    takes: Mapping[str, float] = field(default_factory=dict)  #: bytes that a source sends, if not its whole result
 
 
 @dataclass(frozen=True, slots=True)
 class Slot:
-    """The place of a task in a schedule: its device and its times."""
+    """The entry of a task in a schedule: its device, start and end."""
 
     task: str
     device: str
@@ -95,7 +95,7 @@ class Slot:
 
 @dataclass(frozen=True, slots=True)
 class Move:
-    """A transfer of a result to another device, which holds the copy ``until`` the last use there."""
+    """A transfer of a result to another device, which keeps the copy until its last use there."""
 
     task: str
     bytes: float
@@ -108,7 +108,7 @@ class Move:
 
 @dataclass(frozen=True, slots=True)
 class Schedule:
-    """A schedule: device and times of each task, in order of time, with makespan, memory and transfers."""
+    """A schedule: the device and times of each task, in order of time, with makespan, peak memory and transfers."""
 
     slots: tuple[Slot, ...]
     makespan: float
@@ -124,7 +124,7 @@ class Schedule:
         return {name: time / self.makespan if self.makespan else 0.0 for name, time in busy.items()}
 
     def critical_path(self) -> tuple[Slot, ...]:
-        """Return the critical path: the slots of which each delays the next, up to the slot that ends last."""
+        """Return the critical path: tasks of which each delays the start of the next, up to the task that ends last."""
         by_name = {slot.task: slot for slot in self.slots}
         at = max(self.slots, key=lambda slot: slot.end, default=None)
         path = []
@@ -135,19 +135,19 @@ class Schedule:
 
 
 class TooLarge(ValueError):
-    """Error for a task that fits on no device: it needs ``needed`` bytes on ``device``, which has ``memory`` bytes."""
+    """Error for a task that fits on no device, with the bytes that the task needs and the bytes that a device has."""
 
     def __init__(self, task: str, device: str, needed: float, memory: float, parts: int = 1) -> None:
         self.task, self.device, self.needed, self.memory = task, device, needed, memory
         cut = f" in {parts} parts" if parts > 1 else ""
         super().__init__(
-            f"{task} does not fit: its inputs, result and results held there need {_size(needed)} on {device}{cut}, "
+            f"{task} does not fit: its inputs, result and results kept there need {_size(needed)} on {device}{cut}, "
             f"which has {_size(memory)}"
         )
 
     @property
     def short(self) -> float:
-        """Return the number of bytes that the device lacks."""
+        """Return the number of bytes by which the memory of the device is too small."""
         return self.needed - self.memory
 
 

@@ -43,7 +43,7 @@ class Family:
         return [d for d in self.done if d.state != "not needed"]
 
     def cells(self) -> tuple[str, ...]:
-        """Return the table row of these items, with the columns of `HEADER`."""
+        """Return the table row of a step and its items, with the columns of `HEADER`."""
         done, count = self.needed, len(self.members)
         name = f"{self.name} ×{count}" if count > 1 else self.members[0]
         if not done:
@@ -70,7 +70,7 @@ def mode_for(silent: bool) -> Mode:
 
 
 class ProgressTable(ABC):
-    """A table that is on the screen during a ``with`` block."""
+    """A table that is shown on the screen during a ``with`` block."""
 
     header: Sequence[str]
     widths: Sequence[int]  #: least widths of the columns of plain lines
@@ -109,7 +109,7 @@ class ProgressTable(ABC):
         print("  " + "  ".join(padded).rstrip(), flush=True)
 
     def show_error(self, plain: Iterable[str], live: str) -> None:
-        """Print an error: the lines ``plain`` below the last plain row, or the text ``live`` above a live table."""
+        """Print an error: as the lines ``plain`` below plain rows, or as the text ``live`` above a live table."""
         if self.mode == "plain":
             print(*plain, sep="\n", flush=True)
         elif self.mode == "live":
@@ -170,7 +170,10 @@ def families(recipe: Recipe, names: Iterable[str]) -> dict[str, Family]:
 
 
 def note(families: dict[str, Family], event: Event) -> Family:
-    """Add an event to its step and return the items of this step; a second attempt of a run may add steps."""
+    """Add an event to the items of its step, and return these items.
+
+    A second attempt of a run may have steps that the first attempt did not have.
+    """
     short = event.step.partition("[")[0]
     family = families.setdefault(short, Family(short, [], ""))
     if event.step not in family.members:
@@ -218,7 +221,7 @@ def left_out_line(doc: Mapping[str, Any]) -> str:
 
 
 def next_commands(recipe: Recipe) -> list[str]:
-    """Return three commands that work on this recipe."""
+    """Return three example commands for a recipe, each with a comment."""
     name, noise = recipe.name, "sensor.read_noise"
     commands = [
         (f'neusee run {name} {noise}="20 e-"', "only what follows is run", noise in recipe.config.settings),

@@ -1,6 +1,6 @@
-"""Contents of the report of a run: figures, result table, data files, and the steps that each of these reads.
+"""Contents of the report of a run: figures, result table, data files, and the steps that these read.
 
-Only this file names the steps of the camera graph. A need is a text that names a value in the notation of a recipe:
+Only this file names the steps of the camera graph. A need is a text that names the value of one argument:
 
     psf[mask]                    the value of a step
     spot[mask,*]                 a dictionary with the value of each item of a step
@@ -21,7 +21,7 @@ from neusee.workflows.tolerance.cheaper_steps import with_substitutions
 
 @dataclass(frozen=True, slots=True)
 class Figure:
-    """A figure of the report: title, caption, drawing function, and the value that each of its arguments needs."""
+    """A figure of the report: title, caption, drawing function, and the source of each argument of this function."""
 
     name: str
     title: str
@@ -113,7 +113,7 @@ FIGURES = (
 
 
 def _row(arm: str) -> dict[str, str]:
-    """Return the step that each column of the result table reads, for the arm ``plain`` or ``mask``."""
+    """Return the step that each column of the result table reads, for the ``plain`` lens or for the ``mask``."""
     steps = {"peak/I_sat": "peak", "LSR": "lsr", "BSR": "bsr", "quality": "developed_quality", "saturated": "saturated"}
     return {column: f"{step}[{arm}]" for column, step in steps.items()}
 
@@ -130,7 +130,7 @@ SHOWN = ("transfer",)
 BANDS = "bands"
 LINES = "line[*]"
 
-#: Files of ``data/``: the format of each file, and the needs of its writer.
+#: Files of ``data/``: the format of each file, and the needs of the function that writes the file.
 FILES: Mapping[str, tuple[str, Mapping[str, str]]] = {
     "radiance.exr": ("spectral", {"cube": "radiance", "bands": "bands"}),
     "psf_plain.exr": ("spectral", {"cube": "psf[plain]", "bands": "bands"}),

@@ -18,11 +18,11 @@ from neusee.workflows.report.contents import FILES
 from neusee.workflows.report.run_pictures import DerivedFile, files_of
 from neusee.workflows.store.derived_files import DerivedFiles
 
-_VERSION = 1  #: of the file formats; increase the number when a file is written differently
+_VERSION = 1  #: version of the file formats; to be increased when a file is written differently
 
 
 def exports(result: Result, shelf: DerivedFiles) -> tuple[dict[str, Path], dict[str, str]]:
-    """Return the path of each file for ``data/``, and for each file that cannot be written, the reason."""
+    """Write the data files of a run; return the path of each file, and the reason for each missing file."""
     outputs = {step: step for step in result.recipe.outputs}
     contents = {**FILES, "outputs.safetensors": ("safetensors", outputs)}
     files = (
@@ -66,7 +66,7 @@ def png16(image: Tensor) -> bytes:
     words = image.detach().cpu().double().round()
     if image.ndim != 3 or image.shape[0] != 3 or float(words.min()) < 0 or float(words.max()) > 65535:
         raise ValueError(
-            f"a 16-bit PNG needs an image (3, y, x) of values in [0, 65535], not of shape {tuple(image.shape)}"
+            f"a 16-bit PNG needs shape (3, y, x) and values in [0, 65535]; this image has shape {tuple(image.shape)}"
         )
     height, width = image.shape[1:]
     big = words.permute(1, 2, 0).to(torch.int32).numpy().astype(">u2").reshape(height, -1)

@@ -29,7 +29,7 @@ _LONGEST = 100  #: characters of a value in a table, at most
 
 
 def numbers_of(result: Result) -> dict[str, float | list[float]]:
-    """Return the figures of merit that ``neusee run`` prints, by name; a figure of each band is a list."""
+    """Return the figures of merit that ``neusee run`` prints, by name; a figure for each band is a list."""
     recipe = result.recipe.unsubstituted or result.recipe
     names = metrics_of(recipe, {*result.keys, *wanted(recipe)})
     absent = [name for name in names if name not in result.values]
@@ -63,7 +63,7 @@ def result_line(result: Result) -> str:
 
 
 def result_html(result: Result) -> str:
-    """Return a page with pictures, the result table and the state of each step, without values that take over 2 s."""
+    """Return an HTML page with pictures, result table and states of steps; omit values that take over 2 s."""
     values = _at_hand(result, [*_of_table(result), *_of_overview().values()])
     return filled(
         "notebook.html.j2",
@@ -91,7 +91,7 @@ def _of_overview() -> dict[str, str]:
 
 
 def _at_hand(result: Result, steps: Iterable[str]) -> dict[str, Any]:
-    """Return the values of those ``steps`` that are stored, or that can be computed again in 2 s."""
+    """Return the values of the ``steps`` that are stored or can be computed again within 2 s."""
     held = {name for name, key in result.keys.items() if name in result.values or result.store.has(key)}
     sources = {name: () if name in held else result.recipe.steps[name].sources for name in result.keys}
     kept: list[str] = []
@@ -155,7 +155,7 @@ def _steps(result: Result) -> dict[str, Any]:
 
 
 def _pictures(values: Mapping[str, Any]) -> list[dict[str, Any]]:
-    """Encode the pictures of the camera overview in one scale, or up to four other images if these are missing."""
+    """Encode the pictures of the camera overview, or up to four other images if a picture is missing."""
     from neusee.workflows.report.figures.camera_overview import centre, high
 
     needs = _of_overview()
@@ -201,7 +201,7 @@ def _picture(name: str, linear: Tensor, edge: int) -> dict[str, Any]:
 
 
 def recipe_html(recipe: Recipe) -> str:
-    """Return a page with the outputs of a recipe, its changed values, its steps, and every value with its source."""
+    """Return an HTML page with the outputs, the changed values, the steps and all values of a recipe."""
     written = {name: s for name, s in recipe.config.settings.items() if not s.default and not name.startswith("steps.")}
     changed = {name: s for name, s in recipe.config.settings.items() if "argument " in s.source}
     lines = [recipe.title, f"gives {', '.join(by_family(recipe.outputs))}"]
@@ -220,7 +220,7 @@ def recipe_html(recipe: Recipe) -> str:
 
 
 def _graph(recipe: Recipe) -> dict[str, Any]:
-    """Return the table of steps; all items of one step share a row."""
+    """Return the table of the steps of a recipe; all items of one step share a row."""
     rows = []
     for family, names in by_family(recipe.steps).items():
         step = recipe.steps[names[0]]

@@ -28,15 +28,15 @@ class Bound:
         return self.step.node(*inputs, **{**self.step.params, **changes})
 
     def reference(self, *inputs: Any, **changes: Any) -> Any:
-        """Compute the reference of the node, its slow float64 form; raise `Missing` if the node has no reference."""
+        """Call the float64 reference implementation of the node; raise `Missing` if the node has none."""
         if self.step.node.hooks.reference is None:
-            raise Missing(f"the node {self.step.node.path} has no reference, a slow form in float64")
+            raise Missing(f"the node {self.step.node.path} has no reference implementation in float64")
         return self.step.node.hooks.reference(*inputs, **{**self.step.params, **changes})
 
 
 @dataclass(frozen=True, slots=True)
 class Found:
-    """A resolved need: the steps to read, a function that returns the argument, and the identity of the argument."""
+    """The source of an argument: steps to read, a function that returns the argument, and a part of the cache key."""
 
     steps: tuple[str, ...]
     make: Any  #: a function of the values by step, which returns the argument
@@ -44,7 +44,7 @@ class Found:
 
 
 def find(need: str, recipe: Recipe, keys: Mapping[str, str], code: Code) -> Found:
-    """Resolve a need such as ``psf[mask]``, in the notation of `neusee.workflows.report.contents`."""
+    """Find the source of an argument from a text such as ``psf[mask]``; the module `contents` lists all forms."""
     if need.endswith("()"):
         step = _step(need[:-2], recipe)
         params = [[name, plain(value)] for name, value in step.params.items()]
@@ -67,7 +67,7 @@ def _step(name: str, recipe: Recipe) -> Step:
 
 
 def _items(prefix: str, recipe: Recipe, keys: Mapping[str, str]) -> Found:
-    """Resolve the need of all items of a step, such as ``spot[mask,``; the argument is a dictionary by item."""
+    """Find the items of a step whose names begin with ``prefix``, such as ``spot[mask,``."""
     names = {n[len(prefix) : -1]: n for n in recipe.steps if n.startswith(prefix) and n in keys}
     if not names:
         raise Missing(f"the recipe has no step {prefix}…]")

@@ -27,7 +27,7 @@ _MOST = 4096  #: elements, at most, of a result whose numbers become rows
 
 
 def expected(recipe: Recipe, value: Value) -> list[dict[str, Any]]:
-    """Return every expected number of the recipe, with the number from the run."""
+    """Return every expected number of a recipe, with the number that the run gave."""
     rows = []
     for e in recipe.expect:
         found: Any = value(e.step)
@@ -60,7 +60,7 @@ def _cell(found: Any, field: str, number: Callable[[Tensor, int], Any], form: st
 
 
 def _band(recipe: Recipe, keys: Mapping[str, str], value: Value) -> tuple[int, str]:
-    """Return the index and the text of the band that is nearest to the first laser, or to 550 nm without a laser."""
+    """Return the index and the name of the band nearest to the first laser, or to 550 nm without a laser."""
     if BANDS not in keys:
         return 0, "the first band"
     prefix = LINES.removesuffix("*]")
@@ -75,12 +75,12 @@ def metrics(recipe: Recipe, keys: Mapping[str, str], value: Value) -> list[list[
 
 
 def metrics_of(recipe: Recipe, among: Container[str]) -> list[str]:
-    """Return those steps of ``among`` whose nodes are metrics, in the order of the recipe."""
+    """Return the steps in ``among`` whose nodes are metrics, in the order of the recipe."""
     return [name for name, step in recipe.steps.items() if name in among and step.node.path.startswith("metrics.")]
 
 
 def numbers_of(step: str, found: Any) -> list[list[Any]]:
-    """Return a row (step, field, index, value) for each number of a small result, and no row for a picture."""
+    """Return a row (step, field, index, value) for each number of a small result; a picture gives no rows."""
     rows: list[list[Any]] = []
     for field, tensor in _fields(found):
         if tensor.numel() <= _MOST and not tensor.is_complex():

@@ -89,7 +89,7 @@ def _rename(part: Path, target: Path) -> Path:
 
 
 def _point(root: Path, name: str) -> None:
-    """Make ``latest`` a symbolic link to the run ``name``, or a file with this name if links are not possible."""
+    """Make ``latest`` a symbolic link to the run ``name``, or a file with this text if links are not possible."""
     part = root / f".latest.{os.getpid()}"
     try:
         part.symlink_to(name, target_is_directory=True)

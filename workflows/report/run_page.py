@@ -102,7 +102,7 @@ def rebuild(folder: Path) -> Path:
 
 
 def verdict(found: Sequence[Mapping[str, Any]], failed: Sequence[str]) -> str:
-    """Return one line with the number of expected numbers that are met, and the number of checks that failed."""
+    """Return one line with the counts of expected numbers that the run met and of checks that failed."""
     met = sum(e["ok"] for e in found)
     some = f"{met} of {len(found)} expected numbers within tolerance"
     numbers = some if found else "No expected numbers in this recipe"
@@ -144,7 +144,7 @@ def _step(done: StepRecord, result: Result) -> dict[str, Any]:
 
 
 def _planned(result: Result) -> float | None:
-    """Return the planned seconds of a run; None if the plan lacks a step that ran, or its cost."""
+    """Return the planned duration of a run (s), or None if the plan lacks a step that ran, or the cost of a step."""
     ran = [done for done in result.done.values() if done.state == "run"]
     if result.schedule is None or any(done.predicted is None for done in ran):
         return None
@@ -153,14 +153,14 @@ def _planned(result: Result) -> float | None:
 
 
 def _remembered(done: StepRecord, about: Mapping[str, Any]) -> StepRecord:
-    """Return the record of a step that did not run, completed by the metadata ``about`` its stored result."""
+    """Complete the record of a step that did not run from the metadata of its stored result."""
     checks = tuple(Check(text, ok) for text, ok in about.get("checks", ()))
     why = f"made {about['date'][:16].replace('T', ' ')} UTC"
     return replace(done, why=why, facts=facts_in(about), checks=checks, bytes=about["bytes"])
 
 
 def unit_of(docstring: str) -> str:
-    """Return the unit of a node's result: in ``Units:``, the word after ``result``, or the first word without it."""
+    """Return the unit of a node's result from the ``Units:`` line of the docstring of the node."""
     lines = (line.strip() for line in docstring.splitlines())
     units = next((line for line in lines if line.startswith("Units:")), "Units:").removeprefix("Units:").strip()
     before, found, after = units.partition("result ")

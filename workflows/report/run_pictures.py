@@ -1,4 +1,4 @@
-"""Pictures of a run. A picture is drawn once and stored under a key of the values that the picture shows."""
+"""Pictures of a run: each picture is drawn once and stored under a key of the values that the picture shows."""
 
 from __future__ import annotations
 
@@ -33,7 +33,7 @@ TIMELINE = (
 
 @dataclass(frozen=True, slots=True)
 class DerivedFile:
-    """A file made from results: the needs of the arguments of ``make``, a function that returns the bytes."""
+    """A file that the function ``make`` computes from results, with the source of each argument of this function."""
 
     name: str
     suffix: str
@@ -46,7 +46,7 @@ Job = tuple[DerivedFile, str, Mapping[str, Found]]  #: a file, its key, and the 
 
 
 def pictures(result: Result, shelf: DerivedFiles) -> tuple[dict[str, Path], dict[str, str]]:
-    """Return the path of each picture, and for each picture that cannot be drawn, the reason."""
+    """Draw the pictures of a run; return the path of each picture, and the reason for each missing picture."""
     drawing = engine(*sorted({figure.draw.partition(":")[0] for figure in FIGURES}), "report.figures.recipe_graph")
     files = (DerivedFile(f.name, ".png", ("figure", f.draw, drawing), f.needs, _function(f.draw)) for f in FIGURES)
     paths, missing = files_of(files, result, shelf)
@@ -56,7 +56,7 @@ def pictures(result: Result, shelf: DerivedFiles) -> tuple[dict[str, Path], dict
 def files_of(
     files: Iterable[DerivedFile], result: Result, shelf: DerivedFiles
 ) -> tuple[dict[str, Path], dict[str, str]]:
-    """Return the path of each file, either stored or made now, and for each file that cannot be made, the reason."""
+    """Make the files that are not stored; return the path of each file, and the reason for each missing file."""
     code, jobs, missing = Code(result.store.code_memo), list[Job](), dict[str, str]()
     for file in files:
         try:
@@ -98,7 +98,7 @@ def _in_turn(known: Iterable[StepRecord]) -> tuple[Slot, ...]:
 
 
 def _arguments(needs: Mapping[str, str], result: Result, code: Code) -> dict[str, Found]:
-    """Resolve the need of each argument; omit an argument if its need begins with ``?`` and its step is missing."""
+    """Find the source of each argument; omit an optional argument, marked by ``?``, if its step is missing."""
     found = {}
     for argument, need in needs.items():
         try:
@@ -110,7 +110,7 @@ def _arguments(needs: Mapping[str, str], result: Result, code: Code) -> dict[str
 
 
 def _made(jobs: Sequence[Job], result: Result, shelf: DerivedFiles, missing: dict[str, str]) -> dict[str, Path]:
-    """Return the path of each file; one run provides the values for all files that are not stored."""
+    """Make the files that are not stored from the values of one run; return the path of each file."""
     paths = {file.name: path for file, key, _ in jobs if (path := shelf.find(key, file.suffix))}
     new = [job for job in jobs if job[0].name not in paths]
     steps = {step for _, _, found in new for x in found.values() for step in x.steps}
@@ -133,7 +133,7 @@ def _function(path: str) -> Callable[..., bytes]:
 
 
 def _graph(result: Result, shelf: DerivedFiles, drawing: str) -> Path:
-    """Draw the graph with the state of each step, and also the graph that a run from the cache alone will show."""
+    """Draw the graph with the states of all steps, and also the graph of a later run that loads all results."""
     states = {name: "cached" if done.state == "not needed" else str(done.state) for name, done in result.done.items()}
     again = {name: "left out" if state == "left out" else "cached" for name, state in states.items()}
     sources = {name: list(result.recipe.steps[name].sources) for name in result.done}

@@ -1,4 +1,4 @@
-"""Times of a run: seconds of computing, seconds that the cache saved, and the seconds that were predicted."""
+"""Times of a run: computing time, time saved by the cache, and predicted time."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ StepRow = Mapping[str, Any]  #: a step in the document of a run
 
 
 def timing(steps: Sequence[StepRow], planned: float | None = None) -> dict[str, Any]:
-    """Return predicted, planned, actual and saved seconds, and bytes read and written; each key counts once."""
+    """Return predicted, planned, actual and saved seconds, and bytes read and written; each result counts once."""
     ran = [s for s in steps if s["state"] == "run"]
     own = {s["key"] for s in ran}
     served = _once(s for s in steps if s["state"] in ("cached", "not needed") and s["key"] not in own)
@@ -36,7 +36,7 @@ def timing(steps: Sequence[StepRow], planned: float | None = None) -> dict[str, 
 
 
 def _once(steps: Iterable[StepRow]) -> list[StepRow]:
-    """Return one step for each key: a step that was read from the cache, or the first step if none was read."""
+    """Return one step for each result: a step that was read from the cache, or else the first step."""
     found: dict[str, StepRow] = {}
     for step in steps:
         if step["key"] not in found or step["state"] == "cached":
@@ -45,7 +45,7 @@ def _once(steps: Iterable[StepRow]) -> list[StepRow]:
 
 
 def said_of(found: Mapping[str, Any]) -> list[str]:
-    """Return the numbers from `timing` as sentences."""
+    """Return the times and sizes from `timing` as sentences."""
     lines = []
     if found["ran"]:
         lines.append(f"{found['ran']} of {found['steps']} steps ran: {_seconds(found['seconds'])} of computing time.")

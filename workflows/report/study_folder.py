@@ -2,7 +2,7 @@
 
 run = StudyRun("stability", recipe, command)            # starts the clock
 document = run.document({"failed": 3})                  # the content of provenance.json
-report = StudyReport("Stability of it", lead, sections) # the page, its pictures and its tables
+report = StudyReport("Stability", lead, sections) # the page, its pictures and its tables
 folder = run.write(runs, key, document, report)
 """
 
@@ -41,7 +41,7 @@ class StudyReport:
     tables: Mapping[str, CsvTable] = field(default_factory=dict)  #: by file name
     files: Mapping[str, Content] = field(default_factory=dict)  #: by file name
     shown: Sequence[str] = SHOWN  #: the values of the document that the page shows
-    banner: str = ""  #: reason why nobody may use the result
+    banner: str = ""  #: reason why the result must not be used
 
     def write(self, folder: RunFolder, document: Mapping[str, Any]) -> None:
         """Write the page, the pictures, the tables, the other files, and ``document`` as ``provenance.json``."""
@@ -78,7 +78,10 @@ class StudyRun:
         }
 
     def write(self, runs: Path, key: str, document: Mapping[str, Any], report: StudyReport, name: str = "") -> Path:
-        """Write the folder ``runs/<date>_<recipe>_<name>_<key>`` and return its path; ``name`` replaces the kind."""
+        """Write the folder ``runs/<date>_<recipe>_<name>_<key>`` and return its path.
+
+        Without ``name``, the folder has the kind of the study in its name.
+        """
         with new_run(runs, f"{self.recipe.name}_{name or self.kind.replace('-', '_')}", key) as folder:
             report.write(folder, document)
         return folder.path

@@ -29,7 +29,7 @@ class Section:
 
 
 def page(title: str, lead: str, sections: Sequence[Section], provenance: Mapping[str, Any], banner: str = "") -> str:
-    """Return the HTML of a page; ``lead`` states the result, and a red ``banner`` says why nobody may use it."""
+    """Return the HTML of a page; ``lead`` states the result, and a red ``banner`` says why it must not be used."""
     return filled(
         "study_page.html.j2",
         title=title,
@@ -41,7 +41,7 @@ def page(title: str, lead: str, sections: Sequence[Section], provenance: Mapping
 
 
 def filled(template: str, **values: Any) -> str:
-    """Return the HTML of a template of this room with ``values`` filled in."""
+    """Fill ``values`` into an HTML template of the folder ``templates``, and return the HTML."""
     from jinja2 import Environment, StrictUndefined
 
     text = (Path(__file__).parent / "templates" / template).read_text(encoding="utf-8")
@@ -49,7 +49,7 @@ def filled(template: str, **values: Any) -> str:
 
 
 def said(value: Any) -> str:
-    """Return the text of a cell: three digits of a real number, all digits of an integer, a dash for None."""
+    """Return the text of a table cell: three digits of a real number, all digits of an integer, a dash for None."""
     if value is None:
         return "–"
     if isinstance(value, bool):
@@ -76,7 +76,7 @@ def _section(anchor: str, section: Section) -> dict[str, Any]:
 
 
 def _refuse_stray_marks(section: Section) -> None:
-    """Raise ValueError if a mark is outside the table, where nobody would see the mark."""
+    """Raise ValueError if a mark refers to a cell outside the table, where the mark would be invisible."""
     for row, column in section.marks:
         if not (0 <= row < len(section.rows) and 0 <= column < len(section.rows[row])):
             raise ValueError(
@@ -93,7 +93,7 @@ def _is_number(value: Any) -> bool:
 
 
 def _holds_numbers(cells: Sequence[Any]) -> bool:
-    """Return True if a column holds numbers only, apart from empty cells."""
+    """Return True if a column contains only numbers, apart from empty cells."""
     filled_cells = [c for c in cells if c is not None]
     return bool(filled_cells) and all(map(_is_number, filled_cells))
 

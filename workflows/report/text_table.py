@@ -1,4 +1,4 @@
-"""Tables as lines of text: each column is as wide as its widest cell."""
+"""Tables as lines of text, in which each column is as wide as its widest cell."""
 
 from __future__ import annotations
 

@@ -19,9 +19,9 @@ NORM = "root mean square over the largest element"
 
 
 def spent(result: Result) -> dict[str, Any]:
-    """Return the tolerance of a run and its use as plain JSON.
+    """Return the tolerance of a run, and the use of this tolerance, as plain JSON.
 
-    ``bounds`` has the error bound of each output, and of each input of a step that states no error bound.
+    ``bounds`` has the error bound of each output, and of each input of a step without an error bound.
     ``measured`` has the error of each output relative to a run with ``--exact``, if the store has its results.
     """
     costs = past_costs(result.store) if result.recipe.substitutions or _left_out(result) else Costs([])
@@ -55,7 +55,7 @@ def said_of_economies(account: Mapping[str, Any]) -> str:
     found = max(account["measured"].values(), default=None)
     measured = f", measured {found:.1e}" if found is not None else ""
     names = ", ".join([*summed, *nothing])
-    return f"spared   {names}: error at most {worst:.1e} in all{measured}; tolerance {account['tolerance']:g}"
+    return f"cheaper  {names}: error at most {worst:.1e} in all{measured}; tolerance {account['tolerance']:g}"
 
 
 def _within(bound: float | None) -> str:

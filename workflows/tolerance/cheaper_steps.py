@@ -1,8 +1,8 @@
-"""Cheaper steps: substitutes for full steps where the error in the outputs stays below the tolerance.
+"""Cheaper substitutes for steps, used where the error in the outputs stays below the tolerance.
 
 The sensor sums bands into a few channels before any random step. Where the steps after an image read only such sums,
-the sums are convolved instead of the bands. The substitutes are added beside the full steps, and only the wires of
-their readers change. A value requested by name is therefore always computed in full.
+the sums are convolved instead of the bands. The substitutes are added beside the full steps, and only the inputs of
+the later steps change. A value requested by name is therefore always computed in full.
 """
 
 from __future__ import annotations
@@ -20,16 +20,17 @@ from neusee.workflows.tolerance.zero_effect_steps import without_nothing
 if TYPE_CHECKING:
     from neusee.nodes import Node
 
-CHANNELS = 0.25  #: share of the tolerance for the channels of one image; the level may follow a second image
+CHANNELS = 0.25  #: share of the tolerance for the channels of an image; the scene level may depend on a second image
 _LEAST = 2e-5  #: tolerance below which sums over bands cannot be proved, because their round-off alone is 1.4e-6
-_MIXTURE = 0.1  #: share for a low-rank cube, rounded down to a power of ten so that the cube seldom changes
+_MIXTURE = 0.1  #: share of the tolerance for a low-rank cube, rounded to a power of ten so that the cube seldom changes
 
 
 def with_substitutions(recipe: Recipe, wanted: Iterable[str], pinned: Collection[str] = ()) -> Recipe:
-    """Return ``recipe`` with cheaper steps that suffice for the outputs ``wanted``, or unchanged if it is exact.
+    """Return ``recipe`` with cheaper steps in place of full steps; an exact recipe is returned unchanged.
 
-    The scene of an image that follows a step in ``pinned`` stays whole, because a cube that is being
-    optimised has no low-rank form yet. A recipe with substitutions does not change again.
+    The errors of the outputs ``wanted`` stay within the tolerance. An image whose scene depends on a step in
+    ``pinned`` stays in full, because a cube that is being optimised has no low-rank form yet. A second call
+    changes nothing.
     """
     wanted = frozenset(wanted)
     if recipe.exact:
@@ -50,13 +51,13 @@ def with_substitutions(recipe: Recipe, wanted: Iterable[str], pinned: Collection
 
 
 def _limited(recipe: Recipe, order: Sequence[str]) -> Recipe:
-    """Return the recipe with a list of its steps without error bound, if the tolerance exceeds `METRIC_TOLERANCE`."""
+    """Mark in the recipe the steps whose errors have no bound, if the tolerance exceeds `METRIC_TOLERANCE`."""
     steps = unbounded_steps(recipe, order) if recipe.tolerance > METRIC_TOLERANCE else frozenset[str]()
     return recipe if steps == recipe.unbounded else replace(recipe, unbounded=steps)
 
 
 def _dependent(recipe: Recipe, order: Iterable[str], pinned: Collection[str]) -> set[str]:
-    """Return the pinned steps and all steps that depend on a pinned step."""
+    """Return the steps in ``pinned`` and all steps that depend on a step in ``pinned``."""
     dependent = set(pinned)
     for name in order:
         if not dependent.isdisjoint(recipe.steps[name].sources):
@@ -65,7 +66,7 @@ def _dependent(recipe: Recipe, order: Iterable[str], pinned: Collection[str]) ->
 
 
 def _readers(recipe: Recipe, order: Iterable[str]) -> dict[str, list[str]]:
-    """Return the steps that read the result of each step, by the name of the step that is read."""
+    """Return for each step the names of the steps that read its result."""
     readers = defaultdict[str, list[str]](list)
     for name in order:
         for source in dict.fromkeys(recipe.steps[name].sources):
@@ -75,7 +76,7 @@ def _readers(recipe: Recipe, order: Iterable[str]) -> dict[str, list[str]]:
 
 @dataclass(frozen=True)
 class Asked:
-    """The sums over the bands of an image that later steps need: one for each channel, and perhaps one for the well."""
+    """The sums over the bands of an image that later steps need, with the steps that read these sums."""
 
     bands: str
     responses: str
@@ -84,7 +85,7 @@ class Asked:
 
 
 def asked_of(recipe: Recipe, image: str, wanted: Iterable[str]) -> Asked | None:
-    """Return the sums over the bands of ``image`` that the outputs ``wanted`` need, or None if outputs need more."""
+    """Return the sums over the bands of ``image`` that outputs need, or None if an output needs single bands."""
     names = _readers(recipe, needed(recipe, wanted)).get(image, [])
     readers = [recipe.steps[name] for name in names]
     weights = _Draft(recipe, frozenset(wanted), {}).spectral(image, readers)
@@ -93,7 +94,7 @@ def asked_of(recipe: Recipe, image: str, wanted: Iterable[str]) -> Asked | None:
 
 @dataclass
 class _Draft:
-    """A recipe, with the cheaper steps that are to replace some of its steps."""
+    """A recipe in which some steps are being replaced by cheaper steps."""
 
     recipe: Recipe
     wanted: frozenset[str]
@@ -112,7 +113,7 @@ class _Draft:
         name, within = f"{image.name}.channels", self.recipe.allowed(image.name) * CHANNELS
         cube, rows = self._mixture(radiance, image), self._rows(*weights, readers, image)
         wires = {"radiance": cube, "psf": image.wires.get("psf"), "rows": rows}
-        # the level follows the brightest pixel
+        # the level of the scene follows the brightest pixel
         largest = any(reader.node.hooks.band_invariant is not None for reader in readers)
         self._add(name, node, wires, {**image.params, "within": within, "largest": largest}, image)
         for reader in readers:
@@ -121,7 +122,7 @@ class _Draft:
         self.substitutions.append(Substitution(image.name, name, within, "only sums over its bands are needed"))
 
     def spectral(self, image: str, readers: Sequence[Step]) -> tuple[str, str] | None:
-        """Return the bands and responses with which all ``readers`` sum an image, or None if a reader needs more."""
+        """Return the bands and the responses that all ``readers`` read, or None if a reader needs single bands."""
         pairs = {(r.wires.get("bands"), r.wires.get("responses")) for r in readers if "responses" in r.node.inputs}
         if len(pairs) != 1 or not all(self._sums(r, image) for r in readers):
             return None
@@ -129,7 +130,7 @@ class _Draft:
         return (bands, responses) if isinstance(bands, str) and isinstance(responses, str) else None
 
     def finished(self) -> Recipe:
-        """Return the recipe with the cheaper steps and the changed wires."""
+        """Return the recipe with the cheaper steps and with changed connections."""
         if not self.substitutions:
             return self.recipe
         steps = {**self.recipe.steps, **self.added, **self.rewired}
@@ -139,7 +140,7 @@ class _Draft:
         return replace(self.recipe, steps=steps, substitutions=substitutions, unsubstituted=whole)
 
     def _sums(self, reader: Step, image: str) -> bool:
-        """Return True if a step reads from the image only sums over the bands."""
+        """Return True if a step needs from an image only its sums over the bands."""
         node, band_invariant = reader.node, reader.node.hooks.band_invariant
         reads = {i for i, wire in reader.wires.items() if image == wire or (isinstance(wire, tuple) and image in wire)}
         if not reads <= set(node.accepts_channel_sums) or (band_invariant and not band_invariant(reader.params)):
@@ -147,14 +148,14 @@ class _Draft:
         return all(self._even(reader.wires.get(i)) for i in node.needs_band_invariant)
 
     def _even(self, wire: Wire) -> bool:
-        """Return True if the result at a wire is the same for every band, as its node states, or the wire is empty."""
+        """Return True if a wire is empty, or if its node states that the result is the same for every band."""
         if not isinstance(wire, str):
             return wire is None
         step = self.recipe.steps[wire]
         return step.node.hooks.band_invariant is not None and step.node.hooks.band_invariant(step.params)
 
     def _rows(self, bands: str, responses: str, readers: list[Step], image: Step) -> str:
-        """Add a step for the weights of the bands in each channel, and in the well if needed; return its name."""
+        """Add a step that computes the weight of each band in each channel sum; return the name of the new step."""
         from neusee.nodes import spectra
 
         well = _well(readers)
@@ -162,7 +163,10 @@ class _Draft:
         return self._add(name, spectra.rows, wires, {"well": well}, image)
 
     def _mixture(self, name: str, image: Step) -> str:
-        """Add a step for the cube ``name`` in low-rank form, converted as early as nodes allow; return its name."""
+        """Add steps that compute the cube ``name`` in low-rank form; return the name of the last new step.
+
+        The conversion to low rank comes as early as the nodes allow.
+        """
         from neusee.nodes import spectra
 
         step, new = self.recipe.steps[name], f"{name}.mixture"
@@ -176,13 +180,13 @@ class _Draft:
         return self._add(new, spectra.compress, {"cube": name}, within, step)
 
     def _add(self, name: str, node: Node, wires: Mapping[str, Wire], params: Mapping[str, Any], like: Step) -> str:
-        """Add a step with the location in the recipe and the device of ``like``; return the name of the new step."""
+        """Add a step with the recipe location and the device of the step ``like``; return the name of the new step."""
         self.added[name] = Step(name, node, params, wires, like.mark, {}, like.device)
         return name
 
 
 def _well(readers: Iterable[Step]) -> bool:
-    """Return True if one of the steps reads bands but no responses, as a step for the well of a pixel does."""
+    """Return True if a step reads bands but no responses, as a step that computes the electrons of a pixel does."""
     return any("bands" in r.node.inputs and "responses" not in r.node.inputs for r in readers)
 
 

@@ -1,4 +1,4 @@
-"""Error budget: the part of the tolerance that omitted steps have used, at each step of a recipe."""
+"""Error budget: the part of the tolerance that omitted steps have used up, for each step of a recipe."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from neusee.workflows.tolerance.skip_decision import FactsOf, SkipDecision, judg
 
 
 class ErrorBudget:
-    """Error bounds of the omitted steps before each step: an omission leaves less tolerance for later steps.
+    """Sum of the error bounds of omitted steps for each step: an omission leaves less tolerance for later steps.
 
     Steps are added in running order, each with `pass_on` or `verdict`.
     """
@@ -29,7 +29,7 @@ class ErrorBudget:
         return twin
 
     def verdict(self, step: Step, params: Mapping[str, Any], facts_of: FactsOf) -> SkipDecision:
-        """Decide whether a step is left out, and return the decision; with `Recipe.exact` every step stays."""
+        """Decide whether a step is left out and return the decision; an exact recipe keeps every step."""
         spent = self.pass_on(step)
         if self._recipe.exact:
             return SkipDecision(float("inf"), False, "the recipe is exact", "")
@@ -44,7 +44,7 @@ class ErrorBudget:
             self._spent[step.name] = {**self._spent.get(step.name, {}), step.name: bound}
 
     def pass_on(self, step: Step) -> dict[str, float]:
-        """Return the bounds of all omitted steps on which ``step`` depends, by the name of the omitted step."""
+        """Return the error bound of each omitted step on which ``step`` depends, by the name of the omitted step."""
         parts = [spent for name in dict.fromkeys(step.sources) if (spent := self._spent.get(name))]
         if not parts:
             return {}

@@ -1,7 +1,8 @@
-"""Error norm: the distance of a result from its reference, as all tolerances and studies measure the distance.
+"""Error norm: the measure of the error of a result for all tolerances and studies.
 
-The norm is the root mean square of the difference over the reference's largest element; 1e-3 is a peak signal-to-noise
-ratio of 60 dB. Every bound of a node bounds the largest difference, and therefore also this norm.
+The norm is the root mean square of the difference between result and reference, divided by the largest element of the
+reference; 1e-3 is a peak signal-to-noise ratio of 60 dB. Every error bound of a node bounds the largest difference, and
+therefore also this norm.
 """
 
 from __future__ import annotations
@@ -16,22 +17,22 @@ _PART = 1 << 22  #: elements that are compared at once in float64
 
 
 def error_of(value: Any, reference: Any) -> float:
-    """Return the root mean square of ``value - reference`` over the largest ``|reference|``.
+    """Return the root mean square of ``value - reference``, divided by the largest ``|reference|``.
 
-    For tuples, lists and mappings the worst member counts. Where the reference is 0 everywhere, the root mean square
-    itself is returned. Elements that are the same infinity, or both NaN, agree; an element that is not finite where the
-    other element is finite makes the error infinite. Raises `ValueError` where the values differ in kind or shape.
+    For tuples, lists and mappings the largest error of a member counts. If the reference is 0 everywhere, the root mean
+    square itself is returned. Elements that are the same infinity, or both NaN, agree; an element that is not finite
+    makes the error infinite if the other element is finite. Raises `ValueError` if the values differ in kind or shape.
     """
     return _errors(value, reference)[0]
 
 
 def largest_error(value: Any, reference: Any) -> float:
-    """Return the largest difference over the largest ``|reference|``, with the special cases of `error_of`."""
+    """Return the largest ``|value - reference|``, divided by the largest ``|reference|``."""
     return _errors(value, reference)[1]
 
 
 def _errors(value: Any, reference: Any) -> tuple[float, float]:
-    """Return the root mean square error and the largest error, each of the worst pair of tensors or numbers."""
+    """Return the root mean square error and the largest error, each as the maximum over all pairs of tensors."""
     pairs, mean, largest = [(value, reference)], 0.0, 0.0
     while pairs:
         a, b = pairs.pop()
@@ -68,7 +69,7 @@ def _tensor_errors(a: Tensor, b: Tensor) -> tuple[float, float]:
 
 
 def _kind(x: Any) -> str:
-    return f"a tensor of {tuple(x.shape)}" if isinstance(x, Tensor) else f"a {type(x).__name__}"
+    return f"a tensor of shape {tuple(x.shape)}" if isinstance(x, Tensor) else f"a {type(x).__name__}"
 
 
 def _parts(x: Tensor) -> tuple[Tensor, ...]:

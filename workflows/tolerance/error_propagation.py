@@ -1,7 +1,7 @@
 """Error propagation: upper bounds on the effect of omitted and approximated steps, from node to node.
 
 A node computes the error of its result from the errors of its inputs (`Node.propagate_error`).
-Behind a node without this hook no error is known; the errors of its inputs must meet the tolerance instead.
+After a node without this hook no error bound is known; the errors of its inputs must meet the tolerance instead.
 """
 
 from __future__ import annotations
@@ -28,7 +28,7 @@ class ErrorBounds:
     held: Mapping[str, float] = field(default_factory=dict)  #: of outputs, and of the inputs of nodes without bounds
 
     def of(self, step: str) -> float | None:
-        """Return the error bound of a step's result, or None where no bound is known."""
+        """Return the error bound of a step's result, or None if no bound is known."""
         share = self.shares.get(step, 0.0)
         return share if math.isfinite(share) else None
 
@@ -38,7 +38,7 @@ class ErrorBounds:
         return max(self.held.values(), default=0.0)
 
     def over(self, recipe: Recipe) -> float:
-        """Return the largest ratio of an error bound to the limit that ``recipe`` sets; infinite for a limit of 0."""
+        """Return the largest ratio of an error bound to its limit in ``recipe``; infinity if a limit is 0."""
         shares = [(share, recipe.limit(name)) for name, share in self.held.items() if share > 0]
         return max((share / limit if limit > 0 else math.inf for share, limit in shares), default=0.0)
 
@@ -80,7 +80,7 @@ def _bounds_its_error(step: Step) -> bool:
 def proof(
     recipe: Recipe, order: Iterable[str], wanted: Iterable[str], done: Callable[[str], StepRecord], facts_of: FactsOf
 ) -> ErrorBounds:
-    """Return the error bounds of all results of a run, from bounds and statistics alone; no step is computed."""
+    """Return the error bounds of all results of a run, derived from known statistics without computing a step."""
     bounds: dict[str, ErrorBound] = {}
     held: dict[str, float] = {}
     for name in order:
@@ -113,7 +113,7 @@ def _own(step: Step, done: StepRecord, facts_of: FactsOf) -> float | None:
 
 
 def _carried(step: Step, inputs: list[_Input], result: TensorStats | None) -> float:
-    """Return the error that a step passes on from its inputs to its result; infinite where no bound is known."""
+    """Return the error of a step's result that comes from errors of its inputs, or infinity if no bound is known."""
     errors, hooks = [bound.rms for bound in _flat(inputs)], step.node.hooks
     if not any(errors) or hooks.approximation_error is not None:  # this hook covers all errors of the result
         return 0.0

@@ -1,4 +1,4 @@
-"""Decision to leave out a step, by comparing an error bound from the statistics of its inputs with the tolerance."""
+"""Decision whether a step is left out: the bound on the effect of the step is compared with the tolerance."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ _NO_BOUND = float("inf")
 
 @dataclass(frozen=True, slots=True)
 class SkipDecision:
-    """Decision on leaving a step out: the bound on the effect, the reason, and the step that replaces the result."""
+    """Decision whether a step is left out, with the bound on its effect, the reason, and the step to use instead."""
 
     bound: float
     left_out: bool
@@ -27,7 +27,7 @@ class SkipDecision:
 
 
 class _Later:
-    """Statistics of a result that are looked up or computed only when a bound reads one of the statistics."""
+    """Statistics of a result that are obtained only when an error bound reads one of the statistics."""
 
     __slots__ = ("_find", "_seen")
 
@@ -42,7 +42,7 @@ class _Later:
 
 
 def judge(step: Step, params: Mapping[str, Any], facts_of: FactsOf, tolerance: float) -> SkipDecision:
-    """Decide whether ``step`` may be left out; ``facts_of`` returns the statistics of a step's result by name."""
+    """Decide whether ``step`` may be left out; ``facts_of`` returns the statistics of the result of a named step."""
     node, first = step.node, step.wires.get(step.node.inputs[0])
     if node.hooks.skip_bound is None or not isinstance(first, str):
         return SkipDecision(_NO_BOUND, False, "the step has no input that could replace its result", "")

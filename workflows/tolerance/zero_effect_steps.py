@@ -1,4 +1,4 @@
-"""Removal of steps with zero effect: a laser without power, ghosts without energy, a clean window.
+"""Removal of steps with zero effect, such as a laser without power, ghosts without energy or a clean window.
 
 Such steps are found from parameters alone, before the run: a step whose node bounds its result by 0
 (`Node.zero_bound`) is removed from the inputs to which it would add nothing.
@@ -17,14 +17,14 @@ _DARK = TensorStats((), "float32", 0.0, 0.0, 0.0, 0, True)  #: statistics of a r
 
 
 class _Unknown:
-    """Statistics of a step that has not run: every read of an attribute raises `LookupError`."""
+    """Statistics of a step that has not run yet: reading any attribute raises `LookupError`."""
 
     def __getattr__(self, name: str) -> Any:
         raise LookupError(name)
 
 
 def without_nothing(recipe: Recipe, order: Iterable[str]) -> Recipe:
-    """Return ``recipe`` without the inputs from steps whose result is 0; ``order`` lists the steps in running order."""
+    """Return ``recipe`` without inputs from steps whose result is 0; ``order`` lists the steps with sources first."""
     dark: dict[str, None] = {}
     changed: dict[str, Step] = {}
     for name in order:
@@ -43,7 +43,7 @@ def without_nothing(recipe: Recipe, order: Iterable[str]) -> Recipe:
 
 
 def _nothing(step: Step, dark: Mapping[str, None]) -> bool:
-    """Return True if the node of a step bounds its result by 0, given that the results of the steps ``dark`` are 0."""
+    """Return True if the result of a step must be 0 when the results of the steps in ``dark`` are 0."""
     if step.node.hooks.zero_bound is None:
         return False
     inputs = [_known(step.wires.get(name), dark) for name in step.node.inputs]
@@ -62,7 +62,10 @@ def _known(wire: Wire, dark: Mapping[str, None]) -> Any:
 
 
 def without(step: Step, dark: Mapping[str, None]) -> dict[str, Wire]:
-    """Return the wires of a step without its inputs from the steps ``dark``, and without their companion inputs."""
+    """Return the inputs of a step after removing the inputs from steps in ``dark``.
+
+    The other inputs of the same group are removed, too.
+    """
     wires = dict(step.wires)
     for group in step.node.additive_inputs:
         wire = wires.get(group[0])

@@ -85,11 +85,11 @@ def test_room_is_made(store):
 def test_a_value_is_pinned_by_the_beginning_of_its_key(store):
     assert cache_commands.pin_lines(store, "AB0") == [f"pinned: {KEYS[0]}  s0"]
     assert store.pinned() == {KEYS[0]}
-    with pytest.raises(ValueError, match="'ab' names no single value: these begin so: ab0000000000, ab1111111111"):
+    with pytest.raises(ValueError, match="'ab' must be the start of the key of one value: it matches ab000"):
         cache_commands.pin_lines(store, "ab")
-    with pytest.raises(ValueError, match="'cd' names no single value: no value begins so"):
+    with pytest.raises(ValueError, match="'cd' must be the start of the key of one value: it matches no key"):
         cache_commands.pin_lines(store, "cd")
-    with pytest.raises(ValueError, match="'ab1' names no single pinned value"):
+    with pytest.raises(ValueError, match="'ab1' must be the start of the key of one pinned value"):
         cache_commands.pin_lines(store, "ab1", pin=False)
     assert cache_commands.pin_lines(store, "ab0", pin=False) == [f"no longer pinned: {KEYS[0]}  s0"]
     assert store.pinned() == set()

@@ -97,7 +97,7 @@ def test_a_step_is_cut_where_it_can_be_and_refused_where_it_cannot(machines):
     cards = replace(machines, cluster=replace(machines.cluster, devices=machines.devices[1:]))
     lines = cluster_lines(recipe(), large, cards)
     assert lines[1:] == [
-        "refused: b does not fit: its inputs, result and results held there need 3,200,000,000 B (3.2 GB) on "
+        "refused: b does not fit: its inputs, result and results kept there need 3,200,000,000 B (3.2 GB) on "
         "cuda:1, which has 1,000,000,000 B (1 GB)"
     ]
     banded = recipe()

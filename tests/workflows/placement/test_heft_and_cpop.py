@@ -397,11 +397,11 @@ def test_utilisation_is_the_share_of_the_makespan():
 @pytest.mark.parametrize(
     ("tasks", "message"),
     [
-        ([Task("a", (), {"cuda:1": 1.0})], "a runs on cuda:1; there are: cpu"),
-        ([Task("a", ("pfs",), {"cpu": 1.0}), Task("psf", (), {"cpu": 1.0})], "no task pfs; did you mean psf?"),
+        ([Task("a", (), {"cuda:1": 1.0})], "a needs cuda:1; the cluster has cpu"),
+        ([Task("a", ("pfs",), {"cpu": 1.0}), Task("psf", (), {"cpu": 1.0})], "there is no task pfs; did you mean psf?"),
         ([Task("a", ("b",), {"cpu": 1.0}), Task("b", ("a",), {"cpu": 1.0})], "depend on each other in a cycle"),
         ([Task("a", (), {"cpu": 1.0}), Task("a", (), {"cpu": 1.0})], "two tasks have the name a"),
-        ([Task("a", (), {"cpu": math.nan})], "a must have finite seconds of 0 or more"),
+        ([Task("a", (), {"cpu": math.nan})], "a must take a finite time of 0 s or more"),
     ],
 )
 def test_what_is_no_graph_is_refused(tasks, message):

@@ -96,8 +96,8 @@ def test_every_mistake_is_told_at_once_with_its_place(refused):
         "3:13 devices.b.kind: unknown kind of device; did you mean cuda?",
         "3:27 devices.b.memory: has the wrong unit 'GBB': write a number and one of B, kB, MB, GB, TB, MiB, GiB, TiB",
         "3:42 devices.b.count: must be a whole number from 1 to 4096",
-        "3:51 devices.b.node: must name one machine or more, each once",
-        "4:6 devices.c: must be a mapping of kind, count, memory, speed, node, not a number",
+        "3:51 devices.b.node: must name at least one machine, and no machine twice",
+        "4:6 devices.c: must be a mapping with kind, count, memory, speed, node, not a number",
         "6:3 links.cuda-cpu: needs bandwidth",
         "6:14 links.cuda-cpu.bandwith: unknown; did you mean bandwidth?",
         "6:41 links.cuda-cpu.latency: needs a unit: write a number and one of s, ms, us, µs, μs, ns",
@@ -139,7 +139,7 @@ ONE = "devices: {a: {kind: cpu, memory: 1 GB}}\n"
         ),
         (
             "devices: {a: {kind: cpu, memory: 1 GB, speed: 0}}",
-            "1:47 devices.a.speed: must be a number above 0: the speed relative to the measured machine",
+            "1:47 devices.a.speed: must be a number above 0: the ratio to the measured speed",
         ),
         (
             "devices: {a: {kind: cpu, memory: 1 GB, node: 3}}",

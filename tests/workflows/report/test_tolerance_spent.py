@@ -129,7 +129,7 @@ def test_the_command_line_shows_what_stands_in(warm, tmp_path, monkeypatch):
     done = CliRunner().invoke(app, ["run", "first_light", *SMALL, "--out", str(tmp_path / "runs")])
     assert done.exit_code == 0, done.output
     assert "cube.mixture" in done.output
-    assert "spared   image[mask] (at most" in done.output
+    assert "cheaper  image[mask] (at most" in done.output
 
 
 def test_the_command_line_shows_a_run_that_could_not_prove_its_tolerance(tmp_path, monkeypatch):
@@ -138,7 +138,7 @@ def test_the_command_line_shows_a_run_that_could_not_prove_its_tolerance(tmp_pat
     words = ["run", "first_light", *SMALL, "tolerance=1e-7", "--out", str(tmp_path / "runs")]
     done = CliRunner().invoke(app, words)
     assert done.exit_code == 0, done.output
-    assert "spared" not in done.output
+    assert "cheaper" not in done.output
     assert "\n  cube  " in done.output
 
 

@@ -15,7 +15,7 @@ from neusee.workflows.report.figures.style import ORANGE, canvas, drawn, encoded
 def overview(
     *, truth: Tensor, plain: Tensor, mask: Tensor, restored: Tensor, spots: Mapping[str, Tensor] | None = None
 ) -> Any:
-    """Draw truth, plain lens, mask and restored picture in one scale, then the absolute error; mark each laser."""
+    """Draw the true scene, its pictures through plain lens and mask, the restored picture and its error."""
     white = high(truth)
     pictures = {"truth": truth, "plain lens": plain, "with mask": mask, "restored": restored}
     figure, axes = canvas(13.0, 3.4, 1, 5)
@@ -32,16 +32,16 @@ def overview(
 
 
 def high(values: Tensor) -> float:
-    """Return the level that one value in 200 exceeds; the level is at least 1e-9."""
+    """Return the 99.5 % quantile of the values, but at least 1e-9."""
     sample = values.detach().flatten()[:: max(1, values.numel() // 200_000)].float()
     return max(float(torch.quantile(sample, 0.995)), 1e-9)
 
 
 def centre(image: Tensor, like: Tensor) -> Tensor:
-    """Return the central part of an image, as large as ``like``; the optical axis of both is at sample N // 2."""
+    """Return the central part of an image with the size of ``like``; the optical axis stays at sample N // 2."""
     top, left = (image.shape[d] // 2 - like.shape[d] // 2 for d in (-2, -1))
     if top < 0 or left < 0:
-        raise ValueError(f"a picture of {tuple(image.shape)} is smaller than the true picture, {tuple(like.shape)}")
+        raise ValueError(f"a picture of shape {tuple(image.shape)} is smaller than the scene, {tuple(like.shape)}")
     return image[..., top : top + like.shape[-2], left : left + like.shape[-1]].float()
 
 

@@ -13,13 +13,13 @@ Row = tuple[str, str, float, float]  #: step, lane, start in s since the run beg
 Spans = Mapping[str, tuple[str, float, float]]  #: lane, start in s and duration in s of each step
 
 _COLOURS = (BLUE, ORANGE, GREEN, "#CC79A7", "#56B4E9", "#8C6D1F", "#6A51A3", "#5F6B6D")
-_MOST = 80  #: rows of steps, at most; of more steps, the longest have a row
+_MOST = 80  #: largest number of rows of steps; only the longest steps have a row
 _STEP_HEIGHT, _LANE_HEIGHT = 0.2, 0.3  #: inches, of the row of a step and of a lane
 
 
 @drawn
 def timeline(*, schedule: Schedule, rows: Iterable[Row]) -> Any:
-    """Draw lanes above and steps below, with hollow bars for the plan and solid bars for the run from 0 s on.
+    """Draw the times of devices above and of steps below: hollow bars for the plan, solid bars for the run.
 
     ``rows`` may lack steps of the plan, and may have steps that the plan lacks.
     """
@@ -45,13 +45,13 @@ def timeline(*, schedule: Schedule, rows: Iterable[Row]) -> Any:
 
 
 def _shown(plan: Spans, ran: Spans) -> list[str]:
-    """Return the steps that have a row, in the order of their start."""
+    """Return the steps that have a row in the chart, in the order of their start."""
     longest = sorted({**plan, **ran}, key=lambda s: -max(plan.get(s, ("", 0, 0))[2], ran.get(s, ("", 0, 0))[2]))
     return sorted(longest[:_MOST], key=lambda s: (ran.get(s) or plan[s])[1])
 
 
 def _lanes(ax: Any, colour: Mapping[str, str], plan: Spans, ran: Spans, scale: float) -> None:
-    """Draw two rows for each lane: the plan above, the run below."""
+    """Draw two rows for each device: the plan above, the run below."""
     for y, lane in enumerate(colour):
         planned = [(start * scale, took * scale) for on, start, took in plan.values() if on == lane]
         done = [(start * scale, took * scale) for on, start, took in ran.values() if on == lane]
@@ -101,7 +101,7 @@ def _title(plan: Spans, ran: Spans) -> str:
 
 
 def _unit(seconds: float) -> tuple[float, str]:
-    """Return the unit that suits a time, after the factor from seconds to this unit."""
+    """Return the factor from seconds to a unit that suits a time, and the name of this unit."""
     return (1.0, "s") if seconds >= 1.0 else (1e3, "ms") if seconds >= 1e-3 else (1e6, "µs")
 
 

@@ -13,7 +13,7 @@ from torch import Tensor
 from neusee.nodes.values import Psf, Pupil
 from neusee.workflows.report.figures.style import BLUE, GREEN, canvas, drawn
 
-STRENGTHS = (0.0, 1.0, 1e3, 1e6)  #: peak of the laser over the white of the scene
+STRENGTHS = (0.0, 1.0, 1e3, 1e6)  #: peak of the laser divided by the white of the scene
 METHODS = ("shifted PSF, added", "scene and laser\nin one convolution")
 
 
@@ -37,7 +37,10 @@ def error_time(*, step: Callable[..., Any], pupil: Pupil) -> Any:
 
 
 def precision_trial(step: Callable[..., Any], pupil: Pupil) -> list[tuple[str, int, float, float]]:
-    """Return rows (precision, window, seconds, error relative to the direct float64 sum) for the middle band."""
+    """Measure the time and the error of the PSF of the middle band, for each precision and window size.
+
+    The rows are (precision, window, seconds, error relative to the direct float64 sum).
+    """
     band = slice(len(pupil.wavelengths) // 2, len(pupil.wavelengths) // 2 + 1)
     one = pupil._replace(index=pupil.index[band], wavelengths=pupil.wavelengths[band])
     truth = step.reference(one, shape=(9, 9)).intensity.double()  # type: ignore[attr-defined]
@@ -78,7 +81,7 @@ def _verdict(error: float) -> tuple[str, str]:
 
 
 def laser_trial(step: Callable[..., Any], psf: Psf, size: int = 192) -> Tensor:
-    """Return the float32 error for each method and strength, with the middle band and a random scene."""
+    """Return the float32 error of a laser for each method and each strength, in the middle band of a random scene."""
     band, half = psf.intensity.shape[0] // 2, min(64, *(n // 2 for n in psf.intensity.shape[-2:]))
     top, left = (n // 2 - half for n in psf.intensity.shape[-2:])
     core = psf.intensity[band : band + 1, top : top + 2 * half, left : left + 2 * half]

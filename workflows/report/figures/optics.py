@@ -74,7 +74,7 @@ def _window(image: Tensor, size: int) -> Tensor:
 
 
 def _encircled(ax: Any, psf: Psf, bands: Bands, pitch: float, arm: str) -> None:
-    """Draw the share of the clear pupil's light within a radius, at three wavelengths."""
+    """Draw the encircled energy against the radius, relative to the clear pupil, at three wavelengths."""
     for wavelength, colour in zip(_WAVELENGTHS, (BLUE, "#00785A", "#B3261E"), strict=True):
         band, name = nearest(bands.centres, wavelength)
         share = metrics.encircled_curve(psf.intensity[band])

@@ -1,4 +1,4 @@
-"""Photon-transfer curve of the sensor: standard deviation over mean of simulated flat fields."""
+"""Photon-transfer curve of the sensor: standard deviation against mean of simulated flat fields."""
 
 from __future__ import annotations
 
@@ -11,7 +11,10 @@ from neusee.workflows.report.figures.style import BLACK, BLUE, GREEN, VERMILION,
 
 @drawn
 def transfer(*, measured: Tensor) -> Any:
-    """Draw the curve from rows (signal DN, variance DN², predicted variance DN²); the first row has no light."""
+    """Draw the photon-transfer curve from rows (signal DN, variance DN², predicted variance DN²).
+
+    The first row is measured without light.
+    """
     signal, variance, predicted = measured.detach().double().cpu().unbind(1)
     figure, axes = canvas(6.6, 4.4)
     ax = axes[0, 0]

@@ -15,7 +15,7 @@ LOOKS = {
     "cached": ("#BFDDF0", "from the cache"),
     "left out": ("#FFFFFF", "left out: within the tolerance"),
 }
-_WIDTH, _HEIGHT = 1.75, 0.66  #: inches, of the place of a box
+_WIDTH, _HEIGHT = 1.75, 0.66  #: inches, space for a box
 
 
 @drawn
@@ -54,7 +54,7 @@ def grouped(
 
 
 def layout(wires: Mapping[str, list[str]]) -> dict[str, tuple[float, int]]:
-    """Return (x, row) of each step: the depth decides the row, and the positions of the sources decide x."""
+    """Return the position (x, row) of each step: its depth decides the row, and its sources decide x."""
     depth = _depths(wires)
     rows: dict[int, list[str]] = {}
     for name, row in depth.items():
@@ -70,7 +70,7 @@ def layout(wires: Mapping[str, list[str]]) -> dict[str, tuple[float, int]]:
 
 
 def _depths(wires: Mapping[str, list[str]]) -> dict[str, int]:
-    """Return the row of each step: just above the first step that reads its result."""
+    """Return the row of each step, which is just above the first step that reads its result."""
     order = in_order(wires, wires)
     depth: dict[str, int] = {}
     for name in order:

@@ -61,7 +61,7 @@ def drawn(draw: Callable[P, Any]) -> Callable[P, bytes]:
 
 
 def picture(axes: Any, image: Any, title: str, **options: Any) -> Any:
-    """Show an image without ticks; ``options``, such as the colour scale, go to ``imshow``."""
+    """Show an image without axis ticks; pass ``options``, such as the colour scale, to ``imshow``."""
     shown = axes.imshow(image, **options)
     axes.set(title=title, xticks=[], yticks=[])
     axes.grid(False)
