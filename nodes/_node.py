@@ -91,6 +91,7 @@ def _attaches(hook: str) -> Callable[[Any, Fn], Fn]:
         setattr(to.hooks, hook, fn)
         return fn
 
+    attach.__doc__ = f"Attach the function to the node as its ``{hook}``, which `Hooks` describes."
     return attach
 
 

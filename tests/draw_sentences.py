@@ -73,6 +73,7 @@ def _label(part: ast.expr) -> str:
 def readme_sentences() -> list[str]:
     """Return the sentences of the README, without code blocks, tables and headings."""
     text = re.sub(r"```.*?```", "", (ROOT / "README.md").read_text(encoding="utf-8"), flags=re.DOTALL)
+    text = re.sub(r"^ {4}\S.*$", "", text, flags=re.MULTILINE)
     blocks = re.split(r"\n\s*\n|\n(?=\s*[-*] )", text)
     prose = (" ".join(block.split()) for block in blocks if not block.lstrip().startswith(("|", "#", "!", "<")))
     sentences = (sentence for block in prose for sentence in re.split(r"(?<=[.!?])\s", block))

@@ -76,16 +76,10 @@ def failing(*errors: type[Exception], code: int = BAD, before: str = "") -> Iter
 
 def check_device(device: str) -> None:
     """End the command if a device does not exist on this machine; ``device`` may be a list with commas."""
-    import torch
+    from neusee.workflows.engine.device_names import check_devices
 
-    names = device.split(",")
-    if len(set(names)) < len(names):
-        fail(f"--device {device}: names a device twice")
-    for name in names:
-        try:
-            torch.empty(0, device=name)
-        except (RuntimeError, AssertionError) as error:
-            fail(f"--device {name}: {str(error).partition(chr(10))[0]}")
+    with failing(ValueError, before="--device "):
+        check_devices(device)
 
 
 def say(lines: list[str]) -> None:

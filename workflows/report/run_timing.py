@@ -9,6 +9,14 @@ from neusee.workflows.store.byte_sizes import format_size
 
 StepRow = Mapping[str, Any]  #: a step in the document of a run
 
+#: of the file ``timing.csv``, which has a line for each step
+COLUMNS = ("step", "node", "device", "lane", "state", "began", "seconds", "predicted", "peak", "bytes", "key")
+
+
+def rows(steps: Iterable[StepRow]) -> list[list[Any]]:
+    """Return the lines of ``timing.csv``: the values of `COLUMNS` for each step."""
+    return [[step[column] for column in COLUMNS] for step in steps]
+
 
 def timing(steps: Sequence[StepRow], planned: float | None = None) -> dict[str, Any]:
     """Return predicted, planned, actual and saved seconds, and bytes read and written; each result counts once."""

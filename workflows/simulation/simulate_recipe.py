@@ -15,7 +15,7 @@ from neusee.workflows.explain.why_rerun import explained
 from neusee.workflows.graph.recipe_graph import Recipe
 from neusee.workflows.graph.step_record import Event, StepRecord
 from neusee.workflows.keys.cache_key import digest
-from neusee.workflows.report import run_page
+from neusee.workflows.report import run_page, run_timing
 from neusee.workflows.report.contents import wanted
 from neusee.workflows.report.data_exports import exports
 from neusee.workflows.report.run_folder import RunFolder, new_run
@@ -23,8 +23,6 @@ from neusee.workflows.report.run_pictures import pictures, timeline
 from neusee.workflows.store.derived_files import DerivedFiles
 from neusee.workflows.store.result_store import Store
 from neusee.workflows.tolerance.cheaper_steps import with_substitutions
-
-_TIMING = ("step", "node", "device", "lane", "state", "began", "seconds", "predicted", "peak", "bytes", "key")
 
 
 @dataclass(frozen=True)
@@ -89,7 +87,7 @@ def _write(
         folder.take(f"data/{name}", path)
     folder.write("recipe.yaml", recipe_text(result.recipe))
     folder.write_rows("metrics.csv", ("step", "field", "index", "value"), doc["metrics"])
-    folder.write_rows("timing.csv", _TIMING, [[s[column] for column in _TIMING] for s in doc["steps"]])
+    folder.write_rows("timing.csv", run_timing.COLUMNS, run_timing.rows(doc["steps"]))
     folder.write("provenance.json", json.dumps(doc, indent=1, ensure_ascii=False, allow_nan=True))
     folder.write("report.html", run_page.page(doc, shown))
     return doc
