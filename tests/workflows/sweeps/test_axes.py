@@ -53,23 +53,23 @@ def test_values_as_they_are_written(text, values):
 @pytest.mark.parametrize(
     ("text", "told"),
     [
-        ("1,,2", "a value is missing beside a comma"),
-        ("1,2,", "a value is missing beside a comma"),
-        ("[1,2", "a bracket is left open: ] is missing"),
+        ("1,,2", "a value is missing before or after a comma"),
+        ("1,2,", "a value is missing before or after a comma"),
+        ("[1,2", "a bracket is not closed: ] is missing"),
         ("range()", "range: write range(stop)"),
-        ("range(5, 1)", "range: there are no values"),
-        ("range(0, 1, 0)", "range: the step is 0, so that the range never ends"),
+        ("range(5, 1)", "range: the range is empty"),
+        ("range(0, 1, 0)", "range: the step must not be 0"),
         ("range(1e9)", f"range: 1000000000 values: an axis has at most {MOST}"),
         ("range(0, 1, 1e-300)", "range: too many values"),
         ("range(1e999)", "range: 1e999 is not a number"),
         ("range(a, b)", "range: a is not a number"),
-        ("linspace(1 nm, 2 um, 3)", "linspace: write every number in one unit, not in nm, um"),
-        ("linspace(1, 2 um, 3)", "linspace: write every number in one unit, not in none, um"),
+        ("linspace(1 nm, 2 um, 3)", "linspace: write all numbers in the same unit instead of nm, um"),
+        ("linspace(1, 2 um, 3)", "linspace: write all numbers in the same unit instead of none, um"),
         ("linspace(1, 2)", "linspace: write the first value, the last value and the number of values"),
-        ("linspace(1, 2, 2.5)", "linspace: the number of values is a whole number from 1, not 2.5"),
-        ("linspace(1, 2, 0)", "linspace: there are no values"),
-        ("logspace(0, 1, 3)", "logspace: both ends must be positive"),
-        ("linspce(1, 2, 3)", "no range is called linspce; did you mean linspace?"),
+        ("linspace(1, 2, 2.5)", "linspace: the number of values must be a whole number of at least 1, not 2.5"),
+        ("linspace(1, 2, 0)", "linspace: the range is empty"),
+        ("logspace(0, 1, 3)", "logspace: the first and the last value must be positive"),
+        ("linspce(1, 2, 3)", "there is no range function linspce; did you mean linspace?"),
     ],
 )
 def test_what_is_no_list_of_values_is_refused_with_the_fix(text, told):
@@ -179,7 +179,7 @@ def test_axes_of_arrays(tmp_path):
         ({"a": []}, "axis a | a | the list of values is empty"),
         ({"a": 3}, "axis a | a | give a list of values, not int"),
         ({"+a": [1]}, "axis +a | +a | write the name of an axis without + or ~"),
-        ({"a": "1,,2"}, "axis a | a=1,,2 | a value is missing beside a comma"),
+        ({"a": "1,,2"}, "axis a | a=1,,2 | a value is missing before or after a comma"),
     ],
 )
 def test_axes_of_python_that_are_none(tmp_path, axes, told):
