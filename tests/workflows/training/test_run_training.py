@@ -283,7 +283,10 @@ def test_what_is_not_a_number_stops_and_is_kept(tmp_path, tiny, monkeypatch):
     from neusee.nodes import losses
 
     monkeypatch.setattr(losses, "charbonnier", lambda a, b: (a - b).mean() * float("nan"))
-    with pytest.raises(ArithmeticError, match="stage 1, iteration 0, pictures 0 to 1: NaN or infinite: reconstruction"):
+    with pytest.raises(
+        ArithmeticError,
+        match="stage 1, iteration 0, pictures 0 to 1: these numbers are NaN or infinite: reconstruction",
+    ):
         trained(tiny, tmp_path)
     (folder,) = (tmp_path / "runs").iterdir()
     kept = torch.load(folder / "not_finite_1_0.pt", weights_only=True)
@@ -446,7 +449,7 @@ def test_a_mask_is_designed_where_nothing_else_could_learn(command, tmp_path, ph
 def test_a_mask_is_not_designed_over_one_that_learns(tmp_path, tiny, photographs):
     folder = trained(tiny, tmp_path, [1])
     before = (folder / "mask.safetensors").read_bytes()
-    with pytest.raises(ValueError, match="stage 1 has begun"):
+    with pytest.raises(ValueError, match="stage 1 has already begun"):
         trained(tiny, tmp_path, [0])
     assert (folder / "mask.safetensors").read_bytes() == before
 
