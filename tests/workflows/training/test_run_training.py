@@ -188,7 +188,7 @@ def test_patches_are_the_same_places_of_a_picture_and_its_truth(tmp_path, photog
         ((y, x),) = same
         assert torch.equal(whole.truth[0, :, y : y + 12, x : x + 9], true)
     too_large = replace(recipe, training=how.model_copy(update={"patch": (40, 9)}))
-    with pytest.raises(ValueError, match=r"train\.patch: \[40, 9\] is larger than the picture, \[32, 32\]"):
+    with pytest.raises(ValueError, match=r"train\.patch: \[40, 9\] is larger than the picture \[32, 32\]: set a smaller"):
         samples_of(too_large, tmp_path, still=True)({}, 2, 0)
 
 
@@ -355,7 +355,7 @@ def test_a_network_with_options_is_learnt_and_restores_only_with_them(tmp_path, 
     load("first_light", [*run, *(f"restore.{x}" for x in options)])
 
 
-@pytest.mark.parametrize(("doe", "said"), [("flat", "of which nothing is learnt"), ("unet", ""), ("axicon", "")])
+@pytest.mark.parametrize(("doe", "said"), [("flat", "which has no trainable parameters"), ("unet", ""), ("axicon", "")])
 def test_only_what_learns_can_be_learnt(tmp_path, photographs, doe, said):
     changes = [c for c in TINY if not c.startswith("doe.") or doe == "unet"]
     recipe = load("train_small", [f"doe={doe}", *changes,
@@ -437,7 +437,7 @@ def test_a_mask_is_designed_where_nothing_else_could_learn(command, tmp_path, ph
     words = ["train_small", "doe=flat", *changes, "train.mask.kind=five_half_rings",
              "train.mask.iterations=1", "+train.mask.population=5", "+train.mask.polish=5", "+train.mask.bands=2",
              f"train.photographs={photographs}"]  # fmt: skip
-    assert "of which nothing is learnt" in command(*words)[2]
+    assert "which has no trainable parameters" in command(*words)[2]
     code, out, err = command(*words, "--stage", "mask")
     assert (code, err) == (0, "")
     assert "too steep for the samples of the pupil" in out
