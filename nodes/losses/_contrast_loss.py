@@ -1,4 +1,4 @@
-"""The contrast loss of a mask: it keeps the contrast of the scene while another loss lowers the laser peak."""
+"""The contrast loss, which keeps the image contrast of a mask while another loss lowers the laser peak."""
 
 import math
 from typing import Annotated
@@ -11,7 +11,7 @@ from neusee.nodes import node
 from neusee.nodes._half_precision import single
 from neusee.nodes.values import Psf
 
-_DARK = 1e-30  #: share of the light that counts as none
+_DARK = 1e-30  #: share of the light below which a band counts as dark
 
 ContrastFloor = Annotated[float, Field(gt=0, le=0.1)]
 HighestFrequency = Annotated[float, Field(gt=0, le=0.5)]  #: cycles per pixel
@@ -19,7 +19,7 @@ HighestFrequency = Annotated[float, Field(gt=0, le=0.5)]  #: cycles per pixel
 
 @node()
 def contrast(psf: Psf, *, floor: ContrastFloor = 1e-4, up_to: HighestFrequency | None = None) -> Tensor:
-    """Sum the loss of contrast over the bands: for each band, minus the mean of ln sqrt(MTF**2 + floor**2).
+    """Sum over the bands the contrast loss -mean(ln sqrt(MTF**2 + floor**2)), with the mean over frequencies.
 
     The mean is over the frequencies that the clear aperture passes, as in `metrics.mtf`, and the contrast is the
     modulus of the OTF over its value at frequency 0. A mean of logarithms is the logarithm of the geometric mean and

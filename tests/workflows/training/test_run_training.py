@@ -188,7 +188,9 @@ def test_patches_are_the_same_places_of_a_picture_and_its_truth(tmp_path, photog
         ((y, x),) = same
         assert torch.equal(whole.truth[0, :, y : y + 12, x : x + 9], true)
     too_large = replace(recipe, training=how.model_copy(update={"patch": (40, 9)}))
-    with pytest.raises(ValueError, match=r"train\.patch: \[40, 9\] is larger than the picture \[32, 32\]: set a smaller"):
+    with pytest.raises(
+        ValueError, match=r"train\.patch: \[40, 9\] is larger than the picture \[32, 32\]: set a smaller patch"
+    ):
         samples_of(too_large, tmp_path, still=True)({}, 2, 0)
 
 
