@@ -28,7 +28,7 @@ def wiener(
     colour: OneBandShare = 1.0,
     up_to: HighestFrequency | None = None,
 ) -> Tensor:
-    """Compute the log of the error variance after a Wiener filter, relative to the picture, averaged over channels.
+    """Average over channels the logarithm of (error variance after a Wiener filter) / (variance of the picture).
 
     The power of the pictures falls with frequency as in the prior of `restore.wiener`. The filter uses the PSF of a
     channel for a grey scene. The error at a frequency has two parts: the part of the picture that noise hides, and, for

@@ -53,7 +53,7 @@ def _(result: Tensor, *inputs: Psf) -> list[Check]:
 
 @node(rtol=1e-6, accepts_channel_sums=("image", "plain_image"))
 def bsr(image: Tensor | Channels, plain_image: Tensor | Channels) -> Tensor:
-    """Compute the background suppression ratio: scene light in the field, divided by that of the plain lens.
+    """Compute the background suppression ratio: scene light in the field, divided by the light with the plain lens.
 
     An image that is summed over its bands, `Channels`, still contains the light of each band.
 
@@ -103,7 +103,7 @@ def _(result: Saturated, *inputs: Tensor, **params: Any) -> list[Check]:
 
 
 def clipped(raw: Tensor, *, full_well: float, gain: float, bits: int) -> Tensor:
-    """Return True for raw values at the full well, at the largest number of the converter, or NaN."""
+    """Return True for raw values at the full well, at the largest number of the converter, and for NaN."""
     full = int(full_well * gain - 0.5)
     marked: Tensor = ~(raw < max(1, min(2**bits - 1, full)))  # NaN counts as clipped
     return marked

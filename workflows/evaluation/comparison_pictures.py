@@ -1,4 +1,4 @@
-"""The comparison figure of the paper: one scene under each laser, as the plain lens and every pipeline show it."""
+"""The comparison figure of the paper: one scene under each laser, with the plain lens and with every pipeline."""
 
 from __future__ import annotations
 

@@ -67,7 +67,7 @@ def mean(values: Sequence[float] | Numbers) -> Interval:
 
 
 def gain(values: Numbers, reference: Numbers, seed: int) -> Interval:
-    """Return the relative reduction of the mean of a metric from the mean of the reference, such as 0.101 for 10.1 %.
+    """Return the relative decrease of the mean of a metric against the reference, such as 0.101 for 10.1 %.
 
     The interval comes from a bootstrap with the seed ``seed``, which draws the same scenes for both pipelines.
     """
@@ -84,7 +84,7 @@ def gain(values: Numbers, reference: Numbers, seed: int) -> Interval:
 
 
 def compare_with(values: MetricTable, reference: MetricTable, seed: int) -> dict[str, Interval]:
-    """Return the reduction of L1 from the reference: absolute, relative, and relative for reduced pictures."""
+    """Return the decrease of L1 against the reference: absolute, relative, and relative for small pictures."""
     own, other = values.scenes("l1"), reference.scenes("l1")
     return {
         "l1 less": mean(other - own),
@@ -94,7 +94,7 @@ def compare_with(values: MetricTable, reference: MetricTable, seed: int) -> dict
 
 
 def metric_table(points: Sequence[Mapping[float, Mapping[str, float]]], strengths: Sequence[float]) -> MetricTable:
-    """Return the metrics of the points of one pipeline as arrays (scene, laser strength)."""
+    """Arrange the metrics of one pipeline as arrays (scene, laser strength)."""
     each = {
         metric: np.array([[point.get(k, {}).get(metric, math.nan) for k in strengths] for point in points])
         for metric in METRICS

@@ -153,7 +153,7 @@ class EvaluationPoints:
         return self._drawn[key][1]
 
     def _share(self, function: Any, recipe: Recipe) -> None:
-        """Replace the fixed results of a function by the equal objects of earlier functions, so that all are shared."""
+        """Reuse the fixed results of earlier functions in a function, because results are shared by object identity."""
         keys = self._keys(recipe, function.fixed)
         for name, value in function.fixed.items():
             function.fixed[name] = self._fixed.setdefault(keys[name], value)
@@ -176,7 +176,7 @@ class EvaluationPoints:
 
 
 class _SharedResults:
-    """The results that successive points share: those of the same scene, and those of the same laser strength."""
+    """A cache of the results that successive points share, by scene and by laser strength."""
 
     def __init__(self) -> None:
         self._of_scene: dict[Any, tuple[Any, Any]] = {}

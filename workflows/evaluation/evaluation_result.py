@@ -27,7 +27,7 @@ class EvaluationResult:
     reference: str  #: the pipeline with which all others are compared
     points: dict[str, list[dict[float, PointNumbers]]]  #: by pipeline and scene
     tables: dict[str, MetricTable]  #: by pipeline
-    against: dict[str, dict[str, Interval]]  #: by pipeline, reductions of L1 from the reference
+    against: dict[str, dict[str, Interval]]  #: by pipeline, decrease of L1 against the reference
     masks: dict[str, MaskOptics]  #: by mask
     panels: Sequence[Panel]
     pipelines: Sequence[Pipeline]

@@ -37,7 +37,7 @@ class Scene:
 
     @property
     def seed(self) -> int:
-        """Return the seed of the scene's noise and laser direction, with which a run of the recipe is identical."""
+        """Return the seed of noise and laser direction; a run of the recipe with this seed gives the same values."""
         return self.recipe.seed + self.number
 
     @cached_property
@@ -74,7 +74,7 @@ class Scene:
 
 
 def scenes(recipe: Recipe, store: Store, root: Path | None, count: int) -> tuple[list[Scene], list[tuple[Path, str]]]:
-    """Return ``count`` scenes, with the lasers in turn, and a list of unreadable photographs with reasons."""
+    """Return ``count`` scenes, which cycle through the lasers, and a list of unreadable photographs with reasons."""
     broken: list[tuple[Path, str]] = []
     own = recipe.steps["scene"]
     shape = _shape(recipe)

@@ -147,16 +147,16 @@ def _words(pipeline: Pipeline) -> list[str]:
 
 
 def _takes(group: str, option: str) -> str:
-    """Return the name of an option's parameter for a file; raise `EvaluationRefused` if the option takes no file."""
+    """Return the parameter that names the file of an option; raise `EvaluationRefused` if the option takes no file."""
     options = groups_of(packaged()).get(group, [])
     path = packaged() / group / f"{option}.yaml"
     if option == NONE or (option in options and not path.is_file()):
-        raise EvaluationRefused(f"{option} takes no file: remove the part from @ on")
+        raise EvaluationRefused(f"{option} takes no file: remove @ and the file name")
     if not path.is_file():
         raise EvaluationRefused(f"no option {option} in {group}; {nearest(option, options)}")
     if match := re.search(r"\b(file|weights): null", path.read_text(encoding="utf-8")):
         return match[1]
-    raise EvaluationRefused(f"{option} takes no file: remove the part from @ on")
+    raise EvaluationRefused(f"{option} takes no file: remove @ and the file name")
 
 
 def _with_laser(recipe: str, words: Sequence[str | Override], fwhm: float, folder: Path, case: str) -> Recipe:

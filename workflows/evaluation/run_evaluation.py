@@ -91,7 +91,7 @@ def evaluate(
 
 def _strengths(strengths: Sequence[float]) -> tuple[float, ...]:
     if not strengths or min(strengths) < 0 or not all(map(np.isfinite, strengths)):
-        raise EvaluationRefused("--strengths: write finite multiples of saturation from 0 on, such as 0,1e1,1e3,1e6")
+        raise EvaluationRefused("--strengths: write finite multiples of saturation, 0 or more, such as 0,1e1,1e3,1e6")
     return tuple(sorted(set(map(float, strengths))))
 
 

@@ -1,4 +1,4 @@
-"""The axes of a sweep, in the notation of Hydra such as ``a=1,2,3``, and all combinations of their values."""
+"""The axes of a sweep, in the notation of Hydra such as ``a=1,2,3``, and all combinations of the values."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ from neusee.workflows.sweeps.value_ranges import MOST, spans, values_of
 
 @dataclass(frozen=True, slots=True)
 class Coordinate:
-    """One value of an axis, with the changes of the recipe that set this value."""
+    """One value on an axis of a sweep, with the changes of the recipe that set this value."""
 
     shown: str  #: as a user writes it
     value: Any  #: as YAML reads it
@@ -29,7 +29,7 @@ class Coordinate:
 
 @dataclass(frozen=True, slots=True)
 class Axis:
-    """An axis of a sweep: a parameter or a group of a recipe, and the list of values that the sweep gives it."""
+    """An axis of a sweep: a parameter or a group of a recipe, with the list of values for the sweep."""
 
     name: str
     coordinates: tuple[Coordinate, ...]
@@ -70,7 +70,7 @@ def read_axes(axes: Mapping[str, str | Iterable[Any]], folder: Path) -> list[Arg
 
 
 def points(arguments: Sequence[Argument], paired: bool = False) -> list[Point]:
-    """Return the points of a sweep: all combinations of values, or only values of equal index if ``paired``.
+    """Return the points of a sweep: all combinations of values, or, if ``paired``, the n-th values of all axes.
 
     The last axis varies fastest.
     """
@@ -158,7 +158,7 @@ def _axis(name: str, values: Sequence[str], mark: Location) -> Axis:
 
 
 def _wrong(axes: Sequence[Axis], paired: bool) -> Iterable[Diagnostic]:
-    """Yield the mistakes in a set of axes: repeated names or values, unequal lengths when paired, too many points."""
+    """Yield the mistakes in the axes of a sweep, such as a repeated name, a repeated value or too many points."""
     if not axes:
         yield Diagnostic(Location("sweep"), "", "there is no axis: write a=1,2,3 or a='linspace(450 nm, 650 nm, 5)'")
     first: dict[str, Axis] = {}

@@ -56,7 +56,7 @@ def dataset(
 
 
 def _lengths(outcomes: Sequence[PointOutcome], taken: Collection[str]) -> dict[str, int]:
-    """Return the largest number of values at any point, for each result that is an array."""
+    """Return the largest length over all points, for each result that is an array."""
     long: dict[str, int] = {}
     for outcome in outcomes:
         for step, part, index, _ in outcome.numbers:

@@ -88,7 +88,7 @@ def sweep(
     device: str = "cpu",
     folder: str | os.PathLike[str] | None = None,
 ) -> Sweep:
-    """Run ``recipe`` at every combination of the values of the axes; ``zip`` combines only values of equal index.
+    """Run ``recipe`` at every combination of axis values, or, with ``zip``, at the n-th values of all axes together.
 
     Args: axes: by parameter or group, a list of values, or a text as on the command line, such
     as ``"linspace(450 nm, 650 nm, 5)"``. overrides: changes that are the same at every point.

@@ -17,7 +17,7 @@ AFTER = ("status", "step", "field", "index", "value", "seconds", "cached", "mess
 
 @dataclass(frozen=True, slots=True)
 class AxisColumn:
-    """The column of an axis in the table of a sweep, with the unit in the header if all values have one dimension."""
+    """The column of an axis in a table, with the unit in the header if all values have the same physical dimension."""
 
     name: str
     header: str
@@ -27,7 +27,7 @@ class AxisColumn:
 
 
 def column(axis: Axis) -> AxisColumn:
-    """Return the table column of an axis: quantities in their common unit, else in SI, and words unchanged."""
+    """Return the table column of an axis: numbers in their common unit, or in SI if units differ; words unchanged."""
     values = [c.value for c in axis.coordinates]
     quantities = [q for q in map(_quantity, values) if q is not None]
     header = f"{axis.name} (axis)" if axis.name in ("point", *AFTER) else axis.name
@@ -76,7 +76,7 @@ def rows_of(outcome: PointOutcome, columns: Sequence[AxisColumn]) -> Iterator[li
 
 
 def headline(numbers: Sequence[ResultNumber]) -> dict[str, str]:
-    """Return the text of each result, which is a number or the range of an array; single numbers come first."""
+    """Format each result of a point as text: a number, or the range of an array; single numbers come first."""
     results: dict[str, list[float]] = {}
     for step, part, _, value in numbers:
         results.setdefault(f"{step}.{part}".rstrip("."), []).append(value)

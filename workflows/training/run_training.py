@@ -128,7 +128,7 @@ class _TrainingLoop(ResumableLoop[Learner]):
         for number in stages:
             if number not in self.settings.learnt:
                 stages_left = self.settings.learnt
-                raise ValueError(f"there is no stage {number}: train.stages and train.learn define {stages_left}")
+                raise ValueError(f"there is no stage {number}: train.stages and train.learn define only {stages_left}")
             if number > self.stage:
                 first = f"run the {self._length} iterations of stage {self.stage} first, or --stage mask"
                 raise ValueError(f"stage {number} needs stage {self.stage}: {first}")
@@ -159,7 +159,7 @@ class _TrainingLoop(ResumableLoop[Learner]):
         self.mesh.wait()  # until the first process has written the mask
 
     def iterate(self) -> Losses:
-        """Train on one batch of pictures, and return the losses and the factor of the learning rates."""
+        """Train on one batch of pictures, and return the losses and the present factor of the learning rates."""
         rate = self.learner.set_rates(self.iteration)
         losses, self.seen = self.learner.iterate(self.samples, self.stage, self.iteration)
         return losses | {"rate": rate}
@@ -217,12 +217,12 @@ class _TrainingLoop(ResumableLoop[Learner]):
 
 
 def frozen(recipe: Recipe, settings: Training, folder: Path) -> Recipe:
-    """Return the recipe with the trained mask, fixed, in the step that was trained."""
+    """Return the recipe with the trained mask of the file ``mask.safetensors`` as a fixed mask."""
     if settings.learn is None:
         return recipe
     file = folder / "mask.safetensors"
     if not file.is_file():
-        raise ValueError(f"{file} does not exist: run --stage 1 or --stage mask first, which writes this file")
+        raise ValueError(f"{file} does not exist: run --stage 1 or --stage mask first to write this file")
     step = recipe.steps[settings.learn]
     params, wires = {"file": file, "depth": 1e-6, "scale": 0.1}, {"stop": step.wires["stop"]}
     learnt = replace(step, node=doe.pixelwise, params=params, wires=wires)

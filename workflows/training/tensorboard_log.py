@@ -8,7 +8,7 @@ from typing import Any
 
 
 def open_board(folder: Path, first: int) -> Any:
-    """Return a TensorBoard writer for a training that continues at iteration ``first``; later old events are hidden.
+    """Return a TensorBoard writer for a training, which hides older events from iteration ``first`` on.
 
     Raises ValueError if TensorBoard is not installed.
     """

@@ -1,4 +1,4 @@
-"""The pictures on which a training trains, numbered, each with its own scene, laser, sensor and noise.
+"""The numbered pictures for a training, each with its own scene, laser, sensor and noise.
 
 Steps that depend neither on the mask nor on a drawn value are computed once, steps that depend only on the mask once
 in each iteration, and steps that depend on a scene, a drawn value or noise once for each picture. Gradients of steps
@@ -84,7 +84,7 @@ class TrainingStream:
     def _divide(
         self, recipe: Recipe, learn: str | None, border: list[str], drawn: set[str], noise: set[str], store: Store
     ) -> None:
-        """Divide the recipe after the steps ``border``, the last steps that depend on the mask and on no picture."""
+        """Divide the recipe after the steps ``border``, the last steps that depend on the mask but on no picture."""
         settings = self.settings
         ways: dict[str, Any] = {"store": store, "device": self.device}
         read = self.shards.steps & _sources(recipe, drawn - self.shards.steps)
@@ -181,7 +181,7 @@ class TrainingStream:
 
 
 def require_steps(recipe: Recipe, block: str, names: Sequence[str]) -> None:
-    """Raise ValueError unless the recipe has all steps ``names`` that one of its blocks names."""
+    """Raise ValueError unless the recipe has all steps ``names`` to which the block ``block`` refers."""
     for name in names:
         if name not in recipe.steps:
             raise ValueError(f"{block}: the recipe has no step {name}; {nearest(name, recipe.steps)}")

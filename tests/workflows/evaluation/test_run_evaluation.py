@@ -242,7 +242,7 @@ def test_every_mistake_is_said_before_anything_runs(tmp_path):
         "is not a safetensors file",
         "flat+unet:",
         "needs trained weights",
-        "flat takes no file: remove the part from @ on",
+        "flat takes no file: remove @ and the file name",
     ):
         assert part in said, said
     assert said.count("falt+none:") == 1

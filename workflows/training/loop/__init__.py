@@ -1,4 +1,4 @@
-"""How does a stopped training continue and give the same bits as without the stop?
+"""How does a stopped training continue with bit-identical results?
 
 The loop of every training, and its files: the state, the table of losses, and the trained weights.
 Nothing here depends on a certain network or recipe.

@@ -1,4 +1,4 @@
-"""The files of a training: the checkpoint from which it continues, the table of losses, and the trained weights."""
+"""The files of a training: its checkpoint, its table of losses, and its trained weights."""
 
 from __future__ import annotations
 
@@ -73,7 +73,7 @@ class Rows:
         self._kept = 0
 
     def cut(self, stage: int, iteration: int, write: bool = True) -> None:
-        """Read the table of losses, without the rows of the given iteration and of later iterations."""
+        """Read the table of losses, and discard the rows from the given iteration on."""
         if self._path.exists():
             with self._path.open(newline="", encoding="utf-8") as file:
                 self.rows = [row for row in csv.DictReader(file) if _place(row) < (stage, iteration)]

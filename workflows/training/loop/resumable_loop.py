@@ -1,4 +1,4 @@
-"""The training loop, in which a stopped training continues from its last checkpoint and gives the same bits."""
+"""The training loop, in which a stopped training continues from its last checkpoint with bit-identical results."""
 
 from __future__ import annotations
 

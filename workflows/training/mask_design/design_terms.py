@@ -30,7 +30,7 @@ class Fabrication:
 
     @classmethod
     def of(cls, recipe: Recipe, settings: MaskTraining) -> Fabrication:
-        """Return the limits of the recipe's step of `doe.fabricate`, and the smallest feature of the mask."""
+        """Return the fabrication limits from the recipe's `doe.fabricate` step, and the smallest mask feature."""
         steps = (recipe.steps[name] for name in needed(recipe, [settings.psf]))
         params = next((step.params for step in steps if step.node.path == "doe.fabricate"), {})
         limits = {name: params.get(name) for name in ("levels", "max_height", "wrap_at")}

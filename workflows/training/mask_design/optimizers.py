@@ -166,7 +166,7 @@ def _few(shape: nn.Module) -> dict[str, Any]:
 
 
 def half_ring_height(genes: Any, settings: MaskTraining) -> Callable[[Stop], Tensor]:
-    """Return a function that computes the half-ring height map of these genes on the grid of a stop."""
+    """Return a function that computes the height map of half-rings with these genes on a pupil grid."""
     *slopes, side, turn = (float(gene) for gene in genes)
     given = {"waves": tuple(slopes), "alternate": side >= 0.5, "orientation": turn}
 
@@ -262,7 +262,7 @@ def _population(
 
 
 def _steepest(terms: Terms) -> float:
-    """Return the Nyquist limit of the slopes, in waves at the rim, at the shortest wavelength of the recipe."""
+    """Return the Nyquist limit of the mask slopes, in waves at the rim, at the shortest wavelength of the recipe."""
     material, wavelength = terms.settings.material, terms.settings.wavelength
     turned = wave_height(material, wavelength) / wave_height(material, float(terms.bands.centres.min()))
     return float(terms.stop.diameter / (4 * terms.stop.pitch * turned))

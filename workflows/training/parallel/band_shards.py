@@ -75,7 +75,7 @@ class Shards:
         return call(step, inputs, params, seed, device)
 
     def gathered(self, name: str, value: Any) -> Any:
-        """Return a result with all bands, gathered from all processes."""
+        """Gather all bands of a step's result from all processes."""
         axis = self.axis(name)
         return with_band_tensors(value, [gathered(self.mesh, x, axis, self.count) for x in band_tensors(value)])
 

@@ -1,4 +1,4 @@
-"""Messages among the processes that share a picture by band, which exchange bands and return gradients.
+"""Messages among processes that have different spectral bands: the exchange of bands and of gradients.
 
 Process r of m has the bands r, r + m, ... A message is linear in its tensors, and gradients return by the transposed
 message, so that the derivatives of all processes add up to the derivative of the sum. Sums are added in the order of
@@ -22,7 +22,7 @@ def own_bands(mesh: Mesh, count: int) -> list[int]:
 
 
 def gathered(mesh: Mesh, x: Tensor, axis: int, count: int) -> Tensor:
-    """Return a tensor with all spectral bands, gathered from all processes."""
+    """Gather all spectral bands of a tensor from all processes."""
     mine = _filled(x.detach().movedim(axis, 0), -(-count // mesh.band))
     return _woven(_from_each(mesh, mine), axis, count)
 
@@ -34,7 +34,7 @@ def gathered_back(mesh: Mesh, grad: Tensor, axis: int, count: int) -> Tensor:
 
 
 class Bands:
-    """An all-to-all exchange: each process sends its bands of every picture and receives all bands of one picture."""
+    """An all-to-all exchange: each process sends its bands of every picture and receives all bands of its own."""
 
     def __init__(self, mesh: Mesh, axis: int, count: int) -> None:
         self.mesh, self.axis, self.count = mesh, axis, count
@@ -53,7 +53,7 @@ class Bands:
 
 
 class Sum:
-    """An exchange of sums: each process sends its part of every picture and receives the sum of all parts of one."""
+    """An exchange of sums: each process sends a part of every picture and receives the sum for its own picture."""
 
     def __init__(self, mesh: Mesh) -> None:
         self.mesh = mesh
@@ -78,7 +78,7 @@ def _stacked(mesh: Mesh, parts: Sequence[Tensor]) -> Tensor:
 
 
 def _woven(each: Tensor, axis: int, count: int) -> Tensor:
-    """Return a tensor of axes (process, bands of the process, ...) with all bands on one axis, in spectral order."""
+    """Reorder a tensor (process, bands of the process, ...) so that one axis has all bands in spectral order."""
     return each.transpose(0, 1).flatten(0, 1)[:count].movedim(0, axis).contiguous()
 
 

@@ -25,7 +25,7 @@ class MeshError(ValueError):
 
 @dataclass(frozen=True)
 class Mesh:
-    """One process of a mesh of ``data`` x ``band`` processes; the processes of a row divide the bands of pictures."""
+    """One process of a mesh of ``data`` x ``band`` processes; the processes of a row divide the spectral bands."""
 
     data: int = 1
     band: int = 1
@@ -70,7 +70,7 @@ class Mesh:
         dist.all_gather_object(texts, about)
         for rank, other in enumerate(texts):
             if other != texts[0]:
-                raise MeshError(f"process 0 is at {texts[0]}, process {rank} at {other}: use one folder for all")
+                raise MeshError(f"process 0 is at {texts[0]}, process {rank} at {other}: all need the same folder")
 
     def numbers(self, own: Mapping[str, float], names: Sequence[str], device: str) -> dict[str, float]:
         """Return the numbers ``names``, each summed over all processes."""

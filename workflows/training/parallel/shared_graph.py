@@ -48,7 +48,7 @@ class Shared:
             torch.autograd.backward([x for x, _ in roots], [grad for _, grad in roots])
 
     def _to_own(self, name: str, own: Tensor, whole: Tensor) -> None:
-        """Add the gradients that all processes have for the bands of this process; without a picture they are zero."""
+        """Sum the gradients at the bands of this process over all processes; one without a picture contributes zero."""
         if not own.requires_grad:
             return
         assert self.shards is not None
