@@ -47,7 +47,7 @@ def _lost(kernel: Tensor, clear_peak: float, floor: float, up_to: float | None) 
     light = kernel.sum()
     dark = light.detach() <= _DARK  # false for NaN, so that NaN reaches the result
     otf = torch.fft.rfft2(kernel / light.where(~dark, 1.0))[inside]
-    square = (otf.real.square() + otf.imag.square()).where(~dark, 0.0).double()  # float32 loses the floor beside 1
+    square = (otf.real.square() + otf.imag.square()).where(~dark, 0.0).double()  # float32 would lose the floor beside 1
     lost: Tensor = -0.5 * (square + floor**2).log().mean()
     return lost.to(kernel)
 

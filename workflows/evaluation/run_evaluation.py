@@ -122,7 +122,7 @@ def _points(
     for done, scene in enumerate(sorted(shown, key=lambda scene: order.index(scene.case)), 1):
         if before not in ("", scene.case):
             bench.forget()
-        before, alone = scene.case, replace(scene)  # a copy, so that the picture is released with it
+        before, alone = scene.case, replace(scene)  # a copy, which releases the picture when it is deleted
         for strength in strengths if scene.case != NONE else (0.0,):
             for pipeline in each:
                 point = bench.point(pipeline, PointRequest(alone, strength))

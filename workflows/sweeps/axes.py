@@ -22,8 +22,8 @@ from neusee.workflows.sweeps.value_ranges import MOST, spans, values_of
 class Coordinate:
     """One value on an axis of a sweep, with the changes of the recipe that set this value."""
 
-    shown: str  #: as a user writes it
-    value: Any  #: as YAML reads it
+    shown: str  #: the value as a user writes it
+    value: Any  #: the value as YAML reads it
     overrides: tuple[Override, ...]
 
 
@@ -44,7 +44,7 @@ _T = TypeVar("_T")
 class Point:
     """A point of a sweep: one combination of values, with one value from each axis."""
 
-    number: int  #: counts from 1, with the last axis fastest
+    number: int  #: counts from 1, where the last axis varies fastest
     place: tuple[int, ...]  #: index of the value on each axis
     coordinates: tuple[Coordinate, ...]  #: one for each axis
     overrides: tuple[Override, ...]  #: every change of the recipe, in the order of the arguments
@@ -127,7 +127,7 @@ def _read_axis(name: str, values: str | Iterable[Any], folder: Path) -> Axis:
         raise RecipeError([Diagnostic(mark, name, f"give a list of values, not {type(values).__name__}")])
     coordinates = tuple(_coordinate(name, value, folder) for value in listed)
     if not coordinates:
-        raise RecipeError([Diagnostic(mark, name, "the list of values is empty")])
+        raise RecipeError([Diagnostic(mark, name, "the list of values is empty: give at least one value")])
     return Axis(name, coordinates, mark)
 
 
@@ -164,14 +164,14 @@ def _wrong(axes: Sequence[Axis], paired: bool) -> Iterable[Diagnostic]:
     first: dict[str, Axis] = {}
     for axis in axes:
         if first.setdefault(axis.name, axis) is not axis:
-            yield Diagnostic(axis.mark, axis.name, f"{axis.name} is already an axis ({first[axis.name].mark})")
+            yield Diagnostic(axis.mark, axis.name, f"{axis.name} is already an axis in {first[axis.name].mark}: remove one")
         twice = [value for value, count in Counter(c.shown for c in axis.coordinates).items() if count > 1]
         if twice:
-            yield Diagnostic(axis.mark, axis.name, f"the value {twice[0]} appears twice")
+            yield Diagnostic(axis.mark, axis.name, f"the value {twice[0]} appears twice: remove one")
         there, here = len(axes[0].coordinates), len(axis.coordinates)
         if paired and there != here:
             text = f"has {here} values, and {axes[0].name} ({axes[0].mark}) has {there}"
-            yield Diagnostic(axis.mark, axis.name, f"{text}: paired axes need equally many values")
+            yield Diagnostic(axis.mark, axis.name, f"{text}: give paired axes the same number of values")
     product = 1 if paired else math.prod(len(axis.coordinates) for axis in axes)
     if product > MOST:
         yield Diagnostic(Location("sweep"), "", f"a sweep of {product} points is too long: at most {MOST} points")

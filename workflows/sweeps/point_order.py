@@ -21,7 +21,7 @@ class PointJob:
     """The steps that one point of a sweep needs, with the cache key and the input steps of each."""
 
     place: tuple[int, ...]  #: index of the value on each axis
-    keys: Mapping[str, Key]  #: of every step that the outputs need
+    keys: Mapping[str, Key]  #: cache key of every step that the outputs need
     sources: Mapping[str, tuple[str, ...]]  #: by step, the steps that it reads
     outputs: tuple[str, ...]
 

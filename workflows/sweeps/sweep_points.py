@@ -61,10 +61,10 @@ class PointOutcome:
 class SweepPlan:
     """The plan of a sweep: its checked points in the order in which they run."""
 
-    recipe: Recipe  #: of the first point
+    recipe: Recipe  #: the recipe of the first point
     checked: tuple[CheckedPoint, ...]
     costs: dict[str, float]  #: seconds by step, of steps that ran before
-    work: tuple[float, ...]  #: of each point, without stored results, in seconds, or in steps if no step ran before
+    work: tuple[float, ...]  #: work of each point without stored results, in seconds, or in steps if no step ran before
     notes: tuple[str, ...]
 
     @property

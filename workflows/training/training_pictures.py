@@ -29,7 +29,7 @@ from neusee.workflows.training.parallel.picture_rounds import Pictures
 from neusee.workflows.training.parallel.process_mesh import ALONE, Mesh
 from neusee.workflows.training.parallel.shared_graph import Shared
 
-_LASER = ("optics.laser_irradiance", "strength")  #: a node, and its parameter that is 0 without a laser
+_LASER = ("optics.laser_irradiance", "strength")  #: the node of a laser, and the parameter that is 0 without a laser
 _SEEDS = 2**31
 
 
@@ -38,7 +38,7 @@ class Sample:
     """One training picture, or patches of the picture, with the true picture."""
 
     picture: Tensor  #: (n, 3, y, x), the developed picture of the camera
-    truth: Tensor  #: (n, 3, y, x)
+    truth: Tensor  #: (n, 3, y, x), the true picture
     light: Tensor  #: (band,), the fraction of the light of the scene that the mask keeps
     drawn: Mapping[str, Any]  #: the values that were drawn for the picture
 
@@ -70,7 +70,7 @@ class TrainingStream:
         self._lasers = [f"{n}.{_LASER[1]}" for n in order if recipe.steps[n].node.path == _LASER[0]]
         readers = dict.fromkeys([*(self._inputs.readers if self._inputs else ()), *self._lasers])
         self._readers = {name: _given(recipe, name) for name in readers}
-        fixed = set(needed(recipe, [settings.psf]))  # the dirt on a window is the same in all pictures
+        fixed = set(needed(recipe, [settings.psf]))  # random effects in the PSF, such as dirt, are constant
         noise = {name for name in order if recipe.steps[name].node.random and name not in fixed}
         drawn = _behind(recipe, order, noise | {settings.scene, *(name.rpartition(".")[0] for name in readers)})
         learnt = _behind(recipe, order, {learn} if learn else set())

@@ -138,7 +138,7 @@ def test_paired_axes_run_together(tmp_path):
 
 def test_paired_axes_of_unequal_length_name_both(tmp_path):
     arguments = read_words(["a=1,2", "b=range(3)"], tmp_path, first=2)
-    told = "argument 3 | b | has 3 values, and a (argument 2) has 2: paired axes need equally many values"
+    told = "argument 3 | b | has 3 values, and a (argument 2) has 2: give paired axes the same number of values"
     assert refused(lambda: points(arguments, paired=True)) == [told]
 
 
@@ -151,8 +151,8 @@ def test_every_wrong_argument_is_named_at_once(tmp_path):
     ("words", "told"),
     [
         (["a=1"], "sweep |  | there is no axis: write a=1,2,3 or a='linspace(450 nm, 650 nm, 5)'"),
-        (["a=1,2", "a=3,4"], "argument 2 | a | a is already an axis (argument 1)"),
-        (["a=1,2,1"], "argument 1 | a | the value 1 appears twice"),
+        (["a=1,2", "a=3,4"], "argument 2 | a | a is already an axis in argument 1: remove one"),
+        (["a=1,2,1"], "argument 1 | a | the value 1 appears twice: remove one"),
         (["a=range(1000)", "b=range(1000)"], "sweep |  | a sweep of 1000000 points is too long: at most 100000 points"),
     ],
 )
@@ -176,7 +176,7 @@ def test_axes_of_arrays(tmp_path):
 @pytest.mark.parametrize(
     ("axes", "told"),
     [
-        ({"a": []}, "axis a | a | the list of values is empty"),
+        ({"a": []}, "axis a | a | the list of values is empty: give at least one value"),
         ({"a": 3}, "axis a | a | give a list of values, not int"),
         ({"+a": [1]}, "axis +a | +a | write the name of an axis without + or ~"),
         ({"a": "1,,2"}, "axis a | a=1,,2 | a value is missing before or after a comma"),

@@ -415,7 +415,7 @@ def test_a_mask_is_designed_and_stage_2_learns_behind_it(command, tmp_path, phot
     assert made["fabrication"] == {"levels": 16, "max_height": 3e-6, "wrap_at": None, "feature": 3e-4}
     assert not (folder / "mask.state").exists()
     before = (folder / "mask.safetensors").stat().st_mtime_ns
-    assert "the mask is designed" in command(*words, "--stage", "mask")[1]
+    assert "the mask is already designed" in command(*words, "--stage", "mask")[1]
     for stage in ("1", "both"):
         code, _, err = command(*words, "--stage", stage)
         assert code != 0

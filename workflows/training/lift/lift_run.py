@@ -17,7 +17,7 @@ from neusee.workflows.training.loop.checkpoint import export
 from neusee.workflows.training.loop.resumable_loop import DOCUMENT, Losses, Progress, ResumableLoop, Watch
 
 _COLUMNS = ("iteration", "MRAE", "RMSE", "slope", "rate", "seconds")
-#: names of settings in the key of a folder, so that trainings of version 0.1 continue
+#: old names of settings in the folder key, so that trainings of version 0.1 continue
 _OLD_NAMES = {"min_rate": "least", "warmup": "warm", "ema_decay": "average", "validation_batches": "judge"}
 
 

@@ -86,7 +86,7 @@ def design_in(
     if training.learn is None:
         raise ValueError("train.learn: write the name of the step whose mask is designed")
     if designed(folder):
-        progress("the mask is designed")
+        progress("the mask is already designed")
         return
     if (folder / "state.pt").exists():
         raise ValueError(f"stage 1 has already begun in {folder}: remove this folder, or change a value of train.mask")

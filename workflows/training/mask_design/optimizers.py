@@ -38,7 +38,7 @@ class LearntMask:
 
     height: Callable[[Stop], Tensor]
     loss: float
-    numbers: dict[str, Any]  #: parameters of a mask with few parameters
+    numbers: dict[str, Any]  #: the parameters, if the mask has few parameters
     history: list[dict[str, float]]
 
 
