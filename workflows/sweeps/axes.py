@@ -164,7 +164,7 @@ def _wrong(axes: Sequence[Axis], paired: bool) -> Iterable[Diagnostic]:
     first: dict[str, Axis] = {}
     for axis in axes:
         if first.setdefault(axis.name, axis) is not axis:
-            yield Diagnostic(axis.mark, axis.name, f"{axis.name} is already an axis in {first[axis.name].mark}: remove one")
+            yield Diagnostic(axis.mark, axis.name, f"{axis.name} is also in {first[axis.name].mark}: remove one")
         twice = [value for value, count in Counter(c.shown for c in axis.coordinates).items() if count > 1]
         if twice:
             yield Diagnostic(axis.mark, axis.name, f"the value {twice[0]} appears twice: remove one")

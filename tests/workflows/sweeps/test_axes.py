@@ -151,7 +151,7 @@ def test_every_wrong_argument_is_named_at_once(tmp_path):
     ("words", "told"),
     [
         (["a=1"], "sweep |  | there is no axis: write a=1,2,3 or a='linspace(450 nm, 650 nm, 5)'"),
-        (["a=1,2", "a=3,4"], "argument 2 | a | a is already an axis in argument 1: remove one"),
+        (["a=1,2", "a=3,4"], "argument 2 | a | a is also in argument 1: remove one"),
         (["a=1,2,1"], "argument 1 | a | the value 1 appears twice: remove one"),
         (["a=range(1000)", "b=range(1000)"], "sweep |  | a sweep of 1000000 points is too long: at most 100000 points"),
     ],
