@@ -1,4 +1,4 @@
-"""Losses: the functions that training minimises."""
+"""Losses: the functions that a training minimises."""
 
 from neusee.nodes.losses._contrast_loss import ContrastFloor, HighestFrequency, contrast
 from neusee.nodes.losses._gradient_penalty import gradient_penalty

@@ -1,4 +1,4 @@
-"""The contrast loss of a mask: it keeps the contrast of the scene while another loss lowers the laser peak."""
+"""The contrast loss, which keeps the image contrast of a mask while another loss lowers the laser peak."""
 
 import math
 from typing import Annotated
@@ -11,7 +11,7 @@ from neusee.nodes import node
 from neusee.nodes._half_precision import single
 from neusee.nodes.values import Psf
 
-_DARK = 1e-30  #: share of the light that counts as none
+_DARK = 1e-30  #: share of the light below which a band counts as dark
 
 ContrastFloor = Annotated[float, Field(gt=0, le=0.1)]
 HighestFrequency = Annotated[float, Field(gt=0, le=0.5)]  #: cycles per pixel
@@ -19,7 +19,7 @@ HighestFrequency = Annotated[float, Field(gt=0, le=0.5)]  #: cycles per pixel
 
 @node()
 def contrast(psf: Psf, *, floor: ContrastFloor = 1e-4, up_to: HighestFrequency | None = None) -> Tensor:
-    """Sum the loss of contrast over the bands: for each band, minus the mean of ln sqrt(MTF**2 + floor**2).
+    """Sum over the bands the contrast loss -mean(ln sqrt(MTF**2 + floor**2)), with the mean over frequencies.
 
     The mean is over the frequencies that the clear aperture passes, as in `metrics.mtf`, and the contrast is the
     modulus of the OTF over its value at frequency 0. A mean of logarithms is the logarithm of the geometric mean and
@@ -47,7 +47,7 @@ def _lost(kernel: Tensor, clear_peak: float, floor: float, up_to: float | None) 
     light = kernel.sum()
     dark = light.detach() <= _DARK  # false for NaN, so that NaN reaches the result
     otf = torch.fft.rfft2(kernel / light.where(~dark, 1.0))[inside]
-    square = (otf.real.square() + otf.imag.square()).where(~dark, 0.0).double()  # float32 loses the floor beside 1
+    square = (otf.real.square() + otf.imag.square()).where(~dark, 0.0).double()  # float32 would lose the floor beside 1
     lost: Tensor = -0.5 * (square + floor**2).log().mean()
     return lost.to(kernel)
 

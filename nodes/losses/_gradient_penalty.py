@@ -1,4 +1,4 @@
-"""The gradient penalty of a critic: the loss that keeps the norm of its gradient near 1."""
+"""The gradient penalty, a loss that keeps the norm of a critic's gradient near 1."""
 
 from torch import Tensor
 
@@ -8,7 +8,7 @@ from neusee.nodes._half_precision import single
 
 @node()
 def gradient_penalty(slopes: Tensor) -> Tensor:
-    """Average (norm - 1)^2 over samples, where the norm is that of a sample's gradient of the critic.
+    """Average (norm - 1)^2 over samples, where norm is the norm of the critic's gradient at a sample.
 
     ``slopes`` are the gradients of the critic with respect to its inputs, made with ``create_graph=True``.
 

@@ -1,4 +1,4 @@
-"""Losses of a mask: the peak that a laser leaves, and the light of the scene that the mask scatters away."""
+"""Losses of a mask: the remaining peak of a laser, and the scene light that the mask scatters out of the field."""
 
 from typing import Annotated
 
@@ -10,15 +10,15 @@ from neusee.nodes import node
 from neusee.nodes._half_precision import single
 from neusee.nodes.values import Psf
 
-_DARK = 1e-30  #: light, or a ratio, that counts as none
+_DARK = 1e-30  #: light, or ratio, below which a band counts as dark
 
 
 @node()
 def suppression_loss(psf: Psf, *, power: Annotated[float, Field(ge=8, le=64)] = 8.0, log: bool = False) -> Tensor:
-    """Sum the laser suppression ratio over the bands, with a smooth peak whose gradient reaches all bright pixels.
+    """Sum the laser suppression ratio over the bands, with a p-norm over pixels as a smooth maximum.
 
-    The peak of PSF / clear peak is the p-norm over pixels, whose gradient reaches every bright pixel, while the
-    gradient of the maximum reaches a single pixel. With ``log`` each band counts by its logarithm, so that a factor
+    The p-norm of PSF / clear peak stands for the maximum over pixels: its gradient reaches every bright pixel, while
+    the gradient of the maximum reaches a single pixel. With ``log`` each band counts by its logarithm, so that a factor
     counts alike at 1e-3 and at 1.
 
     Shapes: psf.intensity (band, y, x) -> ().
@@ -51,7 +51,7 @@ def _(psf: Psf, *, power: float = 8.0, log: bool = False) -> Tensor:
 
 @node()
 def background_loss(image: Tensor, plain_image: Tensor) -> Tensor:
-    """Sum over the bands the ratio of the scene's light through the plain lens to the light through the mask.
+    """Sum over the bands the ratio of scene light with the plain lens to scene light with the mask.
 
     Shapes: image and plain_image (..., band, y, x) -> ().
     Units:  none; equal to the number of bands where no light is lost.

@@ -1,4 +1,4 @@
-"""Losses of a restoration: differences from the true picture by pixel and by spatial frequency."""
+"""Losses of a restored picture: differences from the true picture by pixel and by spatial frequency."""
 
 from typing import Annotated
 
@@ -17,7 +17,7 @@ _LEAST = 1e-30  #: least power, because the root has no gradient at 0
 def charbonnier(
     estimate: Tensor, truth: Tensor, *, epsilon: Annotated[float, Field(gt=0, allow_inf_nan=False)] = 1e-6
 ) -> Tensor:
-    """Average sqrt(difference^2 + epsilon): an absolute difference that is smooth at 0.
+    """Average sqrt(difference^2 + epsilon), an absolute difference of pictures that is smooth at 0.
 
     Kornia's `charbonnier_loss` has a fixed epsilon of 1, and is a square for all differences of pictures in [0, 1].
 
@@ -33,7 +33,7 @@ def charbonnier(
 
 @node()
 def fft_l1(estimate: Tensor, truth: Tensor) -> Tensor:
-    """Average the absolute difference of the spatial Fourier spectra of estimate and truth.
+    """Average the absolute difference between the spatial Fourier spectra of the estimated and the true picture.
 
     The transform is in float64: in single precision a coefficient near 0 has neither a reliable size nor a reliable
     direction, and the gradient is that direction.

@@ -1,4 +1,4 @@
-"""The loss of a spectral lift: the error of every band, relative to the true value."""
+"""The loss of spectra estimated from RGB: the error of every band, relative to the true value."""
 
 from typing import Annotated
 
@@ -15,7 +15,7 @@ from neusee.nodes.metrics._picture_quality import require_same_shape
 def mrae(
     estimate: Tensor, truth: Tensor, *, floor: Annotated[float, Field(gt=0, allow_inf_nan=False)] = 0.02
 ) -> Tensor:
-    """Average the absolute difference of spectra, divided by the true value or by `floor`, whichever is larger.
+    """Average the absolute error of spectra, divided by the true value or by `floor`, whichever is larger.
 
     Without a floor a black of 1e-4 has ten thousand times the gradient of white, and training fits the noise of the
     black. With a floor no gradient exceeds 1 / floor, and for a truth below the floor the divisor is constant.

@@ -1,4 +1,4 @@
-"""The Wiener loss of a mask: the part of a picture that a Wiener filter behind the mask cannot recover."""
+"""The Wiener loss of a mask: the share of a picture that a Wiener filter cannot recover behind the mask."""
 
 from typing import Annotated
 
@@ -28,7 +28,7 @@ def wiener(
     colour: OneBandShare = 1.0,
     up_to: HighestFrequency | None = None,
 ) -> Tensor:
-    """Average over channels the logarithm of the share of a picture's variance that a Wiener filter leaves as error.
+    """Average over channels the logarithm of (error variance after a Wiener filter) / (variance of the picture).
 
     The power of the pictures falls with frequency as in the prior of `restore.wiener`. The filter uses the PSF of a
     channel for a grey scene. The error at a frequency has two parts: the part of the picture that noise hides, and, for
@@ -64,7 +64,7 @@ def _square(spectrum: Tensor) -> Tensor:
 
 
 def _counted(size: tuple[int, int], up_to: float | None) -> Tensor:
-    """Return True for the frequencies of half a spectrum above 0 and up to ``up_to``."""
+    """Return True for the frequencies above 0 and up to ``up_to``, in the layout of `torch.fft.rfft2`."""
     fy, fx = torch.fft.fftfreq(size[0], dtype=torch.float64), torch.fft.rfftfreq(size[1], dtype=torch.float64)
     square = fy[:, None].square() + fx.square()
     inside: Tensor = (square > 0) & (square <= (1.0 if up_to is None else up_to**2))

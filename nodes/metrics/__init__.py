@@ -1,4 +1,4 @@
-"""Metrics: the numbers that judge a mask, a picture and a laser spot."""
+"""Metrics: figures of merit of a mask, a picture and a laser spot."""
 
 from neusee.nodes.metrics._mask_limits import Limits, least_lsr, limits, most_contrast, most_unsuppressed
 from neusee.nodes.metrics._picture_quality import Quality, quality

@@ -1,4 +1,4 @@
-"""Limits that no mask can exceed: the least laser suppression ratio, and the most contrast for a given peak."""
+"""Physical limits of any mask: the lowest laser suppression ratio, and the highest contrast for a given peak."""
 
 import math
 from typing import NamedTuple
@@ -9,13 +9,13 @@ from torch import Tensor
 from neusee.nodes import Check, node
 from neusee.nodes.values import Psf
 
-_DARK = 1e-30  #: share of the light that counts as none
+_DARK = 1e-30  #: share of the light below which a band counts as dark
 
 
 class Limits(NamedTuple):
-    """Bounds that follow from the size, the light and the peak of a PSF, with the contrast of the PSF beside them."""
+    """Bounds of laser suppression and contrast for a PSF, and the root mean square contrast of this PSF."""
 
-    floor: Tensor  #: (band,) float64, LSR of the light in the window if spread evenly over the window
+    floor: Tensor  #: (band,) float64, LSR if the light in the window is spread evenly over the window
     rms: Tensor  #: (band,) float64, root mean square contrast over all frequencies that the pixels sample
     bound: Tensor  #: (band,) float64, upper bound of `rms`: sqrt(LSR p0 / light)
     passed: Tensor  #: (band,) float64, upper bound of the root mean square over the frequencies of the clear aperture
@@ -24,7 +24,7 @@ class Limits(NamedTuple):
 
 @node(rtol=1e-6)
 def limits(psf: Psf) -> Limits:
-    """Compute bounds of suppression and contrast from evenly spread light and from Parseval's theorem.
+    """Compute bounds of laser suppression, from evenly spread light, and of contrast, from Parseval's theorem.
 
     Light E in N pixels has a peak of at least E / N, and LSR = peak / p0. The mean of |OTF|**2 over all frequencies is
     the sum of PSF**2, which is at most peak times light. Over a share s of the frequencies the mean is at most 1 / s
@@ -43,7 +43,7 @@ def limits(psf: Psf) -> Limits:
 
 
 def _contrast_bound(kernel: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-    """Return the light of one band, the root mean square contrast, and the upper bound of this contrast."""
+    """Return the light of one band, its root mean square contrast, and the upper bound of this contrast."""
     dark = kernel.sum() <= _DARK  # false for NaN, so that NaN reaches the result
     kernel = kernel.where(~dark, 1.0)  # a root has no gradient at 0
     light, peak = kernel.sum(), kernel.amax()
@@ -55,37 +55,40 @@ def _contrast_bound(kernel: Tensor) -> tuple[Tensor, Tensor, Tensor]:
 def _(result: Limits, psf: Psf) -> list[Check]:
     low, high = float(result.floor.min()), float(result.floor.max())
     bounded = bool((result.rms <= result.bound * (1 + 1e-6)).all())
-    return [Check(f"even light: LSR {low:.3g} to {high:.3g}; rms contrast {float(result.rms.mean()):.3g}, at most "
-                  f"{float(result.bound.mean()):.3g}", bounded)]  # fmt: skip
+    return [Check(f"LSR of evenly spread light {low:.3g} to {high:.3g}; rms contrast {float(result.rms.mean()):.3g}, "
+                  f"bound {float(result.bound.mean()):.3g}", bounded)]  # fmt: skip
 
 
 # --- limits of any mask on this lens ----------------------------------------------------------------------------------
 
 
 def least_lsr(psf: Psf) -> Tensor:
-    """Return the laser suppression ratio of light spread evenly over the field: (band,) float64.
+    """Return the laser suppression ratio of light that is spread evenly over the field: (band,) float64.
 
-    The field has N pixels, and the clear lens puts a share p0 of the light into the brightest pixel. With an element
-    that keeps all light in the field the brightest pixel holds at least 1/N, so that LSR >= 1 / (N p0). An element that
-    scatters light out of the field can reach a lower LSR, by the share of the light that the element keeps.
+    The field has N pixels, and the clear lens puts a share p0 of the light into the brightest pixel. With a mask that
+    keeps all light in the field, the brightest pixel has at least 1/N of the light, so that LSR >= 1 / (N p0). A mask
+    that scatters light out of the field lowers this bound by the share of the light that the mask keeps.
     """
     pixels = psf.intensity.shape[-2] * psf.intensity.shape[-1]
     return 1.0 / (pixels * psf.clear_peak.double())
 
 
 def most_unsuppressed(psf: Psf) -> Tensor:
-    """Return `Limits.passed` (band,) of a mask with LSR 1 that keeps all light; the bound scales with sqrt(LSR)."""
+    """Return the bound of the rms contrast, (band,), of a lossless mask with LSR 1; the bound scales with sqrt(LSR)."""
     clear_peak = psf.clear_peak.double()
     return (clear_peak / shares(psf).to(clear_peak)).sqrt()
 
 
 def shares(psf: Psf) -> Tensor:
-    """Return the share of the sampled frequencies below the cut-off sqrt(4 p0 / pi) of the lens: (band,) float64."""
+    """Return the share of the sampled frequencies that lie below the cut-off of the lens: (band,) float64.
+
+    The cut-off is sqrt(4 p0 / pi) cycles per pixel, where p0 is the peak of the clear lens.
+    """
     fy, fx = (torch.fft.fftfreq(n, dtype=torch.float64) for n in psf.intensity.shape[-2:])
     radius = torch.hypot(fy[:, None], fx)
     return torch.stack([(radius <= math.sqrt(4.0 * float(p) / math.pi)).double().mean() for p in psf.clear_peak])
 
 
 def most_contrast(unsuppressed: float, lsr: Tensor) -> Tensor:
-    """Return the bound, at most 1, of the rms contrast of a mask at each `lsr`, from the bound at an LSR of 1."""
+    """Scale the bound of the rms contrast at LSR 1 to each value of ``lsr``; the result is at most 1."""
     return (unsuppressed * lsr.sqrt()).clamp_max(1.0)

@@ -10,12 +10,12 @@ from torch import Tensor
 from neusee.nodes import Check, node
 from neusee.nodes._half_precision import single
 
-_WINDOW = 11  #: pixels of the Gaussian of SSIM
-_STRIPE = 118  #: rows that are compared together: 128 with the margin of the window
+_WINDOW = 11  #: width in pixels of the Gaussian window of SSIM
+_STRIPE = 118  #: rows that are compared at a time: 128 with the margin of the window
 
 
 class Quality(NamedTuple):
-    """Three measures of the difference of two pictures, each over all channels together."""
+    """Three measures of the difference between two pictures, each over all channels together."""
 
     l1: Tensor  #: () float64, mean absolute difference
     psnr: Tensor  #: () float64, dB, for a white of 1; 200 dB for equal pictures
@@ -30,7 +30,7 @@ def quality(
     border: Annotated[int, Field(ge=0)] = 0,
     domain: Literal["linear", "encoded"] = "encoded",
 ) -> Quality:
-    """Compare a picture with the truth: mean absolute difference, PSNR and SSIM.
+    """Compare a picture with the true picture by mean absolute difference, PSNR and SSIM.
 
     Both pictures are clipped to [0, 1], the range of a display. `encoded` compares sRGB-encoded values, as is usual for
     published photographs; `linear` compares light. SSIM is that of kornia (Gaussian window, 11 x 11, sigma 1.5),
@@ -48,7 +48,7 @@ def quality(
     a, b = (_inside(x, border) for x in (estimate, truth))
     if min(a.shape[-2:]) < _WINDOW:
         size = f"{_WINDOW} x {_WINDOW}"
-        raise ValueError(f"{tuple(a.shape[-2:])} pixels inside the border: SSIM needs {size}, so give a larger picture")
+        raise ValueError(f"{tuple(a.shape[-2:])} pixels inside the border: SSIM needs {size}: give a larger picture")
     absolute, square, alike = _sums(a, b, domain)
     psnr = -10.0 * (square / a.numel()).clamp_min(1e-20).log10()
     seen = a[..., _WINDOW - 1 :, _WINDOW - 1 :].numel()
@@ -62,7 +62,7 @@ def _(result: Quality, *inputs: Tensor, **params: object) -> list[Check]:
 
 
 def require_same_shape(estimate: Tensor, truth: Tensor, fix: str = "crop the truth to the estimate") -> None:
-    """Raise ValueError for an estimate and a truth of different shapes."""
+    """Raise ValueError unless the estimate and the true values have the same shape."""
     if estimate.shape != truth.shape:
         raise ValueError(f"estimate {tuple(estimate.shape)} and truth {tuple(truth.shape)} differ in shape: {fix}")
 
@@ -80,7 +80,7 @@ def _shown(picture: Tensor, domain: str) -> Tensor:
 
 
 def _sums(a: Tensor, b: Tensor, domain: str) -> tuple[Tensor, Tensor, Tensor]:
-    """Sum absolute differences, square differences and SSIM over all pixels, in stripes that fit into the CPU cache."""
+    """Sum the absolute difference, squared difference and SSIM over all pixels, in stripes that fit the CPU cache."""
     absolute, square, alike = (torch.zeros((), dtype=torch.float64, device=a.device) for _ in range(3))
     rows = a.shape[-2] - _WINDOW + 1
     for first in range(0, rows, _STRIPE):
@@ -95,7 +95,7 @@ def _sums(a: Tensor, b: Tensor, domain: str) -> tuple[Tensor, Tensor, Tensor]:
 
 
 def _ssim(p: Tensor, q: Tensor) -> Tensor:
-    """Return SSIM at the pixels whose window lies inside the picture, on CUDA without the rounding of TF32."""
+    """Return SSIM at each pixel whose window lies inside the picture; on CUDA, TF32 is switched off."""
     from kornia.metrics import ssim
 
     pictures = (x.reshape(1, -1, *x.shape[-2:]) for x in (p, q))

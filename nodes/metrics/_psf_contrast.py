@@ -1,4 +1,4 @@
-"""Contrast of the images that a PSF gives, and the spread of the light of a PSF."""
+"""Contrast (MTF) and encircled energy of a PSF."""
 
 import math
 from typing import NamedTuple
@@ -11,11 +11,11 @@ from neusee.nodes._half_precision import single
 from neusee.nodes.units import PositiveLength
 from neusee.nodes.values import Psf
 
-_DARK = 1e-30  #: share of the light that counts as none
+_DARK = 1e-30  #: share of the light below which a band counts as dark
 
 
 class Mtf(NamedTuple):
-    """Statistics of the contrast over the frequencies that the clear aperture passes."""
+    """Statistics of the contrast over the spatial frequencies that the clear aperture passes."""
 
     rms: Tensor  #: (band,) float64, root mean square
     median: Tensor  #: (band,) float64
@@ -24,7 +24,7 @@ class Mtf(NamedTuple):
 
 @node(rtol=1e-5)
 def mtf(psf: Psf) -> Mtf:
-    """Compute the contrast, |OTF| / OTF(0), over all frequencies up to the cut-off of the clear aperture.
+    """Compute statistics of the contrast |OTF| / OTF(0) over all frequencies up to the cut-off of the clear aperture.
 
     The cut-off D / (wavelength x f) follows from the peak of the clear lens p0: sqrt(4 p0 / pi) cycles per pixel.
     Parseval: no mask has an rms contrast (over all frequencies that the pixels sample) above sqrt(LSR p0 / light kept).
@@ -63,7 +63,7 @@ def _(result: Mtf, *inputs: Psf) -> list[Check]:
 
 @node(rtol=1e-6)
 def encircled(psf: Psf, *, pixel_pitch: PositiveLength, radius: PositiveLength) -> Tensor:
-    """Compute the share of the light through the clear pupil that falls within a radius of the axis.
+    """Compute the share of the light, relative to the clear pupil, that falls within a radius around the axis.
 
     Shapes: psf.intensity (band, y, x) -> (band,) float64.
     Units:  radius m on the sensor; result a share of the light through the clear pupil.
@@ -79,14 +79,14 @@ def encircled(psf: Psf, *, pixel_pitch: PositiveLength, radius: PositiveLength) 
 @encircled.check
 def _(result: Tensor, *inputs: Psf, **params: float) -> list[Check]:
     low, high = float(result.min()), float(result.max())
-    return [Check(f"{low:.1%} to {high:.1%} of the light inside", high <= 1.01)]
+    return [Check(f"{low:.1%} to {high:.1%} of the light within the radius", high <= 1.01)]
 
 
 # --- as curves --------------------------------------------------------------------------------------------------------
 
 
 def encircled_curve(light: Tensor) -> Tensor:
-    """Return the light of one band (y, x) within 0, 1, 2, … pixels of the axis: (radius,) float64."""
+    """Return the light of one band within 0, 1, 2, … pixels from the axis, for an image (y, x): (radius,) float64."""
     y, x = (torch.arange(n, dtype=torch.float64) - n // 2 for n in light.shape)
     radius = torch.hypot(y[:, None], x[None, :]).ceil().long().flatten()
     rings = torch.zeros(int(radius.max()) + 1, dtype=torch.float64)
@@ -94,6 +94,6 @@ def encircled_curve(light: Tensor) -> Tensor:
 
 
 def over_clear_peak(psf: Psf, band: int) -> Tensor:
-    """Return the PSF (y, x) of a band as multiples of the peak of the clear lens."""
+    """Divide the PSF (y, x) of a band by the peak of the PSF of the clear lens."""
     relative: Tensor = psf.intensity[band] / psf.clear_peak[band]
     return relative

@@ -1,4 +1,4 @@
-"""Effect of a mask on the laser and on the scene, with the brightest and the saturated pixels of the sensor."""
+"""Laser and background suppression of a mask, and the brightest and the saturated pixels of the sensor."""
 
 from typing import Annotated, Any, NamedTuple
 
@@ -15,18 +15,18 @@ from neusee.nodes.sensor._saturation import Efficiency, Well, saturation
 from neusee.nodes.units import Gain, PositiveLength, Time
 from neusee.nodes.values import Bands, Channels, Psf
 
-_DARK = 1e-30  #: light that counts as none
+_DARK = 1e-30  #: light below which a band counts as dark
 
 
 class Peak(NamedTuple):
-    """The brightest pixel, as a multiple of the saturation irradiance."""
+    """The irradiance of the brightest pixel, in multiples of the saturation irradiance."""
 
     irradiance: Tensor  #: () float64, multiple of saturation
     damaged: Tensor  #: () float64, 1 where the irradiance exceeds the damage threshold
 
 
 class Saturated(NamedTuple):
-    """Pixels with at least one clipped channel."""
+    """The number and the share of pixels with at least one clipped channel."""
 
     pixels: Tensor  #: () float64
     share: Tensor  #: () float64, relative to all pixels
@@ -34,7 +34,7 @@ class Saturated(NamedTuple):
 
 @node(rtol=1e-6)
 def lsr(psf: Psf) -> Tensor:
-    """Compute the laser suppression ratio: the brightest pixel of the PSF over that of the clear lens.
+    """Compute the laser suppression ratio: the peak of the PSF divided by the peak of the PSF of the clear lens.
 
     Shapes: psf.intensity (band, y, x) -> (band,) float64.
     Units:  none; 1 for the clear lens.
@@ -48,14 +48,14 @@ def lsr(psf: Psf) -> Tensor:
 def _(result: Tensor, *inputs: Psf) -> list[Check]:
     floor = float(least_lsr(inputs[0]).max())
     return [Check(f"LSR {float(result.min()):.3g} to {float(result.max()):.3g}", bool((result <= 1.05).all())),
-            Check(f"evenly spread light would reach {floor:.2g}")]  # fmt: skip
+            Check(f"LSR of evenly spread light would be {floor:.2g}")]  # fmt: skip
 
 
 @node(rtol=1e-6, accepts_channel_sums=("image", "plain_image"))
 def bsr(image: Tensor | Channels, plain_image: Tensor | Channels) -> Tensor:
-    """Compute the background suppression ratio: scene light in the field, over the scene light of the plain lens.
+    """Compute the background suppression ratio: scene light in the field, divided by the light with the plain lens.
 
-    An image summed over its bands, `Channels`, still carries the light of each band.
+    An image that is summed over its bands, `Channels`, still contains the light of each band.
 
     Shapes: image and plain_image (..., band, y, x) -> (..., band) float64.
     Units:  none; about 1 for an element that absorbs no light and scatters no light out of the field.
@@ -85,7 +85,7 @@ def _(result: Tensor, *inputs: Tensor | Channels) -> list[Check]:
 
 @node(rtol=1e-6)
 def saturated(raw: Tensor, *, full_well: Well, gain: Gain, bits: Bits = 16) -> Saturated:
-    """Count the pixels with a channel at the full well or at the largest number of the converter.
+    """Count the pixels with a channel at the full well or at the largest number of the analogue-to-digital converter.
 
     Shapes: raw (..., channel, y, x) -> two scalars, float64.
     Units:  raw DN; pixels.
@@ -99,11 +99,11 @@ def saturated(raw: Tensor, *, full_well: Well, gain: Gain, bits: Bits = 16) -> S
 
 @saturated.check
 def _(result: Saturated, *inputs: Tensor, **params: Any) -> list[Check]:
-    return [Check(f"{int(result.pixels)} saturated pixels, {float(result.share):.2%}")]
+    return [Check(f"{int(result.pixels)} saturated pixels, {float(result.share):.2%} of all")]
 
 
 def clipped(raw: Tensor, *, full_well: float, gain: float, bits: int) -> Tensor:
-    """Return True for values at the full well, at the largest number of the converter, and for NaN."""
+    """Return True for raw values at the full well, at the largest number of the converter, and for NaN."""
     full = int(full_well * gain - 0.5)
     marked: Tensor = ~(raw < max(1, min(2**bits - 1, full)))  # NaN counts as clipped
     return marked
@@ -123,7 +123,7 @@ def peak_irradiance(
     exposure: Time,
     damage: Annotated[float, Field(gt=0)] = 1e6,
 ) -> Peak:
-    """Find the largest sum over wavelengths of I / I_sat in a pixel, for the scene and all lasers together.
+    """Find the brightest pixel: the largest sum of I / I_sat over wavelengths, for the scene and all lasers together.
 
     Shapes: image (band, y, x), level (band,), each spot (line band, y, x) -> two scalars, float64.
     Units:  multiples of saturation; damage the multiple above which a sensor may break.
@@ -143,10 +143,10 @@ def peak_irradiance(
 
 
 def _in_wells(irradiance: Tensor | Channels, saturating: Tensor) -> Tensor:
-    """Return the irradiance of each pixel in units of saturation: the sum over wavelengths of I / I_sat."""
+    """Return the irradiance of each pixel in multiples of saturation: the sum of I / I_sat over wavelengths."""
     return weighted(irradiance, (1.0 / saturating)[None])[0]
 
 
 @peak_irradiance.check
 def _(result: Peak, *inputs: Any, **params: Any) -> list[Check]:
-    return [Check(f"peak {float(result.irradiance):.3g} I_sat", not bool(result.damaged))]
+    return [Check(f"brightest pixel {float(result.irradiance):.3g} I_sat", not bool(result.damaged))]

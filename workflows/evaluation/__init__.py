@@ -1,6 +1,6 @@
-"""Which mask and restorer are better, over scenes and strengths of a laser?
+"""Which mask and which restorer give the best pictures, over many scenes and laser strengths?
 
-Pipelines, scenes and points of an evaluation, intervals of confidence, and the page that compares.
+Pipelines, scenes and points of an evaluation, confidence intervals, and the page of the comparison.
 Nothing here is trained; metrics are nodes.
 Offers: `run_evaluation.evaluate`, `pipelines.read_pipelines`, `evaluation_result.EvaluationResult`.
 """

@@ -1,4 +1,4 @@
-"""The figure of the paper: one scene with each laser and without a laser, by the plain lens and by every pipeline."""
+"""The comparison figure of the paper: one scene under each laser, with the plain lens and with every pipeline."""
 
 from __future__ import annotations
 
@@ -21,17 +21,20 @@ _WEAKEST = 1e4  #: strength of the first laser in the figure of the paper
 
 @dataclass(frozen=True)
 class Panel:
-    """A column of the figure: the pictures of one laser by row, linear sRGB (3, y, x)."""
+    """A column of the comparison figure: the pictures with one laser, in linear sRGB (3, y, x)."""
 
     case: str
     strength: float
-    pictures: dict[str, Tensor]  #: "truth", "plain lens" and pipelines
+    pictures: dict[str, Tensor]  #: by name of the row: "truth", "plain lens" or a pipeline
 
 
 def panels(
     bench: EvaluationPoints, each: Sequence[PipelineRecipes], scene: Scene, strengths: Sequence[float]
 ) -> list[Panel]:
-    """Return a column for each laser, with strengths from 1e4, as in the paper, to the largest of ``strengths``."""
+    """Return the columns of the comparison figure, one for each laser and one without a laser.
+
+    The strengths of the lasers rise from 1e4, as in the paper, to the largest of ``strengths``.
+    """
     columns = []
     lasers = [case for case in CASES if case != NONE]
     top = max(max(strengths), _WEAKEST)

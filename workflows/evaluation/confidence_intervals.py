@@ -1,4 +1,4 @@
-"""Confidence intervals over scenes, of means and of differences from a reference in each scene."""
+"""Confidence intervals of means over scenes, and of differences from a reference in the same scenes."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 Numbers = NDArray[np.float64]
 CONFIDENCE = 0.95
-_AGAIN = 10_000  #: sets of scenes that the bootstrap draws for a ratio
+_AGAIN = 10_000  #: sets of scenes that the bootstrap draws for the interval of a ratio
 _AT_ONCE = 500  #: sets in memory at once
 _FEW = 5  #: smallest number of scenes for the bootstrap
 METRICS = ("l1", "psnr", "ssim", "l1 small", "psnr small", "ssim small", "saturated", "peak", "damaged")
@@ -19,7 +19,7 @@ METRICS = ("l1", "psnr", "ssim", "l1 small", "psnr small", "ssim small", "satura
 
 @dataclass(frozen=True)
 class Interval:
-    """A mean with its 95 % confidence interval, whose limits are NaN for too few scenes."""
+    """A mean and its 95 % confidence interval, whose limits are NaN if there are too few scenes."""
 
     mean: float
     low: float
@@ -27,35 +27,35 @@ class Interval:
 
     @property
     def half(self) -> float:
-        """Return half the width of the interval."""
+        """Return the half-width of the interval."""
         return (self.high - self.low) / 2
 
     @property
     def excludes_zero(self) -> bool:
-        """Return True if zero lies outside of the interval."""
+        """Return True if zero lies outside the interval."""
         return self.low > 0 or self.high < 0
 
 
 @dataclass(frozen=True)
 class MetricTable:
-    """All points of one pipeline: values (scene, strength) by metric, NaN for a scene that has no laser."""
+    """The metrics of one pipeline, each as an array (scene, laser strength), with NaN for a scene without a laser."""
 
     strengths: tuple[float, ...]
     values: Mapping[str, Numbers]
 
     def scenes(self, metric: str) -> Numbers:
-        """Return the mean of a metric over strengths, for each scene."""
+        """Return the mean of a metric over all laser strengths, for each scene."""
         means: Numbers = np.nanmean(self.values[metric], axis=1)
         return means
 
     def at(self, metric: str, strength: int) -> Numbers:
-        """Return the values of a metric at one strength, for each scene that has a value."""
+        """Return the values of a metric at one laser strength, without scenes that have no value."""
         column: Numbers = self.values[metric][:, strength]
         return column[~np.isnan(column)]
 
 
 def mean(values: Sequence[float] | Numbers) -> Interval:
-    """Return the mean over scenes with the confidence interval of Student's t distribution."""
+    """Return the mean of values over scenes, with its confidence interval from Student's t distribution."""
     x = np.asarray(values, dtype=np.float64)
     centre = float(x.mean()) if len(x) else math.nan
     if len(x) < 2:
@@ -67,9 +67,9 @@ def mean(values: Sequence[float] | Numbers) -> Interval:
 
 
 def gain(values: Numbers, reference: Numbers, seed: int) -> Interval:
-    """Return the fraction by which the mean of a metric is lower than the mean of the reference, such as 10.1 %.
+    """Return the relative decrease of the mean of a metric against the reference, such as 0.101 for 10.1 %.
 
-    The interval comes from the bootstrap, which draws the same scenes of both pipelines from the seed ``seed``.
+    The interval comes from a bootstrap with the seed ``seed``, which draws the same scenes for both pipelines.
     """
     fraction = 1.0 - float(values.mean()) / float(reference.mean())
     if len(values) < _FEW:
@@ -84,7 +84,7 @@ def gain(values: Numbers, reference: Numbers, seed: int) -> Interval:
 
 
 def compare_with(values: MetricTable, reference: MetricTable, seed: int) -> dict[str, Interval]:
-    """Return by how much L1 is lower than L1 of the reference: the difference, the fraction, and of small pictures."""
+    """Return the decrease of L1 against the reference: absolute, relative, and relative for small pictures."""
     own, other = values.scenes("l1"), reference.scenes("l1")
     return {
         "l1 less": mean(other - own),
@@ -94,7 +94,7 @@ def compare_with(values: MetricTable, reference: MetricTable, seed: int) -> dict
 
 
 def metric_table(points: Sequence[Mapping[float, Mapping[str, float]]], strengths: Sequence[float]) -> MetricTable:
-    """Return the points of one pipeline by scene and strength as arrays (scene, strength)."""
+    """Arrange the metrics of one pipeline as arrays (scene, laser strength)."""
     each = {
         metric: np.array([[point.get(k, {}).get(metric, math.nan) for k in strengths] for point in points])
         for metric in METRICS

@@ -1,4 +1,4 @@
-"""Figures of an evaluation: lasers, error over strength, suppression by wavelength, suppression against contrast."""
+"""Figures of an evaluation: pictures by laser, error by laser strength, laser suppression, and image contrast."""
 
 from __future__ import annotations
 
@@ -18,13 +18,13 @@ if TYPE_CHECKING:
     from neusee.workflows.evaluation.mask_optics import MaskOptics
 
 _COLOURS = (BLUE, VERMILION, GREEN, ORANGE, "#56B4E9", "#CC79A7", BLACK, "#777777")
-_STYLES = ("-", "--", ":", "-.")  #: the next style begins when all colours are used
+_STYLES = ("-", "--", ":", "-.")  #: line styles, of which the next begins when all colours are used
 _GREY = "#777777"
-_LETTERS = 16  #: longest name of a row on one line
+_LETTERS = 16  #: characters of the longest row name that stays on one line
 
 
 def _looks(names: Sequence[str]) -> dict[str, dict[str, Any]]:
-    """Return a colour and a line style for each name, the same in every figure."""
+    """Return the colour and the line style of each curve, by name of the pipeline or mask."""
     count = len(_COLOURS)
     return {
         name: {"color": _COLOURS[i % count], "linestyle": _STYLES[i // count % len(_STYLES)]}
@@ -34,7 +34,7 @@ def _looks(names: Sequence[str]) -> dict[str, dict[str, Any]]:
 
 @drawn
 def cases(panels: Sequence[Panel]) -> Any:
-    """Draw truth, plain lens and every pipeline (rows) for each laser (columns), all with the same scale."""
+    """Draw the true picture, the plain lens and every pipeline in rows, and the lasers in columns, on one scale."""
     rows = list(panels[0].pictures)
     white = high(panels[0].pictures["truth"])
     figure, axes = canvas(1.95 * len(panels) + 0.6, 2.0 * len(rows) + 0.3, len(rows), len(panels))
@@ -57,7 +57,7 @@ def _broken(name: str) -> str:
 
 @drawn
 def strengths(tables: Mapping[str, MetricTable], small: int) -> Any:
-    """Draw L1 over the strength of the laser with its 95 % interval, for full pictures and for small pictures."""
+    """Draw the L1 error with its 95 % interval over the laser strength, for full-size and reduced pictures."""
     figure, axes = canvas(11.0, 4.2, 1, 2, sharex=True)
     looks = _looks(list(tables))
     titles = {"l1": "full size", "l1 small": f"shorter side {small} pixels"}
@@ -84,14 +84,14 @@ def _line(ax: Any, table: MetricTable, metric: str, look: Mapping[str, Any], nam
 
 
 def _places(values: Sequence[float]) -> list[float]:
-    """Return the logarithms of strengths; a strength of 0 is one decade below the smallest strength."""
+    """Return the positions of laser strengths on a logarithmic axis, with 0 one decade below the smallest."""
     logs = [float(np.log10(k)) for k in values if k > 0]
     return [float(np.log10(k)) if k > 0 else (min(logs) - 1 if logs else 0.0) for k in values]
 
 
 @drawn
 def curves(masks: Mapping[str, MaskOptics]) -> Any:
-    """Draw LSR and BSR of every mask over the wavelength."""
+    """Draw the laser and background suppression ratios (LSR, BSR) of every mask over the wavelength."""
     figure, axes = canvas(11.0, 4.2, 1, 2, sharex=True)
     looks = _looks(list(masks))
     left, right = axes[0]
@@ -114,7 +114,7 @@ def curves(masks: Mapping[str, MaskOptics]) -> Any:
 
 @drawn
 def plane(masks: Mapping[str, MaskOptics]) -> Any:
-    """Draw the contrast of each mask over its mean LSR, and the region that no mask reaches."""
+    """Draw the contrast of each mask over its mean LSR, and shade the region that no mask can reach."""
     figure, axes = canvas(8.4, 5.2)
     ax = axes[0, 0]
     floor = float(np.mean([mask.floor.mean() for mask in masks.values()]))

@@ -1,4 +1,4 @@
-"""The page of an evaluation: tables, pictures and their explanations."""
+"""The report page of an evaluation, with tables, pictures and explanations."""
 
 from __future__ import annotations
 
@@ -19,12 +19,12 @@ if TYPE_CHECKING:
 _EACH = ("mean", "low", "high")
 COLUMNS = ("pipeline", "mask", "restorer", "scenes", *(f"{m} {e}" for m in METRICS for e in _EACH),
            *(f"{name} {e}" for name in ("l1 less", "l1 gain", "l1 small gain") for e in _EACH))  # fmt: skip
-_COARSE = 1.05  #: the frequencies of a circular aperture are counted on the square grid of the pixels
+_COARSE = 1.05  #: tolerance of a bound, because a circular aperture is sampled on a square grid of frequencies
 _DIGITS = {"psnr": ".2f", "l1": ".4f", "ssim": ".3f", "saturated": ".0f", "damaged": ".2f"}
 
 
 def draw_pictures(result: EvaluationResult) -> dict[str, bytes]:
-    """Draw the pictures of the page, and return each picture by name."""
+    """Draw the figures of the evaluation page, and return the PNG files by name."""
     return {
         "cases": figures.cases(result.panels),
         "strengths": figures.strengths(result.tables, result.small),
@@ -34,7 +34,7 @@ def draw_pictures(result: EvaluationResult) -> dict[str, bytes]:
 
 
 def summary(result: EvaluationResult) -> dict[str, Any]:
-    """Return the mean and interval of every metric and the gain over the reference, for each pipeline."""
+    """Return for each pipeline the mean and interval of every metric, and the improvement over the reference."""
     return {
         p.name: {
             "mask": p.front,
@@ -47,7 +47,7 @@ def summary(result: EvaluationResult) -> dict[str, Any]:
 
 
 def rows(result: EvaluationResult) -> list[Sequence[Any]]:
-    """Return the rows of ``table.csv``, with the numbers of `summary` for each pipeline."""
+    """Return the rows of ``table.csv``, one for each pipeline, with the numbers of `summary`."""
     listed: list[Sequence[Any]] = []
     for p in result.pipelines:
         each = [mean(result.tables[p.name].scenes(metric)) for metric in METRICS] + list(
@@ -59,7 +59,7 @@ def rows(result: EvaluationResult) -> list[Sequence[Any]]:
 
 
 def lead(result: EvaluationResult) -> str:
-    """Return the result of the evaluation in a few sentences."""
+    """Return a few sentences with the main result of the evaluation."""
     best = min(result.pipelines, key=lambda p: float(result.tables[p.name].scenes("l1").mean()))
     least = _with_interval(mean(result.tables[best.name].scenes("l1")), "l1")
     strengths = ", ".join("none" if k == 0 else f"{k:g}".replace("e+0", "e") for k in result.strengths)
@@ -74,7 +74,7 @@ def lead(result: EvaluationResult) -> str:
 
 
 def sections(result: EvaluationResult, shown: Mapping[str, bytes]) -> list[Section]:
-    """Return the sections of the page, from the table of masks and restorers to the list of scenes."""
+    """Return all sections of the evaluation page."""
     parts = [_crossed(result), _numbers(result), _compared(result)]
     text = """Mean over scenes and its 95 % interval. A scene without a laser counts only at the strength none, so
         that every scene of the other points has a laser."""

@@ -1,4 +1,4 @@
-"""The points of an evaluation: the numbers for a scene, a strength of the laser and a pipeline, computed once each."""
+"""The points of an evaluation: the metrics of one scene, at one laser strength, with one pipeline."""
 
 from __future__ import annotations
 
@@ -27,40 +27,40 @@ from neusee.workflows.store.memo import compute_once
 from neusee.workflows.store.result_store import Store
 from neusee.workflows.tolerance.cheaper_steps import with_substitutions
 
-_MOVED = ("spot", "photons")  #: the first steps that depend on the strength of the laser
+_MOVED = ("spot", "photons")  #: names of the first steps that depend on the laser strength
 
 PointNumbers = dict[str, Any]  #: numbers by name; ``bsr`` is a list
 
 
 @dataclass(frozen=True)
 class PointRequest:
-    """A scene with its laser, and the strength of the laser."""
+    """A request for the metrics of one scene at one laser strength."""
 
     scene: Scene
     strength: float
 
     @property
     def lit(self) -> str:
-        """Return the name of the laser whose recipe is run, which is none if the strength is 0."""
+        """Return the name of the laser in the scene, which is ``none`` if the strength is 0."""
         return self.scene.case if self.strength > 0 else NONE
 
 
 class EvaluationPoints:
-    """The computation of points; results that several points share are computed once."""
+    """The computation of the points of an evaluation, where results that points share are computed once."""
 
     def __init__(self, store: Store, small: int, device: str = "cpu") -> None:
         self.store, self.small, self.device = store, small, device
         self.computed = 0  #: points that were not in the store
-        self.seconds = 0.0  #: that these points took
+        self.seconds = 0.0  #: computing time of these points
         self._code = Code(store.code_memo)
         self._functions: dict[tuple[str, str], Any] = {}
         #: by identity of a recipe; the recipe is kept too, so that no other recipe gets the same identity
         self._drawn: dict[Any, tuple[Recipe, Inputs | None]] = {}
-        self._fixed: dict[str, Any] = {}  #: results that do not depend on a scene, by key: one copy for all functions
+        self._fixed: dict[str, Any] = {}  #: by key, results that do not depend on a scene: one copy for all functions
         self._kept = _SharedResults()
 
     def point(self, pipeline: PipelineRecipes, point: PointRequest) -> PointNumbers:
-        """Return the numbers of a point from the store, or compute and store them."""
+        """Return the metrics of a point from the store, or else compute and store the metrics."""
         compute = partial(self._measure, pipeline, point)
         return compute_once(self.store, self.key(pipeline, point), dict, compute, {"step": "evaluate"}, small=True)
 
@@ -72,7 +72,7 @@ class EvaluationPoints:
         return numbers
 
     def values(self, pipeline: PipelineRecipes, point: PointRequest, more: Sequence[str] = ()) -> dict[str, Any]:
-        """Return the outputs of a run with this scene and laser, and the results of the steps ``more``."""
+        """Run a pipeline on one scene and laser, and return its outputs and the results of the steps ``more``."""
         outputs = (*pipeline.pipeline.outputs, *more)
         function = self._function(pipeline, point.lit, outputs)
         self._kept.turn(point)
@@ -83,14 +83,14 @@ class EvaluationPoints:
         return values
 
     def forget(self) -> None:
-        """Release all results that depend on the laser."""
+        """Release from memory all results that depend on the laser."""
         self._functions = {name: f for name, f in self._functions.items() if name[1] == NONE}
         used = {id(value) for f in self._functions.values() for value in f.fixed.values()}
         self._fixed = {key: value for key, value in self._fixed.items() if id(value) in used}
         self._kept.clear()
 
     def key(self, pipeline: PipelineRecipes, point: PointRequest) -> str:
-        """Return a digest of everything that decides a point: the keys of a run and the settings of the comparison."""
+        """Return the cache key of a point, from the keys of its steps and the settings of the comparison."""
         recipe, outputs = pipeline.recipe(point.lit), pipeline.pipeline.outputs
         params: dict[str, dict[str, Any]] = {}
         for name, value in self._changed(recipe, point, outputs).items():
@@ -106,7 +106,7 @@ class EvaluationPoints:
         return digest("evaluate", engine("evaluation.evaluation_points"), [keys[name] for name in outputs], within, own)
 
     def _keys(self, recipe: Recipe, outputs: Iterable[str], scene: Scene | None = None) -> dict[str, str]:
-        """Return the key of each step; only steps that depend on the scene get the seed of the scene."""
+        """Return the cache key of each step; only steps that depend on the scene use the seed of the scene."""
         keys = {"scene": scene.key(self._code)} if scene else {}
         live = _reached(recipe, keys)
         for name in needed(recipe, outputs):
@@ -133,7 +133,7 @@ class EvaluationPoints:
         return self._functions[name]
 
     def _changed(self, recipe: Recipe, point: PointRequest, outputs: Sequence[str]) -> dict[str, Any]:
-        """Return the parameters that a point changes: drawn values, and the direction and strength of the laser."""
+        """Return the parameters of a recipe that a point sets: drawn values, laser direction and laser strength."""
         inputs = self._inputs(recipe, outputs)
         changed = inputs.theta(point.scene.draw(inputs)) if inputs else {}
         if point.lit != NONE:
@@ -142,7 +142,7 @@ class EvaluationPoints:
         return changed
 
     def _inputs(self, recipe: Recipe, outputs: Sequence[str]) -> Inputs | None:
-        """Return the uncertain inputs of the recipe, or None if no output depends on an uncertain input."""
+        """Return the uncertain inputs of a recipe, or None if no output depends on an uncertain input."""
         if recipe.uncertain is None or not recipe.uncertain.names:
             return None
         key = (id(recipe), tuple(outputs))
@@ -153,7 +153,7 @@ class EvaluationPoints:
         return self._drawn[key][1]
 
     def _share(self, function: Any, recipe: Recipe) -> None:
-        """Give a function the equal fixed results of earlier functions, so that later results are shared too."""
+        """Reuse the fixed results of earlier functions in a function, because results are shared by object identity."""
         keys = self._keys(recipe, function.fixed)
         for name, value in function.fixed.items():
             function.fixed[name] = self._fixed.setdefault(keys[name], value)
@@ -176,7 +176,7 @@ class EvaluationPoints:
 
 
 class _SharedResults:
-    """Results that the next point needs again: results of the scene, and results of the strength."""
+    """A cache of the results that successive points share, by scene and by laser strength."""
 
     def __init__(self) -> None:
         self._of_scene: dict[Any, tuple[Any, Any]] = {}
@@ -186,12 +186,12 @@ class _SharedResults:
         self._seed = 0
 
     def clear(self) -> None:
-        """Release all results."""
+        """Release all kept results from memory."""
         self._of_scene.clear()
         self._of_strength.clear()
 
     def turn(self, point: PointRequest) -> None:
-        """Go to a point, and release the results of other scenes, lasers and strengths."""
+        """Begin a point, and release the results of all other scenes, lasers and strengths."""
         scene = (point.scene.number, point.scene.seed, point.scene.case)
         if scene != self._scene:
             self._of_scene.clear()
@@ -200,9 +200,9 @@ class _SharedResults:
         self._scene, self._strength, self._seed = scene, point.strength, point.scene.seed
 
     def caller(self, moved: set[str]) -> Callable[..., Any]:
-        """Return a function that computes a step, or returns the kept result of a step for the same input objects.
+        """Return a function that computes a step, or reuses the step's result if the input objects are the same.
 
-        ``moved`` names the steps that depend on the strength of the laser.
+        ``moved`` names the steps that depend on the laser strength.
         """
 
         def compute(step: Step, inputs: Sequence[Any], params: Mapping[str, Any], seed: int, device: str) -> Any:
@@ -222,7 +222,7 @@ def _spots(recipe: Recipe, outputs: Sequence[str]) -> list[str]:
 
 
 def _reached(recipe: Recipe, roots: Iterable[str]) -> set[str]:
-    """Return the steps ``roots`` and all steps that depend on these steps."""
+    """Return the steps ``roots`` and all steps that depend on them."""
     reached = set(roots)
     for name in needed(recipe, recipe.steps):
         if not reached.isdisjoint(recipe.steps[name].sources):
@@ -231,7 +231,7 @@ def _reached(recipe: Recipe, roots: Iterable[str]) -> set[str]:
 
 
 def reduced(picture: Tensor, side: int) -> Tensor:
-    """Clip a picture to [0, 1] and reduce the shorter side to ``side`` pixels, antialiased and in linear light."""
+    """Clip a picture to [0, 1], and resize it, antialiased, so that its shorter side has ``side`` pixels."""
     y, x = picture.shape[-2:]
     scale = side / min(y, x)
     return resize(picture.clamp(0, 1), round(y * scale), round(x * scale))

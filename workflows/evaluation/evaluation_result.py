@@ -1,4 +1,4 @@
-"""The result of an evaluation: the numbers of every pipeline in every scene, and statistics over the scenes."""
+"""The result of an evaluation: the metrics of every pipeline in every scene, and statistics over the scenes."""
 
 from __future__ import annotations
 
@@ -17,17 +17,17 @@ from neusee.workflows.graph.recipe_graph import Recipe
 
 @dataclass(frozen=True)
 class EvaluationResult:
-    """The scenes, points, statistics, masks and pictures of an evaluation."""
+    """The result of an evaluation: its scenes, points, statistics, masks and pictures."""
 
     recipe: Recipe
     scenes: Sequence[Scene]
     broken: Sequence[tuple[Path, str]]
     strengths: tuple[float, ...]
-    small: int  #: pixels of the shorter side of the small pictures
+    small: int  #: pixels of the shorter side of the reduced pictures
     reference: str  #: the pipeline with which all others are compared
     points: dict[str, list[dict[float, PointNumbers]]]  #: by pipeline and scene
     tables: dict[str, MetricTable]  #: by pipeline
-    against: dict[str, dict[str, Interval]]  #: gains over the reference by pipeline
+    against: dict[str, dict[str, Interval]]  #: by pipeline, decrease of L1 against the reference
     masks: dict[str, MaskOptics]  #: by mask
     panels: Sequence[Panel]
     pipelines: Sequence[Pipeline]

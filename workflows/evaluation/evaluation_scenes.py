@@ -1,4 +1,4 @@
-"""The numbered scenes of an evaluation: part of a photograph, direction of a laser and seed of the noise."""
+"""The scenes of an evaluation, each with a crop of a photograph, a laser direction and a seed of the noise."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ _PHOTOGRAPH = "scene.photograph"
 
 @dataclass(frozen=True)
 class Scene:
-    """One scene of an evaluation, whose picture is read when the picture is first needed."""
+    """One scene of an evaluation; the file of its picture is read on first use."""
 
     number: int
     case: str  #: name of the laser, or none
@@ -37,12 +37,12 @@ class Scene:
 
     @property
     def seed(self) -> int:
-        """Return the seed of noise and direction: a run of the recipe with this seed has the same values."""
+        """Return the seed of noise and laser direction; a run of the recipe with this seed gives the same values."""
         return self.recipe.seed + self.number
 
     @cached_property
     def picture(self) -> Tensor:
-        """Return the picture in linear sRGB (3, y, x)."""
+        """Return the picture of the scene in linear sRGB (3, y, x)."""
         if self.path is None:
             own: Tensor = run(self.recipe, self.store, ("scene",))["scene"]
             return own
@@ -53,39 +53,39 @@ class Scene:
             raise EvaluationRefused(f"{self.path}: {error}: {text}") from error
 
     def key(self, code: Code) -> str:
-        """Return a digest of everything that decides the picture."""
+        """Return the cache key of the picture of the scene."""
         if self.path is None:
             return digest("own scene", key_of(self.recipe.steps["scene"], {}, self.recipe.seed, code)[0])
         own = code.digest(crop_photograph.__module__)
         return digest("photograph", own, file_digest(self.path), list(self.shape), self.recipe.seed, self.number)
 
     def draw(self, inputs: Inputs) -> dict[str, float]:
-        """Draw each uncertain value, in SI, with the same result for every mask, restorer and laser."""
+        """Draw the uncertain values of the scene, in SI; every mask, restorer and laser gets the same values."""
         import numpy as np
 
         z = [np.random.default_rng([self.seed, stream_seed(0, name)]).standard_normal() for name in inputs.names]
         return dict(zip(inputs.names, map(float, inputs.at(np.array([z]))[0]), strict=True))
 
     def angle(self, recipe: Recipe) -> tuple[float, float]:
-        """Draw the direction cosines (y, x) of the laser as the paper does."""
+        """Draw the direction cosines (y, x) of the laser from the distribution in the paper."""
         step = recipe.steps[f"direction[{BEAM}]"]
         drawn = call(step, [], step.params, self.seed, "cpu")
         return float(drawn[0]), float(drawn[1])
 
 
 def scenes(recipe: Recipe, store: Store, root: Path | None, count: int) -> tuple[list[Scene], list[tuple[Path, str]]]:
-    """Return ``count`` scenes with the lasers in turn, and the unreadable photographs with the reasons."""
+    """Return ``count`` scenes, which cycle through the lasers, and a list of unreadable photographs with reasons."""
     broken: list[tuple[Path, str]] = []
     own = recipe.steps["scene"]
     shape = _shape(recipe)
     paths: Sequence[Path] = [own.params["file"]] if own.node.path == _PHOTOGRAPH else []
     if root is not None:
         if not root.is_dir():
-            raise EvaluationRefused(f"--data {root}: no such folder")
+            raise EvaluationRefused(f"--data {root}: this folder does not exist")
         paths, broken = list_photographs(root)
         if not paths:
             reason = f"; {broken[0][0].name}: {broken[0][1]}" if broken else ""
-            raise EvaluationRefused(f"--data {root}: no photograph that can be read, PNG or JPEG{reason}")
+            raise EvaluationRefused(f"--data {root}: the folder contains no readable PNG or JPEG file{reason}")
     cases, shown = list(CASES), []
     for i in range(count):
         path = choose_photograph(paths, recipe.seed, i) if paths else None
@@ -95,10 +95,10 @@ def scenes(recipe: Recipe, store: Store, root: Path | None, count: int) -> tuple
 
 
 def _shape(recipe: Recipe) -> tuple[int, int]:
-    """Return the size of the scene from the parameters of its step; raise `EvaluationRefused` without a size."""
+    """Return the size (y, x) of the scene in pixels; raise `EvaluationRefused` if the recipe sets no size."""
     shape = recipe.steps["scene"].params.get("shape")
     if shape is None and recipe.steps["scene"].node.path == _PHOTOGRAPH:
-        raise EvaluationRefused("scene.shape: give the size to crop from every photograph, such as [768, 768]")
+        raise EvaluationRefused("scene.shape is missing: write the size to crop from photographs, such as [768, 768]")
     if shape is None:
-        raise EvaluationRefused("the scene of the recipe has no shape: write one, such as scene.shape=[768, 768]")
+        raise EvaluationRefused("the scene of the recipe has no shape: write a shape, such as scene.shape=[768, 768]")
     return int(shape[0]), int(shape[1])

@@ -1,4 +1,4 @@
-"""The optics of a mask without a scene: suppression and contrast at each wavelength, and bounds on both."""
+"""Figures of merit of a mask by wavelength: laser suppression, image contrast, and bounds of both."""
 
 from __future__ import annotations
 
@@ -18,13 +18,13 @@ from neusee.workflows.store.result_store import Store
 
 @dataclass(frozen=True)
 class MaskOptics:
-    """Suppression and contrast of a mask by band."""
+    """The laser suppression and the image contrast of a mask, by spectral band."""
 
     wavelengths: Numbers  #: nm
     lsr: Numbers
     bsr: Numbers  #: mean over scenes
-    median: Numbers  #: contrast, within the band of the clear aperture
-    rms: Numbers  #: rms contrast within the same band
+    median: Numbers  #: median contrast over the frequencies that the clear aperture passes
+    rms: Numbers  #: rms contrast over the same frequencies
     floor: Numbers  #: smallest LSR of a mask that keeps all light in the field
     most: Numbers  #: largest rms contrast that the peak allows
     unsuppressed: Numbers  #: largest rms contrast of a mask with an LSR of 1 that keeps all light
@@ -33,7 +33,7 @@ class MaskOptics:
 def masks(
     each: Sequence[PipelineRecipes], store: Store, device: str, points: Mapping[str, Sequence[Mapping[float, Any]]]
 ) -> dict[str, MaskOptics]:
-    """Return the optics of each mask by name, in the order of the pipelines."""
+    """Return the figures of merit of each mask by name, in the order of the pipelines."""
     optics: dict[str, MaskOptics] = {}
     for pipeline in each:
         if pipeline.pipeline.front not in optics:

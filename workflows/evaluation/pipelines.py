@@ -1,4 +1,4 @@
-"""The pipelines of an evaluation: pairs of a mask and a restorer, with one recipe for each laser."""
+"""The pipelines of an evaluation, each of a mask and a restorer, with one recipe for each laser."""
 
 from __future__ import annotations
 
@@ -31,12 +31,12 @@ _HOW = "write MASK+RESTORER, such as flat+none, five_half_rings+wiener or pixelw
 
 
 class EvaluationRefused(ValueError):
-    """Error for mistakes in the arguments or the photographs of an evaluation."""
+    """Error for mistakes in the arguments or in the photographs of an evaluation."""
 
 
 @dataclass(frozen=True)
 class Pipeline:
-    """A mask in front of the lens, and the restorer of the picture behind this mask."""
+    """A mask in front of the lens, together with the restorer of the picture that the lens gives."""
 
     mask: str  #: an option of `doe`
     restorer: str  #: an option of `restore`, or none
@@ -45,32 +45,32 @@ class Pipeline:
 
     @property
     def name(self) -> str:
-        """Return the pipeline as text, with the names of files without folders."""
+        """Return the pipeline as text, such as ``flat+none``, with file names but no folders."""
         return f"{self.front}+{self.back}"
 
     @property
     def front(self) -> str:
-        """Return the name of the mask, with its file if any."""
+        """Return the name of the mask, followed by the name of its file if it has a file."""
         return self.mask + (f"@{self.height_file.name}" if self.height_file else "")
 
     @property
     def back(self) -> str:
-        """Return the name of the restorer, with its file if any."""
+        """Return the name of the restorer, followed by the name of its file if it has a file."""
         return self.restorer + (f"@{self.weights.name}" if self.weights else "")
 
     @property
     def picture(self) -> str:
-        """Return the step whose picture is compared with the truth."""
+        """Return the name of the step whose picture is compared with the true picture."""
         return "developed[mask]" if self.restorer == NONE else "restored"
 
     @property
     def quality(self) -> str:
-        """Return the step that compares the picture with the truth."""
+        """Return the name of the step that compares the result with the true picture."""
         return "developed_quality[mask]" if self.restorer == NONE else "restored_quality"
 
     @property
     def outputs(self) -> tuple[str, ...]:
-        """Return the steps whose results an evaluation needs."""
+        """Return the names of the steps whose results an evaluation needs."""
         return (self.picture, "truth", self.quality, "saturated[mask]", "peak[mask]", "bsr[mask]")
 
 
@@ -79,7 +79,7 @@ class PipelineRecipes:
     """A pipeline with one recipe for each laser; the recipes differ only in the wavelength of the laser."""
 
     pipeline: Pipeline
-    recipe: Callable[[str], Recipe]  #: of a laser by name
+    recipe: Callable[[str], Recipe]  #: returns the recipe of a laser by name
 
     @property
     def name(self) -> str:
@@ -87,7 +87,7 @@ class PipelineRecipes:
 
 
 def read_pipelines(text: str, folder: Path) -> list[Pipeline]:
-    """Read pipelines such as ``flat+none, five_half_rings+wiener``; raise `EvaluationRefused` with every mistake."""
+    """Parse pipelines such as ``flat+none, five_half_rings+wiener``; raise `EvaluationRefused` with all mistakes."""
     found: list[Pipeline] = []
     wrong: list[str] = []
     for word in filter(None, (part.strip() for part in text.split(","))):
@@ -97,11 +97,11 @@ def read_pipelines(text: str, folder: Path) -> list[Pipeline]:
             continue
         height, weights = (folder / Path(x).expanduser() if (x := match[k]) else None for k in ("height", "weights"))
         found.append(Pipeline(match["mask"], match["restorer"], height, weights))
-        wrong += [f"{word}: no file {path}" for path in (height, weights) if path and not path.is_file()]
+        wrong += [f"{word}: no such file: {path}" for path in (height, weights) if path and not path.is_file()]
     twice = {p.name for p in found if [q.name for q in found].count(p.name) > 1}
-    wrong += [f"{name}: is listed twice" for name in sorted(twice)]
+    wrong += [f"{name} is listed twice: remove one" for name in sorted(twice)]
     if not found and not wrong:
-        wrong = [f"no pipeline: {_HOW}"]
+        wrong = [f"there is no pipeline: {_HOW}"]
     if wrong:
         raise EvaluationRefused("\n".join(wrong))
     return found
@@ -110,7 +110,7 @@ def read_pipelines(text: str, folder: Path) -> list[Pipeline]:
 def compose_pipelines(
     recipe: str, changes: Sequence[str | Override], pipelines: Sequence[Pipeline], folder: Path
 ) -> list[PipelineRecipes]:
-    """Return the recipes of every pipeline; raise `EvaluationRefused` with the mistakes of all pipelines."""
+    """Return each pipeline with its recipes; raise `EvaluationRefused` with the mistakes of all pipelines."""
     fwhm = _fwhm(recipe, changes, folder)
     found: list[PipelineRecipes] = []
     wrong: dict[str, None] = {}
@@ -135,7 +135,7 @@ def _one_line(problem: Diagnostic) -> str:
 
 
 def _words(pipeline: Pipeline) -> list[str]:
-    """Return the arguments that change the recipe to the mask and restorer of a pipeline."""
+    """Return the overrides that set the mask and the restorer of a pipeline in a recipe."""
     words = [f"doe={pipeline.mask}"]
     if pipeline.height_file:
         words.append(f"doe.{_takes('doe', pipeline.mask)}={pipeline.height_file.absolute()}")
@@ -147,20 +147,20 @@ def _words(pipeline: Pipeline) -> list[str]:
 
 
 def _takes(group: str, option: str) -> str:
-    """Return the parameter that gives a file to an option of a group; raise `EvaluationRefused` without a parameter."""
+    """Return the parameter that names the file of an option; raise `EvaluationRefused` if the option takes no file."""
     options = groups_of(packaged()).get(group, [])
     path = packaged() / group / f"{option}.yaml"
     if option == NONE or (option in options and not path.is_file()):
-        raise EvaluationRefused(f"{option} takes no file")
+        raise EvaluationRefused(f"{option} takes no file: remove @ and the file name")
     if not path.is_file():
         raise EvaluationRefused(f"no option {option} in {group}; {nearest(option, options)}")
     if match := re.search(r"\b(file|weights): null", path.read_text(encoding="utf-8")):
         return match[1]
-    raise EvaluationRefused(f"{option} takes no file")
+    raise EvaluationRefused(f"{option} takes no file: remove @ and the file name")
 
 
 def _with_laser(recipe: str, words: Sequence[str | Override], fwhm: float, folder: Path, case: str) -> Recipe:
-    """Load a recipe with the laser of a case; strength and direction of the laser are set later for each point."""
+    """Load a recipe with the laser ``case``, whose strength and direction are set later for each point."""
     laser = ""
     if (metres := CASES[case]) is not None:
         line = f"wavelength: {metres * 1e9:g} nm, fwhm: {fwhm * 1e9:g} nm"
@@ -169,7 +169,7 @@ def _with_laser(recipe: str, words: Sequence[str | Override], fwhm: float, folde
 
 
 def _fwhm(recipe: str, changes: Sequence[str | Override], folder: Path) -> float:
-    """Return the width of the first laser line of the recipe in m, or 10 nm for a recipe without a laser."""
+    """Return the FWHM of the recipe's first laser in m, or 10 nm if the recipe has no laser."""
     try:
         steps = load(recipe, changes, folder).steps
     except RecipeError as error:
@@ -181,4 +181,4 @@ def _fwhm(recipe: str, changes: Sequence[str | Override], folder: Path) -> float
 def _check(recipe: Recipe, pipeline: Pipeline) -> None:
     missing = [name for name in ("scene", *pipeline.outputs, "lsr[mask]", "mtf[mask]") if name not in recipe.steps]
     if missing:
-        raise EvaluationRefused(f"{recipe.name} lacks steps that an evaluation needs: {', '.join(missing)}")
+        raise EvaluationRefused(f"{recipe.name} lacks these steps, which an evaluation needs: {', '.join(missing)}")

@@ -1,10 +1,10 @@
-"""The evaluation of masks and restorers as in the paper: every pipeline on the same scenes and laser strengths.
+"""The evaluation of masks and restorers as in the paper, with the same scenes and laser strengths for each pair.
 
     evaluate("first_light", read_pipelines("flat+none, five_half_rings+wiener", Path()), data=Path("photographs"))
 
-Each point has a scene, a strength of the laser and a pipeline, and the numbers of a run of the recipe to the last bit.
-A run that cannot prove its tolerance is computed again more strictly; a point is computed once. The store keeps all
-points, so that an interrupted evaluation continues.
+Each point has a scene, a laser strength and a pipeline, and its metrics equal those of a run of the recipe to the last
+bit. A run that cannot prove its tolerance is computed again more strictly; a point is computed once. The store keeps
+all points, so that an interrupted evaluation continues.
 """
 
 from __future__ import annotations
@@ -60,11 +60,11 @@ def evaluate(
     device: str = "cpu",
     folder: Path | None = None,
 ) -> Path:
-    """Measure every pipeline on ``count`` scenes at all ``strengths``, and return the folder of the results.
+    """Evaluate every pipeline on ``count`` scenes at all laser ``strengths``, and return the folder of the results.
 
     Args: recipe, changes: the camera, as for `load`. data: a folder of photographs, by default the scene of the recipe.
-    small: shorter side of the reduced pictures, which are compared too. reference: the pipeline with which the others
-    are compared, by default the first pipeline. progress: receives a line for each scene.
+    small: shorter side of the reduced pictures, which are compared too. reference: the pipeline with which all other
+    pipelines are compared, by default the first pipeline. progress: receives a line for each scene.
     Raises: `EvaluationRefused` with every mistake before anything runs.
     """
     store, place = store or open_store(), folder or Path.cwd()
@@ -91,14 +91,14 @@ def evaluate(
 
 def _strengths(strengths: Sequence[float]) -> tuple[float, ...]:
     if not strengths or min(strengths) < 0 or not all(map(np.isfinite, strengths)):
-        raise EvaluationRefused("--strengths: write multiples of saturation, 0 or more, such as 0,1e1,1e3,1e6")
+        raise EvaluationRefused("--strengths: write finite multiples of saturation, 0 or more, such as 0,1e1,1e3,1e6")
     return tuple(sorted(set(map(float, strengths))))
 
 
 def _reference(reference: str, pipelines: Sequence[Pipeline]) -> str:
     names = [pipeline.name for pipeline in pipelines]
     if reference and reference not in names:
-        raise EvaluationRefused(f"--reference {reference}: write one of the pipelines {', '.join(names)}")
+        raise EvaluationRefused(f"--reference {reference} is not evaluated: write one of {', '.join(names)}")
     return reference or names[0]
 
 
@@ -116,13 +116,13 @@ def _points(
     strengths: Sequence[float],
     progress: Progress,
 ) -> dict[str, list[dict[float, PointNumbers]]]:
-    """Compute all points, with the scenes of one laser one after another because these scenes share optics."""
+    """Compute all points, grouped by laser because scenes with the same laser share optical results."""
     points: dict[str, list[dict[float, PointNumbers]]] = {p.name: [{} for _ in shown] for p in each}
     before, order = "", [scene.case for scene in shown]
     for done, scene in enumerate(sorted(shown, key=lambda scene: order.index(scene.case)), 1):
         if before not in ("", scene.case):
             bench.forget()
-        before, alone = scene.case, replace(scene)  # a copy, so that the picture is released with it
+        before, alone = scene.case, replace(scene)  # a copy, which releases the picture when it is deleted
         for strength in strengths if scene.case != NONE else (0.0,):
             for pipeline in each:
                 point = bench.point(pipeline, PointRequest(alone, strength))

@@ -1,4 +1,4 @@
-"""The axes of a sweep in the notation of Hydra, ``a=1,2,3`` and ``b='range(0, 10, 2)'``, and the points of the axes."""
+"""The axes of a sweep, in the notation of Hydra such as ``a=1,2,3``, and all combinations of the values."""
 
 from __future__ import annotations
 
@@ -20,16 +20,16 @@ from neusee.workflows.sweeps.value_ranges import MOST, spans, values_of
 
 @dataclass(frozen=True, slots=True)
 class Coordinate:
-    """One value of an axis, with the changes of the recipe that set the value."""
+    """One value on an axis of a sweep, with the changes of the recipe that set this value."""
 
-    shown: str  #: as a user writes it
-    value: Any  #: as YAML reads it
+    shown: str  #: the value as a user writes it
+    value: Any  #: the value as YAML reads it
     overrides: tuple[Override, ...]
 
 
 @dataclass(frozen=True, slots=True)
 class Axis:
-    """A parameter or a group of a recipe, with the values that a sweep gives to the parameter or group."""
+    """An axis of a sweep: a parameter or a group of a recipe, with the list of values for the sweep."""
 
     name: str
     coordinates: tuple[Coordinate, ...]
@@ -42,32 +42,38 @@ _T = TypeVar("_T")
 
 @dataclass(frozen=True, slots=True)
 class Point:
-    """One combination of the values of all axes."""
+    """A point of a sweep: one combination of values, with one value from each axis."""
 
-    number: int  #: counts from 1, with the last axis fastest
-    place: tuple[int, ...]  #: index along every axis
+    number: int  #: counts from 1, where the last axis varies fastest
+    place: tuple[int, ...]  #: index of the value on each axis
     coordinates: tuple[Coordinate, ...]  #: one for each axis
     overrides: tuple[Override, ...]  #: every change of the recipe, in the order of the arguments
     axes: tuple[str, ...]  #: the names of the axes
 
     @property
     def shown(self) -> str:
-        """Return the point as text: ``sensor.read_noise=5 e-, doe=axicon``."""
+        """Return the point as text, such as ``sensor.read_noise=5 e-, doe=axicon``."""
         return ", ".join(f"{name}={c.shown}" for name, c in zip(self.axes, self.coordinates, strict=True))
 
 
 def read_words(words: Sequence[str | Override], folder: Path, first: int = 1) -> list[Argument]:
-    """Read arguments of the command line, counted from ``first``; raise `RecipeError` with all mistakes."""
+    """Read axes and overrides from command-line arguments; raise `RecipeError` with the mistakes of all arguments.
+
+    Messages number the arguments from ``first``.
+    """
     return _every(partial(_read_word, word, number, folder) for number, word in enumerate(words, first))
 
 
 def read_axes(axes: Mapping[str, str | Iterable[Any]], folder: Path) -> list[Argument]:
-    """Read axes whose values are a Python list, or a text as on the command line."""
+    """Read axes whose values are either a Python list or a text in the notation of the command line."""
     return _every(partial(_read_axis, name, values, folder) for name, values in axes.items())
 
 
 def points(arguments: Sequence[Argument], paired: bool = False) -> list[Point]:
-    """Return all combinations of values, the last axis fastest, or, if ``paired``, value n of every axis for each n."""
+    """Return the points of a sweep: all combinations of values, or, if ``paired``, the n-th values of all axes.
+
+    The last axis varies fastest.
+    """
     axes = [argument for argument in arguments if isinstance(argument, Axis)]
     diagnostics = list(_wrong(axes, paired))
     if diagnostics:
@@ -81,7 +87,7 @@ def points(arguments: Sequence[Argument], paired: bool = False) -> list[Point]:
 
 
 def _every(readers: Iterable[Callable[[], _T]]) -> list[_T]:
-    """Call each function and return the results; raise one `RecipeError` with the mistakes of all functions."""
+    """Call each function and return the results; raise one `RecipeError` that lists the mistakes from all calls."""
     results: list[_T] = []
     diagnostics: list[Diagnostic] = []
     for read in readers:
@@ -121,7 +127,7 @@ def _read_axis(name: str, values: str | Iterable[Any], folder: Path) -> Axis:
         raise RecipeError([Diagnostic(mark, name, f"give a list of values, not {type(values).__name__}")])
     coordinates = tuple(_coordinate(name, value, folder) for value in listed)
     if not coordinates:
-        raise RecipeError([Diagnostic(mark, name, "the list of values is empty")])
+        raise RecipeError([Diagnostic(mark, name, "the list of values is empty: give at least one value")])
     return Axis(name, coordinates, mark)
 
 
@@ -152,20 +158,20 @@ def _axis(name: str, values: Sequence[str], mark: Location) -> Axis:
 
 
 def _wrong(axes: Sequence[Axis], paired: bool) -> Iterable[Diagnostic]:
-    """Yield the mistakes in the names and the numbers of values of all axes."""
+    """Yield the mistakes in the axes of a sweep, such as a repeated name, a repeated value or too many points."""
     if not axes:
         yield Diagnostic(Location("sweep"), "", "there is no axis: write a=1,2,3 or a='linspace(450 nm, 650 nm, 5)'")
     first: dict[str, Axis] = {}
     for axis in axes:
         if first.setdefault(axis.name, axis) is not axis:
-            yield Diagnostic(axis.mark, axis.name, f"{axis.name} is already an axis ({first[axis.name].mark})")
+            yield Diagnostic(axis.mark, axis.name, f"{axis.name} is also in {first[axis.name].mark}: remove one")
         twice = [value for value, count in Counter(c.shown for c in axis.coordinates).items() if count > 1]
         if twice:
-            yield Diagnostic(axis.mark, axis.name, f"the value {twice[0]} appears twice")
+            yield Diagnostic(axis.mark, axis.name, f"the value {twice[0]} appears twice: remove one")
         there, here = len(axes[0].coordinates), len(axis.coordinates)
         if paired and there != here:
             text = f"has {here} values, and {axes[0].name} ({axes[0].mark}) has {there}"
-            yield Diagnostic(axis.mark, axis.name, f"{text}: paired axes need equally many values")
+            yield Diagnostic(axis.mark, axis.name, f"{text}: give paired axes the same number of values")
     product = 1 if paired else math.prod(len(axis.coordinates) for axis in axes)
     if product > MOST:
         yield Diagnostic(Location("sweep"), "", f"a sweep of {product} points is too long: at most {MOST} points")

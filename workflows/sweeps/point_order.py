@@ -1,7 +1,7 @@
-"""The order in which the points of a sweep run, the results that points share, and the work of each point.
+"""The order in which the points of a sweep run, the results that points share, and the computing time of each point.
 
 Two points share the result of a step if the step has the same key at both points. An axis that changes costly steps
-varies slowly, and only one axis changes from point to point: a costly result is computed once and released soon.
+varies slowly, and only one axis changes from point to point: a costly result is computed once and released early.
 """
 
 from __future__ import annotations
@@ -18,33 +18,33 @@ from neusee.workflows.keys.cache_key import Key
 
 @dataclass(frozen=True, slots=True)
 class PointJob:
-    """The steps that one point of a sweep needs, with their keys and sources."""
+    """The steps that one point of a sweep needs, with the cache key and the input steps of each."""
 
-    place: tuple[int, ...]  #: index along every axis
-    keys: Mapping[str, Key]  #: of every step that the outputs need
-    sources: Mapping[str, tuple[str, ...]]  #: by step, the steps that feed it
+    place: tuple[int, ...]  #: index of the value on each axis
+    keys: Mapping[str, Key]  #: cache key of every step that the outputs need
+    sources: Mapping[str, tuple[str, ...]]  #: by step, the steps that it reads
     outputs: tuple[str, ...]
 
 
 @dataclass(frozen=True, slots=True)
 class Sharing:
-    """The results that the points of a sweep share, and the work that this saves."""
+    """The number of results that the points of a sweep share, and the computing time that sharing saves."""
 
     points: int
     distinct: Mapping[str, int]  #: number of different results of each step
     steps: int  #: number of steps of all points together
     made: int  #: number of different results of all steps
-    alone: float  #: work of all points, each for itself: seconds, or steps where no seconds are known
-    together: float  #: work of the different results
+    alone: float  #: work of all points without sharing, in seconds, or in steps if no step has run before
+    together: float  #: work of the different results, each computed once
 
     @property
     def saved(self) -> float:
-        """Return the fraction of the work that shared results save, in [0, 1]."""
+        """Return the fraction of the computing time that shared results save, in [0, 1]."""
         return 1 - self.together / self.alone if self.alone else 0.0
 
 
 def filled(costs: Mapping[str, float], steps: Iterable[str]) -> dict[str, float]:
-    """Return a cost for every step: the known cost of the step, else the median of the known costs, else 1."""
+    """Return the cost of every step, where a step without a known cost gets the median of the known costs, or 1."""
     steps = list(steps)
     known = [costs[step] for step in steps if step in costs]
     usual = median(known) if known else 1.0
@@ -52,12 +52,12 @@ def filled(costs: Mapping[str, float], steps: Iterable[str]) -> dict[str, float]
 
 
 def best_order(jobs: Sequence[PointJob], costs: Mapping[str, float], paired: bool = False) -> list[int]:
-    """Return indices of ``jobs`` in an order in which costly shared steps run once although few results are held.
+    """Return the indices of ``jobs`` in an order in which costly shared steps run once and few results stay in memory.
 
     Args: jobs: one job for each point, in the order of the product of the axes, the last axis fastest.
-    costs: known seconds by step. paired: the axes vary together, as one axis.
+    costs: known seconds by step. paired: the axes vary together like one axis.
 
-    If each axis changes a fixed set of steps, no other order of a product changes less work from point to point.
+    If each axis changes a fixed set of steps, no other order recomputes less from point to point.
     """
     weights = filled(costs, {step for job in jobs for step in job.keys})
     if paired:
@@ -70,7 +70,7 @@ def best_order(jobs: Sequence[PointJob], costs: Mapping[str, float], paired: boo
 
 
 def sharing(jobs: Sequence[PointJob], costs: Mapping[str, float]) -> Sharing:
-    """Count the different results of every step, and the work with and without shared results."""
+    """Count the different results of every step, and sum the computing time with and without shared results."""
     weights = filled(costs, {step for job in jobs for step in job.keys})
     different: dict[Key, float] = {}
     alone, steps = 0.0, 0
@@ -83,7 +83,7 @@ def sharing(jobs: Sequence[PointJob], costs: Mapping[str, float]) -> Sharing:
 
 
 def work_left(jobs: Iterable[PointJob], costs: Mapping[str, float], stored: Callable[[Key], bool]) -> list[float]:
-    """Return the work of each job in turn; a result that is stored, or computed by an earlier job, costs nothing."""
+    """Return the computing time of each job, without the results that are stored or that an earlier job computes."""
     computed: set[Key] = set()
     in_store = cache(stored)
     work = []
@@ -101,7 +101,7 @@ def work_left(jobs: Iterable[PointJob], costs: Mapping[str, float], stored: Call
 
 
 def _reach(jobs: Sequence[PointJob], weights: Mapping[str, float], sizes: Sequence[int], axis: int) -> float:
-    """Return the mean work of the steps that change from one value of an axis to the next."""
+    """Return the mean computing time of the steps that a change to the next value of ``axis`` invalidates."""
     stride = math.prod(sizes[axis + 1 :])
     work = [
         sum(weights[step] for step, key in job.keys.items() if jobs[i - stride].keys.get(step) != key)
@@ -112,7 +112,7 @@ def _reach(jobs: Sequence[PointJob], weights: Mapping[str, float], sizes: Sequen
 
 
 def _there_and_back(sizes: Sequence[int], slowest_first: Sequence[int]) -> list[tuple[int, ...]]:
-    """Return the indices of every point along the axes; from one point to the next one index changes by 1."""
+    """Return all points as index tuples, in a serpentine order in which successive points differ by 1 in one index."""
     rows: list[list[int]] = [[0] * len(sizes)]
     for axis in slowest_first:
         grown = []
@@ -124,7 +124,7 @@ def _there_and_back(sizes: Sequence[int], slowest_first: Sequence[int]) -> list[
 
 
 def _grouped(jobs: Sequence[PointJob], weights: Mapping[str, float]) -> list[int]:
-    """Return indices of ``jobs`` with equal costly results one after another, and otherwise in the given order."""
+    """Return the indices of ``jobs``, sorted so that jobs that share costly results are neighbours."""
     first: dict[str, dict[Key, int]] = defaultdict(dict)
     for i, job in enumerate(jobs):
         for step, key in job.keys.items():

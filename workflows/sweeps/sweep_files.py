@@ -1,4 +1,4 @@
-"""The data set of a sweep: an `xarray.Dataset` with the axes of the sweep as named dimensions."""
+"""The results of a sweep as an `xarray.Dataset`, whose named dimensions are the axes of the sweep."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ _PACKAGES = ("xarray", "h5netcdf", "h5py")
 
 
 def require_xarray(asked_by: str) -> None:
-    """Raise `RecipeError` if xarray or a package with which xarray writes files is not installed."""
+    """Raise `RecipeError` unless xarray, h5netcdf and h5py are installed."""
     missing = [name for name in _PACKAGES if importlib.util.find_spec(name) is None]
     if missing:
         text = f'needs {" and ".join(missing)}: pip install "neusee[xarray]"'
@@ -26,10 +26,10 @@ def require_xarray(asked_by: str) -> None:
 def dataset(
     outcomes: Sequence[PointOutcome], columns: Sequence[AxisColumn], paired: bool, about: Mapping[str, str]
 ) -> Any:
-    """Return an `xarray.Dataset` whose dimensions are the axes, or ``point`` for paired axes; coordinates are in SI.
+    """Return the results of a sweep as an `xarray.Dataset` whose dimensions are the axes, with coordinates in SI.
 
-    A result of several numbers has its own dimension, ``<result> index``. The numbers of a point that failed, or did
-    not run, are NaN; ``ran`` is true at the points that have numbers.
+    Paired axes give the one dimension ``point``. A result of several numbers has the further dimension
+    ``<result> index``. A point that failed or did not run is NaN; ``ran`` is true at points that have numbers.
     """
     import numpy
     import xarray
@@ -56,7 +56,7 @@ def dataset(
 
 
 def _lengths(outcomes: Sequence[PointOutcome], taken: Collection[str]) -> dict[str, int]:
-    """Return the largest number of values of every result that has several values."""
+    """Return the largest length over all points, for each result that is an array."""
     long: dict[str, int] = {}
     for outcome in outcomes:
         for step, part, index, _ in outcome.numbers:
@@ -67,6 +67,6 @@ def _lengths(outcomes: Sequence[PointOutcome], taken: Collection[str]) -> dict[s
 
 
 def _variable(step: str, part: str, taken: Collection[str]) -> str:
-    """Return the name of a result in the data set, distinct from the names of the coordinates."""
+    """Return the variable name of a result in the data set, which differs from all coordinate names."""
     name = f"{step}.{part}".rstrip(".").replace("/", "_")
     return f"{name} (result)" if name in taken else name

@@ -1,7 +1,7 @@
-"""The points of a sweep, which are all checked and then run one after another on one store.
+"""The runs of a sweep: all points are checked first, and then run one after another.
 
-Every point is composed and checked before the first point runs. A point keeps its composed values, which it shares
-almost entirely with the other points; the steps of a point are bound again when the point runs.
+Every point is composed and checked before the first point runs. A point keeps its composed values, most of which are
+the same objects at all points; the steps of a point are built again when the point runs.
 """
 
 from __future__ import annotations
@@ -37,7 +37,7 @@ ResultNumber = tuple[str, str, int | str, float]  #: step, field, index (empty f
 
 @dataclass(frozen=True, slots=True)
 class CheckedPoint:
-    """A point without mistakes, and the steps that the point needs."""
+    """A point of a sweep that passed all checks, with the steps that the point needs."""
 
     point: Point
     composed: Composed
@@ -46,25 +46,25 @@ class CheckedPoint:
 
 @dataclass(frozen=True, slots=True)
 class PointOutcome:
-    """The outcome of one point of a sweep: its numbers, or the error that stopped the point."""
+    """The outcome of one point of a sweep: the resulting numbers, or the error that stopped the run."""
 
     point: Point
     state: PointState  #: ``cached``: no step had to run
     seconds: float
     numbers: tuple[ResultNumber, ...] = ()
     step: str = ""  #: the step that failed
-    message: str = ""  #: why the step failed, with its location in the recipe
+    message: str = ""  #: why the step failed, with the location of the step in the recipe
     left: float = 0.0  #: predicted seconds of all later points
 
 
 @dataclass(frozen=True)
 class SweepPlan:
-    """The checked points in the order in which they run."""
+    """The plan of a sweep: its checked points in the order in which they run."""
 
-    recipe: Recipe  #: of the first point
+    recipe: Recipe  #: the recipe of the first point
     checked: tuple[CheckedPoint, ...]
     costs: dict[str, float]  #: seconds by step, of steps that ran before
-    work: tuple[float, ...]  #: of each point, without stored results: seconds, or steps where none ran before
+    work: tuple[float, ...]  #: work of each point without stored results, in seconds, or in steps if no step ran before
     notes: tuple[str, ...]
 
     @property
@@ -75,7 +75,7 @@ class SweepPlan:
 def plan_sweep(
     recipe: str, points: Sequence[Point], folder: Path, store: Store, paired: bool = False, device: str = "cpu"
 ) -> SweepPlan:
-    """Compose, check and order the points; raise `RecipeError` with every mistake of every point."""
+    """Check all points and choose the order of their runs; raise `RecipeError` with the mistakes of all points."""
     checker = _Checker(recipe, folder, store, device)
     checked = list(checker.every(points))
     if checker.diagnostics or checker.first is None:
@@ -94,9 +94,9 @@ def outcomes(
     started: Callable[[Point], None] = lambda point: None,
     watch: Callable[[Event], None] | None = None,
 ) -> Generator[PointOutcome, None, None]:
-    """Run the points one after another, and yield the outcome of each point.
+    """Run the points of a sweep one after another, and yield the outcome of each point.
 
-    With ``on_error="stop"`` the error of the first point that fails is raised after the outcome of the point.
+    With ``on_error="stop"``, the first error is raised after the outcome of its point is yielded.
     """
     clock = _Clock(plan.work)
     for checked in plan.checked:
@@ -139,23 +139,23 @@ def _costs(store: Store) -> dict[str, float]:
 
 
 class _Clock:
-    """A prediction of the remaining seconds of a sweep, from the finished work and the remaining work."""
+    """A clock that predicts the remaining seconds of a sweep from its finished and its remaining work."""
 
     def __init__(self, work: Sequence[float]) -> None:
-        least = sum(work) / 100 / len(work) or 1.0  # reading a point's numbers is work too
+        least = sum(work) / 100 / len(work) or 1.0  # reading the numbers of a stored point also takes time
         self.work = [max(one, least) for one in work]
         self.todo = sum(self.work)
         self.done = self.seconds = 0.0
 
     def left(self, seconds: float) -> float:
-        """Return the seconds that the remaining points will take, after a point that took ``seconds``."""
+        """Record that a point took ``seconds``, and return the predicted seconds of all remaining points."""
         work = self.work.pop(0)
         self.todo, self.done, self.seconds = self.todo - work, self.done + work, self.seconds + seconds
         return max(self.todo, 0.0) * self.seconds / self.done if self.work else 0.0
 
 
 class _Checker:
-    """The check of the points of a sweep, one after another, which collects the mistakes of all points."""
+    """A checker of the points of a sweep, which collects the mistakes of all points."""
 
     def __init__(self, recipe: str, folder: Path, store: Store, device: str) -> None:
         self.recipe, self.folder, self.device = recipe, folder, device
@@ -166,7 +166,7 @@ class _Checker:
         self._same: dict[Any, Any] = {}
 
     def every(self, points: Sequence[Point]) -> Iterator[CheckedPoint]:
-        """Yield the points without mistakes, and add the mistakes of all other points to ``diagnostics``."""
+        """Yield each point that passes all checks, and add the mistakes of the other points to ``diagnostics``."""
         for point in points:
             try:
                 composed = compose(self.recipe, point.overrides, self.folder)
@@ -191,5 +191,5 @@ class _Checker:
         return PointJob(point.place, keys, graph, recipe.outputs)
 
     def _once(self, key: Key) -> Key:
-        """Return one text object for equal keys, which saves memory because points share most of their keys."""
+        """Return the first string object with this key, which saves memory because points share most of their keys."""
         return str(self._same.setdefault(key, key))

@@ -1,4 +1,4 @@
-"""A run of a recipe at every combination of some of its values, with all numbers in one table.
+"""Parameter sweeps: runs of a recipe at every combination of the listed values, with all results in one table.
 
     sweep("first_light", {"sensor.read_noise": ["5 e-", "10 e-"], "doe": ["axicon", "vortex"]})
 
@@ -35,7 +35,7 @@ SweepState = Literal["complete", "stopped", "interrupted"]
 
 @dataclass(frozen=True)
 class Sweep:
-    """The result of a sweep: the outcomes of the points that ran, in the order of the axes, the last axis fastest."""
+    """The result of a sweep: the outcomes of the points that ran, sorted by axis, the last axis varying fastest."""
 
     recipe: str
     title: str
@@ -53,18 +53,18 @@ class Sweep:
 
     @property
     def rows(self) -> list[dict[str, Any]]:
-        """Return the tidy table of the sweep, with one row for each number of each point."""
+        """Return the results of the sweep in long format, with one row for each number of each point."""
         names = header(self.columns)
         return [dict(zip(names, row, strict=True)) for o in self.outcomes for row in rows_of(o, self.columns)]
 
     def table(self) -> str:
-        """Return a text table with one line for each point."""
+        """Return the results of the sweep as a text table, with one line for each point."""
         return "\n".join(indented(wide(self.outcomes, self.columns)))
 
     def to_xarray(self) -> Any:
-        """Return an `xarray.Dataset` with the axes as dimensions and coordinates in SI; a failed point is NaN.
+        """Return the results as an `xarray.Dataset` whose dimensions are the axes, in SI; failed points are NaN.
 
-        Raises: RecipeError where xarray is not installed.
+        Raises: RecipeError if xarray is not installed.
         """
         require_xarray("to_xarray")
         about = {"recipe": self.recipe, "title": self.title, "neusee": versions()["neusee"], "state": self.state}
@@ -88,12 +88,12 @@ def sweep(
     device: str = "cpu",
     folder: str | os.PathLike[str] | None = None,
 ) -> Sweep:
-    """Run ``recipe`` at every combination of the values of the axes, or, with ``zip``, at value n of every axis.
+    """Run ``recipe`` at every combination of axis values, or, with ``zip``, at the n-th values of all axes together.
 
     Args: axes: by parameter or group, a list of values, or a text as on the command line, such
     as ``"linspace(450 nm, 650 nm, 5)"``. overrides: changes that are the same at every point.
-    on_error: ``"stop"`` raises the first point's error, ``"continue"`` keeps it as a row.
-    folder: the folder of relative paths, by default the current folder.
+    on_error: ``"stop"`` raises the error of the first failed point, ``"continue"`` writes each error into its row.
+    folder: the folder to which relative paths refer, by default the current folder.
 
     Raises: RecipeError with every mistake of every point, before anything runs.
     """
@@ -117,14 +117,14 @@ class Sweeping:
         self.sharing = sharing(self.plan.jobs, self.plan.costs)
 
     def sweep(self, outcomes: Sequence[PointOutcome], state: SweepState) -> Sweep:
-        """Return the result of the sweep with these outcomes, sorted by the number of the point."""
+        """Return the result of the sweep, with the outcomes sorted by the number of the point."""
         recipe, in_turn = self.plan.recipe, sorted(outcomes, key=lambda outcome: outcome.point.number)
         count = len(self.plan.checked)
         return Sweep(recipe.name, recipe.title, self.columns, tuple(in_turn), count, self.sharing, self.paired, state)
 
 
 def write_sweep(work: Sweeping, result: Sweep, again: Sequence[str], out: Path, netcdf: bool, seconds: float) -> Path:
-    """Write the folder of a sweep, with ``partial`` in the name of an unfinished sweep, and return its path."""
+    """Write the result folder of a sweep and return its path; the name of an unfinished sweep contains ``partial``."""
     name = f"{result.recipe}{'' if result.state == 'complete' else '_partial'}"
     key = digest([checked.job.keys[name] for checked in work.plan.checked for name in checked.job.outputs])
     with new_run(out / "sweeps", name, key) as folder:

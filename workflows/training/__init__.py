@@ -1,6 +1,6 @@
-"""How are a mask and a restorer trained on pictures?
+"""How are a mask and a restoration network trained on pictures?
 
-Training pictures through the graph of a recipe, the iterations and stages, the state that is kept, and the figures.
+Training pictures from the graph of a recipe, iterations and stages of a training, its state, and its figures.
 Settings are read in `recipe.blocks`; networks and losses are nodes.
 Offers: `run_training.train`, `training_iteration.Learner`, `training_pictures.TrainingStream`.
 """

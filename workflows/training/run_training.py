@@ -1,4 +1,4 @@
-"""The training of a mask and of the network that restores its pictures, in stages and in one folder."""
+"""The training of a mask and of the network that restores the pictures behind the mask, in two stages."""
 
 from __future__ import annotations
 
@@ -41,23 +41,23 @@ def train(
     watch: Watch | None = None,
     mesh: Mesh = ALONE,
 ) -> Path:
-    """Train through the stages and return the folder of the training; a stopped training continues.
+    """Run the stages of a training, or continue a stopped training, and return its folder.
 
-    Stage 0 designs the mask without images, in place of stage 1.
+    Stage 0 designs the mask without images and replaces stage 1.
 
     Every process of a mesh calls this function with the same arguments and a folder that all processes see; only the
-    first process writes, and an error in one process ends all processes. The mesh changes results only by rounding.
+    first process writes, and an error in one process ends all processes. The mesh changes results by rounding only.
 
     Raises ValueError for a recipe without the block ``train``, a folder without photographs, stage 2 without a mask,
     stage 1 after the mask was designed, or a mesh that does not fit; ArithmeticError for a loss that is NaN or
-    infinite, with the weights and pictures that led to the loss in a file.
+    infinite, after the weights and picture numbers that led to the loss are written to a file.
     """
     settings = recipe.training
     if settings is None:
-        raise ValueError(f"{recipe.name} has no block train: add `train: recommended` to its defaults")
+        raise ValueError(f"{recipe.name} has no block `train`: add `train: recommended` to its defaults")
     with_pictures = [number for number in stages if number != MASK]
     if MASK in stages and mesh.size > 1:
-        raise MeshError("--stage mask runs in one process: start the training without torchrun")
+        raise MeshError("--stage mask runs in a single process: start the training without torchrun")
     _require_equal_shares(recipe, settings, mesh)
     photographs = _photographs(recipe, settings, bool(with_pictures))
     folder = runs / f"{recipe.name}_train_{_key(recipe, settings, photographs)}"
@@ -79,7 +79,7 @@ def _require_equal_shares(recipe: Recipe, settings: Training, mesh: Mesh) -> Non
             path = f"{KEY}.stages.{number}.batch"
             setting = recipe.config.settings.get(path)
             raise MeshError(
-                f"{setting.source if setting else recipe.name}   {path}   {stage.batch} pictures cannot be shared "
+                f"{setting.source if setting else recipe.name}   {path}   {stage.batch} pictures cannot be divided "
                 f"equally among {mesh.data} processes: --mesh {mesh} needs a multiple of {mesh.data}"
             )
 
@@ -89,12 +89,12 @@ def _photographs(recipe: Recipe, settings: Training, needed: bool) -> Photograph
         return Photographs.under(settings.photographs)
     file = recipe.steps[settings.scene].params.get("file") if settings.scene in recipe.steps else None
     if not isinstance(file, Path) and needed:
-        raise ValueError("train.photographs: write the path of a folder of photographs")
+        raise ValueError("train.photographs is missing: write the path of a folder of photographs")
     return Photographs((file,) if isinstance(file, Path) else ())
 
 
 def _key(recipe: Recipe, settings: Training, photographs: Photographs) -> str:
-    """Return a digest of all values that change the result of a training, without ``keep`` and ``show``."""
+    """Return a digest of all settings that can change the result of a training."""
     items = recipe.config.settings.items()
     values = {name: str(setting.value) for name, setting in items if not name.startswith(f"{KEY}.")}
     usual = {"mask"} if settings.mask == MaskSettings() else set()  # so that trainings of older versions continue
@@ -118,19 +118,19 @@ class _TrainingLoop(ResumableLoop[Learner]):
         self.board = open_board(folder, self._iterations_of_all_stages) if settings.tensorboard and mesh.first else None
 
     def begin_stage(self) -> None:
-        """Give the learner new optimisers for the present stage; after the last stage nothing learns."""
+        """Prepare new optimisers for the present stage of the training."""
         self.learner.begin(self.settings.stages.get(self.stage, Stage(iterations=0)), self.stage == 1)
 
     def run_stages(self, stages: Sequence[int], command: Sequence[str]) -> None:
-        """Train through these stages, and write the results of the training."""
+        """Run the given stages of the training, and write the results."""
         if self.designed and 1 in stages:
             raise ValueError(f"the mask in {self.folder} was designed without images: continue with --stage 2")
         for number in stages:
             if number not in self.settings.learnt:
                 stages_left = self.settings.learnt
-                raise ValueError(f"there is no stage {number}: train.stages and train.learn allow {stages_left}")
+                raise ValueError(f"there is no stage {number}: train.stages and train.learn define only {stages_left}")
             if number > self.stage:
-                first = f"run its {self._length} iterations first, or --stage mask"
+                first = f"run the {self._length} iterations of stage {self.stage} first, or --stage mask"
                 raise ValueError(f"stage {number} needs stage {self.stage}: {first}")
             if number == self.stage:
                 self._run_stage()
@@ -146,7 +146,7 @@ class _TrainingLoop(ResumableLoop[Learner]):
         return self.settings.stages[self.stage].iterations
 
     def _run_stage(self) -> None:
-        """Iterate to the end of the stage, and write the state with which the next stage begins."""
+        """Train to the end of the present stage, and write the checkpoint from which the next stage begins."""
         fixed = None if self.stage == 1 else frozen(self.recipe, self.settings, self.folder)
         parts = self.recipe, self.settings, self.photographs, self.store, self.device
         self.samples = TrainingStream(*parts, fixed, self.mesh)
@@ -159,26 +159,26 @@ class _TrainingLoop(ResumableLoop[Learner]):
         self.mesh.wait()  # until the first process has written the mask
 
     def iterate(self) -> Losses:
-        """Train on one batch of pictures, and return the losses and the factor on the learning rates."""
+        """Train on one batch of pictures, and return the losses and the present factor of the learning rates."""
         rate = self.learner.set_rates(self.iteration)
         losses, self.seen = self.learner.iterate(self.samples, self.stage, self.iteration)
         return losses | {"rate": rate}
 
     def note(self, losses: Losses) -> None:
-        """Write the losses to TensorBoard, and pass the losses to the function that watches the training."""
+        """Write the losses to TensorBoard, and pass the losses to the callback ``watch``."""
         if self.board:
             for name, value in losses.items():
                 self.board.add_scalar(name, value, self._iterations_of_all_stages - 1)
         super().note(losses)
 
     def keep(self) -> None:
-        """Write the events of TensorBoard, the table of losses and the state to disk."""
+        """Write the TensorBoard events, the table of losses and the checkpoint to disk."""
         if self.board:
             self.board.flush()
         super().keep()
 
     def show(self) -> None:
-        """Write the first picture of the last batch, the picture that the network restores, and the truth."""
+        """Write one image with a picture of the last batch, the restored picture and the true picture."""
         sample = self.seen[0]
         with torch.no_grad():
             restored = self.learner.net(sample.picture[:1])[0].float()
@@ -217,12 +217,12 @@ class _TrainingLoop(ResumableLoop[Learner]):
 
 
 def frozen(recipe: Recipe, settings: Training, folder: Path) -> Recipe:
-    """Return the recipe with the trained mask in place of the step whose mask was trained."""
+    """Return the recipe with the trained mask of the file ``mask.safetensors`` as a fixed mask."""
     if settings.learn is None:
         return recipe
     file = folder / "mask.safetensors"
     if not file.is_file():
-        raise ValueError(f"{file} does not exist: --stage 1 or --stage mask writes this file")
+        raise ValueError(f"{file} does not exist: run --stage 1 or --stage mask first to write this file")
     step = recipe.steps[settings.learn]
     params, wires = {"file": file, "depth": 1e-6, "scale": 0.1}, {"stop": step.wires["stop"]}
     learnt = replace(step, node=doe.pixelwise, params=params, wires=wires)

@@ -1,4 +1,4 @@
-"""The TensorBoard log of a training: the losses over the iterations, and the pictures."""
+"""The TensorBoard log of a training, with its losses and pictures by iteration."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ from typing import Any
 
 
 def open_board(folder: Path, first: int) -> Any:
-    """Return a ``SummaryWriter`` for the folder ``tensorboard/``, which hides older events from iteration ``first`` on.
+    """Return a TensorBoard writer for a training, which hides older events from iteration ``first`` on.
 
     Raises ValueError if TensorBoard is not installed.
     """

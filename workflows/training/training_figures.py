@@ -1,4 +1,4 @@
-"""Figures of a training: the curves of its losses, and pictures before and after the network."""
+"""Figures of a training: loss curves, and pictures before and after restoration."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ _GAP = 4  #: pixels between pictures
 
 @drawn
 def curves(rows: Sequence[Mapping[str, str]]) -> Any:
-    """Draw each loss over the iterations of both stages: the values pale, and their running median in full colour."""
+    """Draw each loss over the iterations of both stages, in a pale colour, and its running median in full colour."""
     names = [name for name in _SHOWN if any(row[name] for row in rows)]
     figure, axes = canvas(11.0, 2.4 * -(-len(names) // 2), -(-len(names) // 2), 2)
     first = 1 + max((int(r["iteration"]) for r in rows if r["stage"] == "1"), default=-1)
@@ -40,20 +40,20 @@ def curves(rows: Sequence[Mapping[str, str]]) -> Any:
 
 
 def running_median(values: Sequence[float]) -> list[float]:
-    """Return the median around each value, over about a twentieth of all values."""
+    """Return the running median of a sequence, in a window of about a twentieth of its length."""
     half = max(1, len(values) // 40)
     return [statistics.median(values[max(0, i - half) : i + half + 1]) for i in range(len(values))]
 
 
 def strip(pictures: Sequence[Tensor]) -> Any:
-    """Return linear pictures (3, y, x) side by side as one sRGB array (y, x, 3) of bytes."""
+    """Place linear pictures (3, y, x) side by side, and return one 8-bit sRGB array (y, x, 3)."""
     gap = torch.ones(3, pictures[0].shape[-2], _GAP)
     parts = [part for picture in pictures for part in (picture.detach().cpu(), gap)][:-1]
     return (encoded(torch.cat(parts, -1)) * 255).round().astype("uint8")
 
 
 def png(codes: Any) -> bytes:
-    """Return an array (y, x, 3) of bytes as a PNG file."""
+    """Encode an 8-bit array (y, x, 3) as a PNG file."""
     from PIL import Image
 
     memory = io.BytesIO()

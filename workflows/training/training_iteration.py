@@ -1,4 +1,4 @@
-"""The mask, the network and the critics of a training, and one iteration of the training."""
+"""The trainable parts of a training (mask, restoration network, critics), and one training iteration."""
 
 from __future__ import annotations
 
@@ -36,14 +36,14 @@ from neusee.workflows.training.training_pictures import Sample, TrainingStream
 
 
 class Scales(NamedTuple):
-    """A batch of pictures at half size and at full size."""
+    """A batch of pictures at half resolution and at full resolution."""
 
     coarse: Tensor
     fine: Tensor
 
 
 class Learner:
-    """The mask, networks and optimisers of a training on one device, equal in every process of a mesh."""
+    """The mask, the networks and the optimisers of a training, which are equal in all processes."""
 
     def __init__(
         self, recipe: Recipe, settings: Training, device: str, designed: bool = False, mesh: Mesh = ALONE
@@ -58,20 +58,20 @@ class Learner:
         self.begin(Stage(iterations=0), learns=True)
 
     def _start(self, recipe: Recipe, learn: str) -> nn.Module:
-        """Return the parameters of the mask that learns."""
+        """Return the mask of the step ``learn`` as a module with trainable parameters."""
         step = recipe.steps[learn]
         path = step.node.path
         if path not in PARAMETRISATIONS:
-            text = f"{learn} is {path}, of which nothing is learnt; {nearest(path, PARAMETRISATIONS)}"
+            text = f"{learn} is {path}, which has no trainable parameters; {nearest(path, PARAMETRISATIONS)}"
             raise ValueError(f"train: {text}; or design it without images: --stage mask")
         stop = recipe.steps[str(step.wires["stop"])]
         self._stop = call(stop, [], stop.params, recipe.seed, "cpu")
         return PARAMETRISATIONS[path](self._stop, step.params, self._rng("element")).to(self.settings.dtype)
 
     def height(self) -> Tensor:
-        """Return the height map (v, u) in m; raise ValueError where no mask learns."""
+        """Return the height map (v, u) of the mask in m; raise ValueError if no mask is trained."""
         if self._stop is None:
-            raise ValueError("train.learn: no mask learns")
+            raise ValueError("train.learn: no mask is trained")
         height: Tensor = self.mask(self._stop)
         return height
 
@@ -79,7 +79,10 @@ class Learner:
         return torch.Generator(self.device).manual_seed(stream_seed(self.seed, " ".join(map(str, ("train", *names)))))
 
     def begin(self, stage: Stage, learns: bool) -> None:
-        """Begin a stage with new optimisers and the first learning rates; the mask is trained if ``learns``."""
+        """Begin a stage of the training with new optimisers and the initial learning rates.
+
+        If ``learns``, the mask is trained together with the network.
+        """
         rates, self.stage, self.learns = self.settings.rates, stage, learns
         groups = parameter_groups(self.net, rates.weights, rates.biases)
         if learns:
@@ -91,7 +94,7 @@ class Learner:
         self._first = [[g["lr"] for g in o.param_groups] for o in (self.generator_optimizer, self.critic_optimizer)]
 
     def set_rates(self, iteration: int) -> float:
-        """Set the learning rates of an iteration of the stage, and return the factor on the first learning rates."""
+        """Set the learning rates of this iteration, and return their factor relative to the initial learning rates."""
         factor = self.settings.rates.share(iteration)
         for optimiser, first in zip((self.generator_optimizer, self.critic_optimizer), self._first, strict=True):
             for group, rate in zip(optimiser.param_groups, first, strict=True):
@@ -99,17 +102,17 @@ class Learner:
         return factor
 
     def parts(self) -> dict[str, Any]:
-        """Return every part whose state decides later iterations, by its name in the state."""
+        """Return by name the objects whose state a checkpoint must contain."""
         parts = {"mask": self.mask, "net": self.net, "critics": self.critics, "makers": self.generator_optimizer}
         return {**parts, "judges": self.critic_optimizer, **({"average": self.average} if self.average else {})}
 
     # --- one iteration ------------------------------------------------------------------------------------------------
 
     def iterate(self, samples: TrainingStream, stage: int, iteration: int) -> tuple[Losses, list[Sample]]:
-        """Train on a batch of pictures, one after another; raise `NotFinite` before a step with NaN or infinity.
+        """Train on one batch of pictures; raise `NotFinite` if a loss or gradient is NaN or infinite.
 
         Returns the losses of the batch, and the pictures of this process. Each of several processes has its own
-        pictures, and all processes step along the sum of the gradients.
+        pictures, and all processes apply the sum of the gradients.
         """
         self.generator_optimizer.zero_grad(set_to_none=True)
         shared = samples.begin(self.height()) if samples.shared else Shared.of({})
@@ -134,15 +137,15 @@ class Learner:
         return found, seen
 
     def _names(self) -> list[str]:
-        """Return the names of the losses of the stage, which are the same in every process."""
+        """Return the names of the losses of the present stage, in the same order in every process."""
         weights = {"BSR": self.stage.bsr, "reconstruction": self.stage.reconstruction,
                    "adversarial": self.stage.adversarial}  # fmt: skip
         return [*(["LSR"] if self.learns else []), "L1", *(name for name, weight in weights.items() if weight)]
 
     def _mask_suppression(self, shared: Shared, samples: TrainingStream) -> Losses:
-        """Differentiate the suppression band by band, which saves memory, and return the mean LSR of all bands.
+        """Backpropagate the laser suppression loss band by band, which saves memory, and return the mean LSR.
 
-        Several processes have different bands, or the same bands with smaller weights, so that each band counts once.
+        Processes have different bands, or the same bands with smaller weights, so that each band counts once.
         """
         psf: Psf = shared.values[self.settings.psf]
         count, times = samples.counted(self.settings.psf, len(psf.clear_peak))
@@ -160,7 +163,7 @@ class Learner:
         return loss
 
     def _restoration_terms(self, sample: Sample) -> tuple[dict[str, tuple[float, Tensor]], Scales, Scales]:
-        """Return each term of the loss with its weight, the truth, and the detached estimate of the network."""
+        """Return the weighted loss terms of a picture, the true picture, and the detached estimate of the network."""
         low = torch.autocast(device_kind(self.device), torch.bfloat16, self.settings.precision == "bfloat16")
         picture = sample.picture if self.learns else sample.picture.detach()
         with low:
@@ -181,7 +184,7 @@ class Learner:
         return terms, truth, Scales(estimate.coarse.detach(), estimate.fine.detach())
 
     def _train_critics(self, pairs: Mapping[int, tuple[Scales, Scales]], rng: torch.Generator) -> Losses:
-        """Train the critics to tell truth from estimates, with random numbers that are the same in every process."""
+        """Train the critics to distinguish true from estimated pictures, with equal random numbers in every process."""
         self.critic_optimizer.zero_grad(set_to_none=True)
         found, batch = {"critics": 0.0, "penalty": 0.0}, self.stage.batch
         for i in range(batch):
@@ -200,10 +203,10 @@ class Learner:
         return found
 
     def _move(self, optimiser: torch.optim.Optimizer, found: Mapping[str, float], parts: Sequence[nn.Module]) -> float:
-        """Step against the gradient, and return the largest gradient norm of a part; raise `NotFinite` before the step.
+        """Clip the gradients, let the optimiser step, and return the largest gradient norm among the modules ``parts``.
 
-        The gradient of each part is clipped separately, because the suppression acts on the mask a thousand times as
-        strongly as on a network.
+        The gradient of each module is clipped separately, because the laser suppression loss has a thousand times as
+        large a gradient for the mask as for a network. Raises `NotFinite` before the step.
         """
         self.mesh.add_gradients(parts)
         norm = max(float(nn.utils.clip_grad_norm_(part.parameters(), STEEPEST)) for part in parts)

@@ -1,4 +1,4 @@
-"""The numbered pictures of a training, each with its own scene, laser, sensor and noise.
+"""The numbered pictures for a training, each with its own scene, laser, sensor and noise.
 
 Steps that depend neither on the mask nor on a drawn value are computed once, steps that depend only on the mask once
 in each iteration, and steps that depend on a scene, a drawn value or noise once for each picture. Gradients of steps
@@ -29,22 +29,22 @@ from neusee.workflows.training.parallel.picture_rounds import Pictures
 from neusee.workflows.training.parallel.process_mesh import ALONE, Mesh
 from neusee.workflows.training.parallel.shared_graph import Shared
 
-_LASER = ("optics.laser_irradiance", "strength")  #: a node, and its parameter that is 0 without a laser
+_LASER = ("optics.laser_irradiance", "strength")  #: the node of a laser, and the parameter that is 0 without a laser
 _SEEDS = 2**31
 
 
 @dataclass(frozen=True)
 class Sample:
-    """One picture of a training, or patches of the picture, with the truth."""
+    """One training picture, or patches of the picture, with the true picture."""
 
     picture: Tensor  #: (n, 3, y, x), the developed picture of the camera
-    truth: Tensor  #: (n, 3, y, x)
+    truth: Tensor  #: (n, 3, y, x), the true picture
     light: Tensor  #: (band,), the fraction of the light of the scene that the mask keeps
     drawn: Mapping[str, Any]  #: the values that were drawn for the picture
 
 
 class TrainingStream:
-    """The pictures of a recipe whose mask is trained, or of the recipe ``frozen`` with a trained mask."""
+    """The training pictures of a recipe whose mask is trained, or of the recipe ``frozen`` with a fixed mask."""
 
     def __init__(
         self,
@@ -70,12 +70,12 @@ class TrainingStream:
         self._lasers = [f"{n}.{_LASER[1]}" for n in order if recipe.steps[n].node.path == _LASER[0]]
         readers = dict.fromkeys([*(self._inputs.readers if self._inputs else ()), *self._lasers])
         self._readers = {name: _given(recipe, name) for name in readers}
-        fixed = set(needed(recipe, [settings.psf]))  # the dirt on a window is the same in all pictures
+        fixed = set(needed(recipe, [settings.psf]))  # random effects in the PSF, such as dirt, are constant
         noise = {name for name in order if recipe.steps[name].node.random and name not in fixed}
         drawn = _behind(recipe, order, noise | {settings.scene, *(name.rpartition(".")[0] for name in readers)})
         learnt = _behind(recipe, order, {learn} if learn else set())
         if settings.psf in drawn:
-            raise ValueError(f"{settings.psf} changes with each picture: name a PSF in train.psf that does not change")
+            raise ValueError(f"train.psf: {settings.psf} changes with each picture: name a PSF that is constant")
         self.shards = Shards.of(recipe, settings.psf, outputs, drawn | learnt, store, mesh)
         drawn |= self.shards.behind
         read = _sources(recipe, drawn) | {settings.psf}
@@ -84,7 +84,7 @@ class TrainingStream:
     def _divide(
         self, recipe: Recipe, learn: str | None, border: list[str], drawn: set[str], noise: set[str], store: Store
     ) -> None:
-        """Divide the recipe after the steps ``border``, the last steps that depend on the mask but not on a picture."""
+        """Divide the recipe after the steps ``border``, the last steps that depend on the mask but on no picture."""
         settings = self.settings
         ways: dict[str, Any] = {"store": store, "device": self.device}
         read = self.shards.steps & _sources(recipe, drawn - self.shards.steps)
@@ -95,19 +95,19 @@ class TrainingStream:
         self._each = Pictures(recipe, [*border, settings.scene, *self._readers], outputs, noise, self.shards, ways)
 
     def begin(self, height: Tensor) -> Shared:
-        """Compute the steps that depend on the mask alone, once for all pictures of an iteration."""
+        """Compute the steps that depend on the mask alone, once for all pictures of a training iteration."""
         results = self.shared({str(self.settings.learn): height}) if self.shared else {}
         return Shared.of(results, self.shards, self._whole)
 
     def counted(self, name: str, here: int) -> tuple[int, int]:
-        """Return the number of bands of a result in all processes, and the number of processes that have each band."""
+        """Return the total number of bands of a result, and the number of processes that compute each band."""
         by_band = name in self.shards.steps
         return (self.shards.count, self.mesh.data) if by_band else (here, self.mesh.size)
 
     def batch(self, shared: Shared, stage: int, first: int, count: int) -> Iterator[tuple[int, Sample]]:
-        """Yield the pictures of this process among ``count`` pictures from number ``first`` on, each with its index.
+        """Yield this process's pictures of a batch of ``count`` pictures that begins at number ``first``, with indices.
 
-        The caller must read every picture, because its gradients return to all processes that computed a part.
+        The caller must exhaust the iterator, because gradients return to all processes that computed a part.
         """
         group = range(self.mesh.row, count, self.mesh.data)
         for begin in range(0, len(group), self.mesh.band):
@@ -124,7 +124,7 @@ class TrainingStream:
                     yield mine, self._sample(values, begun[mine][2])
 
     def __call__(self, shared: Mapping[str, Any], stage: int, number: int) -> Sample:
-        """Return the picture of a number, which is the same in any order and in any process."""
+        """Return the training picture of this number, which is the same in any order and in any process."""
         if self._pool is None:
             return self._alone(shared, stage, number % _SEEDS)
         number %= self._pool
@@ -137,7 +137,7 @@ class TrainingStream:
         return self._sample(self._each.alone({**shared, **theta}, noise), drawn)
 
     def _drawn(self, stage: int, number: int) -> tuple[dict[str, Any], int, dict[str, Any]]:
-        """Draw the inputs of a picture and the seed of its noise, and return both with all drawn values."""
+        """Return the random inputs of a picture, the seed of its noise, and a record of all drawn values."""
         rng = np.random.default_rng((self.seed, stage, number, 1))
         theta, drawn = dict(self._readers), dict[str, Any]()
         if self._inputs is not None:
@@ -153,10 +153,10 @@ class TrainingStream:
         return theta, noise, {**drawn, "noise": noise, "number": number}
 
     def _sample(self, values: Mapping[str, Any], drawn: Mapping[str, Any]) -> Sample:
-        """Return a picture and its truth, resized to ``train.size`` and cut into patches.
+        """Return a training picture and the true picture, resized to ``train.size`` and cut into patches.
 
         Antialiased `kornia.geometry.transform.resize` lets stripes alias: at 2/3 of the size the finest stripes keep a
-        contrast of 0.69 there, and of 0.09 here.
+        contrast of 0.69 with kornia, and of 0.09 with `resize`.
         """
         both = [values[name].to(self.settings.dtype) for name in (self.settings.picture, self.settings.truth)]
         if self.settings.size is not None:
@@ -165,15 +165,15 @@ class TrainingStream:
         return Sample(picture, truth, values[self.settings.light], drawn)
 
     def _patches(self, both: Tensor, seed: int) -> Tensor:
-        """Cut patches at the same positions of a picture and its truth: (2, 3, y, x) -> (2, n, 3, y, x).
+        """Cut patches from a picture and the true picture at the same positions: (2, 3, y, x) -> (2, n, 3, y, x).
 
-        A slice has the pixels of `kornia.geometry.transform.crop_by_indices`, and takes a tenth of the time.
+        A slice gives the same pixels as `kornia.geometry.transform.crop_by_indices` in a tenth of the time.
         """
         if self.settings.patch is None:
             return both[:, None]
         size, patch = (both.shape[-2], both.shape[-1]), self.settings.patch
         if any(have < want for have, want in zip(size, patch, strict=True)):
-            raise ValueError(f"train.patch: {list(patch)} is larger than the picture, {list(size)}")
+            raise ValueError(f"train.patch: {list(patch)} is larger than the picture {list(size)}: set a smaller patch")
         rng = np.random.default_rng((seed, 2))
         count = self.settings.patches
         places = [[int(rng.integers(h - w + 1)) for h, w in zip(size, patch, strict=True)] for _ in range(count)]
@@ -181,7 +181,7 @@ class TrainingStream:
 
 
 def require_steps(recipe: Recipe, block: str, names: Sequence[str]) -> None:
-    """Raise ValueError for a step that a block of the recipe names and that the recipe does not have."""
+    """Raise ValueError unless the recipe has all steps ``names`` to which the block ``block`` refers."""
     for name in names:
         if name not in recipe.steps:
             raise ValueError(f"{block}: the recipe has no step {name}; {nearest(name, recipe.steps)}")
@@ -190,7 +190,7 @@ def require_steps(recipe: Recipe, block: str, names: Sequence[str]) -> None:
 def _frame(recipe: Recipe, scene: str) -> tuple[int, int]:
     shape = recipe.steps[scene].params.get("shape")
     if shape is None:
-        raise ValueError(f"train: {scene} has no shape: set the size of the part of a photograph, such as [96, 96]")
+        raise ValueError(f"train: {scene} has no shape: set the shape in pixels, such as [96, 96]")
     return shape[0], shape[1]
 
 
@@ -204,7 +204,7 @@ def _sources(recipe: Recipe, readers: Iterable[str]) -> set[str]:
 
 
 def _behind(recipe: Recipe, order: Sequence[str], first: set[str]) -> set[str]:
-    """Return the steps ``first`` and all steps that depend on these steps."""
+    """Return the steps ``first`` and all steps that depend on them."""
     dependents = set(first)
     for name in order:
         if not dependents.isdisjoint(recipe.steps[name].sources):

@@ -228,8 +228,8 @@ def test_every_mistake_is_said_before_anything_runs(tmp_path):
     said = str(error.value).splitlines()
     assert len(said) == 3
     assert "write MASK+RESTORER" in said[0]
-    assert f"no file {tmp_path / 'gone.npy'}" in said[1]
-    assert said[2] == "flat+none: is listed twice"
+    assert f"no such file: {tmp_path / 'gone.npy'}" in said[1]
+    assert said[2] == "flat+none is listed twice: remove one"
     (tmp_path / "net.safetensors").write_bytes(b"nothing")
     words = "falt+none, flat+wener, flat+nafnet@net.safetensors, flat+unet, flat@net.safetensors+none"
     asked = read_pipelines(words, tmp_path)
@@ -242,7 +242,7 @@ def test_every_mistake_is_said_before_anything_runs(tmp_path):
         "is not a safetensors file",
         "flat+unet:",
         "needs trained weights",
-        "flat takes no file",
+        "flat takes no file: remove @ and the file name",
     ):
         assert part in said, said
     assert said.count("falt+none:") == 1
@@ -259,11 +259,11 @@ def test_weights_of_another_network_are_refused(tmp_path):
 @pytest.mark.parametrize(
     ("options", "said"),
     [
-        (["--data", "nowhere"], "--data nowhere: no such folder"),
-        (["--data", "empty"], "--data empty: no photograph that can be read"),
+        (["--data", "nowhere"], "--data nowhere: this folder does not exist"),
+        (["--data", "empty"], "--data empty: the folder contains no readable PNG or JPEG file"),
         (["--strengths", "0,lots"], "--strengths: lots is no number"),
-        (["--strengths", "-1"], "--strengths: write multiples"),
-        (["--reference", "flat+wiener"], "--reference flat+wiener: write one of the pipelines"),
+        (["--strengths", "-1"], "--strengths: write finite multiples of saturation"),
+        (["--reference", "flat+wiener"], "--reference flat+wiener is not evaluated: write one of"),
         (["--pipelines", "flat"], "flat: write MASK+RESTORER"),
     ],
 )

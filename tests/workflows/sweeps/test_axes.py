@@ -53,23 +53,23 @@ def test_values_as_they_are_written(text, values):
 @pytest.mark.parametrize(
     ("text", "told"),
     [
-        ("1,,2", "a value is missing beside a comma"),
-        ("1,2,", "a value is missing beside a comma"),
-        ("[1,2", "a bracket is left open: ] is missing"),
+        ("1,,2", "a value is missing before or after a comma"),
+        ("1,2,", "a value is missing before or after a comma"),
+        ("[1,2", "a bracket is not closed: ] is missing"),
         ("range()", "range: write range(stop)"),
-        ("range(5, 1)", "range: there are no values"),
-        ("range(0, 1, 0)", "range: the step is 0, so that the range never ends"),
+        ("range(5, 1)", "range: the range is empty"),
+        ("range(0, 1, 0)", "range: the step must not be 0"),
         ("range(1e9)", f"range: 1000000000 values: an axis has at most {MOST}"),
         ("range(0, 1, 1e-300)", "range: too many values"),
         ("range(1e999)", "range: 1e999 is not a number"),
         ("range(a, b)", "range: a is not a number"),
-        ("linspace(1 nm, 2 um, 3)", "linspace: write every number in one unit, not in nm, um"),
-        ("linspace(1, 2 um, 3)", "linspace: write every number in one unit, not in none, um"),
+        ("linspace(1 nm, 2 um, 3)", "linspace: write all numbers in the same unit instead of nm, um"),
+        ("linspace(1, 2 um, 3)", "linspace: write all numbers in the same unit instead of none, um"),
         ("linspace(1, 2)", "linspace: write the first value, the last value and the number of values"),
-        ("linspace(1, 2, 2.5)", "linspace: the number of values is a whole number from 1, not 2.5"),
-        ("linspace(1, 2, 0)", "linspace: there are no values"),
-        ("logspace(0, 1, 3)", "logspace: both ends must be positive"),
-        ("linspce(1, 2, 3)", "no range is called linspce; did you mean linspace?"),
+        ("linspace(1, 2, 2.5)", "linspace: the number of values must be a whole number of at least 1, not 2.5"),
+        ("linspace(1, 2, 0)", "linspace: the range is empty"),
+        ("logspace(0, 1, 3)", "logspace: the first and the last value must be positive"),
+        ("linspce(1, 2, 3)", "there is no range function linspce; did you mean linspace?"),
     ],
 )
 def test_what_is_no_list_of_values_is_refused_with_the_fix(text, told):
@@ -138,7 +138,7 @@ def test_paired_axes_run_together(tmp_path):
 
 def test_paired_axes_of_unequal_length_name_both(tmp_path):
     arguments = read_words(["a=1,2", "b=range(3)"], tmp_path, first=2)
-    told = "argument 3 | b | has 3 values, and a (argument 2) has 2: paired axes need equally many values"
+    told = "argument 3 | b | has 3 values, and a (argument 2) has 2: give paired axes the same number of values"
     assert refused(lambda: points(arguments, paired=True)) == [told]
 
 
@@ -151,8 +151,8 @@ def test_every_wrong_argument_is_named_at_once(tmp_path):
     ("words", "told"),
     [
         (["a=1"], "sweep |  | there is no axis: write a=1,2,3 or a='linspace(450 nm, 650 nm, 5)'"),
-        (["a=1,2", "a=3,4"], "argument 2 | a | a is already an axis (argument 1)"),
-        (["a=1,2,1"], "argument 1 | a | the value 1 appears twice"),
+        (["a=1,2", "a=3,4"], "argument 2 | a | a is also in argument 1: remove one"),
+        (["a=1,2,1"], "argument 1 | a | the value 1 appears twice: remove one"),
         (["a=range(1000)", "b=range(1000)"], "sweep |  | a sweep of 1000000 points is too long: at most 100000 points"),
     ],
 )
@@ -176,10 +176,10 @@ def test_axes_of_arrays(tmp_path):
 @pytest.mark.parametrize(
     ("axes", "told"),
     [
-        ({"a": []}, "axis a | a | the list of values is empty"),
+        ({"a": []}, "axis a | a | the list of values is empty: give at least one value"),
         ({"a": 3}, "axis a | a | give a list of values, not int"),
         ({"+a": [1]}, "axis +a | +a | write the name of an axis without + or ~"),
-        ({"a": "1,,2"}, "axis a | a=1,,2 | a value is missing beside a comma"),
+        ({"a": "1,,2"}, "axis a | a=1,,2 | a value is missing before or after a comma"),
     ],
 )
 def test_axes_of_python_that_are_none(tmp_path, axes, told):

@@ -23,5 +23,5 @@ def test_a_state_of_0_1_is_read(tmp_path):
 
 @pytest.mark.parametrize(("parts", "edition"), [({}, 0), ([], 1), (None, 1)])
 def test_what_is_no_state_is_refused_with_what_to_do(tmp_path, parts, edition):
-    with pytest.raises(ValueError, match=r"state.pt cannot be read .*: remove its folder to begin anew"):
+    with pytest.raises(ValueError, match=r"state.pt cannot be read .*: remove its folder to start again"):
         StateFile(written(tmp_path / "state.pt", parts, edition)).read()

@@ -188,7 +188,9 @@ def test_patches_are_the_same_places_of_a_picture_and_its_truth(tmp_path, photog
         ((y, x),) = same
         assert torch.equal(whole.truth[0, :, y : y + 12, x : x + 9], true)
     too_large = replace(recipe, training=how.model_copy(update={"patch": (40, 9)}))
-    with pytest.raises(ValueError, match=r"train\.patch: \[40, 9\] is larger than the picture, \[32, 32\]"):
+    with pytest.raises(
+        ValueError, match=r"train\.patch: \[40, 9\] is larger than the picture \[32, 32\]: set a smaller patch"
+    ):
         samples_of(too_large, tmp_path, still=True)({}, 2, 0)
 
 
@@ -283,7 +285,10 @@ def test_what_is_not_a_number_stops_and_is_kept(tmp_path, tiny, monkeypatch):
     from neusee.nodes import losses
 
     monkeypatch.setattr(losses, "charbonnier", lambda a, b: (a - b).mean() * float("nan"))
-    with pytest.raises(ArithmeticError, match="stage 1, iteration 0, pictures 0 to 1: NaN or infinite: reconstruction"):
+    with pytest.raises(
+        ArithmeticError,
+        match="stage 1, iteration 0, pictures 0 to 1: these numbers are NaN or infinite: reconstruction",
+    ):
         trained(tiny, tmp_path)
     (folder,) = (tmp_path / "runs").iterdir()
     kept = torch.load(folder / "not_finite_1_0.pt", weights_only=True)
@@ -352,7 +357,7 @@ def test_a_network_with_options_is_learnt_and_restores_only_with_them(tmp_path, 
     load("first_light", [*run, *(f"restore.{x}" for x in options)])
 
 
-@pytest.mark.parametrize(("doe", "said"), [("flat", "of which nothing is learnt"), ("unet", ""), ("axicon", "")])
+@pytest.mark.parametrize(("doe", "said"), [("flat", "which has no trainable parameters"), ("unet", ""), ("axicon", "")])
 def test_only_what_learns_can_be_learnt(tmp_path, photographs, doe, said):
     changes = [c for c in TINY if not c.startswith("doe.") or doe == "unet"]
     recipe = load("train_small", [f"doe={doe}", *changes,
@@ -410,7 +415,7 @@ def test_a_mask_is_designed_and_stage_2_learns_behind_it(command, tmp_path, phot
     assert made["fabrication"] == {"levels": 16, "max_height": 3e-6, "wrap_at": None, "feature": 3e-4}
     assert not (folder / "mask.state").exists()
     before = (folder / "mask.safetensors").stat().st_mtime_ns
-    assert "the mask is designed" in command(*words, "--stage", "mask")[1]
+    assert "the mask is already designed" in command(*words, "--stage", "mask")[1]
     for stage in ("1", "both"):
         code, _, err = command(*words, "--stage", stage)
         assert code != 0
@@ -434,7 +439,7 @@ def test_a_mask_is_designed_where_nothing_else_could_learn(command, tmp_path, ph
     words = ["train_small", "doe=flat", *changes, "train.mask.kind=five_half_rings",
              "train.mask.iterations=1", "+train.mask.population=5", "+train.mask.polish=5", "+train.mask.bands=2",
              f"train.photographs={photographs}"]  # fmt: skip
-    assert "of which nothing is learnt" in command(*words)[2]
+    assert "which has no trainable parameters" in command(*words)[2]
     code, out, err = command(*words, "--stage", "mask")
     assert (code, err) == (0, "")
     assert "too steep for the samples of the pupil" in out
@@ -446,7 +451,7 @@ def test_a_mask_is_designed_where_nothing_else_could_learn(command, tmp_path, ph
 def test_a_mask_is_not_designed_over_one_that_learns(tmp_path, tiny, photographs):
     folder = trained(tiny, tmp_path, [1])
     before = (folder / "mask.safetensors").read_bytes()
-    with pytest.raises(ValueError, match="stage 1 has begun"):
+    with pytest.raises(ValueError, match="stage 1 has already begun"):
         trained(tiny, tmp_path, [0])
     assert (folder / "mask.safetensors").read_bytes() == before
 

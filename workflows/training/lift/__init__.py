@@ -1,6 +1,6 @@
-"""How is a lift from RGB to spectra trained?
+"""How is a network trained to estimate spectra from RGB?
 
-Pairs of pictures and spectra through a recipe, the iterations of the network, and its figures.
+Pairs of pictures and spectra from a recipe, the iterations of the training, and its figures.
 No mask and no restorer belongs here.
 Offers: `lift_run.train_lift`, `lift_iteration.LiftLearner`.
 """

@@ -1,4 +1,4 @@
-"""The network of a lift, one iteration of its training, and the numbered pictures with known spectra."""
+"""The network that estimates spectra from RGB, one iteration of its training, and the training data."""
 
 from __future__ import annotations
 
@@ -21,18 +21,18 @@ from neusee.workflows.training.training_pictures import require_steps
 
 
 class Pairs:
-    """Pairs of a picture (3, y, x) and its spectra (31, y, x), where a number always gives the same pair."""
+    """Numbered training pairs, each of a picture (3, y, x) and the true spectra of its pixels (31, y, x)."""
 
     def __init__(self, recipe: Recipe, settings: LiftTraining, store: Store, device: str) -> None:
         require_steps(recipe, "train_lift", (settings.measured, settings.picture, settings.cube))
         bands = recipe.steps[settings.measured].wires.get("bands")
         if not isinstance(bands, str):
             name = settings.measured
-            raise ValueError(f"train_lift.measured: {name} takes no bands: name a step of spectra.reflectances")
+            raise ValueError(f"train_lift.measured: {name} has no input `bands`: name a step of spectra.reflectances")
         self._names, self._seed = (settings.picture, settings.cube), recipe.seed
         random = {name for name in needed(recipe, self._names) if recipe.steps[name].node.random}
         if not random:
-            raise ValueError(f"train_lift: {settings.picture} is always the same picture: draw it with spectra.leaves")
+            raise ValueError(f"train_lift: the picture {settings.picture} never changes: draw it with spectra.leaves")
         known = recipe.run(store, [bands, settings.measured], device=device)
         self.bands: Bands = known[bands]
         self.measured: Tensor = known[settings.measured]
@@ -40,19 +40,19 @@ class Pairs:
         self._draw = as_function(recipe, outputs=self._names, store=store, device=device, redraw=random)
 
     def __call__(self, *number: object) -> tuple[Tensor, Tensor]:
-        """Return the picture of a number, and the spectra of the picture."""
+        """Return the training picture of this number and its true spectra; the same number gives the same picture."""
         values = self._draw({}, seed=stream_seed(self._seed, " ".join(map(str, ("lift", *number)))))
         picture, cube = (values[name] for name in self._names)
         return picture.float(), cube.float()
 
     def batch(self, numbers: Sequence[int]) -> tuple[Tensor, Tensor]:
-        """Return the pictures and the spectra of several numbers, each stacked into one tensor."""
+        """Return a batch of training pictures and a batch of their true spectra, each as one tensor."""
         pictures, cubes = zip(*map(self, numbers), strict=True)
         return torch.stack(pictures), torch.stack(cubes)
 
 
 class LiftLearner:
-    """The network of a lift, its optimiser and the moving average of its weights."""
+    """The network that estimates spectra from RGB, its optimiser and the moving average of its weights."""
 
     def __init__(self, settings: LiftTraining, pairs: Pairs, seed: int, device: str) -> None:
         self.settings, self.pairs = settings, pairs
@@ -64,12 +64,12 @@ class LiftLearner:
         self.best: nn.Module = self.average.module if self.average else self.net
 
     def parts(self) -> dict[str, Any]:
-        """Return every part whose state decides later iterations, by name."""
+        """Return by name the objects whose state a checkpoint must contain."""
         parts = {"net": self.net, "optimiser": self.optimiser, "average": self.average}
         return {name: part for name, part in parts.items() if part}
 
     def iterate(self, iteration: int) -> Losses:
-        """Train on one batch and return the losses; raise `NotFinite` before a step with NaN or infinity."""
+        """Train on one batch and return the losses; raise `NotFinite` if a loss or the gradient is NaN or infinite."""
         batch, rate = self.settings.batch, self.settings.rate_at(iteration)
         for group in self.optimiser.param_groups:
             group["lr"] = rate
@@ -88,7 +88,7 @@ class LiftLearner:
 
     @torch.no_grad()
     def validate(self) -> dict[str, Losses]:
-        """Return the mean errors of the network and of the linear estimate on pictures outside of the training."""
+        """Return the mean errors of the network and of the linear estimate on pictures that are not trained on."""
         sums, count = dict[str, Losses](), self.settings.validation_batches
         for number in range(count):
             picture, cube = self.pairs("judge", number)
@@ -102,7 +102,7 @@ class LiftLearner:
         return sums
 
     def estimates(self, picture: Tensor) -> dict[str, Tensor]:
-        """Return the spectra of a picture that the network estimates, and the linear estimate of the spectra."""
+        """Return two estimates of the spectra of a picture: from the network, and from the linear reconstruction."""
         linear = torch.einsum("bc,cyx->byx", self.linear, picture)
         return {
             "mst_plus_plus": lift_pictures(self.best, picture[None])[0].clamp_min(0),

@@ -1,4 +1,4 @@
-"""The training of a lift from RGB to spectra, from the settings of a recipe to the file of weights."""
+"""The training of a network that estimates spectra from RGB, from the settings to the file of weights."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ from neusee.workflows.training.loop.checkpoint import export
 from neusee.workflows.training.loop.resumable_loop import DOCUMENT, Losses, Progress, ResumableLoop, Watch
 
 _COLUMNS = ("iteration", "MRAE", "RMSE", "slope", "rate", "seconds")
-#: names of settings in the key of a folder, so that trainings of version 0.1 continue
+#: old names of settings in the folder key, so that trainings of version 0.1 continue
 _OLD_NAMES = {"min_rate": "least", "warmup": "warm", "ema_decay": "average", "validation_batches": "judge"}
 
 
@@ -30,16 +30,16 @@ def train_lift(
     device: str = "cpu",
     watch: Watch | None = None,
 ) -> Path:
-    """Train MST++ with the settings ``train_lift`` of a recipe and return the folder; a stopped training continues.
+    """Train MST++ with the block ``train_lift`` of a recipe, or continue a stopped training, and return its folder.
 
     ``mst_plus_plus.safetensors`` holds the weights for `spectra.lift_mst_plus_plus`.
 
     Raises ValueError for a recipe without the block or the steps that the block names; ArithmeticError for a loss that
-    is NaN or infinite, with the weights and pictures that led to the loss in a file.
+    is NaN or infinite, after the weights and picture numbers that led to the loss are written to a file.
     """
     settings = recipe.lifting
     if settings is None:
-        raise ValueError(f"{recipe.name} has no block train_lift: start from the recipe train_lift")
+        raise ValueError(f"{recipe.name} has no block `train_lift`: start from the recipe train_lift")
     pairs = Pairs(recipe, settings, store, device)
     folder = runs / f"{recipe.name}_{_key(recipe, settings)}"
     folder.mkdir(parents=True, exist_ok=True)
@@ -49,7 +49,7 @@ def train_lift(
 
 
 def _key(recipe: Recipe, settings: LiftTraining) -> str:
-    """Return a digest of all values that change the result of a training, without ``keep`` and ``show``."""
+    """Return a digest of all settings that can change the result of a training."""
     steps = {
         name: [
             recipe.steps[name].node.path,
@@ -72,7 +72,7 @@ class _LiftLoop(ResumableLoop[LiftLearner]):
         self.resume()
 
     def run_to_end(self, recipe: Recipe, command: Sequence[str]) -> None:
-        """Train to the last iteration and write the results, unless the training is finished."""
+        """Train to the last iteration and write the results; do nothing if the training is finished."""
         if self.iteration == self.settings.iterations and (self.folder / DOCUMENT).is_file():
             return
         if self.iteration < self.settings.iterations:
@@ -93,7 +93,7 @@ class _LiftLoop(ResumableLoop[LiftLearner]):
 
     @torch.no_grad()
     def show(self) -> None:
-        """Write a picture with its true and estimated spectra."""
+        """Write a figure of one picture with its true and estimated spectra."""
         picture, cube = self.learner.pairs("show", 0)
         centres = self.learner.pairs.bands.centres
         self.write_picture(

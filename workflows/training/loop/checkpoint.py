@@ -1,4 +1,4 @@
-"""The files of a training: the state from which a training continues, the table of losses, and the trained weights."""
+"""The files of a training: its checkpoint, its table of losses, and its trained weights."""
 
 from __future__ import annotations
 
@@ -14,11 +14,11 @@ from typing import Any
 import torch
 
 _FORMAT = 1  #: format of a state; a state of another format is refused
-_NAMES = {"relief": "mask"}  #: new names of the parts of a state that version 0.1 wrote
+_NAMES = {"relief": "mask"}  #: names in a state of version 0.1, with the present names
 
 
 def write_whole(path: Path, data: bytes) -> None:
-    """Write a whole file, or leave the old file as it was."""
+    """Replace a file atomically: an interrupted write leaves the old file unchanged."""
     part = path.with_name(f".{path.name}.{os.getpid()}.part")
     try:
         with part.open("wb") as file:
@@ -33,19 +33,19 @@ def write_whole(path: Path, data: bytes) -> None:
 
 @dataclass(frozen=True)
 class StateFile:
-    """A file with the state of unfinished work; a killed process leaves either the old or the new state, complete."""
+    """A checkpoint file that is replaced atomically, so that a killed process never leaves an incomplete state."""
 
     path: Path
 
     def write(self, state: Mapping[str, Any]) -> None:
-        """Write the state in place of the old state."""
+        """Replace the stored state by this state."""
         self.path.parent.mkdir(parents=True, exist_ok=True)
         memory = io.BytesIO()
         torch.save({"edition": _FORMAT, **state}, memory)
         write_whole(self.path, memory.getvalue())
 
     def read(self, device: str = "cpu", strict: bool = True) -> dict[str, Any]:
-        """Return the state, which is empty if there is no file.
+        """Return the stored state, or an empty dictionary if there is no file.
 
         Raises ValueError for a file that cannot be read; if not ``strict``, an unreadable file counts as absent.
         """
@@ -60,12 +60,12 @@ class StateFile:
         except (RuntimeError, KeyError, EOFError, OSError, ValueError, TypeError, AttributeError) as error:
             if not strict:
                 return {}
-            raise ValueError(f"{self.path} cannot be read ({error}): remove its folder to begin anew") from error
+            raise ValueError(f"{self.path} cannot be read ({error}): remove its folder to start again") from error
         return state
 
 
 class Rows:
-    """The table ``losses.csv`` with a row for each iteration of a training."""
+    """The table ``losses.csv`` of a training, with one row for each iteration."""
 
     def __init__(self, path: Path, columns: Sequence[str]) -> None:
         self._path, self._columns = path, columns
@@ -73,7 +73,7 @@ class Rows:
         self._kept = 0
 
     def cut(self, stage: int, iteration: int, write: bool = True) -> None:
-        """Read the table, and remove the rows from an iteration of a stage on."""
+        """Read the table of losses, and discard the rows from the given iteration on."""
         if self._path.exists():
             with self._path.open(newline="", encoding="utf-8") as file:
                 self.rows = [row for row in csv.DictReader(file) if _place(row) < (stage, iteration)]
@@ -82,12 +82,12 @@ class Rows:
             self.keep()
 
     def add(self, stage: int, iteration: int, losses: Mapping[str, float]) -> None:
-        """Add the row of an iteration, which the next call of `keep` writes to disk."""
+        """Append the losses of an iteration to the table in memory; `keep` writes the table to disk."""
         row = {"stage": stage, "iteration": iteration, **{name: f"{x:.6g}" for name, x in losses.items()}}
         self.rows.append({name: str(row.get(name, "")) for name in self._columns})
 
     def keep(self) -> None:
-        """Append the new rows to the file; the first call writes the whole file."""
+        """Append the new rows to the file of losses; the first call writes the whole file."""
         text = io.StringIO(newline="")
         writer = csv.DictWriter(text, self._columns)
         if self._kept == 0:
@@ -102,7 +102,7 @@ class Rows:
 
 
 def _place(row: Mapping[str, str | None]) -> tuple[int, int]:
-    """Return the stage and iteration of a row; an incomplete row of a killed process comes after all others."""
+    """Return the stage and iteration of a row, for sorting; an incomplete row comes last."""
     with suppress(ValueError, TypeError, KeyError):
         if None not in row.values():
             return int(row.get("stage") or 0), int(row["iteration"] or 0)
@@ -110,7 +110,7 @@ def _place(row: Mapping[str, str | None]) -> tuple[int, int]:
 
 
 def export(folder: Path, name: str, tensors: Mapping[str, torch.Tensor], about: dict[str, str] | None = None) -> None:
-    """Write tensors and their metadata to the safetensors file ``name`` of a folder."""
+    """Write tensors and their metadata to the file ``<name>.safetensors`` of a folder."""
     from safetensors.torch import save
 
     whole = {key: x.detach().cpu().contiguous() for key, x in tensors.items()}

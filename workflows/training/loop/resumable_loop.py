@@ -1,4 +1,4 @@
-"""The loop of every training: a stopped training continues from its last state and reaches the same bits."""
+"""The training loop, in which a stopped training continues from its last checkpoint with bit-identical results."""
 
 from __future__ import annotations
 
@@ -18,10 +18,10 @@ from neusee.workflows.recipe.blocks.train_lift_block import LiftTraining
 from neusee.workflows.training.loop.checkpoint import Rows, StateFile, write_whole
 
 Losses = dict[str, float]
-Progress = Callable[[str], None]  #: takes one line about what a training does
+Progress = Callable[[str], None]  #: takes one line of text about the progress of a training
 Watch = Callable[[int, int, Mapping[str, float]], None]  #: takes the stage, its iterations so far, and the losses
 DOCUMENT = "training.json"  #: the file that a training writes last
-STEEPEST = 10.0  #: largest norm of a gradient; a longer gradient is clipped
+STEEPEST = 10.0  #: largest norm of a gradient; a larger gradient is clipped
 
 
 class NotFinite(ArithmeticError):
@@ -29,19 +29,19 @@ class NotFinite(ArithmeticError):
 
 
 class Learns(Protocol):
-    """Everything that a training changes: networks, parameters and optimisers."""
+    """Interface of the objects that a training changes: networks, parameters and optimisers."""
 
     def parts(self) -> dict[str, Any]:
-        """Return every part whose state decides later iterations, by name."""
+        """Return by name the objects whose state a checkpoint must contain."""
 
 
 L = TypeVar("L", bound=Learns)
 
 
 class ResumableLoop(ABC, Generic[L]):
-    """A training in a folder with its state, table of losses, pictures and, at the end, a document.
+    """A training loop that writes a checkpoint, a table of losses, pictures and a final document into one folder.
 
-    Of several processes only one process ``writes`` files. A training without stages stays in stage 0.
+    Among several processes, only the process with ``writes`` writes files. A training without stages is in stage 0.
     """
 
     def __init__(
@@ -55,17 +55,20 @@ class ResumableLoop(ABC, Generic[L]):
 
     @abstractmethod
     def iterate(self) -> Losses:
-        """Compute one iteration and return the losses; raise `NotFinite` before a step with NaN or infinity."""
+        """Compute one iteration and return the losses; raise `NotFinite` if a loss or gradient is NaN or infinite.
+
+        `NotFinite` is raised before the optimiser changes the weights.
+        """
 
     @abstractmethod
     def show(self) -> None:
-        """Write a picture that shows what the networks do at this iteration."""
+        """Write a picture that shows the present output of the networks."""
 
     def begin_stage(self) -> None:
-        """Prepare the learner for the present stage."""
+        """Prepare networks and optimisers for the present stage of the training."""
 
     def resume(self) -> None:
-        """Continue from the state that an earlier process wrote, or else begin at the first iteration."""
+        """Load the checkpoint of an earlier process, or begin at the first iteration if there is no checkpoint."""
         state = self.state.read(self.device)
         self.stage, self.iteration = state.get("stage", self.stage), state.get("iteration", 0)
         self.begin_stage()
@@ -78,7 +81,7 @@ class ResumableLoop(ABC, Generic[L]):
             )
 
     def run(self, iterations: int, batch: int) -> None:
-        """Iterate to the end of the present stage; the caller saves the state after the last iteration."""
+        """Compute the remaining iterations of the present stage; the caller saves the state at the end."""
         self.batch = batch
         while self.iteration < iterations:
             began = time.perf_counter()
@@ -97,23 +100,26 @@ class ResumableLoop(ABC, Generic[L]):
                 self.keep()
 
     def note(self, losses: Losses) -> None:
-        """Pass the losses of the last iteration to the function that watches the training."""
+        """Pass the losses of the last iteration to the callback ``watch``."""
         if self.watch is not None:
             self.watch(self.stage, self.iteration, losses)
 
     def keep(self) -> None:
-        """Write the table and then the state, because `resume` can remove surplus rows but not restore missing rows."""
+        """Write the table of losses, and then the checkpoint.
+
+        In this order a killed process can leave surplus rows, which `resume` removes, but no missing rows.
+        """
         if self.writes:
             self.rows.keep()
             self.state.write(self._packed())
 
     def write_picture(self, name: str, picture: bytes) -> None:
-        """Write a PNG into the folder ``pictures``."""
+        """Write a PNG file into the folder ``pictures`` of the training."""
         (self.folder / "pictures").mkdir(exist_ok=True)
         write_whole(self.folder / "pictures" / f"{name}.png", picture)
 
     def close(self, curves: bytes, recipe: str, command: Sequence[str], **facts: Any) -> None:
-        """Write the curves of the losses and, last, the document with the settings and the results of the training."""
+        """Write the loss curves, and then the document with the settings and the results of the training."""
         write_whole(self.folder / "curves.png", curves)
         seconds = sum(float(row["seconds"]) for row in self.rows.rows)
         about = {"command": list(command), "recipe": recipe, **facts, "seconds": seconds, "versions": versions()}
@@ -125,7 +131,7 @@ class ResumableLoop(ABC, Generic[L]):
         return {"stage": self.stage, "iteration": self.iteration, **about, "parts": parts}
 
     def _dumped(self, error: NotFinite) -> ArithmeticError:
-        """Write the weights and the numbers of the pictures that led to an error, and return the error to raise."""
+        """Write the weights and the picture numbers that led to a NaN or infinity, and return the error to raise."""
         place = [self.stage, self.iteration] if self.stage else [self.iteration]
         dump = StateFile(self.folder / f"not_finite_{'_'.join(map(str, place))}.pt")
         first, count = self.iteration * self.batch, self.batch
@@ -139,13 +145,13 @@ class ResumableLoop(ABC, Generic[L]):
 
 
 def require_finite(numbers: Mapping[str, float]) -> None:
-    """Raise `NotFinite` with the names of all numbers that are NaN or infinite."""
+    """Raise `NotFinite` if a number is NaN or infinite; the message names all such numbers."""
     wrong = [name for name, x in numbers.items() if not abs(x) < float("inf")]
     if wrong:
-        raise NotFinite(f"NaN or infinite: {', '.join(wrong)}")
+        raise NotFinite(f"these numbers are NaN or infinite: {', '.join(wrong)}")
 
 
 def averaged(net: nn.Module, decay: float) -> AveragedModel | None:
-    """Return an exponential moving average of the weights of a network, or None for a decay of 0."""
+    """Return an exponential moving average of the weights of a network, or None if ``decay`` is 0."""
     mean = get_ema_multi_avg_fn(decay)  # type: ignore[no-untyped-call]
     return AveragedModel(net, multi_avg_fn=mean) if decay else None

@@ -1,6 +1,6 @@
-"""How is a mask designed without pictures?
+"""How is a mask designed without training pictures?
 
-Terms of the mask alone, optimizers over its height map, and the page of what came out.
+Loss terms that depend on the mask alone, optimizers of its height map, and the page of the result.
 No network and no photograph belongs here.
 Offers: `design_run.design`, `design_terms.Terms`, `optimizers.learn`.
 """

@@ -1,4 +1,4 @@
-"""The page of a designed mask: height map, figures of merit at each wavelength with bounds, and losses."""
+"""The page of a designed mask, with its height map, its figures of merit by wavelength, and the losses."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ _NAMES = ("lsr", "energy_floor", "bsr", "median_mtf", "median_mtf_bound", "rms_m
 
 
 def pictures(terms: Terms, height: Tensor, learnt: LearntMask) -> dict[str, bytes]:
-    """Draw the height map, PSF, suppression by wavelength and losses of a mask, and return each picture as PNG."""
+    """Draw the height map, PSF, laser suppression and losses of a designed mask, and return the PNG files by name."""
     pupil, psf, plain = terms.pupil(height), terms.psf(height), terms.plain()
     pitch = terms.recipe.steps[terms.settings.psf].params["pixel_pitch"]
     drawings = {
@@ -32,7 +32,7 @@ def pictures(terms: Terms, height: Tensor, learnt: LearntMask) -> dict[str, byte
 
 @drawn
 def history(rows: Sequence[Mapping[str, float]]) -> Any:
-    """Draw the loss and the terms of the loss over the iterations, with one line for each start."""
+    """Draw the loss and its terms over the iterations, with one curve for each start of the optimisation."""
     names = [name for name in dict.fromkeys(n for row in rows for n in row) if name not in ("start", "iteration")]
     figure, axes = canvas(3.6 * len(names), 3.2, 1, len(names))
     for ax, name in zip(axes[0], names, strict=True):
@@ -45,7 +45,7 @@ def history(rows: Sequence[Mapping[str, float]]) -> Any:
 
 
 def sections(bands: Mapping[str, Any], limits: Fabrication, shown: Mapping[str, bytes]) -> list[Section]:
-    """Return the sections of the page of a mask with these figures by band, limits of fabrication and pictures."""
+    """Return the sections of the page of a mask, from its figures of merit by band, its limits and its pictures."""
     columns = [[1e9 * value for value in bands["wavelength"]], *(bands[name] for name in _NAMES)]
     bounds = (
         "`even light` is the LSR of light that is spread evenly over the window of the PSF. "

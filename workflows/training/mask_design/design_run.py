@@ -1,7 +1,7 @@
-"""The design of a mask without images, which spreads the laser and keeps the light and the contrast of the scene.
+"""The design of a mask without training images: laser light is spread, and light and contrast of the scene are kept.
 
-The height map is optimised through the graph of the recipe with terms that depend on the mask alone. Then the mask is
-judged by the same figures of merit as any other mask, on every band and at the full sampling of the recipe.
+The height map is optimised through the graph of the recipe with loss terms that depend on the mask alone. Then the
+figures of merit of the mask are computed on every band and at the full sampling of the recipe.
 """
 
 from __future__ import annotations
@@ -47,13 +47,13 @@ _LEARNT_WITH = {
 def design(
     recipe: Recipe, settings: MaskTraining, store: Store | None, out: Path, progress: Progress, *, device: str = "cpu"
 ) -> Path:
-    """Design a mask, write ``out/<date>_<recipe>_mask_<key>/`` and return this folder.
+    """Design a mask, write the folder ``out/<date>_<recipe>_mask_<key>/``, and return the path of this folder.
 
-    ``mask.safetensors`` holds the height map for `doe.pixelwise`, ``history.csv`` the terms at each iteration,
+    ``mask.safetensors`` holds the height map for `doe.pixelwise`, ``history.csv`` the loss terms at each iteration,
     ``mask.json`` the figures of merit, ``provenance.json`` the settings. The state of an unfinished design lies beside
     the folder; the same call continues from this state.
 
-    Raises: `DesignError` for a recipe without the steps, or a loss that is NaN or infinite.
+    Raises: `DesignError` if the recipe lacks a step, or the loss is NaN or infinite.
     """
     need_steps(recipe.steps, settings)
     key = _key(recipe, settings, store)
@@ -66,7 +66,7 @@ def design(
 
 
 def designed(folder: Path) -> bool:
-    """Return True if the training in a folder has a complete mask that was designed without images."""
+    """Return True if the folder of a training contains a complete mask that was designed without images."""
     return (folder / "mask.json").is_file()
 
 
@@ -79,17 +79,17 @@ def design_in(
     progress: Progress,
     device: str,
 ) -> None:
-    """Design the mask in the folder of a training, or continue a design that was stopped.
+    """Design a mask in the folder of a training, or continue a stopped design.
 
-    Raises `DesignError` as `design` does; ValueError if stage 1 has begun to train another mask, or no mask is trained.
+    Raises `DesignError` as `design` does; ValueError if stage 1 has begun to train a mask, or no mask is to be trained.
     """
     if training.learn is None:
         raise ValueError("train.learn: write the name of the step whose mask is designed")
     if designed(folder):
-        progress("the mask is designed")
+        progress("the mask is already designed")
         return
     if (folder / "state.pt").exists():
-        raise ValueError(f"stage 1 has begun in {folder}: remove this folder, or change a value of train.mask")
+        raise ValueError(f"stage 1 has already begun in {folder}: remove this folder, or change a value of train.mask")
     kept = StateFile(folder / "mask.state")
     DesignedMask.of(recipe, training.design, store, kept, progress, device).write(RunFolder(folder), command)
     kept.path.unlink(missing_ok=True)
@@ -97,7 +97,7 @@ def design_in(
 
 @dataclass(frozen=True)
 class DesignedMask:
-    """A designed height map at the sampling of the recipe, with the figures of merit of the mask."""
+    """A designed mask: its height map at the sampling of the recipe, and its figures of merit."""
 
     terms: Terms
     learnt: LearntMask
@@ -114,7 +114,7 @@ class DesignedMask:
         progress: Progress,
         device: str,
     ) -> DesignedMask:
-        """Optimise a mask, or continue from the state ``kept``, and compute the figures of merit of the mask."""
+        """Optimise a mask, or continue from the checkpoint ``kept``, and compute the figures of merit of the mask."""
         learning = Terms(_at(recipe, settings), settings, store, device)
         full = Terms(recipe, settings, store, device) if settings.at else learning
         progress(f"fabrication: {full.fabrication}")
@@ -126,7 +126,7 @@ class DesignedMask:
         return cls(full, learnt, height, figures)
 
     def write(self, folder: RunFolder, command: Sequence[str] = ()) -> None:
-        """Write mask, losses, page and settings, and last ``mask.json``, which marks a complete design."""
+        """Write the files of a designed mask; the last file, ``mask.json``, marks a complete design."""
         learnt, recipe, settings = self.learnt, self.terms.recipe, self.terms.settings
         provenance = {
             "stage": "mask",
@@ -158,7 +158,7 @@ class DesignedMask:
 
 
 def _at(recipe: Recipe, settings: MaskTraining) -> Recipe:
-    """Return the recipe with the values of ``at``, which replace other values while the mask is optimised."""
+    """Return the recipe with the parameters ``at``, such as a coarser sampling, that apply during the optimisation."""
     if not settings.at:
         return recipe
     try:
@@ -168,7 +168,7 @@ def _at(recipe: Recipe, settings: MaskTraining) -> Recipe:
 
 
 def _key(recipe: Recipe, settings: MaskTraining, store: Store | None) -> str:
-    """Return a digest of everything that decides the bits of a mask: recipe, settings, code of nodes and design."""
+    """Return a digest of the recipe, the settings and the code, which together decide the bits of a designed mask."""
     code = Code((store or Store()).code_memo)
     steps = [recipe.steps[name] for name in needed(recipe, [settings.psf, settings.plain])]
     nodes = sorted({step.node.fn.__module__ for step in steps} | _LEARNT_WITH)
@@ -185,7 +185,7 @@ def _key(recipe: Recipe, settings: MaskTraining, store: Store | None) -> str:
 
 
 def mask_figures(terms: Terms, height: Tensor) -> dict[str, Any]:
-    """Return LSR, BSR and contrast of a mask by band, with bounds on the contrast, and the means over the bands."""
+    """Return LSR, BSR and contrast of a mask, with bounds of the contrast, by band and as means over the bands."""
     with torch.no_grad():
         psf, plain = terms.psf(height), terms.plain()
         lsr, bsr = metrics.lsr(psf), metrics.bsr(psf.intensity, plain.intensity)
@@ -201,7 +201,7 @@ def mask_figures(terms: Terms, height: Tensor) -> dict[str, Any]:
 
 
 def summary_line(figures: Mapping[str, Any]) -> str:
-    """Return the mean figures of merit of a mask in one line."""
+    """Return one line of text with the mean figures of merit of a mask."""
     mean = figures["mean"]
     return (
         f"mean LSR {mean['lsr']:.3g} (even light {mean['energy_floor']:.2g}), BSR {mean['bsr']:.3f}, "

@@ -1,4 +1,4 @@
-"""Optimisation of a mask by Adam or by differential evolution, which continues from the state of a stopped design."""
+"""Resumable optimisation of a mask by Adam or by differential evolution."""
 
 from __future__ import annotations
 
@@ -28,22 +28,22 @@ from neusee.workflows.training.loop.checkpoint import StateFile
 from neusee.workflows.training.loop.resumable_loop import Progress
 from neusee.workflows.training.mask_design.design_terms import Terms
 
-_APART = 7919  #: difference of the seeds of two starts
-_USUAL = (12.0, 18.0, 24.0, 30.0, 36.0, 1.0, 0.0)  #: genes of half-rings that were chosen by hand
+_APART = 7919  #: difference of the seeds of successive starts
+_USUAL = (12.0, 18.0, 24.0, 30.0, 36.0, 1.0, 0.0)  #: genes of a hand-designed mask of half-rings
 
 
 @dataclass
 class LearntMask:
-    """The best mask of a design, and the losses at all iterations."""
+    """The best mask that an optimisation found, and the losses at all iterations."""
 
     height: Callable[[Stop], Tensor]
     loss: float
-    numbers: dict[str, Any]  #: parameters of a mask with few parameters
+    numbers: dict[str, Any]  #: the parameters, if the mask has few parameters
     history: list[dict[str, float]]
 
 
 def learn(terms: Terms, state: StateFile, progress: Progress) -> LearntMask:
-    """Optimise a mask; on the CPU the same settings give the same bits, also if the design was stopped."""
+    """Optimise a mask, or continue a stopped optimisation; on the CPU the same settings give the same bits."""
     optimise = _evolve if terms.settings.kind == "five_half_rings" else _descend
     return optimise(terms, state, progress)
 
@@ -52,7 +52,7 @@ def learn(terms: Terms, state: StateFile, progress: Progress) -> LearntMask:
 
 
 def shape_of(terms: Terms, start: int) -> nn.Module:
-    """Return the mask with its trainable parameters as they are at the beginning of a start."""
+    """Return the trainable mask with the initial parameters of start number ``start``."""
     settings = terms.settings
     shape = _free(terms, torch.Generator().manual_seed(settings.seed + _APART * start))
     return shape if settings.feature is None else Written(shape, settings.feature)
@@ -62,7 +62,7 @@ def _free(terms: Terms, rng: torch.Generator) -> nn.Module:
     settings, step = terms.settings, terms.mask_step
     if settings.kind == "recipe_mask":
         if step.node.path not in PARAMETRISATIONS:
-            raise DesignError(f"kind: {step.name} is {step.node.path}, whose samples are not learnt")
+            raise DesignError(f"kind: {step.name} is {step.node.path}, which has no trainable parameters")
         return PARAMETRISATIONS[step.node.path](terms.stop, step.params, rng)
     if settings.kind == "pixelwise":
         return Pixels(settings.grid, settings.max_height, settings.scale, rng, _start(settings))
@@ -74,17 +74,17 @@ def _free(terms: Terms, rng: torch.Generator) -> nn.Module:
 
 
 def _start(settings: MaskTraining) -> Tensor | None:
-    """Return the height map of the file ``start``, from which the optimisation of pixels begins."""
+    """Return the height map from which the optimisation of pixels begins, read from the file ``start``."""
     if settings.start is None:
         return None
     height = read_height_map(settings.start, settings.max_height)
     if (deepest := float(height.max())) > settings.max_height:
-        raise DesignError(f"start: {settings.start.name} is {deepest * 1e6:.3g} um deep: set max_height to more")
+        raise DesignError(f"start: {settings.start.name} is {deepest * 1e6:.3g} um deep: set a larger max_height")
     return height
 
 
 def rate(settings: MaskTraining, number: int) -> float:
-    """Return the learning rate of an iteration; iterations count from 0."""
+    """Return the learning rate of iteration ``number``, where iterations count from 0."""
     done = number / settings.iterations
     if settings.schedule == "step":
         return settings.rate * 0.5 ** math.floor(5 * done)
@@ -117,7 +117,7 @@ def _descend(terms: Terms, file: StateFile, progress: Progress) -> LearntMask:
 def _one_start(
     terms: Terms, shape: nn.Module, start: int, state: dict[str, Any], file: StateFile, progress: Progress
 ) -> None:
-    """Optimise the parameters from one start, and save the losses and, at times, the parameters in ``state``."""
+    """Optimise the mask from one start; add the losses and, every ``save_every`` iterations, the mask to ``state``."""
     settings = terms.settings
     adam = torch.optim.Adam(shape.parameters(), lr=settings.rate)
     if "shape" in state:
@@ -156,7 +156,7 @@ def _losses_line(row: dict[str, float]) -> str:
 
 
 def _few(shape: nn.Module) -> dict[str, Any]:
-    """Return the parameters of a mask as lists, without matrices and without lists of more than 1000 numbers."""
+    """Return the parameters of a mask as lists, without matrices and without vectors of more than 1000 numbers."""
     inner: Any = shape.shape if isinstance(shape, Written) else shape
     state = {} if isinstance(inner, Drawn) else inner.state_dict()
     return {name: x.tolist() for name, x in state.items() if x.numel() <= 1000 and x.dim() == 1}
@@ -166,7 +166,7 @@ def _few(shape: nn.Module) -> dict[str, Any]:
 
 
 def half_ring_height(genes: Any, settings: MaskTraining) -> Callable[[Stop], Tensor]:
-    """Return a function that computes the height map of the half-rings of a set of genes on a grid."""
+    """Return a function that computes the height map of half-rings with these genes on a pupil grid."""
     *slopes, side, turn = (float(gene) for gene in genes)
     given = {"waves": tuple(slopes), "alternate": side >= 0.5, "orientation": turn}
 
@@ -178,7 +178,7 @@ def half_ring_height(genes: Any, settings: MaskTraining) -> Callable[[Stop], Ten
 
 
 class _LossOfGenes:
-    """The loss of a set of genes; the losses of calls before an interruption are read from the state."""
+    """The loss as a function of the genes; after an interruption, stored losses are returned without computation."""
 
     def __init__(self, terms: Terms, state: StateFile, progress: Progress) -> None:
         self.terms, self.state = terms, state
@@ -193,7 +193,7 @@ class _LossOfGenes:
                 height = half_ring_height(genes, self.terms.settings)(self.terms.stop)
                 loss = float(self.terms.total(self.terms.parts(height.to(self.terms.device), self.chosen)))
             if not math.isfinite(loss):
-                raise DesignError(f"mask {self.asked}: the loss of slopes {list(genes[:-2])} is NaN or infinite")
+                raise DesignError(f"mask {self.asked}: the loss with slopes {list(genes[:-2])} is NaN or infinite")
             self.known.append(loss)
             if len(self.known) % (self.terms.settings.save_every * 10) == 0:
                 self.state.write({"values": self.known})
@@ -225,7 +225,7 @@ def _evolve(terms: Terms, state: StateFile, progress: Progress) -> LearntMask:
 def _population(
     loss: _LossOfGenes, bounds: Any, start: int, history: list[dict[str, float]], progress: Progress
 ) -> tuple[float, Any]:
-    """Return the least loss and the best genes of one population, and add a row for each generation to ``history``."""
+    """Evolve one population, and return its lowest loss and best genes; ``history`` gets a row for each generation."""
     import numpy as np
     from scipy.optimize import differential_evolution, minimize
 
@@ -262,12 +262,12 @@ def _population(
 
 
 def _steepest(terms: Terms) -> float:
-    """Return the slope, in waves at the rim, that changes by half a wave per sample in the shortest band (Nyquist)."""
+    """Return the Nyquist limit of the mask slopes, in waves at the rim, at the shortest wavelength of the recipe."""
     material, wavelength = terms.settings.material, terms.settings.wavelength
     turned = wave_height(material, wavelength) / wave_height(material, float(terms.bands.centres.min()))
     return float(terms.stop.diameter / (4 * terms.stop.pitch * turned))
 
 
 def _holds_usual(settings: MaskTraining) -> bool:
-    """Return True if the slopes that were chosen by hand lie within the allowed slopes."""
+    """Return True if the allowed slopes include the slopes of the hand-designed mask."""
     return settings.slopes[0] <= min(_USUAL[:5]) and settings.slopes[1] >= max(_USUAL[:5])

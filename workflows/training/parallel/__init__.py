@@ -1,6 +1,6 @@
 """How do several processes train together?
 
-Groups of processes, the bands and pictures that each takes, and what they exchange.
-Nothing here knows what is trained.
+The mesh of processes, the bands and pictures of each process, and the messages between processes.
+Nothing here depends on the mask or network that is trained.
 Offers: `process_mesh.Mesh`, `process_mesh.joined`, `shared_graph.Shared`.
 """

@@ -1,4 +1,4 @@
-"""The steps whose bands are divided among several processes, and the later steps that need all bands.
+"""Division of spectral bands among processes: the steps that are divided, and the later steps that need all bands.
 
 Each process computes its own bands of every step that works band by band, with the same bits as a single process. The
 first step that does not work band by band needs all bands: every process gathers the bands of the mask's PSF, and the
@@ -31,20 +31,20 @@ Port = Swapped | Sum
 
 @dataclass(frozen=True)
 class Shards:
-    """The steps of a recipe whose bands are divided among processes, and the later steps that need all bands."""
+    """The steps of a recipe whose spectral bands are divided among processes, and the steps that need all bands."""
 
     recipe: Recipe
     mesh: Mesh = ALONE
     count: int = 0  #: bands of the scene
     steps: frozenset[str] = frozenset()  #: steps of which each process computes its own bands
     behind: frozenset[str] = frozenset()  #: later steps, which need all bands
-    rows: Mapping[str, Tensor] = field(default_factory=dict)  #: weights of sums, by image whose bands are only summed
+    rows: Mapping[str, Tensor] = field(default_factory=dict)  #: weights of sums over bands, by image that is summed
 
     @classmethod
     def of(
         cls, recipe: Recipe, psf: str, outputs: Sequence[str], live: Collection[str], store: Store, mesh: Mesh
     ) -> Shards:
-        """Divide the ``live`` steps by band among the processes; raise MeshError for too few bands."""
+        """Divide the bands of the ``live`` steps among the processes; raise MeshError if there are too few bands."""
         if mesh.band == 1:
             return cls(recipe)
         spectral = _sampled(recipe, psf)
@@ -68,38 +68,38 @@ class Shards:
         return own_bands(self.mesh, self.count)
 
     def call(self, step: Step, inputs: Sequence[Any], params: Mapping[str, Any], seed: int, device: str) -> Any:
-        """Compute a step and return its result, only at the bands of this process if the step is divided by band."""
+        """Compute a step and return its result, which has only the bands of this process if the step is divided."""
         if step.name in self.steps:
             whole = [name for name in step.node.inputs if step.wires.get(name) not in self.steps]
             inputs = taken(step, inputs, self.own, whole)
         return call(step, inputs, params, seed, device)
 
     def gathered(self, name: str, value: Any) -> Any:
-        """Gather all bands of a result of which each process has its own bands."""
+        """Gather all bands of a step's result from all processes."""
         axis = self.axis(name)
         return with_band_tensors(value, [gathered(self.mesh, x, axis, self.count) for x in band_tensors(value)])
 
     def axis(self, name: str) -> int:
-        """Return the axis of the bands in the result of a step that works band by band."""
+        """Return the index of the tensor axis along which the result of a step has its bands."""
         bands = self.recipe.steps[name].node.bands
         assert bands is not None
         return bands["return"]
 
     def sent(self, name: str, value: Any) -> list[Tensor]:
-        """Return the tensors of a result that are sent to the process that owns the picture."""
+        """Return the tensors of a step's result that are sent to the process that owns the picture."""
         if name not in self.rows:
             return band_tensors(value)
         part = channel_sums(value, self.rows[name][:, self.own])
         return [part.planes, part.flux]
 
     def ports(self, name: str, sent: Sequence[Tensor]) -> list[Port]:
-        """Return the exchange by which each of the tensors ``sent`` goes to the process that owns the picture."""
+        """Return one exchange between processes for each of the tensors ``sent``: of bands, or of sums over bands."""
         if name in self.rows:
             return [Sum(self.mesh), Swapped(self.mesh, -1, self.count)]
         return [Swapped(self.mesh, self.axis(name), self.count) for _ in sent]
 
     def received(self, name: str, like: Any, found: Sequence[Tensor]) -> Any:
-        """Return the result of a step from the received tensors, in the form that later steps read."""
+        """Return the result of a step, assembled from the tensors that other processes sent."""
         if name not in self.rows:
             return with_band_tensors(like, found)
         planes, flux = found
@@ -108,18 +108,18 @@ class Shards:
 
 
 def _sampled(recipe: Recipe, name: str) -> set[str]:
-    """Return the steps whose result is the bands of a step."""
+    """Return the steps that define the spectral bands on which the step ``name`` depends."""
     return {n for n in needed(recipe, [name]) if recipe.steps[n].node.hints["return"] is Bands}
 
 
 def _by_band(recipe: Recipe, name: str, spectral: set[str]) -> bool:
-    """Return True if a step works separately on each band of the steps ``spectral``."""
+    """Return True if a step computes each band of the steps ``spectral`` independently of the other bands."""
     node = recipe.steps[name].node
     return node.bands is not None and _sampled(recipe, name) == spectral and not _mixed(recipe, name)
 
 
 def _mixed(recipe: Recipe, name: str) -> bool:
-    """Return True if the planes of the result of a step are mixtures of several bands."""
+    """Return True if the result of a step is a low-rank cube, whose planes are mixtures of bands."""
     while (kind := recipe.steps[name].node.hints["return"]) is not LowRankCube:
         step = recipe.steps[name]
         through = next((w for i in step.node.accepts_low_rank if isinstance(w := step.wires.get(i), str)), None)
@@ -133,15 +133,15 @@ def _count(recipe: Recipe, psf: str, spectral: set[str], store: Store, mesh: Mes
     step = recipe.steps[psf]
     if not _by_band(recipe, psf, spectral) or len(spectral) != 1:
         raise MeshError(
-            f"{step.mark}: {psf} ({step.node.path}) couples its bands, so that --mesh {mesh} cannot share the bands: "
+            f"{step.mark}: {psf} ({step.node.path}) computes all bands together, which --mesh {mesh} cannot divide: "
             f"write --mesh {mesh.size}x1"
         )
     (bands,) = spectral
     count = len(run(recipe, store, [bands]).values[bands].centres)
     if mesh.band > count:
         raise MeshError(
-            f"{recipe.steps[bands].mark}: {bands} has {count} bands, which {mesh.band} processes cannot share: write a "
-            f"band axis of at most {count} in --mesh {mesh}"
+            f"{recipe.steps[bands].mark}: {bands} has only {count} bands for {mesh.band} processes: "
+            f"write --mesh with a band axis of at most {count} instead of --mesh {mesh}"
         )
     return count
 
@@ -149,7 +149,7 @@ def _count(recipe: Recipe, psf: str, spectral: set[str], store: Store, mesh: Mes
 def _asked(
     recipe: Recipe, name: str, outputs: Sequence[str], behind: Collection[str], live: Collection[str]
 ) -> Asked | None:
-    """Return the sums that later steps read from an image; None if other values are read or the weights change."""
+    """Return the sums over bands that later steps read from an image, or None if other values are read."""
     asked = None if name in outputs else asked_of(recipe, name, outputs)
     still = asked is not None and asked.bands not in live and asked.responses not in live
     return asked if asked is not None and still and set(behind).issuperset(asked.readers) else None

@@ -1,8 +1,8 @@
-"""Messages between the processes of a band axis, which exchange bands for pictures and return gradients.
+"""Messages among processes that have different spectral bands: the exchange of bands and of gradients.
 
-Process r of m holds the bands r, r + m, ... A message is linear in its tensors, and gradients return by the transposed
-message, so that the derivatives of all processes add up to the derivative of the sum. Sums are taken in the order of
-the processes, which is the same on every backend.
+Process r of m has the bands r, r + m, ... A message is linear in its tensors, and gradients return by the transposed
+message, so that the derivatives of all processes add up to the derivative of the sum. Sums are added in the order of
+the processes, so that every backend gives the same bits.
 """
 
 from __future__ import annotations
@@ -17,68 +17,68 @@ from neusee.workflows.training.parallel.process_mesh import Mesh
 
 
 def own_bands(mesh: Mesh, count: int) -> list[int]:
-    """Return the indices of the bands of this process among ``count`` bands."""
+    """Return the indices of the spectral bands of this process, out of ``count`` bands."""
     return list(range(mesh.column, count, mesh.band))
 
 
 def gathered(mesh: Mesh, x: Tensor, axis: int, count: int) -> Tensor:
-    """Gather all bands of a tensor from the processes, each of which has its own bands."""
+    """Gather all spectral bands of a tensor from all processes."""
     mine = _filled(x.detach().movedim(axis, 0), -(-count // mesh.band))
     return _woven(_from_each(mesh, mine), axis, count)
 
 
 def gathered_back(mesh: Mesh, grad: Tensor, axis: int, count: int) -> Tensor:
-    """Add the gradients of all processes, and return the sum at the bands of this process."""
+    """Sum a gradient over all processes, and return the sum at the bands of this process."""
     total = _added(_exchanged(mesh, _unwoven(mesh, grad, axis, count)))
     return total[: len(own_bands(mesh, count))].movedim(0, axis)
 
 
 class Bands:
-    """An exchange in which a process sends its bands of every picture and receives all bands of its own picture."""
+    """An all-to-all exchange: each process sends its bands of every picture and receives all bands of its own."""
 
     def __init__(self, mesh: Mesh, axis: int, count: int) -> None:
         self.mesh, self.axis, self.count = mesh, axis, count
 
     def there(self, parts: Sequence[Tensor]) -> Tensor:
-        """Send all bands of picture j to process j, and zeros to a process without a picture."""
+        """Send the bands of picture j to process j, and return the picture of this process with all bands."""
         most = -(-self.count // self.mesh.band)
         sent = [_filled(x.detach().movedim(self.axis, 0), most) for x in parts]
         return _woven(_exchanged(self.mesh, _stacked(self.mesh, sent)), self.axis, self.count)
 
     def back(self, grad: Tensor) -> list[Tensor]:
-        """Return the gradient of each picture at the bands of this process."""
+        """Return the gradients of all pictures at the bands of this process."""
         own = len(own_bands(self.mesh, self.count))
         each = _exchanged(self.mesh, _unwoven(self.mesh, grad, self.axis, self.count))
         return [x[:own].movedim(0, self.axis) for x in each]
 
 
 class Sum:
-    """A sum in which a process sends its part of every picture and receives the sum of all parts of its own picture."""
+    """An exchange of sums: each process sends a part of every picture and receives the sum for its own picture."""
 
     def __init__(self, mesh: Mesh) -> None:
         self.mesh = mesh
 
     def there(self, parts: Sequence[Tensor]) -> Tensor:
-        """Send the sum of the parts of picture j to process j."""
+        """Send the part of picture j to process j, and return the sum of all parts of the picture of this process."""
         return _added(_exchanged(self.mesh, _stacked(self.mesh, [x.detach() for x in parts])))
 
     def back(self, grad: Tensor) -> list[Tensor]:
-        """Return the gradient of the sum of each picture, which is the gradient of every part."""
+        """Return the gradients of all pictures; the gradient of a sum is the gradient of each of its parts."""
         return list(_from_each(self.mesh, grad.contiguous()))
 
 
 def _filled(x: Tensor, most: int) -> Tensor:
-    """Append zeros to a tensor until it has ``most`` bands."""
+    """Pad a tensor with zeros to ``most`` bands."""
     return x.contiguous() if len(x) == most else torch.cat([x, x.new_zeros(most - len(x), *x.shape[1:])])
 
 
 def _stacked(mesh: Mesh, parts: Sequence[Tensor]) -> Tensor:
-    """Stack one tensor for each process, with zeros for a process without a picture."""
+    """Stack the tensors of all pictures, with zeros for each process that has no picture."""
     return torch.stack([*parts, *(torch.zeros_like(parts[0]) for _ in range(mesh.band - len(parts)))])
 
 
 def _woven(each: Tensor, axis: int, count: int) -> Tensor:
-    """Return a tensor (process, bands of the process, ...) in the order of the bands."""
+    """Reorder a tensor (process, bands of the process, ...) so that one axis has all bands in spectral order."""
     return each.transpose(0, 1).flatten(0, 1)[:count].movedim(0, axis).contiguous()
 
 
@@ -96,14 +96,14 @@ def _added(each: Tensor) -> Tensor:
 
 
 def _exchanged(mesh: Mesh, each: Tensor) -> Tensor:
-    """Send tensor j to process j, and return the tensors that all processes send to this process."""
+    """Send tensor j to process j, and return the stack of the tensors that this process receives."""
     received = torch.empty_like(each)
     dist.all_to_all_single(received, each, group=mesh.group)
     return received
 
 
 def _from_each(mesh: Mesh, x: Tensor) -> Tensor:
-    """Return the tensors of all processes, which have equal shapes, stacked in the order of the processes."""
+    """Return the stack of the tensors ``x`` of all processes, in the order of the processes."""
     received = x.new_empty(mesh.band, *x.shape)
     dist.all_gather(list(received.unbind()), x, group=mesh.group)
     return received

@@ -1,6 +1,6 @@
-"""Pictures of processes that share bands: each process begins the pictures of all and finishes its own picture.
+"""Computation of training pictures by several processes, each of which has some of the spectral bands.
 
-Every process computes its bands of every picture. Then the process that owns a picture receives the bands, or sums over
+Every process computes its bands of every picture. Then the process that owns a picture receives all bands, or sums over
 the bands, and computes all later steps. Gradients return to all processes.
 """
 
@@ -20,7 +20,7 @@ from neusee.workflows.training.parallel.shared_graph import Shared
 
 
 class Pictures:
-    """The steps of a recipe that are computed for each picture, divided at the steps that need all bands."""
+    """The steps that are computed for each training picture, divided at the steps that need all bands."""
 
     def __init__(
         self,
@@ -42,21 +42,21 @@ class Pictures:
             self._start = as_function(recipe, *first, outputs=self._cut, redraw=redraw, caller=shards.call, **run)
 
     def alone(self, theta: Theta, seed: int) -> dict[str, Any]:
-        """Compute a picture without other processes, and return the outputs."""
+        """Compute one picture in this process alone, and return the outputs of the recipe."""
         return self._end(_only(theta, self._end.free), seed)
 
     @property
     def by_band(self) -> bool:
-        """Return True if every process computes its bands of the pictures of all processes."""
+        """Return True if the computation of each picture is divided by band among the processes."""
         return bool(self._cut)
 
     @contextmanager
     def together(
         self, shared: Shared, drawn: Mapping[int, tuple[Theta, int]], mine: int | None
     ) -> Iterator[dict[str, Any]]:
-        """Begin the pictures of all processes, and yield the outputs of picture ``mine``, or nothing for None.
+        """Compute this process's bands of all pictures, and yield the outputs of picture ``mine``; None yields nothing.
 
-        When the block ends, the gradients return to the processes that sent the bands.
+        When the ``with`` block ends, the gradients return to the processes that sent the bands.
         """
         start = self._start
         begun = [start(_only({**shared.values, **theta}, start.free), seed) for theta, seed in drawn.values()]
@@ -70,10 +70,10 @@ class Pictures:
 
 
 class _Cut:
-    """The results of several pictures that are sent to the processes that own the pictures."""
+    """The intermediate results of several pictures, sent to the processes that own the pictures."""
 
     def __init__(self, begun: Sequence[Mapping[str, Any]], names: Sequence[str], shards: Shards) -> None:
-        self._sent: list[tuple[Port, tuple[Tensor, ...], Tensor]] = []  #: tensors of all pictures, and what is received
+        self._sent: list[tuple[Port, tuple[Tensor, ...], Tensor]] = []  #: exchange, sent tensors, received tensor
         self.values: dict[str, Any] = {}
         for name in names:
             parts = [shards.sent(name, one[name]) for one in begun]
@@ -84,7 +84,7 @@ class _Cut:
             self.values[name] = shards.received(name, begun[0][name], leaves)
 
     def back(self) -> None:
-        """Return each gradient to the processes that sent bands; a process without a picture sends zeros."""
+        """Send the gradients back to the processes that sent the bands; a process without a picture sends zeros."""
         roots: list[Tensor] = []
         grads: list[Tensor] = []
         for port, sent, leaf in self._sent:
@@ -102,7 +102,7 @@ def _live(recipe: Recipe, given: Sequence[str], outputs: Sequence[str]) -> list[
 
 
 def _used(recipe: Recipe, free: Sequence[str], outputs: Sequence[str]) -> list[str]:
-    """Return the free steps and parameters on which an output depends."""
+    """Return those of the steps and parameters ``free`` on which an output depends."""
     live = set(_live(recipe, free, outputs))
     return [name for name in free if (name if name in recipe.steps else name.rpartition(".")[0]) in live]
 

@@ -1,4 +1,4 @@
-"""The mesh (data, band) of the processes that `torchrun` starts for one training.
+"""The mesh of the processes that `torchrun` starts for one training, with the two axes data and band.
 
 Processes along the data axis have different pictures. Processes along the band axis share the optics of the same
 pictures by wavelength. Gradients are added over all processes, so that networks, optimisers and state stay equal in all
@@ -20,21 +20,21 @@ from torch import nn
 
 
 class MeshError(ValueError):
-    """Error for a mesh that does not fit the number of processes, the recipe or the arguments."""
+    """Error for a process mesh that contradicts the number of processes, the recipe or the arguments."""
 
 
 @dataclass(frozen=True)
 class Mesh:
-    """One process of a mesh of ``data`` x ``band`` processes; neighbours share the bands of the same pictures."""
+    """One process of a mesh of ``data`` x ``band`` processes; the processes of a row divide the spectral bands."""
 
     data: int = 1
     band: int = 1
     rank: int = 0
-    group: Any = None  #: the process group of torch.distributed with the same pictures
+    group: Any = None  #: the process group (torch.distributed) of the processes with the same pictures
 
     @property
     def size(self) -> int:
-        """Return the number of processes of the mesh."""
+        """Return the number of processes in the mesh."""
         return self.data * self.band
 
     @property
@@ -49,7 +49,7 @@ class Mesh:
 
     @property
     def first(self) -> bool:
-        """Return True for the only process that writes files."""
+        """Return True if this is process 0, the only process that writes files."""
         return self.rank == 0
 
     def __str__(self) -> str:
@@ -70,10 +70,10 @@ class Mesh:
         dist.all_gather_object(texts, about)
         for rank, other in enumerate(texts):
             if other != texts[0]:
-                raise MeshError(f"process 0 is at {texts[0]}, process {rank} at {other}: use the same folder in all")
+                raise MeshError(f"process 0 is at {texts[0]}, process {rank} at {other}: all need the same folder")
 
     def numbers(self, own: Mapping[str, float], names: Sequence[str], device: str) -> dict[str, float]:
-        """Return the sum over all processes of each of the numbers ``names``."""
+        """Return the numbers ``names``, each summed over all processes."""
         if self.size == 1:
             return dict(own)
         total = torch.tensor([own.get(name, 0.0) for name in names], dtype=torch.float64, device=device)
@@ -81,7 +81,7 @@ class Mesh:
         return dict(zip(names, total.tolist(), strict=True))
 
     def add_gradients(self, parts: Iterable[nn.Module]) -> None:
-        """Replace the gradients in all processes by their sum, in one message for each dtype; None stays None."""
+        """Replace each gradient by its sum over all processes, with one message for each dtype."""
         if self.size == 1:
             return
         own = [p for part in parts for p in part.parameters()]
@@ -90,7 +90,7 @@ class Mesh:
 
 
 def _add(own: Sequence[nn.Parameter]) -> None:
-    """Add gradients over all processes; a gradient that is None in every process stays None."""
+    """Sum gradients over all processes; a gradient that is None in every process stays None."""
     there = torch.tensor([float(p.grad is not None) for p in own]).to(own[0])
     grads = [torch.zeros_like(p) if p.grad is None else p.grad for p in own]
     flat = torch.cat([*(g.reshape(-1) for g in grads), there])
@@ -104,12 +104,15 @@ ALONE = Mesh()
 
 
 def processes() -> tuple[int, int]:
-    """Return the index of this process and the number of processes from the environment that `torchrun` sets."""
+    """Return the index of this process and the number of processes, as `torchrun` sets them in the environment."""
     return int(os.environ.get("RANK", "0")), int(os.environ.get("WORLD_SIZE", "1"))
 
 
 def shape_of(text: str, world: int) -> tuple[int, int]:
-    """Return (4, 2) for the text ``4x2``, and (world, 1) for no text; raise MeshError for another product."""
+    """Parse a mesh such as ``4x2`` as (4, 2), or an empty text as (world, 1).
+
+    Raises MeshError for a malformed text, or unless the product is ``world``, the number of processes.
+    """
     if not text:
         return world, 1
     if not re.fullmatch(r"[1-9]\d*x[1-9]\d*", text):
@@ -123,14 +126,17 @@ def shape_of(text: str, world: int) -> tuple[int, int]:
 
 
 def device_here(device: str) -> str:
-    """Return the name of the device that this process uses."""
+    """Return the name of this process's device, such as ``cuda:1`` for the second process on a machine."""
     local = os.environ.get("LOCAL_RANK", "0")
     return f"cuda:{local}" if device == "cuda" and processes()[1] > 1 else device
 
 
 @contextmanager
 def joined(text: str, device: str) -> Iterator[Mesh]:
-    """Join the mesh that ``--mesh`` names until the block ends; raise MeshError for a mesh that does not fit."""
+    """Return a context in which this process belongs to the mesh ``text``, an argument of ``--mesh``.
+
+    Raises MeshError if the mesh contradicts the number of processes.
+    """
     rank, world = processes()
     data, band = shape_of(text, world)
     if world == 1:
@@ -143,4 +149,4 @@ def joined(text: str, device: str) -> Iterator[Mesh]:
         dist.init_process_group("gloo")
     groups = [dist.new_group(list(range(row * band, (row + 1) * band))) for row in range(data)]
     yield Mesh(data, band, rank, groups[rank // band])
-    dist.destroy_process_group()  # not after an error, when a process would wait for others that have ended
+    dist.destroy_process_group()  # not after an error, because this process would wait for processes that have ended

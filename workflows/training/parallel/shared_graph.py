@@ -1,4 +1,4 @@
-"""The results that depend on the mask alone, which all pictures of an iteration share."""
+"""Results that depend on the mask alone, and are computed once for all pictures of a training iteration."""
 
 from __future__ import annotations
 
@@ -16,16 +16,16 @@ from neusee.workflows.training.parallel.collectives import gathered_back
 
 @dataclass(frozen=True)
 class Shared:
-    """Results that depend on the mask alone, and detached copies at which the gradients of all pictures add up."""
+    """Results that depend on the mask alone, with detached copies that accumulate the gradients of all pictures."""
 
-    made: Mapping[str, Any]  #: results with their graph, at the bands of this process
+    made: Mapping[str, Any]  #: results with their autograd graph, at the bands of this process
     values: Mapping[str, Any]  #: detached copies
     whole: Mapping[str, Any] = field(default_factory=dict)  #: copies with all bands
     shards: Shards | None = None
 
     @classmethod
     def of(cls, made: Mapping[str, Any], shards: Shards | None = None, whole: Sequence[str] = ()) -> Shared:
-        """Detach results from their graph, and gather all bands of the steps ``whole``."""
+        """Detach results from their autograd graph, and gather all bands of the results ``whole``."""
         leaves = {name: each_tensor(leaf, value) for name, value in made.items()}
         if shards is None or not leaves:
             return cls(made, leaves)
@@ -34,11 +34,11 @@ class Shared:
 
     @property
     def seen(self) -> Mapping[str, Any]:
-        """Return the detached copies, with all bands of results that later steps read whole."""
+        """Return the detached copies that later steps read, with all bands where later steps need all bands."""
         return {**self.values, **self.whole}
 
     def back(self) -> None:
-        """Propagate the summed gradients from the copies to the mask."""
+        """Propagate the accumulated gradients from the detached copies to the mask."""
         for name, value in self.whole.items():
             for own, whole in zip(tensors_in(self.values[name]), tensors_in(value), strict=True):
                 self._to_own(name, own, whole)
@@ -48,7 +48,7 @@ class Shared:
             torch.autograd.backward([x for x, _ in roots], [grad for _, grad in roots])
 
     def _to_own(self, name: str, own: Tensor, whole: Tensor) -> None:
-        """Add the gradients of all processes to the bands of this process; a process without a picture adds zeros."""
+        """Sum the gradients at the bands of this process over all processes; one without a picture contributes zero."""
         if not own.requires_grad:
             return
         assert self.shards is not None
@@ -58,12 +58,12 @@ class Shared:
 
 
 def leaf(x: Tensor) -> Tensor:
-    """Return a detached copy of a tensor, which requires gradients if the tensor requires gradients."""
+    """Return a detached copy of a tensor, with the same ``requires_grad``."""
     return x.detach().requires_grad_(x.requires_grad)
 
 
 def _alike(value: Any, like: Any) -> Any:
-    """Make the tensors of ``value`` require gradients where the tensors of ``like`` do, and return ``value``."""
+    """Copy ``requires_grad`` from the tensors of ``like`` to the tensors of ``value``, and return ``value``."""
     for x, y in zip(tensors_in(value), tensors_in(like), strict=True):
         x.requires_grad_(y.requires_grad)
     return value

@@ -133,7 +133,7 @@ def test_what_is_not_a_number_stops_and_is_kept(tmp_path, monkeypatch):
     from neusee.nodes import losses as nodes
 
     monkeypatch.setattr(nodes, "mrae", lambda a, b, floor: (a - b).mean() * float("nan"))
-    with pytest.raises(ArithmeticError, match=r"iteration 0, picture 0: NaN or infinite: MRAE"):
+    with pytest.raises(ArithmeticError, match=r"iteration 0, picture 0: these numbers are NaN or infinite: MRAE"):
         trained(load("train_lift", TINY), tmp_path)
     (folder,) = (tmp_path / "runs").iterdir()
     assert {"net", "optimiser"} <= torch.load(folder / "not_finite_0.pt", weights_only=True)["parts"].keys()
@@ -159,7 +159,7 @@ def test_a_mistake_is_located(change, said):
     ("change", "said"),
     [
         ("train_lift.cube=cub", "did you mean cube"),
-        ("train_lift.measured=bands", "takes no bands"),
+        ("train_lift.measured=bands", "bands has no input `bands`"),
         ("steps.bands.with.count=16", "31 bands from 400 to 700 nm"),
     ],
 )

@@ -196,14 +196,14 @@ def test_a_batch_that_cannot_be_shared_is_refused_where_it_stands(tmp_path):
 
 def test_more_processes_than_bands_are_refused_where_the_bands_stand(tmp_path):
     recipe = load("train_small", EVERY)
-    with pytest.raises(MeshError, match=r"neusee\.yaml:\d+:\d+: bands has 5 bands, which 6 processes cannot share"):
+    with pytest.raises(MeshError, match=r"neusee\.yaml:\d+:\d+: bands has only 5 bands for 6 processes"):
         samples(recipe, tmp_path, Mesh(1, 6))
 
 
 def test_a_psf_that_couples_its_bands_is_named(tmp_path):
     recipe = load("train_small", EVERY)
     coupled = replace(recipe, steps={**recipe.steps, "psf[mask]": replace(recipe.steps["psf[mask]"], node=doe.flat)})
-    with pytest.raises(MeshError, match=r"psf\[mask\] \(doe.flat\) couples its bands.* write --mesh 2x1"):
+    with pytest.raises(MeshError, match=r"psf\[mask\] \(doe.flat\) computes all bands together.* write --mesh 2x1"):
         Shards.of(coupled, "psf[mask]", ["psf[mask]"], {"psf[mask]"}, Store(tmp_path), Mesh(1, 2))
 
 
