@@ -1,9 +1,9 @@
-"""The functions `neusee.run`, `sweep`, `train`, `evaluate`, `calibrate` and `study`, with the same options in each.
+"""Functions for use from Python: `neusee.run`, `sweep`, `train`, `evaluate`, `calibrate` and `study`.
 
-``changes`` change a recipe that a caller names: a mapping as `load` takes it
-(``{"doe": "axicon", "sensor": {"read_noise": "20 e-"}}``), or arguments as on the command line (``["doe=axicon"]``).
+All functions have these options. ``changes`` change a recipe that is given by name or file: a mapping like the values
+of `load` (``{"doe": "axicon", "sensor": {"read_noise": "20 e-"}}``), or command-line arguments (``["doe=axicon"]``).
 ``store`` keeps results; None means ``$NEUSEE_CACHE`` or the default folder. The folder of results is made in ``out``.
-``progress`` takes a line for each finished part, and the page shows ``command`` as the command that repeats the call.
+``progress`` is called with a line for each finished part. The report shows ``command``, which repeats the call.
 """
 
 from __future__ import annotations
@@ -47,7 +47,7 @@ def run(
     executor: Executor | None = None,
     memory: int | None = None,
 ) -> Result:
-    """Run a recipe and return the values of ``outputs``, or of the recipe's own outputs for None.
+    """Run a recipe and return the values of ``outputs``; None means the outputs that the recipe names.
 
     Args: device: one or several devices, ``cuda:0,cuda:1,cpu``, the preferred one first. watch: takes every `Event`.
     executor: computes instead of this process. memory: largest number of bytes to use on each device.
@@ -168,7 +168,7 @@ def calibrate(
     move: str = "de",
     draws: int = 1000,
 ) -> Path:
-    """Find the posterior of a recipe's sensor, or continue a stopped calibration, and return the folder of results.
+    """Estimate the posterior of a recipe's sensor, or continue a stopped calibration, and return the folder of results.
 
     Args: walkers: number of walkers in each of the four ensembles. move: the move of the walkers, ``"de"`` or
     ``"stretch"``. draws: least number of independent draws.
@@ -207,7 +207,7 @@ def study(
 
 
 def _read(recipe: Recipe | Named, changes: Changes) -> Recipe:
-    """Return ``recipe`` itself, or the recipe of that name or file with ``changes``."""
+    """Return a loaded recipe unchanged, or load a recipe by name or file with ``changes``."""
     if not isinstance(recipe, Recipe):
         return load(recipe, _arguments(changes))
     if changes:
@@ -216,14 +216,14 @@ def _read(recipe: Recipe | Named, changes: Changes) -> Recipe:
 
 
 def _name(recipe: Named, verb: str) -> str:
-    """Return the name or file of a recipe that ``verb`` loads several times; raise TypeError for a loaded recipe."""
+    """Return the name or file of a recipe, which the function ``verb`` needs; raise TypeError for a loaded recipe."""
     if isinstance(recipe, Recipe):
         raise TypeError(f"{verb} loads the recipe several times: pass the name or file of the recipe, and changes")
     return os.fspath(recipe)
 
 
 def _arguments(changes: Changes) -> list[str | Override]:
-    """Return changes as arguments of `load`; raise TypeError for a single text."""
+    """Return ``changes`` as overrides for `load`; raise TypeError if ``changes`` is a string."""
     if isinstance(changes, str):
         raise TypeError(f"changes must be a mapping or a list of arguments: write changes=[{changes!r}]")
     return [*overrides_of(changes, Path.cwd())] if isinstance(changes, Mapping) else [*changes]

@@ -11,7 +11,7 @@ UNREAD = "unread"  #: code of a value to which no step refers
 
 @dataclass(frozen=True, slots=True, order=True)
 class Location:
-    """Location of a value: line and column in a file, both counted from 1, or an argument of a command (line 0)."""
+    """Location of a value: a line and a column in a file, counted from 1, or an argument, which has line 0."""
 
     file: str  #: as shown to the user: ``first_light.yaml``, ``sensor/neusee.yaml``, ``argument 2``
     line: int = 0
@@ -47,7 +47,7 @@ def _table(diagnostics: tuple[Diagnostic, ...]) -> str:
 
 
 def nearest(name: str, among: Iterable[str]) -> str:
-    """Return ``did you mean gain?`` with the most similar of the names, or a list of the names if none is similar."""
+    """Return a hint with the known name most similar to ``name``, or with a list of known names if none is similar."""
     names = sorted(set(map(str, among)))
     close = difflib.get_close_matches(str(name), names, 1, 0.6)
     if close:

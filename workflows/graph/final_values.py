@@ -33,7 +33,7 @@ class Config:
         return self.settings[path]
 
     def to_yaml(self) -> str:
-        """Return a recipe with these values and no groups as YAML; comments give the sources, and defaults in SI."""
+        """Return the final values as a YAML recipe without groups; comments give the sources and the defaults."""
         tree: dict[str | int, Any] = {}
         for setting in self.settings.values():
             *parents, last = setting.path

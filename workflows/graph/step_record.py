@@ -1,4 +1,4 @@
-"""Records of a run: for each step whether the step ran, why, on which device, and its time and memory."""
+"""Records of a run: the state of each step with the reason, and its device, time and memory."""
 
 from __future__ import annotations
 
@@ -34,7 +34,7 @@ class StepRecord:
 
 @dataclass(frozen=True, slots=True)
 class Event:
-    """Event for a live table: a step has started (``done`` is None) or has finished."""
+    """Event of a run, for a live table of steps: the start of a step (``done`` is None) or its end."""
 
     step: str
     done: StepRecord | None
