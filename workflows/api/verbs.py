@@ -51,7 +51,7 @@ def run(
 
     Args: device: one or several devices, ``cuda:0,cuda:1,cpu``, the preferred one first. watch: takes every `Event`.
     executor: computes instead of this process. memory: largest number of bytes to use on each device.
-    Raises: `RecipeError` before anything runs, `RunError` where a step fails, ValueError for an unknown output.
+    Raises: `RecipeError` before anything runs, `RunError` if a step fails, ValueError for an unknown output.
     """
     names = (outputs,) if isinstance(outputs, str) else outputs
     return _read(recipe, changes).run(store, names, watch, device, executor, memory)
@@ -97,7 +97,7 @@ def train(
     stages of the recipe. watch: takes the stage (0 for a lift), its finished iterations and the losses. mesh: the
     processes of `torchrun`.
     Raises: ValueError, or its subclass `DesignError` or `MeshError`, for a recipe that cannot be trained; `NotFinite`
-    where a loss is NaN or infinite.
+    if a loss is NaN or infinite.
     """
     recipe, folder, store = _read(recipe, changes), Path(out), store or open_store()
     if recipe.lifting is not None:
@@ -131,9 +131,9 @@ def evaluate(
 
     Args: pipelines: a mask and a restorer each, ``"flat+none, five_half_rings+wiener"``. data: a folder of photographs;
     None means the recipe's own scene. scenes: number of scenes. strengths: of the laser, in multiples of saturation;
-    None means those of the paper. small: the shorter side in pixels of reduced pictures, which are compared too.
+    None means the strengths in the paper. small: the shorter side in pixels of reduced pictures, also compared.
     reference: the pipeline with which all others are compared.
-    Raises: `EvaluationRefused` with every mistake before anything runs, `RunError` where a step fails.
+    Raises: `EvaluationRefused` with every mistake before anything runs, `RunError` if a step fails.
     """
     from neusee.workflows.evaluation import run_evaluation
 
@@ -172,7 +172,7 @@ def calibrate(
 
     Args: walkers: number of walkers in each of the four ensembles. move: the move of the walkers, ``"de"`` or
     ``"stretch"``. draws: least number of independent draws.
-    Raises: `CalibrationRefused` where the levels constrain the sensor too little, ValueError for a recipe without a
+    Raises: `CalibrationRefused` if the levels constrain the sensor too little, ValueError for a recipe without a
     likelihood.
     """
     from neusee.workflows.calibration import run_calibration
@@ -197,7 +197,7 @@ def study(
 
     Args: kind: ``"accuracy"``, ``"stability"``, ``"leave-out"``, ``"calibration"`` or ``"uncertainty"``. options: the
     options of this kind, as ``neusee study KIND --help`` lists them.
-    Raises: ValueError for an unknown kind or an unsuitable recipe, `RunError` where a step fails.
+    Raises: ValueError for an unknown kind or an unsuitable recipe, `RunError` if a step fails.
     """
     from neusee.workflows.studies import run_study
 

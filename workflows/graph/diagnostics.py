@@ -16,7 +16,7 @@ class Location:
     file: str  #: as shown to the user: ``first_light.yaml``, ``sensor/neusee.yaml``, ``argument 2``
     line: int = 0
     column: int = 0
-    folder: str = field(default=".", compare=False)  #: folder in which relative paths of the file begin
+    folder: str = field(default=".", compare=False)  #: folder to which paths in the file are relative
 
     def __str__(self) -> str:
         return f"{self.file}:{self.line}:{self.column}" if self.line else self.file
@@ -29,7 +29,7 @@ class Diagnostic:
     mark: Location
     path: str
     message: str
-    code: str = field(default="", compare=False)  #: names the kind of a mistake for programs, such as `UNREAD`
+    code: str = field(default="", compare=False)  #: kind of the mistake for programs, such as `UNREAD`
 
 
 class RecipeError(ValueError):

@@ -39,7 +39,7 @@ class Config:
             *parents, last = setting.path
             branch = tree
             for key in parents:
-                if not isinstance(branch.get(key), dict):  # `with: {}` has only defaults below it
+                if not isinstance(branch.get(key), dict):  # only defaults follow after `with: {}`
                     branch[key] = {}
                 branch = branch[key]
             branch[last] = setting

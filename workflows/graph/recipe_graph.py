@@ -66,7 +66,7 @@ class Expectation:
 
 
 _COPIES = 8  #: copies of a step that a message lists
-METRIC_TOLERANCE = 1e-3  #: largest error of an input of a figure of merit, which may depend on a small difference
+METRIC_TOLERANCE = 1e-3  #: largest error of an input of a metric, because a metric may depend on a small difference
 
 
 @dataclass(frozen=True, slots=True, repr=False)
@@ -83,13 +83,13 @@ class Recipe:
     config: Config = field(default_factory=Config)
     notes: tuple[str, ...] = ()
     absent: Mapping[str, str] = field(default_factory=dict)  #: location of the null, by the name of a step that is null
-    exact: bool = False  #: compute every step in full, whatever the tolerance allows
-    substitutions: tuple[Substitution, ...] = ()  #: cheaper steps in place of full steps; empty when read
+    exact: bool = False  #: whether every step is computed in full at any tolerance
+    substitutions: tuple[Substitution, ...] = ()  #: cheaper steps in place of full steps; empty after loading
     tolerance_scale: float = 1.0  #: fraction of the tolerance in use; below 1 after a failed proof
     unsubstituted: Recipe | None = field(default=None, compare=False)  #: the recipe before substitutions, if any
     uncertain: Uncertain | None = field(default=None, compare=False)  #: distributions for the study of uncertainty
-    training: Training | None = field(default=None, compare=False)  #: training of a network
-    lifting: LiftTraining | None = field(default=None, compare=False)  #: training of a lift
+    training: Training | None = field(default=None, compare=False)  #: settings of the training of a network
+    lifting: LiftTraining | None = field(default=None, compare=False)  #: settings of the training of a lift
     unbounded: frozenset[str] = frozenset()  #: steps whose errors reach a node without an error bound
 
     def limit(self, step: str) -> float:

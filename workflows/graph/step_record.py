@@ -23,13 +23,13 @@ class StepRecord:
     checks: tuple[Check, ...] = ()
     device: str = "cpu"
     bytes: int = 0
-    bound: float | None = None  #: upper bound of the change when the step is omitted
-    began: float = 0.0  #: s since the run began
+    bound: float | None = None  #: upper bound of the change of the result if the step is omitted
+    began: float = 0.0  #: start time of the step in s after the start of the run
     lane: str = ""  #: device or worker of the executor that computed the step
-    peak: int | None = None  #: peak bytes of memory beyond the memory in use before
-    predicted: float | None = None  #: s predicted from earlier runs
+    peak: int | None = None  #: peak memory in bytes beyond the memory in use before the step
+    predicted: float | None = None  #: time in s predicted from earlier runs
     error: tuple[float, float] | None = None  #: of a cheaper step: rms and maximum, relative to the largest element
-    kept: bool = True  #: whether the store holds the value
+    kept: bool = True  #: whether the value is in the store
 
 
 @dataclass(frozen=True, slots=True)
