@@ -49,8 +49,8 @@ def run(
 ) -> Result:
     """Run a recipe and return the values of ``outputs``; None means the outputs that the recipe names.
 
-    Args: device: one or several devices, ``cuda:0,cuda:1,cpu``, the preferred one first. watch: takes every `Event`.
-    executor: computes instead of this process. memory: largest number of bytes to use on each device.
+    Args: device: one or several devices, ``cuda:0,cuda:1,cpu``, the preferred one first. watch: gets every `Event`.
+    executor: computes the steps instead of this process. memory: largest number of bytes to use on each device.
     Raises: `RecipeError` before anything runs, `RunError` if a step fails, ValueError for an unknown output.
     """
     names = (outputs,) if isinstance(outputs, str) else outputs
@@ -70,8 +70,8 @@ def sweep(
     """Run a recipe at every combination of the values of ``axes``, and return the results of all points.
 
     Args: axes: from a parameter or group to a list of values, or to a text such as ``"linspace(450 nm, 650 nm, 5)"``.
-    zip: pair the values of the axes instead of combining them. on_error: ``"continue"`` keeps a failed point as a row.
-    Raises: `RecipeError` with every mistake of every point before anything runs, the error of the first failed point.
+    zip: pair the values of the axes instead of combining them. on_error: ``"continue"`` lists a failed point as a row.
+    Raises: `RecipeError` with all mistakes of all points before anything runs, or the error of the first failed point.
     """
     from neusee.workflows.sweeps.sweep_run import sweep as run_sweep
 
@@ -94,8 +94,8 @@ def train(
     """Train the mask and the networks of a recipe, or continue a stopped training, and return the folder of results.
 
     Args: stages: 1 trains mask and network, 2 the network alone, 0 designs the mask without pictures; None means all
-    stages of the recipe. watch: takes the stage (0 for a lift), its finished iterations and the losses. mesh: the
-    processes of `torchrun`.
+    stages of the recipe. watch: is called with the stage (0 for a lift), its finished iterations and the losses. mesh:
+    the processes of `torchrun`.
     Raises: ValueError, or its subclass `DesignError` or `MeshError`, for a recipe that cannot be trained; `NotFinite`
     if a loss is NaN or infinite.
     """

@@ -1,10 +1,10 @@
 """A store at a URL that many machines share, on any file system of fsspec, with a local folder for copies.
 
-A value that is read is kept in the local folder (the local layer), an ordinary `Store`; a value that is written goes to
-both. At the URL, a payload has its checksum in its name and is complete before the metadata that name the payload, so
-that two writers of one key cannot mix their halves. Leases, pins and the size budget belong to the local layer alone:
-two machines may compute the same key, and the first result stays. A URL that fails costs one warning; the run goes on
-with the local layer.
+The local folder (the local layer) is an ordinary `Store`. It stores each value that is read from the URL; a new value
+is stored in the local layer and at the URL. At the URL, a payload has its checksum in its name and is complete before
+the metadata that name the payload, so that two writers of one key cannot mix their files. Leases, pins and the size
+budget belong to the local layer alone: two machines may compute the same key, and the first result stays. After a
+failure of the URL, a run issues one warning and continues with the local layer.
 """
 
 from __future__ import annotations
@@ -58,8 +58,8 @@ class RemoteStore(Store):
         self, url: str, root: Path | str | None = None, *, verify: Verify | None = None, budget: int | None = None
     ) -> None:
         self.url, self._remote = url, RemoteFiles(url)
-        self._seen: dict[Key, Metadata] = {}  # metadata read from the remote
-        self._broken: set[Key] = set()  # keys whose remote copy is unusable
+        self._seen: dict[Key, Metadata] = {}  # metadata read from the URL
+        self._broken: set[Key] = set()  # keys whose copy at the URL cannot be used
         super().__init__(root or local_layer(url), verify=verify, budget=budget)
 
     def __reduce__(self) -> tuple[Any, ...]:

@@ -1,10 +1,10 @@
 """Store of results: a folder with the files ``<key>.json`` and ``<key>.safetensors`` of each result.
 
-The JSON holds the metadata of a result (the recipe of its key, layout, statistics, checks, seconds, versions) and the
+The JSON holds the metadata of a result (the parts of its key, layout, statistics, checks, seconds, versions) and the
 whole value of a small result. Of an evicted or unsaved value only the metadata remain, called a receipt. A checksum
 covers every byte and is compared at each load. A result that fails the comparison is moved away with one warning and
-counts as missing. A result gets its final name when it is complete, so that a killed process leaves no half result.
-Where the folder cannot be written, a run warns once and goes on.
+counts as missing. A result gets its final name when it is complete, so that a killed process leaves no incomplete
+result. If the folder cannot be written, a run issues one warning and continues.
 """
 
 from __future__ import annotations

@@ -1,8 +1,8 @@
 """Format of a stored value: a layout in JSON, and the tensors in one safetensors file.
 
-The file is written from the memory of the tensors and read through a memory map, so that neither direction makes a
-copy. Each tensor begins at a multiple of 64 bytes, as a newly allocated tensor does: a kernel then takes the same path
-for a stored value as for a computed value. The layout of a `Stacked` tensor names one band file for each slice.
+The file is written from the memory of the tensors and read through a memory map, so that neither writing nor reading
+makes a copy. Each tensor begins at a multiple of 64 bytes like a newly allocated tensor, so that a kernel uses the same
+code path for a stored value and a computed value. The layout of a `Stacked` tensor names one band file for each slice.
 """
 
 from __future__ import annotations

@@ -1,7 +1,7 @@
 """A folder to which many processes and many users write at the same time.
 
 A file is complete before it gets its final name; until then its temporary name contains the owner. The next writer
-removes the temporary files of killed processes, at any time of the clock. Folders, and the few files to which all
+removes the temporary files of killed processes without using the clock. Folders, and the few files to which all
 processes write, copy the permissions of the root.
 """
 
@@ -136,7 +136,7 @@ class Disk:
     def sweep(self, dry: bool = False, patience: float = math.inf) -> list[tuple[str, int]]:
         """Remove the temporary files of dead processes; return the path and the bytes of each file.
 
-        Leases and badges of other machines stay for ``patience`` seconds, so that no jump of a clock makes them old.
+        Leases and badges of other machines stay for ``patience`` seconds, because clocks may jump.
         """
         gone = []
         for entry in os.scandir(f"{self.folder}/tmp"):

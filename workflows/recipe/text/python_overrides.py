@@ -1,7 +1,7 @@
 """Overrides of a recipe by Python values: ``sensor={"read_noise": "20 e-"}`` means ``sensor.read_noise=20 e-``.
 
-A mapping changes only the values that it names, but an empty mapping and a step with its ``node`` replace the whole
-value. A string is not read as YAML.
+A mapping changes only the values that it names, but an empty mapping or a step with ``node`` replaces the whole value.
+A string is not read as YAML.
 """
 
 from __future__ import annotations
