@@ -93,7 +93,7 @@ class Recipe:
     unbounded: frozenset[str] = frozenset()  #: steps whose errors reach a node without an error bound
 
     def limit(self, step: str) -> float:
-        """Return the error allowed for a step: the recipe's tolerance, or less if a later node has no error bound."""
+        """Return the largest error allowed for a step: the tolerance, or less if a later node has no error bound."""
         return min(self.tolerance, METRIC_TOLERANCE) if step in self.unbounded else self.tolerance
 
     def allowed(self, step: str) -> float:

@@ -60,7 +60,7 @@ def _items(block: dict[str | int, Value]) -> tuple[str, ...] | None:
 
 
 def _current(step: Declared) -> bool:
-    """Return True if the name of a step's node still refers to the same node as in the cache."""
+    """Return True if the node of a cached step has not been replaced by another node of the same name."""
     family, _, name = str(step.value.items["node"].data).partition(".")
     return getattr(sys.modules.get(f"{neusee.nodes.__name__}.{family}"), name, None) is step.node
 

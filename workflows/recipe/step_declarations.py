@@ -104,7 +104,7 @@ def _node(
 
 
 def _dims(step: Value, root: Value, diagnostics: list[Diagnostic]) -> tuple[str, ...] | None:
-    """Return the names in the key ``each`` of a step, which are at most two lists of items, or None for a mistake."""
+    """Return the names of the lists of items in a step's key ``each``, at most two, or None for a mistake."""
     given = step.items.get("each")
     if given is None or given.data is None:
         return ()
@@ -170,7 +170,7 @@ def find_node(name: str) -> Node:
 
 
 def _elsewhere(attribute: str) -> str:
-    """Return a hint with the nodes of the same name in other families."""
+    """Return a hint that lists the nodes of the same name in other families."""
     names = [f"{family}.{attribute}" for family in families() if attribute in nodes_of(family)]
     return f"did you mean {' or '.join(names)}?" if names else ""
 

@@ -74,7 +74,7 @@ class Blobs:
         self._lost: set[str] = set()  # damaged files that the user may have no permission to move
 
     def has(self, name: str) -> bool:
-        """Return True if the band file of this name exists, without reading the file."""
+        """Return True if the band file ``name`` exists, without reading the file."""
         return name not in self._lost and os.path.exists(self.path(name))
 
     def about(self, name: str) -> Blob:
@@ -159,7 +159,7 @@ class Blobs:
                 raise self._damaged(name, error) from None
 
     def path(self, name: str) -> str:
-        """Return the path of the file of the band ``name``."""
+        """Return the path of the band file ``name``."""
         return f"{self._folder}/{name[:2]}/{name}"
 
     def _damaged(self, name: str, error: Exception) -> Damaged:
@@ -181,7 +181,7 @@ def bytes_of(x: Tensor) -> memoryview:
 
 
 def dtype_of(name: str) -> torch.dtype:
-    """Return the dtype of torch with a name such as ``float32``; raise `ValueError` for an unknown name."""
+    """Return the torch dtype with a name such as ``float32``; raise `ValueError` for an unknown name."""
     dtype = getattr(torch, name, None)
     if not isinstance(dtype, torch.dtype):
         raise ValueError(f"{name!r} is not a dtype of torch")

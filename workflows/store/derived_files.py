@@ -27,7 +27,7 @@ class DerivedFiles:
         self._spare: TemporaryDirectory[str] | None = None
 
     def find(self, key: str, suffix: str) -> Path | None:
-        """Return the path of the derived file with a key, or None if the file is missing or has a wrong checksum."""
+        """Return the path of the derived file ``key``, or None if the file is missing or has a wrong checksum."""
         path = self._path(key, suffix)
         with suppress(KeyError):
             if path.is_file() and self.store.has(key) and bytes(self.store.get(key).tolist()) == _checksum(path):

@@ -14,7 +14,7 @@ Verify = Literal["always", "sampled", "never"]
 def default_root() -> Path:
     """Return the default folder of a store: ``$NEUSEE_CACHE``, ``cache/`` of the checkout or ``~/.cache/neusee``.
 
-    The first of these that exists or is set is used. Raises `ValueError` if the variable contains a URL.
+    The first of these folders that is set or exists is used. Raises `ValueError` if the variable contains a URL.
     """
     if value := os.environ.get("NEUSEE_CACHE"):
         if "://" in value:

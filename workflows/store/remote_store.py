@@ -45,7 +45,7 @@ def open_store(where: str | Path | None = None) -> Store:
 
 
 def local_layer(url: str) -> Path:
-    """Return the local folder for copies from ``url``: ``$NEUSEE_CACHE_LOCAL``, or a folder in ``~/.cache/neusee``."""
+    """Return the local folder for copies from ``url``: ``$NEUSEE_CACHE_LOCAL`` or a folder in ``~/.cache/neusee``."""
     if folder := os.environ.get("NEUSEE_CACHE_LOCAL"):
         return Path(folder)
     return Path.home() / ".cache" / "neusee" / digest(url.rstrip("/"))[:16]
@@ -130,7 +130,7 @@ class RemoteStore(Store):
                 self._distrust(key, error)
 
     def _fetch_value(self, key: Key) -> None:
-        """Copy a value from the URL into the local layer; after a failure, do not try this key again."""
+        """Copy the value of a key from the URL into the local layer; after a failure, do not fetch this key again."""
         about = self._remote_metadata(key, look=True)
         try:
             if is_kept(about) and not self._value_fetched(key, about):

@@ -35,7 +35,7 @@ class Disk:
         self._ready = False
 
     def path(self, key: str, suffix: str) -> str:
-        """Return the path of the file of the result ``key`` with a suffix such as ``json``."""
+        """Return the path of a file of the result ``key``, by a suffix such as ``json``."""
         return f"{self.folder}/{key[:2]}/{key}.{suffix}"
 
     def prepare(self) -> None:

@@ -113,5 +113,5 @@ def need_steps(recipe_steps: Any, settings: MaskTraining) -> None:
 
 
 def state_file(out: Path, recipe: str, key: str) -> Path:
-    """Return the path of the file with the state of an unfinished mask design, which no run removes."""
+    """Return the path of the file that stores the state of an unfinished mask design; other runs keep this file."""
     return out / f".{recipe}_mask_{key[:16]}.state"

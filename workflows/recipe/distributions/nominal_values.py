@@ -169,7 +169,7 @@ class _Reader:
         raise ValueError(f"use = {use}: write mean, nominal (the recipe's own value){number}")
 
     def _pairs(self, given: Value | None, posterior: Posterior) -> dict[str, str]:
-        """Return the names that recipe values have in the posterior, by the path of the value in the recipe."""
+        """Return a dict from the path of each value in the recipe to the name of that value in the posterior."""
         names = posterior.joint.names
         if given is not None and not isinstance(given.data, dict):
             raise ValueError("values: write {path of the recipe: name in the posterior}")

@@ -31,7 +31,7 @@ class InputDraws:
 
 @dataclass(frozen=True)
 class Inputs:
-    """The uncertain inputs of a recipe that are drawn, in the order of `names`."""
+    """The uncertain inputs of a recipe that affect its outputs, in the order of `names`."""
 
     recipe: Recipe
     uncertain: Uncertain

@@ -95,7 +95,7 @@ def shown(path: Path, folder: Path) -> str:
 
 
 def merge(below: Value, above: Value) -> Value:
-    """Return ``below`` updated with ``above``; a list, a scalar or a step with ``node`` replaces the whole value."""
+    """Return ``below`` updated with ``above``; a list, scalar or step with ``node`` in ``above`` replaces a value."""
     if not isinstance(below.data, dict) or not isinstance(above.data, dict) or _new_step(above):
         return above
     data = dict(below.data)
@@ -106,7 +106,7 @@ def merge(below: Value, above: Value) -> Value:
 
 @functools.lru_cache(maxsize=16)
 def _merged(parts: tuple[Value, ...]) -> Value:
-    """Return the options of the groups and the recipe, merged in order; the same parts give the same object."""
+    """Merge the options of the groups and the recipe in order; the same parts give the same object from a cache."""
     mark = parts[-1].mark
     return functools.reduce(merge, (part.without("defaults") for part in parts), Value({}, mark, mark, ()))
 
