@@ -1,4 +1,4 @@
-"""What may a caller in Python ask for?
+"""Which functions does neusee offer to Python code?
 
 The verbs of `neusee`, all with the same options. A verb reads a recipe, opens the store and calls the room that
 computes. The command line calls the same verbs.

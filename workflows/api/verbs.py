@@ -1,9 +1,9 @@
-"""The functions `neusee.run`, `sweep`, `train`, `evaluate`, `calibrate` and `study`, with the same options in each.
+"""Functions for use from Python: `neusee.run`, `sweep`, `train`, `evaluate`, `calibrate` and `study`.
 
-``changes`` change a recipe that a caller names: a mapping as `load` takes it
-(``{"doe": "axicon", "sensor": {"read_noise": "20 e-"}}``), or arguments as on the command line (``["doe=axicon"]``).
+All functions have these options. ``changes`` change a recipe that is given by name or file: a mapping like the values
+of `load` (``{"doe": "axicon", "sensor": {"read_noise": "20 e-"}}``), or command-line arguments (``["doe=axicon"]``).
 ``store`` keeps results; None means ``$NEUSEE_CACHE`` or the default folder. The folder of results is made in ``out``.
-``progress`` takes a line for each finished part, and the page shows ``command`` as the command that repeats the call.
+``progress`` is called with a line for each finished part. The report shows ``command``, which repeats the call.
 """
 
 from __future__ import annotations
@@ -47,11 +47,11 @@ def run(
     executor: Executor | None = None,
     memory: int | None = None,
 ) -> Result:
-    """Run a recipe and return the values of ``outputs``, or of the recipe's own outputs for None.
+    """Run a recipe and return the values of ``outputs``; None means the outputs that the recipe names.
 
-    Args: device: one or several devices, ``cuda:0,cuda:1,cpu``, the preferred one first. watch: takes every `Event`.
-    executor: computes instead of this process. memory: largest number of bytes to use on each device.
-    Raises: `RecipeError` before anything runs, `RunError` where a step fails, ValueError for an unknown output.
+    Args: device: one or several devices, ``cuda:0,cuda:1,cpu``, the preferred one first. watch: gets every `Event`.
+    executor: computes the steps instead of this process. memory: largest number of bytes to use on each device.
+    Raises: `RecipeError` before anything runs, `RunError` if a step fails, ValueError for an unknown output.
     """
     names = (outputs,) if isinstance(outputs, str) else outputs
     return _read(recipe, changes).run(store, names, watch, device, executor, memory)
@@ -70,8 +70,8 @@ def sweep(
     """Run a recipe at every combination of the values of ``axes``, and return the results of all points.
 
     Args: axes: from a parameter or group to a list of values, or to a text such as ``"linspace(450 nm, 650 nm, 5)"``.
-    zip: pair the values of the axes instead of combining them. on_error: ``"continue"`` keeps a failed point as a row.
-    Raises: `RecipeError` with every mistake of every point before anything runs, the error of the first failed point.
+    zip: pair the values of the axes instead of combining them. on_error: ``"continue"`` lists a failed point as a row.
+    Raises: `RecipeError` with all mistakes of all points before anything runs, or the error of the first failed point.
     """
     from neusee.workflows.sweeps.sweep_run import sweep as run_sweep
 
@@ -94,10 +94,10 @@ def train(
     """Train the mask and the networks of a recipe, or continue a stopped training, and return the folder of results.
 
     Args: stages: 1 trains mask and network, 2 the network alone, 0 designs the mask without pictures; None means all
-    stages of the recipe. watch: takes the stage (0 for a lift), its finished iterations and the losses. mesh: the
-    processes of `torchrun`.
+    stages of the recipe. watch: is called with the stage (0 for a lift), its finished iterations and the losses. mesh:
+    the processes of `torchrun`.
     Raises: ValueError, or its subclass `DesignError` or `MeshError`, for a recipe that cannot be trained; `NotFinite`
-    where a loss is NaN or infinite.
+    if a loss is NaN or infinite.
     """
     recipe, folder, store = _read(recipe, changes), Path(out), store or open_store()
     if recipe.lifting is not None:
@@ -131,9 +131,9 @@ def evaluate(
 
     Args: pipelines: a mask and a restorer each, ``"flat+none, five_half_rings+wiener"``. data: a folder of photographs;
     None means the recipe's own scene. scenes: number of scenes. strengths: of the laser, in multiples of saturation;
-    None means those of the paper. small: the shorter side in pixels of reduced pictures, which are compared too.
+    None means the strengths in the paper. small: the shorter side in pixels of reduced pictures, also compared.
     reference: the pipeline with which all others are compared.
-    Raises: `EvaluationRefused` with every mistake before anything runs, `RunError` where a step fails.
+    Raises: `EvaluationRefused` with every mistake before anything runs, `RunError` if a step fails.
     """
     from neusee.workflows.evaluation import run_evaluation
 
@@ -168,11 +168,11 @@ def calibrate(
     move: str = "de",
     draws: int = 1000,
 ) -> Path:
-    """Find the posterior of a recipe's sensor, or continue a stopped calibration, and return the folder of results.
+    """Estimate the posterior of a recipe's sensor, or continue a stopped calibration, and return the folder of results.
 
     Args: walkers: number of walkers in each of the four ensembles. move: the move of the walkers, ``"de"`` or
     ``"stretch"``. draws: least number of independent draws.
-    Raises: `CalibrationRefused` where the levels constrain the sensor too little, ValueError for a recipe without a
+    Raises: `CalibrationRefused` if the levels constrain the sensor too little, ValueError for a recipe without a
     likelihood.
     """
     from neusee.workflows.calibration import run_calibration
@@ -197,7 +197,7 @@ def study(
 
     Args: kind: ``"accuracy"``, ``"stability"``, ``"leave-out"``, ``"calibration"`` or ``"uncertainty"``. options: the
     options of this kind, as ``neusee study KIND --help`` lists them.
-    Raises: ValueError for an unknown kind or an unsuitable recipe, `RunError` where a step fails.
+    Raises: ValueError for an unknown kind or an unsuitable recipe, `RunError` if a step fails.
     """
     from neusee.workflows.studies import run_study
 
@@ -207,7 +207,7 @@ def study(
 
 
 def _read(recipe: Recipe | Named, changes: Changes) -> Recipe:
-    """Return ``recipe`` itself, or the recipe of that name or file with ``changes``."""
+    """Return a loaded recipe unchanged, or load a recipe by name or file with ``changes``."""
     if not isinstance(recipe, Recipe):
         return load(recipe, _arguments(changes))
     if changes:
@@ -216,14 +216,14 @@ def _read(recipe: Recipe | Named, changes: Changes) -> Recipe:
 
 
 def _name(recipe: Named, verb: str) -> str:
-    """Return the name or file of a recipe that ``verb`` loads several times; raise TypeError for a loaded recipe."""
+    """Return the name or file of a recipe, which the function ``verb`` needs; raise TypeError for a loaded recipe."""
     if isinstance(recipe, Recipe):
         raise TypeError(f"{verb} loads the recipe several times: pass the name or file of the recipe, and changes")
     return os.fspath(recipe)
 
 
 def _arguments(changes: Changes) -> list[str | Override]:
-    """Return changes as arguments of `load`; raise TypeError for a single text."""
+    """Return ``changes`` as overrides for `load`; raise TypeError if ``changes`` is a string."""
     if isinstance(changes, str):
         raise TypeError(f"changes must be a mapping or a list of arguments: write changes=[{changes!r}]")
     return [*overrides_of(changes, Path.cwd())] if isinstance(changes, Mapping) else [*changes]

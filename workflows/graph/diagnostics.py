@@ -11,12 +11,12 @@ UNREAD = "unread"  #: code of a value to which no step refers
 
 @dataclass(frozen=True, slots=True, order=True)
 class Location:
-    """Location of a value: line and column in a file, both counted from 1, or an argument of a command (line 0)."""
+    """Location of a value: a line and a column in a file, counted from 1, or an argument, whose line is 0."""
 
     file: str  #: as shown to the user: ``first_light.yaml``, ``sensor/neusee.yaml``, ``argument 2``
     line: int = 0
     column: int = 0
-    folder: str = field(default=".", compare=False)  #: folder in which relative paths of the file begin
+    folder: str = field(default=".", compare=False)  #: folder to which paths in the file are relative
 
     def __str__(self) -> str:
         return f"{self.file}:{self.line}:{self.column}" if self.line else self.file
@@ -29,7 +29,7 @@ class Diagnostic:
     mark: Location
     path: str
     message: str
-    code: str = field(default="", compare=False)  #: names the kind of a mistake for programs, such as `UNREAD`
+    code: str = field(default="", compare=False)  #: kind of the mistake for programs, such as `UNREAD`
 
 
 class RecipeError(ValueError):
@@ -47,7 +47,7 @@ def _table(diagnostics: tuple[Diagnostic, ...]) -> str:
 
 
 def nearest(name: str, among: Iterable[str]) -> str:
-    """Return ``did you mean gain?`` with the most similar of the names, or a list of the names if none is similar."""
+    """Return a hint with the known name most similar to ``name``, or with a list of known names if none is similar."""
     names = sorted(set(map(str, among)))
     close = difflib.get_close_matches(str(name), names, 1, 0.6)
     if close:

@@ -33,13 +33,13 @@ class Config:
         return self.settings[path]
 
     def to_yaml(self) -> str:
-        """Return a recipe with these values and no groups as YAML; comments give the sources, and defaults in SI."""
+        """Return the final values as a YAML recipe without groups; comments give the sources and the defaults."""
         tree: dict[str | int, Any] = {}
         for setting in self.settings.values():
             *parents, last = setting.path
             branch = tree
             for key in parents:
-                if not isinstance(branch.get(key), dict):  # `with: {}` has only defaults below it
+                if not isinstance(branch.get(key), dict):  # only defaults follow after `with: {}`
                     branch[key] = {}
                 branch = branch[key]
             branch[last] = setting

@@ -45,7 +45,7 @@ class Step:
 
 @dataclass(frozen=True, slots=True)
 class Substitution:
-    """Replacement of a step by a cheaper step, with a bound on the error."""
+    """Replacement of a step by a cheaper step, with an upper bound on the error of the result."""
 
     step: str  #: the full step
     instead: str  #: the step that is computed
@@ -55,7 +55,7 @@ class Substitution:
 
 @dataclass(frozen=True, slots=True)
 class Expectation:
-    """Expected number: the result of ``step`` at the indices ``at`` equals ``value`` within ``rtol``."""
+    """Expected number: the ``value`` of the result of ``step`` at the indices ``at``, with a relative tolerance."""
 
     name: str
     step: str
@@ -66,7 +66,7 @@ class Expectation:
 
 
 _COPIES = 8  #: copies of a step that a message lists
-METRIC_TOLERANCE = 1e-3  #: largest error of an input of a figure of merit, which may depend on a small difference
+METRIC_TOLERANCE = 1e-3  #: largest error of an input of a metric, because a metric may depend on a small difference
 
 
 @dataclass(frozen=True, slots=True, repr=False)
@@ -82,22 +82,22 @@ class Recipe:
     expect: tuple[Expectation, ...] = ()
     config: Config = field(default_factory=Config)
     notes: tuple[str, ...] = ()
-    absent: Mapping[str, str] = field(default_factory=dict)  #: step that is null -> where the null was written
-    exact: bool = False  #: compute every step in full, whatever the tolerance allows
-    substitutions: tuple[Substitution, ...] = ()  #: cheaper steps in place of full steps; empty when read
-    tolerance_scale: float = 1.0  #: share of the tolerance in use; below 1 after a failed proof
+    absent: Mapping[str, str] = field(default_factory=dict)  #: location of the null, by the name of a step that is null
+    exact: bool = False  #: whether every step is computed in full at any tolerance
+    substitutions: tuple[Substitution, ...] = ()  #: cheaper steps in place of full steps; empty after loading
+    tolerance_scale: float = 1.0  #: fraction of the tolerance in use; below 1 after a failed proof
     unsubstituted: Recipe | None = field(default=None, compare=False)  #: the recipe before substitutions, if any
     uncertain: Uncertain | None = field(default=None, compare=False)  #: distributions for the study of uncertainty
-    training: Training | None = field(default=None, compare=False)  #: training of a network
-    lifting: LiftTraining | None = field(default=None, compare=False)  #: training of a lift
+    training: Training | None = field(default=None, compare=False)  #: settings of the training of a network
+    lifting: LiftTraining | None = field(default=None, compare=False)  #: settings of the training of a lift
     unbounded: frozenset[str] = frozenset()  #: steps whose errors reach a node without an error bound
 
     def limit(self, step: str) -> float:
-        """Return the error allowed for a step: the tolerance, or less where a later node has no bound of its error."""
+        """Return the largest error allowed for a step: the tolerance, or less if a later node has no error bound."""
         return min(self.tolerance, METRIC_TOLERANCE) if step in self.unbounded else self.tolerance
 
     def allowed(self, step: str) -> float:
-        """Return the error that all omissions and approximations up to a step may cause together."""
+        """Return the total error that all omissions and approximations up to a step may cause."""
         return self.limit(step) * self.tolerance_scale
 
     def run(
@@ -109,7 +109,7 @@ class Recipe:
         executor: Executor | None = None,
         memory: int | None = None,
     ) -> Result:
-        """Run the recipe as `neusee.workflows.run` does; several threads may do so at once with the same store."""
+        """Run the recipe like `neusee.workflows.run`; several threads may run recipes with the same store at once."""
         from neusee.workflows.engine.runner import run
 
         return run(self, store, outputs, watch, device, executor, memory)
@@ -124,12 +124,12 @@ class Recipe:
 
 
 def needed(recipe: Recipe, outputs: Iterable[str]) -> list[str]:
-    """Return the names of the steps that ``outputs`` need, each step after the steps that feed it."""
+    """Return the names of the steps that ``outputs`` need, in topological order."""
     return in_order({name: step.sources for name, step in recipe.steps.items()}, outputs)
 
 
 def in_order(sources: Mapping[str, Iterable[str]], names: Iterable[str]) -> list[str]:
-    """Return ``names`` and all their sources, each name after its sources; the graph must have no cycle."""
+    """Return ``names`` and all their sources in topological order; the graph must have no cycle."""
     order: dict[str, None] = {}
     stack = [(name, iter(sources[name])) for name in reversed(list(names))]
     while stack:
@@ -144,7 +144,7 @@ def in_order(sources: Mapping[str, Iterable[str]], names: Iterable[str]) -> list
 
 
 def unknown_step(name: str, steps: Collection[str]) -> str:
-    """Return a message that a step does not exist, with the copies of that step or the most similar name."""
+    """Return the message for an unknown step, with copies such as ``psf[mask]`` or the most similar name."""
     copies = sorted(step for step in steps if step.startswith(f"{name}["))
     if not copies:
         return f"no step {name!r}; {nearest(name, steps)}"
@@ -153,7 +153,7 @@ def unknown_step(name: str, steps: Collection[str]) -> str:
 
 
 def kept_promises(recipe: Recipe, written: Recipe) -> Recipe:
-    """Return ``recipe`` without the expected numbers of steps that differ from the steps of ``written``."""
+    """Return a recipe without the expected numbers that are affected by changes to the recipe ``written``."""
     same: set[str] = set()
     for name in needed(recipe, recipe.steps):
         if same.issuperset(recipe.steps[name].sources) and _alike(recipe, written, name):

@@ -26,7 +26,7 @@ class RunError(RuntimeError):
 
 
 def _unpickled(step: str, text: str, cause: str) -> RunError:
-    """Return the error in another process: with its text, but without the traceback of the cause."""
+    """Return a `RunError` from another process with its text, but without the traceback of the cause."""
     error = RunError.__new__(RunError, text)
     RuntimeError.__init__(error, text)
     error.step, error.cause = step, RuntimeError(cause)

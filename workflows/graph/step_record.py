@@ -1,4 +1,4 @@
-"""Records of a run: for each step whether the step ran, why, on which device, and its time and memory."""
+"""Records of a run: the state of each step with the reason, and its device, time and memory."""
 
 from __future__ import annotations
 
@@ -23,18 +23,18 @@ class StepRecord:
     checks: tuple[Check, ...] = ()
     device: str = "cpu"
     bytes: int = 0
-    bound: float | None = None  #: upper bound of the change when the step is omitted
-    began: float = 0.0  #: s since the run began
+    bound: float | None = None  #: upper bound of the change of the result if the step is omitted
+    began: float = 0.0  #: start time of the step in s after the start of the run
     lane: str = ""  #: device or worker of the executor that computed the step
-    peak: int | None = None  #: peak bytes of memory beyond the memory in use before
-    predicted: float | None = None  #: s predicted from earlier runs
+    peak: int | None = None  #: peak memory in bytes beyond the memory in use before the step
+    predicted: float | None = None  #: time in s predicted from earlier runs
     error: tuple[float, float] | None = None  #: of a cheaper step: rms and maximum, relative to the largest element
-    kept: bool = True  #: whether the store holds the value
+    kept: bool = True  #: whether the value is in the store
 
 
 @dataclass(frozen=True, slots=True)
 class Event:
-    """Event for a live table: a step has started (``done`` is None) or has finished."""
+    """Event of a run, for a live table of steps: the start of a step (``done`` is None) or its end."""
 
     step: str
     done: StepRecord | None

@@ -1,6 +1,6 @@
-"""What decides the result of a step?
+"""Which inputs, parameters and code determine the cache key of a result?
 
-Keys of the cache, from parameters, inputs and files, and digests of the code of nodes and of the program itself.
-Nothing here reads or writes a result, and no tensor is read to make a key.
+Cache keys of results, and digests of the code of nodes and of the program itself.
+Nothing here reads or writes a result, and no key depends on the content of a tensor.
 Offers: `cache_key.key_of`, `cache_key.digest`, `code_digest.Code`, `engine_digest.engine`.
 """

@@ -1,7 +1,8 @@
 """Cache keys: the key of a result is a digest of everything that determines the result, and of nothing else.
 
-A key covers the node with its code, the parameters, the content of input files, the keys of the inputs and the random
-stream; a key covers no tensor, number of threads, version of a library or (but for random nodes) device.
+A key depends on the node with its code, the parameters, the content of input files, the keys of the inputs and the
+random stream. A key does not depend on tensors, the number of threads, the versions of libraries or, except for random
+nodes, the device.
 """
 
 from __future__ import annotations
@@ -21,12 +22,12 @@ if TYPE_CHECKING:
     from neusee.workflows.keys.code_digest import Code
 
 Key = str
-_SETTLED = 2_000_000_000  #: ns after a change of a file within which a second change may leave the same time stamp
+_SETTLED = 2_000_000_000  #: ns after a change of a file in which a second change may not change the time stamp
 _files: dict[tuple[int, ...], str] = {}
 
 
 def digest(*parts: Any) -> str:
-    """Return the digest of ``parts`` (plain JSON) as 32 hexadecimal digits; floats count to the last bit."""
+    """Return the digest of ``parts`` (plain JSON) as 32 hexadecimal digits; every bit of a float affects the digest."""
     text = json.dumps(parts, sort_keys=True, separators=(",", ":"))
     return hashlib.blake2b(text.encode(), digest_size=16).hexdigest()
 
@@ -34,7 +35,7 @@ def digest(*parts: Any) -> str:
 def key_of(
     step: Step, keys: Mapping[str, Key], seed: int, code: Code, device: str = "cpu"
 ) -> tuple[Key, dict[str, Any]]:
-    """Return the cache key of ``step``, and the parts of the key; ``keys`` are the keys of the steps before."""
+    """Return the cache key of ``step`` and its parts; ``keys`` are the cache keys of the steps that feed ``step``."""
     node = step.node
     parts: dict[str, Any] = {
         "node": node.path,
@@ -64,7 +65,7 @@ def _keys_of(wire: Wire, keys: Mapping[str, Key]) -> Any:
 
 
 def plain(value: Any) -> Any:
-    """Return a parameter as JSON that is the same in every process; a file becomes the digest of its content."""
+    """Return a parameter as JSON that is the same in every process; a file is replaced by the digest of its content."""
     if value is None or isinstance(value, bool | int | str):
         return value
     if isinstance(value, float):
@@ -81,7 +82,10 @@ def plain(value: Any) -> Any:
 
 
 def file_digest(path: Path) -> str:
-    """Return the xxh3 digest of a file; read the file again only if its time stamp is new or very recent."""
+    """Return the xxh3 digest of a file; an unchanged file is read only once in a process.
+
+    A file that changed in the last two seconds is read each time, because its time stamp may not show a second change.
+    """
     stat = os.stat(path)
     stamp = (stat.st_dev, stat.st_ino, stat.st_size, stat.st_mtime_ns, stat.st_ctime_ns)
     if stamp in _files:

@@ -1,8 +1,8 @@
-"""Digests of code: of the module of a node, and of all modules of `neusee.nodes` that this module imports.
+"""Digests of the code of nodes: a digest covers a node's module and all modules of `neusee.nodes` that it imports.
 
-Helpers and constants affect a digest; comments, layout and docstrings do not. A file keeps the summaries of sources,
-so that a cached run parses no source. The files ``code/<digest>.json`` keep the digests of single definitions: cache
-keys do not need these files, but reports of changes name the changed function by them.
+Helpers and constants affect a digest; comments, layout and docstrings do not. A file stores the summaries of source
+files, so that a run from the cache parses no source. The files ``code/<digest>.json`` store the digests of single
+definitions. Cache keys do not need these files; reports of changes use them to name the changed function.
 """
 
 from __future__ import annotations
@@ -24,14 +24,14 @@ from pydantic import TypeAdapter
 from neusee.workflows.keys.cache_key import digest
 from neusee.workflows.keys.source_summary import ROOT, Summary, Use, module_file, summarise
 
-_LEFT_OUT = frozenset({ROOT, f"{ROOT}._node"})  #: modules that do not affect what a node computes
+_LEFT_OUT = frozenset({ROOT, f"{ROOT}._node"})  #: modules that do not affect the result of a node
 _KEPT = 1000  #: number of summaries in the file
 _SUMMARIES = TypeAdapter(dict[str, Summary])
 _PYTHON = "{}.{}".format(*sys.version_info)  #: the text of a syntax tree depends on the version of Python
 _THIS_PROCESS = os.urandom(8).hex()
 
 _edited_since: set[str] = set()  #: loaded modules whose source was edited after the import
-_frozen: dict[str, tuple[Any, str]] = {}  #: module -> its spec, and the digest of its source at the first reading
+_frozen: dict[str, tuple[Any, str]] = {}  #: spec and source digest at the first reading, by module
 
 
 class Code:
@@ -48,7 +48,7 @@ class Code:
     def digest(self, module: str) -> str:
         """Return the digest of a module and of all modules of `neusee.nodes` that it imports, directly or not.
 
-        Raises `LookupError` where an imported module or its source cannot be determined.
+        Raises `LookupError` if an imported module or its source cannot be determined.
         """
         if module not in self._digests:
             seen: dict[str, str] = {}
@@ -60,12 +60,12 @@ class Code:
                     seen[name], parts[name], imports = self._look(name)
                     todo += imports
             code = self._digests[module] = digest(seen)
-            if _edited_since.isdisjoint(seen):  # otherwise the digest is valid in this process only
+            if _edited_since.isdisjoint(seen):  # otherwise the digest is valid only in this process
                 self._parts[code] = parts
         return self._digests[module]
 
     def save(self) -> None:
-        """Write the new summaries and definitions to files; skip a folder that cannot be written."""
+        """Write new summaries of source files and digests of definitions to files; skip an unwritable folder."""
         if self._new:
             self._new = False
             _write(self._memo, dict(list(self._summaries.items())[-_KEPT:]), self._memo.parent / "tmp")
@@ -104,7 +104,7 @@ class Code:
         yield base
 
     def _used(self, use: Use, package: str) -> list[str] | None:
-        """Return the modules that a chain such as ``name.a.b`` reads, or None if it ends at the package of nodes."""
+        """Return the modules that ``name.a.b`` in a source file uses, or None if it uses the package of all nodes."""
         level, base, name, chain, _ = use
         modules = [".".join(filter(None, (_absolute(level, base, package), name)))]
         rest = chain.split(".") if chain else []
@@ -128,12 +128,12 @@ class Code:
 
 
 def parts_file(root: Path, code: str) -> Path:
-    """Return the file in which a store keeps the digests of the definitions behind a digest of code."""
+    """Return the path of the file that stores the digests of all definitions behind the digest ``code``."""
     return root / "code" / f"{code}.json"
 
 
 def _absolute(level: int, base: str, package: str) -> str:
-    """Return the full name of the module that a ``from`` import names."""
+    """Return the absolute name of the module ``base`` in an import with ``level`` leading dots."""
     if not level:
         return base
     above = package.split(".")
@@ -141,7 +141,7 @@ def _absolute(level: int, base: str, package: str) -> str:
 
 
 def _write(path: Path, content: Any, folder: Path) -> None:
-    """Write a JSON file by atomic rename; do nothing where the folder cannot be written."""
+    """Write a JSON file by atomic rename; do nothing if the folder cannot be written."""
     part = folder / f"{path.name}.{os.getpid()}.{threading.get_ident()}"
     with suppress(OSError):
         folder.mkdir(parents=True, exist_ok=True)
@@ -151,7 +151,7 @@ def _write(path: Path, content: Any, folder: Path) -> None:
 
 
 def _read(memo: Path) -> dict[str, Summary]:
-    """Return the summaries that earlier runs saved, or an empty dict if the file is damaged or has an older format."""
+    """Return the saved summaries of source files, or an empty dict if their file is damaged or has an older format."""
     try:
         return _SUMMARIES.validate_json(memo.read_bytes())
     except (OSError, ValueError):
@@ -159,7 +159,7 @@ def _read(memo: Path) -> dict[str, Summary]:
 
 
 def source_file(module: str) -> Path | None:
-    """Return the source file of a module without importing the module, or None without such a file."""
+    """Return the source file of a module without importing the module, or None if there is no source file."""
     if module in sys.modules:
         file = getattr(sys.modules[module], "__file__", None)
         return Path(file) if file and os.path.isfile(file) else None
@@ -170,7 +170,7 @@ def source_file(module: str) -> Path | None:
 
 
 def _source_digest(module: str, path: Path) -> str:
-    """Return the xxh3 digest of a source file; for a loaded module at its first reading, because that code runs."""
+    """Return the xxh3 digest of a source file; for a loaded module, return the digest from its first reading."""
     spec = getattr(sys.modules.get(module), "__spec__", None)
     if spec is not None and module in _frozen and _frozen[module][0] is spec:
         return _frozen[module][1]
@@ -180,12 +180,12 @@ def _source_digest(module: str, path: Path) -> str:
         _frozen[module] = (spec, source)
         if _edited(spec, path):
             _edited_since.add(module)
-            warnings.warn(f"{path} was edited after its import: restart Python to keep its results", stacklevel=2)
+            warnings.warn(f"{path} was edited after its import: restart Python to keep new results", stacklevel=2)
     return source
 
 
 def _edited(spec: Any, path: Path) -> bool:
-    """Return True if the byte code that Python wrote at the import belongs to another version of the source file."""
+    """Return True if the source file has changed since Python wrote the byte code of the module."""
     try:
         with open(spec.cached or "", "rb") as file:
             head = file.read(16)

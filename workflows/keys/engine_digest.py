@@ -1,7 +1,7 @@
-"""Digest of the program's own code: of some modules, and of all modules of `neusee.workflows` that they import.
+"""Digest of the program's own code: it covers given modules and all modules of `neusee.workflows` that these import.
 
-The key of a stored study, design or posterior has this digest, so that changed code never leads to an old result.
-`code_digest.Code` has the digests of nodes.
+The key of a stored study, design or posterior contains this digest, so that changed code never leads to an old
+result. `code_digest.Code` computes the digests of nodes.
 """
 
 from __future__ import annotations
@@ -20,9 +20,10 @@ _ROOT = "neusee.workflows"
 
 @functools.cache
 def engine(*modules: str) -> str:
-    """Return the digest of some modules of neusee.workflows (default ``engine.runner``) and of all that they import.
+    """Return the digest of the code of some modules of neusee.workflows and of all modules that these import.
 
-    Only imports at the top of a module count. Raises `LookupError` for a module without a source file.
+    The default module is ``engine.runner``. Only imports of neusee.workflows at the top level of a module count.
+    Raises `LookupError` for a module without a source file.
     """
     seen: dict[str, str] = {}
     todo = list(modules or ("engine.runner",))
@@ -32,7 +33,7 @@ def engine(*modules: str) -> str:
             continue
         path = _source(name)
         if path is None:
-            raise LookupError(f"{_ROOT}.{name} has no source file below {_HERE}, so its results can have no cache key")
+            raise LookupError(f"{_ROOT}.{name} has no source file below {_HERE}, so its results have no cache key")
         seen[name], imports = _parsed(path.read_bytes())
         todo += imported(imports)
     return digest(seen)
@@ -40,13 +41,13 @@ def engine(*modules: str) -> str:
 
 @functools.cache
 def _parsed(source: bytes) -> tuple[str, list[ast.stmt]]:
-    """Return the digest of a source file and the import statements at its top, kept because programs share files."""
+    """Return the digest of a source file and the import statements at its top level."""
     imports: list[ast.stmt] = [item for item in ast.parse(source).body if isinstance(item, ast.Import | ast.ImportFrom)]
     return summarise(source).tree, imports
 
 
 def imported(statements: Iterable[ast.stmt]) -> Iterator[str]:
-    """Yield the modules of neusee.workflows that import statements name, such as ``engine.runner``."""
+    """Yield the modules of neusee.workflows in import statements, by names such as ``engine.runner``."""
     for item in statements:
         if isinstance(item, ast.Import):
             yield from (_below(alias.name) for alias in item.names if alias.name.startswith(f"{_ROOT}."))

@@ -1,4 +1,4 @@
-"""Summary of a source file: digests of the file and of its definitions, and the names of `neusee` that it uses."""
+"""Summary of a source file: the digests of the file and of its definitions, and its imports from `neusee`."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from typing import NamedTuple
 from neusee.workflows.keys.cache_key import digest
 
 ROOT = "neusee.nodes"
-_parsing = threading.Lock()  #: for one thread at a time: the parser of Python 3.11 miscounts the depth of two
+_parsing = threading.Lock()  #: lock of the parser of Python 3.11, which miscounts the depth in two threads
 _SHORT = 16  #: digits of the digest of a definition
 
 Import = tuple[int, str, str]  #: level of a relative import, module, name (empty for ``import module``)
@@ -25,13 +25,13 @@ class Summary(NamedTuple):
 
     tree: str  #: digest of the syntax tree without docstrings
     imports: list[Import]
-    binds: list[str]  #: names bound by those imports
+    binds: list[str]  #: names bound by the imports
     uses: list[Use]
     definitions: dict[str, str]  #: digest by label: ``psf()``, ``class Psf``, ``constant _FALL``, ``imports``
 
 
 def summarise(source: bytes) -> Summary:
-    """Return the summary of a source file; comments, layout and docstrings do not affect its digests."""
+    """Return the summary of a source file; comments, layout and docstrings do not affect the digests."""
     with _parsing:
         tree = ast.parse(source)
     imports: list[Import] = []
@@ -55,14 +55,14 @@ def summarise(source: bytes) -> Summary:
 
 
 def module_file(folder: str | Path, names: Sequence[str]) -> Path | None:
-    """Return the file of a module or a package below a folder, or None without a file; ``names`` is its path."""
+    """Return the source file of a module or package in a folder, or None; ``names`` are the parts of its name."""
     stem = os.path.join(folder, *names)
     files = (f"{stem}.py", os.path.join(stem, "__init__.py"))
     return next((Path(file) for file in files if os.path.isfile(file)), None)
 
 
 def _uses(tree: ast.Module, bound: dict[str, set[Import]]) -> list[Use]:
-    """Return each attribute chain that begins with an imported name, and each package that is used as a whole."""
+    """Return each expression such as ``a.b.c`` on an imported name, and each package that is used as a whole."""
     lines: dict[tuple[int, str, str, str], int] = {}
     for name, attributes, line in _chains(tree):
         for way in bound.get(name, ()):
@@ -72,8 +72,8 @@ def _uses(tree: ast.Module, bound: dict[str, set[Import]]) -> list[Use]:
 
 
 def _chains(tree: ast.Module) -> Iterator[tuple[str, list[str], int]]:
-    """Yield the first name, the attributes and the line of each chain such as ``a.b.c``, and of each single name."""
-    inner: set[int] = set()  # parts of earlier chains, because a walk meets a chain before its parts
+    """Yield the first name, the attributes and the line of each expression such as ``a.b.c`` or ``a``."""
+    inner: set[int] = set()  # parts of earlier expressions, because the walk yields an expression before its parts
     for item in ast.walk(tree):
         if id(item) in inner or not isinstance(item, ast.Attribute | ast.Name):
             continue
@@ -88,7 +88,7 @@ def _chains(tree: ast.Module) -> Iterator[tuple[str, list[str], int]]:
 
 
 def _definitions(tree: ast.Module) -> dict[str, str]:
-    """Return the digest of each top-level definition by its label; definitions with one label share a digest."""
+    """Return the digest of each top-level definition by its label; definitions with the same label share one digest."""
     dumps: dict[str, list[str]] = defaultdict(list)
     for item in tree.body:
         dump = ast.dump(item)

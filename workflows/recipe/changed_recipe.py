@@ -1,4 +1,4 @@
-"""Changes of a recipe that was loaded: its final values are written to a file, changed and checked again."""
+"""Changes of a loaded recipe: the final values of the recipe are written to a file, changed and checked again."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from neusee.workflows.recipe.loading import load
 
 
 def changed(recipe: Recipe, overrides: Sequence[str]) -> Recipe:
-    """Return a recipe with some values changed by overrides; raise `RecipeError` for a value that is a mistake."""
+    """Return a loaded recipe with values changed by ``overrides``; raise `RecipeError` for an invalid value."""
     with TemporaryDirectory(prefix="neusee-") as folder:
         path = Path(folder) / "recipe.yaml"
         path.write_text(recipe.config.to_yaml(), encoding="utf-8")

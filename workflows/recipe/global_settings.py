@@ -17,7 +17,7 @@ _NUMBERS = {"seed": "must be a whole number of 0 or more", "tolerance": "must be
 
 
 def seed_and_tolerance(root: Value, references: References, diagnostics: list[Diagnostic]) -> tuple[int, float]:
-    """Return the seed and the tolerance of a recipe; each is 0 where the recipe does not set it."""
+    """Return the seed and the tolerance of a recipe; a value that the recipe does not set is 0."""
     numbers = dict.fromkeys(_NUMBERS, 0)
     for key in (key for key in _NUMBERS if key in root.items):
         value = references.resolve(root.items[key], Scope({}, key))
@@ -29,7 +29,7 @@ def seed_and_tolerance(root: Value, references: References, diagnostics: list[Di
 
 
 def outputs_of(root: Value, wiring: Wiring) -> tuple[str, ...]:
-    """Return the names of the steps that the recipe key ``outputs`` names, with a copy for each item."""
+    """Return the names of the steps in the recipe key ``outputs``, with the copies of each step for its items."""
     given = root.items.get("outputs")
     if given is None or given.data in (None, "", [], {}):
         if given is not None or not get_close_matches("outputs", map(str, root.items)):  # else reported as unknown
@@ -45,7 +45,7 @@ def outputs_of(root: Value, wiring: Wiring) -> tuple[str, ...]:
 
 
 def expectations(root: Value, wiring: Wiring) -> tuple[Expectation, ...]:
-    """Return the expected numbers of a recipe, which the recipe key ``expect`` gives."""
+    """Return the expected numbers of a recipe, which are in the recipe key ``expect``."""
     given = root.items.get("expect")
     if given is None or given.data is None:
         return ()

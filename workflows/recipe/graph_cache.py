@@ -1,6 +1,6 @@
-"""Cache of recipe graphs, valid while the steps of a recipe, the names of its items and its nodes are unchanged.
+"""Cache of recipe graphs; a graph is valid while the recipe's steps, item names and nodes are unchanged.
 
-The node and the wires of a step depend on no other values, so that the points of a sweep share one graph; parameters
+The node and the wires of a step depend on no other values, so that the points of a sweep share one graph. Parameters
 and files are checked for each point.
 """
 
@@ -15,15 +15,15 @@ from neusee.workflows.graph.recipe_graph import Wire
 from neusee.workflows.recipe.step_declarations import Declared
 from neusee.workflows.recipe.text.yaml_values import Value
 
-Names = tuple[tuple[str, tuple[str, ...] | None], ...]  #: name and items of each block, or None for the items
+Names = tuple[tuple[str, tuple[str, ...] | None], ...]  #: name and items of each block; None for a block without items
 
-_MOST = 16  #: graphs in the cache
+_MOST = 16  #: largest number of graphs in the cache
 _graphs: dict[tuple[Value | None, Names], CachedGraph] = {}  #: by ``steps`` and the names of the items
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class CachedGraph:
-    """Steps and wires of a recipe without mistakes."""
+    """Steps and wires of a recipe without mistakes, as they are cached."""
 
     steps: dict[str, Declared]
     absent: dict[str, Value]
@@ -31,7 +31,7 @@ class CachedGraph:
 
 
 def cached_graph(root: Value) -> CachedGraph | None:
-    """Return the cached graph of a recipe, or None where there is none or where a node has changed since."""
+    """Return the cached graph of a recipe, or None if the cache has no valid graph of the recipe."""
     graph = _graphs.get((root.items.get("steps"), _names(root)))
     return graph if graph is not None and all(map(_current, graph.steps.values())) else None
 
@@ -39,7 +39,7 @@ def cached_graph(root: Value) -> CachedGraph | None:
 def cache_graph(
     root: Value, steps: dict[str, Declared], absent: dict[str, Value], wires: Mapping[str, Mapping[str, Wire]]
 ) -> None:
-    """Add a graph without mistakes to the cache; the cache has no wire that is a reference."""
+    """Add the graph of a recipe without mistakes to the cache; omit wires that are references."""
     if any(_refers(step.value.items.get("node")) for step in steps.values()):
         return
     fixed = [name for step in steps.values() if not _refers(step.value.items.get("from")) for name in step.instances]
@@ -60,7 +60,7 @@ def _items(block: dict[str | int, Value]) -> tuple[str, ...] | None:
 
 
 def _current(step: Declared) -> bool:
-    """Return True if the node of a cached step is still the node of that name."""
+    """Return True if the node of a cached step has not been replaced by another node of the same name."""
     family, _, name = str(step.value.items["node"].data).partition(".")
     return getattr(sys.modules.get(f"{neusee.nodes.__name__}.{family}"), name, None) is step.node
 

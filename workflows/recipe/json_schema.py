@@ -1,7 +1,7 @@
 """JSON schema of recipe files, with which an editor completes names and marks mistakes.
 
-The schema of a step depends on its ``node``, so that a wrong name under ``with`` is one mistake and not one for each
-node. The schema requires no key, because groups may complete a file.
+The schema of a step depends on its ``node``, so that an editor reports a wrong name under ``with`` once, and not once
+for each node. The schema requires no key, because groups may complete a file.
 """
 
 from __future__ import annotations
@@ -34,7 +34,7 @@ _NUMBER = r"(\d+\.?\d*|\.\d+)([eE][-+]?\d+)?"
 
 
 def schema() -> Schema:
-    """Return the JSON schema of recipes and of the options of groups."""
+    """Return the JSON schema of recipe files, which is also valid for the options of groups."""
     nodes = dict(all_nodes())
     return {
         "$schema": "https://json-schema.org/draft/2020-12/schema",
@@ -124,7 +124,7 @@ def _training() -> Schema:
 
 
 class _Generator(GenerateJsonSchema):
-    """Generator of schemas that also allow quantities with units, and references."""
+    """Generator of JSON schemas that also allow quantities with units, references and distributions."""
 
     def generate_inner(self, schema: Any) -> JsonSchemaValue:
         inner = super().generate_inner(schema)

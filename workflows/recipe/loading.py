@@ -1,4 +1,4 @@
-"""Loading of a recipe: a name or a file and arguments become checked steps; all mistakes are reported at once."""
+"""Loading of a recipe from a name or file and arguments, with a check that reports all mistakes at once."""
 
 from __future__ import annotations
 
@@ -51,8 +51,8 @@ def load(
         load("first_light", doe="axicon", sensor={"read_noise": "20 e-"}, lasers={"green": {"strength": 1e4}})
         load("first_light", **{"sensor.read_noise": "20 e-", "+lasers.red": {"wavelength": "638 nm", …}})
 
-    ``values`` are overrides as Python values, which follow ``overrides``; a mapping changes only the values that it
-    names. Paths are relative to ``folder`` (default: the working folder), and messages number ``overrides`` from
+    ``values`` are overrides as Python values, which are applied after ``overrides``; a mapping changes only the values
+    that it names. Paths are relative to ``folder`` (default: the working folder). Messages number ``overrides`` from
     ``first``. A note names the expected numbers that overrides affect, because these are not compared.
     Raises `RecipeError` with all mistakes.
     """
@@ -71,12 +71,12 @@ def _as_written(name: str, folder: Path) -> Recipe:
 
 @functools.lru_cache(maxsize=16)
 def _checked(composed: Composed, graph: CachedGraph) -> Recipe:
-    """Return a checked recipe from the cache, as long as its graph is the same."""
+    """Return a composed recipe after a check; the result is cached by recipe and graph."""
     return check(composed)
 
 
 def check(composed: Composed) -> Recipe:
-    """Return the checked recipe of composed values; raise `RecipeError` with all mistakes."""
+    """Return a composed recipe after a check of all its values; raise `RecipeError` with all mistakes."""
     blocks = [composed.root.items[key] for key in (TRAINING, LIFTING) if key in composed.root.items]
     composed, training = read_training(composed)
     composed, lifting = read_lift_training(composed)
@@ -106,7 +106,7 @@ def check(composed: Composed) -> Recipe:
 
 
 def _bind(wiring: Wiring, checker: Checker, known: Mapping[str, Mapping[str, Wire]]) -> Iterator[Step]:
-    """Yield all copies of all steps with their parameters and wires; ``known`` are wires from the cache."""
+    """Yield every copy of every step with its parameters and wires; ``known`` contains the cached wires."""
     checked: list[tuple[Step, Value, Value]] = []
     for step in wiring.steps.values():
         if not step.items:
@@ -132,7 +132,7 @@ def _bind(wiring: Wiring, checker: Checker, known: Mapping[str, Mapping[str, Wir
 
 
 def _value_before_run(step: Step) -> Any:
-    """Return the result of a step without inputs, or None for parameters that the step's own preflight reports."""
+    """Return the result of a step without inputs, or None if the parameters of the step are invalid."""
     try:
         return step.node(**step.params)
     except ValueError:
@@ -142,7 +142,7 @@ def _value_before_run(step: Step) -> Any:
 def _final_values(
     wiring: Wiring, bound: dict[str, Step], checker: Checker, uncertain: Uncertain | None
 ) -> dict[str, Setting]:
-    """Return the final values by path: the written values, and after each step the defaults of its node."""
+    """Return the final values of a recipe by path: the written values, and after each step the defaults of its node."""
     settings: dict[str, Setting] = {}
     spare = wiring.references.spare
     for key, block in wiring.root.items.items():
@@ -175,7 +175,7 @@ def _defaults(step: Declared, bound: dict[str, Step]) -> Iterator[tuple[str, Set
             yield ".".join(map(str, path)), Setting(value, f"default of {first.node.path}", path, True)
 
 
-# --- what there is --------------------------------------------------------------------------------------------------
+# --- lists of recipes and groups ------------------------------------------------------------------------------------
 
 
 def recipes() -> list[Titled]:
@@ -184,7 +184,7 @@ def recipes() -> list[Titled]:
 
 
 def groups(beside: Path | None = None) -> dict[str, list[Titled]]:
-    """Return the options of all groups, which are packaged or in folders ``beside`` the recipe of a user."""
+    """Return the options of all groups: packaged options, and files in folders ``beside`` the recipe of a user."""
     folders = [folder for folder in (beside, packaged()) if folder]
     return {
         group: [_titled(next(p for f in folders if (p := f / group / f"{name}.yaml").is_file())) for name in names]

@@ -1,4 +1,4 @@
-"""Readings of the paper where the paper contradicts itself: the choice of the recipes, with its reason.
+"""Contradictions in the paper: for each, the reading that the recipes choose and the reason for the choice.
 
 Source: Peng et al., "Learning to See Through Flare", ICCV 2025 workshops. The group ``reading`` makes each choice.
 """
@@ -10,7 +10,7 @@ from typing import NamedTuple
 
 
 class Reading(NamedTuple):
-    """Contradiction of the paper: the recipe key, its coherent and its printed value, and the reason for the choice."""
+    """Contradiction in the paper: the recipe key, its coherent and its printed value, and the reason for the choice."""
 
     path: str  #: of the recipe key
     number: str
@@ -110,7 +110,7 @@ READINGS = (
 
 
 def in_force(values: dict[str, object]) -> Iterable[tuple[Reading, str]]:
-    """Yield each reading in a recipe with its state: ``coherent``, ``as printed``, or another value."""
+    """Yield each contradiction that a recipe resolves, with ``coherent``, ``as printed`` or the recipe's own value."""
     for row in READINGS:
         if row.path in values:
             value = values[row.path]

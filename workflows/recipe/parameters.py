@@ -20,7 +20,7 @@ from neusee.workflows.recipe.text.references import broken
 from neusee.workflows.recipe.text.renamed_keys import instead, new_name
 from neusee.workflows.recipe.text.yaml_values import Value, kind
 
-_LONGEST = 40  #: most characters of a value in a message
+_LONGEST = 40  #: largest number of characters of a value in a message
 
 
 @dataclass(slots=True)
@@ -50,7 +50,7 @@ class Checker:
         return {name: getattr(model, name) for name in node.params.model_fields}
 
     def preflight(self, bound: Step, early: Mapping[str, Any], values: Mapping[str, Value], step: Value) -> None:
-        """Call the node's own check before the run; ``early`` holds the results, by step, that are known already."""
+        """Call the preflight check of a step's node; ``early`` contains the results known before the run, by step."""
         node, inputs = bound.node, {name: early.get(str(bound.wires.get(name))) for name in bound.node.preflight_inputs}
         if node.hooks.preflight is None:
             return
@@ -66,7 +66,7 @@ class Checker:
             self.diagnostics.append(Diagnostic(step.key, step.name, str(error)))
 
     def _plain(self, node: Node, name: str, value: Value) -> Any:
-        """Return a value as plain data; a path is relative to the folder of the YAML file that has the path."""
+        """Return a value as plain data; a path is relative to the folder of the YAML file that contains the path."""
         parts = value.data if isinstance(value.data, list) else [value]
         if not _is_file(node.hints.get(name)) or not all(isinstance(part.data, str) for part in parts):
             return value.plain
@@ -104,13 +104,13 @@ def _problems(
         else:
             value = _deepest(values[name], e["loc"][1:])
             wrong.setdefault((value.mark, _said(value)), []).append(_message(e) + _in_si(e, value))
-    yield from gone.values()  # parameters that moved to the same place need one message
+    yield from gone.values()  # parameters that moved to the same node share one message
     for (mark, path), messages in wrong.items():
         yield Diagnostic(mark, path, ", or ".join(dict.fromkeys(messages)))
 
 
 def _deepest(value: Value, path: tuple[int | str, ...]) -> Value:
-    """Return the value at a path, or the last value on the way that exists."""
+    """Return the value at a path below ``value``, or the deepest value on the path that exists."""
     while path and (child := value.child(path[0])):
         value, path = child, path[1:]
     return value
@@ -123,7 +123,7 @@ def _said(value: Value) -> str:
 
 
 def _message(error: ErrorDetails) -> str:
-    """Return the message of pydantic in other words, which say what to write."""
+    """Return the message of a pydantic error in words that tell the user what to write."""
     if error["type"] == "missing":
         return f"must have at least {int(error['loc'][-1]) + 1} values"
     text = error["msg"].removeprefix("Value error, ")
@@ -143,6 +143,6 @@ def _message(error: ErrorDetails) -> str:
 
 
 def _in_si(error: ErrorDetails, value: Value) -> str:
-    """Return the value in SI of a quantity beyond a limit, because the message gives the limit in SI."""
+    """Return a text with the value of a quantity in SI if the message has a limit, which is in SI."""
     limit = next((v for key, v in error.get("ctx", {}).items() if key in ("gt", "ge", "lt", "le")), 0)
     return f" in SI, not {error['input']:.4g}" if limit and isinstance(value.data, str) else ""

@@ -1,4 +1,4 @@
-"""Declarations of steps in a recipe: the node of each step, and the items for which the step is copied."""
+"""Declarations of the steps in a recipe: the node of each step, and the items for which the step is copied."""
 
 from __future__ import annotations
 
@@ -30,8 +30,8 @@ class Declared:
 
     name: str
     value: Value
-    node: Node | None  #: None where the node does not exist; the wires are checked even so
-    dims: tuple[str, ...]  #: lists of items that ``each`` names
+    node: Node | None  #: None if the node does not exist; the wires are checked nevertheless
+    dims: tuple[str, ...]  #: names of the lists of items in ``each``
     items: tuple[tuple[str, ...], ...]  #: items of each copy; one empty tuple without ``each``
 
     def instance(self, items: tuple[str, ...]) -> str:
@@ -42,7 +42,7 @@ class Declared:
         return tuple(map(self.instance, self.items))
 
     def part(self, key: str) -> Value:
-        """Return the value of the step's key ``from``, ``with`` or ``device``, or an empty mapping without the key."""
+        """Return the value of a step's key ``from``, ``with`` or ``device``, or an empty mapping for a missing key."""
         given = self.value.items.get(key)
         return Value({}, self.value.key, self.value.key, (*self.value.path, key)) if given is None else given
 
@@ -54,7 +54,7 @@ class Declared:
 def declare(
     root: Value, references: References, diagnostics: list[Diagnostic]
 ) -> tuple[dict[str, Declared], dict[str, Value]]:
-    """Return the declared steps, and the steps that are null; report the mistakes in the declarations."""
+    """Return the declared steps and the steps that are null; report mistakes in the declarations."""
     given = root.items.get("steps")
     if given is None or not isinstance(given.data, dict) or not given.data:
         mark = root.mark if given is None else given.mark
@@ -88,7 +88,7 @@ def _well_formed(name: str, value: Value, diagnostics: list[Diagnostic]) -> bool
 def _node(
     step: Value, find: Callable[[str], Node], references: References, diagnostics: list[Diagnostic]
 ) -> Node | None:
-    """Return the node that a step names, or None for a mistake; ``find`` returns the node of a name."""
+    """Return the node that a step names, or None for a mistake; the function ``find`` returns a node by name."""
     given = step.items.get("node")
     if given is None:
         diagnostics.append(Diagnostic(step.key, step.name, "has no node: write `node: family.name`"))
@@ -104,7 +104,7 @@ def _node(
 
 
 def _dims(step: Value, root: Value, diagnostics: list[Diagnostic]) -> tuple[str, ...] | None:
-    """Return the names of at most two lists of items that ``each`` names, or None for a mistake."""
+    """Return the names of the lists of items in a step's key ``each``, at most two, or None for a mistake."""
     given = step.items.get("each")
     if given is None or given.data is None:
         return ()
@@ -122,7 +122,7 @@ def _dims(step: Value, root: Value, diagnostics: list[Diagnostic]) -> tuple[str,
         else:
             dims.append(value.data)
             diagnostics += [
-                Diagnostic(item.key, item.name, "an item's name has no space, comma or bracket")
+                Diagnostic(item.key, item.name, "an item's name must not have a space, comma or bracket")
                 for key, item in block.items.items()
                 if not _ITEM.fullmatch(str(key))
             ]
@@ -170,13 +170,13 @@ def find_node(name: str) -> Node:
 
 
 def _elsewhere(attribute: str) -> str:
-    """Return a hint with the nodes of the same name in other families."""
+    """Return a hint that lists the nodes of the same name in other families."""
     names = [f"{family}.{attribute}" for family in families() if attribute in nodes_of(family)]
     return f"did you mean {' or '.join(names)}?" if names else ""
 
 
 def families() -> list[str]:
-    """Return the names of the families of nodes; no family is imported."""
+    """Return the names of the families of nodes, without importing a family."""
     packages = {info.name for info in pkgutil.iter_modules(neusee.nodes.__path__) if info.ispkg}
     loaded = (re.fullmatch(rf"{neusee.nodes.__name__}\.([a-z]\w*)", module) for module in list(sys.modules))
     return sorted(packages | {match[1] for match in loaded if match and nodes_of(match[1])})
@@ -189,7 +189,7 @@ def nodes_of(family: str) -> dict[str, Node]:
 
 
 def all_nodes() -> Iterator[tuple[str, Node]]:
-    """Yield the name in recipes and the node, for all nodes of all families."""
+    """Yield the name and the node of every node in all families; recipes use these names."""
     for family in families():
         for name, node in nodes_of(family).items():
             yield f"{family}.{name}", node

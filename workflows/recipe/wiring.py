@@ -48,7 +48,7 @@ class Wiring:
         return wires
 
     def outputs(self, value: Value, path: str) -> tuple[str, ...]:
-        """Return the names of the steps that an output or an expected number names."""
+        """Return the names of the steps that a value of ``outputs`` or ``expect`` names."""
         return self._producers(value, path, {}) or ()
 
     def refuse(self, value: Value, path: str, message: str) -> None:
@@ -56,7 +56,7 @@ class Wiring:
         self.diagnostics.append(Diagnostic(value.mark, path, message))
 
     def _by_input(self, node: Node, given: Value) -> dict[str, Value] | None:
-        """Return the values of ``from`` by input, or None for a mistake; a single name feeds the first input."""
+        """Return the values in ``from`` by input, or None for a mistake; a single name feeds the first input."""
         if given.data is BROKEN:
             return None
         if given.data is None:
@@ -76,7 +76,7 @@ class Wiring:
         return {str(name): value for name, value in given.data.items()}
 
     def _require(self, step: Declared, node: Node, name: str, given: Value) -> None:
-        """Report an input that ``from`` does not name, unless the input is optional."""
+        """Report an input that the key ``from`` does not name, unless the input is optional."""
         if name in node.optional or (name == "stop" and became_input(node.path, map(str, step.part("with").items))):
             return  # the parameters of an old recipe are reported with the step that replaces them
         if not (isinstance(given.data, dict) and _misspelt(name, node, given)):
@@ -110,7 +110,7 @@ class Wiring:
         return None
 
     def _producers(self, value: Value, path: str, here: Mapping[str, str], makers: str = "") -> tuple[str, ...] | None:
-        """Return the copies of a step that a wire names; ``here`` are the items of the step that reads the wire."""
+        """Return the copies of a step that a wire names; ``here`` has the items of the step that reads the wire."""
         parsed = _parse(value)
         if parsed is None or parsed[0] not in self.steps:
             self.refuse(value, path, self._unknown(value, makers))
@@ -138,7 +138,10 @@ class Wiring:
         return f"no step {name}; {hint if hint.startswith('did you mean') else f'check the name{makers}'}"
 
     def _chosen(self, producer: Declared, items: Sequence[str], value: Value, path: str) -> dict[str, str] | None:
-        """Return the item in brackets for each list of items; a single item may belong to any of the lists."""
+        """Return the items in the brackets of a wire, by the name of the list that contains each item.
+
+        A single item may be in any of the lists of the step.
+        """
         if not producer.dims:
             self.refuse(value, path, f"{producer.name} has no items: leave out the brackets")
             return None
@@ -159,7 +162,7 @@ class Wiring:
         return [str(name) for name in self.root.items[dim].items]
 
     def _agree(self, node: Node, name: str, producer: Declared, value: Value, path: str) -> None:
-        """Report a step whose result has another type than the input needs."""
+        """Report a step whose result does not have the type that an input needs."""
         needed, returned = needs(node, name), _returned(producer)
         if returned and needed and not _fits(returned, needed):
             message = f"{node.path} needs {_a(needed)}; {producer.name} returns {_a(returned)}{self._makers(needed)}"
@@ -184,7 +187,7 @@ def _parse(value: Value) -> tuple[str, list[str] | None] | None:
 
 
 def _misspelt(name: str, node: Node, given: Value) -> bool:
-    """Return True if ``from`` has an input under a misspelt name, which is reported elsewhere."""
+    """Return True if the key ``from`` has a misspelt form of an input's name, which is reported elsewhere."""
     strangers = [str(key) for key in given.items if key not in node.inputs]
     return any(nearest(stranger, node.inputs) == f"did you mean {name}?" for stranger in strangers)
 
@@ -195,7 +198,7 @@ def takes_many(node: Node, name: str) -> bool:
 
 
 def needs(node: Node, name: str) -> tuple[type, ...]:
-    """Return the classes that an input of a node accepts; return none for an annotation without classes."""
+    """Return the classes that an input of a node accepts, or an empty tuple for an annotation without classes."""
     hints = _options(node.hints.get(name))
     return tuple(k for h in hints for k in _kinds(get_args(h)[0] if get_origin(h) in _LISTS else h))
 
@@ -209,7 +212,7 @@ def _fits(returned: Iterable[type], needed: Iterable[type]) -> bool:
 
 
 def _options(hint: Any) -> list[Any]:
-    """Return the types in a union without None and ``Annotated``; another type is returned alone."""
+    """Return the member types of an annotation, without None and ``Annotated``."""
     if get_origin(hint) is Annotated:
         return _options(get_args(hint)[0])
     if get_origin(hint) in (Union, types.UnionType):
@@ -250,7 +253,7 @@ def _lines_of(marks: list[Location]) -> str:
 
 
 def _loops(sources: Mapping[str, list[str]]) -> Iterator[list[str]]:
-    """Yield the names of the steps in each cycle, in the direction of the data."""
+    """Yield the names of the steps in each cycle, each step before the step that reads its result."""
     done: set[str] = set()
     for root in sources:
         path: dict[str, Iterator[str]] = {} if root in done else {root: iter(sources[root])}

@@ -1,6 +1,6 @@
 """Band files: one file for each slice of a stack of bands, shared by every result that contains the slice.
 
-A band file (a blob) holds the bytes of a slice and a trailer: type and shape, checksum and the trailer's length. The
+A band file (a blob) holds the bytes of a slice and a trailer with type, shape, checksum and the trailer's length. The
 bytes begin at the start of the file, so that slices of whole memory pages are mapped side by side into one address
 range, which gives a contiguous tensor without a copy. The maps are private: a write to the tensor changes no file.
 """
@@ -49,11 +49,11 @@ class Stacked:
     """A tensor whose slices along the first axis are stored in one band file each."""
 
     tensor: Tensor
-    names: tuple[str, ...]  #: one name for each slice; equal names are equal slices
+    names: tuple[str, ...]  #: one name for each slice; slices with equal names are equal
 
 
 class Blob(NamedTuple):
-    """Type, shape and checksum of a slice, as the trailer of its band file names them."""
+    """Type, shape and checksum of a slice, which are in the trailer of its band file."""
 
     dtype: torch.dtype
     shape: tuple[int, ...]
@@ -71,14 +71,14 @@ class Blobs:
         self.root = root
         self._folder = os.fspath(root)
         self._disk = Disk(root.parent)
-        self._lost: set[str] = set()  # damaged files, which the user may not be allowed to move away
+        self._lost: set[str] = set()  # damaged files that the user may have no permission to move
 
     def has(self, name: str) -> bool:
-        """Return True if the band file of this name exists, without reading the file."""
+        """Return True if the band file ``name`` exists, without reading the file."""
         return name not in self._lost and os.path.exists(self.path(name))
 
     def about(self, name: str) -> Blob:
-        """Return type, shape and checksum of a band; raise `Damaged` where the trailer of its file cannot be read."""
+        """Return the type, shape and checksum of a band; raise `Damaged` if the trailer of its file cannot be read."""
         try:
             with open(self.path(name), "rb") as file:
                 return _trailer(file.fileno())[0]
@@ -106,7 +106,7 @@ class Blobs:
             return list(pool.map(self.write, names, slices))
 
     def _named(self, name: str, part: str) -> str | None:
-        """Rename a complete file to its band; if the band has a file already, return the checksum of that file."""
+        """Give a complete file the name of its band; if a file has that name, return the checksum of that file."""
         self._disk.make_folder(self._folder)
         if name in self._lost or not self._disk.link(part, self.path(name)):
             if name not in self._lost:
@@ -126,8 +126,9 @@ class Blobs:
     ) -> Tensor:
         """Return one contiguous tensor of ``shape`` whose slices along the first axis are the bands ``names``.
 
-        The files are mapped where a slice is whole memory pages, else copied. ``verify`` compares the checksum of every
-        byte; ``xxh3`` lists the expected checksums. Raises `Damaged`; a damaged file then counts as missing.
+        The files are mapped if a slice consists of whole memory pages, otherwise copied. ``verify`` compares the
+        checksum of every byte; ``xxh3`` lists the expected checksums. Raises `Damaged` for a missing or damaged file,
+        which then counts as missing.
         """
         expected = [Blob(dtype, tuple(shape[1:]), xxh3[i] if xxh3 else "") for i in range(len(names))]
         size = expected[0].nbytes if expected else 0
@@ -145,7 +146,7 @@ class Blobs:
     def _fill(
         self, names: Sequence[str], expected: Sequence[Blob], into: memoryview, address: int | None, verify: bool
     ) -> None:
-        """Load bands side by side into memory: map the files where an ``address`` is given, else read the files."""
+        """Load bands into consecutive memory: map the files if an ``address`` is given, otherwise read the files."""
         size = expected[0].nbytes
         for i, (name, blob) in enumerate(zip(names, expected, strict=True)):
             try:
@@ -158,7 +159,7 @@ class Blobs:
                 raise self._damaged(name, error) from None
 
     def path(self, name: str) -> str:
-        """Return the path of a band's file."""
+        """Return the path of the band file ``name``."""
         return f"{self._folder}/{name[:2]}/{name}"
 
     def _damaged(self, name: str, error: Exception) -> Damaged:
@@ -172,7 +173,7 @@ class Blobs:
 
 
 def bytes_of(x: Tensor) -> memoryview:
-    """Return the bytes of a tensor, without a copy where the tensor is contiguous and on the CPU."""
+    """Return the bytes of a tensor, without a copy if the tensor is contiguous and on the CPU."""
     flat = x.detach().cpu().resolve_conj().resolve_neg().contiguous().reshape(-1)
     if flat.stride() != (1,):  # a single element is contiguous whatever its stride, but cannot be viewed as bytes
         flat = flat.clone(memory_format=torch.contiguous_format)
@@ -180,7 +181,7 @@ def bytes_of(x: Tensor) -> memoryview:
 
 
 def dtype_of(name: str) -> torch.dtype:
-    """Return ``torch.float32`` for ``"float32"``; raise `ValueError` for a name that torch does not know."""
+    """Return the torch dtype with a name such as ``float32``; raise `ValueError` for an unknown name."""
     dtype = getattr(torch, name, None)
     if not isinstance(dtype, torch.dtype):
         raise ValueError(f"{name!r} is not a dtype of torch")
@@ -198,7 +199,7 @@ def _checksum(data: memoryview, kind: bytes) -> str:
 
 
 def _trailer(file: int) -> tuple[Blob, bytes]:
-    """Return the trailer of a band file, decoded and as bytes; raise `ValueError` where the file size is wrong."""
+    """Return the trailer of a band file, decoded and as bytes; raise `ValueError` if the file size is wrong."""
     size = os.fstat(file).st_size
     tail = os.pread(file, 512, max(0, size - 512))
     length = int.from_bytes(tail[-4:], "little")
@@ -213,12 +214,12 @@ def _trailer(file: int) -> tuple[Blob, bytes]:
 
 
 def _load(file: BufferedReader, expected: Blob, into: memoryview, address: int | None, verify: bool) -> None:
-    """Load the band of a file into memory; raise `ValueError` where the file holds another band or damaged bytes."""
+    """Load the band in a file into memory; raise `ValueError` if the file holds another band or damaged bytes."""
     blob, kind = _trailer(file.fileno())
     if blob[:2] != expected[:2]:
         raise ValueError(f"the file holds {blob.dtype} {blob.shape} instead of {expected.dtype} {expected.shape}")
     if expected.xxh3 and blob.xxh3 != expected.xxh3:
-        raise ValueError("the file holds another band than the band that was written with this result")
+        raise ValueError("the file holds a different band than was written with this result")
     if address is not None:
         _map(file.fileno(), address, blob.nbytes)
     elif file.readinto(into) != len(into):
@@ -233,7 +234,7 @@ def _reserve(size: int) -> Any:
     flags = mmap.MAP_PRIVATE | mmap.MAP_ANON
     address = _LIBC.mmap(None, size, 0, flags, -1, 0)
     if address in (None, ctypes.c_void_p(-1).value):
-        raise OSError(ctypes.get_errno(), "no free address range for the bands of a stack")
+        raise OSError(ctypes.get_errno(), "there is no free address range for the bands of a stack")
     space = (ctypes.c_char * size).from_address(address)
     weakref.finalize(space, _LIBC.munmap, address, size).atexit = False  # a thread may use it until the very end
     return space

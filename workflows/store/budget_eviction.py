@@ -1,8 +1,8 @@
-"""Eviction of values from a store beyond its budget: values that save the fewest seconds per byte go first.
+"""Eviction of values from a store beyond its budget; values that save the fewest seconds per byte are evicted first.
 
-The weight of a value halves for every week between its last use and the newest use in the store, whatever today's
-date is. Pinned values stay. The metadata of an evicted value stay as its receipt, so that origin and cost remain known;
-a process that reads the value at that moment keeps its memory map.
+The weight of a value halves for every week between its last use and the newest use in the store; today's date does not
+matter. Pinned values stay. The metadata of an evicted value stay as its receipt, so that origin and cost remain known.
+A process that reads the value at that moment keeps its memory map.
 """
 
 from __future__ import annotations
@@ -30,7 +30,7 @@ class Candidate:
 
     key: str
     size: int  #: bytes that the eviction frees
-    seconds: float  #: s for computing the value, less the s for loading it
+    seconds: float  #: time in s for computing the value, minus the time for loading the value
     used: float  #: time of the last use, s
 
 
@@ -53,7 +53,7 @@ def chosen(candidates: Iterable[Candidate], excess: float) -> list[Candidate]:
 
 
 def evict(disk: Disk, among: Iterable[Candidate], excess: float, dry: bool) -> tuple[list[Candidate], list[Candidate]]:
-    """Evict values until ``excess`` bytes are free; return the evicted values and the values of other users."""
+    """Evict values until ``excess`` bytes are free; return the evicted values and the values that cannot be deleted."""
     left, gone, refused = {c.key: c for c in among}, list[Candidate](), list[Candidate]()
     while excess > 0 and (batch := chosen(left.values(), excess)):
         for candidate in batch:
@@ -67,14 +67,17 @@ def evict(disk: Disk, among: Iterable[Candidate], excess: float, dry: bool) -> t
 
 
 class CacheBudget:
-    """Comparison of a store's bytes with its budget, without a count of all bytes at each write."""
+    """Check of the size of a store against its budget, without a count of all bytes at each write."""
 
     def __init__(self, disk: Disk, budget: int) -> None:
         self._disk, self.budget = disk, budget
         self._spare = 0.0  # bytes that may be written before all bytes are counted again
 
     def excess(self, size: int) -> float:
-        """Return the bytes to evict after a write of ``size`` bytes; recount all after writes of 5 % of the budget."""
+        """Return the number of bytes to evict after a write of ``size`` bytes.
+
+        All bytes of the store are counted again after writes of 5 % of the budget.
+        """
         self._spare -= size
         if self._spare > 0:
             return 0.0
@@ -87,12 +90,12 @@ class CacheBudget:
 
 
 def total(disk: Disk) -> int:
-    """Return the bytes of all results of a store, with their files and bands."""
+    """Return the total bytes of all results of a store, with their derived files and bands."""
     return sum(size for _, size, _ in files(disk))
 
 
 def candidates(disk: Disk, pinned: Collection[str], read_seconds: Callable[[float], float]) -> Iterator[Candidate]:
-    """Yield every value that may be evicted, with its share of the bytes of bands that several values use."""
+    """Yield every value that may be evicted; the bytes of a band are divided among the values that use the band."""
     stats = {os.path.basename(path): (size, changed) for path, size, changed in files(disk)}
     kept = {key: about for key, about in metadata.each(disk) if metadata.is_kept(about)}
     bands = {key: set(metadata.bands(about)) for key, about in kept.items()}
@@ -107,7 +110,7 @@ def candidates(disk: Disk, pinned: Collection[str], read_seconds: Callable[[floa
 
 
 def drop(disk: Disk, key: str) -> bool:
-    """Delete a value and keep its metadata as a receipt; return False where we may not delete the value."""
+    """Delete a value and keep its metadata as a receipt; return False if the value cannot be deleted."""
     try:
         with disk.lock():
             about = metadata.read(disk, key)
@@ -122,7 +125,7 @@ def drop(disk: Disk, key: str) -> bool:
 
 
 def _write_receipt(disk: Disk, key: str, about: Metadata) -> None:
-    """Replace the metadata of an evicted value by its receipt; on a full disk delete the metadata instead."""
+    """Replace the metadata of an evicted value by its receipt; on a full disk, delete the metadata."""
     try:
         metadata.write(disk, key, metadata.receipt(about), over=True)
     except OSError as error:
@@ -141,7 +144,7 @@ def _delete_files(disk: Disk, key: str, about: Metadata) -> None:
 
 
 def files(disk: Disk) -> Iterator[tuple[str, int, float]]:
-    """Yield path, bytes and last change of every file that counts against the budget."""
+    """Yield the path, the bytes and the time of the last change of every file that counts against the budget."""
     for base in (disk.folder, f"{disk.folder}/files", f"{disk.folder}/bands"):
         for entry in below(base):
             with suppress(OSError):
@@ -150,14 +153,14 @@ def files(disk: Disk) -> Iterator[tuple[str, int, float]]:
 
 
 def below(base: str) -> Iterator[os.DirEntry[str]]:
-    """Yield the files in all subfolders of ``base`` whose names have two letters."""
+    """Yield the files in those subfolders of ``base`` whose names have two letters."""
     for folder in entries(base):
         if len(folder.name) == 2 and folder.is_dir(follow_symlinks=False):
             yield from entries(folder.path)
 
 
 def entries(folder: str) -> list[os.DirEntry[str]]:
-    """Return the files and folders in a folder, or an empty list where the folder cannot be read."""
+    """Return the files and folders in a folder, or an empty list if the folder cannot be read."""
     try:
         with os.scandir(folder) as listing:
             return list(listing)

@@ -10,7 +10,7 @@ _SIZE = re.compile(r"\s*(\d+(?:\.\d+)?)\s*((?:[kmgt]i?)?b?)\s*", re.IGNORECASE)
 
 
 def parse_size(text: str) -> int:
-    """Return the number of bytes of a text such as ``20 GB`` or ``1.5 TiB``; raise `ValueError` for any other text."""
+    """Return the number of bytes in a text such as ``20 GB`` or ``1.5 TiB``; raise `ValueError` for an invalid text."""
     match = _SIZE.fullmatch(text)
     if not match:
         raise ValueError(f"{text!r} is not a size: write a number of bytes, such as 20 GB")
@@ -19,6 +19,6 @@ def parse_size(text: str) -> int:
 
 
 def format_size(count: float) -> str:
-    """Return a number of bytes as text with three digits and the largest fitting unit, such as ``20 GB``."""
+    """Return a number of bytes as text with three significant digits and a suitable unit, such as ``20 GB``."""
     unit = next((unit for unit in ("B", "kB", "MB", "GB") if count < 1000 * UNITS[unit]), "TB")
     return f"{count / UNITS[unit]:.3g} {unit}"

@@ -1,6 +1,6 @@
-"""Files derived from results, such as pictures and spectral EXR, kept by key so that a second run draws nothing.
+"""Files derived from results, such as pictures and spectral EXR, stored by key so that a second run reuses the files.
 
-The bytes are in the folder ``files/`` of the store; the store itself keeps their checksum.
+The files are in the folder ``files/`` of the store; their checksums are results of the store.
 """
 
 from __future__ import annotations
@@ -19,7 +19,7 @@ from neusee.workflows.store.result_store import Store
 
 
 class DerivedFiles:
-    """Derived files beside the results of a store, or in a temporary folder where the store cannot be written."""
+    """Derived files in the folder of a store, or in a temporary folder if the store cannot be written."""
 
     def __init__(self, store: Store) -> None:
         self.store = store
@@ -27,7 +27,7 @@ class DerivedFiles:
         self._spare: TemporaryDirectory[str] | None = None
 
     def find(self, key: str, suffix: str) -> Path | None:
-        """Return the path of a key's file if the file exists and its checksum matches, else None."""
+        """Return the path of the derived file ``key``, or None if the file is missing or has a wrong checksum."""
         path = self._path(key, suffix)
         with suppress(KeyError):
             if path.is_file() and self.store.has(key) and bytes(self.store.get(key).tolist()) == _checksum(path):

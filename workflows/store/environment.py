@@ -1,4 +1,4 @@
-"""Settings of a store from environment variables: its folder, how often checksums are compared, and its budget."""
+"""Settings of a store from environment variables: the folder, the mode of checksum comparison and the budget."""
 
 from __future__ import annotations
 
@@ -12,13 +12,13 @@ Verify = Literal["always", "sampled", "never"]
 
 
 def default_root() -> Path:
-    """Return the folder ``$NEUSEE_CACHE``, else ``cache/`` of the surrounding checkout, else ``~/.cache/neusee``.
+    """Return the default folder of a store: ``$NEUSEE_CACHE``, ``cache/`` of the checkout or ``~/.cache/neusee``.
 
-    Raises `ValueError` where the variable holds a URL.
+    The first of these folders that is set or exists is used. Raises `ValueError` if the variable contains a URL.
     """
     if value := os.environ.get("NEUSEE_CACHE"):
         if "://" in value:
-            raise ValueError(f"NEUSEE_CACHE is {value!r}, which is not a folder: `open_store` takes URLs too")
+            raise ValueError(f"NEUSEE_CACHE is {value!r}, which is not a folder: open a URL with `open_store`")
         return Path(value)
     here = Path.cwd()
     for folder in (here, *here.parents):
@@ -29,7 +29,10 @@ def default_root() -> Path:
 
 
 def verify_mode(mode: str | None) -> Verify:
-    """Return ``mode``, else ``$NEUSEE_CACHE_VERIFY``, else ``always``; raise `ValueError` for any other word."""
+    """Return the mode of checksum comparison: ``mode`` if given, else ``$NEUSEE_CACHE_VERIFY``, else ``always``.
+
+    Raises `ValueError` for an unknown mode.
+    """
     name = "verify" if mode else "NEUSEE_CACHE_VERIFY"
     mode = mode or os.environ.get("NEUSEE_CACHE_VERIFY") or "always"
     if mode not in get_args(Verify):
@@ -38,7 +41,10 @@ def verify_mode(mode: str | None) -> Verify:
 
 
 def budget_bytes(budget: int | None) -> int | None:
-    """Return ``budget``, else ``$NEUSEE_CACHE_BUDGET`` in bytes, else None; raise `ValueError` for a bad size."""
+    """Return the budget of a store in bytes: ``budget`` if given, else ``$NEUSEE_CACHE_BUDGET``, else None.
+
+    Raises `ValueError` for an invalid size.
+    """
     text = os.environ.get("NEUSEE_CACHE_BUDGET")
     if budget is not None or not text:
         return budget

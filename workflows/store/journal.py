@@ -1,7 +1,7 @@
 """Journal of a store: one line for every finished result, so that a query reads one file instead of all results.
 
-The journal is advice. Each line is one write, and a torn line is skipped. A journal that is
-missing or damaged is rebuilt from the metadata of the results.
+No result depends on the journal. Each line is one write, and a torn line is skipped. A journal that is missing or
+damaged is rebuilt from the metadata of the results.
 """
 
 from __future__ import annotations
@@ -37,13 +37,13 @@ class Journal:
     """The lines of the journal of one store, the newest line last."""
 
     def __init__(self, disk: Disk, others: Callable[[], Iterable[tuple[str, Row]]] = tuple) -> None:
-        """Open the journal of a store; ``others`` yields key and metadata of results without files of their own."""
+        """Open the journal of a store; ``others`` yields the key and the metadata of each result in the common file."""
         self._disk, self._others, self._guard = disk, others, threading.RLock()
         self._path = f"{disk.folder}/journal.jsonl"
         self._forget()
 
     def append(self, key: str, about: Row) -> None:
-        """Append the line of a result to the file; ignore a failure, because a lost line costs time and no result."""
+        """Append the line of a result to the journal; ignore a failure, because no result depends on the journal."""
         with suppress(OSError):
             try:
                 append(self._path, b"\n" + _encode(row_of(key, about)).encode())
@@ -52,7 +52,10 @@ class Journal:
                     self._rebuild()
 
     def rows(self) -> list[Row]:
-        """Return every line: key, step, recipe, node, seconds, bytes, device, peak, date, kept. Change no line."""
+        """Return every line of the journal as a dict, which the caller must not change.
+
+        The fields of a line are key, step, recipe, node, seconds, bytes, device, peak, date and kept.
+        """
         self._read()
         return self._rows
 
@@ -61,13 +64,13 @@ class Journal:
         return [row for row in self.rows() if row["step"] == name]
 
     def mark_evicted(self, keys: Collection[str]) -> None:
-        """Record in the journal that the values of these keys are no longer stored."""
+        """Record in the journal that the values of ``keys`` are no longer stored."""
         with self._guard:
             self._read()
             self._replace([{**row, "kept": False} if row["key"] in keys else row for row in self._rows])
 
     def compact(self) -> None:
-        """Rewrite the journal with the newest line of each existing result, corrected for evicted values."""
+        """Rewrite the journal with the newest line of each existing result, and mark the evicted values."""
         self._read()
         known = {row["key"]: (i, row) for i, row in enumerate(self._rows)}
         lines = []
@@ -115,7 +118,7 @@ class Journal:
         self._replace(sorted(rows, key=lambda row: str(row["date"])))
 
     def _replace(self, rows: list[Row]) -> None:
-        """Replace the file by one with the lines ``rows``; a line that another process adds meanwhile may be lost."""
+        """Replace the journal file by the lines ``rows``; a line that another process adds meanwhile may be lost."""
         self._forget()
         self._rows = rows
         self._head = f'{{"journal":"{os.urandom(8).hex()}"}}'.encode()
@@ -129,7 +132,7 @@ class Journal:
 
 
 def _parsed(raw: bytes) -> Iterator[Row]:
-    """Yield the valid lines in the text ``raw``; parse all lines at once, or one by one where a line is damaged."""
+    """Yield the valid lines in the text ``raw``; parse all lines at once, or one by one if a line is damaged."""
     lines = [line for line in raw.split(b"\n") if line]
     try:
         rows = json.loads(b"[" + b",".join(lines) + b"]")

@@ -3,8 +3,8 @@
 A lease is a second hard link to the badge of a process, a file that names the process: one atomic step takes a lease,
 and one heartbeat serves all leases of a process. On the same machine, an observer looks up the owner by process number
 and start time, so that the next process takes over at once after ``kill -9``. An owner on another machine must change
-its badge in time. The observer measures this time by its own monotonic clock, so that no clock that jumps makes a live
-owner dead. A lease is advice: two processes with the same lease would do the same work twice and no other harm.
+its badge at intervals. The observer measures the intervals by its own monotonic clock, so that a jump of a clock never
+makes a live owner count as dead. Two processes with the same lease would compute a result twice and do no other harm.
 """
 
 from __future__ import annotations
@@ -22,12 +22,12 @@ BEAT = 2.0  #: s between heartbeats
 WINDOW = 10.0  #: s without a heartbeat after which an owner on another machine counts as dead
 _guard = threading.Lock()
 _held: set[Lease] = set()
-_badges: dict[str, str] = {}  #: by folder, the badge of this process: the file that names the process
+_badges: dict[str, str] = {}  #: path of the badge of this process by folder; a badge is a file that names the process
 _thread: threading.Thread | None = None
 
 
 class Lease:
-    """The right to compute the result of a key until `release`; ``path`` is None where no file can be written."""
+    """The right to compute the result of a key until `release`; ``path`` is None if no file can be written."""
 
     __slots__ = ("_inode", "_path")
 
@@ -36,7 +36,7 @@ class Lease:
         self._inode = os.stat(path).st_ino if path else 0
 
     def release(self) -> None:
-        """Delete the file of the lease, unless another process took the lease over or this is a forked child."""
+        """Delete the file of the lease, unless another process took it over or this process is a forked child."""
         with _guard:
             if self not in _held:
                 return
@@ -54,16 +54,16 @@ class Lease:
 
 
 class Leases:
-    """The leases of one store, as seen by this process."""
+    """The leases of one store, as this process observes them."""
 
     def __init__(self, disk: Disk) -> None:
         self._disk = disk
-        self._seen: dict[str, tuple[object, float]] = {}  #: by path: content, and since when unchanged
+        self._seen: dict[str, tuple[object, float]] = {}  #: by path: content, and the time of its first observation
 
     def claim(self, key: str) -> Lease | None:
         """Return the lease of ``key``, or None while a live process holds the lease.
 
-        A caller that had to wait looks up the result once more before computing it.
+        A caller that had to wait must look up the result again before it computes the result.
         """
         try:
             return self._claimed(key, f"{self._disk.folder}/tmp/{key}.lease")
@@ -83,7 +83,7 @@ class Leases:
             return None
 
     def _taken(self, path: str) -> Lease:
-        """Take a free lease; try twice, because the folder or the badge of this process may be missing."""
+        """Take a free lease; make the folder and the badge of this process if they are missing."""
         with _guard:
             try:
                 os.link(_badge(self._disk), path)
@@ -101,7 +101,7 @@ class Leases:
             if now is not None and (seen is None or now[:2] != seen[:2]):
                 raise FileExistsError(path)
             with _guard:
-                os.link(_badge(self._disk), path if now is None else part)  # one of two observers is first
+                os.link(_badge(self._disk), path if now is None else part)  # fails for the later of two observers
             try:
                 if now is not None:
                     os.replace(part, path)
@@ -134,7 +134,7 @@ class Leases:
 
 
 def _look(path: str) -> tuple[object, ...] | None:
-    """Return content, inode, size and change time of the file of a lease, or None where no such file exists."""
+    """Return the content, inode, size and change time of the file of a lease, or None if the file does not exist."""
     try:
         with open(path, "rb") as file:
             stat, text = os.fstat(file.fileno()), file.readline(200).decode(errors="replace")
@@ -146,7 +146,7 @@ def _look(path: str) -> tuple[object, ...] | None:
 
 
 def _badge(disk: Disk) -> str:
-    """Return the path of this process's badge, a file that names the process; write the file at the first call."""
+    """Return the path of the badge of this process, a file that names the process; the first call writes the file."""
     if disk.folder not in _badges:
         disk.prepare()
         path = f"{disk.folder}/tmp/badge.{me()}"
@@ -164,7 +164,7 @@ def _badge(disk: Disk) -> str:
 
 
 def _beat() -> None:
-    """Change the badges of this process from time to time while leases are held, to show that the process lives."""
+    """Change the badge files of this process at intervals while leases are held, as a heartbeat."""
     global _thread
     while True:
         time.sleep(BEAT)
@@ -180,7 +180,7 @@ def _beat() -> None:
 
 
 def _retire() -> None:
-    """Delete all badges of this process; two threads may do so at the same time."""
+    """Delete all badge files of this process; two threads may call this function at the same time."""
     with suppress(KeyError):
         while True:
             _, path = _badges.popitem()
@@ -189,7 +189,7 @@ def _retire() -> None:
 
 
 def _forked() -> None:
-    """Forget all leases in a forked child, because the leases belong to the parent process."""
+    """Forget all leases in a forked child process, because the leases belong to the parent process."""
     global _guard, _thread
     _guard, _thread = threading.Lock(), None
     _held.clear()

@@ -1,4 +1,4 @@
-"""Maintenance of a store: pins, eviction, removal of orphan files and the check for damage."""
+"""Maintenance of a store: pins, eviction, removal of orphan files, and a check for damage."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ class Swept:
     """Summary of a clean-up of a store, done or simulated."""
 
     evicted: tuple[str, ...]  #: keys whose values were evicted
-    refused: tuple[str, ...]  #: keys whose values only another user can remove
+    refused: tuple[str, ...]  #: keys whose values cannot be deleted, for example because another user owns them
     freed: int  #: bytes of evicted values and of orphan files
     orphans: int  #: number of orphan files, which belonged to no result
     left: int  #: bytes that remain
@@ -28,15 +28,15 @@ class Swept:
 
 @dataclass(frozen=True, slots=True)
 class Checked:
-    """A result whose bytes were all read and compared with their checksums."""
+    """Outcome of the check of one result, in which all bytes were compared with their checksums."""
 
     key: str
     about: Metadata | None
-    problem: str  #: empty where the result is undamaged
+    problem: str  #: empty if the result is undamaged
 
 
 class Maintained(Protocol):
-    """The part of a store that cleans up and checks results; `Store` defines the members that are declared first."""
+    """Base class of `Store` with the methods for maintenance; `Store` defines the members that are declared first."""
 
     disk: Disk
     journal: Journal
@@ -48,7 +48,7 @@ class Maintained(Protocol):
     def put_aside(self, key: str, error: Exception) -> None: ...
 
     def gc(self, budget: int | None = None, dry: bool = False) -> Swept:
-        """Remove orphan files, and evict values beyond ``budget`` or, if None, beyond the budget of the store."""
+        """Remove orphan files, and evict values beyond ``budget``; None means the budget of the store."""
         budget = self.budget if budget is None else budget
         before = total(self.disk)
         orphans = dict(orphan_files.sweep(self.disk, dry))
@@ -62,7 +62,7 @@ class Maintained(Protocol):
         return Swept(tuple(c.key for c in gone), tuple(c.key for c in refused), freed, len(orphans), after)
 
     def make_room(self, excess: float, dry: bool = False) -> tuple[list[Candidate], list[Candidate]]:
-        """Evict values until ``excess`` bytes are free; return the evicted values and the values of other users."""
+        """Evict values until ``excess`` bytes are free; return the evicted values and values that cannot be deleted."""
         if excess <= 0:
             return [], []
         gone, refused = evict(self.disk, candidates(self.disk, self.pinned(), self.read_seconds), excess, dry)
@@ -73,7 +73,10 @@ class Maintained(Protocol):
         return gone, refused
 
     def check(self) -> Iterator[Checked]:
-        """Read every value, compare every checksum whatever ``verify`` says, and move damaged results to ``bad/``."""
+        """Read every value, compare every checksum, and move damaged results to ``bad/``.
+
+        The mode ``verify`` of the store has no effect on this check.
+        """
         for key in metadata.names(self.disk):
             about, problem = None, ""
             try:
@@ -88,7 +91,7 @@ class Maintained(Protocol):
             yield Checked(key, about, problem)
 
     def pin(self, key: str) -> None:
-        """Protect the value of ``key`` from eviction. Raises `OSError` where the folder cannot be written."""
+        """Protect the value of ``key`` from eviction. Raises `OSError` if the folder cannot be written."""
         self.disk.prepare()
         self.disk.make_folder(f"{self.disk.folder}/pins")
         open(f"{self.disk.folder}/pins/{key}", "wb").close()

@@ -18,10 +18,10 @@ T = TypeVar("T")
 def compute_once(
     store: Store, key: str, kind: type[T], compute: Callable[[], T], about: Metadata, *, small: bool = False
 ) -> T:
-    """Return the value that ``store`` has under ``key``; if the store has none, compute and store the value.
+    """Return the value that ``store`` has under ``key``, or compute and store the value if it is missing.
 
     Args: kind: the type of the value. A dataclass is stored as the dict of its fields. about: metadata of the value,
-    beside the date and the seconds that ``compute`` took. small: whether to store the value with `Store.put_small`.
+    which get the date and the seconds that ``compute`` took. small: whether to store the value with `Store.put_small`.
     """
     with suppress(KeyError):
         kept = store.get(key)

@@ -28,7 +28,7 @@ def seal(about: Metadata) -> bytes:
 
 
 def unseal(raw: bytes) -> Metadata:
-    """Return the metadata that `seal` wrote; raise `ValueError` where the checksum does not match."""
+    """Return the metadata that `seal` wrote; raise `ValueError` if the checksum does not match."""
     body = raw[:-_SEAL_SIZE]
     if raw[-_SEAL_SIZE:] != f'{_SEAL}{xxhash.xxh3_128_hexdigest(body)}"}}'.encode():
         raise ValueError("checksum mismatch: the metadata have changed since they were written")
@@ -37,7 +37,7 @@ def unseal(raw: bytes) -> Metadata:
 
 
 def read(disk: Disk, key: str) -> Metadata:
-    """Return the metadata of ``key``; raise one of the errors in `UNREADABLE` where the file cannot be trusted."""
+    """Return the metadata of ``key``; raise one of the errors in `UNREADABLE` if the file is missing or damaged."""
     with open(disk.path(key, "json"), "rb") as file:
         return unseal_of(key, file.read())
 
@@ -51,7 +51,7 @@ def unseal_of(key: str, raw: bytes) -> Metadata:
 
 
 def write(disk: Disk, key: str, about: Metadata, over: bool) -> bool:
-    """Write the metadata of ``key``; unless ``over``, keep an existing file and return False."""
+    """Write the metadata of ``key``; if ``over`` is False, keep an existing file and return False."""
     path = disk.path(key, "json")
     with disk.temporary(key) as (part, file):
         file.write(seal(about))
@@ -79,10 +79,10 @@ def _read_whole(disk: Disk, key: str) -> Metadata:
 
 
 def find(disk: Disk, key: str) -> Metadata | None:
-    """Return the metadata of ``key``, or None where no metadata exist; raise an error in `UNREADABLE` if damaged.
+    """Return the metadata of ``key``, or None if no metadata exist; raise an error in `UNREADABLE` if damaged.
 
-    Metadata that cannot be trusted are read a second time before the result counts as damaged,
-    because another process may be renaming the file at that moment.
+    Damaged metadata are read a second time before the result counts as damaged, because another process may be
+    renaming the file at that moment.
     """
     for _ in range(2):
         try:
@@ -108,12 +108,12 @@ def is_kept(about: Metadata | None) -> TypeGuard[Metadata]:
 
 
 def bands(about: Metadata) -> list[str]:
-    """Return the names of the bands of a value that are stored in one file each."""
+    """Return the names of those bands of a value that are stored in files of their own."""
     return list((about.get("bands") or {}).get("names", []))
 
 
 def receipt(about: Metadata) -> Metadata:
-    """Return the receipt of a result: its metadata without the fields that describe the stored value."""
+    """Return the receipt of a result: the metadata without the fields that describe the stored value."""
     return {k: v for k, v in about.items() if k not in _OF_THE_VALUE} | {"kept": False}
 
 

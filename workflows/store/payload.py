@@ -1,4 +1,4 @@
-"""Values and their metadata: the metadata of a new value, and a stored value from its metadata."""
+"""Conversion between values and metadata: the metadata of a new value, and the loading of a stored value."""
 
 from __future__ import annotations
 
@@ -16,11 +16,11 @@ if TYPE_CHECKING:
     from neusee.workflows.store.band_files import Blobs
 
 _SAMPLED = 1 / 20  #: fraction of the loads that mode ``sampled`` verifies although the file has not been touched
-_draw = random.Random()  # a generator of the store's own: loads do not change the random numbers of a user
+_draw = random.Random()  # a separate generator, so that loads do not change the random numbers of a user
 
 
 def described(key: str, value: Any, about: Metadata, blobs: Blobs | None = None) -> tuple[Metadata, list[Tensor]]:
-    """Return the metadata of a new value, with small tensors inside, and the tensors that need a payload file."""
+    """Return the metadata of a new value, which contain small tensors, and the tensors that need a payload file."""
     from neusee.workflows.store import serialization
 
     layout, tensors = serialization.pack(value, blobs)
@@ -34,9 +34,9 @@ def described(key: str, value: Any, about: Metadata, blobs: Blobs | None = None)
 
 
 def load(disk: Disk, about: Metadata, verify: str, blobs: Blobs) -> tuple[Any, int]:
-    """Return the value that ``about`` describes, and the number of payload bytes whose checksum was compared.
+    """Return the value with the metadata ``about``, and the number of payload bytes whose checksum was compared.
 
-    Raises one of the errors in `UNREADABLE` where the value cannot be trusted.
+    Raises one of the errors in `UNREADABLE` if the value is missing or damaged.
     """
     from neusee.workflows.store import serialization
 
@@ -56,7 +56,7 @@ def load(disk: Disk, about: Metadata, verify: str, blobs: Blobs) -> tuple[Any, i
 
 
 def stamp_of(path: str) -> list[int]:
-    """Return inode, size and times (ns) of a file; any write to the file changes one of these numbers."""
+    """Return the inode, size and times (ns) of a file; any write to the file changes one of these numbers."""
     stat = os.stat(path)
     return [stat.st_ino, stat.st_size, stat.st_mtime_ns, stat.st_ctime_ns]
 

@@ -15,18 +15,18 @@ _IDLE = "ZTtXx"  #: states in /proc of a process that has ended or is stopped
 
 @dataclass(frozen=True, slots=True)
 class Owner:
-    """A process on a machine; the start time distinguishes the process from a later process of the same number."""
+    """A process on a machine; the start time distinguishes processes that have the same number."""
 
     host: str  #: digest of the machine, its present boot and its namespace of process numbers
     pid: int
-    began: str  #: start time in ticks since the machine's boot; empty where the system does not give the time
+    began: str  #: start time in ticks since the machine's boot; empty if the system does not give the time
 
     def __str__(self) -> str:
         return f"{self.host}-{self.pid}-{self.began}"
 
     @property
     def state(self) -> State:
-        """Return ``alive``, ``dead`` or, for another machine, ``foreign``; a stopped process counts as ``dead``."""
+        """Return the state ``alive``, ``dead`` or, for another machine, ``foreign``; a stopped process is ``dead``."""
         if self.host != host():
             return "foreign"
         if self.pid == os.getpid():
@@ -41,7 +41,7 @@ class Owner:
 
 
 def owner_of(text: str) -> Owner | None:
-    """Return the `Owner` that was written as ``text``, or None for any other text."""
+    """Return the `Owner` that a text describes, or None for any other text."""
     host, _, rest = text.partition("-")
     pid, _, began = rest.partition("-")
     return Owner(host, int(pid), began) if len(host) == 12 and pid.isdecimal() and len(pid) < 12 else None
@@ -72,7 +72,7 @@ def host() -> str:
 
 
 def _process(pid: int) -> tuple[str, str]:
-    """Return state and start time of a process from ``/proc``."""
+    """Return the state and the start time of a process from ``/proc``."""
     with open(f"/proc/{pid}/stat", "rb") as file:
         fields = file.read().rpartition(b")")[2].split()  # behind the name, which may hold any character
     if len(fields) < 20:

@@ -1,7 +1,7 @@
-"""Files by name at a URL, through fsspec: a URL that fails counts as empty, after one warning.
+"""Access by fsspec to files at a URL; a URL that fails counts as empty after one warning.
 
-Whether a file exists is read from listings of its folder, which count as valid for a while: a
-cold run of a thousand steps sends 256 requests in parallel instead of a thousand in a row.
+Listings of the folders show whether a file exists, and each listing counts as valid for a while: a run of a thousand
+steps with an empty cache sends 256 requests in parallel instead of a thousand in a row.
 """
 
 from __future__ import annotations
@@ -22,12 +22,12 @@ T = TypeVar("T")
 Direction = Literal["down", "up"]
 _DIRECTIONS: tuple[Direction, ...] = ("down", "up")
 _FRESH = 20.0  #: s for which a listing counts as valid
-_FEW = 3  #: folders that are listed one by one; a request for a further folder lists all folders
-_PAUSE = 60.0  #: s for which a failed remote is not used; doubled at each failure
+_FEW = 3  #: number of folders that are listed one by one; the next request lists all folders
+_PAUSE = 60.0  #: s for which a URL is not used after a failure; doubled at each failure
 _LEARN = 1_000_000  #: bytes from which a transfer updates the rate; a smaller transfer updates the latency
 _ORPHAN = 86400.0  #: s after which a half-written file counts as abandoned
 _FOLDERS = tuple(f"{i:02x}" for i in range(256))
-_RENAMES = frozenset({"file", "local", "sftp", "ssh"})  #: show half-written files, but can rename
+_RENAMES = frozenset({"file", "local", "sftp", "ssh"})  #: show half-written files, but can rename files
 _NEAR = frozenset({"file", "local", "memory"})
 
 
@@ -49,11 +49,11 @@ class RemoteFiles:
         self._lock = threading.Lock()
 
     def seconds(self, direction: Direction, size: float) -> float:
-        """Return the predicted seconds for moving a result of ``size`` bytes with its metadata."""
+        """Return the predicted time in seconds for a transfer of a result of ``size`` bytes and its metadata."""
         return 2 * self._latency[direction] + size / self._rate[direction]
 
     def exists(self, name: str) -> bool:
-        """Return True if the file ``name`` existed at the last listing of its folder, which may be some seconds old."""
+        """Return True if the file ``name`` is in the last listing of its folder, which may be some seconds old."""
         with self._lock:
             if not self._fresh(name[:2]):
                 few = sum(map(self._fresh, self._listed)) < _FEW
@@ -67,11 +67,11 @@ class RemoteFiles:
             return set().union(*(names for _, names in self._listed.values()))
 
     def read(self, name: str) -> bytes | None:
-        """Return the bytes of a small file, or None where the file cannot be read."""
+        """Return the bytes of a small file at the URL, or None if the file cannot be read."""
         return self._attempt("down", lambda: bytes(self._fs.cat_file(self._path(name))), len)
 
     def fetch(self, name: str, path: str) -> bool:
-        """Copy a file from the URL to the local ``path``; return False where the copy fails."""
+        """Copy a file from the URL to the local ``path``; return False if the copy fails."""
 
         def get() -> int:
             self._fs.get_file(self._path(name), path)
@@ -80,7 +80,7 @@ class RemoteFiles:
         return self._attempt("down", get, int) is not None
 
     def send(self, path: str, name: str) -> bool:
-        """Copy the local file at ``path`` to the URL; return False where the copy fails or the local file is gone."""
+        """Copy the local file at ``path`` to the URL; return False if the copy fails or the local file is missing."""
 
         def put(to: str) -> int:
             try:
@@ -94,7 +94,7 @@ class RemoteFiles:
         return self._write(name, put)
 
     def write(self, name: str, raw: bytes, over: bool = False) -> bool:
-        """Write a small file; return False on failure. Without ``over``, an existing file stays where possible."""
+        """Write a small file at the URL; return False on failure. If ``over`` is False, keep an existing file."""
 
         def pipe(to: str) -> int:
             try:
@@ -110,7 +110,7 @@ class RemoteFiles:
         return bool(exists) or self._write(name, pipe)
 
     def warn(self, text: str) -> None:
-        """Issue the warning ``text``, unless this object has issued a warning before."""
+        """Issue the warning ``text`` if it is the first warning of this object."""
         if not self._warned:
             self._warned = True
             warnings.warn(text, stacklevel=5)
@@ -122,7 +122,7 @@ class RemoteFiles:
         return folder in self._listed and time.monotonic() - self._listed[folder][0] < _FRESH
 
     def _list_folders(self, folders: Sequence[str]) -> None:
-        """List in parallel those ``folders`` whose last listing is too old."""
+        """List the files of the ``folders`` whose last listing is too old, in parallel."""
         old = [folder for folder in folders if not self._fresh(folder)]
         with suppress(AttributeError):
             self._fs.invalidate_cache()
@@ -136,7 +136,7 @@ class RemoteFiles:
         return {str(path).rpartition("/")[2] for path in paths or ()}
 
     def _write(self, name: str, put: Callable[[str], int]) -> bool:
-        """Let ``put`` write a file, and give the file its name only when it is complete; return False on failure."""
+        """Write a file with the function ``put``, and give a complete file its name; return False on failure."""
 
         def whole() -> int:
             if not self._renames:
@@ -172,13 +172,13 @@ class RemoteFiles:
                     self._fs.rm_file(entry["name"])
 
     def _attempt(self, direction: Direction, do: Callable[[], T], size: Callable[[T], int] | None = None) -> T | None:
-        """Return the result of ``do``, or None if ``do`` fails or the URL is out of use after an earlier failure."""
+        """Return the result of the function ``do``, or None if ``do`` fails or the URL is disabled after a failure."""
         if time.monotonic() < self._resume[direction]:
             return None
         began = time.perf_counter()
         try:
             result = do()
-        except Exception as error:  # each file system raises its own errors, which share no narrower base class
+        except Exception as error:  # file systems raise different errors, which have no other common base class
             if not (direction == "down" and isinstance(error, FileNotFoundError)):
                 self._failed(direction, error)
             return None
@@ -188,7 +188,7 @@ class RemoteFiles:
         return result
 
     def _failed(self, direction: Direction, error: Exception) -> None:
-        alone = isinstance(error, PermissionError | FileNotFoundError)  # what cannot be written may be readable
+        alone = isinstance(error, PermissionError | FileNotFoundError)  # a file that cannot be written may be readable
         for each in (direction,) if alone else _DIRECTIONS:
             self._resume[each] = time.monotonic() + self._pause[each]
             self._pause[each] *= 2
@@ -196,7 +196,7 @@ class RemoteFiles:
         self.warn(f"{self.url} cannot be {what} ({type(error).__name__}: {error}): results stay local")
 
     def _update_speed(self, direction: Direction, size: int, seconds: float) -> None:
-        """Move the predicted latency or rate a third of the way towards the measured value."""
+        """Change the predicted latency or rate by a third of the difference from the measured value."""
         if size < _LEARN:
             self._latency[direction] += (seconds - self._latency[direction]) / 3
         else:
@@ -205,7 +205,7 @@ class RemoteFiles:
 
 
 def _file_system(url: str) -> tuple[Any, str]:
-    """Return the file system of a URL and the path there; errors name the missing package or the nearest scheme."""
+    """Return the file system and the path of a URL; errors name the missing package or the most similar scheme."""
     try:
         import fsspec
     except ImportError as error:

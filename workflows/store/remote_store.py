@@ -1,10 +1,10 @@
-"""A store at a URL that many machines share, on any file system of fsspec, with a local folder in front.
+"""A store at a URL that many machines share, on any file system of fsspec, with a local folder for copies.
 
-A value that is read is kept in the local folder (the local layer), an ordinary `Store`; a value that is written goes to
-both. At the URL, a payload has its checksum in its name and is complete before the metadata that name the payload, so
-that two writers of one key cannot mix their halves. Leases, pins and the size budget belong to the local layer alone:
-two machines may compute the same key, and the first result stays. A URL that fails costs one warning; the run goes on
-with the local layer.
+The local folder (the local layer) is an ordinary `Store`. It stores each value that is read from the URL; a new value
+is stored in the local layer and at the URL. At the URL, a payload has its checksum in its name and is complete before
+the metadata that name the payload, so that two writers of one key cannot mix their files. Leases, pins and the size
+budget belong to the local layer alone: two machines may compute the same key, and the first result stays. After a
+failure of the URL, a run issues one warning and continues with the local layer.
 """
 
 from __future__ import annotations
@@ -36,7 +36,7 @@ _NAME = re.compile("[0-9a-f]{32}")
 def open_store(where: str | Path | None = None) -> Store:
     """Open the store at a folder or a URL (``s3://bucket/name``); None means ``$NEUSEE_CACHE`` or the default folder.
 
-    Raises `ValueError` for an unknown scheme, and `ModuleNotFoundError` where the package for the scheme is missing.
+    Raises `ValueError` for an unknown scheme, and `ModuleNotFoundError` if the package for the scheme is missing.
     """
     where = os.environ.get("NEUSEE_CACHE") or None if where is None else where
     if isinstance(where, str) and "://" in where:
@@ -45,7 +45,7 @@ def open_store(where: str | Path | None = None) -> Store:
 
 
 def local_layer(url: str) -> Path:
-    """Return the local folder for copies from ``url``: ``$NEUSEE_CACHE_LOCAL``, else one in ``~/.cache/neusee``."""
+    """Return the local folder for copies from ``url``: ``$NEUSEE_CACHE_LOCAL`` or a folder in ``~/.cache/neusee``."""
     if folder := os.environ.get("NEUSEE_CACHE_LOCAL"):
         return Path(folder)
     return Path.home() / ".cache" / "neusee" / digest(url.rstrip("/"))[:16]
@@ -58,8 +58,8 @@ class RemoteStore(Store):
         self, url: str, root: Path | str | None = None, *, verify: Verify | None = None, budget: int | None = None
     ) -> None:
         self.url, self._remote = url, RemoteFiles(url)
-        self._seen: dict[Key, Metadata] = {}  # metadata read from the remote
-        self._broken: set[Key] = set()  # keys whose remote copy is unusable
+        self._seen: dict[Key, Metadata] = {}  # metadata read from the URL
+        self._broken: set[Key] = set()  # keys whose copy at the URL cannot be used
         super().__init__(root or local_layer(url), verify=verify, budget=budget)
 
     def __reduce__(self) -> tuple[Any, ...]:
@@ -71,13 +71,13 @@ class RemoteStore(Store):
         return here if is_kept(here) else self._remote_metadata(key) or here
 
     def get(self, key: Key) -> Any:
-        """Return the value of ``key``; raise `KeyError` where neither the local layer nor the URL has the value."""
+        """Return the value of ``key``; raise `KeyError` if neither the local layer nor the URL has the value."""
         if not self._is_local(key):
             self._fetch_value(key)
         return super().get(key)
 
     def put(self, key: Key, value: Any, about: Metadata) -> bool:
-        """Store a value locally and at the URL; return False where the local layer does not take the value."""
+        """Store a value locally and at the URL; return False if the value cannot be stored locally."""
         stored = super().put(key, value, about)
         if stored:
             self._send(key)
@@ -112,7 +112,7 @@ class RemoteStore(Store):
         return is_kept(super().about(key))
 
     def _remote_metadata(self, key: Key, look: bool = False) -> Metadata | None:
-        """Return the metadata of a result at the URL; with ``look``, read the file whatever the last listing says."""
+        """Return the metadata of a result at the URL; if ``look`` is True, read the file without using a listing."""
         value, note = f"{key}.json", _receipt_name(key)
         if key not in self._broken and (look or self._remote.exists(value)) and not is_kept(self._seen.get(key)):
             self._read_metadata(key, value)
@@ -130,7 +130,7 @@ class RemoteStore(Store):
                 self._distrust(key, error)
 
     def _fetch_value(self, key: Key) -> None:
-        """Copy a value from the URL into the local layer; after a failure, do not try this key again."""
+        """Copy the value of a key from the URL into the local layer; after a failure, do not fetch this key again."""
         about = self._remote_metadata(key, look=True)
         try:
             if is_kept(about) and not self._value_fetched(key, about):
@@ -142,7 +142,7 @@ class RemoteStore(Store):
             self._remote.warn(f"{self.root} cannot keep copies of {self.url} ({error}): set NEUSEE_CACHE_LOCAL")
 
     def _value_fetched(self, key: Key, about: Metadata) -> bool:
-        """Copy a value into the local layer after a check of every byte; return False where the URL fails."""
+        """Copy a value into the local layer after a check of every byte; return False if the URL fails."""
         payload, bands = about["payload"], _bands(about["layout"])
         missing = {name: xxh3 for name, xxh3 in bands.items() if not self.blobs.has(name)}
         with ExitStack() as files:
@@ -165,7 +165,7 @@ class RemoteStore(Store):
         return part
 
     def _named(self, parts: dict[str, str], bands: dict[str, str]) -> None:
-        """Give fetched band files their final names; raise `ValueError` where a band has a wrong checksum."""
+        """Give fetched band files their final names; raise `ValueError` if a band has a wrong checksum."""
         for name, part in parts.items():
             self.disk.make_folder(str(self.blobs.root))
             self.disk.link(part, self.blobs.path(name))
@@ -186,7 +186,7 @@ class RemoteStore(Store):
         self._lost.discard(key)
 
     def _fetched(self, name: str, part: str, payload: Metadata) -> bool:
-        """Copy the file ``name`` to ``part``; return False on failure, raise `ValueError` for a wrong checksum."""
+        """Copy the file ``name`` to ``part``; return False if the URL fails; raise ValueError for a wrong checksum."""
         if not self._remote.fetch(name, part):
             return False
         with open(part, "rb") as file:
@@ -197,7 +197,7 @@ class RemoteStore(Store):
         return True
 
     def _send(self, key: Key) -> None:
-        """Send a local value to the URL, the large files before the metadata; send nothing for an evicted value."""
+        """Copy a local value to the URL, the large files before the metadata; copy nothing for an evicted value."""
         name, over = f"{key}.json", key in self._broken
         if not over and self._remote.exists(name):
             return
@@ -217,7 +217,7 @@ class RemoteStore(Store):
             self._broken.discard(key)
 
     def _files(self, key: Key, about: Metadata) -> dict[str, str]:
-        """Return the local path of each file of a value beside its metadata, by the name of the file at the URL."""
+        """Return the local paths of the payload and band files of a value, by the name of each file at the URL."""
         paths = {}
         if payload := about["payload"]:
             paths[_payload_name(key, payload["xxh3"])] = self.disk.path(key, "safetensors")

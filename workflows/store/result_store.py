@@ -1,10 +1,10 @@
 """Store of results: a folder with the files ``<key>.json`` and ``<key>.safetensors`` of each result.
 
-The JSON holds the metadata of a result (the recipe of its key, layout, statistics, checks, seconds, versions) and the
+The JSON holds the metadata of a result (the parts of its key, layout, statistics, checks, seconds, versions) and the
 whole value of a small result. Of an evicted or unsaved value only the metadata remain, called a receipt. A checksum
 covers every byte and is compared at each load. A result that fails the comparison is moved away with one warning and
-counts as missing. A result gets its final name when it is complete, so that a killed process leaves no half result.
-Where the folder cannot be written, a run warns once and goes on.
+counts as missing. A result gets its final name when it is complete, so that a killed process leaves no incomplete
+result. If the folder cannot be written, a run issues one warning and continues.
 """
 
 from __future__ import annotations
@@ -36,16 +36,16 @@ if TYPE_CHECKING:
     from neusee.workflows.store.band_files import Blobs
 
 
-_USED = 3600.0  #: s between two records of the use of a value
+_USED = 3600.0  #: smallest time in s between two records of the use of a value
 
 
 class Store(Maintained):
-    """A folder of results by key. Every failure of the folder leads to a missing result, never to a wrong result."""
+    """Store of results by key in a folder. A failure of the folder gives a missing result, never a wrong result."""
 
     def __init__(
         self, root: Path | str | None = None, *, verify: Verify | None = None, budget: int | None = None
     ) -> None:
-        """Open the store in ``root``; an argument that is None comes from the environment, such as $NEUSEE_CACHE.
+        """Open the store in the folder ``root``; environment variables such as $NEUSEE_CACHE replace arguments of None.
 
         ``verify="always"`` compares the checksum of every payload that is loaded. ``"sampled"`` compares the checksum
         of a file that was touched after its last write, and otherwise at one load in twenty. ``"never"`` compares no
@@ -62,7 +62,7 @@ class Store(Maintained):
         self._room = None if self.budget is None else CacheBudget(self.disk, self.budget)
         self._speeds = Speeds(self.disk)
         self._known: dict[str, Metadata] = {}
-        self._lost: set[str] = set()  # damaged results, which the user may not be allowed to move away
+        self._lost: set[str] = set()  # damaged results that the user may have no permission to move
         self._used: set[str] = set()
         self._warned = False
 
@@ -98,7 +98,7 @@ class Store(Maintained):
         return about
 
     def get(self, key: str) -> Any:
-        """Return the value of ``key``; raise `KeyError` where no undamaged value is stored."""
+        """Return the value of ``key``; raise `KeyError` if no undamaged value is stored."""
         about = self.about(key)
         while is_kept(about):
             try:
@@ -114,7 +114,7 @@ class Store(Maintained):
         raise KeyError(key)
 
     def put(self, key: str, value: Any, about: Metadata) -> bool:
-        """Store a value and its metadata; return False where the folder is not writable or the budget is too small."""
+        """Store a value and its metadata; return False if the folder is not writable or the budget is too small."""
         return self._try(self._write, key, value, about)
 
     def put_receipt(self, key: str, about: Metadata) -> bool:
@@ -122,44 +122,44 @@ class Store(Maintained):
         return self._try(self._write_receipt, key, about)
 
     def put_small(self, key: str, value: Any, about: Metadata) -> bool:
-        """Store a small value without a file of its own; store only the metadata of a larger value."""
+        """Store a small value in the common file of small values; of a larger value, store only the metadata."""
         return self._try(self._write_small, key, value, about)
 
     def entries(self) -> Iterator[tuple[str, Metadata]]:
-        """Yield every key with its metadata, in the order of the keys; also the keys whose values are not stored."""
+        """Yield every key with its metadata, in the order of the keys; include keys whose values are not stored."""
         for key in heapq.merge(metadata.names(self.disk), (key for key, _ in self.brief.each())):
             about = self.about(key)
             if about is not None:
                 yield key, about
 
     def claim(self, key: str) -> Lease | None:
-        """Return the lease for computing ``key``, or None while another process holds the lease; see `Leases.claim`."""
+        """Return the lease of ``key``, or None while another process holds the lease, like `Leases.claim`."""
         return self._leases.claim(key)
 
     def read_seconds(self, size: float) -> float:
-        """Return the predicted seconds for loading ``size`` bytes, from earlier loads of this store."""
+        """Return the predicted time in seconds for loading ``size`` bytes, based on earlier loads from this store."""
         return self._speeds.seconds("read", size)
 
     def write_seconds(self, size: float) -> float:
-        """Return the predicted seconds for storing ``size`` bytes, from earlier writes of this store."""
+        """Return the predicted time in seconds for storing ``size`` bytes, based on earlier writes to this store."""
         return self._speeds.seconds("write", size)
 
     def _again(self, key: str) -> Metadata | None:
-        """Read the metadata of a result again; return None where another process has removed the metadata."""
+        """Read the metadata of a result again; return None if the metadata were removed or cannot be read."""
         self._known.pop(key, None)
         with suppress(*UNREADABLE):
             return metadata.read(self.disk, key)
         return None
 
     def load(self, about: Metadata, verify: str) -> Any:
-        """Return the value that ``about`` describes; raise an error in `UNREADABLE` where the value is damaged."""
+        """Return the value with the metadata ``about``; raise an error in `UNREADABLE` if the value is damaged."""
         began = time.perf_counter()
         value, size = payload.load(self.disk, about, verify, self.blobs)
         self._speeds.learn("read", size, time.perf_counter() - began)
         return value
 
     def _use(self, key: str) -> None:
-        """Record the use of a value as the change time of its JSON file, at most once an hour."""
+        """Record the use of a value as the modification time of its JSON file, at most once an hour."""
         if key not in self._used:
             self._used.add(key)
             path = self.disk.path(key, "json")
@@ -168,7 +168,7 @@ class Store(Maintained):
                     os.utime(path)
 
     def _try(self, write: Callable[..., bool], key: str, *arguments: Any) -> bool:
-        """Call ``write``, again if another process removed a folder; on failure, warn once and return False."""
+        """Call ``write``, a second time if another process removed a folder; on failure, warn once and return False."""
         try:
             try:
                 return write(key, *arguments)
@@ -177,7 +177,7 @@ class Store(Maintained):
                 return write(key, *arguments)
         except OSError as error:
             if not self._warned:
-                warnings.warn(f"{self.root} cannot be written ({error}): results are not kept", stacklevel=4)
+                warnings.warn(f"{self.root} cannot be written ({error}): results are not stored", stacklevel=4)
             self._warned = True
             return False
 
@@ -236,7 +236,7 @@ class Store(Maintained):
         self._known[key] = entry
 
     def _write_receipt(self, key: str, about: Metadata) -> bool:
-        """Write the metadata of a result without its value, unless metadata of the result exist."""
+        """Write the metadata of a result without its value, unless the store has metadata of the result."""
         entry = metadata.receipt({"key": key, **about})
         if self.about(key) is None and metadata.write(self.disk, key, entry, over=False):
             self._known[key] = entry
@@ -250,7 +250,7 @@ class Store(Maintained):
 
     def _put_aside(self, key: str, error: Exception) -> None:
         self.put_aside(key, error)
-        warnings.warn(f"the stored result {key} is damaged ({error}) and is put aside", stacklevel=5)
+        warnings.warn(f"the stored result {key} is damaged ({error}) and counts as missing", stacklevel=5)
 
     def put_aside(self, key: str, error: Exception) -> None:
         """Move the files of a damaged result to ``bad/`` for inspection; a file of another user stays."""

@@ -1,8 +1,8 @@
 """Format of a stored value: a layout in JSON, and the tensors in one safetensors file.
 
-The file is written from the memory of the tensors and read through a memory map, so that neither direction makes a
-copy. Each tensor begins at a multiple of 64 bytes, as a newly allocated tensor does: a kernel then takes the same path
-for a stored value as for a computed value. The layout of a `Stacked` tensor names one band file for each slice.
+The file is written from the memory of the tensors and read through a memory map, so that neither writing nor reading
+makes a copy. Each tensor begins at a multiple of 64 bytes like a newly allocated tensor, so that a kernel uses the same
+code path for a stored value and a computed value. The layout of a `Stacked` tensor names one band file for each slice.
 """
 
 from __future__ import annotations
@@ -44,12 +44,15 @@ _NAMES = {name: dtype for dtype, name in _DTYPES.items()}
 
 
 def each_tensor(change: Callable[[Tensor], Tensor], value: Any) -> Any:
-    """Return ``value`` with ``change`` applied to every tensor in it; change a repeated tensor once."""
+    """Return ``value`` with the function ``change`` applied once to every distinct tensor in ``value``."""
     return _change(value, change, {})
 
 
 def _change(item: Any, change: Callable[[Tensor], Tensor], done: dict[int, Tensor]) -> Any:
-    """Apply ``change`` to the tensors in an item; a nested function would hold the tensors until garbage collection."""
+    """Return ``item`` with ``change`` applied to its tensors; ``done`` has the changed tensors by identity.
+
+    A nested function would hold the tensors until garbage collection.
+    """
     if isinstance(item, Tensor):
         if id(item) not in done:
             done[id(item)] = change(item)
@@ -63,7 +66,7 @@ def _change(item: Any, change: Callable[[Tensor], Tensor], done: dict[int, Tenso
 
 
 def tensors_in(value: Any) -> list[Tensor]:
-    """Return the tensors in ``value``, a repeated tensor once."""
+    """Return the distinct tensors in ``value``."""
     tensors: list[Tensor] = []
     each_tensor(lambda t: tensors.append(t) or t, value)  # type: ignore[func-returns-value]
     return tensors
@@ -101,7 +104,7 @@ class _Listed:
 def pack(value: Any, blobs: Blobs | None = None) -> tuple[Any, list[Tensor]]:
     """Return the layout of ``value`` and its tensors; write each `Stacked` tensor to the folder ``blobs`` if given.
 
-    Raises `TypeError` for a value that cannot be stored, and `OSError` where ``blobs`` cannot be written.
+    Raises `TypeError` for a value that cannot be stored, and `OSError` if ``blobs`` cannot be written.
     """
     listed = _Listed()
     return _layout(value, listed, blobs), listed.tensors
@@ -132,13 +135,13 @@ def _stack_layout(item: Stacked, blobs: Blobs) -> dict[str, Any]:
 
 
 def unpack(layout: Any, tensors: list[Tensor], blobs: Blobs | None = None, verify: bool = True) -> Any:
-    """Return the value for which `pack` returned layout and tensors; raise `ValueError` where a band is damaged."""
+    """Return the value that `pack` turned into ``layout`` and ``tensors``; raise `ValueError` if a band is damaged."""
     ((kind, body),) = ((k, v) for k, v in layout.items() if k != "items")
     if kind == "tensor":
         return tensors[body]
     if kind == "stacked":
         if blobs is None:
-            raise ValueError("the bands are stored in files of their own, and no folder of bands is given")
+            raise ValueError("the value has bands in files of their own, and no folder of band files is given")
         return blobs.read(body["names"], body["shape"], dtype_of(body["dtype"]), verify, body["xxh3"])
     if kind == "bytes":
         return tensors[body].numpy().tobytes()
@@ -163,7 +166,7 @@ def blobs_in(layout: Any) -> dict[str, str]:
 
 
 def _class_path(item: tuple[Any, ...]) -> str:
-    """Return module and name of the class of a named tuple, or an empty string for a plain tuple."""
+    """Return the module and the name of the class of a named tuple, or an empty string for a plain tuple."""
     kind = type(item)
     if kind is tuple:
         return ""
@@ -181,12 +184,12 @@ def _class(path: str) -> Callable[..., Any]:
 
 
 def to_text(x: Tensor) -> list[Any]:
-    """Return a small tensor as values for JSON: type, shape, whether the tensor is complex, and bytes as text."""
+    """Return a small tensor as four JSON values: type, shape, True for a complex tensor, and the bytes as text."""
     return [*_kind(x), base64.b64encode(bytes_of(x)).decode()]
 
 
 def from_text(kind: str, shape: list[int], is_complex: bool, text: str) -> Tensor:
-    """Return the tensor for which `to_text` returned these four values."""
+    """Return the tensor that `to_text` turned into four JSON values."""
     return _tensor(bytearray(base64.b64decode(text)), 0, kind, shape, is_complex)
 
 
@@ -216,7 +219,7 @@ def write(file: IO[bytes], tensors: list[Tensor]) -> str:
 
 
 def read(path: str, expected: str | None) -> list[Tensor]:
-    """Map the tensors of a file of `write` into memory; compare the checksum of the file with ``expected`` if given."""
+    """Map the tensors in a safetensors file into memory; compare the file with the checksum ``expected`` if given."""
     with open(path, "rb") as file:
         data = mmap.mmap(file.fileno(), 0, access=mmap.ACCESS_COPY)
     if expected is not None and xxhash.xxh3_128_hexdigest(data) != expected:

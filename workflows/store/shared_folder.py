@@ -1,7 +1,7 @@
 """A folder to which many processes and many users write at the same time.
 
 A file is complete before it gets its final name; until then its temporary name contains the owner. The next writer
-removes the temporary files of killed processes, whatever the clock says. Folders, and the few files to which all
+removes the temporary files of killed processes without using the clock. Folders, and the few files to which all
 processes write, copy the permissions of the root.
 """
 
@@ -21,7 +21,7 @@ from typing import IO
 from neusee.workflows.store.process_owner import me, owner_of
 
 OLD = 3600.0  #: s after which a temporary file of another machine counts as abandoned
-_PATIENCE = 10.0  #: s to wait for the lock; its holder may be stopped, and a missing lock costs repeated work only
+_PATIENCE = 10.0  #: s to wait for the lock; its owner may be stopped, and a run without the lock may only repeat work
 _LINKLESS = (errno.EPERM, errno.EOPNOTSUPP, errno.ENOSYS, errno.EMLINK)  #: errors of a file system without hard links
 _count = itertools.count()
 
@@ -31,15 +31,15 @@ class Disk:
 
     def __init__(self, root: Path) -> None:
         self.root = root
-        self.folder = os.fspath(root)  # text, because a path object costs as much as the look-up itself
+        self.folder = os.fspath(root)  # text, because building a path object takes as long as the look-up itself
         self._ready = False
 
     def path(self, key: str, suffix: str) -> str:
-        """Return the path of the file with this suffix of the result ``key``."""
+        """Return the path of a file of the result ``key``, by a suffix such as ``json``."""
         return f"{self.folder}/{key[:2]}/{key}.{suffix}"
 
     def prepare(self) -> None:
-        """Make the folder of temporary files, and remove the temporary files of killed processes."""
+        """Make the folder of temporary files, and remove temporary files of killed processes."""
         if not self._ready:
             self.root.mkdir(parents=True, exist_ok=True)
             self.make_folder(f"{self.folder}/tmp")
@@ -47,12 +47,12 @@ class Disk:
             self._ready = True
 
     def forget(self) -> None:
-        """Let the next write make the folder of temporary files again, because another process has removed it."""
+        """Let the next write make the folder of temporary files again, after another process has removed it."""
         self._ready = False
 
     @contextmanager
     def temporary(self, name: str) -> Iterator[tuple[str, IO[bytes]]]:
-        """Yield path and handle of a new temporary file; delete the file at the end unless the caller renamed it."""
+        """Yield the path and handle of a new temporary file; delete the file later unless the caller renamed it."""
         self.prepare()
         part = f"{self.folder}/tmp/{name}.{me()}.{next(_count)}"
         try:
@@ -71,7 +71,7 @@ class Disk:
             os.replace(part, f"{self.folder}/{name}")
 
     def rename(self, part: str, path: str) -> None:
-        """Rename a complete file to its final name, replacing an existing file."""
+        """Rename a complete file to its final name, and replace an existing file of that name."""
         try:
             os.replace(part, path)
         except FileNotFoundError:
@@ -79,7 +79,7 @@ class Disk:
             os.replace(part, path)
 
     def link(self, part: str, path: str) -> bool:
-        """Link a complete file to its final name; return False where a file of that name exists."""
+        """Link a complete file to its final name; return False if a file of that name exists."""
         try:
             try:
                 os.link(part, path)
@@ -136,7 +136,7 @@ class Disk:
     def sweep(self, dry: bool = False, patience: float = math.inf) -> list[tuple[str, int]]:
         """Remove the temporary files of dead processes; return the path and the bytes of each file.
 
-        Leases and badges of other machines stay for ``patience`` seconds, so that no jump of a clock makes them old.
+        Leases and badges of other machines stay for ``patience`` seconds, because clocks may jump.
         """
         gone = []
         for entry in os.scandir(f"{self.folder}/tmp"):

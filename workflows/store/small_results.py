@@ -1,8 +1,8 @@
-"""Small results as lines of one file, for results that take less time to compute than to write to a file each.
+"""Small results as lines of one file, for results whose computation takes less time than writing a file for each.
 
-A line is one write. A line that is torn or fails its checksum is ignored; the loss of a line
-costs less than a millisecond of computation. All processes see the lines of each other,
-because a look-up that misses reads the lines added since the last look-up.
+A line is one write. A line that is torn or fails its checksum is ignored; the loss of a line costs less than a
+millisecond of computation. All processes see the lines of each other, because a look-up of a key that is not known
+reads the lines added since the last look-up.
 """
 
 from __future__ import annotations
@@ -22,7 +22,7 @@ _KEY = slice(len(_HEAD), len(_HEAD) + 32)
 
 
 class SmallResults:
-    """The results of one store without files of their own: each result is one line of a common file."""
+    """The small results of one store: each result is one line of a common file."""
 
     def __init__(self, disk: Disk) -> None:
         self._disk, self._guard = disk, threading.Lock()
@@ -31,15 +31,15 @@ class SmallResults:
         self._file, self._offset = 0, 0
 
     def find(self, key: str) -> Metadata | None:
-        """Return the metadata in the line of ``key``, or None where no line can be trusted."""
+        """Return the metadata in the line of ``key``, or None if there is no undamaged line."""
         if key not in self._lines:
             self._read_new_lines()
-        with suppress(*UNREADABLE):  # also a KeyError where the key has no line
+        with suppress(*UNREADABLE):  # also a KeyError if the key has no line
             return metadata.unseal_of(key, self._lines[key])
         return None
 
     def append(self, about: Metadata) -> None:
-        """Append a line with the metadata ``about``. Raises `OSError` where the line cannot be written."""
+        """Append a line with the metadata ``about``. Raises `OSError` if the line cannot be written."""
         raw = metadata.seal(about)
         try:
             self._write(raw)
@@ -56,7 +56,7 @@ class SmallResults:
                 yield key, about
 
     def compact(self) -> None:
-        """Keep the newest lines, up to half of `MOST` bytes; a line that is added meanwhile may be lost."""
+        """Rewrite the file with its newest lines, up to half of `MOST` bytes; lines added meanwhile may be lost."""
         self._read_new_lines()
         kept, size = list[bytes](), 0
         for raw in reversed(self._lines.values()):
@@ -68,12 +68,12 @@ class SmallResults:
             self._disk.replace("brief.jsonl", b"".join(b"\n" + raw for raw in reversed(kept)))
 
     def _write(self, raw: bytes, flags: int = 0) -> None:
-        """Write a line with its line end first, so that a torn line of a killed process stays separate."""
+        """Write a line after a line break, so that the torn line of a killed process stays separate."""
         if append(self._path, b"\n" + raw, flags) != len(raw) + 1:
-            raise OSError(f"{self._path}: no space left for a line")
+            raise OSError(f"{self._path}: there is no space left for a line")
 
     def _read_new_lines(self) -> None:
-        """Read the lines that were added since the last call, or the whole file where the file was replaced."""
+        """Read the lines that were added since the last call, or the whole file if the file was replaced."""
         try:
             stat = os.stat(self._path)
         except OSError:

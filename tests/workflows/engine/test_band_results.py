@@ -304,7 +304,7 @@ def test_a_damaged_band_of_a_stored_result_is_mended(write, tmp_path):
     first = recipe.run(Store(root))
     for path in sorted(files(Store(root).blobs))[::4]:
         damage(path) if path.stat().st_size > 200 else path.unlink()
-    with pytest.warns(UserWarning, match="put aside"):
+    with pytest.warns(UserWarning, match="counts as missing"):
         again = recipe.run(Store(root))
     assert all(same(again.values[name], first.values[name]) for name in first.values)
     assert all(done.state == "cached" for done in recipe.run(Store(root)).done.values() if done.state != "not needed")

@@ -654,7 +654,7 @@ def test_the_store_stands_where_one_expects_it(tmp_path, monkeypatch):
 
 def test_a_url_is_no_folder(monkeypatch):
     monkeypatch.setenv("NEUSEE_CACHE", "s3://bucket/name")
-    with pytest.raises(ValueError, match="'s3://bucket/name', which is not a folder: `open_store` takes URLs"):
+    with pytest.raises(ValueError, match="'s3://bucket/name', which is not a folder: open a URL with `open_store`"):
         Store()
 
 

@@ -341,7 +341,7 @@ def test_a_mistake_is_located(change, said):
 
 
 def test_options_of_one_network_are_refused_of_another():
-    with pytest.raises(RecipeError, match="directions, pyramid: only fft_mamba has this option, not unet"):
+    with pytest.raises(RecipeError, match="directions, pyramid: only fft_mamba has such options, not unet"):
         load("train_small", ["train.network.kind=unet", "train.network.pyramid=true", "train.network.directions=4"])
 
 

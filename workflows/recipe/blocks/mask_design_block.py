@@ -19,63 +19,63 @@ _RATE = {"pixelwise": 0.05, "recipe_mask": 4e-3, "zernike": 0.1, "rings": 0.1, "
 
 
 def half_cosine(angle: float) -> float:
-    """Return the factor of a learning rate that falls from 1 at an angle of 0 to 0 at an angle of pi."""
+    """Return the cosine factor on a learning rate, which falls from 1 at the angle 0 to 0 at the angle pi."""
     return 0.5 * (1 + math.cos(angle))
 
 
 class Weights(SettingsBlock):
-    """Weights of the terms of the loss; each term is a mean over the bands."""
+    """Weights of the terms in the loss of the mask design; each term is a mean over the bands."""
 
     lsr: Weight = 1.0  #: `losses.suppression_loss`
     bsr: Weight = 1.0  #: `losses.background_loss` of a point on the axis: the light that left the field
     contrast: Weight = 0.0  #: `losses.contrast`
-    wiener: Weight = 0.0  #: `losses.wiener`, of all bands at once: the error that a Wiener filter leaves
+    wiener: Weight = 0.0  #: `losses.wiener` of all bands together: the error that remains after a Wiener filter
 
     @model_validator(mode="after")
     def _some(self) -> Weights:
         if not (self.lsr or self.bsr or self.contrast or self.wiener):
-            raise ValueError("every weight is 0: set one of lsr, bsr, contrast, wiener above 0")
+            raise ValueError("every weight is 0: set lsr, bsr, contrast or wiener to a number above 0")
         return self
 
 
 class MaskSettings(SettingsBlock):
-    """Settings of the mask design, which are ``train.mask`` in a recipe: kind of mask, loss and duration."""
+    """Settings of the mask design, ``train.mask`` in a recipe: the kind of mask, the loss and the duration."""
 
     kind: Kind = "pixelwise"  #: `recipe_mask`: all samples of the recipe's own height map, from its formula or file
-    iterations: Count = 300  #: of Adam; for five_half_rings generations
-    learning_rate: Annotated[float, Field(gt=0, allow_inf_nan=False)] | None = None  #: None: the kind's own rate
+    iterations: Count = 300  #: iterations of Adam, or generations for five_half_rings
+    learning_rate: Annotated[float, Field(gt=0, allow_inf_nan=False)] | None = None  #: None: the default for the kind
     schedule: Literal["cosine", "step"] = "cosine"  #: `step`: halved at each fifth of the iterations
     weights: Weights = Weights(bsr=4.0, contrast=1.0)
     power: Annotated[float, Field(ge=8, le=64)] = 16.0  #: exponent of the norm that replaces the peak
-    log: bool = True  #: whether each band counts by the logarithm of its LSR
+    log: bool = True  #: whether the loss uses the logarithm of the LSR of each band
     enough: Annotated[float, Field(gt=0, le=1)] | None = None  #: mean LSR below which the loss does not fall further
     floor: ContrastFloor = 1e-4  #: contrast below which the loss hardly falls
-    up_to: HighestFrequency | None = None  #: cycles a pixel: higher frequencies do not count
+    up_to: HighestFrequency | None = None  #: cycles per pixel: higher frequencies do not affect the loss
     noise_share: NoiseVariance = 1e-3  #: of `losses.wiener`: noise variance over signal variance
-    colour: OneBandShare = 1.0  #: of `losses.wiener`: share of the variance that one band has by itself
-    bands: Count | None = 7  #: number of the recipe's bands in one iteration; None: all
+    colour: OneBandShare = 1.0  #: of `losses.wiener`: fraction of the variance that belongs to one band alone
+    bands: Count | None = 7  #: number of bands of the recipe in one iteration; None: all bands
     seed: int = 0
-    starts: Count = 1  #: independent starts, of which the best on all bands is kept
+    starts: Count = 1  #: independent starts; the result is the best mask on all bands
     at: dict[str, Any] = Field(default={})  #: recipe values that differ during training, such as a coarser pupil
-    save_every: Count = 50  #: iterations
+    save_every: Count = 50  #: iterations between two saved states
 
-    # parameters of the kinds
+    # parameters of the kinds of mask
     max_height: PositiveLength = 5 * 1e-6  #: pixelwise, unet; equal to `5 um` to the last bit
     grid: Count = 270  #: pixelwise, unet: samples along an axis
-    scale: Annotated[float, Field(gt=0, le=1)] = 0.04  #: pixelwise: feature size of the start, in diameters
+    scale: Annotated[float, Field(gt=0, le=1)] = 0.04  #: pixelwise: feature size of the initial mask, in diameters
     start: DataFile | None = None  #: pixelwise: a height map to start from, such as one of another kind
     width: Count = 16  #: unet: channels of its first layer
     modes: Count = 100  #: zernike: number of polynomials, from Noll's number 4 on
-    waves: Annotated[float, Field(gt=0)] = 5.0  #: zernike: root mean square of the start
+    waves: Annotated[float, Field(gt=0)] = 5.0  #: zernike: root mean square of the initial mask in waves
     rings: Count = 40  #: rings: annuli of equal area
-    sided: bool = True  #: rings: odd about the axis, like half-rings
-    noise: Annotated[float, Field(ge=0)] = 1.0  #: rings: random part of each slope of the start, in waves
+    sided: bool = True  #: rings: heights are odd about the axis, like half-rings
+    noise: Annotated[float, Field(ge=0)] = 1.0  #: rings: random part of each slope of the initial mask, in waves
     slopes: tuple[float, float] = (4.0, 48.0)  #: five_half_rings: least and greatest slope, in waves at the rim
     population: Annotated[int, Field(ge=5)] = 70  #: five_half_rings
     polish: Annotated[int, Field(ge=0)] = 300  #: five_half_rings: masks tried by descent from the best, on all bands
     wavelength: Wavelength = 550e-9  #: reference wavelength of heights in waves
     material: Material = "fused silica"  #: material of heights in waves
-    feature: PositiveLength | None = None  #: smallest feature, `doe.smooth`; depth and levels are the recipe's
+    feature: PositiveLength | None = None  #: smallest feature (`doe.smooth`); the recipe sets depth and levels
 
     plain: str = "psf[plain]"  #: the step of the lens without a mask
     illuminant: str = "illuminant"  #: of `losses.wiener`
@@ -89,23 +89,23 @@ class MaskSettings(SettingsBlock):
 
     @property
     def rate(self) -> float:
-        """Return the learning rate that the recipe sets, or the default of the kind of mask."""
+        """Return the learning rate that the recipe sets, or the default rate for the kind of mask."""
         return _RATE[self.kind] if self.learning_rate is None else self.learning_rate
 
 
 class MaskTraining(MaskSettings):
-    """Settings of the mask design, with the names of the steps that it uses."""
+    """Settings of the mask design, with the names of the steps that the design uses."""
 
     height: str = "height"  #: the step whose height map is designed
     psf: str = "psf[mask]"
 
 
 class DesignError(ValueError):
-    """Error for settings with which no mask can be designed; the text names the setting and the fix."""
+    """Error for settings from which no mask can be designed; the text names the setting and the fix."""
 
 
 def need_steps(recipe_steps: Any, settings: MaskTraining) -> None:
-    """Raise `DesignError` where a setting names a step that the recipe does not have."""
+    """Raise `DesignError` if a setting names a step that the recipe does not have."""
     for setting in ("height", "psf", "plain", *(("illuminant", "responses") if settings.weights.wiener else ())):
         name = getattr(settings, setting)
         if name not in recipe_steps:
@@ -113,5 +113,5 @@ def need_steps(recipe_steps: Any, settings: MaskTraining) -> None:
 
 
 def state_file(out: Path, recipe: str, key: str) -> Path:
-    """Return the file that keeps the state of an unfinished design; no run removes a file with this suffix."""
+    """Return the path of the file that stores the state of an unfinished mask design; other runs keep this file."""
     return out / f".{recipe}_mask_{key[:16]}.state"

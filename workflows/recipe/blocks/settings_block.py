@@ -19,7 +19,7 @@ Number = Annotated[int, Field(ge=1)]
 
 
 class SettingsBlock(BaseModel):
-    """Block of settings in which an unknown key is a mistake."""
+    """Base class of a block of settings, in which an unknown key is a mistake."""
 
     model_config = ConfigDict(extra="forbid", frozen=True)
 
@@ -28,9 +28,9 @@ Settings = TypeVar("Settings", bound=SettingsBlock)
 
 
 def read_block(composed: Composed, key: str, model: type[Settings], plain: Any) -> tuple[Composed, Settings | None]:
-    """Return the recipe without the block of a key, and the settings that the plain data of the block give.
+    """Return the recipe without its block ``key``, and the validated settings in that block.
 
-    The settings are None for a block with mistakes, which become diagnostics of the recipe.
+    ``plain`` is the plain data of the block. Mistakes in the block add diagnostics, and the settings are None.
     """
     block, rest = composed.root.items[key], composed.without(key)
     try:
@@ -40,7 +40,7 @@ def read_block(composed: Composed, key: str, model: type[Settings], plain: Any) 
 
 
 def _problem(block: Value, model: type[BaseModel], error: Any) -> Diagnostic:
-    """Return a diagnostic with the fix, at the innermost value of the block that pydantic names."""
+    """Return the diagnostic for a pydantic error, located at the innermost value that the error names."""
     value = block
     for key in error["loc"]:
         value = value.child(key) or value

@@ -1,4 +1,4 @@
-"""Settings of the training of a network and a mask, which are the block ``train`` of a recipe."""
+"""Settings of the training of a network and a mask, which form the block ``train`` of a recipe."""
 
 from __future__ import annotations
 
@@ -29,13 +29,13 @@ class Network(SettingsBlock):
 
     @property
     def options(self) -> dict[str, Any]:
-        """Return the options of the network that differ from their defaults, without its kind and width."""
+        """Return the options of the network that differ from the defaults, without the kind and the width."""
         return self.model_dump(exclude={"kind", "width"}, exclude_defaults=True)
 
     @model_validator(mode="after")
     def _fits(self) -> Network:
         if self.options and self.kind != "fft_mamba":
-            raise ValueError(f"{', '.join(self.options)}: only fft_mamba has this option, not {self.kind}")
+            raise ValueError(f"{', '.join(self.options)}: only fft_mamba has such options, not {self.kind}")
         return self
 
 
@@ -58,7 +58,7 @@ class Rates(SettingsBlock):
     least: Weight = 1e-6
 
     def share(self, iteration: int) -> float:
-        """Return the factor on the learning rates at an iteration of a stage; iterations count from 0."""
+        """Return the factor on the learning rates at an iteration of a stage; the first iteration is 0."""
         if iteration < self.halve:
             return 1.0
         return float(0.5 * self.factor ** ((iteration - self.halve) // self.every))
@@ -80,12 +80,12 @@ class Training(SettingsBlock):
     """Settings of the training of a network and a mask."""
 
     photographs: Path | None = None
-    learn: str | None = "height"  #: None: the recipe's own mask stays fixed, and stage 1 is skipped
+    learn: str | None = "height"  #: step whose mask is trained; None: the mask stays fixed, and stage 1 is skipped
     scene: str = "scene"
     picture: str = "developed[mask]"
     truth: str = "truth"
     psf: str = "psf[mask]"
-    light: str = "bsr[mask]"  #: step that gives the fraction of light kept, by band
+    light: str = "bsr[mask]"  #: step that returns the background suppression ratio (BSR) by band
     network: Network = Network()
     size: tuple[Number, Number] | None = None
     patch: tuple[Number, Number] | None = None  #: pixels (y, x) of a training patch of an image
@@ -98,7 +98,7 @@ class Training(SettingsBlock):
     average: Annotated[float, Field(ge=0, lt=1)] = 0.999
     precision: Literal["float32", "bfloat16", "float64"] = "float32"
     logarithm: bool = True
-    mask: MaskSettings = MaskSettings()  #: the mask without images, in place of stage 1
+    mask: MaskSettings = MaskSettings()  #: settings of the mask design without images, which replaces stage 1
     stages: dict[Annotated[int, Field(ge=1, le=2)], Stage]
     keep: Number = 100
     show: Number = 500
@@ -106,7 +106,7 @@ class Training(SettingsBlock):
 
     @property
     def learnt(self) -> tuple[int, ...]:
-        """Return the numbers of the stages that are trained."""
+        """Return the numbers of the training stages that are run."""
         return tuple(sorted(n for n in self.stages if self.learn or n != 1))
 
     @property
@@ -121,7 +121,7 @@ class Training(SettingsBlock):
 
 
 def read_training(composed: Composed) -> tuple[Composed, Training | None]:
-    """Return the recipe without its block ``train``, and the settings; mistakes become diagnostics of the recipe."""
+    """Return the recipe without its block ``train``, and the settings in the block; report mistakes as diagnostics."""
     block = composed.root.items.get(KEY)
     if block is None:
         return composed, None
@@ -134,7 +134,7 @@ def read_training(composed: Composed) -> tuple[Composed, Training | None]:
 
 
 def _plain(block: Value) -> Any:
-    """Return the block as plain data; a path is relative to the folder of the YAML file that has the path."""
+    """Return the block as plain data; a path is relative to the folder of the YAML file that contains the path."""
     plain = block.plain
     for outer, key in ((block, "photographs"), (block.items.get("mask"), "start")):
         value = outer.items.get(key) if outer else None

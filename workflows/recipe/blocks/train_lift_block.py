@@ -1,4 +1,4 @@
-"""Settings of the training of a lift from RGB to spectra, which are the block ``train_lift`` of a recipe."""
+"""Settings of the training of a lift from RGB to spectra, which form the block ``train_lift`` of a recipe."""
 
 from __future__ import annotations
 
@@ -29,7 +29,7 @@ class LiftTraining(SettingsBlock):
     warmup: Annotated[int, Field(ge=0)] = 200  #: iterations in which the rate rises evenly
     floor: Annotated[float, Field(gt=0, le=1)] = 0.02
     ema_decay: Beta = 0.998  #: of the moving average of the weights; 0: no average
-    validation_batches: Number = 32  #: pictures that validate the network at the end
+    validation_batches: Number = 32  #: number of pictures with which the network is validated at the end
     keep: Number = 100
     show: Number = 1000
 
@@ -40,6 +40,6 @@ class LiftTraining(SettingsBlock):
 
 
 def read_lift_training(composed: Composed) -> tuple[Composed, LiftTraining | None]:
-    """Return the recipe without its block ``train_lift``, and the settings; mistakes become diagnostics."""
+    """Return the recipe without its block ``train_lift``, and the settings in the block; report mistakes."""
     block = composed.root.items.get(KEY)
     return (composed, None) if block is None else read_block(composed, KEY, LiftTraining, block.plain)

@@ -1,4 +1,4 @@
-"""Joint distributions of several values, given by draws or by a mean and a covariance, and the files of posteriors."""
+"""Joint distributions of several values, from draws or from a mean and covariance, and a reader of posterior files."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ from neusee.nodes.units import read_any, read_written
 from neusee.workflows.recipe.distributions.scalar import FloatArray
 from neusee.workflows.recipe.text.renamed_keys import POSTERIOR_NAMES
 
-GAIN_UNIT = "DN/e-"  #: of K, EMVA 1288
+GAIN_UNIT = "DN/e-"  #: unit of the system gain K of EMVA 1288
 BARE_GAIN = (
     "name its draws 'gain [DN/e-]' or 'gain [e-/DN]', or write its mean and sd with DN/e-; "
     "the folder of `neusee calibrate` contains the unit"
@@ -33,8 +33,8 @@ _FILES = "the folder of `neusee calibrate`, its posterior.json, draws in .npz or
 class Joint:
     """Joint distribution of several values, computed from independent standard normal numbers.
 
-    The Cholesky factor of the correlation maps the numbers to the values. Values that draws describe keep the marginal
-    distributions of the draws, and the correlation of their normal scores (a Gaussian copula).
+    The Cholesky factor of the correlation maps the numbers to the values. A distribution from draws has the marginal
+    distributions of the draws and the correlation of their normal scores (a Gaussian copula).
     """
 
     names: tuple[str, ...]
@@ -45,7 +45,7 @@ class Joint:
 
     @classmethod
     def of_draws(cls, names: Sequence[str], draws: FloatArray) -> Joint:
-        """Return the joint distribution of draws; raise ValueError for too few, non-finite or constant draws."""
+        """Return the joint distribution of draws; raise ValueError if the draws are too few, non-finite or constant."""
         if len(draws) < _LEAST:
             raise ValueError(f"{len(draws)} draws are too few: give {_LEAST} or more")
         if not np.isfinite(draws).all():
@@ -68,7 +68,7 @@ class Joint:
         return cls(tuple(names), mean, sd, _factor(correlation))
 
     def at(self, z: FloatArray) -> FloatArray:
-        """Return the values (…, name) at standard normal numbers (…, name)."""
+        """Transform standard normal numbers ``z`` to values of the distribution; both have the shape (…, name)."""
         score = z @ self.factor.T
         if self.draws is None:
             return np.asarray(self.mean + self.sd * score, np.float64)
@@ -79,12 +79,12 @@ class Joint:
         return np.stack(columns, -1)
 
     def numbers(self) -> FloatArray:
-        """Return the standard normal numbers (draw, name) at which `at` reproduces the draws."""
+        """Return the standard normal numbers (draw, name) from which `at` reproduces the draws."""
         assert self.draws is not None
         return np.asarray(np.linalg.solve(self.factor, _scores(self.draws).T).T, np.float64)
 
     def below(self, name: str, value: float) -> float:
-        """Return the probability that the value of a name is less than ``value``."""
+        """Return the probability that the quantity ``name`` is less than ``value``."""
         i = self.names.index(name)
         if self.draws is not None:
             return float((self.draws[:, i] < value).mean())
@@ -93,7 +93,7 @@ class Joint:
         return float(ndtr((value - self.mean[i]) / self.sd[i]))
 
     def interval(self, name: str) -> tuple[float, float]:
-        """Return the 5 % and the 95 % quantile of the value of a name."""
+        """Return the 5 % and the 95 % quantile of the quantity ``name``."""
         i = self.names.index(name)
         if self.draws is not None:
             low, high = np.quantile(self.draws[:, i], [0.05, 0.95])
@@ -101,7 +101,7 @@ class Joint:
         return float(self.mean[i] - Z_90 * self.sd[i]), float(self.mean[i] + Z_90 * self.sd[i])
 
     def only(self, names: Sequence[str]) -> Joint:
-        """Return the joint distribution of some of the values, marginalised over all other values."""
+        """Return the joint distribution of the quantities ``names``, marginalised over all other quantities."""
         at = [self.names.index(name) for name in names]
         if self.draws is not None:
             return Joint.of_draws(names, self.draws[:, at])
@@ -124,15 +124,15 @@ def _factor(correlation: FloatArray) -> FloatArray:
 
 @dataclass(frozen=True)
 class Posterior:
-    """Joint distribution from a file, with the kinds and the units of its values in that file."""
+    """Posterior from a file: the joint distribution, and the kind and the unit of each value."""
 
     joint: Joint
     kinds: Mapping[str, str] = field(default_factory=dict)  #: of `neusee calibrate`: estimate, upper, lower, none
-    units: Mapping[str, str] = field(default_factory=dict)  #: in words, as far as the file gives them
+    units: Mapping[str, str] = field(default_factory=dict)  #: as text, for the values whose unit the file gives
 
 
 def read_posterior(path: Path) -> Posterior:
-    """Return the posterior in a file, or in the newest file of a pattern; raise ValueError for an invalid file."""
+    """Return the posterior in a file or in the newest file of a glob pattern; raise ValueError for an invalid file."""
     if any(sign in str(path) for sign in "*?["):
         path = max(map(Path, glob(str(path))), key=lambda each: (each.stat().st_mtime, each), default=path)
     if path.is_dir():
@@ -176,14 +176,14 @@ def _document(path: Path) -> Posterior:
 
 
 def _headed(columns: Mapping[str, FloatArray]) -> tuple[dict[str, FloatArray], dict[str, str]]:
-    """Return the draws by name, and the units in headings such as ``gain [DN/e-]``."""
+    """Return the draws by name and the units by name, from headings such as ``gain [DN/e-]``."""
     heads = {head: _HEAD.fullmatch(head) for head in columns}
     named = {m[1] if m else head: columns[head] for head, m in heads.items()}
     return named, {m[1]: m[2].strip() for m in heads.values() if m}
 
 
 def _drawn(columns: Mapping[str, FloatArray], units: Mapping[str, str]) -> Posterior:
-    """Return the posterior that draws describe; draws of a gain in e-/DN become draws in DN/e-."""
+    """Return the posterior with the given draws; draws of a gain in e-/DN are converted to DN/e-."""
     with np.errstate(divide="ignore"):
         draws = [1.0 / x if units.get(name) == "e-/DN" else x for name, x in columns.items()]
     lengths = {len(x) for x in draws}
@@ -196,7 +196,7 @@ def _drawn(columns: Mapping[str, FloatArray], units: Mapping[str, str]) -> Poste
 def _arrays(path: Path) -> dict[str, FloatArray]:
     with path.open("rb") as file:
         if file.read(2) != b"PK":
-            raise ValueError(f"{path.name} cannot be read: the file is not in .npz format")
+            raise ValueError(f"{path.name} cannot be read: the file does not have the format .npz")
     with np.load(path) as arrays:
         return {name: np.asarray(arrays[name], np.float64).reshape(-1) for name in arrays}
 
@@ -214,7 +214,7 @@ def _columns(path: Path) -> dict[str, FloatArray]:
 
 
 def summary(given: Mapping[str, Any]) -> Posterior:
-    """Return the normal posterior of a summary, which is a mean with sd or with covariance, in SI or with units."""
+    """Return the normal posterior with the given means, and with standard deviations or a covariance matrix."""
     joint = _normal(given)
     return Posterior(joint, units={str(name): read_any(x)[1] for name, x in given["mean"].items()})
 
@@ -242,7 +242,7 @@ def _normal(given: Mapping[str, Any]) -> Joint:
 def _si(text: Any) -> float:
     number, _, reciprocal = read_written(text)
     if reciprocal:
-        raise ValueError(f"{text}: write the mean and the sd of a gain in DN/e-, the unit of K")
+        raise ValueError(f"{text}: write the mean and the sd of a gain in DN/e-")
     return number
 
 

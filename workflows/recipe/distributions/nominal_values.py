@@ -1,4 +1,4 @@
-"""Nominal values of uncertain inputs: the values that a run uses in place of distributions and of a ``posterior``.
+"""Nominal values of uncertain inputs: the values that a run uses in place of distributions and of a posterior.
 
 A run uses the median of a distribution and the value that ``posterior`` chooses; the study of uncertainty draws values.
 """
@@ -20,15 +20,15 @@ from neusee.workflows.recipe.text.renamed_keys import POSTERIOR_NAMES
 from neusee.workflows.recipe.text.yaml_values import Value, Where, dotted
 
 KEY = "posterior"  #: key of the block in a recipe
-_BLOCK = "sensor"  #: block of the values that a calibration names without a block
+_BLOCK = "sensor"  #: block of the values that a calibration names without their block
 _KEYS = ("file", "use", "values")
 _SUMMARY = ("mean", "sd", "correlation", "covariance")
-_FAR = 0.005  #: tail probability of a posterior in which a recipe's own value counts as far off
+_FAR = 0.005  #: probability of each tail of a posterior in which a recipe's own value counts as far off
 
 
 @dataclass(frozen=True)
 class Standing:
-    """Comparison of a value of the recipe with its posterior."""
+    """Comparison of a value in a recipe with the posterior of that value."""
 
     path: str
     own: str  #: the recipe's own value
@@ -44,7 +44,7 @@ class Standing:
 
     @property
     def far(self) -> bool:
-        """Return True if the recipe's own value lies in the far tails of its posterior."""
+        """Return True if the recipe's own value lies in the far tails of the posterior."""
         return not _FAR <= self.below <= 1 - _FAR
 
 
@@ -54,7 +54,7 @@ class Uncertain:
 
     composed: Composed  #: the recipe with a value in place of every distribution
     laws: Mapping[str, Law]  #: by path
-    joint: Joint | None  #: its names are paths
+    joint: Joint | None  #: joint distribution of the posterior's values, whose names are paths
     standings: tuple[Standing, ...] = ()
     notes: tuple[str, ...] = ()
     source: str = ""  #: of the posterior
@@ -66,11 +66,11 @@ class Uncertain:
         return (*self.laws, *(self.joint.names if self.joint else ()))
 
     def said(self, name: str) -> str:
-        """Return the text of the distribution of a value, or the source of its posterior."""
+        """Return the distribution of a value as text, or the source of the posterior of that value."""
         return self.laws[name].text if name in self.laws else f"posterior {self.source}"
 
     def at(self, values: Mapping[str, float]) -> Any:
-        """Return the checked recipe with these values in SI; raise `RecipeError` for a value that is a mistake."""
+        """Return the checked recipe with the given values in SI; raise `RecipeError` for an invalid value."""
         from neusee.workflows.recipe.loading import check
 
         root = self.composed.root
@@ -81,7 +81,7 @@ class Uncertain:
 
 
 def settle(composed: Composed) -> tuple[Composed, Uncertain | None]:
-    """Return the recipe with a value in place of every distribution, and its uncertain values if there are any."""
+    """Return the recipe with a value in place of every distribution, and the uncertain values of the recipe or None."""
     laws, root = dict[str, Law](), composed.root
     diagnostics = list(composed.diagnostics)
     for path, leaf in _laws(root):
@@ -105,7 +105,7 @@ def settle(composed: Composed) -> tuple[Composed, Uncertain | None]:
 
 
 def _laws(root: Value) -> Iterator[tuple[Where, Value]]:
-    """Yield the path and the value of every distribution in a recipe, once for each alias of the value."""
+    """Yield the path and the value of every distribution in a recipe; a value with aliases has several paths."""
     stack: list[tuple[Where, Value]] = [((key,), value) for key, value in root.items.items() if key != KEY]
     while stack:
         path, value = stack.pop()
@@ -115,7 +115,7 @@ def _laws(root: Value) -> Iterator[tuple[Where, Value]]:
 
 
 def put(root: Value, path: Where, data: Any, mark: Location | None = None) -> Value:
-    """Return the recipe with other data at a path, which must exist."""
+    """Return the recipe with the value at an existing path replaced by ``data``."""
     if not path:
         return replace(root, data=data, mark=mark or root.mark)
     key = next(key for key in root.items if str(key) == str(path[0]))
@@ -134,7 +134,7 @@ class _Reader:
         self.source = ""
 
     def read(self, given: Value) -> None:
-        """Read the posterior, and put its values into the recipe; report each mistake with its location."""
+        """Read the posterior and put its values into the recipe; report each mistake with the location."""
         if given.data is None:
             return
         items = given.items if isinstance(given.data, dict) else {"file": given}
@@ -169,7 +169,7 @@ class _Reader:
         raise ValueError(f"use = {use}: write mean, nominal (the recipe's own value){number}")
 
     def _pairs(self, given: Value | None, posterior: Posterior) -> dict[str, str]:
-        """Return the name in the posterior of each value of the recipe, by the path of the value."""
+        """Return a dict from the path of each value in the recipe to the name of that value in the posterior."""
         names = posterior.joint.names
         if given is not None and not isinstance(given.data, dict):
             raise ValueError("values: write {path of the recipe: name in the posterior}")
@@ -192,7 +192,7 @@ class _Reader:
         return pairs
 
     def _conventions(self, posterior: Posterior, pairs: Mapping[str, str]) -> None:
-        """Raise ValueError for a gain without a unit, or for a posterior of another exposure than the recipe's."""
+        """Raise ValueError if the posterior has a gain without a unit, or a dark current for another exposure time."""
         for path, name in pairs.items():
             value = self._value(path)
             is_gain = value and isinstance(value.data, str) and value.data.strip().endswith(("e-/DN", GAIN_UNIT))
@@ -203,7 +203,7 @@ class _Reader:
         if "dark_current" in pairs.values() and exposure is not None and " in " in words:
             other, own = read_any(words.partition(" in ")[2])[0], read_any(exposure.data)[0]
             if abs(other - own) > 1e-9 * own:
-                raise ValueError(f"the posterior's dark current is for {other:g} s, the recipe's exposure is {own:g} s")
+                raise ValueError(f"the dark current is for {other:g} s in the posterior and {own:g} s in the recipe")
 
     def _value(self, path: str) -> Value | None:
         return self.root.below(path.split("."))
@@ -231,7 +231,7 @@ class _Reader:
             self.joint = replace(joint, names=tuple(kept))
 
     def _stand(self, posterior: Posterior, path: str, name: str, own: float, use: str | int, mark: Location) -> None:
-        """Compare a value of the recipe with its posterior, and put the value that a run uses into the recipe."""
+        """Compare a value in the recipe with the posterior, and put the value that a run uses into the recipe."""
         joint, unit, kind = posterior.joint, self.units[path], posterior.kinds.get(name, "estimate")
         i = joint.names.index(name)
         used, why = own, "recipe"
@@ -255,7 +255,7 @@ class _Reader:
 
 
 def _flat(value: Value) -> Any:
-    """Return the values in a mapping at any depth by dotted path; return another value as plain data."""
+    """Return the values of a nested mapping by dotted path; return any other value as plain data."""
     if not isinstance(value.data, dict):
         return value.plain
     return {dotted(leaf.path[len(value.path) :]): leaf.plain for leaf in value.leaves() if leaf is not value}

@@ -33,10 +33,10 @@ class Law:
     first: float
     second: float
     unit: str  #: SI unit of a draw; empty for a number without a unit
-    reciprocal: bool = False  #: whether the distribution is that of 1 over a draw
+    reciprocal: bool = False  #: whether a draw is the reciprocal of a number from the distribution
 
     def at(self, z: FloatArray) -> FloatArray:
-        """Return the values of this distribution at the quantiles of standard normal numbers ``z``."""
+        """Return the values of the distribution at the cumulative probabilities of standard normal numbers ``z``."""
         from scipy.special import ndtr
 
         a, b = self.first, self.second
@@ -58,12 +58,12 @@ class Law:
 
 
 def is_law(text: Any) -> bool:
-    """Return True if a value begins like a distribution, such as ``normal(``."""
+    """Return True if a value is a text that begins like a distribution, such as ``normal(``."""
     return isinstance(text, str) and _BEGIN.match(text) is not None
 
 
 def read_law(text: str) -> Law:
-    """Return the distribution that a text means; raise ValueError with the correct form."""
+    """Return the distribution that a text describes; raise ValueError with the correct form for an invalid text."""
     match = _CALL.fullmatch(text.strip())
     if match is None:
         raise ValueError("is not a complete distribution: write kind(…, …), in quotes inside [ ] or { }")
@@ -92,5 +92,5 @@ def _fault(kind: str, first: float, second: float) -> str:
 
 
 def written(value: float, unit: str) -> str | float:
-    """Return a value in SI as a recipe contains it: a number, or a text with the unit."""
+    """Return a value in SI as it is written in a recipe: a number, or a text with the unit."""
     return f"{value!r} {unit}" if unit else value

@@ -1,4 +1,4 @@
-"""Uncertain inputs of a recipe: draws of the uncertain values, and the parameters of steps that read these values."""
+"""Uncertain inputs of a recipe: draws of the uncertain values, and the step parameters that read these values."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from neusee.workflows.graph.recipe_graph import Recipe, needed
 from neusee.workflows.recipe.distributions.nominal_values import Uncertain
 from neusee.workflows.recipe.distributions.scalar import FloatArray
 
-SCRAMBLES = 8  #: number of independently scrambled Sobol sequences, whose differences give the error
+SCRAMBLES = 8  #: number of independently scrambled Sobol sequences, whose scatter gives the error
 _PROBE = 0.3  #: standard deviations by which a value is changed to find the parameters that read the value
 _CORRELATED = 0.1  #: smallest correlation of two values that count as correlated
 _EDGE = 1e-12  #: smallest distance of the probability of a point from 0 and 1
@@ -31,7 +31,7 @@ class InputDraws:
 
 @dataclass(frozen=True)
 class Inputs:
-    """The uncertain inputs of a recipe that are drawn, in the order of `names`."""
+    """The uncertain inputs of a recipe that affect its outputs, in the order of `names`."""
 
     recipe: Recipe
     uncertain: Uncertain
@@ -43,7 +43,7 @@ class Inputs:
     def of(cls, recipe: Recipe, outputs: Sequence[str] | None = None) -> Inputs:
         """Return the uncertain inputs that affect some outputs, by default the outputs of the recipe.
 
-        Raises ValueError for a recipe without uncertain values, and where no output depends on an uncertain value.
+        Raises ValueError for a recipe without uncertain values, and if no output depends on an uncertain value.
         """
         outputs = recipe.outputs if outputs is None else outputs
         uncertain = recipe.uncertain
@@ -65,17 +65,17 @@ class Inputs:
 
     @property
     def labels(self) -> list[str]:
-        """Return the label of each input, which says when the input is correlated with other inputs."""
+        """Return the label of each input, which shows whether the input is correlated with other inputs."""
         return [_label(self.uncertain, name) for name in self.names]
 
     @property
     def most(self) -> int | None:
-        """Return the largest number of independent draws, or None where there is no limit."""
+        """Return the largest possible number of independent draws, or None if there is no limit."""
         joint = self.uncertain.joint
         return None if joint is None or joint.draws is None else len(joint.draws)
 
     def theta(self, values: Mapping[str, float]) -> dict[str, Any]:
-        """Return the parameters that read the inputs, by ``step.parameter``, at some values of the inputs."""
+        """Return the parameters that read the inputs, by ``step.parameter``, for given values of the inputs."""
         parameters = {}
         for reader, inputs in self.readers.items():
             step, _, param = reader.rpartition(".")
@@ -85,13 +85,13 @@ class Inputs:
         return parameters
 
     def at(self, z: FloatArray) -> FloatArray:
-        """Return the values (draw, input) of the inputs at standard normal numbers."""
+        """Transform standard normal numbers ``z`` to values of the inputs; both have the shape (draw, input)."""
         columns = [law.at(z[:, i]) for i, law in enumerate(self.uncertain.laws.values())]
         joint = self.uncertain.joint
         return np.stack([*columns, *(joint.at(z[:, len(columns) :]).T if joint else ())], 1)
 
     def independent(self, count: int, seed: int) -> InputDraws:
-        """Return independent draws of the inputs; a larger count begins with the same draws."""
+        """Return independent draws of the inputs; with the same seed, a larger count begins with the same draws."""
         z = np.random.default_rng([seed, 1]).standard_normal((count, len(self.names)))
         values, joint = self.at(z), self.uncertain.joint
         if joint is None or joint.draws is None:
@@ -114,7 +114,7 @@ class Inputs:
         return InputDraws(z, self.at(z))
 
     def checked(self, values: FloatArray) -> None:
-        """Check the smallest and the largest value of each input; raise `RecipeError` for a value that is a mistake."""
+        """Check the smallest and the largest value of each input; raise `RecipeError` for an invalid value."""
         for name, column in zip(self.names, values.T, strict=True):
             for value in (float(column.min()), float(column.max())):
                 try:
@@ -125,7 +125,7 @@ class Inputs:
 
 
 def _only(uncertain: Uncertain, names: Collection[str]) -> Uncertain:
-    """Return the uncertain values of a recipe that are among ``names``."""
+    """Return the uncertain values of a recipe, reduced to the values ``names``."""
     laws = {name: law for name, law in uncertain.laws.items() if name in names}
     joint = uncertain.joint
     kept = [name for name in joint.names if name in names] if joint else []
@@ -133,7 +133,7 @@ def _only(uncertain: Uncertain, names: Collection[str]) -> Uncertain:
 
 
 def _readers(recipe: Recipe, uncertain: Uncertain, name: str, outputs: Sequence[str]) -> Iterator[tuple[str, Index]]:
-    """Yield the parameters that read the value of ``name``, as ``step.parameter``, and the index in each parameter."""
+    """Yield each parameter that reads the value ``name`` as ``step.parameter``, and the index of the value there."""
     if name in uncertain.laws:
         probe = float(uncertain.laws[name].at(np.array(_PROBE)))
     else:
@@ -153,7 +153,7 @@ def _readers(recipe: Recipe, uncertain: Uncertain, name: str, outputs: Sequence[
 
 
 def _changed(before: Any, after: Any) -> Iterator[tuple[Index, Any]]:
-    """Yield the index of each difference between two parameters, and the value of the second parameter there."""
+    """Yield the index of each difference between two values of a parameter, and the new value at that index."""
     if isinstance(after, list | tuple) and isinstance(before, list | tuple) and len(after) == len(before):
         for i, (a, b) in enumerate(zip(before, after, strict=True)):
             yield from (((i, *rest), new) for rest, new in _changed(a, b))
@@ -181,4 +181,4 @@ def _label(uncertain: Uncertain, name: str) -> str:
     correlated = np.abs(whole[i]) > _CORRELATED
     if correlated[:i].any():
         return f"rest of {name}"
-    return f"{name} and what goes with it" if correlated[i + 1 :].any() else name
+    return f"{name} and correlated values" if correlated[i + 1 :].any() else name

@@ -1,4 +1,4 @@
-"""Which values do the files of a recipe and the arguments give together?
+"""Which values does a recipe have after its files and the arguments are combined?
 
 YAML with the location of every value, groups and their composition, overrides and references.
 Nothing here knows what a node is.

@@ -1,4 +1,4 @@
-"""Composition of a recipe: first the options of its groups, then its own file, then the arguments."""
+"""Composition of a recipe from the options of its groups, its own file and the arguments, in this order."""
 
 from __future__ import annotations
 
@@ -27,11 +27,11 @@ class Composed:
     whole: bool = True  #: whether every named group could be read
 
     def without(self, key: str) -> Composed:
-        """Return the recipe without the block of one key."""
+        """Return the recipe without the block ``key``."""
         return replace(self, root=self.root.without(key))
 
     def with_problems(self, diagnostics: Iterable[Diagnostic]) -> Composed:
-        """Return the recipe with more diagnostics."""
+        """Return the recipe with ``diagnostics`` added to its diagnostics."""
         return replace(self, diagnostics=(*self.diagnostics, *diagnostics))
 
 
@@ -52,7 +52,7 @@ def packaged() -> Path:
 
 
 def locate(recipe: str | Path, folder: Path) -> Path:
-    """Return the file of a recipe, which is the name of a packaged recipe or a path that ends in ``.yaml``."""
+    """Return the path of a recipe file from the name of a packaged recipe or from a path that ends in ``.yaml``."""
     if str(recipe).endswith((".yaml", ".yml")):
         path = folder / Path(recipe).expanduser()
         if path.is_file():
@@ -67,7 +67,7 @@ def locate(recipe: str | Path, folder: Path) -> Path:
 
 
 def compose(recipe: str | Path, arguments: Sequence[str | Override], folder: Path, first: int = 1) -> Composed:
-    """Return a recipe composed of its files and arguments; messages number the arguments from ``first``."""
+    """Return a recipe composed from its files and arguments; messages number the arguments from ``first``."""
     path = locate(recipe, folder)
     document = read(path, shown(path, folder))
     diagnostics: list[Diagnostic] = []
@@ -87,7 +87,7 @@ def compose(recipe: str | Path, arguments: Sequence[str | Override], folder: Pat
 
 
 def shown(path: Path, folder: Path) -> str:
-    """Return the path of a file relative to the packaged recipes or to the working folder, or else the full path."""
+    """Return the path of a file relative to the packaged recipes or to ``folder``, or else the full path."""
     for above in (packaged(), folder):
         if path.is_relative_to(above):
             return path.relative_to(above).as_posix()
@@ -95,7 +95,7 @@ def shown(path: Path, folder: Path) -> str:
 
 
 def merge(below: Value, above: Value) -> Value:
-    """Return ``below`` with the values of ``above``; a list, a scalar and a step with ``node`` replace all."""
+    """Return ``below`` updated with ``above``; a list, scalar or step with ``node`` in ``above`` replaces a value."""
     if not isinstance(below.data, dict) or not isinstance(above.data, dict) or _new_step(above):
         return above
     data = dict(below.data)
@@ -106,7 +106,7 @@ def merge(below: Value, above: Value) -> Value:
 
 @functools.lru_cache(maxsize=16)
 def _merged(parts: tuple[Value, ...]) -> Value:
-    """Return the options of the groups and the recipe merged in order; the same parts give the identical value."""
+    """Merge the options of the groups and the recipe in order; the same parts give the same object from a cache."""
     mark = parts[-1].mark
     return functools.reduce(merge, (part.without("defaults") for part in parts), Value({}, mark, mark, ()))
 
@@ -119,7 +119,7 @@ def _new_step(value: Value) -> bool:
 
 
 def groups_of(*folders: Path) -> dict[str, list[str]]:
-    """Return the names of the options by group: each folder of YAML files in one of ``folders`` is a group."""
+    """Return the names of the options by group; each folder of YAML files in one of ``folders`` is a group."""
     options: dict[str, set[str]] = {}
     for folder in folders:
         for path in folder.glob("*/*.yaml"):
@@ -130,7 +130,7 @@ def groups_of(*folders: Path) -> dict[str, list[str]]:
 def _choose(
     root: Value, overrides: list[Override], beside: Path, diagnostics: list[Diagnostic]
 ) -> tuple[list[Choice], list[Override]]:
-    """Return the options of the groups after overrides such as ``laser=six``, and the overrides of values."""
+    """Return the options of the groups after overrides such as ``laser=six``, and the remaining overrides."""
     choices = {choice.group: choice for choice in _defaults(root, diagnostics)}
     groups = groups_of(beside, packaged())
     rest = []

@@ -25,14 +25,14 @@ class Override:
     """An override of a recipe, parsed from one argument."""
 
     text: str
-    sign: str  #: ``""`` changes a value, ``+`` adds one, ``~`` removes one
+    sign: str  #: ``""`` changes a value, ``+`` adds a value, ``~`` removes a value
     path: tuple[str, ...]
     value: Value | None
     mark: Location
 
 
 def read_override(text: str, mark: Location) -> Override:
-    """Return the override that an argument means; the value is read as YAML, so that ``20 e-`` stays a string."""
+    """Return the override in an argument; the value is read as YAML, so that ``20 e-`` is a string."""
     match = _SYNTAX.fullmatch(text)
     if match is None:
         raise RecipeError([Diagnostic(mark, text, _HELP)])
@@ -62,7 +62,7 @@ def apply(root: Value, override: Override, diagnostics: list[Diagnostic], groups
 
 
 def _follow(root: Value, path: tuple[str, ...]) -> tuple[Trail, tuple[str, ...]]:
-    """Return the values along a path with their keys, and the end of the path that does not exist."""
+    """Return the values along a path with their keys, and the part of the path that does not exist."""
     trail: Trail = []
     here = root
     for n, part in enumerate(path):
@@ -76,7 +76,7 @@ def _follow(root: Value, path: tuple[str, ...]) -> tuple[Trail, tuple[str, ...]]
 
 
 def _fault(root: Value, o: Override, trail: Trail, missing: tuple[str, ...], groups: Iterable[str]) -> str | None:
-    """Return the message for an override that is a mistake, or None."""
+    """Return the message for an invalid override, or None for a valid override."""
     here = trail[-1][0]
     if not missing:
         return "exists already: remove the + to change the value" if o.sign == "+" else None
@@ -90,7 +90,7 @@ def _fault(root: Value, o: Override, trail: Trail, missing: tuple[str, ...], gro
 
 
 def _implied(root: Value, path: tuple[str, ...]) -> bool:
-    """Return True if a path may be set without a + although the recipe lacks it: a global key, or a key of a step."""
+    """Return True if an override may set a missing path without a +: the path of a global key or of a key of a step."""
     if path[0] != "steps":
         return path[0] in RESERVED and (len(path) == 1 or path[0] in ("expect", "posterior"))
     steps = root.items.get("steps")
@@ -117,7 +117,7 @@ def _suggest(root: Value, path: tuple[str, ...], groups: Iterable[str]) -> str:
 
 
 def _rebuild(trail: Trail, missing: tuple[str, ...], o: Override) -> Value:
-    """Return the recipe with the changed value, rebuilt from the innermost value of the trail outwards."""
+    """Return the recipe after an override; each value along the path is rebuilt, from the innermost value outwards."""
     value = _parsed_again(trail, missing, o)
     for n in range(len(missing) - 1, 0, -1):
         assert value is not None
@@ -130,7 +130,7 @@ def _rebuild(trail: Trail, missing: tuple[str, ...], o: Override) -> Value:
 
 
 def _parsed_again(trail: Trail, missing: tuple[str, ...], o: Override) -> Value | None:
-    """Return the value of an override with its final path, in which a key of digits is a number as in a file."""
+    """Return the value of an override, parsed again if its path has integer keys."""
     keys = tuple(key for _, key in trail)
     path = (*keys[:-1], *map(_key, missing)) if missing else keys
     return o.value if o.value is None or path == o.path else parse(o.text.partition("=")[2], o.mark, path)
@@ -141,7 +141,7 @@ def _key(part: str | int) -> str | int:
 
 
 def arguments_in(value: Value) -> Iterator[Location]:
-    """Yield the arguments that changed a value within a list or a mapping."""
+    """Yield the locations of the arguments that changed a value within a list or a mapping."""
     for child in value.items.values():
         if not child.mark.line:
             yield child.mark

@@ -1,7 +1,7 @@
 """Overrides of a recipe by Python values: ``sensor={"read_noise": "20 e-"}`` means ``sensor.read_noise=20 e-``.
 
-A mapping changes only the values that it names, but an empty mapping and a step with its ``node`` replace the whole
-value. A string is not read as YAML.
+A mapping changes only the values that it names, but an empty mapping or a step with ``node`` replaces the whole value.
+A string is not read as YAML.
 """
 
 from __future__ import annotations
@@ -18,11 +18,11 @@ from neusee.workflows.recipe.text.overrides import Override, read_override
 from neusee.workflows.recipe.text.yaml_values import Value, Where, dotted
 
 _ALLOWED = "give a number, a string, True or False, None, a list or a mapping"
-_LONGEST = 40  #: characters of a value that a message repeats
+_LONGEST = 40  #: largest number of characters of a value in a message
 
 
 def overrides_of(values: Mapping[str, Any], folder: Path) -> list[Override]:
-    """Return the overrides that keyword arguments mean; raise one `RecipeError` for all values that are mistakes."""
+    """Return the overrides in keyword arguments; raise one `RecipeError` for all invalid values."""
     overrides: list[Override] = []
     diagnostics: list[Diagnostic] = []
     for key, value in values.items():
@@ -37,7 +37,7 @@ def overrides_of(values: Mapping[str, Any], folder: Path) -> list[Override]:
 
 
 def _read(key: str, given: Any, mark: Location) -> Iterator[Override]:
-    """Yield the overrides that one keyword means: one override for each value in a mapping."""
+    """Yield the overrides in one keyword argument: one override for each value in a mapping."""
     if key.startswith("~") and given is not None:
         raise RecipeError([Diagnostic(mark, key, f"~ removes a value and cannot set one: write {{{key!r}: None}}")])
     try:

@@ -27,7 +27,7 @@ class Scope:
     step: str
 
     def find(self, parts: list[str]) -> tuple[Value | None, list[str], str]:
-        """Return the item to which a reference refers, the path below the item, and a message where no item fits."""
+        """Return the item to which a reference refers, the path below the item, and a message if no item fits."""
         dims = list(self.items)
         if parts[0] == "item" and len(dims) == 1:
             return self.items[dims[0]], parts[1:], ""
@@ -93,7 +93,7 @@ class References:
         return self._followed(target, scope, origin)
 
     def _followed(self, target: Value, scope: Scope, origin: Value) -> Value | None:
-        """Return a target with its own references resolved; report a reference that leads back to itself."""
+        """Return the target of a reference with its own references resolved; report a cycle of references."""
         if target.path in self.known:
             return self.known[target.path]
         if target.path in self.open:
@@ -101,7 +101,7 @@ class References:
             self._fail(origin, f"refers to itself: {' -> '.join(map(dotted, loop))}")
             return None
         if len(self.open) > _DEEPEST:
-            self._fail(origin, f"a chain of more than {_DEEPEST} references")
+            self._fail(origin, f"begins a chain of more than {_DEEPEST} references")
             return None
         self.open.append(target.path)
         value = self.resolve(target, scope if target.path[0] == "steps" else Scope({}, dotted(target.path)))
@@ -111,7 +111,7 @@ class References:
         return value
 
     def _missing(self, start: Value, parts: list[str], origin: Value, scope: Scope) -> None:
-        """Report a missing target: as a mistake of the item if other items have the target, else of the reference."""
+        """Report a missing target: as a mistake in the item if other items have the target, else in the reference."""
         path = (*start.path, *parts)
         name = dotted(path)
         siblings = self.root.items[str(start.path[0])].items.values() if start.path else ()
@@ -130,7 +130,7 @@ class References:
         return replace(origin, data=BROKEN)
 
     def touch(self, value: Value, dims: Sequence[str]) -> None:
-        """Mark the values to which a step with an empty list of items refers as used, so that none is reported."""
+        """Mark as used all values to which a step with an empty list of items refers, so that no value is reported."""
         for text in _texts(value):
             for match in _REFERENCE.finditer(text.data):
                 parts = match[1].strip().split(".")
@@ -142,9 +142,10 @@ class References:
                 self.used |= {(dim, name, *rest) for dim, block in blocks for name in block}
 
     def finish(self) -> None:
-        """Report values that no step uses and references without a target; a value and a reference may be one mistake.
+        """Report values that no step uses, and references without a target.
 
-        A packaged option may set more values than a recipe uses: a camera needs the pixel pitch, a bench does not.
+        An unused value with a name similar to a missing target is one mistake. A packaged option may set more values
+        than a recipe uses: a camera needs the pixel pitch, a bench does not.
         """
         targets = dict(self.lacking)
         misspelt = set()
@@ -170,7 +171,7 @@ class References:
         return [v for v in leaves if not any(v.path[:n] in self.used for n in range(1, len(v.path) + 1))]
 
     def _meant(self, leaf: Value) -> Where | None:
-        """Return the path that an unused path probably means: its new name, or a similar path to which steps refer."""
+        """Return the path that an unused path probably means: the new name, or a similar path to which steps refer."""
         if now := new_name(leaf.name):
             return tuple(now.split("."))
         known = {*self.used, *(path for path, _ in self.lacking)}

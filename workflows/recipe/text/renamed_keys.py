@@ -33,14 +33,14 @@ _CALLED = {
     "calibrate.camera_prior.dark_noise": "temporal_dark_noise",
     "restore.electrons.pedestal": "offset",
     "restore.electrons.pedestal_subtracted": "offset_subtracted",
-}  #: a key of a recipe by its path, a node by its name, a parameter by its node and name
+}  #: old name -> new name, of a key by path, of a node by name, of a parameter by node and name
 
-_UNIT = "a gain says its unit: write {}.gain: 0.37 e-/DN, or 2.7 DN/e-"
+_UNIT = "a gain has its own unit: write {}.gain: 0.37 e-/DN, or 2.7 DN/e-"
 _GRID = ("samples", "pitch", "diameter", "aperture")
 _ON_A_GRID = (
     *(f"doe.{mask}" for mask in ("flat", "vortex", "axicon", "spiral_axicon", "cubic", "half_rings", "zernike")),
     *("doe.pixelwise", "doe.unet", "doe.smooth", "flare.dirt", "optics.pupil"),
-)  #: nodes that had parameters of the pupil grid in 0.1
+)  #: nodes that had parameters of the pupil grid in version 0.1
 _STOP = (
     "is set by the step of the pupil grid: write stop: {node: optics.stop, with: {samples: …, pitch: …, diameter: …, "
     "aperture: …}}, add stop: stop to `from` here, and remove these parameters here"
@@ -62,11 +62,11 @@ _GONE = {
             "calibrate.density.gain_unit",
             "calibrate.camera.gain_unit",
         ),
-        "a gain says its unit: write gain: 0.37 e-/DN, or 2.7 DN/e-, and leave this out",
+        "a gain has its own unit: write gain: 0.37 e-/DN, or 2.7 DN/e-, and remove this parameter",
     ),
-}  #: what to write instead of a key or a parameter that is gone
+}  #: what to write instead of a key or a parameter that was removed
 
-#: of parameters in a posterior of 0.1
+#: present names of the parameters in a posterior of version 0.1
 POSTERIOR_NAMES = {"pedestal": "offset", "dark_noise": "temporal_dark_noise"}
 
 
@@ -80,17 +80,17 @@ def new_name(old: str) -> str | None:
 
 
 def instead(old: str) -> str:
-    """Return a message that says what to write instead of an old path, or an empty text for another path."""
+    """Return a message that says what to write instead of an old path, or an empty text for any other path."""
     if now := new_name(old):
         return f"is called {now} now"
     return _GONE.get(old, "")
 
 
 def became_input(node: str, parameters: Iterable[str]) -> bool:
-    """Return True if a node is given parameters of the pupil grid, which are an input now."""
+    """Return True if ``parameters`` contain parameters of the pupil grid, which the node now gets from an input."""
     return node in _ON_A_GRID and not set(_GRID).isdisjoint(parameters)
 
 
 def old_names() -> tuple[str, ...]:
-    """Return all old paths in the table."""
+    """Return all old paths in the table of renamed keys."""
     return (*_CALLED, *_GONE)

@@ -1,4 +1,4 @@
-"""Values of YAML 1.2 with their locations: ``1e3`` is a number, ``on`` a string, and ``010`` ten."""
+"""Values of YAML 1.2 with their locations: ``1e3`` is a number, ``on`` is a string, and ``010`` is the number ten."""
 
 from __future__ import annotations
 
@@ -21,8 +21,8 @@ Where = tuple[str | int, ...]  #: path of a value: keys and indices from the top
 _TAG = "tag:yaml.org,2002:"
 _INT = re.compile(r"[-+]?[0-9]+|0o[0-7]+|0x[0-9a-fA-F]+")
 _FLOAT = re.compile(r"[-+]?(?:\.[0-9]+|[0-9]+(?:\.[0-9]*)?)(?:[eE][-+]?[0-9]+)?")
-_MOST = 1_000_000  #: values in one file
-_MOST_ALIASED = 100_000  #: values in one file that come from aliases
+_MOST = 1_000_000  #: largest number of values in one file
+_MOST_ALIASED = 100_000  #: largest number of values from aliases in one file
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -53,21 +53,21 @@ class Value:
         return dict(enumerate(self.data)) if isinstance(self.data, list) else {}
 
     def child(self, name: str | int) -> Value | None:
-        """Return the child with a key or an index, also for a number that is written as a string."""
+        """Return the child with a key or an index; an index may be written as a string."""
         items = self.items
         if name not in items and isinstance(name, str) and name.isdecimal():
             name = int(name)
         return items[name] if name in items else next((v for key, v in items.items() if str(key) == str(name)), None)
 
     def below(self, path: Iterable[str | int]) -> Value | None:
-        """Return the value at a path below this value, or None where the path does not exist."""
+        """Return the value at a path below this value, or None if the path does not exist."""
         value: Value | None = self
         for name in path:
             value = value.child(name) if value else None
         return value
 
     def replaced(self, key: str | int, child: Value | None) -> Value:
-        """Return a mapping or a list with another child at a key, or without the key if ``child`` is None."""
+        """Return a copy of a mapping or a list with ``child`` at a key, or without the key if ``child`` is None."""
         items = {k: v for k, v in self.items.items() if child is not None or k != key}
         if child is not None:
             items[key] = child
@@ -76,7 +76,7 @@ class Value:
         return replace(self, data=items)
 
     def without(self, key: str) -> Value:
-        """Return a mapping without one of its keys; return the same mapping where it does not have the key."""
+        """Return a copy of a mapping without ``key``, or the mapping itself if it does not have the key."""
         return self.replaced(key, None) if key in self.items else self
 
     def leaves(self) -> Iterator[Value]:
@@ -90,7 +90,7 @@ class Value:
 
 @dataclass(frozen=True, slots=True)
 class Document:
-    """A YAML file: its top mapping, and as title its first line if that line is a comment."""
+    """A YAML file: its top-level mapping, and its title, which is a comment in the first line."""
 
     root: Value
     title: str
@@ -124,7 +124,7 @@ def _document(text: str, shown: str, folder: str) -> Document:
 
 
 def parse(text: str, start: Location, path: Where = ()) -> Value:
-    """Read YAML text that begins at a location; all values of an argument (line 0) have the same location."""
+    """Read YAML text that begins at a location; all values in an argument have the location of the argument."""
     builder = _Builder(start)
     try:
         node = YAML(typ="safe", pure=True).compose(text)
@@ -193,7 +193,7 @@ class _Builder:
         return [self.value(child, (*path, i), self._mark(child)) for i, child in enumerate(node.value)]
 
     def _weigh(self, node: Node, value: Value) -> None:
-        """Count the values in a list or a mapping; raise `RecipeError` where aliases make too many values."""
+        """Count the values in a list or a mapping; raise `RecipeError` if aliases produce too many values."""
         children = [v for pair in node.value for v in pair] if isinstance(node, MappingNode) else node.value
         self.size[id(node)] = 1 + sum(self.size.get(id(child), 1) for child in children)
         self._refuse_many(self.size[id(node)], _MOST, value.mark, value.path)
@@ -235,7 +235,7 @@ def _scalar(node: ScalarNode) -> Any:
 
 
 def number(text: str) -> int | float | str:
-    """Return the number that a text means in YAML 1.2, or the text if it is no number."""
+    """Return the number that a text represents in YAML 1.2, or the text itself if it is not a number."""
     if _INT.fullmatch(text):
         return int(text, 0 if text[:2] in ("0o", "0x") else 10)
     if _FLOAT.fullmatch(text):
@@ -255,7 +255,7 @@ def _key(node: Node) -> str | int | None:
 
 
 def _explain(error: Exception, text: str, start: Location, path: Where) -> Diagnostic:
-    """Return the diagnostic for a text that is not YAML."""
+    """Return the diagnostic for a text that is not valid YAML."""
     at = getattr(error, "problem_mark", None)
     line, column = (at.line, at.column) if at else _control(text)
     problem = error.problem if isinstance(error, MarkedYAMLError) and error.problem else "an invalid character"
