@@ -17,10 +17,10 @@ if TYPE_CHECKING:
 
 WEAK = 3.0  #: ratio of the prior's standard deviation to that of the levels; below, the prior constrains more
 _PART = 0.1  #: least component with which a parameter counts as part of a direction of length 1
-_ALONE = 0.97  #: least component with which one parameter alone stands for a direction
+_ALONE = 0.97  #: least component with which a direction counts as that of one parameter alone
 _WIDER = 1.25  #: largest factor by which doubled priors may widen the posterior of a determined parameter
-_FAR = 3.0  #: standard deviations of the prior between its middle and the value that the levels may contradict
-_FALLS = 4.0  #: nats by which the levels must contradict a value for a limit
+_FAR = 3.0  #: distance from the prior's middle, in standard deviations, at which the likelihood is compared
+_FALLS = 4.0  #: nats by which the likelihood must fall at this distance to set a limit
 
 KINDS = {"estimate": "", "upper": "only an upper limit", "lower": "only a lower limit", "none": "not from these frames"}
 #: by parameter and kind: the reason why the frames set only a limit, or none

@@ -122,7 +122,7 @@ def _document(result: AccuracyResult, cache: PointCache, quick: bool) -> dict[st
         "quick": quick,
         "device": cache.device,
         "machine": accuracy_report.machine_line(),
-        "failed": accuracy_report.count_missed(result.points),  # tolerances
+        "failed": accuracy_report.count_missed(result.points),  # number of tolerances
         "engine": engine(),
     }
 

@@ -38,7 +38,7 @@ Cut = tuple[int, int]  #: the longest side and the largest number of bands; 0 fo
 SHARE = 0.01  #: least share of the run time of a step that is measured
 _ITEM = re.compile(r"\[.*?\]")
 _CUTS: Sequence[Cut] = ((32, 2), (64, 2), (128, 3), (256, 3), (512, 3), (1024, 3), (0, 3), (0, 0))
-_GROWTH = 16.0  #: expected ratio of the reference's times on two successive cuts, as of a direct convolution
+_GROWTH = 16.0  #: expected growth of the reference's time from cut to cut, as for a direct convolution
 USED, _PRECISION = "as used", "precision"
 _WINDOWS = (0.75, 0.5, 0.25)  #: shares of the side of a PSF
 _ALLOWANCES = (1e3, 1e2, 1e1, 1e-1, 1e-2, 1e-3)  #: factors on the allowed error ``within`` of a step
@@ -71,7 +71,7 @@ class StepTried:
 
     step: str  #: the slowest item of the step
     node: str
-    share: float  #: of the run time, all items of the step together
+    share: float  #: share of the run time that all items of the step take together
     found: StepMeasurement
 
     @property

@@ -53,7 +53,7 @@ class PointMeasurement:
     seconds: list[float] = field(default_factory=list)  #: of the engine, one for each cold run
     computing: float = 0.0  #: s in the steps of the first cold run
     load: float = 0.0  #: runnable processes for each core before the run, this process included
-    bound: float | None = None  #: error of the worst output that the engine proved
+    bound: float | None = None  #: proved error bound of the worst output
     steps: dict[str, float] = field(default_factory=dict)  #: s by step, in the first cold run
     refused: str = ""
 

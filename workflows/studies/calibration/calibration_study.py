@@ -130,7 +130,7 @@ def _report(recipe: Recipe, result: CalibrationStudyResult, pixels: int) -> Stud
         "table.csv": (_COLUMNS, map(_line, result.rank_tests)),
         "simulations.csv": (("parameter", "truth", "rank", "inside", "z", "told"), _each(result)),
     }
-    return StudyReport(f"{recipe.name}: is the posterior right?", _lead(result), sections, {"ranks": picture}, tables)
+    return StudyReport(f"{recipe.name}: is the posterior correct?", _lead(result), sections, {"ranks": picture}, tables)
 
 
 def _line(v: RankTest) -> Sequence[Any]:

@@ -17,7 +17,7 @@ BINS, SHARE = 10, 0.9
 _CHANCE = 0.01  #: probability of a false alarm by the ranks, over all parameters together
 _DRAWN = 0.99  #: share of the bins of uniform ranks inside the drawn band
 _GREY = "#777777"
-_CERTAIN = 0.999  #: probability that the coverage of a right posterior is within its limits
+_CERTAIN = 0.999  #: probability that the coverage of a correct posterior is within its limits
 #: limits of the coverage by number of simulations, rounded; the exact limits for 1000 are 0.868 and 0.930
 _ROUNDED = {200: (0.825, 0.960), 1000: (0.870, 0.930)}
 

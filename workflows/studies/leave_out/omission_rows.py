@@ -29,7 +29,7 @@ from neusee.workflows.tolerance.error_norm import error_of, largest_error
 
 _SURE = 4.0  #: standard errors by which a mean over pixels may differ from the mean over all noise
 _ABOUT = {"step": "study leave-out"}
-_ROUNDING = 2e-7  #: of a sum in float32, as a share of its largest element
+_ROUNDING = 2e-7  #: rounding error of a sum in float32, relative to its largest element
 
 
 @dataclass(frozen=True)
@@ -41,11 +41,11 @@ class OmissionRow:
     why: str
     taken: bool
     bound: float
-    rms: float  #: at the step, or at the steps that read it
+    rms: float  #: error at the step, or at the steps that read its result
     largest: float
-    outputs: dict[str, float]  #: root mean square error of each output by this omission alone
+    outputs: dict[str, float]  #: root mean square error of each output with this omission alone
     back: float | None  #: root mean square change of the worst output when this omission is undone
-    seconds: float  #: that the omission saves
+    seconds: float  #: run time that the omission saves
     holds: bool
 
 
@@ -54,7 +54,7 @@ class OutputError:
     """The error of an output of the recipe with the chosen omissions, relative to the full computation."""
 
     output: str
-    bound: float | None  #: proved by the engine
+    bound: float | None  #: error bound that the engine proved
     rms: float
     largest: float
     holds: bool

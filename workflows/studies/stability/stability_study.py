@@ -144,7 +144,7 @@ def _tables(rows: Sequence[GridCell]) -> Iterator[Section]:
     for mark, heading in headings.items():
         lines = [_line(row) for row in rows if row.cell.mark == mark]
         marks = {(i, _COLUMNS.index("mark")): mark for i in range(len(lines))}
-        yield Section(heading, "" if lines else "Nothing.", _COLUMNS if lines else (), lines, marks=marks)
+        yield Section(heading, "" if lines else "No cell.", _COLUMNS if lines else (), lines, marks=marks)
     cases = {row.case.name: row.case for row in rows}.values()
     yield Section("The cases", "", ("case", "group", "what"), [(c.name, c.group, c.what) for c in cases])
 

@@ -126,14 +126,14 @@ def _node_of(result: UncertaintyResult, quantity: str) -> str:
 
 def lead(result: UncertaintyResult) -> str:
     """Return the summary of the uncertainty study in a few sentences."""
-    count, kind = len(result.points.z), "points of Sobol" if result.sequences else "independent draws"
+    count, kind = len(result.points.z), "Sobol points" if result.sequences else "independent draws"
     known = f"every standard deviation is known to {result.error:.1%}"
     if result.error > result.wanted:
         known = f"the standard deviation of {result.worst} is known to {result.error:.1%} only"
         known += f"; {result.wanted:.1%} was requested"
     numbers = {name: result.scatter[name] for name in result.numbers[:_MOST]}
     values = [f"{name} {float(s.mean[0]):.5g} ± {float(s.sd[0]):.2g}" for name, s in numbers.items()]
-    strange = f" Not finite in some draw: {', '.join(result.strange)}." if result.strange else ""
+    strange = f" NaN or infinite in some draw: {', '.join(result.strange)}." if result.strange else ""
     return f"{count} {kind} of {', '.join(result.inputs.names)}: {known}.{strange}\n\n{'; '.join(values)}."
 
 

@@ -358,6 +358,6 @@ def test_what_is_not_finite_fails_and_is_said(tmp_path, store, monkeypatch):
     monkeypatch.setattr(OutputDraws, "numbers", broken)
     folder = study_recipe("uncertainty", small("developed_quality", *LAWS), store, tmp_path, most=64, error=1.0)
     assert count_failures(folder) == 1
-    assert "Not finite in some draw: developed_quality[mask].psnr" in (folder / "report.html").read_text()
+    assert "NaN or infinite in some draw: developed_quality[mask].psnr" in (folder / "report.html").read_text()
     table = (folder / "table.csv").read_text()
     assert "developed_quality[mask].psnr,,nan,nan" in table
