@@ -1,4 +1,4 @@
-"""The pictures of a calibration: photon-transfer curve, pairs of parameters, and chains."""
+"""The pictures of a calibration: photon-transfer curve, corner plot of the parameters, and traces of the chains."""
 
 from __future__ import annotations
 
@@ -22,10 +22,10 @@ _LEAST = 0.1  #: DN², the variance at which a level without scatter is drawn
 
 @drawn
 def transfer(measured: FloatArray, predicted: FloatArray, whole: NDArray[np.bool_]) -> Any:
-    """Draw variance against mean, and the distance of each level from the prediction of the posterior.
+    """Draw the photon-transfer curve, and the distance of each level from the prediction of the posterior.
 
-    ``measured`` (2, level) holds mean and variance, and ``predicted`` (2, draw, level) the mean and variance of another
-    such measurement. ``whole`` (level,) is False for levels that the well or the converter clips.
+    ``measured`` (2, level) has mean and variance, and ``predicted`` (2, draw, level) mean and variance of a repeated
+    measurement. ``whole`` (level,) is False for levels that the well or the converter clips.
     """
     figure, axes = canvas(9.0, 7.2, 2, 1, sharex=True, height_ratios=(2.2, 1.0))
     above, below = axes[0, 0], axes[1, 0]
@@ -33,7 +33,7 @@ def transfer(measured: FloatArray, predicted: FloatArray, whole: NDArray[np.bool
     mean, (low, middle, high) = predicted[0].mean(0)[order], np.percentile(predicted[1], _BAND, axis=0)[:, order]
     above.fill_between(mean, low, high, color=BLUE, alpha=0.25, linewidth=0, label="predicted, 90 %")
     above.plot(mean, middle, color=BLUE, linewidth=1.2, label="predicted, median")
-    clipped = {"color": VERMILION, "markerfacecolor": "none", "label": "cut off or coarse: counted number by number"}
+    clipped = {"color": VERMILION, "markerfacecolor": "none", "label": "clipped or coarse: numbers counted one by one"}
     for at, style in ((whole, {"color": BLACK, "label": "measured"}), (~whole, clipped)):
         if at.any():
             above.plot(measured[0, at], measured[1, at].clip(_LEAST), "o", markersize=5, **style)
@@ -43,7 +43,7 @@ def transfer(measured: FloatArray, predicted: FloatArray, whole: NDArray[np.bool
     below.axhspan(-2, 2, color=BLUE, alpha=0.12, linewidth=0)
     below.axhline(0, color=BLUE, linewidth=1.0)
     below.plot(measured[0, whole], distance, "o", color=BLACK, markersize=5)
-    below.set(xlabel="mean (DN)", ylabel="off, in sd of\nthe prediction")
+    below.set(xlabel="mean (DN)", ylabel="distance in sd\nof the prediction")
     reach = max(3.5, 1.1 * float(np.abs(distance).max(initial=0.0)))
     below.set_ylim(-reach, reach)
     return figure
@@ -51,7 +51,7 @@ def transfer(measured: FloatArray, predicted: FloatArray, whole: NDArray[np.bool
 
 @drawn
 def corners(draws: FloatArray, names: Sequence[str], nominal: Sequence[float]) -> Any:
-    """Draw every pair of parameters, with the recipe's own values in orange."""
+    """Draw a corner plot of all pairs of parameters, with the recipe's own values in orange."""
     import corner
     from matplotlib.backends.backend_agg import FigureCanvasAgg
     from matplotlib.figure import Figure
@@ -68,7 +68,7 @@ def corners(draws: FloatArray, names: Sequence[str], nominal: Sequence[float]) -
 
 @drawn
 def traces(draws: FloatArray, labels: Sequence[str]) -> Any:
-    """Draw the median and the middle 90 % of the walkers of each ensemble, for each coordinate by step."""
+    """Draw a trace plot of each coordinate: the median and the middle 90 % of the walkers of each ensemble."""
     count = len(labels)
     figure, axes = canvas(9.0, 1.35 * count + 0.5, count, 1, sharex=True)
     every = max(1, draws.shape[1] // _POINTS)
@@ -80,5 +80,5 @@ def traces(draws: FloatArray, labels: Sequence[str]) -> Any:
             ax.fill_between(steps, low, high, color=colour, alpha=0.12, linewidth=0)
             ax.plot(steps, middle, color=colour, linewidth=0.8)
         ax.set_ylabel(label, fontsize=9, rotation=0, ha="right", va="center")
-    axes[-1, 0].set_xlabel("step, without what was thrown away")
+    axes[-1, 0].set_xlabel("step after the discarded steps")
     return figure

@@ -32,7 +32,7 @@ _PURE = ("quantum_efficiency", "spread", "scatter", "lamp", "bend", "twist")  #:
 
 @dataclass(frozen=True)
 class ParameterEstimate:
-    """The posterior of one parameter: mean, standard deviation and interval beside the recipe's own value."""
+    """The posterior of one parameter: mean, standard deviation and interval, compared with the recipe's own value."""
 
     name: str
     unit: str
@@ -47,7 +47,7 @@ class ParameterEstimate:
 
     @property
     def text(self) -> str:
-        """Return the estimate or the limit with its unit, or a text that the frames give neither."""
+        """Return the estimate or the limit as text with unit, or a text for a parameter that has neither."""
         if self.kind == "estimate":
             return f"{with_uncertainty(self.mean, self.sd)} {self.unit}".rstrip()
         if self.kind == "none":
@@ -69,7 +69,7 @@ class CalibrationResult:
 
     @property
     def params(self) -> Mapping[str, Any]:
-        """Return the recipe's own parameters of the step that computes the likelihood."""
+        """Return the parameters that the recipe gives to the step of the likelihood."""
         return self.problem.recipe.steps[self.problem.step].params
 
     @property
@@ -78,7 +78,7 @@ class CalibrationResult:
         return {name: x.numpy() for name, x in self.problem.parameters(self.chains.draws).items()}
 
     def rows(self) -> list[ParameterEstimate]:
-        """Return one estimate for each parameter."""
+        """Return the estimate of each parameter."""
         rows = zip(self.draws.items(), self.mode.shares.tolist(), strict=True)
         return [self._estimate(name, draws, narrower) for (name, draws), narrower in rows]
 
@@ -91,7 +91,7 @@ class CalibrationResult:
 
 
 def with_uncertainty(mean: float, sd: float) -> str:
-    """Return a mean and its standard deviation as text, with two significant digits of the standard deviation."""
+    """Return mean ± standard deviation as text, rounded to two significant digits of the standard deviation."""
     if not sd > 0:
         return f"{mean:.6g} ± {sd:g}"
     digits = 1 - math.floor(math.log10(sd))
@@ -116,7 +116,7 @@ def banner(result: CalibrationResult) -> str:
 
 
 def lead(result: CalibrationResult) -> str:
-    """Return the opening of the page: estimates, values to state, and the directions that are not determined."""
+    """Return the opening of the page: estimates, values to state, and directions that are not determined."""
     values = [f"{_words(row.name)} {row.text}" for row in result.rows()]
     estimated = [m for m in result.models if result.identifiability.kinds[m.name] == "estimate"]
     stated = [f"{_words(m.name)} {_between(m.stated)}" for m in estimated]
@@ -142,9 +142,9 @@ def sections(result: CalibrationResult) -> list[Section]:
 
 
 def _parameters(result: CalibrationResult) -> Section:
-    text = """A value is given only where the frames narrow the prior to less than a third. Elsewhere there is a
-        limit, which depends on the prior. The last columns show where the recipe's own value lies among the draws, and
-        the width of the posterior over that of the prior."""
+    text = """A value is given only if the posterior is less than a third as wide as the prior. Otherwise there is a
+        limit, which depends on the prior. The last columns show the share of the draws below the recipe's own value,
+        and the width of the posterior divided by the width of the prior."""
     columns = ("parameter", "posterior", "5 %", "95 %", "unit", "recipe", "draws below it", "width / prior")
     estimates = result.rows()
     rows = [
@@ -158,9 +158,10 @@ def _parameters(result: CalibrationResult) -> Section:
 
 
 def _models(result: CalibrationResult) -> Section:
-    text = """The posterior of the same levels by a response that is straight, bent once and bent twice, each with
-        its 90 % interval. The stated value is the middle of the two richest models; its width is the wider of both and
-        half their distance. The interval of a single model is too narrow."""
+    text = """The posterior with a linear response, and with responses of one and of two more terms, each with its 90 %
+        interval. The stated value is the mean of the two models with the most terms. The stated standard deviation is
+        the larger one of both models and half the distance of both values, added in quadrature. The interval of a
+        single model is too narrow."""
     columns = ("parameter", *(f"{n} terms" for n in range(len(result.models[0].models))), "stated", "unit")
     rows = [
         (_words(m.name), *map(_between, (*m.models, m.stated)), unit_of(m.name, result.params)) for m in result.models
@@ -176,13 +177,13 @@ def _checks(result: CalibrationResult) -> Section:
     rows = [(check.name, check.found, check.bar, check.mark) for check in result.checks]
     marks: dict[tuple[int, int], Mark] = {(i, 3): check.mark for i, check in enumerate(result.checks)}
     count = count_failures(result.checks)
-    text = f"{count} fail: the posterior is not fit for use." if count else "None fails."
+    text = f"{count} fail: the posterior is not fit for use." if count else "No check fails."
     return Section("Checks", text, ("check", "found", "bar", "holds"), rows, marks=marks)
 
 
 def _not_determined(result: CalibrationResult) -> Section:
-    text = """Singular values of the slopes of the levels per standard deviation of the prior, before anything is
-        drawn. In a direction below 3 the prior constrains the parameters more than the frames do."""
+    text = """Singular values of the derivatives of the levels per standard deviation of the prior, computed before any
+        sampling. In a direction below 3 the prior constrains the parameters more than the frames do."""
     strengths, directions = result.identifiability.strengths, result.identifiability.directions
     rows = list(zip(strengths, [""] * (len(strengths) - len(directions)) + [*directions], strict=True))
     marks: dict[tuple[int, int], Mark] = {(i, 0): "warn" if text else "pass" for i, (_, text) in enumerate(rows)}
@@ -199,14 +200,14 @@ def _curve(result: CalibrationResult) -> Section:
     whole: NDArray[np.bool_] = np.asarray((variance > 0).all(0))
     whole[levels.cell_level.numpy()] = False
     picture = figures.transfer(np.stack(_moments(levels)), np.stack([mean, variance * (1 + chance)]), whole)
-    text = """The measured variance of each level against its mean, and the prediction of the posterior for another
-        such measurement. Levels that the well or the converter clips, or that are too coarse for a mean and a variance,
-        enter the likelihood number by number and have no prediction here."""
+    text = """The measured variance of each level against its mean, and the prediction of the posterior for a repeated
+        measurement. If a level is clipped by the well or the converter, or too coarse for a mean and a variance, each
+        of its digital numbers enters the likelihood, and the level has no prediction here."""
     return Section("Photon-transfer curve", text, picture=picture)
 
 
 def _moments(levels: Sufficient | Levels) -> tuple[FloatArray, FloatArray]:
-    """Return the mean and the variance of all numbers of each level, also of those that `Sufficient` counts singly."""
+    """Return the mean and the variance of all digital numbers of each level, including numbers counted one by one."""
     if isinstance(levels, Levels):
         return levels.mean.numpy(), levels.variance.numpy()
     at, value, count = (x.numpy() for x in levels[-3:])
@@ -228,6 +229,6 @@ def _corner(result: CalibrationResult) -> Section:
 
 
 def _chains(result: CalibrationResult) -> Section:
-    text = "Four independent ensembles, in the coordinates in which they walk."
+    text = "Four independent ensembles of walkers, in the coordinates of the posterior."
     picture = figures.traces(result.chains.draws, result.problem.coordinates.labels)
     return Section("Chains", text, picture=picture)

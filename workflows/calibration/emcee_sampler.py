@@ -1,4 +1,4 @@
-"""Draws from the posterior of a sensor with emcee: four ensembles, which end when their chains are long enough.
+"""Draws from the posterior of a sensor with emcee: four ensembles of walkers, until the chains are long enough.
 
 Only this file and `ensembles` import emcee. After each round all draws are written in emcee's HDF5 format. A killed run
 continues from the last round and gives the same draws, to the last bit, as a run that never stopped.
@@ -27,7 +27,7 @@ ENSEMBLES = 4
 STRANDED = 20.0  #: nats by which the median of a stranded walker lies below that of all walkers
 _FIRST, _GROWTH, _LONGEST = 250, 1.25, 32_000  #: steps of the first round; growth by round; most steps
 _TAUS, _CHANGE = 50.0, 0.01  #: least length of a chain in tau, and the largest change of tau in its last round
-_SURELY = 100.0  #: length in tau from which any change of tau is allowed
+_SURELY = 100.0  #: length of a chain in tau at which any change of tau is allowed
 _BESIDE = 5.0  #: nats for each parameter by which a starting point may lie below the mode
 _BURN = 10.0  #: autocorrelation times that are discarded
 _MOVES = {"de": emcee.moves.DEMove, "stretch": emcee.moves.StretchMove}
@@ -35,23 +35,23 @@ _MOVES = {"de": emcee.moves.DEMove, "stretch": emcee.moves.StretchMove}
 
 @dataclass(frozen=True)
 class Chains:
-    """The draws and log posteriors of all ensembles, and how well their walkers mix."""
+    """The draws and log posteriors of all ensembles, and measures of how well the walkers mix."""
 
     draws: FloatArray  #: (ensemble, step, walker, free) coordinates, without the discarded steps
     log: FloatArray  #: (ensemble, step, walker)
-    accepted: float  #: share of the moves
+    accepted: float  #: share of the proposed moves
     tau: float  #: steps, the longest autocorrelation time of any coordinate
     steps: int  #: with the discarded steps
     long: bool  #: True if the chains are long enough
 
     @property
     def flat(self) -> FloatArray:
-        """Return the draws (draw, free) of all ensembles."""
+        """Return the draws of all ensembles in one array (draw, free)."""
         return self.draws.reshape(-1, self.draws.shape[-1])
 
 
 def move(name: str) -> Any:
-    """Return the move of walkers ``de`` or ``stretch``; raise `ValueError` for any other name."""
+    """Return emcee's move with the name ``de`` or ``stretch``; raise `ValueError` for any other name."""
     if name in _MOVES:
         return _MOVES[name]()
     if "snooker" in name.lower():
@@ -59,7 +59,7 @@ def move(name: str) -> Any:
             "DESnookerMove of emcee up to 3.1.6 draws from a distribution that is 18 % too narrow (emcee's pull "
             "request 531 corrects it): use de or stretch"
         )
-    raise ValueError(f"no move {name!r}: write de or stretch")
+    raise ValueError(f"unknown move {name!r}: write de or stretch")
 
 
 def sample(
@@ -73,9 +73,9 @@ def sample(
     wanted: int = 1000,
     progress: Progress = silent,
 ) -> Chains:
-    """Draw until every chain is 50 autocorrelation times long and the effective sample size is ``wanted``.
+    """Draw until every chain is 50 autocorrelation times long and the effective sample size is at least ``wanted``.
 
-    ``file`` keeps the draws; where it exists, the chains continue from it.
+    ``file`` keeps the draws; if the file exists, the chains continue from its last step.
     """
     moves = move(how)
     runs = [start_ensemble(problem, mode, file, index, seed, walkers, moves) for index in range(ENSEMBLES)]
@@ -100,7 +100,7 @@ def _longest_time(runs: Sequence[Walk], steps: int | None = None) -> float:
 
 
 def _round(iteration: int) -> tuple[int, int]:
-    """Return the lengths in steps of two successive rounds; the second is the first round to reach ``iteration``."""
+    """Return the numbers of steps of two successive rounds, the second of which is the first to reach ``iteration``."""
     before, steps = 0, _FIRST
     while steps < iteration:
         before, steps = steps, int(_GROWTH * steps)
@@ -110,7 +110,7 @@ def _round(iteration: int) -> tuple[int, int]:
 def start_ensemble(
     problem: SensorPosterior, mode: LaplaceFit, file: Path, index: int, seed: int, walkers: int, moves: Any
 ) -> Walk:
-    """Return an ensemble that continues the draws in ``file`` or starts from the normal distribution at the mode."""
+    """Return an ensemble of walkers that continues the draws in ``file``, or that starts near the mode."""
     dimensions = len(problem.names)
     backend = _read(file, index)
     if backend is not None and backend.shape == (walkers, dimensions):
@@ -125,7 +125,7 @@ def start_ensemble(
 
 
 def _alive(problem: SensorPosterior, mode: LaplaceFit, walkers: int, rng: np.random.Generator) -> FloatArray:
-    """Return starting points (walker, free) that are likely; beyond a full well the posterior is almost zero."""
+    """Return starting points (walker, free) near the mode, except points where the posterior is almost zero."""
     points = np.empty((0, len(mode.theta)))
     for _ in range(50):
         drawn = mode.draw(4 * walkers, rng)
@@ -134,19 +134,19 @@ def _alive(problem: SensorPosterior, mode: LaplaceFit, walkers: int, rng: np.ran
         if len(points) >= walkers:
             return points[:walkers]
     raise ValueError(
-        "the normal distribution about the mode hardly overlaps the posterior, so no chain can start from it"
+        "samples around the mode have almost no posterior density, so no chain can start there: give narrower priors"
     )
 
 
 def autocorrelation_time(chain: FloatArray) -> float:
-    """Return the longest autocorrelation time of any coordinate, in steps of a chain (step, walker, free)."""
+    """Return the longest autocorrelation time of all coordinates of a chain (step, walker, free), in steps."""
     with np.errstate(invalid="ignore"):
         tau = float(np.max(emcee.autocorr.integrated_time(chain, tol=0, has_walkers=True)))
     return tau if np.isfinite(tau) else float(len(chain))  # NaN for walkers that never move
 
 
 def stranded(log: FloatArray) -> int:
-    """Return the number of walkers of ``log`` (..., step, walker) that stay where the posterior is almost zero."""
+    """Return the number of walkers whose log posterior ``log`` (..., step, walker) is far below that of the others."""
     middle = np.median(log, -2)
     return int((middle < np.median(middle) - STRANDED).sum())
 
@@ -160,7 +160,7 @@ def _gathered(runs: Sequence[Walk], tau: float, steps: int, long: bool) -> Chain
 
 
 def _read(file: Path, index: int) -> Any:
-    """Return the draws of an ensemble as a backend in memory; return None where no file can be read."""
+    """Read the draws of an ensemble into a backend in memory; return None if the file cannot be read."""
     if not file.is_file():
         return None
     try:
@@ -176,11 +176,11 @@ def _read(file: Path, index: int) -> Any:
 
 
 def _keep(file: Path, backends: Sequence[Any], progress: Progress) -> None:
-    """Write the draws; report a failure, such as a full disk, as progress and continue."""
+    """Write the draws to a file; if this fails, for example on a full disk, report the error and continue."""
     try:
         _write(file, backends)
     except (OSError, RuntimeError) as error:  # h5py raises both
-        progress(f"draws are not kept, so a stop would lose them: {error}")
+        progress(f"the draws are not on disk, so an interruption would lose them: {error}")
 
 
 def _write(file: Path, backends: Sequence[Any]) -> None:

@@ -1,8 +1,8 @@
-"""Ensembles of walkers that step together, so that one call evaluates the proposals of all ensembles.
+"""Ensembles of walkers that advance together, so that one call evaluates the proposals of all ensembles.
 
 Each ensemble has emcee's moves and its own random stream. The draws are exactly those of emcee's `EnsembleSampler`,
 which evaluates one ensemble after another in a loop over walkers. A likelihood of few numbers takes as long for one
-ensemble as for four, and less time than that loop.
+ensemble as for four, and less time than the loop of emcee.
 """
 
 from __future__ import annotations
@@ -20,7 +20,7 @@ Weigh = Callable[["FloatArray"], "FloatArray"]  #: returns the log density (walk
 
 
 class Walk:
-    """One ensemble of walkers with its draws, its move and its random stream."""
+    """An ensemble of walkers, with the draws, the move and the random stream of the ensemble."""
 
     def __init__(
         self, backend: Any, move: Any, random: np.random.RandomState, initial_theta: FloatArray | None
@@ -31,11 +31,11 @@ class Walk:
 
     @property
     def iteration(self) -> int:
-        """Return the number of steps so far."""
+        """Return the number of steps that the walkers have made."""
         return int(self.backend.iteration)
 
     def prepare(self, steps: int, weigh: Weigh) -> None:
-        """Reserve memory for ``steps`` more steps, and start from the last one."""
+        """Reserve memory for ``steps`` more steps, and load the walkers' state after the last step."""
         if self.initial_theta is not None and self.iteration == 0:
             self._state = emcee.State(self.initial_theta.copy(), log_prob=weigh(self.initial_theta))
         else:
@@ -43,7 +43,7 @@ class Walk:
         self.backend.grow(steps, None)
 
     def begin_step(self) -> None:
-        """Split the walkers into parts; the proposals of each part depend on the other parts."""
+        """Split the walkers into parts for one step; the proposals for each part depend on the other parts."""
         self.random.random_sample()  # emcee draws one of several moves with this number
         self.move.setup(self._state.coords)
         self._part = np.arange(len(self._state.coords)) % self.move.nsplits
@@ -52,7 +52,7 @@ class Walk:
         self._accepted = np.zeros(len(self._part), dtype=bool)
 
     def propose(self, part: int) -> FloatArray:
-        """Return the proposals (walker, free) of one part."""
+        """Return the proposed coordinates (walker, free) for one part of the walkers."""
         sets = [self._state.coords[self._part == other] for other in range(self.move.nsplits)]
         others = sets[:part] + sets[part + 1 :]
         self._proposed, self._factors = self.move.get_proposal(sets[part], others, self.random)
@@ -60,7 +60,7 @@ class Walk:
         return proposed
 
     def decide(self, part: int, log: FloatArray) -> None:
-        """Accept or reject the proposals of one part."""
+        """Accept or reject the proposed coordinates of one part of the walkers."""
         own = np.flatnonzero(self._part == part)
         gain = self._factors + log - self._state.log_prob[own]
         accepted = gain > np.log(self.random.rand(len(own)))
@@ -69,16 +69,16 @@ class Walk:
         self._accepted[at] = True
 
     def end_step(self) -> None:
-        """Add the step to the draws."""
+        """Add the walkers' coordinates after this step to the draws."""
         self.backend.save_step(self._state, self._accepted)
 
     def rest(self) -> None:
-        """Store the state of the random stream, from which a later run continues."""
+        """Store the state of the random stream, so that a later run can continue from this state."""
         self.backend.random_state = self.random.get_state()
 
 
 def walk_until(walks: Sequence[Walk], steps: int, weigh: Weigh) -> None:
-    """Walk until every ensemble has ``steps`` steps; the ensembles with the fewest steps go first."""
+    """Advance the ensembles until each has ``steps`` steps; ensembles with the fewest steps go first."""
     while (now := min(walk.iteration for walk in walks)) < steps:
         behind = [walk for walk in walks if walk.iteration == now]
         until = min([steps, *(walk.iteration for walk in walks if walk.iteration > now)])

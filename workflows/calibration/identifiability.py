@@ -1,4 +1,4 @@
-"""The parameters of a sensor that the levels determine, in words, before anything is drawn from the posterior."""
+"""Identifiability of a sensor's parameters: which parameters the measured levels determine, before any sampling."""
 
 from __future__ import annotations
 
@@ -15,15 +15,15 @@ from neusee.workflows.calibration.posterior_mode import LaplaceFit
 if TYPE_CHECKING:
     from neusee.workflows.calibration.log_posterior import FloatArray
 
-WEAK = 3.0  #: standard deviation of the prior over that of the levels; below, the prior says more than the frames
+WEAK = 3.0  #: ratio of the prior's standard deviation to that of the levels; below, the prior constrains more
 _PART = 0.1  #: least component with which a parameter counts as part of a direction of length 1
-_ALONE = 0.97  #: least component with which one parameter alone stands for a direction
-_WIDER = 1.25  #: factor by which priors twice as wide may widen a parameter that the levels determine
-_FAR = 3.0  #: standard deviations of the prior between its middle and the value that the levels may contradict
-_FALLS = 4.0  #: nats by which the levels must contradict a value for a limit
+_ALONE = 0.97  #: least component with which a direction counts as that of one parameter alone
+_WIDER = 1.25  #: largest factor by which doubled priors may widen the posterior of a determined parameter
+_FAR = 3.0  #: distance from the prior's middle, in standard deviations, at which the likelihood is compared
+_FALLS = 4.0  #: nats by which the likelihood must fall at this distance to set a limit
 
 KINDS = {"estimate": "", "upper": "only an upper limit", "lower": "only a lower limit", "none": "not from these frames"}
-#: why the frames set no more than the kind of limit, by parameter and kind
+#: by parameter and kind: the reason why the frames set only a limit, or none
 _REASONS = {
     ("full_well", "lower"): ": no frame is saturated by the well",
     ("dark_current", "upper"): ": no dark was exposed for long enough",
@@ -34,21 +34,21 @@ _REASONS = {
 
 @dataclass(frozen=True)
 class Identifiability:
-    """The parameters, and the directions among parameters, that the levels determine or leave to the prior."""
+    """The parameters, and the directions in parameter space, that the levels determine or leave to the prior."""
 
     kinds: dict[str, str]  #: one of `KINDS` for each parameter
     directions: Sequence[str]  #: a sentence for each direction that the levels do not determine
     strengths: Sequence[float]  #: singular values, the largest first, one for each free parameter
-    refused: str  #: why no posterior is worth drawing from; empty where one is
+    refused: str  #: the reason why sampling is not useful; empty if sampling is useful
 
     @property
     def estimated(self) -> tuple[str, ...]:
-        """Return the parameters whose value the levels determine."""
+        """Return the names of the parameters whose values the levels determine."""
         return tuple(name for name, kind in self.kinds.items() if kind == "estimate")
 
 
 def identify(problem: SensorPosterior, mode: LaplaceFit) -> Identifiability:
-    """Return the parameters that the levels determine, by singular values of the slopes of the levels."""
+    """Find the parameters that the levels determine, by singular values of the derivatives of the levels."""
     _, s, v = np.linalg.svd(mode.scaled_slopes)
     s = np.concatenate([s, np.zeros(len(v) - len(s))])
     kinds = {n: "estimate" if own else "none" for n, own in zip(problem.names, _own(s, v), strict=True)}
@@ -69,9 +69,9 @@ def identify(problem: SensorPosterior, mode: LaplaceFit) -> Identifiability:
 
 
 def _own(s: FloatArray, v: FloatArray) -> FloatArray:
-    """Return True (free,) for each parameter that the levels determine, not the priors.
+    """Return an array (free,) that is True for parameters that the levels determine rather than the priors.
 
-    The width of such a parameter is less than a third of its prior's, and hardly grows if all priors are twice as wide.
+    The posterior of such a parameter is less than a third as wide as its prior, and hardly widens with doubled priors.
     """
     sd, wide = ((v.T**2 / (s**2 + width**-2)).sum(1) ** 0.5 for width in (1.0, 2.0))
     own: FloatArray = (sd < 1 / WEAK) & (wide < _WIDER * sd)
@@ -79,7 +79,10 @@ def _own(s: FloatArray, v: FloatArray) -> FloatArray:
 
 
 def _sorted_out(weak: FloatArray) -> Sequence[FloatArray]:
-    """Return the weak directions with those of one parameter alone first; any mixture of two is as weak as both."""
+    """Return orthogonal weak directions: first the directions of a single parameter, then all others.
+
+    A mixture of weak directions is weak too, so that any basis of the same space is allowed.
+    """
     alone = np.flatnonzero((weak**2).sum(0) > _ALONE**2)
     units = np.eye(weak.shape[1])[alone]
     _, _, v = np.linalg.svd(weak - (weak @ units.T) @ units)
@@ -87,7 +90,7 @@ def _sorted_out(weak: FloatArray) -> Sequence[FloatArray]:
 
 
 def _limit(problem: SensorPosterior, mode: LaplaceFit, name: str) -> str:
-    """Return the kind of limit that the levels set to a parameter while the other parameters stay at the mode."""
+    """Return the kind of limit that the levels set on a parameter, with all other parameters at the mode."""
     at = problem.names.index(name)
     z = np.repeat(problem.whitened(mode.theta)[None], 2, 0)
     z[:, at] = _FAR, -_FAR
@@ -99,7 +102,7 @@ def _limit(problem: SensorPosterior, mode: LaplaceFit, name: str) -> str:
 
 
 def _together(parts: Sequence[tuple[str, float]]) -> str:
-    """Return a sentence about parameters of which the levels determine one combination alone."""
+    """Return a text about several parameters that the levels determine only in combination."""
     first = max(parts, key=lambda part: abs(part[1]))
     rest = [(name, bool(x * first[1] > 0)) for name, x in parts if name != first[0]]
     more, less = ([_plain(name) for name, same in rest if same is up] for up in (True, False))

@@ -1,4 +1,4 @@
-"""Importance sampling of a posterior, from a density that is fitted until both agree."""
+"""Importance sampling of a posterior, with a proposal density that is fitted to the posterior in several rounds."""
 
 from __future__ import annotations
 
@@ -14,14 +14,14 @@ if TYPE_CHECKING:
 
 DRAWS = 4000
 _ROUNDS, _TAIL = 8, 6.0
-_ENOUGH, _SOFT, _LEAST = 0.3, 0.1, 0.02  #: effective sample fractions: to end, to fit the next density to, at least
+_ENOUGH, _SOFT, _LEAST = 0.3, 0.1, 0.02  #: effective sample fractions: to stop, to fit the next proposal, to accept
 
 
 def draw_samples(problem: SensorPosterior, mode: LaplaceFit, rng: np.random.Generator) -> tuple[FloatArray, FloatArray]:
-    """Return samples, and for each sample the logarithm of the posterior over the density of the draw.
+    """Return samples, and for each sample the logarithm of the posterior over the proposal density.
 
-    The density is Student's t; its mean and covariance start as those at the mode and are fitted to the weighted
-    samples. Raises: `ValueError` where density and posterior never agree.
+    The proposal is Student's t distribution; its mean and covariance start at those of the mode and are fitted to the
+    weighted samples. Raises: `ValueError` if the effective sample size stays too small.
     """
     centre, covariance = mode.theta, mode.covariance
     kept, best = (np.empty((0, len(centre))), np.empty(0)), 0.0
@@ -45,7 +45,7 @@ def draw_samples(problem: SensorPosterior, mode: LaplaceFit, rng: np.random.Gene
 
 
 def weights(log: FloatArray) -> FloatArray:
-    """Return the weight of each sample from the logarithm of that weight; the weights sum to one."""
+    """Return the normalised weight of each sample from the logarithms of the weights; the sum of weights is 1."""
     weight = np.exp(log - log.max())
     normalized: FloatArray = weight / weight.sum()
     return normalized
@@ -54,7 +54,7 @@ def weights(log: FloatArray) -> FloatArray:
 def _proposed(
     problem: SensorPosterior, centre: FloatArray, covariance: FloatArray, rng: np.random.Generator
 ) -> tuple[FloatArray, FloatArray]:
-    """Return samples of Student's t, and the logarithm of the posterior over the density of Student's t."""
+    """Draw samples from Student's t distribution; return the samples and the logarithms of their weights."""
     off = rng.standard_normal((DRAWS, len(centre))) / np.sqrt(rng.chisquare(_TAIL, (DRAWS, 1)) / _TAIL)
     samples = centre + off @ np.linalg.cholesky(covariance).T
     log: FloatArray = problem.log_posterior(samples) + 0.5 * (_TAIL + len(centre)) * np.log1p((off**2).sum(1) / _TAIL)
@@ -62,5 +62,5 @@ def _proposed(
 
 
 def _effective_sample_fraction(weight: FloatArray) -> float:
-    """Return the effective sample size as a share of all samples."""
+    """Return the effective sample size divided by the number of samples."""
     return float(1.0 / (weight**2).sum() / len(weight))

@@ -1,4 +1,4 @@
-"""The posterior of a recipe's sensor as a function of its free parameters."""
+"""The posterior of a sensor as a function of the sensor's free parameters."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ if TYPE_CHECKING:
 
     FloatArray = NDArray[np.float64]
 
-_Function = Callable[[Mapping[str, Any]], dict[str, Any]]  #: the likelihood by the name of the step, of parameters
+_Function = Callable[[Mapping[str, Any]], dict[str, Any]]  #: from parameters to the likelihood by step name
 #: from the node of the likelihood to the node of the prior and the class of the coordinates
 _KINDS: dict[str, tuple[str, type[Coordinates] | type[CameraCoordinates]]] = {
     "calibrate.density": ("calibrate.prior", Coordinates),
@@ -34,7 +34,7 @@ _KINDS: dict[str, tuple[str, type[Coordinates] | type[CameraCoordinates]]] = {
 
 @dataclass(frozen=True)
 class SensorPosterior:
-    """The posterior of a recipe's sensor; a sample is a row of coordinates, one for each free parameter."""
+    """The posterior of the sensor of a recipe; a sample has one coordinate for each free parameter."""
 
     recipe: Recipe
     step: str  #: name of the step that computes the likelihood
@@ -42,11 +42,11 @@ class SensorPosterior:
     coordinates: Coordinates | CameraCoordinates
     levels: Sufficient | Levels
     weigh: _Function
-    weigh_in_full: _Function  #: with deviances and slopes too
+    weigh_in_full: _Function  #: also returns deviances and derivatives
 
     @classmethod
     def of(cls, recipe: Recipe, store: Store) -> SensorPosterior:
-        """Return the posterior of a recipe; raise `ValueError` unless there is one likelihood with one prior."""
+        """Return the posterior of a recipe; raise `ValueError` unless the recipe has one likelihood and one prior."""
         density = only_step(recipe, *_KINDS)
         prior_node, kind = _KINDS[density.node.path]
         prior = only_step(recipe, prior_node)
@@ -69,22 +69,22 @@ class SensorPosterior:
         return self.coordinates.names
 
     def parameters(self, samples: FloatArray) -> dict[str, Tensor]:
-        """Return the parameters by name, each (...), of samples (..., free)."""
+        """Convert samples (..., free) to parameters by name, each of shape (...)."""
         return self.coordinates.parameters(torch.from_numpy(np.ascontiguousarray(samples)))
 
     def theta(self, parameters: Mapping[str, float | Tensor]) -> FloatArray:
-        """Return the coordinates (..., free) of parameters."""
+        """Convert parameters by name to coordinates (..., free)."""
         coordinates: FloatArray = self.coordinates.place(parameters).numpy()
         return coordinates
 
     def likelihood(self, samples: FloatArray) -> Likelihood:
-        """Return the likelihood of the levels at samples (walker, free)."""
+        """Return the likelihood of the measured levels at samples (walker, free)."""
         with torch.no_grad(), one_thread():
             likelihood: Likelihood = self.weigh_in_full(self._named(self.parameters(samples)))[self.step]
         return likelihood
 
     def log_posterior(self, samples: FloatArray) -> FloatArray:
-        """Return the logarithm (walker,) of the posterior density of the coordinates, up to a constant."""
+        """Return the log posterior density (walker,) at samples (walker, free), up to a constant."""
         with torch.no_grad(), one_thread():
             parameters = self.parameters(samples)
             total = self.weigh(self._named(parameters))[self.step].log + self.coordinates.log_prior(parameters)
@@ -92,7 +92,7 @@ class SensorPosterior:
         return log
 
     def whitened(self, samples: FloatArray) -> FloatArray:
-        """Return samples (..., free) in standard deviations of the prior."""
+        """Return samples (..., free) as distances from the middle of the prior, in standard deviations of the prior."""
         whitened: FloatArray = self.coordinates.whitened(self.parameters(samples)).numpy()
         return whitened
 
@@ -101,12 +101,12 @@ class SensorPosterior:
 
 
 def only_step(recipe: Recipe, *paths: str) -> Step:
-    """Return the only step whose node is in ``paths``; raise `ValueError` for no such step or several."""
+    """Return the only step whose node is in ``paths``; raise `ValueError` if there is no such step or more than one."""
     steps = [step for step in recipe.steps.values() if step.node.path in paths]
     if len(steps) != 1:
         count = f"{len(steps)} steps" if steps else "no step"
         raise ValueError(
-            f"{recipe.name} has {count} of the node {' or '.join(paths)}, but a calibration has one step: see "
+            f"{recipe.name} has {count} of the node {' or '.join(paths)}, but a calibration needs exactly one: see "
             "`neusee run calibrate` and `neusee run calibrate_camera`"
         )
     return steps[0]

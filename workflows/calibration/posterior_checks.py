@@ -1,4 +1,4 @@
-"""The checks that a statistician would ask for before using a posterior, each with the bound that must hold."""
+"""Statistical checks of a posterior: chains, mode, importance sampling, and fit of the model to the levels."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ if TYPE_CHECKING:
 
 Mark = Literal["pass", "warn", "fail"]
 MISFIT = 1e-3  #: probability below which chance does not explain a deviance
-_NEVER = -1e6  #: nats of an impossible sample
+_NEVER = -1e6  #: log weight of an impossible sample
 _RHAT, _INDEPENDENT, _ACCEPTED = 1.01, 1000.0, (0.1, 0.7)
 _TAIL, _SD, _MEAN, _BELOW = 0.5, 0.05, 0.1, 2.0
 _LUCK = 4.0  #: standard errors by which the widths of two samples may differ
@@ -33,13 +33,13 @@ class Check:
 
     name: str
     found: str
-    bar: str  #: what must hold
+    bar: str  #: the criterion that must hold
     mark: Mark
 
 
 @dataclass(frozen=True)
 class GoodnessOfFit:
-    """The deviance of all levels, and the probability of a deviance as large by chance alone."""
+    """The deviance of all levels, and the probability that chance alone gives a deviance at least as large."""
 
     deviance: float
     freedom: float  #: degrees of freedom
@@ -47,13 +47,13 @@ class GoodnessOfFit:
 
     @property
     def good(self) -> bool:
-        """Return True if chance alone may explain the deviance."""
+        """Return True if chance alone can explain the deviance."""
         return self.p >= MISFIT
 
 
 @dataclass(frozen=True)
 class ImportanceSamples:
-    """Samples of the posterior with Pareto-smoothed weights, drawn without a chain."""
+    """Importance samples of the posterior, with Pareto-smoothed weights."""
 
     samples: FloatArray  #: (draw, free)
     weights: FloatArray  #: (draw,) sum 1
@@ -70,14 +70,14 @@ class ImportanceSamples:
         return sd
 
     def doubt(self, like: FloatArray) -> FloatArray:
-        """Return the relative standard error (free,) of `sd` for a distribution with the kurtosis of ``like``."""
+        """Return the relative standard error (free,) of the standard deviation, with the kurtosis of ``like``."""
         z = (like - like.mean(0)) / like.std(0)
         error: FloatArray = np.sqrt(((z**4).mean(0) - 1) * (self.weights**2).sum() / 4)
         return error
 
 
 def arviz() -> Any:
-    """Return the library ArviZ; raise `ImportError` with the command that installs the library."""
+    """Import and return ArviZ; raise `ImportError` with the command that installs ArviZ if the import fails."""
     try:
         with warnings.catch_warnings():
             warnings.simplefilter("ignore")  # ArviZ warns of its next version
@@ -88,7 +88,7 @@ def arviz() -> Any:
 
 
 def importance_samples(problem: SensorPosterior, mode: LaplaceFit, seed: int) -> ImportanceSamples:
-    """Return importance samples of the posterior, with Pareto-smoothed weights."""
+    """Draw importance samples from the posterior, and return them with Pareto-smoothed weights."""
     samples, log = draw_samples(problem, mode, np.random.default_rng(seed))
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")
@@ -99,7 +99,7 @@ def importance_samples(problem: SensorPosterior, mode: LaplaceFit, seed: int) ->
 def checks(
     problem: SensorPosterior, mode: LaplaceFit, identifiability: Identifiability, chains: Chains, law: ImportanceSamples
 ) -> list[Check]:
-    """Return all checks of a posterior, which is unfit for use if one check fails."""
+    """Run all checks of a posterior and return the results; if a check fails, the posterior is not fit for use."""
     peak, data = _of_peak(problem, mode, identifiability, chains, law), _of_data(problem, mode, identifiability)
     return [*_of_chains(chains), *peak, *data]
 
@@ -109,17 +109,22 @@ def _of_chains(chains: Chains) -> Iterator[Check]:
 
     taus = chains.steps / chains.tau
     yield Check(
-        "chains are long", f"{taus:.0f} autocorrelation times", "at least 50, and tau has settled", _mark(chains.long)
+        "chains are long enough",
+        f"{taus:.0f} autocorrelation times",
+        "at least 50, and a stable tau",
+        _mark(chains.long),
     )
     coordinates = np.moveaxis(chains.draws, -1, 0)
     rhat = max(map(_rhat, coordinates))
     yield Check("ensembles agree", f"R-hat {rhat:.4f}", f"at most {_RHAT}", _mark(rhat <= _RHAT))
     bulk, tail = (min(_effective_sample_size(draws, part) for draws in coordinates) for part in ("bulk", "tail"))
     size, enough = f"effective sample size {bulk:.0f}, {tail:.0f} in the tails", min(bulk, tail) >= _INDEPENDENT
-    yield Check("draws are enough", size, f"{_INDEPENDENT:.0f} each", _mark(enough))
+    yield Check("draws are numerous enough", size, f"at least {_INDEPENDENT:.0f} each", _mark(enough))
     low, high = _ACCEPTED
     well = low <= chains.accepted <= high
-    yield Check("walkers move", f"{chains.accepted:.0%} of the steps", f"{low:.0%} to {high:.0%}", _mark(well, "warn"))
+    yield Check(
+        "moves are accepted", f"{chains.accepted:.0%} of the moves", f"{low:.0%} to {high:.0%}", _mark(well, "warn")
+    )
     lost = emcee_sampler.stranded(chains.log)  # R-hat cannot see stranded walkers that all ensembles have
     text = f"{lost} of {chains.log.shape[0] * chains.log.shape[2]} lie {emcee_sampler.STRANDED:.0f} nats below the rest"
     yield Check("no walker is stranded", text, "none", _mark(lost == 0))
@@ -129,10 +134,10 @@ def _of_peak(
     problem: SensorPosterior, mode: LaplaceFit, identifiability: Identifiability, chains: Chains, law: ImportanceSamples
 ) -> Iterator[Check]:
     search = "settled" if mode.settled else "the search stopped"
-    yield Check("the mode was found", search, "settled", _mark(mode.settled))
+    yield Check("the search found the mode", search, "settled", _mark(mode.settled))
     below = mode.log - float(chains.log.max())
     distance = f"{abs(below):.2g} nats {'below' if below > 0 else 'above'} the mode"
-    yield Check("draws reach the mode", distance, f"within {_BELOW:.0f} nats", _mark(abs(below) <= _BELOW))
+    yield Check("the best draw is near the mode", distance, f"within {_BELOW:.0f} nats", _mark(abs(below) <= _BELOW))
     at = [i for i, name in enumerate(problem.names) if identifiability.kinds[name] == "estimate"]
     if not at:
         return
@@ -144,7 +149,9 @@ def _of_peak(
     text = f"widths within {apart[worst]:.1%}, means {off:.2f} sd; k-hat {law.tail:.2f}"
     bar = f"{allowed[worst]:.0%} and {_MEAN} sd, where k-hat is below {_TAIL}"
     agrees = bool((apart <= allowed).all()) and off <= _MEAN
-    yield Check("importance sampling agrees", text, bar, _mark(agrees, "fail" if law.tail < _TAIL else "warn"))
+    yield Check(
+        "importance sampling agrees with the chains", text, bar, _mark(agrees, "fail" if law.tail < _TAIL else "warn")
+    )
 
 
 def _of_data(problem: SensorPosterior, mode: LaplaceFit, identifiability: Identifiability) -> Iterator[Check]:
@@ -152,7 +159,7 @@ def _of_data(problem: SensorPosterior, mode: LaplaceFit, identifiability: Identi
     if float(look.degrees_of_freedom.sum()) > len(identifiability.estimated):
         fit = goodness_of_fit(look, len(identifiability.estimated))
         text = f"deviance {fit.deviance:.1f} of {fit.freedom:.0f} degrees of freedom, p = {fit.p:.2g}"
-        yield Check("the model of the sensor fits the levels", text, f"p above {MISFIT}", _mark(fit.good))
+        yield Check("the model of the sensor fits the levels", text, f"a p-value above {MISFIT}", _mark(fit.good))
     count = len(identifiability.directions)
     weak = f"{count} of {len(identifiability.strengths)} directions are not determined"
     text = weak if count else "all parameters are determined"
@@ -162,18 +169,18 @@ def _of_data(problem: SensorPosterior, mode: LaplaceFit, identifiability: Identi
 def goodness_of_fit(likelihood: Likelihood, free: int = 0) -> GoodnessOfFit:
     """Return the goodness of fit of one sensor whose ``free`` parameters were fitted to the same levels.
 
-    Raises: `ValueError` for a likelihood without deviances, for several sensors, and without a degree of freedom.
+    Raises: `ValueError` for a likelihood without deviances, for several sensors, and for no degree of freedom.
     """
     from scipy.special import chdtrc
 
     if not len(likelihood.degrees_of_freedom):
-        raise ValueError("this likelihood has no deviances: compute the likelihood with told: true")
+        raise ValueError("the likelihood has no deviances: set told: true in the step of the likelihood")
     if likelihood.deviance.numel() != len(likelihood.degrees_of_freedom):
         shape = tuple(likelihood.deviance.shape)
-        raise ValueError(f"deviances {shape} are not of one sensor: give one row of parameters")
+        raise ValueError(f"deviances of shape {shape} belong to several sensors: give one row of parameters")
     deviance, freedom = float(likelihood.deviance.sum()), float(likelihood.degrees_of_freedom.sum()) - free
     if freedom <= 0:
-        raise ValueError(f"{freedom + free:.0f} numbers cannot test {free} free parameters: give more levels")
+        raise ValueError(f"{freedom + free:.0f} measured numbers cannot test {free} free parameters: give more levels")
     return GoodnessOfFit(deviance, freedom, float(chdtrc(freedom, deviance)))
 
 
@@ -182,7 +189,7 @@ def _mark(good: bool, else_: Mark = "fail") -> Mark:
 
 
 def _rhat(draws: FloatArray) -> float:
-    """Return R-hat of draws (ensemble, step, walker), each ensemble a chain because its walkers are correlated."""
+    """Return R-hat of draws (ensemble, step, walker); an ensemble is one chain, because its walkers are correlated."""
     return float(arviz().rhat(draws.reshape(len(draws), -1)))
 
 

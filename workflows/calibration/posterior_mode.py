@@ -1,4 +1,4 @@
-"""The mode and the covariance of a posterior by Fisher's scoring, which starts at the least squares of EMVA 1288."""
+"""The mode and the covariance of a posterior, by Fisher scoring from the least-squares estimate of EMVA 1288."""
 
 from __future__ import annotations
 
@@ -27,17 +27,17 @@ _SHORT = 1e-7  #: step before any standard deviation is known: levels may determ
 
 @dataclass(frozen=True)
 class LaplaceFit:
-    """The normal distribution about the mode of a posterior."""
+    """The Laplace approximation of a posterior: the normal distribution about the mode."""
 
     theta: FloatArray  #: (free,)
     log: float  #: log posterior at the mode
     covariance: FloatArray  #: (free, free), of the coordinates
-    scaled_slopes: FloatArray  #: (row, free) slopes of the levels per standard deviation of the prior
+    scaled_slopes: FloatArray  #: (row, free) derivatives of the levels per standard deviation of the prior
     shares: FloatArray  #: (free,) standard deviation of each parameter over that of its prior
     settled: bool  #: True if no further step raises the posterior
 
     def draw(self, count: int, rng: np.random.Generator) -> FloatArray:
-        """Return samples (count, free) of the normal distribution."""
+        """Draw samples (count, free) from the normal distribution about the mode."""
         values, vectors = np.linalg.eigh(self.covariance)
         normal = rng.standard_normal((count, len(self.theta)))
         samples: FloatArray = self.theta + (normal * np.sqrt(values.clip(0))) @ vectors.T
@@ -52,10 +52,10 @@ def log_density(mode: LaplaceFit, samples: FloatArray) -> FloatArray:
 
 
 def initial_theta(problem: SensorPosterior) -> FloatArray:
-    """Return the start of the search for the mode: a point from the guess to the middle of the prior.
+    """Return the start of the search for the mode, a point between a first guess and the middle of the prior.
 
     The start is the point closest to the guess at which the posterior is not zero.
-    Raises: `ValueError` where the posterior is zero at all points.
+    Raises: `ValueError` if the posterior is zero at all points.
     """
     coordinates = problem.coordinates
     middle = coordinates.from_whitened(torch.zeros(len(problem.names), dtype=torch.float64))
@@ -76,7 +76,7 @@ def initial_theta(problem: SensorPosterior) -> FloatArray:
 
 
 def find_mode(problem: SensorPosterior, initial_theta: FloatArray) -> LaplaceFit:
-    """Climb from ``initial_theta`` to the mode, and return the normal distribution about the mode.
+    """Search for the mode from ``initial_theta``, and return the normal distribution about the mode.
 
     In a direction that no level constrains, the distribution is as wide as the prior.
     """
@@ -106,7 +106,7 @@ def find_mode(problem: SensorPosterior, initial_theta: FloatArray) -> LaplaceFit
 
 
 def _climb(problem: SensorPosterior, theta: FloatArray, log: float, step: FloatArray) -> tuple[FloatArray, float, bool]:
-    """Return the best of many points along ``step``, its log posterior, and True if the point is higher than ``theta``.
+    """Return the best of many points along ``step``, its log posterior, and True if it is higher than at ``theta``.
 
     The points change all coordinates, or all except one, which may be at an edge.
     """
@@ -120,7 +120,7 @@ def _climb(problem: SensorPosterior, theta: FloatArray, log: float, step: FloatA
 def _differences(
     function: Callable[[FloatArray], FloatArray], theta: FloatArray, step: FloatArray, sides: FloatArray
 ) -> FloatArray:
-    """Return the slopes (value, free) of ``function`` by differences; ``sides`` (2, free) is 1 for each side to use."""
+    """Return derivatives (value, free) of ``function`` by differences; ``sides`` (2, free) is 1 for sides to use."""
     apart = np.diag(step)
     high, low = np.split(function(np.concatenate([theta + apart * sides[0], theta - apart * sides[1]])), 2)
     slopes: FloatArray = (high - low).T / (step * sides.sum(0).clip(1))
@@ -128,7 +128,7 @@ def _differences(
 
 
 def _sides(problem: SensorPosterior, theta: FloatArray, step: FloatArray) -> FloatArray:
-    """Return 1 (2, free) where a step up or down in a coordinate crosses no edge, such as a full well; 0 elsewhere."""
+    """Return an array (2, free): 1 where a step up or down crosses no edge, such as a full well, and 0 elsewhere."""
     apart = np.diag(step)
     log = problem.log_posterior(np.concatenate([theta[None], theta + apart, theta - apart]))
     possible: FloatArray = (log[1:] > log[0] - _EDGE).reshape(2, -1).astype(np.float64)
@@ -136,31 +136,31 @@ def _sides(problem: SensorPosterior, theta: FloatArray, step: FloatArray) -> Flo
 
 
 def _slopes(problem: SensorPosterior, theta: FloatArray, step: FloatArray) -> tuple[FloatArray, FloatArray]:
-    """Return the slopes of levels and prior by coordinate; the Gram matrix of both is Fisher's information."""
+    """Return the derivatives of levels and prior by coordinate; the Gram matrix of both is Fisher's information."""
     rows = _differences(lambda p: problem.likelihood(p).scaled.numpy(), theta, step, _sides(problem, theta, step))
     rounded = problem.recipe.steps[problem.step].params["rounding"] == "nearest"
     for name in problem.coordinates.edged.intersection(problem.names) if rounded else ():
-        at = problem.names.index(name)  # levels depend on this parameter at edges alone, over which there is no slope
+        at = problem.names.index(name)  # levels depend on this parameter only at edges, where they have no derivative
         rows[:, at] = 0.0
         rows[-1, at] = float(problem.likelihood(theta[None]).scaled[0, -1])
     return rows, _differences(problem.whitened, theta, step, np.ones((2, len(step))))
 
 
 def _gradient(problem: SensorPosterior, theta: FloatArray, step: FloatArray) -> FloatArray:
-    """Return the slope (free,) of the log posterior."""
+    """Return the gradient (free,) of the log posterior."""
     sides = _sides(problem, theta, step)
     gradient: FloatArray = _differences(problem.log_posterior, theta, step, sides)
     return gradient
 
 
 def _free(problem: SensorPosterior, theta: FloatArray, step: FloatArray, gradient: FloatArray) -> FloatArray:
-    """Return the gradient without the components that lead over an edge, beyond which the posterior is zero."""
+    """Return the gradient with 0 for components that lead over an edge, beyond which the posterior is zero."""
     up, down = _sides(problem, theta, step) == 0
     return np.where((up & (gradient > 0)) | (down & (gradient < 0)), 0.0, gradient)
 
 
 def _covariance(rows: FloatArray, prior: FloatArray) -> FloatArray:
-    """Return the covariance by singular values of the slopes; inverting the information would lose half the digits."""
+    """Return the covariance by an SVD of the derivatives; inverting Fisher's information would lose half the digits."""
     _, s, v = np.linalg.svd(np.concatenate([rows, prior]), full_matrices=False)
     covariance: FloatArray = (v.T / s**2) @ v
     return covariance

@@ -1,4 +1,4 @@
-"""``neusee calibrate``: compute the posterior of a recipe's sensor and write its folder."""
+"""The command ``neusee calibrate``: the posterior of a recipe's sensor, and the folder with the results."""
 
 from __future__ import annotations
 
@@ -29,7 +29,7 @@ _KEPT = 4000  #: draws in the file ``draws.npz``
 
 
 class CalibrationRefused(ValueError):
-    """Error for levels that constrain the sensor too little for a useful posterior."""
+    """Error raised if the levels constrain the sensor too little for a useful posterior."""
 
 
 def calibrate(
@@ -46,7 +46,7 @@ def calibrate(
     """Draw from the posterior of the sensor of ``recipe``, and return the folder with the results.
 
     A second call continues an interrupted calibration and does not repeat draws. Raises: `CalibrationRefused` before
-    anything is drawn where the levels constrain the sensor too little, `ValueError` for a recipe without a likelihood.
+    any sampling if the levels constrain the sensor too little, `ValueError` for a recipe without a likelihood.
     """
     study_run = StudyRun("calibrate", recipe, command)
     result = find_posterior(recipe, store, progress, walkers=walkers, move=move, draws=draws)
@@ -57,7 +57,7 @@ def calibrate(
 def find_posterior(
     recipe: Recipe, store: Store, progress: Progress, *, walkers: int, move: str, draws: int
 ) -> CalibrationResult:
-    """Compute the posterior with its identifiability, checks and models of the response."""
+    """Compute the posterior of a recipe's sensor, with identifiability, checks and models of the response."""
     from neusee.workflows.calibration import emcee_sampler
 
     emcee_sampler.move(move)  # raises for a wrong name before anything is computed
@@ -81,7 +81,7 @@ def find_posterior(
 
 
 def _document(result: CalibrationResult) -> dict[str, Any]:
-    """Return the part of ``posterior.json`` that only a calibration has."""
+    """Return the results of a calibration for ``posterior.json``."""
     problem, flat = result.problem, result.chains.flat
     return {
         "failed": count_failures(result.checks),
@@ -98,7 +98,7 @@ def _document(result: CalibrationResult) -> dict[str, Any]:
 
 
 def _plain(row: Mapping[str, Any]) -> dict[str, Any]:
-    """Return the row of a parameter, without mean and standard deviation where there is no estimate."""
+    """Return the row of a parameter, without mean and standard deviation if the frames give no estimate."""
     kept = {name: value for name, value in row.items() if row["kind"] == "estimate" or name not in ("mean", "sd")}
     return {name: None if isinstance(x, float) and not math.isfinite(x) else x for name, x in kept.items()}
 
@@ -125,7 +125,7 @@ def _draws(result: CalibrationResult) -> bytes:
 
 
 def _inference_data(result: CalibrationResult) -> Any:
-    """Return the draws as inference data of ArviZ, with each walker as a chain."""
+    """Return the draws as ArviZ inference data, with each walker as a chain."""
     chains = result.chains
 
     def by_walker(draws: Any) -> Any:

@@ -1,4 +1,4 @@
-"""Cold runs of a recipe: each begins with an empty store, so that it computes every needed step."""
+"""Cold runs of a recipe: each run starts with an empty store and computes every needed step."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ from neusee.workflows.store.result_store import Store
 
 @contextmanager
 def cold(store: Store) -> Iterator[Store]:
-    """Yield an empty store with a copy of the code digests in ``store``, and delete the empty store afterwards."""
+    """Yield a temporary store that has only the code digests of ``store``, and delete it afterwards."""
     with TemporaryDirectory(prefix="neusee-") as folder:
         if os.path.isfile(store.code_memo):
             shutil.copyfile(store.code_memo, Path(folder) / store.code_memo.name)
@@ -27,7 +27,7 @@ def cold(store: Store) -> Iterator[Store]:
 
 
 def run_cold(recipe: Recipe, store: Store, device: str = "cpu") -> Result:
-    """Return the result of a cold run on ``device``."""
+    """Run ``recipe`` on ``device`` with a temporary store that has no results, and return the result."""
     with cold(store) as empty:
         return run(recipe, empty, device=device)
 

@@ -35,8 +35,8 @@ def study_recipe(
 ) -> Path:
     """Run a study of ``recipe`` and return the folder of the study; ``kind`` is one of `KINDS`.
 
-    Args: store: keeps the points of the study, so that an interrupted study continues. runs: the parent of the folder.
-    progress: receives a line for each point that is done. options: of the kind of study.
+    Args: store: keeps finished parts, so that an interrupted study continues. runs: the parent of the study's folder.
+    progress: is called with a line of text for each finished part. options: arguments of the kind of study.
     """
     room = kind.replace("-", "_")
     module = import_module(f"neusee.workflows.studies.{room}.{room}_study")

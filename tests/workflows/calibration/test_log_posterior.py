@@ -71,7 +71,7 @@ def test_what_no_frame_tells_is_said_in_words(store):
 def test_the_snooker_is_refused_by_name():
     with pytest.raises(ValueError, match="18 % too narrow"):
         emcee_sampler.move("DESnookerMove")
-    with pytest.raises(ValueError, match="no move"):
+    with pytest.raises(ValueError, match="unknown move"):
         emcee_sampler.move("walk")
 
 
@@ -127,7 +127,7 @@ def test_draws_that_cannot_be_kept_are_drawn_and_said(store, tmp_path, monkeypat
     found = emcee_sampler.sample(p, best, tmp_path / "file" / "c.h5", seed=3, walkers=16, progress=said.append)
     kept = emcee_sampler.sample(p, best, tmp_path / "c.h5", seed=3, walkers=16)
     assert np.array_equal(found.draws, kept.draws)
-    assert sum("a stop would lose them" in line for line in said) == 1
+    assert sum("an interruption would lose them" in line for line in said) == 1
 
 
 def test_a_damaged_file_of_draws_is_drawn_anew(store, tmp_path, monkeypatch):
@@ -162,7 +162,7 @@ def test_good_draws_pass_and_each_fault_is_found(drawn):
     good = marks(drawn)
     assert set(good.values()) <= {"pass", "warn"}
     chains = drawn[3]
-    assert marks(drawn, long=False)["chains are long"] == "fail"
+    assert marks(drawn, long=False)["chains are long enough"] == "fail"
     shifted = chains.draws.copy()
     shifted[0] += 0.5 * chains.flat.std(0)
     assert marks(drawn, draws=shifted)["ensembles agree"] == "fail"
@@ -171,10 +171,10 @@ def test_good_draws_pass_and_each_fault_is_found(drawn):
     lost = replace(chains, log=log)
     assert emcee_sampler.stranded(lost.log) == 1
     assert marks(drawn, log=log)["no walker is stranded"] == "fail"
-    assert marks(drawn, log=chains.log - 10.0)["draws reach the mode"] == "fail"
-    assert marks(drawn, draws=chains.draws[:, :20])["draws are enough"] == "fail"
+    assert marks(drawn, log=chains.log - 10.0)["the best draw is near the mode"] == "fail"
+    assert marks(drawn, draws=chains.draws[:, :20])["draws are numerous enough"] == "fail"
     narrow = chains.flat.mean(0) + 0.8 * (chains.draws - chains.flat.mean(0))
-    assert marks(drawn, draws=narrow)["importance sampling agrees"] in ("fail", "warn")
+    assert marks(drawn, draws=narrow)["importance sampling agrees with the chains"] in ("fail", "warn")
 
 
 def test_draws_too_narrow_fail_where_importance_sampling_can_tell(drawn, monkeypatch):
@@ -182,7 +182,7 @@ def test_draws_too_narrow_fail_where_importance_sampling_can_tell(drawn, monkeyp
     law = replace(importance_samples(p, best, 1), tail=0.2)
     narrow = replace(chains, draws=chains.flat.mean(0) + 0.8 * (chains.draws - chains.flat.mean(0)))
     found = {check.name: check.mark for check in checks(p, best, told, narrow, law)}
-    assert found["importance sampling agrees"] == "fail"
+    assert found["importance sampling agrees with the chains"] == "fail"
 
 
 @pytest.mark.parametrize(
@@ -217,7 +217,7 @@ def test_short_chains_end_in_a_red_page_and_code_three(here, capsys, monkeypatch
     monkeypatch.setattr(emcee_sampler, "_LONGEST", 60)
     code, printed = said(capsys, SEEN, "--walkers", "16")
     assert code == 3, printed.err
-    assert "chains are long" in printed.err
+    assert "chains are long enough" in printed.err
     page = (here / "runs" / "latest" / "report.html").read_text()
     assert 'role="alert"' in page
     document = json.loads((here / "runs" / "latest" / "posterior.json").read_text())

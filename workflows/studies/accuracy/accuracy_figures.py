@@ -1,4 +1,4 @@
-"""Pictures of the study of accuracy: error against run time, and measured error against tolerance."""
+"""Diagrams of the accuracy study: error against run time, and measured error against tolerance."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ import numpy as np
 from neusee.workflows.report.figures.style import BLACK, BLUE, GREEN, ORANGE, VERMILION, canvas, drawn
 
 EXACT = 1e-9  #: the level at which smaller errors are drawn, because a logarithmic axis has no 0
-_STEP_EXACT = 1e-17  #: the same level for a single step, in double precision
+_STEP_EXACT = 1e-17  #: the same level in the diagrams of single steps, some of which are in double precision
 _COLOURS = (BLUE, ORANGE, GREEN, VERMILION, "#CC79A7", "#56B4E9", "#8B7500", "#555555")
 _STYLES = tuple(zip(_COLOURS, "osD^vP*X", strict=True))
 _LABEL_OFFSETS = ((6, 4), (6, -12), (-6, 4), (-6, -12), (0, 9), (0, -17), (16, 13), (-16, 13), (16, -21), (-16, -21))
@@ -22,23 +22,23 @@ _GREY = "#777777"
 
 @dataclass(frozen=True)
 class Dot:
-    """A point of a diagram: a run time, an error and a label."""
+    """A point of a diagram, with a run time, an error and a label."""
 
     seconds: float
     error: float
     label: str
     least: float | None = None  #: smallest error over the seeds, for an error bar
     most: float | None = None  #: largest error over the seeds
-    own: bool = False  #: whether the point is the recipe's own setting
+    own: bool = False  #: whether the recipe itself has this setting
 
 
 Styles = Mapping[str, tuple[str, str]]  #: colour and marker of each line by its name
-Diagram = tuple[Any, Sequence["Line"], Styles, float]  #: axes, lines, their styles, and the level of smaller errors
+Diagram = tuple[Any, Sequence["Line"], Styles, float]  #: axes, lines, styles, `EXACT` or `_STEP_EXACT`
 
 
 @dataclass(frozen=True)
 class Line:
-    """A line of a diagram: the points at all settings of one parameter."""
+    """A line of a diagram, with one point for each setting of a parameter."""
 
     name: str
     dots: Sequence[Dot]
@@ -49,7 +49,7 @@ class Line:
 def work_precision(
     lines: Sequence[Line], pareto_front: Sequence[tuple[float, float]], tolerance: float, title: str
 ) -> Any:
-    """Draw error against run time: a line for each parameter, the Pareto line, and a ring around the recipe itself."""
+    """Draw error against run time: a line for each parameter, the Pareto front, and a ring at the recipe itself."""
     figure, axes = canvas(10.0, 7.0)
     ax = axes[0, 0]
     styles = _styles(line.name for line in lines)
@@ -59,7 +59,7 @@ def work_precision(
     if pareto_front:
         x, y = zip(*pareto_front, strict=True)
         style = {"color": BLACK, "linewidth": 5.0, "alpha": 0.16, "zorder": 0}
-        ax.step(x, np.maximum(y, EXACT), where="post", label="Pareto line", **style)
+        ax.step(x, np.maximum(y, EXACT), where="post", label="Pareto front", **style)
     ax.axhline(tolerance, color=VERMILION, linestyle="--", linewidth=1.2, label="tolerance of the recipe")
     ax.set_title(title)
     ax.set_xlabel("run time (s)")
@@ -71,7 +71,7 @@ def work_precision(
 
 @drawn
 def steps(diagrams: Sequence[tuple[str, Sequence[Line], float]]) -> Any:
-    """Draw a diagram for each step: error against run time in ms, with the reference's run time as a dotted line."""
+    """Draw error against run time in ms for each step, with a dotted line at the run time of the step's reference."""
     columns = min(3, len(diagrams))
     rows = -(-len(diagrams) // columns)
     figure, axes = canvas(3.9 * columns + 0.4, 3.5 * rows + 0.7, rows, columns)
@@ -81,7 +81,7 @@ def steps(diagrams: Sequence[tuple[str, Sequence[Line], float]]) -> Any:
         scaled = [replace(line, dots=[replace(d, seconds=1e3 * d.seconds) for d in line.dots]) for line in lines]
         shown.append((ax, scaled, styles, _STEP_EXACT))
         _draw_diagram(shown[-1], seconds=[1e3 * reference])
-        ax.axvline(1e3 * reference, color=_GREY, linestyle=":", label="its reference")
+        ax.axvline(1e3 * reference, color=_GREY, linestyle=":", label="reference of the step")
         ax.set_title(name)
         ax.set_xlabel("run time (ms)")
         ax.set_ylabel("error")
@@ -95,17 +95,17 @@ def steps(diagrams: Sequence[tuple[str, Sequence[Line], float]]) -> Any:
 
 @drawn
 def promises(asked: Sequence[float], measured: Mapping[str, Sequence[float]], proved: Sequence[float | None]) -> Any:
-    """Draw the measured error of each output and the proved bound against the tolerance that was asked for."""
+    """Draw the measured error of each output and the proved error bound against the requested tolerance."""
     figure, axes = canvas(8.4, 5.0)
     ax = axes[0, 0]
-    ax.loglog(asked, asked, color=BLACK, linewidth=1.2, label="as asked")
+    ax.loglog(asked, asked, color=BLACK, linewidth=1.2, label="error equal to the tolerance")
     bounds = [(t, max(b, EXACT)) for t, b in zip(asked, proved, strict=True) if b is not None]
     if bounds:
-        ax.loglog(*zip(*bounds, strict=True), color=_GREY, linestyle="--", label="proved before it was measured")
+        ax.loglog(*zip(*bounds, strict=True), color=_GREY, linestyle="--", label="proved error bound")
     for name, (colour, mark) in _styles(measured).items():
         style = {"color": colour, "marker": mark, "markersize": 6, "linewidth": 1.0}
         ax.loglog(asked, np.maximum(measured[name], EXACT), label=name, **style)
-    ax.set_title("Measured error of each output against the tolerance asked")
+    ax.set_title("Measured error of each output against the requested tolerance")
     ax.set_xlabel("tolerance")
     ax.set_ylabel("error")
     ax.invert_xaxis()
@@ -120,13 +120,13 @@ def _styles(names: Iterable[str]) -> Styles:
 
 
 def _draw_diagram(diagram: Diagram, errors: Sequence[float] = (), seconds: Sequence[float] = ()) -> None:
-    """Draw the lines on logarithmic axes that also contain the given ``errors`` and ``seconds``."""
+    """Draw the lines of a diagram on logarithmic axes whose limits also include ``errors`` and ``seconds``."""
     ax, lines, styles, exact = diagram
     ax.set_xscale("log")
     ax.set_yscale("log")
     dots = [d for line in lines for d in line.dots]
     y = [max(e, exact) for d in dots for e in (d.error, d.most or d.error)]
-    # limits come first: the automatic limits of an axis warn of errors that differ in their last digit only
+    # set limits first: with automatic limits, matplotlib warns of errors that differ in the last digit only
     ax.set_xlim(*_axis_limits([*(d.seconds for d in dots), *seconds], 10.0, 1.5))
     ax.set_ylim(*_axis_limits([*y, *errors], 100.0, 4.0))
     for line in lines:
@@ -136,14 +136,14 @@ def _draw_diagram(diagram: Diagram, errors: Sequence[float] = (), seconds: Seque
 
 
 def _axis_limits(values: Sequence[float], least: float, margin: float) -> tuple[float, float]:
-    """Return axis limits with a margin around all values; their ratio is at least ``least``."""
+    """Return axis limits that leave a margin around all values and have a ratio of at least ``least``."""
     low, high = min(values) / margin, max(values) * margin
     wider = math.sqrt(max(1.0, least / (high / low)))
     return low / wider, high * wider
 
 
 def _draw(ax: Any, line: Line, colour: str, mark: str, exact: float) -> None:
-    """Draw one line with a marker at each point, and bars from the smallest to the largest error of each point."""
+    """Draw one line with a marker at each point, and error bars from the smallest to the largest error of the point."""
     y = np.maximum([d.error for d in line.dots], exact)
     least = np.maximum([d.error if d.least is None else d.least for d in line.dots], exact)
     most = np.maximum([d.error if d.most is None else d.most for d in line.dots], exact)
@@ -156,7 +156,7 @@ def _ring_own_setting(ax: Any, lines: Sequence[Line]) -> None:
     ring = {"marker": "o", "markersize": 17, "markerfacecolor": "none", "markeredgecolor": BLACK, "linestyle": ""}
     for dot in [d for line in lines for d in line.dots if d.own][:1]:
         at = [dot.seconds], [max(dot.error, EXACT)]
-        ax.plot(*at, **ring, markeredgewidth=1.6, label="the recipe as it is", zorder=4)
+        ax.plot(*at, **ring, markeredgewidth=1.6, label="the recipe's own settings", zorder=4)
 
 
 def _tick_seconds(ax: Any) -> None:
@@ -173,11 +173,11 @@ def _draw_exact_level(ax: Any, errors: Iterable[float], exact: float) -> None:
     if any(e < exact for e in errors):
         ax.axhline(exact, color=_GREY, linewidth=0.8, linestyle=":")
         at = ax.get_yaxis_transform()
-        ax.text(0.01, exact / 1.2, "no error, or less", transform=at, va="top", fontsize=9, color=_GREY)
+        ax.text(0.01, exact / 1.2, "smaller errors, and no error", transform=at, va="top", fontsize=9, color=_GREY)
 
 
 def _place_labels(figure: Any, diagrams: Sequence[Diagram]) -> None:
-    """Label each point where the label covers no marker and no other label; leave out labels without free space."""
+    """Write the label of each point where it covers no marker and no other label; omit labels without free space."""
     from matplotlib.transforms import Bbox
 
     figure.canvas.draw()
@@ -191,7 +191,7 @@ def _place_labels(figure: Any, diagrams: Sequence[Diagram]) -> None:
 
 
 def _label(figure: Any, ax: Any, dot: Dot, colour: str, taken: list[Any]) -> None:
-    """Write a label at the first offset where it overlaps no box in ``taken``, and add its own box to ``taken``."""
+    """Write a label at the first offset at which it overlaps no box in ``taken``, and append its box to ``taken``."""
     from matplotlib.patheffects import withStroke
 
     inside, at = ax.get_window_extent(), (dot.seconds, dot.error)

@@ -1,4 +1,4 @@
-"""The page of the study of accuracy: its tables, its pictures and the sentences around them."""
+"""The page of the accuracy study: tables, diagrams and explanations."""
 
 from __future__ import annotations
 
@@ -20,28 +20,27 @@ from neusee.workflows.studies.accuracy.work_precision_points import WorkPrecisio
 TOLERANCE, KEEP_ALL = "tolerance", "everything kept"
 HEADER = ("part", "line", "setting", "output", "seed", "error", "seconds", "computing", "proved", "refused")
 _BUSY = 1.5  #: processes for each core, above which times are not reliable
-_NO_WORSE = 2.0  #: factor over the error of everything kept, which is one draw of its rounding
+_NO_WORSE = 2.0  #: factor on the error of the full computation, which is one draw of its rounding error
 _FACTOR = 2.0  #: the largest accepted ratio of the chosen run time to the cheapest
 
-_REFERENCE = """The reference is the recipe at its own sampling (bands, pupil samples, window), nothing left out,
-every step in the best precision that it has. So a coarser setting shows what it loses, a finer one what the recipe's
-own sampling leaves open. The error of an output is the root mean square of its difference from the reference over
-the reference's largest element; the worst output counts. Outputs whose shape a parameter changes are not
-compared at its settings and stand as a dash."""
-_TIME = """Run time is what the engine takes for a cold run of the outputs, choosing and writing results included: an
-empty store in a temporary folder, in a process that has imported its libraries. It is the median of three, taken in
-turn with the other points, where one takes less than 5 s, and a single one otherwise."""
+_REFERENCE = """The reference is the recipe at its own sampling (bands, pupil samples, window), without omissions,
+with every step in its best precision. So a coarser setting shows the error that it adds, and a finer setting the error
+of the recipe's own sampling. The error of an output is the root mean square of its difference from the reference,
+divided by the reference's largest element; the worst output counts. A dash marks an output that cannot be compared,
+because the setting changes its shape."""
+_TIME = """Run time is the engine's time for a cold run of the outputs, including its choices and the writing of
+results: with an empty store in a temporary folder, in a process that has imported its libraries. A run of less than 5 s
+is repeated, in turn with the other points, and the median of three times counts."""
 _ONE_SEED = "One seed: errors have no range."
-_SEEDS = """Noise was drawn with {} seeds, the same ones for every point: the error is the median over them,
-and least to most stand beside it. The names of its streams are the same at every point, so that noise
-itself is no error."""
-_POISSON = """But the Poisson law takes as many numbers from its stream as the light asks for: light that differs by
-rounding alone can shift the rest of the stream, and the errors then hold the noise."""
+_SEEDS = """Noise was drawn with {} seeds, which are the same for every point. The error is the median over the
+seeds, beside the least and the largest error. Every point draws the same noise, so that noise itself is no error."""
+_POISSON = """But the light decides how many random numbers the Poisson distribution takes: light that differs only by
+rounding can shift all later random numbers, and the errors then include the noise."""
 
 
 @dataclass(frozen=True)
 class AccuracyResult:
-    """The measured points and steps of a recipe."""
+    """The result of the accuracy study: the measured points and the measured steps of a recipe."""
 
     recipe: Recipe
     points: tuple[WorkPrecisionPoint, ...]
@@ -51,57 +50,57 @@ class AccuracyResult:
 
 
 def power_of_ten(tolerance: float) -> str:
-    """Return a tolerance as text, such as ``1e-3``."""
+    """Return a tolerance as text with one digit, such as ``1e-3``."""
     return f"{tolerance:.2g}" if tolerance >= 1 else f"{tolerance:.0e}".replace("e-0", "e-")
 
 
 def machine_line() -> str:
-    """Return one line on the machine: system, processor, cores and threads, without the name of the machine."""
+    """Return a line that describes the machine: system, processor, cores and threads, without the host name."""
     return f"{platform.system()} {platform.machine()}, {os.cpu_count()} cores, {torch.get_num_threads()} threads"
 
 
 def summary_line(point: WorkPrecisionPoint) -> str:
-    """Return one line of progress: the parameter and setting of a point, its run time and its error."""
+    """Return the line of progress of a point: parameter, setting, run time and error."""
     return f"{point.trial.name}: {point.found.refused or f'{point.seconds:.3g} s, error {point.error:.2g}'}"
 
 
 def choices(points: Points) -> list[ToleranceChoice]:
-    """Return for each tolerance the point that the engine chose, and the cheapest point within the tolerance."""
+    """Return for each tolerance the point that the engine chose and the cheapest point within the tolerance."""
     sound = [p for p in points if p.sound]
     asked = ((p.trial.value, p) for p in sound)
     return [ToleranceChoice(value, p, cheapest(sound, value)) for value, p in asked if value is not None]
 
 
 def count_missed(points: Points) -> int:
-    """Return how many tolerances were exceeded although the arithmetic of the recipe is precise enough for them."""
+    """Return how many tolerances are exceeded by more than the rounding error of the full computation."""
     return sum(not c.held and not _beyond_rounding(c, points) for c in choices(points))
 
 
 def lead(recipe: Recipe, points: Points) -> str:
-    """Return the result of the study in a few sentences."""
+    """Return the summary of the accuracy study in a few sentences."""
     own, whole, chosen = _own(points), _whole(points), choices(points)
     sentences = []
     if own is not None:
         sentences.append(
-            f"As it is written, with a tolerance of {power_of_ten(recipe.tolerance)}, the recipe takes "
-            f"{own.seconds:.3g} s and is off by {own.most:.2g} at most, {_worst_output(own)} being the worst."
+            f"With its own tolerance of {power_of_ten(recipe.tolerance)}, the recipe takes {own.seconds:.3g} s; "
+            f"its largest error is {own.most:.2g}, at the output {_worst_output(own)}."
         )
     if own is not None and whole is not None:
         ratio = whole.seconds / own.seconds
-        sentences.append(f"Everything in full takes {whole.seconds:.3g} s, {ratio:.1f} times as long.")
+        sentences.append(f"The full computation takes {whole.seconds:.3g} s, {ratio:.1f} times as long.")
     sentences.append(f"{sum(c.held for c in chosen)} of {len(chosen)} tolerances were held.")
     if whole is not None and (beyond := sum(_beyond_rounding(c, points) for c in chosen)):
         sentences.append(
-            f"{beyond} cannot be told: everything kept is off by {whole.most:.1g} itself, by its arithmetic."
+            f"{beyond} cannot be tested: rounding gives the full computation itself an error of {whole.most:.1g}."
         )
     if (ratio_of_times := median_ratio(chosen)) is not None:
         sentences.append(
-            f"The engine's choice costs {ratio_of_times:.2f} times the cheapest setting that holds, at the median."
+            f"At the median, the engine's choice takes {ratio_of_times:.2f} times as long as the cheapest setting."
         )
     load = max((p.found.load for p in points), default=0.0)
     if load > _BUSY:
-        busy = f"The machine was busy with other work ({load:.1f} processes a core)"
-        sentences.append(f"{busy}: times are long and scatter.")
+        busy = f"The machine was busy with other work ({load:.1f} processes for each core)"
+        sentences.append(f"{busy}: run times are too long and vary.")
     return " ".join(sentences)
 
 
@@ -121,7 +120,7 @@ def _beyond_rounding(choice: ToleranceChoice, points: Points) -> bool:
 
 
 def pictures(result: AccuracyResult) -> dict[str, bytes]:
-    """Return the diagrams of the measured points and steps, as PNG by name."""
+    """Return the diagrams of the page by name, as PNG bytes."""
     drawn = {}
     sound = [p for p in result.points if p.sound]
     if sound:
@@ -138,7 +137,7 @@ def pictures(result: AccuracyResult) -> dict[str, bytes]:
 
 
 def sections(result: AccuracyResult, drawn: Mapping[str, bytes]) -> list[Section]:
-    """Return the sections of the page; ``drawn`` has the pictures by name."""
+    """Return the sections of the page; ``drawn`` has the PNG bytes of each diagram by name."""
     seeds = _SEEDS.format(result.seeds) if result.seeds > 1 else _ONE_SEED
     if result.seeds > 1 and any("poisson" in step.params.values() for step in result.recipe.steps.values()):
         seeds += " " + _POISSON
@@ -164,8 +163,8 @@ def _all_points(points: Points, text: str, picture: bytes | None) -> Section:
         rows.append((p.trial.line, f"{p.trial.label}{' (the recipe)' * p.trial.own}{' *' * (id(p) in best)}", *row))
         if p.trial.value is not None:
             marks[len(rows) - 1, 6] = _mark(ToleranceChoice(p.trial.value, p, None), points)
-    text += """\n\nA star: on the Pareto line, no other point is as quick and as right. Marks: whether a tolerance was
-        held with every seed; an exclamation mark where only arithmetic, that of everything kept, misses it."""
+    text += """\n\nA star marks the Pareto front: no other point is both quicker and more accurate. The marks show
+        whether a tolerance was held with every seed; an exclamation mark, that only rounding exceeds it."""
     return Section("Error against run time", text, columns, rows, picture, marks)
 
 
@@ -179,8 +178,8 @@ def _chosen(points: Points) -> Section:
         marks[i, 1] = _mark(c, points)
         if c.ratio is not None:
             marks[i, 6] = "pass" if c.ratio <= _FACTOR else "warn"
-    text = f"""For each tolerance, the engine's choice against the quickest of all points above whose error it would
-        also have allowed. Marked: up to {_FACTOR:g} times."""
+    text = f"""For each tolerance, the engine's choice and the quickest of all points above whose error is within the
+        tolerance. A choice passes if it takes at most {_FACTOR:g} times as long as the quickest point."""
     return Section("Chosen against cheapest", text, columns, rows, None, marks)
 
 
@@ -191,7 +190,7 @@ def _outputs(points: Points, picture: bytes | None) -> Section:
         for p in points
         if p.sound
     ]
-    text = "The greatest error over the seeds of every output; a dash where the parameter changes its shape."
+    text = "The largest error of each output over the seeds; a dash where the setting changes the output's shape."
     return Section("Every output", text, ("parameter", "setting", *names), rows, picture)
 
 
@@ -204,10 +203,10 @@ def _steps(tried: Sequence[StepTried], picture: bytes | None) -> Section:
         rows += [(*head, f"{f.line} {f.label}".strip(), f.error, f.seconds, s.found.reference, on) for f in s.variants]
         if s.found.refused:
             rows.append((*head, f"not tried: {s.found.refused}", None, None, None, None))
-    text = """Steps that take more than a hundredth of the time with everything kept; of several items, the slowest.
-        Each variant of a step is compared with its reference, float64 and direct, on the step's own inputs; where
-        that would take too long, on a part of them, with the times of that part. `left out` hands on the first
-        input. Times are medians of repeated calls."""
+    text = """Steps that take more than a hundredth of the run time of the full computation; for a step of several
+        items, the slowest item. Each variant is compared with the node's reference, a direct computation in float64, on
+        the step's own inputs. If that takes too long, all variants are timed and compared on a part of the inputs.
+        `left out` returns the first input. Times are medians of repeated calls."""
     return Section("Step by step", text, columns, rows, picture)
 
 
@@ -220,7 +219,7 @@ def _not_varied(result: AccuracyResult) -> Section:
 
 
 def table(result: AccuracyResult) -> Iterator[tuple[Any, ...]]:
-    """Yield the rows of ``table.csv``, one for each measured error and each refusal."""
+    """Yield the rows of ``table.csv``: one for each measured error, and one for each setting that was not possible."""
     for p in result.points:
         head = ("recipe", p.trial.line, p.trial.label)
         if p.found.refused:
@@ -242,13 +241,13 @@ def _lines(recipe: Recipe, points: Points) -> list[Line]:
 
 
 def _dot(p: WorkPrecisionPoint, recipe: Recipe) -> Dot:
-    """Return a point of a diagram; the point of the recipe's own setting, where all lines meet, has no label."""
+    """Return the dot of a point, without a label at the recipe's own settings, where all lines of the diagram meet."""
     label = "" if p.trial.recipe is recipe else p.trial.label
     return Dot(p.seconds, p.error, label, min(p.by_seed), p.most, p.trial.own)
 
 
 def _diagram(s: StepTried) -> tuple[str, list[Line], float]:
-    """Return the title of a step's diagram, a line for each kind of variant, and the seconds of the reference."""
+    """Return the diagram of a step: the title, a line for each kind of variant, and the reference's run time in s."""
     names = dict.fromkeys(f.line for f in s.variants)
     lines = [Line(n, [Dot(f.seconds, f.error, f.label) for f in s.variants if f.line == n], n == USED) for n in names]
     on = f"\non {s.found.cut_inputs}" if s.found.cut_inputs else ""

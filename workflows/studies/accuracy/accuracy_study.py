@@ -1,4 +1,4 @@
-"""The study of accuracy: error against run time, for tolerances, for settings of the recipe, and for its steps."""
+"""The accuracy study: error against run time for tolerances, for settings of a recipe, and for single steps."""
 
 from __future__ import annotations
 
@@ -25,8 +25,8 @@ from neusee.workflows.tolerance.cheaper_steps import with_substitutions
 
 TOLERANCES = (1e-1, 1e-2, 1e-3, 1e-4, 1e-5, 1e-6)
 _FEWER = (1e-1, 1e-2, 1e-3, 1e-4)
-_PATIENCE, _LITTLE = 4.0, 1.0  #: s that the reference of a step may take
-_LEFT = "left for another time: run the study again to go on"
+_PATIENCE, _LITTLE = 4.0, 1.0  #: s that the reference of a step may take; the second value is for ``quick``
+_LEFT = "not measured within the budget: run the study again to continue"
 
 
 def study(
@@ -43,9 +43,9 @@ def study(
 ) -> Path:
     """Measure error against run time, write ``runs/<date>_<recipe>_accuracy_<key>/`` and return that folder.
 
-    Args: seeds: of the noise, for the range of each error. quick: fewer settings. budget: seconds after which the study
-    measures no other setting of a parameter; the page names these settings, and the next study measures them.
-    Raises: `ValueError` for no seed.
+    Args: seeds: number of seeds of the noise, which give the range of each error. quick: measures fewer settings.
+    budget: seconds after which the study measures no further setting of a parameter; the page names the settings that
+    are left, and the next study measures them. Raises: `ValueError` if ``seeds`` is less than 1.
     """
     if seeds < 1:
         raise ValueError(f"seeds={seeds}: the study of accuracy needs at least one seed, such as seeds=3")
@@ -58,7 +58,7 @@ def study(
 
 
 def trials(recipe: Recipe, turned: Knobs, quick: bool) -> Iterator[Trial]:
-    """Yield the settings to evaluate: each tolerance, the full computation, and each setting of each parameter."""
+    """Yield the settings to measure: each tolerance, the full computation, and each setting of each parameter."""
     asked = sorted({*(_FEWER if quick else TOLERANCES), recipe.tolerance}, reverse=True)
     for tolerance in asked:
         other = replace(recipe, tolerance=tolerance, exact=False)
@@ -96,14 +96,14 @@ def _measure(recipe: Recipe, cache: PointCache, progress: Progress, quick: bool,
 
 
 def _may_wait(trial: Trial, cache: PointCache) -> bool:
-    """Return True if a setting is neither a tolerance nor the full computation, and is not measured yet."""
+    """Return True if a setting can be left to a later study: it belongs to a parameter and is not measured yet."""
     if trial.recipe is None or trial.line in (TOLERANCE, KEEP_ALL):
         return False
     return not cache.store.has(cache.key(trial.recipe))
 
 
 def _slow_steps(recipe: Recipe, points: Sequence[WorkPrecisionPoint]) -> Iterator[tuple[Recipe, str, float]]:
-    """Yield (recipe, name, share of the run time) of each slow step, in the full computation and in the recipe."""
+    """Yield (recipe, name, share of run time) of each slow step, and of slow steps that the engine substitutes."""
     whole = next((p.found.steps for p in points if p.trial.line == KEEP_ALL), {})
     for name, share in steps_that_matter(recipe, whole):
         yield recipe, name, share
@@ -122,7 +122,7 @@ def _document(result: AccuracyResult, cache: PointCache, quick: bool) -> dict[st
         "quick": quick,
         "device": cache.device,
         "machine": accuracy_report.machine_line(),
-        "failed": accuracy_report.count_missed(result.points),  # tolerances
+        "failed": accuracy_report.count_missed(result.points),  # number of tolerances
         "engine": engine(),
     }
 

@@ -1,8 +1,8 @@
-"""The knobs of a recipe: its values that trade accuracy for run time, found by the parameters of its nodes.
+"""Values of a recipe that trade accuracy for run time, such as the number of bands and the precision.
 
-A node that makes bands has a ``count``, a pupil has ``samples`` and a ``pitch``, a node that gives a PSF has the
-``shape`` of its window, and a ``precision`` is a choice of words. The recipe shows where each value is written and
-which other steps depend on the value.
+The values are found by the parameters of nodes: ``count`` of a node that returns bands, ``samples`` and ``pitch`` of a
+pupil, the window's ``shape`` of a node that returns a PSF, and every ``precision``. The recipe shows where each value
+is written and which other steps depend on the value.
 """
 
 from __future__ import annotations
@@ -18,15 +18,15 @@ from neusee.workflows.recipe.changed_recipe import changed
 
 _REFERENCE = re.compile(r"\$\{([\w.-]+)\}")
 _ONE_BY_ONE = ("item", "each")  #: first names of paths whose value differs from item to item
-_FACTORS = (0.2, 1 / 3, 0.5, 2.0)  #: of the spaces between bands
+_FACTORS = (0.2, 1 / 3, 0.5, 2.0)  #: factors on the number of intervals between bands
 _FEWER = (1 / 3, 2.0)
-_SCALES = (0.5, 0.75, 0.9, 1.5, 2.0)  #: of samples, and of the side of a window
+_SCALES = (0.5, 0.75, 0.9, 1.5, 2.0)  #: factors on the number of samples, and on the side of a window
 _FEWER_SCALES = (0.75, 1.5)
 
 
 @dataclass(frozen=True)
 class Change:
-    """One setting of a recipe value; without overrides, the recipe's own setting."""
+    """A setting of a recipe value, as overrides of the recipe; the recipe's own setting has no overrides."""
 
     label: str
     overrides: tuple[str, ...]
@@ -34,7 +34,7 @@ class Change:
 
 @dataclass(frozen=True)
 class Knob:
-    """A recipe value that trades accuracy for run time, or several values together, and the settings to measure."""
+    """A value of a recipe, or several values that change together, and the settings to measure."""
 
     name: str  #: path in the recipe, such as ``optics.bands``
     what: str
@@ -43,7 +43,7 @@ class Knob:
 
 @dataclass(frozen=True)
 class Knobs:
-    """The values of a recipe that can be varied, and the reasons why other values cannot."""
+    """The values of a recipe that can be varied, and the reasons why other values cannot be varied."""
 
     found: tuple[Knob, ...]
     without: tuple[str, ...]
@@ -51,7 +51,7 @@ class Knobs:
 
 @dataclass(frozen=True)
 class _Place:
-    """A path in the recipe at which a parameter value is written, and the steps that read the value."""
+    """The path in a recipe at which a parameter value is written, and the steps that read the value."""
 
     path: str
     value: Any
@@ -59,7 +59,7 @@ class _Place:
 
 
 def knobs(recipe: Recipe, quick: bool = False) -> Knobs:
-    """Return the values of ``recipe`` that trade accuracy for run time, with their settings; fewer if ``quick``."""
+    """Return the values of ``recipe`` that trade accuracy for run time; ``quick`` gives each value fewer settings."""
     found: list[Knob] = []
     without: list[str] = []
     for what, turned in (
@@ -72,12 +72,12 @@ def knobs(recipe: Recipe, quick: bool = False) -> Knobs:
         found += [knob for knob in mine if isinstance(knob, Knob) and len(knob.changes) > 1]
         without += [f"{what}: {knob}" for knob in mine if isinstance(knob, str)]
         if not mine:
-            without.append(f"{what}: this recipe has none")
+            without.append(f"{what}: this recipe has no such value")
     return Knobs(tuple(found), tuple(without))
 
 
 def finest(recipe: Recipe) -> Recipe:
-    """Return the recipe at its own sampling, with nothing left out and every step in its best precision."""
+    """Return the recipe without omissions and with every step in its best precision; the sampling does not change."""
     best = [f"{place.path}={allowed_words(place.steps[0], 'precision')[-1]}" for place in _places(recipe, "precision")]
     return replace(changed(recipe, best) if best else recipe, exact=True)
 
@@ -93,11 +93,11 @@ def _samples(recipe: Recipe, quick: bool) -> Iterator[Knob | str]:
     samples, pitches = (_places(recipe, name, beside=other) for name, other in _BOTH)
     if len(samples) != 1 or len(pitches) != 1:
         if samples:
-            yield f"{' and '.join(p.path for p in (*samples, *pitches))} do not go together"
+            yield f"{' and '.join(p.path for p in (*samples, *pitches))} are not one pair of samples and pitch"
         return
     own, pitch = int(samples[0].value), float(pitches[0].value)
     if others := _others(recipe, "pitch", pitches[0]):
-        yield f"{', '.join(others)} would keep another pitch"
+        yield f"{', '.join(others)} would keep the old pitch, which is written elsewhere"
         return
     at, other = samples[0].path, pitches[0].path
     sizes = sorted({max(2, round(own * f)) for f in (1.0, *(_FEWER_SCALES if quick else _SCALES))})
@@ -110,7 +110,7 @@ _BOTH = (("samples", "pitch"), ("pitch", "samples"))
 def _windows(recipe: Recipe, quick: bool) -> Iterator[Knob | str]:
     for place in _places(recipe, "shape", gives=Psf):
         if others := _others(recipe, "shape", place):
-            yield f"{place.path} is the shape of {others[0]} too"
+            yield f"{place.path} is also a parameter of the step {others[0]}"
             continue
         own, scales = tuple(place.value), (1.0, *(_FEWER_SCALES if quick else _SCALES))
         sizes = sorted({tuple(max(1, round(n * f)) for n in own) for f in scales})
@@ -118,7 +118,7 @@ def _windows(recipe: Recipe, quick: bool) -> Iterator[Knob | str]:
 
 
 def _precisions(recipe: Recipe) -> Iterator[Knob | str]:
-    """Yield one knob for the precisions of all steps, because double precision in one step alone gains nothing."""
+    """Yield one knob for the precisions of all steps, because double precision in one step alone improves no result."""
     if places := _places(recipe, "precision"):
         words = allowed_words(places[0].steps[0], "precision")
         path = ", ".join(p.path for p in places)
@@ -126,18 +126,18 @@ def _precisions(recipe: Recipe) -> Iterator[Knob | str]:
 
 
 def _knob(path: str, settings: Sequence[tuple[Any, str, tuple[str, ...]]], own: Any) -> Knob:
-    """Return a knob for the value at ``path``; each setting has a value, a label and overrides."""
+    """Return the knob of the value at ``path`` from settings (value, label, overrides) and the recipe's own value."""
     return Knob(path, "", tuple(Change(label, () if value == own else how) for value, label, how in settings))
 
 
 def allowed_words(step: Step, parameter: str) -> tuple[str, ...]:
-    """Return the words that a parameter accepts, in the order of the node: the coarsest word first."""
+    """Return the words that a parameter accepts, such as names of precisions; nodes list the coarsest word first."""
     hint = step.node.hints[parameter]
     return tuple(map(str, get_args(hint))) if get_origin(hint) is Literal else (str(step.params[parameter]),)
 
 
 def _places(recipe: Recipe, parameter: str, gives: type | None = None, beside: str = "") -> list[_Place]:
-    """Return each path at which ``parameter`` is written, for steps that return ``gives`` and also have ``beside``."""
+    """Return where the recipe sets ``parameter``, for steps of return type ``gives`` that also have ``beside``."""
     found: dict[str, _Place] = {}
     for name in needed(recipe, recipe.outputs):
         step = recipe.steps[name]
@@ -153,7 +153,7 @@ def _places(recipe: Recipe, parameter: str, gives: type | None = None, beside: s
 
 
 def _written(recipe: Recipe, step: Step, parameter: str) -> str | None:
-    """Return the path at which the value of a step's parameter is written, or None if the value varies by item."""
+    """Return the recipe path at which a step's parameter is written, or None if the value differs from item to item."""
     path = f"steps.{step.name.partition('[')[0]}.with.{parameter}"
     while True:
         setting = recipe.config.settings.get(path)
@@ -166,7 +166,7 @@ def _written(recipe: Recipe, step: Step, parameter: str) -> str | None:
 
 
 def _others(recipe: Recipe, parameter: str, place: _Place) -> list[str]:
-    """Return the other steps that read the value at ``place``, or for a pitch, steps with an equal pitch elsewhere."""
+    """Return the names of other steps that read the value at ``place``, or that have an equal pitch at another path."""
     mine = {step.name for step in place.steps}
     if parameter == "pitch":
         apart = (s for s in recipe.steps.values() if parameter in s.params and s.params[parameter] == place.value)

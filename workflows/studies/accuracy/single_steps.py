@@ -1,8 +1,7 @@
-"""Run time and error of single steps: each variant of a node's computation, against the node's reference.
+"""Run time and error of several variants of single steps, compared with the reference of the node.
 
 A variant is the step as used, in another precision, with another allowed error, with a smaller window of the PSF, or
-left out. Where the reference would take too long, all variants are tried on the middle of the pictures and on fewer
-bands.
+left out. If the reference takes too long, all variants are measured on the middle of the pictures and on fewer bands.
 """
 
 from __future__ import annotations
@@ -36,22 +35,22 @@ from neusee.workflows.studies.accuracy.recipe_knobs import allowed_words
 from neusee.workflows.tolerance.error_norm import error_of
 
 Cut = tuple[int, int]  #: the longest side and the largest number of bands; 0 for no limit
-SHARE = 0.01  #: of the run time; steps with a smaller share are not tried
+SHARE = 0.01  #: least share of the run time of a step that is measured
 _ITEM = re.compile(r"\[.*?\]")
 _CUTS: Sequence[Cut] = ((32, 2), (64, 2), (128, 3), (256, 3), (512, 3), (1024, 3), (0, 3), (0, 0))
-_GROWTH = 16.0  #: expected ratio of the reference's times on two successive cuts, as of a direct convolution
+_GROWTH = 16.0  #: expected growth of the reference's time from cut to cut, as for a direct convolution
 USED, _PRECISION = "as used", "precision"
-_WINDOWS = (0.75, 0.5, 0.25)  #: of the side of a PSF
-_ALLOWANCES = (1e3, 1e2, 1e1, 1e-1, 1e-2, 1e-3)  #: factors on the error that a step may choose
+_WINDOWS = (0.75, 0.5, 0.25)  #: shares of the side of a PSF
+_ALLOWANCES = (1e3, 1e2, 1e1, 1e-1, 1e-2, 1e-3)  #: factors on the allowed error ``within`` of a step
 _LONG_ENOUGH, _TIMES = 0.5, 5  #: seconds and calls; a variant is called again until one of the two is reached
 
 
 @dataclass(frozen=True)
 class Variant:
-    """One way to compute a step, with its error and run time."""
+    """One way to compute a step, with the resulting error and run time."""
 
     line: str  #: the property that is changed
-    label: str  #: its new value
+    label: str  #: the new value of the property
     error: float
     seconds: float
 
@@ -62,17 +61,17 @@ class StepMeasurement:
 
     variants: list[dict[str, Any]] = field(default_factory=list)
     reference: float = 0.0  #: s
-    cut_inputs: str = ""  #: the part of the inputs that was used; empty for all of them
+    cut_inputs: str = ""  #: description of the part of the inputs that was used; empty for the whole inputs
     refused: str = ""
 
 
 @dataclass(frozen=True)
 class StepTried:
-    """A step with a large share of the run time, and its measurement or the reason why the step was not tried."""
+    """A step with a large share of the run time, and its measurement or the reason why it was not measured."""
 
-    step: str  #: the slowest of its items
+    step: str  #: the slowest item of the step
     node: str
-    share: float  #: of the time, with all its items
+    share: float  #: share of the run time that all items of the step take together
     found: StepMeasurement
 
     @property
@@ -81,7 +80,7 @@ class StepTried:
 
 
 def steps_that_matter(recipe: Recipe, seconds: Mapping[str, float]) -> list[tuple[str, float]]:
-    """Return (slowest item, share of the time) of each step whose items together take more than `SHARE` of the time."""
+    """Return (slowest item, share of the run time) of each step whose items take more than `SHARE` of the run time."""
     items: dict[str, list[str]] = defaultdict(list)
     for name in seconds:
         if name in recipe.steps:
@@ -92,10 +91,10 @@ def steps_that_matter(recipe: Recipe, seconds: Mapping[str, float]) -> list[tupl
 
 
 def try_step(recipe: Recipe, name: str, share: float, store: Store, patience: float) -> StepTried:
-    """Return the measured variants of a step, on inputs that its reference computes in ``patience`` seconds."""
+    """Measure the variants of a step on inputs so small that the reference takes at most about ``patience`` seconds."""
     step = recipe.steps[name]
     if step.node.hooks.reference is None:
-        return StepTried(name, step.node.path, share, StepMeasurement(refused="its node has no reference"))
+        return StepTried(name, step.node.path, share, StepMeasurement(refused="the node has no reference"))
     key = _key(recipe, name, patience, store)
     compute = partial(_measure, recipe, step, store, patience)
     found = compute_once(store, key, StepMeasurement, compute, {"step": f"study accuracy: {name}"})
@@ -114,12 +113,12 @@ def _measure(recipe: Recipe, step: Step, store: Store, patience: float) -> StepM
     try:
         values = run(replace(recipe, exact=True), store, step.sources).values
     except RunError as error:
-        return StepMeasurement(refused=f"its inputs: {error.cause}")
+        return StepMeasurement(refused=f"the inputs could not be computed: {error.cause}")
     inputs = [_gathered(step.wires.get(name), values) for name in step.node.inputs]
     with torch.no_grad():
         afforded = _largest(step, inputs, recipe.seed, patience)
         if afforded is None:
-            return StepMeasurement(refused="its reference fails on its inputs and on every part of them")
+            return StepMeasurement(refused="the reference fails on the inputs and on every part of the inputs")
         size, truth, seconds = afforded
         part = cut_inputs(step.node, inputs, size)
         variants = [asdict(variant) for variant in _variants(step, part, truth, recipe.seed)]
@@ -132,7 +131,7 @@ def _gathered(wire: str | tuple[str, ...] | None, values: Mapping[str, Any]) -> 
 
 
 def _largest(step: Step, inputs: list[Any], seed: int, patience: float) -> tuple[Cut, Any, float] | None:
-    """Return the largest part of the inputs that the reference computes within ``patience``, its result and seconds."""
+    """Return the largest input size that the reference computes in ``patience`` s, with the result and the seconds."""
     best: tuple[Cut, Any, float] | None = None
     for size in _CUTS:
         if best is not None and best[2] * _GROWTH > patience:
@@ -140,13 +139,13 @@ def _largest(step: Step, inputs: list[Any], seed: int, patience: float) -> tuple
         part = cut_inputs(step.node, inputs, size)
         try:
             best = (size, *_time_once(partial(_call, step, step.node.hooks.reference, part, seed)))
-        except Exception:  # a part of a picture may be too small an input; a larger part may be possible
+        except Exception:  # a small part of a picture may be no valid input; a larger part may be
             continue
     return best
 
 
 def _variants(step: Step, inputs: list[Any], truth: Any, seed: int) -> Iterator[Variant]:
-    """Yield every variant of the step whose result can be compared with the result ``truth`` of the reference."""
+    """Yield each variant of the step, except variants that fail or whose result has another shape than ``truth``."""
     for (line, label), compute in _calls(step, inputs, seed).items():
         with suppress(ValueError, RuntimeError):  # another shape, or a dtype that the variant does not take
             value, seconds = _median_time(compute)
@@ -154,7 +153,7 @@ def _variants(step: Step, inputs: list[Any], truth: Any, seed: int) -> Iterator[
 
 
 def _calls(step: Step, inputs: list[Any], seed: int) -> dict[tuple[str, str], Callable[[], Any]]:
-    """Return a function for each variant of the step, by the changed property and its new value."""
+    """Return for each variant (changed property, new value) a function that computes the step."""
     node = step.node
     calls: dict[tuple[str, str], Callable[[], Any]] = {(USED, ""): partial(_call, step, node, inputs, seed)}
     own = step.params.get("precision")
@@ -167,7 +166,7 @@ def _calls(step: Step, inputs: list[Any], seed: int) -> dict[tuple[str, str], Ca
     for factor in _ALLOWANCES if "within" in step.params else ():
         within = step.params["within"] * factor
         label = f"{within:.0e}".replace("e-0", "e-")
-        calls["error it may choose", label] = partial(_call, step, node, inputs, seed, within=within)
+        calls["allowed error", label] = partial(_call, step, node, inputs, seed, within=within)
     for share in _WINDOWS if any(isinstance(x, Psf) for x in inputs) else ():
         smaller = [_inner(x, share) if isinstance(x, Psf) else x for x in inputs]
         calls["window of the PSF", f"{share:g}"] = partial(_call, step, node, smaller, seed)
@@ -177,7 +176,7 @@ def _calls(step: Step, inputs: list[Any], seed: int) -> dict[tuple[str, str], Ca
 
 
 def _inner(psf: Psf, share: float) -> Psf:
-    """Return the middle of a PSF; the centre stays at N // 2."""
+    """Return a PSF cropped to ``share`` of each side; the centre stays at index N // 2."""
     x = psf.intensity
     for axis in (-2, -1):
         x = _centred(x, axis, max(1, round(share * x.shape[axis])))
@@ -189,7 +188,7 @@ def _centred(x: Tensor, axis: int, count: int) -> Tensor:
 
 
 def _compared_value(value: Any) -> Any:
-    """Return the tensors to compare: the full cube of a low-rank cube, the planes and flux of channels."""
+    """Return the part of a result to compare: the full cube of a low-rank cube, or the planes and flux of channels."""
     if isinstance(value, LowRankCube):
         return torch.einsum("bk,kyx->byx", value.basis.to(value.planes), value.planes)
     return (value.planes, value.flux) if isinstance(value, Channels) else value
@@ -207,7 +206,7 @@ def _time_once(compute: Callable[[], Any]) -> tuple[Any, float]:
 
 
 def _median_time(compute: Callable[[], Any]) -> tuple[Any, float]:
-    """Return the result, and the median time of several calls without a short first call, which computes tables."""
+    """Return the result and the median time of several calls, without a short first call that only builds tables."""
     value, seconds = _time_once(compute)
     times = [] if seconds < _LONG_ENOUGH else [seconds]
     while len(times) < _TIMES and sum(times) < _LONG_ENOUGH:
@@ -215,11 +214,11 @@ def _median_time(compute: Callable[[], Any]) -> tuple[Any, float]:
     return value, median(times)
 
 
-# --- smaller inputs, on which the slow reference can be afforded ------------------------------------------------------
+# --- smaller inputs, on which the reference is fast enough ------------------------------------------------------------
 
 
 def cut_inputs(node: Node, inputs: list[Any], size: Cut) -> list[Any]:
-    """Return the middle of each picture in ``inputs``, with fewer bands where the node names the axis of bands."""
+    """Crop each picture in ``inputs`` to its middle, and keep fewer bands if the node declares the axis of bands."""
     side, bands = size
     parts = []
     for name, value in zip(node.inputs, inputs, strict=True):
@@ -243,7 +242,7 @@ def _middle(x: Tensor, side: int) -> Tensor:
 
 
 def _fewer_bands(value: Any, axis: int, bands: int) -> Any:
-    """Return ``value`` with only ``bands`` bands, spread evenly over all bands."""
+    """Return ``value`` with only ``bands`` of its bands, evenly spaced."""
     if isinstance(value, Tensor):
         count = value.shape[axis]
         if count <= bands:

@@ -1,4 +1,4 @@
-"""The points of a work-precision diagram: the time of a cold run, and the errors of its outputs."""
+"""Points of a work-precision diagram: the run time of a cold run and the errors of the outputs."""
 
 from __future__ import annotations
 
@@ -23,20 +23,20 @@ from neusee.workflows.studies.cold_run import cold, key_parts, run_cold
 from neusee.workflows.tolerance.cheaper_steps import with_substitutions
 from neusee.workflows.tolerance.error_norm import error_of
 
-TIMES = 3  #: cold runs of a point, of which the median counts
+TIMES = 3  #: cold runs of a point; the median of their times counts
 _QUICK = 5.0  #: s; a recipe that takes longer is run once
 _ABOUT = {"step": "study accuracy"}
 
 
 @dataclass(frozen=True)
 class Trial:
-    """A setting to evaluate: the recipe with the setting, or the reason why the setting is not possible."""
+    """A setting to measure, as a changed recipe or as the reason why the setting is not possible."""
 
     line: str  #: the parameter that is set
     label: str
     recipe: Recipe | None
     refused: str = ""
-    value: float | None = None  #: of a tolerance
+    value: float | None = None  #: the tolerance, for settings of the tolerance
     own: bool = False  #: whether the recipe itself has this setting
 
     @property
@@ -53,14 +53,14 @@ class PointMeasurement:
     seconds: list[float] = field(default_factory=list)  #: of the engine, one for each cold run
     computing: float = 0.0  #: s in the steps of the first cold run
     load: float = 0.0  #: runnable processes for each core before the run, this process included
-    bound: float | None = None  #: error of the worst output that the engine proved
+    bound: float | None = None  #: proved error bound of the worst output
     steps: dict[str, float] = field(default_factory=dict)  #: s by step, in the first cold run
     refused: str = ""
 
 
 @dataclass(frozen=True)
 class WorkPrecisionPoint:
-    """A setting to evaluate and its measurement."""
+    """A point of a work-precision diagram: a setting of the recipe and its measurement."""
 
     trial: Trial
     found: PointMeasurement
@@ -76,12 +76,12 @@ class WorkPrecisionPoint:
 
     @property
     def error(self) -> float:
-        """Return the median over the seeds of the worst output's error."""
+        """Return the error of the worst output, as the median over the seeds."""
         return median(self.by_seed) if self.by_seed else float("inf")
 
     @property
     def most(self) -> float:
-        """Return the greatest error over all outputs and seeds, which is compared with the tolerance."""
+        """Return the largest error over all outputs and seeds, which must be within the tolerance."""
         return max(self.by_seed, default=float("inf"))
 
     @property
@@ -91,7 +91,7 @@ class WorkPrecisionPoint:
 
 
 class PointCache:
-    """A cache of points: each recipe is compared with the reference once, and the store keeps the point."""
+    """A cache of measured points: a recipe that was once compared with the reference is not run again."""
 
     def __init__(self, reference: Recipe, store: Store, seeds: int, device: str = "cpu") -> None:
         self.reference, self.store, self.device = reference, store, device
@@ -102,7 +102,7 @@ class PointCache:
         self._warm = False
 
     def point(self, trial: Trial) -> WorkPrecisionPoint:
-        """Return the point of a setting, from the store or measured now."""
+        """Return the measured point of a setting; measure the point if the store does not have it."""
         recipe = trial.recipe
         if recipe is None:
             return WorkPrecisionPoint(trial, PointMeasurement(refused=trial.refused))
@@ -111,7 +111,7 @@ class PointCache:
         return WorkPrecisionPoint(trial, found)
 
     def time_again(self, point: WorkPrecisionPoint, number: int) -> WorkPrecisionPoint:
-        """Return the point with the time of cold run ``number`` added, if its first run was quick."""
+        """Return the point with the time of cold run ``number`` added, or the same point if its first run was slow."""
         recipe, seconds = point.trial.recipe, point.found.seconds
         if recipe is None or not seconds or seconds[0] >= _QUICK:
             return point
@@ -123,12 +123,12 @@ class PointCache:
         return run_cold(recipe, self.store, self.device).seconds
 
     def key(self, recipe: Recipe) -> str:
-        """Return the store key of a point: a digest of both recipes, the engine, the seeds and the machine."""
+        """Return the store key of a point: a digest of recipe, reference, engine, seeds, device and machine."""
         both = [key_parts(r, self._code, self.device) for r in (recipe, self.reference)]
         return digest("accuracy", both, self.seeds, self.device, engine(), machine())
 
     def truth(self, seed: int) -> dict[str, Any]:
-        """Return the outputs of the reference with the noise of ``seed``, from the store where it has them."""
+        """Return the outputs of the reference with the noise of ``seed``, from the store or computed now."""
         if seed not in self._truth:
             recipe = replace(self.reference, seed=self.reference.seed + seed)
             result = run(recipe, self.store, device=self.device)
@@ -141,7 +141,7 @@ class PointCache:
         ran: dict[str, float] = {}
 
         def watch(event: Event) -> None:
-            if event.done is not None and event.done.state == "run":  # several times where the engine tries again
+            if event.done is not None and event.done.state == "run":  # again if the engine retries
                 ran[event.step] = ran.get(event.step, 0.0) + event.done.seconds
 
         try:
@@ -164,7 +164,7 @@ class PointCache:
             self._warm = True
 
     def _errors(self, recipe: Recipe, values: Mapping[str, Any], store: Store) -> dict[str, list[float]]:
-        """Return the errors, one for each seed, of every output that has the shape of the reference."""
+        """Return the errors of each output for all seeds, without outputs whose shape differs from the reference."""
         found = compare_outputs(values, self.truth(0))
         for seed in range(1, self.seeds):
             again = run(replace(recipe, seed=recipe.seed + seed), store, device=self.device)
@@ -174,7 +174,7 @@ class PointCache:
 
 
 def compare_outputs(values: Mapping[str, Any], truth: Mapping[str, Any]) -> dict[str, list[float]]:
-    """Return the error of each output, except of outputs whose shape differs from the reference."""
+    """Return the error of each output by name, without outputs whose shape differs from the reference."""
     found: dict[str, list[float]] = {}
     for name, value in values.items():
         with suppress(ValueError):

@@ -1,6 +1,6 @@
-"""Is the posterior of a sensor right?
+"""Is the posterior of a sensor's parameters correct?
 
-Simulated sensors with known constants, and the ranks of these among draws of the posterior.
-The posterior itself belongs to `calibration`.
+Sensors with known parameters are simulated, and the parameters are ranked among draws from the posterior.
+The package `calibration` computes the posterior.
 Offers: `calibration_study.study`.
 """

@@ -1,4 +1,4 @@
-"""The study of a calibration: tests of its posterior by simulations, and its sensitivity to the prior."""
+"""The calibration study: tests of a posterior by simulated sensors, and its sensitivity to the prior."""
 
 from __future__ import annotations
 
@@ -32,7 +32,7 @@ _COLUMNS = ("parameter", "simulations", "p", "least p", "coverage", "from", "to"
 
 @dataclass(frozen=True)
 class CalibrationStudyResult:
-    """The simulations, the test of each parameter, and the sensitivity to the prior."""
+    """The result of the calibration study: simulations, a test of each parameter, and the sensitivity to the prior."""
 
     simulations: Sequence[SensorSimulation]
     rank_tests: Sequence[RankTest]
@@ -46,17 +46,17 @@ class CalibrationStudyResult:
 
     @property
     def short(self) -> int:
-        """Return how many simulations have a chain that is too short for its autocorrelation time."""
+        """Return the number of simulations whose chain is too short for its autocorrelation time."""
         return sum(not s.refused and not s.independent for s in self.simulations)
 
     @property
     def stranded(self) -> int:
-        """Return how many simulations have walkers that stay where the posterior is almost 0."""
+        """Return the number of simulations in which a walker stays where the posterior is almost 0."""
         return sum(s.stranded > 0 for s in self.simulations)
 
     @property
     def failed(self) -> int:
-        """Return how many criteria fail: two for each parameter, and three for all simulations together."""
+        """Return the number of criteria that fail: two for each parameter, and three for all simulations together."""
         return sum(v.failed for v in self.rank_tests) + bool(self.refused) + bool(self.short) + bool(self.stranded)
 
 
@@ -71,7 +71,10 @@ def study(
     pixels: int = PIXELS,
     sampler: Sampler | None = None,
 ) -> Path:
-    """Simulate and calibrate sensors, with draws by ``sampler`` or by walkers with the move ``move``."""
+    """Simulate and calibrate sensors, and return the folder with the results.
+
+    The posterior is sampled by ``sampler``, or by walkers with the move ``move`` if there is no ``sampler``.
+    """
     study_run = StudyRun("calibration", recipe, command)
     with one_thread():
         simulator = SensorSimulator(recipe, store, pixels, sampler or partial(walk_draws, how=move), move)
@@ -93,7 +96,7 @@ def _simulate_all(simulator: SensorSimulator, count: int, progress: Progress) ->
 
 
 def _sensitivity(recipe: Recipe, move: str) -> tuple[Sensitivity | None, str]:
-    """Return the sensitivity of the recipe's own posterior to its prior, or the reason why there is none."""
+    """Return the sensitivity of the recipe's own posterior to the prior, or None and the reason."""
     with TemporaryDirectory(prefix="neusee-") as folder:
         problem = SensorPosterior.of(recipe, Store(folder))
     mode = find_mode(problem, initial_theta(problem))
@@ -102,7 +105,7 @@ def _sensitivity(recipe: Recipe, move: str) -> tuple[Sensitivity | None, str]:
         return None, identified.refused
     drawn = walk_draws(problem, mode, recipe.seed, move, _WEIGHED)
     if not drawn.independent:
-        return None, f"its chain is too short for its autocorrelation time of {drawn.tau:.0f} steps"
+        return None, f"the chain is too short for its autocorrelation time of {drawn.tau:.0f} steps"
     return sensitivity(problem, drawn.samples, identified.kinds), ""
 
 
@@ -127,7 +130,7 @@ def _report(recipe: Recipe, result: CalibrationStudyResult, pixels: int) -> Stud
         "table.csv": (_COLUMNS, map(_line, result.rank_tests)),
         "simulations.csv": (("parameter", "truth", "rank", "inside", "z", "told"), _each(result)),
     }
-    return StudyReport(f"{recipe.name}: is the posterior right?", _lead(result), sections, {"ranks": picture}, tables)
+    return StudyReport(f"{recipe.name}: is the posterior correct?", _lead(result), sections, {"ranks": picture}, tables)
 
 
 def _line(v: RankTest) -> Sequence[Any]:
@@ -141,37 +144,37 @@ def _each(result: CalibrationStudyResult) -> Iterator[Sequence[Any]]:
 
 
 def _lead(result: CalibrationStudyResult) -> str:
-    held = "All bars hold" if not result.failed else f"{result.failed} bars do not hold"
+    held = "All criteria hold" if not result.failed else f"{result.failed} criteria do not hold"
     seconds = sum(s.seconds for s in result.simulations) / len(result.simulations)
     taus = max((s.tau for s in result.simulations), default=0.0)
-    short = f"{result.short} a chain that is too short, {result.stranded} a walker that is lost"
+    short = f"{result.short} a chain that is too short, {result.stranded} a stranded walker"
     return (
-        f"{held}, of {len(result.simulations)} simulations of {seconds:.2g} s each: {len(result.refused)} have no "
+        f"{held}. Of {len(result.simulations)} simulations of {seconds:.2g} s each, {len(result.refused)} have no "
         f"posterior, {short}. The longest autocorrelation time is {taus:.0f} steps."
     )
 
 
 def _ranks(result: CalibrationStudyResult, picture: bytes, pixels: int) -> Section:
-    text = f"""Parameters are drawn from the prior, frames of {pixels} x {pixels} pixels are taken with them by the
-        recipe's own steps, and {DRAWS} nearly independent draws are made from the posterior of these frames. Where
-        the posterior is right, the number of draws below the truth is uniform. Grey: the band of 99 of 100 bins of
-        uniform ranks. Where ranks heap at both ends, the posterior is too narrow; in the middle, too wide; at one end,
-        biased.
+    text = f"""Parameters are drawn from the prior, the recipe's own steps simulate frames of {pixels} x {pixels} pixels
+        with these parameters, and {DRAWS} nearly independent draws are made from the posterior of the frames. If the
+        posterior is correct, the number of draws below the truth, its rank, is uniform. The grey band contains 99 of
+        100 bins of uniform ranks. If ranks are frequent at both ends, the posterior is too narrow; in the middle, too
+        wide; at one end, biased.
 
         The prior is that of the recipe, but no wider than the standard deviations below (of the logarithm; in e- for
         the offset), so that frames of the recipe's levels constrain every sensor that is drawn. The search for the
-        mode starts near the truth: this study judges the posterior and the draws, not that search. A walker is lost
+        mode starts near the truth: this study tests the posterior and the draws, not the search. A walker is stranded
         if its median log posterior lies 20 nats below that of the others."""
     rows = [(_plain(name), width) for name, width in result.prior_widths.items()]
     return Section("Ranks of the truth", text, ("parameter", "width of the prior"), rows, picture)
 
 
 def _intervals(result: CalibrationStudyResult) -> Section:
-    text = """p: the probability that uniform ranks, in ten bins, are as uneven as these or more; the least is 0.01 over
-        the number of parameters. Coverage: how often the central 90 % of the draws hold the truth; a right posterior
-        is within the bar in 999 of 1000 studies. z: posterior mean minus truth, in posterior standard deviations; a
-        normal posterior has mean 0 and standard deviation 1, one that a limit cuts off not quite. Told: in how many
-        simulations the frames estimate, or only limit, the parameter."""
+    text = """p: the probability that uniform ranks in ten bins are at least as uneven as the ranks found; p must exceed
+        0.01 divided by the number of parameters. Coverage: how often the central 90 % of the draws contain the truth; a
+        correct posterior is within the bar in 999 of 1000 studies. z: posterior mean minus truth, in posterior standard
+        deviations. For a normal posterior z has mean 0 and standard deviation 1; for a posterior cut off by a limit,
+        only about. Told: in how many simulations the frames estimate the parameter, or only limit it."""
     columns = ("parameter", "p", "at least", "coverage", "bar", "z mean", "z sd", "told")
     rows, marks = [], dict[tuple[int, int], Mark]()
     for i, v in enumerate(result.rank_tests):
@@ -188,15 +191,15 @@ def _count_kinds(result: CalibrationStudyResult, name: str) -> str:
 
 
 def _weighed(result: CalibrationStudyResult) -> Section:
-    heading = "What the prior does"
+    heading = "Sensitivity to the prior"
     if result.sensitivity is None:
-        return Section(heading, f"Nothing can be said of the recipe's own frames: {result.no_sensitivity}.")
+        return Section(heading, f"The sensitivity to the prior is not known: {result.no_sensitivity}.")
     names, left = list(result.sensitivity.left), result.sensitivity.left
-    text = f"""Draws from the posterior of the recipe's own frames and prior, reweighted as if one prior had been twice
-        as wide. Value: the mean, or the limit of 95 % of a parameter that is only limited. Under each prior: how far
-        the value moves, in posterior standard deviations. Last row: the effective sample size as a share of the draws.
-        Below {ENOUGH:g} reweighting is unreliable, and there is a dash: the prior of that parameter constrains it about
-        as much as the frames do, or more."""
+    text = f"""Draws from the posterior of the recipe's own frames and prior, reweighted as if one prior were twice as
+        wide. Value: the mean, or the 95 % limit of a parameter that the frames only limit. Under each prior: the change
+        of the value, in posterior standard deviations. Last row: the effective sample size as a share of the draws.
+        Below {ENOUGH:g} reweighting is unreliable, and the table has a dash: the prior of this parameter constrains the
+        parameter at least about as much as the frames do."""
     columns = ("parameter", "from these frames", "value", "sd", *(f"{_plain(name)} x 2" for name in names))
     rows: list[list[Any]] = []
     for f in result.sensitivity.findings:

@@ -1,4 +1,4 @@
-"""A few nearly independent draws from a posterior, by one ensemble of walkers."""
+"""Nearly independent draws from a posterior, made by one ensemble of walkers."""
 
 from __future__ import annotations
 
@@ -15,15 +15,15 @@ from neusee.workflows.calibration.posterior_mode import LaplaceFit
 
 FloatArray = NDArray[np.float64]
 WALKERS, DRAWS = 64, 99
-_FIRST, _GROWTH, _LONGEST = 320, 1.5, 4000  #: steps of the first round, growth for each round, and largest number
+_FIRST, _GROWTH, _LONGEST = 320, 1.5, 4000  #: steps of the first round, growth for each round, and most steps
 _APART = 6.0  #: least length of a chain in autocorrelation times; its first half is discarded
-_ALIKE = 1.25  #: ratio of two standard deviations that chance exceeds rarely, for 64 walkers by three tau each
+_ALIKE = 1.25  #: ratio of two standard deviations that chance rarely exceeds, for 64 walkers and three tau each
 _NOT_KEPT = Path("/dev/null/not kept")  #: a file that never exists, because a simulation is too short to be resumed
 
 
 @dataclass(frozen=True)
 class PosteriorDraws:
-    """Draws from a posterior, and the quality of their chain."""
+    """Draws from a posterior, and measures of the quality of their chain."""
 
     samples: FloatArray  #: (draw, free parameter)
     tau: float = 0.0  #: steps, the longest autocorrelation time of any coordinate
@@ -56,6 +56,6 @@ def walk_draws(
 
 
 def _steady(chain: FloatArray) -> bool:
-    """Return True if the walkers (step, walker, free parameter) spread equally far in both halves of the chain."""
+    """Return True if the standard deviations are alike in both halves of a chain (step, walker, free parameter)."""
     early, late = (half.reshape(-1, half.shape[-1]).std(0) for half in np.array_split(chain, 2))
     return bool(((late < _ALIKE * early) & (early < _ALIKE * late)).all())

@@ -1,4 +1,4 @@
-"""Sensitivity of a posterior to its prior: the same draws, reweighted as if one prior had been twice as wide."""
+"""Sensitivity of a posterior to its prior, by reweighting of draws to a prior that is twice as wide."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ _TAIL = 0.05  #: probability beyond a limit
 
 @dataclass(frozen=True)
 class ParameterSensitivity:
-    """The estimate of a parameter in its unit, and its estimates under wider priors."""
+    """The estimate of one parameter, and the estimates with each prior twice as wide."""
 
     name: str
     kind: str  #: one of `identifiability.KINDS`; for `upper` and `lower` the value is a limit of 95 %
@@ -27,14 +27,14 @@ class ParameterSensitivity:
 
 @dataclass(frozen=True)
 class Sensitivity:
-    """The sensitivity of all parameters to the width of each prior."""
+    """The sensitivity of the estimates of all parameters to the width of each prior."""
 
     findings: Sequence[ParameterSensitivity]
     left: Mapping[str, float]  #: effective sample fraction with each prior twice as wide
 
 
 def sensitivity(problem: SensorPosterior, samples: FloatArray, kinds: Mapping[str, str]) -> Sensitivity:
-    """Return the sensitivity of each parameter, from nearly independent draws ``samples`` (draw, free parameter)."""
+    """Return the sensitivity of each parameter to each prior, from draws ``samples`` (draw, free parameter)."""
     values = {name: x.numpy() for name, x in problem.parameters(samples).items()}
     z = problem.whitened(samples)
     weights = {name: _weights(z[:, i]) for i, name in enumerate(problem.names)}
@@ -50,7 +50,7 @@ def sensitivity(problem: SensorPosterior, samples: FloatArray, kinds: Mapping[st
 
 
 def _weights(z: FloatArray) -> FloatArray:
-    """Return normalised weights at ``z``: the ratio of normal densities of standard deviations 2 and 1."""
+    """Return normalised weights at ``z``: the ratio of the normal densities with standard deviations 2 and 1."""
     log = 0.5 * (1.0 - 0.25) * z**2
     ratios = np.exp(log - log.max())
     weights: FloatArray = ratios / ratios.sum()
@@ -58,7 +58,7 @@ def _weights(z: FloatArray) -> FloatArray:
 
 
 def _value(x: FloatArray, weights: FloatArray, kind: str) -> float:
-    """Return the weighted mean of ``x``, or the limit of 95 % if the frames only limit the parameter."""
+    """Return the weighted mean of the draws ``x``, or their 95 % limit if the frames only limit the parameter."""
     if kind not in ("upper", "lower"):
         return float(weights @ x)
     order = np.argsort(x)

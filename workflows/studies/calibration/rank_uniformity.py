@@ -1,4 +1,4 @@
-"""Tests of a posterior: uniform ranks of the truth, and coverage of the truth by 90 % intervals."""
+"""Tests of a posterior: uniformity of the ranks of true parameters, and coverage of 90 % intervals."""
 
 from __future__ import annotations
 
@@ -17,20 +17,20 @@ BINS, SHARE = 10, 0.9
 _CHANCE = 0.01  #: probability of a false alarm by the ranks, over all parameters together
 _DRAWN = 0.99  #: share of the bins of uniform ranks inside the drawn band
 _GREY = "#777777"
-_CERTAIN = 0.999  #: probability that the coverage of a right posterior is within its limits
+_CERTAIN = 0.999  #: probability that the coverage of a correct posterior is within its limits
 #: limits of the coverage by number of simulations, rounded; the exact limits for 1000 are 0.868 and 0.930
 _ROUNDED = {200: (0.825, 0.960), 1000: (0.870, 0.930)}
 
 
 @dataclass(frozen=True)
 class RankTest:
-    """The ranks and the coverage of one parameter over all simulations, and their limits."""
+    """The rank test and the coverage test of one parameter over all simulations."""
 
     name: str
     counts: tuple[int, ...]  #: ranks by bin
     p: float  #: probability that uniform ranks are as uneven as these
     least_p: float
-    coverage: float  #: share of the simulations whose central 90 % hold the truth
+    coverage: float  #: share of the simulations whose central 90 % of draws contain the truth
     bar: tuple[float, float]  #: limits of the coverage
     z_mean: float
     z_sd: float
@@ -49,7 +49,7 @@ class RankTest:
 
 
 def rank_tests(simulations: Sequence[SensorSimulation]) -> list[RankTest]:
-    """Return one test for each parameter, from the simulations that gave a posterior."""
+    """Return the rank test and coverage test of each parameter, from all simulations that have a posterior."""
     sound = [s for s in simulations if not s.refused]
     if not sound:
         raise ValueError(f"no simulation has a posterior; reason of the first simulation: {simulations[0].refused}")
@@ -74,7 +74,7 @@ def _rank_test(name: str, sound: Sequence[SensorSimulation], parameters: int) ->
 
 
 def coverage_limits(count: int) -> tuple[float, float]:
-    """Return the coverage limits of ``count`` simulations that a right posterior exceeds in one of 1000 studies."""
+    """Return limits that the coverage of a correct posterior exceeds in 1 of 1000 studies of ``count`` simulations."""
     if count in _ROUNDED:
         return _ROUNDED[count]
     low, high = chance_band(count, SHARE, _CERTAIN)
@@ -82,7 +82,7 @@ def coverage_limits(count: int) -> tuple[float, float]:
 
 
 def chance_band(count: int, share: float, certain: float) -> tuple[float, float]:
-    """Return limits between which a binomial count lies with the probability ``certain``."""
+    """Return the central interval of a binomial distribution that contains the probability ``certain``."""
     from scipy.stats import binom
 
     low, high = binom.interval(certain, count, share)
@@ -91,7 +91,7 @@ def chance_band(count: int, share: float, certain: float) -> tuple[float, float]
 
 @drawn
 def ranks(rank_tests: Sequence[RankTest]) -> Any:
-    """Draw a histogram of the ranks of each parameter, with a band that holds 99 of 100 bins of uniform ranks."""
+    """Draw a histogram of the ranks of each parameter, with the band that contains 99 % of bins of uniform ranks."""
     columns = min(3, len(rank_tests))
     rows = -(-len(rank_tests) // columns)
     figure, axes = canvas(3.4 * columns, 2.4 * rows + 0.4, rows, columns, sharex=True)

@@ -1,7 +1,7 @@
-"""Simulation-based calibration: sensors drawn from a recipe's prior, simulated frames, and the posterior of each.
+"""Simulation-based calibration: sensors drawn from the prior, their simulated frames, and their posteriors.
 
-Each simulation depends on the recipe and its number only, and the store keeps the result: an interrupted study
-continues, and the first 200 of 1000 simulations are those of a shorter study.
+Each simulation depends only on the recipe and on the simulation's number, and the store keeps the result: an
+interrupted study continues, and the first 200 of 1000 simulations are those of a shorter study.
 """
 
 from __future__ import annotations
@@ -29,7 +29,7 @@ from neusee.workflows.store.memo import compute_once
 from neusee.workflows.store.result_store import Store
 from neusee.workflows.studies.calibration.independent_draws import PosteriorDraws
 
-#: draws from a posterior with its mode, by a seed
+#: function of a posterior, its mode and a seed, which returns draws from the posterior
 Sampler = Callable[[SensorPosterior, LaplaceFit, int], PosteriorDraws]
 _EXPOSE = "calibrate.expose"
 #: largest standard deviation of the prior of each logarithm, and of the offset in e-: with a wider prior some sensors
@@ -48,13 +48,13 @@ _TAIL = 0.05  #: share of the draws beyond either end of the interval whose cove
 
 @dataclass(frozen=True)
 class SensorSimulation:
-    """The result of one simulation, as plain values by parameter that the store can keep."""
+    """The result of one simulated sensor, as plain values that the store can keep."""
 
     truth: dict[str, float]
     rank: dict[str, int] = field(default_factory=dict)  #: number of draws below the truth
-    inside: dict[str, bool] = field(default_factory=dict)  #: whether the central 90 % of the draws hold the truth
+    inside: dict[str, bool] = field(default_factory=dict)  #: whether the central 90 % of the draws contain the truth
     z: dict[str, float] = field(default_factory=dict)  #: mean minus truth, in standard deviations of the draws
-    kinds: dict[str, str] = field(default_factory=dict)  #: how the frames constrain it, one of `identifiability.KINDS`
+    kinds: dict[str, str] = field(default_factory=dict)  #: by parameter, one of `identifiability.KINDS`
     tau: float = 0.0  #: steps
     independent: bool = False  #: whether the chain was long enough
     stranded: int = 0  #: walkers that stay where the posterior is almost 0
@@ -63,14 +63,14 @@ class SensorSimulation:
 
 
 class SensorSimulator:
-    """The simulations of a recipe's calibration; each has its own sensor and frames."""
+    """A simulator of sensors for a recipe's calibration; each simulation has its own sensor and frames."""
 
     def __init__(self, recipe: Recipe, store: Store, pixels: int, sampler: Sampler, label: str) -> None:
-        """Read the recipe; ``label`` names the sampler in the keys of its results."""
+        """Prepare simulations of ``recipe``; ``label`` names the sampler in the store keys of the results."""
         self.store, self.sampler, self.label = store, sampler, label
         self.exposed = [name for name in needed(recipe, recipe.steps) if recipe.steps[name].node.path == _EXPOSE]
         if not self.exposed:
-            raise ValueError(f"{recipe.name} simulates no frames: {_EXPOSE} is the step whose parameters are drawn")
+            raise ValueError(f"{recipe.name} simulates no frames: add a step of the node {_EXPOSE}")
         self.recipe = with_narrow_prior(recipe, {name: {"shape": (pixels, pixels)} for name in self.exposed})
         with TemporaryDirectory(prefix="neusee-") as folder:
             self.nominal = SensorPosterior.of(self.recipe, Store(folder))
@@ -78,18 +78,18 @@ class SensorSimulator:
             self._weigh, self._weigh_in_full = self._functions(Store(folder))
 
     def simulation(self, number: int) -> SensorSimulation:
-        """Return the simulation with this number, from the store or computed now."""
+        """Return the simulation with the number ``number``; compute the simulation if the store does not have it."""
         key = digest("calibration study", self._key_parts(), number)
         seed, about = stream_seed(self.recipe.seed, f"calibration study {number}"), {"step": "study calibration"}
         return compute_once(self.store, key, SensorSimulation, lambda: self._simulate(seed), about, small=True)
 
     def truth(self, seed: int) -> dict[str, float]:
-        """Return the parameters of a sensor, drawn from the prior."""
+        """Draw the parameters of a sensor from the prior."""
         drawn = self.nominal.coordinates.draw(1, torch.Generator().manual_seed(seed))
         return {name: float(x) for name, x in drawn.items()}
 
     def problem(self, truth: Mapping[str, float], seed: int) -> SensorPosterior:
-        """Return the posterior of simulated frames of the sensor ``truth``."""
+        """Simulate frames of a sensor with the parameters ``truth``, and return the posterior of these frames."""
         levels = self._levels(truth, seed)
 
         def with_levels(function: Callable[[Any], Any]) -> Callable[[Any], Any]:
@@ -99,7 +99,7 @@ class SensorSimulator:
         return replace(self.nominal, levels=levels, weigh=weigh, weigh_in_full=weigh_in_full)
 
     def prior_widths(self) -> dict[str, float]:
-        """Return the prior standard deviation of each free parameter: of its logarithm, or of the offset in e-."""
+        """Return the prior standard deviation of the logarithm of each free parameter, or of the offset in e-."""
         widths = zip(NAMES, self.nominal.coordinates.prior.width.tolist(), strict=True)
         return {name: width for name, width in widths if np.isfinite(width)}
 
@@ -119,7 +119,7 @@ class SensorSimulator:
         return replace(ranked, kinds=identified.kinds, seconds=time.perf_counter() - began)
 
     def _levels(self, truth: Mapping[str, float], seed: int) -> Sufficient:
-        """Return the statistics of simulated frames of the sensor ``truth``, without keeping the frames."""
+        """Simulate frames of a sensor with the parameters ``truth``, and return the statistics of the frames."""
         values = {f"{step}.{name}": x for step in self.exposed for name, x in truth.items()}
         recipe = replace(self.recipe, seed=seed)
         with TemporaryDirectory(prefix="neusee-") as folder, torch.no_grad():
@@ -128,7 +128,7 @@ class SensorSimulator:
         return levels
 
     def _functions(self, store: Store) -> tuple[Callable[[Any], Any], Callable[[Any], Any]]:
-        """Return the two likelihood functions of `SensorPosterior.of`, with the levels as one more argument."""
+        """Return two likelihood functions of levels and parameters: without and with deviances and slopes."""
         step = self.recipe.steps[self.nominal.step]
         free = [self._source, *(f"{step.name}.{name}" for name in self.nominal.names)]
 
@@ -146,7 +146,7 @@ class SensorSimulator:
 
 
 def with_narrow_prior(recipe: Recipe, changed: Mapping[str, Mapping[str, Any]]) -> Recipe:
-    """Return the recipe with the parameters in ``changed`` by step, and with a prior at most as wide as `WIDEST`."""
+    """Return the recipe with the parameters of each step in ``changed``, and with a prior no wider than `WIDEST`."""
     prior = only_step(recipe, "calibrate.prior")
     capped = {name: _capped(name, law) for name, law in prior.params.items()}
     both = {**changed, prior.name: capped}
@@ -162,7 +162,7 @@ def _capped(name: str, law: tuple[float, float] | None) -> tuple[float, float] |
 
 
 def rank_truth(problem: SensorPosterior, truth: Mapping[str, float], drawn: PosteriorDraws) -> SensorSimulation:
-    """Return the rank of each true parameter among the draws, and the difference of the mean draw and the truth."""
+    """Return the rank of each true parameter among the draws, and the difference of posterior mean and truth."""
     values = {name: x.numpy() for name, x in problem.parameters(drawn.samples).items()}
     found = SensorSimulation(dict(truth), tau=drawn.tau, independent=drawn.independent, stranded=drawn.stranded)
     for name, x in values.items():

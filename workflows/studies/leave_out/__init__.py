@@ -1,6 +1,6 @@
-"""Does every omission keep its bound, and how much time does it save?
+"""Does the error of every omission stay within its bound, and how much run time does the omission save?
 
 Runs with and without each omission, and the run time of simpler scenes.
-No other study belongs here.
+Other studies have their own packages.
 Offers: `leave_out_study.study`.
 """

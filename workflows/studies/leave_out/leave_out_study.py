@@ -1,4 +1,4 @@
-"""The study of omissions: the error of each step that a recipe leaves out, and the run time of simpler scenes."""
+"""The leave-out study: the error of each omission of a recipe, and the run time of simpler scenes."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ _HELD = {True: "holds", False: "fails"}
 
 @dataclass(frozen=True)
 class LeaveOutResult:
-    """The measured errors of outputs and omissions, and the run times of scenes."""
+    """The result of the leave-out study: errors of outputs and omissions, and run times of scenes."""
 
     output_errors: Sequence[OutputError]
     rows: Sequence[OmissionRow]
@@ -33,14 +33,14 @@ class LeaveOutResult:
 
     @property
     def failed(self) -> int:
-        """Return how many outputs and omissions exceed their bound."""
+        """Return how many outputs and omissions exceed their error bounds."""
         return sum(not output.holds for output in self.output_errors) + sum(not row.holds for row in self.rows)
 
 
 def study(
     recipe: Recipe, store: Store, runs: Path, command: Sequence[str], progress: Progress, contents: bool = True
 ) -> Path:
-    """Measure the error of every omission of ``recipe``; with ``contents``, also the run time of simpler scenes."""
+    """Measure the error of every omission of ``recipe`` and, with ``contents``, the run time of simpler scenes."""
     study_run = StudyRun("leave-out", recipe, command)
     comparison = OmissionComparison(recipe, store)
     output_errors, rows = comparison.output_errors(), []
@@ -70,7 +70,7 @@ def _report(recipe: Recipe, result: LeaveOutResult) -> StudyReport:
         tables["costs.csv"] = (("scene", "seconds", "computing", "steps", "left out", "refused"), scenes)
         sections.append(_scenes(result))
         picture = sections[-1].picture
-    title, shown = f"{recipe.name}: what is left out", (*SHOWN, "tolerance")
+    title, shown = f"{recipe.name}: omissions", (*SHOWN, "tolerance")
     return StudyReport(title, _lead(recipe, result), sections, {"content": picture}, tables, shown=shown)
 
 
@@ -88,32 +88,32 @@ def _lead(recipe: Recipe, result: LeaveOutResult) -> str:
     worst = max((p.rms for p in result.output_errors), default=0.0)
     held = "All bounds hold" if not result.failed else f"{result.failed} bounds do not hold"
     return (
-        f"{held}. Of {len(result.rows)} steps that could be left out or made cheaper with a known bound, the recipe "
-        f"does so with {len(chosen)} at its tolerance of {recipe.tolerance:.2g}; its worst output is then {worst:.2g} "
-        "from the one with everything in full."
+        f"{held}. Of {len(result.rows)} possible omissions with a known bound, the recipe chooses {len(chosen)} at its "
+        f"tolerance of {recipe.tolerance:.2g}. The largest error of an output is then {worst:.2g}, "
+        "relative to the full computation."
     )
 
 
 def _outputs(recipe: Recipe, result: LeaveOutResult) -> Section:
     rows = [(p.output, p.bound, p.rms, p.largest, recipe.tolerance, _HELD[p.holds]) for p in result.output_errors]
-    text = """Each output of the recipe as it chooses, against the same with everything in full (--exact). The
-        error is the root mean square of the difference over the largest element, which the tolerance limits. The
-        proved bound is what the nodes propagate from the omissions, where they have a bound."""
+    text = """Each output of the recipe with the chosen omissions, compared with the full computation (--exact). The
+        error is the root mean square of the difference over the largest element; the tolerance limits this error. The
+        proved bound follows from the bounds of the omissions, if all nodes can propagate them."""
     columns = ("output", "proved bound", "error", "largest difference", "tolerance", "holds")
     return Section("The outputs", text, columns, rows, marks=_marks(result.output_errors, 5))
 
 
 def _omissions(result: LeaveOutResult) -> Section:
-    text = """Each omission alone, with everything else in full. A step that is left out passes its input on. Light
-        may be not added. For a summed image, only the sums over bands that its readers need are convolved. The stated
-        bound and the change are shares of the largest element: of the step's full result; for light that is not added,
-        of the sum; for a summed image, of the steps that read it. For noise and for sums the bound limits the root mean
-        square, and one draw of the noise may differ by four standard errors; for all others it limits the largest
-        difference.
+    text = """Each omission alone, with all other steps computed in full. A step that is left out returns its input.
+        Light that is not added is replaced by zero. For a summed image, only the sums over bands that later steps need
+        are convolved. The stated bound and the error are relative to the largest element: of the step's full result; of
+        the sum, for light that is not added; of the steps that read the image, for a summed image. For noise and for
+        summed images the bound limits the root mean square error, and one draw of the noise may exceed the bound by
+        four standard errors. For all other omissions the bound limits the largest error.
 
-        Outputs: the error of the worst output by this omission alone. Put back: the change of the worst output when the
-        recipe as it chooses computes this one step in full. Saved: the seconds of its steps. A bound that the tolerance
-        does not allow is tested too."""
+        Outputs: the error of the worst output with this omission alone. Put back: the change of the worst output when
+        the recipe with the chosen omissions computes this step in full. Saved: the run time of the omitted steps, in s.
+        Omissions that the tolerance does not allow are tested too."""
     columns = ("step", "how", "chosen", "bound", "error", "largest", "outputs", "put back", "saved s", "holds")
     cells = [(_cells(row), row) for row in result.rows]
     rows = [(name, _HOW[kind], *rest, _HELD[row.holds]) for (name, kind, *rest), row in cells]
@@ -121,8 +121,8 @@ def _omissions(result: LeaveOutResult) -> Section:
 
 
 def _scenes(result: LeaveOutResult) -> Section:
-    text = """The run time from an empty store, in one process: the median of up to three runs. The first row
-        computes everything in full; the others may leave out what their scene does not need."""
+    text = """The run time from an empty store, in one process: the median of up to three runs. The first row is the
+        full computation; in the other rows the engine may leave out steps that the scene does not need."""
     full = result.costs[0].seconds
     rows = []
     for c in result.costs:
@@ -130,7 +130,7 @@ def _scenes(result: LeaveOutResult) -> Section:
         rows.append((c.scene, *seconds, c.steps, c.refused or ", ".join(c.left_out) or "nothing"))
     columns = ("scene", "seconds", "share of full", "steps", "left out or made cheaper")
     timed = [c for c in result.costs if math.isfinite(c.seconds)]
-    return Section("Cost follows content", text, columns, rows, _bars(timed) if timed else None)
+    return Section("Run time of simpler scenes", text, columns, rows, _bars(timed) if timed else None)
 
 
 @drawn
@@ -141,7 +141,7 @@ def _bars(costs: Sequence[SceneCost]) -> Any:
     inside = [min(cost.computing, cost.seconds) for cost in costs]
     ax.barh(names, inside, color=BLUE, label="in the steps")
     beside = [cost.seconds - part for cost, part in zip(costs, inside, strict=True)]
-    ax.barh(names, beside, left=inside, color=_WAITING, label="reading, keeping, choosing")
+    ax.barh(names, beside, left=inside, color=_WAITING, label="in the engine and the store")
     for row, cost in enumerate(costs):
         ax.annotate(f" {cost.seconds:.3g} s", (cost.seconds, row), va="center", fontsize=9)
     ax.invert_yaxis()

@@ -1,7 +1,8 @@
-"""The comparison of each omission with the full computation: its bound, its measured change, and the time it saves.
+"""Comparison of each omission with the full computation: error bound, measured error and saved run time.
 
-The full computation is the recipe with everything kept. It is compared with the recipe as the engine chooses its
-omissions, and with one omission alone. The recipe as chosen is also compared with one of its omissions put back.
+The full computation is the recipe without omissions. It is compared with the recipe with all omissions that the engine
+chooses, and with one omission alone. The recipe with the chosen omissions is also compared with the same recipe after
+one of the omissions is undone.
 """
 
 from __future__ import annotations
@@ -28,39 +29,39 @@ from neusee.workflows.tolerance.error_norm import error_of, largest_error
 
 _SURE = 4.0  #: standard errors by which a mean over pixels may differ from the mean over all noise
 _ABOUT = {"step": "study leave-out"}
-_ROUNDING = 2e-7  #: of a sum in float32, as a share of its largest element
+_ROUNDING = 2e-7  #: rounding error of a sum in float32, relative to its largest element
 
 
 @dataclass(frozen=True)
 class OmissionRow:
-    """One omission and its measured effect; errors are shares of the largest element."""
+    """One omission with its bound, its measured errors relative to the largest element, and the saved run time."""
 
     name: str
     kind: str
     why: str
     taken: bool
     bound: float
-    rms: float  #: at the step, or at the steps that read it
+    rms: float  #: error at the step, or at the steps that read its result
     largest: float
-    outputs: dict[str, float]  #: root mean square error of each output by this omission alone
-    back: float | None  #: root mean square change of the worst chosen output when this omission is put back
-    seconds: float  #: that the omission saves
+    outputs: dict[str, float]  #: root mean square error of each output with this omission alone
+    back: float | None  #: root mean square change of the worst output when this omission is undone
+    seconds: float  #: run time that the omission saves
     holds: bool
 
 
 @dataclass(frozen=True)
 class OutputError:
-    """The error of an output of the recipe with its chosen omissions, against the full computation."""
+    """The error of an output of the recipe with the chosen omissions, relative to the full computation."""
 
     output: str
-    bound: float | None  #: proved by the engine
+    bound: float | None  #: error bound that the engine proved
     rms: float
     largest: float
     holds: bool
 
 
 class OmissionComparison:
-    """The full computation of a recipe, its run with the chosen omissions, and its runs with one omission each."""
+    """The runs to compare: the full computation, the recipe with the chosen omissions, and a run for each omission."""
 
     def __init__(self, recipe: Recipe, store: Store) -> None:
         self.recipe, self.store = recipe, store
@@ -70,11 +71,11 @@ class OmissionComparison:
         self.found = list(omissions(self.full, self.chosen, self.facts))
 
     def facts(self, step: str) -> TensorStats | None:
-        """Return the statistics of a step's full result, from the metadata of the store if possible."""
+        """Return statistics of a step's result in the full computation, from the store's metadata if possible."""
         return facts_in(self.store.about(self.truth.keys[step])) or TensorStats.of(self.truth.value(step))
 
     def output_errors(self) -> list[OutputError]:
-        """Return the error of each output of the recipe with its chosen omissions."""
+        """Return the error of each output of the recipe with the chosen omissions."""
         errors = []
         for name in self.recipe.outputs:
             value, reference = self.chosen.values[name], self.truth.values[name]
@@ -84,7 +85,7 @@ class OmissionComparison:
         return errors
 
     def rows(self) -> Iterator[OmissionRow]:
-        """Yield a row for each omission, from the store or measured now."""
+        """Yield the row of each omission; measure the omission if the store does not have the row."""
         for omission in self.found:
             alone = omission.applied_to(self.full)
             key, compute = self._key(omission, alone), partial(self._row, omission, alone)
@@ -109,14 +110,14 @@ class OmissionComparison:
         )
 
     def _reached(self, omission: Omission, alone: Recipe, changed: bool) -> tuple[dict[str, float], float | None]:
-        """Return the error of each output by one omission alone, and the change when the omission is put back."""
+        """Return the error of each output with one omission alone, and the change when the omission is undone."""
         if not changed:
             return dict.fromkeys(self.recipe.outputs, 0.0), 0.0 if omission.taken else None
         outputs = _errors(self.recipe.outputs, alone.outputs, run(alone, self.store), self.truth)
         return outputs, self._back(omission) if omission.taken else None
 
     def _holds(self, omission: Omission, bound: float, pair: tuple[Any, Any], result: Result) -> bool:
-        """Return True if a change is within its bound: on average for noise and sums over bands, else everywhere."""
+        """Return True if the error is within the bound: the rms for noise and band sums, else the largest error."""
         if omission.kind == "stands in":  # both computations have a documented error of their own
             steps = [self.full.steps[name] for name in omission.exchange]
             cheaper = [result.recipe.steps[name] for name in omission.exchange.values()]
@@ -128,9 +129,9 @@ class OmissionComparison:
         return largest_error(*pair) <= bound * (1 + 1e-5) + (_ROUNDING if bound else 0.0)
 
     def _back(self, omission: Omission) -> float:
-        """Return the largest change of an output when the recipe computes one of its chosen omissions in full."""
+        """Return the change of the worst output when one of the chosen omissions is undone."""
         recipe = self.full
-        for other in reversed(self.found):  # the last first, because the input that is handed on may be left out too
+        for other in reversed(self.found):  # from the last, because the input that is handed on may be left out too
             if other.taken and other is not omission:
                 recipe = other.applied_to(recipe)
         return max(_errors(self.recipe.outputs, recipe.outputs, run(recipe, self.store), self.chosen).values())
@@ -151,13 +152,13 @@ class OmissionComparison:
 
 
 def _errors(names: Sequence[str], others: Sequence[str], result: Result, truth: Result) -> dict[str, float]:
-    """Return the error of each output by name; ``others`` are the names of the same outputs in ``result``."""
+    """Return the error of each output in ``names``; ``others`` are the names of the same outputs in ``result``."""
     pairs = zip(names, others, strict=True)
     return {name: error_of(result.values[other], truth.values[name]) for name, other in pairs}
 
 
 def _bounds(omission: Omission, result: Result) -> dict[str, float]:
-    """Return the bound at each compared step: the stated bound, or for sums over bands the proved bound."""
+    """Return the error bound at each compared step: the stated bound, or for sums over bands the proved bound."""
     if omission.kind != "stands in":
         return dict.fromkeys(omission.at, omission.bound)
     return {name: bound for name in omission.at if (bound := result.proof.of(name)) is not None}
@@ -166,8 +167,9 @@ def _bounds(omission: Omission, result: Result) -> dict[str, float]:
 def least_error(value: Tensor, reference: Tensor) -> float:
     """Return a lower limit of the relative root mean square error over all noise, estimated from one draw.
 
-    Pixels count as draws. Where rare large pixels decide the mean of the squares, its standard error is as large as
-    the mean. The largest element was drawn too, and may lie as far above its own mean.
+    Each pixel counts as a draw. If a few large pixels dominate the mean square error, the standard error of the mean is
+    as large as the mean. The largest element is random too, so four standard
+    deviations are added to it.
     """
     change = value.double() - reference.double()
     squares, count = change.square(), change.numel()

@@ -1,8 +1,9 @@
-"""The possible omissions of a recipe: each omission is a change of the full computation.
+"""The possible omissions of a recipe, each as a change of the full computation.
 
-There are three kinds. A step whose node bounds its effect is left out, and its first input is handed on. Light or dirt
-whose largest element is bounded is not added. Sums over bands stand in for an image of all bands. Each omission can be
-measured alone, whether the engine chose it or not.
+There are three kinds. ``handed on``: a step whose node bounds its effect is left out, and the first input of the step
+takes the place of its result. ``not added``: light or dirt whose largest element is bounded is not added. ``stands
+in``: sums over bands replace an image of all bands. Each omission can be measured alone, even if the engine does not
+choose it.
 """
 
 from __future__ import annotations
@@ -27,11 +28,11 @@ Kind = Literal["handed on", "not added", "stands in"]
 
 @dataclass(frozen=True)
 class Omission:
-    """Steps that can be left out, or replaced by cheaper steps."""
+    """An omission: steps of a recipe that can be left out or replaced by cheaper steps."""
 
     name: str
     kind: Kind
-    exchange: Mapping[str, str]  #: by step, the step that replaces it, or an empty text
+    exchange: Mapping[str, str]  #: for each omitted step, the step that replaces it, or an empty text
     bound: float  #: largest relative change at the compared steps; NaN if only a run can determine the bound
     why: str
     taken: bool  #: whether the recipe's own run has this omission
@@ -39,7 +40,7 @@ class Omission:
     beside: tuple[Step, ...] = ()  #: replacing steps that are not in the recipe
 
     def applied_to(self, recipe: Recipe) -> Recipe:
-        """Return ``recipe`` with this omission as its only change."""
+        """Return ``recipe`` changed by this omission and by nothing else."""
         readers = set(recipe.steps) if self.kind != "stands in" else set(self.at)
         steps = {**recipe.steps, **{step.name: step for step in self.beside}}
         for name in readers & recipe.steps.keys():
@@ -49,7 +50,7 @@ class Omission:
         return replace(recipe, steps={name: steps[name] for name in order}, outputs=outputs)
 
     def value_of(self, step: str) -> str:
-        """Return the step that gives the value of ``step`` in a recipe with this omission."""
+        """Return the step whose result takes the place of the result of ``step`` in a recipe with this omission."""
         return self.exchange.get(step, step) if self.kind == "handed on" else step
 
     def _wires(self, reader: Step) -> Mapping[str, Wire]:
@@ -65,7 +66,7 @@ def _exchanged(wire: Wire, exchange: Mapping[str, str]) -> Wire:
 
 
 def omissions(full: Recipe, chosen: Result, facts_of: FactsOf) -> Iterator[Omission]:
-    """Yield every omission of ``full`` whose effect has a bound."""
+    """Yield every omission of the full computation ``full`` whose error has a bound."""
     order = needed(full, full.outputs)
     yield from _stand_ins(full, order, chosen)
     for name in order:
@@ -96,7 +97,10 @@ def _not_added(recipe: Recipe, order: list[str], name: str, facts_of: FactsOf) -
 
 
 def _stand_ins(full: Recipe, order: list[str], chosen: Result) -> Iterator[Omission]:
-    """Yield one omission that replaces all images by sums over bands, because two compared images must be alike."""
+    """Yield the omission that replaces all images by sums over bands.
+
+    All images are replaced together, because two images that a step compares must be computed in the same way.
+    """
     sparse = with_substitutions(replace(full, exact=False), full.outputs)
     exchange = {economy.step: economy.instead for economy in sparse.substitutions if economy.instead}
     if not exchange:
@@ -109,7 +113,7 @@ def _stand_ins(full: Recipe, order: list[str], chosen: Result) -> Iterator[Omiss
 
 
 def _adding(recipe: Recipe, order: list[str], name: str) -> tuple[str, ...]:
-    """Return the steps that read the result of step ``name``, if each of them only adds the result; else no step."""
+    """Return the steps that read the result of step ``name`` if all of them only add the result, else no steps."""
     readers = [recipe.steps[n] for n in order if name in recipe.steps[n].sources]
     return tuple(reader.name for reader in readers) if all(_only_adds(reader, name) for reader in readers) else ()
 
@@ -120,7 +124,7 @@ def _only_adds(reader: Step, name: str) -> bool:
 
 
 def _largest(step: Step, facts_of: FactsOf) -> float:
-    """Return the node's bound of the largest element of a step's result, from the statistics of its inputs."""
+    """Return the node's bound of the largest element of a step's result, from statistics of the step's inputs."""
     assert step.node.hooks.zero_bound is not None
     facts = [_facts(step.wires.get(name), facts_of) for name in step.node.inputs]
     try:
@@ -134,7 +138,7 @@ def _facts(wire: Wire, facts_of: FactsOf) -> TensorStats | list[TensorStats | No
 
 
 def _share(largest: float, recipe: Recipe, at: tuple[str, ...], facts_of: FactsOf) -> float:
-    """Return ``largest`` relative to the largest element at the steps ``at``, or infinity if these give no tensor."""
+    """Return ``largest`` over the largest element of the results of steps ``at``; infinity if a result is no tensor."""
     if largest == 0:
         return 0.0
     if any(recipe.steps[name].node.hints.get("return") is not Tensor for name in at):

@@ -1,4 +1,4 @@
-"""The run time of simpler scenes: the recipe without its laser, in one colour, or behind a clean window."""
+"""Run times of simpler scenes: the recipe without a laser, at one wavelength, or behind a clean window."""
 
 from __future__ import annotations
 
@@ -18,16 +18,16 @@ from neusee.workflows.store.memo import compute_once
 from neusee.workflows.store.result_store import Store
 from neusee.workflows.studies.cold_run import key_parts, run_cold
 
-_TIMES = 3  #: cold runs, of which the median counts
+_TIMES = 3  #: cold runs of a scene; the median of their times counts
 _QUICK = 5.0  #: s; a scene that takes longer is run once
 _WINDOW = ("flare.dirt", "flare.ghosts")
-_LIFT = "steps.cube={node: spectra.lift_mallett, from: {rgb: scene, bands: bands}}"  #: of as few bands as one
+_LIFT = "steps.cube={node: spectra.lift_mallett, from: {rgb: scene, bands: bands}}"  #: works even with one band
 _GREY = "steps.scene={node: scene.targets, with: {kind: siemens, shape: '${scene.shape}'}}"
 
 
 @dataclass(frozen=True)
 class SceneCost:
-    """The run time of one scene."""
+    """The run time of a recipe with one scene, and the steps that the engine left out."""
 
     scene: str
     seconds: float  #: median of the engine's cold runs; NaN if the scene could not be run
@@ -38,7 +38,7 @@ class SceneCost:
 
 
 def measure_scenes(recipe: Recipe, store: Store, progress: Callable[[str], None]) -> Iterator[SceneCost]:
-    """Yield the run time of each scene that ``recipe`` can be changed to, from the store or measured now."""
+    """Yield the run time of ``recipe`` with each simpler scene; measure the time if the store does not have it."""
     code, warm = Code(store.code_memo), list[Result]()
     for scene, changed_recipe in scenes(recipe).items():
         if isinstance(changed_recipe, str):
@@ -46,7 +46,7 @@ def measure_scenes(recipe: Recipe, store: Store, progress: Callable[[str], None]
             continue
 
         def compute(scene: str = scene, recipe: Recipe = changed_recipe) -> SceneCost:
-            if not warm:  # libraries are imported and code is read by the first run of a process
+            if not warm:  # the first run of a process imports libraries and reads code
                 warm.append(run_cold(recipe, store))
             return _cost(scene, recipe, store)
 
@@ -58,7 +58,7 @@ def measure_scenes(recipe: Recipe, store: Store, progress: Callable[[str], None]
 
 
 def scenes(recipe: Recipe) -> dict[str, Recipe | str]:
-    """Return the recipe of each simpler scene by name, or the reason why the scene is not possible."""
+    """Return the recipe with each simpler scene by name, or the reason why the recipe cannot have the scene."""
     found: dict[str, Recipe | str] = {"everything in full": replace(recipe, exact=True)}
     found["as the recipe chooses"] = recipe
     for scene, overrides in _overrides(recipe).items():
@@ -70,7 +70,7 @@ def scenes(recipe: Recipe) -> dict[str, Recipe | str]:
 
 
 def _changed(recipe: Recipe, overrides: Sequence[str]) -> Recipe:
-    """Return ``recipe`` with the overrides, and without the values that no step refers to any more."""
+    """Return ``recipe`` with the overrides, without the values that no step reads after these changes."""
     try:
         return changed(recipe, overrides)
     except RecipeError as error:
@@ -96,7 +96,7 @@ def _overrides(recipe: Recipe) -> Mapping[str, Sequence[str]]:
 
 
 def _window_steps(recipe: Recipe) -> set[str]:
-    """Return the steps of dirt and ghosts, and the steps that need their results."""
+    """Return the names of the steps that compute dirt and ghosts, and of the steps that need such a result."""
     window = {name for name, step in recipe.steps.items() if step.node.path in _WINDOW}
     for name, step in recipe.steps.items():
         needs = {w for i, w in step.wires.items() if isinstance(w, str) and i not in step.node.optional}

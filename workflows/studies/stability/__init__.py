@@ -1,6 +1,6 @@
-"""Where do steps break in stiff and extreme cases?
+"""Which steps fail or lose accuracy in extreme cases?
 
-Extreme cases of each step, forward and gradient, against float64.
-No other study belongs here.
+The result and the gradient of each step in extreme cases, compared with float64.
+Other studies have their own packages.
 Offers: `stability_study.study`.
 """

@@ -1,4 +1,4 @@
-"""A recipe at a small size with the changes of one case: its steps and losses, their keys, and their inputs."""
+"""The recipe of one extreme case: a small recipe with the changes of the case, and the inputs of each step."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ from neusee.workflows.keys.code_digest import Code
 from neusee.workflows.recipe.step_declarations import find_node
 from neusee.workflows.studies.stability.extreme_cases import Case, Size
 
-_COMPARES: dict[str, tuple[tuple[str, dict[str, Any]], ...]] = {  # a loss has the inputs of its metric
+_COMPARES: dict[str, tuple[tuple[str, dict[str, Any]], ...]] = {  # by node: nodes for the same inputs
     "metrics.lsr": (("losses.suppression_loss", {}), ("losses.suppression_loss", {"log": True})),
     "metrics.bsr": (("losses.background_loss", {}),),
     "metrics.mtf": (("losses.contrast", {}), ("metrics.limits", {})),
@@ -27,13 +27,13 @@ _SMALLER = {"pixels": 256, "levels": 6, "grid": 16, "width": 4}  #: limits of ot
 
 
 def with_losses(recipe: Recipe) -> dict[str, Step]:
-    """Return the steps of the recipe, the losses that belong to its metrics, and related steps with equal inputs."""
+    """Return the steps of the recipe, with extra steps for losses and related nodes that take the same inputs."""
     steps = dict(recipe.steps)
     for name, step in recipe.steps.items():
         for path, params in _COMPARES.get(step.node.path, ()):
             node = find_node(path)
             wires = {to: step.wires[source] for to, source in zip(node.inputs, step.node.inputs, strict=False)}
-            if "stop" in node.inputs:  # of the mask before this step
+            if "stop" in node.inputs:  # from the mask that this step reads
                 wires["stop"] = recipe.steps[step.sources[0]].wires["stop"]
             family, _, title = path.partition(".")
             label = f"{'loss ' if family == 'losses' else ''}{title}{' log' if 'log' in params else ''} of {name}"
@@ -42,7 +42,7 @@ def with_losses(recipe: Recipe) -> dict[str, Step]:
 
 
 def with_size(steps: Mapping[str, Step], size: Size) -> dict[str, Step]:
-    """Return the steps with fewer pixels, pupil samples and bands, at the same pupil diameters and spot positions."""
+    """Return the steps with fewer pixels, pupil samples and bands; pupil diameters do not change."""
     sides = [side for step in steps.values() for name in ("shape",) for side in step.params.get(name) or ()]
     part = size.pixels / max(sides, default=size.pixels)
     return {name: replace(step, params=_smaller(step, size, part)) for name, step in steps.items()}
@@ -63,7 +63,7 @@ def _smaller(step: Step, size: Size, part: float) -> dict[str, Any]:
 
 
 def with_parameters(steps: Mapping[str, Step], case: Case) -> dict[str, Step]:
-    """Return the steps with the parameters of a case."""
+    """Return the steps with the parameter values that a case changes."""
     return {name: replace(step, params=_changed(step, case)) for name, step in steps.items()}
 
 
@@ -79,7 +79,7 @@ def _changed(step: Step, case: Case) -> dict[str, Any]:
 
 @dataclass
 class CaseRecipe:
-    """The recipe of one case, whose results are computed when they are first needed."""
+    """The recipe of one extreme case; each result is computed when it is first needed."""
 
     recipe: Recipe
     case: Case
@@ -90,7 +90,7 @@ class CaseRecipe:
 
     @classmethod
     def of(cls, recipe: Recipe, case: Case, code: Code) -> CaseRecipe:
-        """Return the recipe of a case with the key of each step; a result that the case changes has another key."""
+        """Return the recipe of a case with the key of each step; results that the case changes have other keys."""
         steps = with_parameters(with_size(with_losses(recipe), case.size), case)
         chain = cls(recipe, case, steps)
         for name in in_order({n: s.sources for n, s in steps.items()}, steps):
@@ -99,7 +99,7 @@ class CaseRecipe:
         return chain
 
     def inputs(self, name: str) -> list[Any]:
-        """Return the inputs of a step; raise `LookupError` where an earlier step refused its inputs."""
+        """Return the inputs of a step; raise `LookupError` if an earlier step gave no result."""
         return [self._gathered(self.steps[name].wires.get(i)) for i in self.steps[name].node.inputs]
 
     def _gathered(self, wire: Any) -> Any:
@@ -118,7 +118,7 @@ class CaseRecipe:
     def _compute(self, name: str) -> None:
         step = self.steps[name]
         if any(source in self.refused for source in step.sources):
-            self.refused[name] = "a step before it refused"
+            self.refused[name] = "an earlier step gave no result"
             return
         inputs = self.inputs(name)
         try:
@@ -140,7 +140,7 @@ def _put(step: Step, case: Case) -> Any:
 
 
 def unchanged_steps(chain: CaseRecipe, usual: CaseRecipe) -> Iterator[str]:
-    """Yield the steps whose inputs and parameters are the same in a case as in the usual case."""
+    """Yield the steps that have the same inputs and parameters in an extreme case as in the usual case."""
     if chain.case is usual.case or chain.case.inputs or chain.case.alike:
         return
     for name, step in chain.steps.items():

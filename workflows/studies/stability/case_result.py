@@ -1,8 +1,8 @@
-"""One cell of the grid: the errors of a step's result and of its gradient in one case, against float64.
+"""The test of one step in one extreme case: errors of its result and of its gradient, relative to float64.
 
-The reference is that of the node, or the same function on the same inputs in float64; random numbers are the same.
-The bound of the result is the node's ``rtol`` times the largest element of the reference. The bound of the gradient is
-1e-4 of its largest element, or ten times ``rtol`` where that is more.
+The reference is the node's own reference, or the node's function on the same inputs in float64, with the same random
+numbers. The bound of the result is the node's ``rtol`` times the largest element of the reference. The bound of the
+gradient is 1e-4 of its largest element, or ten times ``rtol`` if that is more.
 """
 
 from __future__ import annotations
@@ -25,7 +25,7 @@ from neusee.workflows.tolerance.error_norm import largest_error
 
 ROUNDING = 2.0**-23  #: the least bound of a result in single precision
 SLOPE = 1e-4  #: the least bound of a gradient in single precision
-_NEAR = 0.5  #: share of a bound above which a cell warns
+_NEAR = 0.5  #: share of a bound above which the mark is ``warn``
 _STEEPER = 10.0  #: ratio of the bound of a gradient to the bound of the result
 _LEAST = math.sqrt(torch.finfo(torch.float32).tiny)  #: the least scale of an error, far above denormal numbers
 _DIM = 1e-3  #: share of the brightest element below which an element is dim
@@ -36,7 +36,7 @@ _HALVES = {torch.float16: 2.0**-11, torch.bfloat16: 2.0**-8}
 
 @dataclass(frozen=True)
 class Cell:
-    """The mark of one step in one extreme case, with the errors of its result and gradient, and their bounds."""
+    """The test result of one step in one extreme case: a mark, the errors of result and gradient, and the bounds."""
 
     mark: Mark
     note: str
@@ -47,11 +47,11 @@ class Cell:
 
 
 class _Refused(Exception):
-    """The error of a step that refuses its inputs."""
+    """Error of a step that rejects its inputs with `ValueError`."""
 
 
 class _CountedInSingle(TorchFunctionMode):
-    """A PyTorch mode that draws Poisson counts in float64 from the mean rounded to single precision."""
+    """A PyTorch mode that draws float64 Poisson counts from the mean rounded to single precision."""
 
     def __torch_function__(self, func: Any, types: Any, args: Any = (), kwargs: Any = None) -> Any:
         if func is torch.poisson and args[0].dtype == torch.float64:
@@ -60,7 +60,7 @@ class _CountedInSingle(TorchFunctionMode):
 
 
 def judge_step(step: Step, inputs: Sequence[Any], case: Case, seed: int) -> Cell | None:
-    """Return the cell of a step: pass, warn or fail; None if the case changes no input of the step."""
+    """Test a step in a case and return its mark and errors; return None if the case changes no input of the step."""
     given = _changed_inputs(inputs, case)
     if given is None:
         return None
@@ -73,7 +73,7 @@ def judge_step(step: Step, inputs: Sequence[Any], case: Case, seed: int) -> Cell
 
 
 def _changed_inputs(inputs: Sequence[Any], case: Case) -> list[Any] | None:
-    """Return the inputs with the change of the case, or None if the case cannot change an input."""
+    """Return the inputs with the case's change of pictures, or None if the inputs have no picture to change."""
     given = list(inputs)
     if case.alike:
         if len(given) < 2 or not all(isinstance(x, Tensor) and _is_picture(x) for x in given[:2]):
@@ -101,7 +101,7 @@ def _run(step: Step, fn: Any, inputs: Sequence[Any], seed: int, **params: Any) -
 
 
 def _as_used(step: Step, inputs: Sequence[Any], seed: int) -> Any:
-    """Return the result of the step as in a run; raise `_Refused` if the step raises `ValueError`."""
+    """Compute the step as in a run and return the result; raise `_Refused` if the step raises `ValueError`."""
     try:
         return _run(step, step.node.fn, inputs, seed)
     except ValueError as error:
@@ -115,7 +115,7 @@ def _in_double(step: Step, inputs: Sequence[Any], seed: int) -> Any:
         return _run(step, step.node.fn, wide, seed, **precise)
 
 
-# --- as accurate as the node says -------------------------------------------------------------------------------------
+# --- errors of results ------------------------------------------------------------------------------------------------
 
 
 def _compared(step: Step, inputs: list[Any], case: Case, seed: int) -> Cell:
@@ -123,7 +123,7 @@ def _compared(step: Step, inputs: list[Any], case: Case, seed: int) -> Cell:
         value, reference = _as_used(step, inputs, seed), step.node.hooks.reference
         truth = _run(step, reference, inputs, seed) if reference else _in_double(step, inputs, seed)
     if not _finite(value):
-        overflows = Cell("pass", "overflows in the open, as its reference in single")
+        overflows = Cell("pass", "overflows visibly, as the reference does in single precision")
         return Cell("fail", "not finite") if _fits_single_precision(truth) else overflows
     bound = max([step.node.rtol, ROUNDING, *(_HALVES.get(x.dtype, 0.0) for x in tensors_in(value))])
     dim = case.expect == "dim part" and step.node.path.startswith(_LIGHT)
@@ -138,7 +138,7 @@ def _compared(step: Step, inputs: list[Any], case: Case, seed: int) -> Cell:
 
 
 def _marked(error: float, bound: float, slope: float | None, steeper: float) -> Cell:
-    """Return a cell that passes up to half of its bounds, warns up to the bounds, and fails beyond."""
+    """Compare errors with their bounds: pass up to half of the bounds, warn up to the bounds, fail beyond."""
     used = [error / bound] if slope is None else [error / bound, slope / steeper]
     within = all(share <= 1.0 for share in used)  # NaN is not within its bound
     near = within and max(used) > _NEAR
@@ -147,13 +147,13 @@ def _marked(error: float, bound: float, slope: float | None, steeper: float) -> 
 
 
 def _error(value: Any, truth: Any) -> float:
-    """Return the largest difference between a result and its reference, over the largest element."""
+    """Return the largest difference of a result from the reference, relative to the reference's largest element."""
     pairs = list(zip(tensors_in(value), tensors_in(truth), strict=True))
     return max((_over(a, b, _LEAST) for a, b in pairs), default=0.0)
 
 
 def _cancelled(step: Step, inputs: list[Any], truth: Tensor, seed: int) -> float:
-    """Return the relative loss of precision where terms of a sum f(x) cancel: |f| over sum |x df/dx|, at most 1."""
+    """Return the inverse condition number of a scalar result f(x), |f| / sum |x df/dx|, but at most 1."""
     with torch.enable_grad():
         slopes = _true_slopes(step, inputs, seed) or []
     moved = sum(float((x.double() * g).abs().sum()) for x, g in zip(_pictures(inputs), slopes, strict=False))
@@ -162,13 +162,13 @@ def _cancelled(step: Step, inputs: list[Any], truth: Tensor, seed: int) -> float
 
 
 def _over(a: Tensor, b: Tensor, floor: float) -> float:
-    """Return the largest difference over the largest ``|b|``, or over ``floor`` if that is larger."""
+    """Return the largest difference of ``a`` and ``b``, divided by the larger of the largest ``|b|`` and ``floor``."""
     error, top = largest_error(a, b), float(b.detach().double().abs().max()) if b.numel() else 0.0
     return error if top >= floor else error * (top or 1.0) / floor
 
 
 def _dim_error(value: Any, truth: Any) -> float:
-    """Return the largest error among the elements far below the brightest element."""
+    """Return the largest error of elements far darker than the brightest element, relative to the largest of them."""
     worst = 0.0
     for a, b in zip(tensors_in(value), tensors_in(truth), strict=True):
         dim = b.abs() < _DIM * b.abs().max() if b.is_floating_point() and b.ndim >= 2 else None
@@ -201,12 +201,12 @@ def _slope_error(step: Step, inputs: list[Any], seed: int) -> float | None:
     pictures = _pictures(inputs)
     tops = [torch.finfo(torch.float32 if x.dtype == torch.float64 else x.dtype).max for x in pictures]
     if any(bool((g.abs() >= top).any()) for g, top in zip(truth, tops, strict=True)):
-        return 0.0  # beyond the range of the gradient's type, which is that of the picture
+        return 0.0  # the gradient exceeds the range of the picture's type
     return max(_over(a, b, _slight(x)) for a, b, x in zip(usual, truth, pictures, strict=True))
 
 
 def _slight(picture: Tensor) -> float:
-    """Return the least scale of a gradient: that of a mean's gradient, or the least normal number of the type."""
+    """Return the least scale of a gradient error: the gradient of a normalised mean, or the least normal number."""
     top = float(picture.detach().double().abs().max())
     return max(1.0 / (picture.numel() * max(top, _LEAST)), torch.finfo(picture.dtype).tiny)
 
@@ -237,7 +237,7 @@ def _slopes(inputs: list[Any], fn: Any, ids: list[int] | None = None) -> list[Te
 
 
 def _weighed(value: Any) -> Tensor | None:
-    """Return the sum of all results with a gradient, each scaled to about 1 and times fixed weights."""
+    """Return a weighted sum of all differentiable results, each scaled to about 1; the weights are always the same."""
     parts = [(x.double() * _weight(x) / _near(x)).sum() for x in tensors_in(value) if x.requires_grad]
     return torch.stack(parts).sum() if parts else None
 
@@ -256,7 +256,7 @@ def _near(x: Tensor) -> float:
 
 
 def _seen(step: Step, inputs: Sequence[Any], given: list[Any], case: Case, seed: int) -> Cell:
-    """Return a cell that fails if a step hides NaN or infinity in one of its pictures."""
+    """Return a cell that fails if the result of a step hides NaN or infinity in one of the input pictures."""
     notes = [_one_seen(step, _with_one_changed(i, inputs, given), seed) for i in range(len(_pictures(inputs)))]
     hidden = [note for note in notes if note.startswith("hidden")]
     stated = stated_words(step.node, case.name)
@@ -266,7 +266,7 @@ def _seen(step: Step, inputs: Sequence[Any], given: list[Any], case: Case, seed:
 
 
 def _one_seen(step: Step, given: list[Any], seed: int) -> str:
-    """Return whether NaN or infinity is refused, seen in the result, treated as a large number, or hidden."""
+    """Return a note on how a step treats NaN or infinity: refused, seen in the result, as a large number, or hidden."""
     with torch.no_grad():
         try:
             value = _as_used(step, given, seed)
@@ -276,11 +276,11 @@ def _one_seen(step: Step, given: list[Any], seed: int) -> str:
             return "seen"
         bad = next(float(x[~x.isfinite()][0]) for x in _pictures(given) if not _finite(x))
         if math.isnan(bad):
-            return "hidden: a finite result of NaN"
+            return "hidden: a finite result in spite of NaN"
         large = each_tensor(lambda x: x.nan_to_num(posinf=_HUGE, neginf=-_HUGE), given)
         limit = _run(step, step.node.fn, large, seed)
         same = _finite(limit) and largest_error(value, limit) <= max(step.node.rtol, ROUNDING)
-        return "as its limit" if same else "hidden: a finite result that is no limit"
+        return "like a large number" if same else "hidden: another result than for a large number"
 
 
 def _with_one_changed(which: int, inputs: Sequence[Any], given: Sequence[Any]) -> list[Any]:

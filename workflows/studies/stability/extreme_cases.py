@@ -1,8 +1,8 @@
-"""The catalogue of stiff and extreme cases: the changes of a recipe's parameters, results or inputs.
+"""The catalogue of extreme cases: changes of a recipe's parameters, results or inputs.
 
-A case changes parameters by ``node.parameter`` (``*.exposure`` of every node), results by the path of their node, or
-the inputs of each step. The expected result is not written here: it is that of the node's own reference, within the
-documented error of the node (`case_result`).
+A case changes parameters by ``node.parameter`` (``*.exposure`` for every node), results by the path of their node, or
+the inputs of each step. The catalogue has no expected results: each result must agree with the node's own reference
+within the documented error of the node (`case_result`).
 """
 
 from __future__ import annotations
@@ -34,7 +34,7 @@ class Size:
 
 @dataclass(frozen=True)
 class Case:
-    """One row of the grid: an extreme case and its changes of a recipe."""
+    """An extreme case: the changes that it makes to a recipe. Each case is one row of the grid."""
 
     name: str
     what: str  #: the extreme property
@@ -47,7 +47,7 @@ class Case:
     expect: Expect = "accurate"
 
 
-#: by node and case, the words of its docstring on NaN in its inputs, where the result cannot show NaN
+#: by node and case: words of the node's docstring about NaN in the inputs, if the result cannot show NaN
 _STATED = {
     ("restore.clipped", "NaN"): "so is what is not a number",
     ("metrics.saturated", "NaN"): "so does one that is not a number",
@@ -55,7 +55,7 @@ _STATED = {
 
 
 def stated_words(node: Node, case: str) -> str | None:
-    """Return the words on NaN in the docstring of a node, or None if the docstring does not have them."""
+    """Return the words about NaN in the docstring of a node, or None if the docstring does not have these words."""
     words = _STATED.get((node.path, case))
     return words if words is not None and words in " ".join((node.__doc__ or "").split()) else None
 
@@ -80,7 +80,7 @@ def _peak_of(top: float) -> Callable[[Tensor], Tensor]:
 
 
 def _lamp(scene: Tensor) -> Tensor:
-    """Return the scene with one lamp in its middle that is a million times brighter than the scene."""
+    """Return the scene with one lamp in the middle that is a million times brighter than the rest."""
     return middle(1.0)(scene * (1e-6 / scene.max()))
 
 
@@ -93,7 +93,7 @@ def _noise(depth: float) -> Callable[[Tensor], Tensor]:
 
 
 def _steps(height: Tensor) -> Tensor:
-    """Return a checkerboard height map with steps of 0.9 waves at 550 nm in fused silica, which are aliased."""
+    """Return a checkerboard height map with aliased steps of 0.9 waves at 550 nm in fused silica."""
     v, u = (torch.arange(n) for n in height.shape)
     return ((v[:, None] + u) % 2 * 1.076e-6).to(height.dtype)
 
@@ -107,7 +107,7 @@ def _closed(pupil: Pupil) -> Pupil:
 
 
 def _off_axis(share: float) -> Callable[[Params], tuple[float, float]]:
-    """Return a function for the angle of a laser whose spot is ``share`` sensor widths from the middle along x."""
+    """Return a function for the angle of a laser whose spot is ``share`` sensor widths off the centre along x."""
     return lambda p: (0.0, share * field_of_view(p["focal_length"], p["pixel_pitch"], p["shape"])[1])
 
 
@@ -140,7 +140,7 @@ CASES: tuple[Case, ...] = (
     Case("zero light", "no scene, no laser", "light", {_LASER: 0.0}, _BLACK),
     Case("all saturated", "a scene of 1e4 wells", "light", {_SCENE: 1e4}),
     Case("one photon", "one photon in the brightest pixel", "light", {_LASER: 0.0, _SCENE: _one_photon}),
-    Case("contrast 1e6", "one lamp; the error is that of the rest, over its own brightest", "light",
+    Case("contrast 1e6", "one lamp; the error of the rest, relative to its brightest element", "light",
          values={"scene.": _lamp}, params={_LASER: 0.0}, expect="dim part"),
     Case("exposure 1 us", "exposure 1e-6 s", "sensor", {"*.exposure": 1e-6}),
     Case("exposure 1000 s", "exposure 1e3 s", "sensor", {"*.exposure": 1e3}),

@@ -1,4 +1,4 @@
-"""Picture of the stability study: a grid of cells, each with a colour, a sign and the error nearest to its bound."""
+"""The picture of the stability study: a grid with the mark and the error of each node in each case."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ Entry = tuple[str, str, str, Cell]  #: group, case, node, cell
 
 @drawn
 def grid_picture(entries: Sequence[Entry]) -> Any:
-    """Draw the grid: a row for each case, a column for each node, the losses last."""
+    """Draw the grid of marks and errors: a row for each case and a column for each node, with losses last."""
     cases = list(dict.fromkeys((group, case) for group, case, _, _ in entries))
     nodes = sorted({node for _, _, node, _ in entries}, key=lambda n: (n.startswith("losses."), n))
     panels = max(1, -(-len(nodes) // _ACROSS))
@@ -50,7 +50,7 @@ def _panel(ax: Any, entries: Sequence[Entry], cases: list[tuple[str, str]], node
 
 
 def cell_text(cell: Cell) -> str:
-    """Return the text of a cell: a sign if the cell does not pass, and the error nearest to its bound."""
+    """Return the text of a cell of the grid: a sign for warn or fail, and the error nearest to its bound."""
     sign = {"pass": "", "warn": "!", "fail": "×"}[cell.mark]
     if cell.error is None:
         short = "r" if cell.note.startswith("refused") else "s" if "seen" in cell.note else "–"
@@ -64,7 +64,7 @@ def _share(value: float, bound: float | None) -> float:
 
 
 def short_number(value: float) -> str:
-    """Return a number with one digit and its exponent, such as ``2e-7``."""
+    """Return a number as text with one digit and an exponent, such as ``2e-7``."""
     if value == 0:
         return "0"
     if not math.isfinite(value):

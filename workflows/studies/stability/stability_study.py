@@ -1,4 +1,4 @@
-"""The study of stability: the errors of each step in extreme cases, against their bounds."""
+"""The stability study: errors of each step's result and gradient in extreme cases, compared with bounds."""
 
 from __future__ import annotations
 
@@ -27,20 +27,20 @@ from neusee.workflows.studies.stability.stability_figures import grid_picture
 
 _COLUMNS = ("case", "step", "node", "mark", "error", "bound", "gradient error", "gradient bound", "note")
 _HOW = """Each step has the inputs of the recipe, at a small size, with one change: a parameter of the recipe, the
-result of one of its steps, or the pictures among the inputs of the step. Its result is compared with the
-node's own reference, or with the same function on the same inputs in float64; the number is the largest difference over
-the largest element, and the bound is the node's rtol (no less than 1.2e-7, what single precision can hold).
+result of an earlier step, or the pictures among the inputs of the step. The result is compared with the node's own
+reference, or with the same function on the same inputs in float64. The error is the largest difference over the
+largest element, and the bound is the node's rtol (at least 1.2e-7, the rounding of single precision).
 
-The second number is that of the gradient of a weighted sum of the result with respect to every picture, over its
-largest element; the bound is 1e-4, or ten times the node's rtol where that is more. A cell
-above half of its bound has a warning: the rounding of another machine may take it over. NaN or infinity must be refused
-with a reason, show in the result, or give the limit of large numbers. A step that refuses its inputs passes if its
-error names the cause. Empty: the step has the inputs of the usual case, or none."""
+The second error is that of the gradient of a weighted sum of the result with respect to every picture, over the
+gradient's largest element; the bound is 1e-4, or ten times the node's rtol if that is more. An error above half of its
+bound is a warning: with the rounding of another machine it may exceed the bound. NaN or infinity must be refused with a
+reason, show in the result, or have the effect of a large number. A step that refuses its inputs passes if its error
+names the cause. An empty cell: the step has the inputs of the usual case, or no inputs."""
 
 
 @dataclass(frozen=True)
 class GridCell:
-    """One cell of the grid with its case, step and node."""
+    """One cell of the grid, with the case, the step and the node that were tested."""
 
     case: Case
     step: str
@@ -49,7 +49,7 @@ class GridCell:
 
     @property
     def severity(self) -> tuple[int, float]:
-        """Return a sort key that is largest for the worst cell: its mark, then its largest share of a bound."""
+        """Return a sort key, largest for the worst cell: rank of the mark, then the largest ratio of error to bound."""
         cell = self.cell
         pairs = ((cell.error, cell.bound), (cell.slope, cell.slope_bound))
         shares = [error / bound for error, bound in pairs if error is not None and bound]
@@ -64,7 +64,7 @@ def study(
     progress: Progress,
     cases: Sequence[Case] = CASES,
 ) -> Path:
-    """Test every step of ``recipe`` and its losses in every case; write the folder of the study and return it."""
+    """Test every step of ``recipe`` and its losses in every case, and return the folder with the results."""
     study_run = StudyRun("stability", recipe, command)
     with one_thread():
         rows = list(_rows(recipe, store, cases, progress))
@@ -97,7 +97,7 @@ def _row(chain: CaseRecipe, same: set[str], store: Store, own: str) -> Iterator[
 
 
 def _judge(chain: CaseRecipe, name: str) -> dict[str, Any]:
-    """Return the fields of a cell, or an empty dict if an earlier step refused or the case changes no input."""
+    """Return the fields of a cell, or an empty dict if an earlier step failed or the case changes no input."""
     try:
         inputs = chain.inputs(name)
         with warnings.catch_warnings():
@@ -140,11 +140,11 @@ def _worst_by_case_and_node(rows: Sequence[GridCell]) -> list[GridCell]:
 
 
 def _tables(rows: Sequence[GridCell]) -> Iterator[Section]:
-    headings: dict[Mark, str] = {"fail": "What fails", "warn": "What holds by less than twice"}
+    headings: dict[Mark, str] = {"fail": "What fails", "warn": "What uses more than half of its bound"}
     for mark, heading in headings.items():
         lines = [_line(row) for row in rows if row.cell.mark == mark]
         marks = {(i, _COLUMNS.index("mark")): mark for i in range(len(lines))}
-        yield Section(heading, "" if lines else "Nothing.", _COLUMNS if lines else (), lines, marks=marks)
+        yield Section(heading, "" if lines else "No cell.", _COLUMNS if lines else (), lines, marks=marks)
     cases = {row.case.name: row.case for row in rows}.values()
     yield Section("The cases", "", ("case", "group", "what"), [(c.name, c.group, c.what) for c in cases])
 

@@ -1,6 +1,6 @@
-"""How far do outputs scatter because of uncertain values in the recipe?
+"""How much do the outputs of a recipe vary because some of its values are uncertain?
 
-Draws of uncertain values, runs at each, scatter, sensitivities and the page.
-Distributions are read in `recipe.distributions`.
+Draws of uncertain values, a run at each draw, the scatter and sensitivity of the outputs, and the page.
+The package `recipe.distributions` reads the distributions.
 Offers: `uncertainty_study.study`.
 """

@@ -1,4 +1,4 @@
-"""The outputs of a recipe at draws of its inputs; only the steps that an input reaches are computed for each draw."""
+"""The outputs of a recipe at draws of its uncertain inputs; steps that depend on no input are computed only once."""
 
 from __future__ import annotations
 
@@ -37,7 +37,7 @@ _NARROW = 8  #: a tensor of two axes counts as a picture if both are longer
 
 
 class OutputDraws:
-    """The outputs at draws of the inputs; the store keeps the numbers of each draw."""
+    """The outputs of a recipe at draws of its uncertain inputs; the store keeps the numbers of each draw."""
 
     def __init__(self, inputs: Inputs, store: Store, device: str = "cpu", workers: int = 0) -> None:
         self.inputs, self.store, self.device = inputs, store, device
@@ -50,22 +50,22 @@ class OutputDraws:
         self._code = Code(store.root / "code.json")
         self._fixed = self._keys({})
         self.computed = 0  #: draws that were not in the store
-        self.seconds = 0.0  #: that these draws took
+        self.seconds = 0.0  #: run time of these draws, s
 
     @cached_property
     def _function(self) -> Any:
-        """Return the recipe as a function of the inputs; compute the steps that no input reaches first."""
+        """Compute the steps that depend on no input, and return the recipe as a function of the inputs."""
         free = tuple(self.inputs.readers)
         return as_function(self.inputs.recipe, *free, outputs=self.outputs, store=self.store, device=self.device)
 
     def ready(self) -> float:
-        """Compute the steps that no input reaches; return the seconds that this took."""
+        """Compute the steps that depend on no input, and return the run time in seconds."""
         began = time.perf_counter()
         _ = self._function
         return time.perf_counter() - began
 
     def numbers(self, values: FloatArray) -> list[Numbers]:
-        """Return all numbers of the outputs at each draw (draw, input), from the store or computed now."""
+        """Return all numbers of the outputs at each draw (draw, input); compute draws that the store does not have."""
         keys = [self.key(row) for row in values]
         found = [kept and kept["numbers"] for kept in map(self._kept, keys)]
         lacking = [i for i, numbers in enumerate(found) if numbers is None]
@@ -74,7 +74,7 @@ class OutputDraws:
         return [numbers for numbers in found if numbers is not None]
 
     def pictures(self, values: FloatArray) -> dict[str, tuple[Tensor, Tensor]]:
-        """Return the mean and the standard deviation of every picture among the outputs; keep the numbers too."""
+        """Return mean and standard deviation of every picture among the outputs; store the numbers of each draw too."""
         keys = [self.key(row) for row in values]
         whole = digest("uncertainty pictures", keys)
         if (first := self._kept(keys[0])) is not None and not first["pictures"]:
@@ -93,7 +93,7 @@ class OutputDraws:
         return {name: (total.mean, total.sd) for name, total in sums.items()}
 
     def key(self, row: FloatArray) -> str:
-        """Return the store key of a draw: a digest of the keys that a run with these values gives its outputs."""
+        """Return the store key of a draw: a digest of the keys of the outputs in a run with the drawn values."""
         recipe = self.inputs.recipe
         keys = self._keys(self.inputs.theta(self._named(row)))
         outputs = [[name, keys[name]] for name in self.outputs]
@@ -101,7 +101,7 @@ class OutputDraws:
         return digest("uncertainty draw", engine("studies.uncertainty.output_draws"), outputs, within)
 
     def _keys(self, theta: Mapping[str, Any]) -> dict[str, str]:
-        """Return the key of each step with parameters ``theta``, or if empty, of the steps that no input reaches."""
+        """Return the key of each step at the inputs ``theta``, or without inputs, of steps that depend on no input."""
         recipe, keys = self.inputs.recipe, dict(self._fixed) if theta else {}
         by_step: dict[str, dict[str, Any]] = {}
         for reader, value in theta.items():
@@ -130,7 +130,7 @@ class OutputDraws:
         return numbers
 
     def _results(self, rows: Sequence[FloatArray]) -> Iterator[dict[str, Any]]:
-        """Yield the outputs at each draw in order; ``self.workers`` draws are computed at once, each on one thread."""
+        """Yield the outputs at each draw in order; ``self.workers`` threads compute one draw each at the same time."""
         if not rows:
             return
         self.ready()
@@ -159,7 +159,7 @@ class OutputDraws:
 
 
 def quantities(result: Mapping[str, Any]) -> Numbers:
-    """Return the numbers in ``result`` by step and field; pictures are ignored."""
+    """Return all numbers in ``result`` by step and field, without pictures."""
     found: Numbers = {}
     for step, value in result.items():
         for _, field, _, number in () if _is_picture(value) else numbers_of(step, value):
@@ -180,7 +180,7 @@ def _is_picture(value: Any) -> bool:
 
 
 class _Sum:
-    """The mean and the standard deviation of pictures that are added one after another (Welford)."""
+    """The running mean and standard deviation of pictures, by Welford's method."""
 
     def __init__(self) -> None:
         self.count = 0
@@ -200,7 +200,7 @@ class _Sum:
 
 @cache
 def _keep_memory() -> None:
-    """Let the process reuse the memory of a draw for the next draw, because a new allocation takes too long.
+    """Make the process reuse the memory of a draw for the next draw, because a new allocation takes too long.
 
     The setting works with glibc only, and lasts for the rest of the process.
     """

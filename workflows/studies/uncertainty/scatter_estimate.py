@@ -1,4 +1,4 @@
-"""The scatter of quantities over draws, and the standard error of their standard deviations."""
+"""Means and standard deviations of quantities over draws, and the standard errors of the standard deviations."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ _CONSTANT = 1e-12  #: share of the largest value; a quantity with a smaller stan
 
 @dataclass(frozen=True)
 class Scatter:
-    """The scatter of one quantity over the draws, for each of its elements."""
+    """The mean, standard deviation and quantiles over all draws, for each element of one quantity."""
 
     mean: FloatArray
     sd: FloatArray
@@ -25,14 +25,14 @@ class Scatter:
 
     @property
     def is_constant(self) -> bool:
-        """Return True if the quantity does not depend on the draws."""
+        """Return True if the quantity has the same value in all draws."""
         return not float(self.sd.max()) > 0
 
 
 def scatter(values: FloatArray, sequences: int = 0) -> Scatter:
-    """Return the scatter of ``values`` (draw, element) over the draws.
+    """Return mean, standard deviation and quantiles of ``values`` (draw, element) over the draws.
 
-    With ``sequences``, draw i belongs to the scrambled sequence i % sequences.
+    With ``sequences``, draw i belongs to the scrambled Sobol sequence i % sequences; otherwise draws are independent.
     """
     with np.errstate(invalid="ignore"):  # a quantity that is infinite in a draw has no standard deviation
         mean, sd = values.mean(0), values.std(0, ddof=1)
@@ -44,7 +44,7 @@ def scatter(values: FloatArray, sequences: int = 0) -> Scatter:
 
 
 def _jackknife(x: FloatArray) -> float:
-    """Return the relative standard error of the standard deviation of independent draws ``x``, by the jackknife."""
+    """Estimate the relative standard error of the standard deviation of independent draws ``x`` by the jackknife."""
     n = len(x)
     apart = (x - x.mean()) ** 2
     without = np.sqrt((apart.sum() - apart * n / (n - 1)).clip(0.0) / (n - 2))
@@ -53,13 +53,13 @@ def _jackknife(x: FloatArray) -> float:
 
 
 def _of_sequences(x: FloatArray, count: int) -> float:
-    """Return the relative standard error of the standard deviation, from the mean squares of each sequence."""
+    """Estimate the relative standard error of the standard deviation from the variance in each Sobol sequence."""
     squares = (x - x.mean()) ** 2
     each = np.array([squares[i::count].mean() for i in range(count)])
     return float(each.std(ddof=1) / math.sqrt(count) / each.mean() / 2)
 
 
 def worst_known(found: Mapping[str, Scatter]) -> tuple[str, float]:
-    """Return the quantity whose standard deviation has the largest relative error, and this error."""
+    """Return the name of the quantity whose standard deviation has the largest relative error, and this error."""
     name = max(found, key=lambda each: found[each].error)
     return name, found[name].error

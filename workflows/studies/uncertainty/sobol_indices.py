@@ -1,4 +1,4 @@
-"""The Sobol indices of independent inputs: the share of each input in the variance of a number, by SALib."""
+"""Sobol indices, computed with SALib: the share of each independent input in the variance of a number."""
 
 from __future__ import annotations
 
@@ -13,13 +13,13 @@ import numpy as np
 from neusee.workflows.studies.uncertainty.scatter_estimate import FloatArray
 
 EXPLAINED = 0.9  #: least share of the variance that the polynomial must predict for draws outside the fit
-_SALTELLI = 1024  #: points of the polynomial for each input
+_SALTELLI = 1024  #: base number of Saltelli's points, at which the polynomial is evaluated
 _BY_TERM = 3  #: least number of draws for each term of the polynomial
 
 
 @dataclass(frozen=True)
 class SobolIndices:
-    """The shares of a variance that each input causes, alone and together with other inputs."""
+    """The first-order and total Sobol indices of each input, with their errors."""
 
     first: Sequence[float]  #: share of each input alone, from the draws
     first_error: Sequence[float]  #: half of the 95 % interval
@@ -29,12 +29,12 @@ class SobolIndices:
 
     @property
     def explains_enough(self) -> bool:
-        """Return True if the polynomial explains enough of the variance for its indices to be meaningful."""
+        """Return True if the polynomial explains enough of the variance for the total indices to be reliable."""
         return self.explained >= EXPLAINED
 
 
 def require_salib() -> None:
-    """Raise `ImportError` with the command that installs SALib if SALib is missing."""
+    """Raise `ImportError` with the command that installs SALib if SALib is not installed."""
     try:
         import SALib  # noqa: F401
     except ImportError:
@@ -42,9 +42,9 @@ def require_salib() -> None:
 
 
 def indices(names: Sequence[str], z: FloatArray, y: FloatArray, seed: int) -> SobolIndices:
-    """Return the shares of the variance of ``y`` (draw,) that the standard normal inputs ``z`` (draw, input) cause.
+    """Return the Sobol indices of the standard normal inputs ``z`` (draw, input) in the variance of ``y`` (draw,).
 
-    First-order indices are those of RBD-FAST, from the draws only; total indices are those of Saltelli's points (Sobol,
+    First-order indices come from the draws alone, by RBD-FAST. Total indices come from Saltelli's points (Sobol,
     Jansen) on a polynomial of second order that is fitted to the draws.
     """
     from SALib.analyze import rbd_fast, sobol
@@ -66,7 +66,7 @@ def indices(names: Sequence[str], z: FloatArray, y: FloatArray, seed: int) -> So
 
 
 def _fit(z: FloatArray, y: FloatArray) -> tuple[FloatArray, float]:
-    """Return the coefficients of the polynomial, and the share of the variance that it predicts (PRESS)."""
+    """Fit the polynomial; return its coefficients and the share of the variance that it predicts (PRESS)."""
     many = _count(z.shape[1], 2)
     terms = _terms(z, many if many * _BY_TERM <= len(z) else _count(z.shape[1], 1))
     fitted = np.asarray(np.linalg.lstsq(terms, y, rcond=None)[0], np.float64)
@@ -80,7 +80,7 @@ def _count(inputs: int, order: int) -> int:
 
 
 def _terms(z: FloatArray, count: int) -> FloatArray:
-    """Return the Hermite polynomials of each draw: 1, each input, and for a larger ``count`` products of two inputs."""
+    """Return the Hermite polynomials of each draw: 1, the inputs and, if ``count`` is larger, their products."""
     columns = [np.ones(len(z)), *z.T]
     if count > len(columns):
         pairs = combinations_with_replacement(range(z.shape[1]), 2)

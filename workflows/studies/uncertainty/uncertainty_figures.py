@@ -1,4 +1,4 @@
-"""Pictures of the study of uncertainty: influence of inputs, bands of curves, histograms, and uncertain images."""
+"""Pictures of the uncertainty study: tornado diagrams, bands of curves, histograms, and images with deviations."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ _ALONG = 200  #: signals of a photon-transfer curve
 
 @drawn
 def tornado(swings: Mapping[str, Sequence[tuple[str, float, float]]], middles: Mapping[str, float]) -> Any:
-    """Draw a tornado diagram of each number: its value with one input at 5 % and at 95 %, the widest bar on top."""
+    """Draw a tornado diagram of each number: its values with one input at the 5 % and at the 95 % quantile."""
     columns = min(2, len(swings))
     rows = -(-len(swings) // columns)
     most = max(map(len, swings.values()))
@@ -40,8 +40,8 @@ def tornado(swings: Mapping[str, Sequence[tuple[str, float, float]]], middles: M
 def _bars(ax: Any, bars: Sequence[tuple[str, float, float]], middle: float) -> None:
     low = [bar[1] - middle for bar in bars]
     up = [bar[2] - middle for bar in bars]
-    ax.barh(range(len(bars)), low, 0.7, left=middle, color=BLUE, label="input at its 5 %")
-    ax.barh(range(len(bars)), up, 0.7, left=middle, color=ORANGE, label="input at its 95 %")
+    ax.barh(range(len(bars)), low, 0.7, left=middle, color=BLUE, label="input at its 5 % quantile")
+    ax.barh(range(len(bars)), up, 0.7, left=middle, color=ORANGE, label="input at its 95 % quantile")
     ax.axvline(middle, color=BLACK, linewidth=0.9)
     ax.set_yticks(range(len(bars)), [bar[0] for bar in bars])
     ax.ticklabel_format(axis="x", useOffset=False)
@@ -51,9 +51,9 @@ def _bars(ax: Any, bars: Sequence[tuple[str, float, float]], middle: float) -> N
 
 @drawn
 def bands(curves: Mapping[str, tuple[FloatArray, Mapping[str, FloatArray]]], axis: str) -> Any:
-    """Draw the middle 90 % of each family of curves, and below the same band relative to the median.
+    """Draw the middle 90 % of each family of curves and, in a second row, the same band relative to the median.
 
-    A family is its abscissa and its draws (draw, element) by name.
+    Each family has an abscissa, and draws (draw, element) of each curve by name.
     """
     figure, axes = canvas(5.6 * len(curves), 5.4, 2, len(curves), sharex="col", height_ratios=[2, 1])
     for (ax, below), (family, (x, members)) in zip(axes.T, curves.items(), strict=True):
@@ -71,14 +71,14 @@ def bands(curves: Mapping[str, tuple[FloatArray, Mapping[str, FloatArray]]], axi
 
 @drawn
 def transfer(draws: FloatArray) -> Any:
-    """Draw photon-transfer curves in DN; ``draws`` is an array (draw, level, signal | variance | predicted)."""
+    """Draw bands of photon-transfer curves in DN from ``draws`` (draw, level, signal | variance | predicted)."""
     figure, axes = canvas(6.6, 5.8, 2, 1, sharex=True, height_ratios=[2, 1])
     ax, below = axes[:, 0]
     for column, colour, name in ((2, BLUE, "predicted"), (1, ORANGE, "flat fields")):
         _band(ax, below, *_at_one_signal(draws, column), colour, f"{name}: middle 90 %")
     ax.set_xscale("log")
     ax.set_yscale("log")
-    ax.set_title("photon-transfer curve: what the draws leave open")
+    ax.set_title("photon-transfer curve: middle 90 % of the draws")
     ax.set_ylabel("standard deviation (DN)")
     below.set_xlabel("mean above dark (DN)")
     below.set_ylabel("over the\nmedian (%)")
@@ -87,7 +87,7 @@ def transfer(draws: FloatArray) -> Any:
 
 
 def _band(ax: Any, below: Any, x: FloatArray, draws: FloatArray, colour: str, name: str) -> None:
-    """Draw the median and the middle 90 % of the draws, and below the same band relative to the median."""
+    """Draw the median and the middle 90 % of the draws in ``ax``, and the band relative to the median in ``below``."""
     low, middle, up = np.quantile(draws, [0.05, 0.5, 0.95], axis=0)
     ax.fill_between(x, low, up, color=colour, alpha=0.35, linewidth=0, label=name)
     ax.plot(x, middle, color=colour, linewidth=1.0)
@@ -97,7 +97,7 @@ def _band(ax: Any, below: Any, x: FloatArray, draws: FloatArray, colour: str, na
 
 
 def _at_one_signal(draws: FloatArray, column: int) -> tuple[FloatArray, FloatArray]:
-    """Return signals that all draws reach, and the curve of each draw interpolated at these signals."""
+    """Return signal levels that all draws reach, and the curve of each draw interpolated at these levels."""
     lit = draws[:, 1:]
     ends = float(lit[..., 0].clip(1e-9).min(1).max()), float(lit[..., 0].max(1).min())
     signal = np.geomspace(*ends, _ALONG)
@@ -110,7 +110,7 @@ def _at_one_signal(draws: FloatArray, column: int) -> tuple[FloatArray, FloatArr
 
 @drawn
 def histograms(draws: Mapping[str, FloatArray], middles: Mapping[str, float]) -> Any:
-    """Draw a histogram of each number over all draws, and a line at its value with all inputs at their median."""
+    """Draw a histogram of each number over all draws, and a line at the value for all inputs at their medians."""
     columns = min(3, len(draws))
     rows = -(-len(draws) // columns)
     figure, axes = canvas(3.6 * columns, 2.5 * rows, rows, columns)
@@ -129,7 +129,7 @@ def histograms(draws: Mapping[str, FloatArray], middles: Mapping[str, float]) ->
 
 @drawn
 def pictures(found: Mapping[str, tuple[Tensor, Tensor]]) -> Any:
-    """Draw the mean and the standard deviation of each picture; the deviation is averaged over the channels."""
+    """Draw the mean of each picture, and its standard deviation averaged over the channels."""
     figure, axes = canvas(9.6, 4.2 * len(found), len(found), 2)
     for (left, right), (name, (mean, sd)) in zip(axes, found.items(), strict=True):
         white = high(mean.clamp_min(0))

@@ -1,4 +1,4 @@
-"""The result of the study of uncertainty, and its page: sections, pictures and lead."""
+"""The result of the uncertainty study, and the page that shows the result."""
 
 from __future__ import annotations
 
@@ -25,14 +25,14 @@ _CONSTRAINT = {"upper": "only an upper limit", "lower": "only a lower limit", "n
 
 @dataclass(frozen=True)
 class UncertaintyResult:
-    """The draws of all inputs, and the values and statistics of each quantity."""
+    """The result of the uncertainty study: draws of all inputs, and values and statistics of each quantity."""
 
     inputs: Inputs
     points: InputDraws  #: the used draws
     values: Mapping[str, FloatArray]  #: by quantity (draw, element)
     scatter: Mapping[str, Scatter]
     middle: Mapping[str, Sequence[float]]  #: by quantity, with every input at its median
-    swings: Mapping[str, Sequence[tuple[str, float, float]]]  #: by number: input, at its 5 %, at its 95 %
+    swings: Mapping[str, Sequence[tuple[str, float, float]]]  #: by number: input, value at its 5 %, value at its 95 %
     shares: Mapping[str, SobolIndices]  #: by number
     pictures: Mapping[str, tuple[Tensor, Tensor]]  #: mean and standard deviation by output
     is_constant: tuple[str, ...]  #: outputs that depend on no input
@@ -41,22 +41,22 @@ class UncertaintyResult:
 
     @property
     def error(self) -> float:
-        """Return the greatest relative error of a standard deviation."""
+        """Return the largest relative error of the standard deviations of all quantities."""
         return worst_known(self.scatter)[1]
 
     @property
     def worst(self) -> str:
-        """Return the quantity whose standard deviation has the greatest relative error."""
+        """Return the name of the quantity whose standard deviation has the largest relative error."""
         return worst_known(self.scatter)[0]
 
     @property
     def strange(self) -> list[str]:
-        """Return the quantities that are not finite in some draw."""
+        """Return the names of quantities that are NaN or infinite in at least one draw."""
         return [name for name, x in self.values.items() if not np.isfinite(x).all()]
 
     @property
     def failed(self) -> int:
-        """Return the number of quantities that are not finite, plus one if the requested error is exceeded."""
+        """Return the number of quantities with NaN or infinity, plus one if the requested error is exceeded."""
         return len(self.strange) + (not self.error <= self.wanted)
 
     @property
@@ -70,12 +70,12 @@ class UncertaintyResult:
 
     @property
     def numbers(self) -> list[str]:
-        """Return the varying quantities of one element, without quantities that are proportional to another one."""
+        """Return the names of varying scalar quantities, only one for each group of proportional quantities."""
         return list(self.swings)
 
 
 def draw_pictures(result: UncertaintyResult) -> dict[str, bytes]:
-    """Return the pictures of the page as PNG, by name."""
+    """Draw the pictures of the page, and return them by name as PNG bytes."""
     shown = {}
     numbers = result.numbers[:_MOST]
     if numbers:
@@ -93,7 +93,7 @@ def draw_pictures(result: UncertaintyResult) -> dict[str, bytes]:
 
 
 def _curves(result: UncertaintyResult) -> tuple[dict[str, tuple[FloatArray, dict[str, FloatArray]]], str] | None:
-    """Return the abscissa and the draws of each varying curve, by its step, and the name of the abscissa."""
+    """Return the abscissa and the draws of each varying curve by step, and the label of the abscissa."""
     wavelengths = _wavelengths_nm(result)
     curves: dict[str, tuple[FloatArray, dict[str, FloatArray]]] = {}
     spectral = True
@@ -125,41 +125,41 @@ def _node_of(result: UncertaintyResult, quantity: str) -> str:
 
 
 def lead(result: UncertaintyResult) -> str:
-    """Return the result of the study in a few sentences."""
-    count, kind = len(result.points.z), "points of Sobol" if result.sequences else "independent draws"
+    """Return the summary of the uncertainty study in a few sentences."""
+    count, kind = len(result.points.z), "Sobol points" if result.sequences else "independent draws"
     known = f"every standard deviation is known to {result.error:.1%}"
     if result.error > result.wanted:
         known = f"the standard deviation of {result.worst} is known to {result.error:.1%} only"
-        known += f", {result.wanted:.1%} was asked"
+        known += f"; {result.wanted:.1%} was requested"
     numbers = {name: result.scatter[name] for name in result.numbers[:_MOST]}
     values = [f"{name} {float(s.mean[0]):.5g} ± {float(s.sd[0]):.2g}" for name, s in numbers.items()]
-    strange = f" Not finite in some draw: {', '.join(result.strange)}." if result.strange else ""
+    strange = f" NaN or infinite in some draw: {', '.join(result.strange)}." if result.strange else ""
     return f"{count} {kind} of {', '.join(result.inputs.names)}: {known}.{strange}\n\n{'; '.join(values)}."
 
 
 def sections(result: UncertaintyResult, shown: Mapping[str, bytes]) -> list[Section]:
-    """Return the sections of the page; ``shown`` has the pictures by name."""
+    """Return the sections of the page; ``shown`` has the PNG bytes of each picture by name."""
     parts = [_inputs(result), *_posterior(result), _numbers(result, shown.get("numbers"))]
     parts += _moves(result, shown.get("tornado"))
     if "bands" in shown:
         text = "The middle 90 % of the draws, element by element."
         parts.append(Section("Curves", text, picture=shown["bands"]))
     if "transfer" in shown:
-        text = """The curves that a laboratory would measure of the drawn sensors, by the steps that make the picture.
-            The prediction has no noise of its own. Flat fields have the noise of their pixels, because each draw has
-            its own light."""
+        text = """The curves that a laboratory would measure with the drawn sensors, simulated by the recipe's steps.
+            The prediction has no noise. Flat fields have the noise of their pixels, because each draw has its own
+            light."""
         parts.append(Section("Photon-transfer curve", text, picture=shown["transfer"]))
     if "pictures" in shown:
-        text = """Mean and standard deviation of each pixel over the first 32 draws, the deviation known to 13 %. The
-            noise is the same in all draws, so only the inputs matter; pictures.npz has the numbers."""
+        text = """Mean and standard deviation of each pixel over the first 32 draws; the standard deviation is known to
+            13 %. The noise is the same in all draws, so only the inputs matter. pictures.npz has the numbers."""
         parts.append(Section("Pictures", text, picture=shown["pictures"]))
     return [*parts, *_rest(result)]
 
 
 def _inputs(result: UncertaintyResult) -> Section:
-    text = """The drawn values, in SI. In a joint distribution the first value moves together with the others as far as
-        they correlate, and each further one by what is left of it, so that all inputs are independent. The same noise
-        is drawn every time, so that only the inputs make a difference."""
+    text = """The drawn values, in SI units. A joint distribution is drawn from independent inputs: the first input
+        moves all correlated values, and each further input the part of its value that the inputs before it leave free.
+        The same noise is drawn every time, so that only the inputs make a difference."""
     rows = [(r["name"], r["label"], r["law"], f"{r['mean']:.6g}", r["sd"]) for r in result.input_rows]
     return Section("Inputs", text, ("value", "drawn as", "law", "mean", "sd"), rows)
 
@@ -168,7 +168,7 @@ def _posterior(result: UncertaintyResult) -> list[Section]:
     standings = [s for s in result.inputs.uncertain.standings if s.path in result.inputs.names]
     if not standings:
         return []
-    text = """Where the recipe's own value lies in the posterior. A value that the frames only limit, or do not
+    text = """The position of the recipe's own value in the posterior. A value that the frames only limit, or do not
         determine, is drawn mostly from the prior of the calibration."""
     rows, marks = [], dict[tuple[int, int], Mark]()
     for i, s in enumerate(standings):
@@ -182,8 +182,8 @@ def _posterior(result: UncertaintyResult) -> list[Section]:
 
 
 def _numbers(result: UncertaintyResult, picture: bytes | None) -> Section:
-    how = f"by how {result.sequences} scrambled sequences differ" if result.sequences else "by the jackknife"
-    text = f"Error: of the standard deviation, relative, {how}. Of a curve, the worst element."
+    how = f"from {result.sequences} scrambled Sobol sequences" if result.sequences else "by the jackknife"
+    text = f"Error: the relative error of the standard deviation, {how}. For a curve, the worst element counts."
     columns = ("quantity", "at the medians", "mean", "sd", "error", "5 %", "95 %")
     rows, marks = list[Sequence[Any]](), dict[tuple[int, int], Mark]()
     for name, s in result.scatter.items():
@@ -198,11 +198,11 @@ def _numbers(result: UncertaintyResult, picture: bytes | None) -> Section:
 def _moves(result: UncertaintyResult, picture: bytes | None) -> list[Section]:
     if picture is None:
         return []
-    text = f"""Each input by itself at its 5 and its 95 %, all others at their median. The table: shares of the variance
-        (SALib). First: what the input does alone, from the draws (RBD-FAST). Total: with what it does together with
-        others, from a polynomial of second order; explained is what that polynomial tells of draws that it has not
-        seen, and below {EXPLAINED:.0%} its total shares are not shown. Inputs of less than {_LITTLE:.0%}, or of no more
-        than half an error, have no row; sensitivity in provenance.json has all."""
+    text = f"""Each input alone at its 5 % and its 95 % quantile, all others at their medians. The table has shares of
+        the variance (SALib). First: the effect of the input alone, from the draws (RBD-FAST). Total: the effect alone
+        and together with other inputs, from a polynomial of second order. Explained: the share of the variance that
+        this polynomial predicts for draws outside the fit; below {EXPLAINED:.0%} the total shares are not shown. Inputs
+        with less than {_LITTLE:.0%}, or with at most half their error, have no row; provenance.json has all."""
     columns = ("quantity", "input", "first", "±", "total", "±", "explained")
     rows: list[Sequence[Any]] = []
     marks: dict[tuple[int, int], Mark] = {}
@@ -217,13 +217,11 @@ def _moves(result: UncertaintyResult, picture: bytes | None) -> list[Section]:
                 rows.append((name, label, *alone, *shown, shares.explained))
         if len(rows) > before and not shares.explains_enough:
             marks[before, 6] = "warn"
-    return [Section("What moves them", text, columns, rows, picture, marks)]
+    return [Section("Influence of the inputs", text, columns, rows, picture, marks)]
 
 
 def _rest(result: UncertaintyResult) -> list[Section]:
-    sentences = (
-        [f"No input reaches {', '.join(result.is_constant)}: these are as in a run."] if result.is_constant else []
-    )
+    sentences = [f"Outputs that depend on no input: {', '.join(result.is_constant)}."] if result.is_constant else []
     if result.inputs.idle:
-        sentences.append(f"{', '.join(result.inputs.idle)} reach no output, and were not drawn.")
+        sentences.append(f"Inputs that change no output and were not drawn: {', '.join(result.inputs.idle)}.")
     return [Section("What does not vary", "\n\n".join(sentences))] if sentences else []

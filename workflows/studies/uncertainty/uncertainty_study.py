@@ -1,4 +1,4 @@
-"""The study of uncertainty: the scatter of a recipe's outputs over its uncertain input values."""
+"""The uncertainty study: the scatter of a recipe's outputs because of uncertain values in the recipe."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ from neusee.workflows.studies.uncertainty.uncertainty_page import UncertaintyRes
 
 LEAST = 64  #: draws before the first decision to stop
 _ROUND = 16  #: independent draws in each further round
-PICTURED = 32  #: draws for the mean and deviation of pictures; the deviation is known to 13 %
+PICTURED = 32  #: draws for the mean and standard deviation of pictures; the deviation is known to 13 %
 _COLUMNS = ("quantity", "element", "at the medians", "mean", "sd", "5 %", "95 %")
 
 
@@ -40,9 +40,9 @@ def study(
     workers: int = 0,
     device: str = "cpu",
 ) -> Path:
-    """Draw inputs until every standard deviation is known to a relative ``error``, but at most ``most`` times.
+    """Draw inputs until the relative error of every standard deviation is below ``error``, at most ``most`` times.
 
-    On the CPU, ``workers`` draws are computed at once; 0 means one for each core.
+    On the CPU, ``workers`` draws are computed at once; 0 means one for each core. Returns the folder with the results.
     """
     study_run = StudyRun("uncertainty", recipe, command)
     require_salib()
@@ -62,7 +62,7 @@ def _points(inputs: Inputs, seed: int, most: int, points: str) -> InputDraws:
 
 
 def _ends(inputs: Inputs) -> FloatArray:
-    """Return the inputs for one run at all medians, and for two runs of each input at its 5 % and its 95 %."""
+    """Return inputs (run, input): all at their medians, then each input alone at its 5 % and at its 95 % quantile."""
     count = len(inputs.names)
     z = np.concatenate([np.zeros((1, count)), *(np.stack([-Z_90 * e, Z_90 * e]) for e in np.eye(count))])
     return inputs.at(z)
@@ -72,15 +72,15 @@ def _measure(
     inputs: Inputs, draws: OutputDraws, at: InputDraws, progress: Progress, wanted: float, sequences: int
 ) -> UncertaintyResult:
     progress(f"{len(inputs.names)} inputs: {', '.join(inputs.names)}; {len(draws.outputs)} outputs depend on them")
-    progress(f"steps that no input reaches: {draws.ready():.1f} s")
+    progress(f"steps that depend on no input: {draws.ready():.1f} s")
     pictures = draws.pictures(at.values[:PICTURED])
     ends = draws.numbers(_ends(inputs))
     if not ends[0]:
-        raise ValueError("the outputs are pictures only: ask for a number too, such as saturated or restored_quality")
+        raise ValueError("the outputs are pictures only: add an output with numbers, such as restored_quality")
     numbers: list[Numbers] = []
     used = 0
     while used < len(at.values):
-        # points of Sobol are even only after a power of two
+        # Sobol points are evenly spread only for a power of two
         used = min(len(at.values), max(LEAST, 2 * used if sequences else used + _ROUND))
         numbers += draws.numbers(at.values[len(numbers) : used])
         values = {name: np.array([n[name] for n in numbers]) for name in ends[0]}
@@ -99,7 +99,7 @@ def _measure(
 def _swings(
     inputs: Inputs, ends: Sequence[Numbers], values: Mapping[str, FloatArray], scattered: Mapping[str, Scatter]
 ) -> dict[str, list[tuple[str, float, float]]]:
-    """Return each number's values with one input at its 5 % and at its 95 %; skip numbers proportional to another."""
+    """Return each number's values with one input at its 5 % and 95 % quantile; skip numbers proportional to others."""
     found: dict[str, list[tuple[str, float, float]]] = {}
     for name, x in values.items():
         known = np.isfinite(x).all() and np.isfinite([end[name] for end in ends]).all()
@@ -153,7 +153,7 @@ def _report(result: UncertaintyResult) -> StudyReport:
     if arrays:
         files["pictures.npz"] = _npz(arrays)
     return StudyReport(
-        f"{result.inputs.recipe.name}: how certain it is",
+        f"{result.inputs.recipe.name}: uncertainty",
         lead(result),
         sections(result, pictures),
         pictures,

@@ -102,7 +102,7 @@ def test_a_value_that_something_else_reads_is_no_knob(nodes, write, tmp_path):
         load(write(both.replace("  again", "  again", 1).replace("seed: 3\ntolerance: 1e-3\n", "")), folder=tmp_path)
     )
     assert "optics.window" not in {k.name for k in found.found}
-    assert "window of the PSF: optics.window is the shape of again too" in found.without
+    assert "window of the PSF: optics.window is also a parameter of the step again" in found.without
 
 
 def test_a_recipe_without_a_knob_says_so(nodes, write, tmp_path):
@@ -110,7 +110,7 @@ def test_a_recipe_without_a_knob_says_so(nodes, write, tmp_path):
     text = text.replace(", samples: 8, pitch: 1 mm, window: [6, 8]", "").replace("sensor: {sigma: 0.1}\n", "")
     found = knobs(load(write(text), folder=tmp_path))
     assert [k.name for k in found.found] == ["optics.bands"]
-    assert "precision: this recipe has none" in found.without
+    assert "precision: this recipe has no such value" in found.without
 
 
 def test_the_reference_is_the_same_sampling_in_double_with_everything_kept(recipe):
@@ -191,7 +191,7 @@ def test_a_point_is_another_with_another_tolerance_recipe_seed_or_number_of_seed
     assert cache.key(recipe) == PointCache(finest(recipe), store, seeds=2).key(recipe)
 
 
-# --- the Pareto line --------------------------------------------------------------------------------------------------
+# --- the Pareto front -------------------------------------------------------------------------------------------------
 
 
 @dataclass(frozen=True)
@@ -240,7 +240,7 @@ def test_a_step_is_tried_in_its_forms_against_its_reference(nodes, recipe, store
 
 
 def test_a_step_without_a_reference_says_so(recipe, store):
-    assert try_step(recipe, "image", 0.5, store, 1.0).found.refused == "its node has no reference"
+    assert try_step(recipe, "image", 0.5, store, 1.0).found.refused == "the node has no reference"
 
 
 def test_a_part_of_the_inputs_is_their_middle_and_bands_from_all_over(nodes):
@@ -299,9 +299,9 @@ def _look_at(folder):
 @pytest.mark.slow
 def test_what_the_budget_leaves_is_said_and_measured_the_next_time(nodes, recipe, store, tmp_path):
     folder = study(recipe, store, tmp_path / "runs", [], print, seeds=1, quick=True, budget=0.0)
-    left = [r for r in rows_of(folder) if r["refused"].startswith("left for another time")]
+    left = [r for r in rows_of(folder) if r["refused"].startswith("not measured within the budget")]
     assert {r["setting"] for r in left} == {"4", "17", "6", "12", "4×6", "9×12", "double"}
-    assert "left for another time" in (folder / "report.html").read_text()
+    assert "not measured within the budget" in (folder / "report.html").read_text()
     again = study(recipe, store, tmp_path / "runs", [], print, seeds=1, quick=True)
     assert not [r for r in rows_of(again) if r["refused"].startswith("left")]
 
@@ -314,9 +314,9 @@ def test_a_tolerance_finer_than_the_arithmetic_is_told_from_one_that_was_missed(
     fine = cache.point(Trial("tolerance", "1e-9", replace(recipe, tolerance=1e-9), value=1e-9))
     assert fine.most > 1e-9  # a third in float32
     said = lead(recipe, [*points, fine])
-    assert "4 of 5 tolerances were held. 1 cannot be told: everything kept is off by " in said
+    assert "4 of 5 tolerances were held. 1 cannot be tested: rounding gives the full computation" in said
     off = WorkPrecisionPoint(replace(fine.trial, value=1e-9), replace(fine.found, errors={"raw": [1e-3]}))
-    assert "cannot be told" not in lead(recipe, [*points, off])
+    assert "cannot be tested" not in lead(recipe, [*points, off])
     assert (count_missed([*points, fine]), count_missed([*points, off])) == (0, 1)
 
 

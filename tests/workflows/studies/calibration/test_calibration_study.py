@@ -262,7 +262,9 @@ def test_a_study_has_a_page_and_goes_on(tmp_path, monkeypatch, quick):
     assert count_failures(folder) == doc["failed"] == 0
     assert {v["name"] for v in doc["verdicts"]} == set(doc["widths"])
     assert doc["widths"]["gain"] == pytest.approx(0.1)
-    assert all(text in page for text in ("Ranks of the truth", "Coverage", "What the prior does", "All bars hold"))
+    assert all(
+        text in page for text in ("Ranks of the truth", "Coverage", "Sensitivity to the prior", "All criteria hold")
+    )
     assert "http" not in page.replace("http://www.w3.org", "")
     assert (folder / "figures" / "ranks.png").stat().st_size > 10_000
     assert len((folder / "simulations.csv").read_text().splitlines()) == 1 + 20 * 6
@@ -313,7 +315,7 @@ def test_a_study_fails_where_draws_are_too_narrow(tmp_path, quick):
 
     folder = studied(tmp_path, 40, narrow)
     assert count_failures(folder) >= 6
-    assert "bars do not hold" in (folder / "report.html").read_text()
+    assert "criteria do not hold" in (folder / "report.html").read_text()
     assert 'class="n fail"' in (folder / "report.html").read_text()
 
 

@@ -306,7 +306,13 @@ def test_the_command_writes_a_page_and_fails_where_too_few_draws_were_allowed(tm
     assert "1 do not hold" in done.output
     folder = tmp_path / "runs" / "latest"
     text = (folder / "report.html").read_text()
-    for said in ("What moves them", "What does not vary", "sensor.gain", "is known to", "Photon-transfer curve"):
+    for said in (
+        "Influence of the inputs",
+        "What does not vary",
+        "sensor.gain",
+        "is known to",
+        "Photon-transfer curve",
+    ):
         assert (said in text) == (said != "What does not vary"), said
     assert {p.stem for p in (folder / "figures").iterdir()} == {"bands", "numbers", "pictures", "tornado", "transfer"}
     with np.load(folder / "draws.npz") as draws:
@@ -352,6 +358,6 @@ def test_what_is_not_finite_fails_and_is_said(tmp_path, store, monkeypatch):
     monkeypatch.setattr(OutputDraws, "numbers", broken)
     folder = study_recipe("uncertainty", small("developed_quality", *LAWS), store, tmp_path, most=64, error=1.0)
     assert count_failures(folder) == 1
-    assert "Not finite in some draw: developed_quality[mask].psnr" in (folder / "report.html").read_text()
+    assert "NaN or infinite in some draw: developed_quality[mask].psnr" in (folder / "report.html").read_text()
     table = (folder / "table.csv").read_text()
     assert "developed_quality[mask].psnr,,nan,nan" in table
