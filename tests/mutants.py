@@ -85,7 +85,7 @@ MUTANTS = (
         within("nodes/flare", "ghosts.py::test_coatings_are_tuned_to_all_of_the_visible_range"),
     ),
     Mutant(
-        "workflows/keys/cache_key.py",
+        "workflows/keys/input_file_digest.py",
         "_SETTLED = 2_000_000_000",
         "_SETTLED = 200_000_000",
         within(

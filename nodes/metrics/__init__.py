@@ -1,9 +1,11 @@
 """Metrics: figures of merit of a mask, a picture and a laser spot."""
 
 from neusee.nodes.metrics._mask_limits import Limits, least_lsr, limits, most_contrast, most_unsuppressed
+from neusee.nodes.metrics._peak_irradiance import Peak, peak_irradiance
 from neusee.nodes.metrics._picture_quality import Quality, quality
 from neusee.nodes.metrics._psf_contrast import Mtf, encircled, encircled_curve, mtf, over_clear_peak
-from neusee.nodes.metrics._suppression import Peak, Saturated, bsr, lsr, peak_irradiance, saturated
+from neusee.nodes.metrics._saturated_pixels import Saturated, saturated
+from neusee.nodes.metrics._suppression_ratios import bsr, lsr
 
 __all__ = [
     "Limits",

@@ -5,7 +5,7 @@ from torch import Tensor
 
 from neusee.nodes import node
 from neusee.nodes._half_precision import single
-from neusee.nodes.metrics._suppression import clipped as at_the_end
+from neusee.nodes.metrics._saturated_pixels import clipped as at_the_end
 from neusee.nodes.sensor._digitization import Bits
 from neusee.nodes.sensor._saturation import Well
 from neusee.nodes.units import Electrons, Gain

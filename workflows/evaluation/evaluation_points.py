@@ -18,7 +18,7 @@ from neusee.workflows.engine.differentiable_function import as_function
 from neusee.workflows.engine.node_call import call, place
 from neusee.workflows.evaluation.evaluation_scenes import Scene
 from neusee.workflows.evaluation.pipelines import BEAM, NONE, PipelineRecipes
-from neusee.workflows.graph.recipe_graph import Recipe, Step, needed
+from neusee.workflows.graph.recipe_graph import Recipe, Step, dependents, needed
 from neusee.workflows.keys.cache_key import device_kind, digest, key_of
 from neusee.workflows.keys.code_digest import Code
 from neusee.workflows.keys.engine_digest import engine
@@ -108,7 +108,7 @@ class EvaluationPoints:
     def _keys(self, recipe: Recipe, outputs: Iterable[str], scene: Scene | None = None) -> dict[str, str]:
         """Return the cache key of each step; only steps that depend on the scene use the seed of the scene."""
         keys = {"scene": scene.key(self._code)} if scene else {}
-        live = _reached(recipe, keys)
+        live = dependents(recipe, keys)
         for name in needed(recipe, outputs):
             if name not in keys:
                 step = recipe.steps[name]
@@ -126,7 +126,7 @@ class EvaluationPoints:
             free = ["scene", *(r for r in (inputs.readers if inputs else ()) if r.rpartition(".")[0] in steps)]
             if case != NONE:
                 free += [f"direction[{BEAM}].angle", *(f"{spot}.strength" for spot in _spots(recipe, outputs))]
-            caller = self._kept.caller(_reached(whole, [n for n in whole.steps if n.partition("[")[0] in _MOVED]))
+            caller = self._kept.caller(dependents(whole, [n for n in whole.steps if n.partition("[")[0] in _MOVED]))
             ways: dict[str, Any] = {"store": self.store, "device": self.device, "caller": caller}
             self._functions[name] = as_function(whole, *free, outputs=outputs, **ways)
             self._share(self._functions[name], whole)
@@ -219,15 +219,6 @@ class _SharedResults:
 
 def _spots(recipe: Recipe, outputs: Sequence[str]) -> list[str]:
     return [name for name in needed(recipe, outputs) if name.startswith("spot[")]
-
-
-def _reached(recipe: Recipe, roots: Iterable[str]) -> set[str]:
-    """Return the steps ``roots`` and all steps that depend on them."""
-    reached = set(roots)
-    for name in needed(recipe, recipe.steps):
-        if not reached.isdisjoint(recipe.steps[name].sources):
-            reached.add(name)
-    return reached
 
 
 def reduced(picture: Tensor, side: int) -> Tensor:

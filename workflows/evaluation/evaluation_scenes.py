@@ -15,8 +15,9 @@ from neusee.workflows.engine.node_call import call
 from neusee.workflows.engine.runner import run
 from neusee.workflows.evaluation.pipelines import BEAM, CASES, EvaluationRefused
 from neusee.workflows.graph.recipe_graph import Recipe
-from neusee.workflows.keys.cache_key import digest, file_digest, key_of, stream_seed
+from neusee.workflows.keys.cache_key import digest, key_of, stream_seed
 from neusee.workflows.keys.code_digest import Code
+from neusee.workflows.keys.input_file_digest import file_digest
 from neusee.workflows.recipe.distributions.uncertain_inputs import Inputs
 from neusee.workflows.store.result_store import Store
 

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Collection, Iterable, Mapping
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Any
 
 from neusee.nodes import Node
@@ -128,6 +128,15 @@ def needed(recipe: Recipe, outputs: Iterable[str]) -> list[str]:
     return in_order({name: step.sources for name, step in recipe.steps.items()}, outputs)
 
 
+def dependents(recipe: Recipe, roots: Iterable[str], order: Iterable[str] | None = None) -> set[str]:
+    """Return the steps ``roots`` and all steps that depend on these steps; ``order`` limits the candidates."""
+    found = set(roots)
+    for name in needed(recipe, recipe.steps) if order is None else order:
+        if not found.isdisjoint(recipe.steps[name].sources):
+            found.add(name)
+    return found
+
+
 def in_order(sources: Mapping[str, Iterable[str]], names: Iterable[str]) -> list[str]:
     """Return ``names`` and all their sources in topological order; the graph must have no cycle."""
     order: dict[str, None] = {}
@@ -150,24 +159,3 @@ def unknown_step(name: str, steps: Collection[str]) -> str:
         return f"no step {name!r}; {nearest(name, steps)}"
     more = f" and {len(copies) - _COPIES} more" if len(copies) > _COPIES else ""
     return f"no output {name}: this recipe has {', '.join(copies[:_COPIES])}{more}"
-
-
-def kept_promises(recipe: Recipe, written: Recipe) -> Recipe:
-    """Return a recipe without the expected numbers that are affected by changes to the recipe ``written``."""
-    same: set[str] = set()
-    for name in needed(recipe, recipe.steps):
-        if same.issuperset(recipe.steps[name].sources) and _alike(recipe, written, name):
-            same.add(name)
-    lost = [e for e in recipe.expect if e in written.expect and e.step not in same]
-    if not lost:
-        return recipe
-    note = f"not compared, because your changes affect these numbers: {', '.join(e.name for e in lost)}"
-    kept = tuple(e for e in recipe.expect if e not in lost)
-    return replace(recipe, expect=kept, notes=(*recipe.notes, note))
-
-
-def _alike(recipe: Recipe, written: Recipe, name: str) -> bool:
-    one, other = recipe.steps[name], written.steps.get(name)
-    if other is None or (one.node.random and recipe.seed != written.seed):
-        return False
-    return (one.node, one.params, one.wires) == (other.node, other.params, other.wires)

@@ -9,21 +9,17 @@ from __future__ import annotations
 
 import hashlib
 import json
-import os
-import time
 from collections.abc import Mapping
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-import xxhash
+from neusee.workflows.keys.input_file_digest import file_digest
 
 if TYPE_CHECKING:
     from neusee.workflows.graph.recipe_graph import Step, Wire
     from neusee.workflows.keys.code_digest import Code
 
 Key = str
-_SETTLED = 2_000_000_000  #: ns after a change of a file in which a second change may not change the time stamp
-_files: dict[tuple[int, ...], str] = {}
 
 
 def digest(*parts: Any) -> str:
@@ -79,19 +75,3 @@ def plain(value: Any) -> Any:
     if isinstance(value, complex):
         return {"complex": [value.real, value.imag]}
     raise TypeError(f"a parameter must be a number, a string, a file or a collection of these, not {value!r}")
-
-
-def file_digest(path: Path) -> str:
-    """Return the xxh3 digest of a file; an unchanged file is read only once in a process.
-
-    A file that changed in the last two seconds is read each time, because its time stamp may not show a second change.
-    """
-    stat = os.stat(path)
-    stamp = (stat.st_dev, stat.st_ino, stat.st_size, stat.st_mtime_ns, stat.st_ctime_ns)
-    if stamp in _files:
-        return _files[stamp]
-    with open(path, "rb") as file:
-        digits = hashlib.file_digest(file, xxhash.xxh3_128).hexdigest()
-    if time.time_ns() - max(stat.st_mtime_ns, stat.st_ctime_ns) > _SETTLED:
-        _files[stamp] = digits
-    return digits

@@ -11,12 +11,13 @@ from typing import Any
 
 from neusee.workflows.graph.diagnostics import RecipeError
 from neusee.workflows.graph.final_values import Config, Setting
-from neusee.workflows.graph.recipe_graph import Recipe, Step, Wire, kept_promises
+from neusee.workflows.graph.recipe_graph import Recipe, Step, Wire
 from neusee.workflows.recipe.blocks.train_block import KEY as TRAINING
 from neusee.workflows.recipe.blocks.train_block import read_training
 from neusee.workflows.recipe.blocks.train_lift_block import KEY as LIFTING
 from neusee.workflows.recipe.blocks.train_lift_block import read_lift_training
 from neusee.workflows.recipe.distributions.nominal_values import Uncertain, settle
+from neusee.workflows.recipe.expected_numbers import unaffected_expectations
 from neusee.workflows.recipe.global_settings import expectations, outputs_of, seed_and_tolerance
 from neusee.workflows.recipe.graph_cache import CachedGraph, cache_graph, cached_graph
 from neusee.workflows.recipe.parameters import Checker
@@ -59,7 +60,7 @@ def load(
     name, beside = os.fspath(name_or_path), Path(folder or ".").absolute()
     changes: tuple[str | Override, ...] = (*overrides, *overrides_of(values, beside))
     recipe = check(compose(name, changes, beside, first))
-    return kept_promises(recipe, _as_written(name, beside)) if recipe.expect and changes else recipe
+    return unaffected_expectations(recipe, _as_written(name, beside)) if recipe.expect and changes else recipe
 
 
 def _as_written(name: str, folder: Path) -> Recipe:

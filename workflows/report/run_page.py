@@ -214,7 +214,7 @@ def _facts(result: Result) -> list[list[str]]:
 
 def _inputs(recipe: Recipe) -> list[dict[str, str]]:
     """Return a row for every file that a parameter of the recipe names."""
-    from neusee.workflows.keys.cache_key import file_digest
+    from neusee.workflows.keys.input_file_digest import file_digest
 
     return [
         {"parameter": f"{step.name}.{name}", "file": value.name, "digest": file_digest(value)}

@@ -19,7 +19,7 @@ from neusee.nodes.bicubic_resize import resize
 from neusee.nodes.scene import Photographs
 from neusee.workflows.engine.differentiable_function import as_function
 from neusee.workflows.graph.diagnostics import nearest
-from neusee.workflows.graph.recipe_graph import Recipe, needed
+from neusee.workflows.graph.recipe_graph import Recipe, dependents, needed
 from neusee.workflows.recipe.blocks.train_block import Training
 from neusee.workflows.recipe.distributions.uncertain_inputs import Inputs
 from neusee.workflows.store.result_store import Store
@@ -72,8 +72,8 @@ class TrainingStream:
         self._readers = {name: _given(recipe, name) for name in readers}
         fixed = set(needed(recipe, [settings.psf]))  # random effects in the PSF, such as dirt, are constant
         noise = {name for name in order if recipe.steps[name].node.random and name not in fixed}
-        drawn = _behind(recipe, order, noise | {settings.scene, *(name.rpartition(".")[0] for name in readers)})
-        learnt = _behind(recipe, order, {learn} if learn else set())
+        drawn = dependents(recipe, noise | {settings.scene, *(name.rpartition(".")[0] for name in readers)}, order)
+        learnt = dependents(recipe, {learn} if learn else (), order)
         if settings.psf in drawn:
             raise ValueError(f"train.psf: {settings.psf} changes with each picture: name a PSF that is constant")
         self.shards = Shards.of(recipe, settings.psf, outputs, drawn | learnt, store, mesh)
@@ -201,12 +201,3 @@ def _given(recipe: Recipe, name: str) -> Any:
 
 def _sources(recipe: Recipe, readers: Iterable[str]) -> set[str]:
     return {source for reader in readers for source in recipe.steps[reader].sources}
-
-
-def _behind(recipe: Recipe, order: Sequence[str], first: set[str]) -> set[str]:
-    """Return the steps ``first`` and all steps that depend on them."""
-    dependents = set(first)
-    for name in order:
-        if not dependents.isdisjoint(recipe.steps[name].sources):
-            dependents.add(name)
-    return dependents

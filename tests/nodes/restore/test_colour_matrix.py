@@ -70,5 +70,5 @@ def test_darkness_has_a_finite_matrix():
 
 
 def test_bands_must_agree():
-    with pytest.raises(ValueError, match="same bands"):
+    with pytest.raises(ValueError, match="differ in the number of bands"):
         colour_matrix(BANDS, D65, CIE[:, :5], LEVEL, quantum_efficiency=0.56, **SHUTTER)

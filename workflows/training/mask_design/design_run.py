@@ -21,9 +21,10 @@ from neusee.workflows.engine.provenance import timestamp, versions
 from neusee.workflows.graph.diagnostics import RecipeError
 from neusee.workflows.graph.final_values import flow
 from neusee.workflows.graph.recipe_graph import Recipe, needed
-from neusee.workflows.keys.cache_key import digest, file_digest
+from neusee.workflows.keys.cache_key import digest
 from neusee.workflows.keys.code_digest import Code
 from neusee.workflows.keys.engine_digest import engine
+from neusee.workflows.keys.input_file_digest import file_digest
 from neusee.workflows.recipe.blocks.mask_design_block import DesignError, MaskTraining, Weights, need_steps, state_file
 from neusee.workflows.recipe.blocks.train_block import Training
 from neusee.workflows.recipe.changed_recipe import changed

@@ -1,0 +1,28 @@
+"""Expected numbers of a recipe that the user's changes leave valid; the others are not compared."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+from neusee.workflows.graph.recipe_graph import Recipe, needed
+
+
+def unaffected_expectations(recipe: Recipe, written: Recipe) -> Recipe:
+    """Return a recipe without the expected numbers that are affected by changes to the recipe ``written``."""
+    same: set[str] = set()
+    for name in needed(recipe, recipe.steps):
+        if same.issuperset(recipe.steps[name].sources) and _alike(recipe, written, name):
+            same.add(name)
+    lost = [e for e in recipe.expect if e in written.expect and e.step not in same]
+    if not lost:
+        return recipe
+    note = f"not compared, because your changes affect these numbers: {', '.join(e.name for e in lost)}"
+    kept = tuple(e for e in recipe.expect if e not in lost)
+    return replace(recipe, expect=kept, notes=(*recipe.notes, note))
+
+
+def _alike(recipe: Recipe, written: Recipe, name: str) -> bool:
+    one, other = recipe.steps[name], written.steps.get(name)
+    if other is None or (one.node.random and recipe.seed != written.seed):
+        return False
+    return (one.node, one.params, one.wires) == (other.node, other.params, other.wires)
