@@ -30,7 +30,7 @@ Evaluate = Callable[[Sequence[Any]], Any]  #: a function from the inputs of a st
 
 
 def call_by_band(step: Step, inputs: Sequence[Any], evaluate: Evaluate, code: str, blobs: Blobs, parts: int = 1) -> Any:
-    """Return the result of ``step``; compute only the bands that the store ``blobs`` does not contain.
+    """Return the result of ``step``; compute only the wavelength bands that the store ``blobs`` does not contain.
 
     ``code`` is the digest of the code of the node. More passes over the bands, ``parts``, need less memory. Tensors
     that can be stored by band are returned as `Stacked`, which `plain_of` converts to plain tensors.
@@ -52,7 +52,7 @@ def call_by_band(step: Step, inputs: Sequence[Any], evaluate: Evaluate, code: st
 
 
 def plain_of(value: Any) -> Any:
-    """Return ``value`` with a plain tensor in place of every `Stacked` tensor."""
+    """Return ``value`` with every `Stacked` tensor (stored by band) replaced by an ordinary PyTorch tensor."""
     if isinstance(value, Stacked):
         return value.tensor
     return value._make(map(plain_of, value)) if type(value) in BAND_FIELDS else value
@@ -69,7 +69,7 @@ def band_count(step: Step, inputs: Sequence[Any]) -> int:
 
 
 def band_keys(step: Step, inputs: Sequence[Any], code: str) -> list[str]:
-    """Return the key of each band: a digest of node, code, parameters, and this band of the inputs."""
+    """Return the cache key of each wavelength band: a digest of node, code, parameters and this band of the inputs."""
     params = {name: plain(value) for name, value in step.params.items()}
     same: list[Any] = ["band", step.node.path, code, params]
     each: list[list[str]] = []
@@ -96,14 +96,14 @@ def _axis(step: Step, name: str, value: Any) -> int | None:
 
 
 def band_tensors(value: Any) -> list[Tensor]:
-    """Return the tensors of a value that have a band axis."""
+    """Return the tensors of a result that have an axis of wavelength bands."""
     if isinstance(value, Tensor):
         return [value]
     return [getattr(value, name) for name in BAND_FIELDS[type(value)]]
 
 
 def with_band_tensors(value: Any, tensors: Sequence[Tensor]) -> Any:
-    """Replace the tensors of ``value`` that have a band axis by ``tensors``, and return the result."""
+    """Return ``value`` with ``tensors`` in place of its tensors that have an axis of wavelength bands."""
     if isinstance(value, Tensor):
         return tensors[0]
     return value._replace(**dict(zip(BAND_FIELDS[type(value)], tensors, strict=True)))
@@ -118,7 +118,10 @@ def _has(x: Tensor, axis: int) -> bool:
 
 
 def taken(step: Step, inputs: Sequence[Any], which: list[int], of: Collection[str] | None = None) -> list[Any]:
-    """Return the inputs of a step with only the bands ``which``; if ``of`` names inputs, slice only these inputs."""
+    """Return the inputs of a step, reduced to the wavelength bands with the indices ``which``.
+
+    If ``of`` names inputs, only these inputs are reduced.
+    """
     found = list(inputs)
     for i, (name, value) in enumerate(zip(step.node.inputs, inputs, strict=False)):
         axis = _axis(step, name, value)
@@ -128,7 +131,7 @@ def taken(step: Step, inputs: Sequence[Any], which: list[int], of: Collection[st
 
 
 def _slices(x: Tensor, axis: int, which: list[int]) -> Tensor:
-    """Return the bands ``which`` of a tensor, as a view if these bands are contiguous and aligned, else as a copy."""
+    """Return the bands with the indices ``which``: a view of the tensor if contiguous and aligned, else a copy."""
     if which == list(range(which[0], which[0] + len(which))):
         part = x.narrow(axis, which[0], len(which))
         if part.is_contiguous() and part.data_ptr() % _ALIGN == 0:
@@ -166,7 +169,10 @@ def _leads(step: Step, x: Tensor) -> bool:
 def _gathered(
     step: Step, inputs: Sequence[Any], evaluate: Evaluate, keys: list[str], missing: list[int], size: int, blobs: Blobs
 ) -> Any:
-    """Compute the missing bands, ``size`` at a time, and assemble all bands; raise `Damaged` for a damaged band."""
+    """Compute missing bands of a result in groups of ``size`` bands, and assemble all bands.
+
+    Raises `Damaged` if a stored band is damaged.
+    """
     assert step.node.bands is not None
     axis = step.node.bands["return"]
     stacks = [_Stack(axis, [f"{key}.{n}" for key in keys], blobs) for n in range(_fields(step))]
@@ -186,7 +192,7 @@ class _Stack:
         self.inside: set[int] = set()  # indices of the bands in memory
 
     def add(self, which: list[int], x: Tensor) -> None:
-        """Add the computed bands ``x``, whose indices are ``which``."""
+        """Add the computed wavelength bands ``x`` with the indices ``which`` to the tensor."""
         axis = self.axis % x.dim()
         slices = x.unbind(axis)
         if axis == 0:
@@ -200,7 +206,7 @@ class _Stack:
         self.inside.update(which)
 
     def whole(self) -> Tensor | Stacked:
-        """Return all bands as one tensor; raise `Damaged` if a stored band is damaged."""
+        """Return all wavelength bands as one tensor; raise `Damaged` if a stored band is damaged."""
         blob = self.blobs.about(self.names[0]) if self.held is None else None
         if blob is not None:
             shape = (len(self.names), *blob.shape)

@@ -19,7 +19,7 @@ Row = Mapping[str, Any]  #: a line of the journal
 
 @dataclass(frozen=True, slots=True)
 class Estimate:
-    """The predicted cost of a step."""
+    """Predicted cost of a step: run time, size of the result, and memory."""
 
     seconds: Mapping[str, float]  #: by kind of device: ``cpu``, ``cuda``
     bytes: float  #: size of the result
@@ -28,7 +28,7 @@ class Estimate:
 
 
 class Costs:
-    """Measured costs of steps and nodes, from the lines of a journal in order of time."""
+    """Measured costs of steps and nodes, from the journal of a result store in order of time."""
 
     def __init__(self, rows: Iterable[Row]) -> None:
         self._steps: dict[str, list[Row]] = {}
@@ -40,7 +40,7 @@ class Costs:
         self._ratio = {"cpu": 1.0, **self._measured_ratios()}
 
     def of(self, step: Step, kinds: Sequence[str], exact: Row | None = None) -> Estimate:
-        """Predict the cost of ``step`` on each kind of device; ``exact`` is a measurement of the same result."""
+        """Predict the cost of ``step`` on each kind of device; ``exact`` holds measured costs of the same result."""
         own = self._steps.get(f"{step.name} {step.node.path}", [])
         rows = [exact] if exact else own[-_NEWEST:] or self._nodes.get(step.node.path, [])[-_NEWEST:]
         if not rows:

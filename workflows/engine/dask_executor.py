@@ -27,7 +27,7 @@ from neusee.workflows.store.result_store import Store
 from neusee.workflows.store.serialization import tensors_in
 
 _SHARE = 0.4  #: fraction of the planned memory for values that the next tasks of a worker may read
-_PLANNED = 0.6  #: fraction of the memory of a worker that a plan may use
+_PLANNED = 0.6  #: fraction of the memory of a worker that a schedule may use
 _LOOK = 1.0  #: s between two queries for the connected workers
 _TRIES = 3  #: number of workers that may die during one chain before the run fails
 
@@ -47,13 +47,13 @@ class Dask:
 
     @property
     def lanes(self) -> Mapping[str, Lane]:
-        """Return one lane for each worker; the list of workers is updated at most once a second."""
+        """Return the device and memory of each worker, by address; the workers are queried at most once a second."""
         if time.monotonic() - self._looked > _LOOK or not self._lanes:
             self._look()
         return self._lanes
 
     def submit(self, work: Sequence[StepJob]) -> None:
-        """Send a chain of jobs to the worker of its lane, or to another worker if that worker is gone."""
+        """Send a chain of jobs to the assigned worker, or to another worker if the assigned worker is gone."""
         self._tries[work[0].key] = self._tries.get(work[0].key, 0) + 1
         future = self.client.submit(
             work_here,
@@ -70,7 +70,7 @@ class Dask:
         self._running[future] = tuple(work)
 
     def wait(self, seconds: float | None = None) -> list[Outcome]:
-        """Return the outcomes that have arrived since the last call."""
+        """Return the outcomes of jobs that have arrived since the last call."""
         from distributed import wait
 
         if not self._running:
@@ -89,7 +89,7 @@ class Dask:
             self._running = {}
 
     def _taken(self, future: Any) -> list[Outcome]:
-        """Return the outcomes of a chain, or an outcome with a `RunError` if its workers died."""
+        """Return the outcomes of a chain of jobs, or one outcome with a `RunError` if the workers died."""
         chain = self._running.pop(future)
         if future.status == "finished":
             outcomes: list[Outcome] = future.result()
@@ -104,7 +104,7 @@ class Dask:
         return [Outcome(chain[0], error=RunError(chain[0].step, [], OSError(text)))]
 
     def _look(self) -> None:
-        """Update the lanes from the connected workers and their devices; wait until a worker is connected."""
+        """Update the list of connected workers and their devices; wait until a worker is connected."""
         if not self.client.nthreads():
             self.client.wait_for_workers(1, timeout=60)
         there = self.client.nthreads()
@@ -148,7 +148,7 @@ _here: dict[str, _Here] = {}
 
 
 def lane_here(dask_worker: Any) -> tuple[str, float]:
-    """Return the device of a worker, and the bytes of memory that a plan may use on this device."""
+    """Return the device of a worker, and the memory (bytes) that a schedule may use on this device."""
     if torch.cuda.is_available():
         return "cuda:0", _PLANNED * there_is("cuda:0")
     allowed = getattr(dask_worker.memory_manager, "memory_limit", None)
@@ -156,7 +156,7 @@ def lane_here(dask_worker: Any) -> tuple[str, float]:
 
 
 def work_here(chain: tuple[StepJob, ...], where: str, threads: int, room: float) -> list[Outcome]:
-    """Compute a chain of jobs on a worker and return outcomes without values; keep at most ``room`` bytes."""
+    """Compute a chain of jobs on a worker; return outcomes without values, and cache up to ``room`` bytes of values."""
     if torch.get_num_threads() != threads:
         torch.set_num_threads(threads)
     here = _here.get(where) or _here.setdefault(where, _Here(where, room))

@@ -9,7 +9,7 @@ def check_devices(text: str) -> None:
     """Raise ValueError for a list of devices that names a device twice, or a device that this machine does not have."""
     names = text.split(",")
     if len(set(names)) < len(names):
-        raise ValueError(f"{text}: names a device twice")
+        raise ValueError(f"{text}: names a device twice; name each device once")
     for name in names:
         try:
             torch.empty(0, device=name)

@@ -34,12 +34,12 @@ def as_function(
     redraw: Collection[str] = (),
     caller: Callable[..., Any] = call,
 ) -> _Function:
-    """Return the recipe as a differentiable function ``theta -> {output: value}``, equal to `run` to the last bit.
+    """Return the recipe as a differentiable function ``theta -> {output: value}``, bit-identical to `run`.
 
     Args: free: parameters such as ``"spot.strength"``, or steps such as ``"height"``, whose result the caller
     provides. Steps that do not depend on ``free`` are computed once, here, or read from the store. Noise is the
     same at every call, because its stream depends on the seed and the step. Random steps in ``redraw`` are
-    computed at every call, which may have another seed. ``caller`` replaces `call` for every live step.
+    computed at every call, which may have another seed. ``caller`` replaces `call` for all steps computed at a call.
     """
     wanted = recipe.outputs if outputs is None else tuple(outputs)
     given, tuned = _read(recipe, free)
@@ -59,7 +59,7 @@ def as_function(
 
 
 def _read(recipe: Recipe, free: tuple[str, ...]) -> tuple[set[str], dict[str, dict[str, str]]]:
-    """Return the free steps, and the free parameters of every other step with their full names."""
+    """Split the names ``free`` into names of steps, and full names of parameters grouped by step."""
     given: set[str] = set()
     tuned: dict[str, dict[str, str]] = {}
     for name in free:
@@ -97,10 +97,10 @@ class _Function:
         self._last = {source: name for name in live for source in self.recipe.steps[name].sources}
 
     def __call__(self, theta: Theta, seed: int | None = None) -> dict[str, Any]:
-        """Return the outputs for the free values ``theta``, with noise from ``seed`` or the seed of the recipe."""
+        """Return the outputs for the free values ``theta``; the seed of the noise is ``seed`` or the recipe's seed."""
         seed = self.recipe.seed if seed is None else seed
         if set(theta) != set(self.free):
-            raise ValueError(f"give values for exactly {', '.join(self.free)}, not for {', '.join(theta) or 'nothing'}")
+            raise ValueError(f"theta must hold exactly {', '.join(self.free)}, not {', '.join(theta) or 'nothing'}")
         values, ledger = dict(self.fixed), self._spent.copy()
         for name in self.live:
             step, given = self.recipe.steps[name], name in self.given
@@ -149,7 +149,7 @@ class _Ends:
 
 
 def _spent(recipe: Recipe, fixed: Mapping[str, Any], left_out: Mapping[str, float]) -> ErrorBudget:
-    """Return an error budget that contains the error bounds of all fixed steps."""
+    """Return an error budget with the error bounds of all steps that do not depend on the free values."""
     ledger = ErrorBudget(recipe)
     for name in needed(recipe, fixed):
         ledger.pass_on(recipe.steps[name])

@@ -18,7 +18,7 @@ MemoryProfile = Callable[[StepJob, Sequence[StepJob]], bool]
 
 
 class Loop:
-    """Progress of a plan: the waiting chains of jobs, the ready chains, and the chain that each lane computes."""
+    """Progress of a run: chains of jobs that wait for inputs, chains that are ready, and the chain on each device."""
 
     def __init__(
         self, chains: Sequence[Chain], executor: Executor, begin: Callable[[StepJob], StepJob], room: MemoryProfile
@@ -38,7 +38,7 @@ class Loop:
         self._open = len(chains)
 
     def outcomes(self) -> Iterator[Outcome]:
-        """Yield each outcome when it arrives, until all jobs are done; the caller must raise errors in outcomes."""
+        """Yield the outcome of each job when it arrives, until all jobs are done; the caller raises its errors."""
         while self._open:
             self._hand_out()
             if not self.busy and not self._held:
@@ -50,12 +50,12 @@ class Loop:
                     yield outcome
 
     def _outside(self, chain: Chain) -> set[Key]:
-        """Return the keys that a chain reads from other chains of this plan."""
+        """Return the keys of the values that a chain of jobs reads from other chains of the same run."""
         own = {work.key for work in chain}
         return {key for work in chain for key in work.sources if key in self._chain_of and key not in own}
 
     def _hand_out(self) -> None:
-        """Submit to every idle lane the first ready chain that may run on this lane."""
+        """Submit to every idle device or worker the first ready chain of jobs that may run there."""
         self._look_again()
         for lane, where in self.executor.lanes.items():
             if lane in self.busy or not self._ready:
@@ -69,7 +69,10 @@ class Loop:
                 self.executor.submit(chain)
 
     def _first_for(self, lane: str, device: str) -> int | None:
-        """Return the index of the next ready chain that ``lane`` may compute, also a chain of a busy or lost lane."""
+        """Return the index of the next ready chain of jobs that the device or worker ``lane`` may compute, or None.
+
+        A chain of another lane may move to ``lane`` if the other lane is busy or lost.
+        """
         running = [work for chain in self.busy.values() for work in chain]
         there = self.executor.lanes
         for place in range(len(self._ready) - 1, -1, -1):
@@ -87,7 +90,7 @@ class Loop:
             self._held[i] = (float("inf"), self._held[i][1])
 
     def _patience(self) -> float | None:
-        """Return the time (s) to wait for running jobs; sleep first if only other processes are computing."""
+        """Return the time (s) to wait for running jobs; if only other processes compute, first sleep for this time."""
         waits = [when for when, _ in self._held.values() if when < float("inf")]
         if not waits:
             return None
@@ -97,7 +100,7 @@ class Loop:
         return pause
 
     def _settle(self, outcome: Outcome) -> None:
-        """Mark the lane of an outcome as idle, and the chains that waited for its result as ready."""
+        """Mark the device of a finished job as idle, and the chains that waited only for its result as ready."""
         i = self._chain_of[outcome.work.key]
         chain = self._chains[i]
         last = outcome.work.key == chain[-1].key
@@ -122,7 +125,7 @@ class Loop:
 
 
 def chains_of(works: Sequence[StepJob], fused: bool) -> list[Chain]:
-    """Group jobs into chains: one job each, or if ``fused``, jobs of one lane of which each feeds only the next job."""
+    """Group jobs into chains: single jobs, or if ``fused``, jobs on one device that each feed only the next job."""
     if not fused:
         return [(work,) for work in works]
     readers = Counter(key for work in works for key in set(work.sources))
@@ -141,5 +144,5 @@ def chains_of(works: Sequence[StepJob], fused: bool) -> list[Chain]:
 
 
 def _moved(work: StepJob, lane: str, device: str) -> StepJob:
-    """Return a job after moving it to another lane; a job that needs the CPU still computes on the CPU."""
+    """Assign a job to another device or worker and return the job; a job that needs the CPU still uses the CPU."""
     return replace(work, lane=lane, device=device if device_kind(work.device) == device_kind(device) else work.device)

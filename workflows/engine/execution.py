@@ -68,7 +68,7 @@ class Execution:
         self.schedule: Schedule | None = None
 
     def resolve(self, order: list[str]) -> None:
-        """Compute the key of every step; leave out each step whose effect is within the tolerance."""
+        """Compute the cache key of every step; leave out each step whose effect is within the tolerance."""
         for name in order:
             step = self.recipe.steps[name]
             if step.node.hooks.skip_bound is not None:
@@ -89,7 +89,7 @@ class Execution:
                 self.makers[key], self.origins[key] = step, origin
 
     def make(self, targets: list[Key], keep: bool, later: Sequence[Key] = ()) -> None:
-        """Load or compute the values with the keys ``targets``.
+        """Load or compute the values with the cache keys ``targets``.
 
         Values that the keys ``later`` need stay in memory, and with ``keep`` also each value that is not stored.
         """
@@ -184,14 +184,14 @@ class Execution:
             self._fetch(key)
 
     def _free(self, keys: Iterable[Key], uses: Counter[Key], keep: bool) -> None:
-        """Delete from memory the values that no step will use."""
+        """Delete from memory the values that no later step needs."""
         for key in keys:
             unsafe = key in self.own.later or (keep and not self.store.has(key))
             if uses[key] <= 0 and key in self.values and not unsafe:
                 del self.values[key]
 
     def _outcomes(self, plan: list[Key], again: frozenset[Key], targets: list[Key]) -> Iterator[Outcome]:
-        """Compute the plan and yield each outcome; after an error no further step begins."""
+        """Compute the values with the keys ``plan`` and yield each outcome; after an error no further step begins."""
         works = [self._work(key, key in again, key in targets) for key in plan]
         self.costs = self.costs or past_costs(self.store)
         try:

@@ -1,4 +1,4 @@
-"""Choice between loading and computing each value: a minimum cut gives the lowest total time.
+"""Choice between loading and computing each value of a run: a minimum cut of a graph gives the lowest total time.
 
 To load a value costs the time of reading. To compute a value costs the time of its step and requires
 its inputs. The cheapest choice for a whole graph is a minimum cut (Xin et al., Helix, PVLDB 12(4),
@@ -21,7 +21,7 @@ Price = Callable[[Key], float]
 
 
 class Upstream(dict[Key, list[Key]]):
-    """Dictionary from the key of a value to the keys of its sources; a value that is known already has no sources."""
+    """Dictionary from the key of a value to the keys of its inputs; the list is empty for a value that is known."""
 
     def __init__(self, known: Callable[[Key], bool], sources: Callable[[Key], list[Key]]) -> None:
         self._known, self._sources = known, sources
@@ -39,7 +39,7 @@ class Upstream(dict[Key, list[Key]]):
 def uses_of(
     plan: Iterable[Key], targets: Sequence[Key], known: Callable[[Key], bool], sources: Callable[[Key], list[Key]]
 ) -> Counter[Key]:
-    """Return the number of times that each value is read while ``plan`` and ``targets`` are computed."""
+    """Return how often each value is read while the values with the keys ``plan`` and ``targets`` are computed."""
     below, uses = Upstream(known, sources), Counter(targets)
     in_order(below, targets)
     for key in below.missing.union(plan):
@@ -55,7 +55,7 @@ def worth_solving(load: float, compute: float) -> bool:
 def cheaper_to_recompute(
     targets: Sequence[Key], sources: Callable[[Key], Sequence[Key]], load: Price, compute: Price
 ) -> set[Key]:
-    """Return the stored keys that are cheaper to compute than to load.
+    """Return the keys of the stored values that are cheaper to compute than to load.
 
     ``load`` returns inf for a value that is not stored, and 0 for a value in memory.
     """

@@ -19,11 +19,11 @@ from neusee.workflows.engine.write_behind import WriteBehind
 from neusee.workflows.keys.cache_key import Key
 from neusee.workflows.store.result_store import Store
 
-_SHARE = 0.9  #: fraction of a device's memory that a plan may use
+_SHARE = 0.9  #: fraction of a device's memory that a schedule may use
 
 
 def lanes_of(devices: Sequence[str], memory: int | None = None) -> dict[str, Lane]:
-    """Return one lane for each device; lanes with a common memory divide the bytes that a plan may use."""
+    """Return one `Lane` for each device; devices with a common memory divide the bytes that a schedule may use."""
     pools = [pool_of(device) for device in devices]
     return {d: Lane(d, (memory or _SHARE * there_is(d)) / pools.count(pool_of(d))) for d in devices}
 
@@ -44,7 +44,7 @@ class Local:
         self._running: set[Future[Outcome]] = set()
 
     def submit(self, work: Sequence[StepJob]) -> None:
-        """Add the jobs to the queue, or start them in the threads of their lanes."""
+        """Add the jobs to the queue, or start the jobs in the threads of their devices."""
         for job in work:
             if len(self.lanes) == 1:
                 self._queue.append(job)

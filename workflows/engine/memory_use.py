@@ -44,7 +44,7 @@ class PeakMemory:
 
 
 def pool_of(device: str) -> str:
-    """Return the name of the memory that a device uses; all lanes of the CPU use the same memory."""
+    """Return the name of the memory that a device uses; ``cpu:0`` and ``cpu:1`` use the same memory."""
     return "cpu" if device.startswith("cpu") else device
 
 

@@ -30,7 +30,7 @@ def call(step: Step, inputs: Sequence[Any], params: Mapping[str, Any], seed: int
 
 
 def examine(step: Step, value: Any, inputs: Sequence[Any]) -> tuple[Check, ...]:
-    """Return the results of the checks of a node; a check that raises an error counts as failed."""
+    """Run the checks of a node on its result and return the outcomes; a check that raises an error counts as failed."""
     if step.node.hooks.check is None:
         return ()
     try:
@@ -58,7 +58,7 @@ def places(step: Step, devices: Sequence[str]) -> tuple[str, ...]:
 
 
 def fits(device: str, kind: str, hint: str) -> bool:
-    """Return True if the hint of a step, such as ``cpu``, ``gpu`` or ``cuda:1``, allows this device."""
+    """Return True if the device hint of a step, such as ``cpu``, ``gpu`` or ``cuda:1``, allows ``device``."""
     if hint in ("any", ""):
         return True
     return kind != "cpu" if hint == "gpu" else hint in (kind, device)

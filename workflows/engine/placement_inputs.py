@@ -21,7 +21,7 @@ MOST_PARTS = 64  #: upper bound on the parts of a step; the number of bands is o
 
 @dataclass(frozen=True, slots=True)
 class Prepared:
-    """Jobs in the order in which they begin, their predicted costs, and the schedule."""
+    """Scheduled jobs of a run in the order in which they begin, with their predicted costs and the schedule."""
 
     works: list[StepJob]
     expected: Mapping[Key, Estimate]
@@ -35,7 +35,7 @@ def prepare(
     lanes: Mapping[str, Lane],
     keep: Collection[Key],
 ) -> Prepared:
-    """Assign a lane and a device to each job; raise `TooLarge` if the memory is too small."""
+    """Assign a device to each job of a run and schedule the jobs; raise `TooLarge` if the memory is too small."""
     kinds = sorted({lane.kind for lane in lanes.values()} | {"cpu"})
     expected = {w.key: costs.of(w.step, kinds, abouts.get(w.key)) for w in works}
     only, lane = next(iter(lanes.items()))
@@ -53,7 +53,7 @@ def prepare(
 
 
 def room_for(expected: Mapping[Key, Estimate], executor: Executor, values: Mapping[Key, Any]) -> MemoryProfile:
-    """Return a function that is True if one more job fits into memory beside the running jobs and ``values``."""
+    """Return a function that is True if one more job fits into memory with the running jobs and ``values``."""
 
     def room(work: StepJob, running: Sequence[StepJob]) -> bool:
         pool = pool_of(work.device)
@@ -106,7 +106,7 @@ def _cpu_only(work: StepJob) -> bool:
 def _one_after_another(
     works: Sequence[StepJob], expected: Mapping[Key, Estimate], lane: str, keep: Collection[Key]
 ) -> Schedule:
-    """Return the schedule of the jobs in the given order on one lane; each result is freed after its last use."""
+    """Return the schedule of jobs one after another on one device; each result is freed after its last use."""
     last = {key: work.key for work in works for key in work.sources}
     now, held, most, slots = 0.0, 0.0, 0.0, []
     for work in works:
@@ -121,5 +121,5 @@ def _one_after_another(
 
 
 def past_costs(store: Store) -> Costs:
-    """Return the measured costs of all results in the journal of a store."""
+    """Return the measured costs of all results that the journal of a result store lists."""
     return Costs(store.journal.rows())

@@ -33,14 +33,14 @@ class Resolved:
         return None if verdict is None and name in self.verdicts else verdict is not None and verdict.left_out
 
     def stands_for(self, name: str) -> str:
-        """Return step ``name``, or if this step is left out, the upstream step whose result is used instead."""
+        """Return ``name``, or if the step ``name`` is left out, the name of the upstream step that is used instead."""
         while (verdict := self.verdicts.get(name)) is not None and verdict.left_out:
             name = verdict.instead
         return name
 
 
 def resolve(recipe: Recipe, order: Iterable[str], store: Store, device: str = "cpu") -> Resolved:
-    """Return the cache key of each step for a run on ``device``; ``order`` lists the steps with sources first."""
+    """Return the cache key of each step for a run on ``device``; ``order`` lists each step after its inputs."""
     found, code, ledger = Resolved(), Code(store.code_memo), ErrorBudget(recipe)
 
     def facts_of(name: str) -> TensorStats | None:

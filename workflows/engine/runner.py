@@ -1,4 +1,4 @@
-"""Run of a recipe: stored results are reused, and only other results that the outputs need are computed."""
+"""Run of a recipe: stored results are reused, and missing results that the outputs depend on are computed."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ _SAFE = 0.8  #: tolerance scale of a second attempt, relative to the largest sca
 
 @dataclass(frozen=True, repr=False)
 class Result:
-    """Result of a run: the wanted values, and a record of every step upstream of these values."""
+    """Result of a run: the requested values, and a record of every step upstream of these values."""
 
     values: dict[str, Any]
     done: dict[str, StepRecord]
@@ -88,7 +88,7 @@ def run(
 
     Args: outputs: if None, the outputs of the recipe. device: one or several devices, such as
     ``cuda:0,cuda:1,cpu``, the preferred device first. executor: computes the steps in place of this process.
-    memory: bytes of each device that a plan may use; if None, nine tenths of its memory.
+    memory: bytes of each device that the run may use; if None, nine tenths of its memory.
     Raises `RunError`, which names the step.
     """
     began = time.perf_counter()

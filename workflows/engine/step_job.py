@@ -34,12 +34,12 @@ _WATCHED = 1 << 20  #: bytes of inputs from which the memory of a step is measur
 
 
 class InputMissing(Exception):
-    """Error for a stored result that is damaged or missing when it is read; the run then makes a new plan."""
+    """Error for a stored result that is damaged or missing when it is read; the run then computes the result."""
 
 
 @dataclass(frozen=True, slots=True)
 class StepJob:
-    """A step to compute, with the keys of its inputs."""
+    """A step to compute, with the cache keys of its inputs."""
 
     step: Step
     key: Key
@@ -48,7 +48,7 @@ class StepJob:
     seed: int
     recipe: str
     device: str  #: device of the computation: ``cpu``, ``cuda:1``
-    lane: str  #: lane of the executor
+    lane: str  #: name of the `Lane` (device or worker) that computes the job
     wanted: bool = False  #: True if the result is requested, and therefore kept whatever its cost
     unlocked: bool = False  #: compute without a lease, because the node takes so little time
     recompute: bool = False  #: True to compute a stored result because computing is faster than reading
@@ -87,7 +87,7 @@ class Lane:
     """A device or worker that computes one job at a time."""
 
     device: str
-    memory: float  #: bytes that a plan may use
+    memory: float  #: bytes that a schedule may use
 
     @property
     def kind(self) -> str:
@@ -100,17 +100,17 @@ class Executor(Protocol):
 
     @property
     def lanes(self) -> Mapping[str, Lane]:
-        """Return the lanes of the executor by name."""
+        """Return the devices or workers of the executor, by name."""
 
     @property
     def shares(self) -> bool:
         """Return True if values stay in this process, and False if steps exchange values through the store."""
 
     def submit(self, work: Sequence[StepJob]) -> None:
-        """Start a chain of jobs in one lane; each job computes an input of the next job."""
+        """Start a chain of jobs on one device or worker; each job computes an input of the next job."""
 
     def wait(self, seconds: float | None = None) -> list[Outcome]:
-        """Return the outcomes since the last call; while jobs run, wait at most ``seconds`` for an outcome."""
+        """Return the outcomes of jobs since the last call; while jobs run, wait at most ``seconds`` for an outcome."""
 
     def cancel(self) -> None:
         """Start no further job, and wait for the running jobs."""
@@ -174,7 +174,7 @@ def _computed(work: StepJob, inputs: list[Any], store: Store) -> Outcome:
 
 
 def _kept(outcome: Outcome, store: Store, later: WriteBehind | None, lease: Lease) -> Outcome:
-    """Store the metadata of an outcome, and the value too if reading is cheaper than computing."""
+    """Store the metadata of a result, and also its value if reading is faster than computing the result again."""
     work, value, about = outcome.work, outcome.value, _about(outcome)
     small = outcome.bytes <= INLINE
     try:

@@ -36,7 +36,7 @@ Found = tuple[list[str], list[Pair]]  #: differences at a pair itself, and the p
 
 @dataclass(frozen=True, slots=True)
 class Roots:
-    """Root causes of a change, the nearest first, and the path from the compared step to each cause."""
+    """Root causes of a changed result, the nearest first, with the path from the compared step to each cause."""
 
     found: dict[str, Pair]  #: by the description of the cause
     above: dict[Pair, Pair | None]
@@ -79,13 +79,13 @@ class Comparison:
         return Roots(found, above)
 
     def compare(self, pair: Pair) -> Found:
-        """Return the differences of two results themselves, and the pairs of inputs that differ."""
+        """Return the differences between two results of a step, and the pairs of their inputs that differ."""
         if pair not in self.seen:
             self.seen[pair] = self._compare(pair)
         return self.seen[pair]
 
     def own(self, label: str, old: Origin, new: Origin) -> list[str]:
-        """Return the differences of two results of a step in node, parameters, code and random stream."""
+        """Return the differences between two results of a step in node, parameters, code and random stream."""
         if old["node"] != new["node"]:
             where = self.wording.source("steps", label.partition("[")[0], "node")
             return [f"{old['node']} -> {new['node']}{where}"]
@@ -95,11 +95,11 @@ class Comparison:
         return found + self._stream(old.get("stream"), new.get("stream"))
 
     def origin(self, key: Key) -> Origin | None:
-        """Return the parts of a key from the recipe or from the store, or None if the key is in neither."""
+        """Return the parts of a cache key, from the recipe or from the store, or None if the key is unknown."""
         return self.resolved.origins.get(key) or (self.about(key) or {}).get("origin")
 
     def step(self, key: Key) -> str | None:
-        """Return the first step with this key, or None if the key is unknown."""
+        """Return the name of the first step with the cache key ``key``, or None if the key is unknown."""
         return self.resolved.makers.get(key) or (self.about(key) or {}).get("step")
 
     def _compare(self, pair: Pair) -> Found:
@@ -126,7 +126,7 @@ class Comparison:
         return [((*path, name), [self.resolved.stands_for(wire) for wire in wired]) for name, wired in wires]
 
     def _input(self, path: tuple[str, ...], labels: list[str], new: list[Key], old: list[Key]) -> Found:
-        """Return the differences of an input, which reads one step or several steps."""
+        """Return the differences between the new and the earlier steps that one input reads."""
         if len(new) == 1 and len(old) == 1:
             return self._source(path, labels[0], new[0], old[0])
         then = dict(zip([self.step(key) or key for key in old], old, strict=True))
@@ -139,7 +139,7 @@ class Comparison:
         return texts or ([] if pairs else ["the order of its sources changed"]), pairs
 
     def _source(self, path: tuple[str, ...], label: str, new: Key, old: Key) -> Found:
-        """Return the differences of one source of an input: a change, an exchange, or an added or removed step."""
+        """Return how one source of an input differs: a step has changed, or was exchanged, added or removed."""
         if new == old:
             return [], []
         was = self.step(old)
@@ -160,14 +160,14 @@ class Comparison:
         return [exchanged], []
 
     def _joined(self, path: tuple[str, ...], came: list[str], went: list[str]) -> list[str]:
-        """Return one clause for the added sources and one clause for the removed sources of an input."""
+        """Return one text clause for the added and one for the removed steps that an input reads."""
         where = self._wired(path) if any("[" not in name for name in came) else ""
         texts = [f"reads {_few(came)} now{where}"] if came else []
         null = self.recipe.absent.get(went[0].partition("[")[0]) if went and self.recipe else None
         return [*texts, f"reads {_few(went)} no more{f': it is {null}' if null else ''}"] if went else texts
 
     def _between(self, key: Key, wanted: tuple[str | None, ...]) -> tuple[list[str], Key | None]:
-        """Follow first inputs upstream to a step in ``wanted``; return the steps passed and the key of this step."""
+        """Go upstream along first inputs to a step in ``wanted``; return the passed steps and the key found."""
         passed: list[str] = []
         for _ in range(_FAR):
             first = next(iter((self.origin(key) or {}).get("inputs", ())), None)
@@ -194,7 +194,7 @@ class Comparison:
         return self.wording.source(*path) or self.wording.source(*path[:-1]) if path else ""
 
     def _stream(self, old: list[Any] | None, new: list[Any] | None) -> list[str]:
-        """Return one clause for each difference in the random stream of a step."""
+        """Return one text clause for each difference in the random stream of a step."""
         if old is None or new is None:
             return [] if old == new else ["it draws noise now" if new else "it draws no noise any more"]
         texts = (

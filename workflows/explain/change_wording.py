@@ -26,7 +26,7 @@ class Wording:
         self._recipe = recipe
 
     def params(self, label: str, old: Mapping[str, Any], new: Mapping[str, Any]) -> list[str]:
-        """Return one clause for each parameter that differs between two results of the step ``label``."""
+        """Return one text clause for each parameter that differs between two results of the step ``label``."""
         step = self._recipe.steps.get(label) if self._recipe else None
         names = [n for n in dict.fromkeys([*old, *new]) if old.get(n) != new.get(n)]
         return [self._param(step, n, old.get(n, _ABSENT), new.get(n, _ABSENT)) for n in names]
@@ -52,7 +52,7 @@ class Wording:
         return f"{path} {before} -> {after}{where}"
 
     def _setting(self, step: Step | None, name: str) -> tuple[Setting | None, str]:
-        """Return the setting that gives the value of a parameter, or None, and the location of the value."""
+        """Return the recipe setting that gives a parameter its value, or None, and the location of the value."""
         if step is None:
             return None, ""
         if name not in step.param_marks:
@@ -86,7 +86,7 @@ def _other_file(old: Any, new: Mapping[str, Any]) -> str:
 
 
 def _both(written: Any, old: Any, new: Any) -> tuple[str, str]:
-    """Return the old and the new value as text, both in the unit of the new value."""
+    """Return the old and the new value of a parameter as text, both in the unit of the new value."""
     after = _as_written(written, new)
     if isinstance(old, list) and isinstance(new, list) and len(old) == len(new):
         parts = written if isinstance(written, list) and len(written) == len(old) else [None] * len(old)
@@ -110,21 +110,21 @@ def _is_number(value: Any) -> bool:
 
 
 def _items(old: Mapping[str, Any], new: Mapping[str, Any]) -> tuple[str, str]:
-    """Return as text the entries that only the old mapping has, and the entries that only the new mapping has."""
+    """Return two texts: the entries that only the old mapping has, and the entries that only the new mapping has."""
     pairs = [[(str(key), value) for key, value in m.get("items", ())] for m in (old, new)]
     only = [[f"{k}: {spoken(v)}" for k, v in pairs[i] if (k, v) not in pairs[1 - i]] for i in (0, 1)]
     return f"{{{', '.join(only[0])}}}", f"{{{', '.join(only[1])}}}"
 
 
 def _as_written(written: Any, new: Any) -> str:
-    """Return a new value as text, as the user wrote this value if the text has a unit."""
+    """Return a parameter value as text: as the user wrote the value if that text has a unit, else in short form."""
     if _unit(written, new) or (isinstance(written, list) and isinstance(new, list)):
         return flow(written)
     return spoken(new)
 
 
 def _unit(written: Any, new: Any) -> tuple[Callable[[float], float], str] | None:
-    """Return the conversion from SI to the unit that the user wrote, and this unit; None without a unit."""
+    """Return a function from SI units to the unit that the user wrote, and this unit; None if there is no unit."""
     match = _QUANTITY.fullmatch(written.strip()) if isinstance(written, str) else None
     if match is None or not _is_number(new):
         return None

@@ -18,7 +18,7 @@ _SHOWN = 24  #: steps of the critical path
 
 
 def cluster_lines(recipe: Recipe, estimates: Mapping[str, Estimate], machines: Machines) -> list[str]:
-    """Return lines on the makespan, the devices, the transfers and the critical path of a run with an empty store.
+    """Return text on the makespan, the devices, the transfers and the critical path of a run with an empty store.
 
     The seconds on a device are the measured seconds on the CPU, divided by the relative speed of the device.
     """
@@ -60,7 +60,7 @@ def _task(step: Step, cost: Estimate, among: Mapping[str, Estimate], machines: M
 
 
 def _devices(schedule: Schedule, machines: Machines) -> list[str]:
-    """Return one line for each device: busy share of the makespan, number of steps and peak memory."""
+    """Return one text line for each device: busy fraction of the makespan, number of steps and peak memory."""
     shares, steps = schedule.utilisation(), Counter(slot.device for slot in schedule.slots)
     rows = [
         [d.name, f"{shares[d.name]:.0%}", str(steps[d.name]), format_size(schedule.peak[d.name]), format_size(d.memory)]

@@ -11,7 +11,7 @@ Parts = dict[str, dict[str, str]]  #: digests of definitions, by module
 
 
 def edits(root: Path, old: str, new: str) -> list[str]:
-    """Return one clause for each definition that differs, or an empty list without records of the code."""
+    """Return one text clause for each definition that differs between two versions of code; [] if no record exists."""
     before, after = _parts(root, old), _parts(root, new)
     if not before or not after:
         return []
@@ -22,7 +22,7 @@ def edits(root: Path, old: str, new: str) -> list[str]:
 
 
 def _inside(module: str, old: dict[str, str], new: dict[str, str]) -> list[str]:
-    """Return one clause for each changed, added or removed definition of a module."""
+    """Return one text clause for each changed, added or removed definition of a module."""
     file = _file(module)
     differ = [label for label in new if label in old and old[label] != new[label]]
     changed = [f"{'code of ' + label if label.endswith('()') else _named(label)} in {file} changed" for label in differ]
@@ -45,7 +45,7 @@ def _file(module: str) -> str:
 
 
 def _parts(root: Path, found: str) -> Parts:
-    """Return the digest of each definition in a recorded version of the code, or {} without an undamaged record."""
+    """Return the digest of each definition in a version of the code; {} if its record is missing or damaged."""
     try:
         parts = json.loads(parts_file(root, found).read_bytes())
         whole = all(isinstance(found, str) for inside in parts.values() for found in inside.values())

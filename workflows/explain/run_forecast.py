@@ -102,7 +102,7 @@ def _row(name: str, plan: Plan, store: Store) -> list[str]:
 
 
 def _sums(plan: Plan, lanes: Mapping[str, Lane]) -> list[str]:
-    """Return lines with totals over all steps, and with the steps that may be left out."""
+    """Return text lines with the totals of a forecast over all steps, and with the steps that may be left out."""
     ran, new = len(plan.expected), sum(e.bytes for e in plan.expected.values())
     guesses = sum(not e.known for e in plan.expected.values())
     lines = []

@@ -39,7 +39,7 @@ def why_lines(recipe: Recipe, store: Store, step: str, device: str = "cpu") -> l
 
 
 def why_key_lines(store: Store, prefix: str) -> list[str]:
-    """Return lines with the origin of a result, whose key begins with ``prefix``, and its differences.
+    """Return text lines on the origin of the result with key ``prefix...``, and on differences from earlier results.
 
     Raises `LookupError` if no key or more than one key begins with ``prefix``.
     """
@@ -144,7 +144,7 @@ def _at_once(comparison: Comparison, step: Step, key: Key, earlier: list[Key]) -
 
 
 def _direct(comparison: Comparison, step: Step, old: Origin, new: Origin) -> list[str]:
-    """Return the differences of a step itself, followed by the inputs that differ."""
+    """Return the differences between two results of a step, followed by the names of inputs that differ."""
     texts = comparison.own(step.name, old, new)
     if old["node"] != new["node"] or len(old["inputs"]) != len(new["inputs"]):
         return texts
@@ -156,7 +156,7 @@ def _direct(comparison: Comparison, step: Step, old: Origin, new: Origin) -> lis
 
 
 def _made_of(comparison: Comparison, key: Key) -> Iterator[str]:
-    """Yield one line for each part of a key: node, parameters, inputs and random stream."""
+    """Yield one text line for each part of a cache key: node, parameters, inputs and random stream."""
     origin = comparison.origin(key)
     if origin is None:
         return
@@ -171,7 +171,7 @@ def _made_of(comparison: Comparison, key: Key) -> Iterator[str]:
 
 
 def _chain(names: list[str]) -> str:
-    """Return names as a chain such as ``restored <- raw <- read``, shortened if the chain is long."""
+    """Return names of steps as a chain such as ``restored <- raw <- read``, shortened if the chain is long."""
     if len(names) > _LINKS:
         names = [*names[: _LINKS - 2], f"({len(names) - _LINKS + 1} more)", names[-1]]
     return " <- ".join(names)

@@ -24,7 +24,7 @@ __all__ = ["Cluster", "Device", "Link", "Schedule", "Slot", "Task", "TooLarge", 
 
 
 def heft(tasks: Sequence[Task], cluster: Cluster, keep: Collection[str] = ()) -> Schedule:
-    """Return the HEFT schedule: tasks in order of their longest path, each on the device that finishes it first.
+    """Return the HEFT schedule: tasks by longest remaining path, each on the device with the earliest finish time.
 
     ``keep`` names the results that stay in memory to the end. If memory is short, orders of the tasks that need less
     memory are tried too. If one device alone would finish all tasks sooner, this device runs all tasks; tasks that one
@@ -49,7 +49,7 @@ def heft(tasks: Sequence[Task], cluster: Cluster, keep: Collection[str] = ()) ->
 
 
 def cpop(tasks: Sequence[Task], cluster: Cluster, keep: Collection[str] = ()) -> Schedule:
-    """Return the CPOP schedule: the critical path on one device, every other task on the device that finishes it first.
+    """Return the CPOP schedule: the critical path on one device, other tasks on the device with the earliest finish.
 
     Raises: as `heft`.
     """
@@ -62,7 +62,7 @@ def cpop(tasks: Sequence[Task], cluster: Cluster, keep: Collection[str] = ()) ->
 
 
 def _best(graph: Graph, orders: Sequence[Sequence[int]], pinned: Mapping[int, int] | None = None) -> Schedule:
-    """Return the schedule for the first of ``orders`` if it fits into memory, else the shortest schedule that fits."""
+    """Return the schedule of the first task order if the memory suffices, else the shortest schedule that fits."""
     pinned = pinned or {}
     memory = {device.name: device.memory for device in graph.cluster.devices}
     schedule = _placed(PartialSchedule(graph, bounded=False), orders[0], pinned).schedule()
@@ -84,10 +84,10 @@ def _best(graph: Graph, orders: Sequence[Sequence[int]], pinned: Mapping[int, in
 def _placed(
     board: PartialSchedule, order: Sequence[int], pinned: Mapping[int, int], below: float = math.inf
 ) -> PartialSchedule:
-    """Add the tasks to the partial schedule ``board`` in the given order, and return ``board``.
+    """Add the tasks to the partial schedule ``board`` in the order ``order``, and return ``board``.
 
-    A task in ``pinned`` runs on its device there, if the task fits. A task that does not fit into memory waits
-    until later tasks free memory. The placement stops early if it cannot end before ``below``.
+    A task in ``pinned`` runs on the device that ``pinned`` names, if the task fits. A task that does not fit into
+    memory waits until later tasks free memory. The placement stops early if it cannot end before ``below``.
     """
     graph = board.graph
     missing, turn = [len(sources) for sources in graph.sources], {i: n for n, i in enumerate(order)}
@@ -117,7 +117,7 @@ def _placed(
 
 
 def _critical(graph: Graph, through: Sequence[float]) -> list[int]:
-    """Return the tasks on the critical path, from a task without sources to a task without readers."""
+    """Return the tasks on the critical path, from a task without inputs to a task whose result no task reads."""
     at = max((i for i, sources in enumerate(graph.sources) if not sources), key=through.__getitem__, default=-1)
     path = []
     while at >= 0:
@@ -137,7 +137,7 @@ def _able(graph: Graph) -> list[int]:
 
 
 def _alone(graph: Graph, devices: Sequence[int], *refused: TooLarge) -> Schedule:
-    """Return the first schedule on one device that fits into memory; try two orders of the tasks on each device."""
+    """Try each device alone, with two task orders each, and return the first schedule that fits into memory."""
     for d in devices:
         for order in (graph.by(range(len(graph.tasks))), frugal(graph)):
             try:
@@ -171,6 +171,9 @@ def _sequence(graph: Graph, d: int, order: Sequence[int]) -> Schedule:
 
 
 def _fewest(graph: Graph, i: int, room: float) -> int:
-    """Return the smallest number of parts with which task ``i`` fits into ``room`` bytes, or the largest allowed."""
+    """Return the smallest number of band slices with which task ``i`` fits into ``room`` bytes of memory.
+
+    If no allowed number suffices, return the largest allowed number.
+    """
     most = graph.tasks[i].parts
     return 1 + bisect_left(range(1, most), True, key=lambda parts: graph.work(i, parts) <= room)

@@ -40,7 +40,7 @@ _Reader = Callable[[Value, "list[Diagnostic]"], Any]
 
 @dataclass(frozen=True)
 class Machines:
-    """A cluster, with the speed of each device relative to the machine on which run times were measured."""
+    """Cluster of devices, with the speed of each device relative to the machine on which run times were measured."""
 
     title: str
     cluster: Cluster
@@ -57,7 +57,7 @@ class Machines:
 
 
 def read_machines(path: Path | str) -> Machines:
-    """Return the machines that a file or a packaged example describes; raise one `RecipeError` with all mistakes."""
+    """Read a machine file or a packaged example; raise one `RecipeError` that lists all mistakes in the file."""
     document = read(_path(path), str(path))
     diagnostics: list[Diagnostic] = []
     root = _fields(document.root, {"devices": _groups, "links": _links, "network": _link}, ("devices",), diagnostics)
@@ -92,7 +92,10 @@ def _path(path: Path | str) -> Path:
 
 
 def _devices(groups: list[dict[str, Any]]) -> dict[Device, dict[str, Any]]:
-    """Return the group of each device; a device has a name such as ``cpu`` or ``a/cuda:0``, GPU 0 of machine ``a``."""
+    """Return each device of a machine file with the group of settings that describes the device.
+
+    A device has a name such as ``cpu``, or ``a/cuda:0`` for GPU 0 of the machine ``a``.
+    """
     rows = [(machine, group) for group in groups for machine in group["node"] for _ in range(group["count"])]
     total, seen = Counter((machine, group["kind"]) for machine, group in rows), Counter[tuple[str, str]]()
     devices = {}
@@ -109,7 +112,9 @@ def _devices(groups: list[dict[str, Any]]) -> dict[Device, dict[str, Any]]:
 
 def _groups(value: Value, diagnostics: list[Diagnostic]) -> list[dict[str, Any]]:
     if not isinstance(value.data, dict) or not value.data:
-        diagnostics.append(_problem(value, "must be a mapping of groups, such as `a100: {kind: cuda, memory: 80 GB}`"))
+        diagnostics.append(
+            _problem(value, "must be a mapping of device groups, such as `a100: {kind: cuda, memory: 80 GB}`")
+        )
         return []
     readers: dict[str, _Reader] = {"kind": _kind, "count": _count, "memory": _size, "speed": _speed, "node": _names}
     usual: dict[str, Any] = {"count": 1, "speed": {"default": 1.0}, "node": [""]}
@@ -118,7 +123,7 @@ def _groups(value: Value, diagnostics: list[Diagnostic]) -> list[dict[str, Any]]
 
 def _links(value: Value, diagnostics: list[Diagnostic]) -> dict[tuple[str, str], Link]:
     if not isinstance(value.data, dict):
-        diagnostics.append(_problem(value, "must be a mapping such as `cuda-cuda: {bandwidth: 300 GB/s}`"))
+        diagnostics.append(_problem(value, "must be a mapping of links, such as `cuda-cuda: {bandwidth: 300 GB/s}`"))
         return {}
     links = {}
     for name, link in value.data.items():
@@ -138,7 +143,10 @@ def _link(value: Value, diagnostics: list[Diagnostic]) -> Link:
 def _fields(
     value: Value, readers: Mapping[str, _Reader], required: tuple[str, ...], diagnostics: list[Diagnostic]
 ) -> dict[str, Any]:
-    """Return the fields of a mapping, read by the functions ``readers``; report unknown and missing fields."""
+    """Convert the fields of a YAML mapping and return the values; report unknown and missing fields.
+
+    ``readers`` holds a conversion function for each allowed field.
+    """
     if not isinstance(value.data, dict):
         diagnostics.append(_problem(value, f"must be a mapping with {', '.join(readers)}, not {kind(value)}"))
         return {}
@@ -160,7 +168,7 @@ def _kind(value: Value, diagnostics: list[Diagnostic]) -> str:
 
 def _count(value: Value, diagnostics: list[Diagnostic]) -> int:
     if isinstance(value.data, bool) or not isinstance(value.data, int) or not 1 <= value.data <= _MOST:
-        diagnostics.append(_problem(value, f"must be a whole number from 1 to {_MOST}"))
+        diagnostics.append(_problem(value, f"must be a whole number of devices from 1 to {_MOST}"))
         return 1
     return value.data
 
@@ -214,7 +222,7 @@ _time = partial(_quantity, units=_SECONDS, such="10 us")
 
 
 def _absent(links: Value | None, kinds: set[str]) -> list[Diagnostic]:
-    """Return a diagnostic for each kind of device that is in ``links`` but not in the cluster."""
+    """Return a diagnostic for each kind of device, such as ``cuda``, that has a link but is not in the cluster."""
     return [
         _problem(link, f"there is no device of kind {name}; {nearest(name, kinds)}", link.key)
         for pair, link in (links.items.items() if links else ())

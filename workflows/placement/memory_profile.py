@@ -28,22 +28,22 @@ class MemoryProfile:
         self.kept = 0.0  # bytes that are reserved without end
 
     def add(self, start: float, end: float, size: float) -> None:
-        """Reserve ``size`` bytes from ``start`` until ``end``; a negative ``size`` frees reserved bytes."""
+        """Reserve ``size`` bytes of memory from ``start`` until ``end``; a negative ``size`` frees reserved bytes."""
         if size and start < end:
             first = self._cut(start)
             self.level[first : self._cut(end) if end < math.inf else len(self.times)] += size
             self.kept += size if end == math.inf else 0.0
 
     def highest(self, start: float, end: float) -> float:
-        """Return the largest number of bytes in use during [start, end)."""
+        """Return the peak memory in use (bytes) in the time interval [start, end)."""
         return float(self.level[self._within(start, end)].max())
 
     def free(self) -> float:
-        """Return the number of bytes that are free after all placed tasks have ended."""
+        """Return the number of bytes of memory that are free after all scheduled tasks have ended."""
         return self.limit - self.kept
 
     def wait(self, holds: Iterable[Hold]) -> float:
-        """Return the least delay (s) after which all memory reservations in ``holds`` stay below the limit."""
+        """Return the smallest delay (s) of the reservations ``holds`` that keeps the memory in use within the limit."""
         shift = 0.0
         for start, end, size in stacked(holds):
             span = self._within(start, end)
@@ -58,7 +58,7 @@ class MemoryProfile:
         return slice(first, len(self.times) if end == math.inf else max(bisect_left(self.times, end), first + 1))
 
     def _cut(self, time: float) -> int:
-        """Return the index of the interval that begins at ``time``; if there is none, split an interval at ``time``."""
+        """Return the index of the time interval that begins at ``time``; split an interval at ``time`` if necessary."""
         at, count = bisect_left(self.times, time), len(self.times)
         if at < count and self.times[at] == time:
             return at
@@ -71,7 +71,7 @@ class MemoryProfile:
 
 
 def stacked(holds: Iterable[Hold]) -> Iterator[Hold]:
-    """Yield the total of the memory reservations in ``holds`` as consecutive time spans of constant size."""
+    """Yield the total memory reserved by ``holds`` as consecutive time intervals with a constant number of bytes."""
     steps = defaultdict[float, float](float)
     for start, end, size in holds:
         if start < end and size:
@@ -85,7 +85,7 @@ def stacked(holds: Iterable[Hold]) -> Iterator[Hold]:
 
 
 def without(start: float, end: float, taken: Iterable[tuple[float, float]]) -> Iterator[tuple[float, float]]:
-    """Yield the parts of [start, end) outside the spans in ``taken``, which are sorted and disjoint."""
+    """Yield the parts of the time interval [start, end) outside the sorted, disjoint intervals in ``taken``."""
     for first, last in taken:
         if first < end and last > start:
             if start < first:

@@ -15,7 +15,7 @@ Of = tuple[int, float, int]  #: task of the result, bytes of the result, device
 
 
 class PartialSchedule:
-    """An unfinished schedule, in which each task is placed after its sources and never moves again."""
+    """Unfinished schedule: a task is added after the tasks that compute its inputs, and keeps its device and times."""
 
     def __init__(self, graph: Graph, bounded: bool = True) -> None:
         self.graph, devices, count = graph, graph.cluster.devices, len(graph.tasks)
@@ -76,7 +76,7 @@ class PartialSchedule:
         return zip(self.graph.sources[i], self.graph.sizes[i], strict=True)
 
     def _slot(self, i: int, d: int, ready: float, seconds: float, best: float) -> float:
-        """Return the earliest start of task ``i`` on device ``d``, or infinity if the end is not before ``best``."""
+        """Return the earliest start of task ``i`` on device ``d``, or infinity if it cannot end before ``best``."""
         starts, ends = self.gaps[d]
         for gap in range(bisect_left(ends, ready + seconds), len(ends)):
             start = max(starts[gap], ready)
@@ -91,7 +91,10 @@ class PartialSchedule:
         return math.inf
 
     def _fitting(self, i: int, d: int, start: float, seconds: float, end: float) -> float:
-        """Return the earliest start of task ``i`` with enough memory, or a start after which the gap is too short."""
+        """Return the earliest start at which device ``d`` has enough memory for task ``i``.
+
+        If the task cannot end before ``end``, where the idle gap ends, the returned start is too late for the gap.
+        """
         room, parts = self.rooms[d], self.graph.tasks[i].parts
         if room is None:
             return start
@@ -103,7 +106,7 @@ class PartialSchedule:
         return start
 
     def _holds(self, i: int, d: int, start: float, end: float, parts: int) -> list[Hold]:
-        """Return the memory reservations of task ``i`` on device ``d`` for result, work, and copies of inputs."""
+        """Return the memory reservations of task ``i`` on device ``d``: result, working memory and copies of inputs."""
         graph = self.graph
         holds = [(start, math.inf if graph.held(i) else end, graph.own[i]), (start, end, graph.work(i, parts))]
         for of, leaves in self._arriving(i, d, start):
@@ -118,7 +121,7 @@ class PartialSchedule:
                 yield (j, size, d), max(start - self.links[self.where[j]][d].seconds(size), self.end[j])
 
     def _needs(self, i: int, d: int) -> float:
-        """Return the bytes of memory with which device ``d`` could run task ``i`` after all tasks placed so far."""
+        """Return the memory (bytes) that device ``d`` needs to run task ``i`` after all tasks scheduled so far."""
         room = self.rooms[d]
         assert room is not None
         copies = sum(math.ceil(size) for j, size in self._inputs(i) if self.where[j] != d)
@@ -148,7 +151,7 @@ class PartialSchedule:
         self.placed.append(i)
 
     def _fewest(self, i: int, d: int, start: float, end: float, room: MemoryProfile) -> int:
-        """Return the smallest number of parts into which task ``i`` must be cut to fit into the memory of device ``d``.
+        """Return the smallest number of band slices with which task ``i`` fits into the memory of device ``d``.
 
         The largest allowed number always fits.
         """
@@ -175,7 +178,7 @@ class PartialSchedule:
         return TooLarge(graph.tasks[i].name, device.name, needed, device.memory, graph.tasks[i].parts)
 
     def schedule(self) -> Schedule:
-        """Return the finished schedule after all tasks are placed."""
+        """Return the finished schedule; all tasks must have been placed before."""
         devices = self.graph.cluster.devices
         self._bridge()
         moves = sorted(self._moves(), key=lambda m: (m.start, m.task, m.device))
@@ -222,7 +225,7 @@ class PartialSchedule:
         return held
 
     def _slots(self) -> Iterator[Slot]:
-        """Yield the device and the times of every task, with the task that delayed the start."""
+        """Yield the schedule entry of each task: device, start, end, and the task that delayed the start."""
         tasks, devices = self.graph.tasks, self.graph.cluster.devices
         before, ended = [-1] * len(devices), dict[float, int]()
         for i in sorted(self.placed, key=self.start.__getitem__):
@@ -246,7 +249,7 @@ class PartialSchedule:
 
 
 def _joined(copies: list[Copy]) -> list[Copy]:
-    """Return the copies of a result on a device in order of time, with overlapping copies joined into one."""
+    """Merge copies of a result that overlap in time on a device, and return the copies in order of time."""
     joined: list[Copy] = []
     for copy in sorted(copies):
         if joined and copy[0] <= joined[-1][2]:

@@ -39,14 +39,14 @@ class Graph:
         self._check()
 
     def held(self, i: int) -> bool:
-        """Return True if a later task reads the result of task ``i``, or if the result is kept to the end."""
+        """Return True if a later task reads the result of task ``i``, or if the run keeps the result to the end."""
         return bool(self.readers[i]) or i in self.kept
 
     def work(self, i: int, parts: int) -> float:
         return float(math.ceil(self.tasks[i].work / parts))
 
     def by(self, keys: Sequence[Any]) -> list[int]:
-        """Return the tasks in an order with sources first; among tasks that are ready, smaller keys come first."""
+        """Return the tasks in order, each after its inputs; the ready task with the smallest key comes next."""
         missing = [len(sources) for sources in self.sources]
         ready = [(keys[i], i) for i, count in enumerate(missing) if not count]
         heapq.heapify(ready)
@@ -77,7 +77,7 @@ def ranked(graph: Graph, ranks: Sequence[float]) -> list[int]:
 
 
 def upward(graph: Graph) -> list[float]:
-    """Return the upward rank of each task: the seconds from its start to the end of the graph, with mean costs.
+    """Return the upward rank of each task: the longest time (s) from its start to the end of the graph, at mean costs.
 
     Source: Topcuoglu, Hariri, Wu, IEEE TPDS 13 (2002) 260, eq. 8.
     """
@@ -91,7 +91,7 @@ def upward(graph: Graph) -> list[float]:
 
 
 def downward(graph: Graph) -> list[float]:
-    """Return the downward rank of each task: the seconds from the start of the graph to its start, with mean costs.
+    """Return the downward rank of each task: the longest time (s) from the graph's start to its start, at mean costs.
 
     Source: Topcuoglu, Hariri, Wu, IEEE TPDS 13 (2002) 260, eq. 10.
     """
@@ -103,7 +103,7 @@ def downward(graph: Graph) -> list[float]:
 
 
 def frugal(graph: Graph) -> list[int]:
-    """Return a depth-first order of the tasks with a low peak of memory in use.
+    """Return a depth-first order of the tasks that keeps the peak memory low.
 
     Of the inputs of a task, the input that frees most of its peak memory comes first. Of all depth-first
     orders of a tree this order has the smallest peak memory (Liu, ACM TOMS 12 (1986) 249).
@@ -123,7 +123,7 @@ def frugal(graph: Graph) -> list[int]:
 
 
 def _needs(graph: Graph) -> tuple[list[float], list[list[int]]]:
-    """Return the peak memory of each task with all its predecessors, and the best order of its sources."""
+    """Return for each task the peak memory of a run up to this task, and the order of inputs with the lowest peak."""
     need, befores = [0.0] * len(graph.tasks), list[list[int]]([] for _ in graph.tasks)
     for i in graph.by(range(len(graph.tasks))):
         befores[i] = sorted(graph.sources[i], key=lambda j: (graph.own[j] - need[j], j))
@@ -140,7 +140,7 @@ def _mean_seconds(graph: Graph) -> list[float]:
 
 
 def _mean_transfer(graph: Graph) -> tuple[float, float]:
-    """Return the mean latency (s) and the mean seconds per byte over all pairs of devices."""
+    """Return the mean latency (s) and the mean transfer time per byte (s) over all pairs of devices."""
     names = [device.name for device in graph.cluster.devices]
     links = [graph.cluster.link(a, b) for a in names for b in names if a != b]
     count = max(len(links), 1)

@@ -83,7 +83,7 @@ class Task:
 
 @dataclass(frozen=True, slots=True)
 class Slot:
-    """The entry of a task in a schedule: its device, start and end."""
+    """Entry of a task in a schedule: the device, the start and the end of the task."""
 
     task: str
     device: str
@@ -95,7 +95,7 @@ class Slot:
 
 @dataclass(frozen=True, slots=True)
 class Move:
-    """A transfer of a result to another device, which keeps the copy until its last use there."""
+    """Transfer of a result to another device, and the time until which this device keeps the copy."""
 
     task: str
     bytes: float
@@ -124,7 +124,7 @@ class Schedule:
         return {name: time / self.makespan if self.makespan else 0.0 for name, time in busy.items()}
 
     def critical_path(self) -> tuple[Slot, ...]:
-        """Return the critical path: tasks of which each delays the start of the next, up to the task that ends last."""
+        """Return the critical path: a chain of tasks, each of which delays the next, up to the task that ends last."""
         by_name = {slot.task: slot for slot in self.slots}
         at = max(self.slots, key=lambda slot: slot.end, default=None)
         path = []

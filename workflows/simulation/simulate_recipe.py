@@ -27,14 +27,14 @@ from neusee.workflows.tolerance.cheaper_steps import with_substitutions
 
 @dataclass(frozen=True)
 class Simulation:
-    """A finished run: its folder, and its document, which is the content of ``provenance.json``."""
+    """A finished run: the path of its folder, and the content of its file ``provenance.json``."""
 
     folder: Path
     document: dict[str, Any]
 
     @property
     def page(self) -> Path:
-        """Return the path of the HTML page."""
+        """Return the path of the HTML page of the run."""
         return self.folder / "report.html"
 
 

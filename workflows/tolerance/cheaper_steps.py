@@ -76,7 +76,7 @@ def _readers(recipe: Recipe, order: Iterable[str]) -> dict[str, list[str]]:
 
 @dataclass(frozen=True)
 class Asked:
-    """The sums over the bands of an image that later steps need, with the steps that read these sums."""
+    """Sums over the wavelength bands of an image that later steps need, with the steps that read these sums."""
 
     bands: str
     responses: str
@@ -85,7 +85,7 @@ class Asked:
 
 
 def asked_of(recipe: Recipe, image: str, wanted: Iterable[str]) -> Asked | None:
-    """Return the sums over the bands of ``image`` that outputs need, or None if an output needs single bands."""
+    """Return the sums over wavelength bands of ``image`` that outputs need, or None if an output needs single bands."""
     names = _readers(recipe, needed(recipe, wanted)).get(image, [])
     readers = [recipe.steps[name] for name in names]
     weights = _Draft(recipe, frozenset(wanted), {}).spectral(image, readers)
@@ -104,7 +104,7 @@ class _Draft:
     substitutions: list[Substitution] = field(default_factory=list)
 
     def collapse(self, image: Step) -> None:
-        """Add a step for the channel sums of an image, if all readers of the image need only sums over its bands."""
+        """Add a step that computes sums over the bands of an image, if no later step needs single bands."""
         readers = [self.rewired.get(name, self.recipe.steps[name]) for name in self.readers.get(image.name, ())]
         node, radiance = image.node.channel_sum_form, image.wires.get("radiance")
         weights = self.spectral(image.name, readers)
@@ -122,7 +122,10 @@ class _Draft:
         self.substitutions.append(Substitution(image.name, name, within, "only sums over its bands are needed"))
 
     def spectral(self, image: str, readers: Sequence[Step]) -> tuple[str, str] | None:
-        """Return the bands and the responses that all ``readers`` read, or None if a reader needs single bands."""
+        """Return the steps that give all ``readers`` the wavelength bands and the camera responses.
+
+        Return None if a step in ``readers`` needs single bands, or if the steps read different bands or responses.
+        """
         pairs = {(r.wires.get("bands"), r.wires.get("responses")) for r in readers if "responses" in r.node.inputs}
         if len(pairs) != 1 or not all(self._sums(r, image) for r in readers):
             return None
@@ -140,7 +143,7 @@ class _Draft:
         return replace(self.recipe, steps=steps, substitutions=substitutions, unsubstituted=whole)
 
     def _sums(self, reader: Step, image: str) -> bool:
-        """Return True if a step needs from an image only its sums over the bands."""
+        """Return True if the step ``reader`` needs only sums over wavelength bands of an image."""
         node, band_invariant = reader.node, reader.node.hooks.band_invariant
         reads = {i for i, wire in reader.wires.items() if image == wire or (isinstance(wire, tuple) and image in wire)}
         if not reads <= set(node.accepts_channel_sums) or (band_invariant and not band_invariant(reader.params)):
@@ -148,14 +151,14 @@ class _Draft:
         return all(self._even(reader.wires.get(i)) for i in node.needs_band_invariant)
 
     def _even(self, wire: Wire) -> bool:
-        """Return True if a wire is empty, or if its node states that the result is the same for every band."""
+        """Return True if an input is unconnected, or if its source node states that all wavelength bands are equal."""
         if not isinstance(wire, str):
             return wire is None
         step = self.recipe.steps[wire]
         return step.node.hooks.band_invariant is not None and step.node.hooks.band_invariant(step.params)
 
     def _rows(self, bands: str, responses: str, readers: list[Step], image: Step) -> str:
-        """Add a step that computes the weight of each band in each channel sum; return the name of the new step."""
+        """Add a step that computes the weight of each wavelength band in each channel sum; return the step's name."""
         from neusee.nodes import spectra
 
         well = _well(readers)
@@ -163,7 +166,7 @@ class _Draft:
         return self._add(name, spectra.rows, wires, {"well": well}, image)
 
     def _mixture(self, name: str, image: Step) -> str:
-        """Add steps that compute the cube ``name`` in low-rank form; return the name of the last new step.
+        """Add steps that compute the spectral cube ``name`` in low-rank form; return the name of the last added step.
 
         The conversion to low rank comes as early as the nodes allow.
         """

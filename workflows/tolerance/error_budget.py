@@ -12,7 +12,7 @@ from neusee.workflows.tolerance.skip_decision import FactsOf, SkipDecision, judg
 
 
 class ErrorBudget:
-    """Sum of the error bounds of omitted steps for each step: an omission leaves less tolerance for later steps.
+    """Error bounds of omitted steps, summed for each later step; the sum reduces the tolerance of the later step.
 
     Steps are added in running order, each with `pass_on` or `verdict`.
     """
@@ -23,13 +23,13 @@ class ErrorBudget:
         self._spent: dict[str, dict[str, float]] = {}  # by step: bound by omitted step; equal dicts are one object
 
     def copy(self) -> ErrorBudget:
-        """Return an independent copy of the budget."""
+        """Return an independent copy of the error budget."""
         twin = copy(self)
         twin._spent = dict(self._spent)
         return twin
 
     def verdict(self, step: Step, params: Mapping[str, Any], facts_of: FactsOf) -> SkipDecision:
-        """Decide whether a step is left out and return the decision; an exact recipe keeps every step."""
+        """Decide whether a step is left out and return the decision; in an exact recipe no step is left out."""
         spent = self.pass_on(step)
         if self._recipe.exact:
             return SkipDecision(float("inf"), False, "the recipe is exact", "")
@@ -39,7 +39,7 @@ class ErrorBudget:
         return decision
 
     def leave_out(self, step: Step, bound: float) -> None:
-        """Add the error bound of an omitted step to the budget."""
+        """Add the error bound of an omitted step to the error budget."""
         if bound > 0:
             self._spent[step.name] = {**self._spent.get(step.name, {}), step.name: bound}
 

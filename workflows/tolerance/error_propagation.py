@@ -38,7 +38,7 @@ class ErrorBounds:
         return max(self.held.values(), default=0.0)
 
     def over(self, recipe: Recipe) -> float:
-        """Return the largest ratio of an error bound to its limit in ``recipe``; infinity if a limit is 0."""
+        """Return the largest ratio of an error bound to the error limit in ``recipe``; infinity if a limit is 0."""
         shares = [(share, recipe.limit(name)) for name, share in self.held.items() if share > 0]
         return max((share / limit if limit > 0 else math.inf for share, limit in shares), default=0.0)
 
@@ -52,7 +52,10 @@ class ToleranceNotProven(Exception):
 
 
 def tolerance_frontier(recipe: Recipe, order: Iterable[str], wanted: Iterable[str]) -> list[str]:
-    """Return the inexact steps that must meet the tolerance: outputs, and inputs of nodes without an error bound."""
+    """Return the approximate steps whose error bounds must meet the tolerance.
+
+    These steps are outputs, or inputs of nodes that give no error bound.
+    """
     inexact, frontier = set[str](), dict[str, None]()
     for name in order:
         step = recipe.steps[name]

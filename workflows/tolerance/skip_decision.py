@@ -27,7 +27,7 @@ class SkipDecision:
 
 
 class _Later:
-    """Statistics of a result that are obtained only when an error bound reads one of the statistics."""
+    """Statistics of a result, obtained only when the calculation of an error bound reads one of these statistics."""
 
     __slots__ = ("_find", "_seen")
 

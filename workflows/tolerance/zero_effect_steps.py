@@ -24,7 +24,7 @@ class _Unknown:
 
 
 def without_nothing(recipe: Recipe, order: Iterable[str]) -> Recipe:
-    """Return ``recipe`` without inputs from steps whose result is 0; ``order`` lists the steps with sources first."""
+    """Disconnect steps whose result must be 0 and return the recipe; ``order`` lists each step after its inputs."""
     dark: dict[str, None] = {}
     changed: dict[str, Step] = {}
     for name in order:
@@ -62,7 +62,7 @@ def _known(wire: Wire, dark: Mapping[str, None]) -> Any:
 
 
 def without(step: Step, dark: Mapping[str, None]) -> dict[str, Wire]:
-    """Return the inputs of a step after removing the inputs from steps in ``dark``.
+    """Return the inputs of a step without the inputs from the steps ``dark``, whose results are 0.
 
     The other inputs of the same group are removed, too.
     """

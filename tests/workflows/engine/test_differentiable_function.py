@@ -199,7 +199,7 @@ def test_a_wrong_name_is_refused_with_the_nearest(store, free, message):
 
 @pytest.mark.parametrize("theta", [{}, {"height": 1.0, "scene": 1.0}, {"scene": 1.0}])
 def test_theta_must_be_what_was_asked_for(store, theta):
-    with pytest.raises(ValueError, match="give values for exactly height"):
+    with pytest.raises(ValueError, match="theta must hold exactly height"):
         as_function(camera(), "height", store=store)(theta)
 
 

@@ -95,7 +95,7 @@ def test_every_mistake_is_told_at_once_with_its_place(refused):
         "2:51 devices.a100.speed.optcs: unknown; did you mean optics?",
         "3:13 devices.b.kind: unknown kind of device; did you mean cuda?",
         "3:27 devices.b.memory: has the wrong unit 'GBB': write a number and one of B, kB, MB, GB, TB, MiB, GiB, TiB",
-        "3:42 devices.b.count: must be a whole number from 1 to 4096",
+        "3:42 devices.b.count: must be a whole number of devices from 1 to 4096",
         "3:51 devices.b.node: must name at least one machine, and no machine twice",
         "4:6 devices.c: must be a mapping with kind, count, memory, speed, node, not a number",
         "6:3 links.cuda-cpu: needs bandwidth",
@@ -114,8 +114,11 @@ ONE = "devices: {a: {kind: cpu, memory: 1 GB}}\n"
     ("text", "message"),
     [
         ("links: {}", "1:1 : needs devices"),
-        ("devices: {}", "1:10 devices: must be a mapping of groups, such as `a100: {kind: cuda, memory: 80 GB}`"),
-        (ONE + "links: 3", "2:8 links: must be a mapping such as `cuda-cuda: {bandwidth: 300 GB/s}`"),
+        (
+            "devices: {}",
+            "1:10 devices: must be a mapping of device groups, such as `a100: {kind: cuda, memory: 80 GB}`",
+        ),
+        (ONE + "links: 3", "2:8 links: must be a mapping of links, such as `cuda-cuda: {bandwidth: 300 GB/s}`"),
         (
             ONE + "links: {cpu-cuda: {bandwidth: 1 GB/s}}",
             "2:9 links.cpu-cuda: there is no device of kind cuda; there are: cpu",
