@@ -131,7 +131,7 @@ def taken(step: Step, inputs: Sequence[Any], which: list[int], of: Collection[st
 
 
 def _slices(x: Tensor, axis: int, which: list[int]) -> Tensor:
-    """Return the bands with the indices ``which``: a view of the tensor if contiguous and aligned, else a copy."""
+    """Return the bands of a tensor with the indices ``which``, as a view if the memory layout allows."""
     if which == list(range(which[0], which[0] + len(which))):
         part = x.narrow(axis, which[0], len(which))
         if part.is_contiguous() and part.data_ptr() % _ALIGN == 0:

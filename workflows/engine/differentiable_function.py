@@ -34,7 +34,9 @@ def as_function(
     redraw: Collection[str] = (),
     caller: Callable[..., Any] = call,
 ) -> _Function:
-    """Return the recipe as a differentiable function ``theta -> {output: value}``, bit-identical to `run`.
+    """Return the recipe as a differentiable function ``theta -> {output: value}``.
+
+    Every value equals the value of `run` bit for bit.
 
     Args: free: parameters such as ``"spot.strength"``, or steps such as ``"height"``, whose result the caller
     provides. Steps that do not depend on ``free`` are computed once, here, or read from the store. Noise is the

@@ -38,7 +38,7 @@ class Loop:
         self._open = len(chains)
 
     def outcomes(self) -> Iterator[Outcome]:
-        """Yield the outcome of each job when it arrives, until all jobs are done; the caller raises its errors."""
+        """Yield the outcome of each job, with the error of a failed job, when it arrives, until all jobs are done."""
         while self._open:
             self._hand_out()
             if not self.busy and not self._held:

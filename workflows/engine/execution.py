@@ -131,7 +131,7 @@ class Execution:
         return StepRecord(name, "not needed", "nothing needed it", 0.0, key, bound=self._bound(name), error=error)
 
     def missing(self, names: Iterable[str]) -> set[Key]:
-        """Return the keys of all values that must be computed to obtain the results of the steps ``names``."""
+        """Return the cache keys of all values that must be computed to obtain the results of the steps ``names``."""
         below = Upstream(self.known, self.sources)
         in_order(below, [self.keys[name] for name in names])
         return set(below.missing)

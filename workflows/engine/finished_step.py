@@ -13,13 +13,13 @@ if TYPE_CHECKING:
 
 
 def error_in(about: Mapping[str, Any] | None) -> tuple[float, float] | None:
-    """Return the approximation error from the metadata of a stored result, or None."""
+    """Return the approximation error in the metadata of a stored result, or None if the metadata contain none."""
     found = (about or {}).get("error")
     return (float(found[0]), float(found[1])) if found else None
 
 
 def facts_in(about: Mapping[str, Any] | None) -> TensorStats | None:
-    """Return the statistics from the metadata of a stored result, or None."""
+    """Return the statistics in the metadata of a stored result, or None if the metadata contain none."""
     found = (about or {}).get("facts")
     return TensorStats(**{**found, "shape": tuple(found["shape"])}) if found else None
 

@@ -21,7 +21,7 @@ Price = Callable[[Key], float]
 
 
 class Upstream(dict[Key, list[Key]]):
-    """Dictionary from the key of a value to the keys of its inputs; the list is empty for a value that is known."""
+    """Dictionary from the key of a value to the keys of its inputs; the list is empty if the value is known."""
 
     def __init__(self, known: Callable[[Key], bool], sources: Callable[[Key], list[Key]]) -> None:
         self._known, self._sources = known, sources

@@ -15,7 +15,7 @@ from neusee.workflows.store.serialization import each_tensor, settle, tensors_in
 
 
 def call(step: Step, inputs: Sequence[Any], params: Mapping[str, Any], seed: int, device: str) -> Any:
-    """Call the node of a step; return the result with gradients, in the memory layout of a stored result."""
+    """Call the node of a step and return its result with gradients, in the memory layout that stored results have."""
     moved = [to_device(value, device) for value in inputs]
     rng = {"rng": torch.Generator(device).manual_seed(stream_seed(seed, step.name))} if step.node.random else {}
     tensors = tensors_in(moved)

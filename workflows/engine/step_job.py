@@ -57,7 +57,7 @@ class StepJob:
 
     @property
     def sources(self) -> tuple[Key, ...]:
-        """Return the keys of all values that the job reads."""
+        """Return the cache keys of all values that the job reads."""
         return tuple(k for read in self.reads for k in ((read,) if isinstance(read, str) else read or ()))
 
 

@@ -24,7 +24,7 @@ from neusee.workflows.tolerance.cheaper_steps import with_substitutions
 
 @dataclass(frozen=True)
 class Plan:
-    """Forecast of a run, step by step."""
+    """Forecast of a run: the steps to compute and to read, with their costs and their schedule."""
 
     recipe: Recipe
     order: list[str]
@@ -128,7 +128,7 @@ def _work(recipe: Recipe, name: str, keys: Mapping[str, Key], devices: Sequence[
 
 
 def _awake(recipe: Recipe, keys: Mapping[str, Key], store: Store) -> tuple[set[str], dict[str, int]]:
-    """Return the steps to compute, and the size in bytes of each stored result to read."""
+    """Return the steps that a run must compute, and the size (bytes) of each stored result that the run must read."""
     found, loaded, todo = set[str](), dict[str, int](), [*wanted(recipe)]
     while todo:
         name = todo.pop()

@@ -186,5 +186,5 @@ def _date(about: Mapping[str, Any]) -> str:
 
 
 def _rows(store: Store, step: str | None = None) -> list[dict[str, Any]]:
-    """Return the journal lines of one step or of all steps, in order of time."""
+    """Return the lines on one step or on all steps from the journal of a result store, in order of time."""
     return store.journal.rows() if step is None else store.journal.of_step(step)

@@ -10,11 +10,11 @@ from itertools import pairwise
 
 import numpy as np
 
-Hold = tuple[float, float, float]  #: start, end (infinity if not yet known), bytes
+Hold = tuple[float, float, float]  #: memory reservation: start, end (infinity if not yet known), bytes
 
 
 class MemoryProfile:
-    """The bytes in use on a device as a step function of time that never rises above ``limit``.
+    """Memory in use (bytes) on a device, as a step function of time that never rises above ``limit``.
 
     The memory of a result is reserved without end until the last reader of the result is placed, and then
     only until this reader ends. Reserved memory therefore only shrinks after `wait` has checked it, and no later

@@ -72,7 +72,7 @@ class PartialSchedule:
         return max((end[j] + links[where[j]][d].seconds(size) for j, size in self._inputs(i)), default=0.0)
 
     def _inputs(self, i: int) -> Iterator[tuple[int, float]]:
-        """Yield each source of task ``i`` with the bytes to send if the source is on another device."""
+        """Yield each task whose result task ``i`` reads, with the bytes to send if this result is on another device."""
         return zip(self.graph.sources[i], self.graph.sizes[i], strict=True)
 
     def _slot(self, i: int, d: int, ready: float, seconds: float, best: float) -> float:
@@ -115,7 +115,7 @@ class PartialSchedule:
         return holds
 
     def _arriving(self, i: int, d: int, start: float) -> Iterator[tuple[Of, float]]:
-        """Yield each input of task ``i`` on another device, with the latest time at which its transfer must start."""
+        """Yield each input of task ``i`` that is on another device, with the latest start of the transfer."""
         for j, size in self._inputs(i):
             if self.where[j] != d:
                 yield (j, size, d), max(start - self.links[self.where[j]][d].seconds(size), self.end[j])
@@ -169,7 +169,7 @@ class PartialSchedule:
         starts[gap : gap + 1] = [a for a, _ in left]
         ends[gap : gap + 1] = [b for _, b in left]
 
-    # --- the end --------------------------------------------------------------------------------------------------
+    # --- the finished schedule ------------------------------------------------------------------------------------
 
     def too_large(self) -> TooLarge:
         """Return the error for the first task that fits on no device, with the bytes of memory that would suffice."""
@@ -237,7 +237,7 @@ class PartialSchedule:
             ended[self.end[i]] = i
 
     def _waited(self, i: int, before: int, other: int) -> int:
-        """Return the task that delayed task ``i``: a source, the previous task, or a task that freed memory."""
+        """Return the task that delayed task ``i``: an input, the previous task, or a task that freed memory."""
         start, d = self.start[i], self.where[i]
         for j, size in self._inputs(i):
             if self.end[j] + self.links[self.where[j]][d].seconds(size) == start:

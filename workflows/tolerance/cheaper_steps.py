@@ -151,7 +151,7 @@ class _Draft:
         return all(self._even(reader.wires.get(i)) for i in node.needs_band_invariant)
 
     def _even(self, wire: Wire) -> bool:
-        """Return True if an input is unconnected, or if its source node states that all wavelength bands are equal."""
+        """Return True if an input is unconnected, or if the connected node states that all bands are equal."""
         if not isinstance(wire, str):
             return wire is None
         step = self.recipe.steps[wire]
