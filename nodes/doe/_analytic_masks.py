@@ -107,7 +107,7 @@ def half_rings(
     wavelength: Wavelength = 550e-9,
     material: Material = "fused silica",
 ) -> Tensor:
-    """Send the light of each annulus into one half of a ring: phi = 2 pi a r sgn(cos(theta - orientation)).
+    """Return the height map that focuses each annulus to half a ring: phi = 2 pi a r sgn(cos(theta - orientation)).
 
     Each annulus of equal area has one slope a, from the axis outwards; ``alternate`` flips the side of every second
     annulus. The phase is odd about the axis, so the amplitude of the point-spread function is real.

@@ -31,7 +31,7 @@ def _refuse(material: Material, wrap_at: float | None, levels: int | None, max_h
         text = f"{max_height * 1e6:.3g} um is less than one wave of wrap_at in {material}: needs at least {wave}"
         raise ParameterError("max_height", text)
     if levels is not None and wrap_at is None and max_height is None:
-        raise ParameterError("levels", f"{levels} levels have no depth to divide: set wrap_at or max_height")
+        raise ParameterError("levels", f"{levels} levels need a total depth: set wrap_at or max_height")
 
 
 @node(rtol=1e-5)
@@ -107,7 +107,7 @@ def _(
 
 
 def _largest_change(ends: Tensor, top: float, levels: int | None, cyclic: bool) -> float:
-    """Return an upper bound, in m, of the change of heights between two ends by fabrication; exact without levels."""
+    """Return an upper bound, in m, of the change of any height within ``ends`` by fabrication; exact without levels."""
     low, high = (float(end) for end in ends)
     if not cyclic:
         top = float(torch.tensor(top, dtype=ends.dtype))  # the limit in the precision of the height map

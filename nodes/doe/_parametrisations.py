@@ -50,7 +50,7 @@ class Pixels(nn.Module):
         self.logits = nn.Parameter(logits.to(torch.float32))
 
     def forward(self, stop: Stop) -> Tensor:
-        """Return the height map (v, u)."""
+        """Return the height map (v, u) on the pupil grid of ``stop``."""
         logits: Tensor = self.logits
         samples = int(stop.samples)
         if samples != logits.shape[-1]:
@@ -78,7 +78,7 @@ class Modes(nn.Module):
         return torch.stack(each).where(inside(grid, v.device), 0.0).to(torch.float32)
 
     def forward(self, stop: Stop) -> Tensor:
-        """Return the height map (v, u)."""
+        """Return the height map (v, u) on the pupil grid of ``stop``."""
         grid = grid_of(stop)
         basis = self._polynomials(grid)
         phase = (2 * math.pi * self.waves) @ basis.flatten(1)
@@ -108,7 +108,7 @@ class Rings(nn.Module):
         return ((v.square() + u.square()) * len(self.slopes)).floor().long().clamp(max=len(self.slopes) - 1)
 
     def forward(self, stop: Stop) -> Tensor:
-        """Return the height map (v, u)."""
+        """Return the height map (v, u) on the pupil grid of ``stop``."""
         grid = grid_of(stop)
         v, u = axes(grid, self.slopes.device)
         annulus = self._annuli(grid)
@@ -127,7 +127,7 @@ class Drawn(nn.Module):
         self.grid, self.max_height, self.net = grid, max_height, net or fresh(width, grid, rng)
 
     def forward(self, stop: Stop) -> Tensor:
-        """Return the height map (v, u)."""
+        """Return the height map (v, u) on the pupil grid of ``stop``."""
         return height_of(self.net, int(stop.samples), self.grid, self.max_height)
 
 
@@ -139,7 +139,7 @@ class Written(nn.Module):
         self.shape, self.feature = shape, feature
 
     def forward(self, stop: Stop) -> Tensor:
-        """Return the height map (v, u)."""
+        """Return the height map (v, u) on the pupil grid of ``stop``."""
         height: Tensor = smooth(self.shape(stop), stop, feature=self.feature)
         return height
 

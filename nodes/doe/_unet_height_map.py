@@ -20,7 +20,7 @@ PITCH = 15.0  #: frequency of the first layer's sines: about four periods across
 
 
 class HeightNet(nn.Module):
-    """A network of eight convolutions, four down and four up, from (u, v) to one logit for each sample.
+    """A network of four downsampling and four upsampling convolutions, from (u, v) to one logit for each sample.
 
     Sines follow the first convolution, so that the height map can be less smooth than the coordinates.
     """

@@ -83,7 +83,7 @@ def _reflected(wavelengths: Tensor, tuned: float) -> Tensor:
 
 
 def _colours(drawn: list[_Ghost], wavelengths: Tensor, flux: Tensor) -> list[Tensor]:
-    """Return the gain of each ghost in each band; the gains times the flux add up to the whole flux of the spot."""
+    """Return the gain of each ghost in each band, scaled so that all ghosts together carry the flux of the spot."""
     raw = [g.share * _reflected(wavelengths, g.tuned[0]) * _reflected(wavelengths, g.tuned[1]) for g in drawn]
     moved = torch.stack(raw).sum(0).mul(flux).sum() if raw else flux.sum()
     dark = moved <= 0  # false for NaN, so that NaN reaches the result

@@ -182,7 +182,9 @@ def _agree(pupil: Pupil) -> None:
         )
 
     if pupil.index.requires_grad or pupil.wavelengths.requires_grad:
-        raise ValueError("index and wavelengths take no gradient here: detach both, or train amplitude, height or path")
+        raise ValueError(
+            "index and wavelengths cannot receive gradients: detach both, or train amplitude, height or path"
+        )
 
 
 def _refuse_aliases(pupil: Pupil, camera: _Camera) -> None:

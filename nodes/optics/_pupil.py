@@ -70,7 +70,8 @@ def _shapes(height: Tensor, index: Tensor, bands: Bands, grid: PupilGrid, dirt: 
     refuse_other_grid(height, grid)
     if index.shape != bands.centres.shape:
         raise ValueError(
-            f"index {tuple(index.shape)} and bands {tuple(bands.centres.shape)}: compute both from one `bands` step"
+            f"index {tuple(index.shape)} and bands {tuple(bands.centres.shape)}: "
+            "compute both from one `bands` or `line` step"
         )
     if dirt is not None and dirt.amplitude.shape != height.shape:
         found, wanted = tuple(dirt.amplitude.shape), tuple(height.shape)

@@ -62,7 +62,7 @@ def _(result: Tensor, radiance: Tensor, psf: Psf, **params: Any) -> list[Check]:
 
 
 def _fitted(radiance: Tensor, intensity: Tensor, border: Border) -> tuple[Tensor, Tensor, Corner]:
-    """Return the padded scene, the part of the PSF that reaches the scene, and the first image pixel in the padding."""
+    """Return the padded scene, the PSF that reaches the scene, and the first image pixel within their convolution."""
     if radiance.ndim < 3 or radiance.shape[-3] != intensity.shape[0]:
         raise ValueError(
             f"radiance {tuple(radiance.shape)} and PSF {tuple(intensity.shape)} must have the same bands: "

@@ -73,7 +73,7 @@ class Summed(torch.autograd.Function):
 
 
 def summed(a: Tensor, b: Tensor, mix: Mix, where: Where) -> Tensor:
-    """Return sums (r, y, x) of convolutions of planes (k, y, x) with kernels (q, y, x)."""
+    """Return weighted sums (r, y, x) of convolutions of pictures (k, y, x) with kernels (q, y, x)."""
     result: Tensor = Summed.apply(a, b, mix, where)  # type: ignore[no-untyped-call]
     return result
 

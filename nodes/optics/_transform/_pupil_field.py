@@ -39,7 +39,7 @@ class Screens(NamedTuple):
 
     @classmethod
     def of(cls, amplitude: Tensor, height: Tensor, path: Tensor) -> "Screens":
-        """Return the pupil's factors with the largest height and path; raise ValueError if one of both is not finite."""
+        """Return the pupil's factors and largest height and path; raise ValueError if height or path is not finite."""
         extents = [float(torch.stack(x.detach().aminmax()).abs().max()) for x in (height, path)]
         refuse_not_finite("no light has such a phase", height=extents[0], path=extents[1])
         return cls(amplitude, height, path, *extents)
@@ -58,7 +58,7 @@ class Field:
         self.tilt_v, self.tilt_u = v.to(kind)[:, None], u.to(kind)
 
     def phasor(self, rows: slice, columns: slice, planes: Tensor, work: Workspace) -> None:
-        """Write the cosine and sine of the pupil phase in one patch, from float64 if the phase exceeds two turns."""
+        """Write the cosine and sine of the pupil phase in one patch, in float64 if the phase exceeds two turns."""
         angle = work.take("angle", *planes.shape[1:])
         turns = angle if self.few else work.take("turns", *planes.shape[1:], dtype=torch.float64)
         unit = 2 * math.pi if self.few else 1.0

@@ -74,7 +74,7 @@ class _Normal:
         return inner(x, result, self.seen.torus)
 
     def slope(self, x: Tensor) -> Tensor:
-        """Return the gradient of the log posterior with respect to the picture, at the spectrum x."""
+        """Return the gradient of the log posterior at the picture of spectrum x."""
         result = torch.empty_like(x)
         self._gather(self.weigh(self._blurred(x, result).neg_().add_(self.seen.picture)), result)
         self._finish(x, result, -1.0)

@@ -59,7 +59,7 @@ def most_likely(seen: Blurred, steps: int = STEPS, enough: float = ENOUGH) -> Te
 
 
 class _Followed(torch.autograd.Function):
-    """The deconvolved picture as an autograd function, differentiable through the log posterior."""
+    """An autograd function of the deconvolved picture, which passes gradients to the residual of the linear problem."""
 
     @staticmethod
     def forward(ctx: Any, answer: Tensor, rest: Tensor, seen: Blurred, steps: int) -> Tensor:
@@ -69,9 +69,7 @@ class _Followed(torch.autograd.Function):
     @staticmethod
     @once_differentiable
     def backward(ctx: Any, grad: Tensor) -> tuple[None, Tensor, None, None]:
-        """Back-propagate by the solution of the same linear problem, with the incoming gradient in place of the
-        picture.
-        """
+        """Solve the linear problem of the forward pass with the incoming gradient in place of the picture."""
         pull = torch.fft.rfft2(grad)
         seen = replace(ctx.seen, picture=torch.zeros_like(ctx.seen.picture), pull=pull)
         enough = 1e-10 * float(inner(pull, _spread(seen, pull), seen.torus))

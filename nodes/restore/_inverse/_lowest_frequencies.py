@@ -38,8 +38,9 @@ class Lowest:
         self.whiten = [whiten[end - _ROWS : end, :end].to(gain, copy=True) for end in ends]
 
     def add(self, slope: Tensor, onto: Tensor) -> Tensor:
-        """Add the inverse normal matrix times the gradient `slope` to `onto`; return the inner product of step and
-        gradient.
+        """Add a step, the inverse normal matrix times the gradient `slope`, to `onto`.
+
+        Return the inner product of the step and `slope`.
         """
         risen = _real(slope[:, self.fy, self.fx])
         both, rise = torch.zeros_like(risen), torch.zeros((), dtype=torch.float64, device=slope.device)

@@ -40,7 +40,7 @@ class Blurred:
         return spectrum
 
     def slope(self, x: Tensor) -> Tensor:
-        """Return the gradient of the log posterior at x, which is 0 at the most likely x."""
+        """Return the gradient of the log posterior at the picture of spectrum x; the most likely picture has 0."""
         own, shared = inverse_colour(len(x), self.grey)
         prior = mixed(x, own, -shared) / self.power.clamp_min(1e-30)
         rise = self.gathered(weighing(self)(self.picture - self.blur(x))) - prior
@@ -89,7 +89,7 @@ def times(size: Size, like: Tensor) -> Tensor:
 
 
 def narrowed(spectrum: Tensor, size: Size) -> Tensor:
-    """Return half a spectrum cropped to the frequencies of a coarser grid `size`, with 0 at an even size's highest."""
+    """Return half a spectrum cropped to the frequencies of a coarser grid `size`; the Nyquist frequencies are 0."""
     up, down, right = (size[0] + 1) // 2, (size[0] - 1) // 2, (size[1] + 1) // 2
     cut = spectrum.new_zeros(*spectrum.shape[:-2], size[0], size[1] // 2 + 1)
     cut[..., :up, :right] = spectrum[..., :up, :right]

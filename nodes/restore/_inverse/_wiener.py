@@ -78,7 +78,8 @@ def _(result: Tensor, electrons: Tensor, *inputs: Any, **params: float) -> list[
     finite = math.isfinite(float(result.sum()))
     return [
         Check(
-            f"{share:.2%} of pixels clipped, mean {float(result.mean() / electrons.mean()):.2f} of the raw mean", finite
+            f"{share:.2%} of pixels clipped, restored mean {float(result.mean() / electrons.mean()):.2f} of raw mean",
+            finite,
         )
     ]
 

@@ -163,7 +163,7 @@ def _needed(weights: Path | None) -> Path:
 
 
 def restorer_checks(result: Tensor, picture: Tensor, **params: Any) -> list[Check]:
-    """Return a check of the root mean square change of a picture by a network, which fails if not finite."""
+    """Return a check of the root mean square change by a network, which fails if this change is not finite."""
     change = float((result - picture).square().mean(dtype=torch.float64).sqrt())
     before = float(picture.square().mean(dtype=torch.float64).sqrt())
     return [

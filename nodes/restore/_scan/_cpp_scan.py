@@ -128,8 +128,9 @@ def _call(name: str, sizes: tuple[int, ...], *tensors: Tensor) -> None:
 
 
 class Scan(torch.autograd.Function):
-    """The selective scan in C++, differentiable once: u, dt (batch, length, d), A (d, n), B, C (batch, length, n) -> as
-    u.
+    """The selective scan in C++ as an autograd function that can be differentiated once.
+
+    u, dt (batch, length, d), A (d, n), B, C (batch, length, n) -> as u.
     """
 
     @staticmethod

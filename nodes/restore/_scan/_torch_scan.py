@@ -126,8 +126,9 @@ def _segments(length: int, division: Plan) -> Iterator[slice]:
 
 
 class Scan(torch.autograd.Function):
-    """The selective scan in torch, differentiable once: u, dt (batch, length, d), A (d, n), B, C (batch, length, n) ->
-    u.
+    """The selective scan in torch as an autograd function that can be differentiated once.
+
+    u, dt (batch, length, d), A (d, n), B, C (batch, length, n) -> as u.
     """
 
     @staticmethod

@@ -140,8 +140,9 @@ def _sizes(u: Tensor, rate: Tensor) -> tuple[int, int, int, int, int, int]:
 
 
 class Scan(torch.autograd.Function):
-    """The selective scan in Triton, differentiable once: u, dt (batch, length, d), A (d, n), B, C (batch, length, n) ->
-    as u.
+    """The selective scan in Triton as an autograd function that can be differentiated once.
+
+    u, dt (batch, length, d), A (d, n), B, C (batch, length, n) -> as u.
     """
 
     @staticmethod
