@@ -1,4 +1,7 @@
-"""Analytic masks. Radius r and coordinates u, v are in units of the stop's radius, slopes in waves at the rim."""
+"""Masks whose phase is given by a formula.
+
+Radius r and coordinates u, v are in units of the stop's radius, slopes in waves at the rim.
+"""
 
 import math
 from typing import Annotated
@@ -30,7 +33,7 @@ def flat(stop: Stop) -> Tensor:
 
 @node()
 def vortex(stop: Stop, *, charge: int, wavelength: Wavelength = 550e-9, material: Material = "fused silica") -> Tensor:
-    """Wind the phase ``charge`` times round the axis: phi = charge * theta, one ramp with its step on -u.
+    """Return the height map of a vortex, phi = charge * theta, whose phase ramp has its step on the -u axis.
 
     Shapes: stop -> (v, u).
     Units:  m.
@@ -43,7 +46,7 @@ def vortex(stop: Stop, *, charge: int, wavelength: Wavelength = 550e-9, material
 
 @node()
 def axicon(stop: Stop, *, waves: Real, wavelength: Wavelength = 550e-9, material: Material = "fused silica") -> Tensor:
-    """Tilt the phase away from the axis: phi = 2 pi waves r, which turns the focus into a ring.
+    """Return the height map of an axicon, phi = 2 pi waves r, which turns the focal spot into a ring.
 
     Shapes: stop -> (v, u).
     Units:  waves at the rim; result m.
@@ -58,7 +61,7 @@ def axicon(stop: Stop, *, waves: Real, wavelength: Wavelength = 550e-9, material
 def spiral_axicon(
     stop: Stop, *, waves: Real, charge: int, wavelength: Wavelength = 550e-9, material: Material = "fused silica"
 ) -> Tensor:
-    """Add a vortex to an axicon: phi = 2 pi waves r + charge * theta.
+    """Return the height map of an axicon with a vortex: phi = 2 pi waves r + charge * theta.
 
     Shapes: stop -> (v, u).
     Units:  waves at the rim; result m.
@@ -72,7 +75,7 @@ def spiral_axicon(
 
 @node()
 def cubic(stop: Stop, *, waves: Real, wavelength: Wavelength = 550e-9, material: Material = "fused silica") -> Tensor:
-    """Make the phase cubic: phi = 2 pi waves (u**3 + v**3), which gives an MTF without zeros over a long focus.
+    """Return the height map of phi = 2 pi waves (u**3 + v**3), which gives an MTF without zeros over a long focus.
 
     Shapes: stop -> (v, u).
     Units:  waves at the rim on an axis; result m.
@@ -85,7 +88,7 @@ def cubic(stop: Stop, *, waves: Real, wavelength: Wavelength = 550e-9, material:
 
 
 def _half_rings(grid: PupilGrid, waves: tuple[float, ...], alternate: bool, orientation: float) -> Tensor:
-    """Return the phase of half rings, in rad."""
+    """Return the phase of the half-ring mask, in rad."""
     v, u = axes(grid)
     square = v.square() + u.square()
     annulus = (square * len(waves)).floor().long().clamp(max=len(waves) - 1)
@@ -104,7 +107,7 @@ def half_rings(
     wavelength: Wavelength = 550e-9,
     material: Material = "fused silica",
 ) -> Tensor:
-    """Send the light of each annulus into one half of a ring: phi = 2 pi a r sgn(cos(theta - orientation)).
+    """Return the height map that focuses each annulus to half a ring: phi = 2 pi a r sgn(cos(theta - orientation)).
 
     Each annulus of equal area has one slope a, from the axis outwards; ``alternate`` flips the side of every second
     annulus. The phase is odd about the axis, so the amplitude of the point-spread function is real.
@@ -126,7 +129,7 @@ def zernike(
     wavelength: Wavelength = 550e-9,
     material: Material = "fused silica",
 ) -> Tensor:
-    """Shape the wave with Zernike polynomials, whose coefficients are root mean square optical paths by Noll's number.
+    """Return the height map of a sum of Zernike polynomials, given root mean square optical paths by Noll number.
 
     Shapes: stop -> (v, u).
     Units:  m of optical path at ``wavelength``; result m of height.

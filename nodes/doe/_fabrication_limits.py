@@ -1,4 +1,4 @@
-"""Fabrication limits of a mask: wrapping, limited depth, discrete levels."""
+"""Fabrication limits of a mask: wrapping, limited depth, discrete heights."""
 
 import math
 from typing import Annotated, Any
@@ -17,7 +17,7 @@ _VIOLET = 400e-9  #: m, wavelength at which a change of height is converted to a
 
 
 def _quantize(height: Tensor, step: float, levels: int, cyclic: bool) -> Tensor:
-    """Round each height to the nearest step; the gradient passes through unchanged."""
+    """Round each height to the nearest of ``levels`` discrete heights; the gradient passes through unchanged."""
     with torch.no_grad():
         level = (height / step).round()
         level = level.remainder(levels) if cyclic else level.clamp(0, levels - 1)
@@ -31,7 +31,7 @@ def _refuse(material: Material, wrap_at: float | None, levels: int | None, max_h
         text = f"{max_height * 1e6:.3g} um is less than one wave of wrap_at in {material}: needs at least {wave}"
         raise ParameterError("max_height", text)
     if levels is not None and wrap_at is None and max_height is None:
-        raise ParameterError("levels", f"{levels} levels have no depth to divide: set wrap_at or max_height")
+        raise ParameterError("levels", f"{levels} levels need a total depth: set wrap_at or max_height")
 
 
 @node(rtol=1e-5)
@@ -43,7 +43,7 @@ def fabricate(
     levels: Levels | None = None,
     max_height: PositiveLength | None = None,
 ) -> Tensor:
-    """Wrap the height map at one wave of ``wrap_at``, or cut it flat at ``max_height``; then round to ``levels``.
+    """Wrap the height map at one wave of ``wrap_at`` or limit it to ``max_height``, then round to ``levels`` heights.
 
     The levels of a wrapped height map divide one wave, whose top equals its bottom. The levels of a limited height map
     run from 0 to ``max_height`` inclusive. Wrapping and rounding have the gradient 1; a height that is cut off has 0.
@@ -71,7 +71,7 @@ def fabricate(
 def _(
     height: Tensor, *, material: Material, wrap_at: float | None, levels: int | None, max_height: float | None
 ) -> Tensor:
-    """Compare each height with every allowed height, and return the nearest."""
+    """Compare each height with every allowed height, and return the nearest allowed height."""
     wave = None if wrap_at is None else wave_height(material, wrap_at)
     x = height.to(torch.float64)
     x = x if wave is None else x - wave * (x / wave).floor()
@@ -89,7 +89,7 @@ def _(
 def _(
     height: TensorStats, *, material: Material, wrap_at: float | None, levels: int | None, max_height: float | None
 ) -> float:
-    """Return the largest change of height as a share of the deepest fabricated height; 0 if every height fits.
+    """Return an upper bound of the relative change of a height map by fabrication; 0 if every height fits.
 
     A small change of height may be a large phase: the bound is never below the phase, in radians at 400 nm, of that
     change. Wrapping turns no phase at ``wrap_at``, and counts in full all the same.
@@ -107,7 +107,7 @@ def _(
 
 
 def _largest_change(ends: Tensor, top: float, levels: int | None, cyclic: bool) -> float:
-    """Return an upper bound, in m, of the change of any height between two ends; exact without levels."""
+    """Return an upper bound, in m, of the change of any height within ``ends`` by fabrication; exact without levels."""
     low, high = (float(end) for end in ends)
     if not cyclic:
         top = float(torch.tensor(top, dtype=ends.dtype))  # the limit in the precision of the height map
@@ -131,8 +131,8 @@ def _(*, material: Material, wrap_at: float | None, levels: int | None, max_heig
 
 @fabricate.check
 def _(result: Tensor, height: Tensor, *, wrap_at: float | None, max_height: float | None, **_: Any) -> list[Check]:
-    checks = [Check(f"{float(height.max()) * 1e6:.4g} um deep, {float(result.max()) * 1e6:.4g} um as fabricated")]
+    checks = [Check(f"mask {float(height.max()) * 1e6:.4g} um deep, {float(result.max()) * 1e6:.4g} um as fabricated")]
     if max_height is not None and wrap_at is None:
         share = float((height > max_height).double().mean())
-        checks.append(Check(f"cut flat at max_height: {share:.2%} of the grid", share == 0))
+        checks.append(Check(f"heights cut flat at max_height: {share:.2%} of the pupil grid", share == 0))
     return checks

@@ -40,7 +40,9 @@ def smooth(height: Tensor, stop: Stop, *, feature: PositiveLength) -> Tensor:
 
 
 def _average(samples: int, feature: float) -> Tensor:
-    """Return the averaging matrix along one axis, float64, each row of sum 1; ``feature`` is in samples."""
+    """Return the float64 matrix that averages along one axis over a tool spot of ``feature`` samples; each row sums to
+    1.
+    """
     sigma = feature / math.sqrt(8 * math.log(2))
     index = torch.arange(samples, dtype=torch.float64)
     weights = torch.exp(-((index[:, None] - index) ** 2) / (2 * sigma**2))
@@ -50,7 +52,7 @@ def _average(samples: int, feature: float) -> Tensor:
 
 @smooth.reference
 def _(height: Tensor, stop: Stop, *, feature: float) -> Tensor:
-    """Compute the weighted average at one sample after another."""
+    """Compute the average of the height map over the tool's spot, one sample after another."""
     samples, pitch, _ = grid_of(stop)
     sigma = feature / pitch / math.sqrt(8 * math.log(2))
     x, index = height.double(), torch.arange(samples, dtype=torch.float64)

@@ -32,7 +32,7 @@ _ROOM = 0.05  #: share of a formula's depth that is free above and below its hei
 
 
 class Pixels(nn.Module):
-    """A height for each of ``grid`` x ``grid`` pixels: a sigmoid between 0 and ``max_height``, resampled smoothly.
+    """A trainable height map of ``grid`` x ``grid`` pixels, limited to ``max_height`` by a sigmoid, resampled smoothly.
 
     The heights start from a smooth random height map with features of ``scale`` diameters, or from ``start``.
     """
@@ -50,7 +50,7 @@ class Pixels(nn.Module):
         self.logits = nn.Parameter(logits.to(torch.float32))
 
     def forward(self, stop: Stop) -> Tensor:
-        """Return the height map (v, u)."""
+        """Return the height map (v, u) on the pupil grid of ``stop``."""
         logits: Tensor = self.logits
         samples = int(stop.samples)
         if samples != logits.shape[-1]:
@@ -59,7 +59,7 @@ class Pixels(nn.Module):
 
 
 class Modes(nn.Module):
-    """The ``count`` Zernike polynomials from Noll's number 4 on; coefficients in waves, root mean square.
+    """A trainable height map of ``count`` Zernike polynomials from Noll number 4 on, with root mean squares in waves.
 
     Numbers 1 to 3 are absent: piston changes nothing, and tilt only shifts the spot. The start is a random sum of
     ``waves`` root mean square.
@@ -78,7 +78,7 @@ class Modes(nn.Module):
         return torch.stack(each).where(inside(grid, v.device), 0.0).to(torch.float32)
 
     def forward(self, stop: Stop) -> Tensor:
-        """Return the height map (v, u)."""
+        """Return the height map (v, u) on the pupil grid of ``stop``."""
         grid = grid_of(stop)
         basis = self._polynomials(grid)
         phase = (2 * math.pi * self.waves) @ basis.flatten(1)
@@ -86,7 +86,7 @@ class Modes(nn.Module):
 
 
 class Rings(nn.Module):
-    """A slope a and a step c, in waves at the rim, for each of ``count`` annuli of equal area.
+    """A trainable height map of ``count`` annuli of equal area, each with a phase gradient a and a step c, in waves.
 
     phi = 2 pi (a r + c), times the sign of u if ``sided``. If ``count`` is a multiple of five, five half-rings are a
     special case. The start has the slopes of the half-rings, alternating by fifths, plus ``noise`` random waves.
@@ -108,7 +108,7 @@ class Rings(nn.Module):
         return ((v.square() + u.square()) * len(self.slopes)).floor().long().clamp(max=len(self.slopes) - 1)
 
     def forward(self, stop: Stop) -> Tensor:
-        """Return the height map (v, u)."""
+        """Return the height map (v, u) on the pupil grid of ``stop``."""
         grid = grid_of(stop)
         v, u = axes(grid, self.slopes.device)
         annulus = self._annuli(grid)
@@ -118,7 +118,7 @@ class Rings(nn.Module):
 
 
 class Drawn(nn.Module):
-    """The height map of the network ``net`` of `doe.unet`, or of a new random network, on ``grid`` samples."""
+    """A trainable height map on ``grid`` samples, from the network ``net`` of `doe.unet` or a new random network."""
 
     def __init__(
         self, width: int, grid: int, max_height: float, rng: torch.Generator, net: HeightNet | None = None
@@ -127,19 +127,19 @@ class Drawn(nn.Module):
         self.grid, self.max_height, self.net = grid, max_height, net or fresh(width, grid, rng)
 
     def forward(self, stop: Stop) -> Tensor:
-        """Return the height map (v, u)."""
+        """Return the height map (v, u) on the pupil grid of ``stop``."""
         return height_of(self.net, int(stop.samples), self.grid, self.max_height)
 
 
 class Written(nn.Module):
-    """A height map after `doe.smooth` with ``feature``, so that training cannot use details too fine for the tool."""
+    """A height map smoothed by `doe.smooth` to ``feature``, so that training uses no details too fine for the tool."""
 
     def __init__(self, shape: Make, feature: float) -> None:
         super().__init__()
         self.shape, self.feature = shape, feature
 
     def forward(self, stop: Stop) -> Tensor:
-        """Return the height map (v, u)."""
+        """Return the height map (v, u) on the pupil grid of ``stop``."""
         height: Tensor = smooth(self.shape(stop), stop, feature=self.feature)
         return height
 
@@ -153,7 +153,7 @@ def _pixels(stop: Stop, params: Mapping[str, Any], rng: torch.Generator) -> Pixe
 
 
 def _freed(mask: Callable[..., Tensor]) -> Start:
-    """Return a function that starts pixels at a formula's height map, raised so that no pixel is at a sigmoid's end."""
+    """Return a function that starts trainable pixels at a formula's height map, away from the ends of their sigmoid."""
 
     def start(stop: Stop, params: Mapping[str, Any], rng: torch.Generator) -> Pixels:
         height = mask(stop, **params)

@@ -1,4 +1,4 @@
-"""Height map given sample by sample: from a file, or a smooth random one as the start of a training."""
+"""A height map read from a file, or a smooth random height map at which a training starts."""
 
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
@@ -50,7 +50,7 @@ def _shape_in(file: Path) -> tuple[int, ...]:
 
 
 def _levels(file: Path) -> "Image":
-    """Open a grey picture; raise ParameterError for any other picture."""
+    """Open a greyscale picture file; raise ParameterError for a picture that is not greyscale."""
     from PIL import Image
 
     picture = Image.open(file)
@@ -94,7 +94,7 @@ def pixelwise(
     scale: Scale = 0.1,
     rng: torch.Generator,
 ) -> Tensor:
-    """Read a height map from ``file``, or draw a smooth random one between 0 and ``depth``.
+    """Read a height map from ``file``, or return a smooth random height map between 0 and ``depth``.
 
     The features of the random height map are ``scale`` diameters wide. It is a start for training: a flat height map
     is a saddle point, where the suppression has no gradient.

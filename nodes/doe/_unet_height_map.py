@@ -20,7 +20,7 @@ PITCH = 15.0  #: frequency of the first layer's sines: about four periods across
 
 
 class HeightNet(nn.Module):
-    """A network of eight convolutions, four down and four up, from (u, v) to one logit for each sample.
+    """A network of four downsampling and four upsampling convolutions, from (u, v) to one logit for each sample.
 
     Sines follow the first convolution, so that the height map can be less smooth than the coordinates.
     """
@@ -46,27 +46,27 @@ class HeightNet(nn.Module):
 
 
 def _edged(x: Tensor) -> Tensor:
-    """Repeat the outermost rows and columns: zeros would draw a frame around the height map."""
+    """Pad a tensor with its outermost rows and columns, because zeros would add a frame to the height map."""
     x = torch.cat([x[..., :1, :], x, x[..., -1:, :]], dim=-2)
     return torch.cat([x[..., :1], x, x[..., -1:]], dim=-1)
 
 
 def coordinates(grid: int, device: torch.device | None = None) -> Tensor:
-    """Return the input of the network (2, grid, grid): u and v from -1 to 1 across the pupil grid."""
+    """Return the input (2, grid, grid) of the height network: u and v from -1 to 1 across the pupil grid."""
     line = (torch.arange(grid, dtype=torch.float64, device=device) - (grid - 1) / 2) * (2 / grid)
     v, u = torch.meshgrid(line, line, indexing="ij")
     return torch.stack([u, v]).to(torch.float32)
 
 
 def height_of(net: nn.Module, samples: int, grid: int, max_height: float) -> Tensor:
-    """Return the height map (samples, samples) between 0 and ``max_height``, differentiable in the weights."""
+    """Return the height map (samples, samples) of a network, 0 to ``max_height``, differentiable in the weights."""
     like = next(net.parameters())
     logits = net(coordinates(min(grid, samples), like.device).to(like))
     return max_height * torch.sigmoid(enlarge(logits, samples, samples))
 
 
 def fresh(width: int, grid: int, rng: torch.Generator) -> HeightNet:
-    """Draw a network with orthogonal weights and zero biases.
+    """Return a new height network with random orthogonal weights and zero biases.
 
     The last layer is scaled to logits of mean 0 and standard deviation 1, so that the height map is far from flat.
     """

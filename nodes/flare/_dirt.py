@@ -70,7 +70,7 @@ def dirt(
 
 
 def _streams(count: int, rng: torch.Generator) -> list[torch.Generator]:
-    """Create one generator for each kind of dirt, so that more dust leaves the scratches unchanged."""
+    """Create one random generator for each kind of dirt, so that more dust leaves the scratches unchanged."""
     seeds = torch.randint(2**62, (count,), generator=rng, device=rng.device).tolist()
     return [torch.Generator(rng.device).manual_seed(seed) for seed in seeds]
 
@@ -80,7 +80,7 @@ def _uniform(rng: torch.Generator, low: float = 0.0, high: float = 1.0) -> float
 
 
 def _about(mean: float, spread: float, rng: torch.Generator) -> float:
-    """Draw a normally distributed number, and replace a negative number by 0."""
+    """Sample a normal distribution, and replace a negative number by 0."""
     return max(mean + spread * float(torch.randn((), generator=rng, device=rng.device, dtype=torch.float64)), 0.0)
 
 
@@ -98,7 +98,7 @@ def _scratches(mean: float, length: float, width: float, rng: torch.Generator) -
 
 
 def _scratch(length: float, widest: float, rng: torch.Generator) -> Scratch:
-    """Draw a scratch: a random walk of 1 to 16 steps, each no longer than ``length``."""
+    """Return a random scratch: a random walk of 1 to 16 steps, each no longer than ``length``."""
     points = [(_uniform(rng, -0.5, 0.5), _uniform(rng, -0.5, 0.5))]
     stride = length * _uniform(rng)
     for _ in range(1 + int(16 * _uniform(rng))):
@@ -109,7 +109,7 @@ def _scratch(length: float, widest: float, rng: torch.Generator) -> Scratch:
 
 
 def _dents(rms: float, rng: torch.Generator) -> dict[int, float]:
-    """Draw Zernike coefficients whose root sum of squares is ``rms``."""
+    """Return random Zernike coefficients of the dents in a window, whose root sum of squares is ``rms``."""
     draw = torch.randn(len(DENT_TERMS), generator=rng, device=rng.device, dtype=torch.float64)
     parts = (rms * draw / draw.norm()).tolist()
     return dict(zip(DENT_TERMS, parts, strict=True)) if rms else {}
@@ -119,7 +119,7 @@ def _dents(rms: float, rng: torch.Generator) -> dict[int, float]:
 def _(
     stop: TensorStats, *, dust: float, scratches: float, grease: float, smudges: float, dents: float, **_: Any
 ) -> float:
-    """Return an upper bound of the change of the field by the dirt, at 400 nm or longer; 0 for a clean window.
+    """Return an upper bound of the change of the pupil field by dirt, at 400 nm or longer; 0 for a clean window.
 
     A grain or a scratch may be black. A film is a sum of normal numbers, which the generator keeps below 8.6, so that
     the film stays below 31 times its root mean square. The twelve terms of a dent together reach sqrt(50) times their
@@ -137,11 +137,14 @@ def _(result: Dirt, stop: Stop, **_: Any) -> list[Check]:
     passed, rms = _effect(result, grid_of(stop))
     text = f"dirt passes {passed:.4f} of the light, bends it by {rms:.3g} waves root mean square at 550 nm"
     low, high = (float(x) for x in torch.aminmax(result.amplitude))
-    return [Check(text, passed > 0), Check(f"amplitude from {low:.3g} to {high:.3g}", low >= 0 and high <= 1)]
+    return [
+        Check(text, passed > 0),
+        Check(f"amplitude behind the dirt from {low:.3g} to {high:.3g}", low >= 0 and high <= 1),
+    ]
 
 
 def _effect(dirt: Dirt, grid: PupilGrid) -> tuple[float, float]:
-    """Return the share of the light that passes the dirt, and the root mean square of the path in waves."""
+    """Return the share of the light that passes the dirt, and the root mean square path in the dirt, in waves."""
     sums = torch.zeros(4, dtype=torch.float64)
     for rows in stripes(grid):
         open_ = inside(grid, dirt.path.device, rows)

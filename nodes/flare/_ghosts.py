@@ -36,7 +36,7 @@ def ghosts(
     radius: PositiveLength = 300e-6,
     rng: torch.Generator,
 ) -> Tensor:
-    """Add reflections of the spot: discs on the line through the spot and the optical axis.
+    """Return the reflections of a laser spot in the lens: discs on the line through the spot and the optical axis.
 
     Ghost j is a defocused image of the round stop: a disc of radius r_j (U(0.1, 1) * ``radius``), centred at s_j times
     the position of the source, with s_j from U(-``spread``, ``spread``), and coloured by two quarter-wave coatings.
@@ -52,7 +52,9 @@ def ghosts(
         single quarter-wave layer.
     """
     if spot.ndim != 3 or spot.shape[0] != bands.centres.numel():
-        raise ValueError(f"spot is {tuple(spot.shape)}, bands {bands.centres.numel()}: compute both from one `line`")
+        raise ValueError(
+            f"spot is {tuple(spot.shape)}, bands {bands.centres.numel()}: compute both from one `line` step"
+        )
     drawn = _draw(count, spread, radius, rng)
     spot = single(spot)
     flux = spot.sum(-1).sum(-1, dtype=torch.float64)  # a float64 copy of the spot would be twice as large
@@ -81,7 +83,7 @@ def _reflected(wavelengths: Tensor, tuned: float) -> Tensor:
 
 
 def _colours(drawn: list[_Ghost], wavelengths: Tensor, flux: Tensor) -> list[Tensor]:
-    """Return the gain of each ghost in each band; the gains times the flux add up to the whole flux of the spot."""
+    """Return the gain of each ghost in each band, scaled so that all ghosts together carry the flux of the spot."""
     raw = [g.share * _reflected(wavelengths, g.tuned[0]) * _reflected(wavelengths, g.tuned[1]) for g in drawn]
     moved = torch.stack(raw).sum(0).mul(flux).sum() if raw else flux.sum()
     dark = moved <= 0  # false for NaN, so that NaN reaches the result
@@ -90,12 +92,12 @@ def _colours(drawn: list[_Ghost], wavelengths: Tensor, flux: Tensor) -> list[Ten
 
 
 def _in_pixels(radius: float, pixel_pitch: float) -> float:
-    """Return a radius in pixels, at least 0.5, so that a disc at any position covers the centre of a pixel."""
+    """Return the radius of a ghost in pixels, at least 0.5, so that every ghost covers the centre of a pixel."""
     return max(radius / pixel_pitch, 0.5)
 
 
 def _add(total: Tensor, energy: Tensor, centre: tuple[float, float], radius: float) -> None:
-    """Add the part of a disc inside the window to ``total``; the whole disc has unit sum."""
+    """Add the part of a ghost's disc that lies inside the image to ``total``; the whole disc carries ``energy``."""
     height, width = total.shape[-2:]
     y, x = centre[0] + height // 2, centre[1] + width // 2
     rows, columns = _reach(y, radius), _reach(x, radius)
@@ -107,20 +109,20 @@ def _add(total: Tensor, energy: Tensor, centre: tuple[float, float], radius: flo
 
 
 def _reach(middle: float, radius: float) -> Tensor:
-    """Return the indices, float64, of all pixels along one axis that a disc can touch, also outside the window."""
+    """Return the pixel indices along one axis that a ghost's disc can touch, also outside the image, as float64."""
     first, last = math.floor(middle - radius) - 1, math.ceil(middle + radius) + 1
     return torch.arange(first, last + 1, dtype=torch.float64)
 
 
 def _part(numbers: Tensor, samples: int) -> slice:
-    """Return the slice of the pixel indices that lies in the window, or an empty slice."""
+    """Return the slice of the pixel indices ``numbers`` that lies inside the image, or an empty slice."""
     first = int(numbers[0])
     return slice(min(max(-first, 0), len(numbers)), max(samples - first, 0))
 
 
 @ghosts.zero_bound
 def _(spot: TensorStats, *_: Any, pixel_pitch: float, count: int, energy: float, radius: float, **__: Any) -> float:
-    """Return an upper bound of the brightest pixel: all reflected light in one band and in the smallest ghost.
+    """Return an upper bound of the ghosts' brightest pixel: all reflected light in one band of the smallest ghost.
 
     The samples of a disc of half a pixel or more sum to the area of the disc, pi (r^2 + 1 / 12), within 16 %.
     """

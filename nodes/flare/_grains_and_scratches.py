@@ -28,7 +28,7 @@ class Scratch(NamedTuple):
 
 
 def stamp(amplitude: Tensor, marks: Sequence[Grain | Scratch], grid: PupilGrid) -> Tensor:
-    """Darken an amplitude (v, u) in place by each grain and scratch, and return the amplitude."""
+    """Darken the pupil amplitude (v, u) in place by each grain and scratch, and return the amplitude."""
     scale, middle = grid.diameter / grid.pitch, (grid.samples - 1) / 2
     for mark in marks:
         points = [(mark.v, mark.u)] if isinstance(mark, Grain) else list(mark.points)
@@ -57,7 +57,7 @@ def _darken(amplitude: Tensor, places: list[tuple[float, float]], size: float, o
 
 
 def _window(places: list[tuple[float, float]], margin: float, samples: int) -> tuple[slice, slice] | None:
-    """Return the rows and columns of samples that a mark can touch, or None for a mark outside the grid."""
+    """Return the rows and columns of samples that a grain or scratch can touch, or None if it is outside the grid."""
     spans = []
     for axis in (0, 1):
         low = max(int(min(place[axis] for place in places) - margin), 0)
@@ -78,7 +78,9 @@ def _distance(y: Tensor, x: Tensor, start: tuple[float, float], end: tuple[float
 
 
 def _cover(distance: Tensor, size: float, round_: bool) -> Tensor:
-    """Return the covered share of each sample for a mark that is ``size`` samples wide, so that the sum is the area."""
+    """Return the covered share of each sample under a grain or scratch ``size`` samples wide; the shares sum to the
+    area.
+    """
     if round_:
         square = size**2 / 4
         edge = math.sqrt(max(square - 1 / 12, 1 / 4))

@@ -1,4 +1,4 @@
-"""The direction of a laser: given by the recipe, or drawn at random as in the paper."""
+"""The direction of a laser, given in the recipe or sampled at random as in the paper."""
 
 import math
 from typing import Any, Literal
@@ -23,7 +23,8 @@ def direction(
     rule: Rule = "width_over_focal_length",
     rng: Generator,
 ) -> Tensor:
-    """Return the direction of a source: ``angle``, or a normal draw with 3 sigma = share x W / f on each axis.
+    """Return the direction of a laser: ``angle``, or a normally distributed angle with 3 sigma = share x W / f per
+    axis.
 
     W is the side of the sensor. A draw beyond the edge of the sensor is repeated, so the spot lies on the sensor.
     The paper prints f / W instead: 6.7 rad for its camera, which no lens images. A draw by f / W is refused.
@@ -47,7 +48,7 @@ def field_of_view(focal_length: float, pixel_pitch: float, shape: tuple[int, int
 
 
 def _inside(sigma: float, edge: float, rng: Generator) -> Tensor:
-    """Draw a normal number of standard deviation ``sigma`` until its absolute value is at most ``edge``; return it."""
+    """Sample a normal distribution of standard deviation ``sigma``, limited to absolute values of at most ``edge``."""
     while True:
         drawn = sigma * torch.randn((), generator=rng, device=rng.device, dtype=torch.float64)
         if float(drawn.abs()) <= edge:

@@ -40,7 +40,8 @@ def laser_irradiance(
     """
     if psf.intensity.shape[0] != len(bands.centres):
         raise ValueError(
-            f"PSF of {psf.intensity.shape[0]} bands and line of {len(bands.centres)}: compute both from one `line` step"
+            f"PSF of {psf.intensity.shape[0]} bands and line of {len(bands.centres)} bands: "
+            "compute both from one `line` step"
         )
     sensor = {"full_well": full_well, "quantum_efficiency": quantum_efficiency, "pixel_pitch": pixel_pitch}
     saturating: Tensor = saturation(bands, **sensor, exposure=exposure)
@@ -52,7 +53,7 @@ def laser_irradiance(
 
 @laser_irradiance.zero_bound
 def _(psf: TensorStats, bands: TensorStats, *, strength: float, **sensor: float) -> float:
-    """Return an upper bound of the spot: saturation irradiance x strength x largest laser suppression ratio (LSR).
+    """Return an upper bound of the spot's irradiance: saturation x strength x largest laser suppression ratio (LSR).
 
     The bound needs no PSF, so no PSF is computed for it. A pixel that samples a point is at most as bright as the clear
     peak, where all of the pupil is in phase. The same holds for a pixel that averages over a width up to lambda f / D,
@@ -70,4 +71,4 @@ def _(psf: TensorStats, bands: TensorStats, *, strength: float, **sensor: float)
 def _(result: Tensor, psf: Psf, bands: Bands, *, strength: float, **sensor: float) -> list[Check]:
     share = 1.0 / saturation(bands, **sensor)
     peak = float(torch.tensordot(share.to(result), result, 1).max())
-    return [Check(f"peak {peak:.3g} I_sat of {strength:g}", math.isfinite(peak))]
+    return [Check(f"peak of the spot {peak:.3g} I_sat, strength {strength:g} I_sat", math.isfinite(peak))]

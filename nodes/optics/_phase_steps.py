@@ -1,4 +1,4 @@
-"""Steps of the phase between neighbouring samples of the pupil, which tell whether the samples follow the phase."""
+"""Phase differences between neighbouring pupil samples, which show whether the samples resolve the phase."""
 
 import torch
 from torch import Tensor
@@ -30,6 +30,6 @@ def phase_steps(pupil: Pupil) -> tuple[float, float]:
 
 
 def mask_turns(pupil: Pupil, band: int, step: int = 1) -> Tensor:
-    """Return the phase of the mask in a band, in turns, float64, at every ``step``-th sample."""
+    """Return the phase of the mask in one band, in turns, float64, at every ``step``-th pupil sample."""
     turns: Tensor = pupil.index[band] * pupil.height[::step, ::step].double() / pupil.wavelengths[band]
     return turns

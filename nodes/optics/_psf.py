@@ -98,7 +98,7 @@ def _focus(pupil: Pupil, camera: _Camera, dtype: torch.dtype, method: Method) ->
 
 
 def _area(pupil: Pupil) -> tuple[float, float]:
-    """Return the sums, over the samples of the clear pupil, of the light and of the field."""
+    """Return the sum of the light and the sum of the field over all samples of the pupil without mask and dirt."""
     rows = pupil.aperture.detach()
     light, field = torch.bmm(rows[:, None, :], rows[:, :, None]), rows.sum(dim=1)
     return float(light.sum(dtype=torch.float64)), float(field.sum(dtype=torch.float64))
@@ -109,7 +109,7 @@ def _alpha(pupil: Pupil, camera: _Camera, band: int) -> float:
 
 
 def _views(pupil: Pupil, camera: _Camera, band: int, scale: float, dtype: torch.dtype) -> list[View]:
-    """Return one window of point samples for each quadrature node within a pixel of one band."""
+    """Return the grids of focal points for one band of the PSF, one grid for each quadrature node within a pixel."""
     alpha, wavelength = _alpha(pupil, camera, band), float(pupil.wavelengths[band])
     nodes, weights = _nodes(max(pupil.height.shape) * alpha) if camera.sensor == "integrated" else ([0.0], [1.0])
     axes = [Axis(n, k, alpha) for n, k in zip(pupil.height.shape, camera.shape, strict=True)]
@@ -159,7 +159,7 @@ def _nodes(bandwidth: float) -> tuple[list[float], list[float]]:
 
 
 def _clear_peak(pupil: Pupil, camera: _Camera, band: int, area: float, total: float) -> float:
-    """Return the value of the PSF on the axis behind the clear aperture alone, sampled as the PSF is."""
+    """Return the on-axis value of the PSF of the lens without mask, dirt and aberrations, sampled like the PSF."""
     alpha = _alpha(pupil, camera, band)
     if camera.sensor == "point":
         return total**2 * alpha**2 / area
@@ -182,11 +182,13 @@ def _agree(pupil: Pupil) -> None:
         )
 
     if pupil.index.requires_grad or pupil.wavelengths.requires_grad:
-        raise ValueError("index and wavelengths take no gradient here: detach both, or train amplitude, height or path")
+        raise ValueError(
+            "index and wavelengths cannot receive gradients: detach both, or train amplitude, height or path"
+        )
 
 
 def _refuse_aliases(pupil: Pupil, camera: _Camera) -> None:
-    """Raise ValueError where the window reaches light that a sampled pupil repeats every lambda f / pitch.
+    """Raise ValueError if the PSF window includes aliases, which a sampled pupil repeats every lambda f / pitch.
 
     With ``pixel="zoh"`` the repeated light is real, because square pillars do send light there.
     """

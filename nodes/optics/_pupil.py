@@ -54,7 +54,7 @@ def pupil(
 
 
 def _lens_path(grid: PupilGrid, defocus: float, aberrations: Mapping[int, float], like: Tensor) -> Tensor | None:
-    """Return the path of defocus and aberrations, or None for a lens without either."""
+    """Return the optical path of defocus and aberrations, or None for a lens without defocus and aberrations."""
     if not defocus and not any(aberrations.values()):
         return None
     path, device = torch.empty_like(like), like.device
@@ -69,7 +69,10 @@ def _shapes(height: Tensor, index: Tensor, bands: Bands, grid: PupilGrid, dirt: 
     refuse_half(height=height)
     refuse_other_grid(height, grid)
     if index.shape != bands.centres.shape:
-        raise ValueError(f"index {tuple(index.shape)}, bands {tuple(bands.centres.shape)}: compute both from one step")
+        raise ValueError(
+            f"index {tuple(index.shape)} and bands {tuple(bands.centres.shape)}: "
+            "compute both from one `bands` or `line` step"
+        )
     if dirt is not None and dirt.amplitude.shape != height.shape:
         found, wanted = tuple(dirt.amplitude.shape), tuple(height.shape)
         raise ValueError(f"dirt is {found} and height is {wanted}: compute both from one `stop` step")

@@ -1,4 +1,4 @@
-"""The pupil grid in plain numbers: its coordinates, and its samples inside the stop."""
+"""The grid on which the pupil is sampled: the coordinates of the samples, and the samples inside the stop."""
 
 import math
 from collections.abc import Iterator
@@ -16,7 +16,7 @@ Aperture = Literal["inscribed", "clipped", "stretched"]
 
 
 class PupilGrid(NamedTuple):
-    """The pupil grid of a `Stop` in plain numbers, for the functions that compute coordinates."""
+    """The pupil grid of a `Stop` as Python numbers instead of tensors: samples, pitch and diameter."""
 
     samples: int  #: number of samples along each axis
     pitch: float  #: m between samples
@@ -24,12 +24,12 @@ class PupilGrid(NamedTuple):
 
 
 def grid_of(stop: Stop) -> PupilGrid:
-    """Return the pupil grid of a stop as plain numbers."""
+    """Return the pupil grid of a stop as Python numbers instead of tensors."""
     return PupilGrid(int(stop.samples), float(stop.pitch), float(stop.diameter))
 
 
 def pupil_grid(samples: int, pitch: float, diameter: float, aperture: Aperture = "inscribed") -> PupilGrid:
-    """Return the pupil grid with the final pitch and diameter, also where the aperture is wider than the grid.
+    """Return the pupil grid, with the diameter or the pitch adjusted if the aperture is wider than the grid.
 
     `inscribed` narrows the disc to the grid, `clipped` lets the square grid cut the disc, `stretched` widens the pitch.
 
@@ -80,7 +80,7 @@ def stripes(grid: PupilGrid) -> Iterator[slice]:
 
 
 def refuse_other_grid(height: Tensor, grid: PupilGrid) -> None:
-    """Raise ValueError unless the height map has the samples of the grid."""
+    """Raise ValueError unless the height map has the shape of the pupil grid."""
     wanted = (grid.samples, grid.samples)
     if tuple(height.shape) != wanted:
         raise ValueError(

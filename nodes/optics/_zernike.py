@@ -51,7 +51,7 @@ def _horner(coefficients: list[float], x: Tensor) -> Tensor:
 
 
 def combine(coefficients: Mapping[int, float], v: Tensor, u: Tensor) -> Tensor:
-    """Return the sum of Zernike polynomials at (v, u), in units of the radius, from root mean squares by Noll number.
+    """Return the weighted sum of Zernike polynomials at (v, u), in units of the radius; the weights are by Noll number.
 
     The sum is written in powers of u + iv, so neither the centre nor the cut of the azimuth needs special treatment.
     Source: Noll, J. Opt. Soc. Am. 66, 207 (1976), Eqs. 1 and 2.
@@ -70,6 +70,6 @@ def combine(coefficients: Mapping[int, float], v: Tensor, u: Tensor) -> Tensor:
 def surface(
     coefficients: Mapping[int, float], grid: PupilGrid, device: torch.device | None = None, rows: slice = _ALL
 ) -> Tensor:
-    """Return the sum of Zernike polynomials over the stop, float64 (v, u), 0 outside; ``rows`` selects some rows."""
+    """Return a weighted sum of Zernike polynomials on the pupil grid (v, u), float64, 0 outside the stop."""
     v, u = axes(grid, device)
     return torch.where(inside(grid, device, rows), combine(coefficients, v[rows], u), 0.0)

@@ -53,7 +53,7 @@ def _(result: Tensor, *inputs: Any, **params: float) -> list[Check]:
     spectra = _paints(bands.centres)
     counts = _counts(bands, illuminant, responses, level, **params)
     off = (spectra @ counts.T @ result.T - spectra @ to_srgb(bands.centres).T).square().mean().sqrt()
-    return [Check(f"rms error {float(off):.3f} on colour charts", float(off) < 0.1)]
+    return [Check(f"rms colour error {float(off):.3f} on colour charts", float(off) < 0.1)]
 
 
 def _counts(

@@ -32,7 +32,7 @@ def _(*, offset: float, offset_subtracted: bool = True, **params: object) -> lis
 
 @node(rtol=0.0)
 def clipped(raw: Tensor, *, full_well: Well, gain: Gain, bits: Bits = 16) -> Tensor:
-    """Mark clipped values, which reach the full well or the largest number of the converter.
+    """Mark clipped pixels, which reach the full well or the largest digital number of the converter.
 
     Shapes: raw (..., y, x) -> (..., y, x) bool.
     Units:  raw DN.

@@ -54,12 +54,15 @@ def _(result: Tensor, radiance: Tensor, psf: Psf, **params: Any) -> list[Check]:
         return [Check("the scene holds no light")]
     most = float(psf.intensity.sum(-1).sum(-1, dtype=torch.float64).amax())
     return [
-        Check(f"flux kept {after / before:.2%}", ok=params.get("border") == "reflect" or after <= before * most * 1.001)
+        Check(
+            f"flux kept in the image {after / before:.2%}",
+            ok=params.get("border") == "reflect" or after <= before * most * 1.001,
+        )
     ]
 
 
 def _fitted(radiance: Tensor, intensity: Tensor, border: Border) -> tuple[Tensor, Tensor, Corner]:
-    """Return the scene with its border, the part of the PSF that reaches the scene, and where the image begins."""
+    """Return the padded scene, the PSF that reaches the scene, and the first image pixel within their convolution."""
     if radiance.ndim < 3 or radiance.shape[-3] != intensity.shape[0]:
         raise ValueError(
             f"radiance {tuple(radiance.shape)} and PSF {tuple(intensity.shape)} must have the same bands: "
@@ -76,14 +79,14 @@ def _fitted(radiance: Tensor, intensity: Tensor, border: Border) -> tuple[Tensor
 
 
 def reach(kernel: Tensor, dim: int, size: int) -> Tensor:
-    """Return the samples of the kernel that are at most one scene width from the centre of the kernel."""
+    """Crop a PSF along one axis to the samples that are at most one scene width from the centre of the PSF."""
     centre = kernel.shape[dim] // 2
     low, high = max(0, centre - size + 1), min(kernel.shape[dim], centre + size)
     return kernel.narrow(dim, low, high - low)
 
 
 def _by_contrast(scene: Tensor, kernel: Tensor, at: Corner, size: Corner) -> Tensor:
-    """Convolve each band in the precision that the contrast of the band needs."""
+    """Convolve each band of the scene with its PSF, in float64 if the contrast of the band is too high for float32."""
     deep = _deep(scene) if scene.dtype == torch.float32 else []
     if not any(deep):
         return _convolve(scene, kernel, at, size)
@@ -95,7 +98,7 @@ def _by_contrast(scene: Tensor, kernel: Tensor, at: Corner, size: Corner) -> Ten
 
 
 def _deep(scene: Tensor) -> list[bool]:
-    """Return True for each band whose light is so concentrated that float32 round-off hides the rest of the band."""
+    """Return, for each band of the scene, True if its bright pixels make float32 round-off hide its other pixels."""
     flat = scene.detach().flatten(1)
     few = flat[:, :: max(1, flat.shape[1] >> 16)]
     mostly = few.abs().sqrt().mean(1).square()
@@ -105,7 +108,7 @@ def _deep(scene: Tensor) -> list[bool]:
 
 
 def _convolve(scene: Tensor, kernel: Tensor, at: Corner, size: Corner) -> Tensor:
-    """Return a window of the convolution, computed by the shortest transform without wrap-around in the window."""
+    """Return a window of the convolution of scene and PSF, by the shortest FFT without wrap-around in the window."""
     length = [
         smooth(max(s, a + w, s + k - 1 - a))
         for s, k, a, w in zip(scene.shape[1:], kernel.shape[1:], at, size, strict=True)
@@ -115,7 +118,7 @@ def _convolve(scene: Tensor, kernel: Tensor, at: Corner, size: Corner) -> Tensor
 
 
 class _Product(torch.autograd.Function):
-    """The window of the inverse transform of F(a) F(b), or of F(a) conj F(b), band by band.
+    """The convolution or correlation of two pictures, band by band, as a product of their FFTs, cropped to a window.
 
     ``a`` and ``b`` are padded with zeros around their corners. Both gradients are products of the same
     kind, so only the inputs are stored and derivatives of every order exist.
@@ -131,7 +134,7 @@ class _Product(torch.autograd.Function):
 
     @staticmethod
     def setup_context(ctx: Any, inputs: tuple[Any, ...], output: Tensor) -> None:
-        """Save the inputs apart from `forward`, as `torch.func` requires."""
+        """Save the inputs for the backward pass outside of `forward`, as `torch.func` requires."""
         ctx.save_for_backward(*inputs[:2])
         ctx.how = inputs[2:]
 
@@ -148,7 +151,7 @@ class _Product(torch.autograd.Function):
 
 
 class _Plane:
-    """Memory for the padded rows of one band, reused for the next band.
+    """Memory for the FFT of one zero-padded band of a picture, reused for the next band.
 
     The transform of the columns does not use ``out=``, which makes a copy: 21 ms instead of 12 ms at 3072 x 1537.
     """
@@ -165,7 +168,7 @@ class _Plane:
         return both
 
     def _spectrum(self, x: Tensor, at: Corner) -> Tensor:
-        """Return the spectrum: transform only the rows that hold samples, then all columns."""
+        """Return the FFT of a zero-padded picture: first along the rows that hold samples, then along all columns."""
         (y, left), (h, w) = at, x.shape
         for edge in (self.rows[:y], self.rows[y + h :], self.real[:h, :left], self.real[:h, left + w :]):
             edge.zero_()

@@ -1,4 +1,4 @@
-"""The image of a scene summed over bands before the convolution: few planes in, few planes out."""
+"""Weighted sums over the bands of an image, from few convolutions because bands are summed before the convolution."""
 
 import math
 from typing import Annotated, Any
@@ -29,7 +29,8 @@ def image_channels(
     within: Share = 0.0,
     largest: bool = False,
 ) -> Channels:
-    """Sum the bands of the image by each row of weights, convolving few planes with few kernels instead of all bands.
+    """Compute weighted sums over the bands of the image, with few convolutions instead of one convolution for each
+    band.
 
     Plane i is the sum over k of planes[k] convolved with sum_b rows[i, b] basis[b, k] psf[b]: three planes and three
     rows take 15 transforms where 31 bands take 93. Planes, kernels, bands and the tails of the PSF are omitted as far
@@ -87,7 +88,7 @@ def _(result: Channels, *inputs: Any, within: float = 0.0, **params: Any) -> lis
 
 
 def _fitted(radiance: LowRankCube, psf: Psf, rows: Tensor) -> tuple[Tensor, Tensor]:
-    """Return the planes and the part of the PSF that reaches the scene, both in the same precision."""
+    """Return the basis images of the scene, and the part of the PSF that reaches the scene, in the same precision."""
     bands = {len(radiance.basis), len(psf.intensity), rows.shape[-1]}
     if len(bands) > 1 or radiance.planes.ndim != 3 or psf.intensity.ndim != 3 or rows.ndim != 2:
         raise ValueError(
@@ -124,7 +125,9 @@ def _given(radiance: LowRankCube, planes: Tensor, intensity: Tensor, rows: Tenso
 
 
 def _formed(planes: Tensor, intensity: Tensor, given: Given, within: float) -> tuple[Tensor, Tensor, Tensor]:
-    """Return the planes of the image, their error bound and the sizes of the first plan that satisfies ``within``."""
+    """Return the summed image, its error bound, and the sizes of the first convolution plan of error at most
+    ``within``.
+    """
     eps = torch.finfo(planes.dtype).eps
     brightest, allowed = given.rows.new_zeros(len(given.rows)), within / (1 + within) - 16 * eps
     if within > 0:
@@ -144,7 +147,7 @@ def _formed(planes: Tensor, intensity: Tensor, given: Given, within: float) -> t
 
 
 def _top(result: Tensor, radiance: LowRankCube, intensity: Tensor, given: Given) -> float:
-    """Return the largest error of a row's brightest pixel, as a share of that pixel.
+    """Return the largest relative error of the brightest pixel over all weighted sums of the image bands.
 
     All bands together form the image of the cube's largest residual at each pixel. The true image differs from the
     computed image by at most that image of the residual. The true maximum is therefore at most the maximum of computed
@@ -163,7 +166,9 @@ def _top(result: Tensor, radiance: LowRankCube, intensity: Tensor, given: Given)
 
 
 def _share(off: Tensor, found: Tensor) -> float:
-    """Return the largest ratio of the error ``off`` to the true brightest pixel, which is at least ``found - off``."""
+    """Return the largest relative error of the brightest pixels, given computed values ``found`` and error bounds
+    ``off``.
+    """
     share = torch.where(off > 0, torch.where(off < found, off / (found - off), math.inf), 0.0)
     worst = float(share.amax()) if bool(torch.isfinite(off + found).all()) else math.inf
     return worst

@@ -1,4 +1,4 @@
-"""The choice of planes, kernels, bands and PSF window that suffice for a few sums over the bands of an image."""
+"""The choice of the cheapest way to compute weighted sums over the bands of an image with a bounded error."""
 
 import math
 from collections.abc import Iterator
@@ -17,7 +17,7 @@ _EVERY = 8  #: one band of this many is tested first for a smaller window
 
 
 class Given(NamedTuple):
-    """The properties of scene, PSF and rows that are known before a convolution; on the CPU, float64."""
+    """The properties of scene, PSF and weights from which a convolution plan is chosen; float64, on the CPU."""
 
     rows: Tensor  #: (row, band)
     basis: Tensor  #: (band, k)
@@ -31,7 +31,7 @@ class Given(NamedTuple):
 
 
 class Plan(NamedTuple):
-    """A way to convolve: numbers of planes, kernels and bands, a PSF window, the error bound and the cost."""
+    """A way to convolve a scene with a PSF: basis images, kernels, bands and PSF window, with error bound and cost."""
 
     planes: int
     bands: Tensor  #: indices of the bands that are not omitted
@@ -44,13 +44,13 @@ class Plan(NamedTuple):
 
     @property
     def kept(self) -> list[int]:
-        """Return the sizes in the order of `Channels.kept`."""
+        """Return the numbers of planes, kernels and bands, and the PSF window's size, as in `Channels.kept`."""
         count = len(self.bands) if self.kernels is None else len(self.kernels)
         return [self.planes, count, len(self.bands), *self.window]
 
 
 class Fewer(NamedTuple):
-    """Kernels in order of the light that they contribute, and weights that mix the first kernels into the others."""
+    """A small set of convolution kernels, brightest first, whose weighted sums approximate a larger set of kernels."""
 
     kernels: Tensor  #: (q, band)
     mixed: Tensor  #: (row x plane, q)
@@ -58,7 +58,7 @@ class Fewer(NamedTuple):
 
 
 def with_windows(given: Given, intensity: Tensor, brightest: Tensor, within: float) -> Given:
-    """Return the properties with the losses of smaller PSF windows, unless some bands show that each loses too much."""
+    """Return ``given`` with the light that smaller PSF windows omit, or unchanged if these windows omit too much."""
     few, signed = slice(_EVERY // 2, None, _EVERY), given.passed.signed
     if len(intensity) > _EVERY:
         some = given._replace(rows=given.rows[:, few], basis=given.basis[few], rest=given.rest[:, few])
@@ -68,7 +68,7 @@ def with_windows(given: Given, intensity: Tensor, brightest: Tensor, within: flo
 
 
 def _narrow(given: Given, limit: Tensor) -> bool:
-    """Return True if the second largest window may suffice for any number of planes."""
+    """Return True if the second largest PSF window omits little enough light for some number of basis images."""
     bands, planes = torch.arange(len(given.basis)), range(1, len(given.most) + 1)
     return len(given.passed.windows) > 1 and any(
         bool((given.rows.abs() @ _tail(given, bands, k, 1) <= limit).all()) for k in planes
@@ -76,7 +76,7 @@ def _narrow(given: Given, limit: Tensor) -> bool:
 
 
 def choose(given: Given, brightest: Tensor, within: float) -> Plan:
-    """Return the cheapest plan that omits at most ``within`` of each row's brightest pixel, or the complete plan."""
+    """Return the cheapest convolution plan that omits at most ``within`` of the brightest pixel, or a complete plan."""
     bands, lost = _strong(given, brightest, within)
     whole = min(_plans(given, bands, lost, len(given.most), 0), key=lambda plan: plan.cost)
     best = whole._replace(whole=True)
@@ -91,7 +91,7 @@ def choose(given: Given, brightest: Tensor, within: float) -> Plan:
 
 
 def _strong(given: Given, brightest: Tensor, within: float) -> tuple[Tensor, Tensor]:
-    """Return the bands that are not omitted, and an upper bound of what the omitted bands add to each row."""
+    """Return the bands to convolve, and an upper bound of the light that the omitted bands add to each weighted sum."""
     may = given.rows.abs() * (given.rest[0] * given.passed.total)
     share = torch.where(may > 0, may / brightest.clamp_min(1e-300)[:, None], 0.0).amax(0)
     order = share.argsort()
@@ -103,7 +103,7 @@ def _strong(given: Given, brightest: Tensor, within: float) -> tuple[Tensor, Ten
 
 
 def _enough(given: Given, bands: Tensor, lost: Tensor, brightest: Tensor, within: float) -> list[int]:
-    """Return the smallest numbers of planes whose omitted light is at most ``within`` of each row."""
+    """Return the smallest numbers of basis images that omit at most ``within`` of the brightest pixel."""
     off = lost + (given.rest[:, bands] * given.passed.total[bands]) @ given.rows[:, bands].abs().T
     fits = [k for k in range(1, len(given.most) + 1) if bool((off[k] <= within * brightest).all())]
     return fits[:_FARTHER]
@@ -112,7 +112,7 @@ def _enough(given: Given, bands: Tensor, lost: Tensor, brightest: Tensor, within
 def _plans(
     given: Given, bands: Tensor, lost: Tensor, k: int, j: int, within: tuple[Tensor, Fewer] | None = None
 ) -> Iterator[Plan]:
-    """Yield up to three plans with the first ``k`` planes and the window number ``j``.
+    """Yield up to three convolution plans that use the first ``k`` basis images and the PSF window number ``j``.
 
     The kernels of the three plans are one for each plane and row, one for each band, and fewer kernels to mix.
     """
@@ -138,7 +138,7 @@ def _plans(
 
 
 def _fewer(given: Given, bands: Tensor, k: int, brightest: Tensor) -> Fewer:
-    """Return the singular vectors of the sums over bands, weighted by the light of each plane and each band."""
+    """Return a small set of kernels: singular vectors of the matrix that sums the bands of the PSF to kernels."""
     rows, band = given.rows[:, bands], given.passed.total[bands]
     plane = torch.where(brightest[:, None] > 0, given.most[:k] / brightest[:, None], 0.0).flatten()
     scaled = plane[:, None] * _sums(rows, given.basis[bands, :k]) * band
@@ -151,12 +151,12 @@ def _fewer(given: Given, bands: Tensor, k: int, brightest: Tensor) -> Fewer:
 
 
 def _sums(rows: Tensor, basis: Tensor) -> Tensor:
-    """Return the weights of the bands in the kernel of each row and each plane."""
+    """Return the weight of each PSF band in the convolution kernel of each weighted sum and each basis image."""
     return (rows[:, None, :] * basis.T).flatten(0, 1)
 
 
 def _tail(given: Given, bands: Tensor, k: int, j: int) -> Tensor:
-    """Return a bound, for each band, of the light that the PSF outside the window adds to a pixel.
+    """Return, for each band, an upper bound of the light that the PSF outside the window adds to an image pixel.
 
     The bound is Young's inequality in three norms.
     """
@@ -168,7 +168,7 @@ def _tail(given: Given, bands: Tensor, k: int, j: int) -> Tensor:
 
 
 def _cost(given: Given, window: tuple[int, int], k: int, bands: int, kernels: Tensor | None, mix: Mix) -> float:
-    """Return the estimated seconds of a plan: transforms, products of spectra, sums of kernels; fitted on two cores."""
+    """Return the seconds that a convolution plan is expected to take on two cores: FFTs, products and kernel sums."""
     area = math.prod(transform(given, window))
     count = bands if kernels is None else len(kernels)
     terms = len(mix.x) if mix.x is not None else k
@@ -178,7 +178,7 @@ def _cost(given: Given, window: tuple[int, int], k: int, bands: int, kernels: Te
 
 
 def transform(given: Given, window: tuple[int, int]) -> tuple[int, int]:
-    """Return the shortest lengths of a transform without wrap-around in the image."""
+    """Return the shortest FFT lengths (y, x) for which the convolution has no wrap-around within the image."""
     if given.reflect:
         y, x = (smooth(s + w - 1) for s, w in zip(given.size, window, strict=True))
     else:

@@ -1,4 +1,4 @@
-"""The execution of a plan: borders, kernels, convolutions and an estimate of their round-off."""
+"""The convolution of a scene with PSFs by a chosen plan, with borders, kernels and an estimate of the round-off."""
 
 import math
 
@@ -14,20 +14,20 @@ _SOME = 16  #: rows of the PSF summed at a time; these rows of 31 bands fit in t
 
 
 def convolved(planes: Tensor, intensity: Tensor, given: Given, plan: Plan) -> Tensor:
-    """Return the weighted sums over bands of the image, (row, y, x), computed as ``plan`` says."""
+    """Return weighted sums (row, y, x) over the bands of the image, from the basis images and kernels of ``plan``."""
     scene = bordered(planes[: plan.planes], given, plan.window)
     return summed(scene, _kernels(intensity, plan), plan.mix, _where(given, plan.window))
 
 
 def _where(given: Given, window: tuple[int, int]) -> Where:
-    """Return the paddings of scene and kernel, and the window of the convolution that is the image."""
+    """Return the zero padding of scene and kernel, and the window of their convolution that is the image."""
     (m, n), zero = window, (0, 0)
     at = (m - 1, n - 1) if given.reflect else (m // 2, n // 2)
     return Where(zero, zero, at, given.size, transform(given, window))
 
 
 def majorant(off: Tensor, intensity: Tensor, given: Given) -> Tensor:
-    """Return an upper bound (y, x) of the light that an error ``off`` (y, x) in every band adds to any row."""
+    """Return an upper bound (y, x) of the image error from an error ``off`` (y, x) in every band of the scene."""
     window = (intensity.shape[1], intensity.shape[2])
     heaviest = given.rows.abs().amax(0).to(intensity)
     kernel = _summed_bands(heaviest[None], intensity, given.passed.signed)
@@ -36,7 +36,7 @@ def majorant(off: Tensor, intensity: Tensor, given: Given) -> Tensor:
 
 
 def bordered(planes: Tensor, given: Given, window: tuple[int, int]) -> Tensor:
-    """Return the planes with the border that a convolution with a PSF of size ``window`` needs."""
+    """Return the basis images of the scene, with a mirrored border if the convolution with the PSF needs a border."""
     if not given.reflect:
         return planes
     m, n = window
@@ -55,7 +55,7 @@ def _kernels(intensity: Tensor, plan: Plan) -> Tensor:
 
 
 def _summed_bands(weights: Tensor, stack: Tensor, absolute: bool = False) -> Tensor:
-    """Return weighted sums (kernel, y, x) over the bands of a stack, or of the absolute values of a stack.
+    """Return weighted sums (kernel, y, x) over the bands of a PSF, or over the absolute values of a PSF.
 
     A stack that must be copied is copied in slabs of a few rows.
     """
@@ -70,7 +70,7 @@ def _summed_bands(weights: Tensor, stack: Tensor, absolute: bool = False) -> Ten
 
 
 def guessed(planes: Tensor, given: Given) -> Tensor:
-    """Return an estimate of the brightest pixel of each row of the image.
+    """Return an estimate of the brightest pixel of each weighted sum over the image bands.
 
     The estimate is the smaller of two numbers: a quarter of the brightest pixel without blur, and half of an upper
     bound of the brightest pixel with blur.
@@ -86,7 +86,7 @@ def guessed(planes: Tensor, given: Given) -> Tensor:
 
 
 def rounding(given: Given, plan: Plan, found: Tensor, eps: float) -> Tensor:
-    """Return an estimate of the largest round-off of the transforms, for each row of the image.
+    """Return an estimate of the largest FFT round-off in each weighted sum over the image bands.
 
     The round-off is close to white: a share eps sqrt(log2 N) / 2 of the power, spread over all N samples. The estimate
     takes eight standard deviations of that noise. It adds ten roundings of the brightest pixel for errors that are not

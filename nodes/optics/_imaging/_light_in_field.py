@@ -1,4 +1,4 @@
-"""The flux of an image, computed without the image: the light that each PSF sample moves into the field."""
+"""The flux of an image, computed without the image from the light that each PSF sample moves into the field of view."""
 
 import torch
 from torch import Tensor
@@ -7,7 +7,7 @@ _ROWS = 32  #: rows of the PSF at a time; these rows of 31 bands fit in the cach
 
 
 def flux(planes: Tensor, intensity: Tensor, basis: Tensor, size: tuple[int, int]) -> Tensor:
-    """Return the sum over all pixels of the image of each band: (band,) float64.
+    """Return the flux of each band of an image, which is the sum over all pixels: (band,) float64.
 
     ``planes`` (k, y, x) include their border where the border reflects. ``intensity`` (band, m, n) is no wider than the
     scene of ``size`` can receive; ``basis`` is (band, k). Sample p of the PSF moves a box of each plane into the field,
@@ -25,7 +25,7 @@ def flux(planes: Tensor, intensity: Tensor, basis: Tensor, size: tuple[int, int]
 
 
 def _boxes(plane: Tensor, kernel: torch.Size, size: tuple[int, int]) -> Tensor:
-    """Return for each PSF sample the sum (m, n) of the plane over the box that this sample moves into the field.
+    """Return, for each PSF sample, the sum (m, n) of a plane over the box that the sample moves into the field of view.
 
     The plane is rotated by 180 degrees, so that its boxes follow the order of the samples. The sums are in float64, a
     few rows at a time, because allocating whole float64 planes takes longer than the sums.
@@ -41,7 +41,7 @@ def _boxes(plane: Tensor, kernel: torch.Size, size: tuple[int, int]) -> Tensor:
 
 
 def _along(sums: Tensor, dim: int, kernel: int, size: int) -> Tensor:
-    """Return the sums over each box along ``dim`` from cumulative sums."""
+    """Return sums over moving windows along the axis ``dim``, as differences of cumulative sums."""
     before = kernel // 2
     if sums.shape[dim] == size:  # zeros about the scene: each box starts or ends at the scene's edge
         first = sums.narrow(dim, size - before - 1, before + 1)

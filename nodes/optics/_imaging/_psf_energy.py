@@ -1,4 +1,4 @@
-"""The light of PSFs inside and outside of windows about their centre."""
+"""The light of a PSF inside and outside of windows about the centre of the PSF."""
 
 from itertools import pairwise
 from typing import NamedTuple
@@ -11,7 +11,7 @@ _ROUNDED = 4e-6  #: relative round-off of a float32 sum: a few nested sums of a 
 
 
 class Passed(NamedTuple):
-    """Sums and maxima of the PSFs of all bands inside and outside of windows; on the CPU, float64."""
+    """Sums and maxima of the PSF of each band, inside and outside of windows, as float64 tensors on the CPU."""
 
     windows: list[tuple[int, int]]  #: the largest first
     total: Tensor  #: (band,) sum of |PSF|
@@ -66,12 +66,12 @@ def _cuts(spans: list[tuple[int, int]]) -> list[int]:
 
 
 def _covered(span: tuple[int, int], cuts: list[int]) -> Tensor:
-    """Return True for each piece between two cuts that lies in the span."""
+    """Return True for each interval between two neighbouring cuts that lies inside the span."""
     return torch.tensor([span[0] <= cut < span[1] for cut in cuts[:-1]])
 
 
 def _pieces(size: Tensor, rows: list[int], columns: list[int]) -> tuple[Tensor, Tensor]:
-    """Return the sum, rounded up, and the maximum of each piece of a PSF, both (band, rows, columns).
+    """Return the sum, rounded up, and the maximum of each rectangular piece of a PSF, both (band, rows, columns).
 
     A few large calls are faster than many small calls, each of which waits for other work on the machine.
     """

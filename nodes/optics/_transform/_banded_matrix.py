@@ -12,7 +12,7 @@ _SLACK = 8  #: columns of zeros that let blocks of unequal spacing share one str
 
 
 class _Run(NamedTuple):
-    """A range of ``blocks`` blocks from number ``first`` on, whose columns begin at start, start + stride and so on."""
+    """A range of matrix blocks whose first columns are equally spaced: start, start + stride and so on."""
 
     first: int
     blocks: int
@@ -25,7 +25,7 @@ class _Run(NamedTuple):
 
 
 class Banded:
-    """A banded matrix: row ``i`` has weights in the columns within ``reach`` of ``origin + step i``.
+    """A banded matrix, whose row ``i`` is nonzero only in the columns within ``reach`` of ``origin + step i``.
 
     ``n_rows`` is rounded up to whole blocks; the extra rows are finite and meaningless. The other factor of a product
     needs ``margin`` zeros before and behind its ``n_columns`` samples, so that all blocks have the same size.
@@ -49,7 +49,7 @@ class Banded:
         return self.origin + self.step * row
 
     def fill(self, weigh: Callable[[Tensor, Tensor], Tensor]) -> "Banded":
-        """Set the weights to ``weigh(row, column)``, called with float64 indices, and to zero out of reach."""
+        """Set the matrix to ``weigh(row, column)`` within the band and to zero outside; the indices are float64."""
         starts = [start for run in self.runs for start in run.starts]
         columns = torch.tensor(starts, dtype=torch.float64)[:, None, None] + torch.arange(self.width)
         rows = torch.arange(self.n_rows, dtype=torch.float64).view(self.count, self.block, 1)
@@ -58,12 +58,12 @@ class Banded:
         return self
 
     def to(self, dtype: torch.dtype, device: torch.device) -> "Banded":
-        """Cast the weights to ``dtype`` and move the weights to ``device``."""
+        """Convert the matrix to ``dtype`` and move the matrix to ``device``."""
         self.weights = self.weights.to(device, dtype)
         return self
 
     def part(self, first: int, last: int) -> "Banded":
-        """Return the matrix of the blocks from ``first`` up to ``last``, without ``last``."""
+        """Return the part of the banded matrix from block ``first`` up to, but without, block ``last``."""
         part = copy.copy(self)
         part.count, part.n_rows = last - first, (last - first) * self.block
         part.weights, part.runs = self.weights[first:last], []
@@ -101,7 +101,7 @@ def _multiply(a: Tensor, b: Tensor, out: Tensor) -> None:
 
 
 def _runs(low: list[int], high: list[int], pace: float) -> list[_Run]:
-    """Return a few runs of equally spaced starts that cover all blocks, each with ``low <= start <= high``."""
+    """Return a few runs of matrix blocks with equally spaced first columns, each column from ``low`` to ``high``."""
     runs: list[_Run] = []
     first = 0
     while first < len(low):

@@ -11,7 +11,7 @@ from neusee.nodes.optics._transform._workspace import Workspace
 
 
 class _Chirps(NamedTuple):
-    """The three factors of ``jk = (j^2 + k^2 - (j - k)^2) / 2``: a chirp before, a convolution, a chirp behind."""
+    """The phase factors of the chirp transform, from ``jk = (j^2 + k^2 - (j - k)^2) / 2``, one for each term."""
 
     before: Tensor
     spectrum: Tensor
@@ -34,7 +34,7 @@ def _chirps(axis: Axis, dtype: torch.dtype, device: torch.device) -> _Chirps:
 
 
 def bluestein(rows: Axis, columns: Axis, source: Source, sink: Sink, work: Workspace) -> None:
-    """Transform the rows and then the columns of a field, in chunks that fit in the CPU's cache."""
+    """Compute the scaled Fourier transform of a field by chirps, along rows and then along columns, in small chunks."""
     kind = work.dtype.to_complex()
     along_x, along_y = (_chirps(axis, work.dtype, work.device) for axis in (columns, rows))
     half = work.take("half", columns.n_out, rows.n_in, dtype=kind)
@@ -49,7 +49,7 @@ def bluestein(rows: Axis, columns: Axis, source: Source, sink: Sink, work: Works
 
 
 def _convolve(lines: Tensor, chirps: _Chirps, axis: Axis, work: Workspace) -> Tensor:
-    """Return the transform along the last dimension; the next call overwrites the result."""
+    """Return the chirp transform along the last dimension, in a buffer that the next call overwrites."""
     padded = work.take("padded", lines.shape[0], chirps.length, dtype=lines.dtype)
     torch.mul(lines, chirps.before, out=padded[:, : axis.n_in])
     padded[:, axis.n_in :] = 0
@@ -60,7 +60,7 @@ def _convolve(lines: Tensor, chirps: _Chirps, axis: Axis, work: Workspace) -> Te
 
 @functools.lru_cache(maxsize=256)
 def smooth(n: int, even: bool = False) -> int:
-    """Return the least number from ``n`` on without a prime factor above 5; other lengths make FFTs slower."""
+    """Return the smallest FFT length of at least ``n`` without prime factors above 5, for which FFTs are fast."""
     n += even and n % 2
     while _rough(n):
         n += 1 + even

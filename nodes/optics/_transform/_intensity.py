@@ -19,7 +19,7 @@ KEPT_FIELD_BYTES = 1 << 30  #: bytes; focal fields up to this size are kept for 
 
 @dataclass(frozen=True, slots=True)
 class Sampling:
-    """The windows of point samples, and the precision and method of their transform."""
+    """The grids of focal points, and the precision and method of the transform from the pupil to these grids."""
 
     views: tuple[View, ...]
     dtype: torch.dtype
@@ -27,14 +27,14 @@ class Sampling:
 
 
 def intensity_of(amplitude: Tensor, height: Tensor, path: Tensor, sampling: Sampling) -> Tensor:
-    """Return the intensity; inside a transform of `torch.func`, by an autograd function that `torch.func` accepts."""
+    """Return the intensity of the PSF, differentiable by back-propagation and by the transforms of `torch.func`."""
     form = _Transformed if torch._C._are_functorch_transforms_active() else PupilIntensity
     result: Tensor = form.apply(amplitude, height, path, sampling)  # type: ignore[no-untyped-call]
     return result
 
 
 class PupilIntensity(torch.autograd.Function):
-    """The intensity ``sum over views of weight * envelope * |U|^2``; its gradient is an adjoint transform."""
+    """The PSF intensity ``sum over views of weight * envelope * |U|^2``, whose gradient is an adjoint transform."""
 
     @staticmethod
     def forward(ctx: Any, amplitude: Tensor, height: Tensor, path: Tensor, sampling: Sampling) -> Tensor:
@@ -53,7 +53,7 @@ class PupilIntensity(torch.autograd.Function):
 
 
 class _Transformed(torch.autograd.Function):
-    """The intensity for `torch.func`: no field is kept, and the gradient itself has no derivative."""
+    """The PSF intensity for `torch.func`, differentiable once and without stored focal fields."""
 
     @staticmethod
     def forward(amplitude: Tensor, height: Tensor, path: Tensor, sampling: Sampling) -> Tensor:
@@ -70,7 +70,7 @@ class _Transformed(torch.autograd.Function):
 
 
 class _Gradient(torch.autograd.Function):
-    """The gradients with respect to amplitude, height and path; a second derivative raises an error."""
+    """The gradients of the PSF intensity for amplitude, height and path; a second derivative raises an error."""
 
     @staticmethod
     def forward(weight: Tensor, amplitude: Tensor, height: Tensor, path: Tensor, sampling: Sampling) -> Any:
@@ -87,7 +87,7 @@ class _Gradient(torch.autograd.Function):
 
 
 def _computed(screens: Screens, sampling: Sampling, keep: bool) -> tuple[Tensor, list[Tensor | None]]:
-    """Return the intensity, and the focal field of each view, or None where no fields are kept."""
+    """Return the PSF intensity, and the focal field of each view, or None instead of fields that are not stored."""
     views, shape = sampling.views, (sampling.views[0].rows.n_out, sampling.views[0].columns.n_out)
     device, fields, done = screens.height.device, list[Tensor | None](), -1
     intensity = torch.empty(views[-1].band + 1, *shape, dtype=sampling.dtype, device=device)
@@ -109,7 +109,10 @@ def _adjoint(
     fields: Sequence[Tensor | None],
     needs: Sequence[bool],
 ) -> list[Tensor | None]:
-    """Return the needed gradients of amplitude, height and path; a field that was not kept is computed again."""
+    """Return the gradients with respect to amplitude, height and path, each only if autograd requests the gradient.
+
+    A focal field that was not stored is computed again.
+    """
     grads = [torch.zeros_like(x) if need else None for x, need in zip(screens[:3], needs, strict=True)]
     with borrowed(weight.dtype, weight.device) as work:
         for view, kept in zip(sampling.views, fields, strict=True):
@@ -120,7 +123,7 @@ def _adjoint(
 
 
 def _scaled(view: View, values: Tensor, rows: slice, columns: slice) -> Tensor:
-    """Multiply ``values`` of one patch, in place, by the weight and the envelope of the view."""
+    """Multiply ``values`` on one patch of the focal plane, in place, by the weight and the envelope of the view."""
     if view.envelope is None:
         return values.mul_(view.weight)
     y, x = view.envelope
@@ -128,7 +131,7 @@ def _scaled(view: View, values: Tensor, rows: slice, columns: slice) -> Tensor:
 
 
 def _power(field: Field, out: Tensor, add: bool, kept: Tensor | None, method: Method, work: Workspace) -> None:
-    """Write the weighted |U|^2 of one view to ``out``, or add the values to ``out``."""
+    """Write the weighted intensity |U|^2 of one view of the focal plane to ``out``, or add the intensity to ``out``."""
 
     def sink(rows: slice, columns: slice, patch: Tensor) -> None:
         if kept is not None:
@@ -141,12 +144,12 @@ def _power(field: Field, out: Tensor, add: bool, kept: Tensor | None, method: Me
 
 
 def _keep(kept: Tensor, rows: slice, columns: slice, patch: Tensor) -> None:
-    """Store a patch transposed, which is the layout of patches in the fastest method and its adjoint."""
+    """Store a patch of the focal field transposed, the memory layout of the fastest transform and its adjoint."""
     patch_of(kept.transpose(1, 2), rows, columns, patch).copy_(patch)
 
 
 def _focal(field: Field, sampling: Sampling, work: Workspace) -> Tensor:
-    """Return the focal field of a view, computed again, transposed."""
+    """Compute the focal field of a view again for back-propagation, and return the transposed field."""
     view = field.view
     planes = work.take("focal", 2, view.columns.n_out, view.rows.n_out)
 
@@ -182,7 +185,7 @@ def _add_gradient(
 def _chain(
     field: Field, rows: slice, columns: slice, patch: Tensor, grads: list[Tensor | None], work: Workspace
 ) -> None:
-    """Add the gradients of amplitude, height and path that follow from ``patch``, the gradient of the field."""
+    """Add the gradients of amplitude, height and path by the chain rule, given the gradient ``patch`` of the field."""
     unit = work.take("unit", *patch.shape)
     field.phasor(rows, columns, unit, work)
     if grads[0] is not None:

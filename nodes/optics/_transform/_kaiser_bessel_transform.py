@@ -1,4 +1,4 @@
-"""The scaled Fourier transform by two griddings and one short FFT, exact to the chosen error of the kernel.
+"""The scaled Fourier transform by Kaiser-Bessel interpolation before and after a short FFT, with a chosen accuracy.
 
 The window needs only ``alpha n_in n_out`` samples of information (800 for 2160 -> 2048 at 550 nm).
 The pupil is therefore gathered onto a grid 1.75 times finer than that, and the FFT is longer by another
@@ -19,14 +19,16 @@ from neusee.nodes.optics._transform._workspace import Workspace
 
 
 class _Kernel(NamedTuple):
-    """The Kaiser-Bessel kernel of ``width`` samples for a grid ``oversampling`` times as fine as needed."""
+    """The Kaiser-Bessel interpolation kernel of ``width`` samples, for a grid that is oversampled ``oversampling``
+    times.
+    """
 
     width: int
     oversampling: float
 
     @property
     def peak(self) -> float:
-        """Return the factor by which weights are divided so that they are near one."""
+        """Return the divisor that brings the interpolation weights near one."""
         return self.width * math.sinh(self.beta) / self.beta
 
     @property
@@ -50,7 +52,7 @@ _SINGLE, _DOUBLE = _Kernel(8, 1.75), _Kernel(18, 2.0)
 
 
 class Plan(NamedTuple):
-    """The steps along one axis: gather the input to ``points``, FFT of ``length``, crop to ``kept``, spread."""
+    """The transform along one axis: interpolate to ``points``, FFT of ``length``, crop to ``kept``, interpolate."""
 
     gather: Banded
     spread: Banded
@@ -61,18 +63,18 @@ class Plan(NamedTuple):
 
     @property
     def padded(self) -> int:
-        """Return the index of the first gathered point in the input of the FFT."""
+        """Return the index of the first interpolated sample in the zero-padded input of the FFT."""
         return self.length // 2 - (self.points - 1) // 2
 
     @property
     def cropped(self) -> int:
-        """Return the index of the first kept frequency in the result of the FFT."""
+        """Return the index of the first frequency that is kept in the result of the FFT."""
         return self.length // 2 - (self.kept - 1) // 2
 
 
 @functools.lru_cache(maxsize=64)
 def plan(axis: Axis, dtype: torch.dtype, device: torch.device) -> Plan:
-    """Return grids and weights of one axis; later calls with an equal axis return the same plan."""
+    """Return the grids and interpolation weights of the transform along one axis, cached for later calls."""
     kernel = _SINGLE if dtype == torch.float32 else _DOUBLE
     pitch = min(1 / (axis.alpha * axis.n_out * kernel.oversampling), max(axis.n_in, _WIDEST) / _WIDEST)
     points = _odd(math.ceil((axis.n_in - 1) / pitch) + kernel.width)
@@ -87,7 +89,9 @@ def plan(axis: Axis, dtype: torch.dtype, device: torch.device) -> Plan:
 
 
 def _gather(axis: Axis, kernel: _Kernel, pitch: float, points: int, length: int) -> Banded:
-    """Return the matrix from the field to the grid points, corrected for the interpolation after the FFT."""
+    """Return the matrix that interpolates the field to the grid of the FFT, corrected for the interpolation after the
+    FFT.
+    """
     j0, l0 = (axis.n_in - 1) / 2, (points - 1) // 2
     band = Banded(points, axis.n_in, j0 - pitch * l0, pitch, pitch * kernel.width / 2, _BLOCK)
 
@@ -100,7 +104,9 @@ def _gather(axis: Axis, kernel: _Kernel, pitch: float, points: int, length: int)
 
 
 def _spread(axis: Axis, kernel: _Kernel, pitch: float, length: int) -> Banded:
-    """Return the matrix from the kept frequencies to the window, corrected for the gathering kernel."""
+    """Return the matrix that interpolates the FFT to the output samples, corrected for the interpolation before the
+    FFT.
+    """
     k0, fine = (axis.n_out - 1) / 2, axis.alpha * pitch * length
     kept = _odd(math.ceil((axis.n_out - 1) * fine) + kernel.width)
     q0 = (kept - 1) // 2
@@ -123,7 +129,9 @@ def _odd(n: int) -> int:
 
 
 def kaiser_bessel(rows: Axis, columns: Axis, source: Source, sink: Sink, work: Workspace) -> None:
-    """Transform a field by gathering, a short FFT and interpolation, in chunks that fit in the CPU's cache."""
+    """Compute the scaled Fourier transform by interpolation, a short FFT and interpolation, in chunks that fit in a
+    cache.
+    """
     along_x, along_y = (plan(axis, work.dtype, work.device) for axis in (columns, rows))
     half = _rows_to_frequencies(along_x, along_y.gather.margin, rows.n_in, source, work)
     spectrum = _columns_to_frequencies(along_y, half, work)
@@ -131,7 +139,7 @@ def kaiser_bessel(rows: Axis, columns: Axis, source: Source, sink: Sink, work: W
 
 
 def _rows_to_frequencies(x: Plan, margin: int, n_rows: int, source: Source, work: Workspace) -> Tensor:
-    """Return the kept frequencies along u of every row, between ``margin`` rows of zeros."""
+    """Return the cropped FFT of every pupil row, with ``margin`` rows of zeros above and below."""
     kind, wide = work.dtype.to_complex(), x.gather.n_columns
     half = _zero_margins(work.take("half", n_rows + 2 * margin, x.kept, dtype=kind), 0, margin)
     for start, stop in row_chunks(n_rows, wide):
@@ -153,7 +161,7 @@ def _zero_margins(x: Tensor, dim: int, margin: int) -> Tensor:
 
 
 def _place(blocks: Tensor, line: Tensor, x: Plan) -> None:
-    """Copy gathered (re, im) blocks into the middle of complex lines, and zero the rest of the lines."""
+    """Copy blocks of interpolated (re, im) samples to the middle of the complex FFT input, and set the rest to zero."""
     count, block, n = x.gather.count, x.gather.block, line.shape[0]
     line[:, : x.padded] = 0
     parts = blocks.view(count, 2, n, block).permute(1, 2, 0, 3)
@@ -163,7 +171,7 @@ def _place(blocks: Tensor, line: Tensor, x: Plan) -> None:
 
 
 def _columns_to_frequencies(y: Plan, half: Tensor, work: Workspace) -> Tensor:
-    """Gather along v into zero-padded columns, transform the columns, and return the frequencies transposed."""
+    """Interpolate all columns to the grid of the FFT, transform the columns, and return the cropped FFT transposed."""
     wide = half.shape[1]
     columns = work.take("columns", y.length, wide, dtype=half.dtype)
     y.gather.left(_flat(half), _flat(columns[y.padded : y.padded + y.gather.n_rows]))
@@ -177,7 +185,7 @@ def _columns_to_frequencies(y: Plan, half: Tensor, work: Workspace) -> Tensor:
 
 
 def _interpolate(x: Plan, y: Plan, shape: tuple[int, int], spectrum: Tensor, sink: Sink, work: Workspace) -> None:
-    """Interpolate the frequencies (x, y) onto the window, a few columns at a time, and pass them to ``sink``."""
+    """Interpolate the FFT (x, y) to the output samples, a few columns at a time, and pass these samples to ``sink``."""
     for first in range(0, x.spread.count, _COLUMN_BLOCKS):
         part = x.spread.part(first, min(first + _COLUMN_BLOCKS, x.spread.count))
         line = work.take("stripe", part.n_rows, spectrum.shape[1], dtype=spectrum.dtype)
@@ -191,7 +199,7 @@ def _interpolate(x: Plan, y: Plan, shape: tuple[int, int], spectrum: Tensor, sin
 
 
 def _deliver(tiles: Tensor, columns: slice, n_rows: int, sink: Sink) -> None:
-    """Pass all whole blocks of rows to ``sink``, then the remaining rows of the last block."""
+    """Pass all complete blocks of output rows to ``sink``, then the rows of the incomplete last block."""
     block = tiles.shape[2]
     whole = n_rows // block
     if whole:

@@ -1,4 +1,4 @@
-"""The scaled Fourier transform as matrix products: plain, and folded about the middle of both grids."""
+"""The scaled Fourier transform as matrix products: complex, or real for the even and odd parts of the field."""
 
 import torch
 from torch import Tensor
@@ -21,7 +21,9 @@ def direct(rows: Axis, columns: Axis, source: Source, sink: Sink, work: Workspac
 
 
 def folded(rows: Axis, columns: Axis, source: Source, sink: Sink, work: Workspace) -> None:
-    """Transform the even and the odd part of the field by real matrix products: a quarter of the operations."""
+    """Transform the even and odd parts of the field by real matrix products, in a quarter of the operations of
+    `direct`.
+    """
     turn_x, turn_y = _half_kernels(columns, work), _half_kernels(rows, work)
     half = work.take("half", 2, rows.n_in, columns.n_out)
     for start, stop in row_chunks(rows.n_in, columns.n_in):
@@ -42,7 +44,7 @@ def _kernel(axis: Axis, work: Workspace) -> Tensor:
 
 
 def _half_kernels(axis: Axis, work: Workspace) -> tuple[Tensor, Tensor]:
-    """Return the cosines and signed sines of the kernel on the half grids j >= 0, k >= 0.
+    """Return the cosines and signed sines of the Fourier kernel on the half grids j >= 0, k >= 0.
 
     The cosine is halved at a sample on the axis, which both halves of the field contain.
     """

@@ -1,4 +1,4 @@
-"""The field in the pupil, computed patch by patch from the factors of the pupil and never stored as a whole."""
+"""The complex field in the pupil, computed patch by patch from amplitude, height and path, and never stored whole."""
 
 import math
 from dataclasses import dataclass
@@ -16,7 +16,7 @@ _FEW_TURNS = 2.0  #: below this many turns a float32 phase is exact to 5e-7 rad,
 
 @dataclass(frozen=True, slots=True)
 class View:
-    """A window of point samples in one band; its |U|^2 is multiplied by ``weight`` and by two envelopes."""
+    """A grid of focal points in one band, whose intensity |U|^2 is multiplied by ``weight`` and by two envelopes."""
 
     band: int
     rows: Axis
@@ -29,7 +29,7 @@ class View:
 
 
 class Screens(NamedTuple):
-    """The factors of the pupil that all bands share, with the largest height and path in metres."""
+    """The amplitude, height and path of the pupil in all bands, with the largest height and path in metres."""
 
     amplitude: Tensor
     height: Tensor
@@ -39,7 +39,7 @@ class Screens(NamedTuple):
 
     @classmethod
     def of(cls, amplitude: Tensor, height: Tensor, path: Tensor) -> "Screens":
-        """Return the factors with the largest height and path; raise ValueError where one of these is not finite."""
+        """Return the pupil's factors and largest height and path; raise ValueError if height or path is not finite."""
         extents = [float(torch.stack(x.detach().aminmax()).abs().max()) for x in (height, path)]
         refuse_not_finite("no light has such a phase", height=extents[0], path=extents[1])
         return cls(amplitude, height, path, *extents)
@@ -58,7 +58,7 @@ class Field:
         self.tilt_v, self.tilt_u = v.to(kind)[:, None], u.to(kind)
 
     def phasor(self, rows: slice, columns: slice, planes: Tensor, work: Workspace) -> None:
-        """Write the cosine and sine of the phase of one patch; a phase of more turns than two is reduced in float64."""
+        """Write the cosine and sine of the pupil phase in one patch, in float64 if the phase exceeds two turns."""
         angle = work.take("angle", *planes.shape[1:])
         turns = angle if self.few else work.take("turns", *planes.shape[1:], dtype=torch.float64)
         unit = 2 * math.pi if self.few else 1.0
@@ -72,7 +72,7 @@ class Field:
         torch.sin(angle, out=planes[1])
 
     def rows(self, work: Workspace) -> Source:
-        """Return a function that writes rows of the field, as a transform reads them."""
+        """Return a function that writes the requested rows of the pupil field to a buffer for the transform."""
         everywhere = slice(0, self.screens.height.shape[1])
 
         def fill(start: int, stop: int, planes: Tensor) -> None:

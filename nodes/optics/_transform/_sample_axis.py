@@ -39,7 +39,7 @@ def centred(n: int, device: torch.device) -> Tensor:
 
 
 def radians(turns: Tensor) -> Tensor:
-    """Return the phase of float64 ``turns`` without whole turns, so that a cast to float32 is exact to 2e-7 rad."""
+    """Return the phase ``turns`` modulo one turn, in radians, so that a cast to float32 is exact to 2e-7 rad."""
     return (turns - turns.round()).mul_(2 * math.pi)
 
 
@@ -56,6 +56,6 @@ def patch_of(x: Tensor, rows: slice, columns: slice, like: Tensor) -> Tensor:
 
 
 def row_chunks(rows: int, columns: int, elements: int = 1 << 19) -> list[tuple[int, int]]:
-    """Return ranges of rows, each short enough to fit in the CPU's cache."""
+    """Split the rows of an array into ranges that each fit in the CPU's cache."""
     step = max(1, min(rows, elements // max(columns, 1)))
     return [(start, min(start + step, rows)) for start in range(0, rows, step)]

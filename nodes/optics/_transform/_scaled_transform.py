@@ -23,7 +23,7 @@ def propagate(rows: Axis, columns: Axis, source: Source, sink: Sink, work: Works
 
 
 def cheapest(rows: Axis, columns: Axis, device: torch.device) -> str:
-    """Return the fastest method by expected time; on a GPU that is the folded matrix product at every size."""
+    """Return the transform method with the shortest expected time; on a GPU always the folded matrix product."""
     if device.type != "cpu":
         return "folded"
     expected = _expected_seconds(rows, columns)
@@ -31,7 +31,7 @@ def cheapest(rows: Axis, columns: Axis, device: torch.device) -> str:
 
 
 def _expected_seconds(rows: Axis, columns: Axis) -> dict[str, float]:
-    """Return the time of each method, fitted on two cores with AVX-512 (tests/benchmarks/bench_psf.py)."""
+    """Return the expected seconds of each transform method on two AVX-512 cores (tests/benchmarks/bench_psf.py)."""
     n_in, n_out = rows.n_in * columns.n_in, rows.n_out * columns.n_out
     products = rows.n_in * columns.n_out * (columns.n_in + rows.n_out)
     chirped = rows.n_in * smooth(columns.n_in + columns.n_out) + columns.n_out * smooth(rows.n_in + rows.n_out)
@@ -83,7 +83,7 @@ def _tilts(
     real: torch.dtype,
     device: torch.device,
 ) -> tuple[list[Tensor], list[Tensor]]:
-    """Return the phasors along each axis that shift the centres of a transform to the given centres."""
+    """Return the phasors along each axis that move the centre of a Fourier transform to the given centres."""
     before, after = [], []
     for axis, c_in, c_out in zip(axes, centre_in, centre_out, strict=True):
         d_in, d_out = (axis.n_in - 1) / 2 - c_in, (axis.n_out - 1) / 2 - c_out

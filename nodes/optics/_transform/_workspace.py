@@ -14,7 +14,7 @@ _lock = threading.Lock()
 
 
 class Workspace:
-    """Named buffers for one thread at a time; a name returns the same memory each time, enlarged when needed."""
+    """Named buffers for one thread at a time; each name returns the same memory, enlarged for larger requests."""
 
     def __init__(self, dtype: torch.dtype, device: torch.device) -> None:
         self.dtype, self.device = dtype, device

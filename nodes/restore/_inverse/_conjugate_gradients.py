@@ -15,7 +15,7 @@ _PIECE = 2**18  #: numbers of a spectrum worked on at a time, which fit in the c
 
 
 def descend(seen: Blurred, x: Tensor, steps: int, enough: float) -> Tensor:
-    """Improve the half spectrum `x` in place by at most `steps` steps of conjugate gradients, and return `x`.
+    """Improve the half spectrum `x` of a picture in place by at most `steps` conjugate-gradient steps, and return `x`.
 
     The steps end early when the squared distance from the solution, in units of the posterior, is about `enough`.
     """
@@ -44,7 +44,7 @@ def pieces(spectrum: Tensor) -> Iterator[slice]:
 
 
 def _few(count: int, numbers: int) -> Iterator[slice]:
-    """Return slices that cut `count` lines of `numbers` numbers each into blocks of a few lines."""
+    """Return slices that divide `count` array lines of `numbers` values each into blocks that fit in the cache."""
     step = max(1, _PIECE // numbers)
     return (slice(i, i + step) for i in range(0, count, step))
 
@@ -60,7 +60,7 @@ def corner(spectrum: Tensor, torus: Size, pixels: Tensor) -> None:
 
 
 class _Normal:
-    """The normal matrix of the least-squares problem, whose inverse is the posterior covariance."""
+    """The normal matrix of a least-squares deconvolution, whose inverse is the posterior covariance of the picture."""
 
     def __init__(self, seen: Blurred) -> None:
         self.seen, self.weigh = seen, weighing(seen)
@@ -68,13 +68,13 @@ class _Normal:
         self.plane, self.pixels = seen.picture.new_zeros(seen.torus), torch.empty_like(seen.picture)
 
     def __call__(self, x: Tensor, result: Tensor) -> Tensor:
-        """Write the product of the matrix with x to `result`, and return the inner product of x and `result`."""
+        """Write the product of the normal matrix and x to `result`, and return the inner product of x and `result`."""
         self._gather(self.weigh(self._blurred(x, result)), result)
         self._finish(x, result, 1.0)
         return inner(x, result, self.seen.torus)
 
     def slope(self, x: Tensor) -> Tensor:
-        """Return the gradient of the log posterior at x."""
+        """Return the gradient of the log posterior at the picture of spectrum x."""
         result = torch.empty_like(x)
         self._gather(self.weigh(self._blurred(x, result).neg_().add_(self.seen.picture)), result)
         self._finish(x, result, -1.0)
@@ -87,7 +87,7 @@ class _Normal:
         return self.pixels
 
     def _gather(self, pixels: Tensor, result: Tensor) -> None:
-        """Write the spectra of the pixels to `result`, without the adjoint of the blur."""
+        """Write the spectrum of each channel of a picture to `result`; `_finish` applies the adjoint of the blur."""
         rows, columns = pixels.shape[-2:]
         for channel, picture in enumerate(pixels):
             self.plane[:rows, :columns] = picture
@@ -119,7 +119,9 @@ class _Inverse:
         self.lowest = Lowest(seen, self.gain) if max(seen.picture.shape[-2:]) <= LOWEST else None
 
     def __call__(self, slope: Tensor, result: Tensor) -> Tensor:
-        """Write the product of the preconditioner with the slope, and return the inner product of slope and product."""
+        """Write the preconditioner times the gradient to `result`, and return the inner product of the gradient and
+        `result`.
+        """
         for rows in pieces(slope):
             gain = self.gain[:, rows]
             own = torch.mul(slope[:, rows], gain, out=result[:, rows])

@@ -59,7 +59,7 @@ def most_likely(seen: Blurred, steps: int = STEPS, enough: float = ENOUGH) -> Te
 
 
 class _Followed(torch.autograd.Function):
-    """A function that returns the solution and passes the gradient of the solution on to the residual slope."""
+    """An autograd function of the deconvolved picture, which passes gradients to the residual of the linear problem."""
 
     @staticmethod
     def forward(ctx: Any, answer: Tensor, rest: Tensor, seen: Blurred, steps: int) -> Tensor:
@@ -69,7 +69,7 @@ class _Followed(torch.autograd.Function):
     @staticmethod
     @once_differentiable
     def backward(ctx: Any, grad: Tensor) -> tuple[None, Tensor, None, None]:
-        """Solve the same linear problem with the incoming gradient in place of the picture."""
+        """Solve the linear problem of the forward pass with the incoming gradient in place of the picture."""
         pull = torch.fft.rfft2(grad)
         seen = replace(ctx.seen, picture=torch.zeros_like(ctx.seen.picture), pull=pull)
         enough = 1e-10 * float(inner(pull, _spread(seen, pull), seen.torus))
@@ -95,7 +95,7 @@ def _halvings(picture: Size) -> int:
 
 
 def halved(seen: Blurred) -> Blurred:
-    """Return the same problem on pixels twice as wide; the variance that wide pixels lose counts as noise."""
+    """Return the deconvolution problem on pixels twice as wide, where lost variance of the picture counts as noise."""
     weight = _pooled(seen.weight)
     picture, *glare = (_pooled(seen.weight * p) / weight.clamp_min(1e-30) for p in (seen.picture, *seen.glare))
     size = (seen.torus[0] // 2, seen.torus[1] // 2)
@@ -118,7 +118,7 @@ def halved(seen: Blurred) -> Blurred:
 
 
 def _pooled(pixels: Tensor) -> Tensor:
-    """Return the sums over blocks of two by two pixels."""
+    """Return the sums of a picture over blocks of two by two pixels."""
     y, x = pixels.shape[-2:]
     return 4.0 * avg_pool2d(pad(pixels, (0, x % 2, 0, y % 2)) if x % 2 or y % 2 else pixels, 2)
 
@@ -131,7 +131,7 @@ def _pooling(size: int, like: Tensor) -> Tensor:
 
 
 def _exact(seen: Blurred) -> Tensor:
-    """Return the exact solution for a small picture by Cholesky decomposition in float64."""
+    """Return the exact deconvolution of a small picture, by Cholesky decomposition in float64."""
     channels = len(seen.picture)
     fine = replace(seen, transfer=seen.transfer.to(torch.complex128), power=seen.power.double())
     weight = seen.weight.double().flatten()
@@ -151,7 +151,7 @@ def _exact(seen: Blurred) -> Tensor:
 
 
 def _covariance(seen: Blurred, passed: Tensor) -> Tensor:
-    """Return the prior covariance of all pairs of pixels, given the product of two transfer functions."""
+    """Return the prior covariance of all pairs of picture pixels, given the product of two transfer functions."""
     lags = torch.fft.irfft2(passed * seen.power, s=seen.torus)
     y, x = (torch.arange(n, device=lags.device) for n in seen.picture.shape[-2:])
     down, right = (y[:, None] - y) % seen.torus[0], (x[:, None] - x) % seen.torus[1]
@@ -160,5 +160,5 @@ def _covariance(seen: Blurred, passed: Tensor) -> Tensor:
 
 
 def _spread(seen: Blurred, spectrum: Tensor) -> Tensor:
-    """Return the product of the prior covariance and half a spectrum."""
+    """Return the prior covariance of the picture, multiplied by half a spectrum."""
     return seen.power * mixed(spectrum, 1.0 - seen.grey, seen.grey)

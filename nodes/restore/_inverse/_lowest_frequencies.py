@@ -24,7 +24,7 @@ class Lowest:
     """The inverse of the normal matrix of a blurred picture at the lowest frequencies, including the mean."""
 
     def __init__(self, seen: Blurred, gain: Tensor) -> None:
-        """Build the inverse; `gain` (channel, fy, fx), the diagonal of an approximate inverse, scales the matrix."""
+        """Build the inverse; `gain` (channel, fy, fx), an approximate inverse's diagonal, scales the normal matrix."""
         self.torus = seen.torus
         count = min(MODES, 3 * MODES // len(seen.picture), int(math.prod(seen.torus) / SHARE))
         self.fy, self.fx = (f.to(gain.device) for f in _lowest(seen.torus, max(1, count // 2)))
@@ -38,7 +38,10 @@ class Lowest:
         self.whiten = [whiten[end - _ROWS : end, :end].to(gain, copy=True) for end in ends]
 
     def add(self, slope: Tensor, onto: Tensor) -> Tensor:
-        """Add a step, the inverse times `slope`, to `onto`, and return the inner product of the step and `slope`."""
+        """Add a step, the inverse normal matrix times the gradient `slope`, to `onto`.
+
+        Return the inner product of the step and `slope`.
+        """
         risen = _real(slope[:, self.fy, self.fx])
         both, rise = torch.zeros_like(risen), torch.zeros((), dtype=torch.float64, device=slope.device)
         for some in self.whiten:  # both products while the rows are in the cache
@@ -70,7 +73,7 @@ class Lowest:
         return self._without_glare(matrix.view(size, size), seen, transfer)
 
     def _noise(self, weight: Tensor, through: Tensor) -> Tensor:
-        """Return the normal matrix of the noise of one channel, for all pairs of frequencies and mirror images."""
+        """Return the part of the normal matrix from the noise of one channel, for all pairs of frequencies."""
         plus, minus = (self._at(weight, s) * through.conj()[:, None] for s in (-1, 1))
         plus, minus = plus * through, minus * through.conj()
         top = torch.cat([plus.real + minus.real, (minus.imag - plus.imag)[:, 1:]], 1)
@@ -87,7 +90,7 @@ class Lowest:
         return torch.where(far, values.conj(), values)
 
     def _without_glare(self, matrix: Tensor, seen: Blurred, transfer: Tensor) -> Tensor:
-        """Subtract the information that the unknown strength of each glare removes, and return the same matrix."""
+        """Subtract from the normal matrix the information lost to unknown glare strengths, and return the matrix."""
         if not seen.glare:
             return matrix
         flat = torch.stack(seen.glare).double().flatten(1)
@@ -118,7 +121,7 @@ def _invert(lower: Tensor, inverse: Tensor) -> None:
 
 
 def _real(spectrum: Tensor) -> Tensor:
-    """Return the real and then the imaginary parts of each channel; the first frequency has no imaginary part."""
+    """Return the real and imaginary parts of the spectrum of each channel, without the imaginary part of the mean."""
     return torch.cat([spectrum.real, spectrum.imag[:, 1:]], 1).flatten()
 
 

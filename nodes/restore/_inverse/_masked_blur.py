@@ -35,12 +35,12 @@ class Blurred:
         return torch.stack([torch.fft.irfft2(t * s, s=self.torus)[:y, :x] for t, s in pairs])
 
     def gathered(self, pixels: Tensor) -> Tensor:
-        """Return half the spectrum that the adjoint of `blur` computes from pixels."""
+        """Return half the spectrum that results from the adjoint of `blur`, applied to a picture."""
         spectrum: Tensor = self.transfer.conj() * torch.fft.rfft2(pixels, s=self.torus)
         return spectrum
 
     def slope(self, x: Tensor) -> Tensor:
-        """Return the gradient of the log posterior at x, which is 0 at the most likely x."""
+        """Return the gradient of the log posterior at the picture of spectrum x; the most likely picture has 0."""
         own, shared = inverse_colour(len(x), self.grey)
         prior = mixed(x, own, -shared) / self.power.clamp_min(1e-30)
         rise = self.gathered(weighing(self)(self.picture - self.blur(x))) - prior
@@ -48,7 +48,7 @@ class Blurred:
 
 
 def weighing(seen: Blurred) -> Map:
-    """Return a function that multiplies residuals by the weights and removes any amount of each glare."""
+    """Return a function that multiplies residuals by the pixel weights and removes the fitted glare patterns."""
     if not seen.glare:
         return lambda residual: seen.weight * residual
     flat = torch.stack(seen.glare).flatten(1)
@@ -65,7 +65,7 @@ def weighing(seen: Blurred) -> Map:
 
 
 def mixed(spectrum: Tensor, own: float, shared: float) -> Tensor:
-    """Return `own` times each channel plus `shared` times the sum of all channels."""
+    """Return `own` times the spectrum of each channel plus `shared` times the sum of the spectra of all channels."""
     return own * spectrum + shared * spectrum.sum(0)
 
 
@@ -75,7 +75,7 @@ def inverse_colour(channels: int, grey: float) -> tuple[float, float]:
 
 
 def variance(power: Tensor, size: Size) -> Tensor:
-    """Return the variance of pictures, the mean of the whole power spectrum, given half the power spectrum."""
+    """Return the variance of pictures with a given power spectrum, which is the mean over all frequencies."""
     return (power.sum(-2) * times(size, power)).sum(-1) / (size[0] * size[1])
 
 
@@ -89,7 +89,7 @@ def times(size: Size, like: Tensor) -> Tensor:
 
 
 def narrowed(spectrum: Tensor, size: Size) -> Tensor:
-    """Return half a spectrum cut to the frequencies of a coarser grid `size`; the highest of an even size is 0."""
+    """Return half a spectrum cropped to the frequencies of a coarser grid `size`; the Nyquist frequencies are 0."""
     up, down, right = (size[0] + 1) // 2, (size[0] - 1) // 2, (size[1] + 1) // 2
     cut = spectrum.new_zeros(*spectrum.shape[:-2], size[0], size[1] // 2 + 1)
     cut[..., :up, :right] = spectrum[..., :up, :right]

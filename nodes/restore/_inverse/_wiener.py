@@ -78,13 +78,14 @@ def _(result: Tensor, electrons: Tensor, *inputs: Any, **params: float) -> list[
     finite = math.isfinite(float(result.sum()))
     return [
         Check(
-            f"{share:.2%} of pixels clipped, mean {float(result.mean() / electrons.mean()):.2f} of the raw mean", finite
+            f"{share:.2%} of pixels clipped, restored mean {float(result.mean() / electrons.mean()):.2f} of raw mean",
+            finite,
         )
     ]
 
 
 def effective_psf(psf: Psf, illuminant: Tensor, responses: Tensor, bands: Bands) -> Tensor:
-    """Return the PSF of each channel for a grey scene: (channel, y, x)."""
+    """Return the PSF of each channel of the sensor for a grey scene: (channel, y, x)."""
     lengths = {len(psf.intensity), len(illuminant), responses.shape[-1], len(bands.centres)}
     if len(lengths) > 1:
         raise ValueError(f"PSF, illuminant, responses and bands have {sorted(lengths)} bands: use one `bands` step")
@@ -104,7 +105,7 @@ def grey_shares(illuminant: Tensor, responses: Tensor, bands: Bands) -> Tensor:
 def _restored(
     electrons: Tensor, known: Tensor, kernels: Tensor, glare: list[Tensor], balance: float, read: float
 ) -> Tensor:
-    """Scale the problem to a scene of mean 0 and variance 1, solve the scaled problem, and scale the solution back."""
+    """Deconvolve a picture: scale the scene to mean 0 and variance 1, solve this problem, and scale the result back."""
     y, x = electrons.shape[-2:]
     known = torch.where(known.amax((-2, -1), keepdim=True) > 0, known, 1.0)
     picture = electrons - _strengths(electrons, known, glare)
@@ -123,7 +124,7 @@ def _restored(
 
 
 def _passed(transfer: Tensor, power: Tensor, size: tuple[int, int]) -> Tensor:
-    """Return the variance of a blurred picture: (channel, 1, 1), summed over a few rows of the spectrum at a time."""
+    """Return the expected variance (channel, 1, 1) of a blurred picture, summed over a few spectrum rows at a time."""
     total = power.new_zeros(len(transfer))
     for rows in pieces(transfer):
         through = transfer[:, rows]
@@ -140,13 +141,13 @@ def _noise(electrons: Tensor, mean: Tensor, read: float) -> Tensor:
 
 
 def _mean(picture: Tensor, known: Tensor) -> Tensor:
-    """Return the mean over the known pixels of each channel: (channel, 1, 1)."""
+    """Return the mean of each channel over the known pixels: (channel, 1, 1)."""
     total: Tensor = (picture * known).sum((-2, -1), keepdim=True)
     return total / known.sum((-2, -1), keepdim=True)
 
 
 def _visible(patterns: list[Tensor], known: Tensor) -> list[Tensor]:
-    """Return the patterns that are nonzero at some known pixel, scaled to a maximum of 1."""
+    """Return the glare patterns that are nonzero at some known pixel, each scaled to a maximum of 1."""
     peaks = [float((pattern.detach().abs() * known).max()) for pattern in patterns]
     return [pattern / peak for pattern, peak in zip(patterns, peaks, strict=True) if peak > 0]
 
@@ -169,7 +170,7 @@ def _strengths(electrons: Tensor, known: Tensor, glare: list[Tensor]) -> Tensor:
 
 
 def fall(size: tuple[int, int]) -> Tensor:
-    """Return the power spectrum that the prior assumes, as half a spectrum of mean 1."""
+    """Return the power spectrum that the prior of the scene assumes, as half a spectrum of mean 1."""
     fy, fx = (torch.fft.fftfreq(n, dtype=torch.float64) for n in size)
     squared = fy[:, None].square() + fx[None, : size[1] // 2 + 1].square() + 1.0 / (size[0] * size[1])
     power: Tensor = squared.pow_(-_FALL / 2.0)
@@ -189,7 +190,7 @@ def edge(kernels: Tensor, picture: tuple[int, int]) -> tuple[int, int]:
 
 
 def wrapped(kernels: Tensor, size: tuple[int, int]) -> Tensor:
-    """Return the kernels centred on the first sample of a periodic grid; a kernel wider than the grid wraps around."""
+    """Return PSFs centred on the first sample of a periodic grid; a PSF wider than the grid wraps around."""
     (m, n), (y, x) = kernels.shape[-2:], size
     rows, columns = -(-m // y), -(-n // x)
     around = pad(kernels, (0, columns * x - n, 0, rows * y - m))

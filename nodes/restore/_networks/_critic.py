@@ -17,7 +17,7 @@ SMALLEST = 16  #: pixels a side, from which four halvings leave one
 
 
 class Critic(nn.Module):
-    """A network that halves pictures four times and averages the scores of all positions: (n, 3, y, x) -> (n,).
+    """A network that averages scores over all positions of a picture, halved four times: (n, 3, y, x) -> (n,).
 
     The network has no norm, so each picture is scored alone.
     """
@@ -40,18 +40,18 @@ class Critic(nn.Module):
 
 
 def critics(rng: torch.Generator, width: int = 64) -> tuple[Critic, Critic]:
-    """Return two critics with random orthogonal weights: D0 for the coarse and D1 for the fine estimate."""
+    """Return two critics with random orthogonal weights: D0 for coarse and D1 for fine estimates of pictures."""
     first, second = (start_network(partial(Critic, width), rng) for _ in range(2))
     return first, second
 
 
 def skip_critic_draws(rng: torch.Generator, count: int = 1) -> None:
-    """Advance ``rng`` as `critic_slopes` does for ``count`` pictures, whose slopes another process computes."""
+    """Advance ``rng`` as `critic_slopes` does for ``count`` pictures, whose gradients another process computes."""
     torch.rand(count, 1, 1, 1, generator=rng, device=rng.device)
 
 
 def critic_slopes(critic: nn.Module, truth: Tensor, estimate: Tensor, rng: torch.Generator) -> Tensor:
-    """Return the gradient of the critic at a random point between each true picture and the estimate of the picture.
+    """Return the gradient of the critic at a random mixture of each true picture and the estimate of the picture.
 
     The gradient is at least float32 and can be differentiated again, as `losses.gradient_penalty` does. The pictures
     receive no gradient.

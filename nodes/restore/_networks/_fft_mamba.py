@@ -1,4 +1,4 @@
-"""The restoring network of the paper, which scans a picture and its spectrum, first coarse and then fine."""
+"""The restoring network of the paper: selective scans of a picture and its spectrum, first at half the size."""
 
 from functools import partial
 
@@ -15,7 +15,7 @@ from neusee.nodes.units import Count, DataFile
 
 
 class FFTMamba(Restorer):
-    """The FFT-Mamba network, whose blocks scan rows and columns in turn, run twice with the same weights.
+    """The FFT-Mamba network, whose blocks scan rows and columns in turn, with the same weights at half and full size.
 
     The first pass computes a coarse estimate, from which the second pass computes a fine estimate. With ``directions``
     4 every block scans rows and columns. With ``pyramid`` the network runs once, and the coarse estimate is the reduced
@@ -55,7 +55,7 @@ class FFTMamba(Restorer):
         return coarse, self.improved(picture, resize(coarse, y, x))
 
     def improved(self, picture: Tensor, guess: Tensor) -> Tensor:
-        """Return the picture plus the correction that one pass predicts from the picture and a first estimate."""
+        """Return the picture plus the correction that the network predicts from the picture and a first estimate."""
         first = self.enter(F.pixel_unshuffle(torch.cat([picture, guess], 1), self.shuffle))
         missing = self.last(first + self.leave(self.blocks(first)))
         return picture + F.pixel_shuffle(missing, self.shuffle)

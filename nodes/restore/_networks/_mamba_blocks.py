@@ -1,4 +1,4 @@
-"""Blocks of the FFT-Mamba network, which scan a picture and the spectrum of the picture and mix both results."""
+"""Blocks of the FFT-Mamba network, which combine selective scans of a picture and of the spectrum of the picture."""
 
 import functools
 from typing import Any, Literal
@@ -17,7 +17,7 @@ SMALL = 1e-4  #: added to the square of an amplitude, so that gradients stay fin
 
 
 class Spatial(nn.Module):
-    """A layer that scans a picture along rows, columns, or both (four ``directions``), and gates the result."""
+    """A layer that applies selective scans along the rows or columns of a picture, or both, and gates the result."""
 
     def __init__(
         self, width: int, states: int, by_columns: bool, kind: Kind = "s6", directions: Directions = 2
@@ -43,7 +43,7 @@ class Spatial(nn.Module):
 
 
 def _along(scan: nn.Module, value: Tensor, by_columns: bool) -> Tensor:
-    """Scan a picture (n, channel, y, x) along its rows, or along its columns if ``by_columns``."""
+    """Apply a selective scan along the rows of a picture (n, channel, y, x), or the columns if ``by_columns``."""
     value = value.mT if by_columns else value
     scanned: Tensor = scan(value.flatten(2).transpose(1, 2)).transpose(1, 2).unflatten(2, value.shape[-2:])
     return scanned.mT if by_columns else scanned
@@ -82,7 +82,7 @@ def radial_order(size: tuple[int, int], device: torch.device) -> tuple[Tensor, T
 
 
 class Frequency(nn.Module):
-    """A layer that multiplies the spectrum by a gate, which a scan from low to high frequencies and back computes.
+    """A layer that multiplies the spectrum of a picture by a gate, computed by selective scans over frequency.
 
     The gate uses real and imaginary parts, because phase has no gradient at 0. Amplitude and phase, ``amp_phase``, are
     for comparison. At the start of training the gate is close to 1 and the picture passes almost unchanged.
@@ -124,7 +124,7 @@ class Frequency(nn.Module):
         return (real.square() + imaginary.square() + SMALL).sqrt(), phase
 
     def _factor(self, first: Tensor, second: Tensor) -> Tensor:
-        """Return the factor that multiplies the spectrum: near 1, from a complex number or from amplitude and phase."""
+        """Return the factor near 1 that multiplies the spectrum, in complex form or from amplitude and phase."""
         if self.form == "complex":
             return 1 + self.strength * torch.complex(first, second)
         amplitude, turn = 1 + self.strength * first, self.strength * second
@@ -132,7 +132,7 @@ class Frequency(nn.Module):
 
 
 class Block(nn.Module):
-    """A block that mixes the scans of picture and spectrum at every pixel, followed by a gated feed-forward layer."""
+    """A block that mixes selective scans of a picture and of its spectrum, with a gated feed-forward layer."""
 
     def __init__(
         self,

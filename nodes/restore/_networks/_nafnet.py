@@ -32,7 +32,7 @@ class NAFBlock(nn.Module):
 
 
 class NAFNet(Flat):
-    """A network whose levels halve the size and double the width, and then reverse both, with skip connections."""
+    """A network whose encoder levels halve the size and double the channels, with skips to a mirrored decoder."""
 
     def __init__(self, width: int = 16, levels: Sequence[int] = (1, 1, 2, 4), middle: int = 2) -> None:
         super().__init__()

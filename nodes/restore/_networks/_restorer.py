@@ -35,10 +35,10 @@ class Restorer(nn.Module, ABC):
 
     @abstractmethod
     def scales(self, picture: Tensor) -> tuple[Tensor, Tensor]:
-        """Return the coarse (half the size) and fine estimate of a picture whose sides are multiples of `multiple`."""
+        """Return the restored picture at half and full size, for a picture whose sides are multiples of `multiple`."""
 
     def pyramid(self, picture: Tensor) -> tuple[Tensor, Tensor]:
-        """Return the coarse estimate at half the size, rounded up, and the fine estimate at the full size."""
+        """Return the restored picture at half the size, rounded up, and at the full size."""
         y, x = picture.shape[-2:]
         coarse, fine = self.scales(mirrored(picture, -y % self.multiple, -x % self.multiple))
         return coarse[..., : -(-y // 2), : -(-x // 2)], fine[..., :y, :x]
@@ -48,7 +48,7 @@ class Restorer(nn.Module, ABC):
 
 
 class Flat(Restorer):
-    """A network of one scale that changes a picture; the coarse estimate is the reduced fine estimate."""
+    """A restoring network that works at full size only; its coarse estimate is the reduced fine estimate."""
 
     @abstractmethod
     def change(self, picture: Tensor) -> Tensor:
@@ -60,14 +60,14 @@ class Flat(Restorer):
 
 
 class ChannelNorm(nn.LayerNorm):
-    """A layer norm over the channels of a picture (n, channel, y, x), never in half precision."""
+    """A layer norm over the channels of a picture (n, channel, y, x), computed in float32 or better."""
 
     def forward(self, input: Tensor) -> Tensor:
         return super().forward(single(input).movedim(1, -1)).movedim(-1, 1)
 
 
 class Scale(nn.Module):
-    """A factor for each channel, small at the start, which scales the change that a block adds."""
+    """A trainable factor for each channel, small at the start, which scales the output of a network block."""
 
     def __init__(self, channels: int) -> None:
         super().__init__()
@@ -105,7 +105,7 @@ def start_network(make: Callable[[], Net], rng: torch.Generator) -> Net:
 
 
 def parameter_groups(net: nn.Module, weights: float = 2e-4, biases: float = 4e-4) -> list[dict[str, Any]]:
-    """Return the parameters in two groups for an optimiser; the second group holds the biases of layers."""
+    """Return the network's parameters in two groups for an optimiser; the second group has the biases of layers."""
     of_layers = [m.bias for m in net.modules() if isinstance(m, LAYERS) and m.bias is not None]
     known = set(map(id, of_layers))
     others = [p for p in net.parameters() if id(p) not in known]
@@ -120,7 +120,7 @@ def restored(
     reduce: int = 1,
     detail: bool = False,
 ) -> Tensor:
-    """Restore a picture in float32 by a network with the weights of a file; only the picture receives gradients.
+    """Restore a picture in float32 by a network with weights read from a file; only the picture receives gradients.
 
     ``tile``: the side of the pieces in which a larger picture is restored. ``reduce``: the factor by which the picture
     is first reduced and afterwards enlarged, antialiased; ``detail`` adds the detail that the reduction loses.
@@ -150,7 +150,7 @@ def fitting(
     width: int,
     **sizes: Any,
 ) -> list[str]:
-    """Raise ParameterError without a file of weights, or with the weights of another network; return no warnings."""
+    """Raise ParameterError if the file of weights is absent or belongs to another network; return no warnings."""
     same_layout(partial(network, width, **sizes), _needed(weights), width)
     return []
 
@@ -163,10 +163,12 @@ def _needed(weights: Path | None) -> Path:
 
 
 def restorer_checks(result: Tensor, picture: Tensor, **params: Any) -> list[Check]:
-    """Return a check that reports the root mean square of the change and of the picture, and fails if not finite."""
+    """Return a check of the root mean square change by a network, which fails if this change is not finite."""
     change = float((result - picture).square().mean(dtype=torch.float64).sqrt())
     before = float(picture.square().mean(dtype=torch.float64).sqrt())
-    return [Check(f"changed by {change:.3g} rms; the picture has {before:.3g} rms", math.isfinite(change))]
+    return [
+        Check(f"network changed the picture by {change:.3g} rms, of {before:.3g} rms before", math.isfinite(change))
+    ]
 
 
 def gated(x: Tensor) -> Tensor:

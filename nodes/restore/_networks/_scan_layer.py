@@ -1,4 +1,4 @@
-"""Trainable layers that scan along a line, with the initial values of their steps and decays."""
+"""Trainable layers for selective scans, with the initial values of their time steps and decay rates."""
 
 import math
 from typing import Literal
@@ -17,7 +17,7 @@ STEPS = (1e-3, 0.1)  #: range of the first steps of a scan, log-uniform: a memor
 
 
 class Scan(nn.Module):
-    """A selective scan along a line (n, length, channel), with step, input and output computed from the line."""
+    """A selective scan along a sequence (n, length, channel), with step, input and output weights from the sequence."""
 
     def __init__(self, channels: int, states: int, rank: int) -> None:
         super().__init__()
@@ -29,7 +29,10 @@ class Scan(nn.Module):
         self.D = nn.Parameter(torch.empty(channels))
 
     def start(self, rng: torch.Generator) -> None:
-        """Draw the initial steps and set the initial decays; zero biases would give a memory of one position."""
+        """Set random time steps and fixed decay rates for the start of training.
+
+        Zero biases would give a memory of one position.
+        """
         self.dt_bias.copy_(_first_steps(len(self.D), rng))
         self.A_log.copy_(torch.arange(1.0, 1.0 + self.A_log.shape[1], device=rng.device).log().expand_as(self.A_log))
         self.D.fill_(1.0)
@@ -43,7 +46,7 @@ class Scan(nn.Module):
 
 
 class DualScan(nn.Module):
-    """A selective scan with one step and one decay for all channels of a head, computed by matrix products."""
+    """A selective scan with one step and one decay rate for each head of channels, computed by matrix products."""
 
     def __init__(self, channels: int, states: int, rank: int) -> None:
         super().__init__()
@@ -53,7 +56,7 @@ class DualScan(nn.Module):
         self.dt_bias, self.A_log, self.D = (nn.Parameter(torch.empty(heads)) for _ in range(3))
 
     def start(self, rng: torch.Generator) -> None:
-        """Draw the initial steps, and initial decay rates uniformly from 1 to 16, the range of `Scan`."""
+        """Set random time steps for the start of training, and random decay rates from 1 to 16, the range of `Scan`."""
         self.dt_bias.copy_(_first_steps(len(self.D), rng))
         self.A_log.uniform_(1.0, 16.0, generator=rng).log_()
         self.D.fill_(1.0)
@@ -65,7 +68,7 @@ class DualScan(nn.Module):
 
 
 class BothWays(nn.Module):
-    """The sum of a forward and a backward scan, each with its own weights."""
+    """The sum of a forward and a backward selective scan, each with its own weights."""
 
     def __init__(self, channels: int, states: int, rank: int, kind: Kind = "s6") -> None:
         super().__init__()
@@ -78,7 +81,7 @@ class BothWays(nn.Module):
 
 
 def _first_steps(count: int, rng: torch.Generator) -> Tensor:
-    """Return random biases that softplus turns into log-uniform steps within `STEPS`."""
+    """Return random biases that softplus turns into time steps, log-uniform within the range `STEPS`."""
     low, high = map(math.log, STEPS)
     steps = torch.rand(count, generator=rng, device=rng.device).mul_(high - low).add_(low).exp_()
     return steps + torch.log(-torch.expm1(-steps))

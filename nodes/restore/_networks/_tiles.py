@@ -30,7 +30,7 @@ def tiled(change: Callable[[Tensor], Tensor], picture: Tensor, side: int) -> Ten
 
 
 def _starts(length: int, side: int) -> list[int]:
-    """Return the first pixels of the fewest evenly spread tiles that overlap by at least `_OVERLAP`."""
+    """Return the first pixel of each tile along an axis, for the fewest even tiles that overlap by `_OVERLAP`."""
     if length <= side:
         return [0]
     count = 1 + math.ceil((length - side) / (side * (1 - _OVERLAP)))
@@ -38,7 +38,7 @@ def _starts(length: int, side: int) -> list[int]:
 
 
 def _ramp(start: int, side: int, length: int, like: Tensor) -> Tensor:
-    """Return the weights of a tile along one axis: 1, falling to almost 0 at tile edges inside the picture."""
+    """Return the blending weights of a tile along one axis: 1, falling to almost 0 at tile edges inside the picture."""
     side = min(side, length)
     at = torch.arange(side, dtype=like.dtype, device=like.device) + 0.5
     rise = (at / (side * _OVERLAP)).clamp(max=1.0)

@@ -1,4 +1,4 @@
-"""A plain UNet, which shows how well a network restores without spectra and scans."""
+"""A standard UNet, a baseline for restoring networks that use spectra and selective scans."""
 
 from functools import partial
 from itertools import pairwise
@@ -12,7 +12,7 @@ from neusee.nodes.units import Count, DataFile
 
 
 class UNet(Flat):
-    """A network whose four levels halve the size and double the width, and then reverse both, with skip connections."""
+    """A network whose encoder halves size and doubles channels three times, with skips to a mirrored decoder."""
 
     multiple, gain = 8, LEAKY
 
@@ -51,7 +51,7 @@ def unet(
     reduce: Count = 1,
     detail: bool = False,
 ) -> Tensor:
-    """Restore a colour picture with a plain UNet, a baseline.
+    """Restore a colour picture with a standard UNet, a baseline.
 
     ``tile``, ``reduce`` and ``detail`` as in `fft_mamba`.
 

@@ -37,7 +37,7 @@ class NoCompilerError(RuntimeError):
 
 
 def folder() -> Path:
-    """Return the folder of compiled code: ``$XDG_CACHE_HOME/neusee/build``, else ``~/.cache/neusee/build``.
+    """Return the folder of the compiled C++ scan: ``$XDG_CACHE_HOME/neusee/build``, else ``~/.cache/neusee/build``.
 
     The folder must outlive the process, or each process would compile. No result is kept there or depends on it.
     """
@@ -102,7 +102,7 @@ def _say_once(why: str) -> None:
 
 
 def compiled() -> bool:
-    """Return True if the C++ scan is available, compiled if needed; warn the first time if it is not."""
+    """Return True if the C++ scan is available, compiled if needed; otherwise warn once and return False."""
     try:
         operators()
     except NoCompilerError as error:
@@ -112,7 +112,7 @@ def compiled() -> bool:
 
 
 def _sizes(u: Tensor, rate: Tensor) -> tuple[int, int, int, int, int, int]:
-    """Return the sizes for the C++ scan: batch, length, d, n, groups of channels, and threads.
+    """Return the sizes that the C++ scan takes: batch, length, d, n, groups of channels, and threads.
 
     Each group of channels sums its own gradients of B and C.
     """
@@ -128,7 +128,10 @@ def _call(name: str, sizes: tuple[int, ...], *tensors: Tensor) -> None:
 
 
 class Scan(torch.autograd.Function):
-    """The C++ scan, differentiable once: u, dt (batch, length, d), A (d, n), B, C (batch, length, n) -> as u."""
+    """The selective scan in C++ as an autograd function that can be differentiated once.
+
+    u, dt (batch, length, d), A (d, n), B, C (batch, length, n) -> as u.
+    """
 
     @staticmethod
     def forward(ctx: Any, *tensors: Tensor) -> Tensor:

@@ -30,7 +30,7 @@ def dual_scan(u: Tensor, dt: Tensor, A: Tensor, B: Tensor, C: Tensor, D: Tensor,
 
 
 def _stretches(logs: Tensor) -> Tensor:
-    """Return the sums (…, i, j) of ``logs`` over the positions after j up to i, minus infinity where j is after i."""
+    """Return the sums (…, i, j) of ``logs`` over the positions j + 1 to i, or minus infinity if j is after i."""
     size = logs.shape[-1]
     here = torch.ones(size, size, dtype=torch.bool, device=logs.device).tril()
     after = logs[..., None].expand(*logs.shape, size).masked_fill(~here.tril(-1), 0.0)
@@ -38,7 +38,7 @@ def _stretches(logs: Tensor) -> Tensor:
 
 
 def _handed_on(left: Tensor, decay: Tensor) -> Tensor:
-    """Return the state at the start of each chunk, to which all earlier chunks contribute."""
+    """Return the state of the scan at the start of each chunk, to which all earlier chunks contribute."""
     state, starts = torch.zeros_like(left[:, 0]), []
     for new, share in zip(left.unbind(1), decay.unbind(1), strict=True):
         starts.append(state)

@@ -99,7 +99,9 @@ def _auto(u: Tensor, kind: torch.dtype) -> Backend:
 
 
 def _kernel(named: str) -> Backend:
-    """Return the backend for CUDA: the named backend if it is installed, else another installed backend, else torch."""
+    """Return the scan backend for CUDA: the named backend if it is installed, else another installed backend, else
+    torch.
+    """
     if named != "mamba_ssm" and importlib.util.find_spec("triton"):
         return "triton"
     if named != "triton" and importlib.util.find_spec("mamba_ssm"):

@@ -21,7 +21,7 @@ SEGMENT_CUDA, ROW_CUDA = 1 << 23, 1 << 17  #: the same two numbers on a GPU: cho
 
 
 def refuse_twice() -> None:
-    """Raise RuntimeError for a second derivative, which would be silently wrong, as the backward pass has no graph."""
+    """Raise RuntimeError for a second derivative, which would be silently wrong without a graph of the gradient."""
     if torch.is_grad_enabled():
         raise RuntimeError(
             "the selective scan has no second derivative: do not use create_graph for a gradient through the scan"
@@ -29,7 +29,7 @@ def refuse_twice() -> None:
 
 
 class Plan(NamedTuple):
-    """The division of a line into segments of ``chunks`` chunks, each of ``steps`` steps."""
+    """The division of a sequence into segments of ``chunks`` chunks, each of ``steps`` time steps."""
 
     steps: int
     chunks: int
@@ -40,7 +40,7 @@ class Plan(NamedTuple):
 
 
 def plan(length: int, width: int, cuda: bool) -> Plan:
-    """Divide ``length`` steps of ``width`` numbers each into segments and chunks."""
+    """Divide a sequence of ``length`` time steps with ``width`` numbers each into segments and chunks."""
     row, whole = (ROW_CUDA, SEGMENT_CUDA) if cuda else (ROW, SEGMENT)
     segment = min(length, max(16, whole // width))
     chunks = max(1, min(row // width, int(segment**0.5)))
@@ -48,7 +48,7 @@ def plan(length: int, width: int, cuda: bool) -> Plan:
 
 
 class _Segment:
-    """The inputs and decays of one segment, (step, chunk, batch, d or n), filled up with steps of length 0."""
+    """The inputs and decays of one segment of a sequence, (step, chunk, batch, d or n), padded by steps of length 0."""
 
     def __init__(self, division: Plan, rows: slice, rate: Tensor, *lines: Tensor) -> None:
         self.division, self.rows, self.rate = division, rows, rate
@@ -58,21 +58,21 @@ class _Segment:
         self.lost = (self.dt[..., None] * rate).expm1_()
 
     def turn(self, x: Tensor) -> Tensor:
-        """Rearrange (batch, length, m) into (step, chunk, batch, m)."""
+        """Rearrange one segment of a sequence from (batch, length, m) to (step, chunk, batch, m)."""
         part = F.pad(x[:, self.rows], (0, 0, 0, self.division.segment - self.size)).contiguous()
         return part.view(len(x), self.division.chunks, self.division.steps, -1).permute(2, 1, 0, 3).contiguous()
 
     def back(self, x: Tensor) -> Tensor:
-        """Rearrange (step, chunk, batch, m) into (batch, rows, m)."""
+        """Rearrange one segment of a sequence from (step, chunk, batch, m) to (batch, rows, m)."""
         return x.permute(2, 1, 0, 3).flatten(1, 2)[:, : self.size]
 
     def states(self, start: Tensor) -> tuple[Tensor, Tensor]:
-        """Return the state after each step, from ``start`` (batch, d, n), and the last state in float64."""
+        """Return the state of the scan after each step, from ``start`` (batch, d, n), and the last state in float64."""
         h = self.pushed[..., None] * self.into[..., None, :]
         return h, _walk(h, list(self.lost.unbind(0)), start)
 
     def slopes(self, seen: Tensor, end: Tensor) -> tuple[Tensor, Tensor]:
-        """Return the gradients of all states, and of the state before the first step in float64.
+        """Return the gradients of all states of a scan, and of the state before the first step in float64.
 
         The gradient of a state is the sum of the gradients through its output, ``seen``, and through the next state, or
         ``end`` for the last state.
@@ -100,7 +100,7 @@ class _Segment:
 
 
 def _walk(h: Tensor, lost: list[Tensor], start: Tensor, back: bool = False) -> Tensor:
-    """Turn the inputs ``h`` (step, chunk, ...) into states in place: h_i <- h_i + h_(i-1) + lost_i * h_(i-1).
+    """Turn the inputs ``h`` (step, chunk, ...) of a scan into states in place: h_i <- h_i + (1 + lost_i) h_(i-1).
 
     The state before the first step is ``start``. ``back`` walks from the last step to the first; ``lost``, (chunk, ...)
     for each step, is in the order of the walk. Every chunk starts from 0, and the state that earlier chunks carry over
@@ -126,7 +126,10 @@ def _segments(length: int, division: Plan) -> Iterator[slice]:
 
 
 class Scan(torch.autograd.Function):
-    """The scan in torch, differentiable once: u, dt (batch, length, d), A (d, n), B, C (batch, length, n) -> as u."""
+    """The selective scan in torch as an autograd function that can be differentiated once.
+
+    u, dt (batch, length, d), A (d, n), B, C (batch, length, n) -> as u.
+    """
 
     @staticmethod
     def forward(ctx: Any, *inputs: Tensor) -> Tensor:

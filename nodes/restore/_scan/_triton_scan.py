@@ -134,13 +134,16 @@ def _wide(n: int) -> int:
 
 
 def _sizes(u: Tensor, rate: Tensor) -> tuple[int, int, int, int, int, int]:
-    """Return the sizes for the kernels: batch, length, d, n, blocks of channels, and chunks."""
+    """Return the sizes that the Triton kernels take: batch, length, d, n, blocks of channels, and chunks."""
     (batch, length, d), n = u.shape, rate.shape[1]
     return batch, length, d, n, -(-d // CHANNELS), -(-length // CHUNK)
 
 
 class Scan(torch.autograd.Function):
-    """The Triton scan, differentiable once: u, dt (batch, length, d), A (d, n), B, C (batch, length, n) -> as u."""
+    """The selective scan in Triton as an autograd function that can be differentiated once.
+
+    u, dt (batch, length, d), A (d, n), B, C (batch, length, n) -> as u.
+    """
 
     @staticmethod
     def forward(ctx: Any, *tensors: Tensor) -> Tensor:

@@ -42,7 +42,8 @@ def test_an_element_that_suppresses_by_a_thousand_does_so_here():
     found = laser_irradiance(weak, LINE, strength=1e6, **SENSOR).double()
     assert float((found / saturation(LINE, **SENSOR)[:, None, None]).sum(0).max()) == pytest.approx(1e3, rel=1e-6)
     assert (
-        laser_irradiance.hooks.check(found, weak, LINE, strength=1e6, **SENSOR)[0].text == "peak 1e+03 I_sat of 1e+06"
+        laser_irradiance.hooks.check(found, weak, LINE, strength=1e6, **SENSOR)[0].text
+        == "peak of the spot 1e+03 I_sat, strength 1e+06 I_sat"
     )
 
 

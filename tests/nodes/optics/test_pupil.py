@@ -187,7 +187,7 @@ def test_shapes_that_do_not_belong_together_are_refused():
         optics.pupil(torch.zeros(4, 5), index, line, stop(4))
     with pytest.raises(ValueError, match=r"\(8, 8\), not the square pupil grid \(4, 4\) of `stop`"):
         optics.pupil(torch.zeros(8, 8), index, line, stop(4))
-    with pytest.raises(ValueError, match="from one step"):
+    with pytest.raises(ValueError, match="from one `bands` or `line` step"):
         optics.pupil(torch.zeros(4, 4), index[:1], line, stop(4))
     with pytest.raises(ValueError, match="from one `stop` step"):
         optics.pupil(torch.zeros(4, 4), index, line, stop(4), Dirt(torch.ones(5, 5), torch.zeros(5, 5)))

@@ -86,7 +86,7 @@ def test_check_says_how_much_light_is_kept():
     psf = as_psf(torch.full((1, 3, 3), 0.1))
     (line,) = image.hooks.check(image(scene, psf), scene, psf)
     assert line.ok
-    assert line.text == "flux kept 90.00%"
+    assert line.text == "flux kept in the image 90.00%"
     assert "no light" in image.hooks.check(scene * 0, scene * 0, psf)[0].text
 
 

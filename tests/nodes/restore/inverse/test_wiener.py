@@ -214,7 +214,7 @@ def test_check_says_what_was_not_seen():
     electrons, clipped = torch.full((1, 4, 4), 8.0), torch.zeros(1, 4, 4, dtype=torch.bool)
     clipped[0, 0, 0] = True
     (line,) = wiener.hooks.check(electrons, electrons, None, None, None, None, clipped)
-    assert line.text == f"{1 / 16:.2%} of pixels clipped, mean 1.00 of the raw mean"
+    assert line.text == f"{1 / 16:.2%} of pixels clipped, restored mean 1.00 of raw mean"
     assert not wiener.hooks.check(electrons * math.nan, electrons, None, None, None, None, clipped)[0].ok
 
 
