@@ -19,9 +19,9 @@ from torch.autograd.function import once_differentiable
 from torch.nn.functional import avg_pool2d, pad
 
 from neusee.nodes.restore._inverse._conjugate_gradients import descend, inner, pieces
+from neusee.nodes.restore._inverse._fft_grid import halvings
 from neusee.nodes.restore._inverse._masked_blur import Blurred, Size, mixed, narrowed, variance, widened
 
-DENSE = 40  #: pixels a side, up to which a picture is solved exactly
 STEPS = 20  #: the most steps on the finest grid; each coarser grid may take four times as many, up to MOST
 MOST = 100
 ENOUGH = 1e-5  #: squared distance for each seen pixel, in units of the posterior, at which the iteration ends. The
@@ -29,23 +29,9 @@ ENOUGH = 1e-5  #: squared distance for each seen pixel, in units of the posterio
 CAREFUL = 8.0  #: factor by which the tolerance falls with each coarser grid, whose steps are cheap
 
 
-def torus(picture: Size, edge: Size) -> Size:
-    """Return the size of a periodic grid for the picture and `edge` unknown pixels on each side."""
-    whole = 2 ** _halvings(picture)
-    y, x = (whole * _smooth(-(-(n + 2 * e) // whole)) for n, e in zip(picture, edge, strict=True))
-    return y, x
-
-
-def _smooth(n: int) -> int:
-    """Return the least whole number of at least ``n`` without prime factors above 7, for which FFTs are fast."""
-    while 210**32 % n:
-        n += 1
-    return n
-
-
 def most_likely(seen: Blurred, steps: int = STEPS, enough: float = ENOUGH) -> Tensor:
     """Return half the spectrum of the most likely picture before the blur, given the seen pixels and the prior."""
-    if not _halvings(_size(seen)):
+    if not halvings(_size(seen)):
         return _exact(seen)
     tensors = (seen.picture, seen.weight, seen.transfer, *seen.glare)
     with torch.no_grad():
@@ -78,7 +64,7 @@ class _Followed(torch.autograd.Function):
 
 
 def _nested(seen: Blurred, steps: int, enough: float) -> Tensor:
-    if not _halvings(_size(seen)):
+    if not halvings(_size(seen)):
         return _exact(seen)
     coarse = halved(seen)
     start = widened(_nested(coarse, min(4 * steps, MOST), enough / CAREFUL), coarse.torus, seen.torus)
@@ -88,10 +74,6 @@ def _nested(seen: Blurred, steps: int, enough: float) -> Tensor:
 def _size(seen: Blurred) -> Size:
     y, x = seen.picture.shape[-2:]
     return y, x
-
-
-def _halvings(picture: Size) -> int:
-    return max(0, math.ceil(math.log2(max(picture) / DENSE)))
 
 
 def halved(seen: Blurred) -> Blurred:

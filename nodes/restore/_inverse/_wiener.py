@@ -11,7 +11,8 @@ from torch.nn.functional import avg_pool2d, pad
 from neusee.nodes import Check, node
 from neusee.nodes._half_precision import refuse_not_finite, single
 from neusee.nodes.restore._inverse._conjugate_gradients import pieces
-from neusee.nodes.restore._inverse._hidden_pixels import most_likely, torus
+from neusee.nodes.restore._inverse._fft_grid import torus
+from neusee.nodes.restore._inverse._hidden_pixels import most_likely
 from neusee.nodes.restore._inverse._masked_blur import Blurred, variance
 from neusee.nodes.sensor._digitization import crop
 from neusee.nodes.units import Electrons

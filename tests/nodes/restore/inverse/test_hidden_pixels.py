@@ -5,9 +5,10 @@ from dataclasses import replace
 import pytest
 import torch
 
-from neusee.nodes.restore._inverse import _conjugate_gradients, _hidden_pixels, _lowest_frequencies
+from neusee.nodes.restore._inverse import _conjugate_gradients, _fft_grid, _lowest_frequencies
 from neusee.nodes.restore._inverse._conjugate_gradients import descend
-from neusee.nodes.restore._inverse._hidden_pixels import halved, most_likely, torus
+from neusee.nodes.restore._inverse._fft_grid import torus
+from neusee.nodes.restore._inverse._hidden_pixels import halved, most_likely
 from neusee.nodes.restore._inverse._lowest_frequencies import Lowest
 from neusee.nodes.restore._inverse._masked_blur import Blurred, variance
 from neusee.nodes.restore._inverse._wiener import fall
@@ -111,7 +112,7 @@ def test_few_steps_from_a_coarse_start_are_near_the_exact_answer(monkeypatch):
     found = most_likely(model)
     monkeypatch.setattr(_conjugate_gradients, "LOWEST", 0)
     plain = descend(model, torch.zeros_like(truth), 20, 0.0)
-    monkeypatch.setattr(_hidden_pixels, "DENSE", 60)
+    monkeypatch.setattr(_fft_grid, "DENSE", 60)
     exact = most_likely(model)
     assert error(found) < 1.1 * error(exact)
     assert error(plain) > 1.5 * error(exact)
@@ -180,7 +181,7 @@ def test_gradients_through_the_iteration_are_those_of_the_exact_answer(monkeypat
     pattern, probe = (torch.randn(2, *n, generator=rng, dtype=torch.float64) for n in ((46, 11), size))
     leaves = [seen.picture, weight, torch.view_as_real(seen.transfer), seen.power, pattern]
     found = slopes(leaves, probe, steps=200, enough=1e-14)
-    monkeypatch.setattr(_hidden_pixels, "DENSE", 46)
+    monkeypatch.setattr(_fft_grid, "DENSE", 46)
     for mine, exact in zip(found, slopes(leaves, probe), strict=True):
         assert float((mine - exact).norm()) < 1e-3 * float(exact.norm())
 
@@ -201,7 +202,7 @@ def test_halving_keeps_the_light_and_the_prior(picture):
 @pytest.mark.parametrize("picture", [(1, 1), (1, 300), (39, 40), (640, 640), (2048, 1)])
 def test_the_grid_has_room_and_can_be_halved(picture):
     y, x = torus(picture, (7, 30))
-    times = 2 ** _hidden_pixels._halvings(picture)
+    times = 2 ** _fft_grid.halvings(picture)
     assert (y % times, x % times) == (0, 0)
     assert y >= picture[0] + 14
     assert x >= picture[1] + 60
