@@ -225,7 +225,7 @@ def _load(file: BufferedReader, expected: Blob, into: memoryview, address: int |
     if blob[:2] != expected[:2]:
         raise ValueError(f"the band file holds {blob.dtype} {blob.shape}, not {expected.dtype} {expected.shape}")
     if expected.xxh3 and blob.xxh3 != expected.xxh3:
-        raise ValueError("the band file holds another band than the band that was written with this result")
+        raise ValueError("the band file holds a different band than the band that was written with this result")
     if address is not None:
         _map(file.fileno(), address, blob.nbytes)
     elif file.readinto(into) != len(into):

@@ -99,7 +99,7 @@ class Maintained(Protocol):
             yield Checked(key, about, problem)
 
     def pin(self, key: str) -> None:
-        """Protect the value of ``key`` from eviction. Raises `OSError` if the folder cannot be written."""
+        """Protect the stored value of ``key`` from eviction. Raises `OSError` if the folder cannot be written."""
         self.disk.prepare()
         self.disk.make_folder(f"{self.disk.folder}/pins")
         open(f"{self.disk.folder}/pins/{key}", "wb").close()

@@ -22,7 +22,7 @@ _encode = json.JSONEncoder(separators=(",", ":")).encode
 
 
 def seal(about: Metadata) -> bytes:
-    """Return metadata as JSON whose last field is the checksum of all bytes before that field."""
+    """Return the metadata of a result as JSON whose last field is the checksum of all bytes before that field."""
     body = _encode(about)[:-1].encode()
     return body + f'{_SEAL}{xxhash.xxh3_128_hexdigest(body)}"}}'.encode()
 
@@ -106,7 +106,7 @@ def has_value(disk: Disk, key: str) -> bool:
 
 
 def is_kept(about: Metadata | None) -> TypeGuard[Metadata]:
-    """Return True if metadata describe a stored value, not an evicted or unsaved value."""
+    """Return True if the metadata of a result describe a stored value, not an evicted or unsaved value."""
     return about is not None and bool(about.get("kept", True))
 
 

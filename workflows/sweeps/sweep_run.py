@@ -53,7 +53,7 @@ class Sweep:
 
     @property
     def rows(self) -> list[dict[str, Any]]:
-        """Return the results of the sweep in long format, with one row for each number of each point."""
+        """Return the results of the sweep in long format, with one table row for each number of each point."""
         names = header(self.columns)
         return [dict(zip(names, row, strict=True)) for o in self.outcomes for row in rows_of(o, self.columns)]
 
