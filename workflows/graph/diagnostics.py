@@ -11,7 +11,7 @@ UNREAD = "unread"  #: code of a value to which no step refers
 
 @dataclass(frozen=True, slots=True, order=True)
 class Location:
-    """Location of a value: a line and a column in a file, counted from 1, or an argument, whose line is 0."""
+    """Location of a recipe value: line and column in a file, counted from 1, or an argument of a command (line 0)."""
 
     file: str  #: as shown to the user: ``first_light.yaml``, ``sensor/neusee.yaml``, ``argument 2``
     line: int = 0

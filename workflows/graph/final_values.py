@@ -15,7 +15,7 @@ _WORDS = {"true", "false", "null", "yes", "no", "on", "off"}
 
 @dataclass(frozen=True, slots=True)
 class Setting:
-    """Final value of a recipe key, and its source: ``file:line:column``, ``argument 2`` or the default of a node."""
+    """Final value of one recipe key with its source: a file location, a command argument or the default of a node."""
 
     value: Any
     source: str
@@ -25,7 +25,7 @@ class Setting:
 
 @dataclass(frozen=True, slots=True)
 class Config:
-    """All final values of a recipe by dotted path, in the order of the recipe."""
+    """All final values of a recipe, each under its dotted path such as ``sensor.read_noise``, in recipe order."""
 
     settings: Mapping[str, Setting] = field(default_factory=dict)
 
@@ -33,7 +33,10 @@ class Config:
         return self.settings[path]
 
     def to_yaml(self) -> str:
-        """Return the final values as a YAML recipe without groups; comments give the sources and the defaults."""
+        """Return the final values of a recipe as YAML text, with the source of each value in a comment.
+
+        The text has no groups. Default values of nodes are commented out.
+        """
         tree: dict[str | int, Any] = {}
         for setting in self.settings.values():
             *parents, last = setting.path
@@ -58,7 +61,7 @@ def _lines(tree: Mapping[str | int, Any], depth: int) -> Iterator[str]:
 
 
 def flow(value: Any) -> str:
-    """Return a value as YAML on one line."""
+    """Return a recipe value as YAML text on one line."""
     if isinstance(value, Mapping):
         return f"{{{', '.join(f'{_scalar(key)}: {flow(child)}' for key, child in value.items())}}}"
     if isinstance(value, list | tuple):

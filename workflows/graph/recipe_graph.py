@@ -1,4 +1,4 @@
-"""Graph of a checked recipe: its steps, the wires between them, and the order in which the steps run."""
+"""Graph of a checked recipe: its steps, the connections between the steps, and the order in which the steps run."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ Wire = str | tuple[str, ...] | None  #: one step, the steps of all items, or no 
 
 @dataclass(frozen=True, slots=True)
 class Step:
-    """One step of the graph: a node, its validated parameters and the steps that feed the node."""
+    """One step of a recipe: a node (a function), its validated parameters and the steps that compute its inputs."""
 
     name: str  #: ``psf[mask]``, ``spot[mask,green]``
     node: Node
@@ -38,7 +38,7 @@ class Step:
 
     @property
     def sources(self) -> tuple[str, ...]:
-        """Return the names of all steps that feed this step, in the order of the inputs."""
+        """Return the names of all steps whose results are inputs of this step, in the order of the inputs."""
         wires = ((wire,) if isinstance(wire, str) else wire for wire in self.wires.values())
         return tuple(name for names in wires for name in names or ())
 
@@ -55,7 +55,7 @@ class Substitution:
 
 @dataclass(frozen=True, slots=True)
 class Expectation:
-    """Expected number: the ``value`` of the result of ``step`` at the indices ``at``, with a relative tolerance."""
+    """Number that a recipe expects in the result of ``step`` at the indices ``at``, with a relative tolerance."""
 
     name: str
     step: str
@@ -71,7 +71,7 @@ METRIC_TOLERANCE = 1e-3  #: largest error of an input of a metric, because a met
 
 @dataclass(frozen=True, slots=True, repr=False)
 class Recipe:
-    """Checked recipe: its steps, wires and values are valid, and no step has run yet."""
+    """Checked recipe, in which all steps, values and connections of steps are valid and no step has run yet."""
 
     name: str
     title: str
@@ -93,11 +93,14 @@ class Recipe:
     unbounded: frozenset[str] = frozenset()  #: steps whose errors reach a node without an error bound
 
     def limit(self, step: str) -> float:
-        """Return the largest error allowed for a step: the tolerance, or less if a later node has no error bound."""
+        """Return the largest relative error allowed in the result of a step.
+
+        This is the tolerance of the recipe, or at most `METRIC_TOLERANCE` if a later node has no error bound.
+        """
         return min(self.tolerance, METRIC_TOLERANCE) if step in self.unbounded else self.tolerance
 
     def allowed(self, step: str) -> float:
-        """Return the total error that all omissions and approximations up to a step may cause."""
+        """Return the total relative error that omitted and approximated steps may cause in the result of ``step``."""
         return self.limit(step) * self.tolerance_scale
 
     def run(
@@ -109,7 +112,10 @@ class Recipe:
         executor: Executor | None = None,
         memory: int | None = None,
     ) -> Result:
-        """Run the recipe like `neusee.workflows.run`; several threads may run recipes with the same store at once."""
+        """Run the recipe and return the results of its steps, like `neusee.workflows.run`.
+
+        Several threads may run recipes with the same store at the same time.
+        """
         from neusee.workflows.engine.runner import run
 
         return run(self, store, outputs, watch, device, executor, memory)
@@ -124,12 +130,15 @@ class Recipe:
 
 
 def needed(recipe: Recipe, outputs: Iterable[str]) -> list[str]:
-    """Return the names of the steps that ``outputs`` need, in topological order."""
+    """Return the names of the steps that must run to compute the steps ``outputs``, in topological order."""
     return in_order({name: step.sources for name, step in recipe.steps.items()}, outputs)
 
 
 def dependents(recipe: Recipe, roots: Iterable[str], order: Iterable[str] | None = None) -> set[str]:
-    """Return the steps ``roots`` and all steps that depend on these steps; ``order`` limits the candidates."""
+    """Return the names of the steps ``roots`` and of all steps that depend on ``roots``, directly or not.
+
+    ``order`` lists the steps to consider, in topological order; by default, all steps of the recipe.
+    """
     found = set(roots)
     for name in needed(recipe, recipe.steps) if order is None else order:
         if not found.isdisjoint(recipe.steps[name].sources):
@@ -138,7 +147,7 @@ def dependents(recipe: Recipe, roots: Iterable[str], order: Iterable[str] | None
 
 
 def in_order(sources: Mapping[str, Iterable[str]], names: Iterable[str]) -> list[str]:
-    """Return ``names`` and all their sources in topological order; the graph must have no cycle."""
+    """Return the steps ``names`` and all steps that they depend on, in topological order; the graph has no cycle."""
     order: dict[str, None] = {}
     stack = [(name, iter(sources[name])) for name in reversed(list(names))]
     while stack:
@@ -153,7 +162,7 @@ def in_order(sources: Mapping[str, Iterable[str]], names: Iterable[str]) -> list
 
 
 def unknown_step(name: str, steps: Collection[str]) -> str:
-    """Return the message for an unknown step, with copies such as ``psf[mask]`` or the most similar name."""
+    """Return the error message for an unknown step name, which suggests names such as ``psf[mask]``."""
     copies = sorted(step for step in steps if step.startswith(f"{name}["))
     if not copies:
         return f"no step {name!r}; {nearest(name, steps)}"

@@ -26,7 +26,7 @@ class RunError(RuntimeError):
 
 
 def _unpickled(step: str, text: str, cause: str) -> RunError:
-    """Return a `RunError` from another process with its text, but without the traceback of the cause."""
+    """Return the `RunError` of another process, which keeps its text but not the traceback of its cause."""
     error = RunError.__new__(RunError, text)
     RuntimeError.__init__(error, text)
     error.step, error.cause = step, RuntimeError(cause)

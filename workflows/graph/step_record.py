@@ -1,4 +1,4 @@
-"""Records of a run: the state of each step with the reason, and its device, time and memory."""
+"""Records of the steps of a run: the state of each step with its reason, and the device, time and memory."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ State = Literal["run", "cached", "left out", "not needed"]
 
 @dataclass(frozen=True, slots=True)
 class StepRecord:
-    """Record of one step in a run: its state with the reason, time, memory and checks."""
+    """Record of one step in a run: its state, the reason for this state, its time, memory and checks."""
 
     step: str
     state: State  #: ``not needed``: no step that ran needed this step
@@ -34,7 +34,7 @@ class StepRecord:
 
 @dataclass(frozen=True, slots=True)
 class Event:
-    """Event of a run, for a live table of steps: the start of a step (``done`` is None) or its end."""
+    """Start or end of a step during a run, reported to a live display; ``done`` is None at the start."""
 
     step: str
     done: StepRecord | None

@@ -23,7 +23,7 @@ Key = str
 
 
 def digest(*parts: Any) -> str:
-    """Return the digest of ``parts`` (plain JSON) as 32 hexadecimal digits; every bit of a float affects the digest."""
+    """Return the digest of the JSON values ``parts`` as 32 hexadecimal digits; every bit of a float affects it."""
     text = json.dumps(parts, sort_keys=True, separators=(",", ":"))
     return hashlib.blake2b(text.encode(), digest_size=16).hexdigest()
 
@@ -31,7 +31,10 @@ def digest(*parts: Any) -> str:
 def key_of(
     step: Step, keys: Mapping[str, Key], seed: int, code: Code, device: str = "cpu"
 ) -> tuple[Key, dict[str, Any]]:
-    """Return the cache key of ``step`` and its parts; ``keys`` are the cache keys of the steps that feed ``step``."""
+    """Return the cache key of ``step`` and the data from which the key is computed, such as parameters.
+
+    ``keys`` are the cache keys of the steps whose results are inputs of ``step``.
+    """
     node = step.node
     parts: dict[str, Any] = {
         "node": node.path,
@@ -45,7 +48,7 @@ def key_of(
 
 
 def stream_seed(seed: int, step: str) -> int:
-    """Return the seed of a step's random stream, which depends only on the recipe's seed and the step's name."""
+    """Return the seed of the random numbers of a step, which depends only on the recipe's seed and the step's name."""
     return int(digest(seed, step)[:15], 16)
 
 
@@ -61,7 +64,7 @@ def _keys_of(wire: Wire, keys: Mapping[str, Key]) -> Any:
 
 
 def plain(value: Any) -> Any:
-    """Return a parameter as JSON that is the same in every process; a file is replaced by the digest of its content."""
+    """Return a step's parameter as JSON that is the same in every process; a file becomes the digest of its content."""
     if value is None or isinstance(value, bool | int | str):
         return value
     if isinstance(value, float):

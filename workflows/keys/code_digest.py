@@ -35,7 +35,7 @@ _frozen: dict[str, tuple[Any, str]] = {}  #: spec and source digest at the first
 
 
 class Code:
-    """Digests of the modules of nodes, which stay the same during one run."""
+    """Digests of the source code of nodes, which stay the same during one run."""
 
     def __init__(self, memo: Path) -> None:
         self._memo = memo
@@ -65,7 +65,7 @@ class Code:
         return self._digests[module]
 
     def save(self) -> None:
-        """Write new summaries of source files and digests of definitions to files; skip an unwritable folder."""
+        """Save new summaries of source files and new digests of definitions; skip a folder that cannot be written."""
         if self._new:
             self._new = False
             _write(self._memo, dict(list(self._summaries.items())[-_KEPT:]), self._memo.parent / "tmp")
@@ -78,7 +78,7 @@ class Code:
     def _look(self, module: str) -> tuple[str, dict[str, str], list[str]]:
         path = self._path(module)
         if path is None:
-            raise LookupError(f"{module} has no source file, which the cache keys need: save the module as a file")
+            raise LookupError(f"{module} has no source file, so its nodes have no cache key: save the module as a file")
         summary = self._summary(module, path)
         tree = summary.tree + (_THIS_PROCESS if module in _edited_since else "")
         package = module if path.name == "__init__.py" else module.rpartition(".")[0]
@@ -88,12 +88,12 @@ class Code:
             if used is not None:
                 names += used
             elif module.startswith(ROOT):
-                what = "the package of all nodes is used, so that the modules behind a result are unknown"
-                raise LookupError(f"{path}:{use[-1]}: {what}: import each needed name from its own module")
+                what = "the package of all nodes is used, so the modules that a result depends on are unknown"
+                raise LookupError(f"{path}:{use[-1]}: {what}: import each name from its own module")
         return tree, summary.definitions, [n for n in names if n.startswith(f"{ROOT}.") and n not in _LEFT_OUT]
 
     def _imported(self, level: int, base: str, name: str, package: str) -> Iterator[str]:
-        """Yield the modules that an import reads: a submodule, or the module that defines the imported name."""
+        """Yield the modules that an import needs: a submodule, or the module that defines the imported name."""
         base = _absolute(level, base, package)
         submodule = f"{base}.{name}"
         if name and submodule.startswith(ROOT) and self._path(submodule) is not None:
@@ -104,7 +104,7 @@ class Code:
         yield base
 
     def _used(self, use: Use, package: str) -> list[str] | None:
-        """Return the modules that ``name.a.b`` in a source file uses, or None if it uses the package of all nodes."""
+        """Return the modules in an expression such as ``name.a.b``, or None if it uses all of `neusee.nodes`."""
         level, base, name, chain, _ = use
         modules = [".".join(filter(None, (_absolute(level, base, package), name)))]
         rest = chain.split(".") if chain else []
@@ -128,12 +128,12 @@ class Code:
 
 
 def parts_file(root: Path, code: str) -> Path:
-    """Return the path of the file that stores the digests of all definitions behind the digest ``code``."""
+    """Return the path of the file that stores the digest of each definition that the digest ``code`` covers."""
     return root / "code" / f"{code}.json"
 
 
 def _absolute(level: int, base: str, package: str) -> str:
-    """Return the absolute name of the module ``base`` in an import with ``level`` leading dots."""
+    """Return the absolute name of the module ``base`` in a relative import with ``level`` leading dots."""
     if not level:
         return base
     above = package.split(".")
@@ -170,7 +170,7 @@ def source_file(module: str) -> Path | None:
 
 
 def _source_digest(module: str, path: Path) -> str:
-    """Return the xxh3 digest of a source file; for a loaded module, return the digest from its first reading."""
+    """Return the xxh3 digest of the source file of a module, computed only once if the module is imported."""
     spec = getattr(sys.modules.get(module), "__spec__", None)
     if spec is not None and module in _frozen and _frozen[module][0] is spec:
         return _frozen[module][1]
@@ -180,7 +180,7 @@ def _source_digest(module: str, path: Path) -> str:
         _frozen[module] = (spec, source)
         if _edited(spec, path):
             _edited_since.add(module)
-            warnings.warn(f"{path} was edited after its import: restart Python to keep new results", stacklevel=2)
+            warnings.warn(f"{path} was edited after its import: restart Python to reuse new results", stacklevel=2)
     return source
 
 

@@ -1,4 +1,4 @@
-"""Digest of the program's own code: it covers given modules and all modules of `neusee.workflows` that these import.
+"""Digest of the program's own code, over given modules and all modules of `neusee.workflows` that they import.
 
 The key of a stored study, design or posterior contains this digest, so that changed code never leads to an old
 result. `code_digest.Code` computes the digests of nodes.
@@ -47,7 +47,7 @@ def _parsed(source: bytes) -> tuple[str, list[ast.stmt]]:
 
 
 def imported(statements: Iterable[ast.stmt]) -> Iterator[str]:
-    """Yield the modules of neusee.workflows in import statements, by names such as ``engine.runner``."""
+    """Yield the name of each module of neusee.workflows in import statements, such as ``engine.runner``."""
     for item in statements:
         if isinstance(item, ast.Import):
             yield from (_below(alias.name) for alias in item.names if alias.name.startswith(f"{_ROOT}."))

@@ -55,14 +55,17 @@ def summarise(source: bytes) -> Summary:
 
 
 def module_file(folder: str | Path, names: Sequence[str]) -> Path | None:
-    """Return the source file of a module or package in a folder, or None; ``names`` are the parts of its name."""
+    """Return the source file of a module or package below a folder, or None if there is no such file.
+
+    ``names`` are the parts of the module's name.
+    """
     stem = os.path.join(folder, *names)
     files = (f"{stem}.py", os.path.join(stem, "__init__.py"))
     return next((Path(file) for file in files if os.path.isfile(file)), None)
 
 
 def _uses(tree: ast.Module, bound: dict[str, set[Import]]) -> list[Use]:
-    """Return each expression such as ``a.b.c`` on an imported name, and each package that is used as a whole."""
+    """Return each use of an imported name in an expression such as ``a.b.c``, and each use of a whole package."""
     lines: dict[tuple[int, str, str, str], int] = {}
     for name, attributes, line in _chains(tree):
         for way in bound.get(name, ()):
@@ -72,7 +75,7 @@ def _uses(tree: ast.Module, bound: dict[str, set[Import]]) -> list[Use]:
 
 
 def _chains(tree: ast.Module) -> Iterator[tuple[str, list[str], int]]:
-    """Yield the first name, the attributes and the line of each expression such as ``a.b.c`` or ``a``."""
+    """Yield the first name, the attributes and the line number of each expression such as ``a.b.c`` in a module."""
     inner: set[int] = set()  # parts of earlier expressions, because the walk yields an expression before its parts
     for item in ast.walk(tree):
         if id(item) in inner or not isinstance(item, ast.Attribute | ast.Name):
@@ -88,7 +91,10 @@ def _chains(tree: ast.Module) -> Iterator[tuple[str, list[str], int]]:
 
 
 def _definitions(tree: ast.Module) -> dict[str, str]:
-    """Return the digest of each top-level definition by its label; definitions with the same label share one digest."""
+    """Return the digest of each top-level definition of a module, by labels such as ``psf()`` or ``class Psf``.
+
+    Definitions with the same label share one digest.
+    """
     dumps: dict[str, list[str]] = defaultdict(list)
     for item in tree.body:
         dump = ast.dump(item)
@@ -111,7 +117,7 @@ def _labels(item: ast.stmt) -> Iterable[str]:
 
 
 def _owner(function: ast.FunctionDef | ast.AsyncFunctionDef) -> str:
-    """Return the name of a function, or ``psf.check`` for a function ``_`` that is a hook of the node ``psf``."""
+    """Return the name of a function, or ``psf.check`` for a function ``_`` with the decorator ``@psf.check``."""
     for mark in function.decorator_list:
         if function.name == "_" and isinstance(mark, ast.Attribute) and isinstance(mark.value, ast.Name):
             return f"{mark.value.id}.{mark.attr}"

@@ -1,4 +1,4 @@
-"""Band files: one file for each slice of a stack of bands, shared by every result that contains the slice.
+"""Band files: files with one spectral band each, shared by all stored results that contain the band.
 
 A band file (a blob) holds the bytes of a slice and a trailer with type, shape, checksum and the trailer's length. The
 bytes begin at the start of the file, so that slices of whole memory pages are mapped side by side into one address
@@ -41,7 +41,7 @@ if _LIBC is not None:
 
 
 class Damaged(ValueError):
-    """Error for a band file that is missing, or whose content has changed; the band must be computed again."""
+    """Error for a band file that is missing or damaged, so that its spectral band must be computed again."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -53,7 +53,7 @@ class Stacked:
 
 
 class Blob(NamedTuple):
-    """Type, shape and checksum of a slice, which are in the trailer of its band file."""
+    """Type, shape and checksum of a spectral band, as stored at the end of its band file."""
 
     dtype: torch.dtype
     shape: tuple[int, ...]
@@ -65,7 +65,10 @@ class Blob(NamedTuple):
 
 
 class Blobs:
-    """The folder ``bands`` of a store, with files ``<first two letters>/<name>`` that never change."""
+    """Folder of the band files of a store of results; a written band file never changes.
+
+    The path of a band file is ``bands/<first two letters of the name>/<name>``.
+    """
 
     def __init__(self, root: Path) -> None:
         self.root = root
@@ -78,7 +81,7 @@ class Blobs:
         return name not in self._lost and os.path.exists(self.path(name))
 
     def about(self, name: str) -> Blob:
-        """Return the type, shape and checksum of a band; raise `Damaged` if the trailer of its file cannot be read."""
+        """Return the type, shape and checksum of a stored band; raise `Damaged` if its file is missing or damaged."""
         try:
             with open(self.path(name), "rb") as file:
                 return _trailer(file.fileno())[0]
@@ -106,7 +109,7 @@ class Blobs:
             return list(pool.map(self.write, names, slices))
 
     def _named(self, name: str, part: str) -> str | None:
-        """Give a complete file the name of its band; if a file has that name, return the checksum of that file."""
+        """Rename a complete temporary file to the name of its band, or return the checksum of the file of that name."""
         self._disk.make_folder(self._folder)
         if name in self._lost or not self._disk.link(part, self.path(name)):
             if name not in self._lost:
@@ -124,7 +127,7 @@ class Blobs:
         verify: bool = True,
         xxh3: Sequence[str] | None = None,
     ) -> Tensor:
-        """Return one contiguous tensor of ``shape`` whose slices along the first axis are the bands ``names``.
+        """Return one contiguous tensor whose slices along the first axis are the stored bands ``names``.
 
         The files are mapped if a slice consists of whole memory pages, otherwise copied. ``verify`` compares the
         checksum of every byte; ``xxh3`` lists the expected checksums. Raises `Damaged` for a missing or damaged file,
@@ -146,7 +149,7 @@ class Blobs:
     def _fill(
         self, names: Sequence[str], expected: Sequence[Blob], into: memoryview, address: int | None, verify: bool
     ) -> None:
-        """Load bands into consecutive memory: map the files if an ``address`` is given, otherwise read the files."""
+        """Load stored bands side by side into memory; map the files if an ``address`` is given, else read the files."""
         size = expected[0].nbytes
         for i, (name, blob) in enumerate(zip(names, expected, strict=True)):
             try:
@@ -199,42 +202,45 @@ def _checksum(data: memoryview, kind: bytes) -> str:
 
 
 def _trailer(file: int) -> tuple[Blob, bytes]:
-    """Return the trailer of a band file, decoded and as bytes; raise `ValueError` if the file size is wrong."""
+    """Return type, shape and checksum from the end of a band file, and the JSON of type and shape as bytes.
+
+    Raises `ValueError` if the size of the file is wrong.
+    """
     size = os.fstat(file).st_size
     tail = os.pread(file, 512, max(0, size - 512))
     length = int.from_bytes(tail[-4:], "little")
     body = tail[-36 - length : -4]
     if len(body) != length + 32:
-        raise ValueError("the trailer of the file is missing or cut short")
+        raise ValueError("the trailer of the band file is missing or cut short")
     dtype, shape = json.loads(body[:length])
     blob = Blob(dtype_of(dtype), tuple(int(n) for n in shape), body[length:].decode())
     if size != blob.nbytes + length + 36:
-        raise ValueError(f"the file has {size} bytes instead of the {blob.nbytes + length + 36} that were written")
+        raise ValueError(f"the band file has {size} bytes instead of {blob.nbytes + length + 36} bytes")
     return blob, body[:length]
 
 
 def _load(file: BufferedReader, expected: Blob, into: memoryview, address: int | None, verify: bool) -> None:
-    """Load the band in a file into memory; raise `ValueError` if the file holds another band or damaged bytes."""
+    """Load a band file into memory; raise `ValueError` if the file holds another band or damaged bytes."""
     blob, kind = _trailer(file.fileno())
     if blob[:2] != expected[:2]:
-        raise ValueError(f"the file holds {blob.dtype} {blob.shape} instead of {expected.dtype} {expected.shape}")
+        raise ValueError(f"the band file holds {blob.dtype} {blob.shape}, not {expected.dtype} {expected.shape}")
     if expected.xxh3 and blob.xxh3 != expected.xxh3:
-        raise ValueError("the file holds a different band than was written with this result")
+        raise ValueError("the band file holds a different band than the band that was written with this result")
     if address is not None:
         _map(file.fileno(), address, blob.nbytes)
     elif file.readinto(into) != len(into):
-        raise ValueError("the file was truncated while being read")
+        raise ValueError("the band file was truncated while it was read")
     if verify and _checksum(into, kind) != blob.xxh3:
         raise ValueError("checksum mismatch: the stored bytes have changed since they were written")
 
 
 def _reserve(size: int) -> Any:
-    """Reserve an address range of ``size`` bytes, which is released when the returned array is deleted."""
+    """Reserve ``size`` bytes of the address space, which are released when the returned array is deleted."""
     assert _LIBC is not None
     flags = mmap.MAP_PRIVATE | mmap.MAP_ANON
     address = _LIBC.mmap(None, size, 0, flags, -1, 0)
     if address in (None, ctypes.c_void_p(-1).value):
-        raise OSError(ctypes.get_errno(), "there is no free address range for the bands of a stack")
+        raise OSError(ctypes.get_errno(), "the address space has no free range for the band files of a tensor")
     space = (ctypes.c_char * size).from_address(address)
     weakref.finalize(space, _LIBC.munmap, address, size).atexit = False  # a thread may use it until the very end
     return space
@@ -244,4 +250,4 @@ def _map(file: int, address: int, size: int) -> None:
     assert _LIBC is not None
     access = mmap.PROT_READ | mmap.PROT_WRITE
     if _LIBC.mmap(address, size, access, mmap.MAP_PRIVATE | _FIXED, file, 0) != address:
-        raise OSError(ctypes.get_errno(), "the file of a band cannot be mapped into memory")
+        raise OSError(ctypes.get_errno(), "the band file cannot be mapped into memory")

@@ -1,4 +1,4 @@
-"""Read and write speed of a store, measured while the store reads and writes, and saved in a file of the store."""
+"""Read and write speed of a store of results, measured in normal use and saved in a file of the store."""
 
 from __future__ import annotations
 
@@ -26,11 +26,11 @@ class Speeds:
         self._written: dict[Direction, float] = {}
 
     def seconds(self, way: Direction, size: float) -> float:
-        """Return the predicted time in seconds for reading or writing ``size`` bytes."""
+        """Return the predicted time in seconds for reading or writing ``size`` bytes in the store."""
         return _SETUP[way] + size / self._speed(way)
 
     def learn(self, way: Direction, size: int, seconds: float) -> None:
-        """Update the estimated speed with the measured ``seconds`` of one transfer."""
+        """Update the estimated read or write speed of the store with the measured ``seconds`` of one transfer."""
         if size < LARGE:
             return
         newest = size / max(seconds - _SETUP[way], 1e-6)

@@ -1,4 +1,4 @@
-"""Eviction of values from a store beyond its budget; values that save the fewest seconds per byte are evicted first.
+"""Removal of values from a store beyond its size budget; values that save the least time per byte go first.
 
 The weight of a value halves for every week between its last use and the newest use in the store; today's date does not
 matter. Pinned values stay. The metadata of an evicted value stay as its receipt, so that origin and cost remain known.
@@ -35,7 +35,7 @@ class Candidate:
 
 
 def chosen(candidates: Iterable[Candidate], excess: float) -> list[Candidate]:
-    """Return the values whose eviction frees ``excess`` bytes or more, the least valuable value first."""
+    """Return the stored values to remove so that ``excess`` bytes or more are freed, the least valuable value first."""
     evictable = [c for c in candidates if c.size > 0]
     newest = max((c.used for c in evictable), default=0.0)
     evictable.sort(key=lambda c: (max(c.seconds, 0.0) / c.size * 2 ** ((c.used - newest) / _HALF), c.used, c.key))
@@ -53,7 +53,7 @@ def chosen(candidates: Iterable[Candidate], excess: float) -> list[Candidate]:
 
 
 def evict(disk: Disk, among: Iterable[Candidate], excess: float, dry: bool) -> tuple[list[Candidate], list[Candidate]]:
-    """Evict values until ``excess`` bytes are free; return the evicted values and the values that cannot be deleted."""
+    """Delete stored values until ``excess`` bytes are freed; return the deleted and the undeletable values."""
     left, gone, refused = {c.key: c for c in among}, list[Candidate](), list[Candidate]()
     while excess > 0 and (batch := chosen(left.values(), excess)):
         for candidate in batch:
@@ -67,14 +67,14 @@ def evict(disk: Disk, among: Iterable[Candidate], excess: float, dry: bool) -> t
 
 
 class CacheBudget:
-    """Check of the size of a store against its budget, without a count of all bytes at each write."""
+    """Comparison of the size of a store with its size budget, without a count of all bytes at each write."""
 
     def __init__(self, disk: Disk, budget: int) -> None:
         self._disk, self.budget = disk, budget
         self._spare = 0.0  # bytes that may be written before all bytes are counted again
 
     def excess(self, size: int) -> float:
-        """Return the number of bytes to evict after a write of ``size`` bytes.
+        """Return the number of bytes to evict from the store after a write of ``size`` bytes.
 
         All bytes of the store are counted again after writes of 5 % of the budget.
         """
@@ -95,7 +95,10 @@ def total(disk: Disk) -> int:
 
 
 def candidates(disk: Disk, pinned: Collection[str], read_seconds: Callable[[float], float]) -> Iterator[Candidate]:
-    """Yield every value that may be evicted; the bytes of a band are divided among the values that use the band."""
+    """Yield every stored value that may be evicted, with the number of bytes that its eviction frees.
+
+    The bytes of a band are divided among the values that use the band.
+    """
     stats = {os.path.basename(path): (size, changed) for path, size, changed in files(disk)}
     kept = {key: about for key, about in metadata.each(disk) if metadata.is_kept(about)}
     bands = {key: set(metadata.bands(about)) for key, about in kept.items()}
@@ -110,7 +113,7 @@ def candidates(disk: Disk, pinned: Collection[str], read_seconds: Callable[[floa
 
 
 def drop(disk: Disk, key: str) -> bool:
-    """Delete a value and keep its metadata as a receipt; return False if the value cannot be deleted."""
+    """Delete a stored value but keep its metadata; return False if the value cannot be deleted."""
     try:
         with disk.lock():
             about = metadata.read(disk, key)
@@ -125,7 +128,7 @@ def drop(disk: Disk, key: str) -> bool:
 
 
 def _write_receipt(disk: Disk, key: str, about: Metadata) -> None:
-    """Replace the metadata of an evicted value by its receipt; on a full disk, delete the metadata."""
+    """Record in the metadata of a value that the value was evicted; on a full disk, delete the metadata."""
     try:
         metadata.write(disk, key, metadata.receipt(about), over=True)
     except OSError as error:
@@ -144,7 +147,7 @@ def _delete_files(disk: Disk, key: str, about: Metadata) -> None:
 
 
 def files(disk: Disk) -> Iterator[tuple[str, int, float]]:
-    """Yield the path, the bytes and the time of the last change of every file that counts against the budget."""
+    """Yield the path, size and time of last change of every file that counts against the size budget of a store."""
     for base in (disk.folder, f"{disk.folder}/files", f"{disk.folder}/bands"):
         for entry in below(base):
             with suppress(OSError):

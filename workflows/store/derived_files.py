@@ -1,4 +1,4 @@
-"""Files derived from results, such as pictures and spectral EXR, stored by key so that a second run reuses the files.
+"""Files derived from results, such as pictures, stored by key so that a second run reuses the files.
 
 The files are in the folder ``files/`` of the store; their checksums are results of the store.
 """
@@ -19,7 +19,7 @@ from neusee.workflows.store.result_store import Store
 
 
 class DerivedFiles:
-    """Derived files in the folder of a store, or in a temporary folder if the store cannot be written."""
+    """Files derived from results, in the folder of a store, or in a temporary folder if the store cannot be written."""
 
     def __init__(self, store: Store) -> None:
         self.store = store

@@ -34,10 +34,10 @@ def row_of(key: str, about: Row) -> Row:
 
 
 class Journal:
-    """The lines of the journal of one store, the newest line last."""
+    """Journal of one store: a file with one line for each finished result, the newest line last."""
 
     def __init__(self, disk: Disk, others: Callable[[], Iterable[tuple[str, Row]]] = tuple) -> None:
-        """Open the journal of a store; ``others`` yields the key and the metadata of each result in the common file."""
+        """Open the journal of a store; ``others`` yields key and metadata of each result without its own file."""
         self._disk, self._others, self._guard = disk, others, threading.RLock()
         self._path = f"{disk.folder}/journal.jsonl"
         self._forget()
@@ -91,7 +91,7 @@ class Journal:
                 self._read_new_lines()
 
     def _read_new_lines(self) -> None:
-        """Read the lines that were added to the file since the last call; rebuild a missing or damaged file."""
+        """Read the lines added to the journal file since the last call; rebuild a missing or damaged file."""
         try:
             with open(self._path, "rb") as file:
                 head = file.readline(100).strip()
@@ -132,7 +132,7 @@ class Journal:
 
 
 def _parsed(raw: bytes) -> Iterator[Row]:
-    """Yield the valid lines in the text ``raw``; parse all lines at once, or one by one if a line is damaged."""
+    """Yield the valid lines of the journal text ``raw``, decoded from JSON; skip damaged lines."""
     lines = [line for line in raw.split(b"\n") if line]
     try:
         rows = json.loads(b"[" + b",".join(lines) + b"]")

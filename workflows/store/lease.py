@@ -1,4 +1,4 @@
-"""Leases: only the process that holds the lease of a key computes the result of the key.
+"""Leases: only the process that holds the lease of a cache key computes the result that belongs to the key.
 
 A lease is a second hard link to the badge of a process, a file that names the process: one atomic step takes a lease,
 and one heartbeat serves all leases of a process. On the same machine, an observer looks up the owner by process number
@@ -27,7 +27,10 @@ _thread: threading.Thread | None = None
 
 
 class Lease:
-    """The right to compute the result of a key until `release`; ``path`` is None if no file can be written."""
+    """The right of one process to compute the result of a cache key, until the process calls `release`.
+
+    The argument ``path`` is the file of the lease, or None if no file can be written.
+    """
 
     __slots__ = ("_inode", "_path")
 
@@ -36,7 +39,7 @@ class Lease:
         self._inode = os.stat(path).st_ino if path else 0
 
     def release(self) -> None:
-        """Delete the file of the lease, unless another process took it over or this process is a forked child."""
+        """Delete the file of the lease, unless another process took the lease or this process is a forked child."""
         with _guard:
             if self not in _held:
                 return
@@ -54,14 +57,14 @@ class Lease:
 
 
 class Leases:
-    """The leases of one store, as this process observes them."""
+    """The leases of one store: the rights of processes to compute the results of cache keys."""
 
     def __init__(self, disk: Disk) -> None:
         self._disk = disk
         self._seen: dict[str, tuple[object, float]] = {}  #: by path: content, and the time of its first observation
 
     def claim(self, key: str) -> Lease | None:
-        """Return the lease of ``key``, or None while a live process holds the lease.
+        """Return the lease of ``key``, the right to compute its result, or None while a running process holds it.
 
         A caller that had to wait must look up the result again before it computes the result.
         """
@@ -83,7 +86,7 @@ class Leases:
             return None
 
     def _taken(self, path: str) -> Lease:
-        """Take a free lease; make the folder and the badge of this process if they are missing."""
+        """Take a free lease; make the folder of leases and the file that identifies this process if needed."""
         with _guard:
             try:
                 os.link(_badge(self._disk), path)
@@ -94,7 +97,10 @@ class Leases:
         return self._kept(path)
 
     def _taken_over(self, key: str, path: str, seen: tuple[object, ...] | None) -> Lease:
-        """Take over the lease of a dead owner under the lock; raise `FileExistsError` if another process was first."""
+        """Take over the lease of a process that has ended, under the lock of the store.
+
+        Raises `FileExistsError` if another process was first.
+        """
         part = f"{self._disk.folder}/tmp/{key}.{me()}.{threading.get_ident()}"
         with self._disk.lock():
             now = _look(path)
@@ -164,7 +170,7 @@ def _badge(disk: Disk) -> str:
 
 
 def _beat() -> None:
-    """Change the badge files of this process at intervals while leases are held, as a heartbeat."""
+    """Append to the files that identify this process at intervals, as a heartbeat while the process holds leases."""
     global _thread
     while True:
         time.sleep(BEAT)
@@ -180,7 +186,10 @@ def _beat() -> None:
 
 
 def _retire() -> None:
-    """Delete all badge files of this process; two threads may call this function at the same time."""
+    """Delete all files that identify this process as an owner of leases.
+
+    Two threads may call this function at the same time.
+    """
     with suppress(KeyError):
         while True:
             _, path = _badges.popitem()

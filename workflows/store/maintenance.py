@@ -1,4 +1,4 @@
-"""Maintenance of a store: pins, eviction, removal of orphan files, and a check for damage."""
+"""Maintenance of a store: protection and eviction of values, removal of orphan files, and a check for damage."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ from neusee.workflows.store.shared_folder import Disk
 
 @dataclass(frozen=True, slots=True)
 class Swept:
-    """Summary of a clean-up of a store, done or simulated."""
+    """Summary of a clean-up of a store, which was either done or only simulated."""
 
     evicted: tuple[str, ...]  #: keys whose values were evicted
     refused: tuple[str, ...]  #: keys whose values cannot be deleted, for example because another user owns them
@@ -36,7 +36,10 @@ class Checked:
 
 
 class Maintained(Protocol):
-    """Base class of `Store` with the methods for maintenance; `Store` defines the members that are declared first."""
+    """Base class of `Store` with the methods for maintenance, such as eviction and a check for damage.
+
+    `Store` defines the members that are declared first.
+    """
 
     disk: Disk
     journal: Journal
@@ -48,7 +51,10 @@ class Maintained(Protocol):
     def put_aside(self, key: str, error: Exception) -> None: ...
 
     def gc(self, budget: int | None = None, dry: bool = False) -> Swept:
-        """Remove orphan files, and evict values beyond ``budget``; None means the budget of the store."""
+        """Remove files that belong to no result, and evict values until the store has at most ``budget`` bytes.
+
+        A ``budget`` of None means the budget of the store.
+        """
         budget = self.budget if budget is None else budget
         before = total(self.disk)
         orphans = dict(orphan_files.sweep(self.disk, dry))
@@ -62,7 +68,7 @@ class Maintained(Protocol):
         return Swept(tuple(c.key for c in gone), tuple(c.key for c in refused), freed, len(orphans), after)
 
     def make_room(self, excess: float, dry: bool = False) -> tuple[list[Candidate], list[Candidate]]:
-        """Evict values until ``excess`` bytes are free; return the evicted values and values that cannot be deleted."""
+        """Delete stored values until ``excess`` bytes are freed; return the deleted and the undeletable values."""
         if excess <= 0:
             return [], []
         gone, refused = evict(self.disk, candidates(self.disk, self.pinned(), self.read_seconds), excess, dry)
@@ -73,7 +79,9 @@ class Maintained(Protocol):
         return gone, refused
 
     def check(self) -> Iterator[Checked]:
-        """Read every value, compare every checksum, and move damaged results to ``bad/``.
+        """Yield the outcome of a check of every stored result; move damaged results to the folder ``bad/``.
+
+        The check reads every value and compares every checksum.
 
         The mode ``verify`` of the store has no effect on this check.
         """
@@ -91,7 +99,7 @@ class Maintained(Protocol):
             yield Checked(key, about, problem)
 
     def pin(self, key: str) -> None:
-        """Protect the value of ``key`` from eviction. Raises `OSError` if the folder cannot be written."""
+        """Protect the stored value of ``key`` from eviction. Raises `OSError` if the folder cannot be written."""
         self.disk.prepare()
         self.disk.make_folder(f"{self.disk.folder}/pins")
         open(f"{self.disk.folder}/pins/{key}", "wb").close()

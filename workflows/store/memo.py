@@ -1,4 +1,4 @@
-"""Values that are computed once: read from the store under a key, or computed now and written to the store."""
+"""Values that are computed only once: a value is read from the store, or computed and then stored."""
 
 from __future__ import annotations
 

@@ -22,7 +22,7 @@ _encode = json.JSONEncoder(separators=(",", ":")).encode
 
 
 def seal(about: Metadata) -> bytes:
-    """Return metadata as JSON whose last field is the checksum of all bytes before that field."""
+    """Return the metadata of a result as JSON whose last field is the checksum of all bytes before that field."""
     body = _encode(about)[:-1].encode()
     return body + f'{_SEAL}{xxhash.xxh3_128_hexdigest(body)}"}}'.encode()
 
@@ -46,7 +46,7 @@ def unseal_of(key: str, raw: bytes) -> Metadata:
     """Return the metadata that `seal` wrote for ``key``; raise `ValueError` for the metadata of another key."""
     about = unseal(raw)
     if about["key"] != key:
-        raise ValueError(f"the metadata belong to the key {about['key']}")
+        raise ValueError(f"the metadata of {key} belong to the key {about['key']}")
     return about
 
 
@@ -63,7 +63,10 @@ def write(disk: Disk, key: str, about: Metadata, over: bool) -> bool:
 
 
 def _read_whole(disk: Disk, key: str) -> Metadata:
-    """Return the metadata of ``key`` if the payload has the right size; raise an error in `UNREADABLE` otherwise."""
+    """Return the metadata of the result ``key`` after a check that its file of tensors has the right size.
+
+    Raises an error in `UNREADABLE` if a file is missing or damaged.
+    """
     about = read(disk, key)
     payload = about.get("payload")
     try:
@@ -74,12 +77,12 @@ def _read_whole(disk: Disk, key: str) -> Metadata:
             raise
         return about  # the value was evicted between the two reads
     if payload and size != payload["size"]:
-        raise ValueError(f"the payload has {size} bytes instead of the {payload['size']} that were written")
+        raise ValueError(f"the file of tensors has {size} bytes instead of {payload['size']} bytes")
     return about
 
 
 def find(disk: Disk, key: str) -> Metadata | None:
-    """Return the metadata of ``key``, or None if no metadata exist; raise an error in `UNREADABLE` if damaged.
+    """Return the metadata of ``key``, or None if there are none; raise an error in `UNREADABLE` for damaged metadata.
 
     Damaged metadata are read a second time before the result counts as damaged, because another process may be
     renaming the file at that moment.
@@ -103,28 +106,28 @@ def has_value(disk: Disk, key: str) -> bool:
 
 
 def is_kept(about: Metadata | None) -> TypeGuard[Metadata]:
-    """Return True if metadata describe a stored value, not an evicted or unsaved value."""
+    """Return True if the metadata of a result describe a stored value, not an evicted or unsaved value."""
     return about is not None and bool(about.get("kept", True))
 
 
 def bands(about: Metadata) -> list[str]:
-    """Return the names of those bands of a value that are stored in files of their own."""
+    """Return the names of the spectral bands of a stored value that have band files."""
     return list((about.get("bands") or {}).get("names", []))
 
 
 def receipt(about: Metadata) -> Metadata:
-    """Return the receipt of a result: the metadata without the fields that describe the stored value."""
+    """Return the metadata of a result without the fields that describe the stored value."""
     return {k: v for k, v in about.items() if k not in _OF_THE_VALUE} | {"kept": False}
 
 
 def names(disk: Disk) -> Iterator[str]:
-    """Yield the key of every result in ascending order."""
+    """Yield the cache key of every result of a store in ascending order."""
     for path in sorted(disk.root.glob("[0-9a-f][0-9a-f]/*.json")):
         yield path.stem
 
 
 def each(disk: Disk) -> Iterator[tuple[str, Metadata]]:
-    """Yield every key with its metadata; skip metadata that cannot be read."""
+    """Yield the key and the metadata of every result of a store; skip metadata that cannot be read."""
     for key in names(disk):
         with suppress(*UNREADABLE):
             yield key, read(disk, key)

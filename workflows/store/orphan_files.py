@@ -21,7 +21,7 @@ _WEEK = 7 * 86400.0  #: s for which a damaged entry is kept for inspection
 
 
 def sweep(disk: Disk, dry: bool = False) -> list[tuple[str, int]]:
-    """Remove the files that belong to no result, or list them if ``dry``; return the path and bytes of each file."""
+    """Remove the files of a store that belong to no result, or only list them if ``dry``; return paths and sizes."""
     if not os.path.isdir(disk.folder):
         return []
     gone = disk.sweep(dry, _WEEK) if os.path.isdir(f"{disk.folder}/tmp") else []
@@ -31,7 +31,7 @@ def sweep(disk: Disk, dry: bool = False) -> list[tuple[str, int]]:
 
 
 def removed(disk: Disk, find: Find, dry: bool) -> list[tuple[str, int]]:
-    """Remove the files that ``find`` yields, or list them if ``dry``; return the path and bytes of each file."""
+    """Remove the files that ``find`` yields, or only list them if ``dry``; return the path and size of each file."""
     gone = []
     with suppress(OSError):
         orphans = list(find(disk))  # without the lock; ``find`` decides again under the lock
@@ -47,7 +47,7 @@ def removed(disk: Disk, find: Find, dry: bool) -> list[tuple[str, int]]:
 
 
 def _payloads(disk: Disk) -> Iterator[os.DirEntry[str]]:
-    """Yield the payload files to which no metadata refer; skip a file whose metadata cannot be read."""
+    """Yield the files of tensors to which no metadata refer; skip a file whose metadata cannot be read."""
     for entry in below(disk.folder):
         key, _, suffix = entry.name.partition(".")
         if suffix == "safetensors":
@@ -61,7 +61,7 @@ def _payloads(disk: Disk) -> Iterator[os.DirEntry[str]]:
 
 
 def bands(disk: Disk) -> Iterator[os.DirEntry[str]]:
-    """Yield the band files that no value needs, or no file if metadata of another user cannot be read."""
+    """Yield the band files that no stored value uses, or nothing if metadata of another user cannot be read."""
     files, needed = list(below(f"{disk.folder}/bands")), set[str]()
     for key in metadata.names(disk) if files else ():
         try:
@@ -74,7 +74,7 @@ def bands(disk: Disk) -> Iterator[os.DirEntry[str]]:
 
 
 def _files(disk: Disk) -> Iterator[os.DirEntry[str]]:
-    """Yield old derived files to which no metadata refer, and old half-written derived files."""
+    """Yield old files such as pictures from results, if they are half-written or no metadata refer to them."""
     for entry in below(f"{disk.folder}/files"):
         try:
             needed = not entry.name.startswith(".") and metadata.read(disk, entry.name[:32]).get("file") == entry.name

@@ -1,4 +1,4 @@
-"""Conversion between values and metadata: the metadata of a new value, and the loading of a stored value."""
+"""Conversion of values to metadata and tensors for the store, and loading of stored values."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ _draw = random.Random()  # a separate generator, so that loads do not change the
 
 
 def described(key: str, value: Any, about: Metadata, blobs: Blobs | None = None) -> tuple[Metadata, list[Tensor]]:
-    """Return the metadata of a new value, which contain small tensors, and the tensors that need a payload file."""
+    """Return the metadata of a new value and the tensors that need a file; small tensors are part of the metadata."""
     from neusee.workflows.store import serialization
 
     layout, tensors = serialization.pack(value, blobs)
@@ -34,7 +34,9 @@ def described(key: str, value: Any, about: Metadata, blobs: Blobs | None = None)
 
 
 def load(disk: Disk, about: Metadata, verify: str, blobs: Blobs) -> tuple[Any, int]:
-    """Return the value with the metadata ``about``, and the number of payload bytes whose checksum was compared.
+    """Return the value that the metadata ``about`` describe, and the number of bytes compared with the checksum.
+
+    Only bytes of the payload file are counted.
 
     Raises one of the errors in `UNREADABLE` if the value is missing or damaged.
     """
@@ -47,7 +49,7 @@ def load(disk: Disk, about: Metadata, verify: str, blobs: Blobs) -> tuple[Any, i
         path = disk.path(about["key"], "safetensors")
         stamp = stamp_of(path)
         if stamp[1] != payload["size"]:
-            raise ValueError(f"the payload has {stamp[1]} bytes instead of the {payload['size']} that were written")
+            raise ValueError(f"the file of tensors has {stamp[1]} bytes instead of {payload['size']} bytes")
         due = check or (verify == "sampled" and stamp != payload.get("stamp"))
         tensors, compared = serialization.read(path, payload["xxh3"] if due else None), payload["size"] if due else 0
     if bands and verify == "sampled" and not check:
@@ -62,6 +64,6 @@ def stamp_of(path: str) -> list[int]:
 
 
 def newest(blobs: Blobs, names: Iterable[str]) -> int:
-    """Return the time (ns) of the last write to the files of the bands ``names``."""
+    """Return the time in ns of the last change of any of the band files ``names``."""
     stats = [os.stat(blobs.path(name)) for name in names]
     return max((max(stat.st_mtime_ns, stat.st_ctime_ns) for stat in stats), default=0)

@@ -15,7 +15,7 @@ _IDLE = "ZTtXx"  #: states in /proc of a process that has ended or is stopped
 
 @dataclass(frozen=True, slots=True)
 class Owner:
-    """A process on a machine; the start time distinguishes processes that have the same number."""
+    """A process on a machine, identified by the machine, the process number and the start time."""
 
     host: str  #: digest of the machine, its present boot and its namespace of process numbers
     pid: int
@@ -26,7 +26,7 @@ class Owner:
 
     @property
     def state(self) -> State:
-        """Return the state ``alive``, ``dead`` or, for another machine, ``foreign``; a stopped process is ``dead``."""
+        """Return the process state: ``alive``, ``dead`` (ended or stopped) or ``foreign`` (on another machine)."""
         if self.host != host():
             return "foreign"
         if self.pid == os.getpid():
@@ -41,7 +41,7 @@ class Owner:
 
 
 def owner_of(text: str) -> Owner | None:
-    """Return the `Owner` that a text describes, or None for any other text."""
+    """Return the process that a text such as ``<host>-<number>-<start time>`` names, or None for any other text."""
     host, _, rest = text.partition("-")
     pid, _, began = rest.partition("-")
     return Owner(host, int(pid), began) if len(host) == 12 and pid.isdecimal() and len(pid) < 12 else None
@@ -76,7 +76,7 @@ def _process(pid: int) -> tuple[str, str]:
     with open(f"/proc/{pid}/stat", "rb") as file:
         fields = file.read().rpartition(b")")[2].split()  # behind the name, which may hold any character
     if len(fields) < 20:
-        raise ValueError(f"/proc/{pid}/stat is cut short")
+        raise ValueError(f"the file /proc/{pid}/stat is incomplete")
     return fields[0].decode(), fields[19].decode()
 
 

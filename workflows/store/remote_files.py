@@ -1,4 +1,4 @@
-"""Access by fsspec to files at a URL; a URL that fails counts as empty after one warning.
+"""Access to files at a URL through fsspec; a URL that fails counts as empty after one warning.
 
 Listings of the folders show whether a file exists, and each listing counts as valid for a while: a run of a thousand
 steps with an empty cache sends 256 requests in parallel instead of a thousand in a row.
@@ -49,7 +49,7 @@ class RemoteFiles:
         self._lock = threading.Lock()
 
     def seconds(self, direction: Direction, size: float) -> float:
-        """Return the predicted time in seconds for a transfer of a result of ``size`` bytes and its metadata."""
+        """Return the predicted seconds for a transfer of ``size`` bytes and their metadata to or from the URL."""
         return 2 * self._latency[direction] + size / self._rate[direction]
 
     def exists(self, name: str) -> bool:
@@ -122,7 +122,7 @@ class RemoteFiles:
         return folder in self._listed and time.monotonic() - self._listed[folder][0] < _FRESH
 
     def _list_folders(self, folders: Sequence[str]) -> None:
-        """List the files of the ``folders`` whose last listing is too old, in parallel."""
+        """List the files of ``folders`` at the URL in parallel; skip a folder that was listed a few seconds ago."""
         old = [folder for folder in folders if not self._fresh(folder)]
         with suppress(AttributeError):
             self._fs.invalidate_cache()
@@ -136,7 +136,7 @@ class RemoteFiles:
         return {str(path).rpartition("/")[2] for path in paths or ()}
 
     def _write(self, name: str, put: Callable[[str], int]) -> bool:
-        """Write a file with the function ``put``, and give a complete file its name; return False on failure."""
+        """Write a file at the URL with the function ``put``, by atomic rename if possible; return False on failure."""
 
         def whole() -> int:
             if not self._renames:
@@ -193,10 +193,10 @@ class RemoteFiles:
             self._resume[each] = time.monotonic() + self._pause[each]
             self._pause[each] *= 2
         what = "read" if direction == "down" else "written"
-        self.warn(f"{self.url} cannot be {what} ({type(error).__name__}: {error}): results stay local")
+        self.warn(f"{self.url} cannot be {what} ({type(error).__name__}: {error}): results are stored only locally")
 
     def _update_speed(self, direction: Direction, size: int, seconds: float) -> None:
-        """Change the predicted latency or rate by a third of the difference from the measured value."""
+        """Change the predicted latency or rate of transfers by a third of the difference from the measured value."""
         if size < _LEARN:
             self._latency[direction] += (seconds - self._latency[direction]) / 3
         else:

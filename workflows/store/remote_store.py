@@ -66,12 +66,12 @@ class RemoteStore(Store):
         return partial(type(self), self.url, self.root, verify=self.verify, budget=self.budget), ()
 
     def about(self, key: Key) -> Metadata | None:
-        """Return the metadata of a result from the local layer or the URL, without reading the value."""
+        """Return the metadata of a result from the local folder or the URL, without reading the value."""
         here = super().about(key)
         return here if is_kept(here) else self._remote_metadata(key) or here
 
     def get(self, key: Key) -> Any:
-        """Return the value of ``key``; raise `KeyError` if neither the local layer nor the URL has the value."""
+        """Return the value of ``key``; raise `KeyError` if neither the local folder nor the URL has the value."""
         if not self._is_local(key):
             self._fetch_value(key)
         return super().get(key)
@@ -112,7 +112,7 @@ class RemoteStore(Store):
         return is_kept(super().about(key))
 
     def _remote_metadata(self, key: Key, look: bool = False) -> Metadata | None:
-        """Return the metadata of a result at the URL; if ``look`` is True, read the file without using a listing."""
+        """Return the metadata of a result at the URL; if ``look`` is True, request an unlisted file too."""
         value, note = f"{key}.json", _receipt_name(key)
         if key not in self._broken and (look or self._remote.exists(value)) and not is_kept(self._seen.get(key)):
             self._read_metadata(key, value)
@@ -130,7 +130,7 @@ class RemoteStore(Store):
                 self._distrust(key, error)
 
     def _fetch_value(self, key: Key) -> None:
-        """Copy the value of a key from the URL into the local layer; after a failure, do not fetch this key again."""
+        """Copy the value of a key from the URL into the local folder; after a failure, do not fetch this key again."""
         about = self._remote_metadata(key, look=True)
         try:
             if is_kept(about) and not self._value_fetched(key, about):
@@ -142,7 +142,7 @@ class RemoteStore(Store):
             self._remote.warn(f"{self.root} cannot keep copies of {self.url} ({error}): set NEUSEE_CACHE_LOCAL")
 
     def _value_fetched(self, key: Key, about: Metadata) -> bool:
-        """Copy a value into the local layer after a check of every byte; return False if the URL fails."""
+        """Copy a value from the URL into the local folder after a check of every byte; return False if a copy fails."""
         payload, bands = about["payload"], _bands(about["layout"])
         missing = {name: xxh3 for name, xxh3 in bands.items() if not self.blobs.has(name)}
         with ExitStack() as files:
@@ -165,7 +165,7 @@ class RemoteStore(Store):
         return part
 
     def _named(self, parts: dict[str, str], bands: dict[str, str]) -> None:
-        """Give fetched band files their final names; raise `ValueError` if a band has a wrong checksum."""
+        """Give band files that were copied from the URL their final names; raise `ValueError` for a wrong checksum."""
         for name, part in parts.items():
             self.disk.make_folder(str(self.blobs.root))
             self.disk.link(part, self.blobs.path(name))
@@ -174,7 +174,7 @@ class RemoteStore(Store):
             self.blobs.read([name], (1, *blob.shape), blob.dtype, xxh3=[xxh3])
 
     def _described(self, key: Key, about: Metadata, part: str) -> None:
-        """Give a fetched payload its final name, and write its metadata with the time stamps of the local files."""
+        """Give the copied file of tensors of a value its final name, and write the metadata with local time stamps."""
         about = dict(about)
         if about["payload"]:
             path = self.disk.path(key, "safetensors")
@@ -186,7 +186,10 @@ class RemoteStore(Store):
         self._lost.discard(key)
 
     def _fetched(self, name: str, part: str, payload: Metadata) -> bool:
-        """Copy the file ``name`` to ``part``; return False if the URL fails; raise ValueError for a wrong checksum."""
+        """Copy the file ``name`` from the URL to ``part``; return False if the copy fails.
+
+        Raises `ValueError` for a wrong checksum.
+        """
         if not self._remote.fetch(name, part):
             return False
         with open(part, "rb") as file:
@@ -247,10 +250,13 @@ def _band_name(name: str, xxh3: str) -> str:
 
 
 def _bands(layout: Any) -> dict[str, str]:
-    """Return the checksum of every band that a layout names; raise `ValueError` for a name that may be a path."""
+    """Return the checksum of every band file of a value, by the name of the band.
+
+    Raises `ValueError` for a name that may be a path.
+    """
     from neusee.workflows.store.serialization import blobs_in
 
     checksums = blobs_in(layout)
     if bad := [name for name in checksums if not _NAME.fullmatch(name)]:
-        raise ValueError(f"{bad[0]!r} is not the name of a band (32 hexadecimal digits)")
+        raise ValueError(f"{bad[0]!r} is not the name of a band file, which has 32 hexadecimal digits")
     return checksums

@@ -40,12 +40,15 @@ _USED = 3600.0  #: smallest time in s between two records of the use of a value
 
 
 class Store(Maintained):
-    """Store of results by key in a folder. A failure of the folder gives a missing result, never a wrong result."""
+    """Store of computed results in a folder, each under its cache key.
+
+    A failure of the folder gives a missing result, never a wrong result.
+    """
 
     def __init__(
         self, root: Path | str | None = None, *, verify: Verify | None = None, budget: int | None = None
     ) -> None:
-        """Open the store in the folder ``root``; environment variables such as $NEUSEE_CACHE replace arguments of None.
+        """Open the store in the folder ``root``; environment variables such as $NEUSEE_CACHE replace missing arguments.
 
         ``verify="always"`` compares the checksum of every payload that is loaded. ``"sampled"`` compares the checksum
         of a file that was touched after its last write, and otherwise at one load in twenty. ``"never"`` compares no
@@ -71,7 +74,7 @@ class Store(Maintained):
 
     @cached_property
     def blobs(self) -> Blobs:
-        """Return the folder of the band files."""
+        """Return the folder of the band files of the store, which hold one spectral band each."""
         from neusee.workflows.store.band_files import Blobs
 
         return Blobs(self.root / "bands")
@@ -118,22 +121,22 @@ class Store(Maintained):
         return self._try(self._write, key, value, about)
 
     def put_receipt(self, key: str, about: Metadata) -> bool:
-        """Store the metadata of a result without its value, unless the value or its receipt is stored already."""
+        """Store the metadata of a result without its value, unless the value or its metadata are stored already."""
         return self._try(self._write_receipt, key, about)
 
     def put_small(self, key: str, value: Any, about: Metadata) -> bool:
-        """Store a small value in the common file of small values; of a larger value, store only the metadata."""
+        """Store a small value in the common file of small values; for a larger value, store only the metadata."""
         return self._try(self._write_small, key, value, about)
 
     def entries(self) -> Iterator[tuple[str, Metadata]]:
-        """Yield every key with its metadata, in the order of the keys; include keys whose values are not stored."""
+        """Yield key and metadata of every result in the order of the keys, also of results without a stored value."""
         for key in heapq.merge(metadata.names(self.disk), (key for key, _ in self.brief.each())):
             about = self.about(key)
             if about is not None:
                 yield key, about
 
     def claim(self, key: str) -> Lease | None:
-        """Return the lease of ``key``, or None while another process holds the lease, like `Leases.claim`."""
+        """Return the lease of ``key``, the right to compute its result, or None while a running process holds it."""
         return self._leases.claim(key)
 
     def read_seconds(self, size: float) -> float:
@@ -152,7 +155,7 @@ class Store(Maintained):
         return None
 
     def load(self, about: Metadata, verify: str) -> Any:
-        """Return the value with the metadata ``about``; raise an error in `UNREADABLE` if the value is damaged."""
+        """Return the value that the metadata ``about`` describe; raise an error in `UNREADABLE` if it is damaged."""
         began = time.perf_counter()
         value, size = payload.load(self.disk, about, verify, self.blobs)
         self._speeds.learn("read", size, time.perf_counter() - began)
@@ -168,7 +171,7 @@ class Store(Maintained):
                     os.utime(path)
 
     def _try(self, write: Callable[..., bool], key: str, *arguments: Any) -> bool:
-        """Call ``write``, a second time if another process removed a folder; on failure, warn once and return False."""
+        """Return the result of ``write``, called again if a folder was removed; on failure, return False and warn."""
         try:
             try:
                 return write(key, *arguments)
@@ -210,7 +213,7 @@ class Store(Maintained):
         return is_kept(entry)
 
     def _write_parts(self, key: str, entry: Metadata, tensors: list[Tensor], banded: Any) -> None:
-        """Write the large files first, then the metadata that name the files; keep the value of an earlier writer."""
+        """Write the large files of a value, then the metadata that name the files; keep a value stored earlier."""
         from neusee.workflows.store import serialization
 
         with self.disk.temporary(key) as (part, file):

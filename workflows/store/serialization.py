@@ -87,7 +87,7 @@ def _settled(x: Tensor) -> Tensor:
 
 
 class _Listed:
-    """Tensors in the order of a file, in which tensors that share memory and shape are stored once."""
+    """List of the tensors of one file, in which tensors that share memory and shape appear once."""
 
     def __init__(self) -> None:
         self.tensors: list[Tensor] = []
@@ -102,7 +102,7 @@ class _Listed:
 
 
 def pack(value: Any, blobs: Blobs | None = None) -> tuple[Any, list[Tensor]]:
-    """Return the layout of ``value`` and its tensors; write each `Stacked` tensor to the folder ``blobs`` if given.
+    """Return the JSON layout of ``value`` and its tensors; write `Stacked` tensors to the folder ``blobs`` if given.
 
     Raises `TypeError` for a value that cannot be stored, and `OSError` if ``blobs`` cannot be written.
     """
@@ -141,7 +141,7 @@ def unpack(layout: Any, tensors: list[Tensor], blobs: Blobs | None = None, verif
         return tensors[body]
     if kind == "stacked":
         if blobs is None:
-            raise ValueError("the value has bands in files of their own, and no folder of band files is given")
+            raise ValueError("the value has band files: give the folder of the band files as ``blobs``")
         return blobs.read(body["names"], body["shape"], dtype_of(body["dtype"]), verify, body["xxh3"])
     if kind == "bytes":
         return tensors[body].numpy().tobytes()
@@ -154,7 +154,7 @@ def unpack(layout: Any, tensors: list[Tensor], blobs: Blobs | None = None, verif
 
 
 def blobs_in(layout: Any) -> dict[str, str]:
-    """Return the checksum (xxh3) of every band that a layout names, by the name of the band."""
+    """Return the checksum (xxh3) of every band file that the layout of a value names, by the name of the band."""
     checksums: dict[str, str] = {}
     todo = [layout]
     while todo:
@@ -178,7 +178,7 @@ def _class_path(item: tuple[Any, ...]) -> str:
 def _class(path: str) -> Callable[..., Any]:
     module, _, name = path.partition(":")
     if not module.startswith("neusee.nodes."):
-        raise ValueError(f"{path} is not a class of neusee.nodes")
+        raise ValueError(f"the stored class {path} is not a class of neusee.nodes")
     named_tuple: Callable[..., Any] = getattr(importlib.import_module(module), name)
     return named_tuple
 

@@ -35,7 +35,7 @@ class Disk:
         self._ready = False
 
     def path(self, key: str, suffix: str) -> str:
-        """Return the path of a file of the result ``key``, by a suffix such as ``json``."""
+        """Return the path of the file of the result ``key`` with a suffix such as ``json``."""
         return f"{self.folder}/{key[:2]}/{key}.{suffix}"
 
     def prepare(self) -> None:
@@ -63,7 +63,7 @@ class Disk:
                 os.unlink(part)
 
     def replace(self, name: str, raw: bytes) -> None:
-        """Replace the shared file ``name`` in the root by a file with the content ``raw``."""
+        """Replace the shared file ``name`` in the root folder of the store by a file with the content ``raw``."""
         with self.temporary(name) as (part, file):
             file.write(raw)
             file.flush()
@@ -97,13 +97,13 @@ class Disk:
         return True
 
     def make_folder(self, folder: str) -> None:
-        """Make a folder with write permission for every user who may write in the root."""
+        """Make a folder with write permission for every user who may write in the root folder of the store."""
         with suppress(FileExistsError):
             os.mkdir(folder)
             self.share(folder, 0o7777)
 
     def share(self, path: str, mask: int = 0o666) -> None:
-        """Give other users the permissions on ``path`` that they have on the root."""
+        """Give other users the permissions on ``path`` that they have on the root folder of the store."""
         due, mode = os.stat(self.folder).st_mode & mask, os.stat(path).st_mode
         if due & ~mode:
             with suppress(OSError):
@@ -111,7 +111,10 @@ class Disk:
 
     @contextmanager
     def lock(self) -> Iterator[None]:
-        """Hold the lock of the folder; continue without a lock if the file system has none or the owner is stopped."""
+        """Hold the lock of the store during a ``with`` block.
+
+        The block runs without the lock if the file system has no locks or the wait exceeds `_PATIENCE` seconds.
+        """
         self.prepare()
         file = self._lock_file()
         try:

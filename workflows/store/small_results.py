@@ -1,4 +1,4 @@
-"""Small results as lines of one file, for results whose computation takes less time than writing a file for each.
+"""Small results as lines of one common file, for results that are computed faster than a file is written.
 
 A line is one write. A line that is torn or fails its checksum is ignored; the loss of a line costs less than a
 millisecond of computation. All processes see the lines of each other, because a look-up of a key that is not known
@@ -31,7 +31,7 @@ class SmallResults:
         self._file, self._offset = 0, 0
 
     def find(self, key: str) -> Metadata | None:
-        """Return the metadata in the line of ``key``, or None if there is no undamaged line."""
+        """Return the metadata of the small result ``key``, or None if its line is missing or damaged."""
         if key not in self._lines:
             self._read_new_lines()
         with suppress(*UNREADABLE):  # also a KeyError if the key has no line
@@ -39,7 +39,10 @@ class SmallResults:
         return None
 
     def append(self, about: Metadata) -> None:
-        """Append a line with the metadata ``about``. Raises `OSError` if the line cannot be written."""
+        """Append a line with the metadata ``about`` of a small result to the common file.
+
+        Raises `OSError` if the line cannot be written.
+        """
         raw = metadata.seal(about)
         try:
             self._write(raw)
@@ -49,14 +52,17 @@ class SmallResults:
             self._disk.share(self._path)
 
     def each(self) -> Iterator[tuple[str, Metadata]]:
-        """Yield every key with the metadata in the newest line of the key."""
+        """Yield the key and the newest metadata of every small result."""
         self._read_new_lines()
         for key in sorted(self._lines):
             if (about := self.find(key)) is not None:
                 yield key, about
 
     def compact(self) -> None:
-        """Rewrite the file with its newest lines, up to half of `MOST` bytes; lines added meanwhile may be lost."""
+        """Rewrite the file of small results with only its newest lines; lines added meanwhile may be lost.
+
+        The new file has at most half of `MOST` bytes.
+        """
         self._read_new_lines()
         kept, size = list[bytes](), 0
         for raw in reversed(self._lines.values()):
@@ -68,12 +74,12 @@ class SmallResults:
             self._disk.replace("brief.jsonl", b"".join(b"\n" + raw for raw in reversed(kept)))
 
     def _write(self, raw: bytes, flags: int = 0) -> None:
-        """Write a line after a line break, so that the torn line of a killed process stays separate."""
+        """Append a line break and a line to the file, so that an incomplete line of a killed process stays separate."""
         if append(self._path, b"\n" + raw, flags) != len(raw) + 1:
-            raise OSError(f"{self._path}: there is no space left for a line")
+            raise OSError(f"{self._path}: the disk has no space left for the line of a result")
 
     def _read_new_lines(self) -> None:
-        """Read the lines that were added since the last call, or the whole file if the file was replaced."""
+        """Read the lines added to the file of small results since the last call, or all lines of a replaced file."""
         try:
             stat = os.stat(self._path)
         except OSError:

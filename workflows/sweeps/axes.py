@@ -1,4 +1,4 @@
-"""The axes of a sweep, in the notation of Hydra such as ``a=1,2,3``, and all combinations of the values."""
+"""Axes of a parameter sweep, written as in Hydra such as ``a=1,2,3``, and the combinations of their values."""
 
 from __future__ import annotations
 
@@ -52,12 +52,14 @@ class Point:
 
     @property
     def shown(self) -> str:
-        """Return the point as text, such as ``sensor.read_noise=5 e-, doe=axicon``."""
+        """Return the point of a sweep as text, such as ``sensor.read_noise=5 e-, doe=axicon``."""
         return ", ".join(f"{name}={c.shown}" for name, c in zip(self.axes, self.coordinates, strict=True))
 
 
 def read_words(words: Sequence[str | Override], folder: Path, first: int = 1) -> list[Argument]:
-    """Read axes and overrides from command-line arguments; raise `RecipeError` with the mistakes of all arguments.
+    """Read the axes of a sweep and the fixed changes of its recipe from command-line arguments.
+
+    Raises `RecipeError` with the mistakes of all arguments.
 
     Messages number the arguments from ``first``.
     """
@@ -65,7 +67,7 @@ def read_words(words: Sequence[str | Override], folder: Path, first: int = 1) ->
 
 
 def read_axes(axes: Mapping[str, str | Iterable[Any]], folder: Path) -> list[Argument]:
-    """Read axes whose values are either a Python list or a text in the notation of the command line."""
+    """Read the axes of a sweep, whose values are either Python lists or texts in the notation of the command line."""
     return _every(partial(_read_axis, name, values, folder) for name, values in axes.items())
 
 
@@ -124,10 +126,10 @@ def _read_axis(name: str, values: str | Iterable[Any], folder: Path) -> Axis:
         return _axis(name, _values(values, f"{name}={values}", mark), mark)
     listed = values.tolist() if hasattr(values, "tolist") else values
     if isinstance(listed, Mapping) or not isinstance(listed, Iterable):
-        raise RecipeError([Diagnostic(mark, name, f"give a list of values, not {type(values).__name__}")])
+        raise RecipeError([Diagnostic(mark, name, f"give the axis a list of values, not {type(values).__name__}")])
     coordinates = tuple(_coordinate(name, value, folder) for value in listed)
     if not coordinates:
-        raise RecipeError([Diagnostic(mark, name, "the list of values is empty: give at least one value")])
+        raise RecipeError([Diagnostic(mark, name, "the axis has an empty list of values: give at least one value")])
     return Axis(name, coordinates, mark)
 
 
@@ -160,14 +162,14 @@ def _axis(name: str, values: Sequence[str], mark: Location) -> Axis:
 def _wrong(axes: Sequence[Axis], paired: bool) -> Iterable[Diagnostic]:
     """Yield the mistakes in the axes of a sweep, such as a repeated name, a repeated value or too many points."""
     if not axes:
-        yield Diagnostic(Location("sweep"), "", "there is no axis: write a=1,2,3 or a='linspace(450 nm, 650 nm, 5)'")
+        yield Diagnostic(Location("sweep"), "", "the sweep has no axis: write a=1,2 or a='linspace(450 nm, 650 nm, 5)'")
     first: dict[str, Axis] = {}
     for axis in axes:
         if first.setdefault(axis.name, axis) is not axis:
-            yield Diagnostic(axis.mark, axis.name, f"{axis.name} is also in {first[axis.name].mark}: remove one")
+            yield Diagnostic(axis.mark, axis.name, f"axis {axis.name} is also in {first[axis.name].mark}: remove one")
         twice = [value for value, count in Counter(c.shown for c in axis.coordinates).items() if count > 1]
         if twice:
-            yield Diagnostic(axis.mark, axis.name, f"the value {twice[0]} appears twice: remove one")
+            yield Diagnostic(axis.mark, axis.name, f"the value {twice[0]} appears twice on the axis: remove one")
         there, here = len(axes[0].coordinates), len(axis.coordinates)
         if paired and there != here:
             text = f"has {here} values, and {axes[0].name} ({axes[0].mark}) has {there}"

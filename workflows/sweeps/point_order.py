@@ -18,7 +18,7 @@ from neusee.workflows.keys.cache_key import Key
 
 @dataclass(frozen=True, slots=True)
 class PointJob:
-    """The steps that one point of a sweep needs, with the cache key and the input steps of each."""
+    """The steps that one point of a sweep needs, with the cache key and the input steps of each step."""
 
     place: tuple[int, ...]  #: index of the value on each axis
     keys: Mapping[str, Key]  #: cache key of every step that the outputs need
@@ -44,7 +44,7 @@ class Sharing:
 
 
 def filled(costs: Mapping[str, float], steps: Iterable[str]) -> dict[str, float]:
-    """Return the cost of every step, where a step without a known cost gets the median of the known costs, or 1."""
+    """Return the computing time of each step; a step of unknown time gets the median of the known times, or 1."""
     steps = list(steps)
     known = [costs[step] for step in steps if step in costs]
     usual = median(known) if known else 1.0
@@ -52,7 +52,9 @@ def filled(costs: Mapping[str, float], steps: Iterable[str]) -> dict[str, float]
 
 
 def best_order(jobs: Sequence[PointJob], costs: Mapping[str, float], paired: bool = False) -> list[int]:
-    """Return the indices of ``jobs`` in an order in which costly shared steps run once and few results stay in memory.
+    """Return the order of the points of a sweep in which costly shared steps run once and few results stay in memory.
+
+    The order is a list of indices of ``jobs``.
 
     Args: jobs: one job for each point, in the order of the product of the axes, the last axis fastest.
     costs: known seconds by step. paired: the axes vary together like one axis.
@@ -70,7 +72,7 @@ def best_order(jobs: Sequence[PointJob], costs: Mapping[str, float], paired: boo
 
 
 def sharing(jobs: Sequence[PointJob], costs: Mapping[str, float]) -> Sharing:
-    """Count the different results of every step, and sum the computing time with and without shared results."""
+    """Count the different results of every step in a sweep, and sum the computing time with and without sharing."""
     weights = filled(costs, {step for job in jobs for step in job.keys})
     different: dict[Key, float] = {}
     alone, steps = 0.0, 0
@@ -83,7 +85,7 @@ def sharing(jobs: Sequence[PointJob], costs: Mapping[str, float]) -> Sharing:
 
 
 def work_left(jobs: Iterable[PointJob], costs: Mapping[str, float], stored: Callable[[Key], bool]) -> list[float]:
-    """Return the computing time of each job, without the results that are stored or that an earlier job computes."""
+    """Return the computing time of each point of a sweep, without results that are stored or computed earlier."""
     computed: set[Key] = set()
     in_store = cache(stored)
     work = []
@@ -101,7 +103,7 @@ def work_left(jobs: Iterable[PointJob], costs: Mapping[str, float], stored: Call
 
 
 def _reach(jobs: Sequence[PointJob], weights: Mapping[str, float], sizes: Sequence[int], axis: int) -> float:
-    """Return the mean computing time of the steps that a change to the next value of ``axis`` invalidates."""
+    """Return the mean computing time of the steps that must run again after a change to the next value of ``axis``."""
     stride = math.prod(sizes[axis + 1 :])
     work = [
         sum(weights[step] for step, key in job.keys.items() if jobs[i - stride].keys.get(step) != key)
@@ -112,7 +114,7 @@ def _reach(jobs: Sequence[PointJob], weights: Mapping[str, float], sizes: Sequen
 
 
 def _there_and_back(sizes: Sequence[int], slowest_first: Sequence[int]) -> list[tuple[int, ...]]:
-    """Return all points as index tuples, in a serpentine order in which successive points differ by 1 in one index."""
+    """Return all points of a sweep as index tuples in serpentine order: successive points differ by 1 in one index."""
     rows: list[list[int]] = [[0] * len(sizes)]
     for axis in slowest_first:
         grown = []
@@ -124,7 +126,7 @@ def _there_and_back(sizes: Sequence[int], slowest_first: Sequence[int]) -> list[
 
 
 def _grouped(jobs: Sequence[PointJob], weights: Mapping[str, float]) -> list[int]:
-    """Return the indices of ``jobs``, sorted so that jobs that share costly results are neighbours."""
+    """Return the indices of the points of a sweep, sorted so that points that share costly results are neighbours."""
     first: dict[str, dict[Key, int]] = defaultdict(dict)
     for i, job in enumerate(jobs):
         for step, key in job.keys.items():

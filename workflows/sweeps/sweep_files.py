@@ -26,7 +26,7 @@ def require_xarray(asked_by: str) -> None:
 def dataset(
     outcomes: Sequence[PointOutcome], columns: Sequence[AxisColumn], paired: bool, about: Mapping[str, str]
 ) -> Any:
-    """Return the results of a sweep as an `xarray.Dataset` whose dimensions are the axes, with coordinates in SI.
+    """Return the results of a sweep as an `xarray.Dataset` whose dimensions are the axes, with coordinates in SI units.
 
     Paired axes give the one dimension ``point``. A result of several numbers has the further dimension
     ``<result> index``. A point that failed or did not run is NaN; ``ran`` is true at points that have numbers.
@@ -56,7 +56,7 @@ def dataset(
 
 
 def _lengths(outcomes: Sequence[PointOutcome], taken: Collection[str]) -> dict[str, int]:
-    """Return the largest length over all points, for each result that is an array."""
+    """Return the largest length of each result that is an array, over all points of the sweep."""
     long: dict[str, int] = {}
     for outcome in outcomes:
         for step, part, index, _ in outcome.numbers:
@@ -67,6 +67,6 @@ def _lengths(outcomes: Sequence[PointOutcome], taken: Collection[str]) -> dict[s
 
 
 def _variable(step: str, part: str, taken: Collection[str]) -> str:
-    """Return the variable name of a result in the data set, which differs from all coordinate names."""
+    """Return the name of a result in the `xarray.Dataset`, different from the names of all coordinates."""
     name = f"{step}.{part}".rstrip(".").replace("/", "_")
     return f"{name} (result)" if name in taken else name

@@ -59,7 +59,7 @@ class PointOutcome:
 
 @dataclass(frozen=True)
 class SweepPlan:
-    """The plan of a sweep: its checked points in the order in which they run."""
+    """The checked points of a sweep, in the order in which they run, with the known computing times."""
 
     recipe: Recipe  #: the recipe of the first point
     checked: tuple[CheckedPoint, ...]
@@ -75,7 +75,10 @@ class SweepPlan:
 def plan_sweep(
     recipe: str, points: Sequence[Point], folder: Path, store: Store, paired: bool = False, device: str = "cpu"
 ) -> SweepPlan:
-    """Check all points and choose the order of their runs; raise `RecipeError` with the mistakes of all points."""
+    """Check all points of a sweep and choose the order in which the points run.
+
+    Raises `RecipeError` with the mistakes of all points.
+    """
     checker = _Checker(recipe, folder, store, device)
     checked = list(checker.every(points))
     if checker.diagnostics or checker.first is None:
@@ -139,7 +142,7 @@ def _costs(store: Store) -> dict[str, float]:
 
 
 class _Clock:
-    """A clock that predicts the remaining seconds of a sweep from its finished and its remaining work."""
+    """Prediction of the remaining time of a sweep from the time of its finished points."""
 
     def __init__(self, work: Sequence[float]) -> None:
         least = sum(work) / 100 / len(work) or 1.0  # reading the numbers of a stored point also takes time
@@ -148,7 +151,7 @@ class _Clock:
         self.done = self.seconds = 0.0
 
     def left(self, seconds: float) -> float:
-        """Record that a point took ``seconds``, and return the predicted seconds of all remaining points."""
+        """Record that a point of a sweep took ``seconds``, and return the predicted seconds of all remaining points."""
         work = self.work.pop(0)
         self.todo, self.done, self.seconds = self.todo - work, self.done + work, self.seconds + seconds
         return max(self.todo, 0.0) * self.seconds / self.done if self.work else 0.0
@@ -191,5 +194,5 @@ class _Checker:
         return PointJob(point.place, keys, graph, recipe.outputs)
 
     def _once(self, key: Key) -> Key:
-        """Return the first string object with this key, which saves memory because points share most of their keys."""
+        """Return the same string object for equal cache keys, which saves memory because points share most keys."""
         return str(self._same.setdefault(key, key))

@@ -35,7 +35,7 @@ SweepState = Literal["complete", "stopped", "interrupted"]
 
 @dataclass(frozen=True)
 class Sweep:
-    """The result of a sweep: the outcomes of the points that ran, sorted by axis, the last axis varying fastest."""
+    """Result of a sweep: the outcomes of the points that ran, in the order of the axes, the last axis fastest."""
 
     recipe: str
     title: str
@@ -48,12 +48,12 @@ class Sweep:
 
     @property
     def failed(self) -> tuple[PointOutcome, ...]:
-        """Return the outcomes of the points that failed."""
+        """Return the outcomes of the points of the sweep that failed."""
         return tuple(outcome for outcome in self.outcomes if outcome.state == "failed")
 
     @property
     def rows(self) -> list[dict[str, Any]]:
-        """Return the results of the sweep in long format, with one row for each number of each point."""
+        """Return the results of the sweep in long format, with one table row for each number of each point."""
         names = header(self.columns)
         return [dict(zip(names, row, strict=True)) for o in self.outcomes for row in rows_of(o, self.columns)]
 
@@ -62,7 +62,9 @@ class Sweep:
         return "\n".join(indented(wide(self.outcomes, self.columns)))
 
     def to_xarray(self) -> Any:
-        """Return the results as an `xarray.Dataset` whose dimensions are the axes, in SI; failed points are NaN.
+        """Return the results of the sweep as an `xarray.Dataset` in SI units, whose dimensions are the axes.
+
+        The results of failed points are NaN.
 
         Raises: RecipeError if xarray is not installed.
         """
@@ -157,7 +159,7 @@ def _account(work: Sweeping, result: Sweep, again: Sequence[str], seconds: float
 
 
 def counted(result: Sweep) -> str:
-    """Return the number of points in each state, such as ``12 points: 8 run, 3 cached, 1 failed``."""
+    """Return the number of points of a sweep in each state, such as ``12 points: 8 run, 3 cached, 1 failed``."""
     states = [outcome.state for outcome in result.outcomes]
     parts = [f"{states.count(state)} {state}" for state in ("run", "cached", "failed") if state in states]
     rest = result.points - len(states)

@@ -1,4 +1,4 @@
-"""The table of a sweep: its columns, its rows in a file, and the text of its cells."""
+"""Table of the results of a sweep: its columns, its rows in a file, and the text of its cells."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ AFTER = ("status", "step", "field", "index", "value", "seconds", "cached", "mess
 
 @dataclass(frozen=True, slots=True)
 class AxisColumn:
-    """The column of an axis in a table, with the unit in the header if all values have the same physical dimension."""
+    """Table column of one axis of a sweep; its header has a unit if all values have the same physical dimension."""
 
     name: str
     header: str
@@ -27,7 +27,10 @@ class AxisColumn:
 
 
 def column(axis: Axis) -> AxisColumn:
-    """Return the table column of an axis: numbers in their common unit, or in SI if units differ; words unchanged."""
+    """Return the table column of an axis of a sweep: numbers in their common unit, or in SI units if units differ.
+
+    Words are unchanged.
+    """
     values = [c.value for c in axis.coordinates]
     quantities = [q for q in map(_quantity, values) if q is not None]
     header = f"{axis.name} (axis)" if axis.name in ("point", *AFTER) else axis.name
@@ -67,7 +70,10 @@ def header(columns: Sequence[AxisColumn]) -> list[str]:
 
 
 def rows_of(outcome: PointOutcome, columns: Sequence[AxisColumn]) -> Iterator[list[Any]]:
-    """Yield the table rows of a point: one for each number, or a single row if the point failed or has no numbers."""
+    """Yield the table rows of one point of a sweep: one row for each number, or a single row without a number.
+
+    A point has no numbers if it failed or if its results have none.
+    """
     where = [outcome.point.number, *point_cells(outcome.point, columns)]
     status = "failed" if outcome.state == "failed" else "ok"
     last = [round(outcome.seconds, 6), outcome.state == "cached", outcome.message]
@@ -76,7 +82,10 @@ def rows_of(outcome: PointOutcome, columns: Sequence[AxisColumn]) -> Iterator[li
 
 
 def headline(numbers: Sequence[ResultNumber]) -> dict[str, str]:
-    """Format each result of a point as text: a number, or the range of an array; single numbers come first."""
+    """Return each result of one point of a sweep as text: a single number, or the range of the numbers of an array.
+
+    Single numbers come first.
+    """
     results: dict[str, list[float]] = {}
     for step, part, _, value in numbers:
         results.setdefault(f"{step}.{part}".rstrip("."), []).append(value)
@@ -84,7 +93,7 @@ def headline(numbers: Sequence[ResultNumber]) -> dict[str, str]:
 
 
 def wide(outcomes: Sequence[PointOutcome], columns: Sequence[AxisColumn]) -> list[list[str]]:
-    """Return the header of a table and one row for each point, with its values, results, state and seconds."""
+    """Return the rows of a text table of a sweep: a header, then one row for each point with its results."""
     results = [headline(outcome.numbers) for outcome in outcomes]
     names = list(dict.fromkeys(name for result in results for name in result))
     rows = [["point", *(c.header for c in columns), *names, "state", "seconds"]]
@@ -96,7 +105,7 @@ def wide(outcomes: Sequence[PointOutcome], columns: Sequence[AxisColumn]) -> lis
 
 
 def point_cells(point: Point, columns: Sequence[AxisColumn]) -> list[Any]:
-    """Return the values of a point, one for each axis, as they appear in the table."""
+    """Return the axis values of one point of a sweep as they appear in the table."""
     return [c.cells[i] for c, i in zip(columns, point.place, strict=True)]
 
 

@@ -65,7 +65,10 @@ def _spanned(text: str) -> list[str]:
 
 
 def _function(text: str) -> tuple[str, str] | None:
-    """Return the name and the arguments of a range, or None; raise `ValueError` if the name is misspelt."""
+    """Return the name and the arguments of a range such as ``range(4)``, or None if the text is not a range.
+
+    Raises `ValueError` if the name is misspelt.
+    """
     match = _CALL.fullmatch(text)
     if match is None or match[1] in _FUNCTIONS:
         return match and (match[1], match[2])
@@ -82,7 +85,7 @@ def _range(arguments: list[str]) -> list[str]:
     start, stop = (Fraction(0), numbers[0]) if len(numbers) == 1 else (numbers[0], numbers[1])
     step = numbers[2] if len(numbers) == 3 else Fraction(1)
     if step == 0:
-        raise ValueError("the step must not be 0")
+        raise ValueError("the step of a range must not be 0")
     count = _count(math.ceil((stop - start) / step))
     return [_written(start + i * step, unit) for i in range(count)]
 
@@ -96,7 +99,7 @@ def _linspace(arguments: list[str]) -> list[str]:
 def _logspace(arguments: list[str]) -> list[str]:
     (start, stop), unit, count = _ends(arguments, "logspace(1e2, 1e6, 5)")
     if start <= 0 or stop <= 0:
-        raise ValueError("the first and the last value must be positive")
+        raise ValueError("the first and the last value of a logarithmic range must be positive")
     with localcontext(prec=50):
         low, high = (Decimal(x.numerator) / Decimal(x.denominator) for x in (start, stop))
         step = (high / low).ln() / max(count - 1, 1)
@@ -120,14 +123,14 @@ def _ends(arguments: list[str], example: str) -> tuple[list[Fraction], str, int]
 
 def _count(count: int) -> int:
     if count < 1:
-        raise ValueError("the range is empty: change its ends or its number of values")
+        raise ValueError("the range is empty: change its first value, its last value or the number of values")
     if count > MOST:
-        raise ValueError(f"{count if count < _EXACT else 'too many'} values: an axis has at most {MOST}")
+        raise ValueError(f"the range has {count if count < _EXACT else 'too many'} values: an axis has at most {MOST}")
     return count
 
 
 def _numbers(texts: list[str]) -> tuple[list[Fraction], str]:
-    """Parse numbers as exact fractions, and return the fractions and their common unit."""
+    """Return the numbers in ``texts`` as exact fractions, and their common unit."""
     matches = [_NUMBER.fullmatch(text) for text in texts]
     for text, match in zip(texts, matches, strict=True):
         if match is None or not math.isfinite(float(match[1])):

@@ -263,7 +263,7 @@ def test_a_layout_refuses_a_blob_with_another_content(blobs):
 def test_a_layout_with_blobs_needs_their_folder(blobs):
     x = stack(*PAGES)
     layout, tensors = serialization.pack(Stacked(x, tuple(names_of(x))), blobs)
-    with pytest.raises(ValueError, match="files of their own"):
+    with pytest.raises(ValueError, match="give the folder of the band files"):
         serialization.unpack(layout, tensors)
 
 

@@ -236,7 +236,7 @@ def test_an_entry_under_a_wrong_name_is_not_served(tmp_path):
     other = "ab" + "1" * 30
     for suffix in ("json", "safetensors"):
         os.link(tmp_path / "ab" / f"{KEY}.{suffix}", tmp_path / "ab" / f"{other}.{suffix}")
-    with pytest.warns(UserWarning, match=f"the metadata belong to the key {KEY}"):
+    with pytest.warns(UserWarning, match=f"belong to the key {KEY}"):
         assert not Store(tmp_path).has(other)
 
 

@@ -58,9 +58,9 @@ def test_values_as_they_are_written(text, values):
         ("[1,2", "a bracket is not closed: ] is missing"),
         ("range()", "range: write range(stop)"),
         ("range(5, 1)", "range: the range is empty"),
-        ("range(0, 1, 0)", "range: the step must not be 0"),
-        ("range(1e9)", f"range: 1000000000 values: an axis has at most {MOST}"),
-        ("range(0, 1, 1e-300)", "range: too many values"),
+        ("range(0, 1, 0)", "range: the step of a range must not be 0"),
+        ("range(1e9)", f"range: the range has 1000000000 values: an axis has at most {MOST}"),
+        ("range(0, 1, 1e-300)", "range: the range has too many values"),
         ("range(1e999)", "range: 1e999 is not a number"),
         ("range(a, b)", "range: a is not a number"),
         ("linspace(1 nm, 2 um, 3)", "linspace: write all numbers in the same unit instead of nm, um"),
@@ -68,7 +68,7 @@ def test_values_as_they_are_written(text, values):
         ("linspace(1, 2)", "linspace: write the first value, the last value and the number of values"),
         ("linspace(1, 2, 2.5)", "linspace: the number of values must be a whole number of at least 1, not 2.5"),
         ("linspace(1, 2, 0)", "linspace: the range is empty"),
-        ("logspace(0, 1, 3)", "logspace: the first and the last value must be positive"),
+        ("logspace(0, 1, 3)", "logspace: the first and the last value of a logarithmic range must be positive"),
         ("linspce(1, 2, 3)", "there is no range function linspce; did you mean linspace?"),
     ],
 )
@@ -150,9 +150,9 @@ def test_every_wrong_argument_is_named_at_once(tmp_path):
 @pytest.mark.parametrize(
     ("words", "told"),
     [
-        (["a=1"], "sweep |  | there is no axis: write a=1,2,3 or a='linspace(450 nm, 650 nm, 5)'"),
-        (["a=1,2", "a=3,4"], "argument 2 | a | a is also in argument 1: remove one"),
-        (["a=1,2,1"], "argument 1 | a | the value 1 appears twice: remove one"),
+        (["a=1"], "sweep |  | the sweep has no axis: write a=1,2 or a='linspace(450 nm, 650 nm, 5)'"),
+        (["a=1,2", "a=3,4"], "argument 2 | a | axis a is also in argument 1: remove one"),
+        (["a=1,2,1"], "argument 1 | a | the value 1 appears twice on the axis: remove one"),
         (["a=range(1000)", "b=range(1000)"], "sweep |  | a sweep of 1000000 points is too long: at most 100000 points"),
     ],
 )
@@ -176,8 +176,8 @@ def test_axes_of_arrays(tmp_path):
 @pytest.mark.parametrize(
     ("axes", "told"),
     [
-        ({"a": []}, "axis a | a | the list of values is empty: give at least one value"),
-        ({"a": 3}, "axis a | a | give a list of values, not int"),
+        ({"a": []}, "axis a | a | the axis has an empty list of values: give at least one value"),
+        ({"a": 3}, "axis a | a | give the axis a list of values, not int"),
         ({"+a": [1]}, "axis +a | +a | write the name of an axis without + or ~"),
         ({"a": "1,,2"}, "axis a | a=1,,2 | a value is missing before or after a comma"),
     ],
