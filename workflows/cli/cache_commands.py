@@ -48,7 +48,7 @@ def gc(
     budget: Annotated[str, typer.Option("--budget", help="Largest size of the cache, such as 20 GB.")] = "",
     dry: Annotated[bool, typer.Option("--dry-run", help="Say what would be removed, and remove nothing.")] = False,
 ) -> None:
-    """Remove files that belong to no result, and results beyond a budget.
+    """Remove files that belong to no stored result, and results beyond a budget.
 
     Beyond the budget, the results that save the fewest seconds for each byte are removed first. Pinned results stay.
     """
@@ -58,21 +58,21 @@ def gc(
 
 @cache.command("pin")
 def pin(key: Key) -> None:
-    """Keep a result even if the cache exceeds its budget."""
+    """Keep a stored result even if the cache exceeds its budget."""
     with failing(ValueError):
         say(pin_lines(the_store(), key))
 
 
 @cache.command("unpin")
 def unpin(key: Key) -> None:
-    """Unpin a result, so that `gc` may remove the result."""
+    """Unpin a stored result, so that `cache gc` may remove the result."""
     with failing(ValueError):
         say(pin_lines(the_store(), key, pin=False))
 
 
 @cache.command("why")
 def why(key: Key) -> None:
-    """Print the origin of a result.
+    """Print the origin of a stored result.
 
     Also print the differences from the nearest earlier result.
     """
